@@ -1,0 +1,200 @@
+//! [`Env`]: one world, its actions, its observations, and its picture.
+//!
+//! An environment declares its observation columns up front ([`EnvSpec`]) and writes them into a [`crate::Batch`]
+//! row in place. It owns all its randomness: the same seed and the same actions give the same bytes. Its
+//! full state can be taken and put back ([`Env::snapshot`]), it can start from a row of a dataset
+//! ([`Env::restore_from`]), and it can always make a reachable goal ([`Env::sample_goal`]).
+
+use crate::batch::{ColumnSpec, RowMut, RowRef};
+use crate::{Error, FactorValues, Key, Result, Space, VariationRequest, VariationSpace};
+
+/// What never changes about an environment.
+#[derive(Clone)]
+pub struct EnvSpec {
+    /// Its registered id, such as `swm/PushT-v1`.
+    pub id: &'static str,
+    /// The actions it takes: a `Float32` box or a discrete space.
+    pub action_space: Space,
+    /// The columns [`Env::observe`] writes, in order; `state` is always among them.
+    pub columns: Vec<ColumnSpec>,
+    /// Its factors of variation.
+    pub variation_space: VariationSpace,
+    /// Steps after which an episode is truncated, unless the caller says otherwise.
+    pub max_episode_steps: usize,
+}
+
+impl EnvSpec {
+    /// Numbers in one action.
+    pub fn action_dim(&self) -> usize {
+        self.action_space.len()
+    }
+
+    /// The column that holds actions: `Float32` for boxes, `Int64` for discrete spaces.
+    pub fn action_column(&self) -> ColumnSpec {
+        let shape = match &self.action_space {
+            Space::Discrete { .. } => vec![1],
+            other => other.shape(),
+        };
+        ColumnSpec::new("action", self.action_space.dtype(), shape)
+    }
+}
+
+/// What a caller may choose when making an environment.
+#[derive(Clone, Debug, Default)]
+pub struct EnvConfig {
+    /// Steps after which an episode is truncated; `None` means [`EnvSpec::max_episode_steps`].
+    pub max_episode_steps: Option<usize>,
+}
+
+/// What a caller may choose at a reset.
+#[derive(Clone, Debug, Default)]
+pub struct ResetOptions {
+    /// Factors to sample and to pin.
+    pub variation: VariationRequest,
+    /// The start, in the layout of the `state` column; `None` follows the factors.
+    pub state: Option<Vec<f64>>,
+    /// The goal, in the layout of the `state` column; `None` lets the environment choose.
+    pub goal_state: Option<Vec<f64>>,
+}
+
+/// One action.
+#[derive(Clone, Copy, Debug)]
+pub enum Action<'a> {
+    /// A point of a box.
+    Continuous(&'a [f32]),
+    /// One of a discrete set.
+    Discrete(i64),
+}
+
+impl<'a> Action<'a> {
+    /// The numbers of a continuous action.
+    ///
+    /// # Errors
+    /// When it is discrete, has another length than `dim`, or a number is not finite.
+    pub fn continuous(self, dim: usize) -> Result<&'a [f32]> {
+        match self {
+            Self::Continuous(values) if values.len() == dim => match values.iter().find(|v| !v.is_finite()) {
+                None => Ok(values),
+                Some(_) => Err(Error::NotFinite {
+                    what: "an action".to_owned(),
+                    given: format!("{values:?}"),
+                    fix: "check the policy or the model that produced it".to_owned(),
+                }),
+            },
+            Self::Continuous(values) => {
+                Err(Error::mismatch("stepping", format!("an action of {} numbers", values.len()), format!("{dim}")))
+            }
+            Self::Discrete(index) => {
+                Err(Error::mismatch("stepping", format!("discrete action {index}"), format!("{dim} numbers")))
+            }
+        }
+    }
+
+    /// A discrete action, checked against `n` choices from 0.
+    ///
+    /// # Errors
+    /// When it is continuous or out of range.
+    pub fn discrete(self, n: i64) -> Result<i64> {
+        match self {
+            Self::Discrete(index) if (0..n).contains(&index) => Ok(index),
+            Self::Discrete(index) => {
+                Err(Error::mismatch("stepping", format!("action {index}"), format!("0 ..= {}", n - 1)))
+            }
+            Self::Continuous(values) => {
+                Err(Error::mismatch("stepping", format!("{values:?}"), format!("one integer in 0 ..= {}", n - 1)))
+            }
+        }
+    }
+}
+
+/// What a step brought, apart from the observation.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Transition {
+    /// The reward.
+    pub reward: f64,
+    /// The episode is over because of where the world is: the goal is reached.
+    pub terminated: bool,
+    /// The episode is over because of the clock.
+    pub truncated: bool,
+}
+
+/// An RGB picture to draw into: rows of `width` pixels of 3 bytes.
+pub struct FrameMut<'a> {
+    /// Pixels in a row.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// `height * width * 3` bytes.
+    pub rgb: &'a mut [u8],
+}
+
+impl<'a> FrameMut<'a> {
+    /// A picture over these bytes.
+    ///
+    /// # Panics
+    /// When there are not `height * width * 3` of them.
+    pub fn new(width: usize, height: usize, rgb: &'a mut [u8]) -> Self {
+        assert_eq!(rgb.len(), width * height * 3, "a {width} x {height} RGB picture");
+        Self { width, height, rgb }
+    }
+}
+
+/// The full state of an environment, randomness included: opaque bytes, valid for the same environment id.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Snapshot(pub Vec<u8>);
+
+/// One world.
+pub trait Env: Send {
+    /// What never changes about it.
+    fn spec(&self) -> &EnvSpec;
+
+    /// Starts an episode: samples factors, start and goal from `seed` alone.
+    ///
+    /// # Errors
+    /// When the request names unknown factors or impossible values.
+    fn reset(&mut self, seed: u64, options: &ResetOptions) -> Result<()>;
+
+    /// Applies one action. Continuous actions outside the action space are clipped to it or not, as the
+    /// environment's README says; non-finite ones are errors.
+    ///
+    /// # Errors
+    /// When the action is of the wrong kind, length or range, or not finite.
+    fn step(&mut self, action: Action<'_>) -> Result<Transition>;
+
+    /// Writes the columns of [`EnvSpec::columns`] into the first places of a row.
+    fn observe(&self, row: &mut RowMut<'_>);
+
+    /// Draws the world as it is.
+    fn render(&mut self, frame: FrameMut<'_>);
+
+    /// Draws the world as it would look at the goal.
+    fn render_goal(&mut self, frame: FrameMut<'_>);
+
+    /// The factors of this episode.
+    fn factors(&self) -> &FactorValues;
+
+    /// The full state, randomness included.
+    fn snapshot(&self) -> Snapshot;
+
+    /// Puts a state back; what follows equals what followed the snapshot, bit for bit.
+    ///
+    /// # Errors
+    /// When the snapshot is of another environment.
+    fn restore(&mut self, snapshot: &Snapshot) -> Result<()>;
+
+    /// Continues from a dataset row (its `state` column, and factor columns where it has them) towards the
+    /// state of another row.
+    ///
+    /// # Errors
+    /// When a row lacks what the environment needs.
+    fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()>;
+
+    /// Chooses a new reachable goal that is not already reached, without moving the world.
+    ///
+    /// # Errors
+    /// When none is found in bounded tries.
+    fn sample_goal(&mut self, key: Key) -> Result<()>;
+
+    /// Whether the goal is reached now.
+    fn is_success(&self) -> bool;
+}

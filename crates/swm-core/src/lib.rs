@@ -1,0 +1,36 @@
+//! The vocabulary of stable-worldmodel.
+//!
+//! Read the modules in this order and you know the system:
+//!
+//! 1. [`batch`]: the only thing that flows between its parts, named typed columns.
+//! 2. [`space`] and [`variation`]: what an action, an observation and a factor of variation may be.
+//! 3. [`key`]: where every random number comes from.
+//! 4. [`env`], [`pool`], [`policy`]: worlds, many of them at once, and who acts in them.
+//! 5. [`plan`]: costs of candidate action sequences, and the solvers that minimise them.
+//! 6. [`registry`], [`manifest`], [`error`]: names, provenance, and what goes wrong.
+
+pub mod batch;
+pub mod env;
+pub mod error;
+pub mod key;
+pub mod manifest;
+pub mod plan;
+pub mod policy;
+pub mod pool;
+pub mod registry;
+pub mod space;
+pub mod variation;
+
+pub use batch::{Batch, ColumnSpec, DType, Element, RowMut, RowRef, Schema};
+pub use env::{Action, Env, EnvConfig, EnvSpec, FrameMut, ResetOptions, Snapshot, Transition};
+pub use error::{Error, Result};
+pub use key::{Key, Rng};
+pub use manifest::Manifest;
+pub use plan::{
+    Candidates, Constrained, CostModel, DifferentiableCost, LatentDynamics, Plan, PlanProblem, PlanTrace, Solver,
+};
+pub use policy::{Policy, RandomPolicy};
+pub use pool::EnvPool;
+pub use registry::{Named, Registry};
+pub use space::Space;
+pub use variation::{Factor, FactorValues, VariationRequest, VariationSpace};

@@ -1,0 +1,105 @@
+//! [`Policy`]: who acts. A policy sees the infos of all environments at once and fills one action row for each.
+//!
+//! Randomness of a policy is keyed by the episode a slot plays, not by the slot, so the same episode is
+//! played the same way wherever it runs.
+
+use crate::batch::{Batch, DType, RowMut, RowRef};
+use crate::{EnvSpec, Key, Result, Rng};
+
+/// Who acts.
+pub trait Policy: Send {
+    /// A new episode begins in `slot`; `key` is the episode's.
+    fn begin(&mut self, slot: usize, key: Key);
+
+    /// Fills the `action` rows of the active slots.
+    ///
+    /// # Errors
+    /// When the infos lack what the policy needs, or its model fails.
+    fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()>;
+
+    /// Seconds each plan took since the last call, for policies that plan.
+    fn take_latencies(&mut self) -> Vec<f64> {
+        vec![]
+    }
+}
+
+/// Acts uniformly at random in the action space.
+pub struct RandomPolicy {
+    spec: EnvSpec,
+    rngs: Vec<Rng>,
+}
+
+impl RandomPolicy {
+    /// A random policy for `slots` environments.
+    pub fn new(spec: &EnvSpec, slots: usize) -> Self {
+        Self { spec: spec.clone(), rngs: vec![Key::new(0).rng(); slots] }
+    }
+}
+
+impl Policy for RandomPolicy {
+    fn begin(&mut self, slot: usize, key: Key) {
+        self.rngs[slot] = key.with("random policy").rng();
+    }
+
+    fn act(&mut self, _infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
+        let column = actions.schema().index("action")?;
+        for slot in (0..active.len()).filter(|&slot| active[slot]) {
+            let action = self.spec.action_space.sample(&mut self.rngs[slot]);
+            write_action(&mut actions.row_mut(slot), column, &action);
+        }
+        Ok(())
+    }
+}
+
+/// One environment's expert: reads the infos row, writes the action.
+pub trait Expert: Send {
+    /// A new episode begins.
+    fn begin(&mut self, key: Key);
+
+    /// The action for what the row shows.
+    ///
+    /// # Errors
+    /// When the row lacks what the expert needs.
+    fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()>;
+}
+
+/// One [`Expert`] a slot.
+pub struct ExpertPolicy {
+    experts: Vec<Box<dyn Expert>>,
+    action: Vec<f64>,
+}
+
+impl ExpertPolicy {
+    /// A policy of these experts, one a slot.
+    pub fn new(spec: &EnvSpec, experts: Vec<Box<dyn Expert>>) -> Self {
+        Self { experts, action: vec![0.0; spec.action_dim()] }
+    }
+}
+
+impl Policy for ExpertPolicy {
+    fn begin(&mut self, slot: usize, key: Key) {
+        self.experts[slot].begin(key.with("expert"));
+    }
+
+    fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
+        let column = actions.schema().index("action")?;
+        for slot in (0..active.len()).filter(|&slot| active[slot]) {
+            self.experts[slot].act(infos.row(slot), &mut self.action)?;
+            write_action(&mut actions.row_mut(slot), column, &self.action);
+        }
+        Ok(())
+    }
+}
+
+/// Writes an action in the type of its column.
+#[allow(clippy::cast_possible_truncation)]
+pub fn write_action(row: &mut RowMut<'_>, column: usize, action: &[f64]) {
+    match row.schema().columns()[column].dtype {
+        DType::Float32 => {
+            for (to, &from) in row.at::<f32>(column).iter_mut().zip(action) {
+                *to = from as f32;
+            }
+        }
+        _ => row.set(column, &[action[0] as i64]),
+    }
+}

@@ -1,0 +1,186 @@
+//! What an action, an observation or a factor of variation may be.
+//!
+//! A value of any space is held as `f64`s (exact for every type here); the space says how many, of which
+//! type, and within which bounds. The JSON form is the one `swm fovs --json` prints.
+
+use crate::batch::DType;
+use crate::{Error, Result, Rng};
+use rand::Rng as _;
+use serde::{Deserialize, Serialize};
+
+/// A set of values.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "type")]
+pub enum Space {
+    /// Numbers between bounds, `shape` of them.
+    Box {
+        /// The shape; empty for a scalar.
+        shape: Vec<usize>,
+        /// The type of the numbers.
+        dtype: DType,
+        /// Lower bounds, one for each number, included.
+        low: Vec<f64>,
+        /// Upper bounds, one for each number, included.
+        high: Vec<f64>,
+    },
+    /// One of `n` integers, `start` being the first.
+    Discrete {
+        /// How many.
+        n: i64,
+        /// The first.
+        start: i64,
+    },
+    /// Several integers, the i-th one of `nvec[i]` from 0.
+    MultiDiscrete {
+        /// How many values each has.
+        nvec: Vec<i64>,
+    },
+    /// A colour: red, green and blue from 0 to 255.
+    #[serde(rename = "RGBBox")]
+    Rgb,
+}
+
+impl Space {
+    /// A box with the same bounds for every number.
+    pub fn uniform_box(shape: impl Into<Vec<usize>>, dtype: DType, low: f64, high: f64) -> Self {
+        let shape = shape.into();
+        let n = shape.iter().product();
+        Self::Box { shape, dtype, low: vec![low; n], high: vec![high; n] }
+    }
+
+    /// Numbers in one value.
+    pub fn len(&self) -> usize {
+        match self {
+            Self::Box { low, .. } => low.len(),
+            Self::Discrete { .. } => 1,
+            Self::MultiDiscrete { nvec } => nvec.len(),
+            Self::Rgb => 3,
+        }
+    }
+
+    /// Whether a value holds no number.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The shape of one value.
+    pub fn shape(&self) -> Vec<usize> {
+        match self {
+            Self::Box { shape, .. } => shape.clone(),
+            Self::Discrete { .. } => vec![],
+            Self::MultiDiscrete { nvec } => vec![nvec.len()],
+            Self::Rgb => vec![3],
+        }
+    }
+
+    /// The type of its numbers.
+    pub fn dtype(&self) -> DType {
+        match self {
+            Self::Box { dtype, .. } => *dtype,
+            Self::Discrete { .. } | Self::MultiDiscrete { .. } => DType::Int64,
+            Self::Rgb => DType::U8,
+        }
+    }
+
+    /// The bounds of number `i` of a value, both included.
+    pub fn bounds(&self, i: usize) -> (f64, f64) {
+        #[allow(clippy::cast_precision_loss)]
+        match self {
+            Self::Box { low, high, .. } => (low[i], high[i]),
+            Self::Discrete { n, start } => (*start as f64, (*start + *n - 1) as f64),
+            Self::MultiDiscrete { nvec } => (0.0, (nvec[i] - 1) as f64),
+            Self::Rgb => (0.0, 255.0),
+        }
+    }
+
+    /// Draws a value uniformly.
+    pub fn sample(&self, rng: &mut Rng) -> Vec<f64> {
+        (0..self.len())
+            .map(|i| {
+                let (low, high) = self.bounds(i);
+                match self.dtype() {
+                    DType::Float32 | DType::Float64 => self.round(low + (high - low) * rng.random::<f64>()),
+                    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+                    _ => rng.random_range(low as i64..=high as i64) as f64,
+                }
+            })
+            .collect()
+    }
+
+    /// The nearest number this space's type can hold.
+    pub fn round(&self, value: f64) -> f64 {
+        #[allow(clippy::cast_possible_truncation)]
+        match self.dtype() {
+            DType::Float32 => f64::from(value as f32),
+            _ => value,
+        }
+    }
+
+    /// Checks that `value` is in the space.
+    ///
+    /// # Errors
+    /// When it has another length, a number is out of bounds or not finite, or not whole where it must be.
+    pub fn check(&self, name: &str, value: &[f64]) -> Result<()> {
+        let whole = !matches!(self.dtype(), DType::Float32 | DType::Float64);
+        let fine = value.len() == self.len()
+            && value.iter().enumerate().all(|(i, &v)| {
+                let (low, high) = self.bounds(i);
+                v.is_finite() && v >= low && v <= high && (!whole || v.fract() == 0.0)
+            });
+        if fine {
+            return Ok(());
+        }
+        Err(Error::OutOfSpace { what: name.to_owned(), given: format!("{value:?}"), expected: self.describe() })
+    }
+
+    /// The space in a few words.
+    pub fn describe(&self) -> String {
+        match self {
+            Self::Box { shape, dtype, low, high } => {
+                let same = |v: &[f64]| v.windows(2).all(|w| w[0] == w[1]);
+                let (low, high) = if !low.is_empty() && same(low) && same(high) {
+                    (low[0].to_string(), high[0].to_string())
+                } else {
+                    (format!("{low:?}"), format!("{high:?}"))
+                };
+                let shape = if shape.is_empty() { "one".to_owned() } else { format!("{shape:?}") };
+                format!("{shape} {} in {low} ..= {high}", dtype.name())
+            }
+            Self::Discrete { n, start } => format!("one integer in {start} ..= {}", start + n - 1),
+            Self::MultiDiscrete { nvec } => {
+                format!("{} integers from 0, below {nvec:?}", nvec.len())
+            }
+            Self::Rgb => "a colour: 3 integers in 0 ..= 255".to_owned(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Key;
+
+    #[test]
+    fn samples_are_in_their_space() {
+        let spaces = [
+            Space::uniform_box([2], DType::Float32, -1.0, 1.0),
+            Space::uniform_box([], DType::Float64, 0.0, 1e-3),
+            Space::Discrete { n: 3, start: 1 },
+            Space::MultiDiscrete { nvec: vec![224, 21] },
+            Space::Rgb,
+        ];
+        let mut rng = Key::new(1).rng();
+        for space in &spaces {
+            for _ in 0..200 {
+                let value = space.sample(&mut rng);
+                space.check("value", &value).expect("a sample is in its space");
+            }
+        }
+        let error = spaces[4].check("agent.color", &[0.0, 256.0, 3.0]).expect_err("out of bounds").to_string();
+        assert_eq!(
+            error,
+            "agent.color = [0.0, 256.0, 3.0] is outside its space: expected a colour: 3 integers in 0 ..= 255"
+        );
+        assert!(spaces[2].check("door.number", &[1.5]).is_err());
+    }
+}

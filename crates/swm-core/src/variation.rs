@@ -1,0 +1,313 @@
+//! Factors of variation: what may differ between two episodes of one environment, by dot key.
+//!
+//! A [`VariationSpace`] lists every factor of an environment with its space and default. A
+//! [`VariationRequest`] says which to sample (`"agent.color"`, a group such as `"agent"`, or `"all"`) and which
+//! to pin. [`VariationSpace::resolve`] turns a request and a key into [`FactorValues`], constant for the
+//! episode. Every factor draws from its own stream, so varying one never changes another's draw.
+
+use crate::{Error, Key, Result, Space};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+/// One factor of variation.
+#[derive(Clone, Debug, Serialize)]
+pub struct Factor {
+    /// Its dot key, such as `agent.color`.
+    #[serde(skip)]
+    pub key: String,
+    /// The values it may take.
+    #[serde(flatten)]
+    pub space: Space,
+    /// Its value where nobody varies it.
+    pub init_value: Vec<f64>,
+}
+
+impl Factor {
+    /// A factor.
+    pub fn new(key: &str, space: Space, init_value: impl Into<Vec<f64>>) -> Self {
+        Self { key: key.to_owned(), space, init_value: init_value.into() }
+    }
+}
+
+/// A condition on a factor's value given the factors sampled before it.
+#[derive(Clone)]
+struct Constraint {
+    factor: usize,
+    words: &'static str,
+    holds: fn(&FactorValues) -> bool,
+}
+
+/// All factors of an environment, in sampling order.
+#[derive(Clone)]
+pub struct VariationSpace {
+    factors: Arc<[Factor]>,
+    constraints: Vec<Constraint>,
+    /// What is sampled at a reset that asks for nothing.
+    defaults: Vec<String>,
+}
+
+/// How often a constrained factor is sampled before giving up.
+const TRIES: usize = 10_000;
+
+impl VariationSpace {
+    /// A space of these factors, sampled in this order; `defaults` are sampled when a reset asks for nothing.
+    ///
+    /// # Panics
+    /// When a default value is outside its own space or a default key does not exist: that is a bug of the
+    /// environment, found by its first test.
+    pub fn new(factors: Vec<Factor>, defaults: &[&str]) -> Self {
+        for factor in &factors {
+            if let Err(error) = factor.space.check(&factor.key, &factor.init_value) {
+                panic!("default value: {error}");
+            }
+        }
+        let space = Self {
+            factors: factors.into(),
+            constraints: vec![],
+            defaults: defaults.iter().map(|&key| key.to_owned()).collect(),
+        };
+        for key in &space.defaults {
+            assert!(space.find(key).is_some(), "default variation '{key}' is no factor");
+        }
+        space
+    }
+
+    /// Adds a constraint: after `factor` is sampled, `holds` must be true, else it is sampled again. `holds`
+    /// sees that factor's value, those of factors earlier in the sampling order, and pinned values.
+    ///
+    /// # Panics
+    /// When there is no such factor.
+    #[must_use]
+    pub fn constrain(mut self, factor: &str, words: &'static str, holds: fn(&FactorValues) -> bool) -> Self {
+        let factor = self.find(factor).unwrap_or_else(|| panic!("constraint on '{factor}', which is no factor"));
+        self.constraints.push(Constraint { factor, words, holds });
+        self
+    }
+
+    /// The factors, in sampling order.
+    pub fn factors(&self) -> &[Factor] {
+        &self.factors
+    }
+
+    /// What is sampled at a reset that asks for nothing.
+    pub fn defaults(&self) -> &[String] {
+        &self.defaults
+    }
+
+    /// The place of a factor.
+    pub fn find(&self, key: &str) -> Option<usize> {
+        self.factors.iter().position(|factor| factor.key == key)
+    }
+
+    /// The places of all factors a key names: one, a group, or all.
+    ///
+    /// # Errors
+    /// When the key names none.
+    pub fn select(&self, key: &str) -> Result<Vec<usize>> {
+        let group = format!("{key}.");
+        let chosen: Vec<usize> = (0..self.factors.len())
+            .filter(|&i| key == "all" || self.factors[i].key == key || self.factors[i].key.starts_with(&group))
+            .collect();
+        if chosen.is_empty() {
+            let mut known: Vec<&str> = vec!["all"];
+            for factor in self.factors.iter() {
+                known.push(&factor.key);
+                if let Some((group, _)) = factor.key.split_once('.')
+                    && !known.contains(&group)
+                {
+                    known.push(group);
+                }
+            }
+            return Err(Error::unknown("factor of variation", key, known, "`swm fovs ENV` lists them"));
+        }
+        Ok(chosen)
+    }
+
+    /// The values of an episode: defaults, then pinned values, then samples of what varies.
+    ///
+    /// # Errors
+    /// Unknown keys, pinned values out of bounds, pinned values that violate a constraint, and constraints
+    /// that no sample satisfies.
+    pub fn resolve(&self, request: &VariationRequest, key: Key) -> Result<FactorValues> {
+        let mut varied = vec![false; self.factors.len()];
+        for name in request.variation.as_ref().unwrap_or(&self.defaults) {
+            for i in self.select(name)? {
+                varied[i] = true;
+            }
+        }
+        let mut values = FactorValues {
+            factors: Arc::clone(&self.factors),
+            values: self.factors.iter().map(|factor| factor.init_value.clone()).collect(),
+        };
+        let mut pinned = vec![false; self.factors.len()];
+        for (name, value) in &request.variation_values {
+            let Some(i) = self.find(name) else {
+                let known = self.factors.iter().map(|f| f.key.as_str());
+                return Err(Error::unknown("factor of variation", name, known, "`swm fovs ENV` lists them"));
+            };
+            self.factors[i].space.check(name, value)?;
+            values.values[i] = value.iter().map(|&v| self.factors[i].space.round(v)).collect();
+            (pinned[i], varied[i]) = (true, false);
+        }
+        for (i, factor) in self.factors.iter().enumerate() {
+            let constraints = || self.constraints.iter().filter(move |c| c.factor == i);
+            if !varied[i] {
+                continue;
+            }
+            let mut rng = key.with("factor").with(&factor.key).rng();
+            let mut tries = 0;
+            loop {
+                values.values[i] = factor.space.sample(&mut rng);
+                let Some(broken) = constraints().find(|c| !(c.holds)(&values)) else { break };
+                tries += 1;
+                if tries == TRIES {
+                    return Err(Error::Unsatisfiable {
+                        factor: factor.key.clone(),
+                        constraint: broken.words.to_owned(),
+                        tries,
+                    });
+                }
+            }
+        }
+        // What somebody pinned must fit the final values; defaults that nobody touched are trusted.
+        for constraint in &self.constraints {
+            if pinned[constraint.factor] && !(constraint.holds)(&values) {
+                let factor = &self.factors[constraint.factor];
+                return Err(Error::OutOfSpace {
+                    what: factor.key.clone(),
+                    given: format!("{:?}", values.values[constraint.factor]),
+                    expected: constraint.words.to_owned(),
+                });
+            }
+        }
+        Ok(values)
+    }
+}
+
+/// Which factors to sample and which to pin at a reset.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct VariationRequest {
+    /// Keys to sample: factors, groups, or `all`. `None` means the environment's defaults.
+    #[serde(default)]
+    pub variation: Option<Vec<String>>,
+    /// Factors held at a value.
+    #[serde(default)]
+    pub variation_values: BTreeMap<String, Vec<f64>>,
+}
+
+/// The value of every factor, constant for an episode.
+#[derive(Clone, Debug)]
+pub struct FactorValues {
+    factors: Arc<[Factor]>,
+    values: Vec<Vec<f64>>,
+}
+
+impl FactorValues {
+    /// The factors, in sampling order.
+    pub fn factors(&self) -> &[Factor] {
+        &self.factors
+    }
+
+    /// The value of a factor.
+    ///
+    /// # Panics
+    /// When the environment asks for a factor it did not declare.
+    pub fn get(&self, key: &str) -> &[f64] {
+        let i = self.factors.iter().position(|factor| factor.key == key);
+        &self.values[i.unwrap_or_else(|| panic!("'{key}' is no factor"))]
+    }
+
+    /// The value of a scalar factor.
+    ///
+    /// # Panics
+    /// As [`FactorValues::get`].
+    pub fn scalar(&self, key: &str) -> f64 {
+        self.get(key)[0]
+    }
+
+    /// The value of an integer factor.
+    ///
+    /// # Panics
+    /// As [`FactorValues::get`].
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn integer(&self, key: &str) -> i64 {
+        self.scalar(key) as i64
+    }
+
+    /// The value of a colour factor.
+    ///
+    /// # Panics
+    /// As [`FactorValues::get`].
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub fn rgb(&self, key: &str) -> [u8; 3] {
+        let value = self.get(key);
+        [value[0] as u8, value[1] as u8, value[2] as u8]
+    }
+
+    /// Keys and values, in sampling order.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, &[f64])> {
+        self.factors.iter().map(|f| f.key.as_str()).zip(self.values.iter().map(Vec::as_slice))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::DType;
+
+    fn space() -> VariationSpace {
+        VariationSpace::new(
+            vec![
+                Factor::new("agent.x", Space::uniform_box([], DType::Float32, 0.0, 1.0), [0.25]),
+                Factor::new("agent.color", Space::Rgb, [255.0, 0.0, 0.0]),
+                Factor::new("target.x", Space::uniform_box([], DType::Float32, 0.0, 1.0), [0.75]),
+            ],
+            &["agent.x"],
+        )
+        .constrain("target.x", "target.x > agent.x", |v| v.scalar("target.x") > v.scalar("agent.x"))
+    }
+
+    fn request(keys: &[&str]) -> VariationRequest {
+        VariationRequest {
+            variation: Some(keys.iter().map(|&k| k.to_owned()).collect()),
+            ..VariationRequest::default()
+        }
+    }
+
+    #[test]
+    fn varying_one_factor_leaves_the_others() {
+        let space = space();
+        let key = Key::new(5);
+        let none = space.resolve(&request(&[]), key).expect("nothing");
+        assert_eq!(none.get("agent.color"), [255.0, 0.0, 0.0]);
+        let one = space.resolve(&request(&["agent.color"]), key).expect("one");
+        let group = space.resolve(&request(&["agent"]), key).expect("group");
+        assert_eq!(one.get("agent.color"), group.get("agent.color"));
+        assert_eq!(one.get("agent.x"), [0.25]);
+        assert_ne!(group.get("agent.x"), [0.25]);
+        for seed in 0..100 {
+            let all = space.resolve(&request(&["all"]), Key::new(seed)).expect("all");
+            assert!(all.scalar("target.x") > all.scalar("agent.x"));
+        }
+    }
+
+    #[test]
+    fn wrong_requests_say_what_is_wrong() {
+        let space = space();
+        let pin = |key: &str, value: &[f64]| VariationRequest {
+            variation: None,
+            variation_values: [(key.to_owned(), value.to_vec())].into(),
+        };
+        let message = |r: &VariationRequest| space.resolve(r, Key::new(0)).expect_err("wrong").to_string();
+        assert!(message(&request(&["agent.colour"])).contains("did you mean agent.color"));
+        assert!(message(&pin("agent.x", &[2.0])).contains("0 ..= 1"));
+        assert!(message(&pin("agent.y", &[0.5])).contains("agent.x"));
+        assert!(message(&pin("target.x", &[0.0])).contains("target.x > agent.x"));
+        let impossible = VariationRequest {
+            variation: Some(vec!["target.x".to_owned()]),
+            variation_values: [("agent.x".to_owned(), vec![1.0])].into(),
+        };
+        assert!(message(&impossible).contains("in 10000 tries"));
+    }
+}

@@ -1,0 +1,1 @@
+//! swm-report

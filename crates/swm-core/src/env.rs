@@ -39,13 +39,6 @@ impl EnvSpec {
     }
 }
 
-/// What a caller may choose when making an environment.
-#[derive(Clone, Debug, Default)]
-pub struct EnvConfig {
-    /// Steps after which an episode is truncated; `None` means [`EnvSpec::max_episode_steps`].
-    pub max_episode_steps: Option<usize>,
-}
-
 /// What a caller may choose at a reset.
 #[derive(Clone, Debug, Default)]
 pub struct ResetOptions {

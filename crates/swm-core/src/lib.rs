@@ -7,7 +7,7 @@
 //! 3. [`key`]: where every random number comes from.
 //! 4. [`env`], [`pool`], [`policy`]: worlds, many of them at once, and who acts in them.
 //! 5. [`plan`]: costs of candidate action sequences, and the solvers that minimise them.
-//! 6. [`registry`], [`manifest`], [`error`]: names, provenance, and what goes wrong.
+//! 6. [`registry`], [`manifest`], [`results`], [`error`]: names, provenance, findings, and what goes wrong.
 
 pub mod batch;
 pub mod env;
@@ -18,11 +18,12 @@ pub mod plan;
 pub mod policy;
 pub mod pool;
 pub mod registry;
+pub mod results;
 pub mod space;
 pub mod variation;
 
 pub use batch::{Batch, ColumnSpec, DType, Element, RowMut, RowRef, Schema};
-pub use env::{Action, Env, EnvConfig, EnvSpec, FrameMut, ResetOptions, Snapshot, Transition};
+pub use env::{Action, Env, EnvSpec, FrameMut, ResetOptions, Snapshot, Transition};
 pub use error::{Error, Result};
 pub use key::{Key, Rng};
 pub use manifest::Manifest;
@@ -31,6 +32,7 @@ pub use plan::{
 };
 pub use policy::{Policy, RandomPolicy};
 pub use pool::EnvPool;
-pub use registry::{Named, Registry};
+pub use registry::{EnvEntry, ExpertEntry, Named, Registry};
+pub use results::Results;
 pub use space::Space;
 pub use variation::{Factor, FactorValues, VariationRequest, VariationSpace};

@@ -1,1 +1,10 @@
-//! swm-envs
+//! Native 2-D worlds: one folder each, with physics, render, expert and a README side by side.
+
+pub mod push_t;
+pub mod two_room;
+
+use swm_core::{EnvEntry, Registry};
+
+/// Every native environment.
+pub static ENVS: Registry<EnvEntry> =
+    Registry { kind: "environment", hint: "`swm envs` lists them", rows: &[push_t::ENTRY, two_room::ENTRY] };

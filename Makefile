@@ -1,0 +1,65 @@
+# Two commands matter: `make demo` and `make test`. Each installs what it needs on a fresh Debian machine with a
+# Rust toolchain and Python.
+
+# One cache of compiled crates for every checkout on the machine.
+export CARGO_TARGET_DIR ?= $(HOME)/.cache/swm/target
+CACHE := $(HOME)/.cache/swm
+# A small Python environment with the `lance` package: tests open our datasets with it.
+VENV := $(CACHE)/venv-lance-14.0.2
+SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
+CARGO := cargo
+
+.PHONY: help demo test check build setup setup-python reference bench clean
+
+help:
+	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
+	@echo 'make test       all checks and all tests'
+	@echo 'make build      the swm binary: $(CARGO_TARGET_DIR)/release/swm'
+	@echo 'make bench      our benchmarks, against the reference where `make reference` installed it'
+
+demo: build
+	$(CARGO_TARGET_DIR)/release/swm demo
+
+test: check setup-python
+	SWM_LANCE_PYTHON=$(VENV)/bin/python $(CARGO) test --release --workspace
+
+check: setup
+	$(CARGO) xtask check
+
+build: setup
+	$(CARGO) build --release --package swm
+
+bench: build
+	SWM_REFERENCE_PYTHON=$(CACHE)/reference/bin/python $(CARGO_TARGET_DIR)/release/swm bench envs
+
+# What the build and the tests need: protoc for Lance, a C compiler for zstd, ffmpeg for videos.
+setup:
+	@command -v $(CARGO) >/dev/null || { echo 'cargo is missing: install a Rust toolchain (1.95 or newer)'; exit 1; }
+	@missing=''; \
+	for pair in protoc:protobuf-compiler ffmpeg:ffmpeg cc:gcc git:git python3:python3; do \
+	  command -v $${pair%%:*} >/dev/null || missing="$$missing $${pair##*:}"; \
+	done; \
+	[ -e /usr/include/google/protobuf/any.proto ] || missing="$$missing libprotobuf-dev"; \
+	if [ -n "$$missing" ]; then \
+	  echo "installing Debian packages:$$missing"; \
+	  $(SUDO) apt-get update -qq && DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends $$missing; \
+	fi
+	@$(CARGO) fmt --version >/dev/null 2>&1 && $(CARGO) clippy --version >/dev/null 2>&1 || rustup component add rustfmt clippy
+
+setup-python: $(VENV)/ready
+
+$(VENV)/ready:
+	@mkdir -p $(CACHE)
+	@python3 -c 'import ensurepip, venv' 2>/dev/null || { $(SUDO) apt-get update -qq; \
+	  DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends python3-venv; }
+	python3 -m venv --clear $(VENV)
+	$(VENV)/bin/python -m pip install --quiet pylance==14.0.2 numpy
+	touch $@
+
+# The published reference, for parity and speed: heavy (it brings torch), and only wanted by `make bench`.
+reference: setup
+	python3 -m venv $(CACHE)/reference
+	$(CACHE)/reference/bin/python -m pip install --quiet stable-worldmodel
+
+clean:
+	rm -rf $(CACHE)

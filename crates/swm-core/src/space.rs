@@ -30,10 +30,12 @@ pub enum Space {
         /// The first.
         start: i64,
     },
-    /// Several integers, the i-th one of `nvec[i]` from 0.
+    /// Several integers, the i-th one of `nvec[i]`, `start[i]` being the first.
     MultiDiscrete {
         /// How many values each has.
         nvec: Vec<i64>,
+        /// The first of each.
+        start: Vec<i64>,
     },
     /// A colour: red, green and blue from 0 to 255.
     #[serde(rename = "RGBBox")]
@@ -53,7 +55,7 @@ impl Space {
         match self {
             Self::Box { low, .. } => low.len(),
             Self::Discrete { .. } => 1,
-            Self::MultiDiscrete { nvec } => nvec.len(),
+            Self::MultiDiscrete { nvec, .. } => nvec.len(),
             Self::Rgb => 3,
         }
     }
@@ -68,7 +70,7 @@ impl Space {
         match self {
             Self::Box { shape, .. } => shape.clone(),
             Self::Discrete { .. } => vec![],
-            Self::MultiDiscrete { nvec } => vec![nvec.len()],
+            Self::MultiDiscrete { nvec, .. } => vec![nvec.len()],
             Self::Rgb => vec![3],
         }
     }
@@ -88,7 +90,7 @@ impl Space {
         match self {
             Self::Box { low, high, .. } => (low[i], high[i]),
             Self::Discrete { n, start } => (*start as f64, (*start + *n - 1) as f64),
-            Self::MultiDiscrete { nvec } => (0.0, (nvec[i] - 1) as f64),
+            Self::MultiDiscrete { nvec, start } => (start[i] as f64, (start[i] + nvec[i] - 1) as f64),
             Self::Rgb => (0.0, 255.0),
         }
     }
@@ -147,8 +149,10 @@ impl Space {
                 format!("{shape} {} in {low} ..= {high}", dtype.name())
             }
             Self::Discrete { n, start } => format!("one integer in {start} ..= {}", start + n - 1),
-            Self::MultiDiscrete { nvec } => {
-                format!("{} integers from 0, below {nvec:?}", nvec.len())
+            Self::MultiDiscrete { nvec, start } => {
+                let ranges: Vec<String> =
+                    nvec.iter().zip(start).map(|(n, start)| format!("{start} ..= {}", start + n - 1)).collect();
+                format!("{} integers in {}", nvec.len(), ranges.join(", "))
             }
             Self::Rgb => "a colour: 3 integers in 0 ..= 255".to_owned(),
         }
@@ -166,7 +170,7 @@ mod tests {
             Space::uniform_box([2], DType::Float32, -1.0, 1.0),
             Space::uniform_box([], DType::Float64, 0.0, 1e-3),
             Space::Discrete { n: 3, start: 1 },
-            Space::MultiDiscrete { nvec: vec![224, 21] },
+            Space::MultiDiscrete { nvec: vec![224, 21], start: vec![0, 1] },
             Space::Rgb,
         ];
         let mut rng = Key::new(1).rng();

@@ -1,1 +1,22 @@
-//! swm-data
+//! Datasets of episodes: writing them while they are collected, and reading clips of them for training.
+//!
+//! - [`format`](mod@format): the contracts ([`Reader`], [`Writer`], [`Format`]) and the list of formats.
+//! - [`lance`]: the default format, which the Python `lance` package and the reference read as well.
+//! - [`clip`] and [`loader`]: windows of episodes, shuffled and prefetched as batches.
+//! - [`image`]: how pictures are stored.
+//! - [`stats`]: column statistics and the split into training and validation episodes.
+
+pub mod clip;
+pub mod format;
+pub mod image;
+
+pub mod loader;
+pub mod stats;
+
+pub use clip::{ClipSpec, Clips};
+pub use format::{
+    CommitPolicy, Episode, FORMATS, Format, Reader, StepRange, WriteMode, WriteOptions, Writer, create, open,
+};
+pub use image::ImageCodec;
+pub use loader::{Loader, LoaderConfig};
+pub use stats::{ColumnStats, column_stats, split};

@@ -1,1 +1,15 @@
-//! swm-plan
+//! Planning: solvers that search for cheap action sequences, and the policy that replans with them.
+//!
+//! A solver is a file; each is the algorithm of its paper on a screen, over the contracts of
+//! [`swm_core::plan`]. [`MpcPolicy`] turns any solver and any [`swm_core::CostModel`] into a
+//! [`swm_core::Policy`].
+
+pub mod cem;
+mod history;
+pub mod mpc;
+pub mod scale;
+pub mod topk;
+
+pub use cem::Cem;
+pub use mpc::{MpcConfig, MpcPolicy};
+pub use scale::ActionScale;

@@ -4,6 +4,7 @@
 //! - [`lance`]: the default format, which the Python `lance` package and the reference read as well.
 //! - [`clip`] and [`loader`]: windows of episodes, shuffled and prefetched as batches.
 //! - [`image`]: how pictures are stored.
+//! - [`preview`] and [`video`]: frames as pictures and videos for people.
 //! - [`stats`]: column statistics and the split into training and validation episodes.
 
 pub mod clip;
@@ -11,7 +12,9 @@ pub mod format;
 pub mod image;
 
 pub mod loader;
+pub mod preview;
 pub mod stats;
+pub mod video;
 
 pub use clip::{ClipSpec, Clips};
 pub use format::{
@@ -19,4 +22,6 @@ pub use format::{
 };
 pub use image::ImageCodec;
 pub use loader::{Loader, LoaderConfig};
+pub use preview::{Picture, contact_sheet, write_png};
 pub use stats::{ColumnStats, column_stats, split};
+pub use video::{integer_scale, write_mp4, write_mp4_scaled};

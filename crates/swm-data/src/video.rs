@@ -289,7 +289,7 @@ mod tests {
             assert!(message("ffmpeg", geometry, &[]).contains("no frame"));
             // A program that stops without reading: its own words come through, not a broken pipe.
             let nowhere = folder.path().join("missing").join("a.mp4");
-            let lost = write_mp4(&nowhere, 4, 4, 10, &frames(4, 4, 3)).expect_err("fails").to_string();
+            let lost = write_mp4(&nowhere, 4, 4, 10, frames(4, 4, 3)).expect_err("fails").to_string();
             assert!(lost.contains("No such file or directory"), "{lost}");
         }
         assert!(names(folder.path()).is_empty());

@@ -1,0 +1,75 @@
+//! Factor values as bytes, and out of dataset rows: what every environment's `snapshot`, `restore` and
+//! `restore_from` need.
+
+use swm_core::{Error, FactorValues, Key, Result, RowRef, VariationRequest, VariationSpace};
+
+/// The column that holds a factor in a dataset: `variation_agent_color` for `agent.color`.
+pub fn column(key: &str) -> String {
+    format!("variation_{}", key.replace('.', "_"))
+}
+
+/// A request that resolves to exactly these values.
+///
+/// Only what differs from its default is pinned: constraints are checked on pinned factors, and defaults that
+/// nobody touched are trusted, at the reset as well as here.
+pub fn pin(values: &FactorValues) -> VariationRequest {
+    let changed = values.factors().iter().zip(values.iter()).filter(|(factor, (_, value))| factor.init_value != *value);
+    VariationRequest {
+        variation: Some(vec![]),
+        variation_values: changed.map(|(_, (key, value))| (key.to_owned(), value.to_vec())).collect(),
+    }
+}
+
+/// The factors of a dataset row: those it has a column for, and `current` for the others.
+///
+/// # Errors
+/// When a column holds a value outside its factor's space.
+pub fn from_row(space: &VariationSpace, current: &FactorValues, row: RowRef<'_>) -> Result<FactorValues> {
+    let mut request = pin(current);
+    for factor in space.factors() {
+        let name = column(&factor.key);
+        if row.schema().find(&name).is_some() {
+            let value = row.to_f64(&name)?;
+            if value == factor.init_value {
+                request.variation_values.remove(&factor.key);
+            } else {
+                request.variation_values.insert(factor.key.clone(), value);
+            }
+        }
+    }
+    space.resolve(&request, Key::new(0))
+}
+
+/// Appends every value, in sampling order, to `bytes`.
+pub fn write(values: &FactorValues, bytes: &mut Vec<u8>) {
+    for (_, value) in values.iter() {
+        bytes.extend(value.iter().flat_map(|v| v.to_le_bytes()));
+    }
+}
+
+/// Bytes that [`write`] appends for a space.
+pub fn byte_len(space: &VariationSpace) -> usize {
+    space.factors().iter().map(|factor| factor.space.len() * size_of::<f64>()).sum()
+}
+
+/// The values [`write`] wrote, and the bytes behind them.
+///
+/// # Errors
+/// When there are too few bytes or they hold impossible values.
+pub fn read<'a>(space: &VariationSpace, bytes: &'a [u8]) -> Result<(FactorValues, &'a [u8])> {
+    let Some((mut head, rest)) = bytes.split_at_checked(byte_len(space)) else {
+        let (given, expected) = (format!("{} bytes", bytes.len()), format!("at least {}", byte_len(space)));
+        return Err(Error::mismatch("restoring the factors of a snapshot", given, expected));
+    };
+    let mut request = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
+    for factor in space.factors() {
+        let (own, next) = head.split_at(factor.space.len() * size_of::<f64>());
+        let numbers = own.as_chunks().0.iter();
+        let value: Vec<f64> = numbers.map(|&number| f64::from_le_bytes(number)).collect();
+        if value != factor.init_value {
+            request.variation_values.insert(factor.key.clone(), value);
+        }
+        head = next;
+    }
+    Ok((space.resolve(&request, Key::new(0))?, rest))
+}

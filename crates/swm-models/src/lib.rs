@@ -1,1 +1,4 @@
-//! swm-models
+//! World models and their training.
+
+pub mod lewm;
+pub mod nn;

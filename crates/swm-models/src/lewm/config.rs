@@ -1,0 +1,117 @@
+//! [`LewmConfig`]: the size of a LeWM.
+
+use crate::nn::{PredictorConfig, PyramidConfig, VitConfig};
+use serde::{Deserialize, Serialize};
+use swm_core::{Error, Result};
+
+/// The size of a LeWM.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LewmConfig {
+    /// Side of the square pictures it sees, in pixels.
+    pub image: usize,
+    /// Mean of the pixels by colour, of 0 ..= 1; pixels are normalised with it.
+    pub pixel_mean: [f32; 3],
+    /// Spread of the pixels by colour, of 0 ..= 1.
+    pub pixel_std: [f32; 3],
+    /// Numbers in a latent.
+    pub latent: usize,
+    /// Hidden features of the projections behind encoder and predictor.
+    pub projector: usize,
+    /// The encoder.
+    pub encoder: EncoderConfig,
+    /// The predictor.
+    pub predictor: PredictorConfig,
+}
+
+/// The encoder of a LeWM.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum EncoderConfig {
+    /// A vision transformer, as published.
+    Vit(VitConfig),
+    /// Convolutions of disjoint patches: small and fast.
+    Pyramid(PyramidConfig),
+}
+
+impl EncoderConfig {
+    /// Side of the patches the picture is cut into.
+    pub fn patch(&self) -> usize {
+        match self {
+            Self::Vit(vit) => vit.patch,
+            Self::Pyramid(pyramid) => pyramid.stages.first().map_or(0, |stage| stage.patch),
+        }
+    }
+
+    /// Features the encoder returns.
+    pub fn dim(&self) -> usize {
+        match self {
+            Self::Vit(vit) => vit.dim,
+            Self::Pyramid(pyramid) => pyramid.dim,
+        }
+    }
+}
+
+impl LewmConfig {
+    /// Checks that the sizes fit each other.
+    ///
+    /// # Errors
+    /// Naming the first that does not.
+    pub fn check(&self) -> Result<()> {
+        let wrong = |what: &str, problem: String, fix: &str| Err(Error::config(what, problem, fix));
+        let predictor = &self.predictor;
+        let sizes = [
+            ("model.image", self.image),
+            ("model.latent", self.latent),
+            ("model.projector", self.projector),
+            ("model.predictor.history", predictor.history),
+            ("model.predictor.dim", predictor.dim),
+            ("model.predictor.depth", predictor.depth),
+            ("model.predictor.heads", predictor.heads),
+            ("model.predictor.dim_head", predictor.dim_head),
+            ("model.predictor.mlp", predictor.mlp),
+        ];
+        for (what, size) in sizes {
+            if size == 0 {
+                return wrong(what, "0".to_owned(), "give at least 1");
+            }
+        }
+        for (what, rate) in
+            [("model.predictor.dropout", predictor.dropout), ("model.predictor.emb_dropout", predictor.emb_dropout)]
+        {
+            if !(0.0..1.0).contains(&rate) {
+                return wrong(what, rate.to_string(), "give a probability below 1");
+            }
+        }
+        if self.pixel_std.iter().any(|std| *std <= 0.0) {
+            return wrong("model.pixel_std", format!("{:?}", self.pixel_std), "give three positive numbers");
+        }
+        let patches = match &self.encoder {
+            EncoderConfig::Vit(vit) => {
+                if vit.dim == 0 || vit.heads == 0 || vit.dim % vit.heads != 0 {
+                    let problem = format!("{} features do not split into {} heads", vit.dim, vit.heads);
+                    return wrong("model.encoder.vit.heads", problem, "choose a divisor of `dim`");
+                }
+                vec![vit.patch]
+            }
+            EncoderConfig::Pyramid(pyramid) => {
+                if pyramid.hidden == 0 || pyramid.dim == 0 || pyramid.stages.iter().any(|stage| stage.channels == 0) {
+                    return wrong("model.encoder.pyramid", "a size is 0".to_owned(), "give at least 1");
+                }
+                pyramid.stages.iter().map(|stage| stage.patch).collect()
+            }
+        };
+        let mut side = self.image;
+        for patch in &patches {
+            if *patch == 0 || !side.is_multiple_of(*patch) {
+                let problem = format!("a side of {side} does not split into patches of {patch}");
+                return wrong("model.encoder", problem, "choose patches whose product divides `model.image`");
+            }
+            side /= patch;
+        }
+        if patches.is_empty() {
+            return wrong("model.encoder.pyramid.stages", "none".to_owned(), "give at least one");
+        }
+        Ok(())
+    }
+}

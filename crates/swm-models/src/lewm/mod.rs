@@ -1,0 +1,11 @@
+//! LeWM (LeWorldModel): an encoder and a predictor trained end to end to predict the next latent, kept from
+//! collapsing by [SIGReg](loss). See `docs/models/lewm.md`.
+
+pub mod config;
+pub mod loss;
+pub mod model;
+pub mod pixels;
+pub mod step;
+
+pub use config::{EncoderConfig, LewmConfig};
+pub use model::{Encoder, Lewm};

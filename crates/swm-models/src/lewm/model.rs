@@ -1,0 +1,125 @@
+//! [`Lewm`]: encoder, action encoder, predictor and projections.
+
+use super::config::{EncoderConfig, LewmConfig};
+use crate::nn::{BatchStatistics, Embedder, Init, Noise, Predictor, Projector, Pyramid, Vit};
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use swm_core::Key;
+
+/// An encoder.
+#[derive(Module, Debug)]
+#[allow(clippy::large_enum_variant)]
+pub enum Encoder {
+    /// A vision transformer.
+    Vit(Vit),
+    /// Convolutions of disjoint patches.
+    Pyramid(Pyramid),
+}
+
+impl Encoder {
+    /// # Shapes
+    /// `[frames, patches, 3 * patch * patch]` to `[frames, features]`.
+    pub fn forward(&self, patches: Tensor<3>) -> Tensor<2> {
+        match self {
+            Self::Vit(vit) => vit.forward(patches),
+            Self::Pyramid(pyramid) => pyramid.forward(patches),
+        }
+    }
+}
+
+/// A LeWM: from pictures to latents, and from latents and actions to the next latents.
+#[derive(Module, Debug)]
+pub struct Lewm {
+    /// From pictures to features.
+    pub encoder: Encoder,
+    /// From features to latents.
+    pub projector: Projector,
+    /// From actions to conditions.
+    pub action_encoder: Embedder,
+    /// From latents and conditions to features of the next latents.
+    pub predictor: Predictor,
+    /// From those to latents.
+    pub pred_proj: Projector,
+}
+
+impl Lewm {
+    /// A model of `actions` numbers an action (of all environment steps in a model step), drawn from `key`.
+    pub fn new(config: &LewmConfig, actions: usize, key: Key, device: &Device) -> Self {
+        let init = Init::new(key, device);
+        let features = config.encoder.dim();
+        let project = |name| Projector::new(&init.of(name), features, config.projector, config.latent);
+        let part = init.of("encoder");
+        Self {
+            encoder: match &config.encoder {
+                EncoderConfig::Vit(vit) => Encoder::Vit(vit.init(&part, config.image)),
+                EncoderConfig::Pyramid(pyramid) => Encoder::Pyramid(pyramid.init(&part, config.image)),
+            },
+            projector: project("projector"),
+            action_encoder: Embedder::new(&init.of("action_encoder"), actions, config.latent),
+            predictor: config.predictor.init(&init.of("predictor"), config.latent),
+            pred_proj: Projector::new(&init.of("pred_proj"), config.latent, config.projector, config.latent),
+        }
+    }
+
+    /// The latents of pictures.
+    ///
+    /// # Shapes
+    /// `[frames, patches, 3 * patch * patch]` to `[frames, latent]`.
+    pub fn encode(&self, patches: Tensor<3>) -> Tensor<2> {
+        self.projector.forward(self.encoder.forward(patches))
+    }
+
+    /// The conditions of actions.
+    ///
+    /// # Shapes
+    /// `[windows, steps, actions]` to `[windows, steps, latent]`.
+    pub fn embed_actions(&self, actions: Tensor<3>) -> Tensor<3> {
+        let [windows, steps, numbers] = actions.dims();
+        let embedded = self.action_encoder.forward(actions.reshape([windows * steps, numbers]));
+        let [_, latent] = embedded.dims();
+        embedded.reshape([windows, steps, latent])
+    }
+
+    /// The latent after each latent of a window.
+    ///
+    /// # Shapes
+    /// `[windows, steps, latent]`, twice, to the same.
+    pub fn predict(&self, latents: Tensor<3>, conditions: Tensor<3>) -> Tensor<3> {
+        let features = self.predictor.forward(latents, conditions, &mut Noise::off());
+        let [windows, steps, latent] = features.dims();
+        self.pred_proj.forward(features.reshape([windows * steps, latent])).reshape([windows, steps, latent])
+    }
+
+    /// As [`Lewm::predict`], with the statistics of the batch and dropout.
+    pub fn predict_train(
+        &self,
+        latents: Tensor<3>,
+        conditions: Tensor<3>,
+        noise: &mut Noise<'_>,
+    ) -> (Tensor<3>, BatchStatistics) {
+        let features = self.predictor.forward(latents, conditions, noise);
+        let [windows, steps, latent] = features.dims();
+        let (latents, statistics) = self.pred_proj.forward_train(features.reshape([windows * steps, latent]));
+        (latents.reshape([windows, steps, latent]), statistics)
+    }
+
+    /// All latents of a rollout: those given, then one predicted after each further action.
+    ///
+    /// # Shapes
+    /// Latents `[windows, given, latent]` and actions `[windows, steps, actions]`, `steps >= given`, to
+    /// `[windows, steps + 1, latent]`.
+    pub fn rollout(&self, latents: Tensor<3>, actions: Tensor<3>) -> Tensor<3> {
+        let [windows, given, latent] = latents.dims();
+        let [_, steps, _] = actions.dims();
+        let history = self.predictor.config().history;
+        let conditions = self.embed_actions(actions);
+        let mut all = latents;
+        for end in given..=steps {
+            let window = [0..windows, end.saturating_sub(history)..end, 0..latent];
+            let next = self.predict(all.clone().slice(window.clone()), conditions.clone().slice(window));
+            let [_, seen, _] = next.dims();
+            all = Tensor::cat(vec![all, next.slice([0..windows, seen - 1..seen, 0..latent])], 1);
+        }
+        all
+    }
+}

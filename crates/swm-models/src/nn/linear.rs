@@ -1,0 +1,55 @@
+//! A linear layer in PyTorch's layout.
+
+use super::Init;
+use burn::module::{Module, Param};
+use burn::tensor::Tensor;
+
+/// `y = x Wᵀ + b`.
+#[derive(Module, Debug)]
+pub struct Linear {
+    /// `[outputs, inputs]`.
+    pub weight: Param<Tensor<2>>,
+    /// `[outputs]`.
+    pub bias: Option<Param<Tensor<1>>>,
+}
+
+impl Linear {
+    /// A layer drawn as PyTorch draws it by default: uniform within `1 / sqrt(inputs)`.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn new(init: &Init, inputs: usize, outputs: usize) -> Self {
+        let bound = 1.0 / (inputs as f32).sqrt();
+        Self {
+            weight: init.uniform("weight", [outputs, inputs], bound),
+            bias: Some(init.uniform("bias", [outputs], bound)),
+        }
+    }
+
+    /// A layer without bias.
+    pub fn without_bias(init: &Init, inputs: usize, outputs: usize) -> Self {
+        Self { bias: None, ..Self::new(init, inputs, outputs) }
+    }
+
+    /// A layer that returns 0 until trained.
+    pub fn zeros(init: &Init, inputs: usize, outputs: usize) -> Self {
+        Self { weight: init.constant([outputs, inputs], 0.0), bias: Some(init.constant([outputs], 0.0)) }
+    }
+
+    /// A layer drawn from a normal distribution, with bias 0.
+    pub fn normal(init: &Init, inputs: usize, outputs: usize, std: f32) -> Self {
+        Self { weight: init.normal("weight", [outputs, inputs], std), bias: Some(init.constant([outputs], 0.0)) }
+    }
+
+    /// # Shapes
+    /// `[…, inputs]` to `[…, outputs]`. All leading axes go into one matrix product.
+    pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
+        let [outputs, inputs] = self.weight.dims();
+        let mut shape = x.dims();
+        let rows = shape[..D - 1].iter().product::<usize>();
+        shape[D - 1] = outputs;
+        let mut y = x.reshape([rows, inputs]).matmul(self.weight.val().transpose());
+        if let Some(bias) = &self.bias {
+            y = y + bias.val().unsqueeze();
+        }
+        y.reshape(shape)
+    }
+}

@@ -1,0 +1,87 @@
+//! Building blocks, with the parameter names and layouts PyTorch checkpoints use, so that weights move both ways
+//! without renaming. Every initial value comes from a [`Key`] and the parameter's name, never from a global
+//! generator.
+
+pub mod activation;
+pub mod linear;
+pub mod mlp;
+pub mod norm;
+pub mod parameters;
+pub mod predictor;
+pub mod pyramid;
+pub mod vit;
+
+pub use activation::{Activation, Noise};
+pub use linear::Linear;
+pub use mlp::{Embedder, Projector};
+pub use norm::{BatchNorm, BatchStatistics, LayerNorm};
+pub use parameters::Named;
+pub use predictor::{Predictor, PredictorConfig};
+pub use pyramid::{Pyramid, PyramidConfig, Stage};
+pub use vit::{Vit, VitConfig};
+
+use burn::module::Param;
+use burn::tensor::{Device, Tensor, TensorData};
+use rand_distr::{Distribution as _, StandardNormal};
+use swm_core::Key;
+
+/// Where initial values come from: a key that narrows with the path of the parameter.
+#[derive(Clone)]
+pub struct Init {
+    key: Key,
+    device: Device,
+}
+
+impl Init {
+    /// Initial values decided by `key`, on `device`.
+    pub fn new(key: Key, device: &Device) -> Self {
+        Self { key, device: device.clone() }
+    }
+
+    /// Initial values of a part.
+    #[must_use]
+    pub fn of(&self, part: &str) -> Self {
+        Self { key: self.key.with(part), device: self.device.clone() }
+    }
+
+    /// Initial values of the `index`th part.
+    #[must_use]
+    pub fn at(&self, index: usize) -> Self {
+        Self { key: self.key.at(index as u64), device: self.device.clone() }
+    }
+
+    /// A parameter drawn uniformly from `-bound ..= bound`.
+    pub fn uniform<const D: usize>(&self, name: &str, shape: [usize; D], bound: f32) -> Param<Tensor<D>> {
+        use rand::Rng as _;
+        let mut rng = self.key.with(name).rng();
+        self.draw(shape, || rng.random_range(-bound..=bound))
+    }
+
+    /// A parameter drawn from a normal distribution of mean 0, cut off at two standard deviations.
+    pub fn normal<const D: usize>(&self, name: &str, shape: [usize; D], std: f32) -> Param<Tensor<D>> {
+        let mut rng = self.key.with(name).rng();
+        self.draw(shape, || {
+            loop {
+                let value: f32 = StandardNormal.sample(&mut rng);
+                if value.abs() <= 2.0 {
+                    return value * std;
+                }
+            }
+        })
+    }
+
+    /// A parameter of equal numbers.
+    pub fn constant<const D: usize>(&self, shape: [usize; D], value: f32) -> Param<Tensor<D>> {
+        self.draw(shape, || value)
+    }
+
+    /// A tensor that is stored with the weights but not trained.
+    pub fn buffer<const D: usize>(&self, shape: [usize; D], value: f32) -> Param<Tensor<D>> {
+        self.constant(shape, value).set_require_grad(false)
+    }
+
+    fn draw<const D: usize>(&self, shape: [usize; D], mut next: impl FnMut() -> f32) -> Param<Tensor<D>> {
+        let values: Vec<f32> = (0..shape.iter().product()).map(|_| next()).collect();
+        Param::from_tensor(Tensor::from_data(TensorData::new(values, shape), &self.device))
+    }
+}

@@ -1,0 +1,146 @@
+//! The parameters of a module by their published names.
+
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
+use burn::tensor::{Gradients, Tensor, TensorData};
+use std::collections::BTreeMap;
+
+/// A tensor on the host: its shape and its numbers.
+#[derive(Clone, Debug, PartialEq)]
+pub struct HostTensor {
+    /// The shape.
+    pub shape: Vec<usize>,
+    /// The numbers, row-major.
+    pub values: Vec<f32>,
+}
+
+/// Something by parameter name, in the order of names.
+pub type Named<T> = BTreeMap<String, T>;
+
+/// Follows the path of a traversal.
+#[derive(Default)]
+struct Path(Vec<String>);
+
+impl Path {
+    fn enter(&mut self, name: &str, container: &str) {
+        // The variant of an enum is no part of the name; a field `_3` is number 3 of a sequence.
+        if container.starts_with("Enum:") {
+            self.0.push(String::new());
+        } else {
+            self.0.push(name.strip_prefix('_').unwrap_or(name).to_owned());
+        }
+    }
+
+    fn exit(&mut self) {
+        self.0.pop();
+    }
+
+    fn name(&self) -> String {
+        self.0.iter().filter(|part| !part.is_empty()).map(String::as_str).collect::<Vec<_>>().join(".")
+    }
+}
+
+/// Every parameter and buffer of a module.
+pub fn values<M: Module>(module: &M) -> Named<HostTensor> {
+    struct Visitor(Path, Named<HostTensor>);
+    impl ModuleVisitor for Visitor {
+        fn enter_module(&mut self, name: &str, container: &str) {
+            self.0.enter(name, container);
+        }
+        fn exit_module(&mut self, _name: &str, _container: &str) {
+            self.0.exit();
+        }
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            let tensor = param.val().inner();
+            let shape = tensor.dims().to_vec();
+            let values = tensor.into_data().try_into_vec_as_f32();
+            self.1.insert(self.0.name(), HostTensor { shape, values });
+        }
+    }
+    let mut visitor = Visitor(Path::default(), Named::new());
+    module.visit(&mut visitor);
+    visitor.1
+}
+
+/// Names and shapes of every parameter and buffer of a module.
+pub fn shapes<M: Module>(module: &M) -> Named<Vec<usize>> {
+    struct Visitor(Path, Named<Vec<usize>>);
+    impl ModuleVisitor for Visitor {
+        fn enter_module(&mut self, name: &str, container: &str) {
+            self.0.enter(name, container);
+        }
+        fn exit_module(&mut self, _name: &str, _container: &str) {
+            self.0.exit();
+        }
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            self.1.insert(self.0.name(), param.val().dims().to_vec());
+        }
+    }
+    let mut visitor = Visitor(Path::default(), Named::new());
+    module.visit(&mut visitor);
+    visitor.1
+}
+
+/// The gradients of a module's parameters, flat; parameters that the loss does not reach are left out.
+pub fn gradients<M: Module>(module: &M, gradients: &Gradients) -> Named<Tensor<1>> {
+    struct Visitor<'a>(Path, &'a Gradients, Named<Tensor<1>>);
+    impl ModuleVisitor for Visitor<'_> {
+        fn enter_module(&mut self, name: &str, container: &str) {
+            self.0.enter(name, container);
+        }
+        fn exit_module(&mut self, _name: &str, _container: &str) {
+            self.0.exit();
+        }
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            if let Some(gradient) = param.val().grad(self.1) {
+                let numbers = gradient.dims().iter().product::<usize>();
+                self.2.insert(self.0.name(), gradient.reshape([numbers]));
+            }
+        }
+    }
+    let mut visitor = Visitor(Path::default(), gradients, Named::new());
+    module.visit(&mut visitor);
+    visitor.2
+}
+
+/// Replaces parameters: `change(name, value)` gets and returns them flat.
+pub fn map<M: Module>(module: M, change: impl FnMut(&str, Tensor<1>) -> Tensor<1>) -> M {
+    struct Mapper<F>(Path, F);
+    impl<F: FnMut(&str, Tensor<1>) -> Tensor<1>> ModuleMapper for Mapper<F> {
+        fn enter_module(&mut self, name: &str, container: &str) {
+            self.0.enter(name, container);
+        }
+        fn exit_module(&mut self, _name: &str, _container: &str) {
+            self.0.exit();
+        }
+        fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+            let name = self.0.name();
+            let change = &mut self.1;
+            param.map(|tensor| {
+                let shape = tensor.dims();
+                let numbers = shape.iter().product::<usize>();
+                change(&name, tensor.reshape([numbers])).reshape(shape)
+            })
+        }
+    }
+    module.map(&mut Mapper(Path::default(), change))
+}
+
+/// Replaces every parameter whose name is in `values`, which must have the right number of numbers.
+pub fn load<M: Module>(module: M, values: &Named<HostTensor>) -> M {
+    map(module, |name, old| match values.get(name) {
+        None => old,
+        Some(value) => Tensor::from_data(TensorData::new(value.values.clone(), [value.values.len()]), &old.device()),
+    })
+}
+
+/// Reads numbers that are known to be single precision.
+pub(crate) trait IntoF32 {
+    /// The numbers.
+    fn try_into_vec_as_f32(self) -> Vec<f32>;
+}
+
+impl IntoF32 for TensorData {
+    fn try_into_vec_as_f32(self) -> Vec<f32> {
+        self.iter::<f32>().collect()
+    }
+}

@@ -1,0 +1,240 @@
+//! The predictor: a causal transformer over latents whose layers are modulated by the actions (AdaLN, Peebles and
+//! Xie 2023).
+
+#![allow(non_snake_case)] // published parameter names
+
+use super::norm::standardize;
+use super::{Activation, Init, LayerNorm, Linear, Noise};
+use burn::module::{Module, Param};
+use burn::tensor::{Tensor, TensorData, activation};
+use serde::{Deserialize, Serialize};
+
+/// The size of a [`Predictor`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PredictorConfig {
+    /// Latents it sees: the present one and those before it.
+    pub history: usize,
+    /// Features of a token inside.
+    pub dim: usize,
+    /// Layers.
+    pub depth: usize,
+    /// Attention heads.
+    pub heads: usize,
+    /// Features of a head.
+    pub dim_head: usize,
+    /// Hidden features of the feed-forward part.
+    pub mlp: usize,
+    /// Dropout inside the layers.
+    pub dropout: f32,
+    /// Dropout of the latents that go in.
+    pub emb_dropout: f32,
+}
+
+/// Predicts the next latent after each of a window of latents, given the action taken from each.
+#[derive(Module, Debug)]
+pub struct Predictor {
+    /// `[1, history, latent]`.
+    pub pos_embedding: Param<Tensor<3>>,
+    /// The layers.
+    pub transformer: Transformer,
+    #[module(skip)]
+    config: PredictorConfig,
+}
+
+/// The layers of a [`Predictor`]; projections are there only where the sizes differ.
+#[derive(Module, Debug)]
+pub struct Transformer {
+    /// The last normalisation.
+    pub norm: LayerNorm,
+    /// From latents to tokens.
+    pub input_proj: Option<Linear>,
+    /// From embedded actions to conditions.
+    pub cond_proj: Option<Linear>,
+    /// From tokens to latents.
+    pub output_proj: Option<Linear>,
+    /// In order.
+    pub layers: Vec<Block>,
+}
+
+/// One modulated layer.
+#[derive(Module, Debug)]
+pub struct Block {
+    /// Self-attention.
+    pub attn: Attention,
+    /// The feed-forward part.
+    pub mlp: FeedForward,
+    /// From the condition to shifts, scales and gates.
+    pub adaLN_modulation: Modulation,
+}
+
+/// SiLU, then linear: `[rows, dim]` to `[rows, 6 * dim]`, the shift, scale and gate of the attention, then those of
+/// the feed-forward part. All zero before training.
+#[derive(Module, Debug)]
+pub struct Modulation {
+    /// The layer.
+    pub _1: Linear,
+}
+
+/// Causal self-attention.
+#[derive(Module, Debug)]
+pub struct Attention {
+    /// On what comes in.
+    pub norm: LayerNorm,
+    /// Queries, keys and values in one layer.
+    pub to_qkv: Linear,
+    /// What comes out; absent for a single head of the tokens' size.
+    pub to_out: Option<AttentionOut>,
+}
+
+/// What comes out of an [`Attention`].
+#[derive(Module, Debug)]
+pub struct AttentionOut {
+    /// The layer.
+    pub _0: Linear,
+}
+
+/// Normalisation, linear, GELU, linear.
+#[derive(Module, Debug)]
+pub struct FeedForward {
+    /// The sequence.
+    pub net: FeedForwardNet,
+}
+
+/// The sequence of a [`FeedForward`].
+#[derive(Module, Debug)]
+pub struct FeedForwardNet {
+    /// Normalises.
+    pub _0: LayerNorm,
+    /// Into the hidden features.
+    pub _1: Linear,
+    /// Out of them.
+    pub _4: Linear,
+}
+
+/// What the normalisations before a modulation add to the variance.
+pub(crate) const MODULATED_EPSILON: f64 = 1e-6;
+/// What the other normalisations add.
+const EPSILON: f64 = 1e-5;
+
+impl PredictorConfig {
+    /// A predictor of `latent` numbers.
+    pub fn init(&self, init: &Init, latent: usize) -> Predictor {
+        let (dim, inner) = (self.dim, self.heads * self.dim_head);
+        let bridge =
+            |name: &str, inputs, outputs| (inputs != outputs).then(|| Linear::new(&init.of(name), inputs, outputs));
+        let layer = |index| {
+            let init = init.of("layer").at(index);
+            Block {
+                attn: Attention {
+                    norm: LayerNorm::new(&init, dim, EPSILON),
+                    to_qkv: Linear::without_bias(&init.of("to_qkv"), dim, 3 * inner),
+                    to_out: (self.heads != 1 || self.dim_head != dim)
+                        .then(|| AttentionOut { _0: Linear::new(&init.of("to_out"), inner, dim) }),
+                },
+                mlp: FeedForward {
+                    net: FeedForwardNet {
+                        _0: LayerNorm::new(&init, dim, EPSILON),
+                        _1: Linear::new(&init.of("mlp.1"), dim, self.mlp),
+                        _4: Linear::new(&init.of("mlp.4"), self.mlp, dim),
+                    },
+                },
+                adaLN_modulation: Modulation { _1: Linear::zeros(&init, dim, 6 * dim) },
+            }
+        };
+        Predictor {
+            pos_embedding: init.normal("pos_embedding", [1, self.history, latent], 1.0),
+            transformer: Transformer {
+                norm: LayerNorm::new(init, dim, EPSILON),
+                input_proj: bridge("input_proj", latent, dim),
+                cond_proj: bridge("cond_proj", latent, dim),
+                output_proj: bridge("output_proj", dim, latent),
+                layers: (0..self.depth).map(layer).collect(),
+            },
+            config: self.clone(),
+        }
+    }
+}
+
+impl Predictor {
+    /// The size.
+    pub fn config(&self) -> &PredictorConfig {
+        &self.config
+    }
+
+    /// # Shapes
+    /// Latents `[windows, steps, latent]` and embedded actions of the same shape, `steps` at most the history, to
+    /// predictions of the same shape.
+    pub fn forward(&self, latents: Tensor<3>, actions: Tensor<3>, noise: &mut Noise<'_>) -> Tensor<3> {
+        let [_, steps, latent] = latents.dims();
+        let x = latents + self.pos_embedding.val().slice([0..1, 0..steps, 0..latent]);
+        let mut x = noise.dropout(x, self.config.emb_dropout);
+        let parts = &self.transformer;
+        let through = |layer: &Option<Linear>, x: Tensor<3>| match layer {
+            Some(layer) => layer.forward(x),
+            None => x,
+        };
+        x = through(&parts.input_proj, x);
+        let condition = Activation::Silu.forward(through(&parts.cond_proj, actions));
+        for layer in &parts.layers {
+            x = layer.forward(x, condition.clone(), &self.config, noise);
+        }
+        through(&parts.output_proj, parts.norm.forward(x))
+    }
+}
+
+impl Block {
+    fn forward(
+        &self,
+        x: Tensor<3>,
+        condition: Tensor<3>,
+        config: &PredictorConfig,
+        noise: &mut Noise<'_>,
+    ) -> Tensor<3> {
+        let modulation = self.adaLN_modulation._1.forward(condition).chunk(6, 2);
+        let [shift_attn, scale_attn, gate_attn, shift_mlp, scale_mlp, gate_mlp] =
+            <[Tensor<3>; 6]>::try_from(modulation).expect("six equal parts of a width that is six times another");
+        let modulate = |x: Tensor<3>, shift: Tensor<3>, scale: Tensor<3>| {
+            standardize(x, MODULATED_EPSILON) * (scale + 1.0) + shift
+        };
+        let mixed = self.attn.forward(modulate(x.clone(), shift_attn, scale_attn), config, noise);
+        let x = x + gate_attn * mixed;
+        let fed = self.mlp.forward(modulate(x.clone(), shift_mlp, scale_mlp), config, noise);
+        x + gate_mlp * fed
+    }
+}
+
+impl Attention {
+    #[allow(clippy::cast_precision_loss)]
+    fn forward(&self, x: Tensor<3>, config: &PredictorConfig, noise: &mut Noise<'_>) -> Tensor<3> {
+        let [windows, steps, _] = x.dims();
+        let (heads, width) = (config.heads, config.dim_head);
+        let inner = heads * width;
+        let qkv = self.to_qkv.forward(self.norm.forward(x));
+        let part = |i: usize| qkv.clone().slice([0..windows, 0..steps, i * inner..(i + 1) * inner]);
+        // A single token attends to itself alone.
+        let mixed = if steps == 1 {
+            part(2)
+        } else {
+            let split = |i| part(i).reshape([windows, steps, heads, width]).swap_dims(1, 2);
+            let scores = split(0).matmul(split(1).transpose()) / (width as f64).sqrt();
+            let future: Vec<f32> =
+                (0..steps * steps).map(|i| if i % steps > i / steps { f32::NEG_INFINITY } else { 0.0 }).collect();
+            let future = Tensor::from_data(TensorData::new(future, [1, 1, steps, steps]), &scores.device());
+            let weights = noise.dropout(activation::softmax(scores + future, 3), config.dropout);
+            weights.matmul(split(2)).swap_dims(1, 2).reshape([windows, steps, inner])
+        };
+        match &self.to_out {
+            Some(out) => noise.dropout(out._0.forward(mixed), config.dropout),
+            None => mixed,
+        }
+    }
+}
+
+impl FeedForward {
+    fn forward(&self, x: Tensor<3>, config: &PredictorConfig, noise: &mut Noise<'_>) -> Tensor<3> {
+        let hidden = Activation::Gelu.forward(self.net._1.forward(self.net._0.forward(x)));
+        let hidden = noise.dropout(hidden, config.dropout);
+        noise.dropout(self.net._4.forward(hidden), config.dropout)
+    }
+}

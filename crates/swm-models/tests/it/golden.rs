@@ -1,0 +1,230 @@
+//! Parity with the published LeWM: weights under their published names, outputs, rollouts, costs, losses and
+//! gradients of the reference implementation. Reads every `lewm-*.safetensors` of the folder named by
+//! `SWM_GOLDEN_MODELS`, or of `tests/golden` (written by `export_lewm.py` beside it), or of the shared reference.
+
+use burn::tensor::{Device, Tensor, TensorData};
+use safetensors::SafeTensors;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use swm_core::Key;
+use swm_models::lewm::step::{SigregConfig, TrainBatch, step};
+use swm_models::lewm::{EncoderConfig, Lewm, LewmConfig};
+use swm_models::nn::parameters::{self, HostTensor, Named};
+use swm_models::nn::{PredictorConfig, VitConfig};
+
+const TOLERANCE: f32 = 1e-4;
+
+struct Golden {
+    config: serde_json::Value,
+    tensors: BTreeMap<String, HostTensor>,
+}
+
+impl Golden {
+    fn read(path: &std::path::Path) -> Self {
+        let bytes = std::fs::read(path).expect("the file is readable");
+        let (_, metadata) = SafeTensors::read_metadata(&bytes).expect("a safetensors file");
+        let config = &metadata.metadata().as_ref().expect("metadata")["config"];
+        let tensors = SafeTensors::deserialize(&bytes).expect("a safetensors file");
+        let tensors = tensors
+            .iter()
+            .filter(|(_, view)| view.dtype() == safetensors::Dtype::F32)
+            .map(|(name, view)| {
+                let values =
+                    view.data().chunks(4).map(|b| f32::from_le_bytes(b.try_into().expect("4 bytes"))).collect();
+                (name.to_owned(), HostTensor { shape: view.shape().to_vec(), values })
+            })
+            .collect();
+        Self { config: serde_json::from_str(config).expect("JSON"), tensors }
+    }
+
+    fn size(&self, name: &str) -> usize {
+        usize::try_from(self.config[name].as_u64().expect(name)).expect("a size")
+    }
+
+    fn get(&self, name: &str) -> &HostTensor {
+        self.tensors.get(name).unwrap_or_else(|| panic!("no tensor {name}"))
+    }
+
+    fn tensor<const D: usize>(&self, name: &str) -> Tensor<D> {
+        let host = self.get(name);
+        let shape: [usize; D] = host.shape.clone().try_into().expect("rank");
+        Tensor::from_data(TensorData::new(host.values.clone(), shape), &Device::flex())
+    }
+
+    fn group(&self, prefix: &str) -> Named<HostTensor> {
+        let strip =
+            |(name, tensor): (&String, &HostTensor)| Some((name.strip_prefix(prefix)?.to_owned(), tensor.clone()));
+        self.tensors.iter().filter_map(strip).collect()
+    }
+
+    /// Pictures `[…, 3, image, image]`, already normalised, as patches.
+    fn patches(&self, name: &str) -> Tensor<3> {
+        let (image, patch) = (self.size("image"), self.size("patch"));
+        let (host, grid) = (self.get(name), image / patch);
+        let frames = host.values.len() / (3 * image * image);
+        let frames_tensor =
+            Tensor::<1>::from_data(TensorData::new(host.values.clone(), [host.values.len()]), &Device::flex());
+        frames_tensor.reshape([frames, 3, grid, patch, grid, patch]).permute([0, 2, 4, 1, 3, 5]).reshape([
+            frames,
+            grid * grid,
+            3 * patch * patch,
+        ])
+    }
+
+    fn config(&self) -> LewmConfig {
+        let dim = self.size("dim");
+        LewmConfig {
+            image: self.size("image"),
+            pixel_mean: [0.0; 3],
+            pixel_std: [1.0; 3],
+            latent: dim,
+            projector: self.size("proj_hidden"),
+            encoder: EncoderConfig::Vit(VitConfig {
+                patch: self.size("patch"),
+                dim,
+                depth: self.size("vit_layers"),
+                heads: self.size("vit_heads"),
+                mlp: self.size("vit_mlp"),
+            }),
+            predictor: PredictorConfig {
+                history: self.size("history"),
+                dim,
+                depth: self.size("depth"),
+                heads: self.size("heads"),
+                dim_head: self.size("dim_head"),
+                mlp: self.size("mlp"),
+                dropout: 0.0,
+                emb_dropout: 0.0,
+            },
+        }
+    }
+
+    fn model(&self) -> Lewm {
+        let model = Lewm::new(&self.config(), self.size("action_dim"), Key::new(0), &Device::flex());
+        let weights = self.group("w.");
+        for (name, shape) in parameters::shapes(&model) {
+            assert_eq!(weights.get(&name).map(|w| &w.shape), Some(&shape), "published weight {name}");
+        }
+        parameters::load(model, &weights)
+    }
+}
+
+/// The largest difference, relative to the largest number (or to `floor`, where all are tiny).
+fn error(ours: &[f32], theirs: &[f32], floor: f32) -> f32 {
+    assert_eq!(ours.len(), theirs.len());
+    let scale = theirs.iter().fold(floor, |m, v| m.max(v.abs()));
+    ours.iter().zip(theirs).fold(0.0f32, |m, (a, b)| m.max((a - b).abs())) / scale
+}
+
+fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
+    tensor.into_data().iter::<f32>().collect()
+}
+
+fn check(golden: &Golden, name: &str, ours: &[f32]) {
+    let error = error(ours, &golden.get(name).values, 1e-6);
+    println!("{name}: {error:.1e}");
+    assert!(error < TOLERANCE, "{name} differs by {error:.1e}");
+}
+
+fn files() -> Vec<PathBuf> {
+    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
+    let folders = match std::env::var_os("SWM_GOLDEN_MODELS") {
+        Some(folder) => vec![PathBuf::from(folder)],
+        None => vec![root.join("tests/golden"), root.join("../../../shared/reference/models")],
+    };
+    let mut files: Vec<PathBuf> = folders
+        .iter()
+        .filter_map(|folder| std::fs::read_dir(folder).ok())
+        .flatten()
+        .map(|entry| entry.expect("a folder entry").path())
+        .filter(|path| {
+            let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+            name.starts_with("lewm-") && name.ends_with(".safetensors")
+        })
+        .collect();
+    files.sort();
+    assert!(!files.is_empty(), "no lewm-*.safetensors in {folders:?}: set SWM_GOLDEN_MODELS to a folder that has one");
+    files
+}
+
+#[test]
+fn golden_evaluation() {
+    for file in files() {
+        println!("{}", file.display());
+        let golden = Golden::read(&file);
+        let model = golden.model();
+        let [clips, steps, numbers] = golden.tensor::<3>("i.action").dims();
+        let dim = golden.size("dim");
+        let latents = model.encode(golden.patches("i.pixels")).reshape([clips, steps, dim]);
+        check(&golden, "o.eval.emb", &values(latents.clone()));
+        let conditions = model.embed_actions(golden.tensor("i.action"));
+        check(&golden, "o.eval.act_emb", &values(conditions.clone()));
+        let window = [0..clips, 0..golden.get("o.eval.pred").shape[1], 0..dim];
+        check(
+            &golden,
+            "o.eval.pred",
+            &values(model.predict(latents.clone().slice(window.clone()), conditions.slice(window))),
+        );
+
+        let [envs, samples, horizon, _] = golden.tensor::<4>("i.candidates").dims();
+        let candidates = golden.tensor::<4>("i.candidates").reshape([envs * samples, horizon, numbers]);
+        let goal = model.encode(golden.patches("i.goal")).reshape([envs, 1, dim]).expand([envs, samples, dim]);
+        for history in [1, 3] {
+            // The first frames of the first clips, and the actions taken between them.
+            let repeat = |x: Tensor<3>, length: usize, width: usize| {
+                let x: Tensor<4> = x.slice([0..envs, 0..length, 0..width]).unsqueeze_dim(1);
+                x.expand([envs, samples, length, width]).reshape([envs * samples, length, width])
+            };
+            let mut actions = candidates.clone();
+            if history > 1 {
+                actions = Tensor::cat(vec![repeat(golden.tensor("i.action"), history - 1, numbers), actions], 1);
+            }
+            let rollout = model.rollout(repeat(latents.clone(), history, dim), actions);
+            let [_, length, _] = rollout.dims();
+            check(&golden, &format!("o.rollout.h{history}"), &values(rollout.clone()));
+            let last = rollout.slice([0..envs * samples, length - 1..length, 0..dim]).reshape([envs, samples, dim]);
+            let cost: Tensor<3> = (last - goal.clone()).square().sum_dim(2);
+            check(&golden, &format!("o.cost.h{history}"), &values(cost));
+        }
+    }
+}
+
+#[test]
+fn golden_training() {
+    for file in files() {
+        println!("{}", file.display());
+        let golden = Golden::read(&file);
+        let projections = golden.tensor::<2>("i.sigreg_projections");
+        let sigreg = SigregConfig {
+            weight: golden.config["sigreg_weight"].as_f64().expect("a weight") as f32,
+            directions: golden.size("num_proj"),
+            knots: golden.size("knots"),
+        };
+        for shards in [1, 3] {
+            let batch = TrainBatch { patches: golden.patches("i.pixels"), actions: golden.tensor("i.action") };
+            let output = step(&golden.model(), &batch, &sigreg, &values(projections.clone().transpose()), shards, None);
+            check(&golden, "o.train.emb", &output.latents);
+            check(&golden, "o.train.loss", &[output.losses.total as f32]);
+            check(&golden, "o.train.pred_loss", &[output.losses.prediction as f32]);
+            check(&golden, "o.train.sigreg_loss", &[output.losses.sigreg as f32]);
+            let theirs = golden.group("g.");
+            let largest = theirs.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));
+            let mut worst = (0.0, String::new());
+            for (name, gradient) in &theirs {
+                let ours = values(output.gradients.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
+                // A bias that a batch normalisation or a softmax takes out again has no effect: its gradient is zero but
+                // for rounding, and is held against the others.
+                let idle =
+                    ["projector.net.0.bias", "pred_proj.net.0.bias", ".key.bias", "predictor.transformer.norm.bias"];
+                let floor = if idle.iter().any(|end| name.ends_with(end)) { largest } else { 0.0 };
+                let error = error(&ours, &gradient.values, floor);
+                if error > worst.0 {
+                    worst = (error, name.clone());
+                }
+            }
+            println!("worst gradient: {:.1e} ({})", worst.0, worst.1);
+            assert!(worst.0 < TOLERANCE, "gradient of {} differs by {:.1e}", worst.1, worst.0);
+            assert_eq!(output.gradients.len(), theirs.len());
+        }
+    }
+}

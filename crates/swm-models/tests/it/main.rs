@@ -1,0 +1,5 @@
+//! Integration tests: parity with the published models, training, checkpoints.
+
+#![allow(clippy::print_stdout)] // the measured errors, for `--no-capture`
+
+mod golden;

@@ -1,1 +1,20 @@
-//! swm-eval
+//! Policies in worlds: [`World`] plays episodes, and what is done with them has a file each.
+//!
+//! - [`world`]: many environments, one policy, and the loop both uses below share.
+//! - [`collect`]: every episode goes to a dataset, in the order of its number.
+//! - [`starts`] and [`evaluate`]: from where to play and towards which goal, and how often it is reached.
+//! - [`bench`](mod@bench): how fast all that is, beside the reference where it is installed.
+//!
+//! An episode is decided by its own key. Neither the number of environments, nor that of threads, nor what
+//! was played before in the same slot changes a byte of it.
+
+pub mod bench;
+pub mod collect;
+pub mod evaluate;
+pub mod starts;
+pub mod world;
+
+pub use collect::{CollectConfig, Collected};
+pub use evaluate::{EvalConfig, Videos};
+pub use starts::Starts;
+pub use world::{Control, Progress, World, WorldConfig};

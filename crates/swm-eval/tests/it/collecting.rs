@@ -1,0 +1,171 @@
+//! What lands in a dataset, and that nothing but the seed decides it.
+
+use crate::line::{ENTRY, Walker};
+use crate::memory::Memory;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use swm_core::{Batch, DType, Error, Key, Policy, RandomPolicy, Result, VariationRequest};
+use swm_eval::{CollectConfig, Collected, Control, World, WorldConfig};
+
+fn world(envs: usize, threads: usize) -> World {
+    let config = WorldConfig { envs, image: Some((2, 3)), max_episode_steps: None, threads };
+    World::new(&ENTRY, config).expect("a world")
+}
+
+fn config(episodes: usize) -> CollectConfig {
+    CollectConfig {
+        episodes,
+        seed: 11,
+        variation: VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() },
+        policy: "random".to_owned(),
+        goal: false,
+    }
+}
+
+fn collect(envs: usize, threads: usize, episodes: usize, memory: &Memory) -> Result<Collected> {
+    let mut world = world(envs, threads);
+    let mut policy = RandomPolicy::new(world.spec(), envs);
+    world.collect(&mut policy, memory.writer(), &config(episodes), &mut Control::default())
+}
+
+#[test]
+fn datasets_are_the_same_bytes_for_any_number_of_environments_and_threads() {
+    let alone = Memory::default();
+    let collected = collect(1, 1, 23, &alone).expect("collected");
+    assert_eq!((collected.episodes, collected.added), (23, 23));
+    let rows: usize = alone.episodes.lock().expect("lock").iter().map(Batch::rows).sum();
+    assert_eq!(collected.steps, rows - 23);
+    let lengths: Vec<usize> = alone.episodes.lock().expect("lock").iter().map(Batch::rows).collect();
+    assert!(lengths.iter().any(|&n| n < 13), "some episodes end early, so slots finish out of order: {lengths:?}");
+    for (envs, threads) in [(1, 2), (5, 1), (5, 2), (23, 2), (40, 3)] {
+        let memory = Memory::default();
+        collect(envs, threads, 23, &memory).expect("collected");
+        assert!(memory.bytes() == alone.bytes(), "{envs} environments on {threads} threads");
+    }
+}
+
+#[test]
+fn rows_follow_the_time_convention() {
+    let memory = Memory::default();
+    let mut world = world(3, 1);
+    let schema = world.collect_schema(false).expect("schema");
+    assert_eq!(world.collect_schema(true).expect("schema").columns().len(), schema.columns().len() + 1);
+    world.collect(&mut Walker, memory.writer(), &config(6), &mut Control::default()).expect("collected");
+    for (number, episode) in memory.episodes.lock().expect("lock").iter().enumerate() {
+        assert_eq!(*episode.schema(), schema);
+        let last = episode.rows() - 1;
+        let state = episode.get::<f64>("state").expect("state");
+        let goal = episode.get::<f64>("goal_state").expect("goal")[0];
+        let action = episode.get::<f32>("action").expect("action");
+        let reward = episode.get::<f32>("reward").expect("reward");
+        let terminated = episode.get::<u8>("terminated").expect("terminated");
+        let success = episode.get::<u8>("success").expect("success");
+        for t in 0..last {
+            assert!((state[t] + f64::from(action[t]) - state[t + 1]).abs() < 1e-6, "the action leads to the next row");
+            assert_eq!(reward[t], -(state[t + 1] - goal).abs() as f32, "the reward is that of the step");
+            assert_eq!(terminated[t], u8::from(t + 1 == last));
+            assert_eq!(success[t + 1], terminated[t]);
+        }
+        assert!(action[last].is_nan());
+        assert_eq!((reward[last], terminated[last]), (0.0, 0));
+        let seed = (Key::new(11).with("episode").at(number as u64).seed() >> 1) as i64;
+        assert_eq!(episode.get::<i64>("seed").expect("seed"), vec![seed; last + 1]);
+        let start = episode.get::<f32>("variation.agent.x").expect("factor");
+        assert!(start.iter().all(|&x| f64::from(x) == state[0]), "constant, and where the agent began");
+        let color = episode.get::<u8>("variation.agent.color").expect("factor");
+        assert_eq!(color[..2], episode.get::<u8>("pixels").expect("pixels")[..2]);
+    }
+    let column = |name: &str| schema.column(name).expect("column").clone();
+    assert_eq!((column("variation.goal.x").dtype, column("seed").dtype), (DType::Float64, DType::Int64));
+    assert!(schema.find("goal").is_none() && schema.find("step_idx").is_none());
+}
+
+#[test]
+fn resuming_equals_never_stopping() {
+    let whole = Memory::default();
+    collect(4, 2, 15, &whole).expect("collected");
+    let parts = Memory::default();
+    collect(3, 1, 4, &parts).expect("a first part");
+    let second = collect(2, 2, 15, &parts).expect("the rest");
+    assert_eq!((second.episodes, second.added), (15, 11));
+    assert!(parts.bytes() == whole.bytes());
+    assert_eq!(collect(2, 2, 15, &parts).expect("nothing to do").added, 0);
+    assert_eq!(parts.len(), 15);
+}
+
+#[test]
+fn an_interruption_keeps_what_is_finished() {
+    let (whole, part) = (Memory::default(), Memory::default());
+    collect(4, 1, 30, &whole).expect("collected");
+    let stop = Arc::new(AtomicBool::new(false));
+    let mut world = world(4, 1);
+    let mut policy = RandomPolicy::new(world.spec(), 4);
+    let mut told = 0;
+    let mut control = Control {
+        stop: Some(Arc::clone(&stop)),
+        progress: Some(Box::new(|progress| {
+            told = progress.episodes;
+            stop.store(progress.episodes >= 6, Ordering::Relaxed);
+        })),
+    };
+    let outcome = world.collect(&mut policy, part.writer(), &config(30), &mut control);
+    drop(control);
+    assert!(matches!(outcome, Err(Error::Interrupted)), "{outcome:?}");
+    assert_eq!(*part.finished.lock().expect("lock"), 1, "the writer was finished");
+    assert_eq!(told, part.len(), "what was told is what is stored");
+    assert!((6..30).contains(&part.len()));
+    assert!(whole.bytes().starts_with(&part.bytes()));
+    collect(2, 1, 30, &part).expect("resumed");
+    assert!(part.bytes() == whole.bytes());
+}
+
+/// Fails after some steps.
+struct Broken {
+    walker: Walker,
+    left: usize,
+}
+
+impl Policy for Broken {
+    fn begin(&mut self, _: usize, _: Key) {}
+
+    fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
+        self.left = self.left.checked_sub(1).ok_or(Error::external("acting", "out of ideas"))?;
+        self.walker.act(infos, active, actions)
+    }
+}
+
+#[test]
+fn a_failing_policy_and_a_full_disk_keep_what_is_finished() {
+    let memory = Memory::default();
+    let mut broken = Broken { walker: Walker, left: 20 };
+    let error = world(3, 1).collect(&mut broken, memory.writer(), &config(50), &mut Control::default());
+    assert!(error.expect_err("the policy fails").to_string().contains("out of ideas"));
+    assert!(memory.len() > 0);
+    assert_eq!(*memory.finished.lock().expect("lock"), 1);
+
+    let full = Memory { full_at: Some(5), ..Memory::default() };
+    let error = collect(3, 1, 500, &full).expect_err("the disk is full").to_string();
+    assert!(error.contains("free some space"), "{error}");
+    assert_eq!(full.len(), 5);
+}
+
+#[test]
+fn wrong_requests_say_so() {
+    let made = |config| World::new(&ENTRY, config).err().expect("wrong").to_string();
+    assert!(made(WorldConfig { envs: 0, ..WorldConfig::default() }).contains("at least 1"));
+    assert!(made(WorldConfig { image: Some((0, 3)), ..WorldConfig::default() }).contains("0 x 3"));
+    let unknown = VariationRequest { variation: Some(vec!["agent.colour".to_owned()]), ..Default::default() };
+    let config = CollectConfig { variation: unknown, ..config(1) };
+    let memory = Memory::default();
+    let error = world(1, 1).collect(&mut Walker, memory.writer(), &config, &mut Control::default());
+    assert!(error.expect_err("no such factor").to_string().contains("agent.color"));
+}
+
+#[test]
+fn the_manifest_says_what_was_asked_and_not_how_it_ran() {
+    let manifest = world(3, 1).collect_manifest(&config(9));
+    assert_eq!(manifest, world(1, 2).collect_manifest(&config(9)));
+    assert_eq!((manifest.kind.as_str(), manifest.seed), ("collect", 11));
+    assert_eq!(manifest.config["env"], "test/Line-v0");
+    assert_eq!(manifest.config["image"], serde_json::json!([2, 3]));
+}

@@ -1,0 +1,252 @@
+//! What counts as a success, from which starts, and that nothing but the starts decides it.
+
+use crate::line::{ENTRY, Walker};
+use crate::memory::{Memory, MemoryReader};
+use swm_core::results::Run;
+use swm_core::{Batch, Candidates, CostModel, Error, Key, Policy, RandomPolicy, Result, VariationRequest};
+use swm_data::Reader as _;
+use swm_eval::{CollectConfig, Control, EvalConfig, Starts, Videos, World, WorldConfig};
+use swm_plan::{ActionScale, Cem, MpcConfig, MpcPolicy};
+
+fn world(envs: usize, threads: usize) -> World {
+    let config = WorldConfig { envs, image: Some((4, 4)), max_episode_steps: Some(12), threads };
+    World::new(&ENTRY, config).expect("a world")
+}
+
+fn pinned(values: &[(&str, f64)]) -> VariationRequest {
+    let variation_values = values.iter().map(|&(key, value)| (key.to_owned(), vec![value])).collect();
+    VariationRequest { variation: None, variation_values }
+}
+
+fn run(world: &mut World, policy: &mut dyn Policy, starts: &Starts, budget: Option<usize>) -> Run {
+    let config = EvalConfig { policy: "walker".to_owned(), condition: "test".to_owned(), budget, videos: None };
+    world.evaluate(policy, starts, &config, &mut Control::default()).expect("a run")
+}
+
+/// Everything but how long it took.
+fn timeless(run: &Run) -> String {
+    serde_json::to_string(&Run { timing: Default::default(), ..run.clone() }).expect("JSON")
+}
+
+#[test]
+fn solved_starts_are_counted_apart() {
+    // The agent starts within the goal's reach in some episodes: the goal is at 2, the start anywhere in -4 ..= 4.
+    let variation = VariationRequest { variation: Some(vec!["agent.x".to_owned()]), ..pinned(&[("goal.x", 2.0)]) };
+    let starts = Starts::episodic(200, 3, variation).expect("starts");
+    let found = run(&mut world(16, 2), &mut Walker, &starts, None);
+    assert!(found.solved_at_start > 0, "some starts are solved");
+    assert_eq!(found.success.n + found.solved_at_start, 200);
+    assert_eq!(found.success.successes, found.success.n, "a straight walk of at most 6 steps");
+    for episode in &found.episodes {
+        assert_eq!(episode.solved_at_start, episode.steps == 0);
+        assert!(!(episode.solved_at_start && episode.success));
+    }
+    let time = found.time_to_goal.expect("successes");
+    assert!((1.0..=6.0).contains(&time.median), "{time:?}");
+}
+
+#[test]
+fn the_budget_ends_an_episode() {
+    let starts = Starts::episodic(3, 0, pinned(&[("agent.x", -3.0), ("goal.x", 3.0)])).expect("starts");
+    let steps = |budget| {
+        let found = run(&mut world(2, 1), &mut Walker, &starts, budget);
+        (found.success.successes, found.episodes[0].steps)
+    };
+    assert_eq!((steps(None), steps(Some(6)), steps(Some(5))), ((3, 6), (3, 6), (0, 5)));
+    let config = EvalConfig { budget: Some(13), ..EvalConfig::default() };
+    let error = world(1, 1).evaluate(&mut Walker, &starts, &config, &mut Control::default());
+    assert!(error.expect_err("too long").to_string().contains("truncates episodes after 12"));
+}
+
+/// Costs of a model that knows the world: the distance to the goal after the last action.
+#[derive(Default)]
+struct Knowing {
+    present: Vec<(f64, f64)>,
+}
+
+impl CostModel for Knowing {
+    fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()> {
+        self.present.clear();
+        for &env in envs {
+            let row = infos.row(env);
+            self.present.push((row.get::<f64>("state")?[0], row.get::<f64>("goal_state")?[0]));
+        }
+        Ok(())
+    }
+
+    fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
+        let len = candidates.horizon * candidates.dim;
+        for (i, actions) in candidates.actions.chunks_exact(len).enumerate() {
+            let (x, goal) = self.present[i / candidates.samples];
+            costs[i] = (x + f64::from(actions.iter().sum::<f32>()) - goal).abs() as f32;
+        }
+        Ok(())
+    }
+}
+
+fn planner(world: &World) -> MpcPolicy {
+    let cem = Cem { samples: 32, iterations: 4, elites: 6, sigma: 1.0 };
+    let config = MpcConfig { horizon: 3, receding_horizon: 2, action_block: 2, ..MpcConfig::default() };
+    let (scale, slots) = (ActionScale::identity(1), world.pool().len());
+    MpcPolicy::new(Box::new(cem), Box::new(Knowing::default()), config, scale, world.spec(), slots).expect("a policy")
+}
+
+#[test]
+fn planned_or_random_results_do_not_depend_on_who_is_played_beside() {
+    let starts = Starts::episodic(20, 5, VariationRequest::default()).expect("starts");
+    let mut alone = world(1, 1);
+    let mut policy = planner(&alone);
+    let planned = run(&mut alone, &mut policy, &starts, None);
+    let mut policy = RandomPolicy::new(alone.spec(), 1);
+    let random = run(&mut alone, &mut policy, &starts, None);
+    assert!(planned.success.low > random.success.high, "{:?} beside {:?}", planned.success, random.success);
+    assert!(planned.timing.plan_seconds.is_some_and(|plans| plans.n >= 20) && random.timing.plan_seconds.is_none());
+    for (envs, threads) in [(7, 1), (20, 1), (20, 2), (32, 2)] {
+        let mut world = world(envs, threads);
+        let mut policy = planner(&world);
+        assert_eq!(timeless(&run(&mut world, &mut policy, &starts, None)), timeless(&planned), "{envs} planned");
+        let mut policy = RandomPolicy::new(world.spec(), envs);
+        assert_eq!(timeless(&run(&mut world, &mut policy, &starts, None)), timeless(&random), "{envs} random");
+    }
+}
+
+fn recorded(episodes: usize) -> MemoryReader {
+    let memory = Memory::default();
+    let mut world = world(4, 1);
+    let mut policy = RandomPolicy::new(world.spec(), 4);
+    let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
+    let config = CollectConfig { episodes, seed: 1, variation, ..CollectConfig::default() };
+    world.collect(&mut policy, memory.writer(), &config, &mut Control::default()).expect("collected");
+    memory.reader()
+}
+
+/// Repeats the recorded actions of the start its episode was given.
+struct Oracle<'a> {
+    reader: &'a MemoryReader,
+    starts: &'a Starts,
+    keys: Vec<(Key, usize)>,
+    playing: Vec<[usize; 2]>,
+}
+
+impl Policy for Oracle<'_> {
+    fn begin(&mut self, slot: usize, key: Key) {
+        let episode = self.keys.iter().find(|(known, _)| *known == key).expect("a key of these starts").1;
+        self.playing[slot] = self.starts.pick(episode).expect("starts of a dataset");
+    }
+
+    fn act(&mut self, _: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
+        for slot in (0..active.len()).filter(|&slot| active[slot]) {
+            let [episode, step] = &mut self.playing[slot];
+            let range = swm_data::StepRange { episode: *episode, start: *step, length: 1 };
+            let row = self.reader.read(&["action"], &[range])?;
+            actions.row_mut(slot).set(0, row.get::<f32>("action")?);
+            *step += 1;
+        }
+        Ok(())
+    }
+}
+
+#[test]
+fn repeating_what_was_recorded_reaches_the_recorded_goal() {
+    let reader = recorded(12);
+    let picks = Starts::choose(&reader, 30, 4, 8).expect("picks");
+    assert_eq!(picks, Starts::choose(&reader, 30, 4, 8).expect("picks"), "decided by the seed");
+    assert_ne!(picks, Starts::choose(&reader, 30, 4, 9).expect("picks"));
+    let spec = world(1, 1).spec().clone();
+    let starts = Starts::from_dataset(&reader, &spec, picks, 4, 8, VariationRequest::default()).expect("starts");
+    let keys = (0..30).map(|i| (Key::new(8).with("episode").at(i as u64), i)).collect();
+    let mut oracle = Oracle { reader: &reader, starts: &starts, keys, playing: vec![[0; 2]; 5] };
+    let found = run(&mut world(5, 2), &mut oracle, &starts, Some(4));
+    assert!(found.success.n > 0);
+    assert_eq!(found.success.rate, 1.0, "{found:?}");
+    assert!(found.episodes.iter().all(|episode| episode.start.is_some() && episode.steps <= 4));
+    let still = run(&mut world(5, 1), &mut Still, &starts, Some(4));
+    assert_eq!((still.success.successes, still.solved_at_start), (0, found.solved_at_start));
+    assert_eq!(starts.hashes()["dataset"], "memory");
+    assert_eq!(starts.hashes(), starts.clone().hashes());
+}
+
+struct Still;
+
+impl Policy for Still {
+    fn begin(&mut self, _: usize, _: Key) {}
+
+    fn act(&mut self, _: &Batch, _: &[bool], actions: &mut Batch) -> Result<()> {
+        actions.get_mut::<f32>("action")?.fill(0.0);
+        Ok(())
+    }
+}
+
+/// Notes the first colour it sees.
+#[derive(Default)]
+struct Seeing {
+    color: Vec<u8>,
+}
+
+impl Policy for Seeing {
+    fn begin(&mut self, _: usize, _: Key) {}
+
+    fn act(&mut self, infos: &Batch, _: &[bool], actions: &mut Batch) -> Result<()> {
+        if self.color.is_empty() {
+            self.color = infos.row(0).get::<u8>("pixels")?[..2].to_vec();
+        }
+        Still.act(infos, &[], actions)
+    }
+}
+
+#[test]
+fn recorded_factors_hold_unless_they_are_shifted() {
+    let reader = recorded(12);
+    let spec = world(1, 1).spec().clone();
+    let picks = Starts::choose(&reader, 1, 6, 0).expect("picks");
+    let color = |variation: VariationRequest| {
+        let starts = Starts::from_dataset(&reader, &spec, picks.clone(), 6, 0, variation).expect("starts");
+        let mut seeing = Seeing::default();
+        run(&mut world(1, 1), &mut seeing, &starts, None);
+        seeing.color
+    };
+    let range = swm_data::StepRange { episode: picks[0][0], start: 0, length: 1 };
+    let row = reader.read(&["variation.agent.color"], &[range]).expect("a row");
+    assert_eq!(color(VariationRequest::default()), row.get::<u8>("variation.agent.color").expect("colour")[..2]);
+    let green = VariationRequest {
+        variation: None,
+        variation_values: [("agent.color".to_owned(), vec![1.0, 254.0, 0.0])].into(),
+    };
+    assert_eq!(color(green), [1, 254]);
+}
+
+#[test]
+fn wrong_requests_say_so() {
+    let reader = recorded(3);
+    let spec = world(1, 1).spec().clone();
+    let starts = |picks, offset, variation| {
+        Starts::from_dataset(&reader, &spec, picks, offset, 0, variation).expect_err("wrong").to_string()
+    };
+    assert!(starts(vec![], 1, VariationRequest::default()).contains("at least 1"));
+    assert!(starts(vec![[3, 0]], 1, VariationRequest::default()).contains("0 ..= 2"));
+    assert!(starts(vec![[0, 5]], 50, VariationRequest::default()).contains("50 steps later"));
+    assert!(starts(vec![[0, 0]], 1, pinned(&[("agent.y", 1.0)])).contains("agent.x"));
+    let error = Starts::choose(&reader, 1000, 2, 0).expect_err("too many").to_string();
+    assert!(error.contains("1000") && error.contains("collect more"), "{error}");
+    let blind = WorldConfig { envs: 1, image: None, max_episode_steps: None, threads: 1 };
+    let videos = Videos { root: "nowhere".into(), prefix: "v".to_owned(), count: 1, fps: 10 };
+    let config = EvalConfig { videos: Some(videos), ..EvalConfig::default() };
+    let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("starts");
+    let mut world = World::new(&ENTRY, blind).expect("a world");
+    let error = world.evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect_err("no pictures");
+    assert!(matches!(error, Error::Config { .. }), "{error}");
+}
+
+#[test]
+fn the_first_episodes_are_filmed_beside_their_goal() {
+    if std::process::Command::new("ffmpeg").arg("-version").output().is_err() {
+        return;
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let videos = Videos { root: folder.path().to_owned(), prefix: "videos/walker".to_owned(), count: 2, fps: 10 };
+    let config = EvalConfig { videos: Some(videos), ..EvalConfig::default() };
+    let starts = Starts::episodic(4, 2, VariationRequest::default()).expect("starts");
+    let found = world(3, 1).evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect("a run");
+    assert_eq!(found.videos, ["videos/walker-0.mp4", "videos/walker-1.mp4"]);
+    assert!(found.videos.iter().all(|video| folder.path().join(video).metadata().is_ok_and(|file| file.len() > 500)));
+}

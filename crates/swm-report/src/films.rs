@@ -1,0 +1,67 @@
+//! Videos inside the page, as data URIs.
+
+use crate::text::escape;
+use base64::Engine as _;
+use std::fmt::Write as _;
+use std::path::Path;
+use swm_core::results::Run;
+
+/// The largest video that is embedded, in bytes; base64 makes it a third larger.
+const LARGEST: u64 = 8 << 20;
+
+/// The videos of a run, as figures; `folder` is where its results file lies. Videos that are missing, too
+/// large or of an unknown kind are named instead.
+pub(crate) fn figures(run: &Run, folder: &Path) -> String {
+    let mut html = String::new();
+    for video in &run.videos {
+        let caption = caption(run, video);
+        let who = escape(&format!("{}, {}", run.policy, run.condition));
+        match embed(&folder.join(video)) {
+            Ok(uri) => {
+                let _ = write!(
+                    html,
+                    "<figure class=\"film\">\n<video controls=\"controls\" loop=\"loop\" muted=\"muted\" \
+                     playsinline=\"playsinline\" preload=\"metadata\" aria-label=\"{who}: agent on the left, goal on \
+                     the right\" src=\"{uri}\"></video>\n<figcaption><b>{who}</b>{caption}</figcaption>\n</figure>\n"
+                );
+            }
+            Err(reason) => {
+                let _ = write!(
+                    html,
+                    "<figure class=\"film absent\">\n<p>Not embedded: <code>{}</code> {reason}.</p>\n\
+                     <figcaption><b>{who}</b>{caption}</figcaption>\n</figure>\n",
+                    escape(video)
+                );
+            }
+        }
+    }
+    html
+}
+
+fn embed(path: &Path) -> Result<String, String> {
+    let kind = match path.extension().and_then(|extension| extension.to_str()) {
+        Some("mp4") => "video/mp4",
+        Some("webm") => "video/webm",
+        _ => return Err("is neither MP4 nor WebM".to_owned()),
+    };
+    let size = std::fs::metadata(path).map_err(|_| "was not found beside its results file".to_owned())?.len();
+    if size > LARGEST {
+        return Err(format!("has {:.1} MiB, more than a page should carry", size as f64 / f64::from(1 << 20)));
+    }
+    let bytes = std::fs::read(path).map_err(|error| format!("cannot be read ({})", escape(&error.to_string())))?;
+    Ok(format!("data:{kind};base64,{}", base64::engine::general_purpose::STANDARD.encode(bytes)))
+}
+
+/// What the video shows, where its name ends in the episode's number: `in-distribution/lewm-003.mp4`.
+fn caption(run: &Run, video: &str) -> String {
+    let stem = Path::new(video).file_stem().and_then(|stem| stem.to_str()).unwrap_or_default();
+    let digits = stem.len() - stem.chars().rev().take_while(char::is_ascii_digit).count();
+    let Ok(index) = stem[digits..].parse::<usize>() else { return String::new() };
+    let Some(episode) = run.episodes.get(index) else { return String::new() };
+    let (class, outcome) = match (episode.solved_at_start, episode.success) {
+        (true, _) => ("start", "solved at the start".to_owned()),
+        (_, true) => ("solved", format!("solved in {} steps", episode.steps)),
+        _ => ("unsolved", format!("not solved in {} steps", episode.steps)),
+    };
+    format!("<br/>episode {index} <span class=\"mark {class}\">{outcome}</span>")
+}

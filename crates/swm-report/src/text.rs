@@ -1,0 +1,95 @@
+//! Words and numbers as the page shows them.
+
+/// Words made safe for HTML text and quoted attributes. Control characters, which XML forbids, become spaces.
+pub(crate) fn escape(words: &str) -> String {
+    let mut safe = String::with_capacity(words.len());
+    for c in words.chars() {
+        match c {
+            '&' => safe.push_str("&amp;"),
+            '<' => safe.push_str("&lt;"),
+            '>' => safe.push_str("&gt;"),
+            '"' => safe.push_str("&quot;"),
+            '\'' => safe.push_str("&#39;"),
+            '\n' | '\t' => safe.push(c),
+            c if c.is_control() => safe.push(' '),
+            c => safe.push(c),
+        }
+    }
+    safe
+}
+
+/// Words cut to `most` characters, with an ellipsis where something is missing.
+pub(crate) fn shorten(words: &str, most: usize) -> String {
+    if words.chars().count() <= most {
+        return words.to_owned();
+    }
+    let mut short: String = words.chars().take(most.saturating_sub(1)).collect();
+    short.push('…');
+    short
+}
+
+/// A share as a percentage with one decimal: `92.5 %`.
+pub(crate) fn percent(rate: f64) -> String {
+    format!("{:.1} %", rate * 100.0)
+}
+
+/// A number with about four significant digits and no trailing zeros.
+pub(crate) fn number(value: f64) -> String {
+    let size = value.abs();
+    if !value.is_finite() {
+        return "–".to_owned();
+    }
+    if size != 0.0 && !(1e-4..1e7).contains(&size) {
+        return format!("{value:.2e}");
+    }
+    let decimals = match size {
+        s if s >= 1000.0 => 0,
+        s if s >= 100.0 => 1,
+        s if s >= 10.0 => 2,
+        s if s >= 1.0 || s == 0.0 => 3,
+        s if s >= 0.1 => 4,
+        s if s >= 0.01 => 5,
+        _ => 6,
+    };
+    let text = format!("{value:.decimals$}");
+    if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.').to_owned() } else { text }
+}
+
+/// A duration: `0.8 ms`, `12 ms`, `1.42 s`, `3 min 20 s`, `2 h 5 min`.
+pub(crate) fn duration(seconds: f64) -> String {
+    match seconds {
+        s if !s.is_finite() || s < 0.0 => "–".to_owned(),
+        s if s < 0.009_95 => format!("{:.1} ms", s * 1e3),
+        s if s < 0.999_5 => format!("{:.0} ms", s * 1e3),
+        s if s < 9.995 => format!("{s:.2} s"),
+        s if s < 59.95 => format!("{s:.1} s"),
+        s if s < 3599.5 => {
+            let whole = s.round();
+            format!("{:.0} min {:.0} s", (whole / 60.0).floor(), whole % 60.0)
+        }
+        s => {
+            let minutes = (s / 60.0).round();
+            format!("{:.0} h {:.0} min", (minutes / 60.0).floor(), minutes % 60.0)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_cannot_become_markup() {
+        assert_eq!(escape("<b a=\"1\" c='2'>&\u{1}é"), "&lt;b a=&quot;1&quot; c=&#39;2&#39;&gt;&amp; é");
+        assert_eq!((shorten("éclair", 6), shorten("éclairs", 6)), ("éclair".to_owned(), "éclai…".to_owned()));
+    }
+
+    #[test]
+    fn numbers_are_short() {
+        let numbers = [0.0, 1.0, -2.5, 0.123_456, 12_345.6, 1e-9, 150.0, f64::NAN].map(number);
+        assert_eq!(numbers, ["0", "1", "-2.5", "0.1235", "12346", "1.00e-9", "150", "–"]);
+        let times = [0.000_84, 0.012, 0.9996, 1.417, 59.96, 200.0, 7500.0, -1.0].map(duration);
+        assert_eq!(times, ["0.8 ms", "12 ms", "1.00 s", "1.42 s", "1 min 0 s", "3 min 20 s", "2 h 5 min", "–"]);
+        assert_eq!(percent(0.925), "92.5 %");
+    }
+}

@@ -1,0 +1,244 @@
+//! The whole page, from synthetic results whose numbers are known.
+
+use std::path::{Path, PathBuf};
+use swm_core::results::{EpisodeResult, Proportion, Run, Summary, Timing};
+use swm_core::{Manifest, Results};
+use swm_report::{ReportOptions, read_metrics, read_results, write_report, write_report_with};
+
+/// A run of `n` episodes of which the first `solved` reach the goal, each a step later than the one before.
+fn run(condition: &str, policy: &str, n: usize, solved: usize, plans: Option<f64>) -> Run {
+    let episodes: Vec<EpisodeResult> = (0..n)
+        .map(|i| EpisodeResult {
+            seed: 1000 + i as u64,
+            success: i < solved,
+            solved_at_start: false,
+            steps: if i < solved { 8 + i } else { 60 },
+            total_reward: -1.5,
+            start: None,
+        })
+        .collect();
+    let steps: Vec<f64> = episodes.iter().filter(|e| e.success).map(|e| e.steps as f64).collect();
+    Run {
+        condition: condition.to_owned(),
+        policy: policy.to_owned(),
+        solved_at_start: 0,
+        success: Proportion::wilson(solved, n),
+        time_to_goal: Summary::of(&steps),
+        timing: Timing {
+            plan_seconds: plans.and_then(|s| Summary::of(&[s, s, s * 1.5])),
+            wall_seconds: if plans.is_some() { 83.0 } else { 0.0 },
+        },
+        videos: vec![],
+        episodes,
+    }
+}
+
+fn results() -> Results {
+    let mut manifest = Manifest::new("evaluate", 7, serde_json::json!({"horizon": 5, "note": "</pre><script>"}));
+    manifest.libraries.insert("burn".to_owned(), "0.22.1".to_owned());
+    manifest.hashes.insert("weights".to_owned(), "ab".repeat(32));
+    let mut shifted = run("agent.color shifted", "lewm-tiny", 40, 3, Some(0.0421));
+    shifted.episodes[39].solved_at_start = true;
+    shifted.solved_at_start = 1;
+    shifted.success = Proportion::wilson(3, 39);
+    Results {
+        manifest,
+        env: "swm/TwoRoom-v1".to_owned(),
+        protocol: "episodic".to_owned(),
+        runs: vec![
+            run("in distribution", "random", 40, 2, None),
+            run("in distribution", "expert", 40, 40, None),
+            run("in distribution", "lewm-tiny", 40, 37, Some(0.0384)),
+            run("agent.color shifted", "random", 40, 2, None),
+            shifted,
+        ],
+    }
+}
+
+fn page(results: &[(PathBuf, Results)], folder: &Path) -> String {
+    let path = write_report(results, folder).expect("report");
+    let page = std::fs::read_to_string(path).expect("page");
+    well_formed(&page);
+    page
+}
+
+/// Checks that elements nest, attributes are quoted, and ampersands begin entities: the page is valid XML
+/// apart from its doctype.
+fn well_formed(page: &str) {
+    let mut open: Vec<&str> = vec![];
+    let mut rest = page.strip_prefix("<!DOCTYPE html>").expect("a doctype");
+    while let Some(start) = rest.find('<') {
+        let text = &rest[..start];
+        assert!(!text.contains('>') || open.last() == Some(&"style"), "a stray > in {text}");
+        for (i, _) in text.match_indices('&') {
+            let entity = text[i + 1..].split(';').next().expect("a part");
+            assert!(["amp", "lt", "gt", "quot", "#39"].contains(&entity), "&{entity}");
+        }
+        let end = start + rest[start..].find('>').expect("a tag ends");
+        let tag = &rest[start + 1..end];
+        assert!(tag.matches('"').count().is_multiple_of(2) && !tag.contains('<'), "quotes of <{tag}>");
+        let name = |tag: &'_ str| tag.trim_start_matches('/').split([' ', '\n', '/']).next().map(str::len);
+        let length = name(tag).expect("a name");
+        if let Some(closed) = tag.strip_prefix('/') {
+            assert_eq!(open.pop(), Some(closed));
+        } else if !tag.ends_with('/') {
+            open.push(&tag[..length]);
+        }
+        rest = &rest[end + 1..];
+    }
+    assert!(open.is_empty(), "never closed: {open:?}");
+}
+
+#[test]
+fn the_page_shows_the_numbers() {
+    let folder = tempfile::tempdir().expect("folder");
+    let results = [(PathBuf::from("runs/demo/results.json"), results())];
+    let page = page(&results, folder.path());
+    // 37 of 40: Wilson 80.1 to 97.4 % (z = 1.96); 2 of 40: 1.4 to 16.5 %; 3 of 39: 2.7 to 20.3 %.
+    for words in [
+        "<b>92.5 %</b>",
+        "80.1 – 97.4 %",
+        "1.4 – 16.5 %",
+        "2.7 – 20.3 %",
+        "92.5 % (37/40)",
+        "above the random floor of 5.0 %",
+        "not told apart from the random floor of 5.0 %",
+        "26 (43)",
+        "38 ms (58 ms)",
+        "1 min 23 s",
+        "demo/results.json",
+        &"ab".repeat(32),
+        "burn",
+        "0.22.1",
+        "swm/TwoRoom-v1",
+        "agent.color shifted",
+        "&lt;/pre&gt;&lt;script&gt;",
+    ] {
+        assert!(page.contains(words), "the page lacks: {words}");
+    }
+    // Curves begin at nothing and rise by one episode each: 37 of 40 solved from step 8 to 44.
+    assert!(!page.contains("<script") && !page.contains("src=\"http") && !page.contains("@import"));
+    assert!(!page.contains("NaN") && !page.contains("inf\""));
+}
+
+#[test]
+fn equal_results_give_equal_bytes() {
+    let folder = tempfile::tempdir().expect("folder");
+    let results = [(PathBuf::from("a/results.json"), results())];
+    let pages = ["x", "y"].map(|name| page(&results, &folder.path().join(name)));
+    assert!(pages[0] == pages[1]);
+}
+
+#[test]
+fn words_of_others_cannot_become_markup() {
+    let folder = tempfile::tempdir().expect("folder");
+    let mut results = results();
+    let evil = "<img src=x onerror=\"alert('1')\">&";
+    (results.env, results.protocol) = (evil.to_owned(), evil.to_owned());
+    (results.manifest.device, results.manifest.kind) = (evil.to_owned(), evil.to_owned());
+    results.manifest.hashes.insert(evil.to_owned(), evil.to_owned());
+    for run in &mut results.runs {
+        (run.condition, run.policy) = (evil.to_owned(), evil.to_owned());
+        run.videos = vec![evil.to_owned()];
+    }
+    let options = ReportOptions { title: Some(evil.to_owned()), command: Some(evil.to_owned()), metrics: None };
+    let path = write_report_with(&[(PathBuf::from(evil), results)], &options, folder.path()).expect("report");
+    let page = std::fs::read_to_string(path).expect("page");
+    well_formed(&page);
+    assert!(!page.contains("<img"));
+}
+
+#[test]
+fn nothing_measured_is_said_so() {
+    let folder = tempfile::tempdir().expect("folder");
+    let mut empty = results();
+    empty.runs.clear();
+    let mut unsolved = results();
+    unsolved.env = "swm/PushT-v1".to_owned();
+    unsolved.runs = vec![run("in distribution", "lewm", 0, 0, None)];
+    unsolved.manifest = Manifest::default();
+    let page = page(&[(PathBuf::from("results.json"), empty), (PathBuf::from("b.json"), unsolved)], folder.path());
+    assert!(page.contains("These results hold no run.") && page.contains("no random floor was measured"));
+    assert!(!page.contains("NaN"));
+    let none = write_report(&[], folder.path()).expect_err("nothing to report");
+    assert!(none.is_usage() && none.to_string().contains("at least one results.json"));
+}
+
+#[test]
+fn several_files_of_one_world_stand_side_by_side() {
+    let folder = tempfile::tempdir().expect("folder");
+    let files = ["a.json", "b.json"].map(|name| (PathBuf::from(name), results()));
+    let page = page(&files, folder.path());
+    assert_eq!(page.matches("<h2>Success</h2>").count(), 1);
+    assert!(page.contains("lewm-tiny [1]") && page.contains("lewm-tiny [2]") && page.contains("[2] <code>b.json"));
+}
+
+#[test]
+fn videos_are_carried_and_missing_ones_named() {
+    let folder = tempfile::tempdir().expect("folder");
+    std::fs::create_dir_all(folder.path().join("videos")).expect("folder");
+    std::fs::write(folder.path().join("videos/lewm-2.mp4"), b"not really a video").expect("file");
+    let large = std::fs::File::create(folder.path().join("videos/lewm-39.mp4")).expect("file");
+    large.set_len((8 << 20) + 1).expect("length");
+    let mut results = results();
+    results.runs[2].videos =
+        ["videos/lewm-2.mp4", "videos/lewm-39.mp4", "videos/lost.mp4", "videos/a.avi"].map(str::to_owned).to_vec();
+    let page = page(&[(folder.path().join("results.json"), results)], &folder.path().join("report"));
+    assert!(page.contains("data:video/mp4;base64,bm90IHJlYWxseSBhIHZpZGVv"));
+    assert!(page.contains("episode 2 <span class=\"mark solved\">solved in 10 steps</span>"));
+    assert!(page.contains("episode 39 <span class=\"mark unsolved\">not solved in 60 steps</span>"));
+    for words in ["has 8.0 MiB", "was not found beside its results file", "is neither MP4 nor WebM"] {
+        assert!(page.contains(words), "the page lacks: {words}");
+    }
+}
+
+#[test]
+fn training_logs_become_curves() {
+    let folder = tempfile::tempdir().expect("folder");
+    let log = folder.path().join("metrics.jsonl");
+    let lines: String = (0..900)
+        .map(|i| format!("{{\"step\": {i}, \"loss\": {}, \"optimizer\": {{\"lr\": 0.001}}}}\n", 1.0 / f64::from(i + 1)))
+        .collect();
+    std::fs::write(&log, format!("{lines}{{\"step\": 900, \"lo")).expect("log");
+    let metrics = read_metrics(&log).expect("a torn last line is what a killed training leaves");
+    assert_eq!(metrics.over, "step");
+    assert_eq!(metrics.series.iter().map(|s| s.name.as_str()).collect::<Vec<_>>(), ["loss", "optimizer/lr"]);
+    assert_eq!(metrics.series[0].points[1], (1.0, 0.5));
+    let options = ReportOptions { metrics: Some(log.clone()), ..ReportOptions::default() };
+    let results = [(PathBuf::from("results.json"), results())];
+    let path = write_report_with(&results, &options, &folder.path().join("report")).expect("report");
+    let page = std::fs::read_to_string(path).expect("page");
+    well_formed(&page);
+    assert!(page.contains("loss over step, ending at 0.001111") && page.contains("optimizer/lr"));
+
+    std::fs::write(&log, "{\"step\": 1}\nloss = 3\n{\"step\": 2}\n").expect("log");
+    assert!(read_metrics(&log).expect_err("no JSON").to_string().contains("line 2 is no JSON object"));
+}
+
+#[test]
+fn results_are_read_back_and_wrong_files_say_what_is_wrong() {
+    let folder = tempfile::tempdir().expect("folder");
+    let path = folder.path().join("results.json");
+    let good = serde_json::to_value(results()).expect("json");
+    std::fs::write(&path, good.to_string()).expect("file");
+    assert_eq!(read_results(&path).expect("readable"), results());
+
+    let wrong = |change: &dyn Fn(&mut serde_json::Value)| {
+        let mut value = good.clone();
+        change(&mut value);
+        std::fs::write(&path, value.to_string()).expect("file");
+        read_results(&path).expect_err("unreadable").to_string()
+    };
+    let newer = wrong(&|v| v["manifest"]["swm_version"] = "0.9.2".into());
+    assert!(newer.contains("written by stable-worldmodel 0.9.2") && newer.contains("swm eval"), "{newer}");
+    let lacking = wrong(&|v| v["runs"][0].as_object_mut().map(|run| run.remove("success")).map_or((), drop));
+    assert!(lacking.contains("another layout") && lacking.contains("success"), "{lacking}");
+    let doctored = wrong(&|v| v["runs"][0]["success"]["successes"] = 39.into());
+    assert!(doctored.contains("claims 39 successes in 40, its episodes show 2 in 40"), "{doctored}");
+    assert!(wrong(&|v| *v = serde_json::json!({"loss": 1})).contains("no result file"));
+
+    std::fs::write(&path, "{\"manifest\": ").expect("file");
+    assert!(read_results(&path).expect_err("torn").to_string().contains("no JSON document"));
+    let missing = read_results(&folder.path().join("lost.json")).expect_err("missing").to_string();
+    assert!(missing.contains("reading results"), "{missing}");
+}

@@ -5,7 +5,7 @@
 //! the action taken *from* it. The last row of an episode is its final observation; its action is NaN (float)
 //! or -1 (integer).
 
-use crate::ImageCodec;
+use crate::{ImageCodec, lance};
 
 use std::path::Path;
 use std::sync::Arc;
@@ -171,7 +171,8 @@ impl Named for Format {
 }
 
 /// Every layout there is. The first one that recognises a path is used.
-pub static FORMATS: Registry<Format> = Registry { kind: "dataset format", hint: "`swm formats` lists them", rows: &[] };
+pub static FORMATS: Registry<Format> =
+    Registry { kind: "dataset format", hint: "`swm formats` lists them", rows: &[lance::FORMAT] };
 
 fn detect(path: &Path) -> Result<&'static Format> {
     FORMATS.rows.iter().find(|format| (format.detect)(path)).ok_or_else(|| {

@@ -1,0 +1,3 @@
+//! Datasets on disk, in one test binary.
+
+mod lance;

@@ -150,7 +150,7 @@ fn group_section(html: &mut String, group: &Group<'_>, results: &[(PathBuf, Resu
         figure(
             html,
             "Planning latency",
-            "Seconds one planning call took: the bar ends at the median, the whisker at the 95th percentile; both are \
+            "How long one planning call took: the bar ends at the median, the whisker at the 95th percentile; both are \
              written beside it.",
             &plot,
         );
@@ -177,9 +177,7 @@ fn card(html: &mut String, condition: &Condition<'_>, row: &Row<'_>) {
         Some(floor) if p.n == 0 || floor.n == 0 => ("unknown", "no episode counted".to_owned()),
         Some(floor) if p.low > floor.high => ("above", format!("above the random floor of {}", percent(floor.rate))),
         Some(floor) if p.high < floor.low => ("below", format!("below the random floor of {}", percent(floor.rate))),
-        Some(floor) => {
-            ("within", format!("not told apart from the random floor of {}: intervals overlap", percent(floor.rate)))
-        }
+        Some(floor) => ("within", format!("not told apart from the random floor of {}", percent(floor.rate))),
     };
     let _ = write!(
         html,

@@ -7,9 +7,9 @@ use crate::text::{duration, number, percent, shorten};
 use std::fmt::Write as _;
 
 /// Width of the plots that fill the page.
-const WIDE: f64 = 760.0;
+const WIDE: f64 = 920.0;
 /// Width of the plots of which two stand side by side.
-const HALF: f64 = 380.0;
+const HALF: f64 = 440.0;
 /// Where labelled rows begin.
 const LABELS: f64 = 200.0;
 /// Height of a labelled row.
@@ -123,8 +123,8 @@ pub(crate) fn progress(condition: &Condition<'_>, longest: usize) -> String {
 
 /// Every episode as a square, in order, so that runs over the same starts can be compared start by start.
 pub(crate) fn episodes(group: &Group<'_>) -> String {
-    const CELL: f64 = 11.0;
-    const A_LINE: usize = 50;
+    const CELL: f64 = 12.0;
+    const A_LINE: usize = 60;
     let lines = |n: usize| n.div_ceil(A_LINE).max(1);
     #[allow(clippy::cast_precision_loss)]
     let height: f64 = group.conditions.iter().map(|_| 34.0).sum::<f64>()

@@ -29,7 +29,8 @@ pub fn from_row(space: &VariationSpace, current: &FactorValues, row: RowRef<'_>)
     for factor in space.factors() {
         let name = column(&factor.key);
         if row.schema().find(&name).is_some() {
-            let value = row.to_f64(&name)?;
+            let value: Vec<f64> =
+                row.to_f64(&name)?.iter().enumerate().map(|(i, &v)| snapped(v, factor.space.bounds(i))).collect();
             if value == factor.init_value {
                 request.variation_values.remove(&factor.key);
             } else {
@@ -38,6 +39,12 @@ pub fn from_row(space: &VariationSpace, current: &FactorValues, row: RowRef<'_>)
         }
     }
     space.resolve(&request, Key::new(0))
+}
+
+/// A value on its way through single precision may end a hair outside its bounds.
+fn snapped(value: f64, (low, high): (f64, f64)) -> f64 {
+    let hair = f64::from(f32::EPSILON) * low.abs().max(high.abs());
+    if value >= low - hair && value <= high + hair { value.clamp(low, high) } else { value }
 }
 
 /// Appends every value, in sampling order, to `bytes`.

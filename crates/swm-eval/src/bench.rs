@@ -1,1 +1,272 @@
-//! Benchmarks.
+//! How fast worlds are, beside the reference implementation where it is installed.
+//!
+//! Ours and the reference's turns alternate within one run, so that both meet the same machine, and what is
+//! reported is the median of the ratios of neighbouring turns. Absolute figures mean little on a shared machine;
+//! ratios hold.
+
+use crate::reference::{Reference, Size};
+use crate::world::{Places, episode_key, reset};
+use crate::{CollectConfig, Control, World, WorldConfig};
+use serde::Serialize;
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+use swm_core::pool::Reset;
+use swm_core::results::Summary;
+use swm_core::{EnvEntry, Error, RandomPolicy, Result, VariationRequest};
+use swm_data::{WriteOptions, create};
+
+/// The environment variable that names a Python with the reference.
+pub const REFERENCE_PYTHON: &str = "SWM_REFERENCE_PYTHON";
+
+/// What to measure.
+#[derive(Clone, Debug)]
+pub struct BenchConfig {
+    /// Environments of a world.
+    pub envs: usize,
+    /// Sides of the square pictures, in pixels.
+    pub sizes: Vec<usize>,
+    /// Worker threads; as many as the machine offers for 0. The reference steps on one thread.
+    pub threads: usize,
+    /// Pairs of turns, ours and the reference's.
+    pub pairs: usize,
+    /// Seconds of a turn of stepping.
+    pub seconds: f64,
+    /// Steps of an episode.
+    pub episode_steps: usize,
+    /// Episodes the reference collects in a turn, none to leave collecting out. Ours collects `OURS_MORE` times
+    /// as many, so that both turns are long enough to measure.
+    pub episodes: usize,
+    /// A Python with the reference, if there is one.
+    pub python: Option<PathBuf>,
+}
+
+/// How many times more episodes ours collects in a turn than the reference.
+const OURS_MORE: usize = 8;
+
+impl Default for BenchConfig {
+    /// The setting of the reference's own figures: 8 environments at 224 pixels. The reference is the one of
+    /// [`REFERENCE_PYTHON`].
+    fn default() -> Self {
+        Self {
+            envs: 8,
+            sizes: vec![224],
+            threads: 0,
+            pairs: 5,
+            seconds: 1.0,
+            episode_steps: 50,
+            episodes: 8,
+            python: std::env::var_os(REFERENCE_PYTHON).filter(|path| !path.is_empty()).map(PathBuf::from),
+        }
+    }
+}
+
+/// What was measured.
+#[derive(Clone, Debug, Serialize)]
+pub struct BenchReport {
+    /// Environments of a world.
+    pub envs: usize,
+    /// Worker threads of ours.
+    pub threads: usize,
+    /// The reference's version, or why it is not compared.
+    pub reference: String,
+    /// One entry an environment, size and activity.
+    pub rows: Vec<BenchRow>,
+}
+
+/// One environment at one size doing one thing.
+#[derive(Clone, Debug, Serialize)]
+pub struct BenchRow {
+    /// The environment.
+    pub env: String,
+    /// What was done: `step + render`, or `collect into lance`.
+    pub what: &'static str,
+    /// The side of the pictures, in pixels.
+    pub size: usize,
+    /// Environment steps a second in each of our turns.
+    pub ours: Vec<f64>,
+    /// Environment steps a second in each of the reference's turns; empty without it.
+    pub reference: Vec<f64>,
+    /// The median of our turns.
+    pub steps_per_second: f64,
+    /// The median ratio of neighbouring turns: how many times faster ours is.
+    pub ratio: Option<f64>,
+}
+
+/// Measures stepping with rendering, and collecting into Lance, for every environment and size.
+///
+/// # Errors
+/// When a number makes no sense, a world fails, or the reference fails after it had started. A reference that does
+/// not start is no error: [`BenchReport::reference`] says why.
+pub fn bench_envs(entries: &[&EnvEntry], config: &BenchConfig) -> Result<BenchReport> {
+    if config.pairs == 0 || !(config.seconds > 0.0 && config.seconds.is_finite()) {
+        let given = format!("{} pairs of turns of {} seconds", config.pairs, config.seconds);
+        return Err(Error::config("benchmark", given, "ask for at least 1 pair of more than 0 seconds"));
+    }
+    let mut report = BenchReport {
+        envs: config.envs,
+        threads: swm_core::pool::threads(config.threads)?.current_num_threads(),
+        reference: format!("not compared: set {REFERENCE_PYTHON} to a Python that has stable-worldmodel"),
+        rows: vec![],
+    };
+    for entry in entries {
+        for &size in &config.sizes {
+            let wanted =
+                Size { env: entry.id, envs: config.envs, image: (size, size), episode_steps: config.episode_steps };
+            let mut reference = None;
+            if let Some(python) = &config.python {
+                match Reference::start(python, wanted) {
+                    Ok(started) => {
+                        report.reference.clone_from(&started.version);
+                        reference = Some(started);
+                    }
+                    Err(error) => report.reference = format!("not compared: {error}"),
+                }
+            }
+            let mut ours = Ours::new(entry, size, config)?;
+            // The first turn of each warms up and is not counted.
+            ours.step(config.seconds / 4.0)?;
+            reference.as_mut().map(|reference| reference.step(config.seconds / 4.0)).transpose()?;
+            report.rows.push(BenchRow::measure(
+                entry,
+                size,
+                "step + render",
+                config.pairs,
+                |_| ours.step(config.seconds),
+                reference.as_mut().map(|reference| |_| reference.step(config.seconds)),
+            )?);
+            if config.episodes == 0 {
+                continue;
+            }
+            let folder =
+                tempfile::tempdir().map_err(|e| Error::io("a temporary folder", "making it for datasets", e))?;
+            let path = |who: &str, turn: usize| folder.path().join(format!("{who}-{turn}.lance"));
+            let more = CollectConfig {
+                episodes: config.episodes * OURS_MORE,
+                policy: "random".to_owned(),
+                ..CollectConfig::default()
+            };
+            report.rows.push(BenchRow::measure(
+                entry,
+                size,
+                "collect into lance",
+                config.pairs,
+                |turn| ours.collect(&path("ours", turn), CollectConfig { seed: turn as u64, ..more.clone() }),
+                reference
+                    .as_mut()
+                    .map(|reference| |turn| reference.collect(&path("reference", turn), config.episodes, turn as u64)),
+            )?);
+        }
+    }
+    Ok(report)
+}
+
+/// Our side: a world and a random policy.
+struct Ours {
+    world: World,
+    policy: RandomPolicy,
+    active: Vec<bool>,
+    /// Episodes started so far.
+    episodes: usize,
+    done: Vec<Reset>,
+}
+
+impl Ours {
+    fn new(entry: &EnvEntry, size: usize, config: &BenchConfig) -> Result<Self> {
+        let mut world = World::new(
+            entry,
+            WorldConfig {
+                envs: config.envs,
+                image: Some((size, size)),
+                max_episode_steps: Some(config.episode_steps),
+                threads: config.threads,
+            },
+        )?;
+        world.reset(0, &VariationRequest::default())?;
+        let policy = RandomPolicy::new(world.spec(), config.envs);
+        Ok(Self { world, policy, active: vec![true; config.envs], episodes: config.envs, done: vec![] })
+    }
+
+    /// Steps with random actions for about so long: environment steps a second.
+    fn step(&mut self, seconds: f64) -> Result<f64> {
+        let places = Places::of(self.world.pool().infos().schema())?;
+        let begun = Instant::now();
+        let mut steps = 0;
+        let elapsed = loop {
+            self.world.step(&mut self.policy, &self.active)?;
+            steps += self.active.len();
+            self.done.clear();
+            for slot in 0..self.active.len() {
+                let row = self.world.pool().infos().row(slot);
+                if row.at::<u8>(places.terminated)[0] + row.at::<u8>(places.truncated)[0] > 0 {
+                    self.done.push(reset(slot, episode_key(0, self.episodes), &VariationRequest::default()));
+                    self.episodes += 1;
+                }
+            }
+            if !self.done.is_empty() {
+                self.world.restart(&self.done)?;
+            }
+            let elapsed = begun.elapsed().as_secs_f64();
+            if elapsed >= seconds {
+                break elapsed;
+            }
+        };
+        Ok(steps as f64 / elapsed)
+    }
+
+    /// Collects into a Lance dataset: environment steps a second, everything committed.
+    fn collect(&mut self, path: &Path, config: CollectConfig) -> Result<f64> {
+        let begun = Instant::now();
+        let manifest = Some(self.world.collect_manifest(&config));
+        let writer = create(path, &self.world.collect_schema(false)?, WriteOptions { manifest, ..Default::default() })?;
+        let collected = self.world.collect(&mut self.policy, writer, &config, &mut Control::default())?;
+        let rate = collected.steps as f64 / begun.elapsed().as_secs_f64();
+        // What comes next steps on from running episodes, as it did before.
+        self.world.reset(0, &VariationRequest::default())?;
+        Ok(rate)
+    }
+}
+
+impl BenchRow {
+    /// Alternates turns of ours and, where there is one, of the reference. A turn is given its number.
+    fn measure(
+        entry: &EnvEntry,
+        size: usize,
+        what: &'static str,
+        pairs: usize,
+        mut ours: impl FnMut(usize) -> Result<f64>,
+        mut reference: Option<impl FnMut(usize) -> Result<f64>>,
+    ) -> Result<Self> {
+        let (mut our_turns, mut their_turns) = (vec![], vec![]);
+        for turn in 0..pairs {
+            our_turns.push(ours(turn)?);
+            if let Some(reference) = &mut reference {
+                their_turns.push(reference(turn)?);
+            }
+        }
+        let ratios: Vec<f64> = our_turns.iter().zip(&their_turns).map(|(ours, theirs)| ours / theirs).collect();
+        Ok(Self {
+            env: entry.id.to_owned(),
+            what,
+            size,
+            steps_per_second: Summary::of(&our_turns).map_or(0.0, |turns| turns.median),
+            ratio: Summary::of(&ratios).map(|ratios| ratios.median),
+            ours: our_turns,
+            reference: their_turns,
+        })
+    }
+}
+
+impl fmt::Display for BenchReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "{} environments, {} threads; reference: {}", self.envs, self.threads, self.reference)?;
+        for row in &self.rows {
+            write!(f, "{:<20} {:<18} {:>4} px {:>10.0} steps/s", row.env, row.what, row.size, row.steps_per_second)?;
+            match row.ratio {
+                Some(ratio) => writeln!(f, " {ratio:>8.1} x the reference (median of {})", row.ours.len())?,
+                None => writeln!(f)?,
+            }
+        }
+        Ok(())
+    }
+}

@@ -16,7 +16,10 @@
 //! | `pixels` (and `goal`, if asked for) | pictures, in worlds that draw |
 //! | `action`, `reward`, `terminated`, `truncated`, `success` | the step |
 //! | `variation.<key>` | every factor of variation, constant over the episode |
-//! | `seed` | what the environment was reset with, constant over the episode |
+//! | `episode_seed` | what the environment was reset with, constant over the episode: three `int32` of 21 bits each, the lowest first |
+//!
+//! The seed is split because datasets store numbers as `float32`, which holds whole numbers up to 2^24; and it is
+//! not called `seed` because the reference resets environments with a column of that name.
 
 use crate::world::{Control, Places, Play, Progress, World, episode_key, reset, reset_seed};
 use serde::Serialize;
@@ -181,7 +184,7 @@ impl Layout {
             let name = format!("variation.{}", factor.key);
             columns.push(ColumnSpec::new(name, factor.space.dtype(), factor.space.shape()));
         }
-        columns.push(ColumnSpec::new("seed", DType::Int64, []));
+        columns.push(ColumnSpec::new("episode_seed", DType::Int32, [3]));
         Ok(Self { schema: Schema::new(columns)?, observed, action, reward, factors, places: Places::of(infos)? })
     }
 
@@ -197,17 +200,23 @@ impl Layout {
     }
 
     /// Writes what is constant over an episode into all its rows.
-    #[allow(clippy::cast_possible_wrap)]
     fn fill_constants(&self, episode: &mut Batch, pool: &EnvPool, slot: usize, seed: u64) {
         let factors = pool.env(slot).factors();
         for (i, (_, value)) in factors.iter().enumerate() {
             fill(episode, self.factors + i, value);
         }
         let seed_column = self.factors + factors.factors().len();
+        let digits = seed_digits(seed);
         for row in 0..episode.rows() {
-            episode.row_mut(row).set(seed_column, &[seed as i64]);
+            episode.row_mut(row).set(seed_column, &digits);
         }
     }
+}
+
+/// A seed of 63 bits as three numbers of 21 bits, the lowest first.
+#[allow(clippy::cast_possible_truncation)]
+fn seed_digits(seed: u64) -> [i32; 3] {
+    [0, 21, 42].map(|shift| (seed >> shift & 0x1f_ffff) as i32)
 }
 
 /// Writes a value into all rows of a column, in the column's type.

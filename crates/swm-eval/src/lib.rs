@@ -11,9 +11,11 @@
 pub mod bench;
 pub mod collect;
 pub mod evaluate;
+mod reference;
 pub mod starts;
 pub mod world;
 
+pub use bench::{BenchConfig, BenchReport, bench_envs};
 pub use collect::{CollectConfig, Collected};
 pub use evaluate::{EvalConfig, Videos};
 pub use starts::Starts;

@@ -4,7 +4,7 @@
 use crate::world::{episode_key, reset, reset_seed};
 use rand::Rng as _;
 use std::collections::{BTreeMap, HashSet};
-use swm_core::{Batch, EnvPool, EnvSpec, Error, Key, Result, Schema, VariationRequest, manifest};
+use swm_core::{Batch, ColumnSpec, EnvPool, EnvSpec, Error, Key, Result, Schema, VariationRequest, manifest};
 use swm_data::{Reader, StepRange};
 
 /// Starts and goals, decided by what was asked and nothing else.
@@ -79,7 +79,7 @@ impl Starts {
             ranges.push(StepRange { episode, start: step + goal_offset, length: 1 });
         }
         let names: Vec<&str> = columns.iter().map(String::as_str).collect();
-        let rows = reader.read(&names, &ranges)?;
+        let rows = renamed(reader.read(&names, &ranges)?)?;
         let content = reader.content_hash()?;
         Ok(Self { seed, n: picks.len(), variation, dataset: Some(Rows { picks, goal_offset, rows, content }) })
     }
@@ -216,9 +216,25 @@ fn restored_columns(stored: &Schema, spec: &EnvSpec, variation: &VariationReques
     let mut shifted = HashSet::new();
     for name in variation.variation.iter().flatten().chain(variation.variation_values.keys()) {
         for i in spec.variation_space.select(name)? {
-            shifted.insert(format!("variation.{}", factors[i].key));
+            shifted.insert(flat(&format!("variation.{}", factors[i].key)));
         }
     }
-    let kept = stored.columns().iter().filter(|column| !column.is_image() && !shifted.contains(&column.name));
+    let kept = stored.columns().iter().filter(|column| !column.is_image() && !shifted.contains(&flat(&column.name)));
     Ok(kept.map(|column| column.name.clone()).collect())
+}
+
+/// A column's name as formats without dots store it, and as environments look for it.
+fn flat(name: &str) -> String {
+    name.replace('.', "_")
+}
+
+/// The same rows under flat names, so that environments find factors whatever format they come from.
+fn renamed(rows: Batch) -> Result<Batch> {
+    let columns: Vec<ColumnSpec> =
+        rows.schema().columns().iter().map(|c| ColumnSpec { name: flat(&c.name), ..c.clone() }).collect();
+    let mut flat = Batch::zeros(&Schema::new(columns)?, rows.rows());
+    for column in 0..rows.schema().columns().len() {
+        flat.bytes_mut(column).copy_from_slice(rows.bytes(column));
+    }
+    Ok(flat)
 }

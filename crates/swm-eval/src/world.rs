@@ -210,8 +210,8 @@ pub(crate) fn episode_key(seed: u64, episode: usize) -> Key {
     Key::new(seed).with("episode").at(episode as u64)
 }
 
-/// The seed an environment is reset with. The highest bit is left out so that every integer type in use
-/// holds it: datasets store it as `int64`, and Gymnasium takes no negative seeds.
+/// The seed an environment is reset with. The highest bit is left out so that signed integers hold it: it is
+/// written to results and datasets, and Gymnasium takes no negative seeds.
 pub(crate) fn reset_seed(key: Key) -> u64 {
     key.seed() >> 1
 }

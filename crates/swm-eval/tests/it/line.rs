@@ -107,8 +107,8 @@ impl Env for Line {
     fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()> {
         self.x = start.to_f64("state")?[0];
         self.goal = goal.to_f64("state")?[0];
-        if start.schema().find("variation.agent.color").is_some() {
-            let color = start.to_f64("variation.agent.color")?;
+        if start.schema().find("variation_agent_color").is_some() {
+            let color = start.to_f64("variation_agent_color")?;
             let request = swm_core::VariationRequest {
                 variation: Some(vec![]),
                 variation_values: [("agent.color".to_owned(), color)].into(),

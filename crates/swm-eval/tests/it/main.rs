@@ -1,5 +1,6 @@
 //! Worlds of a tiny environment, so that what is tested is the world and nothing else.
 
+mod benching;
 mod collecting;
 mod evaluating;
 mod line;

@@ -1,0 +1,47 @@
+"""Measures the reference implementation, on request, line by line: `step SECONDS` or `collect PATH EPISODES SEED`.
+
+Answers are lines that begin with `SWM `; whatever else the reference prints is not ours.
+"""
+
+import sys
+import time
+
+import lance
+import numpy as np
+import stable_worldmodel as swm
+from stable_worldmodel.policy import RandomPolicy
+
+env, envs, height, width, limit = sys.argv[1], *map(int, sys.argv[2:6])
+world = swm.World(env, num_envs=envs, image_shape=(height, width), max_episode_steps=limit)
+world.set_policy(RandomPolicy(seed=0))
+world.reset(seed=0)
+
+
+def step(seconds):
+    steps = 0
+    begun = time.perf_counter()
+    while (elapsed := time.perf_counter() - begun) < seconds:
+        _, _, terminated, truncated, world.infos = world.envs.step(world.policy.get_action(world.infos))
+        steps += envs
+        done = np.logical_or(terminated, truncated)
+        if done.any():
+            _, world.infos = world.envs.reset(seed=[None] * envs, mask=done)
+    return steps, elapsed
+
+
+def collect(path, episodes, seed):
+    begun = time.perf_counter()
+    world.collect(path, episodes=int(episodes), seed=int(seed), progress=False)
+    elapsed = time.perf_counter() - begun
+    world.reset(seed=0)
+    return lance.dataset(path).count_rows(), elapsed
+
+
+def answer(*words):
+    print("SWM", *words, flush=True)
+
+
+answer("ready", getattr(swm, "__version__", "of unknown version"))
+for line in sys.stdin:
+    command, *arguments = line.rstrip("\n").split("\t")
+    answer(*(step(float(arguments[0])) if command == "step" else collect(*arguments)))

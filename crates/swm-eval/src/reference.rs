@@ -1,0 +1,107 @@
+//! The reference implementation as a process to be measured beside ours.
+
+use std::fs::File;
+use std::io::{BufRead as _, BufReader, Read as _, Seek as _, Write as _};
+use std::path::Path;
+use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use swm_core::{Error, Result};
+
+const SCRIPT: &str = include_str!("reference.py");
+
+/// A Python process that holds one world of the reference.
+pub(crate) struct Reference {
+    process: Child,
+    ask: ChildStdin,
+    answers: BufReader<ChildStdout>,
+    log: File,
+    /// Which version it is.
+    pub version: String,
+}
+
+/// The world to make: id, environments, `(height, width)`, steps of an episode.
+#[derive(Clone, Copy)]
+pub(crate) struct Size<'a> {
+    pub env: &'a str,
+    pub envs: usize,
+    pub image: (usize, usize),
+    pub episode_steps: usize,
+}
+
+impl Reference {
+    /// Starts it and waits until its world stands.
+    ///
+    /// # Errors
+    /// When Python cannot be started or the reference is not usable there; with its last words.
+    pub fn start(python: &Path, size: Size<'_>) -> Result<Self> {
+        let log = tempfile::tempfile().map_err(|e| Error::io("a temporary file", "making it", e))?;
+        let errors = log.try_clone().map_err(|e| Error::io("a temporary file", "sharing it", e))?;
+        let numbers = [size.envs, size.image.0, size.image.1, size.episode_steps].map(|n| n.to_string());
+        let mut process = Command::new(python)
+            .args(["-u", "-c", SCRIPT, size.env])
+            .args(numbers)
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .stderr(errors)
+            .spawn()
+            .map_err(|e| Error::io(python, "starting the reference's Python", e))?;
+        let (Some(ask), Some(answers)) = (process.stdin.take(), process.stdout.take()) else {
+            return Err(Error::external("starting the reference", "its pipes are missing"));
+        };
+        let mut reference = Self { process, ask, answers: BufReader::new(answers), log, version: String::new() };
+        reference.version = reference.answer()?.split_off(1).join(" ");
+        Ok(reference)
+    }
+
+    /// Steps with random actions for about so long: environment steps a second.
+    pub fn step(&mut self, seconds: f64) -> Result<f64> {
+        self.rate(&format!("step\t{seconds}"))
+    }
+
+    /// Collects into a Lance dataset: environment steps a second.
+    pub fn collect(&mut self, path: &Path, episodes: usize, seed: u64) -> Result<f64> {
+        self.rate(&format!("collect\t{}\t{episodes}\t{seed}", path.display()))
+    }
+
+    fn rate(&mut self, request: &str) -> Result<f64> {
+        let lost = |error| Error::external("asking the reference", error);
+        writeln!(self.ask, "{request}").and_then(|()| self.ask.flush()).map_err(lost)?;
+        let words = self.answer()?;
+        let numbers: Vec<f64> = words.iter().filter_map(|word| word.parse().ok()).collect();
+        match numbers[..] {
+            [steps, seconds] if seconds > 0.0 => Ok(steps / seconds),
+            _ => Err(Error::external("asking the reference", format!("it answered {words:?}"))),
+        }
+    }
+
+    /// The words of its next answer.
+    fn answer(&mut self) -> Result<Vec<String>> {
+        let mut line = String::new();
+        loop {
+            line.clear();
+            let read = self.answers.read_line(&mut line).map_err(|e| Error::external("reading the reference", e))?;
+            if read == 0 {
+                return Err(Error::external("running the reference", self.last_words()));
+            }
+            if let Some(words) = line.strip_prefix("SWM ") {
+                return Ok(words.split_whitespace().map(str::to_owned).collect());
+            }
+        }
+    }
+
+    fn last_words(&mut self) -> String {
+        let mut log = vec![];
+        // What it said is an explanation only; without it the error stands all the same.
+        let _ = self.log.rewind().and_then(|()| self.log.read_to_end(&mut log));
+        let text = String::from_utf8_lossy(&log);
+        let last = text.lines().map(str::trim).rfind(|line| !line.is_empty());
+        last.unwrap_or("it ended without a word").to_owned()
+    }
+}
+
+impl Drop for Reference {
+    fn drop(&mut self) {
+        // It may have ended already; either way nothing of it is left behind.
+        let _ = self.process.kill();
+        let _ = self.process.wait();
+    }
+}

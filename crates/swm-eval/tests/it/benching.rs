@@ -1,0 +1,48 @@
+//! That what is measured is reported, with and without a reference. Times themselves are not tested.
+
+use crate::line::ENTRY;
+use std::io::Write as _;
+use swm_eval::{BenchConfig, bench_envs};
+
+fn config() -> BenchConfig {
+    let (sizes, python) = (vec![8], None);
+    BenchConfig { envs: 2, sizes, threads: 1, pairs: 3, seconds: 0.01, episode_steps: 5, episodes: 0, python }
+}
+
+#[test]
+fn without_the_reference_it_says_so() {
+    let report = bench_envs(&[&ENTRY], &config()).expect("a report");
+    assert!(report.reference.contains("SWM_REFERENCE_PYTHON"));
+    let [row] = &report.rows[..] else { panic!("one environment, one size, stepping only: {report:?}") };
+    assert_eq!((row.ours.len(), row.reference.len(), row.ratio), (3, 0, None));
+    assert!(row.steps_per_second > 0.0);
+    let missing = BenchConfig { python: Some("/no/such/python".into()), ..config() };
+    let report = bench_envs(&[&ENTRY], &missing).expect("a report");
+    assert!(report.reference.contains("/no/such/python"), "{}", report.reference);
+}
+
+#[cfg(unix)]
+#[test]
+fn ratios_are_those_of_neighbouring_turns() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let folder = tempfile::tempdir().expect("a folder");
+    let python = folder.path().join("python");
+    // Stands in for Python with the reference: chats, then answers 10 steps in 2 seconds to everything.
+    let script = "#!/bin/sh\necho hello\necho SWM ready 1.2.3\nwhile read line; do echo SWM 10 2.0; done\n";
+    let mut file = std::fs::File::create(&python).expect("a file");
+    file.write_all(script.as_bytes()).expect("written");
+    file.set_permissions(std::fs::Permissions::from_mode(0o755)).expect("executable");
+    drop(file);
+    let report = bench_envs(&[&ENTRY], &BenchConfig { python: Some(python), ..config() }).expect("a report");
+    assert_eq!(report.reference, "1.2.3");
+    let row = &report.rows[0];
+    assert_eq!(row.reference, [5.0; 3]);
+    assert_eq!(row.ratio, Some(row.steps_per_second / 5.0));
+    assert!(report.to_string().contains("x the reference (median of 3)"), "{report}");
+}
+
+#[test]
+fn a_benchmark_of_nothing_is_refused() {
+    assert!(bench_envs(&[&ENTRY], &BenchConfig { pairs: 0, ..config() }).is_err());
+    assert!(bench_envs(&[&ENTRY], &BenchConfig { seconds: f64::NAN, ..config() }).is_err());
+}

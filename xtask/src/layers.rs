@@ -1,0 +1,158 @@
+//! The layer rules: what a crate must never know, however far down. They keep the vocabulary, the worlds, the
+//! planners and the report quick to build and free to use without a deep-learning framework or a database.
+
+use crate::graph::Graph;
+
+/// A rule about some crates of the workspace.
+pub enum Rule {
+    /// They never reach a package of such a name, directly or through others.
+    Never {
+        /// The crates; empty means all.
+        crates: &'static [&'static str],
+        /// Whether a package's name is forbidden.
+        forbidden: fn(&str) -> bool,
+        /// What holds, as a sentence.
+        words: &'static str,
+    },
+    /// Nobody but `users` depends on them directly.
+    Only {
+        /// Who may.
+        users: &'static [&'static str],
+        /// The crates.
+        crates: &'static [&'static str],
+        /// What holds, as a sentence.
+        words: &'static str,
+    },
+}
+
+/// The rules of this workspace.
+pub const RULES: &[Rule] = &[
+    Rule::Never {
+        crates: &["swm-core", "swm-envs", "swm-plan", "swm-report", "swm-raster"],
+        forbidden: |name| ["burn", "lance", "mujoco", "ffmpeg"].iter().any(|family| of_family(name, family)),
+        words: "core, envs, plan, report and raster know no deep learning, dataset engine, MuJoCo or FFmpeg",
+    },
+    Rule::Never {
+        crates: &[],
+        // `datafusion-common` holds the shared types that Lance's file crate speaks; all others are the engine.
+        forbidden: |name| of_family(name, "datafusion") && name != "datafusion-common",
+        words: "nothing brings DataFusion's query engine",
+    },
+    Rule::Never {
+        crates: &["swm-plan"],
+        forbidden: |name| name == "swm-models",
+        words: "solvers know cost models by their contract only",
+    },
+    Rule::Never {
+        crates: &["swm-eval"],
+        forbidden: |name| name == "swm-models" || name == "swm-envs",
+        words: "evaluation knows models and environments by their contracts only",
+    },
+    Rule::Only {
+        users: &["swm"],
+        crates: &["swm-envs", "swm-models"],
+        words: "only the facade knows concrete families",
+    },
+];
+
+/// Whether a package is `family` or one of its parts, `family-…`.
+fn of_family(name: &str, family: &str) -> bool {
+    name.strip_prefix(family).is_some_and(|rest| rest.is_empty() || rest.starts_with(['-', '_']))
+}
+
+/// What breaks the rules, a sentence each.
+pub fn violations(graph: &Graph, rules: &[Rule]) -> Vec<String> {
+    let mut found = vec![];
+    for rule in rules {
+        match rule {
+            Rule::Never { crates, forbidden, words } => {
+                let bound: Vec<_> =
+                    graph.members().filter(|package| crates.is_empty() || crates.contains(&&*package.name)).collect();
+                if bound.is_empty() {
+                    found.push(format!("a rule binds nobody ({words}): {} are gone; mend xtask", crates.join(", ")));
+                }
+                for package in bound {
+                    if let Some(way) = graph.way(package, *forbidden) {
+                        found.push(format!("{} ({words})", way.join(" → ")));
+                    }
+                }
+            }
+            Rule::Only { users, crates, words } => {
+                for package in graph.members().filter(|package| !users.contains(&&*package.name)) {
+                    for need in graph.member_needs(package).filter(|need| crates.contains(need)) {
+                        found.push(format!("{} → {need} ({words})", package.name));
+                    }
+                }
+            }
+        }
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A workspace that keeps the rules, with more needs for some of its packages.
+    fn with(more: &[(&str, &'static str)]) -> Vec<String> {
+        let mut packages: Vec<(&str, Vec<&str>)> = vec![
+            ("swm-core", vec!["serde"]),
+            ("swm-envs", vec!["swm-core"]),
+            ("swm-plan", vec!["swm-core"]),
+            ("swm-report", vec!["swm-core"]),
+            ("swm-data", vec!["swm-core", "lance-file"]),
+            ("swm-models", vec!["swm-core", "swm-data", "swm-plan", "burn"]),
+            ("swm-eval", vec!["swm-core", "swm-data"]),
+            ("swm", vec!["swm-core", "swm-envs", "swm-models", "swm-eval", "swm-report"]),
+            ("serde", vec![]),
+            ("burn", vec!["burn-core"]),
+            ("burn-core", vec![]),
+            ("burnt-toast", vec![]),
+            ("lance-file", vec!["datafusion-common"]),
+            ("datafusion-common", vec![]),
+            ("datafusion-physical-plan", vec![]),
+            ("ffmpeg-next", vec![]),
+            ("mujoco-rs", vec![]),
+        ];
+        for (name, need) in more {
+            packages.iter_mut().find(|(other, _)| other == name).expect("a package").1.push(need);
+        }
+        let packages: Vec<(&str, &[&str])> = packages.iter().map(|(name, needs)| (*name, needs.as_slice())).collect();
+        violations(&Graph::synthetic(&packages), RULES)
+    }
+
+    #[test]
+    fn a_layered_workspace_passes() {
+        assert_eq!(with(&[("swm-core", "burnt-toast")]), Vec::<String>::new());
+    }
+
+    #[test]
+    fn every_broken_rule_is_named_with_its_way() {
+        for (from, need, says) in [
+            ("swm-core", "burn", "swm-core → burn ("),
+            ("swm-envs", "mujoco-rs", "swm-envs → mujoco-rs ("),
+            ("swm-report", "swm-data", "swm-report → swm-data → lance-file ("),
+            ("swm-plan", "ffmpeg-next", "swm-plan → ffmpeg-next ("),
+            ("serde", "burn-core", "swm-core → serde → burn-core ("),
+            ("swm-plan", "swm-models", "swm-plan → swm-models (solvers"),
+            ("swm-eval", "swm-models", "swm-eval → swm-models (evaluation"),
+            ("swm-data", "swm-envs", "swm-eval → swm-data → swm-envs (evaluation"),
+            ("swm-models", "swm-envs", "swm-models → swm-envs (only the facade"),
+            ("swm-report", "swm-models", "swm-report → swm-models (only the facade"),
+            (
+                "lance-file",
+                "datafusion-physical-plan",
+                "swm → swm-models → swm-data → lance-file → datafusion-physical",
+            ),
+        ] {
+            let found = with(&[(from, need)]);
+            assert!(found.iter().any(|line| line.starts_with(says)), "{from} → {need}: {found:#?}");
+        }
+    }
+
+    #[test]
+    fn a_rule_about_nobody_is_no_rule() {
+        let found = violations(&Graph::synthetic(&[("swm", &[])]), RULES);
+        assert!(found.iter().any(|line| line.contains("binds nobody")), "{found:?}");
+    }
+}

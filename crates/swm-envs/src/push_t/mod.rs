@@ -1,6 +1,402 @@
-//! In work.
+//! Push-T: an agent pushes a block of some shape to a goal pose, on a table with walls.
+//!
+//! The README beside this file lists actions, observations, reward, factors, and where it differs from the
+//! Python reference. Constants are those of the reference's `env.py` unless said otherwise.
 
-use swm_core::EnvEntry;
+mod expert;
+mod physics;
+mod render;
+mod shapes;
+
+use crate::factors;
+use physics::{AGENT, BLOCK, Shape, Vec2, WALLS, World, put, take};
+use render::{Renderer, Scene};
+use shapes::Design;
+use std::f64::consts::{PI, TAU};
+use swm_core::{
+    Action, ColumnSpec, DType, Env, EnvEntry, EnvSpec, Error, ExpertEntry, Factor, FactorValues, FrameMut, Key,
+    ResetOptions, Result, RowMut, RowRef, Snapshot, Space, Transition, VariationRequest, VariationSpace,
+};
 
 /// The registry row.
-pub const ENTRY: EnvEntry = EnvEntry { id: "swm/PushT-v1", summary: "", make: || unreachable!(), experts: &[] };
+pub const ENTRY: EnvEntry = EnvEntry {
+    id: "swm/PushT-v1",
+    summary: "push a block to a goal pose",
+    make: || Box::new(PushT::new()),
+    experts: EXPERTS,
+};
+
+const EXPERTS: &[ExpertEntry] = &[ExpertEntry {
+    id: "weak",
+    summary: "random actions that stay near the block",
+    make: || Box::new(expert::Weak::default()),
+}];
+
+/// Side of the table, in pixels.
+pub const TABLE: f64 = 512.0;
+/// Pixels that an action of 1 asks the agent to move.
+pub const ACTION_SCALE: f32 = 100.0;
+/// Physics steps in one step of the environment (10 Hz control).
+const SUBSTEPS: usize = 10;
+/// Gains of the controller that moves the agent to where the action points.
+const GAINS: [f32; 2] = [100.0, 20.0];
+/// The goal is reached when agent and block together are nearer than this, in pixels,
+const REACH: f64 = 20.0;
+/// and the block's angle is nearer than this, in radians.
+const REACH_ANGLE: f64 = PI / 9.0;
+/// The middle lines of the walls, and half their thickness, in pixels.
+const WALL_LINES: [[[f64; 2]; 2]; 4] = [
+    [[5.0, 506.0], [5.0, 5.0]],
+    [[5.0, 5.0], [506.0, 5.0]],
+    [[506.0, 5.0], [506.0, 506.0]],
+    [[5.0, 506.0], [506.0, 506.0]],
+];
+const WALL_RADIUS: f64 = 2.0;
+/// How many goals are tried before giving up.
+const GOAL_TRIES: usize = 1000;
+
+/// Agent x y, block x y, block angle, agent velocity x y.
+type State = [f64; 7];
+
+/// The environment; see the module.
+pub struct PushT {
+    spec: EnvSpec,
+    factors: FactorValues,
+    world: World,
+    goal: State,
+    /// The world as it looks at the goal.
+    goal_scene: Scene,
+    /// Contact points of all physics steps since the last action.
+    contacts: usize,
+    renderer: Renderer,
+}
+
+impl PushT {
+    /// An environment in the default state of its factors.
+    pub fn new() -> Self {
+        let variation_space = variation_space();
+        let nothing = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
+        let factors = variation_space.resolve(&nothing, Key::new(0)).expect("defaults are in their spaces");
+        let goal = start_of(&factors);
+        let world = settle(world_of(&factors), &goal);
+        let goal_scene = Scene::of(&world);
+        let spec = EnvSpec {
+            id: ENTRY.id,
+            action_space: Space::uniform_box([2], DType::Float32, -1.0, 1.0),
+            columns: columns(),
+            variation_space,
+            max_episode_steps: 200,
+        };
+        Self { spec, renderer: Renderer::new(&factors), factors, world, goal, goal_scene, contacts: 0 }
+    }
+
+    fn state(&self) -> State {
+        state_of(&self.world)
+    }
+
+    /// Begins an episode with these factors: at the goal for its picture, then wherever `start` puts the world.
+    fn begin(&mut self, factors: FactorValues, goal: State) {
+        self.world = settle(world_of(&factors), &goal);
+        self.contacts = self.world.contacts();
+        self.goal_scene = Scene::of(&self.world);
+        self.goal = goal;
+        self.renderer = Renderer::new(&factors);
+        self.factors = factors;
+    }
+}
+
+impl Default for PushT {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl Env for PushT {
+    fn spec(&self) -> &EnvSpec {
+        &self.spec
+    }
+
+    fn reset(&mut self, seed: u64, options: &ResetOptions) -> Result<()> {
+        let key = Key::new(seed);
+        let factors = self.spec.variation_space.resolve(&options.variation, key)?;
+        let start = match &options.state {
+            Some(state) => checked(state, "state")?,
+            None => start_of(&factors),
+        };
+        let goal = match &options.goal_state {
+            Some(state) => checked(state, "goal_state")?,
+            None => find_goal(&factors, &start, key.with("goal"))?,
+        };
+        self.begin(factors, goal);
+        // As in the reference, the world goes on from the goal, so that what the solver remembers of it stays.
+        place(&mut self.world, &start);
+        self.world.step();
+        self.contacts += self.world.contacts();
+        Ok(())
+    }
+
+    fn step(&mut self, action: Action<'_>) -> Result<Transition> {
+        let action = action.continuous(2)?;
+        let mut control = Control::towards(self.world.bodies[AGENT].position(), [action[0], action[1]]);
+        self.contacts = 0;
+        for _ in 0..SUBSTEPS {
+            control.apply(&mut self.world);
+            self.world.step();
+            self.contacts += self.world.contacts();
+        }
+        let state = self.state();
+        Ok(Transition {
+            reward: -distance(&self.goal, &state),
+            terminated: reached(&self.factors, &self.goal, &state),
+            truncated: false,
+        })
+    }
+
+    fn observe(&self, row: &mut RowMut<'_>) {
+        let state = self.state();
+        let [x, y, block_x, block_y, _, vx, vy] = state;
+        let goal = self.goal;
+        let target = self.factors.get("goal.position");
+        row.set(0, &state);
+        row.set(1, &[x, y, vx, vy]);
+        row.set(2, &[x, y]);
+        row.set(3, &[vx, vy]);
+        row.set(4, &[block_x, block_y, self.world.bodies[BLOCK].angle]);
+        row.set(5, &[target[0], target[1], self.factors.scalar("goal.angle")]);
+        row.set(6, &goal);
+        row.set(7, &[goal[0], goal[1], goal[5], goal[6]]);
+        #[allow(clippy::cast_possible_wrap)]
+        row.set(8, &[self.contacts.div_ceil(SUBSTEPS) as i64]);
+    }
+
+    fn render(&mut self, frame: FrameMut<'_>) {
+        self.renderer.draw(&Scene::of(&self.world), frame);
+    }
+
+    fn render_goal(&mut self, frame: FrameMut<'_>) {
+        self.renderer.draw(&self.goal_scene, frame);
+    }
+
+    fn factors(&self) -> &FactorValues {
+        &self.factors
+    }
+
+    fn snapshot(&self) -> Snapshot {
+        let mut bytes = ENTRY.id.as_bytes().to_vec();
+        factors::write(&self.factors, &mut bytes);
+        put(&mut bytes, &self.goal);
+        put(&mut bytes, &[self.contacts as u64]);
+        self.world.save(&mut bytes);
+        Snapshot(bytes)
+    }
+
+    fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
+        let foreign = || Error::mismatch("restoring a snapshot", "other bytes", format!("a snapshot of {}", ENTRY.id));
+        let bytes = snapshot.0.strip_prefix(ENTRY.id.as_bytes()).ok_or_else(foreign)?;
+        let (factors, mut bytes) = factors::read(&self.spec.variation_space, bytes)?;
+        let (mut goal, mut contacts) = (Vec::<f64>::new(), Vec::<u64>::new());
+        let mut world = world_of(&factors);
+        take(&mut bytes, &mut goal)
+            .and_then(|()| take(&mut bytes, &mut contacts))
+            .and_then(|()| world.load(&mut bytes))
+            .filter(|()| bytes.is_empty())
+            .ok_or_else(foreign)?;
+        let &[contacts] = contacts.as_slice() else { return Err(foreign()) };
+        self.begin(factors, checked(&goal, "goal of a snapshot")?);
+        self.world = world;
+        self.contacts = usize::try_from(contacts).map_err(|_| foreign())?;
+        Ok(())
+    }
+
+    fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()> {
+        let factors = factors::from_row(&self.spec.variation_space, &self.factors, start)?;
+        let start = checked(&start.to_f64("state")?, "state of the start row")?;
+        let goal = checked(&goal.to_f64("state")?, "state of the goal row")?;
+        self.begin(factors, goal);
+        // A fresh world: nothing has touched yet, and the state is the row's to the last digit.
+        self.world = world_of(&self.factors);
+        self.contacts = 0;
+        place(&mut self.world, &start);
+        Ok(())
+    }
+
+    fn sample_goal(&mut self, key: Key) -> Result<()> {
+        self.goal = find_goal(&self.factors, &self.state(), key.with("goal"))?;
+        self.goal_scene = Scene::of(&settle(world_of(&self.factors), &self.goal));
+        Ok(())
+    }
+
+    fn is_success(&self) -> bool {
+        reached(&self.factors, &self.goal, &self.state())
+    }
+}
+
+/// The controller that pulls the agent to where an action points, in single precision as the reference's is.
+struct Control {
+    target: [f32; 2],
+}
+
+impl Control {
+    #[allow(clippy::cast_possible_truncation)]
+    fn towards(from: Vec2, action: [f32; 2]) -> Self {
+        Self { target: [from.x as f32 + action[0] * ACTION_SCALE, from.y as f32 + action[1] * ACTION_SCALE] }
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn apply(&mut self, world: &mut World) {
+        const DT: f32 = physics::DT as f32;
+        let agent = &mut world.bodies[AGENT];
+        let next = |target: f32, at: f64, speed: f64| {
+            let pull = GAINS[0] * (target - at as f32) + (f64::from(GAINS[1]) * -speed) as f32;
+            f64::from(speed as f32 + pull * DT)
+        };
+        let (at, velocity) = (agent.position(), agent.velocity);
+        agent.velocity = Vec2::new(next(self.target[0], at.x, velocity.x), next(self.target[1], at.y, velocity.y));
+    }
+}
+
+/// The world of an episode, before anything moved.
+fn world_of(factors: &FactorValues) -> World {
+    let agent = design(factors, "agent");
+    let block = design(factors, "block");
+    let mut bodies = [agent.body(), block.body()];
+    for (body, name) in bodies.iter_mut().zip(["agent", "block"]) {
+        let position = factors.get(&format!("{name}.start_position"));
+        body.set_position(Vec2::new(position[0], position[1]));
+        if body.is_dynamic() {
+            body.set_angle(factors.scalar(&format!("{name}.angle")));
+        }
+    }
+    let wall = |[a, b]: [[f64; 2]; 2]| Shape::segment(WALLS, a.into(), b.into(), WALL_RADIUS);
+    let mut shapes: Vec<Shape> = WALL_LINES.map(wall).into();
+    shapes.extend(agent.shapes(AGENT));
+    shapes.extend(block.shapes(BLOCK));
+    let [agent, block] = bodies;
+    World::new(agent, block, shapes, WALL_LINES.len())
+}
+
+/// The shape of `agent` or `block`.
+fn design(factors: &FactorValues, name: &str) -> Design {
+    Design::new(factors.integer(&format!("{name}.shape")), factors.scalar(&format!("{name}.scale")))
+}
+
+/// Puts the bodies where a state says.
+fn place(world: &mut World, state: &State) {
+    let [x, y, block_x, block_y, angle, vx, vy] = *state;
+    world.bodies[AGENT].velocity = Vec2::new(vx, vy);
+    world.bodies[AGENT].set_position(Vec2::new(x, y));
+    world.bodies[BLOCK].set_angle(angle);
+    world.bodies[BLOCK].set_position(Vec2::new(block_x, block_y));
+}
+
+/// A world in a state, one physics step later, as the reference sets states.
+fn settle(mut world: World, state: &State) -> World {
+    place(&mut world, state);
+    world.step();
+    world
+}
+
+fn state_of(world: &World) -> State {
+    let [agent, block, _] = &world.bodies;
+    let (a, b) = (agent.position(), block.position());
+    [a.x, a.y, b.x, b.y, block.angle.rem_euclid(TAU), agent.velocity.x, agent.velocity.y]
+}
+
+/// The start that the factors describe.
+fn start_of(factors: &FactorValues) -> State {
+    let (agent, block) = (factors.get("agent.start_position"), factors.get("block.start_position"));
+    let velocity = factors.get("agent.velocity");
+    [agent[0], agent[1], block[0], block[1], factors.scalar("block.angle"), velocity[0], velocity[1]]
+}
+
+/// A state that a caller gave.
+fn checked(state: &[f64], what: &str) -> Result<State> {
+    if let Some(bad) = state.iter().find(|v| !v.is_finite()) {
+        let fix = "give finite positions, angle and velocities".to_owned();
+        return Err(Error::NotFinite { what: what.to_owned(), given: bad.to_string(), fix });
+    }
+    state.try_into().map_err(|_| {
+        let expected = "7: agent x y, block x y, block angle, agent velocity x y";
+        Error::mismatch(format!("reading a {what}"), format!("{} numbers", state.len()), expected)
+    })
+}
+
+fn distance(a: &State, b: &State) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt()
+}
+
+/// Whether a state counts as the goal: agent and block in place, the block turned so that it looks the same.
+fn reached(factors: &FactorValues, goal: &State, state: &State) -> bool {
+    let apart = goal[..4].iter().zip(state).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
+    let symmetry = Design::symmetry(factors.integer("block.shape"));
+    let turn = (goal[4] - state[4]).rem_euclid(symmetry);
+    apart < REACH && turn.min(symmetry - turn) < REACH_ANGLE
+}
+
+/// A goal that can be reached (nothing overlaps there) and is not reached at `start`.
+fn find_goal(factors: &FactorValues, start: &State, key: Key) -> Result<State> {
+    let space = |name: &str| factors.factors().iter().find(|factor| factor.key == name).map(|factor| &factor.space);
+    let (Some(agents), Some(blocks)) = (space("agent.start_position"), space("block.start_position")) else {
+        return Err(Error::config("goal", "its spaces are missing", "report this"));
+    };
+    let mut rng = key.rng();
+    let turn = Space::uniform_box([], DType::Float64, 0.0, TAU);
+    for _ in 0..GOAL_TRIES {
+        let (agent, block, angle) = (agents.sample(&mut rng), blocks.sample(&mut rng), turn.sample(&mut rng));
+        let goal = [agent[0], agent[1], block[0], block[1], angle[0], start[5], start[6]];
+        let still = [goal[0], goal[1], goal[2], goal[3], goal[4], 0.0, 0.0];
+        if !reached(factors, &goal, start) && settle(world_of(factors), &still).contacts() == 0 {
+            return Ok(goal);
+        }
+    }
+    Err(Error::Unsatisfiable {
+        factor: "goal".to_owned(),
+        constraint: "agent, block and walls do not overlap".to_owned(),
+        tries: GOAL_TRIES,
+    })
+}
+
+/// What [`Env::observe`] writes, in order.
+fn columns() -> Vec<ColumnSpec> {
+    let column = |name: &str, n: usize| ColumnSpec::new(name, DType::Float64, [n]);
+    vec![
+        column("state", 7),
+        column("proprio", 4),
+        column("pos_agent", 2),
+        column("vel_agent", 2),
+        column("block_pose", 3),
+        column("goal_pose", 3),
+        column("goal_state", 7),
+        column("goal_proprio", 4),
+        ColumnSpec::new("n_contacts", DType::Int64, []),
+    ]
+}
+
+/// Every factor, in the reference's sampling order.
+fn variation_space() -> VariationSpace {
+    let pixels = |low: f64, high: f64| Space::uniform_box([2], DType::Float64, low, high);
+    let angle = || Space::uniform_box([], DType::Float64, -TAU, TAU);
+    let scale = || Space::uniform_box([], DType::Float32, 20.0, 60.0);
+    VariationSpace::new(
+        vec![
+            Factor::new("background.color", Space::Rgb, [255.0, 255.0, 255.0]),
+            Factor::new("goal.angle", angle(), [PI / 4.0]),
+            Factor::new("goal.color", Space::Rgb, [144.0, 238.0, 144.0]),
+            Factor::new("goal.position", pixels(50.0, 450.0), [256.0, 256.0]),
+            Factor::new("goal.scale", scale(), [40.0]),
+            Factor::new("block.angle", angle(), [0.0]),
+            Factor::new("block.color", Space::Rgb, [119.0, 136.0, 153.0]),
+            Factor::new("block.scale", scale(), [30.0]),
+            Factor::new("block.shape", Space::Discrete { n: 7, start: 1 }, [2.0]),
+            Factor::new("block.start_position", pixels(100.0, 400.0), [400.0, 100.0]),
+            Factor::new("agent.angle", angle(), [0.0]),
+            Factor::new("agent.color", Space::Rgb, [65.0, 105.0, 225.0]),
+            Factor::new("agent.scale", scale(), [40.0]),
+            Factor::new("agent.shape", Space::Discrete { n: 8, start: 0 }, [0.0]),
+            Factor::new("agent.start_position", pixels(50.0, 450.0), [256.0, 400.0]),
+            Factor::new("agent.velocity", pixels(0.0, TABLE), [0.0, 0.0]),
+            Factor::new("rendering.render_goal", Space::Discrete { n: 2, start: 0 }, [1.0]),
+        ],
+        &["agent.start_position", "block.start_position", "block.angle"],
+    )
+}

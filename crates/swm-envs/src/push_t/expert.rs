@@ -1,0 +1,37 @@
+//! Who demonstrates.
+
+use super::ACTION_SCALE;
+use rand::Rng as _;
+use swm_core::policy::Expert;
+use swm_core::{Key, Result, Rng, RowRef};
+
+/// Uniformly random actions whose targets stay near the block, so that something happens now and then.
+pub struct Weak {
+    rng: Rng,
+}
+
+/// How far from the block's origin targets may lie, along each axis, in pixels (reference: expert_policy.py).
+const NEAR: f64 = 100.0;
+
+impl Default for Weak {
+    fn default() -> Self {
+        Self { rng: Key::new(0).rng() }
+    }
+}
+
+impl Expert for Weak {
+    fn begin(&mut self, key: Key) {
+        self.rng = key.rng();
+    }
+
+    fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
+        let (agent, block) = (row.get::<f64>("pos_agent")?, row.get::<f64>("block_pose")?);
+        let scale = f64::from(ACTION_SCALE);
+        for i in 0..2 {
+            let target = agent[i] + scale * self.rng.random_range(-1.0..=1.0);
+            let near = target.clamp(block[i] - NEAR, block[i] + NEAR);
+            action[i] = ((near - agent[i]) / scale).clamp(-1.0, 1.0);
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,111 @@
+//! Collision shapes: circles, thick segments and convex quadrilaterals, all of them a few points with a radius.
+
+use super::{Body, Bounds, Vec2};
+
+/// What a shape is; the order is the one in which a pair of shapes is presented to the contact search.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Kind {
+    /// One point and a radius.
+    Circle,
+    /// Two points and a radius.
+    Segment,
+    /// Four points, counter-clockwise (x towards y), no radius.
+    Quad,
+}
+
+/// A collision shape of a body.
+#[derive(Clone, Debug)]
+pub struct Shape {
+    /// What it is.
+    pub kind: Kind,
+    /// Which body it belongs to.
+    pub body: usize,
+    /// What it grows by in every direction.
+    pub radius: f64,
+    /// Corners in body coordinates; the first [`Shape::len`] count.
+    pub corners: [Vec2; 4],
+    /// Outward normal of the edge that ends in the corner of the same place (a segment: of its right side).
+    normals: [Vec2; 4],
+    /// Corners in the world.
+    pub points: [Vec2; 4],
+    /// Normals in the world.
+    pub edges: [Vec2; 4],
+    /// What it covers, in the world.
+    pub bounds: Bounds,
+}
+
+impl Shape {
+    fn new(kind: Kind, body: usize, radius: f64, corners: [Vec2; 4], normals: [Vec2; 4]) -> Self {
+        Self { kind, body, radius, corners, normals, points: corners, edges: normals, bounds: Bounds::default() }
+    }
+
+    /// A circle about the body's origin.
+    pub fn circle(body: usize, radius: f64) -> Self {
+        Self::new(Kind::Circle, body, radius, [Vec2::ZERO; 4], [Vec2::ZERO; 4])
+    }
+
+    /// A segment from `a` to `b`, `radius` thick on either side.
+    pub fn segment(body: usize, a: Vec2, b: Vec2, radius: f64) -> Self {
+        let normal = (b - a).normalized().rperp();
+        Self::new(Kind::Segment, body, radius, [a, b, b, b], [normal; 4])
+    }
+
+    /// A convex quadrilateral with corners from x towards y.
+    pub fn quad(body: usize, corners: [Vec2; 4]) -> Self {
+        let normals = std::array::from_fn(|i| (corners[i] - corners[(i + 3) % 4]).rperp().normalized());
+        Self::new(Kind::Quad, body, 0.0, corners, normals)
+    }
+
+    /// How many corners it has.
+    pub fn len(&self) -> usize {
+        match self.kind {
+            Kind::Circle => 1,
+            Kind::Segment => 2,
+            Kind::Quad => 4,
+        }
+    }
+
+    /// Follows its body.
+    pub fn update(&mut self, body: &Body) {
+        let mut bounds = Bounds::NOTHING;
+        for i in 0..self.len() {
+            let point = body.pose.point(self.corners[i]);
+            self.points[i] = point;
+            self.edges[i] = body.pose.direction(self.normals[i]);
+            bounds = bounds.with(point);
+        }
+        self.bounds = bounds.grown(self.radius);
+    }
+
+    /// The corner farthest along `n`.
+    pub fn support(&self, n: Vec2) -> usize {
+        match self.kind {
+            Kind::Circle => 0,
+            Kind::Segment => usize::from(self.points[0].dot(n) <= self.points[1].dot(n)),
+            Kind::Quad => {
+                let mut best = (0, f64::NEG_INFINITY);
+                for (i, point) in self.points.iter().enumerate() {
+                    let along = point.dot(n);
+                    if along > best.1 {
+                        best = (i, along);
+                    }
+                }
+                best.0
+            }
+        }
+    }
+
+    /// The corners `(from, to)` of the edge that faces `n`.
+    pub fn facing_edge(&self, n: Vec2) -> (usize, usize) {
+        match self.kind {
+            Kind::Circle => (0, 0),
+            Kind::Segment if self.edges[0].dot(n) > 0.0 => (0, 1),
+            Kind::Segment => (1, 0),
+            Kind::Quad => {
+                let at = self.support(n);
+                let next = (at + 1) % 4;
+                if n.dot(self.edges[at]) > n.dot(self.edges[next]) { ((at + 3) % 4, at) } else { (at, next) }
+            }
+        }
+    }
+}

@@ -1,0 +1,151 @@
+//! The shapes of the agent and the block: a circle, or a few rectangles glued together.
+//!
+//! Dimensions, the way the centre of gravity is chosen (the mean of the rectangles' centres, whatever their
+//! size) and the moments of inertia are those of the reference (env.py), oddities included: some shapes add up
+//! the moment of their first rectangle.
+
+use super::physics::{Body, Shape, Vec2};
+use std::f64::consts::{PI, TAU};
+
+/// Names of the shapes, in the order of the `shape` factors.
+pub const NAMES: [&str; 8] = ["o", "L", "T", "Z", "square", "I", "small_tee", "+"];
+/// A radius for a scale of 1.
+const CIRCLE_RADIUS: f32 = 0.375;
+
+/// A rectangle: `[left, top, right, bottom]`, in body coordinates.
+type Rect = [f32; 4];
+
+/// What a body looks like.
+#[derive(Clone, Debug)]
+pub struct Design {
+    /// The rectangles; none for a circle.
+    pub rects: Vec<[Vec2; 4]>,
+    /// The radius of a circle.
+    pub radius: f64,
+    /// The centre of gravity, in body coordinates.
+    pub cog: Vec2,
+    /// The moment of inertia at mass 1.
+    inertia: f64,
+}
+
+impl Design {
+    /// The shape of this place in [`NAMES`], at this scale.
+    ///
+    /// Corners are computed in single precision because scales are sampled in it.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn new(shape: i64, scale: f64) -> Self {
+        let s = scale as f32;
+        match shape {
+            0 => Self { rects: vec![], radius: f64::from(CIRCLE_RADIUS * s), cog: Vec2::ZERO, inertia: f64::INFINITY },
+            1 => Self::of(&[[0.0, 0.0, s, s * 2.0], [0.0, -s, s * 2.0, 0.0]], &[0, 1]),
+            2 => Self::of(&[[-2.0 * s, 0.0, 2.0 * s, s], [-s / 2.0, s, s / 2.0, 4.0 * s]], &[0, 0]),
+            3 => {
+                let (half, wide) = (s / 2.0, 3.0 * s / 2.0);
+                Self::of(&[[-half, 0.0, wide, s], [-wide, -s, half, 0.0]], &[0, 1])
+            }
+            4 => Self::of(&[[-s, -s, s, s]], &[0]),
+            5 => Self::of(&[[-s / 2.0, -2.0 * s, s / 2.0, 2.0 * s]], &[0]),
+            6 => {
+                let wide = 3.0 * s / 2.0;
+                Self::of(&[[-wide, 0.0, wide, s], [-s / 2.0, s, s / 2.0, 2.0 * s]], &[0, 1])
+            }
+            _ => {
+                let (wide, half) = (3.0 * s / 2.0, s / 2.0);
+                Self::of(&[[-wide, -half, wide, half], [-half, half, half, wide], [-half, -wide, half, -half]], &[0; 3])
+            }
+        }
+    }
+
+    /// Rectangles; `inertias` names those whose moments are added up.
+    fn of(rects: &[Rect], inertias: &[usize]) -> Self {
+        let rects: Vec<[Vec2; 4]> = rects
+            .iter()
+            .map(|rect| {
+                let [left, top, right, bottom] = rect.map(f64::from);
+                [Vec2::new(left, top), Vec2::new(right, top), Vec2::new(right, bottom), Vec2::new(left, bottom)]
+            })
+            .collect();
+        let sum = rects.iter().map(|rect| centroid(rect)).reduce(|a, b| a + b).unwrap_or_default();
+        #[allow(clippy::cast_precision_loss)]
+        let count = rects.len() as f64;
+        let cog = Vec2::new(sum.x / count, sum.y / count);
+        let inertia = inertias.iter().map(|&i| moment(&rects[i])).sum();
+        Self { rects, radius: 0.0, cog, inertia }
+    }
+
+    /// The smallest turn after which a shape (by its place in [`NAMES`]) looks the same.
+    pub fn symmetry(shape: i64) -> f64 {
+        match shape {
+            3 | 5 => PI,
+            4 | 7 => PI / 2.0,
+            _ => TAU,
+        }
+    }
+
+    /// Whether it is a circle, which moves like a hand: nothing pushes it.
+    pub fn is_circle(&self) -> bool {
+        self.rects.is_empty()
+    }
+
+    /// A body of this shape, at the origin.
+    pub fn body(&self) -> Body {
+        let mass = if self.is_circle() { f64::INFINITY } else { 1.0 };
+        Body::new(mass, self.inertia, self.cog)
+    }
+
+    /// Its collision shapes, for the body of this place.
+    pub fn shapes(&self, body: usize) -> Vec<Shape> {
+        if self.is_circle() {
+            return vec![Shape::circle(body, self.radius)];
+        }
+        self.rects.iter().map(|&rect| Shape::quad(body, rect)).collect()
+    }
+}
+
+fn edges(corners: &[Vec2; 4]) -> impl Iterator<Item = (Vec2, Vec2)> {
+    (0..4).map(|i| (corners[i], corners[(i + 1) % 4]))
+}
+
+/// The centroid of a polygon.
+fn centroid(corners: &[Vec2; 4]) -> Vec2 {
+    let (mut area, mut sum) = (0.0, Vec2::ZERO);
+    for (a, b) in edges(corners) {
+        let cross = a.cross(b);
+        area += cross;
+        sum += (a + b) * cross;
+    }
+    sum * (1.0 / (3.0 * area))
+}
+
+/// The moment of inertia of a polygon of mass 1 about the origin of its coordinates.
+fn moment(corners: &[Vec2; 4]) -> f64 {
+    let (mut weighted, mut area) = (0.0, 0.0);
+    for (a, b) in edges(corners) {
+        let cross = b.cross(a);
+        weighted += cross * (a.dot(a) + a.dot(b) + b.dot(b));
+        area += cross;
+    }
+    weighted / (6.0 * area)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_long_tee_has_the_moment_and_centre_of_the_reference() {
+        let tee = Design::new(2, 30.0);
+        assert_eq!(tee.cog, Vec2::new(0.0, 45.0));
+        // Two moments of a 120 x 30 bar about the middle of its long side.
+        assert!((tee.inertia - 2.0 * (120.0f64.powi(2) + 4.0 * 30.0f64.powi(2)) / 12.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn every_shape_but_the_circle_can_be_pushed() {
+        for (i, name) in NAMES.iter().enumerate() {
+            let design = Design::new(i as i64, 40.0);
+            assert_eq!(design.body().is_dynamic(), *name != "o", "{name}");
+            assert!(!design.shapes(0).is_empty());
+        }
+    }
+}

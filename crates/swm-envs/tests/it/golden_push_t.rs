@@ -1,0 +1,132 @@
+//! Push-T against rollouts that the Python reference recorded (pymunk 7.3).
+
+use crate::golden::{self, Golden, picture_difference};
+use swm_core::{Action, Batch, Env, FrameMut, ResetOptions, Schema, VariationRequest};
+
+/// An environment and the row it is observed in.
+struct Probe {
+    env: Box<dyn Env>,
+    row: Batch,
+}
+
+impl Probe {
+    fn new(options: &ResetOptions) -> Self {
+        let mut env = (swm_envs::push_t::ENTRY.make)();
+        env.reset(0, options).expect("recorded values are possible");
+        let schema = Schema::new(env.spec().columns.clone()).expect("a schema");
+        Self { env, row: Batch::zeros(&schema, 1) }
+    }
+
+    fn observe(&mut self, column: &str) -> Vec<f64> {
+        self.env.observe(&mut self.row.row_mut(0));
+        self.row.row(0).to_f64(column).expect("a column")
+    }
+
+    fn frame(&mut self) -> Vec<u8> {
+        let mut rgb = vec![0; 224 * 224 * 3];
+        self.env.render(FrameMut::new(224, 224, &mut rgb));
+        rgb
+    }
+}
+
+/// The largest difference of two rows.
+fn apart(a: &[f64], b: &[f64]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
+}
+
+#[test]
+fn contacts_follow_the_reference() {
+    let files = golden::files("pusht-contact");
+    assert!(!files.is_empty(), "the file beside this test is always there");
+    for file in files {
+        let mut golden = Golden::open(&file);
+        for pair in golden.names().iter().filter_map(|name| name.strip_suffix(".state")) {
+            // b<block>a<agent>
+            let shapes: Vec<f64> = pair[1..].split('a').map(|shape| shape.parse().expect("a shape")).collect();
+            let what = format!("{}, {pair}", file.display());
+            let mut read = |name: &str| golden.read::<f64>(&format!("{pair}.{name}"));
+            let [states, rewards, start, goal] = ["state", "reward", "start", "goal"].map(&mut read);
+            let actions = golden.read::<f32>(&format!("{pair}.action"));
+            let terminations = golden.read::<bool>(&format!("{pair}.terminated"));
+            let contacts = golden.read::<i64>(&format!("{pair}.n_contacts"));
+            let shapes = [("block.shape".to_owned(), vec![shapes[0]]), ("agent.shape".to_owned(), vec![shapes[1]])];
+            let mut probe = Probe::new(&ResetOptions {
+                variation: VariationRequest { variation: Some(vec![]), variation_values: shapes.into() },
+                state: Some(start),
+                goal_state: Some(goal),
+            });
+
+            let mut errors = vec![apart(&states[..4], &probe.observe("state")[..4])];
+            assert!(errors[0] < 1e-6, "{what}: off by {} at the reset", errors[0]);
+            let mut touched = false;
+            for (t, action) in actions.chunks_exact(2).enumerate() {
+                let transition = probe.env.step(Action::Continuous(action)).expect("a step");
+                let (wanted, state) = (&states[7 * (t + 1)..][..7], probe.observe("state"));
+                let error = apart(&wanted[..4], &state[..4]);
+                errors.push(error);
+                touched |= contacts[t] > 0;
+                assert!(touched || error < 1e-6, "{what}: off by {error} at {t}, before any contact");
+                if apart(wanted, &state) < 1e-6 {
+                    assert!((transition.reward - rewards[t]).abs() < 1e-6, "{what}: reward {t}");
+                    assert_eq!(transition.terminated, terminations[t], "{what}: terminated {t}");
+                    assert_eq!(transition.terminated, probe.env.is_success(), "{what}: success {t}");
+                    assert_eq!(probe.observe("n_contacts"), [contacts[t] as f64], "{what}: contacts {t}");
+                }
+            }
+            // On x86-64 Linux all errors are 0; elsewhere sine and cosine may round differently.
+            errors.sort_by(f64::total_cmp);
+            let (median, worst) = (errors[errors.len() / 2], errors[errors.len() - 1]);
+            eprintln!("{what}: median error {median:.1e} px, worst {worst:.1e} px");
+            assert!(median < 0.1, "{what}: median error {median} px");
+        }
+    }
+}
+
+#[test]
+fn rollouts_and_pictures_follow_the_reference() {
+    let files = golden::files("swm_PushT-v1-");
+    assert!(files.len() >= 2, "the files beside this test are always there");
+    for file in files {
+        let mut golden = Golden::open(&file);
+        let name = file.display();
+        let columns = [
+            "obs.state",
+            "obs.proprio",
+            "info.pos_agent",
+            "info.vel_agent",
+            "info.block_pose",
+            "info.goal_pose",
+            "info.goal_state",
+            "info.goal_proprio",
+            "info.n_contacts",
+        ];
+        let wanted = columns.map(|column| golden.read::<f64>(column));
+        let goals = golden.read::<f64>("info.goal_state");
+        let mut probe = Probe::new(&ResetOptions {
+            variation: golden.variation(),
+            state: None,
+            goal_state: Some(goals[..7].to_vec()),
+        });
+        let follows = |probe: &mut Probe, t: usize| {
+            for (column, rows) in columns.iter().zip(&wanted) {
+                let got = probe.observe(&column[column.find('.').map_or(0, |dot| dot + 1)..]);
+                let n = got.len();
+                let error = apart(&got, &rows[n * t..][..n]);
+                assert!(error < 1e-6, "{name}: {column} {t} is off by {error}");
+            }
+        };
+        follows(&mut probe, 0);
+        let first = picture_difference(&probe.frame(), &golden.read("frame_first"));
+        let (rewards, terminations) = (golden.read::<f64>("reward"), golden.read::<bool>("terminated"));
+        for (t, action) in golden.read::<f32>("action").chunks_exact(2).enumerate() {
+            let transition = probe.env.step(Action::Continuous(action)).expect("a step");
+            follows(&mut probe, t + 1);
+            assert!((transition.reward - rewards[t]).abs() < 1e-6, "{name}: reward {t}");
+            assert_eq!(transition.terminated, terminations[t], "{name}: terminated {t}");
+        }
+        let last = picture_difference(&probe.frame(), &golden.read("frame_last"));
+        eprintln!("{name}: pictures differ by {first:.4} and {last:.4} of 255");
+        assert!(first < 3000.0 && last < 3.0, "{name}: pictures differ by {first} and {last} of 255");
+    }
+}

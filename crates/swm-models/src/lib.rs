@@ -1,4 +1,14 @@
 //! World models and their training.
+//!
+//! - [`nn`]: building blocks, under PyTorch's parameter names.
+//! - [`lewm`]: the LeWM family: model, loss, planning cost.
+//! - [`train`](mod@train): the training loop, presets, logs.
+//! - [`checkpoint`]: trained models on disk.
 
+pub mod checkpoint;
 pub mod lewm;
 pub mod nn;
+pub mod train;
+
+pub use checkpoint::Checkpoint;
+pub use train::{Observer, PRESETS, Progress, TrainConfig, TrainOptions, TrainSummary, train};

@@ -2,10 +2,12 @@
 //! collapsing by [SIGReg](loss). See `docs/models/lewm.md`.
 
 pub mod config;
+pub mod cost;
 pub mod loss;
 pub mod model;
 pub mod pixels;
 pub mod step;
 
 pub use config::{EncoderConfig, LewmConfig};
+pub use cost::LewmCost;
 pub use model::{Encoder, Lewm};

@@ -98,12 +98,20 @@ pub fn step(
     let pull = (latents.clone() * sigreg_gradient).sum() * config.weight;
 
     let latents = latents.reshape([clips, steps, latent]);
-    let [_, _, numbers] = batch.actions.dims();
-    let seen = (steps - 1).min(head.predictor.config().history);
-    let conditions = head.embed_actions(batch.actions.clone().slice([0..clips, 0..seen, 0..numbers]).autodiff());
-    let context = latents.clone().slice([0..clips, 0..seen, 0..latent]);
-    let (predicted, pred_proj_statistics) = head.predict_train(context, conditions, &mut Noise(noise));
-    let prediction = (predicted - latents.slice([0..clips, 1..seen + 1, 0..latent])).square().mean();
+    // Every window of the history's length that has a next frame. One window where the clip is one longer than the
+    // history, as published.
+    let history = head.predictor.config().history.min(steps - 1);
+    let windows = |x: &Tensor<3>, offset: usize| {
+        let [_, _, width] = x.dims();
+        let starts = 0..steps - history;
+        Tensor::cat(
+            starts.map(|s| x.clone().slice([0..clips, s + offset..s + offset + history, 0..width])).collect(),
+            0,
+        )
+    };
+    let conditions = head.embed_actions(windows(&batch.actions, 0).autodiff());
+    let (predicted, pred_proj_statistics) = head.predict_train(windows(&latents, 0), conditions, &mut Noise(noise));
+    let prediction = (predicted - windows(&latents, 1)).square().mean();
     let prediction_value: f32 = prediction.clone().inner().into_scalar();
 
     let mut all = (prediction + pull).backward();

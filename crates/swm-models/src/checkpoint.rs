@@ -1,0 +1,253 @@
+//! [`Checkpoint`]: a folder that holds a trained model and all that is needed to use it or to train on.
+//!
+//! | file | what |
+//! | --- | --- |
+//! | `config.json` | family, configuration, action scale, environment |
+//! | `weights.safetensors` | weights under their published names |
+//! | `optimizer.safetensors`, `state.json` | what training needs to continue exactly |
+//! | `manifest.json` | where it came from, and the hashes of the files above |
+//!
+//! A new checkpoint is written beside the old one and takes its place by renaming, so a killed process leaves one
+//! of the two.
+
+use crate::lewm::Lewm;
+use crate::nn::parameters::{self, HostTensor, Named};
+use crate::train::TrainConfig;
+use burn::tensor::Device;
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+use swm_core::{Error, Key, Manifest, Result, manifest};
+use swm_plan::ActionScale;
+
+/// A trained model and all that is needed to use it.
+#[derive(Clone, Debug)]
+pub struct Checkpoint {
+    /// The model.
+    pub model: Lewm,
+    /// How it was trained.
+    pub config: TrainConfig,
+    /// Between environment actions and the model's.
+    pub action: ActionScale,
+    /// The environment its data came from, where the dataset says so.
+    pub env: Option<String>,
+    /// Where it came from; `hashes["weights"]` names the checkpoint.
+    pub manifest: Manifest,
+}
+
+/// What training needs to continue exactly.
+pub struct TrainState {
+    /// Steps done.
+    pub step: usize,
+    /// The state of the optimizer.
+    pub moments: Named<HostTensor>,
+}
+
+/// The content of `config.json`.
+#[derive(Serialize, Deserialize)]
+struct Card {
+    family: String,
+    env: Option<String>,
+    image: usize,
+    action_block: usize,
+    action: ActionScale,
+    config: serde_json::Value,
+}
+
+/// The content of `state.json`.
+#[derive(Serialize, Deserialize)]
+struct Position {
+    step: usize,
+}
+
+const FAMILY: &str = "lewm";
+const FOLDER: &str = "checkpoint";
+const CONFIG: &str = "config.json";
+const MANIFEST: &str = "manifest.json";
+const WEIGHTS: &str = "weights.safetensors";
+const OPTIMIZER: &str = "optimizer.safetensors";
+const STATE: &str = "state.json";
+
+impl Checkpoint {
+    /// Whether a folder holds a checkpoint.
+    pub fn exists(run: &Path) -> bool {
+        locate(run).is_some()
+    }
+
+    /// The hash of the weights.
+    pub fn hash(&self) -> &str {
+        self.manifest.hashes.get("weights").map_or("", String::as_str)
+    }
+
+    /// Saves into the run folder `run`, which keeps the last checkpoint only. Returns the hash of the weights.
+    ///
+    /// # Errors
+    /// When the disk refuses; the checkpoint that was there is kept.
+    pub fn save(&mut self, run: &Path, state: Option<&TrainState>) -> Result<String> {
+        let new = run.join(format!("{FOLDER}.new"));
+        if new.exists() {
+            std::fs::remove_dir_all(&new)
+                .map_err(|error| Error::io(&new, "removing an unfinished checkpoint", error))?;
+        }
+        std::fs::create_dir_all(&new).map_err(|error| Error::io(&new, "creating a checkpoint", error))?;
+        let write = |name: &str, bytes: &[u8]| {
+            let path = new.join(name);
+            std::fs::write(&path, bytes).map_err(|error| Error::io(&path, "writing a checkpoint", error))?;
+            Ok(manifest::hash(bytes))
+        };
+        let card = Card {
+            family: FAMILY.to_owned(),
+            env: self.env.clone(),
+            image: self.config.model.image,
+            action_block: self.config.data.frameskip,
+            action: self.action.clone(),
+            config: json(&self.config)?,
+        };
+        write(CONFIG, text(&card)?.as_bytes())?;
+        let weights = write(WEIGHTS, &pack(&parameters::values(&self.model))?)?;
+        self.manifest.hashes.insert("weights".to_owned(), weights.clone());
+        if let Some(state) = state {
+            let hash = write(OPTIMIZER, &pack(&state.moments)?)?;
+            self.manifest.hashes.insert("optimizer".to_owned(), hash);
+            write(STATE, text(&Position { step: state.step })?.as_bytes())?;
+        }
+        write(MANIFEST, text(&self.manifest)?.as_bytes())?;
+
+        let (place, old) = (run.join(FOLDER), run.join(format!("{FOLDER}.old")));
+        let rename = |from: &Path, to: &Path| {
+            std::fs::rename(from, to).map_err(|error| Error::io(to, "putting a checkpoint in its place", error))
+        };
+        if old.exists() && place.exists() {
+            std::fs::remove_dir_all(&old).map_err(|error| Error::io(&old, "removing an old checkpoint", error))?;
+        }
+        if place.exists() {
+            rename(&place, &old)?;
+        }
+        rename(&new, &place)?;
+        if old.exists() {
+            std::fs::remove_dir_all(&old).map_err(|error| Error::io(&old, "removing an old checkpoint", error))?;
+        }
+        Ok(weights)
+    }
+
+    /// Loads the checkpoint of a run folder (or the checkpoint folder itself).
+    ///
+    /// # Errors
+    /// When there is none, it is of another family, it is damaged, or its weights do not fit its configuration.
+    pub fn load(run: &Path, device: &Device) -> Result<Self> {
+        let folder = locate(run).ok_or_else(|| {
+            Error::corrupt(run, "there is no checkpoint", "give the folder that `swm train` wrote to")
+        })?;
+        let card_path = folder.join(CONFIG);
+        let broken = |path: &Path, problem: String| {
+            Error::corrupt(path, problem, "train again, or copy the checkpoint again from where it came")
+        };
+        let card: serde_json::Value =
+            serde_json::from_slice(&read(&card_path)?).map_err(|error| broken(&card_path, error.to_string()))?;
+        let family = card.get("family").and_then(|family| family.as_str()).unwrap_or("unknown");
+        if family != FAMILY {
+            return Err(Error::corrupt(
+                &card_path,
+                format!("it holds a model of the family '{family}'"),
+                format!("give a checkpoint of the family '{FAMILY}'"),
+            ));
+        }
+        let card: Card = serde_json::from_value(card).map_err(|error| broken(&card_path, error.to_string()))?;
+        let config: TrainConfig =
+            serde_json::from_value(card.config).map_err(|error| broken(&card_path, error.to_string()))?;
+        config.check()?;
+        let manifest_path = folder.join(MANIFEST);
+        let manifest: Manifest = serde_json::from_slice(&read(&manifest_path)?)
+            .map_err(|error| broken(&manifest_path, error.to_string()))?;
+
+        let path = folder.join(WEIGHTS);
+        let weights = unpack(&path, manifest.hashes.get("weights"))?;
+        let actions = config.data.frameskip * card.action.dim();
+        let model = Lewm::new(&config.model, actions, Key::new(0), device);
+        let wanted = parameters::shapes(&model);
+        for (name, shape) in &wanted {
+            match weights.get(name) {
+                Some(tensor) if &tensor.shape == shape => {}
+                Some(tensor) => {
+                    let problem = format!("'{name}' is {:?}, but {CONFIG} makes it {shape:?}", tensor.shape);
+                    return Err(broken(&path, problem));
+                }
+                None => return Err(broken(&path, format!("'{name}' is missing, which {CONFIG} asks for"))),
+            }
+        }
+        if let Some(name) = weights.keys().find(|name| !wanted.contains_key(*name)) {
+            return Err(broken(&path, format!("'{name}' is no weight of the model that {CONFIG} describes")));
+        }
+        let model = parameters::load(model, &weights);
+        Ok(Self { model, config, action: card.action, env: card.env, manifest })
+    }
+
+    /// Loads the checkpoint and what training needs to continue.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::load`], and when the checkpoint was saved without that.
+    pub fn load_to_resume(run: &Path, device: &Device) -> Result<(Self, TrainState)> {
+        let checkpoint = Self::load(run, device)?;
+        let folder = locate(run).unwrap_or_else(|| run.to_owned());
+        let path = folder.join(STATE);
+        let position: Position = serde_json::from_slice(&read(&path)?)
+            .map_err(|error| Error::corrupt(&path, error.to_string(), "train again from the beginning"))?;
+        let moments = unpack(&folder.join(OPTIMIZER), checkpoint.manifest.hashes.get("optimizer"))?;
+        Ok((checkpoint, TrainState { step: position.step, moments }))
+    }
+}
+
+/// Where the checkpoint of a run is: in place, or moved aside by a process that was killed before the new one was
+/// in place.
+fn locate(run: &Path) -> Option<PathBuf> {
+    [run.to_owned(), run.join(FOLDER), run.join(format!("{FOLDER}.old"))]
+        .into_iter()
+        .find(|folder| folder.join(CONFIG).is_file())
+}
+
+fn read(path: &Path) -> Result<Vec<u8>> {
+    std::fs::read(path).map_err(|error| Error::io(path, "reading a checkpoint", error))
+}
+
+fn json<T: Serialize>(value: &T) -> Result<serde_json::Value> {
+    serde_json::to_value(value).map_err(|error| Error::external("writing JSON", error))
+}
+
+fn text<T: Serialize>(value: &T) -> Result<String> {
+    serde_json::to_string_pretty(value).map_err(|error| Error::external("writing JSON", error))
+}
+
+/// Tensors as a safetensors file.
+fn pack(tensors: &Named<HostTensor>) -> Result<Vec<u8>> {
+    let failed = |error| Error::external("writing safetensors", error);
+    let bytes: Vec<(&String, Vec<usize>, Vec<u8>)> = tensors
+        .iter()
+        .map(|(name, t)| (name, t.shape.clone(), t.values.iter().flat_map(|v| v.to_le_bytes()).collect()))
+        .collect();
+    let views: Result<Vec<(&String, TensorView<'_>)>> = bytes
+        .iter()
+        .map(|(name, shape, bytes)| Ok((*name, TensorView::new(Dtype::F32, shape.clone(), bytes).map_err(failed)?)))
+        .collect();
+    safetensors::serialize(views?, None).map_err(failed)
+}
+
+/// The tensors of a safetensors file.
+fn unpack(path: &Path, hash: Option<&String>) -> Result<Named<HostTensor>> {
+    let bytes = read(path)?;
+    let broken =
+        |problem: String| Error::corrupt(path, problem, "train again, or copy the checkpoint again from where it came");
+    let tensors = SafeTensors::deserialize(&bytes).map_err(|error| broken(format!("is damaged ({error})")))?;
+    if hash.is_some_and(|hash| *hash != manifest::hash(&bytes)) {
+        return Err(broken(format!("is not the file that {MANIFEST} describes: its hash differs")));
+    }
+    tensors
+        .iter()
+        .map(|(name, view)| {
+            if view.dtype() != Dtype::F32 {
+                return Err(broken(format!("'{name}' holds {:?}, not single precision", view.dtype())));
+            }
+            let values = view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+            Ok((name.to_owned(), HostTensor { shape: view.shape().to_vec(), values }))
+        })
+        .collect()
+}

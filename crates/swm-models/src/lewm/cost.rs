@@ -1,0 +1,120 @@
+//! [`LewmCost`]: what a candidate action sequence costs, as the squared distance between the latent it is predicted
+//! to end in and the latent of the goal picture.
+//!
+//! Every environment is evaluated in calls of its own whose shapes do not depend on its neighbours, on one thread
+//! each, of the current rayon pool: the plan of an environment is the same bytes whoever is planned beside it and
+//! however many threads there are.
+
+use super::config::LewmConfig;
+use super::model::Lewm;
+use super::pixels;
+use crate::checkpoint::Checkpoint;
+use burn::tensor::{Device, Tensor, TensorData};
+use rayon::prelude::*;
+use swm_core::{Batch, Candidates, CostModel, Error, Result};
+
+/// The planning cost of a LeWM.
+pub struct LewmCost {
+    model: Lewm,
+    config: LewmConfig,
+    actions: usize,
+    scenes: Vec<Scene>,
+}
+
+/// Present and goal of one environment.
+#[derive(Clone)]
+struct Scene {
+    /// The latents of the frames seen, oldest first, the present last: `[seen, latent]`.
+    start: Tensor<2>,
+    /// The actions taken between them, in model units: `[seen - 1, actions]`.
+    past: Vec<f32>,
+    /// The latent of the goal picture, `[1, latent]`.
+    goal: Tensor<2>,
+}
+
+impl LewmCost {
+    /// The cost of a trained model.
+    pub fn new(checkpoint: &Checkpoint) -> Self {
+        Self {
+            model: checkpoint.model.clone(),
+            config: checkpoint.config.model.clone(),
+            actions: checkpoint.config.data.frameskip * checkpoint.action.dim(),
+            scenes: vec![],
+        }
+    }
+
+    /// Present and goal of one environment.
+    fn look(&self, infos: &Batch, env: usize) -> Result<Scene> {
+        let row = infos.row(env);
+        let device = Device::flex();
+        let encode = |rgb: &[u8]| Ok::<_, Error>(self.model.encode(pixels::patches(&self.config, rgb, &device)?));
+        // Each picture by itself: what a latent is must not depend on how many are encoded at once.
+        let mut start = vec![encode(row.get::<u8>("pixels")?)?];
+        let mut past = vec![];
+        if infos.schema().find("history.length").is_some() {
+            let length = usize::try_from(row.get::<i32>("history.length")?[0]).unwrap_or(0);
+            let length = length.min(self.config.predictor.history - 1);
+            let bytes = self.config.image * self.config.image * 3;
+            let frames = row.get::<u8>("history.pixels")?;
+            let actions = row.get::<f32>("history.action")?;
+            for frame in frames[frames.len() - length * bytes..].rchunks_exact(bytes) {
+                start.insert(0, encode(frame)?);
+            }
+            past = actions[actions.len() - length * self.actions..].to_vec();
+        }
+        Ok(Scene { start: Tensor::cat(start, 0), past, goal: encode(row.get::<u8>("goal")?)? })
+    }
+}
+
+impl Scene {
+    fn cost(&self, model: &Lewm, candidates: &[f32], horizon: usize, dim: usize, costs: &mut [f32]) {
+        let device = Device::flex();
+        let samples = costs.len();
+        let [seen, latent] = self.start.dims();
+        let steps = seen - 1 + horizon;
+        let mut actions = Vec::with_capacity(samples * steps * dim);
+        for candidate in candidates.chunks_exact(horizon * dim) {
+            actions.extend_from_slice(&self.past);
+            actions.extend_from_slice(candidate);
+        }
+        let actions = Tensor::from_data(TensorData::new(actions, [samples, steps, dim]), &device);
+        let start: Tensor<3> = self.start.clone().unsqueeze();
+        let rollout = model.rollout(start.expand([samples, seen, latent]), actions);
+        let end = rollout.slice([0..samples, steps..steps + 1, 0..latent]).reshape([samples, latent]);
+        let distance: Tensor<2> = (end - self.goal.clone()).square().sum_dim(1);
+        for (cost, value) in costs.iter_mut().zip(distance.into_data().iter::<f32>()) {
+            *cost = value;
+        }
+    }
+}
+
+impl CostModel for LewmCost {
+    fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()> {
+        let scenes: Result<Vec<Scene>> = envs.par_iter().map(|&env| self.look(infos, env)).collect();
+        self.scenes = scenes?;
+        Ok(())
+    }
+
+    fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
+        let Candidates { actions, envs, samples, horizon, dim } = candidates;
+        if envs != self.scenes.len() || dim != self.actions || costs.len() != envs * samples {
+            return Err(Error::mismatch(
+                "costs of a LeWM",
+                format!("{envs} environments, {dim} numbers a model step, {} costs", costs.len()),
+                format!(
+                    "{} environments, {} numbers a model step, {} costs",
+                    self.scenes.len(),
+                    self.actions,
+                    envs * samples
+                ),
+            ));
+        }
+        let (model, scenes) = (&self.model, &self.scenes);
+        costs
+            .par_chunks_mut(samples)
+            .zip(actions.par_chunks(samples * horizon * dim))
+            .zip(scenes)
+            .for_each(|((costs, actions), scene)| scene.cost(model, actions, horizon, dim, costs));
+        Ok(())
+    }
+}

@@ -1,0 +1,162 @@
+//! What a training run leaves behind to look at: one JSON object a line, and a TensorBoard event file.
+
+use prost::Message;
+use std::fs::{File, OpenOptions};
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use std::time::{SystemTime, UNIX_EPOCH};
+use swm_core::{Error, Result};
+
+/// Named numbers of one moment of training.
+pub type Scalars<'a> = &'a [(&'a str, f64)];
+
+/// Writes numbers to `train.jsonl` and to an event file.
+pub struct Log {
+    lines: Writer,
+    events: Writer,
+}
+
+struct Writer {
+    path: PathBuf,
+    file: File,
+}
+
+impl Writer {
+    fn open(path: PathBuf, append: bool) -> Result<Self> {
+        let file = OpenOptions::new().create(true).append(append).write(true).truncate(!append).open(&path);
+        let file = file.map_err(|error| Error::io(&path, "opening a log", error))?;
+        Ok(Self { path, file })
+    }
+
+    fn write(&mut self, bytes: &[u8]) -> Result<()> {
+        self.file.write_all(bytes).map_err(|error| Error::io(&self.path, "writing a log", error))
+    }
+}
+
+impl Log {
+    /// A log in a folder; `resume` continues the lines of an earlier run. Event files are one a run, as TensorBoard
+    /// expects.
+    ///
+    /// # Errors
+    /// When the folder cannot be written.
+    pub fn new(folder: &Path, resume: bool) -> Result<Self> {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let name = format!("events.out.tfevents.{}.{:09}.swm", now.as_secs(), now.subsec_nanos());
+        let mut log = Self {
+            lines: Writer::open(folder.join("train.jsonl"), resume)?,
+            events: Writer::open(folder.join(name), false)?,
+        };
+        log.event(Event {
+            wall_time: now.as_secs_f64(),
+            file_version: Some("brain.Event:2".to_owned()),
+            ..Event::default()
+        })?;
+        Ok(log)
+    }
+
+    /// Writes the numbers of a step.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
+    pub fn write(&mut self, step: usize, scalars: Scalars<'_>) -> Result<()> {
+        let mut object = serde_json::Map::new();
+        object.insert("step".to_owned(), step.into());
+        for (name, value) in scalars {
+            object.insert((*name).to_owned(), (*value).into());
+        }
+        let mut line = serde_json::Value::Object(object).to_string();
+        line.push('\n');
+        self.lines.write(line.as_bytes())?;
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let value =
+            |(name, value): &(&str, f64)| Value { tag: format!("train/{name}"), simple_value: Some(*value as f32) };
+        self.event(Event {
+            wall_time: now.as_secs_f64(),
+            step: step as i64,
+            file_version: None,
+            summary: Some(Summary { value: scalars.iter().map(value).collect() }),
+        })
+    }
+
+    fn event(&mut self, event: Event) -> Result<()> {
+        self.events.write(&record(&event.encode_to_vec()))
+    }
+}
+
+/// The fields of TensorFlow's `event.proto` that scalars need.
+#[derive(Clone, PartialEq, Message)]
+struct Event {
+    #[prost(double, tag = "1")]
+    wall_time: f64,
+    #[prost(int64, tag = "2")]
+    step: i64,
+    #[prost(string, optional, tag = "3")]
+    file_version: Option<String>,
+    #[prost(message, optional, tag = "5")]
+    summary: Option<Summary>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct Summary {
+    #[prost(message, repeated, tag = "1")]
+    value: Vec<Value>,
+}
+
+#[derive(Clone, PartialEq, Message)]
+struct Value {
+    #[prost(string, tag = "1")]
+    tag: String,
+    #[prost(float, optional, tag = "2")]
+    simple_value: Option<f32>,
+}
+
+/// A record of a TFRecord file: length, its checksum, data, their checksum.
+fn record(data: &[u8]) -> Vec<u8> {
+    let length = (data.len() as u64).to_le_bytes();
+    let mut out = length.to_vec();
+    out.extend(masked_crc(&length).to_le_bytes());
+    out.extend(data);
+    out.extend(masked_crc(data).to_le_bytes());
+    out
+}
+
+/// The checksum of TFRecord files: CRC-32C, turned and shifted.
+fn masked_crc(data: &[u8]) -> u32 {
+    crc32c::crc32c(data).rotate_right(15).wrapping_add(0xa282_ead8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn events_read_back_and_their_checksums_hold() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut log = Log::new(folder.path(), false).expect("a log");
+        log.write(7, &[("loss", 0.5), ("lr", 1e-3)]).expect("written");
+        let line = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
+        assert_eq!(line, "{\"loss\":0.5,\"lr\":0.001,\"step\":7}\n");
+        let events = std::fs::read(&log.events.path).expect("events");
+        let mut rest = &events[..];
+        let mut found = vec![];
+        while !rest.is_empty() {
+            let word = |at: usize| u32::from_le_bytes(rest[at..at + 4].try_into().expect("4 bytes"));
+            let length = u64::from_le_bytes(rest[..8].try_into().expect("8 bytes")) as usize;
+            assert_eq!(word(8), masked_crc(&rest[..8]));
+            assert_eq!(word(12 + length), masked_crc(&rest[12..12 + length]));
+            found.push(Event::decode(&rest[12..12 + length]).expect("an event"));
+            rest = &rest[16 + length..];
+        }
+        assert_eq!(found[0].file_version.as_deref(), Some("brain.Event:2"));
+        assert_eq!(found[1].step, 7);
+        let values = &found[1].summary.as_ref().expect("a summary").value;
+        assert_eq!((values[0].tag.as_str(), values[0].simple_value), ("train/loss", Some(0.5)));
+    }
+
+    #[test]
+    fn the_checksum_is_the_published_one() {
+        // The first twelve bytes of every event file that TensorFlow writes: a length of 24, then its checksum.
+        assert_eq!(masked_crc(&24u64.to_le_bytes()), 0x0796_7fa3_u32);
+    }
+}

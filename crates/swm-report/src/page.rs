@@ -13,12 +13,15 @@ const STYLE: &str = include_str!("style.css");
 /// Curves of a training log that are shown; losses come first.
 const CURVES: usize = 8;
 
+/// Metrics that say how fast a training went, which is no business of a page about how well.
+const CLOCKS: [&str; 3] = ["seconds", "clips_per_second", "data_wait"];
+
 /// What a page says beyond its results.
 #[derive(Clone, Debug, Default)]
 pub struct ReportOptions {
     /// The headline; without one the environments are named.
     pub title: Option<String>,
-    /// A training log (`metrics.jsonl`) whose curves are shown.
+    /// A training log (`train.jsonl`) whose curves are shown.
     pub metrics: Option<PathBuf>,
     /// The command that makes the results again; without one `command` in the manifest's configuration is
     /// shown, where it is there.
@@ -273,7 +276,7 @@ fn cells(html: &mut String, row: &Row<'_>) {
 }
 
 fn training_section(html: &mut String, metrics: &Metrics) {
-    let mut series: Vec<_> = metrics.series.iter().collect();
+    let mut series: Vec<_> = metrics.series.iter().filter(|series| !CLOCKS.contains(&series.name.as_str())).collect();
     series.sort_by_key(|series| (!series.name.contains("loss"), series.name.clone()));
     let curves: Vec<String> =
         series.into_iter().filter_map(|series| plots::training(metrics, series)).take(CURVES).collect();

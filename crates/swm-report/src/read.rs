@@ -70,7 +70,7 @@ pub struct Series {
     pub points: Vec<(f64, f64)>,
 }
 
-/// Reads a `metrics.jsonl`: one JSON object a line, of which every number is a metric. A torn last line, as a
+/// Reads a `train.jsonl`: one JSON object a line, of which every number is a metric. A torn last line, as a
 /// killed training leaves, is passed over.
 ///
 /// # Errors
@@ -89,7 +89,7 @@ pub fn read_metrics(path: &Path) -> Result<Metrics> {
             _ if i + 1 == lines.len() && !text.ends_with('\n') => {}
             _ => {
                 let problem = format!("line {} is no JSON object", i + 1);
-                return Err(Error::corrupt(path, problem, "give the metrics.jsonl that training wrote"));
+                return Err(Error::corrupt(path, problem, "give the train.jsonl that training wrote"));
             }
         }
     }

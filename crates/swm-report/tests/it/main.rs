@@ -195,14 +195,19 @@ fn videos_are_carried_and_missing_ones_named() {
 #[test]
 fn training_logs_become_curves() {
     let folder = tempfile::tempdir().expect("folder");
-    let log = folder.path().join("metrics.jsonl");
+    let log = folder.path().join("train.jsonl");
     let lines: String = (0..900)
-        .map(|i| format!("{{\"step\": {i}, \"loss\": {}, \"optimizer\": {{\"lr\": 0.001}}}}\n", 1.0 / f64::from(i + 1)))
+        .map(|i| {
+            format!(
+                "{{\"step\": {i}, \"loss\": {}, \"seconds\": 2, \"optimizer\": {{\"lr\": 0.001}}}}\n",
+                1.0 / f64::from(i + 1)
+            )
+        })
         .collect();
     std::fs::write(&log, format!("{lines}{{\"step\": 900, \"lo")).expect("log");
     let metrics = read_metrics(&log).expect("a torn last line is what a killed training leaves");
     assert_eq!(metrics.over, "step");
-    assert_eq!(metrics.series.iter().map(|s| s.name.as_str()).collect::<Vec<_>>(), ["loss", "optimizer/lr"]);
+    assert_eq!(metrics.series.iter().map(|s| s.name.as_str()).collect::<Vec<_>>(), ["loss", "optimizer/lr", "seconds"]);
     assert_eq!(metrics.series[0].points[1], (1.0, 0.5));
     let options = ReportOptions { metrics: Some(log.clone()), ..ReportOptions::default() };
     let results = [(PathBuf::from("results.json"), results())];
@@ -210,6 +215,7 @@ fn training_logs_become_curves() {
     let page = std::fs::read_to_string(path).expect("page");
     well_formed(&page);
     assert!(page.contains("loss over step, ending at 0.001111") && page.contains("optimizer/lr"));
+    assert!(!page.contains("seconds over step"), "a page is about how well, not how fast");
 
     std::fs::write(&log, "{\"step\": 1}\nloss = 3\n{\"step\": 2}\n").expect("log");
     assert!(read_metrics(&log).expect_err("no JSON").to_string().contains("line 2 is no JSON object"));

@@ -1,0 +1,6 @@
+//! Integration tests: golden rollouts of the Python reference, and what every environment must keep.
+
+mod conformance;
+mod golden;
+mod golden_push_t;
+mod golden_two_room;

@@ -107,7 +107,8 @@ impl Partial {
         };
         let mut hidden = OsString::from(".");
         hidden.push(name);
-        hidden.push(".partial");
+        // Two processes that write the same video must not share it.
+        hidden.push(format!(".{}.partial", std::process::id()));
         Ok(Self { path: target.with_file_name(hidden) })
     }
 

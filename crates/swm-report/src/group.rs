@@ -27,7 +27,7 @@ pub(crate) struct Row<'a> {
     pub run: &'a Run,
     /// The place of its results file.
     pub file: usize,
-    /// The policy's name, with the number of its file where several files stand side by side.
+    /// The policy's name, with the number of its file where several runs would look alike.
     pub label: String,
     /// The class that colours it: `floor`, `expert`, or `c0` and so on.
     pub class: String,
@@ -50,7 +50,6 @@ impl<'a> Group<'a> {
                 groups.push(Self { env: &result.env, protocol: &result.protocol, conditions: vec![] });
                 groups.len() - 1
             });
-            let shared = results.iter().filter(|(_, r)| r.env == result.env && r.protocol == result.protocol).count();
             let conditions = &mut groups[place].conditions;
             for run in &result.runs {
                 let at = conditions.iter().position(|c| c.name == run.condition).unwrap_or_else(|| {
@@ -68,8 +67,20 @@ impl<'a> Group<'a> {
                         format!("c{}", known % COLOURS)
                     }
                 };
-                let mark = if shared > 1 { format!(" [{}]", file + 1) } else { String::new() };
-                conditions[at].rows.push(Row { run, file, label: format!("{}{mark}", run.policy), class });
+                let rows = &mut conditions[at].rows;
+                // Evaluations of several models over the same starts all measured the same floor.
+                if class == "floor" && rows.iter().any(|row| row.is_floor() && row.run.episodes == run.episodes) {
+                    continue;
+                }
+                rows.push(Row { run, file, label: run.policy.clone(), class });
+            }
+        }
+        for condition in groups.iter_mut().flat_map(|group| &mut group.conditions) {
+            let policies: Vec<&str> = condition.rows.iter().map(|row| row.run.policy.as_str()).collect();
+            for row in &mut condition.rows {
+                if policies.iter().filter(|&&policy| policy == row.run.policy).count() > 1 {
+                    row.label = format!("{} [{}]", row.run.policy, row.file + 1);
+                }
             }
         }
         groups
@@ -89,5 +100,10 @@ impl<'a> Condition<'a> {
     /// The random floor of the condition, if it was measured.
     pub(crate) fn floor(&self) -> Option<&Row<'a>> {
         self.rows.iter().find(|row| row.is_floor())
+    }
+
+    /// The floor to hold a run against: that of its own file, else that of the condition.
+    pub(crate) fn floor_of(&self, run: &Row<'_>) -> Option<&Row<'a>> {
+        self.rows.iter().find(|row| row.is_floor() && row.file == run.file).or_else(|| self.floor())
     }
 }

@@ -49,7 +49,7 @@ pub fn write_report_with(results: &[(PathBuf, Results)], options: &ReportOptions
     let page = render(results, options, metrics.as_ref());
     std::fs::create_dir_all(out_dir).map_err(|source| Error::io(out_dir, "making the report's folder", source))?;
     let path = out_dir.join("index.html");
-    let partial = out_dir.join(".index.html.partial");
+    let partial = out_dir.join(format!(".index.html.{}.partial", std::process::id()));
     let written = std::fs::write(&partial, page).and_then(|()| std::fs::rename(&partial, &path));
     written.map_err(|source| {
         // Whatever is left of it is of no use; the first error is the one to tell.
@@ -175,7 +175,7 @@ fn group_section(html: &mut String, group: &Group<'_>, results: &[(PathBuf, Resu
 /// The finding of one policy under one condition, beside its floor.
 fn card(html: &mut String, condition: &Condition<'_>, row: &Row<'_>) {
     let p = row.run.success;
-    let verdict = match condition.floor().map(|floor| floor.run.success) {
+    let verdict = match condition.floor_of(row).map(|floor| floor.run.success) {
         None => ("unknown", "no random floor was measured".to_owned()),
         Some(floor) if p.n == 0 || floor.n == 0 => ("unknown", "no episode counted".to_owned()),
         Some(floor) if p.low > floor.high => ("above", format!("above the random floor of {}", percent(floor.rate))),

@@ -28,9 +28,9 @@ pub(crate) fn shorten(words: &str, most: usize) -> String {
     short
 }
 
-/// A share as a percentage with one decimal: `92.5 %`.
+/// A share as a percentage with one decimal: `92.5 %`, which no line break parts.
 pub(crate) fn percent(rate: f64) -> String {
-    format!("{:.1} %", rate * 100.0)
+    format!("{:.1}\u{a0}%", rate * 100.0)
 }
 
 /// A number with about four significant digits and no trailing zeros.
@@ -90,6 +90,6 @@ mod tests {
         assert_eq!(numbers, ["0", "1", "-2.5", "0.1235", "12346", "1.00e-9", "150", "–"]);
         let times = [0.000_84, 0.012, 0.9996, 1.417, 59.96, 200.0, 7500.0, -1.0].map(duration);
         assert_eq!(times, ["0.8 ms", "12 ms", "1.00 s", "1.42 s", "1 min 0 s", "3 min 20 s", "2 h 5 min", "–"]);
-        assert_eq!(percent(0.925), "92.5 %");
+        assert_eq!(percent(0.925), "92.5\u{a0}%");
     }
 }

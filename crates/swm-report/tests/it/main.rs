@@ -59,7 +59,7 @@ fn page(results: &[(PathBuf, Results)], folder: &Path) -> String {
     let path = write_report(results, folder).expect("report");
     let page = std::fs::read_to_string(path).expect("page");
     well_formed(&page);
-    page
+    page.replace('\u{a0}', " ")
 }
 
 /// Checks that elements nest, attributes are quoted, and ampersands begin entities: the page is valid XML
@@ -171,6 +171,16 @@ fn several_files_of_one_world_stand_side_by_side() {
     let page = page(&files, folder.path());
     assert_eq!(page.matches("<h2>Success</h2>").count(), 1);
     assert!(page.contains("lewm-tiny [1]") && page.contains("lewm-tiny [2]") && page.contains("[2] <code>b.json"));
+
+    assert!(!page.contains("random ["), "one floor, measured twice, is shown once");
+
+    // Runs that differ by condition or policy need no number.
+    let mut shifted = results();
+    shifted.runs.retain(|run| run.condition != "in distribution");
+    let mut plain = results();
+    plain.runs.retain(|run| run.condition == "in distribution");
+    let page = self::page(&[(PathBuf::from("a.json"), plain), (PathBuf::from("b.json"), shifted)], folder.path());
+    assert!(!page.contains("lewm-tiny [") && page.contains("agent.color shifted"));
 }
 
 #[test]

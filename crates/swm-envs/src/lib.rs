@@ -1,5 +1,6 @@
 //! Native 2-D worlds: one folder each, with physics, render, expert and a README side by side.
 
+mod draw;
 mod factors;
 pub mod push_t;
 pub mod two_room;

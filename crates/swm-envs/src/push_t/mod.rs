@@ -100,7 +100,7 @@ impl PushT {
         self.contacts = self.world.contacts();
         self.goal_scene = Scene::of(&self.world);
         self.goal = goal;
-        self.renderer = Renderer::new(&factors);
+        self.renderer.begin(&factors);
         self.factors = factors;
     }
 }

@@ -7,8 +7,6 @@
 use super::physics::{Body, Shape, Vec2};
 use std::f64::consts::{PI, TAU};
 
-/// Names of the shapes, in the order of the `shape` factors.
-pub const NAMES: [&str; 8] = ["o", "L", "T", "Z", "square", "I", "small_tee", "+"];
 /// A radius for a scale of 1.
 const CIRCLE_RADIUS: f32 = 0.375;
 
@@ -29,7 +27,7 @@ pub struct Design {
 }
 
 impl Design {
-    /// The shape of this place in [`NAMES`], at this scale.
+    /// A shape by its number (0 circle, 1 L, 2 T, 3 Z, 4 square, 5 I, 6 small T, 7 +), at this scale.
     ///
     /// Corners are computed in single precision because scales are sampled in it.
     #[allow(clippy::cast_possible_truncation)]
@@ -65,7 +63,7 @@ impl Design {
                 [Vec2::new(left, top), Vec2::new(right, top), Vec2::new(right, bottom), Vec2::new(left, bottom)]
             })
             .collect();
-        let sum = rects.iter().map(|rect| centroid(rect)).reduce(|a, b| a + b).unwrap_or_default();
+        let sum = rects.iter().map(centroid).reduce(|a, b| a + b).unwrap_or_default();
         #[allow(clippy::cast_precision_loss)]
         let count = rects.len() as f64;
         let cog = Vec2::new(sum.x / count, sum.y / count);
@@ -73,7 +71,7 @@ impl Design {
         Self { rects, radius: 0.0, cog, inertia }
     }
 
-    /// The smallest turn after which a shape (by its place in [`NAMES`]) looks the same.
+    /// The smallest turn after which a shape looks the same.
     pub fn symmetry(shape: i64) -> f64 {
         match shape {
             3 | 5 => PI,
@@ -142,9 +140,9 @@ mod tests {
 
     #[test]
     fn every_shape_but_the_circle_can_be_pushed() {
-        for (i, name) in NAMES.iter().enumerate() {
-            let design = Design::new(i as i64, 40.0);
-            assert_eq!(design.body().is_dynamic(), *name != "o", "{name}");
+        for shape in 0..8 {
+            let design = Design::new(shape, 40.0);
+            assert_eq!(design.body().is_dynamic(), shape != 0, "shape {shape}");
             assert!(!design.shapes(0).is_empty());
         }
     }

@@ -127,6 +127,6 @@ fn rollouts_and_pictures_follow_the_reference() {
         }
         let last = picture_difference(&probe.frame(), &golden.read("frame_last"));
         eprintln!("{name}: pictures differ by {first:.4} and {last:.4} of 255");
-        assert!(first < 3000.0 && last < 3.0, "{name}: pictures differ by {first} and {last} of 255");
+        assert!(first < 0.01 && last < 0.01, "{name}: pictures differ by {first} and {last} of 255");
     }
 }

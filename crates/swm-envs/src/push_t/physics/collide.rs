@@ -69,7 +69,7 @@ fn hash_pair(a: u64, b: u64) -> u64 {
 }
 
 fn clamp01(t: f64) -> f64 {
-    t.min(1.0).max(0.0)
+    t.clamp(0.0, 1.0)
 }
 
 /// An edge of a shape.
@@ -119,7 +119,7 @@ fn is_left(a: Vec2, b: Vec2, c: Vec2) -> bool {
 fn nearest_t(a: Vec2, b: Vec2) -> f64 {
     let delta = b - a;
     let squared = delta.length_squared();
-    if squared == 0.0 { 0.0 } else { -(delta.dot(a + b) / squared).max(-1.0).min(1.0) }
+    if squared == 0.0 { 0.0 } else { -(delta.dot(a + b) / squared).clamp(-1.0, 1.0) }
 }
 
 /// The point at `t` on the segment from `a` (-1) to `b` (1).

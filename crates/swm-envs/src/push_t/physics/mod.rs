@@ -135,7 +135,7 @@ impl World {
             bodies: [agent, block, fixed],
             static_tree: Tree::new(walls),
             tree: Tree::new(moving),
-            order: leaf_order(walls, moving),
+            order: visiting_order(walls, moving).into_iter().map(|leaf| leaf as u32).collect(),
             pairs: Vec::with_capacity(shapes.len() * shapes.len()),
             arbiters: Vec::with_capacity(shapes.len() * shapes.len()),
             active: Vec::with_capacity(shapes.len() * shapes.len()),
@@ -403,14 +403,13 @@ impl World {
     }
 }
 
-/// The order in which Chipmunk looks at moving shapes: that of its hash table, whose size is the first of these
-/// primes that is greater than their number.
-fn leaf_order(walls: usize, moving: usize) -> Vec<u32> {
+/// The order in which Chipmunk visits moving shapes, to step and to draw them: that of its hash table, whose size is
+/// the first of these primes that is greater than their number.
+pub fn visiting_order(walls: usize, moving: usize) -> Vec<usize> {
     let size = [5, 13, 23].into_iter().find(|&size| size > moving).unwrap_or(usize::MAX);
-    let mut leaves: Vec<usize> = (0..moving).collect();
-    leaves.sort_by_key(|leaf| (leaf + walls) % size);
-    #[allow(clippy::cast_possible_truncation)]
-    leaves.into_iter().map(|leaf| leaf as u32).collect()
+    let mut order: Vec<usize> = (0..moving).collect();
+    order.sort_by_key(|shape| (shape + walls) % size);
+    order
 }
 
 /// A shape whose box touches the one in question.

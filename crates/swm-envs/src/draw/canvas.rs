@@ -1,0 +1,409 @@
+//! A canvas of palette indices and the shapes one can fill on it.
+
+use std::ops::Range;
+
+/// A whole pixel: column and row; may lie outside the canvas.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Point {
+    /// Column.
+    pub x: i32,
+    /// Row.
+    pub y: i32,
+}
+
+/// Coordinates are cut to this, far outside of any canvas, so that no arithmetic overflows.
+const FAR: f64 = 8192.0;
+
+impl Point {
+    /// A pixel.
+    pub const fn new(x: i32, y: i32) -> Self {
+        Self { x, y }
+    }
+
+    /// The nearest pixel; halves go to the even one.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn nearest(x: f64, y: f64) -> Self {
+        let whole = |v: f64| v.round_ties_even().clamp(-FAR, FAR) as i32;
+        Self { x: whole(x), y: whole(y) }
+    }
+
+    fn shifted(self, x: i32, y: i32) -> Self {
+        Self { x: self.x + x, y: self.y + y }
+    }
+}
+
+/// A rectangle of pixels, the ends excluded.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Area {
+    low: Point,
+    high: Point,
+}
+
+impl Area {
+    /// No pixel.
+    pub const EMPTY: Self = Self { low: Point::new(i32::MAX, i32::MAX), high: Point::new(i32::MIN, i32::MIN) };
+
+    /// The smallest area that also holds the pixels within `reach` of `point`.
+    #[must_use]
+    pub fn with(self, point: Point, reach: i32) -> Self {
+        Self {
+            low: Point::new(self.low.x.min(point.x - reach), self.low.y.min(point.y - reach)),
+            high: Point::new(self.high.x.max(point.x + reach + 1), self.high.y.max(point.y + reach + 1)),
+        }
+    }
+
+    /// All of a canvas of `side`².
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
+    pub const fn square(side: usize) -> Self {
+        Self { low: Point::new(0, 0), high: Point::new(side as i32, side as i32) }
+    }
+
+    /// Whether all its columns and rows lie from `low` to `high`, that one excluded.
+    pub fn is_between(self, low: i32, high: i32) -> bool {
+        self.low.x >= low && self.low.y >= low && self.high.x <= high && self.high.y <= high
+    }
+
+    /// The part inside a canvas of `side`², as columns and rows.
+    #[allow(clippy::cast_sign_loss, clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
+    pub fn within(self, side: usize) -> (Range<usize>, Range<usize>) {
+        let cut = |v: i32| v.clamp(0, side as i32) as usize;
+        (cut(self.low.x)..cut(self.high.x), cut(self.low.y)..cut(self.high.y))
+    }
+}
+
+/// The colours that indices stand for. Those of mixed pixels are added while drawing and dropped by
+/// [`Palette::forget_mixed`].
+#[derive(Clone, Debug)]
+pub struct Palette {
+    colors: Vec<[u8; 3]>,
+    fixed: usize,
+}
+
+impl Palette {
+    /// The indices 0, 1, … stand for these colours.
+    pub fn new(colors: &[[u8; 3]]) -> Self {
+        let mut all = Vec::with_capacity(256);
+        all.extend_from_slice(colors);
+        Self { colors: all, fixed: colors.len() }
+    }
+
+    /// The colour of an index.
+    pub fn color(&self, index: u8) -> [u8; 3] {
+        self.colors[usize::from(index)]
+    }
+
+    /// Drops the colours of mixed pixels.
+    pub fn forget_mixed(&mut self) {
+        self.colors.truncate(self.fixed);
+    }
+
+    /// The index of a share of `color` over what `under` stands for; `under` itself once all indices are taken.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn mixed(&mut self, color: [u8; 3], share: f32, under: u8) -> u8 {
+        let below = self.color(under);
+        let mix = |i: usize| (f32::from(color[i]) * share + f32::from(below[i]) * (1.0 - share)) as u8;
+        match u8::try_from(self.colors.len()) {
+            Ok(index) => {
+                self.colors.push([mix(0), mix(1), mix(2)]);
+                index
+            }
+            Err(_) => under,
+        }
+    }
+}
+
+/// A square of palette indices.
+#[derive(Clone, Debug)]
+pub struct Canvas {
+    side: usize,
+    pixels: Vec<u8>,
+}
+
+impl Canvas {
+    /// A canvas of `side`² pixels of index 0.
+    pub fn new(side: usize) -> Self {
+        Self { side, pixels: vec![0; side * side] }
+    }
+
+    /// Pixels along a side.
+    pub fn side(&self) -> usize {
+        self.side
+    }
+
+    /// One row.
+    pub fn row(&self, y: usize) -> &[u8] {
+        &self.pixels[y * self.side..][..self.side]
+    }
+
+    /// Makes every pixel `index`.
+    pub fn clear(&mut self, index: u8) {
+        self.pixels.fill(index);
+    }
+
+    /// Takes an area over from another canvas of the same size.
+    pub fn copy_area(&mut self, from: &Self, area: Area) {
+        let (columns, rows) = area.within(self.side);
+        for y in rows {
+            let start = y * self.side;
+            let row = start + columns.start..start + columns.end;
+            self.pixels[row.clone()].copy_from_slice(&from.pixels[row]);
+        }
+    }
+
+    /// The pixels from `x0` to `x1`, both included, in either order.
+    #[allow(clippy::cast_sign_loss, clippy::cast_possible_wrap, clippy::cast_possible_truncation)]
+    fn span(&mut self, y: i32, x0: i32, x1: i32, index: u8) {
+        let last = self.side as i32 - 1;
+        let (from, to) = (x0.min(x1).max(0), x0.max(x1).min(last));
+        if (0..=last).contains(&y) && from <= to {
+            let start = y as usize * self.side;
+            self.pixels[start + from as usize..=start + to as usize].fill(index);
+        }
+    }
+
+    /// Fills a polygon of up to [`MAX_CORNERS`] corners.
+    ///
+    /// A row is covered from one edge, rounded down, to the next, rounded down; edges own their upper end only,
+    /// but for the last row; level edges are drawn whole.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
+    pub fn fill_polygon(&mut self, corners: &[Point], index: u8) {
+        let (top, bottom) = corners.iter().fold((i32::MAX, i32::MIN), |(a, b), p| (a.min(p.y), b.max(p.y)));
+        if top == bottom {
+            let (left, right) = corners.iter().fold((i32::MAX, i32::MIN), |(a, b), p| (a.min(p.x), b.max(p.x)));
+            self.span(top, left, right, index);
+            return;
+        }
+        let (first, last) = (top.max(0), bottom.min(self.side as i32 - 1));
+        let mut edges = [Edge::default(); MAX_CORNERS];
+        let mut count = 0;
+        let around = |i: usize| (corners[if i == 0 { corners.len() - 1 } else { i - 1 }], corners[i]);
+        for (a, b) in (0..corners.len()).map(around) {
+            if a.y != b.y && count < MAX_CORNERS {
+                edges[count] = Edge::new(a, b, first, bottom);
+                count += 1;
+            }
+        }
+        for y in first..=last {
+            let mut crossings = [0; MAX_CORNERS];
+            let mut crossed = 0;
+            for edge in &mut edges[..count] {
+                if y >= edge.top && y < edge.end {
+                    let at = edge.x;
+                    edge.advance();
+                    // Insertion keeps the few crossings in order.
+                    let mut place = crossed;
+                    while place > 0 && crossings[place - 1] > at {
+                        crossings[place] = crossings[place - 1];
+                        place -= 1;
+                    }
+                    crossings[place] = at;
+                    crossed += 1;
+                }
+            }
+            for pair in crossings[..crossed].chunks_exact(2) {
+                self.span(y, pair[0], pair[1], index);
+            }
+        }
+        for (a, b) in (0..corners.len()).map(around) {
+            if a.y == b.y && top < a.y && a.y < bottom {
+                self.span(a.y, a.x, b.x, index);
+            }
+        }
+    }
+
+    /// Fills a circle by the midpoint algorithm.
+    pub fn fill_circle(&mut self, centre: Point, radius: i32, index: u8) {
+        let mut decision = 1 - radius;
+        let (mut step_x, mut step_y) = (0, -2 * radius);
+        let (mut x, mut y) = (0, radius);
+        while x < y {
+            if decision >= 0 {
+                y -= 1;
+                step_y += 2;
+                decision += step_y;
+            }
+            x += 1;
+            step_x += 2;
+            decision += step_x + 1;
+            if decision >= 0 {
+                self.span(centre.y + y - 1, centre.x - x, centre.x + x - 1, index);
+                self.span(centre.y - y, centre.x - x, centre.x + x - 1, index);
+            }
+            self.span(centre.y + x - 1, centre.x - y, centre.x + y - 1, index);
+            self.span(centre.y - x, centre.x - y, centre.x + y - 1, index);
+        }
+    }
+
+    /// Draws a line of even width by Bresenham's algorithm, thick along the axis it runs across, its ends flat.
+    pub fn thick_line(&mut self, from: Point, to: Point, width: i32, index: u8) {
+        let (before, after) = (width / 2 - 1, width / 2);
+        let (dx, dy) = ((to.x - from.x).abs(), (to.y - from.y).abs());
+        let (step_x, step_y) = (if from.x < to.x { 1 } else { -1 }, if from.y < to.y { 1 } else { -1 });
+        let steep = dx <= dy;
+        let mut error = (if dx > dy { dx } else { -dy }) / 2;
+        let mut at = from;
+        let end = if steep { to.y + step_y } else { to.x + step_x };
+        while (if steep { at.y } else { at.x }) != end {
+            if steep {
+                self.span(at.y, at.x - before, at.x + after, index);
+            } else {
+                for y in at.y - before..=at.y + after {
+                    self.span(y, at.x, at.x, index);
+                }
+            }
+            let twice = error;
+            if twice > -dx {
+                error -= dy;
+                at.x += step_x;
+            }
+            if twice < dy {
+                error += dx;
+                at.y += step_y;
+            }
+        }
+    }
+
+    /// Draws a rounded bar: a thick line with round ends.
+    ///
+    /// Its sides are found from absolute differences, as the reference's debug drawing does, so they lie askew
+    /// where a bar falls from left to right.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn bar(&mut self, from: Point, to: Point, radius: i32, index: u8) {
+        self.thick_line(from, to, 2 * radius, index);
+        let across = [(to.y - from.y).abs(), (to.x - from.x).abs()].map(f64::from);
+        if across == [0.0, 0.0] {
+            return;
+        }
+        let scale = f64::from(radius) / (across[0] * across[0] + across[1] * across[1]).sqrt();
+        let [x, y] = across.map(|v| (v * scale).round_ties_even() as i32);
+        self.fill_polygon(&[from.shifted(-x, -y), from.shifted(x, y), to.shifted(x, y), to.shifted(-x, -y)], index);
+        self.fill_circle(from, radius, index);
+        self.fill_circle(to, radius, index);
+    }
+
+    /// Draws a line one pixel wide, mixed with what is below where it lies between pixels.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+    pub fn fine_line(&mut self, from: Point, to: Point, color: [u8; 3], palette: &mut Palette) {
+        let steep = (to.x - from.x).abs() < (to.y - from.y).abs();
+        let flip = |p: Point| if steep { Point::new(p.y, p.x) } else { p };
+        let (mut a, mut b) = (flip(from), flip(to));
+        if a.x > b.x {
+            std::mem::swap(&mut a, &mut b);
+        }
+        self.mix(flip(a), color, 1.0, palette);
+        let slope = (b.y - a.y) as f32 / (b.x - a.x).max(1) as f32;
+        let mut y = a.y as f32;
+        for x in a.x + 1..b.x {
+            y += slope;
+            let above = y.floor();
+            self.mix(flip(Point::new(x, above as i32)), color, 1.0 - (y - above), palette);
+            if y > above {
+                self.mix(flip(Point::new(x, above as i32 + 1)), color, y - above, palette);
+            }
+        }
+        if b != a {
+            self.mix(flip(b), color, 1.0, palette);
+        }
+    }
+
+    fn mix(&mut self, at: Point, color: [u8; 3], share: f32, palette: &mut Palette) {
+        let (Ok(x), Ok(y)) = (usize::try_from(at.x), usize::try_from(at.y)) else { return };
+        if x < self.side && y < self.side {
+            let pixel = &mut self.pixels[y * self.side + x];
+            *pixel = palette.mixed(color, share, *pixel);
+        }
+    }
+}
+
+/// The most corners a polygon may have.
+const MAX_CORNERS: usize = 8;
+
+/// An edge of a polygon, followed row by row in whole numbers.
+#[derive(Clone, Copy, Default)]
+struct Edge {
+    top: i32,
+    /// The row after its last.
+    end: i32,
+    /// Where it crosses the current row, rounded down.
+    x: i32,
+    /// What is lost by rounding, in units of 1 / height.
+    rest: i32,
+    step: i32,
+    step_rest: i32,
+    height: i32,
+}
+
+impl Edge {
+    /// The edge between two corners, at its first row from `first` on.
+    fn new(a: Point, b: Point, first: i32, bottom: i32) -> Self {
+        let (upper, lower) = if a.y < b.y { (a, b) } else { (b, a) };
+        let (width, height) = (lower.x - upper.x, lower.y - upper.y);
+        let skipped = (first - upper.y).max(0) * width;
+        Self {
+            top: upper.y,
+            end: if lower.y == bottom { bottom + 1 } else { lower.y },
+            x: upper.x + skipped.div_euclid(height),
+            rest: skipped.rem_euclid(height),
+            step: width.div_euclid(height),
+            step_rest: width.rem_euclid(height),
+            height,
+        }
+    }
+
+    fn advance(&mut self) {
+        self.x += self.step;
+        self.rest += self.step_rest;
+        if self.rest >= self.height {
+            self.x += 1;
+            self.rest -= self.height;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The canvas as text, for pictures in tests.
+    fn picture(canvas: &Canvas) -> Vec<String> {
+        (0..canvas.side()).map(|y| canvas.row(y).iter().map(|&p| if p == 0 { '.' } else { '#' }).collect()).collect()
+    }
+
+    #[test]
+    fn polygons_cover_what_pygame_covers() {
+        // pygame.draw.polygon(surface, 1, [(1, 1), (11, 4), (8, 14), (-2, 11)]), moved by 4 columns.
+        let mut canvas = Canvas::new(18);
+        canvas.fill_polygon(&[Point::new(5, 1), Point::new(15, 4), Point::new(12, 14), Point::new(2, 11)], 1);
+        let wanted = [
+            "..................",
+            ".....#............",
+            "....#####.........",
+            "....########......",
+            "....############..",
+            "...############...",
+            "...############...",
+            "...############...",
+            "..############....",
+            "..############....",
+            "..############....",
+            "..###########.....",
+            ".....########.....",
+            "........#####.....",
+            "............#.....",
+        ];
+        assert_eq!(picture(&canvas)[..wanted.len()], wanted);
+    }
+
+    #[test]
+    fn what_leaves_the_canvas_is_cut() {
+        let mut canvas = Canvas::new(8);
+        let far = Point::nearest(1e300, f64::NEG_INFINITY);
+        canvas.fill_polygon(&[Point::new(-5, -5), Point::new(20, -5), Point::new(20, 20), Point::new(-5, 20)], 1);
+        assert!(canvas.row(7).iter().all(|&p| p == 1));
+        canvas.bar(Point::new(4, 4), far, 2, 2);
+        canvas.fill_circle(far, 30, 3);
+        canvas.fine_line(far, Point::new(4, 4), [1, 2, 3], &mut Palette::new(&[[0; 3]; 4]));
+        canvas.fill_circle(Point::new(0, 0), 3, 4);
+        assert_eq!(canvas.row(0)[..4], [4, 4, 4, 1]);
+    }
+}

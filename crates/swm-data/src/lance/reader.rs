@@ -2,7 +2,7 @@
 //! parallel into the batch.
 
 use super::schema::{self, EPISODE, Kind, STEP, StoredColumn};
-use super::store::{Store, damaged, table_folder, wait};
+use super::store::{self, Store, damaged, table_folder, wait};
 use crate::format::{Episode, Reader, StepRange};
 use crate::image;
 use arrow_array::cast::AsArray;
@@ -13,13 +13,14 @@ use arrow_array::types::{
 use arrow_array::{Array, ArrayRef, ArrowPrimitiveType};
 use arrow_schema::DataType;
 use futures::{StreamExt as _, TryStreamExt as _};
+use lance_core::datatypes::Schema as LanceSchema;
 use lance_encoding::decoder::FilterExpression;
 use lance_file::reader::{FileReader, ReaderProjection};
 use lance_file::versions::reader_projection_from_field_ids;
 use lance_io::ReadBatchParams;
 use lance_table::format::{DataFile, Manifest as Table};
 use rayon::prelude::*;
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::ops::Range;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -27,6 +28,9 @@ use swm_core::{DType, Error, Manifest, Result, Schema};
 
 /// Data files that are kept open. Each takes a file descriptor, of which a process commonly has 1024.
 const OPEN_FILES: usize = 256;
+
+/// Data files up to this size are checked before even the numbers of their episodes are read.
+const SMALL_FILE: u64 = 1 << 20;
 
 /// Rows per decoded piece; more only costs memory.
 const ROWS_PER_PIECE: u32 = 4096;
@@ -47,6 +51,8 @@ struct LanceReader {
     /// The first row of each fragment, and the end.
     fragment_rows: Vec<u64>,
     files: Mutex<OpenFiles>,
+    /// Data files whose content was checked.
+    verified: Mutex<HashSet<String>>,
 }
 
 #[derive(Default)]
@@ -93,6 +99,7 @@ impl LanceReader {
             first_rows: vec![],
             fragment_rows,
             files: Mutex::default(),
+            verified: Mutex::default(),
         };
         let (columns, schema) = schema::columns_to_read(&folder, &reader.table.schema, |column| {
             let pieces = reader.pieces(column, &[0..1.min(reader.rows())])?;
@@ -187,6 +194,7 @@ impl LanceReader {
         }
         let mut reads = vec![];
         for (fragment, parts) in jobs {
+            self.verify(self.data_file(fragment, stored_name)?.0, stored_name != EPISODE)?;
             let (file, projection) = self.locate(fragment, stored_name)?;
             let wanted: u64 = parts.iter().map(|part| part.end - part.start).sum();
             reads.push((file, projection, parts, wanted));
@@ -215,13 +223,43 @@ impl LanceReader {
         Ok(lists.into_iter().flatten().collect())
     }
 
-    /// The open file of a fragment that holds a column, and where in it.
-    fn locate(&self, fragment: usize, stored_name: &str) -> Result<(Arc<FileReader>, ReaderProjection)> {
+    /// The file of a fragment that holds a column, and the table's schema of that column.
+    fn data_file(&self, fragment: usize, stored_name: &str) -> Result<(&DataFile, LanceSchema)> {
         let missing = || damaged(self.folder(), format!("fragment {fragment} has no column '{stored_name}'"));
         let projected = self.table.schema.project(&[stored_name]).map_err(|_| missing())?;
         let id = projected.fields.first().ok_or_else(missing)?.id;
         let holds = |file: &&DataFile| file.fields.contains(&id);
         let file = self.table.fragments[fragment].files.iter().find(holds).ok_or_else(missing)?;
+        Ok((file, projected))
+    }
+
+    /// Checks a file against the hash in its name, once, before anything in it is decoded: Lance trusts what
+    /// it reads, so a flipped bit could make it ask for any amount of memory. A large file is left alone
+    /// until its data are asked for, as opening a dataset must not read all of it.
+    fn verify(&self, file: &DataFile, data_wanted: bool) -> Result<()> {
+        let Some(expected) = store::hash_in_name(&file.path) else { return Ok(()) };
+        let lock = || self.verified.lock().unwrap_or_else(PoisonError::into_inner);
+        if lock().contains(&file.path) {
+            return Ok(());
+        }
+        let path = self.folder().join("data").join(&file.path);
+        let io = |e: std::io::Error| match e.kind() {
+            std::io::ErrorKind::NotFound => damaged(&path, "a data file is missing"),
+            _ => Error::io(&path, "checking a data file", e),
+        };
+        if !data_wanted && std::fs::metadata(&path).map_err(io)?.len() > SMALL_FILE {
+            return Ok(());
+        }
+        if store::hash_file(&path).map_err(io)? != expected {
+            return Err(damaged(&path, "its content does not match the hash in its name"));
+        }
+        lock().insert(file.path.clone());
+        Ok(())
+    }
+
+    /// The open file of a fragment that holds a column, and where in it.
+    fn locate(&self, fragment: usize, stored_name: &str) -> Result<(Arc<FileReader>, ReaderProjection)> {
+        let (file, projected) = self.data_file(fragment, stored_name)?;
         #[allow(clippy::cast_sign_loss)]
         let places: BTreeMap<u32, u32> = file
             .fields
@@ -361,14 +399,13 @@ impl Reader for LanceReader {
 
     fn footprint(&self) -> Result<Vec<(String, u64)>> {
         let mut columns: BTreeMap<String, u64> = BTreeMap::new();
-        for (i, fragment) in self.table.fragments.iter().enumerate() {
+        for i in 0..self.table.fragments.len() {
             for field in &self.table.schema.fields {
                 let Ok((file, projection)) = self.locate(i, &field.name) else { continue };
                 let statistics = file.file_statistics();
                 let bytes = projection.column_indices.iter().filter_map(|&c| statistics.columns.get(c as usize));
                 *columns.entry(field.name.clone()).or_default() += bytes.map(|c| c.size_bytes).sum::<u64>();
             }
-            debug_assert!(!fragment.files.is_empty());
         }
         let known: u64 = columns.values().sum();
         let rest = folder_size(self.folder())?.saturating_sub(known);

@@ -1,5 +1,6 @@
 //! A Lance table on disk: where it is, its newest version, and how a new version is committed.
 
+use arrow_schema::Schema as ArrowSchema;
 use lance_core::cache::LanceCache;
 use lance_encoding::decoder::DecoderPlugins;
 use lance_file::reader::{FileReader, FileReaderOptions};
@@ -163,6 +164,8 @@ impl Store {
             let manifest = read_manifest(&store.objects, &location.path, location.size).await?;
             ensure_can_read_manifest(&manifest)?;
             let indices = read_manifest_indexes(&store.objects, &location, &manifest).await?;
+            // Lance panics on types it does not know, once it is too late to report them.
+            let _ = ArrowSchema::from(&manifest.schema);
             Ok(Some(Version { manifest: Arc::new(manifest), indices }))
         })
     }
@@ -268,6 +271,24 @@ impl Store {
         let plugins = Arc::<DecoderPlugins>::default();
         FileReader::try_open(scheduler, None, plugins, &LanceCache::no_cache(), FileReaderOptions::default()).await
     }
+}
+
+/// The BLAKE3 hash of a file, in hexadecimal.
+pub fn hash_file(path: &Path) -> std::io::Result<String> {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update_reader(std::fs::File::open(path)?)?;
+    Ok(hasher.finalize().to_hex().to_string())
+}
+
+/// The name of a data file with that hash: its content is in its name, so damage is found before it does harm.
+pub fn name_of_hash(hash: &str) -> String {
+    format!("{hash}.lance")
+}
+
+/// The hash in the name of a data file, where it was written here. Other tools name theirs otherwise.
+pub fn hash_in_name(name: &str) -> Option<&str> {
+    let stem = name.strip_suffix(".lance")?;
+    (stem.len() == 64 && stem.bytes().all(|b| b.is_ascii_hexdigit())).then_some(stem)
 }
 
 #[cfg(test)]

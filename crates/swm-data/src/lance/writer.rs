@@ -5,7 +5,7 @@
 //! part of an episode, and a killed process loses the current group at most.
 
 use super::schema::{self, EPISODE, Kind, STEP, StoredColumn};
-use super::store::{Store, Version, table_folder, wait};
+use super::store::{self, Store, Version, table_folder, wait};
 use crate::clip::ACTION;
 use crate::format::{CommitPolicy, WriteMode, WriteOptions, Writer};
 use crate::image::ImageCodec;
@@ -472,8 +472,10 @@ impl Table {
 
     /// Writes episodes to a new data file.
     fn write_fragment(&self, schema: &ArrowSchema, episodes: Vec<RecordBatch>) -> Result<Fragment> {
-        let name = format!("{}.lance", uuid::Uuid::new_v4().simple());
-        let path = self.store.data_path(&name);
+        // Written under a passing name, as the hash is known at the end; killed before, it is a file too many.
+        let passing = format!("{}.lance", uuid::Uuid::new_v4().simple());
+        let path = self.store.data_path(&passing);
+        let data = self.store.folder.join("data");
         let objects = Arc::clone(self.store.objects());
         let version = self.file_version;
         // Field ids are those of the table, which a foreign table may number differently.
@@ -498,6 +500,9 @@ impl Table {
                     return Err(error);
                 }
             };
+            let hash = store::hash_file(&data.join(&passing))?;
+            let name = store::name_of_hash(&hash);
+            std::fs::rename(data.join(&passing), data.join(&name))?;
             let mut ids = vec![];
             let mut columns = vec![];
             for &(id, column) in writer.field_id_to_column_indices() {

@@ -1,91 +1,288 @@
-//! The Lance format: what was written is what is read, whatever happens in between.
+//! The Lance format: what was written is what is read.
 
+use crate::sample::{COLUMNS, check, episode, manifest, options, rows, schema, write};
+use rand::Rng as _;
 use std::path::Path;
-use std::sync::Arc;
-use swm_core::{Batch, ColumnSpec, DType, Manifest, Schema};
-use swm_data::{CommitPolicy, Reader, StepRange, WriteMode, WriteOptions, Writer, create, open};
+use swm_core::{Batch, ColumnSpec, DType, Error, Key, Schema};
+use swm_data::{ImageCodec, StepRange, WriteMode, WriteOptions, column_stats, create, open};
 
-pub fn schema() -> Schema {
-    Schema::new([
-        ColumnSpec::image("pixels", 16, 24),
-        ColumnSpec::new("action", DType::Float32, [2]),
-        ColumnSpec::new("state", DType::Float64, [3]),
-        ColumnSpec::new("reward", DType::Float32, []),
-        ColumnSpec::new("success", DType::Bool, []),
-        ColumnSpec::new("step_idx", DType::Int64, []),
-        ColumnSpec::new("variation.agent.color", DType::Int64, [3]),
-        ColumnSpec::image("goal", 16, 24),
-    ])
-    .expect("schema")
-}
-
-/// Episode `e`: a smooth moving picture, and numbers that say where they belong.
-pub fn episode(e: usize, rows: usize) -> Batch {
-    let mut batch = Batch::zeros(&schema(), rows);
-    batch.par_rows_mut(|t, mut row| {
-        for (i, value) in row.at::<u8>(0).iter_mut().enumerate() {
-            *value = (i / 9 + 3 * t + 20 * e) as u8;
-        }
-        let action = if t + 1 == rows { [f32::NAN; 2] } else { [e as f32, t as f32 / 4.0] };
-        row.set(1, &action);
-        row.set(2, &[e as f64, t as f64, -0.5]);
-        row.set(3, &[t as f32]);
-        row.set(4, &[u8::from(t % 3 == 0)]);
-        row.set(5, &[t as i64]);
-        row.set(6, &[e as i64, 255, 7]);
-        row.at::<u8>(7).fill(100 + e as u8);
-    });
-    batch
-}
-
-pub fn options(mode: WriteMode) -> WriteOptions {
-    WriteOptions {
-        mode,
-        manifest: Some(Manifest::new("collect", 3, serde_json::json!({"env": "test"}))),
-        ..Default::default()
+fn failure(path: &Path, schema: &Schema, mode: WriteMode) -> String {
+    match create(path, schema, options(mode)) {
+        Ok(_) => panic!("{} should be refused", path.display()),
+        Err(error) => error.to_string(),
     }
-}
-
-pub fn write(path: &Path, mode: WriteMode, episodes: std::ops::Range<usize>) {
-    let mut writer = create(path, &schema(), options(mode)).expect("creates");
-    for e in episodes {
-        writer.write_episode(&episode(e, 5 + e)).expect("writes");
-    }
-    writer.finish().expect("finishes");
-}
-
-/// Checks that episode `e` is stored in position `position`.
-pub fn check(reader: &dyn Reader, position: usize, e: usize) {
-    let names: Vec<&str> = schema_names();
-    let expected = episode(e, 5 + e);
-    assert_eq!(reader.episodes()[position].length, expected.rows());
-    let read = reader.read(&names, &[StepRange::new(position, 0, expected.rows())]).expect("reads");
-    assert_eq!(read.schema(), expected.schema());
-    for (i, column) in expected.schema().columns().iter().enumerate() {
-        if column.is_image() {
-            let off = read.bytes(i).iter().zip(expected.bytes(i)).map(|(&a, &b)| a.abs_diff(b)).max();
-            assert!(off.expect("pixels") < 40, "{}: {off:?}", column.name);
-        } else {
-            assert_eq!(read.bytes(i), expected.bytes(i), "{}", column.name);
-        }
-    }
-}
-
-fn schema_names() -> Vec<&'static str> {
-    vec!["pixels", "action", "state", "reward", "success", "step_idx", "variation.agent.color", "goal"]
 }
 
 #[test]
 fn what_is_written_is_read() {
     let folder = tempfile::tempdir().expect("a folder");
-    let path = folder.path().join("with space ü.lance");
-    write(&path, WriteMode::Create, 0..4);
+    let path = folder.path().join("with space ü%20.lance");
+    write(&path, WriteMode::Create, 2, 0..9);
     let reader = open(&path).expect("opens");
-    assert_eq!(reader.episodes().len(), 4);
-    for e in 0..4 {
-        check(&*reader, e, e);
+    assert_eq!(reader.episodes().len(), 9);
+    check(&*reader, 0);
+    assert_eq!(reader.manifest(), Some(manifest(3)));
+    // Names and types are those that were written, the numbering first.
+    let mut expected = vec![ColumnSpec::new("episode_idx", DType::Int32, []), schema().columns()[5].clone()];
+    expected.extend(schema().columns().iter().filter(|c| c.name != "step_idx").cloned());
+    assert_eq!(reader.schema().columns(), expected);
+    // A folder that holds one table names it.
+    assert_eq!(open(folder.path()).expect("opens").episodes(), reader.episodes());
+    let on_disk: u64 = reader.footprint().expect("a footprint").iter().map(|(_, bytes)| bytes).sum();
+    assert!(on_disk > 5_000, "{on_disk}");
+}
+
+#[test]
+fn any_ranges_are_read_in_the_order_asked() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write(&path, WriteMode::Create, 3, 0..12);
+    let reader = open(&path).expect("opens");
+    let mut rng = Key::new(1).rng();
+    for _ in 0..20 {
+        let ranges: Vec<StepRange> = (0..rng.random_range(1..12))
+            .map(|_| {
+                let e = rng.random_range(0..12);
+                let start = rng.random_range(0..rows(e));
+                StepRange::new(e, start, rng.random_range(0..=rows(e) - start))
+            })
+            .collect();
+        let read = reader.read(&["goal", "state", "step_idx", "episode_idx", "pixels"], &ranges).expect("reads");
+        let mut row = 0;
+        for range in &ranges {
+            for t in range.start..range.start + range.length {
+                assert_eq!(read.row(row).at::<f64>(1), [range.episode as f64, t as f64, -0.5]);
+                assert_eq!(read.row(row).at::<i64>(2), [t as i64]);
+                assert_eq!(read.row(row).at::<i32>(3), [range.episode as i32]);
+                assert!(read.row(row).at::<u8>(0)[0].abs_diff(100 + range.episode as u8) < 4);
+                let first = ((3 * t + 20 * range.episode) % 256) as u8;
+                assert!(read.row(row).at::<u8>(4)[0].abs_diff(first) < 40);
+                row += 1;
+            }
+        }
+        assert_eq!(row, read.rows());
     }
-    assert_eq!(reader.manifest().expect("a manifest").seed, 3);
-    let index = reader.schema().find("variation.agent.color").expect("dots come back");
-    assert_eq!(reader.schema().columns()[index].dtype, DType::Int64);
+}
+
+#[test]
+fn wrong_columns_and_rows_say_what_is_right() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write(&path, WriteMode::Create, 3, 0..2);
+    let reader = open(&path).expect("opens");
+    let wrong = |column, range| reader.read(&[column], &[range]).expect_err("wrong").to_string();
+    assert!(wrong("pixel", StepRange::new(0, 0, 1)).contains("did you mean pixels"));
+    assert!(wrong("state", StepRange::new(2, 0, 1)).contains("positions below 2"));
+    assert!(wrong("state", StepRange::new(0, 3, 3)).contains("rows below 5"));
+    let short = reader.read_column("state", &[StepRange::new(0, 0, 1)], &mut [0; 5]).expect_err("too small");
+    assert!(short.to_string().contains("24 for 1 rows"), "{short}");
+    let missing = open(&folder.path().join("none.lance")).err().expect("no dataset").to_string();
+    assert!(missing.contains("there is no such dataset"), "{missing}");
+    let unknown = open(Path::new("/nowhere/at.all")).err().expect("no dataset").to_string();
+    assert!(unknown.contains("no such dataset") && unknown.contains("lance"), "{unknown}");
+}
+
+#[test]
+fn modes_keep_refuse_or_replace() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write(&path, WriteMode::Append, 100, 0..3);
+    assert!(failure(&path, &schema(), WriteMode::Create).contains("exists already"));
+
+    let mut writer = create(&path, &schema(), options(WriteMode::Append)).expect("continues");
+    assert_eq!(writer.episodes(), 3);
+    writer.write_episode(&episode(3)).expect("writes");
+    assert_eq!(writer.episodes(), 4);
+    drop(writer); // as good as `finish`, but cannot say that it failed
+    let reader = open(&path).expect("opens");
+    check(&*reader, 0);
+    assert_eq!(reader.episodes().iter().map(|e| e.index).collect::<Vec<_>>(), [0, 1, 2, 3]);
+
+    // A newer manifest replaces the older one.
+    let newer = WriteOptions { manifest: Some(manifest(4)), ..options(WriteMode::Append) };
+    create(&path, &schema(), newer).expect("continues").finish().expect("finishes");
+    assert_eq!(open(&path).expect("opens").manifest(), Some(manifest(4)));
+
+    write(&path, WriteMode::Overwrite, 100, 5..7);
+    let reader = open(&path).expect("opens");
+    assert_eq!(reader.episodes().len(), 2);
+    check(&*reader, 5);
+    assert_eq!(std::fs::read_dir(path.join("data")).expect("a folder").count(), 1, "old files are removed");
+}
+
+#[test]
+fn an_empty_dataset_opens() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write(&path, WriteMode::Create, 1, 0..0);
+    let reader = open(&path).expect("opens");
+    assert!(reader.episodes().is_empty());
+    assert_eq!(reader.schema().columns().len(), 9);
+    assert_eq!(reader.read(&COLUMNS, &[]).expect("reads").rows(), 0);
+    write(&path, WriteMode::Append, 1, 0..2);
+    check(&*open(&path).expect("opens"), 0);
+}
+
+#[test]
+fn another_schema_is_not_appended() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write(&path, WriteMode::Create, 100, 0..2);
+    let with = |change: &dyn Fn(&mut Vec<ColumnSpec>)| {
+        let mut columns = schema().columns().to_vec();
+        change(&mut columns);
+        failure(&path, &Schema::new(columns).expect("schema"), WriteMode::Append)
+    };
+    assert!(with(&|columns| columns[1].shape = vec![3]).contains("appending to"));
+    assert!(with(&|columns| columns[0].shape = vec![16, 16, 3]).contains("[16, 24, 3]"));
+    assert!(with(&|columns| columns[3].dtype = DType::Float64).contains("reward float32"));
+    assert!(with(&|columns| columns.truncate(4)).contains("the columns it has"));
+    assert!(with(&|columns| columns.push(ColumnSpec::new("more", DType::U8, []))).contains("more"));
+    // Columns in another order are the same columns.
+    let mut columns = schema().columns().to_vec();
+    columns.reverse();
+    let turned = Schema::new(columns).expect("schema");
+    let mut other = Batch::zeros(&turned, rows(2));
+    for (i, column) in turned.columns().iter().enumerate() {
+        other.bytes_mut(i).copy_from_slice(episode(2).bytes(schema().index(&column.name).expect("a column")));
+    }
+    let mut writer = create(&path, &turned, options(WriteMode::Append)).expect("continues");
+    assert!(writer.write_episode(&episode(2)).expect_err("another order").to_string().contains("writing an episode"));
+    writer.write_episode(&other).expect("writes");
+    writer.finish().expect("finishes");
+    check(&*open(&path).expect("opens"), 0);
+}
+
+#[test]
+fn episodes_that_break_the_convention_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut writer = create(&folder.path().join("d.lance"), &schema(), options(WriteMode::Create)).expect("creates");
+    let mut refuse = |change: &dyn Fn(&mut Batch), words: &str| {
+        let mut bad = episode(2);
+        change(&mut bad);
+        let error = writer.write_episode(&bad).expect_err("refused").to_string();
+        assert!(error.contains(words), "{error}");
+    };
+    refuse(&|e| e.get_mut::<f32>("action").expect("actions")[3] = f32::NAN, "row 1 of 7");
+    refuse(&|e| e.get_mut::<f32>("action").expect("actions")[13] = 0.0, "final observation");
+    refuse(&|e| e.get_mut::<i64>("variation.agent.color").expect("colours")[4] = 1 << 30, "within ±2^24");
+    refuse(&|e| e.resize(0), "no rows");
+    assert_eq!(writer.episodes(), 0);
+    writer.write_episode(&episode(0)).expect("a good one is still welcome");
+    writer.finish().expect("finishes");
+
+    let discrete = Schema::new([ColumnSpec::new("action", DType::Int64, [])]).expect("schema");
+    let mut writer = create(&folder.path().join("i.lance"), &discrete, options(WriteMode::Create)).expect("creates");
+    let mut batch = Batch::zeros(&discrete, 3);
+    assert!(writer.write_episode(&batch).expect_err("refused").to_string().contains("-1"));
+    batch.get_mut::<i64>("action").expect("actions")[2] = -1;
+    writer.write_episode(&batch).expect("writes");
+    batch.get_mut::<i64>("action").expect("actions")[0] = -1;
+    assert!(writer.write_episode(&batch).is_err());
+}
+
+#[test]
+fn the_content_hash_knows_content_not_files() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = |name: &str| folder.path().join(name);
+    write(&path("a.lance"), WriteMode::Create, 1, 0..5);
+    write(&path("b.lance"), WriteMode::Create, 100, 0..3);
+    write(&path("b.lance"), WriteMode::Append, 100, 3..5);
+    write(&path("c.lance"), WriteMode::Create, 1, 1..6);
+    let hash = |name: &str| open(&path(name)).expect("opens").content_hash().expect("a hash");
+    assert_eq!(hash("a.lance"), hash("b.lance"));
+    assert_ne!(hash("a.lance"), hash("c.lance"));
+}
+
+#[test]
+fn pictures_can_be_lossless() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    let lossless = WriteOptions { codec: ImageCodec::Png, ..options(WriteMode::Create) };
+    let mut writer = create(&path, &schema(), lossless).expect("creates");
+    writer.write_episode(&episode(1)).expect("writes");
+    writer.finish().expect("finishes");
+    let reader = open(&path).expect("opens");
+    let read = reader.read(&["pixels"], &[StepRange::new(0, 0, rows(1))]).expect("reads");
+    assert_eq!(read.bytes(0), episode(1).bytes(0));
+    let silly = WriteOptions { codec: ImageCodec::Jpeg { quality: 0 }, ..options(WriteMode::Create) };
+    let error = create(&folder.path().join("e.lance"), &schema(), silly).err().expect("refused");
+    assert!(error.is_usage());
+}
+
+#[test]
+fn many_threads_read_at_once() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write(&path, WriteMode::Create, 2, 0..12);
+    let reader = open(&path).expect("opens");
+    std::thread::scope(|scope| {
+        for _ in 0..8 {
+            scope.spawn(|| {
+                for _ in 0..5 {
+                    check(&*reader, 0);
+                }
+            });
+        }
+    });
+}
+
+#[test]
+fn one_writer_at_a_time() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    let mut first = create(&path, &schema(), options(WriteMode::Append)).expect("creates");
+    let mut second = create(&path, &schema(), options(WriteMode::Append)).expect("continues");
+    first.write_episode(&episode(0)).expect("writes");
+    first.finish().expect("finishes");
+    second.write_episode(&episode(0)).expect("takes it");
+    let error = second.finish().expect_err("the first was faster").to_string();
+    assert!(error.contains("another process"), "{error}");
+    check(&*open(&path).expect("opens"), 0);
+}
+
+#[test]
+fn old_versions_do_not_pile_up() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write(&path, WriteMode::Create, 1, 0..30);
+    let versions = std::fs::read_dir(path.join("_versions")).expect("a folder").count();
+    assert!(versions <= 10, "{versions} files");
+    assert_eq!(open(&path).expect("opens").episodes().len(), 30);
+}
+
+#[test]
+fn places_that_cannot_be_written_say_why() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = folder.path().join("file");
+    std::fs::write(&file, "not a folder").expect("writes");
+    let error = failure(&file.join("d.lance"), &schema(), WriteMode::Create);
+    assert!(error.contains("Not a directory"), "{error}");
+    // Not even the administrator may write here.
+    let error = create(Path::new("/proc/d.lance"), &schema(), options(WriteMode::Create)).err().expect("refused");
+    assert!(matches!(error, Error::Io { .. }), "{error}");
+    // Somebody else's folder is left alone.
+    let other = folder.path().join("other.lance");
+    std::fs::create_dir(&other).expect("a folder");
+    std::fs::write(other.join("thesis.tex"), "years of work").expect("writes");
+    for mode in [WriteMode::Create, WriteMode::Append, WriteMode::Overwrite] {
+        assert!(failure(&other, &schema(), mode).contains("thesis.tex"));
+    }
+    assert!(open(&other).err().expect("no dataset").to_string().contains("no Lance table"));
+}
+
+#[test]
+fn statistics_leave_missing_numbers_out() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write(&path, WriteMode::Create, 3, 0..4);
+    let reader = open(&path).expect("opens");
+    let stats = column_stats(&*reader, "action", Some(&[1, 3])).expect("statistics");
+    let first: Vec<f64> = [1.0; 5].into_iter().chain([3.0; 7]).collect();
+    let mean = first.iter().sum::<f64>() / 12.0;
+    let std = (first.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / 12.0).sqrt();
+    assert_eq!(stats.count, [12, 12]);
+    assert!((stats.mean[0] - mean).abs() < 1e-12 && (stats.std[0] - std).abs() < 1e-12);
+    assert_eq!((stats.min[1], stats.max[1]), (0.0, 1.5));
+    assert!(column_stats(&*reader, "pixels", None).is_err());
 }

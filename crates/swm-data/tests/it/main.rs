@@ -1,3 +1,8 @@
 //! Datasets on disk, in one test binary.
 
+mod damage;
+mod foreign;
+mod interruption;
 mod lance;
+mod loader;
+mod sample;

@@ -1,0 +1,164 @@
+//! Datasets of the published `stable-worldmodel`, and ours in its hands. `tests/interop` holds a dataset that
+//! its writer wrote, the script that made it, and the script that opens ours there.
+
+use crate::sample::{episode, options, rows, schema, write};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use swm_core::{Batch, ColumnSpec, DType, Schema};
+use swm_data::{StepRange, WriteMode, create, open};
+
+fn interop() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop")
+}
+
+/// The columns that `export.py` writes.
+fn their_schema() -> Schema {
+    Schema::new([
+        ColumnSpec::image("pixels", 24, 32),
+        ColumnSpec::new("action", DType::Float32, [2]),
+        ColumnSpec::new("reward", DType::Float32, [1]),
+        ColumnSpec::new("variation_agent_color", DType::Float32, [3]),
+    ])
+    .expect("schema")
+}
+
+/// Episode `e` of `export.py`; its third one ends with action 0.
+fn their_episode(e: usize) -> Batch {
+    let rows = 6 + e;
+    let mut batch = Batch::zeros(&their_schema(), rows);
+    batch.par_rows_mut(|t, mut row| {
+        for (i, rgb) in row.at::<u8>(0).chunks_exact_mut(3).enumerate() {
+            rgb.copy_from_slice(&[(4 * (i / 32) + 10 * e) as u8, (4 * (i % 32) + t) as u8, 90]);
+        }
+        let last = if e == 2 { 0.0 } else { f32::NAN };
+        row.set(1, &if t + 1 == rows { [last; 2] } else { [e as f32, t as f32 / 4.0] });
+        row.set(2, &[t as f32]);
+        row.set(3, &[e as f32, 255.0, 7.0]);
+    });
+    batch
+}
+
+fn check_theirs(path: &Path, episodes: usize) {
+    let reader = open(path).expect("opens");
+    assert_eq!(reader.schema().columns()[2..], *their_schema().columns());
+    assert_eq!(reader.episodes().len(), episodes);
+    for e in 0..episodes {
+        let expected = their_episode(e);
+        let names: Vec<&str> = their_schema().columns().iter().map(|_| "").collect();
+        assert_eq!(names.len(), 4);
+        let read = reader
+            .read(
+                &["pixels", "action", "reward", "variation_agent_color"],
+                &[StepRange::new(e, 0, reader.episodes()[e].length)],
+            )
+            .expect("reads");
+        assert_eq!(read.rows(), expected.rows());
+        for column in 1..4 {
+            // Compared as text, in which NaN equals NaN.
+            let text = |b: &Batch| format!("{:?}", bytemuck_f32(b.bytes(column)));
+            assert_eq!(text(&read), text(&expected), "column {column} of episode {e}");
+        }
+        let off: f64 = read.bytes(0).iter().zip(expected.bytes(0)).map(|(&a, &b)| f64::from(a.abs_diff(b))).sum();
+        assert!(off / (expected.bytes(0).len() as f64) < 3.0, "{off}");
+    }
+}
+
+fn bytemuck_f32(bytes: &[u8]) -> Vec<f32> {
+    bytes.chunks_exact(4).map(|b| f32::from_ne_bytes([b[0], b[1], b[2], b[3]])).collect()
+}
+
+#[test]
+fn a_dataset_of_the_reference_opens_here() {
+    check_theirs(&interop().join("reference.lance"), 3);
+    let text = open(&interop().join("reference-text.lance")).expect("opens");
+    let names: Vec<&str> = text.schema().columns().iter().map(|c| c.name.as_str()).collect();
+    assert_eq!(names, ["episode_idx", "step_idx", "state"], "text is left out");
+}
+
+fn copy(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).expect("a folder");
+    for entry in std::fs::read_dir(from).expect("a folder") {
+        let entry = entry.expect("an entry");
+        let target = to.join(entry.file_name());
+        if entry.path().is_dir() {
+            copy(&entry.path(), &target);
+        } else {
+            std::fs::copy(entry.path(), target).expect("copies");
+        }
+    }
+}
+
+/// Continues a copy of the reference's dataset with two episodes of ours.
+fn continued(folder: &Path) -> PathBuf {
+    let path = folder.join("continued.lance");
+    copy(&interop().join("reference.lance"), &path);
+    let mut writer = create(&path, &their_schema(), options(WriteMode::Append)).expect("continues");
+    assert_eq!(writer.episodes(), 3);
+    writer.write_episode(&their_episode(3)).expect("writes");
+    writer.write_episode(&their_episode(4)).expect("writes");
+    writer.finish().expect("finishes");
+    path
+}
+
+#[test]
+fn a_dataset_of_the_reference_is_continued_here() {
+    let folder = tempfile::tempdir().expect("a folder");
+    check_theirs(&continued(folder.path()), 5);
+}
+
+#[test]
+fn our_datasets_open_in_the_reference() {
+    let Some(python) = std::env::var_os("SWM_REFERENCE_PYTHON") else {
+        println!("SKIPPED: set SWM_REFERENCE_PYTHON to a Python with stable-worldmodel and pylance");
+        return;
+    };
+    let folder = tempfile::tempdir().expect("a folder");
+    let ours = folder.path().join("ours.lance");
+    write(&ours, WriteMode::Create, 2, 0..5);
+    write(&ours, WriteMode::Append, 100, 5..8);
+    let theirs = continued(folder.path());
+    let mut command = Command::new(python);
+    command.arg("-B").arg(interop().join("check.py")).args([&ours, &theirs]);
+    let output = command.output().expect("Python runs");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let text = String::from_utf8(output.stdout).expect("text");
+    let seen: Vec<Value> = text.lines().map(|line| serde_json::from_str(line).expect("JSON")).collect();
+
+    let lengths = |value: &Value| -> Vec<u64> {
+        value["lengths"].as_array().expect("a list").iter().map(|v| v.as_u64().expect("a number")).collect()
+    };
+    assert_eq!(lengths(&seen[0]), (0..8).map(|e| rows(e) as u64).collect::<Vec<_>>());
+    assert_eq!(lengths(&seen[1]), [6, 7, 8, 9, 10]);
+    let mut expected = vec![];
+    let mut means = vec![];
+    for e in 0..8 {
+        let batch = episode(e);
+        for t in 0..rows(e) {
+            expected.push((e as i64, t as i64));
+            let frame = batch.row(t).get::<u8>("pixels").expect("pictures");
+            means.push(frame.iter().map(|&v| f64::from(v)).sum::<f64>() / frame.len() as f64);
+        }
+    }
+    let numbers =
+        |value: &Value| -> Vec<Option<f64>> { value.as_array().expect("a list").iter().map(Value::as_f64).collect() };
+    let column = |name: &str| numbers(&seen[0]["columns"][name]);
+    for (i, &(e, t)) in expected.iter().enumerate() {
+        assert_eq!(seen[0]["episode_idx"][i], e);
+        assert_eq!(seen[0]["step_idx"][i], t);
+        let last = t as usize + 1 == rows(e as usize);
+        assert_eq!(column("action")[2 * i], (!last).then_some(e as f64));
+        assert_eq!(column("state")[3 * i + 1], Some(t as f64));
+        assert_eq!(column("variation_agent_color")[3 * i + 1], Some(255.0));
+        assert_eq!(column("reward")[i], Some(t as f64));
+        let mean = seen[0]["pixel_means"][i].as_f64().expect("a mean");
+        assert!((mean - means[i]).abs() < 4.0, "{mean} {}", means[i]);
+    }
+    // Both see the same clips: 2 steps with frameskip 2 take 4 rows.
+    let clips: usize = (0..8).map(|e| rows(e) - 3).sum();
+    assert_eq!(seen[0]["clips"], clips);
+    assert_eq!(seen[0]["clip_action_shape"], serde_json::json!([2, 4]));
+    assert_eq!(numbers(&seen[0]["clip_action"])[1], Some(0.25));
+    assert_eq!(seen[0]["clip_pixels_shape"], serde_json::json!([2, 3, 16, 24]));
+    assert_eq!(schema().columns().len(), 8);
+}

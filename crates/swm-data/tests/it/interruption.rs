@@ -1,0 +1,104 @@
+//! Writers that are killed, or run out of space: what was committed stays, and nothing is half there.
+
+use crate::sample::{check, episode, options, schema, write};
+use std::io::{BufRead as _, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::Duration;
+use swm_data::{CommitPolicy, WriteMode, WriteOptions, create, open};
+
+/// Where the child process writes; only set for it.
+const TARGET: &str = "SWM_TEST_CHILD_TARGET";
+
+/// Not a test of its own: the process that the tests below kill or starve. Writes episodes for ever, a line
+/// each; stops at an error, and prints it.
+#[test]
+fn child() {
+    let Some(path) = std::env::var_os(TARGET).map(PathBuf::from) else { return };
+    let commit = CommitPolicy { episodes: 3, interval: Duration::from_millis(20), ..CommitPolicy::default() };
+    let mut writer = create(&path, &schema(), WriteOptions { commit, ..options(WriteMode::Append) }).expect("creates");
+    for e in writer.episodes()..100_000 {
+        if let Err(error) = writer.write_episode(&episode(e)) {
+            println!("failed: {error}");
+            return;
+        }
+        println!("episode {e}");
+    }
+}
+
+/// The command that runs [`child`], below `shell`, which sets its limits.
+fn run_child(path: &Path, shell: &str) -> Command {
+    let mut command = Command::new("sh");
+    let program = std::env::current_exe().expect("this program");
+    command.args(["-c", &format!("{shell} exec \"$0\" --exact interruption::child --nocapture")]).arg(program);
+    command.env(TARGET, path).stdout(Stdio::piped()).stderr(Stdio::null());
+    command
+}
+
+#[test]
+fn a_killed_writer_keeps_finished_episodes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    let mut stored = 0;
+    for written in [7, 20, 33] {
+        let mut child = run_child(&path, "").spawn().expect("starts");
+        let mut lines = BufReader::new(child.stdout.take().expect("its output")).lines();
+        let mut seen = 0;
+        while seen < written {
+            let line = lines.next().expect("more lines").expect("text");
+            seen += usize::from(line.contains("episode "));
+        }
+        child.kill().expect("killed");
+        child.wait().expect("gone");
+        let reader = open(&path).expect("still opens");
+        // Three episodes make a group; two more may wait for the committing thread, three be on their way.
+        let now = reader.episodes().len();
+        assert!(now + 9 > stored + written, "{now} episodes of {}", stored + written);
+        check(&*reader, 0);
+        stored = now;
+    }
+    write(&path, WriteMode::Append, 2, stored..stored + 2);
+    let reader = open(&path).expect("opens");
+    assert_eq!(reader.episodes().len(), stored + 2);
+    check(&*reader, 0);
+}
+
+/// Runs the child until it fails, and checks what it says and leaves.
+fn starve(path: &Path, shell: &str, words: &str) {
+    let output = run_child(path, shell).output().expect("runs");
+    let text = String::from_utf8_lossy(&output.stdout);
+    let failure = text.lines().find(|line| line.starts_with("failed: ")).unwrap_or_else(|| panic!("{text}"));
+    assert!(failure.contains(words), "{failure}");
+    let written = text.lines().filter(|line| line.starts_with("episode ")).count();
+    let reader = open(path).expect("still opens");
+    assert!(reader.episodes().len() + 9 > written, "{} of {written}", reader.episodes().len());
+    check(&*reader, 0);
+}
+
+#[test]
+fn files_that_may_not_grow_keep_finished_episodes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write(&path, WriteMode::Create, 1, 0..4);
+    // A fragment of three episodes is larger than 8 blocks; the existing manifests are not.
+    starve(&path, "trap '' XFSZ; ulimit -f 8;", "File too large");
+    assert_eq!(open(&path).expect("opens").episodes().len(), 4);
+}
+
+#[test]
+fn a_full_disk_keeps_finished_episodes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mount = Command::new("mount").args(["-t", "tmpfs", "-o", "size=1m", "tmpfs"]).arg(folder.path()).output();
+    if !mount.is_ok_and(|output| output.status.success()) {
+        println!("SKIPPED: mounting a small file system needs more rights than this test has");
+        return;
+    }
+    struct Mounted<'a>(&'a Path);
+    impl Drop for Mounted<'_> {
+        fn drop(&mut self) {
+            let _ = Command::new("umount").arg("-l").arg(self.0).status();
+        }
+    }
+    let _mounted = Mounted(folder.path());
+    starve(&folder.path().join("d.lance"), "", "No space left on device");
+}

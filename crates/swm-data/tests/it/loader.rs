@@ -1,0 +1,161 @@
+//! The loader: every clip once an epoch, in an order that the seed decides, whatever the threads.
+
+use crate::sample::{rows, write};
+use std::path::PathBuf;
+use std::sync::Arc;
+use swm_core::{Batch, DType};
+use swm_data::{ClipSpec, Loader, LoaderConfig, Reader, WriteMode, open};
+
+const EPISODES: usize = 9;
+
+fn dataset(group: usize) -> (tempfile::TempDir, PathBuf) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write(&path, WriteMode::Create, group, 0..EPISODES);
+    (folder, path)
+}
+
+fn config(num_steps: usize, frameskip: usize) -> LoaderConfig {
+    let columns = ["pixels", "action", "state"].map(str::to_owned).to_vec();
+    LoaderConfig {
+        clip: ClipSpec { num_steps, frameskip, columns },
+        batch_size: 4,
+        seed: 11,
+        cache_bytes: 0,
+        ..LoaderConfig::default()
+    }
+}
+
+fn load(reader: &Arc<dyn Reader>, config: LoaderConfig, epoch: u64, first: usize) -> Vec<Batch> {
+    let loader = Loader::new(Arc::clone(reader), config).expect("a loader");
+    let batches: Vec<Batch> = loader.epoch(epoch, first).map(|batch| batch.expect("a batch")).collect();
+    assert_eq!(batches.len(), loader.batches_per_epoch() - first);
+    batches
+}
+
+/// `(episode, first row)` of every clip, from its states.
+fn clips(batches: &[Batch]) -> Vec<(usize, usize)> {
+    let mut found = vec![];
+    for batch in batches {
+        for row in 0..batch.rows() {
+            let state = batch.row(row).get::<f64>("state").expect("states");
+            found.push((state[0] as usize, state[1] as usize));
+        }
+    }
+    found
+}
+
+fn bytes(batches: &[Batch]) -> Vec<Vec<u8>> {
+    batches.iter().flat_map(|b| (0..b.schema().columns().len()).map(|c| b.bytes(c).to_vec())).collect()
+}
+
+#[test]
+fn every_clip_comes_once_and_holds_its_rows() {
+    let (_folder, path) = dataset(2);
+    let reader = open(&path).expect("opens");
+    let (steps, skip) = (2, 3);
+    let batches = load(&reader, config(steps, skip), 0, 0);
+    let mut expected: Vec<(usize, usize)> =
+        (0..EPISODES).flat_map(|e| (0..(rows(e) + 1).saturating_sub(steps * skip)).map(move |s| (e, s))).collect();
+    let mut found = clips(&batches);
+    assert_ne!(found, expected, "shuffled");
+    found.sort_unstable();
+    expected.sort_unstable();
+    assert_eq!(found, expected);
+    for batch in &batches {
+        assert_eq!(batch.schema().columns()[1].shape, [steps, 2 * skip]);
+        for row in 0..batch.rows() {
+            let state = batch.row(row).get::<f64>("state").expect("states");
+            let (e, start) = (state[0] as usize, state[1] as usize);
+            for k in 0..steps {
+                assert_eq!(state[3 * k..3 * k + 2], [e as f64, (start + k * skip) as f64]);
+                let frame = batch.row(row).get::<u8>("pixels").expect("pictures");
+                let frame = &frame[k * 16 * 24 * 3..(k + 1) * 16 * 24 * 3];
+                let first = ((3 * (start + k * skip) + 20 * e) % 256) as u8;
+                assert!(frame[0].abs_diff(first) < 40, "{} {first}", frame[0]);
+            }
+            // Actions of the skipped rows, in order; only that of an episode's last row is missing.
+            let action = batch.row(row).get::<f32>("action").expect("actions");
+            for (i, pair) in action.chunks_exact(2).enumerate() {
+                if start + i + 1 == rows(e) {
+                    assert!(pair.iter().all(|v| v.is_nan()) && i + 1 == steps * skip);
+                } else {
+                    assert_eq!(pair, [e as f32, (start + i) as f32 / 4.0]);
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn the_order_depends_on_seed_and_epoch_alone() {
+    let (_folder, path) = dataset(2);
+    let (_other_folder, other_path) = dataset(100);
+    let reader = open(&path).expect("opens");
+    let other = open(&other_path).expect("opens");
+    let base = load(&reader, config(3, 1), 5, 0);
+    for threads in [0, 1, 4] {
+        for prefetch in [1, 3] {
+            for cache_bytes in [0, 1 << 30] {
+                let config = LoaderConfig { threads, prefetch, cache_bytes, ..config(3, 1) };
+                assert!(bytes(&load(&reader, config.clone(), 5, 0)) == bytes(&base), "{threads} {prefetch}");
+                assert!(bytes(&load(&other, config.clone(), 5, 0)) == bytes(&base), "other files");
+                assert!(bytes(&load(&reader, config, 5, 4)) == bytes(&base[4..]), "resumed");
+            }
+        }
+    }
+    assert_ne!(clips(&load(&reader, config(3, 1), 6, 0)), clips(&base));
+    assert_ne!(clips(&load(&reader, LoaderConfig { seed: 12, ..config(3, 1) }, 5, 0)), clips(&base));
+    let plain = clips(&load(&reader, LoaderConfig { shuffle: false, ..config(3, 1) }, 5, 0));
+    assert!(plain.is_sorted());
+}
+
+#[test]
+fn episodes_batches_and_cache_are_as_configured() {
+    let (_folder, path) = dataset(2);
+    let reader = open(&path).expect("opens");
+    let some = LoaderConfig { episodes: Some(vec![7, 2]), cache_bytes: 1 << 30, ..config(2, 1) };
+    let loader = Loader::new(Arc::clone(&reader), some.clone()).expect("a loader");
+    assert!(loader.is_cached());
+    assert_eq!(loader.clips(), rows(2) + rows(7) - 2);
+    let mut episodes: Vec<usize> = clips(&load(&reader, some.clone(), 0, 0)).iter().map(|c| c.0).collect();
+    episodes.sort_unstable();
+    episodes.dedup();
+    assert_eq!(episodes, [2, 7]);
+    let full = load(&reader, LoaderConfig { drop_last: true, ..some }, 0, 0);
+    assert!(full.iter().all(|batch| batch.rows() == 4));
+    // An epoch may be left early, and one past the end is empty.
+    let loader = Loader::new(Arc::clone(&reader), config(1, 1)).expect("a loader");
+    assert!(!loader.is_cached());
+    assert_eq!(loader.epoch(0, 0).take(2).count(), 2);
+    assert_eq!(loader.epoch(0, loader.batches_per_epoch()).count(), 0);
+    assert_eq!(loader.schema().columns()[0].shape, [1, 16, 24, 3]);
+    assert_eq!(loader.schema().columns()[2].dtype, DType::Float64);
+}
+
+#[test]
+fn wrong_wishes_say_what_is_right() {
+    let (_folder, path) = dataset(100);
+    let reader = open(&path).expect("opens");
+    let wrong = |config| Loader::new(Arc::clone(&reader), config).err().expect("refused").to_string();
+    let columns = |name: &str| ClipSpec { columns: vec![name.to_owned()], ..config(1, 1).clip };
+    assert!(wrong(LoaderConfig { clip: columns("actions"), ..config(1, 1) }).contains("did you mean action"));
+    assert!(wrong(config(4, 4)).contains("the longest has 11"));
+    assert!(wrong(LoaderConfig { batch_size: 0, ..config(1, 1) }).contains("batch_size"));
+    assert!(wrong(LoaderConfig { episodes: Some(vec![9]), ..config(1, 1) }).contains("positions below 9"));
+    assert!(wrong(LoaderConfig { batch_size: 1000, drop_last: true, ..config(1, 1) }).contains("drop_last"));
+}
+
+#[test]
+fn a_damaged_dataset_ends_the_epoch_with_an_error() {
+    let (_folder, path) = dataset(2);
+    let reader = open(&path).expect("opens");
+    for entry in std::fs::read_dir(path.join("data")).expect("a folder") {
+        std::fs::File::create(entry.expect("an entry").path()).expect("emptied");
+    }
+    for threads in [0, 2] {
+        let loader = Loader::new(Arc::clone(&reader), LoaderConfig { threads, ..config(2, 1) }).expect("a loader");
+        let results: Vec<_> = loader.epoch(0, 0).collect();
+        assert!(results.last().is_some_and(Result::is_err), "{threads} threads");
+    }
+}

@@ -131,6 +131,31 @@ impl World {
     }
 }
 
+/// Checks that a collection may be continued: its dataset comes from the same environment, policy, seed and
+/// request, whatever number of episodes was wanted then.
+///
+/// # Errors
+/// When something differs; names it.
+pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
+    let differs = |what: &str, stored: String, wanted: String| {
+        Err(Error::config(
+            format!("continuing a collection with {what} {wanted}"),
+            format!("its episodes were collected with {stored}"),
+            "ask for the same again, or collect into another dataset",
+        ))
+    };
+    if stored.seed != wanted.seed {
+        return differs("seed", stored.seed.to_string(), wanted.seed.to_string());
+    }
+    for what in ["env", "policy", "max_episode_steps", "variation", "image", "goal"] {
+        let (stored, wanted) = (&stored.config[what], &wanted.config[what]);
+        if stored != wanted {
+            return differs(what, stored.to_string(), wanted.to_string());
+        }
+    }
+    Ok(())
+}
+
 /// The writer's side: stores what comes and sends the empty batches back. Works on the world's threads, so
 /// that its setting bounds the encoding of pictures as well.
 fn write_all(

@@ -56,7 +56,8 @@ impl World {
             "variation": starts.variation(),
             "image": image,
         });
-        Manifest { hashes: starts.hashes(), ..Manifest::new("evaluate", starts.seed(), what) }
+        let hashes = [("starts".to_owned(), starts.hash())].into();
+        Manifest { hashes, ..Manifest::new("evaluate", starts.seed(), what) }
     }
 
     /// Plays every start once and judges it. Each slot takes the next start when it is free; what an episode

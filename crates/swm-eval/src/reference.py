@@ -5,6 +5,7 @@ Answers are lines that begin with `SWM `; whatever else the reference prints is 
 
 import sys
 import time
+from importlib.metadata import version
 
 import lance
 import numpy as np
@@ -41,7 +42,7 @@ def answer(*words):
     print("SWM", *words, flush=True)
 
 
-answer("ready", getattr(swm, "__version__", "of unknown version"))
+answer("ready", version("stable-worldmodel"))
 for line in sys.stdin:
     command, *arguments = line.rstrip("\n").split("\t")
     answer(*(step(float(arguments[0])) if command == "step" else collect(*arguments)))

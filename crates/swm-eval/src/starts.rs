@@ -3,7 +3,7 @@
 
 use crate::world::{episode_key, reset, reset_seed};
 use rand::Rng as _;
-use std::collections::{BTreeMap, HashSet};
+use std::collections::HashSet;
 use swm_core::{Batch, ColumnSpec, EnvPool, EnvSpec, Error, Key, Result, Schema, VariationRequest, manifest};
 use swm_data::{Reader, StepRange};
 
@@ -24,8 +24,6 @@ struct Rows {
     goal_offset: usize,
     /// The start and the goal of every pick, one after the other.
     rows: Batch,
-    /// The dataset's content, for the manifest.
-    content: String,
 }
 
 impl Starts {
@@ -80,8 +78,7 @@ impl Starts {
         }
         let names: Vec<&str> = columns.iter().map(String::as_str).collect();
         let rows = renamed(reader.read(&names, &ranges)?)?;
-        let content = reader.content_hash()?;
-        Ok(Self { seed, n: picks.len(), variation, dataset: Some(Rows { picks, goal_offset, rows, content }) })
+        Ok(Self { seed, n: picks.len(), variation, dataset: Some(Rows { picks, goal_offset, rows }) })
     }
 
     /// Chooses `n` different starts of a dataset, uniformly among all whose goal lies in the same episode.
@@ -155,18 +152,19 @@ impl Starts {
         self.dataset.as_ref().map(|dataset| dataset.picks[episode])
     }
 
-    /// BLAKE3 hashes of what the starts are made of, for a manifest: `starts` (the reset seeds, and the rows
-    /// picked, if any) and `dataset` (its content).
-    pub fn hashes(&self) -> BTreeMap<String, String> {
+    /// A BLAKE3 hash of what the starts are made of, for a manifest: the reset seeds, and which rows of the dataset
+    /// were picked and what they hold, if any. The rest of a dataset decides nothing here.
+    pub fn hash(&self) -> String {
         let mut bytes: Vec<u8> = (0..self.n).flat_map(|i| self.reset_seed(i).to_le_bytes()).collect();
-        let mut hashes = BTreeMap::new();
-        if let Some(dataset) = &self.dataset {
-            let numbers = dataset.picks.iter().flatten().chain([&dataset.goal_offset]);
+        if let Some(Rows { picks, goal_offset, rows }) = &self.dataset {
+            let numbers = picks.iter().flatten().chain([goal_offset]);
             bytes.extend(numbers.flat_map(|&number| (number as u64).to_le_bytes()));
-            hashes.insert("dataset".to_owned(), dataset.content.clone());
+            for (i, column) in rows.schema().columns().iter().enumerate() {
+                bytes.extend_from_slice(column.name.as_bytes());
+                bytes.extend_from_slice(rows.bytes(i));
+            }
         }
-        hashes.insert("starts".to_owned(), manifest::hash(&bytes));
-        hashes
+        manifest::hash(&bytes)
     }
 
     pub(crate) fn key(&self, episode: usize) -> Key {

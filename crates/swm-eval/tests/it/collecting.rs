@@ -5,6 +5,7 @@ use crate::memory::Memory;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use swm_core::{Batch, DType, Error, Key, Policy, RandomPolicy, Result, VariationRequest};
+use swm_eval::collect::check_continues;
 use swm_eval::{CollectConfig, Collected, Control, World, WorldConfig};
 
 fn world(envs: usize, threads: usize) -> World {
@@ -172,4 +173,10 @@ fn the_manifest_says_what_was_asked_and_not_how_it_ran() {
     assert_eq!((manifest.kind.as_str(), manifest.seed), ("collect", 11));
     assert_eq!(manifest.config["env"], "test/Line-v0");
     assert_eq!(manifest.config["image"], serde_json::json!([2, 3]));
+    let other = |config: CollectConfig| check_continues(&manifest, &world(1, 1).collect_manifest(&config));
+    other(config(500)).expect("more of the same");
+    let seed = other(CollectConfig { seed: 12, ..config(9) }).expect_err("another seed").to_string();
+    assert!(seed.contains("seed 12") && seed.contains("11"), "{seed}");
+    let policy = other(CollectConfig { policy: "expert".to_owned(), ..config(9) }).expect_err("another policy");
+    assert!(policy.to_string().contains("\"expert\""), "{policy}");
 }

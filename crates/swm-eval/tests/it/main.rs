@@ -3,5 +3,6 @@
 mod benching;
 mod collecting;
 mod evaluating;
+mod lance;
 mod line;
 mod memory;

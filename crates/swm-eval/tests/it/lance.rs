@@ -1,0 +1,90 @@
+//! A real world, a real dataset on disk, and back: what was collected is what is evaluated.
+
+use std::path::Path;
+use swm_core::policy::ExpertPolicy;
+use swm_core::{Error, RandomPolicy, VariationRequest};
+use swm_data::{WriteMode, WriteOptions};
+use swm_envs::two_room::ENTRY;
+use swm_eval::{CollectConfig, Collected, Control, EvalConfig, Starts, World, WorldConfig};
+
+fn world(envs: usize, threads: usize) -> World {
+    World::new(&ENTRY, WorldConfig { envs, image: Some((28, 28)), max_episode_steps: Some(60), threads })
+        .expect("a world")
+}
+
+fn expert(world: &World) -> ExpertPolicy {
+    let experts = (0..world.pool().len()).map(|_| (ENTRY.experts[0].make)()).collect();
+    ExpertPolicy::new(world.spec(), experts)
+}
+
+fn collect(path: &Path, mode: WriteMode, envs: usize, episodes: usize) -> Collected {
+    let mut world = world(envs, 2);
+    let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
+    let config = CollectConfig { episodes, seed: 4, variation, policy: "expert".to_owned(), goal: false };
+    let manifest = Some(world.collect_manifest(&config));
+    let options = WriteOptions { mode, manifest, ..WriteOptions::default() };
+    let schema = world.collect_schema(config.goal).expect("schema");
+    let writer = swm_data::create(path, &schema, options).expect("a dataset");
+    let mut policy = expert(&world);
+    world.collect(&mut policy, writer, &config, &mut Control::default()).expect("collected")
+}
+
+#[test]
+fn resumed_collections_have_the_content_of_uninterrupted_ones() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let [whole, parts] = ["whole.lance", "parts.lance"].map(|name| folder.path().join(name));
+    collect(&whole, WriteMode::Create, 8, 12);
+    collect(&parts, WriteMode::Create, 3, 5);
+    let resumed = collect(&parts, WriteMode::Append, 1, 12);
+    assert_eq!((resumed.episodes, resumed.added), (12, 7));
+    let [whole, parts] = [whole, parts].map(|path| swm_data::open(&path).expect("a dataset"));
+    assert_eq!(whole.content_hash().expect("hash"), parts.content_hash().expect("hash"));
+    assert_eq!(whole.manifest(), parts.manifest());
+    assert_eq!(whole.manifest().expect("a manifest").config["env"], "swm/TwoRoom-v1");
+}
+
+#[test]
+fn recorded_goals_are_within_the_experts_reach() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("rooms.lance");
+    collect(&path, WriteMode::Create, 4, 10);
+    let reader = swm_data::open(&path).expect("a dataset");
+    let picks = Starts::choose(&*reader, 20, 6, 0).expect("picks");
+    let mut world = world(5, 2);
+    let spec = world.spec().clone();
+    let evaluate = |world: &mut World, random: bool, variation: VariationRequest| {
+        let starts = Starts::from_dataset(&*reader, &spec, picks.clone(), 6, 0, variation).expect("starts");
+        let config = EvalConfig { budget: Some(30), ..EvalConfig::default() };
+        let control = &mut Control::default();
+        if random {
+            world.evaluate(&mut RandomPolicy::new(&spec, 5), &starts, &config, control).expect("a run")
+        } else {
+            let mut policy = expert(world);
+            world.evaluate(&mut policy, &starts, &config, control).expect("a run")
+        }
+    };
+    let expert = evaluate(&mut world, false, VariationRequest::default());
+    let random = evaluate(&mut world, true, VariationRequest::default());
+    assert!(expert.success.rate > 0.8, "{:?}", expert.success);
+    assert!(expert.success.low > random.success.high, "{:?} beside {:?}", expert.success, random.success);
+    assert_eq!(expert.solved_at_start, random.solved_at_start, "the same starts");
+    let color = VariationRequest { variation: Some(vec!["agent.color".to_owned()]), ..VariationRequest::default() };
+    assert_eq!(evaluate(&mut world, false, color).success, expert.success, "a colour changes nothing for the expert");
+}
+
+#[test]
+fn a_dataset_of_another_world_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("line.lance");
+    let line = WorldConfig { envs: 1, image: None, max_episode_steps: None, threads: 1 };
+    let mut line = World::new(&crate::line::ENTRY, line).expect("a world");
+    let config = CollectConfig { episodes: 1, ..CollectConfig::default() };
+    let writer = swm_data::create(&path, &line.collect_schema(false).expect("schema"), WriteOptions::default());
+    let writer = writer.expect("a dataset");
+    line.collect(&mut crate::line::Walker, writer, &config, &mut Control::default()).expect("collected");
+    let reader = swm_data::open(&path).expect("a dataset");
+    let spec = world(1, 1).spec().clone();
+    let starts = Starts::from_dataset(&*reader, &spec, vec![[0, 0]], 1, 0, VariationRequest::default());
+    let error = starts.expect_err("another world");
+    assert!(matches!(error, Error::Mismatch { .. }) && error.to_string().contains("swm/TwoRoom-v1"), "{error}");
+}

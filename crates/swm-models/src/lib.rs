@@ -10,5 +10,6 @@ pub mod lewm;
 pub mod nn;
 pub mod train;
 
+pub use burn::tensor::Device;
 pub use checkpoint::Checkpoint;
 pub use train::{Observer, PRESETS, Progress, TrainConfig, TrainOptions, TrainSummary, train};

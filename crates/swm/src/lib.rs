@@ -1,1 +1,18 @@
-//! swm
+//! stable-worldmodel: the whole platform behind one name.
+//!
+//! Collect trajectories from worlds with controllable factors of variation, store and stream them, train world
+//! models, plan with them, and measure how they hold up when the world changes. The parts are crates of their
+//! own, re-exported here; this crate also builds the `swm` command.
+
+pub use swm_core as core;
+pub use swm_data as data;
+pub use swm_envs as envs;
+pub use swm_eval as eval;
+pub use swm_models as models;
+pub use swm_plan as plan;
+pub use swm_report as report;
+
+pub mod home;
+
+/// Every environment of this build.
+pub use swm_envs::ENVS;

@@ -1,1 +1,9 @@
-fn main() {}
+//! The `swm` command.
+
+mod cli;
+
+use clap::Parser as _;
+
+fn main() -> std::process::ExitCode {
+    cli::Cli::parse().run()
+}

@@ -1,0 +1,194 @@
+//! `swm collect`: run a policy and store its episodes.
+
+use super::config::{VariationArgs, image_size};
+use super::{Context, Progress, emit, emit_json};
+use clap::Args;
+use serde_json::json;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+use swm::{ENVS, home};
+use swm_core::policy::ExpertPolicy;
+use swm_core::{EnvEntry, Error, Named as _, Policy, RandomPolicy, Result};
+use swm_data::{ImageCodec, WriteMode, WriteOptions};
+use swm_eval::{CollectConfig, Collected, Control, World, WorldConfig};
+
+/// Arguments of `swm collect`.
+#[derive(Args)]
+pub struct CollectArgs {
+    /// The environment, such as swm/TwoRoom-v1
+    env: String,
+    /// The dataset to write: a path or a name
+    #[arg(short, long, value_name = "DATASET")]
+    output: String,
+    /// Who acts: random, expert, or one of the environment's experts by name
+    #[arg(long, default_value = "expert")]
+    policy: String,
+    /// Episodes the dataset shall have
+    #[arg(long, default_value_t = 100)]
+    episodes: usize,
+    /// What decides every episode, together with its number
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Environments played at the same time; the dataset does not depend on it
+    #[arg(long, default_value_t = 8)]
+    envs: usize,
+    /// Picture size: 64 or HEIGHTxWIDTH
+    #[arg(long, default_value = "224", value_parser = image_size)]
+    image: (usize, usize),
+    /// Store no pictures
+    #[arg(long, conflicts_with = "image")]
+    no_pixels: bool,
+    /// Steps after which an episode is truncated (default: the environment's own)
+    #[arg(long, value_name = "STEPS")]
+    max_steps: Option<usize>,
+    /// JPEG quality of stored pictures, 1 to 100
+    #[arg(long, default_value_t = 95, value_parser = clap::value_parser!(u8).range(1..=100))]
+    quality: u8,
+    /// Continue an interrupted collection
+    #[arg(long, conflicts_with = "overwrite")]
+    resume: bool,
+    /// Replace a dataset that is already there
+    #[arg(long)]
+    overwrite: bool,
+    #[command(flatten)]
+    variation: VariationArgs,
+}
+
+/// A collection, as `swm collect` and `swm demo` ask for it.
+pub struct Collection<'a> {
+    /// The environment.
+    pub entry: &'static EnvEntry,
+    /// Where to.
+    pub path: &'a Path,
+    /// Who acts.
+    pub policy: &'a str,
+    /// Environments, pictures, threads.
+    pub world: WorldConfig,
+    /// Episodes, seed, factors.
+    pub config: CollectConfig,
+    /// What to do with a dataset that is there.
+    pub mode: WriteMode,
+    /// JPEG quality.
+    pub quality: u8,
+}
+
+/// Runs a policy and stores its episodes.
+pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
+    let path = home::dataset(&args.output);
+    let collection = Collection {
+        entry: ENVS.get(&args.env)?,
+        path: &path,
+        policy: &args.policy,
+        world: WorldConfig {
+            envs: args.envs,
+            image: (!args.no_pixels).then_some(args.image),
+            max_episode_steps: args.max_steps,
+            threads: context.threads,
+        },
+        config: CollectConfig {
+            episodes: args.episodes,
+            seed: args.seed,
+            variation: args.variation.request()?,
+            policy: args.policy.clone(),
+            goal: false,
+        },
+        mode: match (args.resume, args.overwrite) {
+            (true, _) => WriteMode::Append,
+            (_, true) => WriteMode::Overwrite,
+            _ => WriteMode::Create,
+        },
+        quality: args.quality,
+    };
+    let collected = run(&collection, context)?;
+    if context.json {
+        return emit_json(&json!({"dataset": path, "collected": collected}));
+    }
+    emit(&format!("{}\n", path.display()));
+    Ok(())
+}
+
+/// Runs a collection with a progress bar.
+pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> {
+    let Collection { entry, path, config, .. } = collection;
+    let mut world = World::new(entry, collection.world)?;
+    let mut policy = policy(entry, collection.policy, &world)?;
+    // A wrong factor is found before anything of an older dataset is replaced.
+    world.spec().variation_space.resolve(&config.variation, swm_core::Key::new(config.seed))?;
+    let manifest = world.collect_manifest(config);
+    if collection.mode == WriteMode::Append && path.exists() {
+        same_collection(path, &manifest)?;
+    }
+    let writer = swm_data::create(
+        path,
+        &world.collect_schema(config.goal)?,
+        WriteOptions {
+            mode: collection.mode,
+            codec: ImageCodec::Jpeg { quality: collection.quality },
+            manifest: Some(manifest),
+            ..WriteOptions::default()
+        },
+    )?;
+    let progress = Progress::new("collect", config.episodes);
+    let begun = Instant::now();
+    #[allow(clippy::cast_precision_loss)]
+    let speed = |steps: usize| format!("{:.0} steps/s", steps as f64 / begun.elapsed().as_secs_f64().max(1e-9));
+    let mut control = Control {
+        stop: Some(context.stop.clone()),
+        progress: Some(Box::new(|at| progress.at(at.episodes, speed(at.steps)))),
+    };
+    let collected = world.collect(&mut *policy, writer, config, &mut control)?;
+    drop(control);
+    progress.done(&format!(
+        "{} episodes in {} ({} new, {} steps, {})",
+        collected.episodes,
+        path.display(),
+        collected.added,
+        collected.steps,
+        speed(collected.steps)
+    ));
+    Ok(collected)
+}
+
+/// Refuses to continue a collection with other settings, which would mix two distributions unseen.
+fn same_collection(path: &Path, now: &swm_core::Manifest) -> Result<()> {
+    let Some(before) = swm_data::open(path)?.manifest() else { return Ok(()) };
+    let settings = |manifest: &swm_core::Manifest| {
+        let mut config = manifest.config.clone();
+        if let Some(config) = config.as_object_mut() {
+            // Asking for more episodes is what continuing is for.
+            config.remove("episodes");
+        }
+        serde_json::json!({"seed": manifest.seed, "config": config})
+    };
+    let (before, now) = (settings(&before), settings(now));
+    if before == now {
+        return Ok(());
+    }
+    Err(Error::config(
+        format!("--resume {}", path.display()),
+        format!("the dataset was collected with {before}, not {now}"),
+        "use the same settings, write to another dataset, or replace this one with --overwrite",
+    ))
+}
+
+/// Who acts in a world: `random`, `expert` (the environment's first), or an expert by name.
+pub fn policy(entry: &EnvEntry, name: &str, world: &World) -> Result<Box<dyn Policy>> {
+    let slots = world.pool().len();
+    if name == "random" {
+        return Ok(Box::new(RandomPolicy::new(world.spec(), slots)));
+    }
+    let expert = match entry.experts {
+        [first, ..] if name == "expert" => first,
+        experts => experts.iter().find(|expert| expert.id == name).ok_or_else(|| {
+            let known = ["random", "expert"].into_iter().chain(experts.iter().map(|expert| expert.id()));
+            Error::unknown("policy", name, known, format!("`swm envs` lists the experts of {}", entry.id))
+        })?,
+    };
+    Ok(Box::new(ExpertPolicy::new(world.spec(), (0..slots).map(|_| (expert.make)()).collect())))
+}
+
+/// What `--output` of a command becomes: the folder, made.
+pub fn folder(path: &Path) -> Result<PathBuf> {
+    std::fs::create_dir_all(path).map_err(|e| Error::io(path, "creating the folder", e))?;
+    Ok(path.to_owned())
+}

@@ -1,0 +1,204 @@
+//! `swm datasets`, `inspect` and `preview`: what data there are and what they look like.
+
+use super::{Progress, emit, emit_json, table};
+use clap::Args;
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use swm::{data, home};
+use swm_core::results::Summary;
+use swm_core::{Error, Result};
+use swm_data::{Reader, StepRange};
+
+/// Arguments of `swm inspect`.
+#[derive(Args)]
+pub struct InspectArgs {
+    /// The dataset: a path or a name
+    dataset: String,
+}
+
+/// Arguments of `swm preview`.
+#[derive(Args)]
+pub struct PreviewArgs {
+    /// The dataset: a path or a name
+    dataset: String,
+    /// Where to write the videos and the contact sheet
+    #[arg(short, long, default_value = "preview", value_name = "DIR")]
+    output: PathBuf,
+    /// How many episodes, spread over the dataset
+    #[arg(long, default_value_t = 4)]
+    episodes: usize,
+    /// The picture column
+    #[arg(long, default_value = "pixels")]
+    column: String,
+    /// Frames in a second of video
+    #[arg(long, default_value_t = 15)]
+    fps: u32,
+}
+
+/// Opens a dataset by path or name; a wrong name gets the nearest right ones.
+pub fn open(given: &str) -> Result<std::sync::Arc<dyn Reader>> {
+    let path = home::dataset(given);
+    if !path.exists() {
+        let names = names_in(&home::datasets());
+        return Err(Error::unknown(
+            "dataset",
+            given,
+            names.iter().map(String::as_str),
+            format!("there is none at {}; `swm datasets` lists those at home", path.display()),
+        ));
+    }
+    data::open(&path)
+}
+
+/// The names of what lies in a folder, in order, hidden ones left out.
+pub fn names_in(folder: &Path) -> Vec<String> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut names: Vec<String> = entries
+        .filter_map(|entry| entry.file_name().into_string().ok())
+        .filter(|name| !name.starts_with('.'))
+        .map(|name| name.strip_suffix(".lance").map(str::to_owned).unwrap_or(name))
+        .collect();
+    names.sort();
+    names
+}
+
+/// Lists the datasets at home.
+pub fn datasets(as_json: bool) -> anyhow::Result<()> {
+    let folder = home::datasets();
+    let found: Vec<Value> = names_in(&folder)
+        .into_iter()
+        .map(|name| match open(&name).and_then(|reader| summary(&*reader)) {
+            Ok(mut found) => {
+                found["name"] = json!(name);
+                found
+            }
+            Err(error) => json!({"name": name, "error": error.to_string()}),
+        })
+        .collect();
+    if as_json {
+        return emit_json(&found);
+    }
+    if found.is_empty() {
+        emit(&format!("no datasets in {}; `swm collect ENV -o NAME` makes one\n", folder.display()));
+        return Ok(());
+    }
+    let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+    let rows = found.iter().map(|found| match found.get("error") {
+        Some(error) => vec![text(&found["name"]), text(error)],
+        None => vec![
+            text(&found["name"]),
+            text(&found["env"]),
+            text(&found["episodes"]),
+            text(&found["steps"]),
+            bytes(found["bytes"].as_u64().unwrap_or_default()),
+        ],
+    });
+    emit(&table(&["dataset", "environment", "episodes", "steps", "on disk"], rows));
+    Ok(())
+}
+
+/// The numbers of a dataset that cost nothing to know.
+fn summary(reader: &dyn Reader) -> Result<Value> {
+    let manifest = reader.manifest();
+    Ok(json!({
+        "env": manifest.as_ref().map_or("?", |m| m.config["env"].as_str().unwrap_or("?")),
+        "episodes": reader.episodes().len(),
+        "steps": reader.episodes().iter().map(|episode| episode.length).sum::<usize>(),
+        "bytes": reader.footprint()?.iter().map(|(_, bytes)| bytes).sum::<u64>(),
+    }))
+}
+
+/// Says what is in a dataset.
+pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
+    let reader = open(&args.dataset)?;
+    let mut found = summary(&*reader)?;
+    #[allow(clippy::cast_precision_loss)]
+    let lengths: Vec<f64> = reader.episodes().iter().map(|episode| episode.length as f64).collect();
+    found["lengths"] = json!(Summary::of(&lengths));
+    found["columns"] = json!(reader.schema());
+    found["footprint"] = json!(reader.footprint()?.into_iter().collect::<std::collections::BTreeMap<_, _>>());
+    found["content_hash"] = json!(reader.content_hash()?);
+    found["manifest"] = json!(reader.manifest());
+    if as_json {
+        return emit_json(&found);
+    }
+    emit(&format!(
+        "{} episodes, {} rows, {} on disk\n",
+        found["episodes"],
+        found["steps"],
+        bytes(found["bytes"].as_u64().unwrap_or_default())
+    ));
+    if let Some(lengths) = Summary::of(&lengths) {
+        emit(&format!(
+            "episode length: mean {:.1}, median {}, 95th percentile {}\n",
+            lengths.mean, lengths.median, lengths.p95
+        ));
+    }
+    let columns = reader.schema().columns().iter();
+    emit(&table(
+        &["column", "type", "shape of a row"],
+        columns.map(|c| vec![c.name.clone(), c.dtype.name().to_owned(), format!("{:?}", c.shape)]),
+    ));
+    emit(&table(&["part", "on disk"], reader.footprint()?.into_iter().map(|(part, size)| vec![part, bytes(size)])));
+    emit(&format!("content hash: {}\n", found["content_hash"].as_str().unwrap_or_default()));
+    match reader.manifest() {
+        Some(manifest) => emit(&format!("manifest: {}\n", serde_json::to_string_pretty(&manifest)?)),
+        None => emit("no manifest: this dataset was not collected by stable-worldmodel\n"),
+    }
+    Ok(())
+}
+
+/// Makes a video of some episodes and a contact sheet of all of them.
+pub fn preview(args: &PreviewArgs, as_json: bool) -> anyhow::Result<()> {
+    /// Frames of an episode on the contact sheet.
+    const SHEET_COLUMNS: usize = 8;
+    let reader = open(&args.dataset)?;
+    let column = reader.schema().column(&args.column)?;
+    let [height, width, 3] = column.shape[..] else {
+        anyhow::bail!(Error::mismatch(
+            format!("previewing column '{}'", args.column),
+            format!("{} {:?}", column.dtype.name(), column.shape),
+            "pictures: uint8 [height, width, 3]",
+        ));
+    };
+    std::fs::create_dir_all(&args.output).map_err(|e| Error::io(&args.output, "creating the folder", e))?;
+    let total = reader.episodes().len();
+    let chosen: Vec<usize> = (0..args.episodes.min(total)).map(|i| i * total / args.episodes.min(total)).collect();
+    let scale = data::video::integer_scale(width, height, 256);
+    let progress = Progress::new("preview", chosen.len());
+    let (mut written, mut sheet) = (vec![], vec![]);
+    for (done, &episode) in chosen.iter().enumerate() {
+        let length = reader.episodes()[episode].length;
+        let batch = reader.read(&[&args.column], &[StepRange::new(episode, 0, length)])?;
+        let frames: Vec<&[u8]> = batch.bytes(0).chunks(width * height * 3).collect();
+        let path = args.output.join(format!("episode_{episode}.mp4"));
+        data::video::write_mp4_scaled(&path, width, height, args.fps, scale, &frames)?;
+        written.push(path);
+        let last = (length - 1).max(1);
+        sheet.extend((0..SHEET_COLUMNS).map(|i| frames[(i * last / (SHEET_COLUMNS - 1)).min(length - 1)].to_vec()));
+        progress.at(done + 1, "");
+    }
+    if !sheet.is_empty() {
+        let picture = data::preview::contact_sheet(width, height, &sheet, SHEET_COLUMNS, 1)?;
+        let path = args.output.join("contact_sheet.png");
+        data::preview::write_png(&path, picture.width, picture.height, &picture.rgb)?;
+        written.push(path);
+    }
+    progress.done(&format!("{} episodes in {}", chosen.len(), args.output.display()));
+    if as_json {
+        return emit_json(&json!({"files": written}));
+    }
+    emit(&written.iter().map(|path| format!("{}\n", path.display())).collect::<String>());
+    Ok(())
+}
+
+/// A number of bytes as people read it.
+#[allow(clippy::cast_precision_loss)]
+pub fn bytes(n: u64) -> String {
+    match n {
+        0..1024 => format!("{n} B"),
+        1024..1_048_576 => format!("{:.1} KiB", n as f64 / 1024.0),
+        1_048_576..1_073_741_824 => format!("{:.1} MiB", n as f64 / 1_048_576.0),
+        _ => format!("{:.2} GiB", n as f64 / 1_073_741_824.0),
+    }
+}

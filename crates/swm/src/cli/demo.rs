@@ -1,0 +1,133 @@
+//! `swm demo`: the whole pipeline on a laptop CPU, in minutes.
+
+use super::collect::{self, Collection};
+use super::eval::{self, Evaluation, PlannerArgs, StartsFrom};
+use super::{Context, complain, datasets, emit, emit_json, train};
+use clap::Args;
+use serde_json::json;
+use std::path::PathBuf;
+use std::time::Instant;
+use swm::{ENVS, home};
+use swm_core::VariationRequest;
+use swm_data::WriteMode;
+use swm_eval::{CollectConfig, WorldConfig};
+use swm_models::{Checkpoint, Device, TrainConfig};
+use swm_report::ReportOptions;
+
+/// Arguments of `swm demo`. The defaults are sized for two CPU cores.
+#[derive(Args)]
+pub struct DemoArgs {
+    /// Where everything goes (default: demo/ under $STABLEWM_HOME); what an earlier demo left there is replaced
+    #[arg(short, long, value_name = "DIR")]
+    output: Option<PathBuf>,
+    /// What decides data, weights and plans
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Episodes to collect
+    #[arg(long, default_value_t = 300)]
+    episodes: usize,
+    /// Episodes to evaluate, each way
+    #[arg(long, default_value_t = 50)]
+    eval_episodes: usize,
+    /// Environments played, and planned for, at the same time; results do not depend on it
+    #[arg(long, default_value_t = 50)]
+    envs: usize,
+    /// Training settings, such as schedule.steps=500
+    #[arg(value_name = "KEY=VALUE")]
+    settings: Vec<String>,
+}
+
+/// The world of the demo.
+const ENV: &str = "swm/TwoRoom-v1";
+
+/// What is shifted: the floor turns from white to a pale blue.
+const SHIFT: (&str, [f64; 3]) = ("background.color", [200.0, 220.0, 255.0]);
+
+/// How the demo plans: a smaller search than the paper's, which is enough here.
+const PLANNER: PlannerArgs =
+    PlannerArgs { horizon: 6, receding_horizon: 2, samples: 128, iterations: 8, elites: 16, sigma: 1.0 };
+
+/// Collects, trains, evaluates and reports.
+pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
+    let begun = Instant::now();
+    let entry = ENVS.get(ENV)?;
+    let output = args.output.clone().unwrap_or_else(|| home::home().join("demo"));
+    let (data, model, results) = (output.join("rooms.lance"), output.join("lewm-rooms"), output.join("results"));
+    let mut config = TrainConfig::load("tiny", &args.settings)?;
+    config.seed = args.seed;
+    let image = (config.model.image, config.model.image);
+    for old in [&model, &results] {
+        if old.exists() {
+            std::fs::remove_dir_all(old).map_err(|e| swm_core::Error::io(old, "removing the last demo", e))?;
+        }
+    }
+
+    complain("1/4 collect: an exploring policy wanders through two rooms\n");
+    let world = WorldConfig { envs: 16, image: Some(image), max_episode_steps: Some(100), threads: context.threads };
+    let collection = Collection {
+        entry,
+        path: &data,
+        policy: "explore",
+        world,
+        config: CollectConfig {
+            episodes: args.episodes,
+            seed: args.seed,
+            policy: "explore".to_owned(),
+            ..CollectConfig::default()
+        },
+        mode: WriteMode::Overwrite,
+        quality: 95,
+    };
+    collect::run(&collection, context)?;
+
+    complain("2/4 train: a small LeWM learns to predict what it will see\n");
+    train::run(&config, datasets::open(&data.to_string_lossy())?, &model, false, context)?;
+    let checkpoint = Checkpoint::load(&model, &Device::flex())?;
+
+    complain("3/4 plan and evaluate: CEM over the model, beside the random floor\n");
+    let shift =
+        VariationRequest { variation_values: [(SHIFT.0.to_owned(), SHIFT.1.to_vec())].into(), ..Default::default() };
+    let (found, file) = eval::run(
+        &Evaluation {
+            entry,
+            name: "lewm",
+            checkpoint: Some(&checkpoint),
+            planner: &PLANNER,
+            world: WorldConfig { envs: args.envs.min(args.eval_episodes), ..world },
+            starts: StartsFrom::Env,
+            episodes: args.eval_episodes,
+            seed: args.seed + 1,
+            conditions: vec![
+                ("in distribution".to_owned(), VariationRequest::default()),
+                (format!("{} shifted", SHIFT.0), shift),
+            ],
+            videos: 3,
+            output: &results,
+            command: command(args),
+        },
+        context,
+    )?;
+
+    complain("4/4 report\n");
+    let options = ReportOptions {
+        title: Some("Two rooms, one small world model".to_owned()),
+        metrics: Some(train::log_of(&model)),
+        command: None,
+    };
+    let page = swm_report::write_report_with(&[(file, found.clone())], &options, &output)?;
+    if context.json {
+        return emit_json(&json!({
+            "report": page, "dataset": data, "checkpoint": model, "results": found, "seconds": begun.elapsed().as_secs_f64(),
+        }));
+    }
+    emit(&eval::summary(&found));
+    emit(&format!("{:.0} s in all; the report: {}\n", begun.elapsed().as_secs_f64(), page.display()));
+    Ok(())
+}
+
+/// The command that gives the same demo.
+fn command(args: &DemoArgs) -> String {
+    let words =
+        [format!("swm demo --seed {} --episodes {} --eval-episodes {}", args.seed, args.episodes, args.eval_episodes)];
+    words.into_iter().chain(args.settings.iter().cloned()).collect::<Vec<_>>().join(" ")
+}

@@ -1,0 +1,140 @@
+//! `swm envs` and `swm fovs`: what worlds there are and what can be varied in them.
+
+use super::{emit, emit_json, table};
+use clap::Args;
+use serde_json::{Map, Value, json};
+use swm::ENVS;
+use swm_core::{EnvEntry, EnvSpec, Space, VariationSpace};
+
+/// Arguments of `swm envs`.
+#[derive(Args)]
+pub struct EnvsArgs {}
+
+/// Arguments of `swm fovs`.
+#[derive(Args)]
+pub struct FovsArgs {
+    /// The environment, such as swm/TwoRoom-v1
+    env: String,
+}
+
+/// Lists the environments.
+pub fn envs(_args: &EnvsArgs, as_json: bool) -> anyhow::Result<()> {
+    if as_json {
+        let all: Map<String, Value> = ENVS.rows.iter().map(|row| (row.id.to_owned(), describe(row))).collect();
+        return emit_json(&all);
+    }
+    let rows = ENVS.rows.iter().map(|row| {
+        let env = (row.make)();
+        let spec = env.spec();
+        vec![
+            row.id.to_owned(),
+            spec.action_space.describe(),
+            spec.variation_space.factors().len().to_string(),
+            row.experts.iter().map(|e| e.id).collect::<Vec<_>>().join(", "),
+            row.summary.to_owned(),
+        ]
+    });
+    emit(&table(&["environment", "action", "factors", "experts", "task"], rows));
+    Ok(())
+}
+
+/// Lists the factors of variation of one environment.
+pub fn fovs(args: &FovsArgs, as_json: bool) -> anyhow::Result<()> {
+    let env = (ENVS.get(&args.env)?.make)();
+    let space = &env.spec().variation_space;
+    if as_json {
+        return emit_json(&json!({
+            "variation": variation(space),
+            "sampling_order": sampling_order(space),
+            "default_variations": space.defaults(),
+        }));
+    }
+    let rows = space.factors().iter().map(|factor| {
+        vec![
+            factor.key.clone(),
+            factor.space.describe(),
+            format!("{:?}", factor.init_value),
+            if space.defaults().contains(&factor.key) { "sampled".to_owned() } else { String::new() },
+        ]
+    });
+    emit(&table(&["factor", "values", "default", "at reset"], rows));
+    Ok(())
+}
+
+/// One environment, with the fields a Python user knows.
+fn describe(row: &EnvEntry) -> Value {
+    let env = (row.make)();
+    let spec: &EnvSpec = env.spec();
+    let info: Map<String, Value> = spec
+        .columns
+        .iter()
+        .map(|column| {
+            let shape: Vec<String> = column.shape.iter().map(ToString::to_string).collect();
+            let shape = if shape.is_empty() { String::new() } else { format!("[{}]", shape.join(", ")) };
+            (column.name.clone(), json!(format!("{}{shape}", column.dtype.name())))
+        })
+        .collect();
+    json!({
+        "summary": row.summary,
+        "action_space": space(&spec.action_space),
+        "info": info,
+        "variation": variation(&spec.variation_space),
+        "sampling_order": sampling_order(&spec.variation_space),
+        "default_variations": spec.variation_space.defaults(),
+        "max_episode_steps": spec.max_episode_steps,
+        "experts": row.experts.iter().map(|e| json!({"id": e.id, "summary": e.summary})).collect::<Vec<_>>(),
+    })
+}
+
+/// Every factor by its key.
+fn variation(variation_space: &VariationSpace) -> Map<String, Value> {
+    let factors = variation_space.factors().iter();
+    factors
+        .map(|factor| {
+            let mut value = space(&factor.space);
+            value["init_value"] = shaped(&factor.space, &factor.init_value);
+            (factor.key.clone(), value)
+        })
+        .collect()
+}
+
+/// Groups and factors, in the order they are sampled.
+fn sampling_order(variation_space: &VariationSpace) -> Vec<String> {
+    let mut order: Vec<String> = vec![];
+    for factor in variation_space.factors() {
+        if let Some((group, _)) = factor.key.split_once('.')
+            && !order.iter().any(|known| known == group)
+        {
+            order.push(group.to_owned());
+        }
+        order.push(factor.key.clone());
+    }
+    order
+}
+
+/// A space with its bounds written out.
+fn space(space: &Space) -> Value {
+    let bounds = |pick: fn((f64, f64)) -> f64| {
+        let values: Vec<f64> = (0..space.len()).map(|i| pick(space.bounds(i))).collect();
+        shaped(space, &values)
+    };
+    match space {
+        Space::Discrete { n, start } => json!({"type": "Discrete", "n": n, "start": start}),
+        Space::MultiDiscrete { nvec, start } => json!({"type": "MultiDiscrete", "nvec": nvec, "start": start}),
+        Space::Box { .. } | Space::Rgb => json!({
+            "type": if matches!(space, Space::Rgb) { "RGBBox" } else { "Box" },
+            "shape": space.shape(),
+            "dtype": space.dtype().name(),
+            "low": bounds(|b| b.0),
+            "high": bounds(|b| b.1),
+        }),
+    }
+}
+
+/// A value as a scalar or a list, in whole numbers where its type is whole.
+#[allow(clippy::cast_possible_truncation)]
+fn shaped(space: &Space, value: &[f64]) -> Value {
+    let whole = matches!(space, Space::Discrete { .. } | Space::MultiDiscrete { .. } | Space::Rgb);
+    let number = |&v: &f64| if whole { json!(v as i64) } else { json!(v) };
+    if space.shape().is_empty() { number(&value[0]) } else { value.iter().map(number).collect() }
+}

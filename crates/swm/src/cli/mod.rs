@@ -1,0 +1,169 @@
+//! The command line: one file a group of commands, each a thin front of the crates.
+
+mod bench;
+mod checkpoints;
+mod collect;
+mod config;
+mod datasets;
+mod demo;
+mod envs;
+mod eval;
+mod models;
+mod progress;
+mod report;
+mod train;
+
+use clap::{Parser, Subcommand};
+use progress::Progress;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Collect data from worlds, train world models, plan with them, evaluate and report.
+#[derive(Parser)]
+#[command(name = "swm", version, propagate_version = true)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Command,
+    /// Print one JSON document on standard output instead of tables
+    #[arg(long, global = true)]
+    json: bool,
+    /// Worker threads (default: one for each core); results do not depend on it
+    #[arg(long, global = true, default_value_t = 0, hide_default_value = true, value_name = "N")]
+    threads: usize,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// List the environments
+    Envs(envs::EnvsArgs),
+    /// List an environment's factors of variation
+    Fovs(envs::FovsArgs),
+    /// Run a policy and store its episodes
+    Collect(collect::CollectArgs),
+    /// List the datasets at home
+    Datasets,
+    /// Say what is in a dataset
+    Inspect(datasets::InspectArgs),
+    /// Make a video and a contact sheet of some episodes of a dataset
+    Preview(datasets::PreviewArgs),
+    /// List the models and their presets
+    Models,
+    /// Train a model on a dataset
+    Train(train::TrainArgs),
+    /// List the checkpoints at home, or show one
+    Checkpoints(checkpoints::CheckpointsArgs),
+    /// Evaluate a checkpoint, the expert or the random floor
+    Eval(eval::EvalArgs),
+    /// Make one self-contained HTML page of results
+    Report(report::ReportArgs),
+    /// Measure speed, beside the reference where it is installed
+    Bench(bench::BenchArgs),
+    /// Collect, train, plan, evaluate and report, in minutes
+    Demo(demo::DemoArgs),
+}
+
+/// What commands that work for a while may use.
+pub struct Context {
+    /// Whether to print JSON.
+    pub json: bool,
+    /// The budget of cores, shared by environments, decoders and matrix products; 0 means all of them.
+    pub threads: usize,
+    /// Set by the first Ctrl-C; long loops stop at the next safe point.
+    pub stop: Arc<AtomicBool>,
+}
+
+impl Cli {
+    /// Runs the command; the exit code is 0 when done, 1 when it failed, 2 for wrong usage, 130 when
+    /// interrupted.
+    pub fn run(self) -> ExitCode {
+        tracing_subscriber::fmt()
+            .with_writer(std::io::stderr)
+            .with_env_filter(
+                tracing_subscriber::EnvFilter::try_from_env("SWM_LOG")
+                    .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn")),
+            )
+            .without_time()
+            .init();
+        match self.dispatch() {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(error) => {
+                complain(&format!("error: {error:#}\n"));
+                match error.downcast_ref::<swm_core::Error>() {
+                    Some(swm_core::Error::Interrupted) => ExitCode::from(130),
+                    Some(error) if error.is_usage() => ExitCode::from(2),
+                    _ => ExitCode::FAILURE,
+                }
+            }
+        }
+    }
+
+    fn dispatch(self) -> anyhow::Result<()> {
+        let json = self.json;
+        match self.command {
+            Command::Envs(args) => envs::envs(&args, json),
+            Command::Fovs(args) => envs::fovs(&args, json),
+            Command::Datasets => datasets::datasets(json),
+            Command::Inspect(args) => datasets::inspect(&args, json),
+            Command::Preview(args) => datasets::preview(&args, json),
+            Command::Models => models::models(json),
+            Command::Checkpoints(args) => checkpoints::checkpoints(&args, json),
+            Command::Report(args) => report::report(&args, json),
+            Command::Collect(args) => collect::collect(&args, &Context::new(json, self.threads)),
+            Command::Train(args) => train::train(&args, &Context::new(json, self.threads)),
+            Command::Eval(args) => eval::eval(&args, &Context::new(json, self.threads)),
+            Command::Bench(args) => bench::bench(&args, &Context::new(json, self.threads)),
+            Command::Demo(args) => demo::demo(&args, &Context::new(json, self.threads)),
+        }
+    }
+}
+
+impl Context {
+    fn new(json: bool, threads: usize) -> Self {
+        // Burn's matrix products use rayon's global pool: it is given the same number of threads.
+        rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().ok();
+        let stop = Arc::new(AtomicBool::new(false));
+        let flag = Arc::clone(&stop);
+        ctrlc::set_handler(move || {
+            if flag.swap(true, Ordering::SeqCst) {
+                std::process::exit(130);
+            }
+            complain("\nstopping at the next safe point; press Ctrl-C again to stop at once\n");
+        })
+        .ok();
+        Self { json, threads, stop }
+    }
+}
+
+/// Prints to standard output; a reader that went away is no error.
+pub fn emit(text: &str) {
+    use std::io::Write as _;
+    let mut out = std::io::stdout().lock();
+    out.write_all(text.as_bytes()).and_then(|()| out.flush()).ok();
+}
+
+/// Prints one JSON document.
+pub fn emit_json(value: &impl serde::Serialize) -> anyhow::Result<()> {
+    emit(&(serde_json::to_string_pretty(value)? + "\n"));
+    Ok(())
+}
+
+/// Prints to standard error.
+pub fn complain(text: &str) {
+    use std::io::Write as _;
+    std::io::stderr().write_all(text.as_bytes()).ok();
+}
+
+/// A table in the house style.
+pub fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> String {
+    let mut table = comfy_table::Table::new();
+    table.load_preset(comfy_table::presets::UTF8_HORIZONTAL_ONLY);
+    table.remove_style(comfy_table::TableComponent::HorizontalLines);
+    table.set_style(comfy_table::TableComponent::HeaderLines, '─');
+    table.set_content_arrangement(comfy_table::ContentArrangement::Dynamic);
+    table.set_header(header.to_vec());
+    for row in rows {
+        table.add_row(row);
+    }
+    format!("{table}\n")
+}

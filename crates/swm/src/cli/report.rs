@@ -1,0 +1,50 @@
+//! `swm report`: one self-contained HTML page of results.
+
+use super::train::log_of;
+use super::{emit, emit_json};
+use clap::Args;
+use serde_json::json;
+use std::path::PathBuf;
+use swm::home;
+use swm_core::Results;
+use swm_report::ReportOptions;
+
+/// Arguments of `swm report`.
+#[derive(Args)]
+pub struct ReportArgs {
+    /// Results files, or folders that hold a results.json
+    #[arg(required = true)]
+    results: Vec<PathBuf>,
+    /// Where to write the page
+    #[arg(short, long, default_value = "report", value_name = "DIR")]
+    output: PathBuf,
+    /// The headline (default: the environments)
+    #[arg(long)]
+    title: Option<String>,
+    /// Show the training curves of this checkpoint: a path or a name
+    #[arg(long, value_name = "CHECKPOINT")]
+    training: Option<String>,
+}
+
+/// Makes the page.
+pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
+    let read: swm_core::Result<Vec<(PathBuf, Results)>> = args
+        .results
+        .iter()
+        .map(|path| {
+            let file = if path.is_dir() { path.join("results.json") } else { path.clone() };
+            swm_report::read_results(&file).map(|results| (file, results))
+        })
+        .collect();
+    let options = ReportOptions {
+        title: args.title.clone(),
+        metrics: args.training.as_deref().map(|name| log_of(&home::checkpoint(name))),
+        command: None,
+    };
+    let page = swm_report::write_report_with(&read?, &options, &args.output)?;
+    if as_json {
+        return emit_json(&json!({"report": page}));
+    }
+    emit(&format!("{}\n", page.display()));
+    Ok(())
+}

@@ -1,0 +1,101 @@
+//! Train, evaluate, report, and the demo that does it all.
+
+use crate::{Swm, text};
+use serde_json::Value;
+
+/// A demo small enough for a test: what it trains is useless, what it writes is complete.
+const DEMO: &[&str] =
+    &["demo", "-o", "demo", "--episodes", "6", "--eval-episodes", "5", "schedule.steps=8", "schedule.warmup=2"];
+
+/// Runs the small demo; returns its dataset's hash and its results without what may differ: times.
+fn demo(swm: &Swm, more: &[&str]) -> (Value, Value) {
+    let args: Vec<&str> = DEMO.iter().chain(more).copied().collect();
+    let mut found = swm.json(&args);
+    for run in found["results"]["runs"].as_array_mut().expect("runs") {
+        run["timing"] = Value::Null;
+    }
+    let dataset = swm.json(&["inspect", "demo/rooms.lance"]);
+    (dataset["content_hash"].clone(), found["results"].clone())
+}
+
+#[test]
+fn the_demo_gives_the_same_bytes_with_any_threads_and_environments() {
+    let swm = Swm::new();
+    let first = demo(&swm, &["--threads", "1", "--envs", "1"]);
+    let page = std::fs::read_to_string(swm.path("demo/index.html")).expect("the report");
+    assert!(page.contains("Two rooms") && page.contains("data:video/mp4"));
+    let second = demo(&swm, &["--threads", "2", "--envs", "5"]);
+    assert_eq!(first.0, second.0, "datasets");
+    assert_eq!(first.1, second.1, "results");
+    let other = demo(&swm, &["--seed", "1"]);
+    assert_ne!(first.0, other.0, "another seed makes other data");
+}
+
+#[test]
+fn a_checkpoint_goes_from_training_to_a_report() {
+    let swm = Swm::new();
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--image", "64", "--episodes", "6", "--max-steps", "60"]);
+    let train = ["train", "lewm", "--data", "rooms", "-o", "small", "schedule.steps=6", "schedule.warmup=2"];
+    let summary = swm.json(&train);
+    assert_eq!(summary["steps"], 6);
+    swm.refuses(&train, 1, &["small", "--resume"]);
+    swm.refuses(&["train", "lewm", "--data", "rooms", "-o", "small", "--resume", "optim.lr=1"], 2, &["optim.lr"]);
+    assert_eq!(swm.json(&["checkpoints"])[0]["name"], "small");
+
+    let quick = ["--samples", "16", "--iterations", "2", "--elites", "4", "--episodes", "4", "--budget", "20"];
+    let eval = |more: &[&'static str]| {
+        let args: Vec<&str> = ["eval", "small"].into_iter().chain(more.iter().copied()).chain(quick).collect();
+        swm.json(&args)
+    };
+    let episodic = eval(&["-o", "episodic", "--videos", "1"]);
+    assert_eq!(episodic["runs"][0]["policy"], "random");
+    assert_eq!(episodic["runs"][1]["policy"], "small");
+    assert_eq!(episodic["runs"][1]["episodes"].as_array().map(Vec::len), Some(4));
+    let dataset = eval(&["-o", "dataset", "--dataset", "rooms", "--goal-offset", "10", "--pin", "agent.color=0,0,255"]);
+    assert_eq!(dataset["protocol"], "dataset");
+    assert_eq!(dataset["runs"][1]["condition"], "agent.color=0,0,255");
+    let report = swm.json(&["report", "episodic", "dataset", "-o", "report"]);
+    let page = std::fs::read_to_string(report["report"].as_str().expect("a path")).expect("the report");
+    assert!(page.contains("agent.color=0,0,255") && page.contains("data:video/mp4"));
+
+    swm.refuses(&["eval", "small", "--env", "swm/PushT-v1"], 2, &["trained on swm/TwoRoom-v1"]);
+    swm.refuses(&["report", "nowhere"], 1, &["nowhere"]);
+
+    // A checkpoint of another family, and one that is cut off.
+    let file = find(&swm.path("checkpoints/small"), "config.json");
+    let config = std::fs::read_to_string(&file).expect("readable");
+    std::fs::write(&file, config.replace("\"lewm\"", "\"dino-wm\"")).expect("writable");
+    swm.refuses(&["eval", "small"], 1, &["dino-wm"]);
+    std::fs::write(&file, config).expect("writable");
+    let weights = find(&swm.path("checkpoints/small"), "weights.safetensors");
+    let bytes = std::fs::read(&weights).expect("readable");
+    std::fs::write(&weights, &bytes[..bytes.len() / 2]).expect("writable");
+    swm.refuses(&["eval", "small"], 1, &["small"]);
+}
+
+/// The one file of that name below a folder.
+fn find(folder: &std::path::Path, name: &str) -> std::path::PathBuf {
+    let mut folders = vec![folder.to_owned()];
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(&folder).expect("a folder").flatten() {
+            let path = entry.path();
+            if path.is_dir() && !path.is_symlink() {
+                folders.push(path);
+            } else if path.file_name().is_some_and(|found| found == name) {
+                return path;
+            }
+        }
+    }
+    panic!("no {name} below {}", folder.display())
+}
+
+#[test]
+fn configurations_can_be_printed_and_wrong_ones_are_refused() {
+    let swm = Swm::new();
+    let output = swm.run(&["train", "lewm", "--preset", "paper", "--print-config", "seed=7"]);
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    assert!(text(&output.stdout).contains("seed = 7"));
+    swm.refuses(&["train", "lwem", "--data", "x"], 2, &["did you mean lewm"]);
+    swm.refuses(&["train", "lewm"], 2, &["--data"]);
+    swm.refuses(&["train", "lewm", "--data", "x", "optim.rl=1"], 2, &["did you mean optim.lr"]);
+}

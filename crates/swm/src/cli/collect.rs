@@ -10,6 +10,7 @@ use swm::{ENVS, home};
 use swm_core::policy::ExpertPolicy;
 use swm_core::{EnvEntry, Error, Named as _, Policy, RandomPolicy, Result};
 use swm_data::{ImageCodec, WriteMode, WriteOptions};
+use swm_eval::collect::check_continues;
 use swm_eval::{CollectConfig, Collected, Control, World, WorldConfig};
 
 /// Arguments of `swm collect`.
@@ -115,8 +116,22 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     // A wrong factor is found before anything of an older dataset is replaced.
     world.spec().variation_space.resolve(&config.variation, swm_core::Key::new(config.seed))?;
     let manifest = world.collect_manifest(config);
-    if collection.mode == WriteMode::Append && path.exists() {
-        same_collection(path, &manifest)?;
+    if path.exists() {
+        match collection.mode {
+            WriteMode::Overwrite => {}
+            WriteMode::Append => {
+                if let Some(stored) = swm_data::open(path)?.manifest() {
+                    check_continues(&stored, &manifest)?;
+                }
+            }
+            WriteMode::Create => {
+                return Err(Error::config(
+                    format!("dataset {}", path.display()),
+                    "there is one already",
+                    "continue it with --resume, replace it with --overwrite, or name another",
+                ));
+            }
+        }
     }
     let writer = swm_data::create(
         path,
@@ -147,28 +162,6 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
         speed(collected.steps)
     ));
     Ok(collected)
-}
-
-/// Refuses to continue a collection with other settings, which would mix two distributions unseen.
-fn same_collection(path: &Path, now: &swm_core::Manifest) -> Result<()> {
-    let Some(before) = swm_data::open(path)?.manifest() else { return Ok(()) };
-    let settings = |manifest: &swm_core::Manifest| {
-        let mut config = manifest.config.clone();
-        if let Some(config) = config.as_object_mut() {
-            // Asking for more episodes is what continuing is for.
-            config.remove("episodes");
-        }
-        serde_json::json!({"seed": manifest.seed, "config": config})
-    };
-    let (before, now) = (settings(&before), settings(now));
-    if before == now {
-        return Ok(());
-    }
-    Err(Error::config(
-        format!("--resume {}", path.display()),
-        format!("the dataset was collected with {before}, not {now}"),
-        "use the same settings, write to another dataset, or replace this one with --overwrite",
-    ))
 }
 
 /// Who acts in a world: `random`, `expert` (the environment's first), or an expert by name.

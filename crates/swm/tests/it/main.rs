@@ -1,4 +1,5 @@
 //! The `swm` command from outside, as a user meets it.
+#![allow(missing_docs)]
 
 mod collecting;
 mod listing;

@@ -34,8 +34,8 @@ fn the_demo_gives_the_same_bytes_with_any_threads_and_environments() {
 #[test]
 fn a_checkpoint_goes_from_training_to_a_report() {
     let swm = Swm::new();
-    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--image", "64", "--episodes", "6", "--max-steps", "60"]);
-    let train = ["train", "lewm", "--data", "rooms", "-o", "small", "schedule.steps=6", "schedule.warmup=2"];
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--image", "64", "--episodes", "12", "--max-steps", "60"]);
+    let train = ["train", "lewm", "--data", "rooms", "-o", "small", "schedule.steps=6", "data.batch_size=32"];
     let summary = swm.json(&train);
     assert_eq!(summary["steps"], 6);
     swm.refuses(&train, 1, &["small", "--resume"]);

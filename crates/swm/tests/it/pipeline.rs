@@ -38,7 +38,7 @@ fn a_checkpoint_goes_from_training_to_a_report() {
     let train = ["train", "lewm", "--data", "rooms", "-o", "small", "schedule.steps=6", "data.batch_size=32"];
     let summary = swm.json(&train);
     assert_eq!(summary["steps"], 6);
-    swm.refuses(&train, 1, &["small", "--resume"]);
+    swm.refuses(&train, 2, &["small", "resume"]);
     swm.refuses(&["train", "lewm", "--data", "rooms", "-o", "small", "--resume", "optim.lr=1"], 2, &["optim.lr"]);
     assert_eq!(swm.json(&["checkpoints"])[0]["name"], "small");
 
@@ -55,7 +55,7 @@ fn a_checkpoint_goes_from_training_to_a_report() {
     assert_eq!(dataset["protocol"], "dataset");
     assert_eq!(dataset["runs"][1]["condition"], "agent.color=0,0,255");
     let report = swm.json(&["report", "episodic", "dataset", "-o", "report"]);
-    let page = std::fs::read_to_string(report["report"].as_str().expect("a path")).expect("the report");
+    let page = std::fs::read_to_string(swm.path(report["report"].as_str().expect("a path"))).expect("the report");
     assert!(page.contains("agent.color=0,0,255") && page.contains("data:video/mp4"));
 
     swm.refuses(&["eval", "small", "--env", "swm/PushT-v1"], 2, &["trained on swm/TwoRoom-v1"]);

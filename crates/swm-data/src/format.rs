@@ -174,15 +174,8 @@ impl Named for Format {
 pub static FORMATS: Registry<Format> =
     Registry { kind: "dataset format", hint: "`swm formats` lists them", rows: &[lance::FORMAT] };
 
-fn detect(path: &Path) -> Result<&'static Format> {
-    FORMATS.rows.iter().find(|format| (format.detect)(path)).ok_or_else(|| {
-        let known: Vec<&str> = FORMATS.rows.iter().map(Named::id).collect();
-        let problem = match path.try_exists() {
-            Ok(true) => "is no dataset of a known format",
-            _ => "there is no such dataset",
-        };
-        Error::corrupt(path, problem, format!("a dataset is a folder NAME.lance (formats: {})", known.join(", ")))
-    })
+fn detect(path: &Path) -> Option<&'static Format> {
+    FORMATS.rows.iter().find(|format| (format.detect)(path))
 }
 
 /// Opens a dataset of any format.
@@ -190,7 +183,15 @@ fn detect(path: &Path) -> Result<&'static Format> {
 /// # Errors
 /// When there is none, it is of no known format, or it is damaged.
 pub fn open(path: &Path) -> Result<Arc<dyn Reader>> {
-    (detect(path)?.open)(path)
+    if let Some(format) = detect(path) {
+        return (format.open)(path);
+    }
+    let problem = match path.try_exists() {
+        Ok(true) => "is no dataset of a known format",
+        _ => "there is no such dataset",
+    };
+    let known: Vec<&str> = FORMATS.rows.iter().map(Named::id).collect();
+    Err(Error::corrupt(path, problem, format!("a dataset is a folder NAME.lance (formats: {})", known.join(", "))))
 }
 
 /// Creates, continues or replaces a dataset whose episodes have these columns.
@@ -199,5 +200,9 @@ pub fn open(path: &Path) -> Result<Arc<dyn Reader>> {
 /// When the path names no known format, the dataset exists and must not, the schema differs from the one
 /// to continue, or the folder cannot be written.
 pub fn create(path: &Path, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
-    (detect(path)?.create)(path, schema, options)
+    let Some(format) = detect(path) else {
+        let problem = format!("{} names no format", path.display());
+        return Err(Error::config("dataset path", problem, "end it in .lance"));
+    };
+    (format.create)(path, schema, options)
 }

@@ -6,6 +6,7 @@
 //! package open what is written here, and the other way round. The original names, types and shapes are kept
 //! in the table's metadata, which foreign readers ignore.
 
+mod convert;
 mod reader;
 mod schema;
 mod store;

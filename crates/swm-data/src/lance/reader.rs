@@ -1,17 +1,12 @@
 //! Reading episodes: all ranges of a batch are sorted, merged and read together, pictures are decoded in
 //! parallel into the batch.
 
+use super::convert::{blob, cast, convert, whole_numbers};
 use super::schema::{self, EPISODE, Kind, STEP, StoredColumn};
 use super::store::{self, Store, damaged, table_folder, wait};
 use crate::format::{Episode, Reader, StepRange};
 use crate::image;
-use arrow_array::cast::AsArray;
-use arrow_array::types::{
-    Float16Type, Float32Type, Float64Type, Int8Type, Int16Type, Int32Type, Int64Type, UInt8Type, UInt16Type,
-    UInt32Type, UInt64Type,
-};
-use arrow_array::{Array, ArrayRef, ArrowPrimitiveType};
-use arrow_schema::DataType;
+use arrow_array::ArrayRef;
 use futures::{StreamExt as _, TryStreamExt as _};
 use lance_core::datatypes::Schema as LanceSchema;
 use lance_encoding::decoder::FilterExpression;
@@ -23,8 +18,9 @@ use rayon::prelude::*;
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
 use std::ops::Range;
 use std::path::Path;
+use std::slice;
 use std::sync::{Arc, Mutex, PoisonError};
-use swm_core::{DType, Error, Manifest, Result, Schema};
+use swm_core::{Error, Manifest, Result, Schema};
 
 /// Data files that are kept open. Each takes a file descriptor, of which a process commonly has 1024.
 const OPEN_FILES: usize = 256;
@@ -102,7 +98,7 @@ impl LanceReader {
             verified: Mutex::default(),
         };
         let (columns, schema) = schema::columns_to_read(&folder, &reader.table.schema, |column| {
-            let pieces = reader.pieces(column, &[0..1.min(reader.rows())])?;
+            let pieces = reader.pieces(column, slice::from_ref(&(0..1.min(reader.rows()))))?;
             pieces.first().map(|piece| blob(&piece.values, 0).map(<[u8]>::to_vec)).transpose()
         })?;
         (reader.columns, reader.schema) = (columns, schema);
@@ -122,9 +118,9 @@ impl LanceReader {
     fn find_episodes(&mut self) -> Result<()> {
         let mut row = 0;
         let mut episodes: Vec<Episode> = vec![];
-        for piece in self.pieces(EPISODE, &[0..self.rows()])? {
+        for piece in self.pieces(EPISODE, slice::from_ref(&(0..self.rows())))? {
             let mut indices = vec![0_i64; piece.rows];
-            numbers(&piece.values, &mut indices)?;
+            whole_numbers(&piece.values, &mut indices)?;
             for index in indices {
                 match episodes.last_mut() {
                     Some(episode) if episode.index == index => episode.length += 1,
@@ -430,7 +426,7 @@ impl Reader for LanceReader {
             let mut start = 0;
             while start < self.rows() {
                 let end = (start + u64::from(ROWS_PER_PIECE)).min(self.rows());
-                for piece in self.pieces(&column.name, &[start..end])? {
+                for piece in self.pieces(&column.name, slice::from_ref(&(start..end)))? {
                     match column.kind {
                         Kind::Image => {
                             for row in 0..piece.rows {
@@ -462,123 +458,4 @@ fn folder_size(folder: &Path) -> Result<u64> {
         size += if metadata.is_dir() { folder_size(&entry.path())? } else { metadata.len() };
     }
     Ok(size)
-}
-
-/// The stored bytes of a picture.
-fn blob(values: &ArrayRef, row: usize) -> Result<&[u8]> {
-    let bytes = if let Some(values) = values.as_binary_opt::<i32>() {
-        (!values.is_null(row)).then(|| values.value(row))
-    } else if let Some(values) = values.as_binary_opt::<i64>() {
-        (!values.is_null(row)).then(|| values.value(row))
-    } else {
-        None
-    };
-    bytes.ok_or_else(|| Error::mismatch("reading pictures", format!("{} or null", values.data_type()), "encoded bytes"))
-}
-
-/// Converts stored values, a scalar or a list of `n` a row, to the bytes of a column of `dtype`.
-fn convert(values: &ArrayRef, n: usize, dtype: DType, out: &mut [u8]) -> Result<(), String> {
-    let numbers = match values.as_fixed_size_list_opt() {
-        Some(lists) if lists.value_length() as usize == n && lists.null_count() == 0 => {
-            // `values` has the list's offset applied by slicing.
-            lists.values().slice(lists.value_offset(0) as usize, lists.len() * n)
-        }
-        Some(lists) => return Err(format!("lists of {}, {} of them null", lists.value_length(), lists.null_count())),
-        None => Arc::clone(values),
-    };
-    if numbers.len() * dtype.size() != out.len() {
-        return Err(format!("{} numbers for {} bytes", numbers.len(), out.len()));
-    }
-    match numbers.data_type() {
-        DataType::Float32 => cast_all::<Float32Type, f64>(&numbers, dtype, out),
-        DataType::Float64 => cast_all::<Float64Type, f64>(&numbers, dtype, out),
-        DataType::Float16 => {
-            let values = numbers.as_primitive::<Float16Type>();
-            cast(values.iter().map(|v| v.map_or(f64::NAN, f64::from)), dtype, out);
-            Ok(())
-        }
-        DataType::Int8 => cast_all::<Int8Type, i64>(&numbers, dtype, out),
-        DataType::Int16 => cast_all::<Int16Type, i64>(&numbers, dtype, out),
-        DataType::Int32 => cast_all::<Int32Type, i64>(&numbers, dtype, out),
-        DataType::Int64 => cast_all::<Int64Type, i64>(&numbers, dtype, out),
-        DataType::UInt8 => cast_all::<UInt8Type, i64>(&numbers, dtype, out),
-        DataType::UInt16 => cast_all::<UInt16Type, i64>(&numbers, dtype, out),
-        DataType::UInt32 => cast_all::<UInt32Type, i64>(&numbers, dtype, out),
-        DataType::UInt64 => {
-            #[allow(clippy::cast_possible_wrap)]
-            let values = numbers.as_primitive::<UInt64Type>().values().iter().map(|&v| v as i64);
-            cast(values, dtype, out);
-            Ok(())
-        }
-        DataType::Boolean if numbers.null_count() == 0 => {
-            cast(numbers.as_boolean().values().iter().map(i64::from), dtype, out);
-            Ok(())
-        }
-        other => Err(format!("{other} is no number that can be read")),
-    }
-}
-
-/// A number on its way to the type of a column.
-trait Number: Copy {
-    /// What a missing value becomes, if anything can stand for it.
-    const MISSING: Option<Self>;
-    fn f64(self) -> f64;
-    fn i64(self) -> i64;
-}
-
-impl Number for f64 {
-    const MISSING: Option<Self> = Some(Self::NAN);
-    fn f64(self) -> f64 {
-        self
-    }
-    #[allow(clippy::cast_possible_truncation)]
-    fn i64(self) -> i64 {
-        self as i64
-    }
-}
-
-impl Number for i64 {
-    const MISSING: Option<Self> = None;
-    #[allow(clippy::cast_precision_loss)]
-    fn f64(self) -> f64 {
-        self as f64
-    }
-    fn i64(self) -> i64 {
-        self
-    }
-}
-
-fn cast_all<T: ArrowPrimitiveType, N: Number>(values: &ArrayRef, dtype: DType, out: &mut [u8]) -> Result<(), String>
-where
-    N: From<T::Native>,
-{
-    let values = values.as_primitive::<T>();
-    if values.null_count() == 0 {
-        cast(values.values().iter().map(|&v| N::from(v)), dtype, out);
-        return Ok(());
-    }
-    let Some(missing) = N::MISSING else { return Err(format!("{} missing numbers", values.null_count())) };
-    cast(values.iter().map(|v| v.map_or(missing, N::from)), dtype, out);
-    Ok(())
-}
-
-fn cast<N: Number>(values: impl Iterator<Item = N>, dtype: DType, out: &mut [u8]) {
-    fn put<const SIZE: usize>(out: &mut [u8], values: impl Iterator<Item = [u8; SIZE]>) {
-        out.chunks_exact_mut(SIZE).zip(values).for_each(|(place, value)| place.copy_from_slice(&value));
-    }
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    match dtype {
-        DType::Bool => put(out, values.map(|v| [u8::from(v.f64() != 0.0)])),
-        DType::U8 => put(out, values.map(|v| [v.i64() as u8])),
-        DType::Int32 => put(out, values.map(|v| (v.i64() as i32).to_ne_bytes())),
-        DType::Int64 => put(out, values.map(|v| v.i64().to_ne_bytes())),
-        DType::Float32 => put(out, values.map(|v| (v.f64() as f32).to_ne_bytes())),
-        DType::Float64 => put(out, values.map(|v| v.f64().to_ne_bytes())),
-    }
-}
-
-/// Whole numbers of any width.
-fn numbers(values: &ArrayRef, out: &mut [i64]) -> Result<()> {
-    convert(values, 1, DType::Int64, bytemuck::cast_slice_mut(out))
-        .map_err(|problem| Error::mismatch(format!("reading '{EPISODE}'"), problem, "whole numbers"))
 }

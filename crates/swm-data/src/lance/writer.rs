@@ -40,8 +40,8 @@ const KEPT_VERSIONS: usize = 8;
 /// Creates, continues or replaces a table.
 pub fn create(path: &Path, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     options.codec.check()?;
-    let columns = schema::columns_to_write(schema)?;
-    let folder = if path.extension().is_some() { path.to_owned() } else { table_folder(path)? };
+    let mut columns = schema::columns_to_write(schema)?;
+    let folder = table_folder(path)?;
     let store = Store::new(&folder)?;
     let found = store.latest()?;
     let metadata = schema::metadata(schema, options.codec, options.manifest.as_ref())?;
@@ -51,8 +51,7 @@ pub fn create(path: &Path, schema: &Schema, options: WriteOptions) -> Result<Box
     let overwrite =
         Operation::Overwrite { fragments: vec![], schema: fresh, config_upsert_values: None, initial_bases: None };
     let mut table = Table { store, version: None, file_version: FILE_VERSION, manifests: VecDeque::new() };
-    let mut existing = Existing::default();
-    let mut columns = columns;
+    let (mut episodes, mut next) = (0, 0);
     match (options.mode, found) {
         (_, None) => table.commit(overwrite)?,
         (WriteMode::Create, Some(_)) => {
@@ -68,8 +67,10 @@ pub fn create(path: &Path, schema: &Schema, options: WriteOptions) -> Result<Box
             table.remove_replaced(&old);
         }
         (WriteMode::Append, Some(old)) => {
-            columns = continued(&folder, columns, &old)?;
-            existing = Existing::of(&folder)?;
+            let known = super::reader::open(&folder)?;
+            columns = continued(&folder, columns, &old, known.schema())?;
+            episodes = known.episodes().len();
+            next = known.episodes().iter().map(|episode| episode.index + 1).max().unwrap_or(0);
             table.file_version = old.manifest.data_storage_format.lance_file_format();
             table.version = Some(old);
             if let Some(manifest) = &options.manifest {
@@ -98,31 +99,21 @@ pub fn create(path: &Path, schema: &Schema, options: WriteOptions) -> Result<Box
         columns,
         arrow,
         codec: options.codec,
-        episodes: existing.episodes,
-        next: existing.next,
+        episodes,
+        next,
         queue: Some(sender),
         thread: Some(thread),
         failure: state,
     }))
 }
 
-/// What a table holds already.
-#[derive(Default)]
-struct Existing {
-    episodes: usize,
-    next: i64,
-}
-
-impl Existing {
-    fn of(folder: &Path) -> Result<Self> {
-        let reader = super::reader::open(folder)?;
-        let next = reader.episodes().iter().map(|episode| episode.index + 1).max().unwrap_or(0);
-        Ok(Self { episodes: reader.episodes().len(), next })
-    }
-}
-
 /// The incoming columns in the order of the table to continue.
-fn continued(folder: &Path, mut incoming: Vec<StoredColumn>, old: &Version) -> Result<Vec<StoredColumn>> {
+fn continued(
+    folder: &Path,
+    mut incoming: Vec<StoredColumn>,
+    old: &Version,
+    known: &Schema,
+) -> Result<Vec<StoredColumn>> {
     let stored = ArrowSchema::from(&old.manifest.schema);
     let offered = schema::arrow_schema(&incoming);
     let describe = |schema: &ArrowSchema| {
@@ -140,9 +131,8 @@ fn continued(folder: &Path, mut incoming: Vec<StoredColumn>, old: &Version) -> R
         ));
     }
     // Types and picture sizes are recorded too, where the table was written here.
-    let known = super::reader::open(folder)?;
     for column in &incoming {
-        if let Ok(spec) = known.schema().column(&column.spec.name)
+        if let Ok(spec) = known.column(&column.spec.name)
             && (spec.dtype, &spec.shape) != (column.spec.dtype, &column.spec.shape)
             && (column.kind == Kind::Image || schema::codec(&old.manifest.schema).is_some())
         {
@@ -197,7 +187,7 @@ impl Writer for LanceWriter {
         check_actions(episode)?;
         let record = self.record(episode)?;
         let queue = self.queue.as_ref();
-        if !queue.is_some_and(|queue| queue.send(record).is_ok()) {
+        if queue.is_none_or(|queue| queue.send(record).is_err()) {
             return Err(self.failed());
         }
         self.episodes += 1;

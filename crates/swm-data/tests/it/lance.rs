@@ -258,6 +258,7 @@ fn places_that_cannot_be_written_say_why() {
     std::fs::write(&file, "not a folder").expect("writes");
     let error = failure(&file.join("d.lance"), &schema(), WriteMode::Create);
     assert!(error.contains("Not a directory"), "{error}");
+    assert!(failure(&folder.path().join("name"), &schema(), WriteMode::Create).contains("end it in .lance"));
     // Not even the administrator may write here.
     let error = create(Path::new("/proc/d.lance"), &schema(), options(WriteMode::Create)).err().expect("refused");
     assert!(matches!(error, Error::Io { .. }), "{error}");

@@ -130,6 +130,15 @@ fn episodes_batches_and_cache_are_as_configured() {
     assert_eq!(loader.epoch(0, 0).take(2).count(), 2);
     assert_eq!(loader.epoch(0, loader.batches_per_epoch()).count(), 0);
     assert_eq!(loader.schema().columns()[0].shape, [1, 16, 24, 3]);
+    // Batches that come back are filled anew.
+    let fresh: Vec<Batch> = loader.epoch(1, 0).map(|batch| batch.expect("a batch")).collect();
+    let again = loader.epoch(1, 0).map(|batch| {
+        let batch = batch.expect("a batch");
+        let copy = batch.clone();
+        loader.recycle(batch);
+        copy
+    });
+    assert!(bytes(&again.collect::<Vec<_>>()) == bytes(&fresh));
     assert_eq!(loader.schema().columns()[2].dtype, DType::Float64);
 }
 

@@ -1,5 +1,8 @@
 //! Datasets on disk, in one test binary.
 
+// Tests say on standard output why they are skipped; the child process of one of them reports there.
+#![allow(clippy::print_stdout)]
+
 mod damage;
 mod foreign;
 mod interruption;

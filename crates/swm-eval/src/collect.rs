@@ -156,7 +156,7 @@ pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
     Ok(())
 }
 
-/// The writer's side: stores what comes and sends the empty batches back. Works on the world's threads, so
+/// The writer's side: stores what comes and sends the batches back. Works on the world's threads, so
 /// that its setting bounds the encoding of pictures as well.
 fn write_all(
     mut writer: Box<dyn Writer>,
@@ -164,9 +164,8 @@ fn write_all(
     back: &Sender<Batch>,
     threads: &rayon::ThreadPool,
 ) -> Result<()> {
-    for mut episode in episodes {
+    for episode in episodes {
         threads.install(|| writer.write_episode(&episode))?;
-        episode.resize(0);
         // Nobody listens any more when the world failed; what it finished is stored nevertheless.
         let _ = back.send(episode);
     }
@@ -213,15 +212,15 @@ impl Layout {
         Ok(Self { schema: Schema::new(columns)?, observed, action, reward, factors, places: Places::of(infos)? })
     }
 
-    /// Appends what a slot shows.
-    fn push(&self, episode: &mut Batch, infos: &Batch, slot: usize) -> usize {
-        let row = episode.rows();
-        episode.resize(row + 1);
+    /// Writes what a slot shows into a row, the first one behind those there are at most.
+    fn observe(&self, episode: &mut Batch, row: usize, infos: &Batch, slot: usize) {
+        if row == episode.rows() {
+            episode.resize(row + 1);
+        }
         for &(from, to) in &self.observed {
             let n = self.schema.columns()[to].row_bytes();
             episode.bytes_mut(to)[row * n..][..n].copy_from_slice(&infos.bytes(from)[slot * n..][..n]);
         }
-        row
     }
 
     /// Writes what is constant over an episode into all its rows.
@@ -265,9 +264,12 @@ fn fill(batch: &mut Batch, column: usize, value: &[f64]) {
     }
 }
 
-/// One episode being played.
+/// One episode being played. Batches come back from the writer with the rows of an older episode, which are
+/// overwritten one by one: clearing them first would cost as much as recording them.
 struct Recording {
     number: usize,
+    /// Rows recorded; the batch may have more until the episode is finished.
+    length: usize,
     rows: Batch,
 }
 
@@ -288,12 +290,12 @@ struct Collecting<'a> {
     steps: usize,
     to_writer: SyncSender<Batch>,
     written: Receiver<Batch>,
-    /// Batches to record into, empty, their memory kept.
+    /// Batches to record into, whatever they hold.
     spare: Vec<Batch>,
 }
 
 impl Collecting<'_> {
-    fn finish(&mut self, Recording { number, rows }: Recording) -> Result<()> {
+    fn finish(&mut self, Recording { number, rows, .. }: Recording) -> Result<()> {
         let place = number - self.handed;
         if self.finished.len() <= place {
             self.finished.resize_with(place + 1, || None);
@@ -354,7 +356,7 @@ impl Play for Collecting<'_> {
         for &(slot, number) in starting {
             resets.push(reset(slot, self.key(number), &self.config.variation));
             let rows = self.spare.pop().unwrap_or_else(|| Batch::zeros(&self.layout.schema, 0));
-            self.recordings[slot] = Some(Recording { number, rows });
+            self.recordings[slot] = Some(Recording { number, length: 0, rows });
         }
         pool.reset(&resets)
     }
@@ -365,7 +367,9 @@ impl Play for Collecting<'_> {
 
     fn acted(&mut self, slot: usize, pool: &EnvPool, actions: &Batch) {
         let Some(recording) = &mut self.recordings[slot] else { return };
-        let row = self.layout.push(&mut recording.rows, pool.infos(), slot);
+        let row = recording.length;
+        recording.length += 1;
+        self.layout.observe(&mut recording.rows, row, pool.infos(), slot);
         let n = self.layout.schema.columns()[self.layout.action].row_bytes();
         let action = &actions.bytes(0)[slot * n..][..n];
         recording.rows.bytes_mut(self.layout.action)[row * n..][..n].copy_from_slice(action);
@@ -379,8 +383,7 @@ impl Play for Collecting<'_> {
         let (layout, places, infos) = (&self.layout, self.layout.places, pool.infos());
         let last = infos.row(slot);
         let (terminated, truncated) = (last.at::<u8>(places.terminated)[0], last.at::<u8>(places.truncated)[0]);
-        let row = recording.rows.rows() - 1;
-        let mut row = recording.rows.row_mut(row);
+        let mut row = recording.rows.row_mut(recording.length - 1);
         row.set(layout.reward, last.at::<f32>(places.reward));
         row.set(layout.reward + 1, &[terminated]);
         row.set(layout.reward + 2, &[truncated]);
@@ -389,13 +392,18 @@ impl Play for Collecting<'_> {
             self.recordings[slot] = Some(recording);
             return Ok(true);
         }
-        let row = layout.push(&mut recording.rows, infos, slot);
-        let mut row = recording.rows.row_mut(row);
+        layout.observe(&mut recording.rows, recording.length, infos, slot);
+        let mut row = recording.rows.row_mut(recording.length);
+        recording.length += 1;
         match layout.schema.columns()[layout.action].dtype {
             DType::Float32 => row.at::<f32>(layout.action).fill(f32::NAN),
             _ => row.at::<i64>(layout.action).fill(-1),
         }
+        row.set(layout.reward, &[0.0f32]);
+        row.set(layout.reward + 1, &[0u8]);
+        row.set(layout.reward + 2, &[0u8]);
         let seed = reset_seed(self.key(recording.number));
+        recording.rows.resize(recording.length);
         layout.fill_constants(&mut recording.rows, pool, slot, seed);
         self.finish(recording)?;
         Ok(false)

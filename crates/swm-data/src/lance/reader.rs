@@ -23,7 +23,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Manifest, Result, Schema};
 
 /// Data files that are kept open. Each takes a file descriptor, of which a process commonly has 1024.
-const OPEN_FILES: usize = 256;
+const OPEN_FILES: usize = 128;
+
+/// Data files that one read has open at a time, be they kept or not.
+const FILES_AT_ONCE: usize = 64;
 
 /// Data files up to this size are checked before even the numbers of their episodes are read.
 const SMALL_FILE: u64 = 1 << 20;
@@ -188,12 +191,21 @@ impl LanceReader {
                 fragment += 1;
             }
         }
+        let mut pieces = vec![];
+        for jobs in jobs.chunks(FILES_AT_ONCE) {
+            pieces.extend(self.read_pieces(stored_name, jobs)?);
+        }
+        Ok(pieces)
+    }
+
+    /// The stored values of some rows of some fragments.
+    fn read_pieces(&self, stored_name: &str, jobs: &[(usize, Vec<Range<u64>>)]) -> Result<Vec<Piece>> {
         let mut reads = vec![];
         for (fragment, parts) in jobs {
-            self.verify(self.data_file(fragment, stored_name)?.0, stored_name != EPISODE)?;
-            let (file, projection) = self.locate(fragment, stored_name)?;
+            self.verify(self.data_file(*fragment, stored_name)?.0, stored_name != EPISODE)?;
+            let (file, projection) = self.locate(*fragment, stored_name)?;
             let wanted: u64 = parts.iter().map(|part| part.end - part.start).sum();
-            reads.push((file, projection, parts, wanted));
+            reads.push((file, projection, parts.clone(), wanted));
         }
         let action = format!("reading column '{stored_name}'");
         let lists = wait(self.folder(), &action, async move {

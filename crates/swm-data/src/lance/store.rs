@@ -56,7 +56,7 @@ pub fn damaged(path: &Path, problem: impl Into<String>) -> Error {
     Error::corrupt(
         path,
         problem,
-        "a file of the dataset is damaged or missing; restore it from a copy, or collect the dataset again",
+        "a file of the dataset is damaged or missing: restore it from a copy, or delete the dataset and collect it again",
     )
 }
 

@@ -104,6 +104,7 @@ pub fn create(path: &Path, schema: &Schema, options: WriteOptions) -> Result<Box
         queue: Some(sender),
         thread: Some(thread),
         failure: state,
+        reported: false,
     }))
 }
 
@@ -171,6 +172,8 @@ struct LanceWriter {
     queue: Option<SyncSender<RecordBatch>>,
     thread: Option<JoinHandle<()>>,
     failure: Failure,
+    /// Whether the caller knows of the failure.
+    reported: bool,
 }
 
 impl Writer for LanceWriter {
@@ -224,7 +227,8 @@ impl LanceWriter {
     }
 
     /// Why the committing thread stopped.
-    fn failed(&self) -> Error {
+    fn failed(&mut self) -> Error {
+        self.reported = true;
         let known = self.failure.lock().unwrap_or_else(PoisonError::into_inner).take();
         known.unwrap_or_else(|| Error::external("writing an episode", "an earlier commit failed; nothing more is kept"))
     }
@@ -235,16 +239,17 @@ impl LanceWriter {
         if thread.join().is_err() {
             return Err(Error::external("committing episodes", "the committing thread panicked; this is a bug"));
         }
-        match self.failure.lock().unwrap_or_else(PoisonError::into_inner).take() {
-            Some(error) => Err(error),
-            None => Ok(()),
-        }
+        let failed = self.reported || self.failure.lock().unwrap_or_else(PoisonError::into_inner).is_some();
+        if failed { Err(self.failed()) } else { Ok(()) }
     }
 }
 
 impl Drop for LanceWriter {
     fn drop(&mut self) {
-        if let Err(error) = self.close() {
+        let reported = self.reported;
+        if let Err(error) = self.close()
+            && !reported
+        {
             tracing::error!(dataset = %self.folder.display(), "the last episodes are lost: {error}");
         }
     }

@@ -13,26 +13,46 @@ const TARGET: &str = "SWM_TEST_CHILD_TARGET";
 /// Not a test of its own: the process that the tests below kill or starve. Writes episodes for ever, a line
 /// each; stops at an error, and prints it.
 #[test]
-fn child() {
+fn child_that_writes() {
     let Some(path) = std::env::var_os(TARGET).map(PathBuf::from) else { return };
     let commit = CommitPolicy { episodes: 3, interval: Duration::from_millis(20), ..CommitPolicy::default() };
     let mut writer = create(&path, &schema(), WriteOptions { commit, ..options(WriteMode::Append) }).expect("creates");
     for e in writer.episodes()..100_000 {
         if let Err(error) = writer.write_episode(&episode(e)) {
             println!("failed: {error}");
+            assert!(writer.finish().is_err(), "what was lost stays lost");
             return;
         }
         println!("episode {e}");
     }
 }
 
-/// The command that runs [`child`], below `shell`, which sets its limits.
-fn run_child(path: &Path, shell: &str) -> Command {
+/// The command that runs a child test, after `shell` has set its limits.
+fn run_child(test: &str, path: &Path, shell: &str) -> Command {
     let mut command = Command::new("sh");
     let program = std::env::current_exe().expect("this program");
-    command.args(["-c", &format!("{shell} exec \"$0\" --exact interruption::child --nocapture")]).arg(program);
+    command.args(["-c", &format!("{shell} exec \"$0\" --exact interruption::{test} --nocapture")]).arg(program);
     command.env(TARGET, path).stdout(Stdio::piped()).stderr(Stdio::null());
     command
+}
+
+/// Not a test of its own: opens the dataset in a process with few file descriptors.
+#[test]
+fn child_that_reads() {
+    let Some(path) = std::env::var_os(TARGET).map(PathBuf::from) else { return };
+    let reader = open(&path).expect("opens");
+    check(&*reader, 0);
+    println!("read {} episodes", reader.episodes().len());
+}
+
+#[test]
+fn many_fragments_need_few_file_descriptors() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write(&path, WriteMode::Create, 1, 0..170);
+    let output = run_child("child_that_reads", &path, "ulimit -n 160;").output().expect("runs");
+    let text = String::from_utf8_lossy(&output.stdout);
+    assert!(text.contains("read 170 episodes"), "{text}");
 }
 
 #[test]
@@ -41,7 +61,7 @@ fn a_killed_writer_keeps_finished_episodes() {
     let path = folder.path().join("d.lance");
     let mut stored = 0;
     for written in [7, 20, 33] {
-        let mut child = run_child(&path, "").spawn().expect("starts");
+        let mut child = run_child("child_that_writes", &path, "").spawn().expect("starts");
         let mut lines = BufReader::new(child.stdout.take().expect("its output")).lines();
         let mut seen = 0;
         while seen < written {
@@ -65,7 +85,7 @@ fn a_killed_writer_keeps_finished_episodes() {
 
 /// Runs the child until it fails, and checks what it says and leaves.
 fn starve(path: &Path, shell: &str, words: &str) {
-    let output = run_child(path, shell).output().expect("runs");
+    let output = run_child("child_that_writes", path, shell).output().expect("runs");
     let text = String::from_utf8_lossy(&output.stdout);
     let failure = text.lines().find(|line| line.starts_with("failed: ")).unwrap_or_else(|| panic!("{text}"));
     assert!(failure.contains(words), "{failure}");

@@ -9,7 +9,7 @@ mod render;
 mod shapes;
 
 use crate::factors;
-use physics::{AGENT, BLOCK, Shape, Vec2, WALLS, World, put, take};
+use physics::{AGENT, BLOCK, Body, Shape, Vec2, WALLS, World, put, take};
 use render::{Renderer, Scene};
 use shapes::Design;
 use std::f64::consts::{PI, TAU};
@@ -26,11 +26,18 @@ pub const ENTRY: EnvEntry = EnvEntry {
     experts: EXPERTS,
 };
 
-const EXPERTS: &[ExpertEntry] = &[ExpertEntry {
-    id: "weak",
-    summary: "random actions that stay near the block",
-    make: || Box::new(expert::Weak::default()),
-}];
+const EXPERTS: &[ExpertEntry] = &[
+    ExpertEntry {
+        id: "expert",
+        summary: "pushes planned with the world's own physics",
+        make: || Box::new(expert::Pusher::default()),
+    },
+    ExpertEntry {
+        id: "weak",
+        summary: "random actions that stay near the block",
+        make: || Box::new(expert::Weak::default()),
+    },
+];
 
 /// Side of the table, in pixels.
 pub const TABLE: f64 = 512.0;
@@ -68,6 +75,8 @@ pub struct PushT {
     goal_scene: Scene,
     /// Contact points of all physics steps since the last action.
     contacts: usize,
+    /// Agent shape and scale, block shape and scale.
+    shapes: [f64; 4],
     renderer: Renderer,
 }
 
@@ -87,7 +96,8 @@ impl PushT {
             variation_space,
             max_episode_steps: 200,
         };
-        Self { spec, renderer: Renderer::new(&factors), factors, world, goal, goal_scene, contacts: 0 }
+        let (renderer, shapes) = (Renderer::new(&factors), shapes_of(&factors));
+        Self { spec, factors, world, goal, goal_scene, contacts: 0, shapes, renderer }
     }
 
     fn state(&self) -> State {
@@ -101,6 +111,7 @@ impl PushT {
         self.goal_scene = Scene::of(&self.world);
         self.goal = goal;
         self.renderer.begin(&factors);
+        self.shapes = shapes_of(&factors);
         self.factors = factors;
     }
 }
@@ -137,13 +148,7 @@ impl Env for PushT {
 
     fn step(&mut self, action: Action<'_>) -> Result<Transition> {
         let action = action.continuous(2)?;
-        let mut control = Control::towards(self.world.bodies[AGENT].position(), [action[0], action[1]]);
-        self.contacts = 0;
-        for _ in 0..SUBSTEPS {
-            control.apply(&mut self.world);
-            self.world.step();
-            self.contacts += self.world.contacts();
-        }
+        self.contacts = advance(&mut self.world, [action[0], action[1]]);
         let state = self.state();
         Ok(Transition {
             reward: -distance(&self.goal, &state),
@@ -167,6 +172,7 @@ impl Env for PushT {
         row.set(7, &[goal[0], goal[1], goal[5], goal[6]]);
         #[allow(clippy::cast_possible_wrap)]
         row.set(8, &[self.contacts.div_ceil(SUBSTEPS) as i64]);
+        row.set(9, &self.shapes);
     }
 
     fn render(&mut self, frame: FrameMut<'_>) {
@@ -231,35 +237,32 @@ impl Env for PushT {
     }
 }
 
-/// The controller that pulls the agent to where an action points, in single precision as the reference's is.
-struct Control {
-    target: [f32; 2],
-}
-
-impl Control {
-    #[allow(clippy::cast_possible_truncation)]
-    fn towards(from: Vec2, action: [f32; 2]) -> Self {
-        Self { target: [from.x as f32 + action[0] * ACTION_SCALE, from.y as f32 + action[1] * ACTION_SCALE] }
-    }
-
-    #[allow(clippy::cast_possible_truncation)]
-    fn apply(&mut self, world: &mut World) {
-        const DT: f32 = physics::DT as f32;
+/// One step of the environment: pulls the agent to where an action points, in single precision as the reference
+/// does. Returns how many contact points the physics steps had, all together.
+#[allow(clippy::cast_possible_truncation)]
+fn advance(world: &mut World, action: [f32; 2]) -> usize {
+    const DT: f32 = physics::DT as f32;
+    let from = world.bodies[AGENT].position();
+    let target = [from.x as f32 + action[0] * ACTION_SCALE, from.y as f32 + action[1] * ACTION_SCALE];
+    let pulled = |target: f32, at: f64, speed: f64| {
+        let pull = GAINS[0] * (target - at as f32) + (f64::from(GAINS[1]) * -speed) as f32;
+        f64::from(speed as f32 + pull * DT)
+    };
+    let mut contacts = 0;
+    for _ in 0..SUBSTEPS {
         let agent = &mut world.bodies[AGENT];
-        let next = |target: f32, at: f64, speed: f64| {
-            let pull = GAINS[0] * (target - at as f32) + (f64::from(GAINS[1]) * -speed) as f32;
-            f64::from(speed as f32 + pull * DT)
-        };
         let (at, velocity) = (agent.position(), agent.velocity);
-        agent.velocity = Vec2::new(next(self.target[0], at.x, velocity.x), next(self.target[1], at.y, velocity.y));
+        agent.velocity = Vec2::new(pulled(target[0], at.x, velocity.x), pulled(target[1], at.y, velocity.y));
+        world.step();
+        contacts += world.contacts();
     }
+    contacts
 }
 
 /// The world of an episode, before anything moved.
 fn world_of(factors: &FactorValues) -> World {
-    let agent = design(factors, "agent");
-    let block = design(factors, "block");
-    let mut bodies = [agent.body(), block.body()];
+    let designs = ["agent", "block"].map(|name| design(factors, name));
+    let mut bodies = [designs[AGENT].body(), designs[BLOCK].body()];
     for (body, name) in bodies.iter_mut().zip(["agent", "block"]) {
         let position = factors.get(&format!("{name}.start_position"));
         body.set_position(Vec2::new(position[0], position[1]));
@@ -267,17 +270,26 @@ fn world_of(factors: &FactorValues) -> World {
             body.set_angle(factors.scalar(&format!("{name}.angle")));
         }
     }
+    assemble(&designs, bodies)
+}
+
+/// Agent and block between the walls.
+fn assemble(designs: &[Design; 2], [agent, block]: [Body; 2]) -> World {
     let wall = |[a, b]: [[f64; 2]; 2]| Shape::segment(WALLS, a.into(), b.into(), WALL_RADIUS);
     let mut shapes: Vec<Shape> = WALL_LINES.map(wall).into();
-    shapes.extend(agent.shapes(AGENT));
-    shapes.extend(block.shapes(BLOCK));
-    let [agent, block] = bodies;
+    shapes.extend(designs[AGENT].shapes(AGENT));
+    shapes.extend(designs[BLOCK].shapes(BLOCK));
     World::new(agent, block, shapes, WALL_LINES.len())
 }
 
 /// The shape of `agent` or `block`.
 fn design(factors: &FactorValues, name: &str) -> Design {
     Design::new(factors.integer(&format!("{name}.shape")), factors.scalar(&format!("{name}.scale")))
+}
+
+/// Agent shape and scale, block shape and scale.
+fn shapes_of(factors: &FactorValues) -> [f64; 4] {
+    ["agent.shape", "agent.scale", "block.shape", "block.scale"].map(|key| factors.scalar(key))
 }
 
 /// Puts the bodies where a state says.
@@ -328,9 +340,14 @@ fn distance(a: &State, b: &State) -> f64 {
 /// Whether a state counts as the goal: agent and block in place, the block turned so that it looks the same.
 fn reached(factors: &FactorValues, goal: &State, state: &State) -> bool {
     let apart = goal[..4].iter().zip(state).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
-    let symmetry = Design::symmetry(factors.integer("block.shape"));
-    let turn = (goal[4] - state[4]).rem_euclid(symmetry);
-    apart < REACH && turn.min(symmetry - turn) < REACH_ANGLE
+    apart < REACH && turn(factors.integer("block.shape"), goal[4], state[4]) < REACH_ANGLE
+}
+
+/// The smallest turn from one angle to another after which a block looks the same.
+fn turn(shape: i64, from: f64, to: f64) -> f64 {
+    let symmetry = Design::symmetry(shape);
+    let turn = (from - to).rem_euclid(symmetry);
+    turn.min(symmetry - turn)
 }
 
 /// A goal that can be reached (nothing overlaps there) and is not reached at `start`.
@@ -369,6 +386,7 @@ fn columns() -> Vec<ColumnSpec> {
         column("goal_state", 7),
         column("goal_proprio", 4),
         ColumnSpec::new("n_contacts", DType::Int64, []),
+        column("shapes", 4),
     ]
 }
 

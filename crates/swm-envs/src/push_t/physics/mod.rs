@@ -161,6 +161,18 @@ impl World {
         world
     }
 
+    /// Becomes like another world of the same shapes, without allocating.
+    pub fn copy_from(&mut self, other: &Self) {
+        self.bodies = other.bodies;
+        self.shapes.clone_from(&other.shapes);
+        self.tree.nodes.clone_from(&other.tree.nodes);
+        (self.tree.root, self.tree.spare) = (other.tree.root, other.tree.spare);
+        self.pairs.clone_from(&other.pairs);
+        self.arbiters.clone_from(&other.arbiters);
+        self.active.clone_from(&other.active);
+        (self.tree_stamp, self.stamp) = (other.tree_stamp, other.stamp);
+    }
+
     /// Lets [`DT`] seconds pass.
     pub fn step(&mut self) {
         self.stamp += 1;

@@ -1,6 +1,6 @@
-//! Who demonstrates.
+//! Random actions near the block.
 
-use super::ACTION_SCALE;
+use crate::push_t::ACTION_SCALE;
 use rand::Rng as _;
 use swm_core::policy::Expert;
 use swm_core::{Key, Result, Rng, RowRef};

@@ -1,0 +1,8 @@
+//! Who demonstrates.
+
+mod pusher;
+mod route;
+mod weak;
+
+pub use pusher::Pusher;
+pub use weak::Weak;

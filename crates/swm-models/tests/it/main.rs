@@ -2,4 +2,8 @@
 
 #![allow(clippy::print_stdout)] // the measured errors, for `--no-capture`
 
+mod checkpoints;
+mod dots;
 mod golden;
+mod planning;
+mod training;

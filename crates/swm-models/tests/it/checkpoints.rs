@@ -1,0 +1,63 @@
+//! A checkpoint that cannot be used says why.
+
+use crate::training::{config, run};
+use burn::tensor::Device;
+use std::path::Path;
+use swm_models::{Checkpoint, TrainOptions};
+
+fn edit(path: &Path, change: impl FnOnce(&mut serde_json::Value)) {
+    let mut value = serde_json::from_slice(&std::fs::read(path).expect("readable")).expect("JSON");
+    change(&mut value);
+    std::fs::write(path, value.to_string()).expect("written");
+}
+
+#[test]
+fn damage_and_mismatches_are_named() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let trained = folder.path().join("run");
+    let load = |path: &Path| Checkpoint::load(path, &Device::flex());
+    let message = |path: &Path| load(path).expect_err("unusable").to_string();
+    assert!(message(&trained).contains("no checkpoint"));
+
+    run(&config(&["schedule.steps=1"]), &trained, &TrainOptions::default(), 0).expect("trained");
+    let checkpoint = load(&trained).expect("whole");
+    assert_eq!(checkpoint.env.as_deref(), Some("test/Dots-v0"));
+    assert_eq!(checkpoint.hash().len(), 64);
+
+    let inner = trained.join("checkpoint");
+    let weights = inner.join("weights.safetensors");
+    let whole = std::fs::read(&weights).expect("readable");
+    std::fs::write(&weights, &whole[..whole.len() / 2]).expect("written");
+    assert!(message(&trained).contains("is damaged"), "{}", message(&trained));
+    let mut flipped = whole.clone();
+    *flipped.last_mut().expect("bytes") ^= 1;
+    std::fs::write(&weights, flipped).expect("written");
+    assert!(message(&trained).contains("its hash differs"), "{}", message(&trained));
+    std::fs::write(&weights, &whole).expect("written");
+
+    let card = inner.join("config.json");
+    let original = std::fs::read(&card).expect("readable");
+    edit(&card, |card| card["config"]["model"]["latent"] = 8.into());
+    assert!(message(&trained).contains("config.json makes it"), "{}", message(&trained));
+    std::fs::write(&card, &original).expect("written");
+    edit(&card, |card| card["config"]["model"]["predictor"]["depth"] = 1.into());
+    assert!(message(&trained).contains("is no weight of the model"), "{}", message(&trained));
+    std::fs::write(&card, &original).expect("written");
+    edit(&card, |card| card["family"] = "pldm".into());
+    assert!(message(&trained).contains("family 'pldm'"), "{}", message(&trained));
+    std::fs::write(&card, &original).expect("written");
+
+    // A process killed between the two renames leaves the old checkpoint, which is found.
+    std::fs::rename(&inner, trained.join("checkpoint.old")).expect("renamed");
+    load(&trained).expect("the old one");
+}
+
+#[test]
+fn resuming_something_else_is_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    run(&config(&["schedule.steps=1"]), folder.path(), &TrainOptions::default(), 0).expect("trained");
+    let resume = TrainOptions { resume: true, ..TrainOptions::default() };
+    let error = run(&config(&["schedule.steps=1", "optim.lr=2e-3"]), folder.path(), &resume, 0);
+    let message = error.expect_err("another run").to_string();
+    assert!(message.contains("optim.lr: 0.001 there, 0.002 here"), "{message}");
+}

@@ -1,0 +1,79 @@
+//! A dataset in memory: a dot that moves as its actions say, on pictures of 16 pixels.
+
+use swm_core::{Batch, ColumnSpec, DType, Error, Key, Manifest, Result, Schema};
+use swm_data::{Episode, Reader, StepRange};
+
+pub const SIDE: usize = 16;
+const LENGTH: usize = 24;
+
+pub struct Dots {
+    rows: Batch,
+    episodes: Vec<Episode>,
+    seed: u64,
+}
+
+impl Dots {
+    pub fn new(episodes: usize, seed: u64) -> Self {
+        use rand::Rng as _;
+        let schema =
+            Schema::new([ColumnSpec::image("pixels", SIDE, SIDE), ColumnSpec::new("action", DType::Float32, [2])])
+                .expect("two columns");
+        let mut rows = Batch::zeros(&schema, episodes * LENGTH);
+        for episode in 0..episodes {
+            let mut rng = Key::new(seed).at(episode as u64).rng();
+            let mut at = [rng.random_range(2.0..13.0f32), rng.random_range(2.0..13.0f32)];
+            for step in 0..LENGTH {
+                let mut row = rows.row_mut(episode * LENGTH + step);
+                draw(at, row.at::<u8>(0));
+                let action = [rng.random_range(-1.0..1.0f32), rng.random_range(-1.0..1.0f32)];
+                let last = step + 1 == LENGTH;
+                row.set(1, &if last { [f32::NAN; 2] } else { action });
+                at = std::array::from_fn(|i| (at[i] + action[i]).clamp(1.0, 14.0));
+            }
+        }
+        let episodes = (0..episodes).map(|i| Episode { index: i as i64, length: LENGTH }).collect();
+        Self { rows, episodes, seed }
+    }
+}
+
+pub fn draw(at: [f32; 2], rgb: &mut [u8]) {
+    for (i, pixel) in rgb.chunks_mut(3).enumerate() {
+        let (dx, dy) = ((i % SIDE) as f32 - at[0], (i / SIDE) as f32 - at[1]);
+        let light = (-(dx * dx + dy * dy) / 4.0).exp();
+        pixel.fill((light * 255.0) as u8);
+    }
+}
+
+impl Reader for Dots {
+    fn schema(&self) -> &Schema {
+        self.rows.schema()
+    }
+
+    fn episodes(&self) -> &[Episode] {
+        &self.episodes
+    }
+
+    fn read_column(&self, column: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        let index = self.rows.schema().index(column)?;
+        let n = self.rows.schema().columns()[index].row_bytes();
+        let mut at = 0;
+        for range in ranges {
+            let (first, bytes) = (range.episode * LENGTH + range.start, range.length * n);
+            out[at..at + bytes].copy_from_slice(&self.rows.bytes(index)[first * n..][..bytes]);
+            at += bytes;
+        }
+        Ok(())
+    }
+
+    fn manifest(&self) -> Option<Manifest> {
+        Some(Manifest::new("collect", self.seed, serde_json::json!({ "env": "test/Dots-v0" })))
+    }
+
+    fn footprint(&self) -> std::result::Result<Vec<(String, u64)>, Error> {
+        Ok(vec![])
+    }
+
+    fn content_hash(&self) -> Result<String> {
+        Ok(swm_core::manifest::hash(self.rows.bytes(0)))
+    }
+}

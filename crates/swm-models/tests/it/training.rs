@@ -1,0 +1,119 @@
+//! Training is exact: the same bytes with any number of threads, resumed or not.
+
+use crate::dots::Dots;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use swm_core::Result;
+use swm_models::{Observer, Progress, TrainConfig, TrainOptions, TrainSummary, train};
+
+/// A model of a few thousand parameters.
+pub fn config(words: &[&str]) -> TrainConfig {
+    let small = [
+        "model.image=16",
+        "model.latent=4",
+        "model.projector=16",
+        "model.encoder.pyramid.stages=[{ patch = 4, channels = 8 }, { patch = 2, channels = 8 }]",
+        "model.encoder.pyramid.hidden=16",
+        "model.encoder.pyramid.dim=16",
+        "model.predictor.dim=16",
+        "model.predictor.history=2",
+        "model.predictor.mlp=32",
+        "model.predictor.dim_head=8",
+        "model.predictor.dropout=0.1",
+        "data.frameskip=2",
+        "data.num_steps=4",
+        "data.batch_size=16",
+        "sigreg.directions=16",
+        "schedule.steps=10",
+        "schedule.warmup=2",
+        "log_every=5",
+    ];
+    let words: Vec<String> = small.iter().chain(words).map(|&word| word.to_owned()).collect();
+    TrainConfig::load("tiny", &words).expect("a configuration")
+}
+
+/// Stops after a step.
+struct StopAt<'a>(usize, &'a AtomicBool);
+
+impl Observer for StopAt<'_> {
+    fn progress(&mut self, progress: &Progress) {
+        self.1.store(progress.step == self.0, Ordering::Relaxed);
+    }
+}
+
+pub fn run(config: &TrainConfig, out: &Path, options: &TrainOptions, stop_at: usize) -> Result<TrainSummary> {
+    let stop = AtomicBool::new(false);
+    train(config, Arc::new(Dots::new(6, 0)), out, options, &mut StopAt(stop_at, &stop), &stop)
+}
+
+fn files(run: &Path) -> Vec<Vec<u8>> {
+    ["config.json", "weights.safetensors", "optimizer.safetensors", "state.json", "manifest.json"]
+        .map(|name| std::fs::read(run.join("checkpoint").join(name)).expect(name))
+        .to_vec()
+}
+
+#[test]
+fn a_resumed_run_ends_in_the_same_bytes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (whole, halved) = (folder.path().join("whole"), folder.path().join("halved"));
+    // 6 episodes of 17 clips: an epoch ends after the sixth step, so the second half crosses it.
+    let config = config(&[]);
+    let options = TrainOptions::default();
+    let summary = run(&config, &whole, &options, 0).expect("trained");
+    assert!((summary.steps, summary.interrupted) == (10, false));
+    let first = run(&config, &halved, &options, 5).expect("trained");
+    assert!((first.steps, first.interrupted) == (5, true));
+    let again = run(&config, &halved, &options, 0).expect_err("a run is there").to_string();
+    assert!(again.contains("resume"), "{again}");
+    let resume = TrainOptions { resume: true, ..options };
+    let second = run(&config, &halved, &resume, 0).expect("trained");
+    assert_eq!((second.steps, &second.weights), (10, &summary.weights));
+    assert_eq!(files(&whole), files(&halved));
+    let lines = std::fs::read_to_string(halved.join("train.jsonl")).expect("lines");
+    let steps: Vec<u64> = lines
+        .lines()
+        .map(|line| serde_json::from_str::<serde_json::Value>(line).expect("JSON")["step"].as_u64().expect("a step"))
+        .collect();
+    assert_eq!(steps, [5, 10]);
+}
+
+#[test]
+fn threads_do_not_change_a_byte() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let config = config(&[]);
+    let mut all = vec![];
+    for (name, threads, loader_threads) in [("one", 1, 0), ("two", 2, 1), ("three", 3, 2)] {
+        let options = TrainOptions { threads, loader_threads, ..TrainOptions::default() };
+        run(&config, &folder.path().join(name), &options, 0).expect("trained");
+        all.push(files(&folder.path().join(name)));
+    }
+    assert_eq!(all[0], all[1]);
+    assert_eq!(all[0], all[2]);
+    let other = self::config(&["seed=1"]);
+    run(&other, &folder.path().join("other"), &TrainOptions::default(), 0).expect("trained");
+    assert_ne!(files(&folder.path().join("other"))[1], all[0][1]);
+}
+
+#[test]
+fn training_learns_to_predict() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let words = ["schedule.steps=300", "log_every=20", "model.predictor.dropout=0", "optim.lr=3e-3"];
+    run(&config(&words), folder.path(), &TrainOptions::default(), 0).expect("trained");
+    let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
+    let numbers = |line: &str, name: &str| {
+        serde_json::from_str::<serde_json::Value>(line).expect("JSON")[name].as_f64().expect(name)
+    };
+    let (first, last) = (lines.lines().next().expect("a line"), lines.lines().last().expect("a line"));
+    assert!(numbers(last, "loss") < 0.5 * numbers(first, "loss"), "{first}\n{last}");
+    // A latent that had collapsed would be predicted perfectly, at a SIGReg of about a tenth of the batch.
+    assert!(numbers(last, "sigreg") < 2.0, "{last}");
+}
+
+#[test]
+fn a_loss_that_is_not_finite_stops_the_run() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let error = run(&config(&["optim.lr=1e30", "optim.clip=1e30"]), folder.path(), &TrainOptions::default(), 0);
+    let message = error.expect_err("not finite").to_string();
+    assert!(message.contains("not finite") && message.contains("optim.lr"), "{message}");
+}

@@ -58,9 +58,10 @@ impl ImageCodec {
                 let fail = |e: png::EncodingError| Error::external("encoding a PNG picture", e);
                 let mut encoder = png::Encoder::new(out, w.into(), h.into());
                 encoder.set_color(png::ColorType::Rgb);
-                // Rows as differences to the one above: on drawn pictures the fastest filter to undo.
-                encoder.set_filter(png::Filter::Up);
+                // The compression level brings a filter of its own, so ours is set after it: rows as differences
+                // to the one above are the fastest to undo.
                 encoder.set_compression(png::Compression::Fast);
+                encoder.set_filter(png::Filter::Up);
                 let mut writer = encoder.write_header().map_err(fail)?;
                 writer.write_image_data(rgb).map_err(fail)
             }

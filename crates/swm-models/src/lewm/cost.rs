@@ -8,14 +8,17 @@
 use super::config::LewmConfig;
 use super::model::Lewm;
 use super::pixels;
+use super::rollout::Rollout;
 use crate::checkpoint::Checkpoint;
-use burn::tensor::{Device, Tensor, TensorData};
+use crate::nn::parameters::IntoF32;
+use burn::tensor::Device;
 use rayon::prelude::*;
 use swm_core::{Batch, Candidates, CostModel, Error, Result};
 
 /// The planning cost of a LeWM.
 pub struct LewmCost {
     model: Lewm,
+    rollout: Rollout,
     config: LewmConfig,
     actions: usize,
     scenes: Vec<Scene>,
@@ -25,11 +28,11 @@ pub struct LewmCost {
 #[derive(Clone)]
 struct Scene {
     /// The latents of the frames seen, oldest first, the present last: `[seen, latent]`.
-    start: Tensor<2>,
+    start: Vec<f32>,
     /// The actions taken between them, in model units: `[seen - 1, actions]`.
     past: Vec<f32>,
-    /// The latent of the goal picture, `[1, latent]`.
-    goal: Tensor<2>,
+    /// The latent of the goal picture, `[latent]`.
+    goal: Vec<f32>,
 }
 
 impl LewmCost {
@@ -37,6 +40,7 @@ impl LewmCost {
     pub fn new(checkpoint: &Checkpoint) -> Self {
         Self {
             model: checkpoint.model.clone(),
+            rollout: Rollout::new(&checkpoint.model),
             config: checkpoint.config.model.clone(),
             actions: checkpoint.config.data.frameskip * checkpoint.action.dim(),
             scenes: vec![],
@@ -47,7 +51,10 @@ impl LewmCost {
     fn look(&self, infos: &Batch, env: usize) -> Result<Scene> {
         let row = infos.row(env);
         let device = Device::flex();
-        let encode = |rgb: &[u8]| Ok::<_, Error>(self.model.encode(pixels::patches(&self.config, rgb, &device)?));
+        let encode = |rgb: &[u8]| {
+            let latent = self.model.encode(pixels::patches(&self.config, rgb, &device)?);
+            Ok::<_, Error>(latent.into_data().try_into_vec_as_f32())
+        };
         // Each picture by itself: what a latent is must not depend on how many are encoded at once.
         let mut start = vec![encode(row.get::<u8>("pixels")?)?];
         let mut past = vec![];
@@ -62,28 +69,26 @@ impl LewmCost {
             }
             past = actions[actions.len() - length * self.actions..].to_vec();
         }
-        Ok(Scene { start: Tensor::cat(start, 0), past, goal: encode(row.get::<u8>("goal")?)? })
+        Ok(Scene { start: start.concat(), past, goal: encode(row.get::<u8>("goal")?)? })
     }
 }
 
+/// Candidates rolled out at once: what they need fits a core's cache.
+const CHUNK: usize = 64;
+
 impl Scene {
-    fn cost(&self, model: &Lewm, candidates: &[f32], horizon: usize, dim: usize, costs: &mut [f32]) {
-        let device = Device::flex();
+    /// The costs of some candidates, `[samples, horizon, numbers]`.
+    fn cost(&self, rollout: &Rollout, latent: usize, candidates: &[f32], horizon: usize, costs: &mut [f32]) {
         let samples = costs.len();
-        let [seen, latent] = self.start.dims();
-        let steps = seen - 1 + horizon;
-        let mut actions = Vec::with_capacity(samples * steps * dim);
-        for candidate in candidates.chunks_exact(horizon * dim) {
+        let steps = self.start.len() / latent - 1 + horizon;
+        let mut actions = Vec::with_capacity(samples * self.past.len() + candidates.len());
+        for candidate in candidates.chunks_exact(candidates.len() / samples) {
             actions.extend_from_slice(&self.past);
             actions.extend_from_slice(candidate);
         }
-        let actions = Tensor::from_data(TensorData::new(actions, [samples, steps, dim]), &device);
-        let start: Tensor<3> = self.start.clone().unsqueeze();
-        let rollout = model.rollout(start.expand([samples, seen, latent]), actions);
-        let end = rollout.slice([0..samples, steps..steps + 1, 0..latent]).reshape([samples, latent]);
-        let distance: Tensor<2> = (end - self.goal.clone()).square().sum_dim(1);
-        for (cost, value) in costs.iter_mut().zip(distance.into_data().iter::<f32>()) {
-            *cost = value;
+        let latents = rollout.run(&self.start, &actions, samples, steps);
+        for (cost, end) in costs.iter_mut().zip(latents[steps].chunks_exact(latent)) {
+            *cost = end.iter().zip(&self.goal).map(|(a, b)| (a - b).powi(2)).sum();
         }
     }
 }
@@ -109,12 +114,14 @@ impl CostModel for LewmCost {
                 ),
             ));
         }
-        let (model, scenes) = (&self.model, &self.scenes);
-        costs
-            .par_chunks_mut(samples)
-            .zip(actions.par_chunks(samples * horizon * dim))
-            .zip(scenes)
-            .for_each(|((costs, actions), scene)| scene.cost(model, actions, horizon, dim, costs));
+        let (rollout, scenes, latent) = (&self.rollout, &self.scenes, self.config.latent);
+        // Chunks are counted from each environment's first candidate.
+        costs.par_chunks_mut(samples).zip(actions.par_chunks(samples * horizon * dim)).zip(scenes).for_each(
+            |((costs, actions), scene)| {
+                let chunks = costs.par_chunks_mut(CHUNK).zip(actions.par_chunks(CHUNK * horizon * dim));
+                chunks.for_each(|(costs, actions)| scene.cost(rollout, latent, actions, horizon, costs));
+            },
+        );
         Ok(())
     }
 }

@@ -6,8 +6,10 @@ pub mod cost;
 pub mod loss;
 pub mod model;
 pub mod pixels;
+pub mod rollout;
 pub mod step;
 
 pub use config::{EncoderConfig, LewmConfig};
 pub use cost::LewmCost;
 pub use model::{Encoder, Lewm};
+pub use rollout::Rollout;

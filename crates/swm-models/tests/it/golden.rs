@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use swm_core::Key;
 use swm_models::lewm::step::{SigregConfig, TrainBatch, step};
-use swm_models::lewm::{EncoderConfig, Lewm, LewmConfig};
+use swm_models::lewm::{EncoderConfig, Lewm, LewmConfig, Rollout};
 use swm_models::nn::parameters::{self, HostTensor, Named};
 use swm_models::nn::{PredictorConfig, VitConfig};
 
@@ -179,8 +179,27 @@ fn golden_evaluation() {
             if history > 1 {
                 actions = Tensor::cat(vec![repeat(golden.tensor("i.action"), history - 1, numbers), actions], 1);
             }
-            let rollout = model.rollout(repeat(latents.clone(), history, dim), actions);
+            let rollout = model.rollout(repeat(latents.clone(), history, dim), actions.clone());
             let [_, length, _] = rollout.dims();
+            // The fast rollout, for each environment from its own present.
+            let fast = Rollout::new(&model);
+            let steps = length - 1;
+            let numbers_of = |x: Tensor<3>, env: usize| {
+                let [_, b, c] = x.dims();
+                values(x.slice([env * samples..(env + 1) * samples, 0..b, 0..c]))
+            };
+            for env in 0..envs {
+                let start = values(latents.clone().slice([env..env + 1, 0..history, 0..dim]));
+                let all = fast.run(&start, &numbers_of(actions.clone(), env), samples, steps);
+                let theirs = &golden.get(&format!("o.rollout.h{history}")).values[env * samples * length * dim..];
+                for (time, latents) in all.iter().enumerate() {
+                    for (sample, latent) in latents.chunks(dim).enumerate() {
+                        let theirs = &theirs[(sample * length + time) * dim..][..dim];
+                        let error = error(latent, theirs, 1.0);
+                        assert!(error < TOLERANCE / 10.0, "fast rollout h{history} {time}: {error:.1e}");
+                    }
+                }
+            }
             check(&golden, &format!("o.rollout.h{history}"), &values(rollout.clone()));
             let last = rollout.slice([0..envs * samples, length - 1..length, 0..dim]).reshape([envs, samples, dim]);
             let cost: Tensor<3> = (last - goal.clone()).square().sum_dim(2);

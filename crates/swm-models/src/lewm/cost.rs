@@ -73,9 +73,6 @@ impl LewmCost {
     }
 }
 
-/// Candidates rolled out at once: what they need fits a core's cache.
-const CHUNK: usize = 64;
-
 impl Scene {
     /// The costs of some candidates, `[samples, horizon, numbers]`.
     fn cost(&self, rollout: &Rollout, latent: usize, candidates: &[f32], horizon: usize, costs: &mut [f32]) {
@@ -115,11 +112,12 @@ impl CostModel for LewmCost {
             ));
         }
         let (rollout, scenes, latent) = (&self.rollout, &self.scenes, self.config.latent);
-        // Chunks are counted from each environment's first candidate.
+        // Parts are counted from each environment's first candidate.
+        let part = Rollout::part(samples);
         costs.par_chunks_mut(samples).zip(actions.par_chunks(samples * horizon * dim)).zip(scenes).for_each(
             |((costs, actions), scene)| {
-                let chunks = costs.par_chunks_mut(CHUNK).zip(actions.par_chunks(CHUNK * horizon * dim));
-                chunks.for_each(|(costs, actions)| scene.cost(rollout, latent, actions, horizon, costs));
+                let parts = costs.par_chunks_mut(part).zip(actions.par_chunks(part * horizon * dim));
+                parts.for_each(|(costs, actions)| scene.cost(rollout, latent, actions, horizon, costs));
             },
         );
         Ok(())

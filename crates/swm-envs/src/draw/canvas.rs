@@ -58,9 +58,9 @@ impl Area {
         Self { low: Point::new(0, 0), high: Point::new(side as i32, side as i32) }
     }
 
-    /// Whether all its columns and rows lie from `low` to `high`, that one excluded.
-    pub fn is_between(self, low: i32, high: i32) -> bool {
-        self.low.x >= low && self.low.y >= low && self.high.x <= high && self.high.y <= high
+    /// Whether the two share a pixel.
+    pub fn touches(self, other: Self) -> bool {
+        self.low.x < other.high.x && other.low.x < self.high.x && self.low.y < other.high.y && other.low.y < self.high.y
     }
 
     /// The part inside a canvas of `side`², as columns and rows.
@@ -75,16 +75,17 @@ impl Area {
 /// [`Palette::forget_mixed`].
 #[derive(Clone, Debug)]
 pub struct Palette {
-    colors: Vec<[u8; 3]>,
+    colors: [[u8; 3]; 256],
     fixed: usize,
+    used: usize,
 }
 
 impl Palette {
     /// The indices 0, 1, … stand for these colours.
-    pub fn new(colors: &[[u8; 3]]) -> Self {
-        let mut all = Vec::with_capacity(256);
-        all.extend_from_slice(colors);
-        Self { colors: all, fixed: colors.len() }
+    pub fn new<const N: usize>(colors: &[[u8; 3]; N]) -> Self {
+        let mut all = [[0; 3]; 256];
+        all[..N].copy_from_slice(colors);
+        Self { colors: all, fixed: N, used: N }
     }
 
     /// The colour of an index.
@@ -94,21 +95,17 @@ impl Palette {
 
     /// Drops the colours of mixed pixels.
     pub fn forget_mixed(&mut self) {
-        self.colors.truncate(self.fixed);
+        self.used = self.fixed;
     }
 
     /// The index of a share of `color` over what `under` stands for; `under` itself once all indices are taken.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn mixed(&mut self, color: [u8; 3], share: f32, under: u8) -> u8 {
         let below = self.color(under);
-        let mix = |i: usize| (f32::from(color[i]) * share + f32::from(below[i]) * (1.0 - share)) as u8;
-        match u8::try_from(self.colors.len()) {
-            Ok(index) => {
-                self.colors.push([mix(0), mix(1), mix(2)]);
-                index
-            }
-            Err(_) => under,
-        }
+        let Some(place) = self.colors.get_mut(self.used) else { return under };
+        *place = std::array::from_fn(|i| (f32::from(color[i]) * share + f32::from(below[i]) * (1.0 - share)) as u8);
+        self.used += 1;
+        (self.used - 1) as u8
     }
 }
 
@@ -234,22 +231,26 @@ impl Canvas {
         }
     }
 
-    /// Draws a line of even width by Bresenham's algorithm, thick along the axis it runs across, its ends flat.
-    pub fn thick_line(&mut self, from: Point, to: Point, width: i32, index: u8) {
-        let (before, after) = (width / 2 - 1, width / 2);
+    /// Draws a line of [`WIDTH`] by Bresenham's algorithm, thick along the axis it runs across, its ends flat.
+    fn thick_line(&mut self, from: Point, to: Point, index: u8) {
+        if from == to {
+            return;
+        }
+        let (before, after) = (WIDTH / 2 - 1, WIDTH / 2);
         let (dx, dy) = ((to.x - from.x).abs(), (to.y - from.y).abs());
         let (step_x, step_y) = (if from.x < to.x { 1 } else { -1 }, if from.y < to.y { 1 } else { -1 });
         let steep = dx <= dy;
         let mut error = (if dx > dy { dx } else { -dy }) / 2;
         let mut at = from;
-        let end = if steep { to.y + step_y } else { to.x + step_x };
-        while (if steep { at.y } else { at.x }) != end {
-            if steep {
-                self.span(at.y, at.x - before, at.x + after, index);
-            } else {
-                for y in at.y - before..=at.y + after {
-                    self.span(y, at.x, at.x, index);
+        for _ in 0..=dx.max(dy) {
+            let first = if steep { at.shifted(-before, 0) } else { at.shifted(0, -before) };
+            match self.strip(first, steep) {
+                Some(start) if steep => {
+                    self.pixels[start..start + WIDTH as usize].copy_from_slice(&[index; WIDTH as usize])
                 }
+                Some(start) => (0..WIDTH as usize).for_each(|k| self.pixels[start + k * self.side] = index),
+                None if steep => self.span(at.y, first.x, at.x + after, index),
+                None => (first.y..=at.y + after).for_each(|y| self.span(y, at.x, at.x, index)),
             }
             let twice = error;
             if twice > -dx {
@@ -263,13 +264,21 @@ impl Canvas {
         }
     }
 
-    /// Draws a rounded bar: a thick line with round ends.
+    /// Where a strip of [`WIDTH`] pixels from `first` to the right or down begins, if all of it is on the canvas.
+    fn strip(&self, first: Point, right: bool) -> Option<usize> {
+        let (x, y) = (usize::try_from(first.x).ok()?, usize::try_from(first.y).ok()?);
+        let (last_x, last_y) = if right { (x + WIDTH as usize - 1, y) } else { (x, y + WIDTH as usize - 1) };
+        (last_x < self.side && last_y < self.side).then_some(y * self.side + x)
+    }
+
+    /// Draws a bar of [`WIDTH`]: a thick line with round ends. A bar without length is not drawn.
     ///
     /// Its sides are found from absolute differences, as the reference's debug drawing does, so they lie askew
     /// where a bar falls from left to right.
     #[allow(clippy::cast_possible_truncation)]
-    pub fn bar(&mut self, from: Point, to: Point, radius: i32, index: u8) {
-        self.thick_line(from, to, 2 * radius, index);
+    pub fn bar(&mut self, from: Point, to: Point, index: u8) {
+        let radius = WIDTH / 2;
+        self.thick_line(from, to, index);
         let across = [(to.y - from.y).abs(), (to.x - from.x).abs()].map(f64::from);
         if across == [0.0, 0.0] {
             return;
@@ -315,6 +324,8 @@ impl Canvas {
     }
 }
 
+/// The width of bars, in pixels.
+pub const WIDTH: i32 = 4;
 /// The most corners a polygon may have.
 const MAX_CORNERS: usize = 8;
 
@@ -400,7 +411,8 @@ mod tests {
         let far = Point::nearest(1e300, f64::NEG_INFINITY);
         canvas.fill_polygon(&[Point::new(-5, -5), Point::new(20, -5), Point::new(20, 20), Point::new(-5, 20)], 1);
         assert!(canvas.row(7).iter().all(|&p| p == 1));
-        canvas.bar(Point::new(4, 4), far, 2, 2);
+        canvas.bar(Point::new(4, 4), far, 2);
+        canvas.bar(far, far, 2);
         canvas.fill_circle(far, 30, 3);
         canvas.fine_line(far, Point::new(4, 4), [1, 2, 3], &mut Palette::new(&[[0; 3]; 4]));
         canvas.fill_circle(Point::new(0, 0), 3, 4);

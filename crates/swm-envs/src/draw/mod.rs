@@ -7,5 +7,5 @@
 mod canvas;
 mod resample;
 
-pub use canvas::{Area, Canvas, Palette, Point};
+pub use canvas::{Area, Canvas, Palette, Point, WIDTH};
 pub use resample::Resampler;

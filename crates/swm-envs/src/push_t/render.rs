@@ -6,16 +6,13 @@
 
 use super::physics::{AGENT, BLOCK, Pose, Vec2, World};
 use super::shapes::Design;
-use super::{TABLE, WALL_LINES, WALL_RADIUS, design};
-use crate::draw::{Area, Canvas, Palette, Point, Resampler};
-use std::ops::Range;
+use super::{TABLE, WALL_LINES, design};
+use crate::draw::{Area, Canvas, Palette, Point, Resampler, WIDTH};
 use swm_core::{FactorValues, FrameMut};
 
 /// Pixels along a side of the canvas.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 const SIDE: usize = TABLE as usize;
-/// Half the width of outlines, in pixels of the canvas.
-const OUTLINE: i32 = 2;
 /// How much smaller the light part of a circle is.
 const RIM: f64 = 4.0;
 /// By how much the inside of a shape is lighter than its outline.
@@ -29,9 +26,6 @@ const TICK: f64 = 2.0;
 const MAX_TICKS: usize = 32;
 /// The scale of the goal pose at which it is as large as the block.
 const GOAL_SCALE: f64 = 40.0;
-
-/// Columns and rows that no wall reaches.
-const INSIDE: Range<i32> = 9..502;
 
 /// Indices of the palette.
 const BACKGROUND: u8 = 0;
@@ -139,7 +133,7 @@ impl Renderer {
                 self.table.fill_polygon(&rect.map(|corner| pixel(pose.point(corner * scale))), GOAL);
             }
         }
-        draw_walls(&mut self.table);
+        walls().iter().for_each(|&[from, to]| self.table.bar(from, to, WALL));
         self.canvas.copy_area(&self.table, Area::square(SIDE));
         self.pictures.clear();
     }
@@ -160,15 +154,17 @@ impl Renderer {
             }
             for (corner, &point) in corners.iter_mut().zip(&design.rects[part]) {
                 *corner = pixel(pose.point(point));
-                areas[body] = areas[body].with(*corner, OUTLINE + 1);
+                areas[body] = areas[body].with(*corner, WIDTH / 2 + 1);
             }
             self.canvas.fill_polygon(&corners, inside);
             for i in 0..4 {
-                self.canvas.bar(corners[i], corners[(i + 1) % 4], OUTLINE, rim);
+                self.canvas.bar(corners[i], corners[(i + 1) % 4], rim);
             }
         }
-        if areas.iter().any(|area| !area.is_between(INSIDE.start, INSIDE.end)) {
-            draw_walls(&mut self.canvas);
+        for wall in walls() {
+            if areas.iter().any(|area| area.touches(around(&wall))) {
+                self.canvas.bar(wall[0], wall[1], WALL);
+            }
         }
         for tick in &scene.ticks[..scene.touching] {
             let [from, to] = tick.ends.map(pixel);
@@ -219,8 +215,12 @@ fn lighter(color: [u8; 3]) -> [u8; 3] {
     color.map(|v| (f32::from(v) * LIGHTER).round_ties_even().min(255.0) as u8)
 }
 
-fn draw_walls(canvas: &mut Canvas) {
-    for [from, to] in WALL_LINES.map(|line| line.map(|[x, y]| Point::nearest(x, y))) {
-        canvas.bar(from, to, whole(WALL_RADIUS), WALL);
-    }
+/// The middle lines of the walls.
+fn walls() -> [[Point; 2]; 4] {
+    WALL_LINES.map(|line| line.map(|[x, y]| Point::nearest(x, y)))
+}
+
+/// The pixels of a bar.
+fn around(bar: &[Point; 2]) -> Area {
+    bar.iter().fold(Area::EMPTY, |area, &end| area.with(end, WIDTH / 2 + 1))
 }

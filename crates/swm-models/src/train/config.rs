@@ -59,7 +59,7 @@ pub struct Preset {
 pub static PRESETS: &[Preset] = &[
     Preset {
         id: "tiny",
-        summary: "64 px, a small convolutional encoder: trains in two minutes on two CPU cores",
+        summary: "64 px, a small convolutional encoder: trains in half a minute on two CPU cores",
         toml: include_str!("../presets/tiny.toml"),
     },
     Preset {

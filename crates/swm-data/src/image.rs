@@ -10,7 +10,7 @@ use zune_core::colorspace::ColorSpace;
 use zune_core::options::DecoderOptions;
 
 /// How pictures are encoded.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
 pub enum ImageCodec {
@@ -20,14 +20,10 @@ pub enum ImageCodec {
         quality: u8,
     },
     /// PNG tuned for speed: lossless. On drawn pictures (Push-T, 224 px) it encodes 9 times and decodes twice as
-    /// fast as JPEG and takes 1.7 times the space; photographs want JPEG. The reference reads it as well.
+    /// fast as JPEG and takes 1.7 times the space; photographs want JPEG. The reference reads it as well. The
+    /// default, so that a model is trained on the very pictures it will see when it acts.
+    #[default]
     Png,
-}
-
-impl Default for ImageCodec {
-    fn default() -> Self {
-        Self::Jpeg { quality: 95 }
-    }
 }
 
 impl ImageCodec {

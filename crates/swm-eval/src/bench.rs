@@ -14,7 +14,7 @@ use std::time::Instant;
 use swm_core::pool::Reset;
 use swm_core::results::Summary;
 use swm_core::{EnvEntry, Error, RandomPolicy, Result, VariationRequest};
-use swm_data::{WriteOptions, create};
+use swm_data::{ImageCodec, WriteOptions, create};
 
 /// The environment variable that names a Python with the reference.
 pub const REFERENCE_PYTHON: &str = "SWM_REFERENCE_PYTHON";
@@ -79,7 +79,7 @@ pub struct BenchReport {
 pub struct BenchRow {
     /// The environment.
     pub env: String,
-    /// What was done: `step + render`, or `collect into lance`.
+    /// What was done: `step + render`, or `collect` into Lance with a codec.
     pub what: &'static str,
     /// The side of the pictures, in pixels.
     pub size: usize,
@@ -146,16 +146,26 @@ pub fn bench_envs(entries: &[&EnvEntry], config: &BenchConfig) -> Result<BenchRe
                 policy: "random".to_owned(),
                 ..CollectConfig::default()
             };
-            report.rows.push(BenchRow::measure(
-                entry,
-                size,
-                "collect into lance",
-                config.pairs,
-                |turn| ours.collect(&path("ours", turn), CollectConfig { seed: turn as u64, ..more.clone() }),
-                reference
-                    .as_mut()
-                    .map(|reference| |turn| reference.collect(&path("reference", turn), config.episodes, turn as u64)),
-            )?);
+            // The reference stores JPEG of quality 95; ours does by default what is lossless, or the same on request.
+            let codecs = [("collect, png", ImageCodec::Png), ("collect, jpeg", ImageCodec::Jpeg { quality: 95 })];
+            for (what, codec) in codecs {
+                report.rows.push(BenchRow::measure(
+                    entry,
+                    size,
+                    what,
+                    config.pairs,
+                    |turn| {
+                        let config = CollectConfig { seed: turn as u64, ..more.clone() };
+                        ours.collect(&path(&format!("ours, {what}"), turn), codec, config)
+                    },
+                    reference.as_mut().map(|reference| {
+                        |turn| {
+                            let path = path(&format!("reference, {what}"), turn);
+                            reference.collect(&path, config.episodes, turn as u64)
+                        }
+                    }),
+                )?);
+            }
         }
     }
     Ok(report)
@@ -215,10 +225,11 @@ impl Ours {
     }
 
     /// Collects into a Lance dataset: environment steps a second, everything committed.
-    fn collect(&mut self, path: &Path, config: CollectConfig) -> Result<f64> {
+    fn collect(&mut self, path: &Path, codec: ImageCodec, config: CollectConfig) -> Result<f64> {
         let begun = Instant::now();
         let manifest = Some(self.world.collect_manifest(&config));
-        let writer = create(path, &self.world.collect_schema(false)?, WriteOptions { manifest, ..Default::default() })?;
+        let options = WriteOptions { manifest, codec, ..Default::default() };
+        let writer = create(path, &self.world.collect_schema(false)?, options)?;
         let collected = self.world.collect(&mut self.policy, writer, &config, &mut Control::default())?;
         let rate = collected.steps as f64 / begun.elapsed().as_secs_f64();
         // What comes next steps on from running episodes, as it did before.

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 use swm_core::{Batch, ColumnSpec, DType, Manifest, Schema};
-use swm_data::{CommitPolicy, Reader, StepRange, WriteMode, WriteOptions, create};
+use swm_data::{CommitPolicy, ImageCodec, Reader, StepRange, WriteMode, WriteOptions, create};
 
 pub const COLUMNS: [&str; 8] =
     ["pixels", "action", "state", "reward", "success", "step_idx", "variation.agent.color", "goal"];
@@ -51,7 +51,8 @@ pub fn manifest(seed: u64) -> Manifest {
 }
 
 pub fn options(mode: WriteMode) -> WriteOptions {
-    WriteOptions { mode, manifest: Some(manifest(3)), ..WriteOptions::default() }
+    let codec = ImageCodec::Jpeg { quality: 95 };
+    WriteOptions { mode, codec, manifest: Some(manifest(3)), ..WriteOptions::default() }
 }
 
 /// Writes episodes, a commit after every `group` of them.

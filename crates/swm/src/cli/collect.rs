@@ -42,7 +42,10 @@ pub struct CollectArgs {
     /// Steps after which an episode is truncated (default: the environment's own)
     #[arg(long, value_name = "STEPS")]
     max_steps: Option<usize>,
-    /// JPEG quality of stored pictures, 1 to 100
+    /// How pictures are stored: png (lossless) or jpeg (what the reference writes)
+    #[arg(long, value_enum, default_value_t = Codec::Png)]
+    codec: Codec,
+    /// Quality of jpeg, 1 to 100
     #[arg(long, default_value_t = 95, value_parser = clap::value_parser!(u8).range(1..=100))]
     quality: u8,
     /// Continue an interrupted collection
@@ -53,6 +56,13 @@ pub struct CollectArgs {
     overwrite: bool,
     #[command(flatten)]
     variation: VariationArgs,
+}
+
+/// How pictures are stored.
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum Codec {
+    Png,
+    Jpeg,
 }
 
 /// A collection, as `swm collect` and `swm demo` ask for it.
@@ -69,8 +79,8 @@ pub struct Collection<'a> {
     pub config: CollectConfig,
     /// What to do with a dataset that is there.
     pub mode: WriteMode,
-    /// JPEG quality.
-    pub quality: u8,
+    /// How pictures are stored.
+    pub codec: ImageCodec,
 }
 
 /// Runs a policy and stores its episodes.
@@ -98,7 +108,10 @@ pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
             (_, true) => WriteMode::Overwrite,
             _ => WriteMode::Create,
         },
-        quality: args.quality,
+        codec: match args.codec {
+            Codec::Png => ImageCodec::Png,
+            Codec::Jpeg => ImageCodec::Jpeg { quality: args.quality },
+        },
     };
     let collected = run(&collection, context)?;
     if context.json {
@@ -115,13 +128,22 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     let mut policy = policy(entry, collection.policy, &world)?;
     // A wrong factor is found before anything of an older dataset is replaced.
     world.spec().variation_space.resolve(&config.variation, swm_core::Key::new(config.seed))?;
-    let manifest = world.collect_manifest(config);
+    let mut manifest = world.collect_manifest(config);
+    manifest.config["codec"] = json!(collection.codec);
     if path.exists() {
         match collection.mode {
             WriteMode::Overwrite => {}
             WriteMode::Append => {
                 if let Some(stored) = swm_data::open(path)?.manifest() {
                     check_continues(&stored, &manifest)?;
+                    let (stored, wanted) = (&stored.config["codec"], &manifest.config["codec"]);
+                    if stored != wanted {
+                        return Err(Error::config(
+                            "--codec",
+                            format!("the dataset's pictures are {stored}, not {wanted}"),
+                            "ask for the same again, or collect into another dataset",
+                        ));
+                    }
                 }
             }
             WriteMode::Create => {
@@ -138,7 +160,7 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
         &world.collect_schema(config.goal)?,
         WriteOptions {
             mode: collection.mode,
-            codec: ImageCodec::Jpeg { quality: collection.quality },
+            codec: collection.codec,
             manifest: Some(manifest),
             ..WriteOptions::default()
         },

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 use swm::{ENVS, home};
 use swm_core::VariationRequest;
-use swm_data::WriteMode;
+use swm_data::{ImageCodec, WriteMode};
 use swm_eval::{CollectConfig, WorldConfig};
 use swm_models::{Checkpoint, Device, TrainConfig};
 use swm_report::ReportOptions;
@@ -76,7 +76,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
             ..CollectConfig::default()
         },
         mode: WriteMode::Overwrite,
-        quality: 95,
+        codec: ImageCodec::default(),
     };
     collect::run(&collection, context)?;
 

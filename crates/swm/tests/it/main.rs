@@ -4,12 +4,13 @@
 mod collecting;
 mod listing;
 mod pipeline;
+mod python;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 /// A `swm` with a home of its own.
-pub struct Swm {
+pub(crate) struct Swm {
     home: tempfile::TempDir,
 }
 

@@ -1,0 +1,46 @@
+//! Datasets in Python: the `lance` package opens what `swm collect` wrote.
+
+use crate::{Swm, text};
+
+/// Prints what a notebook would look at first.
+const LOOK: &str = r#"
+import json, sys
+import lance, numpy as np, pyarrow as pa
+dataset = lance.dataset(sys.argv[1])
+dataset.validate()
+table = dataset.to_table()
+action = np.array(table["action"].to_pylist(), dtype=np.float32)
+print(json.dumps({
+    "rows": dataset.count_rows(),
+    "episodes": len(set(table["episode_idx"].to_pylist())),
+    "state": str(table.schema.field("state").type),
+    "picture": list(table["pixels"][0].as_py()[:4]),
+    "nan_actions": int(np.isnan(action).any(axis=1).sum()),
+    "largest_action": float(np.nanmax(np.abs(action))),
+}))
+"#;
+
+#[test]
+fn the_python_lance_package_opens_a_collected_dataset() {
+    let Some(python) = std::env::var_os("SWM_LANCE_PYTHON") else {
+        println!("SKIPPED: set SWM_LANCE_PYTHON to a Python with pylance, as `make test` does");
+        return;
+    };
+    let swm = Swm::new();
+    swm.json(&["collect", "swm/PushT-v1", "-o", "push", "--image", "64", "--episodes", "3", "--max-steps", "20"]);
+    let ours = swm.json(&["inspect", "push"]);
+    let output = std::process::Command::new(python)
+        .args(["-c", LOOK])
+        .arg(swm.path("datasets/push.lance"))
+        .output()
+        .expect("Python starts");
+    assert!(output.status.success(), "{}", text(&output.stderr));
+    let seen: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(seen["rows"], ours["steps"]);
+    assert_eq!(seen["episodes"], 3);
+    // The last action of each episode is missing.
+    assert_eq!(seen["nan_actions"], 3);
+    assert!(seen["largest_action"].as_f64().is_some_and(|a| a <= 1.0), "{seen}");
+    assert_eq!(seen["state"], "fixed_size_list<item: float>[7]");
+    assert_eq!(seen["picture"], serde_json::json!([0x89, b'P', b'N', b'G']));
+}

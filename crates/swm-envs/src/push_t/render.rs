@@ -86,6 +86,8 @@ pub struct Renderer {
 struct Picture {
     resampler: Resampler,
     rgb: Vec<u8>,
+    /// Whether `rgb` shows the table of this episode.
+    current: bool,
 }
 
 /// At how many sizes the table is kept.
@@ -135,7 +137,7 @@ impl Renderer {
         }
         walls().iter().for_each(|&[from, to]| self.table.bar(from, to, WALL));
         self.canvas.copy_area(&self.table, Area::square(SIDE));
-        self.pictures.clear();
+        self.pictures.iter_mut().for_each(|picture| picture.current = false);
     }
 
     /// Draws a scene.
@@ -173,7 +175,7 @@ impl Renderer {
         }
 
         let picture = self.picture(frame.width, frame.height);
-        let Picture { resampler, rgb } = &self.pictures[picture];
+        let Picture { resampler, rgb, .. } = &self.pictures[picture];
         frame.rgb.copy_from_slice(rgb);
         for area in areas {
             resampler.draw(&self.canvas, &self.palette, area, frame.rgb);
@@ -187,16 +189,18 @@ impl Renderer {
     /// The place of the table at this size.
     fn picture(&mut self, width: usize, height: usize) -> usize {
         let is_it = |picture: &Picture| (picture.resampler.width(), picture.resampler.height()) == (width, height);
-        if let Some(place) = self.pictures.iter().position(is_it) {
-            return place;
+        let place = self.pictures.iter().position(is_it).unwrap_or_else(|| {
+            let (resampler, rgb) = (Resampler::new(SIDE, width, height), vec![0; width * height * 3]);
+            self.pictures.truncate(MAX_PICTURES - 1);
+            self.pictures.insert(0, Picture { resampler, rgb, current: false });
+            0
+        });
+        let picture = &mut self.pictures[place];
+        if !picture.current {
+            picture.resampler.draw(&self.table, &self.palette, Area::square(SIDE), &mut picture.rgb);
+            picture.current = true;
         }
-        let resampler = Resampler::new(SIDE, width, height);
-        let mut rgb = vec![0; width * height * 3];
-        let everything = Area::square(SIDE);
-        resampler.draw(&self.table, &self.palette, everything, &mut rgb);
-        self.pictures.truncate(MAX_PICTURES - 1);
-        self.pictures.insert(0, Picture { resampler, rgb });
-        0
+        place
     }
 }
 

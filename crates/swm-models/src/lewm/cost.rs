@@ -13,7 +13,7 @@ use crate::checkpoint::Checkpoint;
 use crate::nn::parameters::IntoF32;
 use burn::tensor::Device;
 use rayon::prelude::*;
-use swm_core::{Batch, Candidates, CostModel, Error, Result};
+use swm_core::{Batch, Candidates, CostModel, Error, Result, Schema};
 
 /// The planning cost of a LeWM.
 pub struct LewmCost {
@@ -47,6 +47,28 @@ impl LewmCost {
         }
     }
 
+    /// Checks that everything needed is there.
+    fn check(&self, schema: &Schema) -> Result<()> {
+        pixels::check(&self.config, schema, "pixels")?;
+        pixels::check(&self.config, schema, "goal")?;
+        if schema.find("history.length").is_some() {
+            let side = self.config.image;
+            let past = schema.column("history.action")?.shape.first().copied().unwrap_or(0);
+            let wanted = [("history.action", vec![past, self.actions]), ("history.pixels", vec![past, side, side, 3])];
+            for (name, shape) in wanted {
+                let given = &schema.column(name)?.shape;
+                if *given != shape {
+                    return Err(Error::mismatch(
+                        format!("reading '{name}'"),
+                        format!("{given:?}"),
+                        format!("{shape:?}, as the model was trained"),
+                    ));
+                }
+            }
+        }
+        Ok(())
+    }
+
     /// Present and goal of one environment.
     fn look(&self, infos: &Batch, env: usize) -> Result<Scene> {
         let row = infos.row(env);
@@ -60,7 +82,8 @@ impl LewmCost {
         let mut past = vec![];
         if infos.schema().find("history.length").is_some() {
             let length = usize::try_from(row.get::<i32>("history.length")?[0]).unwrap_or(0);
-            let length = length.min(self.config.predictor.history - 1);
+            let length =
+                length.min(self.config.predictor.history - 1).min(infos.schema().column("history.action")?.shape[0]);
             let bytes = self.config.image * self.config.image * 3;
             let frames = row.get::<u8>("history.pixels")?;
             let actions = row.get::<f32>("history.action")?;
@@ -92,6 +115,7 @@ impl Scene {
 
 impl CostModel for LewmCost {
     fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()> {
+        self.check(infos.schema())?;
         let scenes: Result<Vec<Scene>> = envs.par_iter().map(|&env| self.look(infos, env)).collect();
         self.scenes = scenes?;
         Ok(())

@@ -3,7 +3,26 @@
 use super::config::LewmConfig;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
-use swm_core::{Error, Result};
+use swm_core::{DType, Error, Result, Schema};
+
+/// Checks that a column holds pictures of the size the model sees.
+///
+/// # Errors
+/// When there is no such column, or it holds something else.
+pub fn check(config: &LewmConfig, schema: &Schema, column: &str) -> Result<()> {
+    let side = config.image;
+    let spec = schema.column(column)?;
+    if spec.dtype == DType::U8 && spec.shape == [side, side, 3] {
+        return Ok(());
+    }
+    Err(Error::mismatch(
+        format!("reading the pictures of '{column}'"),
+        format!("{} {:?}", spec.dtype.name(), spec.shape),
+        format!(
+            "uint8 [{side}, {side}, 3], what the model sees (draw and collect pictures of {side} pixels, or train with model.image to match)"
+        ),
+    ))
+}
 
 /// Cuts pictures into normalised patches, in rows; the numbers of a patch go by colour, then row, then column.
 ///

@@ -53,14 +53,20 @@ struct Dense {
 }
 
 impl Dense {
+    /// A layer of these weights, laid out in the order of their axes.
+    fn of(weight: Tensor<2>, bias: Vec<f32>) -> Self {
+        let (shape, device) = (weight.dims(), weight.device());
+        Self { weight: Tensor::from_data(TensorData::new(numbers(weight), shape), &device), bias }
+    }
+
     fn new(layer: &Linear) -> Self {
-        Self { weight: layer.weight.val().transpose(), bias: layer.bias.as_ref().map_or_else(Vec::new, host) }
+        Self::of(layer.weight.val().transpose(), layer.bias.as_ref().map_or_else(Vec::new, host))
     }
 
     /// Outputs `from..to` of a layer without bias.
     fn part(layer: &Linear, from: usize, to: usize) -> Self {
         let [_, inputs] = layer.weight.dims();
-        Self { weight: layer.weight.val().slice([from..to, 0..inputs]).transpose(), bias: vec![] }
+        Self::of(layer.weight.val().slice([from..to, 0..inputs]).transpose(), vec![])
     }
 
     /// Rows of inputs to rows of outputs.
@@ -398,7 +404,7 @@ fn fold(projector: &Projector) -> [Dense; 2] {
     };
     let bias = bias * scale.clone() + norm.bias.val();
     let weight = first.weight.val().transpose() * scale.unsqueeze();
-    [Dense { weight, bias: numbers(bias) }, Dense::new(&projector.net._3)]
+    [Dense::of(weight, numbers(bias)), Dense::new(&projector.net._3)]
 }
 
 fn host<const D: usize>(param: &Param<Tensor<D>>) -> Vec<f32> {

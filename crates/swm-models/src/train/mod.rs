@@ -136,15 +136,7 @@ impl<'a> Run<'a> {
         config.check()?;
         let device = Device::flex();
         let (action, action_dim) = action_scale(&*reader)?;
-        let side = config.model.image;
-        let pictures = reader.schema().column("pixels")?;
-        if pictures.shape != [side, side, 3] {
-            return Err(Error::mismatch(
-                "training on pictures",
-                format!("{:?}", pictures.shape),
-                format!("[{side}, {side}, 3] (collect with that size, or set model.image)"),
-            ));
-        }
+        pixels::check(&config.model, reader.schema(), "pixels")?;
         let dataset = reader.content_hash()?;
         let env = reader.manifest().and_then(|manifest| Some(manifest.config.get("env")?.as_str()?.to_owned()));
 

@@ -106,4 +106,8 @@ fn what_does_not_fit_is_refused() {
     let schema = Schema::new([ColumnSpec::image("pixels", SIDE, SIDE)]).expect("a column");
     let message = cost.observe(&Batch::zeros(&schema, 1), &[0]).expect_err("no goal").to_string();
     assert!(message.contains("'goal'"), "{message}");
+    let large = Schema::new([ColumnSpec::image("pixels", 2 * SIDE, 2 * SIDE), ColumnSpec::image("goal", SIDE, SIDE)])
+        .expect("columns");
+    let message = cost.observe(&Batch::zeros(&large, 1), &[0]).expect_err("32 pixels").to_string();
+    assert!(message.contains("[16, 16, 3]"), "{message}");
 }

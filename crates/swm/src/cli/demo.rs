@@ -27,7 +27,7 @@ pub struct DemoArgs {
     #[arg(long, default_value_t = 300)]
     episodes: usize,
     /// Episodes to evaluate, each way
-    #[arg(long, default_value_t = 50)]
+    #[arg(long, default_value_t = 100)]
     eval_episodes: usize,
     /// Environments played, and planned for, at the same time; results do not depend on it
     #[arg(long, default_value_t = 50)]

@@ -1,5 +1,5 @@
 //! The `swm` command from outside, as a user meets it.
-#![allow(missing_docs)]
+#![allow(missing_docs, clippy::print_stdout)]
 
 mod collecting;
 mod listing;

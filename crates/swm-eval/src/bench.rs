@@ -147,8 +147,9 @@ pub fn bench_envs(entries: &[&EnvEntry], config: &BenchConfig) -> Result<BenchRe
                 ..CollectConfig::default()
             };
             // The reference stores JPEG of quality 95; ours does by default what is lossless, or the same on request.
-            let codecs = [("collect, png", ImageCodec::Png), ("collect, jpeg", ImageCodec::Jpeg { quality: 95 })];
-            for (what, codec) in codecs {
+            let codecs =
+                [("png", "collect, png", ImageCodec::Png), ("jpeg", "collect, jpeg", ImageCodec::Jpeg { quality: 95 })];
+            for (name, what, codec) in codecs {
                 report.rows.push(BenchRow::measure(
                     entry,
                     size,
@@ -156,11 +157,11 @@ pub fn bench_envs(entries: &[&EnvEntry], config: &BenchConfig) -> Result<BenchRe
                     config.pairs,
                     |turn| {
                         let config = CollectConfig { seed: turn as u64, ..more.clone() };
-                        ours.collect(&path(&format!("ours, {what}"), turn), codec, config)
+                        ours.collect(&path(&format!("ours-{name}"), turn), codec, config)
                     },
                     reference.as_mut().map(|reference| {
                         |turn| {
-                            let path = path(&format!("reference, {what}"), turn);
+                            let path = path(&format!("reference-{name}"), turn);
                             reference.collect(&path, config.episodes, turn as u64)
                         }
                     }),

@@ -10,6 +10,7 @@
 pub mod clip;
 pub mod format;
 pub mod image;
+mod jpeg;
 pub mod lance;
 
 pub mod loader;

@@ -23,7 +23,7 @@ impl Progress {
         let target = if terminal { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
         let bar = ProgressBar::with_draw_target(Some(total as u64), target);
         if let Ok(style) =
-            ProgressStyle::with_template("{prefix:>9} {bar:28.cyan/dim} {pos}/{len} {elapsed_precise} eta {eta} {msg}")
+            ProgressStyle::with_template("{prefix:>9} {bar:20.cyan/dim} {pos}/{len} eta {eta} {wide_msg}")
         {
             bar.set_style(style.progress_chars("━╸─"));
         }

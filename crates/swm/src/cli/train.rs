@@ -102,7 +102,7 @@ impl Observer for Bar {
         self.0.at(
             at.step,
             format!(
-                "loss {:.3} = prediction {:.4} + SIGReg {:.3}, {:.0} clips/s, data {:.0} %",
+                "loss {:.3} (prediction {:.4}, SIGReg {:.2}), {:.0} clips/s, waits {:.0} %",
                 at.losses.total,
                 at.losses.prediction,
                 at.losses.sigreg,

@@ -187,7 +187,7 @@ fn nearest_clause(names: &[String]) -> String {
 fn disk_hint(source: &std::io::Error) -> &'static str {
     match source.kind() {
         std::io::ErrorKind::StorageFull | std::io::ErrorKind::QuotaExceeded => {
-            " (free some space, then run the same command again: finished episodes are kept)"
+            " (free some space, then continue: committed episodes are kept)"
         }
         _ => "",
     }

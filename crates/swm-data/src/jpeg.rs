@@ -334,6 +334,7 @@ fn transform(block: &Block) -> Block {
 }
 
 /// The one-dimensional transform down the rows, in every lane (Arai, Agui and Nakajima 1988: 5 multiplications).
+#[allow(clippy::needless_range_loop)] // The loop is over lanes, each of which crosses all rows.
 fn cosine(r: &mut Block) {
     for i in 0..8 {
         let (s07, d07, s16, d16) = (r[0][i] + r[7][i], r[0][i] - r[7][i], r[1][i] + r[6][i], r[1][i] - r[6][i]);
@@ -343,7 +344,7 @@ fn cosine(r: &mut Block) {
         let (a, b, c) = (d34 + d25, d25 + d16, d16 + d07);
         // sin(pi / 8), and cos(pi / 8) less and plus it.
         let shared = (a - c) * 0.382_683_43;
-        let (low, high) = (a * 0.541_196_1 + shared, c * 1.306_562_96 + shared);
+        let (low, high) = (a * 0.541_196_1 + shared, c * 1.306_563 + shared);
         let middle = b * std::f32::consts::FRAC_1_SQRT_2;
         let (plus, minus) = (d07 + middle, d07 - middle);
         (r[0][i], r[4][i]) = (even0 + even1, even0 - even1);

@@ -408,13 +408,43 @@ impl Committer {
     }
 
     fn commit(&mut self) -> Result<()> {
-        if self.group.is_empty() {
+        self.bytes = 0;
+        let group = std::mem::take(&mut self.group);
+        self.commit_episodes(&group)
+    }
+
+    /// Commits some episodes. Those for which there is no room together are tried in halves, so that a disk that
+    /// fills up keeps as many finished episodes as it has room for.
+    fn commit_episodes(&mut self, episodes: &[RecordBatch]) -> Result<()> {
+        if episodes.is_empty() {
             return Ok(());
         }
-        let fragment = self.table.write_fragment(&self.schema, std::mem::take(&mut self.group))?;
-        self.bytes = 0;
-        self.table.commit(Operation::Append { fragments: vec![fragment] })
+        let fragment = self.table.write_fragment(&self.schema, episodes.to_vec());
+        let committed = fragment.and_then(|fragment| {
+            let files: Vec<PathBuf> =
+                fragment.files.iter().map(|file| self.table.store.folder.join("data").join(&file.path)).collect();
+            let committed = self.table.commit(Operation::Append { fragments: vec![fragment] });
+            if matches!(&committed, Err(error) if is_full(error)) {
+                // The manifest had no room: what it would have named is of no use.
+                files.iter().for_each(|file| remove(file));
+            }
+            committed
+        });
+        match committed {
+            Err(error) if is_full(&error) && episodes.len() > 1 => {
+                let (first, second) = episodes.split_at(episodes.len() / 2);
+                self.commit_episodes(first)?;
+                self.commit_episodes(second)
+            }
+            committed => committed,
+        }
     }
+}
+
+/// Whether an error says that the disk is full.
+fn is_full(error: &Error) -> bool {
+    use std::io::ErrorKind::{QuotaExceeded, StorageFull};
+    matches!(error, Error::Io { source, .. } if matches!(source.kind(), StorageFull | QuotaExceeded))
 }
 
 /// A table and its newest version.

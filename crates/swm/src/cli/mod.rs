@@ -88,8 +88,10 @@ impl Cli {
         match self.dispatch() {
             Ok(()) => ExitCode::SUCCESS,
             Err(error) => {
-                complain(&format!("error: {error:#}\n"));
-                match error.downcast_ref::<swm_core::Error>() {
+                // Our own errors say everything in one line; others are told with their causes.
+                let ours = error.downcast_ref::<swm_core::Error>();
+                complain(&ours.map_or_else(|| format!("error: {error:#}\n"), |ours| format!("error: {ours}\n")));
+                match ours {
                     Some(swm_core::Error::Interrupted) => ExitCode::from(130),
                     Some(error) if error.is_usage() => ExitCode::from(2),
                     _ => ExitCode::FAILURE,

@@ -27,7 +27,7 @@ check: setup
 	$(CARGO) xtask check
 
 build: setup
-	$(CARGO) build --release --package swm
+	$(CARGO) build --release --workspace
 
 bench: build
 	SWM_REFERENCE_PYTHON=$(CACHE)/reference/bin/python $(CARGO_TARGET_DIR)/release/swm bench envs

@@ -314,6 +314,6 @@ mod tests {
         let full = lance_core::Error::io("failed to persist: No space left on device (os error 28)".to_owned());
         let error = explain(Path::new("x.lance"), "writing", &full);
         assert!(matches!(&error, Error::Io { source, .. } if source.kind() == ErrorKind::StorageFull));
-        assert!(error.to_string().contains("finished episodes are kept"));
+        assert!(error.to_string().contains("committed episodes are kept"));
     }
 }

@@ -97,6 +97,16 @@ pub fn datasets(as_json: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
+/// Lists the dataset formats.
+pub fn formats(as_json: bool) -> anyhow::Result<()> {
+    let rows = data::FORMATS.rows.iter();
+    if as_json {
+        return emit_json(&rows.map(|format| json!({"id": format.id, "summary": format.summary})).collect::<Vec<_>>());
+    }
+    emit(&table(&["format", "what it is"], rows.map(|format| vec![format.id.to_owned(), format.summary.to_owned()])));
+    Ok(())
+}
+
 /// The numbers of a dataset that cost nothing to know.
 fn summary(reader: &dyn Reader) -> Result<Value> {
     let manifest = reader.manifest();

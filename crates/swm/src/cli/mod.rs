@@ -43,6 +43,8 @@ enum Command {
     Collect(collect::CollectArgs),
     /// List the datasets at home
     Datasets,
+    /// List the dataset formats
+    Formats,
     /// Say what is in a dataset
     Inspect(datasets::InspectArgs),
     /// Make a video and a contact sheet of some episodes of a dataset
@@ -106,6 +108,7 @@ impl Cli {
             Command::Envs(args) => envs::envs(&args, json),
             Command::Fovs(args) => envs::fovs(&args, json),
             Command::Datasets => datasets::datasets(json),
+            Command::Formats => datasets::formats(json),
             Command::Inspect(args) => datasets::inspect(&args, json),
             Command::Preview(args) => datasets::preview(&args, json),
             Command::Models => models::models(json),

@@ -45,7 +45,8 @@ fn tables_are_for_people() {
         (&["fovs", "swm/TwoRoom-v1"], &["door.position", "agent.speed"]),
         (&["datasets"], &["no datasets"]),
         (&["checkpoints"], &["no checkpoints"]),
-        (&["models"], &["lewm"]),
+        (&["models"], &["lewm", "tiny", "paper"]),
+        (&["formats"], &["lance"]),
     ] {
         let output = swm.run(args);
         assert!(output.status.success(), "{args:?}: {}", text(&output.stderr));

@@ -26,8 +26,9 @@ test: check setup-python
 check: setup
 	$(CARGO) xtask check
 
+# With the tests, whose needs switch on features of shared dependencies: so `make test` finds them compiled.
 build: setup
-	$(CARGO) build --release --workspace
+	$(CARGO) build --release --workspace --bins --tests
 
 bench: build
 	SWM_REFERENCE_PYTHON=$(CACHE)/reference/bin/python $(CARGO_TARGET_DIR)/release/swm bench envs

@@ -190,4 +190,9 @@ pub trait Env: Send {
 
     /// Whether the goal is reached now.
     fn is_success(&self) -> bool;
+
+    /// How far the world is from its goal, in the unit its README names: 0 at the goal, never negative, falling
+    /// along a good way there (around walls, not through them). A simulator that serves as a cost model
+    /// minimises it.
+    fn goal_distance(&self) -> f64;
 }

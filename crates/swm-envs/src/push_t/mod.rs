@@ -235,6 +235,12 @@ impl Env for PushT {
     fn is_success(&self) -> bool {
         reached(&self.factors, &self.goal, &self.state())
     }
+
+    fn goal_distance(&self) -> f64 {
+        let (state, goal) = (self.state(), &self.goal);
+        let apart = goal[..4].iter().zip(&state).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
+        apart / REACH + turn(self.factors.integer("block.shape"), goal[4], state[4]) / REACH_ANGLE
+    }
 }
 
 /// One step of the environment: pulls the agent to where an action points, in single precision as the reference

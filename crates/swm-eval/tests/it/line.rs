@@ -126,6 +126,10 @@ impl Env for Line {
     fn is_success(&self) -> bool {
         (self.x - self.goal).abs() < NEAR
     }
+
+    fn goal_distance(&self) -> f64 {
+        (self.x - self.goal).abs()
+    }
 }
 
 /// Walks straight to the goal.

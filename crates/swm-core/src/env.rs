@@ -13,7 +13,7 @@ use crate::{Error, FactorValues, Key, Result, Space, VariationRequest, Variation
 pub struct EnvSpec {
     /// Its registered id, such as `swm/PushT-v1`.
     pub id: &'static str,
-    /// The actions it takes: a `Float32` box or a discrete space.
+    /// The actions it takes: a `Float32` box, a discrete space or a multi-discrete one.
     pub action_space: Space,
     /// The columns [`Env::observe`] writes, in order; `state` is always among them.
     pub columns: Vec<ColumnSpec>,
@@ -55,8 +55,8 @@ pub struct ResetOptions {
 pub enum Action<'a> {
     /// A point of a box.
     Continuous(&'a [f32]),
-    /// One of a discrete set.
-    Discrete(i64),
+    /// One of a discrete set, or one of each of several.
+    Discrete(&'a [i64]),
 }
 
 impl<'a> Action<'a> {
@@ -77,24 +77,33 @@ impl<'a> Action<'a> {
             Self::Continuous(values) => {
                 Err(Error::mismatch("stepping", format!("an action of {} numbers", values.len()), format!("{dim}")))
             }
-            Self::Discrete(index) => {
-                Err(Error::mismatch("stepping", format!("discrete action {index}"), format!("{dim} numbers")))
+            Self::Discrete(choice) => {
+                Err(Error::mismatch("stepping", format!("discrete action {choice:?}"), format!("{dim} numbers")))
             }
         }
     }
 
-    /// A discrete action, checked against `n` choices from 0.
+    /// The integers of an action of a discrete space: one, or as many as a multi-discrete space has.
     ///
     /// # Errors
-    /// When it is continuous or out of range.
-    pub fn discrete(self, n: i64) -> Result<i64> {
+    /// When it is continuous, has another length than the space, or is out of range.
+    pub fn discrete(self, space: &Space) -> Result<&'a [i64]> {
+        #[allow(clippy::cast_possible_truncation)]
+        let bounds = |i| {
+            let (low, high) = space.bounds(i);
+            low as i64..=high as i64
+        };
+        let expected = || (0..space.len()).map(|i| format!("{:?}", bounds(i))).collect::<Vec<_>>().join(", ");
         match self {
-            Self::Discrete(index) if (0..n).contains(&index) => Ok(index),
-            Self::Discrete(index) => {
-                Err(Error::mismatch("stepping", format!("action {index}"), format!("0 ..= {}", n - 1)))
+            Self::Discrete(choice)
+                if choice.len() == space.len()
+                    && choice.iter().enumerate().all(|(i, choice)| bounds(i).contains(choice)) =>
+            {
+                Ok(choice)
             }
+            Self::Discrete(choice) => Err(Error::mismatch("stepping", format!("action {choice:?}"), expected())),
             Self::Continuous(values) => {
-                Err(Error::mismatch("stepping", format!("{values:?}"), format!("one integer in 0 ..= {}", n - 1)))
+                Err(Error::mismatch("stepping", format!("{values:?}"), format!("integers in {}", expected())))
             }
         }
     }

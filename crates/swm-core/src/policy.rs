@@ -100,6 +100,10 @@ pub fn write_action(row: &mut RowMut<'_>, column: usize, action: &[f64]) {
                 *to = from as f32;
             }
         }
-        _ => row.set(column, &[action[0] as i64]),
+        _ => {
+            for (to, &from) in row.at::<i64>(column).iter_mut().zip(action) {
+                *to = from as i64;
+            }
+        }
     }
 }

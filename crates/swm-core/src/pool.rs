@@ -206,7 +206,7 @@ impl EnvPool {
             }
             let action = match dtype {
                 DType::Float32 => Action::Continuous(actions.row(i).at::<f32>(column)),
-                _ => Action::Discrete(actions.row(i).at::<i64>(column)[0]),
+                _ => Action::Discrete(actions.row(i).at::<i64>(column)),
             };
             let mut transition = slot.env.step(action)?;
             slot.steps += 1;

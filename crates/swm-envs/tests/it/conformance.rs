@@ -71,9 +71,10 @@ impl Probe {
     fn step(&mut self, key: Key, t: u64) -> swm_core::Transition {
         let action = self.env.spec().action_space.sample(&mut key.at(t).rng());
         let numbers: Vec<f32> = action.iter().map(|&v| v as f32).collect();
+        let choice: Vec<i64> = action.iter().map(|&v| v as i64).collect();
         let action = match self.env.spec().action_space {
-            Space::Discrete { .. } => Action::Discrete(action[0] as i64),
-            _ => Action::Continuous(&numbers),
+            Space::Box { .. } => Action::Continuous(&numbers),
+            _ => Action::Discrete(&choice),
         };
         self.env.step(action).expect("an action of the action space")
     }
@@ -112,10 +113,10 @@ fn rows_declare_what_they_are() {
         assert!(schema.find("state").is_some(), "{id} observes its state");
         let fitting = match spec.action_space {
             Space::Box { dtype, .. } => dtype == DType::Float32,
-            Space::Discrete { .. } => true,
-            _ => false,
+            Space::Discrete { .. } | Space::MultiDiscrete { .. } => true,
+            Space::Rgb => false,
         };
-        assert!(fitting, "{id}: actions are a float32 box or discrete");
+        assert!(fitting, "{id}: actions are a float32 box, discrete or multi-discrete");
         assert!(!entry.experts.is_empty(), "{id} has an expert");
         for (i, expert) in entry.experts.iter().enumerate() {
             assert!(entry.experts[..i].iter().all(|other| other.id != expert.id), "{id}: two experts '{}'", expert.id);
@@ -238,12 +239,17 @@ fn wrong_actions_are_errors_and_change_nothing() {
         let mut probe = Probe::reset(entry, 0, &ResetOptions::default());
         let before = probe.env.snapshot();
         let n = probe.env.spec().action_dim();
-        let wrong: Vec<Action<'_>> = match probe.env.spec().action_space {
-            Space::Discrete { n, start } => {
-                vec![Action::Discrete(start - 1), Action::Discrete(start + n), Action::Continuous(&[0.0])]
+        let space = probe.env.spec().action_space.clone();
+        let wrong: Vec<Action<'_>> = match space {
+            Space::Discrete { .. } | Space::MultiDiscrete { .. } => {
+                let ends = |past: i64| {
+                    let end = |i| if past < 0 { space.bounds(i).0 as i64 - 1 } else { space.bounds(i).1 as i64 + 1 };
+                    Action::Discrete((0..n).map(end).collect::<Vec<_>>().leak())
+                };
+                vec![ends(-1), ends(1), Action::Discrete(vec![0; n + 1].leak()), Action::Continuous(&[0.0])]
             }
             _ => vec![
-                Action::Discrete(0),
+                Action::Discrete(&[0]),
                 Action::Continuous(&[]),
                 Action::Continuous(vec![0.0; n + 1].leak()),
                 Action::Continuous(vec![f32::NAN; n].leak()),

@@ -28,7 +28,8 @@ pub use error::{Error, Result};
 pub use key::{Key, Rng};
 pub use manifest::Manifest;
 pub use plan::{
-    Candidates, Constrained, CostModel, DifferentiableCost, LatentDynamics, Plan, PlanProblem, PlanTrace, Solver,
+    Candidates, Constrained, CostModel, DifferentiableCost, LatentDynamics, Plan, PlanProblem, PlanSpace, PlanTrace,
+    Solver,
 };
 pub use policy::{Policy, RandomPolicy};
 pub use pool::EnvPool;

@@ -4,8 +4,9 @@
 //! cross this border, so solvers know no deep-learning framework. All environments that replan at a step
 //! go in one call, yet the plan of each depends on its own cost and key only.
 
-use crate::{Batch, Key, Result};
+use crate::{Batch, Env, Key, Result};
 use serde::Serialize;
+use std::time::Instant;
 
 /// Candidate action sequences of several environments.
 ///
@@ -40,11 +41,35 @@ pub trait CostModel: Send {
     /// # Errors
     /// When the candidates do not fit the model.
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()>;
+
+    /// Shows the world of `slot` itself, before [`CostModel::observe`] names that slot. Only a model with privileged
+    /// information, such as a simulator, looks.
+    ///
+    /// # Errors
+    /// When the world is not one the model knows.
+    fn see(&mut self, _slot: usize, _env: &dyn Env) -> Result<()> {
+        Ok(())
+    }
+
+    /// This model with its gradient, if it has one.
+    fn differentiable(&mut self) -> Option<&mut dyn DifferentiableCost> {
+        None
+    }
+
+    /// This model with its latent state, if it shows one.
+    fn latent(&mut self) -> Option<&mut dyn LatentDynamics> {
+        None
+    }
+
+    /// This model with its constraints, if it has any.
+    fn constrained(&mut self) -> Option<&mut dyn Constrained> {
+        None
+    }
 }
 
 /// A cost with a gradient.
 pub trait DifferentiableCost: CostModel {
-    /// Costs `[envs, samples]` and their gradient with respect to the candidates, of the candidates' shape.
+    /// Costs `[envs, samples]` and the gradient of each with respect to its candidate, of the candidates' shape.
     ///
     /// # Errors
     /// As [`CostModel::cost`].
@@ -82,7 +107,7 @@ pub trait LatentDynamics: CostModel {
     ) -> Result<()>;
 }
 
-/// Inequality constraints on candidates.
+/// Differentiable inequality constraints on candidates.
 pub trait Constrained: CostModel {
     /// How many.
     fn constraints(&self) -> usize;
@@ -92,6 +117,40 @@ pub trait Constrained: CostModel {
     /// # Errors
     /// As [`CostModel::cost`].
     fn constrain(&mut self, candidates: Candidates<'_>, values: &mut [f32]) -> Result<()>;
+
+    /// The vector-Jacobian product of [`Constrained::constrain`]: adds `Σ_c weights_c ∂value_c / ∂candidate` to
+    /// `gradient`, of the candidates' shape; `weights` is `[envs, samples, constraints]`.
+    ///
+    /// # Errors
+    /// As [`CostModel::cost`].
+    fn constrain_vjp(&mut self, candidates: Candidates<'_>, weights: &[f32], gradient: &mut [f32]) -> Result<()>;
+}
+
+/// What one model step of a plan may be.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum PlanSpace<'a> {
+    /// Numbers within bounds, in the model's (normalised) action units; infinite bounds bound nothing.
+    Continuous {
+        /// The lower bound of each of the `dim` numbers.
+        low: &'a [f32],
+        /// The upper bound of each.
+        high: &'a [f32],
+    },
+    /// Several choices, one after another in a model step, each as a one-hot vector.
+    Discrete {
+        /// Among how many each choice is made; they add up to `dim`.
+        choices: &'a [usize],
+    },
+}
+
+impl PlanSpace<'_> {
+    /// Numbers of one model step.
+    pub fn dim(&self) -> usize {
+        match self {
+            Self::Continuous { low, .. } => low.len(),
+            Self::Discrete { choices } => choices.iter().sum(),
+        }
+    }
 }
 
 /// What a solver is asked.
@@ -99,22 +158,28 @@ pub trait Constrained: CostModel {
 pub struct PlanProblem<'a> {
     /// Model steps to plan.
     pub horizon: usize,
-    /// Numbers of one model step.
-    pub dim: usize,
-    /// Lower bound of each of the `dim` numbers, in the model's (normalised) action units.
-    pub low: &'a [f32],
-    /// Upper bound of each.
-    pub high: &'a [f32],
+    /// What a model step may be.
+    pub space: PlanSpace<'a>,
     /// The key of each environment's plan, one an environment: `(seed, episode, replan)`.
     pub keys: &'a [Key],
-    /// Where to start: `[envs, horizon, dim]`, or `None` for zeros.
+    /// Where to start: `[envs, horizon, dim]`; `None` for zeros, or for every choice equally likely.
     pub init: Option<&'a [f32]>,
+    /// When to stop searching and return the best plan so far: solvers look between iterations, after the first. A plan
+    /// that was cut short depends on the machine's speed.
+    pub deadline: Option<Instant>,
+}
+
+impl PlanProblem<'_> {
+    /// Whether the search is to stop now.
+    pub fn is_late(&self) -> bool {
+        self.deadline.is_some_and(|deadline| Instant::now() >= deadline)
+    }
 }
 
 /// What a solver found.
 #[derive(Clone, Debug, Default)]
 pub struct Plan {
-    /// The action sequences, `[envs, horizon, dim]`.
+    /// The action sequences, `[envs, horizon, dim]`; of discrete actions, one-hot vectors.
     pub actions: Vec<f32>,
     /// The cost of each, `[envs]`: what the model said of the best candidate of the last iteration.
     pub costs: Vec<f32>,
@@ -138,6 +203,7 @@ pub trait Solver: Send {
     /// Solves one problem for every environment `cost` observed.
     ///
     /// # Errors
-    /// When the settings contradict each other, or the model fails or returns costs that are not finite.
+    /// When the settings contradict each other or do not fit the action space or the model, or the model fails or returns
+    /// costs that are not finite.
     fn solve(&mut self, cost: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan>;
 }

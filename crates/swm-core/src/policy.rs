@@ -4,7 +4,7 @@
 //! played the same way wherever it runs.
 
 use crate::batch::{Batch, DType, RowMut, RowRef};
-use crate::{EnvSpec, Key, Result, Rng};
+use crate::{EnvPool, EnvSpec, Key, Result, Rng};
 
 /// Who acts.
 pub trait Policy: Send {
@@ -16,6 +16,15 @@ pub trait Policy: Send {
     /// # Errors
     /// When the infos lack what the policy needs, or its model fails.
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()>;
+
+    /// Shows the worlds themselves, before [`Policy::act`]. Only a policy with privileged information, such as one that
+    /// plans in a simulator, looks.
+    ///
+    /// # Errors
+    /// When a world is not one the policy knows.
+    fn see(&mut self, _worlds: &EnvPool, _active: &[bool]) -> Result<()> {
+        Ok(())
+    }
 
     /// Seconds each plan took since the last call, for policies that plan.
     fn take_latencies(&mut self) -> Vec<f64> {

@@ -126,6 +126,7 @@ impl World {
     }
 
     fn act(&mut self, policy: &mut dyn Policy, active: &[bool]) -> Result<()> {
+        policy.see(&self.pool, active)?;
         let (infos, actions) = (self.pool.infos(), &mut self.actions);
         self.pool.threads().install(|| policy.act(infos, active, actions))
     }

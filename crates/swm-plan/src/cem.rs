@@ -26,7 +26,7 @@ use rand::Rng as _;
 use rand_distr::StandardNormal;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use swm_core::{Candidates, CostModel, Error, Key, Plan, PlanProblem, PlanTrace, Result, Solver};
+use swm_core::{Candidates, CostModel, Error, Key, Plan, PlanProblem, PlanSpace, PlanTrace, Result, Solver};
 
 /// The cross-entropy method; the defaults are those of the paper's experiments.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -51,8 +51,9 @@ impl Default for Cem {
 impl Solver for Cem {
     fn solve(&mut self, cost: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan> {
         self.check()?;
-        let PlanProblem { horizon, dim, low, high, keys, init } = problem;
-        check_problem(&problem)?;
+        let PlanProblem { horizon, space, keys, init, .. } = problem;
+        let (low, high) = continuous("CEM", &problem)?;
+        let dim = space.dim();
         let (envs, samples, len) = (keys.len(), self.samples, horizon * dim);
         if envs == 0 {
             return Ok(Plan::default());
@@ -147,8 +148,17 @@ fn average(values: impl ExactSizeIterator<Item = f32>) -> f32 {
     (values.map(f64::from).sum::<f64>() / n) as f32
 }
 
-fn check_problem(problem: &PlanProblem<'_>) -> Result<()> {
-    let PlanProblem { horizon, dim, low, high, keys, init } = *problem;
+/// The bounds of a problem with continuous actions, checked.
+fn continuous<'a>(solver: &str, problem: &PlanProblem<'a>) -> Result<(&'a [f32], &'a [f32])> {
+    let PlanProblem { horizon, space, keys, init, .. } = *problem;
+    let PlanSpace::Continuous { low, high } = space else {
+        return Err(Error::config(
+            format!("solver {solver}"),
+            "it plans continuous actions; these are discrete",
+            "choose a solver for discrete actions",
+        ));
+    };
+    let dim = space.dim();
     if horizon == 0 || dim == 0 {
         return Err(Error::config(
             "planning horizon",
@@ -181,7 +191,7 @@ fn check_problem(problem: &PlanProblem<'_>) -> Result<()> {
             });
         }
     }
-    Ok(())
+    Ok((low, high))
 }
 
 fn check_costs(costs: &[f32], samples: usize, iteration: usize) -> Result<()> {
@@ -252,7 +262,8 @@ mod tests {
 
     fn solve(cem: &Cem, bowl: &mut Bowl, keys: &[Key], init: Option<&[f32]>) -> Result<Plan> {
         let (low, high) = (&[-1.0; DIM][..], &[0.5, 1.0, f32::INFINITY][..]);
-        cem.clone().solve(bowl, PlanProblem { horizon: HORIZON, dim: DIM, low, high, keys, init })
+        let space = PlanSpace::Continuous { low, high };
+        cem.clone().solve(bowl, PlanProblem { horizon: HORIZON, space, keys, init, deadline: None })
     }
 
     fn small() -> Cem {
@@ -339,7 +350,8 @@ mod tests {
         let wrong_init = solve(&small(), &mut Bowl::of(&[0, 1]), &keys, Some(&[0.0; 5])).expect_err("short");
         assert!(wrong_init.to_string().contains("5 numbers"), "{wrong_init}");
         let (low, high) = (&[0.0; DIM][..], &[1.0; DIM][..]);
-        let empty = PlanProblem { horizon: 0, dim: DIM, low, high, keys: &keys, init: None };
+        let space = PlanSpace::Continuous { low, high };
+        let empty = PlanProblem { horizon: 0, space, keys: &keys, init: None, deadline: None };
         let message = small().solve(&mut Bowl::of(&[0, 1]), empty).expect_err("nothing to plan").to_string();
         assert!(message.contains("horizon"), "{message}");
     }

@@ -7,9 +7,11 @@
 pub mod cem;
 mod history;
 pub mod mpc;
+pub mod registry;
 pub mod scale;
 pub mod topk;
 
 pub use cem::Cem;
 pub use mpc::{MpcConfig, MpcPolicy};
+pub use registry::{SOLVERS, SolverEntry};
 pub use scale::ActionScale;

@@ -18,7 +18,7 @@ use crate::ActionScale;
 use crate::history::History;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
-use swm_core::{Batch, CostModel, EnvSpec, Error, Key, PlanProblem, Policy, Result, Solver};
+use swm_core::{Batch, CostModel, EnvSpec, Error, Key, PlanProblem, PlanSpace, Policy, Result, Solver};
 
 /// How far to plan and how much of a plan to execute.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -177,8 +177,8 @@ impl MpcPolicy {
             slot.plans += 1;
         }
         let (horizon, dim) = (self.config.horizon, self.low.len());
-        let (low, high) = (&self.low[..], &self.high[..]);
-        let problem = PlanProblem { horizon, dim, low, high, keys, init: Some(init) };
+        let space = PlanSpace::Continuous { low: &self.low, high: &self.high };
+        let problem = PlanProblem { horizon, space, keys, init: Some(init), deadline: None };
         let plan = self.solver.solve(&mut *self.cost, problem)?;
         if plan.actions.len() != init.len() {
             return Err(Error::mismatch(
@@ -283,7 +283,7 @@ mod tests {
             let mut calls = self.calls.lock().expect("one thread");
             calls.push((problem.keys.to_vec(), problem.init.expect("a first guess").to_vec()));
             let base = 100.0 * calls.len() as f32;
-            let len = problem.horizon * problem.dim;
+            let len = problem.horizon * problem.space.dim();
             let actions = (0..problem.keys.len() * len).map(|i| base + (i % len) as f32).collect();
             Ok(Plan { actions, ..Plan::default() })
         }

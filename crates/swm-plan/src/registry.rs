@@ -1,0 +1,94 @@
+//! [`SOLVERS`]: every solver, what it plans and what it asks of a model.
+
+use crate::Cem;
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use swm_core::registry::Named;
+use swm_core::{Error, Registry, Result, Solver};
+
+/// How a solver searches.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Family {
+    /// It compares the costs of samples.
+    Sampling,
+    /// It follows the gradient of the cost.
+    Gradient,
+}
+
+/// The actions a solver plans.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Actions {
+    /// Numbers within bounds.
+    Continuous,
+    /// Choices among a few.
+    Discrete,
+}
+
+/// What a solver asks of a model beyond a cost.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Need {
+    /// [`swm_core::DifferentiableCost`].
+    Gradient,
+    /// [`swm_core::LatentDynamics`].
+    Latent,
+    /// [`swm_core::Constrained`].
+    Constraints,
+}
+
+/// A solver that can be made.
+pub struct SolverEntry {
+    /// Its id, such as `cem`.
+    pub id: &'static str,
+    /// How it searches, in a sentence.
+    pub summary: &'static str,
+    /// How it searches.
+    pub family: Family,
+    /// The actions it plans.
+    pub actions: Actions,
+    /// What it asks of a model beyond a cost.
+    pub needs: &'static [Need],
+    /// The publication it follows.
+    pub paper: &'static str,
+    /// Its settings and their defaults, as JSON.
+    pub defaults: fn() -> serde_json::Value,
+    /// Makes one from settings; what they do not name keeps its default.
+    pub make: fn(&serde_json::Value) -> Result<Box<dyn Solver>>,
+}
+
+impl Named for SolverEntry {
+    fn id(&self) -> &'static str {
+        self.id
+    }
+}
+
+/// Every solver.
+pub static SOLVERS: Registry<SolverEntry> = Registry {
+    kind: "solver",
+    hint: "`swm solvers` lists them",
+    rows: &[SolverEntry {
+        id: "cem",
+        summary: "refits a Gaussian to the cheapest samples",
+        family: Family::Sampling,
+        actions: Actions::Continuous,
+        needs: &[],
+        paper: "Rubinstein and Kroese, The Cross-Entropy Method, 2004",
+        defaults: defaults::<Cem>,
+        make: make::<Cem>,
+    }],
+};
+
+/// The default settings of a solver.
+fn defaults<S: Default + Serialize>() -> serde_json::Value {
+    serde_json::to_value(S::default()).unwrap_or_default()
+}
+
+/// A solver with these settings.
+fn make<S: Solver + DeserializeOwned + 'static>(settings: &serde_json::Value) -> Result<Box<dyn Solver>> {
+    match S::deserialize(settings) {
+        Ok(solver) => Ok(Box::new(solver)),
+        Err(error) => Err(Error::config("solver settings", error.to_string(), "`swm solvers` lists what there is")),
+    }
+}

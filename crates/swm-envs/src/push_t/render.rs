@@ -24,8 +24,6 @@ const TICK_COLOR: [u8; 3] = [231, 76, 60];
 const TICK: f64 = 2.0;
 /// The most ticks a picture shows.
 const MAX_TICKS: usize = 32;
-/// The scale of the goal pose at which it is as large as the block.
-const GOAL_SCALE: f64 = 40.0;
 
 /// Indices of the palette.
 const BACKGROUND: u8 = 0;
@@ -130,9 +128,9 @@ impl Renderer {
         if factors.integer("rendering.render_goal") != 0 {
             let at = factors.get("goal.position");
             let pose = Pose::new(Vec2::new(at[0], at[1]), factors.scalar("goal.angle"), Vec2::ZERO);
-            let scale = factors.scalar("goal.scale") / GOAL_SCALE;
+            // As large as the block: the reference samples `goal.scale` and does not look at it.
             for rect in &self.designs[BLOCK].rects {
-                self.table.fill_polygon(&rect.map(|corner| pixel(pose.point(corner * scale))), GOAL);
+                self.table.fill_polygon(&rect.map(|corner| pixel(pose.point(corner))), GOAL);
             }
         }
         walls().iter().for_each(|&[from, to]| self.table.bar(from, to, WALL));

@@ -457,6 +457,10 @@ fn effects(entry: &EnvEntry, factor: &Factor, beside: &VariationRequest) -> Effe
     effects
 }
 
+/// Factors that change nothing, and why.
+const IDLE: &[(&str, &str, &str)] =
+    &[("swm/PushT-v1", "goal.scale", "the reference samples it and draws the goal pose as large as the block")];
+
 #[test]
 fn factors_change_what_they_name() {
     for entry in ENVS.rows {
@@ -473,6 +477,11 @@ fn factors_change_what_they_name() {
         }
         for factor in space.factors() {
             let id = format!("{}, {}", entry.id, factor.key);
+            if let Some((_, _, why)) = IDLE.iter().find(|(env, key, _)| *env == entry.id && *key == factor.key) {
+                let mut all = contexts.iter().map(|context| effects(entry, factor, context));
+                assert!(all.all(|e| e.picture + e.row + e.later == 0), "{id} changes something, but {why}");
+                continue;
+            }
             let Effects { tried, picture, row, .. } = effects(entry, factor, &defaults);
             assert!(tried > 0, "{id}: no value fits beside the defaults");
             let name = factor.key.rsplit('.').next().unwrap_or_default();

@@ -102,9 +102,7 @@ fn rollouts_and_pictures_follow_the_reference() {
         ];
         let wanted = columns.map(|column| golden.read::<f64>(column));
         let goals = golden.read::<f64>("info.goal_state");
-        let mut variation = golden.variation();
-        // The reference samples this factor but draws the goal pose as large as the block all the same.
-        variation.variation_values.remove("goal.scale");
+        let variation = golden.variation();
         let mut probe = Probe::new(&ResetOptions { variation, state: None, goal_state: Some(goals[..7].to_vec()) });
         let follows = |probe: &mut Probe, t: usize| {
             for (column, rows) in columns.iter().zip(&wanted) {

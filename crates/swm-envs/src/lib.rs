@@ -8,5 +8,8 @@ pub mod two_room;
 use swm_core::{EnvEntry, Registry};
 
 /// Every native environment.
-pub static ENVS: Registry<EnvEntry> =
-    Registry { kind: "environment", hint: "`swm envs` lists them", rows: &[push_t::ENTRY, two_room::ENTRY] };
+pub static ENVS: Registry<EnvEntry> = Registry {
+    kind: "environment",
+    hint: "`swm envs` lists them",
+    rows: &[push_t::ENTRY, push_t::discrete::ENTRY, two_room::ENTRY],
+};

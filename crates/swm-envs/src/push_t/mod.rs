@@ -3,6 +3,7 @@
 //! The README beside this file lists actions, observations, reward, factors, and where it differs from the
 //! Python reference. Constants are those of the reference's `env.py` unless said otherwise.
 
+pub mod discrete;
 mod expert;
 mod physics;
 mod render;
@@ -30,7 +31,7 @@ const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
         summary: "pushes planned with the world's own physics",
-        make: || Box::new(expert::Pusher::default()),
+        make: || Box::new(expert::Pusher::new(|action| action)),
     },
     ExpertEntry {
         id: "weak",
@@ -81,21 +82,20 @@ pub struct PushT {
 }
 
 impl PushT {
-    /// An environment in the default state of its factors.
+    /// `swm/PushT-v1` in the default state of its factors.
     pub fn new() -> Self {
+        Self::with_actions(ENTRY.id, Space::uniform_box([2], DType::Float32, -1.0, 1.0))
+    }
+
+    /// The same world under another id, with a box or the grid of [`discrete`] for its actions.
+    fn with_actions(id: &'static str, action_space: Space) -> Self {
         let variation_space = variation_space();
         let nothing = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
         let factors = variation_space.resolve(&nothing, Key::new(0)).expect("defaults are in their spaces");
         let goal = start_of(&factors);
         let world = settle(world_of(&factors), &goal);
         let goal_scene = Scene::of(&world);
-        let spec = EnvSpec {
-            id: ENTRY.id,
-            action_space: Space::uniform_box([2], DType::Float32, -1.0, 1.0),
-            columns: columns(),
-            variation_space,
-            max_episode_steps: 200,
-        };
+        let spec = EnvSpec { id, action_space, columns: columns(), variation_space, max_episode_steps: 200 };
         let (renderer, shapes) = (Renderer::new(&factors), shapes_of(&factors));
         Self { spec, factors, world, goal, goal_scene, contacts: 0, shapes, renderer }
     }
@@ -147,8 +147,11 @@ impl Env for PushT {
     }
 
     fn step(&mut self, action: Action<'_>) -> Result<Transition> {
-        let action = action.continuous(2)?;
-        self.contacts = advance(&mut self.world, [action[0], action[1]]);
+        let action = match &self.spec.action_space {
+            Space::Box { .. } => action.continuous(2).map(|action| [action[0], action[1]])?,
+            grid => discrete::action(action.discrete(grid)?),
+        };
+        self.contacts = advance(&mut self.world, action);
         let state = self.state();
         Ok(Transition {
             reward: -distance(&self.goal, &state),
@@ -188,7 +191,7 @@ impl Env for PushT {
     }
 
     fn snapshot(&self) -> Snapshot {
-        let mut bytes = ENTRY.id.as_bytes().to_vec();
+        let mut bytes = self.spec.id.as_bytes().to_vec();
         factors::write(&self.factors, &mut bytes);
         put(&mut bytes, &self.goal);
         put(&mut bytes, &[self.contacts as u64]);
@@ -197,8 +200,9 @@ impl Env for PushT {
     }
 
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let foreign = || Error::mismatch("restoring a snapshot", "other bytes", format!("a snapshot of {}", ENTRY.id));
-        let bytes = snapshot.0.strip_prefix(ENTRY.id.as_bytes()).ok_or_else(foreign)?;
+        let id = self.spec.id;
+        let foreign = || Error::mismatch("restoring a snapshot", "other bytes", format!("a snapshot of {id}"));
+        let bytes = snapshot.0.strip_prefix(id.as_bytes()).ok_or_else(foreign)?;
         let (factors, mut bytes) = factors::read(&self.spec.variation_space, bytes)?;
         let (mut goal, mut contacts) = (Vec::<f64>::new(), Vec::<u64>::new());
         let mut world = world_of(&factors);

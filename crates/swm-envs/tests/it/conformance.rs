@@ -458,8 +458,10 @@ fn effects(entry: &EnvEntry, factor: &Factor, beside: &VariationRequest) -> Effe
 }
 
 /// Factors that change nothing, and why.
-const IDLE: &[(&str, &str, &str)] =
-    &[("swm/PushT-v1", "goal.scale", "the reference samples it and draws the goal pose as large as the block")];
+const IDLE: &[(&str, &str, &str)] = &[
+    ("swm/PushT-v1", "goal.scale", "the reference samples it and draws the goal pose as large as the block"),
+    ("swm/PushT-Discrete-v1", "goal.scale", "the reference samples it and draws the goal pose as large as the block"),
+];
 
 #[test]
 fn factors_change_what_they_name() {

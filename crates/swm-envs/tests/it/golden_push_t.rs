@@ -1,7 +1,8 @@
 //! Push-T against rollouts that the Python reference recorded (pymunk 7.3).
 
 use crate::golden::{self, Golden, picture_difference};
-use swm_core::{Action, Batch, Env, FrameMut, ResetOptions, Schema, VariationRequest};
+use swm_core::{Action, Batch, Env, EnvEntry, FrameMut, ResetOptions, Schema, VariationRequest};
+use swm_envs::push_t;
 
 /// An environment and the row it is observed in.
 struct Probe {
@@ -10,8 +11,8 @@ struct Probe {
 }
 
 impl Probe {
-    fn new(options: &ResetOptions) -> Self {
-        let mut env = (swm_envs::push_t::ENTRY.make)();
+    fn new(entry: &EnvEntry, options: &ResetOptions) -> Self {
+        let mut env = (entry.make)();
         env.reset(0, options).expect("recorded values are possible");
         let schema = Schema::new(env.spec().columns.clone()).expect("a schema");
         Self { env, row: Batch::zeros(&schema, 1) }
@@ -51,11 +52,12 @@ fn contacts_follow_the_reference() {
             let terminations = golden.read::<bool>(&format!("{pair}.terminated"));
             let contacts = golden.read::<i64>(&format!("{pair}.n_contacts"));
             let shapes = [("block.shape".to_owned(), vec![shapes[0]]), ("agent.shape".to_owned(), vec![shapes[1]])];
-            let mut probe = Probe::new(&ResetOptions {
+            let options = ResetOptions {
                 variation: VariationRequest { variation: Some(vec![]), variation_values: shapes.into() },
                 state: Some(start),
                 goal_state: Some(goal),
-            });
+            };
+            let mut probe = Probe::new(&push_t::ENTRY, &options);
 
             let mut errors = vec![apart(&states[..4], &probe.observe("state")[..4])];
             assert!(errors[0] < 1e-6, "{what}: off by {} at the reset", errors[0]);
@@ -103,7 +105,8 @@ fn rollouts_and_pictures_follow_the_reference() {
         let wanted = columns.map(|column| golden.read::<f64>(column));
         let goals = golden.read::<f64>("info.goal_state");
         let variation = golden.variation();
-        let mut probe = Probe::new(&ResetOptions { variation, state: None, goal_state: Some(goals[..7].to_vec()) });
+        let options = ResetOptions { variation, state: None, goal_state: Some(goals[..7].to_vec()) };
+        let mut probe = Probe::new(&push_t::ENTRY, &options);
         let follows = |probe: &mut Probe, t: usize| {
             for (column, rows) in columns.iter().zip(&wanted) {
                 let got = probe.observe(&column[column.find('.').map_or(0, |dot| dot + 1)..]);
@@ -122,6 +125,34 @@ fn rollouts_and_pictures_follow_the_reference() {
             assert_eq!(transition.terminated, terminations[t], "{name}: terminated {t}");
         }
         let last = picture_difference(&probe.frame(), &golden.read("frame_last"));
+        assert!(first < 0.1 && last < 0.1, "{name}: pictures differ by {first} and {last} of 255");
+    }
+}
+
+#[test]
+fn discrete_actions_follow_the_reference() {
+    let files = golden::files("swm_PushT-Discrete-v1-");
+    assert!(files.len() >= 4, "the files beside this test are always there");
+    for file in files {
+        let mut golden = Golden::open(&file);
+        let name = file.display();
+        let goal_state = Some(golden.read::<f64>("goal_state"));
+        let options = ResetOptions { variation: golden.variation(), state: None, goal_state };
+        let mut probe = Probe::new(&push_t::discrete::ENTRY, &options);
+        let first = picture_difference(&probe.frame(), &golden.read("frame_first"));
+        let (states, contacts) = (golden.read::<f64>("info.state"), golden.read::<i64>("info.n_contacts"));
+        let (rewards, terminations) = (golden.read::<f64>("reward"), golden.read::<bool>("terminated"));
+        let mut errors = vec![apart(&states[..7], &probe.observe("state"))];
+        for (t, action) in golden.read::<i64>("action").chunks_exact(2).enumerate() {
+            let transition = probe.env.step(Action::Discrete(action)).expect("a step");
+            errors.push(apart(&states[7 * (t + 1)..][..7], &probe.observe("state")));
+            assert!((transition.reward - rewards[t]).abs() < 1e-6, "{name}: reward {t}");
+            assert_eq!(transition.terminated, terminations[t], "{name}: terminated {t}");
+            assert_eq!(probe.observe("n_contacts"), [contacts[t + 1] as f64], "{name}: contacts {t}");
+        }
+        let last = picture_difference(&probe.frame(), &golden.read("frame_last"));
+        let worst = errors.iter().copied().fold(0.0, f64::max);
+        assert!(worst < 1e-6, "{name}: the state is off by {worst}");
         assert!(first < 0.1 && last < 0.1, "{name}: pictures differ by {first} and {last} of 255");
     }
 }

@@ -39,6 +39,8 @@ const PATIENCE: usize = 40;
 
 /// The expert.
 pub struct Pusher {
+    /// What the world makes of an action.
+    snap: fn([f64; 2]) -> [f64; 2],
     rng: Rng,
     model: Option<Model>,
     plan: Plan,
@@ -65,9 +67,10 @@ struct Model {
     world: World,
 }
 
-impl Default for Pusher {
-    fn default() -> Self {
-        Self { rng: Key::new(0).rng(), model: None, plan: Plan::default() }
+impl Pusher {
+    /// An expert for a world that turns every action into `snap` of it.
+    pub fn new(snap: fn([f64; 2]) -> [f64; 2]) -> Self {
+        Self { snap, rng: Key::new(0).rng(), model: None, plan: Plan::default() }
     }
 }
 
@@ -94,7 +97,7 @@ impl Expert for Pusher {
             self.plan.way.pop();
         }
         if (self.plan.way.is_empty() && self.plan.steps == 0) || self.plan.patience == 0 {
-            self.plan = model.plan(&state, &goal, &mut self.rng);
+            self.plan = model.plan(&state, &goal, self.snap, &mut self.rng);
         }
         self.plan.patience = self.plan.patience.saturating_sub(1);
         let wanted = match self.plan.way.last() {
@@ -156,7 +159,7 @@ impl Model {
         self.designs[BLOCK].rects.iter().map(|rect| rect.map(|corner| pose.point(corner))).collect()
     }
 
-    fn plan(&mut self, state: &State, goal: &State, rng: &mut Rng) -> Plan {
+    fn plan(&mut self, state: &State, goal: &State, snap: fn([f64; 2]) -> [f64; 2], rng: &mut Rng) -> Plan {
         let agent = Vec2::new(state[0], state[1]);
         let rects = self.rects(state);
         let reach = self.designs[AGENT].reach();
@@ -170,7 +173,7 @@ impl Model {
             for (strength, lean) in STRENGTHS.iter().flat_map(|&s| LEANS.map(|lean| (s, lean))) {
                 let (sin, cos) = lean.sin_cos();
                 let direction = inward * cos + inward.perp() * sin;
-                let push = [direction.x * strength, direction.y * strength];
+                let push = snap([direction.x * strength, direction.y * strength]);
                 let tried = self.attempt(state, goal, from, push);
                 let cost = tried.cost + WAY_COST * (from - agent).length();
                 tries.push(Try { cost, ..tried });

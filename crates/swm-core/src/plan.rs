@@ -87,7 +87,8 @@ pub trait LatentDynamics: CostModel {
     /// When nothing was observed.
     fn encode(&mut self, start: &mut [f32], goal: &mut [f32]) -> Result<()>;
 
-    /// One step for `n` pairs: `next[n, latent]` from `latents[n, latent]` and `actions[n, dim]`.
+    /// One step for `n` pairs: `next[n, latent]` from `latents[n, latent]` and `actions[n, dim]`. Every observed
+    /// environment has equally many pairs, one environment's after another's.
     ///
     /// # Errors
     /// When shapes do not fit the model.

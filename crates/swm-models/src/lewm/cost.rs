@@ -13,26 +13,26 @@ use crate::checkpoint::Checkpoint;
 use crate::nn::parameters::IntoF32;
 use burn::tensor::Device;
 use rayon::prelude::*;
-use swm_core::{Batch, Candidates, CostModel, Error, Result, Schema};
+use swm_core::{Batch, Candidates, CostModel, DifferentiableCost, Error, LatentDynamics, Result, Schema};
 
 /// The planning cost of a LeWM.
 pub struct LewmCost {
-    model: Lewm,
+    pub(super) model: Lewm,
     rollout: Rollout,
-    config: LewmConfig,
-    actions: usize,
-    scenes: Vec<Scene>,
+    pub(super) config: LewmConfig,
+    pub(super) actions: usize,
+    pub(super) scenes: Vec<Scene>,
 }
 
 /// Present and goal of one environment.
 #[derive(Clone)]
-struct Scene {
+pub(super) struct Scene {
     /// The latents of the frames seen, oldest first, the present last: `[seen, latent]`.
-    start: Vec<f32>,
+    pub start: Vec<f32>,
     /// The actions taken between them, in model units: `[seen - 1, actions]`.
-    past: Vec<f32>,
+    pub past: Vec<f32>,
     /// The latent of the goal picture, `[latent]`.
-    goal: Vec<f32>,
+    pub goal: Vec<f32>,
 }
 
 impl LewmCost {
@@ -67,6 +67,20 @@ impl LewmCost {
             }
         }
         Ok(())
+    }
+
+    /// Checks that candidates and costs are those of the observed environments.
+    pub(super) fn fits(&self, candidates: &Candidates<'_>, costs: &[f32]) -> Result<()> {
+        let Candidates { envs, samples, dim, .. } = *candidates;
+        if envs == self.scenes.len() && dim == self.actions && costs.len() == envs * samples {
+            return Ok(());
+        }
+        let words = |envs, dim, costs| format!("{envs} environments, {dim} numbers a model step, {costs} costs");
+        Err(Error::mismatch(
+            "costs of a LeWM",
+            words(envs, dim, costs.len()),
+            words(self.scenes.len(), self.actions, envs * samples),
+        ))
     }
 
     /// Present and goal of one environment.
@@ -122,19 +136,8 @@ impl CostModel for LewmCost {
     }
 
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
-        let Candidates { actions, envs, samples, horizon, dim } = candidates;
-        if envs != self.scenes.len() || dim != self.actions || costs.len() != envs * samples {
-            return Err(Error::mismatch(
-                "costs of a LeWM",
-                format!("{envs} environments, {dim} numbers a model step, {} costs", costs.len()),
-                format!(
-                    "{} environments, {} numbers a model step, {} costs",
-                    self.scenes.len(),
-                    self.actions,
-                    envs * samples
-                ),
-            ));
-        }
+        self.fits(&candidates, costs)?;
+        let Candidates { actions, samples, horizon, dim, .. } = candidates;
         let (rollout, scenes, latent) = (&self.rollout, &self.scenes, self.config.latent);
         // Parts are counted from each environment's first candidate.
         let part = Rollout::part(samples);
@@ -145,5 +148,13 @@ impl CostModel for LewmCost {
             },
         );
         Ok(())
+    }
+
+    fn differentiable(&mut self) -> Option<&mut dyn DifferentiableCost> {
+        Some(self)
+    }
+
+    fn latent(&mut self) -> Option<&mut dyn LatentDynamics> {
+        Some(self)
     }
 }

@@ -3,6 +3,7 @@
 
 pub mod config;
 pub mod cost;
+mod gradient;
 pub mod loss;
 pub mod model;
 pub mod pixels;

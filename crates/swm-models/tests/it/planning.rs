@@ -111,3 +111,101 @@ fn what_does_not_fit_is_refused() {
     let message = cost.observe(&Batch::zeros(&large, 1), &[0]).expect_err("32 pixels").to_string();
     assert!(message.contains("[16, 16, 3]"), "{message}");
 }
+
+/// A model that has observed environments 0 and 1, each with its past.
+fn observed() -> LewmCost {
+    let mut cost = LewmCost::new(&checkpoint());
+    cost.observe(&infos(true), &[0, 1]).expect("observed");
+    cost
+}
+
+#[test]
+fn gradients_are_slopes_of_the_cost() {
+    let (samples, numbers) = (5, HORIZON * DIM);
+    let actions = &candidates()[..2 * samples * numbers];
+    fn of(actions: &[f32]) -> Candidates<'_> {
+        Candidates { actions, envs: 2, samples: 5, horizon: HORIZON, dim: DIM }
+    }
+    let mut model = observed();
+    let (mut costs, mut slopes) = (vec![0.0; 2 * samples], vec![0.0; actions.len()]);
+    let differentiable = model.differentiable().expect("a LeWM has a gradient");
+    differentiable.cost_and_gradient(of(actions), &mut costs, &mut slopes).expect("gradients");
+    let mut plain = vec![0.0; 2 * samples];
+    model.cost(of(actions), &mut plain).expect("costs");
+    for (cost, plain) in costs.iter().zip(&plain) {
+        assert!((cost - plain).abs() < 1e-4 * plain.abs(), "{cost}, not {plain}");
+    }
+    // Central differences, for some numbers of some candidates.
+    let mut moved = |i: usize, by: f32| {
+        let mut actions = actions.to_vec();
+        actions[i] += by;
+        model.cost(of(&actions), &mut plain).expect("costs");
+        f64::from(plain[i / numbers])
+    };
+    let largest = slopes.iter().fold(0.0, |most, slope| slope.abs().max(most));
+    assert!(largest > 1e-4, "slopes are all but zero: {largest}");
+    for i in (0..slopes.len()).step_by(7) {
+        let (step, slope) = (2e-2, f64::from(slopes[i]));
+        let difference = (moved(i, step) - moved(i, -step)) / (2.0 * f64::from(step));
+        assert!((difference - slope).abs() < 0.02 * f64::from(largest), "number {i}: {slope}, not {difference}");
+    }
+}
+
+#[test]
+fn a_gradient_depends_on_its_environment_alone() {
+    let (samples, numbers) = (SAMPLES, HORIZON * DIM);
+    let all = candidates();
+    let run = |envs: &[usize], threads: usize| {
+        let actions: Vec<f32> =
+            envs.iter().flat_map(|&env| all[env * samples * numbers..][..samples * numbers].to_vec()).collect();
+        let mut model = LewmCost::new(&checkpoint());
+        let (mut costs, mut slopes) = (vec![0.0; envs.len() * samples], vec![0.0; actions.len()]);
+        swm_core::pool::threads(threads).expect("threads").install(|| {
+            model.observe(&infos(true), envs).expect("observed");
+            let candidates = Candidates { actions: &actions, envs: envs.len(), samples, horizon: HORIZON, dim: DIM };
+            let model = model.differentiable().expect("a LeWM has a gradient");
+            model.cost_and_gradient(candidates, &mut costs, &mut slopes).expect("gradients");
+        });
+        slopes
+    };
+    let together = run(&[0, 1, 2], 2);
+    assert_eq!(together, run(&[0, 1, 2], 1));
+    assert_eq!(together[samples * numbers..2 * samples * numbers], run(&[1], 2)[..]);
+}
+
+#[test]
+fn one_step_and_its_products_agree() {
+    let mut model = observed();
+    let latent = model.latent().expect("a LeWM has latents");
+    let width = latent.latent_dim();
+    let (mut start, mut goal) = (vec![0.0; 2 * width], vec![0.0; 2 * width]);
+    latent.encode(&mut start, &mut goal).expect("latents");
+    assert_ne!(start, goal);
+    let actions = candidates()[..2 * DIM].to_vec();
+    let mut next = vec![0.0; 2 * width];
+    latent.predict(&start, &actions, &mut next).expect("a step");
+    // Pulled by a random vector, the products are slopes of a scalar function.
+    let pull: Vec<f32> = (0..2 * width).map(|i| ((i * 29 % 17) as f32 - 8.0) / 8.0).collect();
+    let (mut by_latent, mut by_action) = (vec![0.0; 2 * width], vec![0.0; 2 * DIM]);
+    latent.predict_vjp(&start, &actions, &pull, &mut by_latent, &mut by_action).expect("products");
+    let mut value = |start: &[f32], actions: &[f32]| {
+        latent.predict(start, actions, &mut next).expect("a step");
+        next.iter().zip(&pull).map(|(a, b)| f64::from(a * b)).sum::<f64>()
+    };
+    let step = 2e-2f32;
+    for (numbers, slopes, is_action) in [(&start, &by_latent, false), (&actions, &by_action, true)] {
+        for i in (0..numbers.len()).step_by(3) {
+            let mut at = |by: f32| {
+                let mut moved = numbers.clone();
+                moved[i] += by;
+                if is_action { value(&start, &moved) } else { value(&moved, &actions) }
+            };
+            let difference = (at(step) - at(-step)) / f64::from(2.0 * step);
+            let slope = f64::from(slopes[i]);
+            let largest = slopes.iter().fold(0.0, |most, slope| slope.abs().max(most));
+            assert!((difference - slope).abs() < 0.02 * f64::from(largest), "{i}: {slope}, not {difference}");
+        }
+    }
+    let message = latent.predict(&start, &actions[..DIM], &mut goal).expect_err("one action").to_string();
+    assert!(message.contains("actions"), "{message}");
+}

@@ -94,7 +94,7 @@ pub trait LatentDynamics: CostModel {
     /// When shapes do not fit the model.
     fn predict(&mut self, latents: &[f32], actions: &[f32], next: &mut [f32]) -> Result<()>;
 
-    /// The vector-Jacobian product of [`LatentDynamics::predict`]: gradients with respect to latents and actions.
+    /// The vector-Jacobian product of [`LatentDynamics::predict`]: writes the gradients with respect to latents and actions.
     ///
     /// # Errors
     /// As [`LatentDynamics::predict`].
@@ -110,8 +110,8 @@ pub trait LatentDynamics: CostModel {
 
 /// Differentiable inequality constraints on candidates.
 pub trait Constrained: CostModel {
-    /// How many.
-    fn constraints(&self) -> usize;
+    /// How many, for a candidate of `horizon` model steps: a limit on every step counts once a step.
+    fn constraints(&self, horizon: usize) -> usize;
 
     /// Writes `[envs, samples, constraints]`; a constraint is satisfied when its value is at most 0.
     ///
@@ -195,8 +195,12 @@ pub struct PlanTrace {
     pub best: Vec<f32>,
     /// The mean cost of the elites (or of all candidates, where a solver has none).
     pub mean: Vec<f32>,
-    /// The mean spread of the sampling distribution after the iteration.
+    /// The mean spread of the sampling distribution after the iteration (or of the candidates, where a solver has none).
     pub spread: Vec<f32>,
+    /// The largest value of a constraint of the best candidate, where the model has constraints and the solver keeps them:
+    /// at most 0, or the solver's tolerance, when all are satisfied.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub violation: Vec<f32>,
 }
 
 /// Finds cheap action sequences.

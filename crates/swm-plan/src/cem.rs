@@ -21,12 +21,13 @@
 //! - [`Plan::costs`] is the lowest cost of the last iteration; the reference reports the elites' mean, which
 //!   is in the trace here.
 
+use crate::problem::{continuous, score};
 use crate::topk::smallest;
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use swm_core::{Candidates, CostModel, Error, Key, Plan, PlanProblem, PlanSpace, PlanTrace, Result, Solver};
+use swm_core::{Candidates, CostModel, Error, Key, Plan, PlanProblem, PlanTrace, Result, Solver};
 
 /// The cross-entropy method; the defaults are those of the paper's experiments.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -52,7 +53,7 @@ impl Solver for Cem {
     fn solve(&mut self, cost: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan> {
         self.check()?;
         let PlanProblem { horizon, space, keys, init, .. } = problem;
-        let (low, high) = continuous("CEM", &problem)?;
+        let bounds = continuous("cem", cost, &problem)?;
         let dim = space.dim();
         let (envs, samples, len) = (keys.len(), self.samples, horizon * dim);
         if envs == 0 {
@@ -75,14 +76,9 @@ impl Solver for Cem {
                 let (env, sample) = (i / samples, i % samples);
                 let (mean, std) = (&mean[env * len..][..len], &std[env * len..][..len]);
                 draw(candidate, mean, std, (sample > 0).then(|| streams[env].at(sample as u64)));
-                for (j, action) in candidate.iter_mut().enumerate() {
-                    *action = action.clamp(low[j % dim], high[j % dim]);
-                }
+                bounds.clip(candidate);
             });
-            // A model that forgets to write a cost must not be served the last iteration's.
-            costs.fill(f32::NAN);
-            cost.cost(Candidates { actions: &actions, envs, samples, horizon, dim }, &mut costs)?;
-            check_costs(&costs, samples, iteration)?;
+            score(cost, Candidates { actions: &actions, envs, samples, horizon, dim }, iteration, &mut costs)?;
 
             for (env, trace) in trace.iter_mut().enumerate() {
                 let costs = &costs[env * samples..][..samples];
@@ -148,72 +144,10 @@ fn average(values: impl ExactSizeIterator<Item = f32>) -> f32 {
     (values.map(f64::from).sum::<f64>() / n) as f32
 }
 
-/// The bounds of a problem with continuous actions, checked.
-fn continuous<'a>(solver: &str, problem: &PlanProblem<'a>) -> Result<(&'a [f32], &'a [f32])> {
-    let PlanProblem { horizon, space, keys, init, .. } = *problem;
-    let PlanSpace::Continuous { low, high } = space else {
-        return Err(Error::config(
-            format!("solver {solver}"),
-            "it plans continuous actions; these are discrete",
-            "choose a solver for discrete actions",
-        ));
-    };
-    let dim = space.dim();
-    if horizon == 0 || dim == 0 {
-        return Err(Error::config(
-            "planning horizon",
-            format!("{horizon} model steps of {dim} numbers"),
-            "plan at least 1 step of at least 1 number",
-        ));
-    }
-    if low.len() != dim || high.len() != dim {
-        let given = format!("{} lower and {} upper", low.len(), high.len());
-        return Err(Error::mismatch("the action bounds of a plan", given, format!("{dim} of each")));
-    }
-    if let Some(j) = (0..dim).find(|&j| low[j].is_nan() || high[j].is_nan() || low[j] > high[j]) {
-        return Err(Error::config(
-            format!("bounds of action number {j}"),
-            format!("{} ..= {}", low[j], high[j]),
-            "the lower bound must not exceed the upper one",
-        ));
-    }
-    if let Some(init) = init {
-        let expected = keys.len() * horizon * dim;
-        if init.len() != expected {
-            let wanted = format!("{expected} ({} environments x {horizon} x {dim})", keys.len());
-            return Err(Error::mismatch("the first guess of a plan", format!("{} numbers", init.len()), wanted));
-        }
-        if let Some(i) = init.iter().position(|v| !v.is_finite()) {
-            return Err(Error::NotFinite {
-                what: format!("the first guess of planned environment {}", i / (horizon * dim)),
-                given: format!("{} at step {}", init[i], i / dim % horizon),
-                fix: "start from finite actions".to_owned(),
-            });
-        }
-    }
-    Ok((low, high))
-}
-
-fn check_costs(costs: &[f32], samples: usize, iteration: usize) -> Result<()> {
-    match costs.iter().position(|cost| !cost.is_finite()) {
-        None => Ok(()),
-        Some(i) => Err(Error::NotFinite {
-            what: "the cost of a candidate".to_owned(),
-            given: format!(
-                "{} for candidate {} of planned environment {} in iteration {iteration}",
-                costs[i],
-                i % samples,
-                i / samples
-            ),
-            fix: "the model diverges on these actions or its weights are damaged; check the checkpoint".to_owned(),
-        }),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use swm_core::Batch;
+    use swm_core::{Batch, PlanSpace};
 
     const HORIZON: usize = 4;
     const DIM: usize = 3;

@@ -7,6 +7,7 @@
 pub mod cem;
 mod history;
 pub mod mpc;
+pub mod problem;
 pub mod registry;
 pub mod scale;
 pub mod topk;

@@ -10,7 +10,7 @@ mod render;
 mod shapes;
 
 use crate::factors;
-use physics::{AGENT, BLOCK, Body, Shape, Vec2, WALLS, World, put, take};
+use physics::{AGENT, BLOCK, Body, Shape, Vec2, WALLS, World, put, take_array};
 use render::{Renderer, Scene};
 use shapes::Design;
 use std::f64::consts::{PI, TAU};
@@ -203,18 +203,20 @@ impl Env for PushT {
         let id = self.spec.id;
         let foreign = || Error::mismatch("restoring a snapshot", "other bytes", format!("a snapshot of {id}"));
         let bytes = snapshot.0.strip_prefix(id.as_bytes()).ok_or_else(foreign)?;
-        let (factors, mut bytes) = factors::read(&self.spec.variation_space, bytes)?;
-        let (mut goal, mut contacts) = (Vec::<f64>::new(), Vec::<u64>::new());
-        let mut world = world_of(&factors);
-        take(&mut bytes, &mut goal)
-            .and_then(|()| take(&mut bytes, &mut contacts))
-            .and_then(|()| world.load(&mut bytes))
-            .filter(|()| bytes.is_empty())
-            .ok_or_else(foreign)?;
-        let &[contacts] = contacts.as_slice() else { return Err(foreign()) };
-        self.begin(factors, checked(&goal, "goal of a snapshot")?);
-        self.world = world;
-        self.contacts = usize::try_from(contacts).map_err(|_| foreign())?;
+        let (factors, mut bytes) = factors::read_changed(&self.spec.variation_space, &self.factors, bytes)?;
+        let goal = take_array::<f64, 7>(&mut bytes).ok_or_else(foreign)?;
+        let [contacts] = take_array::<u64, 1>(&mut bytes).ok_or_else(foreign)?;
+        let goal = checked(&goal, "goal of a snapshot")?;
+        let contacts = usize::try_from(contacts).map_err(|_| foreign())?;
+        if factors.is_some() || goal != self.goal {
+            self.begin(factors.unwrap_or_else(|| self.factors.clone()), goal);
+        }
+        if self.world.load(&mut bytes).is_none() || !bytes.is_empty() {
+            // Half a world is none: the episode begins anew, at its goal.
+            self.begin(self.factors.clone(), goal);
+            return Err(foreign());
+        }
+        self.contacts = contacts;
         Ok(())
     }
 

@@ -269,12 +269,18 @@ impl Env for TwoRoom {
         let wrong = |given| Error::mismatch("restoring a snapshot", given, format!("one of {}", ENTRY.id));
         let body = snapshot.0.strip_prefix(ENTRY.id.as_bytes());
         let body = body.ok_or_else(|| wrong("a snapshot of another environment".to_owned()))?;
-        let (factors, places) = factors::read(&self.spec.variation_space, body)?;
-        let numbers: Vec<f32> = places.as_chunks().0.iter().map(|&number| f32::from_le_bytes(number)).collect();
-        let [ax, ay, gx, gy] = numbers[..] else {
+        let (factors, places) = factors::read_changed(&self.spec.variation_space, &self.factors, body)?;
+        let (&[ax, ay, gx, gy], []) = places.as_chunks() else {
             return Err(wrong(format!("{} bytes of places", places.len())));
         };
-        self.arrange(factors, [ax, ay], [gx, gy]);
+        let [agent, goal] = [[ax, ay], [gx, gy]].map(|place| place.map(f32::from_le_bytes));
+        match factors {
+            Some(factors) => self.arrange(factors, agent, goal),
+            None => {
+                self.agent.center = agent;
+                self.aim(goal);
+            }
+        }
         Ok(())
     }
 

@@ -17,7 +17,7 @@ mod vec2;
 pub use body::{Body, Pose};
 pub use bounds::Bounds;
 pub use shape::Shape;
-pub use snapshot::{put, take};
+pub use snapshot::{put, take_array};
 pub use vec2::Vec2;
 
 use bytemuck::{Pod, Zeroable};

@@ -17,14 +17,9 @@ impl World {
     /// Reads a state that [`World::save`] wrote for a world of the same shapes; what follows it stays in `bytes`.
     /// Returns `None`, with the world in an unspecified state, when the bytes are none.
     pub fn load(&mut self, bytes: &mut &[u8]) -> Option<()> {
-        let mut bodies = Vec::with_capacity(self.bodies.len());
-        let mut counters: Vec<u32> = Vec::with_capacity(4);
-        take(bytes, &mut bodies)?;
-        self.bodies = bodies.try_into().ok()?;
+        self.bodies = take_array(bytes)?;
         take(bytes, &mut self.tree.nodes)?;
-        take(bytes, &mut counters)?;
-        let counters: [u32; 4] = counters.try_into().ok()?;
-        [self.tree.root, self.tree.spare, self.tree_stamp, self.stamp] = counters;
+        [self.tree.root, self.tree.spare, self.tree_stamp, self.stamp] = take_array(bytes)?;
         take(bytes, &mut self.pairs)?;
         take(bytes, &mut self.arbiters)?;
         take(bytes, &mut self.active)?;
@@ -44,11 +39,25 @@ pub fn put<T: Pod>(bytes: &mut Vec<u8>, items: &[T]) {
 
 /// Reads what [`put`] wrote.
 pub fn take<T: Pod>(bytes: &mut &[u8], items: &mut Vec<T>) -> Option<()> {
+    items.clear();
+    items.extend(take_items::<T>(bytes)?);
+    Some(())
+}
+
+/// Reads `N` items that [`put`] wrote.
+pub fn take_array<T: Pod, const N: usize>(bytes: &mut &[u8]) -> Option<[T; N]> {
+    let mut items = take_items(bytes)?;
+    let mut array = [T::zeroed(); N];
+    for item in &mut array {
+        *item = items.next()?;
+    }
+    items.next().is_none().then_some(array)
+}
+
+fn take_items<'a, T: Pod>(bytes: &mut &'a [u8]) -> Option<impl Iterator<Item = T> + use<'a, T>> {
     let (head, rest) = bytes.split_first_chunk::<8>()?;
     let len = usize::try_from(u64::from_le_bytes(*head)).ok()?.checked_mul(size_of::<T>())?;
     let (body, rest) = rest.split_at_checked(len)?;
-    items.clear();
-    items.extend(body.chunks_exact(size_of::<T>()).map(bytemuck::pod_read_unaligned::<T>));
     *bytes = rest;
-    Some(())
+    Some(body.chunks_exact(size_of::<T>()).map(bytemuck::pod_read_unaligned::<T>))
 }

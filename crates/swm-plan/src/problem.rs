@@ -173,7 +173,7 @@ fn offers(cost: &mut dyn CostModel) -> Vec<Need> {
     let offered = [
         (Need::Gradient, cost.differentiable().is_some()),
         (Need::Latent, cost.latent().is_some()),
-        (Need::Constraints, cost.constrained().is_some_and(|model| model.constraints() > 0)),
+        (Need::Constraints, cost.constrained().is_some()),
     ];
     offered.into_iter().filter_map(|(need, offered)| offered.then_some(need)).collect()
 }

@@ -5,14 +5,18 @@
 //! [`swm_core::Policy`].
 
 pub mod cem;
+pub mod gradient_descent;
 mod history;
 pub mod mpc;
+pub mod optimizer;
+mod population;
 pub mod problem;
 pub mod registry;
 pub mod scale;
 pub mod topk;
 
 pub use cem::Cem;
+pub use gradient_descent::GradientDescent;
 pub use mpc::{MpcConfig, MpcPolicy};
 pub use registry::{SOLVERS, SolverEntry};
 pub use scale::ActionScale;

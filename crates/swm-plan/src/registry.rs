@@ -1,6 +1,6 @@
 //! [`SOLVERS`]: every solver, what it plans and what it asks of a model.
 
-use crate::Cem;
+use crate::{Cem, GradientDescent};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use swm_core::registry::Named;
@@ -68,16 +68,28 @@ impl Named for SolverEntry {
 pub static SOLVERS: Registry<SolverEntry> = Registry {
     kind: "solver",
     hint: "`swm solvers` lists them",
-    rows: &[SolverEntry {
-        id: "cem",
-        summary: "refits a Gaussian to the cheapest samples",
-        family: Family::Sampling,
-        actions: Actions::Continuous,
-        needs: &[],
-        paper: "Rubinstein and Kroese, The Cross-Entropy Method, 2004",
-        defaults: defaults::<Cem>,
-        make: make::<Cem>,
-    }],
+    rows: &[
+        SolverEntry {
+            id: "cem",
+            summary: "refits a Gaussian to the cheapest samples",
+            family: Family::Sampling,
+            actions: Actions::Continuous,
+            needs: &[],
+            paper: "Rubinstein and Kroese, The Cross-Entropy Method, 2004",
+            defaults: defaults::<Cem>,
+            make: make::<Cem>,
+        },
+        SolverEntry {
+            id: "gd",
+            summary: "follows the gradient of the cost from several starts",
+            family: Family::Gradient,
+            actions: Actions::Continuous,
+            needs: &[Need::Gradient],
+            paper: "Maes et al., stable-worldmodel, 2026, algorithm \"Gradient Descent Solver\"",
+            defaults: defaults::<GradientDescent>,
+            make: make::<GradientDescent>,
+        },
+    ],
 };
 
 /// The default settings of a solver.

@@ -1,0 +1,6 @@
+//! Solvers on problems whose answers are known.
+#![allow(missing_docs, clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+
+mod lqr;
+mod solvers;
+mod toys;

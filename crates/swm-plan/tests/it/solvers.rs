@@ -1,0 +1,175 @@
+//! Every solver on every toy: it comes as near to the optimum as its trial says, or refuses and names who can.
+
+use crate::toys::{Model, TOYS, Toy, solve, toy};
+use swm_core::PlanSpace;
+use swm_core::registry::Named;
+use swm_plan::penalty::Penalised;
+use swm_plan::registry::{Actions, Need, SOLVERS, SolverEntry};
+
+/// What a solver is tried with, and how near it must come.
+pub struct Trial {
+    pub solver: &'static str,
+    /// Its settings, as JSON.
+    pub settings: &'static str,
+    /// For each toy it can solve: by how much the cost may exceed the lowest one, and how far any number of the plan may
+    /// be from the best plan's.
+    pub near: &'static [(&'static str, f64, f64)],
+}
+
+pub const TRIALS: &[Trial] = &[
+    Trial {
+        solver: "cem",
+        settings: "{}",
+        near: &[
+            ("quadratic", 1e-6, 1e-3),
+            ("bounded", 1e-6, 1e-3),
+            ("multi-modal", 1e-6, 1e-3),
+            ("constrained", 1e-2, 2e-2),
+            ("lqr", 1e-6, 1e-3),
+            ("reach", 1e-6, 0.0),
+            ("reach-bounded", 1e-6, 1e-3),
+        ],
+    },
+    Trial {
+        solver: "gd",
+        settings: r#"{"iterations": 300}"#,
+        near: &[
+            ("quadratic", 1e-6, 1e-3),
+            ("bounded", 1e-6, 1e-3),
+            ("multi-modal", 1e-6, 1e-3),
+            ("lqr", 1e-6, 1e-3),
+            ("reach", 1e-6, 0.0),
+            ("reach-bounded", 1e-6, 1e-3),
+        ],
+    },
+];
+
+/// What is not tried, and why.
+const SKIPPED: &[(&str, &str, &str)] = &[];
+
+/// The environments every toy is solved for, together.
+const ENVS: [usize; 3] = [0, 1, 2];
+
+/// Multipliers of the constrained toy are below 2.
+const PENALTY: f32 = 4.0;
+
+pub fn trial(solver: &str) -> &'static Trial {
+    let trial = TRIALS.iter().find(|trial| trial.solver == solver);
+    trial.unwrap_or_else(|| panic!("give {solver} a trial"))
+}
+
+/// Whether a solver can plan a toy's actions with what the toy offers, were it not for constraints.
+fn fits(row: &SolverEntry, toy: &Toy) -> bool {
+    let actions = match toy.space {
+        PlanSpace::Continuous { .. } => Actions::Continuous,
+        PlanSpace::Discrete { .. } => Actions::Discrete,
+    };
+    let offered = |need: &Need| match need {
+        Need::Gradient => true,
+        Need::Latent => toy.latent,
+        Need::Constraints => toy.constrained,
+    };
+    row.actions == actions && row.needs.iter().all(offered)
+}
+
+/// Whether it also keeps the toy's constraints.
+pub fn solves(row: &SolverEntry, toy: &Toy) -> bool {
+    fits(row, toy) && (!toy.constrained || row.needs.contains(&Need::Constraints))
+}
+
+#[test]
+fn every_solver_finds_the_optimum_of_every_toy_it_can_solve() {
+    for row in SOLVERS.rows {
+        let trial = trial(row.id);
+        let settings = serde_json::from_str(trial.settings).expect("settings");
+        for toy in TOYS {
+            // A solver that knows no constraints and needs no gradient is given them as a penalty.
+            let penalised = toy.constrained && fits(row, toy) && row.needs.is_empty();
+            let skipped = SKIPPED.iter().any(|&(solver, name, _)| (solver, name) == (row.id, toy.name));
+            let near = trial.near.iter().find(|near| near.0 == toy.name);
+            let tried = (solves(row, toy) || penalised) && !skipped;
+            assert_eq!(near.is_some(), tried, "the trial of {} on {}", row.id, toy.name);
+            let Some(&(_, excess, distance)) = near else { continue };
+
+            let mut solver = (row.make)(&settings).expect("a solver");
+            let mut model = Model::new(toy, &ENVS);
+            let plan = if penalised {
+                let mut model = Penalised::new(Box::new(model), PENALTY).expect("constraints");
+                solve(&mut *solver, &mut model, toy, &ENVS)
+            } else {
+                solve(&mut *solver, &mut model, toy, &ENVS)
+            };
+            let plan = plan.unwrap_or_else(|error| panic!("{} on {}: {error}", row.id, toy.name));
+            let len = toy.horizon * toy.space.dim();
+            assert_eq!(plan.actions.len(), ENVS.len() * len);
+            for (env, actions) in ENVS.into_iter().zip(plan.actions.chunks_exact(len)) {
+                let landscape = (toy.landscape)(env);
+                let actions: Vec<f64> = actions.iter().map(|&a| f64::from(a)).collect();
+                let best = landscape.optimum();
+                let gap = landscape.cost(&actions) - landscape.cost(&best);
+                let off = actions.iter().zip(&best).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                let place = format!("{} on {}, environment {env}", row.id, toy.name);
+                assert!(gap.abs() <= excess, "{place}: costs {gap:e} more than the least");
+                assert!(off <= distance || !landscape.is_unique(), "{place}: {actions:?}, best {best:?}");
+                let violation = landscape.constraints(&actions).into_iter().fold(0.0, f64::max);
+                assert!(violation <= 1e-3, "{place}: violates a constraint by {violation:e}");
+            }
+        }
+    }
+}
+
+#[test]
+fn an_impossible_pairing_names_the_solvers_that_would_work() {
+    let message = |row: &SolverEntry, toy, model: &mut Model| {
+        let mut solver = (row.make)(&serde_json::json!({})).expect("a solver");
+        solve(&mut *solver, model, toy, &ENVS).expect_err(row.id).to_string()
+    };
+    let named = |message: &str, id: &str| message.split(|c: char| !(c.is_alphanumeric() || c == '_')).any(|w| w == id);
+    for (row, toy) in SOLVERS.rows.iter().flat_map(|row| TOYS.iter().map(move |toy| (row, toy))) {
+        if solves(row, toy) {
+            continue;
+        }
+        let message = message(row, toy, &mut Model::new(toy, &ENVS));
+        for other in SOLVERS.rows.iter().filter(|other| other.id() != row.id()) {
+            assert_eq!(named(&message, other.id), solves(other, toy), "{} on {}: {message}", other.id, toy.name);
+        }
+    }
+    // Without a gradient, only sampling is left.
+    for row in SOLVERS.rows.iter().filter(|row| row.needs.contains(&Need::Gradient)) {
+        let toy = toy(if row.actions == Actions::Discrete { "discrete" } else { "quadratic" });
+        let message = message(row, toy, &mut Model::new(toy, &ENVS).opaque());
+        for other in SOLVERS.rows.iter().filter(|other| other.id() != row.id()) {
+            let able = other.actions == row.actions && other.needs.is_empty();
+            assert_eq!(named(&message, other.id), able, "{message}");
+        }
+    }
+}
+
+#[test]
+fn skipped_trials_exist_and_say_why() {
+    for &(solver, name, why) in SKIPPED {
+        assert!(SOLVERS.get(solver).is_ok() && TOYS.iter().any(|toy| toy.name == name) && why.len() > 10, "{solver}");
+    }
+    for trial in TRIALS {
+        assert!(SOLVERS.get(trial.solver).is_ok(), "{}", trial.solver);
+        assert!(trial.near.iter().all(|near| TOYS.iter().any(|toy| toy.name == near.0)), "{}", trial.solver);
+    }
+}
+
+#[test]
+fn a_cost_that_is_missing_or_not_finite_is_named() {
+    for row in SOLVERS.rows {
+        let toy = TOYS.iter().find(|toy| solves(row, toy)).expect("a toy");
+        let message = |cost| {
+            let mut solver = (row.make)(&serde_json::json!({})).expect("a solver");
+            let model = Model::new(toy, &ENVS).with_wrong_cost(1, 0, cost);
+            solve(&mut *solver, &mut { model }, toy, &ENVS).expect_err(row.id).to_string()
+        };
+        for cost in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            let message = message(Some(cost));
+            assert!(message.contains("not finite") && message.contains("environment 1"), "{}: {message}", row.id);
+        }
+        let message = message(None);
+        assert!(message.contains("none for candidate 0 of planned environment 1"), "{}: {message}", row.id);
+    }
+}

@@ -2,6 +2,7 @@
 
 mod draw;
 mod factors;
+pub mod piecewise;
 pub mod push_t;
 pub mod two_room;
 
@@ -11,5 +12,5 @@ use swm_core::{EnvEntry, Registry};
 pub static ENVS: Registry<EnvEntry> = Registry {
     kind: "environment",
     hint: "`swm envs` lists them",
-    rows: &[push_t::ENTRY, push_t::discrete::ENTRY, two_room::ENTRY],
+    rows: &[push_t::ENTRY, push_t::discrete::ENTRY, two_room::ENTRY, piecewise::ENTRY],
 };

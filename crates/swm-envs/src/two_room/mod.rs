@@ -5,9 +5,10 @@ mod physics;
 mod render;
 mod route;
 
+use crate::draw::Disc;
 use crate::factors;
 use physics::{BORDER, GOAL_RADIUS, Layout, MAX_DOORS, Point, SIZE, distance};
-use render::{Disc, Renderer, Scene};
+use render::{Renderer, Scene};
 use swm_core::{
     Action, ColumnSpec, DType, Env, EnvEntry, EnvSpec, Error, Factor, FactorValues, FrameMut, Key, ResetOptions,
     Result, RowMut, RowRef, Snapshot, Space, Transition, VariationRequest, VariationSpace,

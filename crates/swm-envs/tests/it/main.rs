@@ -2,5 +2,6 @@
 
 mod conformance;
 mod golden;
+mod golden_piecewise;
 mod golden_push_t;
 mod golden_two_room;

@@ -1,0 +1,157 @@
+//! Who can demonstrate the task: `expert` steers against the drift, `explore` wanders everywhere.
+//!
+//! Both read `state`, `goal_state` and `dynamics` of the infos row and nothing else.
+
+use super::physics::{BORDER, Dynamics, Point, SIZE, distance};
+use rand::Rng as _;
+use swm_core::policy::Expert;
+use swm_core::{ExpertEntry, Key, Result, Rng, RowRef};
+
+/// The experts of the registry row.
+pub const EXPERTS: &[ExpertEntry] = &[
+    ExpertEntry {
+        id: "expert",
+        summary: "straight to the target, making up for the drift of the zone it is in",
+        make: || Box::new(Straight),
+    },
+    ExpertEntry {
+        id: "explore",
+        summary: "a smooth random walk through all zones",
+        make: || Box::new(Explorer::new(Key::new(0).rng())),
+    },
+];
+
+#[allow(clippy::cast_possible_truncation)]
+fn place(row: RowRef<'_>, column: &str) -> Result<Point> {
+    let value = row.to_f64(column)?;
+    Ok([value[0] as f32, value[1] as f32])
+}
+
+/// Heads straight for the target.
+struct Straight;
+
+impl Expert for Straight {
+    fn begin(&mut self, _key: Key) {}
+
+    fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
+        let dynamics = Dynamics::from_row(&row.to_f64("dynamics")?);
+        let steer = dynamics.steer(place(row, "state")?, place(row, "goal_state")?);
+        action.copy_from_slice(&steer.map(f64::from));
+        Ok(())
+    }
+}
+
+/// Wanders: picks a place anywhere and heads there for a while, with a pace of its own for each place and slowly
+/// changing noise on every step; sometimes it lets itself drift.
+struct Explorer {
+    rng: Rng,
+    /// Where it is heading.
+    to: Point,
+    /// How much of the way there it wants to go each step; 0 drifts.
+    pace: f64,
+    /// Steps before it changes its mind.
+    patience: u32,
+    /// What is added to every action: an autoregressive process.
+    noise: [f64; 2],
+}
+
+/// Share of the time it drifts.
+const DRIFTING: f64 = 0.15;
+/// What is kept of the noise from step to step, and the width of what is added.
+const NOISE: (f64, f64) = (0.8, 0.2);
+/// Nearer than this a place is reached, in pixels.
+const NEAR: f32 = 10.0;
+
+impl Explorer {
+    fn new(rng: Rng) -> Self {
+        Self { rng, to: [0.0; 2], pace: 0.0, patience: 0, noise: [0.0; 2] }
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn choose(&mut self) {
+        self.to = [(); 2].map(|()| self.rng.random_range(BORDER..SIZE - BORDER) as f32);
+        let drifting = self.rng.random_bool(DRIFTING);
+        self.pace = if drifting { 0.0 } else { self.rng.random_range(0.4..1.4) };
+        self.patience = self.rng.random_range(if drifting { 5..15 } else { 20..50 });
+    }
+}
+
+impl Expert for Explorer {
+    fn begin(&mut self, key: Key) {
+        *self = Self::new(key.rng());
+    }
+
+    fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
+        let dynamics = Dynamics::from_row(&row.to_f64("dynamics")?);
+        let at = place(row, "state")?;
+        if self.patience == 0 || distance(at, self.to) < NEAR {
+            self.choose();
+        }
+        self.patience -= 1;
+        let steer = dynamics.steer(at, self.to);
+        for (i, steer) in steer.into_iter().enumerate() {
+            let (keep, width) = NOISE;
+            self.noise[i] = keep * self.noise[i] + width * self.rng.random_range(-1.0..1.0);
+            action[i] = (self.pace * f64::from(steer) + self.noise[i]).clamp(-1.0, 1.0);
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::piecewise::ENTRY;
+    use swm_core::{Action, Batch, ResetOptions, Schema, VariationRequest};
+
+    /// Plays one episode; the places visited, and whether it ended in success.
+    fn play(expert: &ExpertEntry, seed: u64, options: &ResetOptions, goal: bool, steps: usize) -> (Vec<Point>, bool) {
+        let (mut env, mut expert) = ((ENTRY.make)(), (expert.make)());
+        env.reset(seed, options).expect("a reset");
+        if goal {
+            env.sample_goal(Key::new(seed)).expect("a goal");
+        }
+        expert.begin(Key::new(seed));
+        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("columns"), 1);
+        let (mut action, mut places) = ([0.0; 2], vec![]);
+        for _ in 0..steps {
+            env.observe(&mut row.row_mut(0));
+            expert.act(row.row(0), &mut action).expect("an action");
+            places.push(place(row.row(0), "state").expect("a state"));
+            if env.step(Action::Continuous(&action.map(|a| a as f32))).expect("a step").terminated {
+                return (places, true);
+            }
+        }
+        (places, false)
+    }
+
+    #[test]
+    fn the_expert_reaches_the_target() {
+        let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
+        let all = ResetOptions { variation: all, ..ResetOptions::default() };
+        let mut in_reach = 0;
+        for seed in 0..200 {
+            let reaches = |options: &ResetOptions, goal, steps| play(&EXPERTS[0], seed, options, goal, steps).1;
+            assert!(reaches(&ResetOptions::default(), false, 100), "seed {seed}");
+            assert!(reaches(&ResetOptions::default(), true, 100), "seed {seed}, sampled goal");
+            assert!(reaches(&all, true, 400), "seed {seed}, everything varied, sampled goal");
+            in_reach += u32::from(reaches(&all, false, 400));
+        }
+        // The other targets lie behind drift that is stronger than the agent.
+        assert_eq!(in_reach, 182, "everything varied, targets anywhere");
+    }
+
+    #[test]
+    fn the_explorer_sees_the_whole_room() {
+        // The target is kept out of the way, so that episodes last.
+        let apart = ResetOptions { goal_state: Some(vec![0.0, 0.0]), ..ResetOptions::default() };
+        let mut seen = std::collections::BTreeSet::new();
+        for seed in 0..50 {
+            let (places, _) = play(&EXPERTS[1], seed, &apart, false, 100);
+            #[allow(clippy::cast_possible_truncation)]
+            seen.extend(places.iter().map(|p| p.map(|v| (v / 16.0) as i64)));
+        }
+        // 12 x 12 cells of 16 pixels.
+        assert!(seen.len() >= 130, "{} cells seen", seen.len());
+    }
+}

@@ -1,0 +1,84 @@
+//! The picture: a room with a frame of lines, zones and their drift where they are shown, and soft discs for target and
+//! agent, drawn at the reference's 224 pixels.
+
+use super::arrows;
+use super::physics::{BORDER, GRID, SIZE, ZONES};
+use crate::draw::{Area, Brush, Disc, Point, Rgb, Stage};
+use swm_core::FrameMut;
+
+/// Side of the picture as it is drawn.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+const SIDE: usize = SIZE as usize;
+/// The lines that frame the room are this thick, ending where it begins.
+const LINE: i32 = 4;
+
+/// What keeps still during an episode.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scene {
+    /// The colour of everything else.
+    pub background: Rgb,
+    /// The colour of the lines that frame the room.
+    pub border: Rgb,
+    /// The zones' colours, where they are shown.
+    pub zones: Option<[Rgb; ZONES]>,
+    /// The zones' drift, where it is shown.
+    pub drift: Option<[[f64; 2]; ZONES]>,
+    /// The target, where it is shown.
+    pub target: Option<Disc>,
+}
+
+/// Draws frames, remembering the last scene.
+pub struct Renderer {
+    scene: Option<Scene>,
+    stage: Stage,
+    brush: Brush,
+}
+
+impl Default for Renderer {
+    fn default() -> Self {
+        Self { scene: None, stage: Stage::new(SIDE), brush: Brush::default() }
+    }
+}
+
+impl Renderer {
+    /// Draws a scene and the agent in it.
+    pub fn draw(&mut self, scene: &Scene, agent: &Disc, frame: FrameMut<'_>) {
+        if self.scene.as_ref() != Some(scene) {
+            self.set(scene);
+            self.scene = Some(scene.clone());
+        }
+        self.stage.show(frame, |pixels| {
+            self.brush.blend(agent, SIDE, SIDE, pixels.bytes());
+            agent.area()
+        });
+    }
+
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
+    fn set(&mut self, scene: &Scene) {
+        let (side, low) = (SIDE as i32, BORDER as i32);
+        let high = side - low;
+        let room = (high - low) / GRID as i32;
+        self.stage.set(|pixels| {
+            pixels.fill(Area::square(SIDE), scene.background);
+            for (i, &color) in scene.zones.iter().flatten().enumerate() {
+                let [x, y] = [i % GRID, i / GRID].map(|cell| low + cell as i32 * room);
+                pixels.fill(area([x, y], [x + room, y + room]), color);
+            }
+            for start in [low - LINE, high] {
+                pixels.fill(area([start, 0], [start + LINE, side]), scene.border);
+                pixels.fill(area([0, start], [side, start + LINE]), scene.border);
+            }
+            if let Some(target) = &scene.target {
+                self.brush.blend(target, SIDE, SIDE, pixels.bytes());
+            }
+            if let Some(drift) = &scene.drift {
+                arrows::draw(drift, pixels);
+            }
+        });
+    }
+}
+
+/// The pixels from `low` to `high`, the latter excluded.
+fn area(low: [i32; 2], high: [i32; 2]) -> Area {
+    Area::EMPTY.with(Point::new(low[0], low[1]), 0).with(Point::new(high[0] - 1, high[1] - 1), 0)
+}

@@ -5,7 +5,9 @@
 //! [`swm_core::Policy`].
 
 pub mod cem;
+mod codec;
 pub mod gradient_descent;
+mod guard;
 mod history;
 pub mod mpc;
 pub mod optimizer;
@@ -14,7 +16,9 @@ mod population;
 pub mod problem;
 pub mod registry;
 pub mod scale;
+pub mod simulator;
 pub mod topk;
+pub mod trace;
 
 pub use cem::Cem;
 pub use gradient_descent::GradientDescent;
@@ -22,3 +26,5 @@ pub use mpc::{MpcConfig, MpcPolicy};
 pub use penalty::Penalised;
 pub use registry::{SOLVERS, SolverEntry};
 pub use scale::ActionScale;
+pub use simulator::{Score, SimulatorCost};
+pub use trace::{PlanRecord, TraceLog};

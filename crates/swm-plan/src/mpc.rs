@@ -4,21 +4,29 @@
 //! executing. A plan is keyed by (episode, replan), so an episode is played the same way in whichever slot and
 //! beside whichever other episodes it runs.
 //!
+//! # What is planned
+//! Points of a box in model units ([`ActionScale`]), clamped to the box when they are executed; integers as choices, one
+//! one-hot vector an integer. The `action_block` actions of a model step lie one after another.
+//!
 //! # What a model sees
-//! [`CostModel::observe`] gets the world's infos. With `history` above 1 it gets these columns too, oldest
-//! step first and the latest at the end:
+//! [`CostModel::see`] gets the worlds that are about to be planned for, [`CostModel::observe`] the infos. With `history`
+//! above 1 the infos have these columns too, oldest step first and the latest at the end:
 //!
 //! | column | shape | |
 //! | --- | --- | --- |
 //! | `history.length` | one `int32` | how many of the past model steps are real; what precedes them is zero |
-//! | `history.action` | `[history - 1, action_block * action]` `float32` | executed actions, in model units |
+//! | `history.action` | `[history - 1, action_block * action]` `float32` | executed actions, as they are planned |
 //! | `history.pixels` | `[history - 1, H, W, 3]` `uint8` | the picture each model step began with, where there are pictures |
 
 use crate::ActionScale;
+use crate::codec::{ActionCodec, Decoded};
+use crate::guard::{Guard, caught};
 use crate::history::History;
+use crate::trace::{PlanRecord, TraceLog};
 use serde::{Deserialize, Serialize};
-use std::time::Instant;
-use swm_core::{Batch, CostModel, EnvSpec, Error, Key, PlanProblem, PlanSpace, Policy, Result, Solver};
+use std::time::{Duration, Instant};
+use swm_core::{Action, Batch, ColumnSpec, CostModel, EnvPool, EnvSpec, Error, Key, Plan, PlanProblem};
+use swm_core::{Policy, Result, Solver};
 
 /// How far to plan and how much of a plan to execute.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -31,17 +39,21 @@ pub struct MpcConfig {
     /// Environment steps in one model step (the frameskip the model was trained with): their actions lie
     /// one after another in a model step's action.
     pub action_block: usize,
-    /// Whether a plan starts from what the last one left unexecuted, moved forward and filled with zeros
-    /// (the mean action, in model units).
+    /// Whether a plan starts from what the last one left unexecuted, moved forward and filled with zeros (the mean
+    /// action, in model units; no preference, among choices).
     pub warm_start: bool,
     /// Model steps the model may look at, the present one included.
     pub history: usize,
+    /// Seconds after which solvers stop searching and return the best plan so far, counted from when the present is
+    /// observed, for all environments that are planned together. The first iteration is always finished. With a budget,
+    /// results depend on the machine's speed and on what else it does; without, they never do.
+    pub latency_budget: Option<f64>,
 }
 
 impl Default for MpcConfig {
     /// The setting of the paper's planning experiments: 5 model steps of 5 environment steps, open loop.
     fn default() -> Self {
-        Self { horizon: 5, receding_horizon: 5, action_block: 5, warm_start: true, history: 1 }
+        Self { horizon: 5, receding_horizon: 5, action_block: 5, warm_start: true, history: 1, latency_budget: None }
     }
 }
 
@@ -49,7 +61,7 @@ impl MpcConfig {
     /// Checks that the settings fit each other.
     ///
     /// # Errors
-    /// When a number is 0 or more would be executed than planned.
+    /// When a number is 0, more would be executed than planned, or the latency budget is no time.
     pub fn check(&self) -> Result<()> {
         let numbers = [
             ("horizon", self.horizon),
@@ -67,7 +79,20 @@ impl MpcConfig {
                 "execute at most what is planned",
             ));
         }
+        if let Some(seconds) = self.latency_budget.filter(|seconds| !(seconds.is_finite() && *seconds > 0.0)) {
+            return Err(Error::config(
+                "MPC latency budget",
+                format!("{seconds} seconds"),
+                "choose more than 0 seconds, or none for no limit",
+            ));
+        }
         Ok(())
+    }
+
+    /// When a search that begins now has to stop. A budget too long for the clock is none.
+    fn deadline(&self, now: Instant) -> Option<Instant> {
+        let budget = Duration::try_from_secs_f64(self.latency_budget?).ok()?;
+        now.checked_add(budget)
     }
 }
 
@@ -76,15 +101,13 @@ pub struct MpcPolicy {
     solver: Box<dyn Solver>,
     cost: Box<dyn CostModel>,
     config: MpcConfig,
-    scale: ActionScale,
-    /// Bounds of a model step, in model units.
-    low: Vec<f32>,
-    high: Vec<f32>,
-    /// Bounds of an environment action, in its own units.
-    bounds: Vec<(f32, f32)>,
+    codec: ActionCodec,
+    /// What the world's actions look like.
+    column: ColumnSpec,
     slots: Vec<Slot>,
     history: Option<History>,
     latencies: Vec<f64>,
+    log: Option<TraceLog>,
     scratch: Scratch,
 }
 
@@ -94,11 +117,17 @@ struct Slot {
     key: Key,
     /// Plans made in this episode.
     plans: u64,
-    /// Actions to execute, in environment units, and how many of their numbers are done.
-    actions: Vec<f32>,
+    /// The part of the plan to execute, `[receding horizon, dim]`, and how many of its numbers are done.
+    plan: Vec<f32>,
     done: usize,
-    /// Where the next plan starts, `[horizon, block * action]` in model units.
+    /// Where the next plan starts, `[horizon, dim]`.
     warm: Vec<f32>,
+}
+
+impl Slot {
+    fn is_due(&self) -> bool {
+        self.done == self.plan.len()
+    }
 }
 
 /// Buffers that keep their memory between calls.
@@ -107,15 +136,17 @@ struct Scratch {
     replan: Vec<usize>,
     keys: Vec<Key>,
     init: Vec<f32>,
-    action: Vec<f32>,
+    decoded: Decoded,
+    /// An executed action, as it would be planned.
+    executed: Vec<f32>,
 }
 
 impl MpcPolicy {
-    /// A planning policy for `slots` environments of `spec`.
+    /// A planning policy for `slots` environments of `spec`. `scale` is the model's ([`ActionScale::unscaled`] for one that
+    /// sees the environment's own actions).
     ///
     /// # Errors
-    /// When the settings contradict each other, or the environment's actions are not continuous or do not
-    /// fit `scale`.
+    /// When the settings contradict each other, or the environment's actions cannot be planned or do not fit `scale`.
     pub fn new(
         solver: Box<dyn Solver>,
         cost: Box<dyn CostModel>,
@@ -125,134 +156,180 @@ impl MpcPolicy {
         slots: usize,
     ) -> Result<Self> {
         config.check()?;
-        scale.check(spec)?;
-        let (low, high) = scale.bounds(&spec.action_space, config.action_block);
-        #[allow(clippy::cast_possible_truncation)]
-        let bounds = (0..scale.dim())
-            .map(|i| {
-                let (low, high) = spec.action_space.bounds(i);
-                (low as f32, high as f32)
-            })
-            .collect();
+        let codec = ActionCodec::new(spec, scale, config.action_block)?;
+        let (dim, width) = (codec.space().dim(), codec.width());
         let slot = Slot {
             key: Key::new(0),
             plans: 0,
-            actions: Vec::with_capacity(config.receding_horizon * low.len()),
+            plan: Vec::with_capacity(config.receding_horizon * dim),
             done: 0,
-            warm: vec![0.0; config.horizon * low.len()],
+            warm: vec![0.0; config.horizon * dim],
         };
-        let history =
-            (config.history > 1).then(|| History::new(config.history - 1, config.action_block, scale.dim(), slots));
+        let history = (config.history > 1).then(|| History::new(config.history - 1, config.action_block, width, slots));
         Ok(Self {
             solver,
             cost,
-            low,
-            high,
-            bounds,
+            config,
+            codec,
+            column: spec.action_column(),
             slots: vec![slot; slots],
             history,
             latencies: vec![],
-            scratch: Scratch { action: vec![0.0; scale.dim()], ..Scratch::default() },
-            config,
-            scale,
+            log: None,
+            scratch: Scratch { executed: vec![0.0; width], ..Scratch::default() },
         })
     }
 
+    /// Notes every plan in `log`.
+    #[must_use]
+    pub fn traced(mut self, log: TraceLog) -> Self {
+        self.log = Some(log);
+        self
+    }
+
     /// Plans for all slots in `scratch.replan`, in one call.
-    #[allow(clippy::cast_precision_loss)]
     fn replan(&mut self, infos: &Batch) -> Result<()> {
-        let Scratch { replan, keys, init, .. } = &mut self.scratch;
         let begun = Instant::now();
+        let deadline = self.config.deadline(begun);
+        let Scratch { replan, keys, init, .. } = &mut self.scratch;
+        let mut model = Guard::new(&mut *self.cost);
         let infos = match &mut self.history {
             Some(history) => history.infos(infos, replan)?,
             None => infos,
         };
-        self.cost.observe(infos, replan)?;
+        model.observe(infos, replan)?;
         keys.clear();
         init.clear();
         for &slot in replan.iter() {
-            let slot = &mut self.slots[slot];
+            let slot = &self.slots[slot];
             keys.push(slot.key.with("plan").at(slot.plans));
             init.extend_from_slice(&slot.warm);
-            slot.plans += 1;
         }
-        let (horizon, dim) = (self.config.horizon, self.low.len());
-        let space = PlanSpace::Continuous { low: &self.low, high: &self.high };
-        let problem = PlanProblem { horizon, space, keys, init: Some(init), deadline: None };
-        let plan = self.solver.solve(&mut *self.cost, problem)?;
-        if plan.actions.len() != init.len() {
-            return Err(Error::mismatch(
-                "the plan a solver returned",
-                format!("{} numbers", plan.actions.len()),
-                format!("{} ({} environments x {horizon} x {dim})", init.len(), replan.len()),
-            ));
-        }
+        let (horizon, space) = (self.config.horizon, self.codec.space());
+        let problem = PlanProblem { horizon, space, keys, init: Some(init), deadline };
+        let plan = caught("the solver", "planning", || self.solver.solve(&mut model, problem))?;
+        check_plan(&plan, replan.len(), horizon, space.dim())?;
 
-        let action_dim = self.scale.dim();
-        for (&slot, plan) in replan.iter().zip(plan.actions.chunks_exact(horizon * dim)) {
-            let slot = &mut self.slots[slot];
-            let (execute, rest) = plan.split_at(self.config.receding_horizon * dim);
+        let together = replan.len();
+        #[allow(clippy::cast_precision_loss)]
+        let [seconds, model_seconds] = [begun.elapsed().as_secs_f64(), model.seconds].map(|s| s / together as f64);
+        let mut searches = plan.trace.into_iter();
+        for (i, (&index, actions)) in replan.iter().zip(plan.actions.chunks_exact(horizon * space.dim())).enumerate() {
+            let slot = &mut self.slots[index];
+            let (execute, rest) = actions.split_at(self.config.receding_horizon * space.dim());
             slot.done = 0;
-            slot.actions.resize(execute.len(), 0.0);
-            for (env, model) in slot.actions.chunks_exact_mut(action_dim).zip(execute.chunks_exact(action_dim)) {
-                self.scale.to_env(model, env);
-                for (value, &(low, high)) in env.iter_mut().zip(&self.bounds) {
-                    *value = value.clamp(low, high);
-                }
-            }
+            slot.plan.clear();
+            slot.plan.extend_from_slice(execute);
             if self.config.warm_start {
                 slot.warm[..rest.len()].copy_from_slice(rest);
                 slot.warm[rest.len()..].fill(0.0);
             }
+            if let Some(log) = &self.log {
+                log.note(PlanRecord {
+                    episode: slot.key.seed() >> 1,
+                    slot: index,
+                    replan: slot.plans,
+                    together,
+                    seconds,
+                    model_seconds,
+                    cost: plan.costs[i],
+                    search: searches.next().unwrap_or_default(),
+                });
+            }
+            slot.plans += 1;
+            self.latencies.push(seconds);
         }
-        let share = begun.elapsed().as_secs_f64() / replan.len() as f64;
-        self.latencies.extend(std::iter::repeat_n(share, replan.len()));
         Ok(())
     }
+
+    fn check_slots(&self, given: &[usize]) -> Result<()> {
+        if given.iter().all(|&given| given == self.slots.len()) {
+            return Ok(());
+        }
+        let expected = format!("{} of each, the slots this policy was made for", self.slots.len());
+        Err(Error::mismatch("planning", format!("worlds, flags or actions: {given:?}"), expected))
+    }
+}
+
+/// Checks what a solver returned for `envs` environments.
+fn check_plan(plan: &Plan, envs: usize, horizon: usize, dim: usize) -> Result<()> {
+    let wrong = |given, expected| Err(Error::mismatch("the plan a solver returned", given, expected));
+    if plan.actions.len() != envs * horizon * dim {
+        let expected = format!("{} ({envs} environments x {horizon} x {dim})", envs * horizon * dim);
+        return wrong(format!("{} numbers", plan.actions.len()), expected);
+    }
+    if plan.costs.len() != envs {
+        return wrong(format!("{} costs", plan.costs.len()), format!("{envs}, one an environment"));
+    }
+    if !plan.trace.is_empty() && plan.trace.len() != envs {
+        return wrong(format!("{} traces", plan.trace.len()), format!("{envs}, one an environment, or none"));
+    }
+    let len = horizon * dim;
+    let bad_action = plan.actions.iter().position(|v| !v.is_finite());
+    let bad_action = bad_action.map(|i| (i / len, format!("{} at step {}", plan.actions[i], i % len / dim)));
+    let bad_cost = plan.costs.iter().position(|v| !v.is_finite());
+    let Some((env, given)) = bad_action.or_else(|| bad_cost.map(|i| (i, format!("a cost of {}", plan.costs[i]))))
+    else {
+        return Ok(());
+    };
+    Err(Error::NotFinite {
+        what: format!("the plan a solver returned for planned environment {env}"),
+        given,
+        fix: "its settings let the search diverge, or the solver has a mistake".to_owned(),
+    })
 }
 
 impl Policy for MpcPolicy {
     fn begin(&mut self, slot: usize, key: Key) {
         let state = &mut self.slots[slot];
         (state.key, state.plans, state.done) = (key, 0, 0);
-        state.actions.clear();
+        state.plan.clear();
         state.warm.fill(0.0);
         if let Some(history) = &mut self.history {
             history.begin(slot);
         }
     }
 
+    fn see(&mut self, worlds: &EnvPool, active: &[bool]) -> Result<()> {
+        self.check_slots(&[worlds.len(), active.len()])?;
+        let mut model = Guard::new(&mut *self.cost);
+        let mut due = (0..active.len()).filter(|&slot| active[slot] && self.slots[slot].is_due());
+        due.try_for_each(|slot| model.see(slot, worlds.env(slot)))
+    }
+
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
-        let slots = self.slots.len();
-        if [infos.rows(), active.len(), actions.rows()] != [slots; 3] {
-            return Err(Error::mismatch(
-                "planning",
-                format!("{} infos, {} flags, {} actions", infos.rows(), active.len(), actions.rows()),
-                format!("{slots} of each, the slots this policy was made for"),
-            ));
-        }
+        self.check_slots(&[infos.rows(), active.len(), actions.rows()])?;
         let column = actions.schema().index("action")?;
+        let given = &actions.schema().columns()[column];
+        if *given != self.column {
+            return Err(Error::mismatch("planning actions", format!("{given:?}"), format!("{:?}", self.column)));
+        }
         self.scratch.replan.clear();
-        for slot in (0..slots).filter(|&slot| active[slot]) {
+        for slot in (0..active.len()).filter(|&slot| active[slot]) {
             if let Some(history) = &mut self.history {
                 history.see(slot, infos)?;
             }
-            if self.slots[slot].done == self.slots[slot].actions.len() {
+            if self.slots[slot].is_due() {
                 self.scratch.replan.push(slot);
             }
         }
         if !self.scratch.replan.is_empty() {
             self.replan(infos)?;
         }
-        let dim = self.scale.dim();
+        let width = self.codec.width();
+        let Scratch { decoded, executed, .. } = &mut self.scratch;
         for (index, slot) in self.slots.iter_mut().enumerate().filter(|&(index, _)| active[index]) {
-            let action = &slot.actions[slot.done..][..dim];
-            actions.row_mut(index).set(column, action);
-            if let Some(history) = &mut self.history {
-                self.scale.to_model(action, &mut self.scratch.action);
-                history.acted(index, &self.scratch.action);
+            let action = self.codec.decode(&slot.plan[slot.done..][..width], decoded);
+            let mut row = actions.row_mut(index);
+            match action {
+                Action::Continuous(numbers) => row.set(column, numbers),
+                Action::Discrete(integers) => row.set(column, integers),
             }
-            slot.done += dim;
+            if let Some(history) = &mut self.history {
+                self.codec.encode(action, executed);
+                history.acted(index, executed);
+            }
+            slot.done += width;
         }
         Ok(())
     }
@@ -261,200 +338,5 @@ impl Policy for MpcPolicy {
     /// equally.
     fn take_latencies(&mut self) -> Vec<f64> {
         std::mem::take(&mut self.latencies)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use std::sync::{Arc, Mutex};
-    use swm_core::{Candidates, ColumnSpec, DType, Plan, Schema, Space, VariationSpace};
-
-    /// One call of the solver: the keys and the first guess.
-    type Call = (Vec<Key>, Vec<f32>);
-
-    /// Plans `100 * (call + 1) + place of the number`, and notes what it was asked.
-    struct Counting {
-        calls: Arc<Mutex<Vec<Call>>>,
-    }
-
-    impl Solver for Counting {
-        fn solve(&mut self, _: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan> {
-            let mut calls = self.calls.lock().expect("one thread");
-            calls.push((problem.keys.to_vec(), problem.init.expect("a first guess").to_vec()));
-            let base = 100.0 * calls.len() as f32;
-            let len = problem.horizon * problem.space.dim();
-            let actions = (0..problem.keys.len() * len).map(|i| base + (i % len) as f32).collect();
-            Ok(Plan { actions, ..Plan::default() })
-        }
-    }
-
-    /// Notes which slots it was shown, and the past beside them.
-    #[derive(Default)]
-    struct Watching {
-        seen: Arc<Mutex<Vec<Vec<usize>>>>,
-        past: Arc<Mutex<Vec<Past>>>,
-    }
-
-    #[derive(Debug, PartialEq)]
-    struct Past {
-        length: i32,
-        pixels: Vec<u8>,
-        actions: Vec<f32>,
-    }
-
-    impl CostModel for Watching {
-        fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()> {
-            self.seen.lock().expect("one thread").push(envs.to_vec());
-            if infos.schema().find("history.length").is_some() {
-                let row = infos.row(envs[0]);
-                self.past.lock().expect("one thread").push(Past {
-                    length: row.get::<i32>("history.length")?[0],
-                    pixels: row.get::<u8>("history.pixels")?.to_vec(),
-                    actions: row.get::<f32>("history.action")?.to_vec(),
-                });
-            }
-            Ok(())
-        }
-
-        fn cost(&mut self, _: Candidates<'_>, _: &mut [f32]) -> Result<()> {
-            Ok(())
-        }
-    }
-
-    fn spec(high: f64) -> EnvSpec {
-        EnvSpec {
-            id: "test/Line-v0",
-            action_space: Space::uniform_box([1], DType::Float32, -high, high),
-            columns: vec![],
-            variation_space: VariationSpace::new(vec![], &[]),
-            max_episode_steps: 100,
-        }
-    }
-
-    struct Rig {
-        policy: MpcPolicy,
-        calls: Arc<Mutex<Vec<Call>>>,
-        seen: Arc<Mutex<Vec<Vec<usize>>>>,
-        past: Arc<Mutex<Vec<Past>>>,
-        infos: Batch,
-        actions: Batch,
-    }
-
-    impl Rig {
-        fn new(config: MpcConfig, high: f64, slots: usize) -> Self {
-            let calls = Arc::default();
-            let cost = Watching::default();
-            let (seen, past) = (Arc::clone(&cost.seen), Arc::clone(&cost.past));
-            let scale = ActionScale { mean: vec![1.0], std: vec![2.0] };
-            let solver = Box::new(Counting { calls: Arc::clone(&calls) });
-            let policy = MpcPolicy::new(solver, Box::new(cost), config, scale, &spec(high), slots).expect("a policy");
-            let infos = Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("schema");
-            let actions = Schema::new([spec(high).action_column()]).expect("schema");
-            Self {
-                policy,
-                calls,
-                seen,
-                past,
-                infos: Batch::zeros(&infos, slots),
-                actions: Batch::zeros(&actions, slots),
-            }
-        }
-
-        fn act(&mut self, active: &[bool]) -> Vec<f32> {
-            self.policy.act(&self.infos, active, &mut self.actions).expect("actions");
-            self.actions.get::<f32>("action").expect("actions").to_vec()
-        }
-
-        fn seen(&self) -> Vec<Vec<usize>> {
-            self.seen.lock().expect("one thread").clone()
-        }
-    }
-
-    #[test]
-    fn what_is_due_replans_in_one_call_and_starts_from_the_rest() {
-        let config = MpcConfig { horizon: 3, receding_horizon: 2, action_block: 2, warm_start: true, history: 1 };
-        let mut rig = Rig::new(config, 1e6, 3);
-        for slot in 0..3 {
-            rig.policy.begin(slot, Key::new(slot as u64));
-        }
-        // Two model steps of two environment steps are executed: the plan's first four numbers, times 2 plus 1.
-        for number in 0..4 {
-            assert_eq!(rig.act(&[true, true, false])[..2], [201.0 + 2.0 * number as f32; 2]);
-        }
-        assert_eq!(rig.seen(), [[0, 1]]);
-        // A new episode in slot 1; slot 2 joins. All are due: one call.
-        rig.policy.begin(1, Key::new(7));
-        rig.act(&[true, true, true]);
-        assert_eq!(rig.seen(), [vec![0, 1], vec![0, 1, 2]]);
-        let calls = rig.calls.lock().expect("one thread");
-        let (keys, init) = &calls[1];
-        let key = |seed, plan| Key::new(seed).with("plan").at(plan);
-        assert_eq!(keys[..], [key(0, 1), key(7, 0), key(2, 0)]);
-        assert_eq!(init[..6], [104.0, 105.0, 0.0, 0.0, 0.0, 0.0], "what was left, moved forward");
-        assert_eq!(init[6..], [0.0; 12], "new episodes start from zeros");
-        assert_eq!(rig.policy.take_latencies().len(), 5);
-        assert!(rig.policy.take_latencies().is_empty());
-    }
-
-    #[test]
-    fn cold_starts_begin_at_zero_and_open_loop_executes_everything() {
-        let config = MpcConfig { horizon: 2, receding_horizon: 2, action_block: 1, warm_start: true, history: 1 };
-        let mut open = Rig::new(config.clone(), 1e6, 1);
-        (0..3).for_each(|_| drop(open.act(&[true])));
-        assert_eq!(
-            open.calls.lock().expect("one thread").iter().map(|c| c.1.clone()).collect::<Vec<_>>(),
-            [[0.0; 2]; 2]
-        );
-        let mut cold = Rig::new(MpcConfig { receding_horizon: 1, warm_start: false, ..config }, 1e6, 1);
-        (0..2).for_each(|_| drop(cold.act(&[true])));
-        assert_eq!(cold.calls.lock().expect("one thread")[1].1, [0.0; 2]);
-    }
-
-    #[test]
-    fn executed_actions_are_in_the_action_space() {
-        let config = MpcConfig { horizon: 1, receding_horizon: 1, action_block: 1, ..MpcConfig::default() };
-        assert_eq!(Rig::new(config, 5.0, 1).act(&[true]), [5.0]);
-    }
-
-    #[test]
-    fn the_past_is_shown_to_models_that_want_it() {
-        let config = MpcConfig { horizon: 1, receding_horizon: 1, action_block: 2, warm_start: false, history: 3 };
-        let mut rig = Rig::new(config, 1e6, 2);
-        rig.policy.begin(1, Key::new(0));
-        for step in 0..7u8 {
-            rig.infos.get_mut::<u8>("pixels").expect("pixels").fill(10 + step);
-            rig.act(&[false, true]);
-        }
-        let past = rig.past.lock().expect("one thread");
-        let pixel = |values: [u8; 2]| values.iter().flat_map(|&v| [v; 3]).collect::<Vec<_>>();
-        let at = |length, pixels, actions: [f32; 4]| Past { length, pixels: pixel(pixels), actions: actions.to_vec() };
-        assert_eq!(past[0], at(0, [0, 0], [0.0; 4]));
-        assert_eq!(past[1], at(1, [0, 10], [0.0, 0.0, 100.0, 101.0]));
-        assert_eq!(past[2], at(2, [10, 12], [100.0, 101.0, 200.0, 201.0]));
-        assert_eq!(past[3], at(2, [12, 14], [200.0, 201.0, 300.0, 301.0]));
-        drop(past);
-        rig.policy.begin(1, Key::new(1));
-        rig.act(&[false, true]);
-        assert_eq!(rig.past.lock().expect("one thread")[4], at(0, [0, 0], [0.0; 4]));
-    }
-
-    #[test]
-    fn wrong_settings_say_so() {
-        let make = |config: MpcConfig, scale: ActionScale, spec: &EnvSpec| {
-            let solver = Box::new(Counting { calls: Arc::default() });
-            let made = MpcPolicy::new(solver, Box::new(Watching::default()), config, scale, spec, 1);
-            made.err().expect("wrong").to_string()
-        };
-        let scale = ActionScale::identity(1);
-        let far = MpcConfig { receding_horizon: 6, ..MpcConfig::default() };
-        assert!(make(far, scale.clone(), &spec(1.0)).contains("6 model steps to execute, 5 planned"));
-        let none = MpcConfig { horizon: 0, ..MpcConfig::default() };
-        assert!(make(none, scale.clone(), &spec(1.0)).contains("MPC horizon"));
-        assert!(make(MpcConfig::default(), ActionScale::identity(2), &spec(1.0)).contains("2 means"));
-        let flat = ActionScale { mean: vec![0.0], std: vec![0.0] };
-        assert!(make(MpcConfig::default(), flat, &spec(1.0)).contains("above 0"));
-        let discrete = EnvSpec { action_space: Space::Discrete { n: 3, start: 0 }, ..spec(1.0) };
-        assert!(make(MpcConfig::default(), scale, &discrete).contains("continuous actions"));
     }
 }

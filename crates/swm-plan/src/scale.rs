@@ -12,6 +12,11 @@ pub struct ActionScale {
 }
 
 impl ActionScale {
+    /// The scale of a model that sees an environment's own units. Integers are planned as choices, without a scale.
+    pub fn unscaled(spec: &EnvSpec) -> Self {
+        Self::identity(scaled_numbers(&spec.action_space))
+    }
+
     /// The scale of a model that sees environment units.
     pub fn identity(dim: usize) -> Self {
         Self { mean: vec![0.0; dim], std: vec![1.0; dim] }
@@ -39,21 +44,15 @@ impl ActionScale {
     /// Checks the scale against an environment.
     ///
     /// # Errors
-    /// When the environment's actions are not a box, their number differs, or a number of the scale is not
-    /// finite or a standard deviation not above 0.
+    /// When the scale has not one mean and one deviation for each number of a box (none for integers), a number of it is
+    /// not finite, or a standard deviation is not above 0.
     pub fn check(&self, spec: &EnvSpec) -> Result<()> {
-        let Space::Box { low, .. } = &spec.action_space else {
-            return Err(Error::config(
-                format!("planning in {}", spec.id),
-                format!("its action space is discrete ({})", spec.action_space.describe()),
-                "plan in an environment with continuous actions",
-            ));
-        };
-        if self.mean.len() != low.len() || self.std.len() != low.len() {
+        let numbers = scaled_numbers(&spec.action_space);
+        if self.mean.len() != numbers || self.std.len() != numbers {
             return Err(Error::mismatch(
                 "the action scale of a plan",
                 format!("{} means and {} deviations", self.mean.len(), self.std.len()),
-                format!("{} of each, the action numbers of {}", low.len(), spec.id),
+                format!("{numbers} of each: the actions of {} are {}", spec.id, spec.action_space.describe()),
             ));
         }
         let fine = self.mean.iter().all(|v| v.is_finite()) && self.std.iter().all(|&v| v.is_finite() && v > 0.0);
@@ -78,5 +77,13 @@ impl ActionScale {
                 (scaled(low), scaled(high))
             })
             .unzip()
+    }
+}
+
+/// How many numbers of an action are scaled: all of a box, none of integers.
+fn scaled_numbers(space: &Space) -> usize {
+    match space {
+        Space::Box { low, .. } => low.len(),
+        Space::Discrete { .. } | Space::MultiDiscrete { .. } | Space::Rgb => 0,
     }
 }

@@ -2,5 +2,7 @@
 #![allow(missing_docs, clippy::cast_possible_truncation, clippy::cast_precision_loss)]
 
 mod lqr;
+mod mpc;
+mod simulator;
 mod solvers;
 mod toys;

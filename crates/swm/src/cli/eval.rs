@@ -295,6 +295,7 @@ fn mpc(checkpoint: &Checkpoint, planner: &PlannerArgs) -> MpcConfig {
         action_block: checkpoint.config.data.frameskip,
         warm_start: true,
         history: checkpoint.config.model.predictor.history,
+        ..MpcConfig::default()
     }
 }
 

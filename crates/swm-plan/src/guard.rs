@@ -1,0 +1,131 @@
+//! [`Guard`]: a model as a solver is handed it by the policy. It times the model, so that a planner's own share of a
+//! plan is known, and turns a panic into an error that says who panicked.
+
+use std::any::Any;
+use std::cell::RefCell;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::time::Instant;
+use swm_core::{Batch, Candidates, Constrained, CostModel, DifferentiableCost, Env, Error, LatentDynamics, Result};
+
+/// A model that is watched.
+pub(crate) struct Guard<'m> {
+    /// In a cell because [`LatentDynamics`] and [`Constrained`] are asked their sizes through shared references, which
+    /// the model lends through exclusive ones only.
+    model: RefCell<&'m mut dyn CostModel>,
+    /// Seconds spent in the model.
+    pub seconds: f64,
+}
+
+/// Does some work; a panic in it becomes an error that names `who`.
+pub(crate) fn caught<T>(who: &str, doing: &str, work: impl FnOnce() -> Result<T>) -> Result<T> {
+    // What was being changed stays half changed; the error ends the run, and nobody looks at it again.
+    catch_unwind(AssertUnwindSafe(work))
+        .unwrap_or_else(|panic| Err(Error::external(format!("{who} panicked while {doing}"), message(&*panic))))
+}
+
+fn message(panic: &(dyn Any + Send)) -> &str {
+    let text = panic.downcast_ref::<&str>().copied();
+    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("it left no message")
+}
+
+fn gone(what: &str) -> Error {
+    Error::external("asking the model", format!("it offered {what} and does not any more"))
+}
+
+impl<'m> Guard<'m> {
+    pub fn new(model: &'m mut dyn CostModel) -> Self {
+        Self { model: RefCell::new(model), seconds: 0.0 }
+    }
+
+    fn ask<T>(&mut self, doing: &str, question: impl FnOnce(&mut dyn CostModel) -> Result<T>) -> Result<T> {
+        let begun = Instant::now();
+        let answer = caught("the model", doing, || question(*self.model.get_mut()));
+        self.seconds += begun.elapsed().as_secs_f64();
+        answer
+    }
+}
+
+impl CostModel for Guard<'_> {
+    fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()> {
+        self.ask("observing the present", |model| model.observe(infos, envs))
+    }
+
+    fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
+        self.ask("scoring candidates", |model| model.cost(candidates, costs))
+    }
+
+    fn see(&mut self, slot: usize, env: &dyn Env) -> Result<()> {
+        self.ask("looking at the world", |model| model.see(slot, env))
+    }
+
+    fn differentiable(&mut self) -> Option<&mut dyn DifferentiableCost> {
+        self.model.get_mut().differentiable().is_some().then_some(self as _)
+    }
+
+    fn latent(&mut self) -> Option<&mut dyn LatentDynamics> {
+        self.model.get_mut().latent().is_some().then_some(self as _)
+    }
+
+    fn constrained(&mut self) -> Option<&mut dyn Constrained> {
+        self.model.get_mut().constrained().is_some().then_some(self as _)
+    }
+}
+
+impl DifferentiableCost for Guard<'_> {
+    fn cost_and_gradient(&mut self, candidates: Candidates<'_>, costs: &mut [f32], gradient: &mut [f32]) -> Result<()> {
+        self.ask("differentiating its cost", |model| {
+            let model = model.differentiable().ok_or_else(|| gone("a gradient"))?;
+            model.cost_and_gradient(candidates, costs, gradient)
+        })
+    }
+}
+
+impl LatentDynamics for Guard<'_> {
+    fn latent_dim(&self) -> usize {
+        self.model.borrow_mut().latent().map_or(0, |model| model.latent_dim())
+    }
+
+    fn encode(&mut self, start: &mut [f32], goal: &mut [f32]) -> Result<()> {
+        self.ask("encoding start and goal", |model| {
+            model.latent().ok_or_else(|| gone("a latent state"))?.encode(start, goal)
+        })
+    }
+
+    fn predict(&mut self, latents: &[f32], actions: &[f32], next: &mut [f32]) -> Result<()> {
+        self.ask("predicting", |model| {
+            model.latent().ok_or_else(|| gone("a latent state"))?.predict(latents, actions, next)
+        })
+    }
+
+    fn predict_vjp(
+        &mut self,
+        latents: &[f32],
+        actions: &[f32],
+        next_gradient: &[f32],
+        latent_gradient: &mut [f32],
+        action_gradient: &mut [f32],
+    ) -> Result<()> {
+        self.ask("differentiating its prediction", |model| {
+            let model = model.latent().ok_or_else(|| gone("a latent state"))?;
+            model.predict_vjp(latents, actions, next_gradient, latent_gradient, action_gradient)
+        })
+    }
+}
+
+impl Constrained for Guard<'_> {
+    fn constraints(&self, horizon: usize) -> usize {
+        self.model.borrow_mut().constrained().map_or(0, |model| model.constraints(horizon))
+    }
+
+    fn constrain(&mut self, candidates: Candidates<'_>, values: &mut [f32]) -> Result<()> {
+        self.ask("checking constraints", |model| {
+            model.constrained().ok_or_else(|| gone("constraints"))?.constrain(candidates, values)
+        })
+    }
+
+    fn constrain_vjp(&mut self, candidates: Candidates<'_>, weights: &[f32], gradient: &mut [f32]) -> Result<()> {
+        self.ask("differentiating constraints", |model| {
+            model.constrained().ok_or_else(|| gone("constraints"))?.constrain_vjp(candidates, weights, gradient)
+        })
+    }
+}

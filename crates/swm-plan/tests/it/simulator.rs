@@ -1,0 +1,128 @@
+//! The simulator as a model: its costs are those of the actions that the policy executes.
+
+use rand::Rng as _;
+use swm_core::pool::{Reset, threads};
+use swm_core::{Action, Candidates, CostModel, EnvEntry, EnvPool, Key, ResetOptions, Rng, Space};
+use swm_envs::{push_t, two_room};
+use swm_plan::{ActionScale, Score, SimulatorCost};
+
+const HORIZON: usize = 3;
+const BLOCK: usize = 2;
+
+fn pool(entry: &EnvEntry, envs: usize) -> EnvPool {
+    let envs = (0..envs).map(|_| (entry.make)()).collect();
+    let mut pool = EnvPool::new(envs, None, None, threads(1).expect("a thread")).expect("a pool");
+    let resets = (0..pool.len()).map(|slot| Reset { slot, seed: slot as u64, options: ResetOptions::default() });
+    pool.reset(&resets.collect::<Vec<_>>()).expect("a reset");
+    pool
+}
+
+/// A simulator that was shown these slots.
+fn simulator(entry: &EnvEntry, pool: &EnvPool, slots: &[usize], score: Score) -> SimulatorCost {
+    let mut simulator =
+        SimulatorCost::new(entry.make, ActionScale::unscaled(pool.spec()), BLOCK, score).expect("a simulator");
+    slots.iter().for_each(|&slot| simulator.see(slot, pool.env(slot)).expect("its own world"));
+    simulator.observe(pool.infos(), slots).expect("worlds that were shown");
+    simulator
+}
+
+fn costs(simulator: &mut SimulatorCost, actions: &[f32], envs: usize, samples: usize) -> Vec<f32> {
+    let mut costs = vec![f32::NAN; envs * samples];
+    let dim = actions.len() / (envs * samples * HORIZON);
+    simulator.cost(Candidates { actions, envs, samples, horizon: HORIZON, dim }, &mut costs).expect("costs");
+    costs
+}
+
+fn actions(rng: &mut Rng, n: usize) -> Vec<f32> {
+    (0..n).map(|_| rng.random_range(-1.5..1.5)).collect()
+}
+
+#[test]
+fn a_cost_is_what_the_world_itself_would_say() {
+    for entry in [&two_room::ENTRY, &push_t::ENTRY] {
+        let samples = 5;
+        let actions = actions(&mut Key::new(1).rng(), samples * HORIZON * BLOCK * 2);
+        let pool = pool(entry, 2);
+        for score in [Score::Terminal, Score::Running] {
+            let costs = costs(&mut simulator(entry, &pool, &[1], score), &actions, 1, samples);
+            for (candidate, cost) in actions.chunks_exact(HORIZON * BLOCK * 2).zip(costs) {
+                let mut world = (entry.make)();
+                world.restore(&pool.env(1).snapshot()).expect("a snapshot");
+                let distances: Vec<f64> = candidate
+                    .chunks_exact(2)
+                    .map(|action| {
+                        let action = [action[0].clamp(-1.0, 1.0), action[1].clamp(-1.0, 1.0)];
+                        world.step(Action::Continuous(&action)).expect("a step");
+                        world.goal_distance()
+                    })
+                    .collect();
+                let wanted = match score {
+                    Score::Running => distances.iter().sum(),
+                    _ => distances[distances.len() - 1],
+                };
+                assert_eq!(cost.to_bits(), (wanted as f32).to_bits(), "{}, {score:?}", entry.id);
+            }
+        }
+    }
+}
+
+#[test]
+fn reaching_the_goal_early_is_cheapest() {
+    let entry = &two_room::ENTRY;
+    let mut pool = pool(entry, 1);
+    // The goal is within 16 pixels after 3 steps of 5 pixels to the right.
+    pool.restart(&[0], |_, env| {
+        let options = ResetOptions {
+            state: Some(vec![30.0, 100.0]),
+            goal_state: Some(vec![60.0, 100.0]),
+            ..ResetOptions::default()
+        };
+        env.reset(0, &options)
+    })
+    .expect("a reset");
+    let walk = |steps: usize| (0..6).flat_map(move |t| [if t < steps { 1.0 } else { 0.0 }, 0.0]);
+    let actions: Vec<f32> = walk(3).chain(walk(2)).chain(walk(6)).collect();
+    let costs = costs(&mut simulator(entry, &pool, &[0], Score::Reach), &actions, 1, 3);
+    assert_eq!(costs, [-0.5, 20.0, -0.5], "3 of 6 steps are left; 20 pixels are missing; going on changes nothing");
+}
+
+#[test]
+fn costs_depend_on_their_own_world_alone() {
+    for entry in [&two_room::ENTRY, &push_t::ENTRY, &push_t::discrete::ENTRY] {
+        let (envs, samples) = (3, 20);
+        let pool = pool(entry, envs);
+        let space = &pool.spec().action_space;
+        let width: usize = match space {
+            Space::MultiDiscrete { nvec, .. } => nvec.iter().map(|&n| usize::try_from(n).expect("a number")).sum(),
+            Space::Discrete { n, .. } => usize::try_from(*n).expect("a number"),
+            _ => space.len(),
+        };
+        let own = samples * HORIZON * BLOCK * width;
+        let all = actions(&mut Key::new(2).rng(), envs * own);
+        let run = |threads: usize, slots: &[usize]| {
+            let workers = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+            let actions: Vec<f32> = slots.iter().flat_map(|&slot| &all[slot * own..][..own]).copied().collect();
+            let mut simulator = simulator(entry, &pool, slots, Score::Terminal);
+            let costs = workers.install(|| costs(&mut simulator, &actions, slots.len(), samples));
+            costs.chunks(samples).map(<[f32]>::to_vec).collect::<Vec<_>>()
+        };
+        let together = run(1, &[0, 1, 2]);
+        assert!(together.iter().all(|costs| costs.iter().any(|&cost| cost != costs[0])), "{}: all alike", entry.id);
+        assert_eq!(run(2, &[0, 1, 2]), together, "{}: two threads", entry.id);
+        assert_eq!(run(2, &[2, 0]), [together[2].clone(), together[0].clone()], "{}: other company", entry.id);
+    }
+}
+
+#[test]
+fn a_simulator_refuses_worlds_it_does_not_know() {
+    let (room, table) = (pool(&two_room::ENTRY, 1), pool(&push_t::ENTRY, 1));
+    let mut simulator = simulator(&two_room::ENTRY, &room, &[0], Score::Terminal);
+    let foreign = simulator.see(0, table.env(0)).expect_err("another world").to_string();
+    assert!(foreign.contains(push_t::ENTRY.id) && foreign.contains(two_room::ENTRY.id), "{foreign}");
+    let again = simulator.observe(room.infos(), &[0]).expect_err("shown once, observed twice").to_string();
+    assert!(again.contains("was not shown"), "{again}");
+    let wide = Candidates { actions: &[0.0; 6], envs: 1, samples: 1, horizon: 1, dim: 6 };
+    assert!(simulator.cost(wide, &mut [0.0]).expect_err("too wide").to_string().contains("6 numbers"));
+    let none = SimulatorCost::new(two_room::ENTRY.make, ActionScale::identity(2), 0, Score::Terminal);
+    assert!(none.err().expect("no actions").to_string().contains("action block"));
+}

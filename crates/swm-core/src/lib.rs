@@ -14,6 +14,7 @@ pub mod env;
 pub mod error;
 pub mod key;
 pub mod manifest;
+mod pace;
 pub mod plan;
 pub mod policy;
 pub mod pool;

@@ -4,7 +4,9 @@
 //! played the same way wherever it runs.
 
 use crate::batch::{Batch, DType, RowMut, RowRef};
-use crate::{EnvPool, EnvSpec, Key, Result, Rng};
+use crate::pace::Pace;
+use crate::{EnvPool, EnvSpec, Error, Key, Result, Rng};
+use std::time::Instant;
 
 /// Who acts.
 pub trait Policy: Send {
@@ -24,6 +26,11 @@ pub trait Policy: Send {
     /// When a world is not one the policy knows.
     fn see(&mut self, _worlds: &EnvPool, _active: &[bool]) -> Result<()> {
         Ok(())
+    }
+
+    /// Whether [`Policy::act`] works on several threads; one that does not is called on the caller's.
+    fn uses_threads(&self) -> bool {
+        true
     }
 
     /// Seconds each plan took since the last call, for policies that plan.
@@ -58,6 +65,10 @@ impl Policy for RandomPolicy {
         }
         Ok(())
     }
+
+    fn uses_threads(&self) -> bool {
+        false
+    }
 }
 
 /// One environment's expert: reads the infos row, writes the action.
@@ -74,29 +85,53 @@ pub trait Expert: Send {
 
 /// One [`Expert`] a slot.
 pub struct ExpertPolicy {
-    experts: Vec<Box<dyn Expert>>,
+    seats: Vec<Seat>,
+    pace: Pace,
+}
+
+struct Seat {
+    expert: Box<dyn Expert>,
     action: Vec<f64>,
+    failed: Option<Error>,
 }
 
 impl ExpertPolicy {
     /// A policy of these experts, one a slot.
     pub fn new(spec: &EnvSpec, experts: Vec<Box<dyn Expert>>) -> Self {
-        Self { experts, action: vec![0.0; spec.action_dim()] }
+        let seat = |expert| Seat { expert, action: vec![0.0; spec.action_dim()], failed: None };
+        Self { seats: experts.into_iter().map(seat).collect(), pace: Pace::default() }
     }
 }
 
 impl Policy for ExpertPolicy {
     fn begin(&mut self, slot: usize, key: Key) {
-        self.experts[slot].begin(key.with("expert"));
+        self.seats[slot].expert.begin(key.with("expert"));
     }
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
         let column = actions.schema().index("action")?;
-        for slot in (0..active.len()).filter(|&slot| active[slot]) {
-            self.experts[slot].act(infos.row(slot), &mut self.action)?;
-            write_action(&mut actions.row_mut(slot), column, &self.action);
+        let work = |slot: usize, mut row: RowMut<'_>, seat: &mut Seat| {
+            if active[slot] {
+                seat.failed = seat.expert.act(infos.row(slot), &mut seat.action).err();
+                write_action(&mut row, column, &seat.action);
+            }
+        };
+        let begun = Instant::now();
+        let alone = !self.uses_threads();
+        if alone {
+            for (slot, seat) in self.seats.iter_mut().enumerate() {
+                work(slot, actions.row_mut(slot), seat);
+            }
+        } else {
+            actions.par_zip_mut(&mut self.seats, work);
         }
-        Ok(())
+        let workers = if alone { 1 } else { rayon::current_num_threads() };
+        self.pace.note(begun, workers, self.seats.len());
+        self.seats.iter_mut().find_map(|seat| seat.failed.take()).map_or(Ok(()), Err)
+    }
+
+    fn uses_threads(&self) -> bool {
+        !self.pace.alone(self.seats.len())
     }
 }
 

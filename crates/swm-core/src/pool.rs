@@ -6,8 +6,10 @@
 //! number of threads or of neighbours.
 
 use crate::batch::{Batch, ColumnSpec, DType, RowMut, Schema};
+use crate::pace::Pace;
 use crate::{Action, Env, EnvSpec, Error, FrameMut, ResetOptions, Result};
 use std::sync::Arc;
+use std::time::Instant;
 
 /// One slot of a pool to reset.
 #[derive(Clone)]
@@ -38,6 +40,7 @@ pub struct EnvPool {
     places: Places,
     threads: Arc<rayon::ThreadPool>,
     max_episode_steps: usize,
+    pace: Pace,
 }
 
 struct Slot {
@@ -97,6 +100,7 @@ impl EnvPool {
             places,
             threads,
             max_episode_steps,
+            pace: Pace::default(),
         })
     }
 
@@ -149,7 +153,7 @@ impl EnvPool {
         for reset in resets {
             wanted[reset.slot] = Some(reset);
         }
-        self.each(|i, slot, places, row| {
+        self.each(false, |i, slot, places, row| {
             let Some(reset) = wanted[i] else { return Ok(()) };
             slot.env.reset(reset.seed, &reset.options)?;
             slot.start(places, row);
@@ -166,7 +170,7 @@ impl EnvPool {
         slots: &[usize],
         change: impl Fn(usize, &mut dyn Env) -> Result<()> + Sync,
     ) -> Result<()> {
-        self.each(|i, slot, places, row| {
+        self.each(false, |i, slot, places, row| {
             if !slots.contains(&i) {
                 return Ok(());
             }
@@ -200,7 +204,10 @@ impl EnvPool {
             ));
         }
         let limit = self.max_episode_steps;
-        self.each(|i, slot, places, row| {
+        let begun = Instant::now();
+        let stepping = active.iter().filter(|&&active| active).count();
+        let alone = self.pace.alone(stepping);
+        let stepped = self.each(alone, |i, slot, places, row| {
             if !active[i] {
                 return Ok(());
             }
@@ -217,17 +224,30 @@ impl EnvPool {
             row.set(places.truncated, &[u8::from(transition.truncated)]);
             slot.look(places, row);
             Ok(())
-        })
+        });
+        self.pace.note(begun, if alone { 1 } else { self.threads.current_num_threads() }, stepping);
+        stepped
     }
 
-    /// Runs `work` on every slot, in parallel; the first slot's error wins, whatever finished first.
-    fn each(&mut self, work: impl Fn(usize, &mut Slot, Places, &mut RowMut<'_>) -> Result<()> + Sync) -> Result<()> {
+    /// Runs `work` on every slot, in parallel or `alone` on this thread; the first slot's error wins, whatever finished
+    /// first.
+    fn each(
+        &mut self,
+        alone: bool,
+        work: impl Fn(usize, &mut Slot, Places, &mut RowMut<'_>) -> Result<()> + Sync,
+    ) -> Result<()> {
         let (places, slots, infos) = (self.places, &mut self.slots, &mut self.infos);
-        self.threads.install(|| {
-            infos.par_zip_mut(slots, |i, mut row, slot| {
-                slot.failed = work(i, slot, places, &mut row).err();
+        if alone {
+            for (i, slot) in slots.iter_mut().enumerate() {
+                slot.failed = work(i, slot, places, &mut infos.row_mut(i)).err();
+            }
+        } else {
+            self.threads.install(|| {
+                infos.par_zip_mut(slots, |i, mut row, slot| {
+                    slot.failed = work(i, slot, places, &mut row).err();
+                });
             });
-        });
+        }
         match self.slots.iter_mut().find_map(|slot| slot.failed.take()) {
             None => Ok(()),
             Some(error) => {

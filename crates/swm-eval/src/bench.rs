@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm_core::pool::Reset;
 use swm_core::results::Summary;
-use swm_core::{EnvEntry, Error, RandomPolicy, Result, VariationRequest};
+use swm_core::{Action, EnvEntry, Error, Key, RandomPolicy, ResetOptions, Result, Space, VariationRequest};
 use swm_data::{ImageCodec, WriteOptions, create};
 
 /// The environment variable that names a Python with the reference.
@@ -26,6 +26,8 @@ pub struct BenchConfig {
     pub envs: usize,
     /// Sides of the square pictures, in pixels.
     pub sizes: Vec<usize>,
+    /// Whether to measure without pictures, too.
+    pub bare: bool,
     /// Worker threads; as many as the machine offers for 0. The reference steps on one thread.
     pub threads: usize,
     /// Pairs of turns, ours and the reference's.
@@ -51,6 +53,7 @@ impl Default for BenchConfig {
         Self {
             envs: 8,
             sizes: vec![224],
+            bare: true,
             threads: 0,
             pairs: 5,
             seconds: 1.0,
@@ -79,10 +82,11 @@ pub struct BenchReport {
 pub struct BenchRow {
     /// The environment.
     pub env: String,
-    /// What was done: `step + render`, or `collect` into Lance with a codec.
+    /// What was done: `step + render`, `collect` into Lance with a codec, `step` without pictures, or `step` on one
+    /// thread without a world around it.
     pub what: &'static str,
-    /// The side of the pictures, in pixels.
-    pub size: usize,
+    /// The side of the pictures, in pixels; none where nothing is drawn.
+    pub size: Option<usize>,
     /// Environment steps a second in each of our turns.
     pub ours: Vec<f64>,
     /// Environment steps a second in each of the reference's turns; empty without it.
@@ -93,7 +97,8 @@ pub struct BenchRow {
     pub ratio: Option<f64>,
 }
 
-/// Measures stepping with rendering, and collecting into Lance, for every environment and size.
+/// Measures stepping with rendering and collecting into Lance for every environment and size, and stepping without
+/// pictures for every environment.
 ///
 /// # Errors
 /// When a number makes no sense, a world fails, or the reference fails after it had started. A reference that does
@@ -110,26 +115,36 @@ pub fn bench_envs(entries: &[&EnvEntry], config: &BenchConfig) -> Result<BenchRe
         rows: vec![],
     };
     for entry in entries {
+        if config.bare {
+            let mut reference = report.start(entry, 64, config);
+            let mut ours = Ours::new(entry, None, config)?;
+            ours.step(config.seconds / 4.0)?;
+            report.rows.push(BenchRow::measure(
+                entry,
+                None,
+                "step",
+                config.pairs,
+                |_| ours.step(config.seconds),
+                reference.as_mut().map(|reference| |_| reference.bare(config.seconds)),
+            )?);
+            report.rows.push(BenchRow::measure(
+                entry,
+                None,
+                "step, one thread",
+                config.pairs,
+                |turn| alone(entry, turn as u64, config),
+                reference.as_mut().map(|reference| |_| reference.bare(config.seconds)),
+            )?);
+        }
         for &size in &config.sizes {
-            let wanted =
-                Size { env: entry.id, envs: config.envs, image: (size, size), episode_steps: config.episode_steps };
-            let mut reference = None;
-            if let Some(python) = &config.python {
-                match Reference::start(python, wanted) {
-                    Ok(started) => {
-                        report.reference.clone_from(&started.version);
-                        reference = Some(started);
-                    }
-                    Err(error) => report.reference = format!("not compared: {error}"),
-                }
-            }
-            let mut ours = Ours::new(entry, size, config)?;
+            let mut reference = report.start(entry, size, config);
+            let mut ours = Ours::new(entry, Some(size), config)?;
             // The first turn of each warms up and is not counted.
             ours.step(config.seconds / 4.0)?;
             reference.as_mut().map(|reference| reference.step(config.seconds / 4.0)).transpose()?;
             report.rows.push(BenchRow::measure(
                 entry,
-                size,
+                Some(size),
                 "step + render",
                 config.pairs,
                 |_| ours.step(config.seconds),
@@ -152,7 +167,7 @@ pub fn bench_envs(entries: &[&EnvEntry], config: &BenchConfig) -> Result<BenchRe
             for (name, what, codec) in codecs {
                 report.rows.push(BenchRow::measure(
                     entry,
-                    size,
+                    Some(size),
                     what,
                     config.pairs,
                     |turn| {
@@ -183,12 +198,12 @@ struct Ours {
 }
 
 impl Ours {
-    fn new(entry: &EnvEntry, size: usize, config: &BenchConfig) -> Result<Self> {
+    fn new(entry: &EnvEntry, size: Option<usize>, config: &BenchConfig) -> Result<Self> {
         let mut world = World::new(
             entry,
             WorldConfig {
                 envs: config.envs,
-                image: Some((size, size)),
+                image: size.map(|size| (size, size)),
                 max_episode_steps: Some(config.episode_steps),
                 threads: config.threads,
             },
@@ -239,11 +254,65 @@ impl Ours {
     }
 }
 
+impl BenchReport {
+    /// The reference with a world of this size, where there is one; says why where there is not.
+    fn start(&mut self, entry: &EnvEntry, size: usize, config: &BenchConfig) -> Option<Reference> {
+        let wanted =
+            Size { env: entry.id, envs: config.envs, image: (size, size), episode_steps: config.episode_steps };
+        match Reference::start(config.python.as_ref()?, wanted) {
+            Ok(started) => {
+                self.reference.clone_from(&started.version);
+                Some(started)
+            }
+            Err(error) => {
+                self.reference = format!("not compared: {error}");
+                None
+            }
+        }
+    }
+}
+
+/// Environment steps a second of one environment on this thread, nothing observed, random actions drawn beforehand.
+fn alone(entry: &EnvEntry, seed: u64, config: &BenchConfig) -> Result<f64> {
+    const ACTIONS: usize = 4096;
+    /// Steps between two looks at the clock.
+    const ROUND: usize = 1000;
+    let mut env = (entry.make)();
+    let space = env.spec().action_space.clone();
+    let mut rng = Key::new(seed).with("bench").rng();
+    let drawn: Vec<Vec<f64>> = (0..ACTIONS).map(|_| space.sample(&mut rng)).collect();
+    #[allow(clippy::cast_possible_truncation)]
+    let numbers: Vec<Vec<f32>> = drawn.iter().map(|action| action.iter().map(|&v| v as f32).collect()).collect();
+    #[allow(clippy::cast_possible_truncation)]
+    let choices: Vec<Vec<i64>> = drawn.iter().map(|action| action.iter().map(|&v| v as i64).collect()).collect();
+    let continuous = matches!(space, Space::Box { .. });
+    let (mut steps, mut episode, mut in_episode) = (0, 0, 0);
+    env.reset(seed, &ResetOptions::default())?;
+    let begun = Instant::now();
+    loop {
+        for i in 0..ROUND {
+            let i = (steps + i) % ACTIONS;
+            let action = if continuous { Action::Continuous(&numbers[i]) } else { Action::Discrete(&choices[i]) };
+            in_episode += 1;
+            if env.step(action)?.terminated || in_episode == config.episode_steps {
+                episode += 1;
+                in_episode = 0;
+                env.reset(seed + episode, &ResetOptions::default())?;
+            }
+        }
+        steps += ROUND;
+        let elapsed = begun.elapsed().as_secs_f64();
+        if elapsed >= config.seconds {
+            return Ok(steps as f64 / elapsed);
+        }
+    }
+}
+
 impl BenchRow {
     /// Alternates turns of ours and, where there is one, of the reference. A turn is given its number.
     fn measure(
         entry: &EnvEntry,
-        size: usize,
+        size: Option<usize>,
         what: &'static str,
         pairs: usize,
         mut ours: impl FnMut(usize) -> Result<f64>,
@@ -273,7 +342,8 @@ impl fmt::Display for BenchReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{} environments, {} threads; reference: {}", self.envs, self.threads, self.reference)?;
         for row in &self.rows {
-            write!(f, "{:<20} {:<18} {:>4} px {:>10.0} steps/s", row.env, row.what, row.size, row.steps_per_second)?;
+            let size = row.size.map_or("-".to_owned(), |size| format!("{size} px"));
+            write!(f, "{:<20} {:<18} {size:>7} {:>10.0} steps/s", row.env, row.what, row.steps_per_second)?;
             match row.ratio {
                 Some(ratio) => writeln!(f, " {ratio:>8.1} x the reference (median of {})", row.ours.len())?,
                 None => writeln!(f)?,

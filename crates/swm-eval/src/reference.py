@@ -1,4 +1,5 @@
-"""Measures the reference implementation, on request, line by line: `step SECONDS` or `collect PATH EPISODES SEED`.
+"""Measures the reference implementation, on request, line by line: `step SECONDS`, `bare SECONDS` (its environments
+without pictures, outside its world) or `collect PATH EPISODES SEED`.
 
 Answers are lines that begin with `SWM `; whatever else the reference prints is not ours.
 """
@@ -7,6 +8,7 @@ import sys
 import time
 from importlib.metadata import version
 
+import gymnasium
 import lance
 import numpy as np
 import stable_worldmodel as swm
@@ -30,6 +32,22 @@ def step(seconds):
     return steps, elapsed
 
 
+def bare(seconds):
+    plain = [gymnasium.make(env, max_episode_steps=limit) for _ in range(envs)]
+    for seed, one in enumerate(plain):
+        one.reset(seed=seed)
+        one.action_space.seed(seed)
+    steps = 0
+    begun = time.perf_counter()
+    while (elapsed := time.perf_counter() - begun) < seconds:
+        for one in plain:
+            _, _, terminated, truncated, _ = one.step(one.action_space.sample())
+            if terminated or truncated:
+                one.reset()
+        steps += envs
+    return steps, elapsed
+
+
 def collect(path, episodes, seed):
     begun = time.perf_counter()
     world.collect(path, episodes=int(episodes), seed=int(seed), progress=False)
@@ -45,4 +63,7 @@ def answer(*words):
 answer("ready", version("stable-worldmodel"))
 for line in sys.stdin:
     command, *arguments = line.rstrip("\n").split("\t")
-    answer(*(step(float(arguments[0])) if command == "step" else collect(*arguments)))
+    if command == "collect":
+        answer(*collect(*arguments))
+    else:
+        answer(*(step if command == "step" else bare)(float(arguments[0])))

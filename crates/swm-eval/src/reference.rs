@@ -57,6 +57,11 @@ impl Reference {
         self.rate(&format!("step\t{seconds}"))
     }
 
+    /// Steps its environments without pictures, outside its world: environment steps a second.
+    pub fn bare(&mut self, seconds: f64) -> Result<f64> {
+        self.rate(&format!("bare\t{seconds}"))
+    }
+
     /// Collects into a Lance dataset: environment steps a second.
     pub fn collect(&mut self, path: &Path, episodes: usize, seed: u64) -> Result<f64> {
         self.rate(&format!("collect\t{}\t{episodes}\t{seed}", path.display()))

@@ -128,7 +128,11 @@ impl World {
     fn act(&mut self, policy: &mut dyn Policy, active: &[bool]) -> Result<()> {
         policy.see(&self.pool, active)?;
         let (infos, actions) = (self.pool.infos(), &mut self.actions);
-        self.pool.threads().install(|| policy.act(infos, active, actions))
+        if policy.uses_threads() {
+            self.pool.threads().install(|| policy.act(infos, active, actions))
+        } else {
+            policy.act(infos, active, actions)
+        }
     }
 
     /// Plays episodes until `play` has no more, each slot taking the next one when it is free.

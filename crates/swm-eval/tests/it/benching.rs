@@ -6,16 +6,19 @@ use swm_eval::{BenchConfig, bench_envs};
 
 fn config() -> BenchConfig {
     let (sizes, python) = (vec![8], None);
-    BenchConfig { envs: 2, sizes, threads: 1, pairs: 3, seconds: 0.01, episode_steps: 5, episodes: 0, python }
+    BenchConfig { envs: 2, sizes, bare: true, threads: 1, pairs: 3, seconds: 0.01, episode_steps: 5, episodes: 0, python }
 }
 
 #[test]
 fn without_the_reference_it_says_so() {
     let report = bench_envs(&[&ENTRY], &config()).expect("a report");
     assert!(report.reference.contains("SWM_REFERENCE_PYTHON"));
-    let [row] = &report.rows[..] else { panic!("one environment, one size, stepping only: {report:?}") };
-    assert_eq!((row.ours.len(), row.reference.len(), row.ratio), (3, 0, None));
-    assert!(row.steps_per_second > 0.0);
+    let what: Vec<_> = report.rows.iter().map(|row| (row.what, row.size)).collect();
+    assert_eq!(what, [("step", None), ("step, one thread", None), ("step + render", Some(8))]);
+    for row in &report.rows {
+        assert_eq!((row.ours.len(), row.reference.len(), row.ratio), (3, 0, None));
+        assert!(row.steps_per_second > 0.0);
+    }
     let missing = BenchConfig { python: Some("/no/such/python".into()), ..config() };
     let report = bench_envs(&[&ENTRY], &missing).expect("a report");
     assert!(report.reference.contains("/no/such/python"), "{}", report.reference);
@@ -35,9 +38,10 @@ fn ratios_are_those_of_neighbouring_turns() {
     drop(file);
     let report = bench_envs(&[&ENTRY], &BenchConfig { python: Some(python), ..config() }).expect("a report");
     assert_eq!(report.reference, "1.2.3");
-    let row = &report.rows[0];
-    assert_eq!(row.reference, [5.0; 3]);
-    assert_eq!(row.ratio, Some(row.steps_per_second / 5.0));
+    for row in &report.rows {
+        assert_eq!(row.reference, [5.0; 3]);
+        assert_eq!(row.ratio, Some(row.steps_per_second / 5.0));
+    }
     assert!(report.to_string().contains("x the reference (median of 3)"), "{report}");
 }
 

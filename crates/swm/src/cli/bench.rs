@@ -30,6 +30,9 @@ struct EnvsArgs {
     /// Picture sizes
     #[arg(long, value_delimiter = ',', default_value = "224,64")]
     sizes: Vec<usize>,
+    /// Leave out stepping without pictures
+    #[arg(long)]
+    pictures_only: bool,
     /// Pairs of turns, ours and the reference's
     #[arg(long, default_value_t = 5)]
     pairs: usize,
@@ -53,6 +56,7 @@ pub fn bench(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
         &BenchConfig {
             envs: args.num_envs,
             sizes: args.sizes.clone(),
+            bare: !args.pictures_only,
             threads: context.threads,
             pairs: args.pairs,
             seconds: args.seconds,
@@ -68,7 +72,7 @@ pub fn bench(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
         vec![
             row.env.clone(),
             row.what.to_owned(),
-            format!("{} px", row.size),
+            row.size.map_or("–".to_owned(), |size| format!("{size} px")),
             format!("{:.0}", row.steps_per_second),
             median(&row.reference).map_or("–".to_owned(), |steps| format!("{steps:.0}")),
             row.ratio.map_or("–".to_owned(), |ratio| format!("{ratio:.1} ×")),

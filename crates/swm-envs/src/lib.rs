@@ -5,6 +5,7 @@ mod factors;
 pub mod piecewise;
 pub mod push_t;
 pub mod two_room;
+pub mod wrappers;
 
 use swm_core::{EnvEntry, Registry};
 

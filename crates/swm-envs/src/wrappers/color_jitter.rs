@@ -1,0 +1,171 @@
+//! Brightness, contrast, saturation and hue, changed by amounts drawn at the beginning of an episode.
+//!
+//! In this order: every channel is multiplied by a brightness factor; its distance from the mean of the channel over
+//! the picture is multiplied by a contrast factor; the result is clipped to 0 ..= 255; in HSV, hue is turned and
+//! saturation multiplied.
+//!
+//! | parameter | unit | default | range |
+//! | --- | --- | --- | --- |
+//! | `brightness` | factor: from 1 ± this (at least 0), or between low/high | 0.2 | 0 to 10 |
+//! | `contrast` | likewise | 0.2 | 0 to 10 |
+//! | `saturation` | likewise | 0.2 | 0 to 10 |
+//! | `hue` | turns of the colour circle: from ± this, or between low/high | 0.05 | -0.5 to 0.5 |
+//!
+//! All four are drawn uniformly. Source: `ColorJitterWrapper` of the reference, whose HSV is OpenCV's of 8 bits (hue in
+//! 180 steps); followed with its rounding. Addition: ranges, and with them fixed factors (`brightness=1.3/1.3`).
+
+use super::settings::{Domain, Ends, Parameter};
+use super::{View, VisualWrapper, WrapperEntry, typed};
+use rand::Rng as _;
+use serde::Deserialize;
+use swm_core::{FrameMut, Key};
+
+const FACTOR: Domain = Domain::Spread { around: 1.0, low: 0.0, high: 10.0 };
+
+/// The registry row.
+pub const ENTRY: WrapperEntry = WrapperEntry {
+    id: "color-jitter",
+    summary: "changes brightness, contrast, saturation and hue, by the same amounts for an episode",
+    parameters: &[
+        Parameter { name: "brightness", summary: "factor of all channels", domain: FACTOR, default: Some("0.2") },
+        Parameter {
+            name: "contrast",
+            summary: "factor of distances from the mean",
+            domain: FACTOR,
+            default: Some("0.2"),
+        },
+        Parameter { name: "saturation", summary: "factor of saturation", domain: FACTOR, default: Some("0.2") },
+        Parameter {
+            name: "hue",
+            summary: "added to hue, turns of the colour circle",
+            domain: Domain::Spread { around: 0.0, low: -0.5, high: 0.5 },
+            default: Some("0.05"),
+        },
+    ],
+    build: |settings| {
+        let Settings { brightness, contrast, saturation, hue } = typed(ENTRY.id, settings)?;
+        let [brightness, contrast, saturation] = [brightness, contrast, saturation].map(|ends| ends.around(1.0, 0.0));
+        Ok(Box::new(ColorJitter::new([brightness, contrast, saturation, hue.around(0.0, -0.5)])))
+    },
+};
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Settings {
+    brightness: Ends,
+    contrast: Ends,
+    saturation: Ends,
+    hue: Ends,
+}
+
+#[derive(Clone)]
+pub(super) struct ColorJitter {
+    /// Ranges of brightness, contrast, saturation and hue.
+    ranges: [[f64; 2]; 4],
+    brightness: f32,
+    contrast: f32,
+    /// What saturation becomes.
+    saturation: [u8; 256],
+    /// What hue becomes, of 180 steps.
+    hue: [u8; 180],
+}
+
+impl ColorJitter {
+    pub fn new(ranges: [[f64; 2]; 4]) -> Self {
+        let mut jitter = Self { ranges, brightness: 1.0, contrast: 1.0, saturation: [0; 256], hue: [0; 180] };
+        jitter.reset(Key::new(0));
+        jitter
+    }
+
+    /// What every channel becomes before hue and saturation do.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    fn channels(&self, pixels: &[[u8; 3]]) -> [[u8; 256]; 3] {
+        let mut sums = [0u64; 3];
+        for pixel in pixels {
+            for (sum, &channel) in sums.iter_mut().zip(pixel) {
+                *sum += u64::from(channel);
+            }
+        }
+        sums.map(|sum| {
+            let mean = (sum as f64 / pixels.len().max(1) as f64) as f32 * self.brightness;
+            std::array::from_fn(|level| ((level as f32 * self.brightness - mean) * self.contrast + mean) as u8)
+        })
+    }
+}
+
+/// Hue in 180 steps, saturation and value in 256, of a colour. Reciprocals in 2⁻¹² stand for divisions, as in OpenCV.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+fn to_hsv([r, g, b]: [u8; 3]) -> [u8; 3] {
+    let (value, least) = (r.max(g).max(b), r.min(g).min(b));
+    let [r, g, b, value, range] = [r, g, b, value, value - least].map(i32::from);
+    let share = |part: i32, whole: i32, of: i32| {
+        let reciprocal = if whole == 0 { 0 } else { (f64::from(of << 12) / f64::from(whole)).round_ties_even() as i32 };
+        (part * reciprocal + (1 << 11)) >> 12
+    };
+    let turned = if value == r {
+        g - b
+    } else if value == g {
+        b - r + 2 * range
+    } else {
+        r - g + 4 * range
+    };
+    let hue = share(turned, range, 30);
+    [if hue < 0 { hue + 180 } else { hue } as u8, share(range, value, 255) as u8, value as u8]
+}
+
+/// The colour of hue in 180 steps, saturation and value in 256; rounded down, as in OpenCV.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+fn to_rgb([hue, saturation, value]: [u8; 3]) -> [u8; 3] {
+    let sector = hue / 30;
+    let part = f32::from(hue) * (6.0 / 180.0) - f32::from(sector);
+    let [saturation, value] = [saturation, value].map(|level| f32::from(level) * (1.0 / 255.0));
+    let level = |share: f32| (value * share * 255.0) as u8;
+    let (most, least) = (level(1.0), level(1.0 - saturation));
+    let (falling, rising) = (level(1.0 - saturation * part), level(1.0 - saturation * (1.0 - part)));
+    match sector {
+        0 => [most, rising, least],
+        1 => [falling, most, least],
+        2 => [least, most, rising],
+        3 => [least, falling, most],
+        4 => [rising, least, most],
+        _ => [most, least, falling],
+    }
+}
+
+impl VisualWrapper for ColorJitter {
+    fn id(&self) -> &'static str {
+        ENTRY.id
+    }
+
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    fn reset(&mut self, episode: Key) {
+        let mut rng = episode.rng();
+        let [brightness, contrast, saturation, hue] =
+            self.ranges.map(|[low, high]| (low + (high - low) * rng.random::<f64>()) as f32);
+        (self.brightness, self.contrast) = (brightness, contrast);
+        self.saturation = std::array::from_fn(|level| (level as f32 * saturation) as u8);
+        self.hue = std::array::from_fn(|step| (step as f32 + hue * 180.0).rem_euclid(180.0) as u8 % 180);
+    }
+
+    fn apply(&mut self, frame: &mut FrameMut<'_>, _view: View) {
+        let pixels = frame.rgb.as_chunks_mut::<3>().0;
+        let channels = self.channels(pixels);
+        let jitter = |[r, g, b]: [u8; 3]| {
+            let [hue, saturation, value] =
+                to_hsv([channels[0][r as usize], channels[1][g as usize], channels[2][b as usize]]);
+            to_rgb([self.hue[hue as usize], self.saturation[saturation as usize], value])
+        };
+        // Most pixels of a drawn world look like their neighbour.
+        let mut last = ([0; 3], jitter([0; 3]));
+        for pixel in pixels {
+            if *pixel != last.0 {
+                last = (*pixel, jitter(*pixel));
+            }
+            *pixel = last.1;
+        }
+    }
+
+    fn fork(&self) -> Box<dyn VisualWrapper> {
+        Box::new(self.clone())
+    }
+}

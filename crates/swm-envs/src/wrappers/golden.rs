@@ -1,0 +1,114 @@
+//! Every wrapper against the Python reference on one picture, `tests/golden/wrappers.npz`; what the reference drew at
+//! random is set here.
+
+use super::chroma_key::ChromaKey;
+use super::color_jitter::ColorJitter;
+use super::media::{Media, Picture};
+use super::moving_patch::Moving;
+use super::patch::{Patch, Rect};
+use super::random_conv::RandomConv;
+use super::{View, VisualWrapper, WRAPPERS};
+use npyz::npz::NpzArchive;
+use serde_json::{Map, Value};
+use std::fs::File;
+use std::io::BufReader;
+use swm_core::FrameMut;
+
+struct Golden(NpzArchive<BufReader<File>>);
+
+impl Golden {
+    fn picture(&mut self, name: &str) -> Picture {
+        let array = self.0.by_name(name).expect("a readable archive").expect("an array of this name");
+        let [height, width] = [0, 1].map(|axis| usize::try_from(array.shape()[axis]).expect("a size"));
+        Picture { width, height, rgb: array.into_vec().expect("bytes") }
+    }
+
+    fn cases(&mut self) -> Vec<Map<String, Value>> {
+        let text: Vec<String> = self.0.by_name("cases").expect("an archive").expect("cases").into_vec().expect("text");
+        serde_json::from_str(&text.concat()).expect("JSON")
+    }
+}
+
+fn floats(value: &Value) -> Vec<f64> {
+    match value {
+        Value::Array(values) => values.iter().flat_map(floats).collect(),
+        number => vec![number.as_f64().expect("a number")],
+    }
+}
+
+/// The largest mean and the largest single difference from the reference that a wrapper may show, of 255.
+fn tolerance(id: &str) -> (f64, u8) {
+    match id {
+        // Rounding of means that end in a half.
+        "resolution" | "chroma-key" => (0.05, 1),
+        // Products that come out just below a whole number with one way of multiplying and on it with another.
+        "color-jitter" => (0.01, 1),
+        _ => (0.0, 0),
+    }
+}
+
+#[test]
+fn wrappers_do_what_the_reference_does() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/wrappers.npz");
+    let mut golden = Golden(NpzArchive::open(path).expect("the golden file"));
+    let original = golden.picture("frame");
+    let (mut seen, mut wrong) = (std::collections::BTreeSet::new(), vec![]);
+    for (i, mut case) in golden.cases().into_iter().enumerate() {
+        let wanted = golden.picture(&format!("out_{i}"));
+        let what = format!("case {i}, {case:?}");
+        let id = case.remove("wrapper").expect("a wrapper").as_str().expect("a name").to_owned();
+        let drawn = case.remove("drawn").filter(|drawn| !drawn.is_null()).map(|drawn| floats(&drawn));
+        let step = case.remove("step").and_then(|step| step.as_u64()).expect("a step");
+        let Picture { width, height, mut rgb } = Picture { rgb: original.rgb.clone(), ..original };
+        let mut frame = FrameMut::new(width, height, &mut rgb);
+        match (id.as_str(), drawn) {
+            ("chroma-key", _) => {
+                let media = golden.picture(&format!("background_{}", case["media"].as_str().expect("a name")));
+                let key: Vec<u8> = serde_json::from_value(case["key_color"].clone()).expect("a colour");
+                let tolerance = case["tolerance"].as_f64().expect("a number");
+                ChromaKey::new(&key, Media::new(vec![media]), tolerance).apply(&mut frame, View::Step(step));
+            }
+            ("color-jitter", Some(drawn)) => {
+                let fixed: Vec<[f64; 2]> = drawn.iter().map(|&value| [value; 2]).collect();
+                let ranges = fixed.try_into().expect("four factors");
+                ColorJitter::new(ranges).apply(&mut frame, View::Step(step));
+            }
+            ("random-conv", Some(weights)) => {
+                let side = usize::try_from(case["kernel_size"].as_u64().expect("a size")).expect("a size");
+                let mut conv = RandomConv::new(side);
+                #[allow(clippy::cast_possible_truncation)]
+                conv.set(weights.iter().map(|&weight| weight as f32));
+                conv.apply(&mut frame, View::Step(step));
+            }
+            ("occlusion", Some(patches)) => {
+                let color: [u8; 3] = serde_json::from_value(case["color"].clone()).expect("a colour");
+                for patch in patches.as_chunks::<4>().0 {
+                    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+                    let [y, x, height, width] = patch.map(|v| v as usize);
+                    Rect { x, y, width, height }.fill(color, &mut frame);
+                }
+            }
+            ("moving-patch", Some(patches)) => {
+                for &[y, x, h, w, down, right] in patches.as_chunks::<6>().0 {
+                    let parts = [h / height as f64, w / width as f64];
+                    let place = [y / (height as f64 - h), x / (width as f64 - w)];
+                    let moving = Moving { patch: Patch { size: parts, place }, velocity: [down, right] };
+                    moving.rect(&frame, step).fill([255; 3], &mut frame);
+                }
+            }
+            (id, _) => {
+                let mut wrapper = WRAPPERS.get(id).expect("a wrapper").make(&case).expect("settings");
+                wrapper.apply(&mut frame, View::Step(step));
+            }
+        }
+        let apart: Vec<u8> = rgb.iter().zip(&wanted.rgb).map(|(a, b)| a.abs_diff(*b)).collect();
+        let (mean, most) = (apart.iter().map(|&d| f64::from(d)).sum::<f64>() / apart.len() as f64, apart.iter().max());
+        let (mean_allowed, most_allowed) = tolerance(&id);
+        if mean > mean_allowed || most > Some(&most_allowed) {
+            wrong.push(format!("{what}: mean {mean:.4}, most {most:?} of 255"));
+        }
+        seen.insert(id);
+    }
+    assert!(wrong.is_empty(), "{wrong:#?}");
+    assert_eq!(seen.len(), 8, "all but noise, cutout and random-shift are compared: {seen:?}");
+}

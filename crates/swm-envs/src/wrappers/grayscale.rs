@@ -1,0 +1,35 @@
+//! Luma in all three channels: `Y = 0.299 R + 0.587 G + 0.114 B`.
+//!
+//! No parameters. Source: `GrayscaleWrapper` of the reference, whose arithmetic (OpenCV's, weights in 2⁻¹⁵) is
+//! followed bit for bit. Deviation: pictures always have three channels, so there is no `keep_channels`.
+
+use super::{View, VisualWrapper, WrapperEntry};
+use swm_core::FrameMut;
+
+/// The registry row.
+pub const ENTRY: WrapperEntry = WrapperEntry {
+    id: "grayscale",
+    summary: "removes colour and keeps brightness",
+    parameters: &[],
+    build: |_| Ok(Box::new(Grayscale)),
+};
+
+struct Grayscale;
+
+impl VisualWrapper for Grayscale {
+    fn id(&self) -> &'static str {
+        ENTRY.id
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn apply(&mut self, frame: &mut FrameMut<'_>, _view: View) {
+        for pixel in frame.rgb.as_chunks_mut::<3>().0 {
+            let [r, g, b] = pixel.map(u32::from);
+            *pixel = [((r * 9798 + g * 19235 + b * 3735 + (1 << 14)) >> 15) as u8; 3];
+        }
+    }
+
+    fn fork(&self) -> Box<dyn VisualWrapper> {
+        Box::new(Self)
+    }
+}

@@ -1,0 +1,225 @@
+//! Pictures and videos that stand in for a background.
+//!
+//! A PNG file or a folder of them is read here; any other file (MP4, GIF, JPEG, …) by the `ffmpeg` program, once. What
+//! was read, and what it looks like in the sizes it was asked for, is shared by everybody who shows it.
+
+use super::resize::Resizer;
+use std::ffi::OsString;
+use std::io::BufReader;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use swm_core::{Error, Result};
+
+/// Bytes that the frames of one video may take in memory.
+const LIMIT: usize = 1 << 30;
+
+/// One frame: `[height, width, 3]` bytes, none of the sides 0.
+pub struct Picture {
+    pub width: usize,
+    pub height: usize,
+    pub rgb: Vec<u8>,
+}
+
+/// One frame or several, shown one after the other.
+pub struct Media {
+    frames: Vec<Picture>,
+    /// The sizes that somebody asked for.
+    sizes: Mutex<Vec<Arc<Sized>>>,
+}
+
+/// The frames of a [`Media`] in one size, each resized when it is first shown.
+pub struct Sized {
+    size: [usize; 2],
+    frames: Vec<OnceLock<Vec<u8>>>,
+}
+
+impl Media {
+    /// These frames, at least one.
+    pub fn new(frames: Vec<Picture>) -> Self {
+        Self { frames, sizes: Mutex::default() }
+    }
+
+    /// Reads a picture, a folder of pictures in the order of their names, or a video.
+    pub fn read(path: &Path) -> Result<Self> {
+        let frames = if path.is_dir() {
+            read_folder(path)?
+        } else if path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("png")) {
+            vec![read_png(path)?]
+        } else {
+            read_video(Path::new("ffmpeg"), path, LIMIT)?
+        };
+        Ok(Self::new(frames))
+    }
+
+    /// The frames for pictures of a size, `[width, height]`.
+    pub fn sized(&self, size: [usize; 2]) -> Arc<Sized> {
+        // Whoever panicked while it held the lock left a list that is still right.
+        let mut sizes = self.sizes.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(known) = sizes.iter().find(|known| known.size == size) {
+            return known.clone();
+        }
+        let new = Arc::new(Sized { size, frames: self.frames.iter().map(|_| OnceLock::new()).collect() });
+        sizes.push(new.clone());
+        new
+    }
+
+    /// The frame at a step, in the size of `sized`: the first at step 0, and again after the last.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn frame<'a>(&self, sized: &'a Sized, step: u64) -> &'a [u8] {
+        let index = (step % self.frames.len() as u64) as usize;
+        sized.frames[index].get_or_init(|| {
+            let Picture { width, height, rgb } = &self.frames[index];
+            let mut resized = vec![0; 3 * sized.size[0] * sized.size[1]];
+            Resizer::new([*width, *height], sized.size).run(rgb, &mut resized);
+            resized
+        })
+    }
+}
+
+impl Sized {
+    /// Whether it is for pictures of this size, `[width, height]`.
+    pub fn is_for(&self, size: [usize; 2]) -> bool {
+        self.size == size
+    }
+}
+
+fn read_folder(path: &Path) -> Result<Vec<Picture>> {
+    let fail = |source| Error::io(path, "listing pictures", source);
+    let mut files: Vec<PathBuf> = vec![];
+    for entry in std::fs::read_dir(path).map_err(fail)? {
+        let file = entry.map_err(fail)?.path();
+        if file.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("png")) {
+            files.push(file);
+        }
+    }
+    files.sort();
+    if files.is_empty() {
+        return Err(Error::corrupt(path, "no PNG file in this folder", "give a folder of PNG files, a PNG or a video"));
+    }
+    files.iter().map(|file| read_png(file)).collect()
+}
+
+/// Reads a PNG of any kind: grey is repeated, 16 bits become 8, transparency is dropped.
+fn read_png(path: &Path) -> Result<Picture> {
+    let damaged = |error: png::DecodingError| Error::corrupt(path, error.to_string(), "give a PNG file that opens");
+    let file = std::fs::File::open(path).map_err(|source| Error::io(path, "opening a picture", source))?;
+    let mut decoder = png::Decoder::new(BufReader::new(file));
+    decoder.set_transformations(png::Transformations::EXPAND | png::Transformations::STRIP_16);
+    let mut reader = decoder.read_info().map_err(damaged)?;
+    let (width, height) = (reader.info().width as usize, reader.info().height as usize);
+    let bytes = reader.output_buffer_size().filter(|&bytes| bytes <= LIMIT);
+    let Some(bytes) = bytes else { return Err(too_large(path)) };
+    let mut pixels = vec![0; bytes];
+    reader.next_frame(&mut pixels).map_err(damaged)?;
+    let channels = reader.output_color_type().0.samples();
+    let rgb = pixels
+        .chunks_exact(channels)
+        .flat_map(|pixel| if channels < 3 { [pixel[0]; 3] } else { [pixel[0], pixel[1], pixel[2]] })
+        .collect();
+    Ok(Picture { width, height, rgb })
+}
+
+fn too_large(path: &Path) -> Error {
+    let problem = format!("its frames take more than {} MiB in memory", LIMIT >> 20);
+    Error::corrupt(path, problem, "shorten or shrink it: ffmpeg -i IN -t 10 -vf scale=256:-2 OUT.mp4")
+}
+
+/// Decodes all frames of a file. They come as PPM pictures, which say their own size.
+fn read_video(program: &Path, path: &Path, limit: usize) -> Result<Vec<Picture>> {
+    if let Err(source) = std::fs::metadata(path) {
+        return Err(Error::io(path, "opening a picture or video", source));
+    }
+    // `file:` keeps a name with a colon from being read as a protocol.
+    let mut input = OsString::from("file:");
+    input.push(path);
+    let output = Command::new(program)
+        .args(["-nostdin", "-hide_banner", "-loglevel", "error", "-i"])
+        .arg(input)
+        // Every frame once, however long it is to be shown.
+        .args(["-an", "-vf", "settb=1/25,setpts=N", "-r", "25", "-fs", &limit.to_string()])
+        .args(["-f", "image2pipe", "-c:v", "ppm", "-pix_fmt", "rgb24", "pipe:1"])
+        .stdin(Stdio::null())
+        .output()
+        .map_err(|source| match source.kind() {
+            std::io::ErrorKind::NotFound => Error::external(
+                format!("reading {}", path.display()),
+                format!(
+                    "the program '{}' was not found; install FFmpeg (`apt-get install ffmpeg`, `brew install ffmpeg`) \
+                     or give a PNG file or a folder of them",
+                    program.display()
+                ),
+            ),
+            _ => Error::io(program, "starting ffmpeg", source),
+        })?;
+    if output.stdout.len() >= limit {
+        return Err(too_large(path));
+    }
+    let frames = read_ppm(&output.stdout);
+    if !output.status.success() || frames.is_empty() {
+        let log = String::from_utf8_lossy(&output.stderr);
+        let problem = log.lines().rfind(|line| !line.trim().is_empty()).unwrap_or("it shows no frame").to_owned();
+        return Err(Error::corrupt(path, problem, "give a picture or a video that ffmpeg can decode"));
+    }
+    Ok(frames)
+}
+
+/// The pictures of a stream of binary PPM files, up to the first that is not whole.
+fn read_ppm(mut stream: &[u8]) -> Vec<Picture> {
+    let mut frames = vec![];
+    while let Some((width, height, rest)) = ppm_header(stream) {
+        let Some((rgb, rest)) = rest.split_at_checked(3 * width * height) else { break };
+        frames.push(Picture { width, height, rgb: rgb.to_vec() });
+        stream = rest;
+    }
+    frames
+}
+
+/// Width, height and what follows the header `P6 WIDTH HEIGHT 255`.
+fn ppm_header(stream: &[u8]) -> Option<(usize, usize, &[u8])> {
+    let mut rest = stream;
+    let mut word = || {
+        let end = rest.iter().position(u8::is_ascii_whitespace)?;
+        let (word, after) = rest.split_at(end);
+        rest = &after[1..];
+        std::str::from_utf8(word).ok()
+    };
+    if word()? != "P6" {
+        return None;
+    }
+    let (width, height) = (word()?.parse().ok()?, word()?.parse().ok()?);
+    (word()? == "255" && width > 0 && height > 0).then_some((width, height, rest))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_follow_each_other_in_a_stream() {
+        let frames = read_ppm(b"P6\n1 2\n255\nabcdefP6\n2 1\n255\nABCDEFP6\n9 9\n255\ncut off");
+        let found: Vec<_> = frames.iter().map(|f| (f.width, f.height, &f.rgb[..])).collect();
+        assert_eq!(found, [(1, 2, &b"abcdef"[..]), (2, 1, b"ABCDEF")]);
+        assert!(read_ppm(b"P5\n1 1\n255\nabc").is_empty());
+    }
+
+    #[test]
+    fn a_video_without_ffmpeg_or_without_end_is_refused_in_words() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("a.mp4");
+        let message = |program: &str| read_video(Path::new(program), &path, LIMIT).err().expect("fails").to_string();
+        assert!(message("ffmpeg").contains("a.mp4"));
+        std::fs::write(&path, b"no video").expect("a file");
+        assert!(message("no-such-ffmpeg").contains("install FFmpeg"), "{}", message("no-such-ffmpeg"));
+        assert!(too_large(&path).to_string().contains("1024 MiB"));
+    }
+
+    #[test]
+    fn a_media_is_resized_once_a_size_and_repeats() {
+        let frame = |v| Picture { width: 2, height: 1, rgb: vec![v; 6] };
+        let media = Media::new(vec![frame(1), frame(2)]);
+        let sized = media.sized([3, 3]);
+        assert!(Arc::ptr_eq(&sized, &media.sized([3, 3])));
+        assert_eq!([0, 1, 2, 5].map(|step| media.frame(&sized, step)[26]), [1, 2, 1, 2]);
+    }
+}

@@ -1,0 +1,124 @@
+//! Rectangles that drift over the picture and bounce off its edges.
+//!
+//! | parameter | unit | default | range |
+//! | --- | --- | --- | --- |
+//! | `num_patches` | rectangles | 1 | 0 to 256 |
+//! | `size` | height, and independently width, as a part of the picture's; drawn uniformly | 0.1/0.2 | 0 to 1 |
+//! | `color` | red/green/blue, or one number for all | 255 | 0 to 255 |
+//! | `speed` | pixels a step | 2 | 0 to 1000 |
+//!
+//! Place and direction are drawn at the beginning of an episode, uniformly. In the picture of the goal the rectangles
+//! stand where they began. Source: `MovingPatchWrapper` of the reference, whose bouncing step by step is here a formula
+//! of the step: the same way as long as `speed` is below the room a rectangle has.
+
+use super::patch::{Patch, Rect};
+use super::settings::{Color, Domain, Ends, Parameter};
+use super::{View, VisualWrapper, WrapperEntry, typed};
+use rand::Rng as _;
+use serde::Deserialize;
+use swm_core::{FrameMut, Key};
+
+/// The registry row.
+pub const ENTRY: WrapperEntry = WrapperEntry {
+    id: "moving-patch",
+    summary: "lays rectangles over the picture that drift and bounce off its edges",
+    parameters: &[
+        Parameter {
+            name: "num_patches",
+            summary: "how many rectangles",
+            domain: Domain::Integer { low: 0, high: 256 },
+            default: Some("1"),
+        },
+        Parameter {
+            name: "size",
+            summary: "height and width, as parts of the picture's",
+            domain: Domain::Range { low: 0.0, high: 1.0 },
+            default: Some("0.1/0.2"),
+        },
+        Parameter { name: "color", summary: "what they show", domain: Domain::Color, default: Some("255") },
+        Parameter {
+            name: "speed",
+            summary: "pixels a step",
+            domain: Domain::Number { low: 0.0, high: 1000.0 },
+            default: Some("2"),
+        },
+    ],
+    build: |settings| {
+        let Settings { num_patches, size, color, speed } = typed(ENTRY.id, settings)?;
+        Ok(Box::new(MovingPatch { num_patches, size: size.range(), color: color.rgb(), speed, patches: vec![] }))
+    },
+};
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Settings {
+    num_patches: usize,
+    size: Ends,
+    color: Color,
+    speed: f64,
+}
+
+#[derive(Clone)]
+struct MovingPatch {
+    num_patches: usize,
+    size: [f64; 2],
+    color: [u8; 3],
+    speed: f64,
+    patches: Vec<Moving>,
+}
+
+/// A patch and its velocity, downwards and to the right, in pixels a step.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Moving {
+    pub patch: Patch,
+    pub velocity: [f64; 2],
+}
+
+impl Moving {
+    /// Where it lies after some steps.
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub fn rect(&self, frame: &FrameMut<'_>, step: u64) -> Rect {
+        let [height, width] = self.patch.pixels(frame);
+        let free = [frame.height.saturating_sub(height) as f64, frame.width.saturating_sub(width) as f64];
+        let along = |side: usize| {
+            let way = self.patch.place[side] * free[side] + self.velocity[side] * step as f64;
+            bounce(way, free[side]) as usize
+        };
+        Rect { x: along(1), y: along(0), width, height }
+    }
+}
+
+/// Where somebody who walked `way` from 0 is who turns around at 0 and at `end`.
+fn bounce(way: f64, end: f64) -> f64 {
+    if end <= 0.0 {
+        return 0.0;
+    }
+    let way = way.rem_euclid(2.0 * end);
+    if way > end { 2.0 * end - way } else { way }
+}
+
+impl VisualWrapper for MovingPatch {
+    fn id(&self) -> &'static str {
+        ENTRY.id
+    }
+
+    fn reset(&mut self, episode: Key) {
+        let mut rng = episode.rng();
+        self.patches.clear();
+        self.patches.extend((0..self.num_patches).map(|_| {
+            let patch = Patch::draw(self.size, &mut rng);
+            let (sin, cos) = (std::f64::consts::TAU * rng.random::<f64>()).sin_cos();
+            Moving { patch, velocity: [self.speed * sin, self.speed * cos] }
+        }));
+    }
+
+    fn apply(&mut self, frame: &mut FrameMut<'_>, view: View) {
+        for patch in &self.patches {
+            patch.rect(frame, view.step()).fill(self.color, frame);
+        }
+    }
+
+    fn fork(&self) -> Box<dyn VisualWrapper> {
+        Box::new(self.clone())
+    }
+}

@@ -1,0 +1,163 @@
+//! Pixel noise, drawn anew for every picture.
+//!
+//! **Gaussian**: every channel of every pixel gains a draw from N(0, `std`²), is clipped to 0 ..= 255 and rounded
+//! down. **Salt and pepper**: a part `amount` of the pixels becomes white or black, with equal chance.
+//!
+//! | parameter | unit | default | range |
+//! | --- | --- | --- | --- |
+//! | `kind` | | `gaussian` | `gaussian`, `salt-pepper` |
+//! | `std` | levels of 255; number or schedule | 10 | 0 to 255 |
+//! | `amount` | part of the pixels; number or schedule | 0.05 | 0 to 1 |
+//!
+//! Source: `NoiseWrapper` of the reference (Gaussian with a schedule); the paper's table adds salt and pepper, for
+//! which `amount` is the usual measure. Deviations: a schedule counts the steps of the episode, where the reference
+//! counts all steps since the wrapper was made; Gaussian draws are the centres of 8192 equally likely slices, so
+//! none lies beyond 3.8 standard deviations.
+
+use super::settings::{Domain, Parameter, Schedule};
+use super::{View, VisualWrapper, WrapperEntry, gaussian, typed};
+use serde::Deserialize;
+use std::sync::LazyLock;
+use swm_core::{FrameMut, Key};
+
+/// The registry row.
+pub const ENTRY: WrapperEntry = WrapperEntry {
+    id: "noise",
+    summary: "adds Gaussian or salt-and-pepper noise, anew in every picture",
+    parameters: &[
+        Parameter {
+            name: "kind",
+            summary: "the noise",
+            domain: Domain::Choice(&["gaussian", "salt-pepper"]),
+            default: Some("gaussian"),
+        },
+        Parameter {
+            name: "std",
+            summary: "standard deviation of Gaussian noise, levels of 255",
+            domain: Domain::Schedule { low: 0.0, high: 255.0 },
+            default: Some("10"),
+        },
+        Parameter {
+            name: "amount",
+            summary: "part of the pixels that salt and pepper replace",
+            domain: Domain::Schedule { low: 0.0, high: 1.0 },
+            default: Some("0.05"),
+        },
+    ],
+    build: |settings| {
+        let settings: Settings = typed(ENTRY.id, settings)?;
+        Ok(Box::new(Noise { settings, episode: Key::new(0), table: vec![], of: f64::NAN }))
+    },
+};
+
+#[derive(Clone, Copy, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Settings {
+    kind: Kind,
+    std: Schedule,
+    amount: Schedule,
+}
+
+#[derive(Clone, Copy, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+enum Kind {
+    Gaussian,
+    SaltPepper,
+}
+
+/// Slices of the normal distribution; a power of 2.
+const SLICES: usize = 8192;
+
+/// The centres of the slices, scaled to a variance of 1 (slicing loses 0.1 %).
+static STANDARD: LazyLock<Vec<f64>> = LazyLock::new(|| {
+    #[allow(clippy::cast_precision_loss)]
+    let mut centres: Vec<f64> = (0..SLICES).map(|i| gaussian::quantile((i as f64 + 0.5) / SLICES as f64)).collect();
+    #[allow(clippy::cast_precision_loss)]
+    let deviation = (centres.iter().map(|z| z * z).sum::<f64>() / SLICES as f64).sqrt();
+    centres.iter_mut().for_each(|z| *z /= deviation);
+    centres
+});
+
+#[derive(Clone)]
+struct Noise {
+    settings: Settings,
+    episode: Key,
+    /// What the slices add to a channel, for one standard deviation.
+    table: Vec<i16>,
+    /// The standard deviation the table is for.
+    of: f64,
+}
+
+/// A generator whose state is a counter (SplitMix64): a picture takes tens of thousands of draws.
+struct Counter(u64);
+
+impl Counter {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+}
+
+impl Noise {
+    /// Rounding down after adding is adding what is rounded down, because channels are whole numbers.
+    #[allow(clippy::cast_possible_truncation)]
+    fn gaussian(&mut self, rgb: &mut [u8], std: f64, mut random: Counter) {
+        if std <= 0.0 {
+            return;
+        }
+        if self.of.to_bits() != std.to_bits() {
+            self.table.clear();
+            self.table.extend(STANDARD.iter().map(|z| (z * std).floor() as i16));
+            self.of = std;
+        }
+        // A table of known length needs no check of its indices.
+        let Some(table) = self.table.first_chunk::<SLICES>() else { return };
+        for channels in rgb.chunks_mut(4) {
+            let mut bits = random.next();
+            for channel in channels {
+                *channel = (i16::from(*channel) + table[bits as usize % SLICES]).clamp(0, 255) as u8;
+                bits >>= 16;
+            }
+        }
+    }
+}
+
+/// A pixel is hit when a uniform number of 32 bits is below the amount; which colour it gets is the half it hit.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+fn salt_pepper(rgb: &mut [u8], amount: f64, mut random: Counter) {
+    let below = (amount * 2f64.powi(32)).round() as u64;
+    for pixels in rgb.chunks_mut(6) {
+        let mut bits = random.next();
+        for pixel in pixels.as_chunks_mut::<3>().0 {
+            let draw = bits & 0xffff_ffff;
+            if draw < below {
+                *pixel = [if 2 * draw < below { 0 } else { 255 }; 3];
+            }
+            bits >>= 32;
+        }
+    }
+}
+
+impl VisualWrapper for Noise {
+    fn id(&self) -> &'static str {
+        ENTRY.id
+    }
+
+    fn reset(&mut self, episode: Key) {
+        self.episode = episode;
+    }
+
+    fn apply(&mut self, frame: &mut FrameMut<'_>, view: View) {
+        let random = Counter(view.key(self.episode).seed());
+        match self.settings.kind {
+            Kind::Gaussian => self.gaussian(frame.rgb, self.settings.std.at(view.step()), random),
+            Kind::SaltPepper => salt_pepper(frame.rgb, self.settings.amount.at(view.step()), random),
+        }
+    }
+
+    fn fork(&self) -> Box<dyn VisualWrapper> {
+        Box::new(self.clone())
+    }
+}

@@ -1,0 +1,128 @@
+//! A random linear filter from three channels to three, drawn at the beginning of an episode.
+//!
+//! Every channel of the result is the sum, over a window of `kernel_size`² pixels and the three channels, of the picture
+//! times weights from N(0, 1 / (3 kernel_size²)), clipped to 0 ..= 255 and rounded down; edges are mirrored.
+//!
+//! | parameter | unit | default | range |
+//! | --- | --- | --- | --- |
+//! | `kernel_size` | pixels; even numbers mean the next odd one | 3 | 1 to 15 |
+//!
+//! Source: `RandomConvWrapper` of the reference (Lee et al. 2020, "Network Randomization"). Nothing is normalised, so
+//! about one channel in two is black in places, as there.
+
+use super::border::mirror;
+use super::settings::{Domain, Parameter};
+use super::{View, VisualWrapper, WrapperEntry, gaussian, typed};
+use rand::Rng as _;
+use serde::Deserialize;
+use swm_core::{FrameMut, Key};
+
+/// The registry row.
+pub const ENTRY: WrapperEntry = WrapperEntry {
+    id: "random-conv",
+    summary: "passes the picture through a random filter, one an episode",
+    parameters: &[Parameter {
+        name: "kernel_size",
+        summary: "side of the window, pixels; even numbers mean the next odd one",
+        domain: Domain::Integer { low: 1, high: 15 },
+        default: Some("3"),
+    }],
+    build: |settings| {
+        let Settings { kernel_size } = typed(ENTRY.id, settings)?;
+        Ok(Box::new(RandomConv::new(kernel_size | 1)))
+    },
+};
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Settings {
+    kernel_size: usize,
+}
+
+/// Pixels computed together.
+const BLOCK: usize = 8;
+
+#[derive(Clone)]
+pub(super) struct RandomConv {
+    side: usize,
+    /// What the three results take from a channel of a place of the window, `[row, channel, column]`.
+    weights: Vec<[f32; 3]>,
+    /// Every row of the picture, a channel after the other, with its mirrored surroundings.
+    planes: Vec<f32>,
+}
+
+impl RandomConv {
+    pub fn new(side: usize) -> Self {
+        let mut conv = Self { side, weights: vec![[0.0; 3]; 3 * side * side], planes: vec![] };
+        conv.reset(Key::new(0));
+        conv
+    }
+
+    /// Sets the weights, `[result, row, column, channel]`.
+    pub fn set(&mut self, weights: impl Iterator<Item = f32>) {
+        let side = self.side;
+        for (i, weight) in weights.enumerate() {
+            let [result, row, column, channel] = [i / (3 * side * side), i / (3 * side) % side, i / 3 % side, i % 3];
+            self.weights[(row * 3 + channel) * side + column][result] = weight;
+        }
+    }
+}
+
+impl VisualWrapper for RandomConv {
+    fn id(&self) -> &'static str {
+        ENTRY.id
+    }
+
+    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+    fn reset(&mut self, episode: Key) {
+        let mut rng = episode.rng();
+        let n = 3 * self.side * self.side;
+        let deviation = (1.0 / n as f64).sqrt();
+        self.set((0..3 * n).map(|_| (deviation * gaussian::quantile(rng.sample(rand::distr::Open01))) as f32));
+    }
+
+    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, clippy::cast_sign_loss)]
+    fn apply(&mut self, frame: &mut FrameMut<'_>, _view: View) {
+        let (width, height, side) = (frame.width, frame.height, self.side);
+        if width == 0 || height == 0 {
+            return;
+        }
+        let radius = side / 2;
+        let stride = width.next_multiple_of(BLOCK) + 2 * radius;
+        self.planes.resize(3 * stride * height, 0.0);
+        let rows = frame.rgb.as_chunks::<3>().0.chunks_exact(width);
+        for (row, planes) in rows.zip(self.planes.chunks_exact_mut(3 * stride)) {
+            for (channel, plane) in planes.chunks_exact_mut(stride).enumerate() {
+                for (x, value) in plane[..width + 2 * radius].iter_mut().enumerate() {
+                    let inside = x.wrapping_sub(radius);
+                    let from = if inside < width { inside } else { mirror(inside as isize, width) };
+                    *value = f32::from(row[from][channel]);
+                }
+            }
+        }
+        let planes = &self.planes;
+        for (y, row) in frame.rgb.as_chunks_mut::<3>().0.chunks_exact_mut(width).enumerate() {
+            for (start, pixels) in (0..).step_by(BLOCK).zip(row.chunks_mut(BLOCK)) {
+                let mut sums = [[0.0f32; BLOCK]; 3];
+                for (line, weights) in self.weights.chunks_exact(side).enumerate() {
+                    let (from, channel) = (mirror((y + line / 3) as isize - radius as isize, height), line % 3);
+                    let plane = &planes[(3 * from + channel) * stride + start..][..BLOCK + side - 1];
+                    for (values, weights) in plane.array_windows::<BLOCK>().zip(weights) {
+                        for (sums, weight) in sums.iter_mut().zip(weights) {
+                            for (sum, value) in sums.iter_mut().zip(values) {
+                                *sum += weight * value;
+                            }
+                        }
+                    }
+                }
+                for (i, pixel) in pixels.iter_mut().enumerate() {
+                    *pixel = [0, 1, 2].map(|result| sums[result][i] as u8);
+                }
+            }
+        }
+    }
+
+    fn fork(&self) -> Box<dyn VisualWrapper> {
+        Box::new(self.clone())
+    }
+}

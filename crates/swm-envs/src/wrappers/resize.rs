@@ -1,0 +1,111 @@
+//! Pictures in another size, every pixel the mean of what it covers (OpenCV's area interpolation).
+
+/// What one pixel of the result takes from a line of the source: the first pixel, and the weights of it and those
+/// that follow, which add up to 1.
+#[derive(Clone)]
+struct Tap {
+    first: usize,
+    weights: Vec<f32>,
+}
+
+/// How a picture of one size becomes one of another size. Shrinking takes the mean of the covered area. Growing along
+/// a side blends the two pixels that a pixel of the result touches, by how far it reaches into them.
+#[derive(Clone)]
+pub struct Resizer {
+    from: [usize; 2],
+    to: [usize; 2],
+    columns: Vec<Tap>,
+    rows: Vec<Tap>,
+    /// One row of the result before its pixels are taken together: as wide as the source.
+    line: Vec<f32>,
+}
+
+impl Resizer {
+    /// Between two sizes, `[width, height]`, none of them 0.
+    pub fn new(from: [usize; 2], to: [usize; 2]) -> Self {
+        let taps = if (0..2).all(|side| from[side] >= to[side]) { shrinking } else { growing };
+        let [columns, rows] = [0, 1].map(|side| taps(from[side], to[side]));
+        Self { from, to, columns, rows, line: vec![0.0; 3 * from[0]] }
+    }
+
+    /// Whether it is for these sizes.
+    pub fn is_for(&self, from: [usize; 2], to: [usize; 2]) -> bool {
+        self.from == from && self.to == to
+    }
+
+    /// Resizes RGB bytes.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub fn run(&mut self, source: &[u8], result: &mut [u8]) {
+        let stride = self.line.len();
+        for (row, result) in self.rows.iter().zip(result.chunks_exact_mut(3 * self.to[0])) {
+            self.line.fill(0.0);
+            for (source, weight) in source.chunks_exact(stride).skip(row.first).zip(&row.weights) {
+                for (sum, &channel) in self.line.iter_mut().zip(source) {
+                    *sum += weight * f32::from(channel);
+                }
+            }
+            let line = self.line.as_chunks::<3>().0;
+            for (column, pixel) in self.columns.iter().zip(result.as_chunks_mut::<3>().0) {
+                let mut sum = [0.5; 3];
+                for (source, weight) in line[column.first..].iter().zip(&column.weights) {
+                    for (sum, channel) in sum.iter_mut().zip(source) {
+                        *sum += weight * channel;
+                    }
+                }
+                *pixel = sum.map(|channel| channel as u8);
+            }
+        }
+    }
+}
+
+#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+fn shrinking(from: usize, to: usize) -> Vec<Tap> {
+    let scale = from as f64 / to as f64;
+    let tap = |i: usize| {
+        let (start, end) = (i as f64 * scale, ((i + 1) as f64 * scale).min(from as f64));
+        let first = start as usize;
+        // Slivers that rounding leaves of a neighbour would be noise.
+        let last = ((end - 1e-3).ceil() as usize).clamp(first + 1, from);
+        let covered = |pixel: usize| (end.min((pixel + 1) as f64) - start.max(pixel as f64)) / (end - start);
+        Tap { first, weights: (first..last).map(|pixel| covered(pixel) as f32).collect() }
+    };
+    (0..to).map(tap).collect()
+}
+
+#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+fn growing(from: usize, to: usize) -> Vec<Tap> {
+    let scale = from as f64 / to as f64;
+    let tap = |i: usize| {
+        let first = ((i as f64 * scale) as usize).min(from - 1);
+        let reach = (i + 1) as f64 - (first + 1) as f64 / scale;
+        let part = if reach <= 0.0 { 0.0 } else { reach.fract() as f32 };
+        let weights = if part > 0.0 && first + 1 < from { vec![1.0 - part, part] } else { vec![1.0] };
+        Tap { first, weights }
+    };
+    (0..to).map(tap).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn resized(red: &[u8], from: [usize; 2], to: [usize; 2]) -> Vec<u8> {
+        let source: Vec<u8> = red.iter().flat_map(|&v| [v, 0, 9]).collect();
+        let mut result = vec![0; 3 * to[0] * to[1]];
+        Resizer::new(from, to).run(&source, &mut result);
+        result.as_chunks::<3>().0.iter().map(|&[r, _, b]| if b == 9 { r } else { panic!("mixed channels") }).collect()
+    }
+
+    #[test]
+    fn shrinking_is_the_mean_of_what_is_covered() {
+        assert_eq!(resized(&[0, 100, 200, 40], [4, 1], [2, 1]), [50, 120]);
+        assert_eq!(resized(&[0, 90, 240], [3, 1], [2, 1]), [30, 190]);
+        assert_eq!(resized(&[10, 30, 50, 110], [2, 2], [1, 1]), [50]);
+    }
+
+    #[test]
+    fn growing_keeps_the_values() {
+        assert_eq!(resized(&[7, 9], [1, 2], [3, 2]), [7, 7, 7, 9, 9, 9]);
+        assert_eq!(resized(&[0, 200], [2, 1], [4, 1]), [0, 0, 200, 200]);
+    }
+}

@@ -1,0 +1,83 @@
+//! Fewer pixels: the picture shrunk to `scale` of its size and shown at its old size, each pixel a block.
+//!
+//! | parameter | unit | default | range |
+//! | --- | --- | --- | --- |
+//! | `scale` | part of width and height; the sides are rounded and at least 1 | 0.5 | 0 to 1 |
+//!
+//! Source: `ResolutionWrapper` of the reference (area interpolation down, nearest neighbour up). Deviation: no
+//! `scale` above 1, which changes nothing but time.
+
+use super::resize::Resizer;
+use super::settings::{Domain, Parameter};
+use super::{View, VisualWrapper, WrapperEntry, typed};
+use serde::Deserialize;
+use swm_core::FrameMut;
+
+/// The registry row.
+pub const ENTRY: WrapperEntry = WrapperEntry {
+    id: "resolution",
+    summary: "shrinks the picture and shows it at its old size in blocks",
+    parameters: &[Parameter {
+        name: "scale",
+        summary: "part of width and height that is kept",
+        domain: Domain::Number { low: 0.0, high: 1.0 },
+        default: Some("0.5"),
+    }],
+    build: |settings| {
+        let Settings { scale } = typed(ENTRY.id, settings)?;
+        Ok(Box::new(Resolution { scale, resizer: None, small: vec![] }))
+    },
+};
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Settings {
+    scale: f64,
+}
+
+#[derive(Clone)]
+struct Resolution {
+    scale: f64,
+    resizer: Option<Resizer>,
+    small: Vec<u8>,
+}
+
+impl VisualWrapper for Resolution {
+    fn id(&self) -> &'static str {
+        ENTRY.id
+    }
+
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn apply(&mut self, frame: &mut FrameMut<'_>, _view: View) {
+        let from = [frame.width, frame.height];
+        if from.contains(&0) {
+            return;
+        }
+        let to = from.map(|side| ((side as f64 * self.scale).round_ties_even() as usize).max(1));
+        let resizer = match &mut self.resizer {
+            Some(resizer) if resizer.is_for(from, to) => resizer,
+            other => other.insert(Resizer::new(from, to)),
+        };
+        self.small.resize(3 * to[0] * to[1], 0);
+        resizer.run(frame.rgb, &mut self.small);
+        let small = self.small.as_chunks::<3>().0;
+        let stride = 3 * from[0];
+        let mut drawn = None;
+        for y in 0..from[1] {
+            let source = y * to[1] / from[1];
+            if drawn == Some(source) {
+                frame.rgb.copy_within(stride * (y - 1)..stride * y, stride * y);
+                continue;
+            }
+            drawn = Some(source);
+            let line = &small[source * to[0]..][..to[0]];
+            for (x, pixel) in frame.rgb[stride * y..][..stride].as_chunks_mut::<3>().0.iter_mut().enumerate() {
+                *pixel = line[x * to[0] / from[0]];
+            }
+        }
+    }
+
+    fn fork(&self) -> Box<dyn VisualWrapper> {
+        Box::new(self.clone())
+    }
+}

@@ -1,0 +1,172 @@
+//! [`Wrapped`]: an environment whose pictures pass through visual wrappers.
+
+use super::{View, VisualWrapper, parse};
+use swm_core::{
+    Action, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, RowMut, RowRef, Snapshot,
+    Transition,
+};
+
+/// What wrappers do to the picture of the goal.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum GoalPicture {
+    /// Nothing, as in the reference, whose wrappers change what is seen on the way and leave the goal as it was
+    /// recorded or drawn. The default: results compare with the reference's.
+    #[default]
+    Clean,
+    /// What they do to all others: start and goal then differ by where things are, not by how they look.
+    Wrapped,
+}
+
+/// Wrappers in the order they are applied, to be put around any number of environments.
+#[derive(Default)]
+pub struct Stack(Vec<Box<dyn VisualWrapper>>);
+
+impl Stack {
+    /// These wrappers.
+    pub fn new(wrappers: Vec<Box<dyn VisualWrapper>>) -> Self {
+        Self(wrappers)
+    }
+
+    /// Reads `noise,std=8`, `blur` and so on. Files are read once, however many environments are wrapped.
+    ///
+    /// # Errors
+    /// When a wrapper or a parameter is unknown, a value is not allowed, or a file cannot be read.
+    pub fn parse<S: AsRef<str>>(texts: &[S]) -> Result<Self> {
+        texts.iter().map(|text| parse(text.as_ref())).collect::<Result<_>>().map(Self)
+    }
+
+    /// Whether there is no wrapper.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// The environment with these wrappers around it; itself where there is none.
+    pub fn wrap(&self, env: Box<dyn Env>, goal: GoalPicture) -> Box<dyn Env> {
+        if self.is_empty() {
+            return env;
+        }
+        Box::new(Wrapped::new(env, self.0.iter().map(|wrapper| wrapper.fork()).collect(), goal))
+    }
+}
+
+/// An environment whose pictures pass through wrappers, first to last. Everything else is the environment's own.
+///
+/// Steps are counted from the last reset or [`Env::restore_from`]; randomness comes from the seed of the last reset.
+/// Both are part of the snapshot.
+pub struct Wrapped {
+    env: Box<dyn Env>,
+    wrappers: Vec<Box<dyn VisualWrapper>>,
+    goal: GoalPicture,
+    seed: u64,
+    step: u64,
+}
+
+impl Wrapped {
+    /// Puts wrappers around an environment.
+    pub fn new(env: Box<dyn Env>, wrappers: Vec<Box<dyn VisualWrapper>>, goal: GoalPicture) -> Self {
+        let mut wrapped = Self { env, wrappers, goal, seed: 0, step: 0 };
+        wrapped.begin(0, 0);
+        wrapped
+    }
+
+    /// The wrappers are those of an episode after some steps. All they need for it is its key.
+    fn begin(&mut self, seed: u64, step: u64) {
+        (self.seed, self.step) = (seed, step);
+        let episode = Key::new(seed).with("wrapper");
+        for (wrapper, place) in self.wrappers.iter_mut().zip(0..) {
+            wrapper.reset(episode.at(place));
+        }
+    }
+
+    fn apply(&mut self, frame: &mut FrameMut<'_>, view: View) {
+        for wrapper in &mut self.wrappers {
+            wrapper.apply(frame, view);
+        }
+    }
+
+    /// What snapshots of this stack begin with.
+    fn tag(&self) -> Vec<u8> {
+        let ids: Vec<&str> = self.wrappers.iter().map(|wrapper| wrapper.id()).collect();
+        format!("wrapped[{}]", ids.join(",")).into_bytes()
+    }
+}
+
+impl Env for Wrapped {
+    fn spec(&self) -> &EnvSpec {
+        self.env.spec()
+    }
+
+    fn reset(&mut self, seed: u64, options: &ResetOptions) -> Result<()> {
+        self.env.reset(seed, options)?;
+        self.begin(seed, 0);
+        Ok(())
+    }
+
+    fn step(&mut self, action: Action<'_>) -> Result<Transition> {
+        let transition = self.env.step(action)?;
+        self.step += 1;
+        Ok(transition)
+    }
+
+    fn observe(&self, row: &mut RowMut<'_>) {
+        self.env.observe(row);
+    }
+
+    fn render(&mut self, mut frame: FrameMut<'_>) {
+        self.env.render(FrameMut { rgb: &mut *frame.rgb, ..frame });
+        self.apply(&mut frame, View::Step(self.step));
+    }
+
+    fn render_goal(&mut self, mut frame: FrameMut<'_>) {
+        self.env.render_goal(FrameMut { rgb: &mut *frame.rgb, ..frame });
+        if self.goal == GoalPicture::Wrapped {
+            self.apply(&mut frame, View::Goal);
+        }
+    }
+
+    fn factors(&self) -> &FactorValues {
+        self.env.factors()
+    }
+
+    fn snapshot(&self) -> Snapshot {
+        let mut bytes = self.tag();
+        bytes.extend(self.seed.to_le_bytes());
+        bytes.extend(self.step.to_le_bytes());
+        bytes.extend(self.env.snapshot().0);
+        Snapshot(bytes)
+    }
+
+    fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
+        let tag = self.tag();
+        let body = snapshot.0.strip_prefix(&tag[..]).and_then(|rest| rest.split_at_checked(16));
+        let Some((numbers, inner)) = body else {
+            return Err(Error::mismatch(
+                "restoring a snapshot",
+                "one of an environment without wrappers, or with other ones",
+                format!("one of {} {}", self.spec().id, String::from_utf8_lossy(&tag)),
+            ));
+        };
+        self.env.restore(&Snapshot(inner.to_vec()))?;
+        let [seed, step] = [0, 1].map(|i| u64::from_le_bytes(numbers.as_chunks().0[i]));
+        self.begin(seed, step);
+        Ok(())
+    }
+
+    fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()> {
+        self.env.restore_from(start, goal)?;
+        self.step = 0;
+        Ok(())
+    }
+
+    fn sample_goal(&mut self, key: Key) -> Result<()> {
+        self.env.sample_goal(key)
+    }
+
+    fn is_success(&self) -> bool {
+        self.env.is_success()
+    }
+
+    fn goal_distance(&self) -> f64 {
+        self.env.goal_distance()
+    }
+}

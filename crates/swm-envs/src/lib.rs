@@ -1,5 +1,6 @@
 //! Native 2-D worlds: one folder each, with physics, render, expert and a README side by side.
 
+pub mod classic;
 mod draw;
 mod factors;
 pub mod piecewise;
@@ -13,5 +14,11 @@ use swm_core::{EnvEntry, Registry};
 pub static ENVS: Registry<EnvEntry> = Registry {
     kind: "environment",
     hint: "`swm envs` lists them",
-    rows: &[push_t::ENTRY, push_t::discrete::ENTRY, two_room::ENTRY, piecewise::ENTRY],
+    rows: &[
+        push_t::ENTRY,
+        push_t::discrete::ENTRY,
+        two_room::ENTRY,
+        piecewise::ENTRY,
+        classic::cart_pole::ENTRY,
+    ],
 };

@@ -2,6 +2,7 @@
 
 mod conformance;
 mod golden;
+mod golden_classic;
 mod golden_piecewise;
 mod golden_push_t;
 mod golden_two_room;

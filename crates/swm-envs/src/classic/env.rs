@@ -1,0 +1,210 @@
+//! An environment of any [`World`].
+
+use super::picture::Picture;
+use super::{World, factors};
+use crate::factors as values;
+use rand::Rng as _;
+use swm_core::{
+    Action, ColumnSpec, DType, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, Rng, RowMut,
+    RowRef, Snapshot, Transition, VariationRequest,
+};
+
+/// Rollouts from which [`Env::sample_goal`] takes a goal before it gives up.
+const GOAL_TRIES: u64 = 64;
+/// The most steps of such a rollout.
+const GOAL_STEPS: usize = 200;
+
+/// Places in [`EnvSpec::columns`].
+mod columns {
+    pub const STATE: usize = 0;
+    pub const GOAL_STATE: usize = 1;
+    pub const PHYSICS: usize = 2;
+}
+
+/// A world, where it is and where it should go.
+pub struct Classic<W: World> {
+    spec: EnvSpec,
+    factors: FactorValues,
+    /// The values of [`World::PHYSICS`].
+    physics: Vec<f32>,
+    world: W,
+    state: W::State,
+    goal: W::State,
+    /// Made when the first frame is asked for.
+    picture: Option<Picture>,
+    /// Whether `picture` shows this episode's background and colours.
+    current: bool,
+}
+
+impl<W: World> Classic<W> {
+    /// The world with every factor at its default.
+    pub fn new() -> Self {
+        let spec = EnvSpec {
+            id: W::ID,
+            action_space: W::action_space(),
+            columns: vec![
+                ColumnSpec::new("state", DType::Float32, [W::OBSERVED]),
+                ColumnSpec::new("goal_state", DType::Float32, [W::OBSERVED]),
+                ColumnSpec::new("physics", DType::Float32, [W::PHYSICS.len()]),
+            ],
+            variation_space: factors::space::<W>(),
+            max_episode_steps: W::LIMIT,
+        };
+        let none = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
+        let factors = spec.variation_space.resolve(&none, Key::new(0)).expect("defaults are in their spaces");
+        let physics = factors::physics::<W>(&factors);
+        let world = W::new(&physics);
+        let mut rng = Key::new(0).rng();
+        let (state, goal) = (W::start(&mut rng), W::task(&mut rng));
+        Self { spec, factors, physics, world, state, goal, picture: None, current: false }
+    }
+
+    /// Makes the world that of these factors, at this state.
+    fn arrange(&mut self, factors: FactorValues, state: W::State, goal: W::State) {
+        // Most episodes look like the one before.
+        self.current &= factors.iter().eq(self.factors.iter());
+        self.physics = factors::physics::<W>(&factors);
+        self.world = W::new(&self.physics);
+        (self.factors, self.state, self.goal) = (factors, state, goal);
+    }
+
+    fn show(&mut self, state: W::State, frame: FrameMut<'_>) {
+        let picture = self.picture.get_or_insert_with(|| Picture::new(W::SIZE));
+        if !self.current {
+            picture.begin(|surface| self.world.draw_background(surface), &factors::swaps::<W>(&self.factors));
+            self.current = true;
+        }
+        picture.show(|surface| self.world.draw(&state, surface), frame);
+    }
+
+    /// A state that the world comes to within some steps: in the first tries the expert heads for a task, in the later
+    /// ones chance acts. What ends an episode counts where it is the task's goal; in the last tries anything does.
+    #[allow(clippy::cast_possible_truncation)]
+    fn wander(&self, rng: &mut Rng, attempt: u64) -> W::State {
+        let (mut state, task) = (self.state, W::task(rng));
+        for _ in 0..rng.random_range(1..=GOAL_STEPS) {
+            let action = if attempt < GOAL_TRIES / 2 {
+                self.world.control(&state, &task)
+            } else {
+                self.spec.action_space.sample(rng)[0]
+            };
+            let before = state;
+            let ended = self.world.step(&mut state, f64::from(action as f32)).terminated;
+            if ended && attempt < GOAL_TRIES * 3 / 4 {
+                return if self.world.reached(&state, &task) { state } else { before };
+            }
+        }
+        state
+    }
+
+    /// A goal as everybody else sees it: through the `goal_state` column.
+    fn seen(&self, state: &W::State) -> Result<W::State> {
+        let mut row = [0.0; MAX_OBSERVED];
+        W::observe(state, &mut row[..W::OBSERVED]);
+        W::parse("a sampled goal", &row.map(f64::from)[..W::OBSERVED])
+    }
+}
+
+/// The most numbers a `state` column has.
+const MAX_OBSERVED: usize = 8;
+
+impl<W: World> Env for Classic<W> {
+    fn spec(&self) -> &EnvSpec {
+        &self.spec
+    }
+
+    fn reset(&mut self, seed: u64, options: &ResetOptions) -> Result<()> {
+        let key = Key::new(seed);
+        let factors = self.spec.variation_space.resolve(&options.variation, key)?;
+        let state = match &options.state {
+            Some(state) => W::parse("state", state)?,
+            None => W::start(&mut key.with("start").rng()),
+        };
+        let goal = match &options.goal_state {
+            Some(goal) => W::parse("goal_state", goal)?,
+            None => W::task(&mut key.with("task").rng()),
+        };
+        self.arrange(factors, state, goal);
+        Ok(())
+    }
+
+    fn step(&mut self, action: Action<'_>) -> Result<Transition> {
+        let action = W::action(action)?;
+        Ok(self.world.step(&mut self.state, action))
+    }
+
+    fn observe(&self, row: &mut RowMut<'_>) {
+        W::observe(&self.state, row.at(columns::STATE));
+        W::observe(&self.goal, row.at(columns::GOAL_STATE));
+        row.set(columns::PHYSICS, &self.physics);
+    }
+
+    fn render(&mut self, frame: FrameMut<'_>) {
+        self.show(self.state, frame);
+    }
+
+    fn render_goal(&mut self, frame: FrameMut<'_>) {
+        self.show(self.goal, frame);
+    }
+
+    fn factors(&self) -> &FactorValues {
+        &self.factors
+    }
+
+    fn snapshot(&self) -> Snapshot {
+        let mut bytes = W::ID.as_bytes().to_vec();
+        values::write(&self.factors, &mut bytes);
+        for number in self.state.as_ref().iter().chain(self.goal.as_ref()) {
+            bytes.extend(number.to_le_bytes());
+        }
+        Snapshot(bytes)
+    }
+
+    fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
+        let wrong = |given| Error::mismatch("restoring a snapshot", given, format!("one of {}", W::ID));
+        let body = snapshot.0.strip_prefix(W::ID.as_bytes());
+        let body = body.ok_or_else(|| wrong("a snapshot of another environment".to_owned()))?;
+        let (factors, rest) = values::read(&self.spec.variation_space, body)?;
+        let (mut state, mut goal) = (W::State::default(), W::State::default());
+        let numbers = state.as_mut().iter_mut().chain(goal.as_mut());
+        let (chunks, tail) = rest.as_chunks();
+        if chunks.len() != numbers.size_hint().0 || !tail.is_empty() {
+            return Err(wrong(format!("{} bytes of state and goal", rest.len())));
+        }
+        numbers.zip(chunks).for_each(|(number, &bytes)| *number = f64::from_le_bytes(bytes));
+        self.arrange(factors, state, goal);
+        Ok(())
+    }
+
+    fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()> {
+        let state = W::parse("state", &start.to_f64("state")?)?;
+        let goal = W::parse("goal state", &goal.to_f64("state")?)?;
+        let factors = values::from_row(&self.spec.variation_space, &self.factors, start)?;
+        self.arrange(factors, state, goal);
+        Ok(())
+    }
+
+    fn sample_goal(&mut self, key: Key) -> Result<()> {
+        for attempt in 0..GOAL_TRIES {
+            let state = self.wander(&mut key.at(attempt).rng(), attempt);
+            let Ok(goal) = self.seen(&state) else { continue };
+            if !self.world.reached(&self.state, &goal) {
+                self.goal = goal;
+                return Ok(());
+            }
+        }
+        Err(Error::Unsatisfiable {
+            factor: "goal".to_owned(),
+            constraint: "on the way of the expert or of chance, and not reached already".to_owned(),
+            tries: GOAL_TRIES as usize,
+        })
+    }
+
+    fn is_success(&self) -> bool {
+        self.world.reached(&self.state, &self.goal)
+    }
+
+    fn goal_distance(&self) -> f64 {
+        self.world.distance(&self.state, &self.goal)
+    }
+}

@@ -1,0 +1,256 @@
+//! From a [`Surface`] to RGB of another size by the triangle filter of Pillow's bilinear resize, in its arithmetic:
+//! weights of 22 binary digits, first along x, then along y, bytes in between. (From version 13 on, Pillow begins with y
+//! where that is cheaper; single bytes then differ by 1.)
+//!
+//! A pixel of a shrunk picture is a weighted mean of all pixels below it. Rows of flat pictures are a few runs of one
+//! colour, so the mean along x is taken over runs, with sums of weights made beforehand; and only what was drawn on
+//! the surface since the background is averaged again.
+
+use super::surface::{Color, NONE, Surface};
+use std::ops::Range;
+
+/// Binary digits of a weight.
+const DIGITS: u32 = 22;
+/// What rounds to the nearest.
+const HALF: i32 = 1 << (DIGITS - 1);
+
+/// One direction of the filter.
+#[derive(Clone)]
+struct Axis {
+    taps: Vec<Tap>,
+    /// For every tap, the weights of its pixels, and the sums of those before each (one more than pixels).
+    weights: Vec<i32>,
+    sums: Vec<i32>,
+    /// For every pixel of the surface, the taps it is in.
+    reach: Vec<Range<usize>>,
+}
+
+/// The pixels of the surface that a pixel of the picture is made of.
+#[derive(Clone)]
+struct Tap {
+    pixels: Range<usize>,
+    /// Where its weights begin, and its sums.
+    weights: usize,
+    sums: usize,
+}
+
+impl Axis {
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn new(surface: usize, picture: usize) -> Self {
+        let scale = surface as f64 / picture as f64;
+        let support = scale.max(1.0);
+        let mut axis = Self { taps: vec![], weights: vec![], sums: vec![], reach: vec![NONE; surface] };
+        for i in 0..picture {
+            let centre = (i as f64 + 0.5) * scale;
+            let first = (centre - support + 0.5).max(0.0) as usize;
+            let pixels = first..((centre + support + 0.5) as usize).min(surface);
+            let height = |x: usize| (1.0 - ((x as f64 - centre + 0.5) / support).abs()).max(0.0);
+            let total: f64 = pixels.clone().map(height).sum();
+            let tap = Tap { pixels: pixels.clone(), weights: axis.weights.len(), sums: axis.sums.len() };
+            axis.sums.push(0);
+            let mut sum = 0;
+            for x in pixels {
+                let weight = (height(x) / total * f64::from(1 << DIGITS) + 0.5) as i32;
+                sum += weight;
+                axis.weights.push(weight);
+                axis.sums.push(sum);
+                axis.reach[x] = axis.reach[x].start.min(i)..i + 1;
+            }
+            axis.taps.push(tap);
+        }
+        axis
+    }
+
+    /// The taps that some of these pixels are in.
+    fn reached(&self, pixels: &Range<usize>) -> Range<usize> {
+        self.reach[pixels.start].start..self.reach[pixels.end - 1].end
+    }
+}
+
+/// Colours of the surface that become others in the picture, one after the other.
+pub type Swaps<'a> = &'a [(Color, Color)];
+
+/// Pictures of one size.
+#[derive(Clone)]
+pub struct Resize {
+    columns: Axis,
+    rows: Axis,
+    /// The surface averaged along x, its top row first.
+    lines: Vec<u8>,
+    /// The same of the background.
+    still: Vec<u8>,
+    /// The picture of the background.
+    picture: Vec<u8>,
+    /// The columns of every line, and of a row of the picture, that differ from the background; bytes.
+    changed: Vec<Range<usize>>,
+    sums: Vec<i32>,
+}
+
+impl Resize {
+    /// For pictures of `width` x `height` of surfaces of `surface` pixels.
+    pub fn new(surface: (usize, usize), width: usize, height: usize) -> Self {
+        let bytes = 3 * width;
+        Self {
+            columns: Axis::new(surface.0, width),
+            rows: Axis::new(surface.1, height),
+            lines: vec![0; surface.1 * bytes],
+            still: vec![0; surface.1 * bytes],
+            picture: vec![0; height * bytes],
+            changed: vec![0..0; surface.1],
+            sums: vec![0; bytes],
+        }
+    }
+
+    /// Pixels in a row of the picture, and rows.
+    pub fn size(&self) -> (usize, usize) {
+        (self.columns.taps.len(), self.rows.taps.len())
+    }
+
+    /// Takes over a background, all of which counts as drawn.
+    pub fn set_background(&mut self, background: &Surface, swaps: Swaps<'_>) {
+        let mut picture = std::mem::take(&mut self.picture);
+        self.average_rows(background, swaps);
+        self.average_lines(&mut picture);
+        self.still.copy_from_slice(&self.lines);
+        self.picture = picture;
+    }
+
+    /// Draws what is on a surface that began as the background.
+    pub fn draw(&mut self, surface: &Surface, swaps: Swaps<'_>, rgb: &mut [u8]) {
+        rgb.copy_from_slice(&self.picture);
+        self.average_rows(surface, swaps);
+        self.average_lines(rgb);
+        let bytes = self.sums.len();
+        for (y, columns) in self.changed.iter().enumerate().filter(|(_, columns)| !columns.is_empty()) {
+            let line = y * bytes + columns.start..y * bytes + columns.end;
+            self.lines[line.clone()].copy_from_slice(&self.still[line]);
+        }
+    }
+
+    /// Averages along x.
+    fn average_rows(&mut self, surface: &Surface, swaps: Swaps<'_>) {
+        let (bytes, height) = (self.sums.len(), self.changed.len());
+        for (y, changed) in self.changed.iter_mut().enumerate() {
+            let from_below = height - 1 - y;
+            let drawn = surface.drawn(from_below);
+            if drawn.is_empty() {
+                *changed = 0..0;
+                continue;
+            }
+            let taps = self.columns.reached(&drawn);
+            let sums = &mut self.sums[3 * taps.start..3 * taps.end];
+            sums.fill(HALF);
+            let row = surface.row(from_below);
+            let end = self.columns.taps[taps.end - 1].pixels.end;
+            let mut x = self.columns.taps[taps.start].pixels.start;
+            while x < end {
+                let run = x..x + row[x..end].iter().take_while(|&&color| color == row[x]).count();
+                let color = swaps.iter().fold(row[x], |color, &(from, to)| if color == from { to } else { color });
+                let color = color.rgb().map(i32::from);
+                let reached = self.columns.reached(&run);
+                for tap in reached.start.max(taps.start)..reached.end.min(taps.end) {
+                    let Tap { pixels, sums: place, .. } = &self.columns.taps[tap];
+                    let before = |x: usize| self.columns.sums[place + x.clamp(pixels.start, pixels.end) - pixels.start];
+                    let weight = before(run.end) - before(run.start);
+                    let sum = &mut sums[3 * (tap - taps.start)..][..3];
+                    (0..3).for_each(|i| sum[i] += color[i] * weight);
+                }
+                x = run.end;
+            }
+            *changed = 3 * taps.start..3 * taps.end;
+            finish(sums, &mut self.lines[y * bytes..][changed.clone()]);
+        }
+    }
+
+    /// Averages along y.
+    fn average_lines(&mut self, rgb: &mut [u8]) {
+        let bytes = self.sums.len();
+        for (y, tap) in self.rows.taps.iter().enumerate() {
+            let changed = self.changed[tap.pixels.clone()].iter().filter(|columns| !columns.is_empty());
+            let columns = changed.fold(NONE, |all, one| all.start.min(one.start)..all.end.max(one.end));
+            if columns.is_empty() {
+                continue;
+            }
+            let sums = &mut self.sums[columns.clone()];
+            sums.fill(HALF);
+            for (line, &weight) in tap.pixels.clone().zip(&self.rows.weights[tap.weights..]) {
+                let line = &self.lines[line * bytes..][columns.clone()];
+                sums.iter_mut().zip(line).for_each(|(sum, &byte)| *sum += i32::from(byte) * weight);
+            }
+            finish(sums, &mut rgb[y * bytes..][columns]);
+        }
+    }
+}
+
+/// Sums of weighted bytes as bytes.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+fn finish(sums: &[i32], bytes: &mut [u8]) {
+    // Weights may add up to a little more than 1.
+    bytes.iter_mut().zip(sums).for_each(|(byte, &sum)| *byte = (sum >> DIGITS).min(255) as u8);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::draw::Point;
+
+    /// A picture of 9 x 6 in greys, its top row first.
+    fn grey(x: usize, y: usize) -> u8 {
+        if (x / 3 + y / 2) % 2 == 1 { ((x * 37 + y * y * 11) % 256) as u8 } else { 200 }
+    }
+
+    fn surface(shown: impl Fn(usize, usize) -> bool) -> Surface {
+        let mut surface = Surface::new(9, 6, Color::new([77; 3]));
+        for (x, y) in (0..54).map(|i| (i % 9, i / 9)).filter(|&(x, y)| shown(x, y)) {
+            surface.level(5 - y as i32, x as i32, x as i32, Color::new([grey(x, y); 3]));
+        }
+        surface
+    }
+
+    #[test]
+    fn pictures_are_what_pillow_makes_of_them() {
+        // The first rows of Image.resize(size, Image.BILINEAR).
+        let wanted: [(usize, usize, &[u8]); 3] = [
+            (4, 3, &[182, 157, 177, 179, 127, 166, 150, 110, 190, 140, 160, 187]),
+            (9, 2, &[148, 162, 176, 149, 172, 195, 136, 150, 163, 155, 169, 183, 119, 142, 165, 143, 156, 170]),
+            (13, 6, &[200, 200, 200, 200, 145, 122, 148, 174, 191, 200, 200, 200, 200]),
+        ];
+        for (width, height, wanted) in wanted {
+            // A part belongs to the background, the others are drawn before it.
+            for part in 0..4 {
+                let mut resize = Resize::new((9, 6), width, height);
+                let mut background = surface(|x, y| (x + y) % 4 < part);
+                background.set_drawn(true);
+                resize.set_background(&background, &[]);
+                let mut front = background.clone();
+                front.set_drawn(false);
+                for (x, y) in (0..54).map(|i| (i % 9, i / 9)) {
+                    if (x + y) % 4 >= part {
+                        front.blend(Point::new(x as i32, 5 - y as i32), Color::new([0; 3]), 0);
+                        front.level(5 - y as i32, x as i32, x as i32, Color::new([grey(x, y); 3]));
+                    }
+                }
+                for _ in 0..2 {
+                    let mut rgb = vec![1; width * height * 3];
+                    resize.draw(&front, &[], &mut rgb);
+                    let red: Vec<u8> = rgb.chunks(3).map(|pixel| pixel[0]).collect();
+                    assert_eq!(red[..wanted.len()], *wanted, "{width} x {height}, part {part}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn colours_are_swapped_one_after_the_other() {
+        let [a, b, c] = [77, 5, 9].map(|v| Color::new([v; 3]));
+        let mut background = Surface::new(2, 2, a);
+        background.set_drawn(true);
+        let mut resize = Resize::new((2, 2), 1, 1);
+        let mut rgb = [0; 3];
+        for (swaps, wanted) in [(vec![(a, b), (b, c)], 9), (vec![(b, c), (a, b)], 5)] {
+            resize.set_background(&background, &swaps);
+            resize.draw(&background, &swaps, &mut rgb);
+            assert_eq!(rgb, [wanted; 3]);
+        }
+    }
+}

@@ -1,0 +1,55 @@
+//! The worlds of classic control against rollouts of the Python reference (Gymnasium's, wrapped).
+
+use crate::golden::{self, Golden, picture_difference};
+use swm_core::{Action, Batch, Env, FrameMut, ResetOptions, Schema, Space};
+
+fn frame(env: &mut dyn Env, (width, height): (usize, usize)) -> Vec<u8> {
+    let mut rgb = vec![0; width * height * 3];
+    env.render(FrameMut::new(width, height, &mut rgb));
+    rgb
+}
+
+/// Follows every rollout of a world; the reference draws it at `size`.
+fn follow(id: &str, size: (usize, usize)) {
+    let files = golden::files(&format!("{}-", id.replace('/', "_")));
+    assert!(files.len() >= 2, "the files beside this test are always there");
+    for file in files {
+        let mut golden = Golden::open(&file);
+        let name = file.display();
+        let mut env = (swm_envs::ENVS.get(id).expect("a registered world").make)();
+        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
+        let states = golden.read::<f64>("info.state");
+        let n = env.spec().columns[0].len();
+        let options = ResetOptions {
+            variation: golden.variation(),
+            state: Some(states[..n].to_vec()),
+            ..ResetOptions::default()
+        };
+        env.reset(0, &options).expect("recorded values are possible");
+        let first = picture_difference(&frame(&mut *env, size), &golden.read("frame_first"));
+
+        let (rewards, terminations) = (golden.read::<f64>("reward"), golden.read::<bool>("terminated"));
+        let discrete = matches!(env.spec().action_space, Space::Discrete { .. });
+        let choices = if discrete { golden.read::<i64>("action") } else { vec![] };
+        let numbers = if discrete { vec![] } else { golden.read::<f32>("action") };
+        for t in 0..rewards.len() {
+            let action = if discrete { Action::Discrete(&choices[t..=t]) } else { Action::Continuous(&numbers[t..=t]) };
+            let transition = env.step(action).expect("a step");
+            env.observe(&mut row.row_mut(0));
+            let state = row.row(0).to_f64("state").expect("a column");
+            let wanted = &states[n * (t + 1)..][..n];
+            let apart = state.iter().zip(wanted).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            assert!(apart <= 1e-5, "{name}, state {t}: {state:?}, not {wanted:?}");
+            let apart = (transition.reward - rewards[t]).abs();
+            assert!(apart <= 1e-5, "{name}, reward {t}: {}, not {}", transition.reward, rewards[t]);
+            assert_eq!(transition.terminated, terminations[t], "{name}, terminated {t}");
+        }
+        let last = picture_difference(&frame(&mut *env, size), &golden.read("frame_last"));
+        assert!(first <= 3.0 && last <= 3.0, "{name}: frames differ by {first} and {last}");
+    }
+}
+
+#[test]
+fn cart_pole_follows_the_reference() {
+    follow("swm/CartPoleControl-v1", (600, 400));
+}

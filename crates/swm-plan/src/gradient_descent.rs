@@ -69,7 +69,7 @@ impl Solver for GradientDescent {
 
         for iteration in 0..self.iterations {
             population.differentiate(ID, cost, iteration)?;
-            population.record(&mut trace);
+            population.record(&mut trace, &population.cheapest());
             if let Some(norm) = self.clip {
                 let len = population.len();
                 clip_norm(&mut population.gradient, len, norm);
@@ -82,9 +82,9 @@ impl Solver for GradientDescent {
             }
         }
         population.evaluate(cost, self.iterations)?;
-        population.record(&mut trace);
-        let costs = trace.iter().filter_map(|trace| trace.best.last().copied()).collect();
-        Ok(Plan { actions: population.chosen(&population.cheapest()), costs, trace })
+        let best = population.cheapest();
+        population.record(&mut trace, &best);
+        Ok(population.plan(&best, trace))
     }
 }
 

@@ -4,14 +4,17 @@
 //! [`swm_core::plan`]. [`MpcPolicy`] turns any solver and any [`swm_core::CostModel`] into a
 //! [`swm_core::Policy`].
 
+pub mod augmented_lagrangian;
 pub mod cem;
 mod codec;
 pub mod gradient_descent;
+pub mod grasp;
 mod guard;
 mod history;
 pub mod mpc;
 pub mod optimizer;
 pub mod penalty;
+pub mod pgd;
 mod population;
 pub mod problem;
 pub mod registry;
@@ -20,10 +23,13 @@ pub mod simulator;
 pub mod topk;
 pub mod trace;
 
+pub use augmented_lagrangian::AugmentedLagrangian;
 pub use cem::Cem;
 pub use gradient_descent::GradientDescent;
+pub use grasp::Grasp;
 pub use mpc::{MpcConfig, MpcPolicy};
 pub use penalty::Penalised;
+pub use pgd::Pgd;
 pub use registry::{SOLVERS, SolverEntry};
 pub use scale::ActionScale;
 pub use simulator::{Score, SimulatorCost};

@@ -4,7 +4,7 @@ use crate::problem::{UNWRITTEN, check_costs, differentiable, score};
 use rand::Rng as _;
 use rand_distr::StandardNormal;
 use rayon::prelude::*;
-use swm_core::{Candidates, CostModel, Error, Key, PlanProblem, PlanTrace, Result};
+use swm_core::{Candidates, CostModel, Error, Key, Plan, PlanProblem, PlanTrace, Result};
 
 /// Candidates of several environments.
 ///
@@ -19,7 +19,8 @@ pub struct Population {
     pub costs: Vec<f32>,
     /// One stream an environment, from which the draws of the solver derive.
     streams: Vec<Key>,
-    samples: usize,
+    /// Candidates of one environment.
+    pub samples: usize,
     horizon: usize,
     dim: usize,
 }
@@ -50,13 +51,20 @@ impl Population {
         self.horizon * self.dim
     }
 
+    /// The candidates as a model sees them, and where it writes their costs and gradients.
+    pub fn split(&mut self) -> (Candidates<'_>, &mut [f32], &mut [f32]) {
+        let (envs, samples, horizon, dim) = (self.streams.len(), self.samples, self.horizon, self.dim);
+        let candidates = Candidates { actions: &self.actions, envs, samples, horizon, dim };
+        (candidates, &mut self.costs, &mut self.gradient)
+    }
+
     /// Asks the model what every candidate costs.
     ///
     /// # Errors
     /// When the model fails or a cost is not finite.
     pub fn evaluate(&mut self, cost: &mut dyn CostModel, iteration: usize) -> Result<()> {
-        let candidates = candidates(&self.actions, self.streams.len(), self.samples, self.horizon, self.dim);
-        score(cost, candidates, iteration, &mut self.costs)
+        let (candidates, costs, _) = self.split();
+        score(cost, candidates, iteration, costs)
     }
 
     /// Asks the model for the gradients too.
@@ -64,10 +72,10 @@ impl Population {
     /// # Errors
     /// As [`Population::evaluate`], and when a number of a gradient is not finite.
     pub fn differentiate(&mut self, solver: &str, cost: &mut dyn CostModel, iteration: usize) -> Result<()> {
-        let candidates = candidates(&self.actions, self.streams.len(), self.samples, self.horizon, self.dim);
-        self.costs.fill(UNWRITTEN);
-        self.gradient.fill(UNWRITTEN);
-        differentiable(solver, cost)?.cost_and_gradient(candidates, &mut self.costs, &mut self.gradient)?;
+        let (candidates, costs, gradient) = self.split();
+        costs.fill(UNWRITTEN);
+        gradient.fill(UNWRITTEN);
+        differentiable(solver, cost)?.cost_and_gradient(candidates, costs, gradient)?;
         check_costs(&self.costs, self.samples, iteration)?;
         self.check_gradient(iteration)
     }
@@ -106,33 +114,29 @@ impl Population {
         }
     }
 
-    /// Notes how the search stands.
+    /// Notes how the search stands, and what the best candidate of every environment costs.
     #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
-    pub fn record(&self, trace: &mut [PlanTrace]) {
+    pub fn record(&self, trace: &mut [PlanTrace], best: &[usize]) {
         let len = self.len();
         let sets = self.costs.chunks_exact(self.samples).zip(self.actions.chunks_exact(self.samples * len));
-        for (trace, (costs, actions)) in trace.iter_mut().zip(sets) {
-            trace.best.push(costs[lowest(costs)]);
+        for ((trace, &best), (costs, actions)) in trace.iter_mut().zip(best).zip(sets) {
+            trace.best.push(costs[best]);
             trace.mean.push((costs.iter().map(|&c| f64::from(c)).sum::<f64>() / costs.len() as f64) as f32);
             trace.spread.push(spread(actions, len));
         }
     }
 
-    /// The actions of one candidate of every environment, `[envs, horizon, dim]`.
-    pub fn chosen(&self, of: &[usize]) -> Vec<f32> {
-        let len = self.len();
-        let start = |(env, &sample): (usize, &usize)| (env * self.samples + sample) * len;
-        of.iter().enumerate().map(start).flat_map(|at| &self.actions[at..at + len]).copied().collect()
+    /// One candidate of every environment as its plan.
+    pub fn plan(&self, of: &[usize], trace: Vec<PlanTrace>) -> Plan {
+        let rows = || of.iter().enumerate().map(|(env, &sample)| env * self.samples + sample);
+        let actions = rows().flat_map(|row| &self.actions[row * self.len()..][..self.len()]).copied().collect();
+        Plan { actions, costs: rows().map(|row| self.costs[row]).collect(), trace }
     }
 
     /// The cheapest candidate of every environment.
     pub fn cheapest(&self) -> Vec<usize> {
         self.costs.chunks_exact(self.samples).map(lowest).collect()
     }
-}
-
-fn candidates(actions: &[f32], envs: usize, samples: usize, horizon: usize, dim: usize) -> Candidates<'_> {
-    Candidates { actions, envs, samples, horizon, dim }
 }
 
 /// Adds Gaussian noise of the standard deviation `scale`, drawn from `key`.

@@ -1,6 +1,6 @@
 //! [`SOLVERS`]: every solver, what it plans and what it asks of a model.
 
-use crate::{Cem, GradientDescent};
+use crate::{AugmentedLagrangian, Cem, GradientDescent, Grasp, Pgd};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use swm_core::registry::Named;
@@ -88,6 +88,36 @@ pub static SOLVERS: Registry<SolverEntry> = Registry {
             paper: "Maes et al., stable-worldmodel, 2026, algorithm \"Gradient Descent Solver\"",
             defaults: defaults::<GradientDescent>,
             make: make::<GradientDescent>,
+        },
+        SolverEntry {
+            id: "pgd",
+            summary: "follows the gradient on probabilities of the options, then takes the likeliest",
+            family: Family::Gradient,
+            actions: Actions::Discrete,
+            needs: &[Need::Gradient],
+            paper: "Henaff, Whitney and LeCun, Model-Based Planning with Discrete and Continuous Actions, 2017",
+            defaults: defaults::<Pgd>,
+            make: make::<Pgd>,
+        },
+        SolverEntry {
+            id: "lagrangian",
+            summary: "follows the gradient and prices violated constraints ever higher",
+            family: Family::Gradient,
+            actions: Actions::Continuous,
+            needs: &[Need::Gradient, Need::Constraints],
+            paper: "Maes et al., stable-worldmodel, 2026, algorithm \"Lagrangian Solver\"",
+            defaults: defaults::<AugmentedLagrangian>,
+            make: make::<AugmentedLagrangian>,
+        },
+        SolverEntry {
+            id: "grasp",
+            summary: "optimises states and actions together, every model step by itself",
+            family: Family::Gradient,
+            actions: Actions::Continuous,
+            needs: &[Need::Gradient, Need::Latent],
+            paper: "Psenka et al., Parallel Stochastic Gradient-Based Planning for World Models, 2026",
+            defaults: defaults::<Grasp>,
+            make: make::<Grasp>,
         },
     ],
 };

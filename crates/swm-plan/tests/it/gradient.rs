@@ -4,15 +4,19 @@ use crate::toys::{Model, toy};
 use serde::Deserialize;
 use std::time::Instant;
 use swm_core::Solver;
-use swm_core::{Batch, Candidates, CostModel, DifferentiableCost, Key, Plan, PlanProblem, PlanSpace, Result};
-use swm_plan::GradientDescent;
+use swm_core::{
+    Batch, Candidates, Constrained, CostModel, DifferentiableCost, Key, Plan, PlanProblem, PlanSpace, Result,
+};
 use swm_plan::optimizer::{Adam, Memory, Optimizer, RmsProp, Sgd};
+use swm_plan::{AugmentedLagrangian, GradientDescent, Pgd, SOLVERS};
 
 /// What `export_gradient_solvers.py` recorded.
 #[derive(Deserialize)]
 struct Golden {
     optimizers: Paths,
     gd: Descent,
+    pgd: Projected,
+    lagrangian: Augmented,
 }
 
 #[derive(Deserialize)]
@@ -26,6 +30,18 @@ struct Paths {
 struct Descent {
     actions: Vec<f32>,
     costs: Vec<f32>,
+}
+
+#[derive(Deserialize)]
+struct Projected {
+    choices: Vec<usize>,
+    costs: Vec<f32>,
+}
+
+#[derive(Deserialize)]
+struct Augmented {
+    actions: Vec<f32>,
+    losses: Vec<f32>,
 }
 
 fn golden() -> Golden {
@@ -45,10 +61,18 @@ struct Bowl {
     target: &'static [f32],
     /// Writes this instead of one number of the gradient.
     wrong: Option<(usize, f32)>,
+    /// Whether the sum of the numbers of a step is at most a half.
+    limited: bool,
 }
 
-const BOWL: Bowl =
-    Bowl { scale: &[1.0, 0.4, 0.2, 0.7, 0.5, 0.1], target: &[1.0, -2.0, 0.5, 3.0, -1.5, 0.25], wrong: None };
+const BOWL: Bowl = Bowl {
+    scale: &[1.0, 0.4, 0.2, 0.7, 0.5, 0.1],
+    target: &[1.0, -2.0, 0.5, 3.0, -1.5, 0.25],
+    wrong: None,
+    limited: false,
+};
+
+const CHOICE: Bowl = Bowl { scale: &[0.6, 0.2, 0.3, 0.1, 0.5, 0.4], target: &[0.9, 0.4, -0.2, 0.2, 0.3, 1.1], ..BOWL };
 
 impl CostModel for Bowl {
     fn observe(&mut self, _: &Batch, _: &[usize]) -> Result<()> {
@@ -66,6 +90,27 @@ impl CostModel for Bowl {
 
     fn differentiable(&mut self) -> Option<&mut dyn DifferentiableCost> {
         Some(self)
+    }
+
+    fn constrained(&mut self) -> Option<&mut dyn Constrained> {
+        self.limited.then_some(self)
+    }
+}
+
+impl Constrained for Bowl {
+    fn constraints(&self, horizon: usize) -> usize {
+        horizon
+    }
+
+    fn constrain(&mut self, candidates: Candidates<'_>, values: &mut [f32]) -> Result<()> {
+        let steps = candidates.actions.chunks_exact(candidates.dim);
+        values.iter_mut().zip(steps).for_each(|(value, step)| *value = step.iter().sum::<f32>() - 0.5);
+        Ok(())
+    }
+
+    fn constrain_vjp(&mut self, candidates: Candidates<'_>, weights: &[f32], gradient: &mut [f32]) -> Result<()> {
+        gradient.iter_mut().enumerate().for_each(|(i, g)| *g += weights[i / candidates.dim]);
+        Ok(())
     }
 }
 
@@ -118,6 +163,125 @@ fn gradient_descent_takes_the_steps_of_the_reference() {
     assert_near(&plan.trace[0].best[..4], &golden.costs, 1e-5);
     assert_eq!(plan.trace[0].best[4..], plan.costs, "the last entry is of the plan");
 }
+
+#[test]
+fn projected_gradient_descent_takes_the_steps_of_the_reference() {
+    let golden = golden().pgd;
+    let mut pgd = Pgd { samples: 1, iterations: 4, ..Pgd::default() };
+    let start = [0.0, 0.0, 1.0, 1.0, 0.0, 0.0];
+    let space = PlanSpace::Discrete { choices: &[3] };
+    let problem = PlanProblem { horizon: 2, space, keys: &[Key::new(0)], init: Some(&start), deadline: None };
+    let plan = pgd.solve(&mut { CHOICE }, problem).expect("a plan");
+    assert_near(&plan.trace[0].best[..4], &golden.costs, 1e-6);
+    let chosen: Vec<f32> =
+        golden.choices.iter().flat_map(|&c| (0..3).map(move |i| f32::from(u8::from(i == c)))).collect();
+    assert_eq!(plan.actions, chosen);
+    let mut cost = [0.0];
+    { CHOICE }
+        .cost(Candidates { actions: &chosen, envs: 1, samples: 1, horizon: 2, dim: 3 }, &mut cost)
+        .expect("a cost");
+    assert_eq!(plan.costs, cost, "the cost is that of the choices, not of probabilities");
+}
+
+#[test]
+fn the_augmented_lagrangian_takes_the_steps_of_the_reference() {
+    let golden = golden().lagrangian;
+    let mut solver = AugmentedLagrangian {
+        samples: 1,
+        iterations: 3,
+        outer_iterations: 3,
+        penalty_limit: 3.0,
+        ..AugmentedLagrangian::default()
+    };
+    let plan = solve(&mut solver, &mut Bowl { limited: true, ..BOWL }, &[Key::new(0)]).expect("a plan");
+    // Nine steps of Adam: they only agree if multipliers and penalties do.
+    assert_near(&plan.actions, &golden.actions, 1e-5);
+    let trace = &plan.trace[0];
+    assert_eq!(trace.best.len(), 10);
+    // The first steps violate nothing, so their loss is their cost.
+    assert!(trace.violation[0] < 0.0 && trace.violation[1] < 0.0);
+    assert_near(&trace.best[..2], &golden.losses[..2], 1e-5);
+}
+
+#[test]
+fn a_plan_that_breaks_a_constraint_says_so() {
+    // No action within these bounds adds up to at most a half.
+    let space = PlanSpace::Continuous { low: &[0.3, 0.4], high: &[9.0, 9.0] };
+    let problem = PlanProblem { horizon: 3, space, keys: &[Key::new(0)], init: None, deadline: None };
+    let mut solver = AugmentedLagrangian { samples: 8, ..AugmentedLagrangian::default() };
+    let plan = solver.solve(&mut Bowl { limited: true, ..BOWL }, problem).expect("a plan");
+    let violation = plan.trace[0].violation.last().expect("a violation");
+    assert!((violation - 0.2).abs() < 1e-2, "the least violation there is: {violation}");
+    // Where some candidate keeps the constraints, a cheaper one that does not is passed over.
+    let plan = solve(&mut solver, &mut Bowl { limited: true, ..BOWL }, &[Key::new(0)]).expect("a plan");
+    let steps = plan.actions.chunks_exact(2).map(|step| step.iter().sum::<f32>() - 0.5);
+    let violation = steps.fold(f32::NEG_INFINITY, f32::max);
+    assert_eq!(plan.trace[0].violation.last(), Some(&violation));
+    assert!(violation <= solver.tolerance);
+}
+
+/// Small settings with noise wherever a solver can draw some, and a toy for each.
+const NOISY: &[(&str, &str, &str)] = &[
+    ("gd", "quadratic", r#"{"samples": 5, "iterations": 4, "action_noise": 0.1, "clip": 1.0}"#),
+    ("pgd", "discrete", r#"{"samples": 5, "iterations": 4, "action_noise": 0.1}"#),
+    ("lagrangian", "constrained", r#"{"samples": 5, "iterations": 2, "outer_iterations": 2, "action_noise": 0.1}"#),
+    ("grasp", "reach", r#"{"iterations": 6, "sync_every": 3, "sync_iterations": 2}"#),
+];
+
+#[test]
+fn a_plan_is_the_same_whoever_else_is_planned_and_on_any_number_of_threads() {
+    for &(solver, name, settings) in NOISY {
+        let toy = toy(name);
+        let settings = serde_json::from_str(settings).expect("settings");
+        let mut solver = (SOLVERS.get(solver).expect("a solver").make)(&settings).expect("a solver");
+        let mut run = |threads: usize, size: usize| -> Vec<u32> {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+            let all: Vec<usize> = (0..50).collect();
+            let mut plan = |envs: &[usize]| {
+                let plan = pool.install(|| crate::toys::solve(&mut *solver, &mut Model::new(toy, envs), toy, envs));
+                let plan = plan.expect("a plan");
+                plan.actions.into_iter().chain(plan.costs).map(f32::to_bits).collect::<Vec<_>>()
+            };
+            // Actions and costs of one environment after another's.
+            let mut rows = vec![vec![]; 50];
+            for envs in all.chunks(size) {
+                let bits = plan(envs);
+                let len = bits.len() / envs.len();
+                for (i, &env) in envs.iter().enumerate() {
+                    rows[env].extend(&bits[i * (len - 1)..(i + 1) * (len - 1)]);
+                    rows[env].push(bits[envs.len() * (len - 1) + i]);
+                }
+            }
+            rows.concat()
+        };
+        let alone = run(1, 1);
+        for (threads, size) in [(2, 1), (1, 7), (2, 7), (1, 50), (2, 50)] {
+            assert!(run(threads, size) == alone, "{name}: {size} environments on {threads} threads");
+        }
+    }
+}
+
+#[test]
+fn published_searches_stay_the_same() {
+    // Results depend on these numbers: changing them is a breaking change. Rounded, because `exp` and `ln` behind the
+    // Gaussians may differ in the last bit between platforms.
+    for (&(solver, name, settings), expected) in NOISY.iter().zip(PINNED) {
+        let toy = toy(name);
+        let settings = serde_json::from_str(settings).expect("settings");
+        let mut solver = (SOLVERS.get(solver).expect("a solver").make)(&settings).expect("a solver");
+        let plan = crate::toys::solve(&mut *solver, &mut Model::new(toy, &[0]), toy, &[0]).expect("a plan");
+        let rounded: Vec<f32> = plan.trace[0].mean.iter().map(|cost| (cost * 1e3).round() / 1e3).collect();
+        assert_eq!(rounded, *expected, "{name}");
+    }
+}
+
+/// The mean cost of the candidates at every entry of the trace.
+const PINNED: &[&[f32]] = &[
+    &[9.009, 7.106, 5.52, 4.943, 4.004],
+    &[-1.873, -3.722, -3.95, -3.993, -4.033],
+    &[7.874, 7.119, 6.369, 6.35, 6.532],
+    &[0.194, 0.159, 0.062, 0.044, 0.029],
+];
 
 #[test]
 fn gradients_that_are_not_finite_say_where() {

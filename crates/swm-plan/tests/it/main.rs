@@ -1,6 +1,7 @@
 //! Solvers on problems whose answers are known.
 #![allow(missing_docs, clippy::cast_possible_truncation, clippy::cast_precision_loss)]
 
+mod gradient;
 mod lqr;
 mod mpc;
 mod simulator;

@@ -42,6 +42,17 @@ pub const TRIALS: &[Trial] = &[
             ("reach-bounded", 1e-6, 1e-3),
         ],
     },
+    Trial { solver: "pgd", settings: r#"{"step": 0.3}"#, near: &[("discrete", 1e-6, 0.0)] },
+    Trial {
+        solver: "lagrangian",
+        settings: r#"{"outer_iterations": 10, "optimizer": {"kind": "sgd", "step": 0.01}, "penalty_limit": 16, "tolerance": 5e-4}"#,
+        near: &[("constrained", 2e-3, 1e-3)],
+    },
+    Trial {
+        solver: "grasp",
+        settings: r#"{"sync_iterations": 40}"#,
+        near: &[("reach", 1e-4, 0.0), ("reach-bounded", 1e-4, 1e-3)],
+    },
 ];
 
 /// What is not tried, and why.

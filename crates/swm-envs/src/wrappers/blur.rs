@@ -90,7 +90,7 @@ impl VisualWrapper for Blur {
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
     fn apply(&mut self, frame: &mut FrameMut<'_>, _view: View) {
         let (width, height, radius) = (frame.width, frame.height, self.weights.len() / 2);
-        if width == 0 || height == 0 || radius == 0 {
+        if frame.rgb.is_empty() || radius == 0 {
             return;
         }
         let stride = 3 * width;

@@ -1,15 +1,16 @@
 //! What filters see beyond the edge of a picture.
 
-/// The pixel in a line of `n` that stands for place `i`, inside or not: the line mirrored at its last pixels, which
+/// The pixel in a line of `n`, at least 1, that stands for place `i`, inside or not: the line mirrored at its last pixels, which
 /// are not repeated (OpenCV's default border).
 #[allow(clippy::cast_possible_wrap, clippy::cast_sign_loss)]
 pub fn mirror(i: isize, n: usize) -> usize {
-    if n <= 1 {
-        return 0;
+    let inside = i as usize;
+    if inside < n {
+        return inside;
     }
-    let period = 2 * (n - 1);
+    let period = 2 * n.saturating_sub(1).max(1);
     let i = i.rem_euclid(period as isize) as usize;
-    if i < n { i } else { period - i }
+    i.min(period - i).min(n - 1)
 }
 
 #[cfg(test)]

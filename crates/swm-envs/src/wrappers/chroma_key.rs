@@ -83,6 +83,9 @@ impl VisualWrapper for ChromaKey {
     }
 
     fn apply(&mut self, frame: &mut FrameMut<'_>, view: View) {
+        if frame.rgb.is_empty() {
+            return;
+        }
         let size = [frame.width, frame.height];
         let sized = match self.sized.take() {
             Some(sized) if sized.is_for(size) => sized,

@@ -93,24 +93,38 @@ impl ColorJitter {
     }
 }
 
-/// Hue in 180 steps, saturation and value in 256, of a colour. Reciprocals in 2⁻¹² stand for divisions, as in OpenCV.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+/// `of / whole` for every `whole`, in 2⁻¹²: products with them stand for divisions, as in OpenCV.
+const fn shares(of: u32) -> [u32; 256] {
+    let mut shares = [0; 256];
+    let mut whole = 1;
+    while whole < 256 {
+        shares[whole as usize] = ((of << 13) + whole) / (2 * whole);
+        whole += 1;
+    }
+    shares
+}
+
+/// Of the six sectors of the circle, 30 steps each.
+static HUE: [u32; 256] = shares(30);
+static SATURATION: [u32; 256] = shares(255);
+
+/// Hue in 180 steps, saturation and value in 256, of a colour.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_possible_wrap)]
 fn to_hsv([r, g, b]: [u8; 3]) -> [u8; 3] {
     let (value, least) = (r.max(g).max(b), r.min(g).min(b));
-    let [r, g, b, value, range] = [r, g, b, value, value - least].map(i32::from);
-    let share = |part: i32, whole: i32, of: i32| {
-        let reciprocal = if whole == 0 { 0 } else { (f64::from(of << 12) / f64::from(whole)).round_ties_even() as i32 };
-        (part * reciprocal + (1 << 11)) >> 12
-    };
+    let range = value - least;
+    let round = |product: i32| (product + (1 << 11)) >> 12;
+    let [red, green, blue] = [r, g, b].map(i32::from);
     let turned = if value == r {
-        g - b
+        green - blue
     } else if value == g {
-        b - r + 2 * range
+        blue - red + 2 * i32::from(range)
     } else {
-        r - g + 4 * range
+        red - green + 4 * i32::from(range)
     };
-    let hue = share(turned, range, 30);
-    [if hue < 0 { hue + 180 } else { hue } as u8, share(range, value, 255) as u8, value as u8]
+    let hue = round(turned * HUE[range as usize] as i32);
+    let saturation = round(i32::from(range) * SATURATION[value as usize] as i32);
+    [if hue < 0 { hue + 180 } else { hue } as u8, saturation as u8, value]
 }
 
 /// The colour of hue in 180 steps, saturation and value in 256; rounded down, as in OpenCV.

@@ -114,13 +114,16 @@ impl Noise {
         }
         // A table of known length needs no check of its indices.
         let Some(table) = self.table.first_chunk::<SLICES>() else { return };
-        for channels in rgb.chunks_mut(4) {
-            let mut bits = random.next();
-            for channel in channels {
-                *channel = (i16::from(*channel) + table[bits as usize % SLICES]).clamp(0, 255) as u8;
-                bits >>= 16;
+        let mut add = |channels: &mut [u8]| {
+            let bits = random.next();
+            for (i, channel) in channels.iter_mut().enumerate() {
+                let noise = table[(bits >> (16 * i)) as usize % SLICES];
+                *channel = (i16::from(*channel) + noise).clamp(0, 255) as u8;
             }
-        }
+        };
+        let (fours, rest) = rgb.as_chunks_mut::<4>();
+        fours.iter_mut().for_each(|channels| add(channels));
+        add(rest);
     }
 }
 

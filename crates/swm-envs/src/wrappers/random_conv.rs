@@ -84,7 +84,7 @@ impl VisualWrapper for RandomConv {
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, clippy::cast_sign_loss)]
     fn apply(&mut self, frame: &mut FrameMut<'_>, _view: View) {
         let (width, height, side) = (frame.width, frame.height, self.side);
-        if width == 0 || height == 0 {
+        if frame.rgb.is_empty() {
             return;
         }
         let radius = side / 2;
@@ -94,29 +94,27 @@ impl VisualWrapper for RandomConv {
         for (row, planes) in rows.zip(self.planes.chunks_exact_mut(3 * stride)) {
             for (channel, plane) in planes.chunks_exact_mut(stride).enumerate() {
                 for (x, value) in plane[..width + 2 * radius].iter_mut().enumerate() {
-                    let inside = x.wrapping_sub(radius);
-                    let from = if inside < width { inside } else { mirror(inside as isize, width) };
-                    *value = f32::from(row[from][channel]);
+                    *value = f32::from(row[mirror(x as isize - radius as isize, width)][channel]);
                 }
             }
         }
         let planes = &self.planes;
         for (y, row) in frame.rgb.as_chunks_mut::<3>().0.chunks_exact_mut(width).enumerate() {
             for (start, pixels) in (0..).step_by(BLOCK).zip(row.chunks_mut(BLOCK)) {
-                let mut sums = [[0.0f32; BLOCK]; 3];
+                let [mut red, mut green, mut blue] = [[0.0f32; BLOCK]; 3];
                 for (line, weights) in self.weights.chunks_exact(side).enumerate() {
                     let (from, channel) = (mirror((y + line / 3) as isize - radius as isize, height), line % 3);
                     let plane = &planes[(3 * from + channel) * stride + start..][..BLOCK + side - 1];
-                    for (values, weights) in plane.array_windows::<BLOCK>().zip(weights) {
-                        for (sums, weight) in sums.iter_mut().zip(weights) {
-                            for (sum, value) in sums.iter_mut().zip(values) {
-                                *sum += weight * value;
-                            }
+                    for (values, [r, g, b]) in plane.array_windows::<BLOCK>().zip(weights) {
+                        for i in 0..BLOCK {
+                            red[i] += r * values[i];
+                            green[i] += g * values[i];
+                            blue[i] += b * values[i];
                         }
                     }
                 }
                 for (i, pixel) in pixels.iter_mut().enumerate() {
-                    *pixel = [0, 1, 2].map(|result| sums[result][i] as u8);
+                    *pixel = [red[i] as u8, green[i] as u8, blue[i] as u8];
                 }
             }
         }

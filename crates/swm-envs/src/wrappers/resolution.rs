@@ -49,10 +49,10 @@ impl VisualWrapper for Resolution {
 
     #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn apply(&mut self, frame: &mut FrameMut<'_>, _view: View) {
-        let from = [frame.width, frame.height];
-        if from.contains(&0) {
+        if frame.rgb.is_empty() {
             return;
         }
+        let from = [frame.width, frame.height];
         let to = from.map(|side| ((side as f64 * self.scale).round_ties_even() as usize).max(1));
         let resizer = match &mut self.resizer {
             Some(resizer) if resizer.is_for(from, to) => resizer,

@@ -6,3 +6,4 @@ mod golden_classic;
 mod golden_piecewise;
 mod golden_push_t;
 mod golden_two_room;
+mod wrappers;

@@ -4,6 +4,7 @@ pub mod classic;
 mod draw;
 mod factors;
 pub mod piecewise;
+pub mod point_maze;
 pub mod push_t;
 pub mod two_room;
 pub mod wrappers;
@@ -18,6 +19,7 @@ pub static ENVS: Registry<EnvEntry> = Registry {
         push_t::ENTRY,
         push_t::discrete::ENTRY,
         two_room::ENTRY,
+        point_maze::ENTRY,
         piecewise::ENTRY,
         classic::cart_pole::ENTRY,
     ],

@@ -15,7 +15,7 @@ mod stage;
 mod tent;
 
 pub use canvas::{Area, Canvas, Palette, Point, WIDTH};
-pub use pixels::{Pixels, Rgb};
+pub use pixels::{Pixels, Rgb, rect};
 pub use resample::Resampler;
 pub use soft::{Brush, Disc};
 pub use stage::Stage;

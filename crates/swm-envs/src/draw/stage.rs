@@ -28,16 +28,16 @@ struct View {
 const MAX_VIEWS: usize = 4;
 
 impl Stage {
-    /// A black backdrop of `side`² pixels.
+    /// A backdrop of `side`² pixels, to be [`Stage::set`].
     pub fn new(side: usize) -> Self {
-        let black = vec![0; side * side * 3];
-        Self { side, backdrop: black.clone(), canvas: black, views: vec![] }
+        Self { side, backdrop: vec![], canvas: vec![], views: vec![] }
     }
 
     /// Draws another backdrop.
     pub fn set(&mut self, draw: impl FnOnce(&mut Pixels<'_>)) {
+        self.backdrop.resize(self.side * self.side * 3, 0);
         draw(&mut Pixels::new(self.side, &mut self.backdrop));
-        self.canvas.copy_from_slice(&self.backdrop);
+        self.canvas.clone_from(&self.backdrop);
         self.views.iter_mut().for_each(|view| view.current = false);
     }
 

@@ -69,17 +69,15 @@ pub struct Tent {
     rows: Axis,
     /// The rows of the old picture, resized along x.
     between: Vec<u8>,
+    /// A row of the new picture, before it is rounded.
+    sums: Vec<i32>,
 }
 
 impl Tent {
     /// From `side`² to `width` x `height`.
     pub fn new(side: usize, width: usize, height: usize) -> Self {
-        Self {
-            side,
-            columns: Axis::new(side, width),
-            rows: Axis::new(side, height),
-            between: vec![0; width * side * 3],
-        }
+        let (columns, rows) = (Axis::new(side, width), Axis::new(side, height));
+        Self { side, columns, rows, between: vec![0; width * side * 3], sums: Vec::with_capacity(3 * width) }
     }
 
     /// Width and height of the new pictures.
@@ -95,34 +93,44 @@ impl Tent {
             return;
         }
         let width = self.columns.len();
-        let old = old.as_chunks::<3>().0;
-        let between = self.between.as_chunks_mut::<3>().0;
-        for y in self.rows.source(rows.start).start..self.rows.source(rows.end - 1).end {
-            let line = &old[y * self.side..][..self.side];
+        let span = 3 * columns.start..3 * columns.end;
+        let source = self.rows.source(rows.start).start..self.rows.source(rows.end - 1).end;
+        let line = |y: usize| &old[3 * y * self.side..][..3 * self.side];
+        for y in source.clone() {
+            let (above, here) = self.between.split_at_mut(3 * y * width);
+            if y > source.start && line(y) == line(y - 1) {
+                here[span.clone()].copy_from_slice(&above[above.len() - 3 * width..][span.clone()]);
+                continue;
+            }
+            let (line, here) = (line(y).as_chunks::<3>().0, here.as_chunks_mut::<3>().0);
             for x in columns.clone() {
-                between[y * width + x] = weighted(self.columns.weights(x), line[self.columns.first[x]..].iter());
+                let mut sum = [HALF; 3];
+                for (&weight, pixel) in self.columns.weights(x).iter().zip(&line[self.columns.first[x]..]) {
+                    (0..3).for_each(|c| sum[c] += weight * i32::from(pixel[c]));
+                }
+                here[x] = sum.map(rounded);
             }
         }
-        let new = new.as_chunks_mut::<3>().0;
+        self.sums.resize(span.len(), 0);
         for y in rows {
-            for x in columns.clone() {
-                let column = between[self.rows.first[y] * width + x..].iter().step_by(width);
-                new[y * width + x] = weighted(self.rows.weights(y), column);
+            self.sums.fill(HALF);
+            for (k, &weight) in self.rows.weights(y).iter().enumerate() {
+                let line = &self.between[3 * (self.rows.first[y] + k) * width..][span.clone()];
+                self.sums.iter_mut().zip(line).for_each(|(sum, &value)| *sum += weight * i32::from(value));
             }
+            let new = &mut new[3 * y * width..][span.clone()];
+            new.iter_mut().zip(&self.sums).for_each(|(new, &sum)| *new = rounded(sum));
         }
     }
 }
 
-/// The weighted mean of some pixels.
+/// One half, in units of a sum.
+const HALF: i32 = 1 << (BITS - 1);
+
+/// The byte of a sum that began with [`HALF`].
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-fn weighted<'a>(weights: &[i32], pixels: impl Iterator<Item = &'a [u8; 3]>) -> [u8; 3] {
-    let mut sum = [1 << (BITS - 1); 3];
-    for (&weight, pixel) in weights.iter().zip(pixels) {
-        for (sum, &value) in sum.iter_mut().zip(pixel) {
-            *sum += weight * i32::from(value);
-        }
-    }
-    sum.map(|v| (v >> BITS).clamp(0, 255) as u8)
+fn rounded(sum: i32) -> u8 {
+    (sum >> BITS).clamp(0, 255) as u8
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 
 use super::arrows;
 use super::physics::{BORDER, GRID, SIZE, ZONES};
-use crate::draw::{Area, Brush, Disc, Point, Rgb, Stage};
+use crate::draw::{Area, Brush, Disc, Rgb, Stage, rect};
 use swm_core::FrameMut;
 
 /// Side of the picture as it is drawn.
@@ -62,11 +62,11 @@ impl Renderer {
             pixels.fill(Area::square(SIDE), scene.background);
             for (i, &color) in scene.zones.iter().flatten().enumerate() {
                 let [x, y] = [i % GRID, i / GRID].map(|cell| low + cell as i32 * room);
-                pixels.fill(area([x, y], [x + room, y + room]), color);
+                pixels.fill(rect([x, y], [x + room, y + room]), color);
             }
             for start in [low - LINE, high] {
-                pixels.fill(area([start, 0], [start + LINE, side]), scene.border);
-                pixels.fill(area([0, start], [side, start + LINE]), scene.border);
+                pixels.fill(rect([start, 0], [start + LINE, side]), scene.border);
+                pixels.fill(rect([0, start], [side, start + LINE]), scene.border);
             }
             if let Some(target) = &scene.target {
                 self.brush.blend(target, SIDE, SIDE, pixels.bytes());
@@ -76,9 +76,4 @@ impl Renderer {
             }
         });
     }
-}
-
-/// The pixels from `low` to `high`, the latter excluded.
-fn area(low: [i32; 2], high: [i32; 2]) -> Area {
-    Area::EMPTY.with(Point::new(low[0], low[1]), 0).with(Point::new(high[0] - 1, high[1] - 1), 0)
 }

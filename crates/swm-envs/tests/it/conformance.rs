@@ -440,8 +440,11 @@ fn effects(entry: &EnvEntry, factor: &Factor, beside: &VariationRequest) -> Effe
     let mut effects = Effects::default();
     let Some(base) = outcome(entry, beside.clone()) else { return effects };
     let mut rng = Key::new(1).with(&factor.key).rng();
-    for _ in 0..12 {
+    for _ in 0..600 {
         let value = factor.space.sample(&mut rng);
+        if effects.tried == 12 {
+            break;
+        }
         if beside.variation_values.get(&factor.key).unwrap_or(&factor.init_value) == &value {
             continue;
         }

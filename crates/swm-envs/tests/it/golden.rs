@@ -63,7 +63,9 @@ fn flatten(key: &str, value: &serde_json::Value, into: &mut BTreeMap<String, Vec
             }
         }
         serde_json::Value::Array(values) => {
-            into.insert(key.to_owned(), values.iter().map(number).collect());
+            let rows =
+                values.iter().flat_map(|value| value.as_array().map_or(std::slice::from_ref(value), Vec::as_slice));
+            into.insert(key.to_owned(), rows.map(number).collect());
         }
         value => {
             into.insert(key.to_owned(), vec![number(value)]);

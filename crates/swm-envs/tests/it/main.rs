@@ -4,6 +4,7 @@ mod conformance;
 mod golden;
 mod golden_classic;
 mod golden_piecewise;
+mod golden_point_maze;
 mod golden_push_t;
 mod golden_two_room;
 mod wrappers;

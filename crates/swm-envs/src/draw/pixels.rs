@@ -73,7 +73,8 @@ impl<'a> Pixels<'a> {
             };
             let row = self.span(y, left..right);
             let mut edge = |x: usize| {
-                let covered = outer - (x as f64 + 0.5 - cx).hypot(dy);
+                let dx = x as f64 + 0.5 - cx;
+                let covered = outer - (dx * dx + dy * dy).sqrt();
                 mix(&mut row[x - left], color, opacity * covered.clamp(0.0, 1.0));
             };
             (left..first).for_each(&mut edge);

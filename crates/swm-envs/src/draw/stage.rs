@@ -10,8 +10,8 @@ use swm_core::FrameMut;
 pub struct Stage {
     side: usize,
     backdrop: Vec<u8>,
-    /// The backdrop but for what is drawn while a frame is made.
-    canvas: Vec<u8>,
+    /// The backdrop but for what is drawn while a frame is made; made for the first such frame.
+    canvas: Option<Vec<u8>>,
     /// The backdrop at sizes asked for before, the last one first.
     views: Vec<View>,
 }
@@ -30,39 +30,50 @@ const MAX_VIEWS: usize = 4;
 impl Stage {
     /// A backdrop of `side`² pixels, to be [`Stage::set`].
     pub fn new(side: usize) -> Self {
-        Self { side, backdrop: vec![], canvas: vec![], views: vec![] }
+        Self { side, backdrop: vec![], canvas: None, views: vec![] }
     }
 
     /// Draws another backdrop.
     pub fn set(&mut self, draw: impl FnOnce(&mut Pixels<'_>)) {
         self.backdrop.resize(self.side * self.side * 3, 0);
         draw(&mut Pixels::new(self.side, &mut self.backdrop));
-        self.canvas.clone_from(&self.backdrop);
+        if let Some(canvas) = &mut self.canvas {
+            canvas.copy_from_slice(&self.backdrop);
+        }
         self.views.iter_mut().for_each(|view| view.current = false);
     }
 
-    /// Fills a frame: the backdrop and what `draw` draws before it, which says what it touched at most.
-    pub fn show(&mut self, frame: FrameMut<'_>, draw: impl FnOnce(&mut Pixels<'_>) -> Area) {
-        let FrameMut { width, height, rgb } = frame;
-        if (width, height) == (self.side, self.side) {
-            rgb.copy_from_slice(&self.backdrop);
-            draw(&mut Pixels::new(self.side, rgb));
-            return;
+    /// Fills a frame with the backdrop, and says how that was resized, if it was.
+    pub fn fill(&mut self, frame: &mut FrameMut<'_>) -> Option<&Tent> {
+        if (frame.width, frame.height) == (self.side, self.side) {
+            frame.rgb.copy_from_slice(&self.backdrop);
+            return None;
         }
-        let area = draw(&mut Pixels::new(self.side, &mut self.canvas));
-        let place = self.view(width, height);
-        let View { tent, rgb: backdrop, .. } = &mut self.views[place];
-        rgb.copy_from_slice(backdrop);
-        tent.draw(&self.canvas, area, rgb);
-        let (columns, rows) = area.within(self.side);
-        for y in rows {
-            let row = (y * self.side + columns.start) * 3..(y * self.side + columns.end) * 3;
-            self.canvas[row.clone()].copy_from_slice(&self.backdrop[row]);
-        }
+        let view = self.view(frame.width, frame.height);
+        frame.rgb.copy_from_slice(&view.rgb);
+        Some(&view.tent)
     }
 
-    /// The place of the backdrop at this size.
-    fn view(&mut self, width: usize, height: usize) -> usize {
+    /// Fills a frame: the backdrop and what `draw` draws before it, which says what it touched at most.
+    pub fn show(&mut self, mut frame: FrameMut<'_>, draw: impl FnOnce(&mut Pixels<'_>) -> Area) {
+        let side = self.side;
+        if self.fill(&mut frame).is_none() {
+            draw(&mut Pixels::new(side, frame.rgb));
+            return;
+        }
+        let mut canvas = self.canvas.take().unwrap_or_else(|| self.backdrop.clone());
+        let area = draw(&mut Pixels::new(side, &mut canvas));
+        self.view(frame.width, frame.height).tent.draw(&canvas, area, frame.rgb);
+        let (columns, rows) = area.within(side);
+        for y in rows {
+            let row = 3 * (y * side + columns.start)..3 * (y * side + columns.end.max(columns.start));
+            canvas[row.clone()].copy_from_slice(&self.backdrop[row]);
+        }
+        self.canvas = Some(canvas);
+    }
+
+    /// The backdrop at this size.
+    fn view(&mut self, width: usize, height: usize) -> &mut View {
         let place = self.views.iter().position(|view| view.tent.size() == (width, height)).unwrap_or_else(|| {
             let (tent, rgb) = (Tent::new(self.side, width, height), vec![0; width * height * 3]);
             self.views.truncate(MAX_VIEWS - 1);
@@ -74,7 +85,7 @@ impl Stage {
             view.tent.draw(&self.backdrop, Area::square(self.side), &mut view.rgb);
             view.current = true;
         }
-        place
+        view
     }
 }
 

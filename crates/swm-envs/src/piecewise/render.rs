@@ -42,15 +42,15 @@ impl Default for Renderer {
 
 impl Renderer {
     /// Draws a scene and the agent in it.
-    pub fn draw(&mut self, scene: &Scene, agent: &Disc, frame: FrameMut<'_>) {
+    pub fn draw(&mut self, scene: &Scene, agent: &Disc, mut frame: FrameMut<'_>) {
         if self.scene.as_ref() != Some(scene) {
             self.set(scene);
             self.scene = Some(scene.clone());
         }
-        self.stage.show(frame, |pixels| {
-            self.brush.blend(agent, SIDE, SIDE, pixels.bytes());
-            agent.area()
-        });
+        match self.stage.fill(&mut frame) {
+            None => self.brush.blend(agent, SIDE, SIDE, frame.rgb),
+            Some(tent) => self.brush.blend_resized(agent, tent, frame.rgb),
+        }
     }
 
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]

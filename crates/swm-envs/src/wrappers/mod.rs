@@ -149,9 +149,18 @@ impl WrapperEntry {
 /// # Errors
 /// When the wrapper or a parameter is unknown, or a value is not allowed.
 pub fn parse(text: &str) -> Result<Box<dyn VisualWrapper>> {
+    let (entry, settings) = read(text)?;
+    entry.make(&settings)
+}
+
+/// The wrapper and the settings that its form on the command line names.
+///
+/// # Errors
+/// When the wrapper or a parameter is unknown, or a value is not of the parameter's kind.
+pub fn read(text: &str) -> Result<(&'static WrapperEntry, Settings)> {
     let (id, settings) = text.split_once(',').unwrap_or((text, ""));
     let entry = WRAPPERS.get(id)?;
-    entry.make(&settings::read(entry.id, entry.parameters, settings)?)
+    Ok((entry, settings::read(entry.id, entry.parameters, settings)?))
 }
 
 /// The typed settings of a wrapper, from checked values.

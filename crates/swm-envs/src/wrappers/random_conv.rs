@@ -49,11 +49,13 @@ pub(super) struct RandomConv {
     weights: Vec<[f32; 3]>,
     /// Every row of the picture, a channel after the other, with its mirrored surroundings.
     planes: Vec<f32>,
+    /// One row of the result.
+    sums: Vec<[[f32; BLOCK]; 3]>,
 }
 
 impl RandomConv {
     pub fn new(side: usize) -> Self {
-        let mut conv = Self { side, weights: vec![[0.0; 3]; 3 * side * side], planes: vec![] };
+        let mut conv = Self { side, weights: vec![[0.0; 3]; 3 * side * side], planes: vec![], sums: vec![] };
         conv.reset(Key::new(0));
         conv
     }
@@ -98,13 +100,15 @@ impl VisualWrapper for RandomConv {
                 }
             }
         }
-        let planes = &self.planes;
+        let blocks = width.div_ceil(BLOCK);
+        self.sums.resize(blocks, [[0.0; BLOCK]; 3]);
         for (y, row) in frame.rgb.as_chunks_mut::<3>().0.chunks_exact_mut(width).enumerate() {
-            for (start, pixels) in (0..).step_by(BLOCK).zip(row.chunks_mut(BLOCK)) {
-                let [mut red, mut green, mut blue] = [[0.0f32; BLOCK]; 3];
+            for (block, result) in self.sums.iter_mut().enumerate() {
+                let [mut red, mut green, mut blue] = [[0.0; BLOCK]; 3];
                 for (line, weights) in self.weights.chunks_exact(side).enumerate() {
                     let (from, channel) = (mirror((y + line / 3) as isize - radius as isize, height), line % 3);
-                    let plane = &planes[(3 * from + channel) * stride + start..][..BLOCK + side - 1];
+                    let start = (3 * from + channel) * stride + block * BLOCK;
+                    let plane = &self.planes[start..start + BLOCK + side - 1];
                     for (values, [r, g, b]) in plane.array_windows::<BLOCK>().zip(weights) {
                         for i in 0..BLOCK {
                             red[i] += r * values[i];
@@ -113,8 +117,11 @@ impl VisualWrapper for RandomConv {
                         }
                     }
                 }
+                *result = [red, green, blue];
+            }
+            for (pixels, sums) in row.chunks_mut(BLOCK).zip(&self.sums) {
                 for (i, pixel) in pixels.iter_mut().enumerate() {
-                    *pixel = [red[i] as u8, green[i] as u8, blue[i] as u8];
+                    *pixel = [0, 1, 2].map(|channel| sums[channel][i] as u8);
                 }
             }
         }

@@ -1,11 +1,32 @@
 //! Pictures in another size, every pixel the mean of what it covers (OpenCV's area interpolation).
 
-/// What one pixel of the result takes from a line of the source: the first pixel, and the weights of it and those
-/// that follow, which add up to 1.
+/// What the pixels of a line of the result take from a line of the source.
 #[derive(Clone)]
-struct Tap {
-    first: usize,
+struct Taps {
+    /// How many pixels of the source each of them takes, at most.
+    span: usize,
+    /// The first of those pixels; all lie in the line.
+    first: Vec<usize>,
+    /// Their weights, `span` for each pixel of the result, that add up to 1.
     weights: Vec<f32>,
+}
+
+impl Taps {
+    /// From the first pixel and the weights for each pixel of the result; `from` pixels are in the source.
+    fn new(from: usize, taps: &[(usize, Vec<f32>)]) -> Self {
+        let span = taps.iter().map(|(_, weights)| weights.len()).max().unwrap_or(1);
+        let first: Vec<usize> = taps.iter().map(|(first, _)| (*first).min(from - span)).collect();
+        let mut padded = vec![0.0; span * taps.len()];
+        for (((wanted, weights), first), padded) in taps.iter().zip(&first).zip(padded.chunks_exact_mut(span)) {
+            padded[wanted - first..][..weights.len()].copy_from_slice(weights);
+        }
+        Self { span, first, weights: padded }
+    }
+
+    /// For each pixel of the result, the first pixel of the source and the weights.
+    fn iter(&self) -> impl Iterator<Item = (usize, &[f32])> {
+        self.first.iter().copied().zip(self.weights.chunks_exact(self.span))
+    }
 }
 
 /// How a picture of one size becomes one of another size. Shrinking takes the mean of the covered area. Growing along
@@ -14,8 +35,8 @@ struct Tap {
 pub struct Resizer {
     from: [usize; 2],
     to: [usize; 2],
-    columns: Vec<Tap>,
-    rows: Vec<Tap>,
+    columns: Taps,
+    rows: Taps,
     /// One row of the result before its pixels are taken together: as wide as the source.
     line: Vec<f32>,
 }
@@ -24,7 +45,7 @@ impl Resizer {
     /// Between two sizes, `[width, height]`, none of them 0.
     pub fn new(from: [usize; 2], to: [usize; 2]) -> Self {
         let taps = if (0..2).all(|side| from[side] >= to[side]) { shrinking } else { growing };
-        let [columns, rows] = [0, 1].map(|side| taps(from[side], to[side]));
+        let [columns, rows] = [0, 1].map(|side| Taps::new(from[side], &taps(from[side], to[side])));
         Self { from, to, columns, rows, line: vec![0.0; 3 * from[0]] }
     }
 
@@ -37,17 +58,17 @@ impl Resizer {
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn run(&mut self, source: &[u8], result: &mut [u8]) {
         let stride = self.line.len();
-        for (row, result) in self.rows.iter().zip(result.chunks_exact_mut(3 * self.to[0])) {
+        for ((first, weights), result) in self.rows.iter().zip(result.chunks_exact_mut(3 * self.to[0])) {
             self.line.fill(0.0);
-            for (source, weight) in source.chunks_exact(stride).skip(row.first).zip(&row.weights) {
+            for (source, weight) in source[stride * first..].chunks_exact(stride).zip(weights) {
                 for (sum, &channel) in self.line.iter_mut().zip(source) {
                     *sum += weight * f32::from(channel);
                 }
             }
             let line = self.line.as_chunks::<3>().0;
-            for (column, pixel) in self.columns.iter().zip(result.as_chunks_mut::<3>().0) {
+            for ((first, weights), pixel) in self.columns.iter().zip(result.as_chunks_mut::<3>().0) {
                 let mut sum = [0.5; 3];
-                for (source, weight) in line[column.first..].iter().zip(&column.weights) {
+                for (source, weight) in line[first..].iter().zip(weights) {
                     for (sum, channel) in sum.iter_mut().zip(source) {
                         *sum += weight * channel;
                     }
@@ -59,7 +80,7 @@ impl Resizer {
 }
 
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-fn shrinking(from: usize, to: usize) -> Vec<Tap> {
+fn shrinking(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     let scale = from as f64 / to as f64;
     let tap = |i: usize| {
         let (start, end) = (i as f64 * scale, ((i + 1) as f64 * scale).min(from as f64));
@@ -67,20 +88,19 @@ fn shrinking(from: usize, to: usize) -> Vec<Tap> {
         // Slivers that rounding leaves of a neighbour would be noise.
         let last = ((end - 1e-3).ceil() as usize).clamp(first + 1, from);
         let covered = |pixel: usize| (end.min((pixel + 1) as f64) - start.max(pixel as f64)) / (end - start);
-        Tap { first, weights: (first..last).map(|pixel| covered(pixel) as f32).collect() }
+        (first, (first..last).map(|pixel| covered(pixel) as f32).collect())
     };
     (0..to).map(tap).collect()
 }
 
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-fn growing(from: usize, to: usize) -> Vec<Tap> {
+fn growing(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     let scale = from as f64 / to as f64;
     let tap = |i: usize| {
         let first = ((i as f64 * scale) as usize).min(from - 1);
         let reach = (i + 1) as f64 - (first + 1) as f64 / scale;
         let part = if reach <= 0.0 { 0.0 } else { reach.fract() as f32 };
-        let weights = if part > 0.0 && first + 1 < from { vec![1.0 - part, part] } else { vec![1.0] };
-        Tap { first, weights }
+        (first, if part > 0.0 && first + 1 < from { vec![1.0 - part, part] } else { vec![1.0] })
     };
     (0..to).map(tap).collect()
 }

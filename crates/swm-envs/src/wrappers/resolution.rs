@@ -25,7 +25,7 @@ pub const ENTRY: WrapperEntry = WrapperEntry {
     }],
     build: |settings| {
         let Settings { scale } = typed(ENTRY.id, settings)?;
-        Ok(Box::new(Resolution { scale, resizer: None, small: vec![] }))
+        Ok(Box::new(Resolution { scale, resizer: None, columns: vec![], small: vec![] }))
     },
 };
 
@@ -39,6 +39,8 @@ struct Settings {
 struct Resolution {
     scale: f64,
     resizer: Option<Resizer>,
+    /// For every column of the picture, the one of the small picture that it shows.
+    columns: Vec<usize>,
     small: Vec<u8>,
 }
 
@@ -56,7 +58,10 @@ impl VisualWrapper for Resolution {
         let to = from.map(|side| ((side as f64 * self.scale).round_ties_even() as usize).max(1));
         let resizer = match &mut self.resizer {
             Some(resizer) if resizer.is_for(from, to) => resizer,
-            other => other.insert(Resizer::new(from, to)),
+            other => {
+                self.columns = (0..from[0]).map(|x| x * to[0] / from[0]).collect();
+                other.insert(Resizer::new(from, to))
+            }
         };
         self.small.resize(3 * to[0] * to[1], 0);
         resizer.run(frame.rgb, &mut self.small);
@@ -71,8 +76,9 @@ impl VisualWrapper for Resolution {
             }
             drawn = Some(source);
             let line = &small[source * to[0]..][..to[0]];
-            for (x, pixel) in frame.rgb[stride * y..][..stride].as_chunks_mut::<3>().0.iter_mut().enumerate() {
-                *pixel = line[x * to[0] / from[0]];
+            let pixels = frame.rgb[stride * y..][..stride].as_chunks_mut::<3>().0;
+            for (pixel, &column) in pixels.iter_mut().zip(&self.columns) {
+                *pixel = line[column];
             }
         }
     }

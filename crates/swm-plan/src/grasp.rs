@@ -28,6 +28,11 @@
 //! The one-step model is [`LatentDynamics::predict`](swm_core::LatentDynamics::predict). Of a model that looks at several
 //! past states it sees one, and only the synchronisation sees the cost as the model computes it.
 //!
+//! As the gradient stops there, an action feels only what it does within one step. Where it takes two to move a number, as
+//! from a force to a position, the lifted loss cannot see it, and only the synchronisation finds the plan. With plain
+//! gradient steps one step size serves horizons at which gradient descent on the rollout needs another each time
+//! (`tests/it/objective.rs`); with Adam on linear systems, gradient descent is as good or better.
+//!
 //! What a plan costs is known where it is rolled out. So the trace has an entry for every step of a synchronisation,
 //! before it, and one for the plan.
 

@@ -12,6 +12,7 @@ pub mod grasp;
 mod guard;
 mod history;
 pub mod mpc;
+pub mod objective;
 pub mod optimizer;
 pub mod penalty;
 pub mod pgd;

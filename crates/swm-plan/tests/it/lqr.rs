@@ -9,11 +9,11 @@ use crate::toys::{Landscape, draw};
 type State = [f64; 2];
 type Matrix = [[f64; 2]; 2];
 
-const A: Matrix = [[1.0, 0.5], [0.0, 0.9]];
-const B: State = [0.1, 0.5];
-const Q: Matrix = [[1.0, 0.0], [0.0, 0.1]];
-const LAST: Matrix = [[4.0, 0.0], [0.0, 2.0]];
-const R: f64 = 1.0;
+pub const A: Matrix = [[1.0, 0.5], [0.0, 0.9]];
+pub const B: State = [0.1, 0.5];
+pub const Q: Matrix = [[1.0, 0.0], [0.0, 0.1]];
+pub const LAST: Matrix = [[4.0, 0.0], [0.0, 2.0]];
+pub const R: f64 = 1.0;
 
 /// The cart of one environment.
 pub struct Lqr {

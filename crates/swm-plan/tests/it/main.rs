@@ -4,6 +4,7 @@
 mod gradient;
 mod lqr;
 mod mpc;
+mod objective;
 mod simulator;
 mod solvers;
 mod toys;

@@ -1,0 +1,113 @@
+//! [`Regularised`]: the cost of a model, and terms and constraints on the actions alone.
+
+use super::{Constraint, Objective, Rolled, Shape, check_all, check_room};
+use swm_core::{Batch, Candidates, Constrained, CostModel, DifferentiableCost, Env, Error, LatentDynamics, Result};
+
+/// A model whose plans also pay for their actions, or must keep limits on them. It is differentiable if the model is, and
+/// shows the model's latents.
+pub struct Regularised {
+    model: Box<dyn CostModel>,
+    objective: Box<dyn Objective>,
+    constraints: Vec<Box<dyn Constraint>>,
+}
+
+impl Regularised {
+    /// A model with an objective added to its cost, and constraints.
+    ///
+    /// # Errors
+    /// When one of them looks at latents, or the model has constraints of its own.
+    pub fn new(
+        mut model: Box<dyn CostModel>,
+        objective: Box<dyn Objective>,
+        constraints: Vec<Box<dyn Constraint>>,
+    ) -> Result<Self> {
+        refuse_constraints(&mut *model)?;
+        if objective.needs_latents() || constraints.iter().any(|constraint| constraint.needs_latents()) {
+            return Err(Error::config(
+                "objective",
+                "a term on latents cannot be added to the cost of a model as it is",
+                "price the whole rollout: name a goal term too",
+            ));
+        }
+        Ok(Self { model, objective, constraints })
+    }
+
+    fn check<'a>(&self, candidates: Candidates<'a>) -> Result<Rolled<'a>> {
+        let Candidates { horizon, dim, .. } = candidates;
+        check_all(Shape { horizon, latent: 0, dim }, &*self.objective, &self.constraints)?;
+        Ok(Rolled { candidates, latents: &[], goals: &[], latent: 0 })
+    }
+}
+
+/// Refuses models that have constraints already: a candidate has one list of them.
+pub(super) fn refuse_constraints(model: &mut dyn CostModel) -> Result<()> {
+    if model.constrained().is_none() {
+        return Ok(());
+    }
+    Err(Error::config("objective", "the model has constraints of its own", "give all constraints to one objective"))
+}
+
+impl CostModel for Regularised {
+    fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()> {
+        self.model.observe(infos, envs)
+    }
+
+    fn see(&mut self, slot: usize, env: &dyn Env) -> Result<()> {
+        self.model.see(slot, env)
+    }
+
+    fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
+        let rolled = self.check(candidates)?;
+        self.model.cost(candidates, costs)?;
+        rolled.add_costs(&*self.objective, costs);
+        Ok(())
+    }
+
+    fn differentiable(&mut self) -> Option<&mut dyn DifferentiableCost> {
+        if self.model.differentiable().is_some() { Some(self) } else { None }
+    }
+
+    fn latent(&mut self) -> Option<&mut dyn LatentDynamics> {
+        self.model.latent()
+    }
+
+    fn constrained(&mut self) -> Option<&mut dyn Constrained> {
+        if self.constraints.is_empty() { None } else { Some(self) }
+    }
+}
+
+impl DifferentiableCost for Regularised {
+    fn cost_and_gradient(&mut self, candidates: Candidates<'_>, costs: &mut [f32], gradient: &mut [f32]) -> Result<()> {
+        let rolled = self.check(candidates)?;
+        check_room("the gradient of a cost", gradient.len(), candidates.actions.len())?;
+        let Some(model) = self.model.differentiable() else {
+            let fix = "choose a solver that samples";
+            return Err(Error::config("objective", "the model it is added to has no gradient", fix));
+        };
+        model.cost_and_gradient(candidates, costs, gradient)?;
+        rolled.add_costs(&*self.objective, costs);
+        rolled.add_gradients(&*self.objective, &mut [], gradient);
+        Ok(())
+    }
+}
+
+impl Constrained for Regularised {
+    fn constraints(&self, horizon: usize) -> usize {
+        self.constraints.iter().map(|constraint| constraint.count(horizon, 0)).sum()
+    }
+
+    fn constrain(&mut self, candidates: Candidates<'_>, values: &mut [f32]) -> Result<()> {
+        let rolled = self.check(candidates)?;
+        check_room("the values of constraints", values.len(), rolled.count(&self.constraints))?;
+        rolled.constrain(&self.constraints, values);
+        Ok(())
+    }
+
+    fn constrain_vjp(&mut self, candidates: Candidates<'_>, weights: &[f32], gradient: &mut [f32]) -> Result<()> {
+        let rolled = self.check(candidates)?;
+        check_room("the weights of constraints", weights.len(), rolled.count(&self.constraints))?;
+        check_room("the gradient of constraints", gradient.len(), candidates.actions.len())?;
+        rolled.add_constraint_gradients(&self.constraints, weights, &mut [], gradient);
+        Ok(())
+    }
+}

@@ -1,0 +1,479 @@
+//! Objectives and constraints: what they cost, that their gradients are slopes, and what plans they lead to.
+
+use crate::lqr::{self, Lqr};
+use crate::toys::{Landscape as _, Model, draw, toy};
+use rand::Rng as _;
+use swm_core::{
+    Batch, Candidates, Constrained, CostModel, DifferentiableCost, Key, LatentDynamics, Plan, PlanProblem, PlanSpace,
+    Result, Schema, Solver,
+};
+use swm_plan::grasp::Fall;
+use swm_plan::objective::{
+    ActionNorm, Change, Constraint, Control, CustomConstraint, Goal, LatentBox, Objective, ObjectiveConfig,
+    ObjectiveCost, Pick, Regularised, Shape, Slope, Trajectory, When,
+};
+use swm_plan::optimizer::{Adam, Optimizer, Sgd};
+use swm_plan::{AugmentedLagrangian, GradientDescent, Grasp};
+
+/// Latent dynamics `z' = f(M z + B a)`, with one row of `M` and `B` for every number of `z'`. The cost is the squared
+/// distance to the goal after the last step.
+struct System {
+    mix: Vec<Vec<f32>>,
+    push: Vec<Vec<f32>>,
+    /// Whether f is the hyperbolic tangent; otherwise it changes nothing.
+    bent: bool,
+    /// Start and goal of an environment.
+    scene: fn(env: usize) -> (Vec<f32>, Vec<f32>),
+    envs: Vec<usize>,
+}
+
+/// Three latents, two actions of two numbers a model step, nothing linear about it.
+fn bent() -> System {
+    let mut rng = Key::new(1).rng();
+    let mut row = |n: usize| -> Vec<f32> { (0..n).map(|_| rng.random_range(-0.9f32..0.9)).collect() };
+    let (mix, push) = ((0..3).map(|_| row(3)).collect(), (0..3).map(|_| row(4)).collect());
+    let scene = |env| {
+        let numbers: Vec<f32> = draw(env, 6, 0.8).iter().map(|&v| v as f32).collect();
+        (numbers[..3].to_vec(), numbers[3..].to_vec())
+    };
+    System { mix, push, bent: true, scene, envs: vec![] }
+}
+
+impl System {
+    fn dim(&self) -> usize {
+        self.push[0].len()
+    }
+
+    /// `M z + B a`.
+    fn before(&self, z: &[f32], a: &[f32]) -> Vec<f32> {
+        let dot = |row: &[f32], v: &[f32]| row.iter().zip(v).map(|(w, v)| w * v).sum::<f32>();
+        self.mix.iter().zip(&self.push).map(|(mix, push)| dot(mix, z) + dot(push, a)).collect()
+    }
+}
+
+impl CostModel for System {
+    fn observe(&mut self, _: &Batch, envs: &[usize]) -> Result<()> {
+        self.envs = envs.to_vec();
+        Ok(())
+    }
+
+    fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
+        for (i, plan) in candidates.actions.chunks_exact(candidates.horizon * candidates.dim).enumerate() {
+            let (mut z, goal) = (self.scene)(self.envs[i / candidates.samples]);
+            for a in plan.chunks_exact(candidates.dim) {
+                let mut next = vec![0.0; z.len()];
+                self.predict(&z, a, &mut next)?;
+                z = next;
+            }
+            costs[i] = z.iter().zip(goal).map(|(z, goal)| (z - goal).powi(2)).sum();
+        }
+        Ok(())
+    }
+
+    fn latent(&mut self) -> Option<&mut dyn LatentDynamics> {
+        Some(self)
+    }
+}
+
+impl LatentDynamics for System {
+    fn latent_dim(&self) -> usize {
+        self.mix.len()
+    }
+
+    fn encode(&mut self, start: &mut [f32], goal: &mut [f32]) -> Result<()> {
+        let scenes: Vec<_> = self.envs.iter().map(|&env| (self.scene)(env)).collect();
+        start.copy_from_slice(&scenes.iter().flat_map(|scene| scene.0.clone()).collect::<Vec<_>>());
+        goal.copy_from_slice(&scenes.iter().flat_map(|scene| scene.1.clone()).collect::<Vec<_>>());
+        Ok(())
+    }
+
+    fn predict(&mut self, latents: &[f32], actions: &[f32], next: &mut [f32]) -> Result<()> {
+        let latent = self.latent_dim();
+        let pairs = latents.chunks_exact(latent).zip(actions.chunks_exact(self.dim()));
+        for ((z, a), next) in pairs.zip(next.chunks_exact_mut(latent)) {
+            let before = self.before(z, a);
+            next.iter_mut().zip(before).for_each(|(next, b)| *next = if self.bent { b.tanh() } else { b });
+        }
+        Ok(())
+    }
+
+    fn predict_vjp(
+        &mut self,
+        latents: &[f32],
+        actions: &[f32],
+        next_gradient: &[f32],
+        latent_gradient: &mut [f32],
+        action_gradient: &mut [f32],
+    ) -> Result<()> {
+        let (latent, dim) = (self.latent_dim(), self.dim());
+        latent_gradient.fill(0.0);
+        action_gradient.fill(0.0);
+        for (i, (z, a)) in latents.chunks_exact(latent).zip(actions.chunks_exact(dim)).enumerate() {
+            for (row, before) in self.before(z, a).into_iter().enumerate() {
+                let slope = if self.bent { 1.0 - before.tanh().powi(2) } else { 1.0 };
+                let pull = next_gradient[i * latent + row] * slope;
+                (0..latent).for_each(|j| latent_gradient[i * latent + j] += pull * self.mix[row][j]);
+                (0..dim).for_each(|j| action_gradient[i * dim + j] += pull * self.push[row][j]);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Shows a model some environments; what they look like follows from their numbers.
+fn observe(model: &mut dyn CostModel, envs: &[usize]) {
+    model.observe(&Batch::zeros(&Schema::new([]).expect("no columns"), 0), envs).expect("nothing to read");
+}
+
+const HORIZON: usize = 4;
+const ENVS: [usize; 2] = [0, 1];
+const SAMPLES: usize = 3;
+
+fn candidates(actions: &[f32], horizon: usize) -> Candidates<'_> {
+    let dim = actions.len() / (ENVS.len() * SAMPLES * horizon);
+    Candidates { actions, envs: ENVS.len(), samples: SAMPLES, horizon, dim }
+}
+
+fn random(n: usize) -> Vec<f32> {
+    draw(77, n, 1.0).iter().map(|&v| v as f32).collect()
+}
+
+/// An objective with every kind of term.
+fn everything() -> Vec<Box<dyn Objective>> {
+    let running =
+        Goal { weight: 0.7, when: When::Running, discount: 0.8, latents: vec![Pick::One(2), Pick::Range([0, 1])] };
+    vec![
+        Box::new(Goal::default()),
+        Box::new(running),
+        Box::new(Control { weight: 0.1 }),
+        Box::new(Change { weight: 0.3, block: 2 }),
+    ]
+}
+
+/// Every kind of constraint: 8 norms, 4 latents with two bounds, and the product of the first two actions of all steps.
+fn limits() -> Vec<Box<dyn Constraint>> {
+    let product = CustomConstraint {
+        count: 1,
+        needs_latents: true,
+        values: |way: Trajectory<'_>, values: &mut [f32]| {
+            values[0] = way.actions.chunks_exact(way.dim).map(|a| a[0] * a[1]).sum::<f32>() + way.latents[4].powi(2);
+        },
+        gradient: |way: Trajectory<'_>, weights: &[f32], slope: &mut Slope<'_>| {
+            for t in 0..way.actions.len() / way.dim {
+                let at = t * way.dim;
+                slope.actions[at] += weights[0] * way.actions[at + 1];
+                slope.actions[at + 1] += weights[0] * way.actions[at];
+            }
+            slope.latents[4] += 2.0 * weights[0] * way.latents[4];
+        },
+    };
+    let bounds = LatentBox { latents: vec![Pick::One(1)], low: Some(-0.2), high: Some(0.3) };
+    vec![Box::new(ActionNorm { limit: 0.8, block: 2 }), Box::new(bounds), Box::new(product)]
+}
+
+/// Checks a gradient against central differences of a sum over all candidates.
+#[track_caller]
+fn assert_slopes(actions: &[f32], gradient: &[f32], mut sum: impl FnMut(&[f32]) -> f64) {
+    const STEP: f32 = 4e-3;
+    for j in 0..actions.len() {
+        let mut moved = actions.to_vec();
+        moved[j] = actions[j] + STEP;
+        let above = sum(&moved);
+        moved[j] = actions[j] - STEP;
+        let slope = (above - sum(&moved)) / (2.0 * f64::from(STEP));
+        assert!((slope - f64::from(gradient[j])).abs() < 1e-3, "number {j}: slope {slope}, gradient {}", gradient[j]);
+    }
+}
+
+fn total(numbers: &[f32]) -> f64 {
+    numbers.iter().map(|&v| f64::from(v)).sum()
+}
+
+#[test]
+fn gradients_through_time_are_slopes() {
+    let mut model = ObjectiveCost::new(Box::new(bent()), Box::new(everything()), limits()).expect("a model");
+    observe(&mut model, &ENVS);
+    let actions = random(ENVS.len() * SAMPLES * HORIZON * 4);
+    let (mut costs, mut again) = ([f32::NAN; 6], [f32::NAN; 6]);
+    let mut gradient = vec![f32::NAN; actions.len()];
+    model.cost(candidates(&actions, HORIZON), &mut costs).expect("costs");
+    model.cost_and_gradient(candidates(&actions, HORIZON), &mut again, &mut gradient).expect("gradients");
+    assert_eq!(costs, again);
+    assert_slopes(&actions, &gradient, |moved| {
+        model.cost(candidates(moved, HORIZON), &mut costs).expect("costs");
+        total(&costs)
+    });
+
+    let count = Constrained::constraints(&model, HORIZON);
+    assert_eq!(count, 2 * HORIZON + 2 * HORIZON + 1);
+    let weights = random(6 * count);
+    let mut values = vec![0.0; 6 * count];
+    // Gradients of constraints are added to what is there.
+    let mut gradient = vec![0.5; actions.len()];
+    model.constrain_vjp(candidates(&actions, HORIZON), &weights, &mut gradient).expect("gradients");
+    gradient.iter_mut().for_each(|g| *g -= 0.5);
+    assert_slopes(&actions, &gradient, |moved| {
+        model.constrain(candidates(moved, HORIZON), &mut values).expect("values");
+        values.iter().zip(&weights).map(|(value, weight)| f64::from(value * weight)).sum()
+    });
+}
+
+#[test]
+fn terms_and_constraints_cost_what_their_formulas_say() {
+    // Two steps of a latent of two numbers.
+    let way = Trajectory {
+        latents: &[9.0, 9.0, 2.0, 1.0, 4.0, 0.0],
+        goal: &[1.0, 3.0],
+        actions: &[3.0, 4.0, 0.0, 1.0, 0.0, 1.0, 2.0, 1.0],
+        dim: 4,
+    };
+    assert_eq!(Goal::default().cost(way), 9.0 + 9.0);
+    let running = Goal { weight: 2.0, when: When::Running, discount: 0.5, latents: vec![] };
+    assert_eq!(running.cost(way), 2.0 * ((1.0 + 4.0) + 0.5 * (9.0 + 9.0)));
+    assert_eq!(Goal { latents: vec![Pick::One(1)], ..running }.cost(way), 2.0 * (4.0 + 0.5 * 9.0));
+    assert_eq!(Control { weight: 0.5 }.cost(way), 0.5 * (25.0 + 1.0 + 1.0 + 5.0));
+    // Model steps (3 4 0 1), (0 1 2 1); as two actions each, (3 4), (0 1), (0 1), (2 1).
+    assert_eq!(Change { weight: 1.0, block: 1 }.cost(way), 9.0 + 9.0 + 4.0 + 0.0);
+    assert_eq!(Change { weight: 1.0, block: 2 }.cost(way), (9.0 + 9.0) + 0.0 + 4.0);
+    let values = |constraint: &dyn Constraint| {
+        let mut values = vec![f32::NAN; constraint.count(2, 2)];
+        constraint.values(way, &mut values);
+        values
+    };
+    assert_eq!(values(&ActionNorm { limit: 2.0, block: 2 }), [3.0, -1.0, -1.0, 5f32.sqrt() - 2.0]);
+    assert_eq!(values(&LatentBox { high: Some(1.5), ..LatentBox::default() }), [0.5, -0.5, 2.5, -1.5]);
+    let one = LatentBox { latents: vec![Pick::Range([0, 1])], low: Some(3.0), high: Some(5.0) };
+    assert_eq!(values(&one), [1.0, -3.0, -1.0, -1.0]);
+    let none = Control::default().cost(Trajectory { latents: &[], goal: &[], ..way });
+    assert_eq!(none, 32.0, "terms on actions need no latents");
+}
+
+#[test]
+fn a_terminal_goal_is_the_models_own_cost() {
+    let actions = random(ENVS.len() * SAMPLES * HORIZON * 4);
+    let (mut own, mut priced) = ([0.0; 6], [1.0; 6]);
+    let mut model = bent();
+    observe(&mut model, &ENVS);
+    model.cost(candidates(&actions, HORIZON), &mut own).expect("costs");
+    let mut model = ObjectiveCost::new(Box::new(bent()), Box::new(Goal::default()), vec![]).expect("a model");
+    observe(&mut model, &ENVS);
+    model.cost(candidates(&actions, HORIZON), &mut priced).expect("costs");
+    assert_eq!(own, priced);
+    assert!(model.constrained().is_none());
+    // The same candidates elsewhere are predicted anew.
+    observe(&mut model, &[4, 5]);
+    model.cost(candidates(&actions, HORIZON), &mut priced).expect("costs");
+    assert!(own.iter().zip(priced).all(|(own, other)| *own != other));
+}
+
+#[test]
+fn a_model_can_be_regularised_with_its_gradient_or_without() {
+    let quadratic = toy("quadratic");
+    let actions = random(ENVS.len() * SAMPLES * 6);
+    let config = r#"{
+        "terms": [{"term": "control", "weight": 0.25}, {"term": "change", "weight": 0.5}],
+        "constraints": [{"constraint": "action_norm", "limit": 0.5}]
+    }"#;
+    let config: ObjectiveConfig = serde_json::from_str(config).expect("an objective");
+    let mut own = [0.0; 6];
+    Model::new(quadratic, &ENVS).cost(candidates(&actions, 3), &mut own).expect("costs");
+
+    let mut model = config.apply(Box::new(Model::new(quadratic, &ENVS))).expect("a model");
+    let (mut costs, mut gradient) = ([0.0; 6], vec![0.0; actions.len()]);
+    model.cost(candidates(&actions, 3), &mut costs).expect("costs");
+    for ((cost, own), a) in costs.iter().zip(own).zip(actions.chunks_exact(6)) {
+        let change: f32 = (2..6).map(|j| (a[j] - a[j - 2]).powi(2)).sum();
+        let expected = own + 0.25 * a.iter().map(|a| a * a).sum::<f32>() + 0.5 * change;
+        assert!((cost - expected).abs() < 1e-5, "{cost} {expected}");
+    }
+    let differentiable = model.differentiable().expect("the toy has a gradient");
+    differentiable.cost_and_gradient(candidates(&actions, 3), &mut costs, &mut gradient).expect("gradients");
+    assert_slopes(&actions, &gradient, |moved| {
+        model.cost(candidates(moved, 3), &mut costs).expect("costs");
+        total(&costs)
+    });
+    let limits = model.constrained().expect("a constraint");
+    let (weights, mut values) = (random(18), vec![0.0; 18]);
+    gradient.fill(0.0);
+    limits.constrain_vjp(candidates(&actions, 3), &weights, &mut gradient).expect("gradients");
+    assert_slopes(&actions, &gradient, |moved| {
+        limits.constrain(candidates(moved, 3), &mut values).expect("values");
+        values.iter().zip(&weights).map(|(value, weight)| f64::from(value * weight)).sum()
+    });
+
+    let mut opaque = config.apply(Box::new(Model::new(quadratic, &ENVS).opaque())).expect("a model");
+    assert!(opaque.differentiable().is_none() && opaque.latent().is_none() && opaque.constrained().is_some());
+    let mut shown = config.apply(Box::new(Model::new(toy("reach"), &ENVS))).expect("a model");
+    assert!(shown.latent().is_some());
+}
+
+fn solve(solver: &mut dyn Solver, model: &mut dyn CostModel, horizon: usize, dim: usize, envs: &[usize]) -> Plan {
+    try_solve(solver, model, horizon, dim, envs).expect("a plan")
+}
+
+fn try_solve(
+    solver: &mut dyn Solver,
+    model: &mut dyn CostModel,
+    horizon: usize,
+    dim: usize,
+    envs: &[usize],
+) -> Result<Plan> {
+    let keys: Vec<Key> = envs.iter().map(|&env| Key::new(3).at(env as u64)).collect();
+    let (low, high) = (vec![f32::NEG_INFINITY; dim], vec![f32::INFINITY; dim]);
+    let space = PlanSpace::Continuous { low: &low, high: &high };
+    let problem = PlanProblem { horizon, space, keys: &keys, init: None, deadline: None };
+    solver.solve(model, problem)
+}
+
+#[test]
+fn plans_keep_to_an_action_norm_that_the_model_knows_nothing_of() {
+    // A point that is to go farther than three actions of norm 0.1 lead: straight on, at full speed.
+    const LIMIT: f32 = 0.1;
+    let limit: Vec<Box<dyn Constraint>> = vec![Box::new(ActionNorm { limit: LIMIT, block: 1 })];
+    let envs = [0, 1, 2];
+    let model = Box::new(Model::new(toy("reach"), &envs));
+    let mut model = Regularised::new(model, Box::new(Vec::<Control>::new()), limit).expect("a model");
+    let mut solver = AugmentedLagrangian {
+        samples: 4,
+        outer_iterations: 25,
+        iterations: 200,
+        optimizer: Optimizer::Sgd(Sgd { step: 0.02, momentum: 0.0 }),
+        penalty_limit: 8.0,
+        ..AugmentedLagrangian::default()
+    };
+    let plan = solve(&mut solver, &mut model, 3, 2, &envs);
+    for (env, actions) in envs.into_iter().zip(plan.actions.chunks_exact(6)) {
+        let goal = draw(env, 2, 1.0);
+        let norm = goal.iter().map(|g| g * g).sum::<f64>().sqrt();
+        assert!(norm > 0.35, "environment {env}: its goal is near");
+        for (j, action) in actions.iter().enumerate() {
+            let best = f64::from(LIMIT) * goal[j % 2] / norm;
+            assert!((f64::from(*action) - best).abs() < 2e-3, "environment {env}: {actions:?}, goal {goal:?}");
+        }
+        assert!(plan.trace[env].violation.last().is_some_and(|&violation| violation <= solver.tolerance));
+    }
+}
+
+/// The cart of [`lqr`], its cost written as an objective. The states' costs before the first action are left out, as no
+/// plan changes them.
+fn cart() -> ObjectiveCost {
+    let narrow = |row: &[f64; 2]| row.map(|v| v as f32).to_vec();
+    let scene = |env| (draw(env, 2, 1.5).iter().map(|&v| v as f32).collect(), vec![0.0; 2]);
+    let (mix, push) = (lqr::A.iter().map(narrow).collect(), lqr::B.iter().map(|&b| vec![b as f32]).collect());
+    let system = System { mix, push, bent: false, scene, envs: vec![] };
+    let mut terms: Vec<Box<dyn Objective>> = vec![Box::new(Control { weight: lqr::R as f32 })];
+    for i in 0..2 {
+        let (each, last) = (lqr::Q[i][i] as f32, lqr::LAST[i][i] as f32);
+        let latents = vec![Pick::One(i)];
+        terms.push(Box::new(Goal { weight: each, when: When::Running, latents: latents.clone(), ..Goal::default() }));
+        terms.push(Box::new(Goal { weight: last - each, latents, ..Goal::default() }));
+    }
+    ObjectiveCost::new(Box::new(system), Box::new(terms), vec![]).expect("a model")
+}
+
+#[test]
+fn the_regulators_plan_is_found_through_the_latent_dynamics() {
+    let envs = [0, 1, 2];
+    let gd = GradientDescent { samples: 4, iterations: 400, ..GradientDescent::default() };
+    // The loss of GRASP is not the regulator's: what finds its plan is the synchronisation.
+    let sync_optimizer = Optimizer::Adam(Adam { step: 0.05, ..Adam::default() });
+    let grasp = Grasp { iterations: 50, sync_iterations: 600, sync_optimizer, ..Grasp::default() };
+    let solvers: [Box<dyn Solver>; 2] = [Box::new(gd), Box::new(grasp)];
+    for (i, mut solver) in solvers.into_iter().enumerate() {
+        let mut model = cart();
+        observe(&mut model, &envs);
+        let plan = solve(&mut *solver, &mut model, Lqr::HORIZON, 1, &envs);
+        for (env, actions) in envs.into_iter().zip(plan.actions.chunks_exact(Lqr::HORIZON)) {
+            for (action, best) in actions.iter().zip(Lqr::new(env).optimum()) {
+                assert!((f64::from(*action) - best).abs() < 2e-3, "solver {i}, environment {env}: {actions:?}");
+            }
+        }
+    }
+}
+
+/// A point in the plane that turns and flees from the origin by the factor `growth` a step, pushed where one likes.
+fn fleeing(growth: f32) -> ObjectiveCost {
+    let scene = |env| {
+        let numbers: Vec<f32> = draw(env, 4, 1.0).iter().map(|&v| v as f32).collect();
+        (numbers[..2].to_vec(), numbers[2..].to_vec())
+    };
+    let mix = vec![vec![growth, 0.2], vec![-0.2, growth]];
+    let push = vec![vec![1.0, 0.0], vec![0.0, 1.0]];
+    let system = System { mix, push, bent: false, scene, envs: vec![] };
+    ObjectiveCost::new(Box::new(system), Box::new(Goal::default()), vec![]).expect("a model")
+}
+
+#[test]
+fn with_virtual_states_one_step_size_serves_every_horizon() {
+    // What GRASP promises: the curvature of a rollout's cost grows with the horizon, that of the lifted problem does not.
+    // Plain gradient steps show it; Adam, which rescales every number, hides it.
+    let plain = |step| Optimizer::Sgd(Sgd { step, momentum: 0.0 });
+    let still = Fall { from: 0.0, to: 0.0 };
+    let mut grasp = Grasp {
+        iterations: 100,
+        action_optimizer: plain(0.2),
+        state_optimizer: plain(0.2),
+        goal_weight: still,
+        state_noise: still,
+        sync_every: 0,
+        ..Grasp::default()
+    };
+    let envs = [0, 1, 2];
+    let worst = |solver: &mut dyn Solver, growth: f32, horizon: usize| -> Result<f32> {
+        let mut model = fleeing(growth);
+        observe(&mut model, &envs);
+        let plan = try_solve(solver, &mut model, horizon, 2, &envs)?;
+        Ok(plan.costs.into_iter().fold(0.0, f32::max))
+    };
+    for (growth, horizon) in [(1.1, 20), (1.1, 40), (1.3, 20)] {
+        let cost = worst(&mut grasp, growth, horizon).expect("a plan");
+        assert!(cost < 1e-6, "growth {growth}, horizon {horizon}: {cost}");
+    }
+    let gd =
+        |step| GradientDescent { samples: 1, iterations: 100, optimizer: plain(step), ..GradientDescent::default() };
+    assert!(worst(&mut gd(1e-3), 1.1, 20).expect("a plan") < 1e-6, "the right step for 20 steps");
+    let message = worst(&mut gd(1e-3), 1.1, 40).expect_err("too long a step for 40").to_string();
+    assert!(message.contains("not finite"), "{message}");
+    assert!(worst(&mut gd(1e-5), 1.1, 40).expect("a plan") < 1e-6, "the right step for 40 steps");
+    assert!(worst(&mut gd(1e-5), 1.1, 20).expect("a plan") > 1.0, "too short a step for 20");
+}
+
+#[test]
+fn what_does_not_fit_says_so() {
+    let shape = Shape { horizon: 2, latent: 3, dim: 4 };
+    let message = |objective: &dyn Objective| objective.check(shape).expect_err("wrong").to_string();
+    let goal = Goal::default;
+    let past = message(&Goal { latents: vec![Pick::Range([2, 4])], ..goal() });
+    assert_eq!(past, "goal term, latents = 2..4 is outside its space: expected numbers of a latent, within 0..3");
+    assert!(message(&Goal { latents: vec![Pick::One(1), Pick::Range([0, 2])], ..goal() }).contains("1 is named twice"));
+    assert!(message(&Goal { discount: 0.9, ..goal() }).contains("0.9 of a terminal term"));
+    assert!(message(&Goal { weight: f32::NAN, ..goal() }).contains("goal term, weight: NaN"));
+    assert!(message(&Control { weight: -1.0 }).contains("control term, weight: -1"));
+    assert!(message(&Change { weight: 1.0, block: 3 }).contains("3 actions in a model step of 4 numbers"));
+    let message = |constraint: &dyn Constraint| constraint.check(shape).expect_err("wrong").to_string();
+    assert!(message(&ActionNorm { limit: -1.0, block: 1 }).contains("action norm, limit: -1"));
+    assert!(message(&LatentBox::default()).contains("give a finite lower bound"));
+    assert!(message(&LatentBox { low: Some(1.0), high: Some(0.0), ..LatentBox::default() }).contains("Some(1.0)"));
+    let blind = Goal::default().check(Shape { latent: 0, ..shape }).expect_err("no latents").to_string();
+    assert!(blind.contains("this model shows none"), "{blind}");
+
+    let read = |json: &str| serde_json::from_str::<ObjectiveConfig>(json);
+    assert!(read(r#"{"terms": [{"term": "goal", "wieght": 1}]}"#).expect_err("a slip").to_string().contains("wieght"));
+    assert!(read(r#"{"terms": [{"term": "joy"}]}"#).expect_err("unknown").to_string().contains("joy"));
+    let model = |name| Box::new(Model::new(toy(name), &ENVS));
+    let refuse =
+        |json: &str, name| read(json).expect("an objective").apply(model(name)).err().expect("wrong").to_string();
+    let message = refuse(r#"{"terms": [{"term": "goal"}]}"#, "quadratic");
+    assert!(message.contains("it prices latents, and this model shows none"), "{message}");
+    let message = refuse(r#"{"constraints": [{"constraint": "latent_box", "low": 0}]}"#, "reach");
+    assert!(message.contains("name a goal term too"), "{message}");
+    let message = refuse(r#"{"terms": [{"term": "control"}]}"#, "constrained");
+    assert!(message.contains("the model has constraints of its own"), "{message}");
+    assert!(ObjectiveConfig::default().is_empty());
+    assert!(ObjectiveConfig::default().apply(model("constrained")).is_ok(), "nothing to add");
+
+    let mut cost = ObjectiveCost::new(Box::new(bent()), Box::new(goal()), vec![]).expect("a model");
+    let actions = random(ENVS.len() * SAMPLES * HORIZON * 4);
+    let message = cost.cost(candidates(&actions, HORIZON), &mut [0.0; 6]).expect_err("nothing observed").to_string();
+    assert!(message.contains("got 2, expected 0, which were observed"), "{message}");
+}

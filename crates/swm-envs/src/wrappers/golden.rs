@@ -40,9 +40,9 @@ fn floats(value: &Value) -> Vec<f64> {
 fn tolerance(id: &str) -> (f64, u8) {
     match id {
         // Rounding of means that end in a half.
-        "resolution" | "chroma-key" => (0.05, 1),
+        "resolution" | "chroma-key" => (0.03, 1),
         // Products that come out just below a whole number with one way of multiplying and on it with another.
-        "color-jitter" => (0.01, 1),
+        "color-jitter" => (0.001, 1),
         _ => (0.0, 0),
     }
 }

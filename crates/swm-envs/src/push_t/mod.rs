@@ -176,6 +176,7 @@ impl Env for PushT {
         #[allow(clippy::cast_possible_wrap)]
         row.set(8, &[self.contacts.div_ceil(SUBSTEPS) as i64]);
         row.set(9, &self.shapes);
+        row.set(10, &[x, y, self.world.bodies[AGENT].angle]);
     }
 
     fn render(&mut self, frame: FrameMut<'_>) {
@@ -398,6 +399,7 @@ fn columns() -> Vec<ColumnSpec> {
         column("goal_proprio", 4),
         ColumnSpec::new("n_contacts", DType::Int64, []),
         column("shapes", 4),
+        column("agent_pose", 3),
     ]
 }
 
@@ -492,17 +494,23 @@ mod tests {
         let mut env = PushT::new();
         let schema = swm_core::Schema::new(env.spec.columns.clone()).expect("a schema");
         let mut row = swm_core::Batch::zeros(&schema, 1);
-        let reached = (0..10).filter(|&seed| {
+        let mut reaches = |seed: u64, options: &ResetOptions| {
             let mut expert = (EXPERTS[0].make)();
             expert.begin(Key::new(seed));
-            env.reset(seed, &ResetOptions::default()).expect("a reset");
+            env.reset(seed, options).expect("a reset");
             (0..env.spec.max_episode_steps).any(|_| {
                 env.observe(&mut row.row_mut(0));
                 let mut action = [0.0; 2];
                 expert.act(row.row(0), &mut action).expect("an action");
                 env.step(Action::Continuous(&action.map(|v| v as f32))).expect("a step").terminated
             })
-        });
-        assert!(reached.count() >= 9);
+        };
+        assert!((0..10).filter(|&seed| reaches(seed, &ResetOptions::default())).count() >= 9);
+        // An agent that is pushed back, and turned, by what it pushes.
+        let pinned = [("agent.shape", 4.0), ("agent.scale", 25.0), ("block.shape", 6.0)];
+        let mut square = ResetOptions::default();
+        square.variation.variation_values =
+            pinned.into_iter().map(|(key, value)| (key.to_owned(), vec![value])).collect();
+        assert!((0..10).filter(|&seed| reaches(seed, &square)).count() >= 7);
     }
 }

@@ -85,11 +85,6 @@ impl Design {
         self.rects.is_empty()
     }
 
-    /// How far it reaches from its origin.
-    pub fn reach(&self) -> f64 {
-        self.rects.iter().flatten().map(|corner| corner.length()).fold(self.radius, f64::max)
-    }
-
     /// A body of this shape, at the origin.
     pub fn body(&self) -> Body {
         let mass = if self.is_circle() { f64::INFINITY } else { 1.0 };

@@ -1,6 +1,8 @@
 //! Who demonstrates.
 
+mod model;
 mod pusher;
+mod room;
 mod route;
 mod weak;
 

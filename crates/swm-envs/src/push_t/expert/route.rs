@@ -1,84 +1,74 @@
 //! Ways around the block that do not touch it.
 
-use crate::push_t::TABLE;
+use super::room::Room;
 use crate::push_t::physics::Vec2;
 
-/// How many places around the block a way may pass.
-const RING: usize = 16;
-/// Pixels that a way keeps from the block, and from the edge of the table.
-const SPARE: f64 = 2.0;
-const EDGE: f64 = 22.0;
-/// Pixels between two looks along a line.
-const LOOK: f64 = 5.0;
-/// So near to where a way starts, nothing is looked at: the agent may just have pushed.
-const START: f64 = 10.0;
+/// Pixels that a way keeps from touching the block, where it does not begin or end nearer.
+const SPARE: f64 = 3.0;
 
-/// How far a place is from the nearest rectangle, 0 inside.
-pub fn clearance(rects: &[[Vec2; 4]], place: Vec2) -> f64 {
-    rects.iter().map(|rect| distance(rect, place)).fold(f64::INFINITY, f64::min)
+/// The shortest ways from one place to every other, past corners of obstacles.
+pub struct Ways<'a> {
+    room: &'a Room,
+    /// The start, then the corners a way may pass.
+    nodes: Vec<Vec2>,
+    /// How far each is from the start, and which comes before it.
+    reached: Vec<(f64, usize)>,
 }
 
-fn distance(rect: &[Vec2; 4], place: Vec2) -> f64 {
-    let (along, across) = (rect[1] - rect[0], rect[3] - rect[0]);
-    let outside = |axis: Vec2| {
-        let length = axis.length();
-        let at = (place - rect[0]).dot(axis) / length;
-        (at - at.clamp(0.0, length)).abs()
-    };
-    outside(along).hypot(outside(across))
+impl<'a> Ways<'a> {
+    /// All ways from a place: Dijkstra over the corners that see each other.
+    pub fn from(room: &'a Room, start: Vec2) -> Self {
+        let corners = room.obstacles.iter().flat_map(|obstacle| obstacle.around(SPARE + 0.5));
+        let mut nodes = vec![start];
+        nodes.extend(corners.filter(|&corner| room.holds(corner) && room.clearance(corner) > SPARE));
+        let mut reached = vec![(f64::INFINITY, 0); nodes.len()];
+        reached[0].0 = 0.0;
+        let mut open: Vec<usize> = (0..nodes.len()).collect();
+        while let Some(place) = (0..open.len()).min_by(|&a, &b| reached[open[a]].0.total_cmp(&reached[open[b]].0)) {
+            let at = open.swap_remove(place);
+            if reached[at].0.is_infinite() {
+                break;
+            }
+            for &next in &open {
+                let length = reached[at].0 + (nodes[next] - nodes[at]).length();
+                if length < reached[next].0 && is_free(room, nodes[at], nodes[next]) {
+                    reached[next] = (length, at);
+                }
+            }
+        }
+        Self { room, nodes, reached }
+    }
+
+    /// The length of the shortest way to a place, and the last node on it; `None` where there is no way.
+    pub fn to(&self, place: Vec2) -> Option<(f64, usize)> {
+        let mut best: Option<(f64, usize)> = None;
+        for (node, (&at, &(length, _))) in self.nodes.iter().zip(&self.reached).enumerate() {
+            let length = length + (place - at).length();
+            if length.is_finite() && best.is_none_or(|(b, _)| length < b) && is_free(self.room, at, place) {
+                best = Some((length, node));
+            }
+        }
+        best
+    }
+
+    /// The places to pass on the way to a place by way of a node, the first one last.
+    pub fn places(&self, place: Vec2, mut node: usize) -> Vec<Vec2> {
+        let mut places = vec![place];
+        while node != 0 {
+            places.push(self.nodes[node]);
+            node = self.reached[node].1;
+        }
+        places
+    }
 }
 
-/// The shortest way for an agent of this radius, as the places to pass, the first one last. Where there is none, the
-/// straight line.
-pub fn route(rects: &[[Vec2; 4]], radius: f64, from: Vec2, to: Vec2) -> Vec<Vec2> {
-    let free = |a: Vec2, b: Vec2| {
-        let length = (b - a).length();
-        let mut at = if a == from { START } else { 0.0 };
-        while at < length {
-            if clearance(rects, a.lerp(b, at / length)) < radius + SPARE {
-                return false;
-            }
-            at += LOOK;
-        }
-        true
-    };
-    if free(from, to) {
-        return vec![to];
-    }
-    // Dijkstra over a ring of places around the block, with the start as node 0 and the end as node 1.
-    let corners = || rects.iter().flatten().copied();
-    #[allow(clippy::cast_precision_loss)]
-    let centre = corners().fold(Vec2::ZERO, |sum, corner| sum + corner) * (1.0 / (4 * rects.len()).max(1) as f64);
-    let around = corners().map(|corner| (corner - centre).length()).fold(0.0, f64::max) + radius + 3.0 * SPARE;
-    let mut nodes = vec![from, to];
-    nodes.extend((0..RING).map(|i| {
-        #[allow(clippy::cast_precision_loss)]
-        let angle = i as f64 * std::f64::consts::TAU / RING as f64;
-        let place = centre + Vec2::new(angle.cos(), angle.sin()) * around;
-        Vec2::new(place.x.clamp(EDGE, TABLE - EDGE), place.y.clamp(EDGE, TABLE - EDGE))
-    }));
-    let mut best = vec![(f64::INFINITY, 0); nodes.len()];
-    let mut done = vec![false; nodes.len()];
-    best[0].0 = 0.0;
-    while let Some(at) = (0..nodes.len()).filter(|&i| !done[i]).min_by(|&a, &b| best[a].0.total_cmp(&best[b].0)) {
-        if best[at].0.is_infinite() || at == 1 {
-            break;
-        }
-        done[at] = true;
-        for next in 1..nodes.len() {
-            let length = best[at].0 + (nodes[next] - nodes[at]).length();
-            if !done[next] && length < best[next].0 && free(nodes[at], nodes[next]) {
-                best[next] = (length, at);
-            }
-        }
-    }
-    let mut way = vec![to];
-    let mut at = 1;
-    while best[1].0.is_finite() && best[at].1 != 0 {
-        at = best[at].1;
-        way.push(nodes[at]);
-    }
-    way
+/// Whether one can go straight from place to place. Who already is nearer to an obstacle than a way should be may leave
+/// it, but not come nearer.
+fn is_free(room: &Room, from: Vec2, to: Vec2) -> bool {
+    room.obstacles.iter().all(|obstacle| {
+        let margin = SPARE.min(obstacle.clearance(from) - 0.01).min(obstacle.clearance(to) - 0.01);
+        !obstacle.blocks(from, to, margin)
+    })
 }
 
 #[cfg(test)]
@@ -88,16 +78,29 @@ mod tests {
     #[test]
     fn ways_lead_around_the_block() {
         let square = [(200.0, 200.0), (300.0, 200.0), (300.0, 300.0), (200.0, 300.0)].map(|(x, y)| Vec2::new(x, y));
+        let agent: Vec<Vec2> =
+            [(-15.0, -15.0), (15.0, -15.0), (15.0, 15.0), (-15.0, 15.0)].map(|(x, y)| Vec2::new(x, y)).to_vec();
+        let room = Room::new(&[agent], &[square]);
         let (from, to) = (Vec2::new(150.0, 250.0), Vec2::new(350.0, 250.0));
-        let way = route(&[square], 15.0, from, to);
-        assert!(way.len() > 1 && way[0] == to);
+        let ways = Ways::from(&room, from);
+        let (length, node) = ways.to(to).expect("a way");
+        let places = ways.places(to, node);
+        assert!(places.len() == 3 && places[0] == to, "past two corners: {places:?}");
         let mut at = from;
-        for &next in way.iter().rev() {
+        let mut walked = 0.0;
+        for &next in places.iter().rev() {
             for k in 0..=20 {
-                assert!(clearance(&[square], at.lerp(next, f64::from(k) / 20.0)) > 14.0);
+                assert!(room.clearance(at.lerp(next, f64::from(k) / 20.0)) > SPARE - 0.1);
             }
+            walked += (next - at).length();
             at = next;
         }
-        assert_eq!(route(&[square], 15.0, from, Vec2::new(150.0, 50.0)).len(), 1);
+        assert!((walked - length).abs() < 1e-9);
+        // Straight ahead where nothing is between, away from the block where the agent touches it, and not through it.
+        let (_, node) = ways.to(Vec2::new(150.0, 50.0)).expect("a way");
+        assert_eq!(node, 0);
+        let touching = Ways::from(&room, Vec2::new(186.0, 250.0));
+        assert_eq!(touching.to(from).expect("a way").1, 0);
+        assert!(touching.to(to).expect("a way").0 > 250.0);
     }
 }

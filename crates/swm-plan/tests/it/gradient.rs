@@ -307,12 +307,19 @@ fn a_model_without_a_gradient_is_refused_and_others_are_named() {
 
 #[test]
 fn a_late_search_returns_what_it_has() {
-    let mut gd = GradientDescent::default();
-    let deadline = Some(Instant::now());
-    let problem = PlanProblem { horizon: 3, space: FREE, keys: &[Key::new(0)], init: None, deadline };
-    let plan = gd.solve(&mut { BOWL }, problem).expect("a plan");
-    assert_eq!(plan.trace[0].best.len(), 2, "the start and one step");
-    assert!(plan.costs[0] < plan.trace[0].best[0]);
+    for &(id, name, _) in NOISY {
+        let (toy, keys) = (toy(name), [Key::new(0)]);
+        let problem =
+            |deadline| PlanProblem { horizon: toy.horizon, space: toy.space, keys: &keys, init: None, deadline };
+        let mut solver = (SOLVERS.get(id).expect("a solver").make)(&serde_json::json!({})).expect("a solver");
+        let late = solver.solve(&mut Model::new(toy, &[0]), problem(Some(Instant::now()))).expect("a plan");
+        let whole = solver.solve(&mut Model::new(toy, &[0]), problem(None)).expect("a plan");
+        // The start and one step; of GRASP, whose steps are not rolled out, only the plan.
+        assert_eq!(late.trace[0].best.len(), if id == "grasp" { 1 } else { 2 }, "{id}");
+        assert_eq!(late.trace[0].best.last(), Some(&late.costs[0]), "{id}");
+        assert!(late.costs[0].is_finite() && late.actions.len() == whole.actions.len(), "{id}");
+        assert!(late.trace[0].best.len() < whole.trace[0].best.len(), "{id}: the whole search goes on");
+    }
 }
 
 #[test]
@@ -324,4 +331,33 @@ fn settings_that_make_no_sense_say_so() {
     assert!(message(GradientDescent { sigma: f32::NAN, ..default() }).contains("gd sigma: NaN"));
     assert!(message(GradientDescent { action_noise: -1.0, ..default() }).contains("gd action_noise: -1"));
     assert!(message(GradientDescent { clip: Some(0.0), ..default() }).contains("gd clip: 0"));
+
+    // What the others add.
+    let message = |id: &str, settings: serde_json::Value| {
+        let mut solver = match (SOLVERS.get(id).expect("a solver").make)(&settings) {
+            Ok(solver) => solver,
+            Err(error) => return error.to_string(),
+        };
+        solve(&mut *solver, &mut { BOWL }, &[]).expect_err("wrong").to_string()
+    };
+    let table = [
+        ("pgd", r#"{"step": 0}"#, "pgd optimizer, step: 0"),
+        ("pgd", r#"{"momentum": 0.5}"#, "unknown field `momentum`"),
+        ("lagrangian", r#"{"outer_iterations": 0}"#, "lagrangian outer_iterations: 0"),
+        ("lagrangian", r#"{"penalty": -1}"#, "lagrangian penalty: -1"),
+        (
+            "lagrangian",
+            r#"{"penalty": 2, "penalty_limit": 1}"#,
+            "lagrangian penalty_limit: 1, below the first penalty 2",
+        ),
+        ("lagrangian", r#"{"penalty_growth": 0.5}"#, "lagrangian penalty_growth: 0.5"),
+        ("lagrangian", r#"{"tolerance": -0.1}"#, "lagrangian tolerance: -0.1"),
+        ("grasp", r#"{"sync_iterations": 0}"#, "grasp synchronisation: 0 steps every 50 iterations"),
+        ("grasp", r#"{"goal_weight": {"from": -1, "to": 0}}"#, "grasp goal_weight: -1"),
+        ("grasp", r#"{"state_optimizer": {"kind": "sgd", "momentum": 2}}"#, "grasp optimizer, momentum: 2"),
+    ];
+    for (id, settings, expected) in table {
+        let message = message(id, serde_json::from_str(settings).expect("settings"));
+        assert!(message.contains(expected), "{message}");
+    }
 }

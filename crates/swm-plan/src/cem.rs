@@ -21,13 +21,13 @@
 //! - [`Plan::costs`] is the lowest cost of the last iteration; the reference reports the elites' mean, which
 //!   is in the trace here.
 
-use crate::problem::{continuous, score};
-use crate::topk::smallest;
-use rand::Rng as _;
-use rand_distr::StandardNormal;
+use crate::problem::continuous;
+use crate::sampling::{Belief, Samples, Settings, average, search};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use swm_core::{Candidates, CostModel, Error, Key, Plan, PlanProblem, PlanTrace, Result, Solver};
+use swm_core::{CostModel, Plan, PlanProblem, Result, Solver};
+
+const ID: &str = "cem";
 
 /// The cross-entropy method; the defaults are those of the paper's experiments.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -52,102 +52,39 @@ impl Default for Cem {
 impl Solver for Cem {
     fn solve(&mut self, cost: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan> {
         self.check()?;
-        let PlanProblem { horizon, space, keys, init, .. } = problem;
-        let bounds = continuous("cem", cost, &problem)?;
-        let dim = space.dim();
-        let (envs, samples, len) = (keys.len(), self.samples, horizon * dim);
-        if envs == 0 {
-            return Ok(Plan::default());
-        }
+        let bounds = continuous(ID, cost, &problem)?;
+        let mut beliefs = Belief::start(&problem, self.sigma);
+        let mut samples = Samples::new(ID, &problem, self.samples);
 
-        let mut mean = init.map_or_else(|| vec![0.0; envs * len], <[f32]>::to_vec);
-        let mut std = vec![self.sigma; envs * len];
-        let mut actions = vec![0.0; envs * samples * len];
-        let mut costs = vec![0.0; envs * samples];
-        let mut streams: Vec<Key> = keys.to_vec();
-        let mut order = Vec::with_capacity(samples);
-        let mut trace = vec![PlanTrace::default(); envs];
-
-        for iteration in 0..self.iterations {
-            for (stream, key) in streams.iter_mut().zip(keys) {
-                *stream = key.with("cem").at(iteration as u64);
-            }
-            actions.par_chunks_exact_mut(len).enumerate().for_each(|(i, candidate)| {
-                let (env, sample) = (i / samples, i % samples);
-                let (mean, std) = (&mean[env * len..][..len], &std[env * len..][..len]);
-                draw(candidate, mean, std, (sample > 0).then(|| streams[env].at(sample as u64)));
-                bounds.clip(candidate);
+        search(self.iterations, &problem, |iteration| {
+            samples.draw(iteration, &beliefs, bounds, None);
+            samples.score(cost, iteration)?;
+            beliefs.par_iter_mut().enumerate().for_each(|(env, Belief { mean, std, trace, order })| {
+                let elites = samples.of(env).elites(self.elites, order);
+                elites.refit(0.0, mean, std);
+                elites.note(trace, average(std));
             });
-            score(cost, Candidates { actions: &actions, envs, samples, horizon, dim }, iteration, &mut costs)?;
-
-            for (env, trace) in trace.iter_mut().enumerate() {
-                let costs = &costs[env * samples..][..samples];
-                let elites = smallest(costs, self.elites, &mut order);
-                let population = &actions[env * samples * len..][..samples * len];
-                refit(population, elites, &mut mean[env * len..][..len], &mut std[env * len..][..len]);
-                trace.best.push(costs[elites[0]]);
-                trace.mean.push(average(elites.iter().map(|&i| costs[i])));
-                trace.spread.push(average(std[env * len..][..len].iter().copied()));
-            }
-        }
-        let costs = trace.iter().map(|trace| trace.best[self.iterations - 1]).collect();
-        Ok(Plan { actions: mean, costs, trace })
+            Ok(())
+        })?;
+        Ok(Belief::plan(beliefs))
     }
 }
 
 impl Cem {
     fn check(&self) -> Result<()> {
-        let wrong = |what: &str, problem: String, fix: &str| Err(Error::config(format!("CEM {what}"), problem, fix));
-        if self.iterations == 0 {
-            return wrong("iterations", "0".to_owned(), "ask for at least 1");
-        }
-        if !(2..=self.samples).contains(&self.elites) {
-            let given = format!("{} of {} samples", self.elites, self.samples);
-            return wrong("elites", given, "choose at least 2 (a spread needs two) and at most the number of samples");
-        }
-        if !(self.sigma.is_finite() && self.sigma > 0.0) {
-            return wrong("sigma", self.sigma.to_string(), "choose a finite number above 0");
-        }
-        Ok(())
+        let settings = Settings(ID);
+        settings.some("iterations", self.iterations)?;
+        settings.elites(self.elites, 2, self.samples)?;
+        settings.positive("sigma", self.sigma)
     }
-}
-
-/// One candidate: the mean, and noise around it where there is a key.
-fn draw(candidate: &mut [f32], mean: &[f32], std: &[f32], key: Option<Key>) {
-    candidate.copy_from_slice(mean);
-    if let Some(key) = key {
-        let mut rng = key.rng();
-        for (action, std) in candidate.iter_mut().zip(std) {
-            *action += std * rng.sample::<f32, _>(StandardNormal);
-        }
-    }
-}
-
-/// The mean and the unbiased standard deviation of the elites, number by number. Sums run in double precision
-/// from the cheapest elite to the dearest, so they are the same wherever they run.
-#[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
-fn refit(population: &[f32], elites: &[usize], mean: &mut [f32], std: &mut [f32]) {
-    let len = mean.len();
-    let count = elites.len() as f64;
-    for j in 0..len {
-        let values = || elites.iter().map(|&i| f64::from(population[i * len + j]));
-        let centre = values().sum::<f64>() / count;
-        let variance = values().map(|v| (v - centre).powi(2)).sum::<f64>() / (count - 1.0);
-        mean[j] = centre as f32;
-        std[j] = variance.sqrt() as f32;
-    }
-}
-
-#[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
-fn average(values: impl ExactSizeIterator<Item = f32>) -> f32 {
-    let n = values.len() as f64;
-    (values.map(f64::from).sum::<f64>() / n) as f32
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use swm_core::{Batch, PlanSpace};
+    use crate::golden;
+    use rand::Rng as _;
+    use swm_core::{Batch, Candidates, Key, PlanSpace};
 
     const HORIZON: usize = 4;
     const DIM: usize = 3;
@@ -222,30 +159,16 @@ mod tests {
     }
 
     #[test]
-    fn a_plan_is_the_same_whoever_else_is_planned_and_on_any_number_of_threads() {
-        let all: Vec<usize> = (0..50).collect();
-        let run = |threads: usize, size: usize| {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
-            let actions: Vec<f32> =
-                all.chunks(size).flat_map(|envs| pool.install(|| plan(&small(), envs)).actions).collect();
-            actions.iter().map(|action| action.to_bits()).collect::<Vec<_>>()
-        };
-        let alone = run(1, 1);
-        for (threads, size) in [(2, 1), (1, 7), (2, 7), (1, 50), (2, 50)] {
-            assert!(run(threads, size) == alone, "{size} environments on {threads} threads");
+    fn updates_are_the_references() {
+        let mut belief = golden::begin();
+        for update in golden::updates(ID) {
+            golden::assert_near(&golden::candidates(&update, &belief, f32::INFINITY), &update.candidates);
+            let elites = update.population().elites(golden::ELITES, &mut belief.order);
+            elites.refit(0.0, &mut belief.mean, &mut belief.std);
+            golden::assert_near(&belief.mean, &update.mean);
+            golden::assert_near(&belief.std, &update.var);
         }
     }
-
-    #[test]
-    fn published_plans_stay_the_same() {
-        // Results depend on these numbers: changing them is a breaking change. Rounded, because `exp` and `ln`
-        // behind the Gaussians may differ in the last bit between platforms.
-        let plan = plan(&small(), &[0]);
-        let rounded: Vec<f32> = plan.actions[..4].iter().map(|action| (action * 1e3).round() / 1e3).collect();
-        assert_eq!(rounded, GOLDEN, "{plan:?}");
-    }
-
-    const GOLDEN: [f32; 4] = [-0.156, 0.788, 0.654, -0.812];
 
     #[test]
     fn the_first_candidate_is_the_mean() {
@@ -257,13 +180,6 @@ mod tests {
         let plan = solve(&cem, bowl, &[Key::new(0)], Some(&init)).expect("a plan");
         assert_eq!(plan.costs, [0.0]);
         assert_eq!(plan.trace[0].best, [0.0]);
-    }
-
-    #[test]
-    fn refitting_takes_the_unbiased_deviation() {
-        let (mut mean, mut std) = ([0.0], [0.0]);
-        refit(&[1.0, 100.0, 3.0, 5.0], &[0, 2, 3], &mut mean, &mut std);
-        assert_eq!((mean, std), ([3.0], [2.0]));
     }
 
     #[test]

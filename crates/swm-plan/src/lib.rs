@@ -5,32 +5,45 @@
 //! [`swm_core::Policy`].
 
 pub mod augmented_lagrangian;
+pub mod categorical_cem;
 pub mod cem;
 mod codec;
+mod colour;
+mod gaussian;
+#[cfg(test)]
+mod golden;
 pub mod gradient_descent;
 pub mod grasp;
 mod guard;
 mod history;
+pub mod icem;
 pub mod mpc;
+pub mod mppi;
 pub mod objective;
 pub mod optimizer;
 pub mod penalty;
 pub mod pgd;
 mod population;
+pub mod predictive_sampling;
 pub mod problem;
 pub mod registry;
+mod sampling;
 pub mod scale;
 pub mod simulator;
 pub mod topk;
 pub mod trace;
 
 pub use augmented_lagrangian::AugmentedLagrangian;
+pub use categorical_cem::CategoricalCem;
 pub use cem::Cem;
 pub use gradient_descent::GradientDescent;
 pub use grasp::Grasp;
+pub use icem::ICem;
 pub use mpc::{MpcConfig, MpcPolicy};
+pub use mppi::Mppi;
 pub use penalty::Penalised;
 pub use pgd::Pgd;
+pub use predictive_sampling::PredictiveSampling;
 pub use registry::{SOLVERS, SolverEntry};
 pub use scale::ActionScale;
 pub use simulator::{Score, SimulatorCost};

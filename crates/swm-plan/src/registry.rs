@@ -1,6 +1,6 @@
 //! [`SOLVERS`]: every solver, what it plans and what it asks of a model.
 
-use crate::{AugmentedLagrangian, Cem, GradientDescent, Grasp, Pgd};
+use crate::{AugmentedLagrangian, CategoricalCem, Cem, GradientDescent, Grasp, ICem, Mppi, Pgd, PredictiveSampling};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use swm_core::registry::Named;
@@ -70,6 +70,16 @@ pub static SOLVERS: Registry<SolverEntry> = Registry {
     hint: "`swm solvers` lists them",
     rows: &[
         SolverEntry {
+            id: "predictive_sampling",
+            summary: "tries many guesses once and takes the cheapest",
+            family: Family::Sampling,
+            actions: Actions::Continuous,
+            needs: &[],
+            paper: "Howell et al., Predictive Sampling: Real-time Behaviour Synthesis with MuJoCo, 2022",
+            defaults: defaults::<PredictiveSampling>,
+            make: make::<PredictiveSampling>,
+        },
+        SolverEntry {
             id: "cem",
             summary: "refits a Gaussian to the cheapest samples",
             family: Family::Sampling,
@@ -78,6 +88,36 @@ pub static SOLVERS: Registry<SolverEntry> = Registry {
             paper: "Rubinstein and Kroese, The Cross-Entropy Method, 2004",
             defaults: defaults::<Cem>,
             make: make::<Cem>,
+        },
+        SolverEntry {
+            id: "icem",
+            summary: "CEM with coloured noise, kept elites and momentum",
+            family: Family::Sampling,
+            actions: Actions::Continuous,
+            needs: &[],
+            paper: "Pinneri et al., Sample-efficient Cross-Entropy Method for Real-time Planning, 2020",
+            defaults: defaults::<ICem>,
+            make: make::<ICem>,
+        },
+        SolverEntry {
+            id: "mppi",
+            summary: "moves a mean by the weights that samples get from their costs",
+            family: Family::Sampling,
+            actions: Actions::Continuous,
+            needs: &[],
+            paper: "Williams et al., Aggressive Driving with Model Predictive Path Integral Control, 2016",
+            defaults: defaults::<Mppi>,
+            make: make::<Mppi>,
+        },
+        SolverEntry {
+            id: "categorical_cem",
+            summary: "refits the probability of every option to the cheapest samples",
+            family: Family::Sampling,
+            actions: Actions::Discrete,
+            needs: &[],
+            paper: "Rubinstein and Kroese, The Cross-Entropy Method, 2004",
+            defaults: defaults::<CategoricalCem>,
+            make: make::<CategoricalCem>,
         },
         SolverEntry {
             id: "gd",

@@ -302,7 +302,7 @@ fn a_model_without_a_gradient_is_refused_and_others_are_named() {
     let mut gd = GradientDescent::default();
     let message = crate::toys::solve(&mut gd, &mut model, quadratic, &[0]).expect_err("no gradient").to_string();
     assert!(message.starts_with("solver gd: it needs the gradient of the cost"), "{message}");
-    assert!(message.contains("choose cem"), "{message}");
+    assert!(message.contains("choose predictive_sampling or cem"), "{message}");
 }
 
 #[test]

@@ -17,9 +17,23 @@ pub struct Trial {
 }
 
 pub const TRIALS: &[Trial] = &[
+    // One round of guesses: it comes near, no more.
+    Trial {
+        solver: "predictive_sampling",
+        settings: r#"{"samples": 200000, "sigma": 0.7}"#,
+        near: &[
+            ("quadratic", 0.4, 0.4),
+            ("bounded", 0.4, 0.4),
+            ("multi-modal", 0.2, 0.2),
+            ("constrained", 0.1, 0.1),
+            ("lqr", 0.4, 0.4),
+            ("reach", 1e-3, 0.0),
+            ("reach-bounded", 1e-6, 1e-3),
+        ],
+    },
     Trial {
         solver: "cem",
-        settings: "{}",
+        settings: r#"{"samples": 600, "elites": 100, "iterations": 60, "sigma": 2}"#,
         near: &[
             ("quadratic", 1e-6, 1e-3),
             ("bounded", 1e-6, 1e-3),
@@ -30,6 +44,33 @@ pub const TRIALS: &[Trial] = &[
             ("reach-bounded", 1e-6, 1e-3),
         ],
     },
+    Trial {
+        solver: "icem",
+        settings: r#"{"samples": 600, "elites": 100, "iterations": 60, "sigma": 2, "beta": 0.5}"#,
+        near: &[
+            ("quadratic", 1e-6, 1e-3),
+            ("bounded", 1e-6, 1e-3),
+            ("multi-modal", 1e-6, 1e-3),
+            ("constrained", 1e-2, 2e-2),
+            ("lqr", 1e-6, 1e-3),
+            ("reach", 1e-6, 0.0),
+            ("reach-bounded", 1e-6, 1e-3),
+        ],
+    },
+    Trial {
+        solver: "mppi",
+        settings: r#"{"samples": 2000, "elites": 20, "sigma": 0.1, "temperature": 0.01, "iterations": 100}"#,
+        near: &[
+            ("quadratic", 1e-2, 5e-2),
+            ("bounded", 1e-2, 5e-2),
+            ("multi-modal", 1e-2, 5e-2),
+            ("constrained", 1e-2, 5e-2),
+            ("lqr", 1e-2, 5e-2),
+            ("reach", 1e-2, 5e-2),
+            ("reach-bounded", 1e-2, 5e-2),
+        ],
+    },
+    Trial { solver: "categorical_cem", settings: "{}", near: &[("discrete", 1e-6, 0.0)] },
     Trial {
         solver: "gd",
         settings: r#"{"iterations": 300}"#,

@@ -1,0 +1,114 @@
+"""Writes updates.json: what the reference's sampling solvers do with given noise, iteration by iteration.
+
+Run with the Python package `stable-worldmodel` 0.1.1 (and torch) installed:
+
+    python export_updates.py > updates.json
+
+Every draw of the reference is recorded on its way in, every population and its costs where the model is asked, and the
+distribution after each update. The solvers are unchanged; the toy cost has its minimum where no bound is and where one is.
+"""
+
+import contextlib
+import io
+import json
+from types import SimpleNamespace
+
+import gymnasium as gym
+import torch
+from stable_worldmodel.solver import CEMSolver, ICEMSolver, MPPISolver
+from stable_worldmodel.solver.categorical_cem import CategoricalCEMSolver
+
+HORIZON, DIM, SAMPLES, ITERATIONS, ELITES, BOUND = 4, 2, 16, 3, 5, 1.0
+OPTIONS, BLOCK = 3, 2
+
+
+class Toy:
+    """A bowl; notes every population it is shown and what it answered."""
+
+    def __init__(self, numbers):
+        self.target = torch.linspace(-1.5, 1.2, numbers)
+        self.weight = torch.linspace(1.0, 2.0, numbers)
+        self.seen = []
+
+    def get_cost(self, _, candidates):
+        plans = candidates[0].reshape(candidates.shape[1], -1)
+        costs = (self.weight * (plans - self.target) ** 2).sum(-1)
+        self.seen.append((plans.clone(), costs.clone()))
+        return costs[None]
+
+
+class Record:
+    """The distribution after every update."""
+
+    output_key = "record"
+
+    def __init__(self):
+        self.history = []
+
+    def __call__(self, **state):
+        names = [name for name in ("mean", "var", "probs") if name in state]
+        self.history.append({name: state[name][0].clone() for name in names})
+
+    def reset(self): ...
+    def start_batch(self): ...
+    def end_solve(self): ...
+
+
+def run(make, space, numbers, block):
+    toy, record, noise = Toy(numbers), Record(), []
+    randn = torch.randn
+
+    def recorded(*shape, **options):
+        noise.append(randn(*shape, **options))
+        return noise[-1]
+
+    solver = make(toy, record)
+    solver.configure(
+        action_space=space, n_envs=1, config=SimpleNamespace(horizon=HORIZON, action_block=block, receding_horizon=1)
+    )
+    torch.randn = recorded
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            plan = solver.solve({"x": torch.zeros(1, 1)})["actions"][0]
+    finally:
+        torch.randn = randn
+    return toy.seen, record.history, noise, plan
+
+
+def flat(tensor):
+    return [float(f"{value:.8g}") for value in tensor.flatten().tolist()]
+
+
+def main():
+    box = gym.spaces.Box(-BOUND, BOUND, (1, DIM))
+    discrete = gym.spaces.Discrete(OPTIONS)
+    common = {"num_samples": SAMPLES, "n_steps": ITERATIONS, "topk": ELITES, "seed": 7}
+    solvers = {
+        "cem": (lambda toy, record: CEMSolver(toy, callbacks=[record], **common), box, HORIZON * DIM, 1),
+        "icem": (
+            lambda toy, record: ICEMSolver(toy, callbacks=[record], n_elite_keep=2, alpha=0.25, **common),
+            box, HORIZON * DIM, 1,
+        ),
+        "mppi": (lambda toy, _: MPPISolver(toy, temperature=0.5, **common), box, HORIZON * DIM, 1),
+        "categorical_cem": (
+            lambda toy, record: CategoricalCEMSolver(toy, callbacks=[record], smoothing=0.05, alpha=0.25, **common),
+            discrete, HORIZON * BLOCK * OPTIONS, BLOCK,
+        ),
+    }
+    out = {}
+    for name, arguments in solvers.items():
+        torch.manual_seed(0)
+        seen, states, noise, plan = run(*arguments)
+        if name == "mppi":  # It has no callbacks: its mean is the first candidate of the next iteration, and the plan.
+            states = [{"mean": plans[0]} for plans, _ in seen[1:]] + [{"mean": plan}]
+        out[name] = [
+            {"candidates": flat(plans), "costs": flat(costs)}
+            | {key: flat(value) for key, value in state.items()}
+            # iCEM draws its noise with the steps last.
+            | ({"noise": flat(noise[i][0].transpose(-1, -2) if name == "icem" else noise[i][0])} if noise else {})
+            for i, ((plans, costs), state) in enumerate(zip(seen, states, strict=True))
+        ]
+    print(json.dumps(out))
+
+
+main()

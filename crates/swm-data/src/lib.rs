@@ -5,7 +5,8 @@
 //! - [`clip`] and [`loader`]: windows of episodes, shuffled and prefetched as batches.
 //! - [`image`]: how pictures are stored.
 //! - [`preview`] and [`video`]: frames as pictures and videos for people.
-//! - [`stats`]: column statistics and the split into training and validation episodes.
+//! - [`stats`]: column statistics.
+//! - [`Split`]: which episodes are held out.
 
 pub mod clip;
 pub mod format;
@@ -15,6 +16,7 @@ pub mod lance;
 
 pub mod loader;
 pub mod preview;
+mod split;
 pub mod stats;
 pub mod video;
 
@@ -25,5 +27,6 @@ pub use format::{
 pub use image::ImageCodec;
 pub use loader::{Loader, LoaderConfig};
 pub use preview::{Picture, contact_sheet, write_png};
+pub use split::{Part, Split};
 pub use stats::{ColumnStats, column_stats, split};
 pub use video::{integer_scale, write_mp4, write_mp4_scaled};

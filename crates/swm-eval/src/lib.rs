@@ -3,6 +3,8 @@
 //! - [`world`]: many environments, one policy, and the loop both uses below share.
 //! - [`collect`]: every episode goes to a dataset, in the order of its number.
 //! - [`starts`] and [`evaluate`]: from where to play and towards which goal, and how often it is reached.
+//! - [`request`], [`runner`] and [`reproduce`]: all that decides an evaluation as one value, running it for several
+//!   policies on the same starts, and running it again.
 //! - [`bench`](mod@bench): how fast all that is, beside the reference where it is installed.
 //!
 //! An episode is decided by its own key. Neither the number of environments, nor that of threads, nor what
@@ -11,12 +13,22 @@
 pub mod bench;
 pub mod collect;
 pub mod evaluate;
+mod filming;
+mod judge;
 mod reference;
+pub mod reproduce;
+pub mod request;
+pub mod runner;
 pub mod starts;
+mod witness;
 pub mod world;
 
 pub use bench::{BenchConfig, BenchReport, bench_envs};
 pub use collect::{CollectConfig, Collected};
-pub use evaluate::{EvalConfig, Videos};
+pub use evaluate::EvalConfig;
+pub use filming::Videos;
+pub use reproduce::{Difference, Reproduction, reproduce};
+pub use request::{Acts, Choice, Condition, EvalRequest, HeldOut, Model, PolicyRequest, StartsRequest};
+pub use runner::{Actor, Means, Moment, Resolver};
 pub use starts::Starts;
 pub use world::{Control, Progress, World, WorldConfig};

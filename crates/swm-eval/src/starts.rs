@@ -1,10 +1,11 @@
 //! [`Starts`]: from where episodes are played and towards which goal. Every policy of a comparison, the random
 //! floor included, is given the same starts.
 
-use crate::world::{episode_key, reset, reset_seed};
+use crate::world::{episode_key, reset_seed};
 use rand::Rng as _;
 use std::collections::HashSet;
-use swm_core::{Batch, ColumnSpec, EnvPool, EnvSpec, Error, Key, Result, Schema, VariationRequest, manifest};
+use swm_core::pool::Reset;
+use swm_core::{Batch, ColumnSpec, EnvPool, EnvSpec, Error, Key, ResetOptions, Result, Schema, VariationRequest};
 use swm_data::{Reader, StepRange};
 
 /// Starts and goals, decided by what was asked and nothing else.
@@ -12,6 +13,8 @@ use swm_data::{Reader, StepRange};
 pub struct Starts {
     seed: u64,
     n: usize,
+    /// Whether reset seeds count up from the seed instead of being drawn from it.
+    sequential: bool,
     variation: VariationRequest,
     dataset: Option<Rows>,
 }
@@ -34,7 +37,16 @@ impl Starts {
     /// When there is no episode.
     pub fn episodic(n: usize, seed: u64, variation: VariationRequest) -> Result<Self> {
         check_count(n)?;
-        Ok(Self { seed, n, variation, dataset: None })
+        Ok(Self { seed, n, sequential: false, variation, dataset: None })
+    }
+
+    /// The episodic protocol as the Python package `stable-worldmodel` 0.1.1 seeds it: episode `i` resets with
+    /// `seed + i`.
+    ///
+    /// # Errors
+    /// As [`Starts::episodic`].
+    pub fn sequential(n: usize, seed: u64, variation: VariationRequest) -> Result<Self> {
+        Ok(Self { sequential: true, ..Self::episodic(n, seed, variation)? })
     }
 
     /// The dataset-driven protocol (as of DINO-WM and LeWM): each pick `[episode, step]` of a dataset is a start,
@@ -58,14 +70,7 @@ impl Starts {
         let columns = restored_columns(reader.schema(), spec, &variation)?;
         let mut ranges = Vec::with_capacity(2 * picks.len());
         for &[episode, step] in &picks {
-            let Some(found) = reader.episodes().get(episode) else {
-                let given = format!("episode {episode}");
-                return Err(Error::mismatch(
-                    "choosing a start",
-                    given,
-                    format!("0 ..= {}", reader.episodes().len() - 1),
-                ));
-            };
+            let found = reader.episodes().get(episode).ok_or_else(|| no_episode(reader, episode))?;
             if step + goal_offset >= found.length {
                 return Err(Error::mismatch(
                     format!("choosing a start in episode {episode}"),
@@ -78,7 +83,13 @@ impl Starts {
         }
         let names: Vec<&str> = columns.iter().map(String::as_str).collect();
         let rows = renamed(reader.read(&names, &ranges)?)?;
-        Ok(Self { seed, n: picks.len(), variation, dataset: Some(Rows { picks, goal_offset, rows }) })
+        Ok(Self {
+            seed,
+            n: picks.len(),
+            sequential: false,
+            variation,
+            dataset: Some(Rows { picks, goal_offset, rows }),
+        })
     }
 
     /// Chooses `n` different starts of a dataset, uniformly among all whose goal lies in the same episode.
@@ -86,20 +97,36 @@ impl Starts {
     /// # Errors
     /// When there are fewer than `n` of them.
     pub fn choose(reader: &dyn Reader, n: usize, goal_offset: usize, seed: u64) -> Result<Vec<[usize; 2]>> {
-        // Starts are numbered episode after episode; `ends[e]` is the number after the last of episode `e`.
+        let all: Vec<usize> = (0..reader.episodes().len()).collect();
+        Self::choose_among(reader, &all, n, goal_offset, seed)
+    }
+
+    /// As [`Starts::choose`], in these episodes only: those of a held-out [`swm_data::Split`].
+    ///
+    /// # Errors
+    /// When they have fewer than `n` starts, or one of them does not exist.
+    pub fn choose_among(
+        reader: &dyn Reader,
+        episodes: &[usize],
+        n: usize,
+        goal_offset: usize,
+        seed: u64,
+    ) -> Result<Vec<[usize; 2]>> {
+        // Starts are numbered episode after episode; `ends[e]` is the number after the last of the `e`th.
         let mut total = 0;
-        let ends: Vec<usize> = reader
-            .episodes()
-            .iter()
-            .map(|episode| {
-                total += episode.length.saturating_sub(goal_offset);
-                total
-            })
-            .collect();
+        let mut ends = Vec::with_capacity(episodes.len());
+        for &episode in episodes {
+            let found = reader.episodes().get(episode).ok_or_else(|| no_episode(reader, episode))?;
+            total += found.length.saturating_sub(goal_offset);
+            ends.push(total);
+        }
         if n > total {
             return Err(Error::config(
                 "number of evaluation starts",
-                format!("{n}, but the dataset has {total} steps with another {goal_offset} steps behind them"),
+                format!(
+                    "{n}, but the dataset's {} episodes have {total} steps with another {goal_offset} steps behind them",
+                    episodes.len()
+                ),
                 "ask for fewer, lower the goal offset, or collect more episodes",
             ));
         }
@@ -109,9 +136,9 @@ impl Starts {
         while picks.len() < n {
             let number = rng.random_range(0..total as u64) as usize;
             if taken.insert(number) {
-                let episode = ends.partition_point(|&end| end <= number);
-                let before = if episode == 0 { 0 } else { ends[episode - 1] };
-                picks.push([episode, number - before]);
+                let i = ends.partition_point(|&end| end <= number);
+                let before = if i == 0 { 0 } else { ends[i - 1] };
+                picks.push([episodes[i], number - before]);
             }
         }
         Ok(picks)
@@ -152,33 +179,26 @@ impl Starts {
         self.dataset.as_ref().map(|dataset| dataset.picks[episode])
     }
 
-    /// A BLAKE3 hash of what the starts are made of, for a manifest: the reset seeds, and which rows of the dataset
-    /// were picked and what they hold, if any. The rest of a dataset decides nothing here.
-    pub fn hash(&self) -> String {
-        let mut bytes: Vec<u8> = (0..self.n).flat_map(|i| self.reset_seed(i).to_le_bytes()).collect();
-        if let Some(Rows { picks, goal_offset, rows }) = &self.dataset {
-            let numbers = picks.iter().flatten().chain([goal_offset]);
-            bytes.extend(numbers.flat_map(|&number| (number as u64).to_le_bytes()));
-            for (i, column) in rows.schema().columns().iter().enumerate() {
-                bytes.extend_from_slice(column.name.as_bytes());
-                bytes.extend_from_slice(rows.bytes(i));
-            }
-        }
-        manifest::hash(&bytes)
-    }
-
     pub(crate) fn key(&self, episode: usize) -> Key {
         episode_key(self.seed, episode)
     }
 
     pub(crate) fn reset_seed(&self, episode: usize) -> u64 {
-        reset_seed(self.key(episode))
+        if self.sequential {
+            // Without the highest bit, as all reset seeds are.
+            self.seed.wrapping_add(episode as u64) & (u64::MAX >> 1)
+        } else {
+            reset_seed(self.key(episode))
+        }
     }
 
     /// Starts episodes in slots of a pool: `(slot, episode)`.
     pub(crate) fn start(&self, pool: &mut EnvPool, starting: &[(usize, usize)]) -> Result<()> {
-        let resets: Vec<_> =
-            starting.iter().map(|&(slot, episode)| reset(slot, self.key(episode), &self.variation)).collect();
+        let options = ResetOptions { variation: self.variation.clone(), ..ResetOptions::default() };
+        let resets: Vec<Reset> = starting
+            .iter()
+            .map(|&(slot, episode)| Reset { slot, seed: self.reset_seed(episode), options: options.clone() })
+            .collect();
         let Some(dataset) = &self.dataset else { return pool.reset(&resets) };
         let slots: Vec<usize> = starting.iter().map(|&(slot, _)| slot).collect();
         pool.restart(&slots, |slot, env| {
@@ -189,6 +209,11 @@ impl Starts {
             env.restore_from(dataset.rows.row(2 * episode), dataset.rows.row(2 * episode + 1))
         })
     }
+}
+
+fn no_episode(reader: &dyn Reader, episode: usize) -> Error {
+    let known = format!("one of the dataset's {} episodes, counted from 0", reader.episodes().len());
+    Error::mismatch("choosing a start", format!("episode {episode}"), known)
 }
 
 fn check_count(n: usize) -> Result<()> {

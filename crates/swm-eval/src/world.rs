@@ -1,9 +1,12 @@
 //! [`World`]: a pool of environments of one kind and the loop that plays a policy in them.
 
+use crate::Starts;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use swm_core::pool::{Reset, threads};
-use swm_core::{Batch, EnvEntry, EnvPool, EnvSpec, Error, Key, Policy, ResetOptions, Result, Schema, VariationRequest};
+use swm_core::{
+    Batch, Env, EnvEntry, EnvPool, EnvSpec, Error, Key, Policy, ResetOptions, Result, Schema, VariationRequest,
+};
 
 /// How big a world is and what it draws.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -74,6 +77,14 @@ impl World {
     /// When no environment is asked for, pictures have no pixels, episodes have no steps, or threads cannot
     /// be started.
     pub fn new(entry: &EnvEntry, config: WorldConfig) -> Result<Self> {
+        Self::of(|| Ok((entry.make)()), config)
+    }
+
+    /// As [`World::new`], of environments that `make` makes: with wrappers around them, or of none of the registry.
+    ///
+    /// # Errors
+    /// As [`World::new`], and what `make` returns.
+    pub fn of(make: impl FnMut() -> Result<Box<dyn Env>>, config: WorldConfig) -> Result<Self> {
         if let Some((height, width)) = config.image
             && (height == 0 || width == 0)
         {
@@ -83,8 +94,8 @@ impl World {
         if config.max_episode_steps == Some(0) {
             return Err(Error::config("steps of an episode", "0", "ask for at least 1"));
         }
-        let envs = (0..config.envs).map(|_| (entry.make)()).collect();
-        let pool = EnvPool::new(envs, config.image, config.max_episode_steps, threads(config.threads)?)?;
+        let envs: Result<Vec<Box<dyn Env>>> = std::iter::repeat_with(make).take(config.envs).collect();
+        let pool = EnvPool::new(envs?, config.image, config.max_episode_steps, threads(config.threads)?)?;
         let actions = Batch::zeros(&Schema::new([pool.spec().action_column()])?, pool.len());
         Ok(Self { pool, actions })
     }
@@ -120,6 +131,11 @@ impl World {
         self.pool.step(&self.actions, active)
     }
 
+    /// Starts some of these episodes in slots: `(slot, episode)`.
+    pub(crate) fn start(&mut self, starts: &Starts, starting: &[(usize, usize)]) -> Result<()> {
+        starts.start(&mut self.pool, starting)
+    }
+
     /// Starts new episodes in some slots.
     pub(crate) fn restart(&mut self, resets: &[Reset]) -> Result<()> {
         self.pool.reset(resets)
@@ -146,7 +162,7 @@ impl World {
         let mut episodes: Vec<Option<usize>> = vec![None; slots];
         let mut active = vec![false; slots];
         let mut starting: Vec<(usize, usize)> = Vec::with_capacity(slots);
-        loop {
+        while !play.over() {
             control.check()?;
             starting.clear();
             for (slot, episode) in episodes.iter_mut().enumerate().filter(|(_, episode)| episode.is_none()) {
@@ -170,7 +186,7 @@ impl World {
                 *active = episode.is_some();
             }
             if !active.contains(&true) {
-                return Ok(());
+                break;
             }
             self.act(policy, &active)?;
             for slot in (0..slots).filter(|&slot| active[slot]) {
@@ -183,6 +199,7 @@ impl World {
                 }
             }
         }
+        Ok(())
     }
 }
 
@@ -193,6 +210,11 @@ pub(crate) trait Play {
 
     /// Whether [`Play::next`] would name an episode now.
     fn more(&self) -> bool;
+
+    /// Whether nothing more needs to be played, whatever is still running.
+    fn over(&self) -> bool {
+        false
+    }
 
     /// The key of an episode.
     fn key(&self, episode: usize) -> Key;

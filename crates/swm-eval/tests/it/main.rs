@@ -2,7 +2,9 @@
 
 mod benching;
 mod collecting;
+mod counting;
 mod evaluating;
 mod lance;
 mod line;
 mod memory;
+mod requesting;

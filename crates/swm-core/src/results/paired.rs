@@ -1,0 +1,193 @@
+//! [`Comparison`]: two policies on the same starts. Starts differ in how hard they are, so what tells policies apart
+//! is the starts that one solves and the other does not.
+
+use super::{Counting, Proportion, Run};
+use serde::{Deserialize, Serialize};
+
+/// Two policies under one condition, start by start.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Comparison {
+    /// The condition.
+    pub condition: String,
+    /// One policy.
+    pub a: String,
+    /// The other.
+    pub b: String,
+    /// What came of every start that counts.
+    #[serde(flatten)]
+    pub table: Paired,
+}
+
+/// Outcomes of pairs, and what they say about the difference.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Paired {
+    /// Starts both solved.
+    pub both: usize,
+    /// Starts only the first solved.
+    pub only_a: usize,
+    /// Starts only the second solved.
+    pub only_b: usize,
+    /// Starts neither solved.
+    pub neither: usize,
+    /// The two-sided p-value of McNemar's exact test: how likely so uneven a split of the starts that only one solved
+    /// is, were both policies equally good.
+    pub p: f64,
+    /// The first's success rate less the second's.
+    pub difference: f64,
+    /// The lower end of the difference's 95 % interval.
+    pub low: f64,
+    /// The upper end.
+    pub high: f64,
+}
+
+impl Comparison {
+    /// Compares two runs of one condition, or says nothing where they did not play the same starts.
+    pub fn of(a: &Run, b: &Run, counting: Counting) -> Option<Self> {
+        let pairs = || a.episodes.iter().zip(&b.episodes);
+        let same = a.condition == b.condition
+            && a.episodes.len() == b.episodes.len()
+            && pairs().all(|(a, b)| (a.seed, a.start, a.solved_at_start) == (b.seed, b.start, b.solved_at_start));
+        let mut counts = [0; 4];
+        for (a, b) in pairs().filter(|(a, _)| counting.counts(a)) {
+            counts[2 * usize::from(!a.success) + usize::from(!b.success)] += 1;
+        }
+        let [both, only_a, only_b, neither] = counts;
+        (same && counts != [0; 4]).then(|| Self {
+            condition: a.condition.clone(),
+            a: a.policy.clone(),
+            b: b.policy.clone(),
+            table: Paired::of(both, only_a, only_b, neither),
+        })
+    }
+
+    /// Compares every policy with those before it, condition by condition: a learned policy with the floor comes out as
+    /// `learned` less `random`.
+    pub fn all(runs: &[Run], counting: Counting) -> Vec<Self> {
+        let later = runs.iter().enumerate();
+        later.flat_map(|(i, run)| runs[..i].iter().filter_map(move |other| Self::of(run, other, counting))).collect()
+    }
+}
+
+impl Paired {
+    /// What a table of paired outcomes says.
+    ///
+    /// The test is the exact, conditional one (McNemar, "Note on the sampling error of the difference between
+    /// correlated proportions or percentages", 1947): two-sided binomial, with chance one half. The interval of the
+    /// difference is Newcombe's square-and-add ("Improved confidence intervals for the difference between
+    /// binomial proportions based on paired data", 1998, method 10): Wilson intervals of both rates, joined with regard
+    /// to their correlation.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn of(both: usize, only_a: usize, only_b: usize, neither: usize) -> Self {
+        let n = both + only_a + only_b + neither;
+        let (a, b) = (Proportion::wilson(both + only_a, n), Proportion::wilson(both + only_b, n));
+        let [w, x, y, z] = [both, only_a, only_b, neither].map(|count| count as f64);
+        let margins = (w + x) * (y + z) * (w + y) * (x + z);
+        let excess = w * z - x * y;
+        // Newcombe's continuity correction, which applies to positive correlation alone.
+        let corrected = if excess > 0.0 { (excess - n as f64 / 2.0).max(0.0) } else { excess };
+        let phi = if margins > 0.0 { corrected / margins.sqrt() } else { 0.0 };
+        let joined = |a: f64, b: f64| (a * a - 2.0 * phi * a * b + b * b).max(0.0).sqrt();
+        let difference = a.rate - b.rate;
+        Self {
+            both,
+            only_a,
+            only_b,
+            neither,
+            p: mcnemar(only_a, only_b),
+            difference,
+            low: (difference - joined(a.rate - a.low, b.high - b.rate)).max(-1.0),
+            high: (difference + joined(a.high - a.rate, b.rate - b.low)).min(1.0),
+        }
+    }
+
+    /// Pairs.
+    pub fn n(&self) -> usize {
+        self.both + self.only_a + self.only_b + self.neither
+    }
+}
+
+/// The chance of a split of `b + c` fair coins at least as uneven as `b` to `c`, either way.
+#[allow(clippy::cast_precision_loss)]
+fn mcnemar(b: usize, c: usize) -> f64 {
+    let (n, fewer) = (b + c, b.min(c));
+    // The logarithm of the chance of `k` heads, which thousands of coins do not underflow.
+    let mut term = n as f64 * 0.5f64.ln();
+    let mut tail = 0.0;
+    for k in 0..=fewer {
+        tail += term.exp();
+        term += ((n - k) as f64 / (k + 1) as f64).ln();
+    }
+    (2.0 * tail).min(1.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::results::{EpisodeResult, Timing};
+
+    #[test]
+    fn mcnemar_is_the_exact_binomial_test() {
+        // scipy.stats.binomtest(b, b + c, 0.5).pvalue of scipy 1.17.1.
+        let scipy = [
+            (0, 0, 1.0),
+            (1, 0, 1.0),
+            (5, 5, 1.0),
+            (0, 6, 0.03125),
+            (1, 7, 0.0703125),
+            (12, 2, 0.012_939_453_125),
+            (37, 16, 0.005_486_344_876_760_141),
+            (3, 41, 1.618_332_134_967_204_2e-9),
+            (130, 90, 0.008_405_451_752_681_935),
+            (900, 700, 6.319_484_959_450_105e-7),
+        ];
+        for (b, c, p) in scipy {
+            let given = mcnemar(b, c);
+            assert!((given - p).abs() <= 1e-9 * p, "{b} to {c}: {given}, not {p}");
+            assert_eq!(given, mcnemar(c, b));
+        }
+    }
+
+    #[test]
+    fn intervals_are_newcombes() {
+        // Newcombe 1998, table of examples: (36, 12, 2, 0) gives 0.0569 to 0.3404. Altman et al., "Statistics with
+        // confidence", table 6.2: (14, 5, 0, 22) gives 0.011 to 0.226. Fagerland, Lydersen and Laake 2014:
+        // (1, 1, 7, 12) gives -0.507 to -0.026, and p = 0.0703.
+        for ([both, only_a, only_b, neither], low, high) in
+            [([36, 12, 2, 0], 0.0569, 0.3404), ([14, 5, 0, 22], 0.0115, 0.2265), ([1, 1, 7, 12], -0.5069, -0.0256)]
+        {
+            let paired = Paired::of(both, only_a, only_b, neither);
+            assert!((paired.low - low).abs() < 6e-5 && (paired.high - high).abs() < 6e-5, "{paired:?}");
+            let turned = Paired::of(both, only_b, only_a, neither);
+            assert!((turned.low + paired.high).abs() < 1e-12 && (turned.high + paired.low).abs() < 1e-12);
+        }
+        assert!((Paired::of(1, 1, 7, 12).p - 0.0703).abs() < 5e-5);
+        let same = Paired::of(30, 0, 0, 0);
+        assert!((same.p, same.difference) == (1.0, 0.0) && same.low < -0.1 && same.high > 0.1, "{same:?}");
+    }
+
+    fn run(policy: &str, outcomes: &[(u64, bool, bool)]) -> Run {
+        let episodes = outcomes.iter().map(|&(seed, success, solved_at_start)| EpisodeResult {
+            success,
+            solved_at_start,
+            ..EpisodeResult::new(seed)
+        });
+        Run::new("here", policy, Counting::default(), episodes.collect(), Timing::default())
+    }
+
+    #[test]
+    fn runs_are_compared_on_starts_that_count_and_are_the_same() {
+        let floor = run("random", &[(1, false, false), (2, true, false), (3, false, true), (4, false, false)]);
+        let model = run("model", &[(1, true, false), (2, true, false), (3, false, true), (4, false, false)]);
+        let found = Comparison::all(&[floor.clone(), model.clone()], Counting::default());
+        assert_eq!(found.len(), 1);
+        let Comparison { a, b, table, .. } = &found[0];
+        assert_eq!((a.as_str(), b.as_str()), ("model", "random"));
+        assert_eq!([table.both, table.only_a, table.only_b, table.neither], [1, 1, 0, 1]);
+        assert!((table.difference - 1.0 / 3.0).abs() < 1e-12);
+        let mut other = model.clone();
+        other.episodes[3].seed = 5;
+        assert!(Comparison::of(&other, &floor, Counting::default()).is_none(), "other starts");
+        other = Run { condition: "there".to_owned(), ..model };
+        assert!(Comparison::of(&other, &floor, Counting::default()).is_none(), "another condition");
+    }
+}

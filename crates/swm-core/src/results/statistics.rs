@@ -1,0 +1,92 @@
+//! The few statistics findings are told in: shares with intervals, and summaries of many numbers.
+
+use serde::{Deserialize, Serialize};
+
+/// The 97.5th percentile of the standard normal distribution: both tails together leave out 5 %.
+const Z: f64 = 1.959_963_984_540_054;
+
+/// A share of successes with its 95 % Wilson score interval.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Proportion {
+    /// Successes.
+    pub successes: usize,
+    /// Tries.
+    pub n: usize,
+    /// `successes / n`; 0 where nothing was tried.
+    pub rate: f64,
+    /// The lower end of the interval.
+    pub low: f64,
+    /// The upper end of the interval.
+    pub high: f64,
+}
+
+impl Proportion {
+    /// The share of `successes` in `n` tries (Wilson, "Probable inference, the law of succession, and
+    /// statistical inference", 1927, with z = 1.96).
+    #[allow(clippy::cast_precision_loss)]
+    pub fn wilson(successes: usize, n: usize) -> Self {
+        if n == 0 {
+            return Self { successes, n, rate: 0.0, low: 0.0, high: 1.0 };
+        }
+        let (count, p) = (n as f64, successes as f64 / n as f64);
+        let scale = 1.0 + Z * Z / count;
+        let centre = (p + Z * Z / (2.0 * count)) / scale;
+        let half = Z / scale * (p * (1.0 - p) / count + Z * Z / (4.0 * count * count)).sqrt();
+        Self { successes, n, rate: p, low: (centre - half).max(0.0), high: (centre + half).min(1.0) }
+    }
+}
+
+/// A few numbers about many.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Summary {
+    /// How many.
+    pub n: usize,
+    /// Their mean.
+    pub mean: f64,
+    /// Their median.
+    pub median: f64,
+    /// Their 95th percentile (nearest rank).
+    pub p95: f64,
+}
+
+impl Summary {
+    /// A summary of these numbers, or none where there are none.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn of(values: &[f64]) -> Option<Self> {
+        let n = values.len();
+        if n == 0 {
+            return None;
+        }
+        let mut sorted = values.to_vec();
+        sorted.sort_by(f64::total_cmp);
+        let median = (sorted[(n - 1) / 2] + sorted[n / 2]) / 2.0;
+        Some(Self {
+            n,
+            mean: values.iter().sum::<f64>() / n as f64,
+            median,
+            p95: sorted[(n * 95).div_ceil(100).saturating_sub(1)],
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn wilson_matches_published_values() {
+        // Newcombe 1998, table I: 81 of 263 gives 0.2553 to 0.3662; 15 of 148 gives 0.0624 to 0.1605; 0 of
+        // 20 gives 0.0000 to 0.1611.
+        for (successes, n, low, high) in [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611)] {
+            let p = Proportion::wilson(successes, n);
+            assert!((p.low - low).abs() < 5e-5 && (p.high - high).abs() < 5e-5, "{p:?}");
+        }
+    }
+
+    #[test]
+    fn summaries_take_the_middle() {
+        let summary = Summary::of(&[3.0, 1.0, 2.0, 10.0]).expect("some");
+        assert_eq!((summary.mean, summary.median, summary.p95), (4.0, 2.5, 10.0));
+        assert!(Summary::of(&[]).is_none());
+    }
+}

@@ -1,0 +1,118 @@
+//! Which episodes count, and as what: strict and compat, on a line where every outcome can be told beforehand.
+
+use crate::evaluating::{pinned, recorded, run_counted, world};
+use crate::line::Walker;
+use swm_core::policy::write_action;
+use swm_core::results::{Counting, Run};
+use swm_core::{Batch, Key, Policy, RandomPolicy, Result, VariationRequest};
+use swm_eval::{Control, EvalConfig, Starts};
+
+/// Always pushes to the right, through the goal and past it.
+struct Passing;
+
+impl Policy for Passing {
+    fn begin(&mut self, _: usize, _: Key) {}
+
+    fn act(&mut self, _: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
+        (0..active.len()).for_each(|slot| write_action(&mut actions.row_mut(slot), 0, &[1.0]));
+        Ok(())
+    }
+}
+
+#[test]
+fn a_goal_that_is_passed_is_not_held() {
+    // From -2 to 2 in steps of 1: at the goal after 4 steps, beyond it after 5.
+    let starts = Starts::episodic(2, 0, pinned(&[("agent.x", -2.0), ("goal.x", 2.0)])).expect("starts");
+    let play = |policy: &mut dyn Policy, hold| {
+        let found = run_counted(&mut world(2, 1), policy, &starts, Counting::Strict { hold });
+        let first = &found.episodes[0];
+        (found.success.successes, first.steps, first.time_to_goal())
+    };
+    assert_eq!(play(&mut Walker, 1), (2, 4, Some(4)));
+    assert_eq!(play(&mut Walker, 3), (2, 6, Some(4)), "held on from the fourth step");
+    assert_eq!(play(&mut Passing, 1), (2, 4, Some(4)));
+    assert_eq!(play(&mut Passing, 2), (0, 12, None), "played to the end of its budget");
+}
+
+#[test]
+fn holding_for_longer_than_the_budget_is_refused() {
+    let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("starts");
+    for hold in [0, 13] {
+        let config = EvalConfig { counting: Counting::Strict { hold }, ..EvalConfig::default() };
+        let error = world(1, 1).evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect_err("wrong");
+        assert!(error.to_string().contains(&format!("{hold} in a budget of 12")), "{error}");
+    }
+}
+
+#[test]
+fn compat_plays_and_counts_solved_starts_and_tells_the_strict_rate_too() {
+    let reader = recorded(12);
+    let spec = world(1, 1).spec().clone();
+    let picks = Starts::choose(&reader, 40, 1, 3).expect("picks");
+    let starts = Starts::from_dataset(&reader, &spec, picks, 1, 3, VariationRequest::default()).expect("starts");
+    let mut random = RandomPolicy::new(&spec, 5);
+    let strict = run_counted(&mut world(5, 1), &mut random, &starts, Counting::Strict { hold: 1 });
+    let compat = run_counted(&mut world(5, 2), &mut random, &starts, Counting::Compat { envs: 40 });
+    assert!(strict.solved_at_start > 0 && strict.solved_at_start == compat.solved_at_start);
+    assert_eq!(compat.success.n, 40, "every start counts");
+    assert_eq!(compat.strict, Some(strict.success), "one run tells both");
+    assert_eq!(strict.strict, None);
+    for (strict, compat) in strict.episodes.iter().zip(&compat.episodes) {
+        assert!(compat.steps > 0, "every start is played");
+        assert!(strict.solved_at_start || strict == compat);
+    }
+    let flattered = compat.episodes.iter().filter(|episode| episode.solved_at_start && episode.success).count();
+    assert_eq!(compat.success.successes, strict.success.successes + flattered);
+    assert!(flattered > 0);
+}
+
+/// The seeds and outcomes that the reference's loop counts (`World._run_iter`, reset mode `auto`), in the order of the
+/// seeds: environments begin with consecutive seeds, those that are done begin again with the next ones, in order of
+/// their slots, and the first `n` to be done count. `outcome` tells steps and success of a seed.
+fn first_to_finish(n: usize, envs: usize, seed: u64, outcome: impl Fn(u64) -> (usize, bool)) -> Vec<(u64, bool)> {
+    let mut playing: Vec<(u64, usize)> = (0..envs as u64).map(|i| (seed + i, 0)).collect();
+    let mut next = seed + envs as u64;
+    let mut counted = vec![];
+    while counted.len() < n {
+        for (current, steps) in &mut playing {
+            *steps += 1;
+            let (length, success) = outcome(*current);
+            if *steps == length {
+                counted.push((*current, success));
+                (*current, *steps) = (next, 0);
+                next += 1;
+            }
+        }
+    }
+    counted.truncate(n);
+    counted.sort_unstable();
+    counted
+}
+
+#[test]
+fn episodic_compat_counts_the_first_to_finish() {
+    let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
+    let play = |n, seed, envs, threads| -> Run {
+        let starts = Starts::sequential(n, seed, all.clone()).expect("starts");
+        run_counted(&mut world(envs, threads), &mut Passing, &starts, Counting::Compat { envs })
+    };
+    let outcome = |seed| {
+        let alone = play(1, seed, 1, 1);
+        (alone.episodes[0].steps, alone.success.successes == 1)
+    };
+    let mut rates = vec![];
+    for envs in [1, 3, 8, 20] {
+        let found = play(20, 100, envs, 2);
+        let given: Vec<(u64, bool)> = found.episodes.iter().map(|episode| (episode.seed, episode.success)).collect();
+        assert_eq!(given, first_to_finish(20, envs, 100, outcome), "{envs} environments");
+        assert_eq!(found.success.n, 20);
+        assert_eq!(found.episodes, play(20, 100, envs, 1).episodes, "whatever the threads");
+        assert_eq!(found.strict, None, "another selection than strict counting makes");
+        rates.push(found.success.successes);
+    }
+    assert!(rates[3] > rates[0], "long episodes, which fail, are counted less often: {rates:?}");
+    let starts = Starts::sequential(2, 0, all).expect("starts");
+    let config = EvalConfig { counting: Counting::Compat { envs: 2 }, ..EvalConfig::default() };
+    let error = world(3, 1).evaluate(&mut Passing, &starts, &config, &mut Control::default()).expect_err("refused");
+    assert!(error.to_string().contains("among 2 environments, and the world has 3"), "{error}");
+}

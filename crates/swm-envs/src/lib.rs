@@ -22,5 +22,9 @@ pub static ENVS: Registry<EnvEntry> = Registry {
         point_maze::ENTRY,
         piecewise::ENTRY,
         classic::cart_pole::ENTRY,
+        classic::mountain_car::ENTRY,
+        classic::mountain_car::CONTINUOUS,
+        classic::acrobot::ENTRY,
+        classic::pendulum::ENTRY,
     ],
 };

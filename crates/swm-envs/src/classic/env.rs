@@ -4,14 +4,17 @@ use super::picture::Picture;
 use super::{World, factors};
 use crate::factors as values;
 use rand::Rng as _;
+use rand::seq::IndexedRandom as _;
 use swm_core::{
     Action, ColumnSpec, DType, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, Rng, RowMut,
     RowRef, Snapshot, Transition, VariationRequest,
 };
 
-/// Rollouts from which [`Env::sample_goal`] takes a goal before it gives up.
-const GOAL_TRIES: u64 = 64;
-/// The most steps of such a rollout.
+/// Paths from which [`Env::sample_goal`] takes a goal before it gives up.
+const GOAL_TRIES: u64 = 16;
+/// How often chance acts where the expert goes: in a world without chance there is one way, and few goals.
+const CHANCE: f64 = 0.02;
+/// The most steps of such a path.
 const GOAL_STEPS: usize = 200;
 
 /// Places in [`EnvSpec::columns`].
@@ -77,24 +80,29 @@ impl<W: World> Classic<W> {
         picture.show(|surface| self.world.draw(&state, surface), frame);
     }
 
-    /// A state that the world comes to within some steps: in the first tries the expert heads for a task, in the later
-    /// ones chance acts. What ends an episode counts where it is the task's goal; in the last tries anything does.
+    /// The states the world comes through within some steps: in the first tries while the expert carries out a task,
+    /// in the later ones by chance. What ends an episode is left out unless it is the task's goal; in the last tries
+    /// nothing is.
     #[allow(clippy::cast_possible_truncation)]
-    fn wander(&self, rng: &mut Rng, attempt: u64) -> W::State {
-        let (mut state, task) = (self.state, W::task(rng));
-        for _ in 0..rng.random_range(1..=GOAL_STEPS) {
-            let action = if attempt < GOAL_TRIES / 2 {
+    fn path(&self, rng: &mut Rng, attempt: u64) -> Vec<W::State> {
+        let (expert, everything) = (attempt < GOAL_TRIES / 2, attempt >= GOAL_TRIES * 3 / 4);
+        let (mut state, task, mut path) = (self.state, W::task(rng), vec![]);
+        while path.len() < GOAL_STEPS {
+            let action = if expert && !rng.random_bool(CHANCE) {
                 self.world.control(&state, &task)
             } else {
                 self.spec.action_space.sample(rng)[0]
             };
-            let before = state;
             let ended = self.world.step(&mut state, f64::from(action as f32)).terminated;
-            if ended && attempt < GOAL_TRIES * 3 / 4 {
-                return if self.world.reached(&state, &task) { state } else { before };
+            let reached = self.world.reached(&state, &task);
+            if reached || !ended || everything {
+                path.push(state);
+            }
+            if (reached && expert) || (ended && !everything) {
+                break;
             }
         }
-        state
+        path
     }
 
     /// A goal as everybody else sees it: through the `goal_state` column.
@@ -186,9 +194,16 @@ impl<W: World> Env for Classic<W> {
 
     fn sample_goal(&mut self, key: Key) -> Result<()> {
         for attempt in 0..GOAL_TRIES {
-            let state = self.wander(&mut key.at(attempt).rng(), attempt);
-            let Ok(goal) = self.seen(&state) else { continue };
-            if !self.world.reached(&self.state, &goal) {
+            let mut rng = key.at(attempt).rng();
+            let mut goals = self.path(&mut rng, attempt);
+            goals.retain_mut(|goal| match self.seen(goal) {
+                Ok(seen) if !self.world.reached(&self.state, &seen) => {
+                    *goal = seen;
+                    true
+                }
+                _ => false,
+            });
+            if let Some(&goal) = goals.choose(&mut rng) {
                 self.goal = goal;
                 return Ok(());
             }

@@ -3,12 +3,16 @@
 //! A [`World`] is what tells them apart: equations of motion, a task, a controller, a picture. [`Classic`] makes an
 //! environment of any of them.
 
+pub mod acrobot;
+mod angle;
 pub mod cart_pole;
 mod env;
 mod expert;
 mod factors;
 #[cfg(test)]
 mod measure;
+pub mod mountain_car;
+pub mod pendulum;
 mod picture;
 
 use env::Classic;

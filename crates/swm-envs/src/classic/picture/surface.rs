@@ -50,6 +50,8 @@ pub struct Surface {
     pixels: Vec<Color>,
     /// The columns of every row that were drawn on.
     drawn: Vec<Range<usize>>,
+    /// How far a shape covers the pixels of a row.
+    covered: Vec<f32>,
 }
 
 /// No column; joined with others, it adds nothing.
@@ -58,7 +60,7 @@ pub const NONE: Range<usize> = Range { start: usize::MAX, end: 0 };
 impl Surface {
     /// A surface of one colour, of which nothing counts as drawn.
     pub fn new(width: usize, height: usize, color: Color) -> Self {
-        Self { width, pixels: vec![color; width * height], drawn: vec![NONE; height] }
+        Self { width, pixels: vec![color; width * height], drawn: vec![NONE; height], covered: vec![0.0; width] }
     }
 
     /// Pixels in a row, and rows.
@@ -131,10 +133,23 @@ impl Surface {
 
     /// `weight` 256ths of a colour over a pixel.
     pub fn blend(&mut self, at: Point, color: Color, weight: i32) {
+        self.change(at, |below| color.over(below, weight));
+    }
+
+    /// A share of a colour over a pixel, rounded down.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn mix(&mut self, at: Point, color: Color, share: f32) {
+        self.change(at, |below| {
+            let [above, below] = [color, below].map(|color| color.rgb().map(f32::from));
+            Color::new(std::array::from_fn(|i| (above[i] * share + below[i] * (1.0 - share)) as u8))
+        });
+    }
+
+    fn change(&mut self, at: Point, color: impl FnOnce(Color) -> Color) {
         let (Ok(x), Ok(y)) = (usize::try_from(at.x), usize::try_from(at.y)) else { return };
         if x < self.width && y < self.drawn.len() {
-            let below = &mut self.pixels[y * self.width + x];
-            *below = color.over(*below, weight);
+            let pixel = &mut self.pixels[y * self.width + x];
+            *pixel = color(*pixel);
             let drawn = &mut self.drawn[y];
             *drawn = drawn.start.min(x)..drawn.end.max(x + 1);
         }
@@ -175,6 +190,63 @@ impl Surface {
             };
             self.blend(near, color, 255 - weight);
             self.blend(far, color, weight);
+        }
+    }
+
+    /// A line between places, not pixels. Every step along its longer axis is shared between the two pixels around the
+    /// line; its ends cover their pixels in part.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn fine_line(&mut self, from: [f64; 2], to: [f64; 2], color: Color) {
+        let steep = (to[0] - from[0]).abs() < (to[1] - from[1]).abs();
+        let along = usize::from(steep);
+        let (from, to) = if from[along] <= to[along] { (from, to) } else { (to, from) };
+        let slope = (to[1 - along] - from[1 - along]) / (to[along] - from[along]);
+        for step in from[along].floor() as i32..=to[along].ceil() as i32 {
+            let at = f64::from(step);
+            let across = from[1 - along] + slope * (at - from[along]);
+            let covered = (1.0 + at - from[along]).min(1.0 + to[along] - at).min(1.0);
+            let share = across - across.floor();
+            for (beside, share) in [(1, share), (0, 1.0 - share)] {
+                let across = across as i32 + beside;
+                let at = if steep { Point::new(across, step) } else { Point::new(step, across) };
+                self.mix(at, color, (share * covered) as f32);
+            }
+        }
+    }
+
+    /// A shape on some rows, told by the `spans` in which it crosses a level line at a height. A pixel is covered as far
+    /// as the spans at [`LINES`] heights in it are; what spans share counts once for each, but no pixel more than whole.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss, clippy::cast_sign_loss)]
+    pub fn shape<const N: usize>(
+        &mut self,
+        rows: Range<i32>,
+        color: Color,
+        opacity: f32,
+        spans: impl Fn(f64) -> [[f64; 2]; N],
+    ) {
+        let width = self.width as f64;
+        let bounds = |v: f64| v.clamp(0.0, width);
+        for y in rows.start.max(0)..rows.end.min(self.drawn.len() as i32) {
+            let mut reach = NONE;
+            for line in 0..LINES {
+                for [left, right] in spans(f64::from(y) + (line as f64 + 0.5) / LINES as f64) {
+                    let (left, right) = (bounds(left), bounds(right));
+                    if left < right {
+                        let pixels = left as usize..right.ceil() as usize;
+                        for x in pixels.clone() {
+                            let part = right.min(x as f64 + 1.0) - left.max(x as f64);
+                            self.covered[x] += part as f32 / LINES as f32;
+                        }
+                        reach = reach.start.min(pixels.start)..reach.end.max(pixels.end);
+                    }
+                }
+            }
+            for x in reach {
+                let share = std::mem::take(&mut self.covered[x]).min(1.0) * opacity;
+                if share > 0.0 {
+                    self.mix(Point::new(x as i32, y), color, share);
+                }
+            }
         }
     }
 
@@ -297,6 +369,8 @@ impl Surface {
     }
 }
 
+/// At how many heights in a pixel the spans of a shape are asked for.
+const LINES: usize = 4;
 /// The most corners a polygon may have.
 const MAX_CORNERS: usize = 4;
 
@@ -346,6 +420,21 @@ mod tests {
             [255, 255, 255, 255, 255, 220, 110, 0, 255, 255, 255],
         ];
         assert_eq!(polygon, wanted);
+    }
+
+    #[test]
+    fn shapes_told_by_spans_cover_shares_of_pixels() {
+        // A triangle from (2, 1) to (10, 1) and (2, 9), and a square in it that counts no pixel twice.
+        let spans = |y: f64| {
+            if (1.0..9.0).contains(&y) { [[2.0, 11.0 - y], [2.0, 4.0f64.min(11.0 - y)]] } else { [[0.0; 2]; 2] }
+        };
+        let black = Color::new([0; 3]);
+        let triangle = rows(|surface| surface.shape(0..99, black, 1.0, spans), 0..13, 0..14);
+        let white: f64 = triangle.iter().flatten().map(|&v| f64::from(v) / 255.0).sum();
+        assert!((white - (13.0 * 14.0 - 32.0)).abs() < 0.2, "{white}");
+        assert_eq!(triangle[1], [255, 255, 0, 0, 0, 0, 0, 0, 0, 127, 255, 255, 255, 255]);
+        let half = rows(|surface| surface.shape(-5..9, black, 0.5, |_| [[-3.0, 1.5]]), 8..10, 0..3);
+        assert_eq!(half, [[127, 191, 255], [255; 3]]);
     }
 
     #[test]

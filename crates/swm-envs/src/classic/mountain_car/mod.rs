@@ -1,0 +1,220 @@
+#![doc = include_str!("README.md")]
+
+mod expert;
+mod physics;
+mod render;
+
+use super::{Classic, Controller, Paint, Parameter, Surface, World};
+use physics::{ENDS, FASTEST, Hill, height};
+use rand::Rng as _;
+use std::marker::PhantomData;
+use swm_core::{DType, EnvEntry, ExpertEntry, Rng, Space, Transition};
+
+/// The registry row of the world with three actions.
+pub const ENTRY: EnvEntry = EnvEntry {
+    id: Discrete::ID,
+    summary: "swing a car with a weak motor out of a valley, up to the flag",
+    make: || Box::new(Classic::<MountainCar<Discrete>>::new()),
+    experts: &[ExpertEntry { make: || Box::new(Controller::<MountainCar<Discrete>>::new()), ..PUMP }],
+};
+
+/// The registry row of the world in which one chooses the motor's power.
+pub const CONTINUOUS: EnvEntry = EnvEntry {
+    id: Continuous::ID,
+    summary: "swing a car with a weak motor out of a valley, up to the flag, with little power",
+    make: || Box::new(Classic::<MountainCar<Continuous>>::new()),
+    experts: &[ExpertEntry { make: || Box::new(Controller::<MountainCar<Continuous>>::new()), ..PUMP }],
+};
+
+/// Both experts' name.
+const PUMP: ExpertEntry = ExpertEntry {
+    id: "expert",
+    summary: "pushes the way the car rolls, so that it swings higher and higher",
+    make: || Box::new(Controller::<MountainCar<Discrete>>::new()),
+};
+
+/// What tells the two worlds apart.
+trait Variant: Send + 'static {
+    const ID: &'static str;
+    const LIMIT: usize;
+    const PHYSICS: &'static [Parameter];
+    /// Where the flag is.
+    const FLAG: f64;
+
+    fn action_space() -> Space;
+
+    /// The hill with these values of `PHYSICS`.
+    fn hill(physics: &[f32]) -> Hill;
+
+    /// The state after a step.
+    fn step(hill: &Hill, state: [f64; 2], action: f64) -> [f64; 2];
+
+    /// The reward of a step.
+    fn reward(action: f64, terminated: bool) -> f64;
+
+    /// Full power to the right or to the left.
+    fn push(right: bool) -> f64;
+}
+
+/// Push left, do nothing, push right.
+struct Discrete;
+
+impl Variant for Discrete {
+    const ID: &'static str = "swm/MountainCarControl-v0";
+    const LIMIT: usize = 200;
+    const PHYSICS: &'static [Parameter] = &[
+        Parameter("force", [0.0005, 0.0015], 0.001),
+        Parameter("gravity", [0.00125, 0.00375], 0.0025),
+        Parameter("max_speed", [0.035, FASTEST], 0.07),
+    ];
+    const FLAG: f64 = 0.5;
+
+    fn action_space() -> Space {
+        Space::Discrete { n: 3, start: 0 }
+    }
+
+    fn hill(physics: &[f32]) -> Hill {
+        let [push, gravity, max_speed] = std::array::from_fn(|i| f64::from(physics[i]));
+        Hill { push, gravity, max_speed }
+    }
+
+    fn step(hill: &Hill, state: [f64; 2], action: f64) -> [f64; 2] {
+        hill.step(state, action - 1.0)
+    }
+
+    fn reward(_action: f64, _terminated: bool) -> f64 {
+        -1.0
+    }
+
+    fn push(right: bool) -> f64 {
+        if right { 2.0 } else { 0.0 }
+    }
+}
+
+/// Any power from -1 to 1, which costs.
+struct Continuous;
+
+impl Variant for Continuous {
+    const ID: &'static str = "swm/MountainCarContinuousControl-v0";
+    const LIMIT: usize = 999;
+    const PHYSICS: &'static [Parameter] =
+        &[Parameter("max_speed", [0.035, FASTEST], 0.07), Parameter("power", [0.00075, 0.00225], 0.0015)];
+    const FLAG: f64 = 0.45;
+
+    fn action_space() -> Space {
+        Space::uniform_box([1], DType::Float32, -1.0, 1.0)
+    }
+
+    fn hill(physics: &[f32]) -> Hill {
+        Hill { max_speed: f64::from(physics[0]), push: f64::from(physics[1]), gravity: 0.0025 }
+    }
+
+    fn step(hill: &Hill, state: [f64; 2], action: f64) -> [f64; 2] {
+        hill.smooth_step(state, action)
+    }
+
+    fn reward(action: f64, terminated: bool) -> f64 {
+        (if terminated { 100.0 } else { 0.0 }) - action * action * 0.1
+    }
+
+    fn push(right: bool) -> f64 {
+        if right { 1.0 } else { -1.0 }
+    }
+}
+
+/// A car in a valley.
+struct MountainCar<V>(Hill, PhantomData<V>);
+
+/// The start is drawn from here, at rest.
+const START: [f64; 2] = [-0.6, -0.4];
+/// How near to a goal below the flag the car must be.
+const NEAR: f64 = 0.05;
+/// How much more a unit of height counts in the goal distance than one of the way.
+const CLIMB: f64 = 10.0;
+
+impl<V: Variant> MountainCar<V> {
+    /// The place of the flag as the `state` column shows it.
+    #[allow(clippy::cast_possible_truncation)]
+    const FLAG: f64 = V::FLAG as f32 as f64;
+
+    /// Whether the car is at the flag and does not roll back.
+    fn at_flag(state: &[f64; 2]) -> bool {
+        state[0] >= Self::FLAG.min(V::FLAG) && state[1] >= 0.0
+    }
+}
+
+impl<V: Variant> World for MountainCar<V> {
+    const ID: &'static str = V::ID;
+    const LIMIT: usize = V::LIMIT;
+    const OBSERVED: usize = 2;
+    const SIZE: (usize, usize) = render::SIZE;
+    const PHYSICS: &'static [Parameter] = V::PHYSICS;
+    const VISUALS: &'static [Paint] = &[Paint("bg", [0.6, 1.0], [255; 3]), Paint("fg", [0.0, 0.4], render::INK)];
+
+    /// Place and speed.
+    type State = [f64; 2];
+
+    fn action_space() -> Space {
+        V::action_space()
+    }
+
+    fn new(physics: &[f32]) -> Self {
+        Self(V::hill(physics), PhantomData)
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn start(rng: &mut Rng) -> Self::State {
+        [f64::from(rng.random_range(START[0]..START[1]) as f32), 0.0]
+    }
+
+    fn task(_rng: &mut Rng) -> Self::State {
+        [Self::FLAG, 0.0]
+    }
+
+    fn step(&self, state: &mut Self::State, action: f64) -> Transition {
+        *state = V::step(&self.0, *state, action);
+        let terminated = Self::at_flag(state);
+        Transition { reward: V::reward(action, terminated), terminated, truncated: false }
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn observe(state: &Self::State, row: &mut [f32]) {
+        row.copy_from_slice(&state.map(|v| v as f32));
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn states() -> Space {
+        let [low, high] = ENDS.map(|end| f64::from(end as f32));
+        let fastest = f64::from(FASTEST);
+        Space::Box { shape: vec![2], dtype: DType::Float64, low: vec![low, -fastest], high: vec![high, fastest] }
+    }
+
+    fn shown(observed: &[f64]) -> Self::State {
+        [observed[0].clamp(ENDS[0], ENDS[1]), observed[1]]
+    }
+
+    fn reached(&self, state: &Self::State, goal: &Self::State) -> bool {
+        if Self::at_flag(goal) { Self::at_flag(state) } else { (state[0] - goal[0]).abs() <= NEAR }
+    }
+
+    fn distance(&self, state: &Self::State, goal: &Self::State) -> f64 {
+        if Self::at_flag(goal) && self.reached(state, goal) {
+            return 0.0;
+        }
+        let lift = |state: &[f64; 2]| height(state[0]) / 1.35 * self.0.gravity;
+        let missing = (lift(goal) - lift(state) - state[1] * state[1] / 2.0).max(0.0) / self.0.gravity;
+        (state[0] - goal[0]).abs() + CLIMB * missing
+    }
+
+    fn control(&self, state: &Self::State, _goal: &Self::State) -> f64 {
+        V::push(expert::pushes_right(state))
+    }
+
+    fn draw_background(&self, surface: &mut Surface) {
+        render::hill(surface);
+    }
+
+    fn draw(&self, state: &Self::State, surface: &mut Surface) {
+        render::car(surface, state[0], V::FLAG);
+    }
+}

@@ -1,8 +1,9 @@
-//! Who can demonstrate the task: `expert` steers against the drift, `explore` wanders everywhere.
+//! Who can demonstrate the task: `expert` makes up for the drift, `explore` wanders everywhere.
 //!
 //! Both read `state`, `goal_state` and `dynamics` of the infos row and nothing else.
 
 use super::physics::{BORDER, Dynamics, Point, SIZE, distance};
+use super::route::{Detour, walk};
 use rand::Rng as _;
 use swm_core::policy::Expert;
 use swm_core::{ExpertEntry, Key, Result, Rng, RowRef};
@@ -11,8 +12,8 @@ use swm_core::{ExpertEntry, Key, Result, Rng, RowRef};
 pub const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
-        summary: "straight to the target, making up for the drift of the zone it is in",
-        make: || Box::new(Straight),
+        summary: "straight to the target, making up for the drift, or around drift that is too strong",
+        make: || Box::new(Steersman { plan: None }),
     },
     ExpertEntry {
         id: "explore",
@@ -27,16 +28,33 @@ fn place(row: RowRef<'_>, column: &str) -> Result<Point> {
     Ok([value[0] as f32, value[1] as f32])
 }
 
-/// Heads straight for the target.
-struct Straight;
+/// Heads straight for the target where that leads there, and takes a detour where it does not.
+struct Steersman {
+    plan: Option<Plan>,
+}
 
-impl Expert for Straight {
-    fn begin(&mut self, _key: Key) {}
+/// How to get to a target of one world.
+struct Plan {
+    dynamics: Dynamics,
+    to: Point,
+    detour: Option<Detour>,
+}
+
+impl Expert for Steersman {
+    fn begin(&mut self, _key: Key) {
+        self.plan = None;
+    }
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
         let dynamics = Dynamics::from_row(&row.to_f64("dynamics")?);
-        let steer = dynamics.steer(place(row, "state")?, place(row, "goal_state")?);
-        action.copy_from_slice(&steer.map(f64::from));
+        let (at, to) = (place(row, "state")?, place(row, "goal_state")?);
+        let known = self.plan.take().filter(|plan| plan.dynamics == dynamics && plan.to == to);
+        let plan = self.plan.insert(known.unwrap_or_else(|| {
+            let straight = walk(&dynamics, at, to).1.is_some();
+            Plan { dynamics, to, detour: (!straight).then(|| Detour::new(&dynamics, to)) }
+        }));
+        let next = plan.detour.as_ref().and_then(|detour| detour.next(at)).unwrap_or(to);
+        action.copy_from_slice(&dynamics.steer(at, next).map(f64::from));
         Ok(())
     }
 }
@@ -137,8 +155,8 @@ mod tests {
             assert!(reaches(&all, true, 400), "seed {seed}, everything varied, sampled goal");
             in_reach += u32::from(reaches(&all, false, 400));
         }
-        // The other targets lie behind drift that is stronger than the agent.
-        assert_eq!(in_reach, 182, "everything varied, targets anywhere");
+        // The other targets lie behind drift that is stronger than the agent, or nearly so.
+        assert_eq!(in_reach, 190, "everything varied, targets anywhere");
     }
 
     #[test]

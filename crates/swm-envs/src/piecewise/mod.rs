@@ -4,6 +4,7 @@ mod arrows;
 mod expert;
 mod physics;
 mod render;
+mod route;
 
 use crate::draw::Disc;
 use crate::factors;
@@ -25,8 +26,6 @@ pub const ENTRY: EnvEntry = EnvEntry {
 
 /// Samples from which [`Env::sample_goal`] chooses.
 const GOAL_TRIES: usize = 256;
-/// Steps within which a goal must be in reach.
-const GOAL_STEPS: usize = 400;
 /// Names of the zones' factors.
 const BIASES: [&str; ZONES] = ["zones.bias_0", "zones.bias_1", "zones.bias_2", "zones.bias_3"];
 const COLORS: [&str; ZONES] = ["zones.color_0", "zones.color_1", "zones.color_2", "zones.color_3"];
@@ -69,22 +68,6 @@ impl Piecewise {
         if let Some(target) = &mut self.scene.target {
             target.center = goal;
         }
-    }
-
-    /// Where steering towards `goal` leads, and after how many steps it is reached, if it is.
-    fn walk(&self, goal: Point) -> (Point, Option<usize>) {
-        let mut at = self.agent.center;
-        for steps in 0..GOAL_STEPS {
-            if distance(at, goal) < GOAL_RADIUS {
-                return (at, Some(steps));
-            }
-            let next = self.dynamics.advance(at, self.dynamics.steer(at, goal));
-            if next == at {
-                break;
-            }
-            at = next;
-        }
-        (at, None)
     }
 }
 
@@ -276,11 +259,11 @@ impl Env for Piecewise {
         let mut longest: Option<(usize, Point)> = None;
         for _ in 0..GOAL_TRIES {
             let mut goal = point(&space.sample(&mut rng));
-            let (end, mut steps) = self.walk(goal);
+            let (end, mut steps) = route::walk(&self.dynamics, self.agent.center, goal);
             if steps.is_none() {
                 // Out of reach: where the drift holds the agent on its way there may do.
                 goal = end;
-                steps = self.walk(goal).1;
+                steps = route::walk(&self.dynamics, self.agent.center, goal).1;
             }
             let Some(steps) = steps.filter(|&steps| steps > 0) else { continue };
             if longest.is_none_or(|(known, _)| steps > known) {
@@ -331,7 +314,11 @@ mod tests {
                 continue;
             }
             assert!(!env.is_success(), "seed {seed}");
-            assert!(env.walk(env.goal).1.is_some(), "seed {seed}: steering leads to {:?}", env.goal);
+            assert!(
+                route::walk(&env.dynamics, env.agent.center, env.goal).1.is_some(),
+                "seed {seed}: steering leads to {:?}",
+                env.goal
+            );
         }
         // In these, drift that is stronger than the agent holds it in its corner.
         assert_eq!(trapped, [7732, 9434]);

@@ -425,8 +425,10 @@ mod tests {
     #[test]
     fn shapes_told_by_spans_cover_shares_of_pixels() {
         // A triangle from (2, 1) to (10, 1) and (2, 9), and a square in it that counts no pixel twice.
-        let spans = |y: f64| {
-            if (1.0..9.0).contains(&y) { [[2.0, 11.0 - y], [2.0, 4.0f64.min(11.0 - y)]] } else { [[0.0; 2]; 2] }
+        let spans = |y: f64| match y {
+            1.0..6.0 => [[2.0, 11.0 - y], [2.0, 4.0]],
+            6.0..9.0 => [[2.0, 11.0 - y], [0.0; 2]],
+            _ => [[0.0; 2]; 2],
         };
         let black = Color::new([0; 3]);
         let triangle = rows(|surface| surface.shape(0..99, black, 1.0, spans), 0..13, 0..14);

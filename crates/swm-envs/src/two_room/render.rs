@@ -116,28 +116,50 @@ fn average(parts: &[(usize, f64)], color: impl Fn(usize) -> [f64; 3]) -> [f64; 3
     })
 }
 
-/// Draws frames, remembering the last scene and size.
+/// Draws frames, remembering the last scene at the sizes it was asked for.
 #[derive(Default)]
 pub struct Renderer {
     scene: Option<Scene>,
-    size: [usize; 2],
-    background: Vec<u8>,
+    /// The newest first.
+    backgrounds: Vec<Background>,
     brush: Brush,
 }
+
+/// What keeps still, at one size.
+struct Background {
+    size: [usize; 2],
+    rgb: Vec<u8>,
+    /// Whether `rgb` shows the last scene.
+    current: bool,
+}
+
+/// At how many sizes the background is kept.
+const MAX_BACKGROUNDS: usize = 4;
 
 impl Renderer {
     /// Draws a scene and the agent in it.
     pub fn draw(&mut self, scene: &Scene, agent: &Disc, frame: FrameMut<'_>) {
         let FrameMut { width, height, rgb } = frame;
-        if self.size != [width, height] || self.scene.as_ref() != Some(scene) {
-            self.background.resize(width * height * 3, 0);
-            scene.draw(width, height, &mut self.background);
-            if let Some(target) = &scene.target {
-                self.brush.blend(target, width, height, &mut self.background);
-            }
-            (self.size, self.scene) = ([width, height], Some(scene.clone()));
+        if self.scene.as_ref() != Some(scene) {
+            self.scene = Some(scene.clone());
+            self.backgrounds.iter_mut().for_each(|background| background.current = false);
         }
-        rgb.copy_from_slice(&self.background);
+        let size = [width, height];
+        let known = self.backgrounds.iter().position(|background| background.size == size);
+        let place = known.unwrap_or_else(|| {
+            self.backgrounds.truncate(MAX_BACKGROUNDS - 1);
+            self.backgrounds.insert(0, Background { size, rgb: vec![0; width * height * 3], current: false });
+            0
+        });
+        let background = &mut self.backgrounds[place];
+        if !background.current {
+            scene.draw(width, height, &mut background.rgb);
+            if let Some(target) = &scene.target {
+                self.brush.blend(target, width, height, &mut background.rgb);
+            }
+            background.current = true;
+        }
+        rgb.copy_from_slice(&background.rgb);
         self.brush.blend(agent, width, height, rgb);
     }
 }

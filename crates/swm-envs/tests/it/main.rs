@@ -1,5 +1,6 @@
 //! Integration tests: golden rollouts of the Python reference, and what every environment must keep.
 
+mod allocation;
 mod conformance;
 mod golden;
 mod golden_classic;

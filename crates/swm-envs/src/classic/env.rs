@@ -7,7 +7,7 @@ use rand::Rng as _;
 use rand::seq::IndexedRandom as _;
 use swm_core::{
     Action, ColumnSpec, DType, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, Rng, RowMut,
-    RowRef, Snapshot, Transition, VariationRequest,
+    RowRef, Snapshot, Space, Transition, VariationRequest,
 };
 
 /// Paths from which [`Env::sample_goal`] takes a goal before it gives up.
@@ -137,7 +137,11 @@ impl<W: World> Env for Classic<W> {
     }
 
     fn step(&mut self, action: Action<'_>) -> Result<Transition> {
-        let action = W::action(action)?;
+        let action = match self.spec.action_space {
+            Space::Box { .. } => f64::from(action.continuous(1)?[0]),
+            #[allow(clippy::cast_precision_loss)]
+            _ => action.discrete(&self.spec.action_space)?[0] as f64,
+        };
         Ok(self.world.step(&mut self.state, action))
     }
 

@@ -19,7 +19,7 @@ use env::Classic;
 use expert::Controller;
 use factors::{Paint, Parameter};
 use picture::Surface;
-use swm_core::{Action, Result, Rng, Space, Transition};
+use swm_core::{Result, Rng, Space, Transition};
 
 /// One world with the physics of an episode.
 trait World: Send + Sized + 'static {
@@ -51,20 +51,7 @@ trait World: Send + Sized + 'static {
     /// The goal of an episode nobody gave one to.
     fn task(rng: &mut Rng) -> Self::State;
 
-    /// An action as a number.
-    ///
-    /// # Errors
-    /// When it is not of the action space's kind, length or, where it is discrete, range, or not finite.
-    fn action(action: Action<'_>) -> Result<f64> {
-        let space = Self::action_space();
-        Ok(match space {
-            Space::Box { .. } => f64::from(action.continuous(1)?[0]),
-            #[allow(clippy::cast_precision_loss)]
-            _ => action.discrete(&space)?[0] as f64,
-        })
-    }
-
-    /// Moves the world by one step.
+    /// Moves the world by one step. Discrete actions come as the number of their choice.
     fn step(&self, state: &mut Self::State, action: f64) -> Transition;
 
     /// Fills the `state` column.

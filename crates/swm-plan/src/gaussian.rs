@@ -27,22 +27,35 @@ pub fn fill(key: Key, first: usize, noise: &mut [f32]) {
 
 fn fill_runs(rng: &mut Rng, runs: &mut [[f32; RUN]]) {
     rng.fill_bytes(bytemuck::cast_slice_mut(runs.as_flattened_mut()));
-    #[cfg(target_arch = "x86_64")]
-    if std::arch::is_x86_feature_detected!("avx2") {
-        // SAFETY: the function asks for AVX2 and nothing else; the processor has it.
-        #[allow(unsafe_code)]
-        unsafe {
-            transform_with_avx2(runs);
-        }
-        return;
-    }
-    transform(runs);
+    transform_wide(runs);
 }
 
-/// The same function for eight lanes. Nothing in it may be contracted, so its numbers are the same.
+/// [`transform`] with as many lanes as the processor has. The compiler may neither contract nor reorder what is in it, so
+/// the numbers are the same.
 #[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn transform_with_avx2(runs: &mut [[f32; RUN]]) {
+#[allow(unsafe_code)]
+fn transform_wide(runs: &mut [[f32; RUN]]) {
+    #[target_feature(enable = "avx512f")]
+    fn with_avx512(runs: &mut [[f32; RUN]]) {
+        transform(runs);
+    }
+    #[target_feature(enable = "avx2")]
+    fn with_avx2(runs: &mut [[f32; RUN]]) {
+        transform(runs);
+    }
+    if std::arch::is_x86_feature_detected!("avx512f") {
+        // SAFETY: the function asks for AVX-512 F and nothing else; the processor has it.
+        unsafe { with_avx512(runs) }
+    } else if std::arch::is_x86_feature_detected!("avx2") {
+        // SAFETY: the function asks for AVX2 and nothing else; the processor has it.
+        unsafe { with_avx2(runs) }
+    } else {
+        transform(runs);
+    }
+}
+
+#[cfg(not(target_arch = "x86_64"))]
+fn transform_wide(runs: &mut [[f32; RUN]]) {
     transform(runs);
 }
 

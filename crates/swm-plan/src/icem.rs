@@ -55,7 +55,7 @@ impl Solver for ICem {
         self.check()?;
         let bounds = continuous(ID, cost, &problem)?;
         let colour = Colour::new(self.beta, problem.horizon);
-        let mut beliefs = Belief::start(&problem, self.sigma);
+        let mut beliefs = Belief::start(&problem, bounds, self.sigma);
         let mut samples = Samples::new(ID, &problem, self.samples);
         let mut kept = vec![vec![]; beliefs.len()];
 

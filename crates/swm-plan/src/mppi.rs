@@ -47,7 +47,7 @@ impl Solver for Mppi {
     fn solve(&mut self, cost: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan> {
         self.check()?;
         let bounds = continuous(ID, cost, &problem)?;
-        let mut beliefs = Belief::start(&problem, self.sigma);
+        let mut beliefs = Belief::start(&problem, bounds, self.sigma);
         let mut samples = Samples::new(ID, &problem, self.samples);
         let mut weights = vec![vec![]; beliefs.len()];
 

@@ -38,7 +38,7 @@ impl Solver for PredictiveSampling {
         settings.some("samples", self.samples)?;
         settings.positive("sigma", self.sigma)?;
         let bounds = continuous(ID, cost, &problem)?;
-        let mut nominal = Belief::start(&problem, self.sigma);
+        let mut nominal = Belief::start(&problem, bounds, self.sigma);
         let mut samples = Samples::new(ID, &problem, self.samples);
 
         search(1, &problem, |iteration| {

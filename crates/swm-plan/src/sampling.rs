@@ -20,11 +20,15 @@ pub struct Belief {
 }
 
 impl Belief {
-    /// Where the search of every environment begins: at the first guess or at 0, with the standard deviation `sigma`.
-    pub fn start(problem: &PlanProblem<'_>, sigma: f32) -> Vec<Self> {
+    /// Where the search of every environment begins: at the first guess, moved into the bounds, or at the number within
+    /// them that is nearest to 0; with the standard deviation `sigma`.
+    pub fn start(problem: &PlanProblem<'_>, bounds: Bounds<'_>, sigma: f32) -> Vec<Self> {
         let len = problem.horizon * problem.space.dim();
-        let mean = |env| problem.init.map_or_else(|| vec![0.0; len], |init| init[env * len..][..len].to_vec());
-        let start = |env| Self { mean: mean(env), std: vec![sigma; len], trace: PlanTrace::default(), order: vec![] };
+        let start = |env| {
+            let mut mean = problem.init.map_or_else(|| vec![0.0; len], |init| init[env * len..][..len].to_vec());
+            bounds.clip(&mut mean);
+            Self { mean, std: vec![sigma; len], trace: PlanTrace::default(), order: vec![] }
+        };
         (0..problem.keys.len()).map(start).collect()
     }
 
@@ -114,7 +118,6 @@ impl Samples {
                 }
             });
             candidates[..len].copy_from_slice(&belief.mean);
-            bounds.clip(&mut candidates[..len]);
         });
     }
 

@@ -11,6 +11,8 @@ pub struct Trial {
     pub solver: &'static str,
     /// Its settings, as JSON.
     pub settings: &'static str,
+    /// Those of a short search, whose every number is pinned.
+    pub short: &'static str,
     /// For each toy it can solve: by how much the cost may exceed the lowest one, and how far any number of the plan may
     /// be from the best plan's.
     pub near: &'static [(&'static str, f64, f64)],
@@ -21,6 +23,7 @@ pub const TRIALS: &[Trial] = &[
     Trial {
         solver: "predictive_sampling",
         settings: r#"{"samples": 200000, "sigma": 0.7}"#,
+        short: r#"{"samples": 40}"#,
         near: &[
             ("quadratic", 0.4, 0.4),
             ("bounded", 0.4, 0.4),
@@ -34,6 +37,7 @@ pub const TRIALS: &[Trial] = &[
     Trial {
         solver: "cem",
         settings: r#"{"samples": 600, "elites": 100, "iterations": 60, "sigma": 2}"#,
+        short: r#"{"samples": 40, "elites": 8, "iterations": 4}"#,
         near: &[
             ("quadratic", 1e-6, 1e-3),
             ("bounded", 1e-6, 1e-3),
@@ -47,6 +51,7 @@ pub const TRIALS: &[Trial] = &[
     Trial {
         solver: "icem",
         settings: r#"{"samples": 600, "elites": 100, "iterations": 60, "sigma": 2, "beta": 0.5}"#,
+        short: r#"{"samples": 40, "elites": 8, "iterations": 4}"#,
         near: &[
             ("quadratic", 1e-6, 1e-3),
             ("bounded", 1e-6, 1e-3),
@@ -60,6 +65,7 @@ pub const TRIALS: &[Trial] = &[
     Trial {
         solver: "mppi",
         settings: r#"{"samples": 2000, "elites": 20, "sigma": 0.1, "temperature": 0.01, "iterations": 100}"#,
+        short: r#"{"samples": 40, "elites": 8, "iterations": 4}"#,
         near: &[
             ("quadratic", 1e-2, 5e-2),
             ("bounded", 1e-2, 5e-2),
@@ -70,10 +76,16 @@ pub const TRIALS: &[Trial] = &[
             ("reach-bounded", 1e-2, 5e-2),
         ],
     },
-    Trial { solver: "categorical_cem", settings: "{}", near: &[("discrete", 1e-6, 0.0)] },
+    Trial {
+        solver: "categorical_cem",
+        settings: "{}",
+        short: r#"{"samples": 20, "elites": 4, "iterations": 4, "smoothing": 0.1, "momentum": 0.2}"#,
+        near: &[("discrete", 1e-6, 0.0)],
+    },
     Trial {
         solver: "gd",
         settings: r#"{"iterations": 300}"#,
+        short: r#"{"samples": 4, "iterations": 4}"#,
         near: &[
             ("quadratic", 1e-6, 1e-3),
             ("bounded", 1e-6, 1e-3),
@@ -83,15 +95,22 @@ pub const TRIALS: &[Trial] = &[
             ("reach-bounded", 1e-6, 1e-3),
         ],
     },
-    Trial { solver: "pgd", settings: r#"{"step": 0.3}"#, near: &[("discrete", 1e-6, 0.0)] },
+    Trial {
+        solver: "pgd",
+        settings: r#"{"step": 0.3}"#,
+        short: r#"{"samples": 4, "iterations": 4, "action_noise": 0.1}"#,
+        near: &[("discrete", 1e-6, 0.0)],
+    },
     Trial {
         solver: "lagrangian",
         settings: r#"{"outer_iterations": 10, "optimizer": {"kind": "sgd", "step": 0.01}, "penalty_limit": 16, "tolerance": 5e-4}"#,
+        short: r#"{"samples": 4, "outer_iterations": 2, "iterations": 3}"#,
         near: &[("constrained", 2e-3, 1e-3)],
     },
     Trial {
         solver: "grasp",
         settings: r#"{"sync_iterations": 40}"#,
+        short: r#"{"iterations": 4}"#,
         near: &[("reach", 1e-4, 0.0), ("reach-bounded", 1e-4, 1e-3)],
     },
 ];

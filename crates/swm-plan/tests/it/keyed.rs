@@ -1,0 +1,52 @@
+//! Every draw has a key: the plan of an environment is the same bytes whatever is planned beside it and on any number of
+//! threads.
+
+use crate::solvers::{solves, trial};
+use crate::toys::{Model, TOYS, Toy, solve};
+use swm_core::{Plan, PlanTrace};
+use swm_plan::registry::{SOLVERS, SolverEntry};
+
+/// The bits of everything a plan says of each environment.
+fn bits(plan: &Plan, envs: usize) -> Vec<Vec<u32>> {
+    let len = plan.actions.len() / envs;
+    let trace = |PlanTrace { best, mean, spread, violation }: &PlanTrace| [&best[..], mean, spread, violation].concat();
+    let env =
+        |env: usize| [&plan.actions[env * len..][..len], &plan.costs[env..=env], &trace(&plan.trace[env])].concat();
+    (0..envs).map(|i| env(i).into_iter().map(f32::to_bits).collect()).collect()
+}
+
+fn plan(row: &SolverEntry, toy: &'static Toy, envs: &[usize]) -> Vec<Vec<u32>> {
+    let settings = serde_json::from_str(trial(row.id).short).expect("settings");
+    let mut solver = (row.make)(&settings).expect("a solver");
+    bits(&solve(&mut *solver, &mut Model::new(toy, envs), toy, envs).expect("a plan"), envs.len())
+}
+
+/// The first toy a solver can solve.
+fn toy_for(row: &SolverEntry) -> &'static Toy {
+    TOYS.iter().find(|toy| solves(row, toy)).expect("a toy")
+}
+
+#[test]
+fn batches_and_threads_change_nothing() {
+    let envs: Vec<usize> = (0..50).collect();
+    for row in SOLVERS.rows {
+        let run = |threads, size| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+            pool.install(|| envs.chunks(size).flat_map(|envs| plan(row, toy_for(row), envs)).collect::<Vec<_>>())
+        };
+        let alone = run(1, 1);
+        for (threads, size) in [(2, 1), (1, 7), (2, 7), (1, 50), (2, 50)] {
+            assert!(run(threads, size) == alone, "{}: {size} environments on {threads} threads", row.id);
+        }
+        assert!(alone[0] != alone[1], "{}: environments have plans of their own", row.id);
+    }
+}
+
+#[test]
+fn neighbours_change_nothing() {
+    for row in SOLVERS.rows {
+        let toy = toy_for(row);
+        let [first, second] = [[3, 11, 40], [27, 8, 11]].map(|envs| plan(row, toy, &envs));
+        assert!(first[1] == second[2], "{}", row.id);
+    }
+}

@@ -1,0 +1,153 @@
+//! What the sampling solvers have in common: where they start, when they stop, and what they refuse.
+
+use crate::toys::{Model, Toy, solve, toy};
+use serde_json::{Value, json};
+use std::time::Instant;
+use swm_core::{Key, Plan, PlanProblem, PlanSpace, Solver};
+use swm_plan::registry::{Actions, Family, SOLVERS, SolverEntry};
+
+fn samplers() -> impl Iterator<Item = (&'static SolverEntry, &'static Toy)> {
+    let toy_for = |row: &SolverEntry| toy(if row.actions == Actions::Discrete { "discrete" } else { "quadratic" });
+    SOLVERS.rows.iter().filter(|row| row.family == Family::Sampling).map(move |row| (row, toy_for(row)))
+}
+
+fn make(id: &str, settings: &Value) -> Box<dyn Solver> {
+    (SOLVERS.get(id).expect("a solver").make)(settings).expect("settings")
+}
+
+fn plan(id: &str, toy: &'static Toy, init: Option<&[f32]>, deadline: Option<Instant>) -> Plan {
+    let problem = PlanProblem { horizon: toy.horizon, space: toy.space, keys: &[Key::new(1)], init, deadline };
+    make(id, &json!({})).solve(&mut Model::new(toy, &[0]), problem).expect("a plan")
+}
+
+#[test]
+fn a_first_guess_is_the_first_candidate() {
+    for (row, toy) in samplers() {
+        let landscape = (toy.landscape)(0);
+        let optimum = landscape.optimum();
+        let init: Vec<f32> = optimum.iter().map(|&v| v as f32).collect();
+        let found = plan(row.id, toy, Some(&init), None);
+        assert!((f64::from(found.trace[0].best[0]) - landscape.cost(&optimum)).abs() < 1e-6, "{}", row.id);
+        if row.id == "predictive_sampling" {
+            assert_eq!(found.actions, init);
+        }
+    }
+}
+
+#[test]
+fn a_late_search_returns_what_it_has() {
+    for (row, toy) in samplers() {
+        let (late, whole) = (plan(row.id, toy, None, Some(Instant::now())), plan(row.id, toy, None, None));
+        assert_eq!(late.trace[0].best.len(), 1, "{}", row.id);
+        assert_eq!(late.trace[0].best[0], whole.trace[0].best[0], "{}", row.id);
+        assert_eq!(late.costs, late.trace[0].best, "{}", row.id);
+        assert_eq!(whole.trace[0].best.len(), if row.id == "predictive_sampling" { 1 } else { 30 }, "{}", row.id);
+    }
+}
+
+#[test]
+fn traces_are_what_they_say() {
+    for (row, toy) in samplers() {
+        let trace = &plan(row.id, toy, None, None).trace[0];
+        let n = trace.best.len();
+        assert!(trace.mean.len() == n && trace.spread.len() == n && trace.violation.is_empty(), "{}", row.id);
+        assert!(trace.best.iter().zip(&trace.mean).all(|(best, mean)| best <= mean), "{}", row.id);
+        assert!(trace.spread.iter().all(|&spread| spread >= 0.0), "{}", row.id);
+        let fixed = matches!(row.id, "mppi" | "predictive_sampling");
+        assert!(fixed || trace.spread[n - 1] < trace.spread[0] / 10.0, "{}: {:?}", row.id, trace.spread);
+    }
+}
+
+#[test]
+fn candidates_stay_within_bounds() {
+    /// Notes how far candidates reach.
+    struct Watch(f32);
+    impl swm_core::CostModel for Watch {
+        fn observe(&mut self, _: &swm_core::Batch, _: &[usize]) -> swm_core::Result<()> {
+            Ok(())
+        }
+        fn cost(&mut self, candidates: swm_core::Candidates<'_>, costs: &mut [f32]) -> swm_core::Result<()> {
+            self.0 = candidates.actions.iter().fold(self.0, |far, a| far.max(a.abs()));
+            costs.fill(1.0);
+            Ok(())
+        }
+    }
+    for (row, _) in samplers().filter(|(row, _)| row.actions == Actions::Continuous) {
+        let mut watch = Watch(0.0);
+        let space = PlanSpace::Continuous { low: &[-0.3, -0.5], high: &[0.25, 0.5] };
+        let problem = PlanProblem { horizon: 3, space, keys: &[Key::new(0)], init: Some(&[9.0; 6]), deadline: None };
+        let plan = make(row.id, &json!({})).solve(&mut watch, problem).expect("a plan");
+        assert_eq!(watch.0, 0.5, "{}", row.id);
+        // The costs say nothing: the plan must be within bounds all the same.
+        for step in plan.actions.chunks_exact(2) {
+            assert!((-0.3..=0.25).contains(&step[0]) && (-0.5..=0.5).contains(&step[1]), "{}: {step:?}", row.id);
+        }
+    }
+}
+
+#[test]
+fn no_environments_no_plans() {
+    for (row, toy) in samplers() {
+        let plan = solve(&mut *make(row.id, &json!({})), &mut Model::new(toy, &[]), toy, &[]).expect("nothing");
+        assert!(plan.actions.is_empty() && plan.costs.is_empty() && plan.trace.is_empty());
+    }
+}
+
+#[test]
+fn wrong_settings_say_so() {
+    let wrong = [
+        ("predictive_sampling", json!({"samples": 0}), "predictive_sampling samples: 0"),
+        ("predictive_sampling", json!({"sigma": 0}), "predictive_sampling sigma: 0"),
+        ("cem", json!({"iterations": 0}), "cem iterations: 0; ask for at least 1"),
+        ("cem", json!({"samples": 64, "elites": 65}), "cem elites: 65 of 64 samples"),
+        ("cem", json!({"elites": 1}), "at least 2 (a spread needs two)"),
+        ("cem", json!({"sigma": -1}), "cem sigma: -1; choose a finite number above 0"),
+        ("icem", json!({"elites": 0}), "icem elites: 0 of 300 samples"),
+        ("icem", json!({"momentum": 1.5}), "icem momentum: 1.5; choose a number of at least 0 and below 1"),
+        ("icem", json!({"momentum": -0.1}), "icem momentum"),
+        ("icem", json!({"beta": -1}), "icem beta"),
+        ("icem", json!({"keep": 31}), "icem keep: 31; choose at most 30"),
+        ("icem", json!({"samples": 5, "elites": 5, "keep": 5}), "choose at most 4"),
+        ("mppi", json!({"temperature": 0}), "mppi temperature: 0; choose a finite number above 0"),
+        ("mppi", json!({"elites": 0}), "mppi elites: 0 of 300 samples; choose at least 1"),
+        ("mppi", json!({"elites": 301}), "mppi elites: 301 of 300 samples"),
+        ("categorical_cem", json!({"smoothing": -0.5}), "categorical_cem smoothing: -0.5"),
+        ("categorical_cem", json!({"momentum": 1}), "categorical_cem momentum: 1"),
+        ("categorical_cem", json!({"elites": 0}), "categorical_cem elites"),
+    ];
+    for (id, settings, expected) in wrong {
+        let toy = samplers().find(|(row, _)| row.id == id).expect("a sampler").1;
+        let error = solve(&mut *make(id, &settings), &mut Model::new(toy, &[0]), toy, &[0]).expect_err(expected);
+        assert!(error.is_usage() && error.to_string().contains(expected), "{error}");
+    }
+    for (row, _) in samplers() {
+        let error = (row.make)(&json!({"sampels": 3})).err().expect("a typo").to_string();
+        assert!(error.contains("sampels"), "{error}");
+    }
+}
+
+#[test]
+fn wrong_problems_say_so() {
+    let quadratic = toy("quadratic");
+    let message = |id: &str, horizon, space, init: Option<&[f32]>| {
+        let keys = [Key::new(0), Key::new(1)];
+        let problem = PlanProblem { horizon, space, keys: &keys, init, deadline: None };
+        make(id, &json!({})).solve(&mut Model::new(quadratic, &[0, 1]), problem).expect_err("wrong").to_string()
+    };
+    let space = quadratic.space;
+    assert!(message("cem", 0, space, None).contains("planning horizon: 0 model steps"));
+    let given = message("cem", 3, space, Some(&[0.0; 5]));
+    assert!(given.contains("5 numbers") && given.contains("12 (2 environments x 3 x 2)"), "{given}");
+    let infinite = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, f32::INFINITY, 0.0, 0.0, 0.0];
+    let given = message("cem", 3, space, Some(&infinite));
+    assert!(given.contains("planned environment 1") && given.contains("inf at step 1"), "{given}");
+    let crossed = PlanSpace::Continuous { low: &[0.0, 1.0], high: &[1.0, 0.5] };
+    assert!(message("cem", 3, crossed, None).contains("bounds of action number 1: 1 ..= 0.5"));
+    let uneven = PlanSpace::Continuous { low: &[0.0], high: &[1.0, 0.5] };
+    assert!(message("cem", 3, uneven, None).contains("1 lower and 2 upper"));
+    let none = PlanSpace::Discrete { choices: &[2, 0] };
+    assert!(message("categorical_cem", 3, none, None).contains("choice 1 of a model step: there is nothing"));
+    let choices = PlanSpace::Discrete { choices: &[2] };
+    let negative = [1.0, -1.0, 0.0, 0.0];
+    assert!(message("categorical_cem", 1, choices, Some(&negative)).contains("none below 0"));
+}

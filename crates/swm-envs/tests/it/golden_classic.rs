@@ -47,7 +47,7 @@ fn follow(id: &str, size: (usize, usize)) {
             assert_eq!(transition.terminated, terminations[t], "{name}, terminated {t}");
         }
         let last = picture_difference(&frame(&mut *env, size), &golden.read("frame_last"));
-        assert!(first <= 3.0 && last <= 3.0, "{name}: frames differ by {first} and {last}");
+        assert!(first <= 0.2 && last <= 0.2, "{name}: frames differ by {first} and {last}");
     }
 }
 

@@ -84,17 +84,6 @@ impl Checkpoint {
     /// # Errors
     /// When the disk refuses; the checkpoint that was there is kept.
     pub fn save(&mut self, run: &Path, state: Option<&TrainState>) -> Result<String> {
-        let new = run.join(format!("{FOLDER}.new"));
-        if new.exists() {
-            std::fs::remove_dir_all(&new)
-                .map_err(|error| Error::io(&new, "removing an unfinished checkpoint", error))?;
-        }
-        std::fs::create_dir_all(&new).map_err(|error| Error::io(&new, "creating a checkpoint", error))?;
-        let write = |name: &str, bytes: &[u8]| {
-            let path = new.join(name);
-            std::fs::write(&path, bytes).map_err(|error| Error::io(&path, "writing a checkpoint", error))?;
-            Ok(manifest::hash(bytes))
-        };
         let card = Card {
             family: FAMILY.to_owned(),
             env: self.env.clone(),
@@ -103,31 +92,14 @@ impl Checkpoint {
             action: self.action.clone(),
             config: json(&self.config)?,
         };
-        write(CONFIG, text(&card)?.as_bytes())?;
-        let weights = write(WEIGHTS, &pack(&parameters::values(&self.model))?)?;
-        self.manifest.hashes.insert("weights".to_owned(), weights.clone());
+        let mut more = vec![];
         if let Some(state) = state {
-            let hash = write(OPTIMIZER, &pack(&state.moments)?)?;
-            self.manifest.hashes.insert("optimizer".to_owned(), hash);
-            write(STATE, text(&Position { step: state.step })?.as_bytes())?;
+            let optimizer = pack(&state.moments)?;
+            self.manifest.hashes.insert("optimizer".to_owned(), manifest::hash(&optimizer));
+            more.push((OPTIMIZER, optimizer));
+            more.push((STATE, text(&Position { step: state.step })?.into_bytes()));
         }
-        write(MANIFEST, text(&self.manifest)?.as_bytes())?;
-
-        let (place, old) = (run.join(FOLDER), run.join(format!("{FOLDER}.old")));
-        let rename = |from: &Path, to: &Path| {
-            std::fs::rename(from, to).map_err(|error| Error::io(to, "putting a checkpoint in its place", error))
-        };
-        if old.exists() && place.exists() {
-            std::fs::remove_dir_all(&old).map_err(|error| Error::io(&old, "removing an old checkpoint", error))?;
-        }
-        if place.exists() {
-            rename(&place, &old)?;
-        }
-        rename(&new, &place)?;
-        if old.exists() {
-            std::fs::remove_dir_all(&old).map_err(|error| Error::io(&old, "removing an old checkpoint", error))?;
-        }
-        Ok(weights)
+        install(run, &card, &mut self.manifest, &parameters::values(&self.model), &more)
     }
 
     /// Loads the checkpoint of a run folder (or the checkpoint folder itself).
@@ -135,50 +107,12 @@ impl Checkpoint {
     /// # Errors
     /// When there is none, it is of another family, it is damaged, or its weights do not fit its configuration.
     pub fn load(run: &Path, device: &Device) -> Result<Self> {
-        let folder = locate(run).ok_or_else(|| {
-            Error::corrupt(run, "there is no checkpoint", "give the folder that `swm train` wrote to")
-        })?;
-        let card_path = folder.join(CONFIG);
-        let broken = |path: &Path, problem: String| {
-            Error::corrupt(path, problem, "train again, or copy the checkpoint again from where it came")
-        };
-        let card: serde_json::Value =
-            serde_json::from_slice(&read(&card_path)?).map_err(|error| broken(&card_path, error.to_string()))?;
-        let family = card.get("family").and_then(|family| family.as_str()).unwrap_or("unknown");
-        if family != FAMILY {
-            return Err(Error::corrupt(
-                &card_path,
-                format!("it holds a model of the family '{family}'"),
-                format!("give a checkpoint of the family '{FAMILY}'"),
-            ));
-        }
-        let card: Card = serde_json::from_value(card).map_err(|error| broken(&card_path, error.to_string()))?;
-        let config: TrainConfig =
-            serde_json::from_value(card.config).map_err(|error| broken(&card_path, error.to_string()))?;
+        let Stored { folder, card, manifest, config } = Stored::<TrainConfig>::read(run, FAMILY)?;
         config.check()?;
-        let manifest_path = folder.join(MANIFEST);
-        let manifest: Manifest = serde_json::from_slice(&read(&manifest_path)?)
-            .map_err(|error| broken(&manifest_path, error.to_string()))?;
-
-        let path = folder.join(WEIGHTS);
-        let weights = unpack(&path, manifest.hashes.get("weights"))?;
+        let card: Card =
+            serde_json::from_value(card).map_err(|error| broken(&folder.join(CONFIG), error.to_string()))?;
         let actions = config.data.frameskip * card.action.dim();
-        let model = Lewm::new(&config.model, actions, Key::new(0), device);
-        let wanted = parameters::shapes(&model);
-        for (name, shape) in &wanted {
-            match weights.get(name) {
-                Some(tensor) if &tensor.shape == shape => {}
-                Some(tensor) => {
-                    let problem = format!("'{name}' is {:?}, but {CONFIG} makes it {shape:?}", tensor.shape);
-                    return Err(broken(&path, problem));
-                }
-                None => return Err(broken(&path, format!("'{name}' is missing, which {CONFIG} asks for"))),
-            }
-        }
-        if let Some(name) = weights.keys().find(|name| !wanted.contains_key(*name)) {
-            return Err(broken(&path, format!("'{name}' is no weight of the model that {CONFIG} describes")));
-        }
-        let model = parameters::load(model, &weights);
+        let model = fill(Lewm::new(&config.model, actions, Key::new(0), device), &folder, &manifest)?;
         Ok(Self { model, config, action: card.action, env: card.env, manifest })
     }
 
@@ -195,6 +129,119 @@ impl Checkpoint {
         let moments = unpack(&folder.join(OPTIMIZER), checkpoint.manifest.hashes.get("optimizer"))?;
         Ok((checkpoint, TrainState { step: position.step, moments }))
     }
+}
+
+/// The family of the model a run folder holds, if it holds one.
+pub fn family(run: &Path) -> Option<String> {
+    let card: serde_json::Value = serde_json::from_slice(&read(&locate(run)?.join(CONFIG)).ok()?).ok()?;
+    Some(card.get("family")?.as_str()?.to_owned())
+}
+
+/// What every family stores beside its weights.
+pub(crate) struct Stored<C> {
+    /// The checkpoint's folder.
+    pub folder: PathBuf,
+    /// The whole `config.json`.
+    pub card: serde_json::Value,
+    /// Its part `config`.
+    pub config: C,
+    /// Where the checkpoint came from.
+    pub manifest: Manifest,
+}
+
+impl<C: serde::de::DeserializeOwned> Stored<C> {
+    /// Reads it.
+    ///
+    /// # Errors
+    /// When there is none, it is of another family, or it is damaged.
+    pub fn read(run: &Path, family: &str) -> Result<Self> {
+        let folder = locate(run).ok_or_else(|| {
+            Error::corrupt(run, "there is no checkpoint", "give the folder that `swm train` wrote to")
+        })?;
+        let path = folder.join(CONFIG);
+        let wrong = |error: serde_json::Error| broken(&path, error.to_string());
+        let card: serde_json::Value = serde_json::from_slice(&read(&path)?).map_err(wrong)?;
+        let found = card.get("family").and_then(|family| family.as_str()).unwrap_or("unknown");
+        if found != family {
+            return Err(Error::corrupt(
+                &path,
+                format!("it holds a model of the family '{found}'"),
+                format!("give a checkpoint of the family '{family}'"),
+            ));
+        }
+        let config = serde_json::from_value(card["config"].clone()).map_err(wrong)?;
+        let path = folder.join(MANIFEST);
+        let manifest = serde_json::from_slice(&read(&path)?).map_err(|error| broken(&path, error.to_string()))?;
+        Ok(Self { folder, card, config, manifest })
+    }
+}
+
+/// Writes a checkpoint beside the old one and puts it in its place. Notes the hash of the weights in the manifest and
+/// returns it.
+pub(crate) fn install(
+    run: &Path,
+    card: &impl Serialize,
+    manifest: &mut Manifest,
+    weights: &Named<HostTensor>,
+    more: &[(&str, Vec<u8>)],
+) -> Result<String> {
+    let new = run.join(format!("{FOLDER}.new"));
+    if new.exists() {
+        std::fs::remove_dir_all(&new).map_err(|error| Error::io(&new, "removing an unfinished checkpoint", error))?;
+    }
+    std::fs::create_dir_all(&new).map_err(|error| Error::io(&new, "creating a checkpoint", error))?;
+    let write = |name: &str, bytes: &[u8]| {
+        let path = new.join(name);
+        std::fs::write(&path, bytes).map_err(|error| Error::io(&path, "writing a checkpoint", error))
+    };
+    write(CONFIG, text(card)?.as_bytes())?;
+    let weights = pack(weights)?;
+    let hash = manifest::hash(&weights);
+    write(WEIGHTS, &weights)?;
+    manifest.hashes.insert("weights".to_owned(), hash.clone());
+    more.iter().try_for_each(|(name, bytes)| write(name, bytes))?;
+    write(MANIFEST, text(manifest)?.as_bytes())?;
+
+    let (place, old) = (run.join(FOLDER), run.join(format!("{FOLDER}.old")));
+    let rename = |from: &Path, to: &Path| {
+        std::fs::rename(from, to).map_err(|error| Error::io(to, "putting a checkpoint in its place", error))
+    };
+    if old.exists() && place.exists() {
+        std::fs::remove_dir_all(&old).map_err(|error| Error::io(&old, "removing an old checkpoint", error))?;
+    }
+    if place.exists() {
+        rename(&place, &old)?;
+    }
+    rename(&new, &place)?;
+    if old.exists() {
+        std::fs::remove_dir_all(&old).map_err(|error| Error::io(&old, "removing an old checkpoint", error))?;
+    }
+    Ok(hash)
+}
+
+/// A model with the weights of a checkpoint's folder.
+pub(crate) fn fill<M: burn::module::Module>(model: M, folder: &Path, manifest: &Manifest) -> Result<M> {
+    let path = folder.join(WEIGHTS);
+    let weights = unpack(&path, manifest.hashes.get("weights"))?;
+    let wanted = parameters::shapes(&model);
+    for (name, shape) in &wanted {
+        match weights.get(name) {
+            Some(tensor) if &tensor.shape == shape => {}
+            Some(tensor) => {
+                let problem = format!("'{name}' is {:?}, but {CONFIG} makes it {shape:?}", tensor.shape);
+                return Err(broken(&path, problem));
+            }
+            None => return Err(broken(&path, format!("'{name}' is missing, which {CONFIG} asks for"))),
+        }
+    }
+    if let Some(name) = weights.keys().find(|name| !wanted.contains_key(*name)) {
+        return Err(broken(&path, format!("'{name}' is no weight of the model that {CONFIG} describes")));
+    }
+    Ok(parameters::load(model, &weights))
+}
+
+fn broken(path: &Path, problem: String) -> Error {
+    Error::corrupt(path, problem, "train again, or copy the checkpoint again from where it came")
 }
 
 /// Where the checkpoint of a run is: in place, or moved aside by a process that was killed before the new one was
@@ -234,8 +281,7 @@ fn pack(tensors: &Named<HostTensor>) -> Result<Vec<u8>> {
 /// The tensors of a safetensors file.
 fn unpack(path: &Path, hash: Option<&String>) -> Result<Named<HostTensor>> {
     let bytes = read(path)?;
-    let broken =
-        |problem: String| Error::corrupt(path, problem, "train again, or copy the checkpoint again from where it came");
+    let broken = |problem: String| broken(path, problem);
     let tensors = SafeTensors::deserialize(&bytes).map_err(|error| broken(format!("is damaged ({error})")))?;
     if hash.is_some_and(|hash| *hash != manifest::hash(&bytes)) {
         return Err(broken(format!("is not the file that {MANIFEST} describes: its hash differs")));

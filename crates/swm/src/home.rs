@@ -1,6 +1,9 @@
 //! Where things live: `$STABLEWM_HOME` (default `~/.stable_worldmodel`) with `datasets/` and `checkpoints/`.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use swm_core::{Error, Result};
+use swm_data::Reader;
 
 /// The folder everything without a path of its own lives in.
 pub fn home() -> PathBuf {
@@ -28,6 +31,46 @@ pub fn dataset(given: &str) -> PathBuf {
 /// The place of a checkpoint given as a path or as a name under [`checkpoints`].
 pub fn checkpoint(given: &str) -> PathBuf {
     named(given, checkpoints(), "")
+}
+
+/// Opens a dataset by path or name.
+///
+/// # Errors
+/// When there is none (naming the nearest), or it is damaged.
+pub fn open_dataset(given: &str) -> Result<Arc<dyn Reader>> {
+    let path = dataset(given);
+    if !path.exists() {
+        return Err(unknown("dataset", given, &path, &datasets()));
+    }
+    swm_data::open(&path)
+}
+
+/// The folder of a checkpoint that is there, by path or name.
+///
+/// # Errors
+/// When there is none, naming the nearest.
+pub fn find_checkpoint(given: &str) -> Result<PathBuf> {
+    let path = checkpoint(given);
+    if path.exists() { Ok(path) } else { Err(unknown("checkpoint", given, &path, &checkpoints())) }
+}
+
+/// A name that stands for nothing.
+fn unknown(kind: &'static str, given: &str, path: &Path, folder: &Path) -> Error {
+    let names = names_in(folder);
+    let hint = format!("there is none at {}; `swm {kind}s` lists those at home", path.display());
+    Error::unknown(kind, given, names.iter().map(String::as_str), hint)
+}
+
+/// The names of what lies in a folder, in order, hidden ones left out.
+pub fn names_in(folder: &Path) -> Vec<String> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let mut names: Vec<String> = entries
+        .filter_map(|entry| entry.file_name().into_string().ok())
+        .filter(|name| !name.starts_with('.'))
+        .map(|name| name.strip_suffix(".lance").map(str::to_owned).unwrap_or(name))
+        .collect();
+    names.sort();
+    names
 }
 
 /// What has a folder in it, an extension, or exists is a path; the rest are names.

@@ -86,37 +86,8 @@ impl TrainConfig {
                 return Err(Error::unknown("preset", preset, PRESETS.iter().map(|row| row.id), hint));
             }
         };
-        let known = known_keys();
-        let check = |key: &str| {
-            if known.iter().any(|name| name == key || name.starts_with(&format!("{key}."))) {
-                return Ok(());
-            }
-            let known = known.iter().map(String::as_str);
-            Err(Error::unknown("setting", key, known, "`--print-config` shows them all"))
-        };
-        let table: toml::Table =
-            toml::from_str(&text).map_err(|error| Error::config(preset, error.message(), "correct the file"))?;
-        let mut keys = vec![];
-        flatten("", &toml::Value::Table(table), &mut keys);
-        keys.iter().try_for_each(|key| check(key))?;
-
-        let mut figment = Figment::from(Toml::string(&text));
-        for word in words {
-            let Some((key, value)) = word.split_once('=') else {
-                return Err(Error::config(word, "is no setting", "write key=value, such as optim.lr=3e-4"));
-            };
-            check(key)?;
-            // A word that is no TOML value is a string.
-            let value = toml::from_str::<toml::Table>(&format!("value = {value}"))
-                .ok()
-                .and_then(|mut table| table.remove("value"))
-                .unwrap_or_else(|| toml::Value::String(value.to_owned()));
-            figment = figment.merge(Serialized::default(key, value));
-        }
-        let config: Self = figment.extract().map_err(|error| {
-            let key = if error.path.is_empty() { "configuration".to_owned() } else { error.path.join(".") };
-            Error::config(key, error.kind.to_string(), "give a value that fits (`--print-config` shows them all)")
-        })?;
+        let presets: Vec<&str> = PRESETS.iter().map(|preset| preset.toml).collect();
+        let config: Self = layered(&text, words, &presets)?;
         config.check()?;
         Ok(config)
     }
@@ -173,11 +144,49 @@ impl TrainConfig {
     }
 }
 
-/// The dotted keys of all presets.
-fn known_keys() -> Vec<String> {
+/// A configuration from TOML, changed by `key=value` words with dots; the keys there are are those of `presets`.
+///
+/// # Errors
+/// When there is no such key (naming the nearest), or a value does not fit.
+pub(crate) fn layered<C: serde::de::DeserializeOwned>(text: &str, words: &[String], presets: &[&str]) -> Result<C> {
+    let known = known_keys(presets);
+    let check = |key: &str| {
+        if known.iter().any(|name| name == key || name.starts_with(&format!("{key}."))) {
+            return Ok(());
+        }
+        let known = known.iter().map(String::as_str);
+        Err(Error::unknown("setting", key, known, "`--print-config` shows them all"))
+    };
+    let table: toml::Table =
+        toml::from_str(text).map_err(|error| Error::config("configuration", error.message(), "correct the file"))?;
     let mut keys = vec![];
-    for preset in PRESETS {
-        if let Ok(table) = toml::from_str(preset.toml) {
+    flatten("", &toml::Value::Table(table), &mut keys);
+    keys.iter().try_for_each(|key| check(key))?;
+
+    let mut figment = Figment::from(Toml::string(text));
+    for word in words {
+        let Some((key, value)) = word.split_once('=') else {
+            return Err(Error::config(word, "is no setting", "write key=value, such as optim.lr=3e-4"));
+        };
+        check(key)?;
+        // A word that is no TOML value is a string.
+        let value = toml::from_str::<toml::Table>(&format!("value = {value}"))
+            .ok()
+            .and_then(|mut table| table.remove("value"))
+            .unwrap_or_else(|| toml::Value::String(value.to_owned()));
+        figment = figment.merge(Serialized::default(key, value));
+    }
+    figment.extract().map_err(|error| {
+        let key = if error.path.is_empty() { "configuration".to_owned() } else { error.path.join(".") };
+        Error::config(key, error.kind.to_string(), "give a value that fits (`--print-config` shows them all)")
+    })
+}
+
+/// The dotted keys of all presets.
+fn known_keys(presets: &[&str]) -> Vec<String> {
+    let mut keys = vec![];
+    for preset in presets {
+        if let Ok(table) = toml::from_str(preset) {
             flatten("", &toml::Value::Table(table), &mut keys);
         }
     }

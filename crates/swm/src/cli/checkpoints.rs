@@ -1,13 +1,13 @@
 //! `swm checkpoints`: which models were trained here, and where one came from.
 
-use super::datasets::names_in;
 use super::{emit, emit_json, table};
 use clap::Args;
 use serde_json::{Value, json};
-use std::path::PathBuf;
-use swm::home;
-use swm_core::{Error, Result};
-use swm_models::{Checkpoint, Device};
+use swm::home::{self, names_in};
+use swm_core::{Manifest, Result};
+use swm_models::inverse::InverseCheckpoint;
+use swm_models::{Checkpoint, Device, checkpoint};
+use swm_plan::ActionScale;
 
 /// Arguments of `swm checkpoints`.
 #[derive(Args)]
@@ -16,49 +16,33 @@ pub struct CheckpointsArgs {
     checkpoint: Option<String>,
 }
 
-/// Loads a checkpoint by path or name; a wrong name gets the nearest right ones.
-pub fn load(given: &str) -> Result<(PathBuf, Checkpoint)> {
-    let path = home::checkpoint(given);
-    if !path.exists() {
-        let names = names_in(&home::checkpoints());
-        return Err(Error::unknown(
-            "checkpoint",
-            given,
-            names.iter().map(String::as_str),
-            format!("there is none at {}; `swm checkpoints` lists those at home", path.display()),
-        ));
-    }
-    let checkpoint = Checkpoint::load(&path, &Device::flex())?;
-    Ok((path, checkpoint))
-}
-
 /// Lists the checkpoints at home, or shows one.
 pub fn checkpoints(args: &CheckpointsArgs, as_json: bool) -> anyhow::Result<()> {
     if let Some(name) = &args.checkpoint {
-        let (path, checkpoint) = load(name)?;
-        let found = json!({
-            "path": path,
-            "weights": checkpoint.hash(),
-            "env": checkpoint.env,
-            "config": checkpoint.config,
-            "action": checkpoint.action,
-            "manifest": checkpoint.manifest,
-        });
-        return if as_json {
-            emit_json(&found)
-        } else {
-            emit(&format!("{}\nweights {}\n", path.display(), checkpoint.hash()));
-            emit(&format!("trained on {}\n", checkpoint.env.as_deref().unwrap_or("an unknown environment")));
-            emit(&checkpoint.config.to_toml()?);
-            Ok(())
-        };
+        let path = home::find_checkpoint(name)?;
+        let card = Card::load(name)?;
+        if as_json {
+            return emit_json(&json!({
+                "path": path,
+                "family": card.family,
+                "weights": card.weights,
+                "env": card.env,
+                "config": card.config,
+                "action": card.action,
+                "manifest": card.manifest,
+            }));
+        }
+        emit(&format!("{}\n{}, weights {}\n", path.display(), card.family, card.weights));
+        emit(&format!("trained on {}\n", card.env.as_deref().unwrap_or("an unknown environment")));
+        emit(&card.toml);
+        return Ok(());
     }
     let folder = home::checkpoints();
     let found: Vec<Value> = names_in(&folder)
         .into_iter()
-        .map(|name| match load(&name) {
-            Ok((_, checkpoint)) => {
-                json!({"name": name, "env": checkpoint.env, "weights": checkpoint.hash(), "image": checkpoint.config.model.image})
+        .map(|name| match Card::load(&name) {
+            Ok(Card { family, env, weights, image, .. }) => {
+                json!({"name": name, "family": family, "env": env, "weights": weights, "image": image})
             }
             Err(error) => json!({"name": name, "error": error.to_string()}),
         })
@@ -75,11 +59,56 @@ pub fn checkpoints(args: &CheckpointsArgs, as_json: bool) -> anyhow::Result<()> 
         Some(error) => vec![text(&found["name"]), text(error)],
         None => vec![
             text(&found["name"]),
+            text(&found["family"]),
             text(&found["env"]),
             format!("{} px", found["image"]),
             text(&found["weights"]).chars().take(12).collect(),
         ],
     });
-    emit(&table(&["checkpoint", "environment", "pictures", "weights"], rows));
+    emit(&table(&["checkpoint", "model", "environment", "pictures", "weights"], rows));
     Ok(())
+}
+
+/// What there is to say about a checkpoint of any family.
+struct Card {
+    family: &'static str,
+    env: Option<String>,
+    weights: String,
+    /// The side of the pictures it sees.
+    image: usize,
+    config: Value,
+    toml: String,
+    action: ActionScale,
+    manifest: Manifest,
+}
+
+impl Card {
+    /// Loads a checkpoint by path or name, which verifies it.
+    fn load(given: &str) -> Result<Self> {
+        let path = home::find_checkpoint(given)?;
+        if checkpoint::family(&path).as_deref() == Some("inverse") {
+            let found = InverseCheckpoint::load(&path, &Device::flex())?;
+            return Ok(Self {
+                family: "inverse",
+                weights: found.hash().to_owned(),
+                image: found.world.config.model.image,
+                config: json!(found.config),
+                toml: found.config.to_toml()?,
+                env: found.world.env,
+                action: found.world.action,
+                manifest: found.manifest,
+            });
+        }
+        let found = Checkpoint::load(&path, &Device::flex())?;
+        Ok(Self {
+            family: "lewm",
+            weights: found.hash().to_owned(),
+            image: found.config.model.image,
+            config: json!(found.config),
+            toml: found.config.to_toml()?,
+            env: found.env,
+            action: found.action,
+            manifest: found.manifest,
+        })
+    }
 }

@@ -1,14 +1,15 @@
 //! `swm collect`: run a policy and store its episodes.
 
 use super::config::{VariationArgs, image_size};
+use super::wrappers::WrapperArgs;
 use super::{Context, Progress, emit, emit_json};
 use clap::Args;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use swm::resolver::scripted;
 use swm::{ENVS, home};
-use swm_core::policy::ExpertPolicy;
-use swm_core::{EnvEntry, Error, Named as _, Policy, RandomPolicy, Result};
+use swm_core::{EnvEntry, Error, Result};
 use swm_data::{ImageCodec, WriteMode, WriteOptions};
 use swm_eval::collect::check_continues;
 use swm_eval::{CollectConfig, Collected, Control, World, WorldConfig};
@@ -55,6 +56,8 @@ pub struct CollectArgs {
     #[arg(long)]
     overwrite: bool,
     #[command(flatten)]
+    wrappers: WrapperArgs,
+    #[command(flatten)]
     variation: VariationArgs,
 }
 
@@ -81,6 +84,8 @@ pub struct Collection<'a> {
     pub mode: WriteMode,
     /// How pictures are stored.
     pub codec: ImageCodec,
+    /// What pictures pass through before they are stored.
+    pub wrappers: WrapperArgs,
 }
 
 /// Runs a policy and stores its episodes.
@@ -112,6 +117,7 @@ pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
             Codec::Png => ImageCodec::Png,
             Codec::Jpeg => ImageCodec::Jpeg { quality: args.quality },
         },
+        wrappers: args.wrappers.clone(),
     };
     let collected = run(&collection, context)?;
     if context.json {
@@ -124,12 +130,17 @@ pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
 /// Runs a collection with a progress bar.
 pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> {
     let Collection { entry, path, config, .. } = collection;
-    let mut world = World::new(entry, collection.world)?;
-    let mut policy = policy(entry, collection.policy, &world)?;
+    let (stack, goal) = collection.wrappers.stack()?;
+    let mut world = World::of(|| Ok(stack.wrap((entry.make)(), goal)), collection.world)?;
+    let mut policy = scripted(entry, collection.policy, &world)?;
     // A wrong factor is found before anything of an older dataset is replaced.
     world.spec().variation_space.resolve(&config.variation, swm_core::Key::new(config.seed))?;
     let mut manifest = world.collect_manifest(config);
     manifest.config["codec"] = json!(collection.codec);
+    if !collection.wrappers.wrappers.is_empty() {
+        manifest.config["wrappers"] = json!(collection.wrappers.choices()?);
+        manifest.config["wrap_goal"] = json!(collection.wrappers.wrap_goal);
+    }
     if path.exists() {
         match collection.mode {
             WriteMode::Overwrite => {}
@@ -184,22 +195,6 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
         speed(collected.steps)
     ));
     Ok(collected)
-}
-
-/// Who acts in a world: `random`, `expert` (the environment's first), or an expert by name.
-pub fn policy(entry: &EnvEntry, name: &str, world: &World) -> Result<Box<dyn Policy>> {
-    let slots = world.pool().len();
-    if name == "random" {
-        return Ok(Box::new(RandomPolicy::new(world.spec(), slots)));
-    }
-    let expert = match entry.experts {
-        [first, ..] if name == "expert" => first,
-        experts => experts.iter().find(|expert| expert.id == name).ok_or_else(|| {
-            let known = ["random", "expert"].into_iter().chain(experts.iter().map(|expert| expert.id()));
-            Error::unknown("policy", name, known, format!("`swm envs` lists the experts of {}", entry.id))
-        })?,
-    };
-    Ok(Box::new(ExpertPolicy::new(world.spec(), (0..slots).map(|_| (expert.make)()).collect())))
 }
 
 /// What `--output` of a command becomes: the folder, made.

@@ -3,7 +3,8 @@
 use super::{Progress, emit, emit_json, table};
 use clap::Args;
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
+use swm::home::{names_in, open_dataset as open};
 use swm::{data, home};
 use swm_core::results::Summary;
 use swm_core::{Error, Result};
@@ -33,33 +34,6 @@ pub struct PreviewArgs {
     /// Frames in a second of video
     #[arg(long, default_value_t = 15)]
     fps: u32,
-}
-
-/// Opens a dataset by path or name; a wrong name gets the nearest right ones.
-pub fn open(given: &str) -> Result<std::sync::Arc<dyn Reader>> {
-    let path = home::dataset(given);
-    if !path.exists() {
-        let names = names_in(&home::datasets());
-        return Err(Error::unknown(
-            "dataset",
-            given,
-            names.iter().map(String::as_str),
-            format!("there is none at {}; `swm datasets` lists those at home", path.display()),
-        ));
-    }
-    data::open(&path)
-}
-
-/// The names of what lies in a folder, in order, hidden ones left out.
-pub fn names_in(folder: &Path) -> Vec<String> {
-    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    let mut names: Vec<String> = entries
-        .filter_map(|entry| entry.file_name().into_string().ok())
-        .filter(|name| !name.starts_with('.'))
-        .map(|name| name.strip_suffix(".lance").map(str::to_owned).unwrap_or(name))
-        .collect();
-    names.sort();
-    names
 }
 
 /// Lists the datasets at home.

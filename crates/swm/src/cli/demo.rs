@@ -1,17 +1,20 @@
 //! `swm demo`: the whole pipeline on a laptop CPU, in minutes.
 
 use super::collect::{self, Collection};
-use super::eval::{self, Evaluation, PlannerArgs, StartsFrom};
-use super::{Context, complain, datasets, emit, emit_json, train};
+use super::wrappers::WrapperArgs;
+use super::{Context, complain, emit, emit_json, eval, train};
 use clap::Args;
-use serde_json::json;
+use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::time::Instant;
+use swm::resolver::Home;
 use swm::{ENVS, home};
 use swm_core::VariationRequest;
+use swm_core::results::Counting;
 use swm_data::{ImageCodec, WriteMode};
-use swm_eval::{CollectConfig, WorldConfig};
+use swm_eval::{Acts, Choice, CollectConfig, Condition, EvalRequest, Model, PolicyRequest, StartsRequest, WorldConfig};
 use swm_models::{Checkpoint, Device, TrainConfig};
+use swm_plan::{Cem, MpcConfig};
 use swm_report::ReportOptions;
 
 /// Arguments of `swm demo`. The defaults are sized for two CPU cores.
@@ -44,8 +47,9 @@ const ENV: &str = "swm/TwoRoom-v1";
 const SHIFT: (&str, [f64; 3]) = ("background.color", [200.0, 220.0, 255.0]);
 
 /// How the demo plans: a smaller search than the paper's, which is enough here.
-const PLANNER: PlannerArgs =
-    PlannerArgs { horizon: 6, receding_horizon: 2, samples: 128, iterations: 8, elites: 16, sigma: 1.0 };
+const SEARCH: Cem = Cem { samples: 128, iterations: 8, elites: 16, sigma: 1.0 };
+const HORIZON: usize = 6;
+const RECEDING_HORIZON: usize = 2;
 
 /// Collects, trains, evaluates and reports.
 pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
@@ -77,36 +81,48 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
         },
         mode: WriteMode::Overwrite,
         codec: ImageCodec::default(),
+        wrappers: WrapperArgs::default(),
     };
     collect::run(&collection, context)?;
 
     complain("2/4 train: a small LeWM learns to predict what it will see\n");
-    train::run(&config, datasets::open(&data.to_string_lossy())?, &model, false, context)?;
+    train::run(&config, home::open_dataset(&data.to_string_lossy())?, &model, false, context)?;
     let checkpoint = Checkpoint::load(&model, &Device::flex())?;
 
     complain("3/4 plan and evaluate: CEM over the model, beside the random floor\n");
     let shift =
         VariationRequest { variation_values: [(SHIFT.0.to_owned(), SHIFT.1.to_vec())].into(), ..Default::default() };
-    let (found, file) = eval::run(
-        &Evaluation {
-            entry,
-            name: "lewm",
-            checkpoint: Some(&checkpoint),
-            planner: &PLANNER,
-            world: WorldConfig { envs: args.envs.min(args.eval_episodes), ..world },
-            starts: StartsFrom::Env,
-            episodes: args.eval_episodes,
-            seed: args.seed + 1,
-            conditions: vec![
-                ("in distribution".to_owned(), VariationRequest::default()),
-                (format!("{} shifted", SHIFT.0), shift),
-            ],
-            videos: 3,
-            output: &results,
-            command: command(args),
-        },
-        context,
-    )?;
+    let mpc = MpcConfig {
+        horizon: HORIZON,
+        receding_horizon: RECEDING_HORIZON,
+        action_block: checkpoint.config.data.frameskip,
+        history: checkpoint.config.model.predictor.history,
+        ..MpcConfig::default()
+    };
+    let acts = Acts::Plan {
+        model: Model::Checkpoint(model.to_string_lossy().into_owned()),
+        solver: Choice { id: "cem".to_owned(), settings: json!(SEARCH) },
+        mpc: json!(mpc),
+        objective: Value::Null,
+    };
+    let request = EvalRequest {
+        version: EvalRequest::VERSION,
+        env: ENV.to_owned(),
+        wrappers: vec![],
+        wrap_goal: false,
+        image: Some(image.into()),
+        policies: vec![PolicyRequest { name: "lewm".to_owned(), acts }],
+        starts: StartsRequest::Episodic,
+        episodes: args.eval_episodes,
+        seed: args.seed + 1,
+        budget: world.max_episode_steps,
+        counting: Counting::default(),
+        conditions: vec![
+            Condition { name: "in distribution".to_owned(), variation: VariationRequest::default() },
+            Condition { name: format!("{} shifted", SHIFT.0), variation: shift },
+        ],
+    };
+    let (found, file) = eval::run(&request, &Home::tracing(), args.envs, (&results, 3), context)?;
 
     complain("4/4 report\n");
     let options = ReportOptions {
@@ -123,11 +139,4 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     emit(&eval::summary(&found));
     emit(&format!("{:.0} s in all; the report: {}\n", begun.elapsed().as_secs_f64(), page.display()));
     Ok(())
-}
-
-/// The command that gives the same demo.
-fn command(args: &DemoArgs) -> String {
-    let words =
-        [format!("swm demo --seed {} --episodes {} --eval-episodes {}", args.seed, args.episodes, args.eval_episodes)];
-    words.into_iter().chain(args.settings.iter().cloned()).collect::<Vec<_>>().join(" ")
 }

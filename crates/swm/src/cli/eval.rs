@@ -1,25 +1,31 @@
-//! `swm eval`: how often a policy reaches its goals, beside the random floor on the same starts.
+//! `swm eval` and `swm reproduce`: how often policies reach their goals, beside the random floor on the same starts.
 
-use super::collect::{folder, policy};
+use super::collect::folder;
 use super::config::{VariationArgs, image_size};
-use super::{Context, Progress, checkpoints, datasets, emit, emit_json, table};
-use clap::Args;
-use serde_json::json;
+use super::planner::PlannerArgs;
+use super::wrappers::WrapperArgs;
+use super::{Context, Progress, emit, emit_json, table};
+use clap::{Args, ValueEnum};
+use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use swm::ENVS;
-use swm_core::results::{Proportion, Run};
-use swm_core::{EnvEntry, Error, Policy, Result, Results, VariationRequest};
-use swm_eval::{Control, EvalConfig, Starts, Videos, World, WorldConfig};
-use swm_models::Checkpoint;
-use swm_models::lewm::LewmCost;
-use swm_plan::{Cem, MpcConfig, MpcPolicy};
+use swm::resolver::{Home, parse_score};
+use swm::{ENVS, home};
+use swm_core::results::{Counting, Proportion, Run};
+use swm_core::{EnvEntry, Error, Result, Results};
+use swm_data::{Part, Split};
+use swm_eval::reproduce::{Reproduction, reproduce as run_again};
+use swm_eval::{Acts, Condition, EvalRequest, HeldOut, Means, Model, Moment, PolicyRequest, StartsRequest};
+use swm_models::inverse::InverseCheckpoint;
+use swm_models::{Checkpoint, Device, checkpoint};
 
 /// Arguments of `swm eval`.
 #[derive(Args)]
 pub struct EvalArgs {
-    /// Who acts: a checkpoint (path or name), expert, one of the environment's experts, or random
-    policy: String,
-    /// The environment (default: the one the checkpoint was trained on)
+    /// Who acts: a checkpoint (path or name), expert, one of the environment's experts, simulator (which plans in the world
+    /// itself), or random; several are compared on the same starts
+    #[arg(required = true)]
+    policies: Vec<String>,
+    /// The environment (default: the one the first checkpoint was trained on)
     #[arg(long)]
     env: Option<String>,
     /// Take starts and goals from this dataset
@@ -28,6 +34,13 @@ pub struct EvalArgs {
     /// Steps from a start to its goal in the dataset
     #[arg(long, default_value_t = 25, requires = "dataset")]
     goal_offset: usize,
+    /// Take starts from this part of the dataset only: train, validation or test, a tenth of the episodes each for the
+    /// latter two
+    #[arg(long, value_name = "PART", requires = "dataset")]
+    split: Option<Part>,
+    /// What divides the dataset
+    #[arg(long, default_value_t = 0, requires = "split")]
+    split_seed: u64,
     /// How many episodes
     #[arg(long, default_value_t = 50)]
     episodes: usize,
@@ -37,7 +50,13 @@ pub struct EvalArgs {
     /// Steps an episode may take (default: the environment's own, or 50 from a dataset)
     #[arg(long, value_name = "STEPS")]
     budget: Option<usize>,
-    /// Environments played, and planned for, at the same time; results do not depend on it
+    /// How episodes count: strict leaves out starts that are solved already, compat counts as the reference does
+    #[arg(long, value_enum, default_value_t = Protocol::Strict)]
+    protocol: Protocol,
+    /// Steps in a row that must satisfy the goal (strict)
+    #[arg(long, default_value_t = 1, value_name = "STEPS")]
+    hold: usize,
+    /// Environments played, and planned for, at the same time; results do not depend on it, except by the compat protocol
     #[arg(long, default_value_t = 16)]
     envs: usize,
     /// Picture size where no checkpoint decides it: 64 or HEIGHTxWIDTH
@@ -49,118 +68,35 @@ pub struct EvalArgs {
     /// Episodes of each policy to film
     #[arg(long, default_value_t = 0, value_name = "EPISODES")]
     videos: usize,
+    /// Keep how the search of every plan went, in traces.json beside the results
+    #[arg(long)]
+    trace: bool,
+    #[command(flatten)]
+    wrappers: WrapperArgs,
     #[command(flatten)]
     variation: VariationArgs,
     #[command(flatten)]
     planner: PlannerArgs,
 }
 
-/// How a world model plans; the defaults are those of the paper's experiments.
-#[derive(Args, Clone)]
-pub struct PlannerArgs {
-    /// Model steps to plan
-    #[arg(long, default_value_t = 5, help_heading = "Planning")]
-    pub horizon: usize,
-    /// Model steps to execute before planning again
-    #[arg(long, default_value_t = 5, help_heading = "Planning")]
-    pub receding_horizon: usize,
-    /// Candidates of an iteration of CEM
-    #[arg(long, default_value_t = 300, help_heading = "Planning")]
-    pub samples: usize,
-    /// Iterations of CEM
-    #[arg(long, default_value_t = 30, help_heading = "Planning")]
-    pub iterations: usize,
-    /// Candidates that refit the distribution
-    #[arg(long, default_value_t = 30, help_heading = "Planning")]
-    pub elites: usize,
-    /// The first standard deviation, in model action units
-    #[arg(long, default_value_t = 1.0, help_heading = "Planning")]
-    pub sigma: f32,
+/// How episodes count.
+#[derive(Clone, Copy, ValueEnum)]
+enum Protocol {
+    Strict,
+    Compat,
 }
 
-/// An evaluation, as `swm eval` and `swm demo` ask for it.
-pub struct Evaluation<'a> {
-    /// The environment.
-    pub entry: &'static EnvEntry,
-    /// What the policy is called in the results.
-    pub name: &'a str,
-    /// The checkpoint that acts; without one `name` is a policy of the environment.
-    pub checkpoint: Option<&'a Checkpoint>,
-    /// How it plans.
-    pub planner: &'a PlannerArgs,
-    /// Environments, pictures, steps, threads.
-    pub world: WorldConfig,
-    /// Episodes, or picks of a dataset.
-    pub starts: StartsFrom<'a>,
-    /// How many episodes.
-    pub episodes: usize,
-    /// The seed.
-    pub seed: u64,
-    /// Conditions to evaluate under: names and what is sampled or pinned.
-    pub conditions: Vec<(String, VariationRequest)>,
-    /// Episodes of each policy to film.
-    pub videos: usize,
-    /// Where results go.
-    pub output: &'a Path,
-    /// The command that gives the same results.
-    pub command: String,
-}
+/// Steps of an episode from a dataset: the paper's evaluation budget.
+const DATASET_BUDGET: usize = 50;
 
-/// Where starts and goals come from.
-#[derive(Clone, Copy)]
-pub enum StartsFrom<'a> {
-    /// The environment.
-    Env,
-    /// A dataset, with this many steps from start to goal.
-    Dataset(&'a dyn swm_data::Reader, usize),
-}
-
-/// Evaluates a policy and the random floor.
+/// Evaluates policies and the random floor.
 pub fn eval(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
-    /// Steps of an episode from a dataset: the paper's evaluation budget.
-    const DATASET_BUDGET: usize = 50;
-    let named = |env: &Option<String>| match env {
-        Some(id) => ENVS.get(id),
-        None => Err(Error::config("--env", "no environment is given", "name one (`swm envs` lists them)")),
-    };
-    let is_scripted = |entry: &EnvEntry| {
-        matches!(args.policy.as_str(), "random" | "expert") || entry.experts.iter().any(|e| e.id == args.policy)
-    };
-    let asked = args.env.as_ref().map(|id| ENVS.get(id)).transpose()?;
-    let scripted = matches!(args.policy.as_str(), "random" | "expert") || asked.is_some_and(is_scripted);
-    let (entry, checkpoint) = if scripted {
-        (named(&args.env)?, None)
-    } else {
-        let (_, checkpoint) = checkpoints::load(&args.policy)?;
-        let entry = named(&args.env.clone().or_else(|| checkpoint.env.clone()))?;
-        fits(&checkpoint, &args.policy, entry)?;
-        (entry, Some(checkpoint))
-    };
-    let image = checkpoint.as_ref().map_or(args.image, |c| (c.config.model.image, c.config.model.image));
-    let dataset = args.dataset.as_deref().map(datasets::open).transpose()?;
-    let name = Path::new(&args.policy).file_name().map_or(args.policy.clone(), |n| n.to_string_lossy().into_owned());
-    let (results, file) = run(
-        &Evaluation {
-            entry,
-            name: &name,
-            checkpoint: checkpoint.as_ref(),
-            planner: &args.planner,
-            world: WorldConfig {
-                envs: args.envs.min(args.episodes.max(1)),
-                image: Some(image),
-                max_episode_steps: args.budget.or(dataset.as_ref().map(|_| DATASET_BUDGET)),
-                threads: context.threads,
-            },
-            starts: dataset.as_deref().map_or(StartsFrom::Env, |reader| StartsFrom::Dataset(reader, args.goal_offset)),
-            episodes: args.episodes,
-            seed: args.seed,
-            conditions: vec![(args.variation.describe(), args.variation.request()?)],
-            videos: args.videos,
-            output: &args.output,
-            command: args.command(entry, &name),
-        },
-        context,
-    )?;
+    let request = args.request()?;
+    let home = if args.trace { Home::tracing() } else { Home::default() };
+    let (results, file) = run(&request, &home, args.envs, (&args.output, args.videos), context)?;
+    if args.trace {
+        write_json(&args.output.join("traces.json"), &traces(&home))?;
+    }
     if context.json {
         return emit_json(&results);
     }
@@ -170,139 +106,249 @@ pub fn eval(args: &EvalArgs, context: &Context) -> anyhow::Result<()> {
 }
 
 impl EvalArgs {
-    /// The command that gives the same results: what decides them, and nothing else.
-    fn command(&self, entry: &EnvEntry, name: &str) -> String {
-        let PlannerArgs { horizon, receding_horizon, samples, iterations, elites, sigma } = &self.planner;
-        let mut words = vec![format!(
-            "swm eval {name} --env {} --episodes {} --seed {} --horizon {horizon} --receding-horizon {receding_horizon} --samples {samples} --iterations {iterations} --elites {elites} --sigma {sigma}",
-            entry.id, self.episodes, self.seed
-        )];
-        words.extend(self.dataset.iter().map(|data| format!("--dataset {data} --goal-offset {}", self.goal_offset)));
-        words.extend(self.budget.iter().map(|steps| format!("--budget {steps}")));
-        words.extend(self.variation.variation.iter().map(|keys| format!("--variation {}", keys.join(","))));
-        words.extend(self.variation.pin.iter().map(|pin| format!("--pin {pin}")));
-        words.join(" ")
-    }
-}
-
-/// Refuses a checkpoint trained on another environment.
-fn fits(checkpoint: &Checkpoint, name: &str, entry: &EnvEntry) -> Result<()> {
-    match &checkpoint.env {
-        Some(env) if env != entry.id => Err(Error::config(
-            format!("checkpoint {name}"),
-            format!("it was trained on {env}, not on {}", entry.id),
-            format!("evaluate it with --env {env}, or train one on {}", entry.id),
-        )),
-        _ => Ok(()),
-    }
-}
-
-/// Evaluates under every condition, the random floor first, and writes `results.json`.
-pub fn run(evaluation: &Evaluation<'_>, context: &Context) -> Result<(Results, PathBuf)> {
-    let Evaluation { entry, name, checkpoint, planner, episodes, seed, output, .. } = evaluation;
-    folder(output)?;
-    let mut world = World::new(entry, evaluation.world)?;
-    let policies: Vec<&str> = if *name == "random" { vec!["random"] } else { vec!["random", name] };
-    let mut manifest = None;
-    let mut runs = vec![];
-    for (condition, variation) in &evaluation.conditions {
-        let starts = match evaluation.starts {
-            StartsFrom::Env => Starts::episodic(*episodes, *seed, variation.clone())?,
-            StartsFrom::Dataset(reader, goal_offset) => {
-                let picks = Starts::choose(reader, *episodes, goal_offset, *seed)?;
-                Starts::from_dataset(reader, world.spec(), picks, goal_offset, *seed, variation.clone())?
-            }
+    /// Everything that decides the results.
+    fn request(&self) -> Result<EvalRequest> {
+        let found: Vec<Found> =
+            self.policies.iter().map(|given| find(given, self.env.as_deref())).collect::<Result<_>>()?;
+        let trained_on = found.iter().find_map(|found| found.env.clone());
+        let Some(env) = self.env.clone().or(trained_on) else {
+            return Err(Error::config("--env", "no environment is given", "name one (`swm envs` lists them)"));
         };
-        manifest.get_or_insert_with(|| world.eval_manifest(&starts, None));
-        for &who in &policies {
-            let mut acting: Box<dyn Policy> = match checkpoint {
-                Some(checkpoint) if who != "random" => planning(checkpoint, planner, &world)?,
-                _ => policy(entry, who, &world)?,
-            };
-            let progress = Progress::new("evaluate", *episodes);
-            let mut control = Control {
-                stop: Some(context.stop.clone()),
-                progress: Some(Box::new(|at| progress.at(at.episodes, format!("{who}, {condition}")))),
-            };
-            let config = EvalConfig {
-                policy: who.to_owned(),
-                condition: condition.clone(),
-                budget: None,
-                videos: (evaluation.videos > 0).then(|| Videos {
-                    root: output.to_path_buf(),
-                    prefix: format!("videos/{}-{}", slug(who), slug(condition)),
-                    count: evaluation.videos,
-                    fps: 15,
-                }),
-            };
-            let run = world.evaluate(&mut *acting, &starts, &config, &mut control)?;
-            drop(control);
-            progress.done(&format!("{who}, {condition}: {}", percent(&run.success)));
-            runs.push(run);
+        let entry = ENVS.get(&env)?;
+        let mut policies = vec![];
+        for found in found {
+            policies.extend(self.acts(entry, found)?);
         }
+        let image = policies.iter().find_map(|(_, image)| *image);
+        Ok(EvalRequest {
+            version: EvalRequest::VERSION,
+            env,
+            wrappers: self.wrappers.choices()?,
+            wrap_goal: self.wrappers.wrap_goal,
+            image: Some(image.unwrap_or([self.image.0, self.image.1])),
+            policies: policies.into_iter().map(|(policy, _)| policy).collect(),
+            starts: match &self.dataset {
+                None => StartsRequest::Episodic,
+                Some(dataset) => StartsRequest::Dataset {
+                    dataset: dataset.clone(),
+                    goal_offset: self.goal_offset,
+                    held_out: self
+                        .split
+                        .map(|part| HeldOut { part, split: Split { seed: self.split_seed, ..Split::default() } }),
+                },
+            },
+            episodes: self.episodes,
+            seed: self.seed,
+            budget: self.budget.or(self.dataset.as_ref().map(|_| DATASET_BUDGET)),
+            counting: match self.protocol {
+                Protocol::Strict => Counting::Strict { hold: self.hold },
+                Protocol::Compat => Counting::Compat { envs: self.envs },
+            },
+            conditions: vec![Condition { name: self.describe(), variation: self.variation.request()? }],
+        })
     }
-    let mut manifest = manifest.unwrap_or_default();
-    manifest.config["policy"] = json!(name);
-    manifest.config["command"] = json!(evaluation.command);
-    manifest.config["conditions"] = json!(evaluation.conditions);
-    if let Some(checkpoint) = checkpoint {
-        manifest.hashes.insert("weights".to_owned(), checkpoint.hash().to_owned());
-        manifest.config["planner"] = json!({"mpc": mpc(checkpoint, planner), "cem": cem(planner)});
-        manifest.libraries = checkpoint.manifest.libraries.clone();
-        manifest.device = checkpoint.manifest.device.clone();
+
+    /// The condition in a few words.
+    fn describe(&self) -> String {
+        let wrapped = self.wrappers.wrappers.iter().cloned();
+        let varied = Some(self.variation.describe()).filter(|words| words != "in distribution");
+        let words: Vec<String> = varied.into_iter().chain(wrapped).collect();
+        if words.is_empty() { "in distribution".to_owned() } else { words.join(", ") }
     }
-    let results =
-        Results { manifest, env: entry.id.to_owned(), protocol: protocol(evaluation.starts).to_owned(), runs };
+
+    /// What a word of the command line stands for in an environment: one policy, or one for every solver.
+    #[allow(clippy::type_complexity)]
+    fn acts(&self, entry: &EnvEntry, found: Found) -> Result<Vec<(PolicyRequest, Option<[usize; 2]>)>> {
+        let Found { name, kind, image, .. } = found;
+        let image = image.map(|side| [side, side]);
+        let (model, block, history) = match kind {
+            Kind::Acts(acts) => return Ok(vec![(PolicyRequest { name, acts }, image)]),
+            Kind::Plans { model: None, .. } => {
+                parse_score(&self.planner.score)?;
+                (Model::Simulator { score: self.planner.score.clone() }, self.planner.action_block, 1)
+            }
+            Kind::Plans { model: Some(given), block, history } => (Model::Checkpoint(given), block, history),
+        };
+        let solvers = self.planner.solvers(entry)?;
+        let several = solvers.len() > 1;
+        let named = |solver: &str| if several { format!("{name} ({solver})") } else { name.clone() };
+        let policies = solvers.into_iter().map(|solver| {
+            let name = named(&solver.id);
+            let acts = self.planner.plan(model.clone(), solver, block, history)?;
+            Ok((PolicyRequest { name, acts }, image))
+        });
+        policies.collect()
+    }
+}
+
+/// What a word of the command line stands for.
+struct Found {
+    name: String,
+    kind: Kind,
+    /// The environment it was trained on.
+    env: Option<String>,
+    /// The side of the pictures it sees.
+    image: Option<usize>,
+}
+
+enum Kind {
+    /// A policy that does not plan.
+    Acts(Acts),
+    /// A model to plan in; the simulator for none.
+    Plans { model: Option<String>, block: usize, history: usize },
+}
+
+/// Finds out what a word stands for.
+fn find(given: &str, env: Option<&str>) -> Result<Found> {
+    let scripted = |acts| Found { name: given.to_owned(), kind: Kind::Acts(acts), env: None, image: None };
+    let entry = env.map(|id| ENVS.get(id)).transpose()?;
+    if given == "random" {
+        return Ok(scripted(Acts::Random));
+    }
+    if given == "expert" || entry.is_some_and(|entry| entry.experts.iter().any(|expert| expert.id == given)) {
+        return Ok(scripted(Acts::Expert { id: given.to_owned() }));
+    }
+    if given == "simulator" {
+        let kind = Kind::Plans { model: None, block: 1, history: 1 };
+        return Ok(Found { name: given.to_owned(), kind, env: None, image: None });
+    }
+    let path = home::find_checkpoint(given)?;
+    let name = Path::new(given).file_name().map_or(given.to_owned(), |name| name.to_string_lossy().into_owned());
+    if checkpoint::family(&path).as_deref() == Some("inverse") {
+        let found = InverseCheckpoint::load(&path, &Device::flex())?;
+        let kind = Kind::Acts(Acts::Direct { checkpoint: given.to_owned(), settings: Value::Null });
+        return Ok(Found { name, kind, env: found.world.env, image: Some(found.world.config.model.image) });
+    }
+    let found = Checkpoint::load(&path, &Device::flex())?;
+    let (model, block) = (Some(given.to_owned()), found.config.data.frameskip);
+    let kind = Kind::Plans { model, block, history: found.config.model.predictor.history };
+    Ok(Found { name, kind, env: found.env, image: Some(found.config.model.image) })
+}
+
+/// Evaluates with a progress bar and writes `results.json`; `films` is where to, and how many episodes of each run.
+pub fn run(
+    request: &EvalRequest,
+    home: &Home,
+    envs: usize,
+    (output, films): (&Path, usize),
+    context: &Context,
+) -> Result<(Results, PathBuf)> {
+    folder(output)?;
+    let mut bar = Bar::new(request.episodes);
+    let results = request.run(home, &means(envs, (output, films), context), &mut |moment| bar.watch(&moment))?;
     let file = output.join("results.json");
-    let text = serde_json::to_string_pretty(&results).map_err(|e| Error::external("writing results", e))?;
-    std::fs::write(&file, text + "\n").map_err(|e| Error::io(&file, "writing results", e))?;
+    write_json(&file, &results)?;
     Ok((results, file))
 }
 
-fn protocol(starts: StartsFrom<'_>) -> &'static str {
-    match starts {
-        StartsFrom::Env => "episodic",
-        StartsFrom::Dataset(..) => "dataset",
+fn means(envs: usize, (output, films): (&Path, usize), context: &Context) -> Means {
+    Means {
+        envs,
+        threads: context.threads,
+        videos: (films > 0).then(|| (output.to_owned(), films)),
+        stop: Some(context.stop.clone()),
     }
 }
 
-/// A checkpoint that plans.
-fn planning(checkpoint: &Checkpoint, planner: &PlannerArgs, world: &World) -> Result<Box<dyn Policy>> {
-    let policy = MpcPolicy::new(
-        Box::new(cem(planner)),
-        Box::new(LewmCost::new(checkpoint)),
-        mpc(checkpoint, planner),
-        checkpoint.action.clone(),
-        world.spec(),
-        world.pool().len(),
-    )?;
-    Ok(Box::new(policy))
+fn write_json(file: &Path, value: &impl serde::Serialize) -> Result<()> {
+    let text = serde_json::to_string_pretty(value).map_err(|e| Error::external("writing JSON", e))?;
+    std::fs::write(file, text + "\n").map_err(|e| Error::io(file, "writing results", e))
 }
 
-fn cem(planner: &PlannerArgs) -> Cem {
-    Cem {
-        samples: planner.samples,
-        iterations: planner.iterations,
-        elites: planner.elites.min(planner.samples),
-        sigma: planner.sigma,
+/// Every plan of an evaluation, one object each.
+fn traces(home: &Home) -> Vec<Value> {
+    let plans = home.take_traces().into_iter().map(|(policy, record)| {
+        let mut plan = json!(record);
+        plan["policy"] = json!(policy);
+        plan
+    });
+    plans.collect()
+}
+
+/// One progress bar for every policy and condition.
+struct Bar {
+    episodes: usize,
+    progress: Option<Progress>,
+    doing: String,
+}
+
+impl Bar {
+    fn new(episodes: usize) -> Self {
+        Self { episodes, progress: None, doing: String::new() }
+    }
+
+    fn watch(&mut self, moment: &Moment<'_>) {
+        match moment {
+            Moment::Begins { policy, condition } => {
+                self.progress = Some(Progress::new("evaluate", self.episodes));
+                self.doing = format!("{policy}, {condition}");
+            }
+            Moment::Progress(at) => {
+                if let Some(progress) = &self.progress {
+                    progress.at(at.episodes, self.doing.clone());
+                }
+            }
+            Moment::Ends(run) => {
+                if let Some(progress) = self.progress.take() {
+                    progress.done(&format!("{}: {}", self.doing, percent(&run.success)));
+                }
+            }
+        }
     }
 }
 
-fn mpc(checkpoint: &Checkpoint, planner: &PlannerArgs) -> MpcConfig {
-    MpcConfig {
-        horizon: planner.horizon,
-        receding_horizon: planner.receding_horizon.min(planner.horizon),
-        action_block: checkpoint.config.data.frameskip,
-        warm_start: true,
-        history: checkpoint.config.model.predictor.history,
-        ..MpcConfig::default()
-    }
+/// Arguments of `swm reproduce`.
+#[derive(Args)]
+pub struct ReproduceArgs {
+    /// A results.json, or the folder that holds one
+    results: PathBuf,
+    /// Environments played, and planned for, at the same time; results do not depend on it
+    #[arg(long, default_value_t = 16)]
+    envs: usize,
+    /// Where to write the new results.json (default: nowhere)
+    #[arg(short, long, value_name = "DIR")]
+    output: Option<PathBuf>,
 }
 
-/// A table of runs.
+/// Runs an evaluation again and says what differs.
+pub fn reproduce(args: &ReproduceArgs, context: &Context) -> anyhow::Result<()> {
+    let file = if args.results.is_dir() { args.results.join("results.json") } else { args.results.clone() };
+    let old = swm_report::read_results(&file)?;
+    let episodes = EvalRequest::of(&old.manifest)?.episodes;
+    let mut bar = Bar::new(episodes);
+    let means = means(args.envs, (Path::new("."), 0), context);
+    let again: Reproduction = run_again(&old, &Home::default(), &means, &mut |moment| bar.watch(&moment))?;
+    if let Some(output) = &args.output {
+        write_json(&folder(output)?.join("results.json"), &again.results)?;
+    }
+    if context.json {
+        emit_json(&json!({"holds": again.holds(), "differences": again.differences, "results": again.results}))?;
+    } else {
+        emit(&summary(&again.results));
+        for difference in &again.differences {
+            emit(&format!("{difference}\n"));
+        }
+    }
+    if again.holds() {
+        if !context.json {
+            emit(&format!(
+                "{} episodes are as they were\n",
+                again.results.runs.iter().map(|r| r.episodes.len()).sum::<usize>()
+            ));
+        }
+        return Ok(());
+    }
+    anyhow::bail!("the results of {} are not reproduced: {} differences", file.display(), again.differences.len())
+}
+
+/// A table of runs, and how policies compare.
 pub fn summary(results: &Results) -> String {
     let rows = results.runs.iter().map(|run: &Run| {
-        let seconds = |s: f64| if s < 1.0 { format!("{:.0} ms", 1e3 * s) } else { format!("{s:.2} s") };
+        let seconds = |s: f64| match s {
+            s if s < 0.01 => format!("{:.2} ms", 1e3 * s),
+            s if s < 1.0 => format!("{:.0} ms", 1e3 * s),
+            s => format!("{s:.2} s"),
+        };
         vec![
             run.condition.clone(),
             run.policy.clone(),
@@ -313,19 +359,28 @@ pub fn summary(results: &Results) -> String {
             run.timing.plan_seconds.map_or("–".to_owned(), |t| format!("{} ({})", seconds(t.median), seconds(t.p95))),
         ]
     });
-    table(
+    let mut text = table(
         &["condition", "policy", "success [95 %]", "n", "solved at start", "median steps", "plan, median (p95)"],
         rows,
-    )
+    );
+    if !results.comparisons.is_empty() {
+        let rows = results.comparisons.iter().map(|comparison| {
+            let found = &comparison.table;
+            vec![
+                comparison.condition.clone(),
+                format!("{} – {}", comparison.a, comparison.b),
+                format!("{:+.0} % [{:+.0}, {:+.0}]", 100.0 * found.difference, 100.0 * found.low, 100.0 * found.high),
+                format!("{} : {}", found.only_a, found.only_b),
+                if found.p < 1e-4 { "< 0.0001".to_owned() } else { format!("{:.4}", found.p) },
+            ]
+        });
+        text.push('\n');
+        text.push_str(&table(&["condition", "compared", "difference [95 %]", "only one solved", "p (McNemar)"], rows));
+    }
+    text
 }
 
 /// A success rate with its interval.
 pub fn percent(p: &Proportion) -> String {
     format!("{:.0} % [{:.0}, {:.0}]", 100.0 * p.rate, 100.0 * p.low, 100.0 * p.high)
-}
-
-/// A name as part of a file name.
-fn slug(name: &str) -> String {
-    let words: Vec<&str> = name.split(|c: char| !c.is_ascii_alphanumeric()).filter(|word| !word.is_empty()).collect();
-    words.join("-").to_lowercase()
 }

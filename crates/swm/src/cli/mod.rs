@@ -9,9 +9,12 @@ mod demo;
 mod envs;
 mod eval;
 mod models;
+mod planner;
 mod progress;
 mod report;
+mod solvers;
 mod train;
+mod wrappers;
 
 use clap::{Parser, Subcommand};
 use progress::Progress;
@@ -39,6 +42,10 @@ enum Command {
     Envs(envs::EnvsArgs),
     /// List an environment's factors of variation
     Fovs(envs::FovsArgs),
+    /// List the visual wrappers and their settings
+    Wrappers,
+    /// List the solvers, what they plan and what they ask of a model
+    Solvers,
     /// Run a policy and store its episodes
     Collect(collect::CollectArgs),
     /// List the datasets at home
@@ -57,6 +64,8 @@ enum Command {
     Checkpoints(checkpoints::CheckpointsArgs),
     /// Evaluate a checkpoint, the expert or the random floor
     Eval(eval::EvalArgs),
+    /// Run an evaluation again from its results and say what differs
+    Reproduce(eval::ReproduceArgs),
     /// Make one self-contained HTML page of results
     Report(report::ReportArgs),
     /// Measure speed, beside the reference where it is installed
@@ -107,6 +116,8 @@ impl Cli {
         match self.command {
             Command::Envs(args) => envs::envs(&args, json),
             Command::Fovs(args) => envs::fovs(&args, json),
+            Command::Wrappers => wrappers::wrappers(json),
+            Command::Solvers => solvers::solvers(json),
             Command::Datasets => datasets::datasets(json),
             Command::Formats => datasets::formats(json),
             Command::Inspect(args) => datasets::inspect(&args, json),
@@ -117,6 +128,7 @@ impl Cli {
             Command::Collect(args) => collect::collect(&args, &Context::new(json, self.threads)),
             Command::Train(args) => train::train(&args, &Context::new(json, self.threads)),
             Command::Eval(args) => eval::eval(&args, &Context::new(json, self.threads)),
+            Command::Reproduce(args) => eval::reproduce(&args, &Context::new(json, self.threads)),
             Command::Bench(args) => bench::bench(&args, &Context::new(json, self.threads)),
             Command::Demo(args) => demo::demo(&args, &Context::new(json, self.threads)),
         }

@@ -1,13 +1,14 @@
 //! `swm train`: train a model on a dataset.
 
-use super::{Context, Progress, datasets, emit, emit_json, models::MODELS};
+use super::{Context, Progress, emit, emit_json, models::MODELS};
 use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use swm::home;
 use swm_core::{Error, Result};
 use swm_data::Reader;
-use swm_models::{Observer, TrainConfig, TrainOptions, TrainSummary};
+use swm_models::inverse::InverseConfig;
+use swm_models::{Checkpoint, Device, Observer, TrainConfig, TrainOptions, TrainSummary};
 
 /// Arguments of `swm train`.
 #[derive(Args)]
@@ -23,6 +24,9 @@ pub struct TrainArgs {
     /// Where to write the checkpoint and the logs: a path or a name (default: the model's and dataset's names)
     #[arg(short, long, value_name = "CHECKPOINT")]
     output: Option<String>,
+    /// The checkpoint whose frozen encoder is used: a path or a name (inverse only)
+    #[arg(long, value_name = "CHECKPOINT")]
+    encoder: Option<String>,
     /// Continue the run that is there
     #[arg(long)]
     resume: bool,
@@ -40,6 +44,16 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
     if !known.clone().any(|id| id == args.model) {
         anyhow::bail!(Error::unknown("model", &args.model, known, "`swm models` lists them"));
     }
+    if args.model == "inverse" {
+        return inverse(args, context);
+    }
+    if args.encoder.is_some() {
+        anyhow::bail!(Error::config(
+            "--encoder",
+            "lewm trains an encoder of its own",
+            "leave it out, or train inverse"
+        ));
+    }
     let config = TrainConfig::load(&args.preset, &args.settings)?;
     if args.print_config {
         if context.json {
@@ -48,15 +62,67 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
         emit(&config.to_toml()?);
         return Ok(());
     }
-    let Some(data) = &args.data else {
-        anyhow::bail!(Error::config("--data", "no dataset is given", "name one (`swm datasets` lists them)"));
+    let (reader, out) = args.places()?;
+    let summary = run(&config, reader, &out, args.resume, context)?;
+    if context.json {
+        return emit_json(&summary);
+    }
+    emit(&format!("{}\n", summary.checkpoint.display()));
+    Ok(())
+}
+
+impl TrainArgs {
+    /// The dataset, and where the checkpoint goes.
+    fn places(&self) -> Result<(Arc<dyn Reader>, PathBuf)> {
+        let Some(data) = &self.data else {
+            return Err(Error::config("--data", "no dataset is given", "name one (`swm datasets` lists them)"));
+        };
+        let name = self.output.clone().unwrap_or_else(|| {
+            let stem = Path::new(data).file_stem().unwrap_or_default().to_string_lossy();
+            format!("{}-{stem}", self.model)
+        });
+        Ok((home::open_dataset(data)?, home::checkpoint(&name)))
+    }
+}
+
+/// Trains an inverse-dynamics policy on the encoder of a checkpoint.
+fn inverse(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
+    let config = InverseConfig::load(&args.settings)?;
+    if args.print_config {
+        if context.json {
+            return emit_json(&config);
+        }
+        emit(&config.to_toml()?);
+        return Ok(());
+    }
+    let Some(encoder) = &args.encoder else {
+        let fix = "name a checkpoint with --encoder (`swm checkpoints` lists them)";
+        anyhow::bail!(Error::config(
+            "--encoder",
+            "an inverse-dynamics policy sees through another model's encoder",
+            fix
+        ));
     };
-    let reader = datasets::open(data)?;
-    let name = args.output.clone().unwrap_or_else(|| {
-        let stem = Path::new(data).file_stem().unwrap_or_default().to_string_lossy();
-        format!("{}-{stem}", args.model)
-    });
-    let summary = run(&config, reader, &home::checkpoint(&name), args.resume, context)?;
+    if args.resume {
+        let fix = "leave out --resume and choose another --output";
+        anyhow::bail!(Error::config(
+            "--resume",
+            "training an inverse-dynamics policy takes seconds and begins anew",
+            fix
+        ));
+    }
+    let world = Checkpoint::load(&home::find_checkpoint(encoder)?, &Device::flex())?;
+    let (reader, out) = args.places()?;
+    let mut bar = Progress::new("train", config.schedule.steps);
+    let watched = &mut bar;
+    // Borrowed for itself alone: the bar may move to the thread that trains, but not be shared with it.
+    let mut watch = |at: swm_models::inverse::InverseProgress| {
+        let bar: &mut Progress = &mut *watched;
+        bar.at(at.step, format!("loss {:.3}", at.loss));
+    };
+    let summary =
+        swm_models::inverse::train(&config, &world, reader, &out, context.threads, &mut watch, &context.stop)?;
+    bar.done(&format!("{} steps in {:.0} s, {}", summary.steps, summary.seconds, out.display()));
     if context.json {
         return emit_json(&summary);
     }

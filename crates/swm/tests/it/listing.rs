@@ -47,6 +47,8 @@ fn tables_are_for_people() {
         (&["checkpoints"], &["no checkpoints"]),
         (&["models"], &["lewm", "tiny", "paper"]),
         (&["formats"], &["lance"]),
+        (&["solvers"], &["cem", "samples=300"]),
+        (&["wrappers"], &["noise", "chroma-key"]),
     ] {
         let output = swm.run(args);
         assert!(output.status.success(), "{args:?}: {}", text(&output.stderr));

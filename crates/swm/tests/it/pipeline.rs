@@ -42,7 +42,7 @@ fn a_checkpoint_goes_from_training_to_a_report() {
     swm.refuses(&["train", "lewm", "--data", "rooms", "-o", "small", "--resume", "optim.lr=1"], 2, &["optim.lr"]);
     assert_eq!(swm.json(&["checkpoints"])[0]["name"], "small");
 
-    let quick = ["--samples", "16", "--iterations", "2", "--elites", "4", "--episodes", "4", "--budget", "20"];
+    let quick = ["--solver", "cem,samples=16,iterations=2,elites=4", "--episodes", "4", "--budget", "20"];
     let eval = |more: &[&'static str]| {
         let args: Vec<&str> = ["eval", "small"].into_iter().chain(more.iter().copied()).chain(quick).collect();
         swm.json(&args)
@@ -87,6 +87,66 @@ fn find(folder: &std::path::Path, name: &str) -> std::path::PathBuf {
         }
     }
     panic!("no {name} below {}", folder.display())
+}
+
+#[test]
+fn policies_are_compared_on_the_same_starts_and_reproduced() {
+    let swm = Swm::new();
+    let noise = ["--wrapper", "noise,std=4", "--wrapper", "grayscale"];
+    let collect =
+        ["collect", "swm/TwoRoom-v1", "-o", "rooms", "--image", "64", "--episodes", "12", "--max-steps", "60"];
+    swm.json(&[&collect[..], &noise].concat());
+    assert_eq!(swm.json(&["inspect", "rooms"])["manifest"]["config"]["wrappers"][1]["id"], "grayscale");
+    swm.json(&["train", "lewm", "--data", "rooms", "-o", "small", "schedule.steps=6", "data.batch_size=32"]);
+    let inverse = ["train", "inverse", "--data", "rooms", "-o", "direct", "--encoder", "small", "schedule.steps=4"];
+    let trained = swm.json(&[&inverse[..], &["batch_size=16", "hidden=32"]].concat());
+    assert_eq!(trained["steps"], 4);
+    swm.refuses(&inverse, 2, &["holds a training run already"]);
+    swm.refuses(&["train", "inverse", "--data", "rooms"], 2, &["--encoder"]);
+    assert_eq!(swm.json(&["checkpoints"])[0]["family"], "inverse");
+
+    let eval = ["eval", "small", "direct", "simulator", "expert", "--episodes", "4", "--budget", "20", "--trace"];
+    let solver = ["--solver", "icem,samples=12,iterations=2,elites=4,keep=2", "--receding-horizon", "2"];
+    let found = swm.json(&[&eval[..], &solver, &noise, &["--wrap-goal", "-o", "found"]].concat());
+    let runs = found["runs"].as_array().expect("runs");
+    let names: Vec<_> = runs.iter().map(|run| run["policy"].as_str().expect("a name")).collect();
+    assert_eq!(names, ["random", "small", "direct", "simulator", "expert"]);
+    assert_eq!(runs[0]["condition"], "noise,std=4, grayscale");
+    assert_eq!(found["comparisons"].as_array().map(Vec::len), Some(10));
+    assert!(runs.iter().all(|run| run["episodes"][3]["seed"] == runs[0]["episodes"][3]["seed"]));
+    assert!(runs[3]["success"]["rate"].as_f64() > runs[0]["success"]["rate"].as_f64(), "perfect dynamics help");
+    let traces: Value =
+        serde_json::from_slice(&std::fs::read(swm.path("found/traces.json")).expect("traces")).expect("JSON");
+    assert!(traces[0]["policy"] == "small" && traces[0]["best"].as_array().map(Vec::len) == Some(2), "{}", traces[0]);
+
+    let again = swm.json(&["reproduce", "found", "--threads", "1", "--envs", "3"]);
+    assert_eq!((&again["holds"], &again["differences"]), (&Value::Bool(true), &Value::Array(vec![])));
+    // Other weights under the same name are found out before anything is played.
+    std::fs::remove_dir_all(swm.path("checkpoints/small")).expect("removable");
+    let other = ["train", "lewm", "--data", "rooms", "-o", "small", "schedule.steps=7", "data.batch_size=32"];
+    swm.json(&other);
+    swm.refuses(&["reproduce", "found"], 2, &["weights of small", "hash"]);
+}
+
+#[test]
+fn protocols_splits_and_settings_are_checked() {
+    let swm = Swm::new();
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--no-pixels", "--episodes", "40", "--max-steps", "40"]);
+    let expert = ["eval", "expert", "--env", "swm/TwoRoom-v1", "--episodes", "6", "-o", "found"];
+    let run = |more: &[&str]| swm.json(&[&expert[..], more].concat());
+    let test = run(&["--dataset", "rooms", "--goal-offset", "5", "--split", "test"]);
+    assert_eq!(test["manifest"]["config"]["starts"]["dataset"]["held_out"]["part"], "test");
+    assert!(test["runs"][0]["episodes"][0]["start"].is_array());
+    let compat = run(&["--protocol", "compat"]);
+    assert!(compat["manifest"]["config"]["counting"]["compat"]["envs"].is_u64());
+    let held = run(&["--hold", "3"]);
+    assert_eq!(held["counting"]["strict"]["hold"], 3);
+    swm.refuses(&[&expert[..], &["--split", "rest"]].concat(), 2, &["rest"]);
+    swm.refuses(&[&expert[..], &["--wrapper", "nose"]].concat(), 2, &["did you mean noise"]);
+    swm.refuses(&["eval", "simulator", "--env", "swm/TwoRoom-v1", "--solver", "cme"], 2, &["did you mean cem"]);
+    swm.refuses(&["eval", "simulator", "--env", "swm/TwoRoom-v1", "--solver", "gd"], 2, &["gradient", "icem"]);
+    swm.refuses(&["eval", "simulator", "--env", "swm/TwoRoom-v1", "--score", "best"], 2, &["terminal"]);
+    swm.refuses(&["eval", "simulator", "--env", "swm/TwoRoom-v1", "--term", "contrl"], 2, &["control"]);
 }
 
 #[test]

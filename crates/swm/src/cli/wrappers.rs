@@ -1,0 +1,64 @@
+//! `swm wrappers`: what can be done to pictures, and the arguments that ask for it.
+
+use super::{emit, emit_json, table};
+use clap::Args;
+use serde_json::{Map, Value};
+use swm_core::Result;
+use swm_envs::wrappers::{GoalPicture, Stack, WRAPPERS, read};
+use swm_eval::Choice;
+
+/// Which wrappers the pictures of a world pass through.
+#[derive(Args, Clone, Default)]
+pub struct WrapperArgs {
+    /// A wrapper of the pictures, such as noise,std=8; several are applied in this order (`swm wrappers` lists them)
+    #[arg(long = "wrapper", value_name = "NAME[,KEY=VALUE…]")]
+    pub wrappers: Vec<String>,
+    /// Apply the wrappers to the picture of the goal, too
+    #[arg(long, requires = "wrappers")]
+    pub wrap_goal: bool,
+}
+
+impl WrapperArgs {
+    /// The wrappers and their settings, in order.
+    ///
+    /// # Errors
+    /// When a wrapper or a setting is unknown or not allowed, or a file cannot be read.
+    pub fn choices(&self) -> Result<Vec<Choice>> {
+        let choices = self.wrappers.iter().map(|text| {
+            let (entry, settings) = read(text)?;
+            entry.make(&settings)?;
+            Ok(Choice { id: entry.id.to_owned(), settings: settings.into_iter().collect() })
+        });
+        choices.collect()
+    }
+
+    /// The stack of wrappers, and what is done to the picture of the goal.
+    ///
+    /// # Errors
+    /// As [`WrapperArgs::choices`].
+    pub fn stack(&self) -> Result<(Stack, GoalPicture)> {
+        let goal = if self.wrap_goal { GoalPicture::Wrapped } else { GoalPicture::Clean };
+        Ok((Stack::parse(&self.wrappers)?, goal))
+    }
+}
+
+/// Lists them.
+pub fn wrappers(as_json: bool) -> anyhow::Result<()> {
+    if as_json {
+        let all: Map<String, Value> = WRAPPERS.rows.iter().map(|row| (row.id.to_owned(), row.describe())).collect();
+        return emit_json(&all);
+    }
+    let rows = WRAPPERS.rows.iter().map(|row| {
+        let parameters = row.parameters.iter().map(|parameter| {
+            let default = match parameter.default_value() {
+                Value::Null => "…".to_owned(),
+                Value::String(text) => text,
+                other => other.to_string(),
+            };
+            format!("{}={default} ({})", parameter.name, parameter.domain)
+        });
+        vec![row.id.to_owned(), row.summary.to_owned(), parameters.collect::<Vec<_>>().join("\n")]
+    });
+    emit(&table(&["wrapper", "what it does", "settings, defaults (what is allowed)"], rows));
+    Ok(())
+}

@@ -1,0 +1,179 @@
+//! [`Home`]: what the names in an evaluation's request stand for: environments, wrappers and solvers of this build,
+//! datasets and checkpoints at home.
+
+use crate::{ENVS, home};
+use std::cell::RefCell;
+use std::sync::{Arc, Mutex, PoisonError};
+use swm_core::policy::ExpertPolicy;
+use swm_core::{CostModel, Env, EnvEntry, Error, Named as _, Policy, RandomPolicy, Result};
+use swm_data::Reader;
+use swm_envs::wrappers::{GoalPicture, Stack, WRAPPERS};
+use swm_eval::{Actor, Acts, Choice, EvalRequest, Model, PolicyRequest, Resolver, World};
+use swm_models::inverse::{InverseCheckpoint, InversePolicy};
+use swm_models::lewm::LewmCost;
+use swm_models::{Checkpoint, Device};
+use swm_plan::objective::ObjectiveConfig;
+use swm_plan::{ActionScale, MpcConfig, MpcPolicy, PlanRecord, SOLVERS, Score, SimulatorCost, TraceLog};
+
+/// Knows what is built in and what is at home.
+#[derive(Default)]
+pub struct Home {
+    /// The wrappers last asked for, made once: what they read from files is shared by all environments.
+    stack: RefCell<Option<(Vec<Choice>, Arc<Stack>)>>,
+    /// Every plan, with the name of the policy that made it; none where nobody asked for traces.
+    traces: Option<Traces>,
+}
+
+/// Plans and who made them.
+type Traces = Arc<Mutex<Vec<(String, PlanRecord)>>>;
+
+impl Home {
+    /// One that keeps every plan of the policies it makes.
+    pub fn tracing() -> Self {
+        Self { traces: Some(Traces::default()), ..Self::default() }
+    }
+
+    /// The plans made since the last call, in the order they were made, each with the name of its policy.
+    pub fn take_traces(&self) -> Vec<(String, PlanRecord)> {
+        let Some(traces) = &self.traces else { return vec![] };
+        std::mem::take(&mut *traces.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    fn stack(&self, wrappers: &[Choice]) -> Result<Arc<Stack>> {
+        if let Some((known, stack)) = &*self.stack.borrow()
+            && known == wrappers
+        {
+            return Ok(Arc::clone(stack));
+        }
+        let made: Result<Vec<_>> = wrappers
+            .iter()
+            .map(|choice| {
+                let entry = WRAPPERS.get(&choice.id)?;
+                let settings = choice.settings.as_object().cloned().unwrap_or_default();
+                entry.make(&settings.into_iter().collect())
+            })
+            .collect();
+        let stack = Arc::new(Stack::new(made?));
+        *self.stack.borrow_mut() = Some((wrappers.to_vec(), Arc::clone(&stack)));
+        Ok(stack)
+    }
+
+    /// A policy that plans; its plans are traced where that was asked for.
+    fn planning(&self, name: &str, policy: MpcPolicy) -> Actor {
+        let Some(traces) = &self.traces else { return Actor::from(Box::new(policy) as Box<dyn Policy>) };
+        let (log, traces, name) = (TraceLog::default(), Arc::clone(traces), name.to_owned());
+        let policy: Box<dyn Policy> = Box::new(policy.traced(log.clone()));
+        let searches = move || {
+            let records = log.take();
+            let searches = records.iter().map(|record| record.search.clone()).collect();
+            let named = records.into_iter().map(|record| (name.clone(), record));
+            traces.lock().unwrap_or_else(PoisonError::into_inner).extend(named);
+            searches
+        };
+        Actor { searches: Some(Box::new(searches)), ..Actor::from(policy) }
+    }
+}
+
+impl Resolver for Home {
+    fn env(&self, request: &EvalRequest) -> Result<Box<dyn Env>> {
+        let env = (ENVS.get(&request.env)?.make)();
+        let goal = if request.wrap_goal { GoalPicture::Wrapped } else { GoalPicture::Clean };
+        Ok(self.stack(&request.wrappers)?.wrap(env, goal))
+    }
+
+    fn dataset(&self, name: &str) -> Result<Arc<dyn Reader>> {
+        home::open_dataset(name)
+    }
+
+    fn policy(&self, request: &PolicyRequest, world: &World) -> Result<Actor> {
+        let (spec, slots) = (world.spec(), world.pool().len());
+        let entry = ENVS.get(spec.id)?;
+        match &request.acts {
+            Acts::Random => Ok(Actor::from(Box::new(RandomPolicy::new(spec, slots)) as Box<dyn Policy>)),
+            Acts::Expert { id } => scripted(entry, id, world).map(Actor::from),
+            Acts::Direct { checkpoint: given, .. } => {
+                let checkpoint = InverseCheckpoint::load(&home::find_checkpoint(given)?, &Device::flex())?;
+                fits(checkpoint.world.env.as_deref(), given, entry)?;
+                let weights = Some(checkpoint.hash().to_owned());
+                let (libraries, device) = (checkpoint.manifest.libraries.clone(), checkpoint.manifest.device.clone());
+                let policy: Box<dyn Policy> = Box::new(InversePolicy::new(checkpoint, spec, slots)?);
+                Ok(Actor { weights, libraries, device: Some(device), ..Actor::from(policy) })
+            }
+            Acts::Plan { model, solver, mpc, objective } => {
+                let solver = (SOLVERS.get(&solver.id)?.make)(&solver.settings)?;
+                let wrong = |what: &str, error: serde_json::Error| {
+                    Error::config(what, error.to_string(), "`swm eval --help` lists what there is")
+                };
+                let mpc: MpcConfig = serde_json::from_value(mpc.clone()).map_err(|e| wrong("MPC settings", e))?;
+                let objective = match objective {
+                    serde_json::Value::Null => ObjectiveConfig::default(),
+                    given => serde_json::from_value(given.clone()).map_err(|e| wrong("objective", e))?,
+                };
+                match model {
+                    Model::Simulator { score } => {
+                        let score = parse_score(score)?;
+                        let scale = ActionScale::unscaled(spec);
+                        let cost = SimulatorCost::new(entry.make, scale.clone(), mpc.action_block, score)?;
+                        let cost = objective.apply(Box::new(cost))?;
+                        let policy = MpcPolicy::new(solver, cost, mpc, scale, spec, slots)?;
+                        Ok(self.planning(&request.name, policy))
+                    }
+                    Model::Checkpoint(given) => {
+                        let checkpoint = Checkpoint::load(&home::find_checkpoint(given)?, &Device::flex())?;
+                        fits(checkpoint.env.as_deref(), given, entry)?;
+                        let cost: Box<dyn CostModel> = Box::new(LewmCost::new(&checkpoint));
+                        let (cost, scale) = (objective.apply(cost)?, checkpoint.action.clone());
+                        let policy = MpcPolicy::new(solver, cost, mpc, scale, spec, slots)?;
+                        Ok(Actor {
+                            weights: Some(checkpoint.hash().to_owned()),
+                            libraries: checkpoint.manifest.libraries.clone(),
+                            device: Some(checkpoint.manifest.device.clone()),
+                            ..self.planning(&request.name, policy)
+                        })
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Who acts in a world without having been trained: `random`, `expert` (the environment's first), or an expert by name.
+///
+/// # Errors
+/// When the environment has no such expert.
+pub fn scripted(entry: &EnvEntry, name: &str, world: &World) -> Result<Box<dyn Policy>> {
+    let slots = world.pool().len();
+    if name == "random" {
+        return Ok(Box::new(RandomPolicy::new(world.spec(), slots)));
+    }
+    let expert = match entry.experts {
+        [first, ..] if name == "expert" => first,
+        experts => experts.iter().find(|expert| expert.id == name).ok_or_else(|| {
+            let known = ["random", "expert"].into_iter().chain(experts.iter().map(|expert| expert.id()));
+            Error::unknown("policy", name, known, format!("`swm envs` lists the experts of {}", entry.id))
+        })?,
+    };
+    Ok(Box::new(ExpertPolicy::new(world.spec(), (0..slots).map(|_| (expert.make)()).collect())))
+}
+
+/// What a simulator judges a plan by, by name.
+///
+/// # Errors
+/// When there is no such score.
+pub fn parse_score(name: &str) -> Result<Score> {
+    serde_json::from_value(name.into()).map_err(|_| {
+        Error::unknown("score", name, ["terminal", "running", "reach"], "it judges plans of the simulator")
+    })
+}
+
+/// Refuses a checkpoint trained on another environment.
+fn fits(trained_on: Option<&str>, name: &str, entry: &EnvEntry) -> Result<()> {
+    match trained_on {
+        Some(env) if env != entry.id => Err(Error::config(
+            format!("checkpoint {name}"),
+            format!("it was trained on {env}, not on {}", entry.id),
+            format!("evaluate it with --env {env}, or train one on {}", entry.id),
+        )),
+        _ => Ok(()),
+    }
+}

@@ -5,11 +5,13 @@
 
 mod counting;
 mod paired;
+mod prediction;
 mod searches;
 mod statistics;
 
 pub use counting::Counting;
 pub use paired::{Comparison, Paired};
+pub use prediction::{Group, Prediction, Trajectory};
 pub use searches::{Band, Searches};
 pub use statistics::{Proportion, Summary};
 
@@ -56,6 +58,9 @@ pub struct Run {
     /// How the searches behind its plans went, where that was traced.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub searches: Option<Searches>,
+    /// How well its model predicts the trajectories the starts were taken from, where that was asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub prediction: Option<Prediction>,
     /// How long it took: the only part that differs between equal runs.
     pub timing: Timing,
     /// Videos, as paths relative to the results file.
@@ -112,6 +117,7 @@ impl Run {
             success: counting.rate(&episodes),
             strict: None,
             searches: None,
+            prediction: None,
             time_to_goal: Summary::of(&steps),
             timing,
             videos: vec![],

@@ -69,11 +69,20 @@ impl Svg {
 
     /// A line through points.
     pub(crate) fn path(&mut self, class: &str, points: impl IntoIterator<Item = [f64; 2]>) {
-        let _ = write!(self.body, r#"<polyline class="{class}" points=""#);
+        self.outline("polyline", class, points);
+    }
+
+    fn outline(&mut self, element: &str, class: &str, points: impl IntoIterator<Item = [f64; 2]>) {
+        let _ = write!(self.body, r#"<{element} class="{class}" points=""#);
         for (i, [x, y]) in points.into_iter().enumerate() {
             let _ = write!(self.body, "{}{x:.1},{y:.1}", if i == 0 { "" } else { " " });
         }
         self.body.push_str("\"/>\n");
+    }
+
+    /// A surface within points.
+    pub(crate) fn area(&mut self, class: &str, points: impl IntoIterator<Item = [f64; 2]>) {
+        self.outline("polygon", class, points);
     }
 
     /// Words; `class` says how they are anchored and coloured.

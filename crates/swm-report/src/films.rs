@@ -1,6 +1,6 @@
 //! Videos inside the page, as data URIs.
 
-use crate::text::escape;
+use crate::text::{escape, outcome};
 use base64::Engine as _;
 use std::fmt::Write as _;
 use std::path::Path;
@@ -58,10 +58,6 @@ fn caption(run: &Run, video: &str) -> String {
     let digits = stem.len() - stem.chars().rev().take_while(char::is_ascii_digit).count();
     let Ok(index) = stem[digits..].parse::<usize>() else { return String::new() };
     let Some(episode) = run.episodes.get(index) else { return String::new() };
-    let (class, outcome) = match (episode.solved_at_start, episode.success) {
-        (true, _) => ("start", "solved at the start".to_owned()),
-        (_, true) => ("solved", format!("solved in {} steps", episode.steps)),
-        _ => ("unsolved", format!("not solved in {} steps", episode.steps)),
-    };
+    let (class, outcome) = outcome(episode);
     format!("<br/>episode {index} <span class=\"mark {class}\">{outcome}</span>")
 }

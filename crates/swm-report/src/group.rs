@@ -1,18 +1,19 @@
-//! Which runs belong side by side: those of one environment and protocol, by condition, whatever file they
+//! Which runs belong side by side: those of one environment, protocol and counting, by condition, whatever file they
 //! come from.
 
 use crate::text::escape;
 use std::path::PathBuf;
 use swm_core::Results;
-use swm_core::results::Run;
+use swm_core::results::{Comparison, Counting, Paired, Run};
 
 /// How many policies get a colour of their own before colours repeat.
 const COLOURS: usize = 6;
 
-/// Everything measured in one environment under one protocol.
+/// Everything measured in one environment under one protocol, counted one way.
 pub(crate) struct Group<'a> {
     pub env: &'a str,
     pub protocol: &'a str,
+    pub counting: Counting,
     pub conditions: Vec<Condition<'a>>,
 }
 
@@ -45,9 +46,11 @@ impl<'a> Group<'a> {
         let mut groups: Vec<Self> = vec![];
         let mut learned: Vec<&str> = vec![];
         for (file, (_, result)) in results.iter().enumerate() {
-            let place = groups.iter().position(|g| g.env == result.env && g.protocol == result.protocol);
-            let place = place.unwrap_or_else(|| {
-                groups.push(Self { env: &result.env, protocol: &result.protocol, conditions: vec![] });
+            let counting = result.counting;
+            let same = |g: &Self| (g.env, g.protocol, g.counting) == (&*result.env, &*result.protocol, counting);
+            let place = groups.iter().position(same).unwrap_or_else(|| {
+                let (env, protocol) = (&*result.env, &*result.protocol);
+                groups.push(Self { env, protocol, counting, conditions: vec![] });
                 groups.len() - 1
             });
             let conditions = &mut groups[place].conditions;
@@ -92,7 +95,7 @@ impl<'a> Group<'a> {
 
     /// The name of the group, escaped.
     pub(crate) fn title(&self) -> String {
-        format!("{} · {}", escape(self.env), escape(self.protocol))
+        format!("{} · {}, {}", escape(self.env), escape(self.protocol), escape(&self.counting.to_string()))
     }
 }
 
@@ -105,5 +108,12 @@ impl<'a> Condition<'a> {
     /// The floor to hold a run against: that of its own file, else that of the condition.
     pub(crate) fn floor_of(&self, run: &Row<'_>) -> Option<&Row<'a>> {
         self.rows.iter().find(|row| row.is_floor() && row.file == run.file).or_else(|| self.floor())
+    }
+
+    /// Every pair of policies that played the same starts, the later one first: a model, then its floor.
+    pub(crate) fn pairs(&self, counting: Counting) -> Vec<(&Row<'a>, &Row<'a>, Paired)> {
+        let later = self.rows.iter().enumerate();
+        let pairs = later.flat_map(|(i, row)| self.rows[..i].iter().map(move |other| (row, other)));
+        pairs.filter_map(|(a, b)| Some((a, b, Comparison::of(a.run, b.run, counting)?.table))).collect()
     }
 }

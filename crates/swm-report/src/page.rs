@@ -2,10 +2,11 @@
 
 use crate::group::{Condition, Group, Row};
 use crate::read::Metrics;
-use crate::text::{duration, escape, number, percent};
-use crate::{films, plots, read_metrics};
+use crate::text::{duration, escape, number, p_value, percent};
+use crate::{films, paired, plots, prediction, read_metrics, searches};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
+use swm_core::results::{Comparison, Counting};
 use swm_core::{Error, Manifest, Result, Results};
 
 /// Looks, light and dark, on screens and paper.
@@ -103,8 +104,9 @@ fn facts(results: &[(PathBuf, Results)]) -> String {
     let runs: usize = results.iter().map(|(_, r)| r.runs.len()).sum();
     let episodes: usize = results.iter().flat_map(|(_, r)| &r.runs).map(|run| run.episodes.len()).sum();
     format!(
-        "{} protocol · {runs} runs, {episodes} episodes · seed {} · {}",
+        "{} protocol · counting: {} · {runs} runs, {episodes} episodes · seed {} · {}",
         shared(|r| r.protocol.clone()),
+        shared(|r| r.counting.to_string()),
         shared(|r| r.manifest.seed.to_string()),
         shared(|r| r.manifest.device.clone())
     )
@@ -119,10 +121,11 @@ fn group_section(html: &mut String, group: &Group<'_>, results: &[(PathBuf, Resu
     html.push_str("<div class=\"cards\">\n");
     for condition in &group.conditions {
         for row in condition.rows.iter().filter(|row| row.class.starts_with('c')) {
-            card(html, condition, row);
+            card(html, group, condition, row);
         }
     }
     html.push_str("</div>\n");
+    let _ = writeln!(html, "<p class=\"note\">{}</p>", counting_words(group));
     figure(
         html,
         "Success rates",
@@ -131,14 +134,25 @@ fn group_section(html: &mut String, group: &Group<'_>, results: &[(PathBuf, Resu
         &plots::success(group),
     );
     table(html, group);
+    if let Some(plot) = paired::plot(group) {
+        figure(
+            html,
+            "On the same starts",
+            "Points are differences of success rates over starts that both played, whiskers their 95 % intervals \
+             (Newcombe’s square-and-add), p-values those of McNemar’s exact test. They are not corrected for how many pairs \
+             there are.",
+            &plot,
+        );
+        html.push_str(&paired::table(group));
+    }
     let longest = group.rows().flat_map(|row| &row.run.episodes).map(|episode| episode.steps).max().unwrap_or(0);
     if longest > 0 {
-        let curves: String = group.conditions.iter().map(|condition| plots::progress(condition, longest)).collect();
+        let curves: String =
+            group.conditions.iter().map(|condition| plots::progress(condition, group.counting, longest)).collect();
         figure(
             html,
             "Time to goal",
-            "The share of episodes that had reached the goal after so many steps. Starts that already satisfied the \
-             goal are left out.",
+            "The share of the episodes that count that had reached the goal after so many steps.",
             &format!("<div class=\"pair\">\n{curves}</div>\n{}", legend(group)),
         );
         figure(
@@ -158,6 +172,28 @@ fn group_section(html: &mut String, group: &Group<'_>, results: &[(PathBuf, Resu
             &plot,
         );
     }
+    let traced: String = group.conditions.iter().map(searches::plots).collect();
+    if !traced.is_empty() {
+        figure(
+            html,
+            "Searches",
+            "How plans came about: lines are medians over all plans of a run, bands reach from the 10th to the 90th \
+             percentile. A search whose cost still falls at the end was cut short; one whose spread is gone long before \
+             wasted its last iterations.",
+            &format!("<div class=\"pair\">\n{traced}</div>\n"),
+        );
+    }
+    let predicted: String = group.conditions.iter().map(prediction::plots).collect();
+    if !predicted.is_empty() {
+        figure(
+            html,
+            "Prediction errors",
+            "Mean squared errors of latents predicted open loop along recorded trajectories, in units of the latents’ \
+             variance: 1 is the error of always predicting the mean. Apart for starts that were solved and starts that were \
+             not; dots are medians.",
+            &format!("<div class=\"pair\">\n{predicted}</div>\n"),
+        );
+    }
     let videos: String = group
         .rows()
         .map(|row| films::figures(row.run, results[row.file].0.parent().unwrap_or_else(|| Path::new(""))))
@@ -172,15 +208,59 @@ fn group_section(html: &mut String, group: &Group<'_>, results: &[(PathBuf, Resu
     html.push_str("</section>\n");
 }
 
-/// The finding of one policy under one condition, beside its floor.
-fn card(html: &mut String, condition: &Condition<'_>, row: &Row<'_>) {
+/// How episodes were counted, in a sentence or two.
+fn counting_words(group: &Group<'_>) -> String {
+    // Every policy of a condition met the same ones.
+    let most = |condition: &Condition<'_>| condition.rows.iter().map(|row| row.run.solved_at_start).max();
+    let solved: usize = group.conditions.iter().filter_map(most).sum();
+    match group.counting {
+        Counting::Strict { hold } => {
+            let held = match hold {
+                1 => "at the first step that satisfies the goal".to_owned(),
+                _ => format!("once the goal was satisfied for {hold} steps in a row"),
+            };
+            let left = match solved {
+                0 => "No start was solved already.".to_owned(),
+                1 => "One start was solved already; it was not played and does not count.".to_owned(),
+                _ => format!("{solved} starts were solved already; they were not played and do not count."),
+            };
+            format!("Strict counting: an episode succeeds {held}. {left}")
+        }
+        Counting::Compat { envs } => {
+            let first = match group.protocol {
+                "episodic" => format!(" The first to finish of {envs} environments side by side count."),
+                _ => String::new(),
+            };
+            format!(
+                "Compat counting, as the Python package stable-worldmodel counts: every start counts, solved \
+                 already or not ({solved} were), and an episode succeeds when the world terminates.{first}"
+            )
+        }
+    }
+}
+
+/// The finding of one policy under one condition, beside its floor: on the same starts where both played these, else by
+/// their intervals.
+fn card(html: &mut String, group: &Group<'_>, condition: &Condition<'_>, row: &Row<'_>) {
     let p = row.run.success;
-    let verdict = match condition.floor_of(row).map(|floor| floor.run.success) {
-        None => ("unknown", "no random floor was measured".to_owned()),
-        Some(floor) if p.n == 0 || floor.n == 0 => ("unknown", "no episode counted".to_owned()),
-        Some(floor) if p.low > floor.high => ("above", format!("above the random floor of {}", percent(floor.rate))),
-        Some(floor) if p.high < floor.low => ("below", format!("below the random floor of {}", percent(floor.rate))),
-        Some(floor) => ("within", format!("not told apart from the random floor of {}", percent(floor.rate))),
+    let floor = condition.floor_of(row);
+    let paired = floor.and_then(|floor| Comparison::of(row.run, floor.run, group.counting)).map(|found| found.table);
+    let verdict = match (floor.map(|floor| floor.run.success), paired) {
+        (None, _) => ("unknown", "no random floor was measured".to_owned()),
+        (Some(floor), _) if p.n == 0 || floor.n == 0 => ("unknown", "no episode counted".to_owned()),
+        (Some(floor), paired) => {
+            let (above, below) = match paired {
+                Some(table) => (table.p < 0.05 && table.difference > 0.0, table.p < 0.05 && table.difference < 0.0),
+                None => (p.low > floor.high, p.high < floor.low),
+            };
+            let (class, words) = match (above, below) {
+                (true, _) => ("above", "above"),
+                (_, true) => ("below", "below"),
+                _ => ("within", "not told apart from"),
+            };
+            let test = paired.map_or(String::new(), |table| format!(" ({})", p_value(table.p)));
+            (class, format!("{words} the random floor of {}{}", percent(floor.rate), escape(&test)))
+        }
     };
     let _ = write!(
         html,
@@ -254,7 +334,10 @@ fn table(html: &mut String, group: &Group<'_>) {
 fn cells(html: &mut String, row: &Row<'_>) {
     let (run, p) = (row.run, row.run.success);
     const NONE: &str = "<span class=\"quiet\">–</span>";
-    let rate = if p.n == 0 { NONE.to_owned() } else { format!("<b>{}</b>", percent(p.rate)) };
+    // Where compat counting ran, what strict counting makes of the same episodes is beside it.
+    let strict =
+        run.strict.map_or(String::new(), |p| format!("<br/><span class=\"quiet\">strict {}</span>", percent(p.rate)));
+    let rate = if p.n == 0 { NONE.to_owned() } else { format!("<b>{}</b>{strict}", percent(p.rate)) };
     let steps = run.time_to_goal.map(|s| format!("{} ({})", number(s.median), number(s.p95)));
     let latency = run.timing.plan_seconds.map(|s| format!("{} ({})", duration(s.median), duration(s.p95)));
     let _ = write!(
@@ -299,10 +382,17 @@ fn provenance_section(html: &mut String, results: &[(PathBuf, Results)], options
     for (i, (path, result)) in results.iter().enumerate() {
         let number = if results.len() > 1 { format!("[{}] ", i + 1) } else { String::new() };
         let _ = writeln!(html, "<h3>{number}<code>{}</code></h3>", escape(&short_path(path)));
-        let told = result.manifest.config.get("command").and_then(serde_json::Value::as_str);
-        match (told, &options.command) {
+        let config = &result.manifest.config;
+        let told = config.get("command").and_then(serde_json::Value::as_str).map(str::to_owned);
+        // A request of a known layout is all that is needed.
+        let again = config.get("version").map(|_| format!("swm reproduce {}", short_path(path)));
+        match (told.or(again), &options.command) {
             (Some(command), None) => {
-                let _ = write!(html, "<p>The command that makes it again:</p>\n<pre>{}</pre>\n", escape(command));
+                let _ = write!(
+                    html,
+                    "<p>The command that makes it again and says what differs:</p>\n<pre>{}</pre>\n",
+                    escape(&command)
+                );
             }
             (None, None) => html.push_str(
                 "<p class=\"note\">The configuration below, with these versions and hashes, decides every number but \

@@ -3,8 +3,9 @@
 use crate::chart::{Scale, Svg};
 use crate::group::{Condition, Group};
 use crate::read::{Metrics, Series};
-use crate::text::{duration, number, percent, shorten};
+use crate::text::{duration, number, outcome, percent, shorten};
 use std::fmt::Write as _;
+use swm_core::results::{Counting, EpisodeResult};
 
 /// Width of the plots that fill the page.
 const WIDE: f64 = 920.0;
@@ -83,7 +84,7 @@ fn summary(group: &Group<'_>) -> String {
 }
 
 /// The share of episodes solved within so many steps, a curve a run.
-pub(crate) fn progress(condition: &Condition<'_>, longest: usize) -> String {
+pub(crate) fn progress(condition: &Condition<'_>, counting: Counting, longest: usize) -> String {
     let [left, top, bottom] = [46.0, 30.0, 210.0];
     let right = HALF - 12.0;
     let mut svg = Svg::new(HALF, bottom + 42.0);
@@ -101,12 +102,12 @@ pub(crate) fn progress(condition: &Condition<'_>, longest: usize) -> String {
     // The floor first, so that everything else lies on top of it.
     let (floors, others): (Vec<_>, Vec<_>) = condition.rows.iter().partition(|row| row.is_floor());
     for row in floors.into_iter().chain(others) {
-        let counted = || row.run.episodes.iter().filter(|episode| !episode.solved_at_start);
+        let counted = || row.run.episodes.iter().filter(|episode| counting.counts(episode));
         let n = counted().count();
         if n == 0 {
             continue;
         }
-        let mut steps: Vec<usize> = counted().filter(|episode| episode.success).map(|episode| episode.steps).collect();
+        let mut steps: Vec<usize> = counted().filter_map(EpisodeResult::time_to_goal).collect();
         steps.sort_unstable();
         let mut points = vec![[x.at(0.0), y.at(0.0)]];
         #[allow(clippy::cast_precision_loss)]
@@ -139,11 +140,7 @@ pub(crate) fn episodes(group: &Group<'_>) -> String {
             for (i, episode) in row.run.episodes.iter().enumerate() {
                 #[allow(clippy::cast_precision_loss)]
                 let corner = [LABELS + (i % A_LINE) as f64 * CELL, top + (i / A_LINE) as f64 * CELL];
-                let (class, outcome) = match (episode.solved_at_start, episode.success) {
-                    (true, _) => ("start", "solved at the start, not counted".to_owned()),
-                    (_, true) => ("solved", format!("solved in {} steps", episode.steps)),
-                    _ => ("unsolved", format!("not solved in {} steps", episode.steps)),
-                };
+                let (class, outcome) = outcome(episode);
                 let class = format!("cell {class} {}", row.class);
                 let tip = format!("episode {i}, seed {}: {outcome}", episode.seed);
                 svg.rect(&class, corner, [CELL - 2.0, CELL - 2.0], &tip);

@@ -3,6 +3,7 @@
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
+use swm_core::results::{Comparison, Paired};
 use swm_core::{Error, Result, Results};
 
 /// What to do about a result file that cannot be used.
@@ -33,15 +34,25 @@ pub fn read_results(path: &Path) -> Result<Results> {
     let results: Results = serde_json::from_value(value).map_err(|error| {
         Error::corrupt(path, format!("has another layout than this version reads ({error})"), AGAIN)
     })?;
+    let wrong = |problem: String| Err(Error::corrupt(path, format!("contradicts itself: {problem}"), AGAIN));
     for run in &results.runs {
-        let counted = run.episodes.iter().filter(|episode| !episode.solved_at_start);
-        let (n, successes) = (counted.clone().count(), counted.filter(|episode| episode.success).count());
-        if (run.success.n, run.success.successes) != (n, successes) {
-            let problem = format!(
-                "contradicts itself: {} ({}) claims {} successes in {}, its episodes show {successes} in {n}",
-                run.policy, run.condition, run.success.successes, run.success.n
-            );
-            return Err(Error::corrupt(path, problem, AGAIN));
+        let (claimed, shown) = (run.success, results.counting.rate(&run.episodes));
+        if (claimed.successes, claimed.n) != (shown.successes, shown.n) {
+            return wrong(format!(
+                "{} ({}) claims {} successes in {}, its episodes show {} in {}",
+                run.policy, run.condition, claimed.successes, claimed.n, shown.successes, shown.n
+            ));
+        }
+    }
+    for told in &results.comparisons {
+        let find = |name: &str| results.runs.iter().find(|run| run.condition == told.condition && run.policy == name);
+        let shown = find(&told.a).zip(find(&told.b)).and_then(|(a, b)| Comparison::of(a, b, results.counting));
+        let counts = |told: &Comparison| {
+            let Paired { both, only_a, only_b, neither, .. } = told.table;
+            [both, only_a, only_b, neither]
+        };
+        if shown.as_ref().map(counts) != Some(counts(told)) {
+            return wrong(format!("its episodes do not show what it says of {} and {}", told.a, told.b));
         }
     }
     Ok(results)

@@ -1,5 +1,7 @@
 //! Words and numbers as the page shows them.
 
+use swm_core::results::EpisodeResult;
+
 /// Words made safe for HTML text and quoted attributes. Control characters, which XML forbids, become spaces.
 pub(crate) fn escape(words: &str) -> String {
     let mut safe = String::with_capacity(words.len());
@@ -18,6 +20,16 @@ pub(crate) fn escape(words: &str) -> String {
     safe
 }
 
+/// What came of an episode: the class that colours it, and words.
+pub(crate) fn outcome(episode: &EpisodeResult) -> (&'static str, String) {
+    let also = if episode.solved_at_start { ", from a start that was solved already" } else { "" };
+    match episode.time_to_goal() {
+        _ if episode.solved_at_start && episode.steps == 0 => ("start", "solved at the start, not counted".to_owned()),
+        Some(steps) => ("solved", format!("solved in {steps} steps{also}")),
+        None => ("unsolved", format!("not solved in {} steps{also}", episode.steps)),
+    }
+}
+
 /// Words cut to `most` characters, with an ellipsis where something is missing.
 pub(crate) fn shorten(words: &str, most: usize) -> String {
     if words.chars().count() <= most {
@@ -31,6 +43,16 @@ pub(crate) fn shorten(words: &str, most: usize) -> String {
 /// A share as a percentage with one decimal: `92.5 %`, which no line break parts.
 pub(crate) fn percent(rate: f64) -> String {
     format!("{:.1}\u{a0}%", rate * 100.0)
+}
+
+/// A difference of shares in percentage points, with its sign: `+34.0`.
+pub(crate) fn points(difference: f64) -> String {
+    format!("{:+.1}", difference * 100.0).replace('-', "\u{2212}")
+}
+
+/// A p-value: `p = 0.032`, `p < 0.001`.
+pub(crate) fn p_value(p: f64) -> String {
+    if p < 0.001 { "p\u{a0}<\u{a0}0.001".to_owned() } else { format!("p\u{a0}=\u{a0}{p:.3}") }
 }
 
 /// A number with about four significant digits and no trailing zeros.
@@ -91,5 +113,10 @@ mod tests {
         let times = [0.000_84, 0.012, 0.9996, 1.417, 59.96, 200.0, 7500.0, -1.0].map(duration);
         assert_eq!(times, ["0.8 ms", "12 ms", "1.00 s", "1.42 s", "1 min 0 s", "3 min 20 s", "2 h 5 min", "–"]);
         assert_eq!(percent(0.925), "92.5\u{a0}%");
+        assert_eq!((points(0.34), points(-0.051)), ("+34.0".to_owned(), "\u{2212}5.1".to_owned()));
+        assert_eq!(
+            [0.2, 0.000_99, 1.0].map(p_value).map(|p| p.replace('\u{a0}', " ")),
+            ["p = 0.200", "p < 0.001", "p = 1.000"]
+        );
     }
 }

@@ -1,8 +1,8 @@
 //! The whole page, from synthetic results whose numbers are known.
 
 use std::path::{Path, PathBuf};
-use swm_core::results::{EpisodeResult, Proportion, Run, Summary, Timing};
-use swm_core::{Manifest, Results};
+use swm_core::results::{Comparison, Counting, EpisodeResult, Prediction, Run, Searches, Summary, Timing, Trajectory};
+use swm_core::{Manifest, PlanTrace, Results};
 use swm_report::{ReportOptions, read_metrics, read_results, write_report, write_report_with};
 
 /// A run of `n` episodes of which the first `solved` reach the goal, each a step later than the one before.
@@ -14,45 +14,74 @@ fn run(condition: &str, policy: &str, n: usize, solved: usize, plans: Option<f64
             solved_at_start: false,
             steps: if i < solved { 8 + i } else { 60 },
             total_reward: -1.5,
-            start: None,
+            ..EpisodeResult::default()
         })
         .collect();
-    let steps: Vec<f64> = episodes.iter().filter(|e| e.success).map(|e| e.steps as f64).collect();
-    Run {
-        condition: condition.to_owned(),
-        policy: policy.to_owned(),
-        solved_at_start: 0,
-        success: Proportion::wilson(solved, n),
-        time_to_goal: Summary::of(&steps),
-        timing: Timing {
-            plan_seconds: plans.and_then(|s| Summary::of(&[s, s, s * 1.5])),
-            wall_seconds: if plans.is_some() { 83.0 } else { 0.0 },
-        },
-        videos: vec![],
-        episodes,
-    }
+    let timing = Timing {
+        plan_seconds: plans.and_then(|s| Summary::of(&[s, s, s * 1.5])),
+        wall_seconds: if plans.is_some() { 83.0 } else { 0.0 },
+    };
+    Run::new(condition, policy, Counting::default(), episodes, timing)
 }
 
 fn results() -> Results {
     let mut manifest = Manifest::new("evaluate", 7, serde_json::json!({"horizon": 5, "note": "</pre><script>"}));
     manifest.libraries.insert("burn".to_owned(), "0.22.1".to_owned());
     manifest.hashes.insert("weights".to_owned(), "ab".repeat(32));
-    let mut shifted = run("agent.color shifted", "lewm-tiny", 40, 3, Some(0.0421));
-    shifted.episodes[39].solved_at_start = true;
-    shifted.solved_at_start = 1;
-    shifted.success = Proportion::wilson(3, 39);
+    let shifted = run("agent.color shifted", "lewm-tiny", 40, 3, Some(0.0421));
+    let mut episodes = shifted.episodes;
+    (episodes[39].solved_at_start, episodes[39].steps) = (true, 0);
+    let runs = vec![
+        run("in distribution", "random", 40, 2, None),
+        run("in distribution", "expert", 40, 40, None),
+        run("in distribution", "lewm-tiny", 40, 37, Some(0.0384)),
+        run("agent.color shifted", "random", 40, 2, None),
+        Run::new("agent.color shifted", "lewm-tiny", Counting::default(), episodes, shifted.timing),
+    ];
     Results {
         manifest,
         env: "swm/TwoRoom-v1".to_owned(),
         protocol: "episodic".to_owned(),
-        runs: vec![
-            run("in distribution", "random", 40, 2, None),
-            run("in distribution", "expert", 40, 40, None),
-            run("in distribution", "lewm-tiny", 40, 37, Some(0.0384)),
-            run("agent.color shifted", "random", 40, 2, None),
-            shifted,
-        ],
+        counting: Counting::default(),
+        comparisons: Comparison::all(&runs, Counting::default()),
+        runs,
     }
+}
+
+/// Results of a dataset's test split with all that an evaluation can tell: two models on starts that are solved
+/// differently, a goal to be held, traced searches, and prediction errors.
+fn everything() -> Results {
+    let mut found = results();
+    found.manifest.config = serde_json::json!({"version": 1, "env": "swm/TwoRoom-v1"});
+    (found.protocol, found.counting) = ("dataset".to_owned(), Counting::Strict { hold: 5 });
+    let mut other = run("in distribution", "pldm", 40, 25, Some(0.0512));
+    // Of the 37 starts that the first model solves, 3 to 36, this one solves 10 to 34.
+    other.episodes.rotate_right(10);
+    for (i, episode) in other.episodes.iter_mut().enumerate() {
+        episode.seed = 1000 + i as u64;
+        (episode.reached, episode.steps) = (episode.success.then_some(episode.steps), episode.steps + 4);
+    }
+    found.runs.push(Run::new("in distribution", "pldm", found.counting, other.episodes, other.timing));
+    let traces: Vec<PlanTrace> = (0..40)
+        .map(|plan| {
+            let falling = |from: f32, to: f32| -> Vec<f32> {
+                let wobble = 1.0 + 0.3 * (plan as f32 * 0.7).sin();
+                (0..30).map(|i| wobble * (to + (from - to) * (-(i as f32) / 6.0).exp())).collect()
+            };
+            let (best, mean, spread) = (falling(9.0, 1.0), falling(16.0, 1.2), falling(1.0, 0.05));
+            PlanTrace { best, mean, spread, ..PlanTrace::default() }
+        })
+        .collect();
+    let trajectories = (0..40).map(|i| {
+        let success = i < 37;
+        let slope = (1.0 + 0.5 * (i as f64).sin()) * if success { 0.03 } else { 0.06 };
+        let errors = (1..=5).map(|step| slope * f64::from(step)).collect();
+        Trajectory { start: [i, 7], success: Some(success), errors }
+    });
+    found.runs[2].searches = Searches::of(&traces);
+    found.runs[2].prediction = Some(Prediction::new(5, 0.8, trajectories.collect()));
+    found.comparisons = Comparison::all(&found.runs, found.counting);
+    found
 }
 
 fn page(results: &[(PathBuf, Results)], folder: &Path) -> String {
@@ -119,6 +148,62 @@ fn the_page_shows_the_numbers() {
     // Curves begin at nothing and rise by one episode each: 37 of 40 solved from step 8 to 44.
     assert!(!page.contains("<script") && !page.contains("src=\"http") && !page.contains("@import"));
     assert!(!page.contains("NaN") && !page.contains("inf\""));
+}
+
+#[test]
+fn policies_are_compared_on_the_same_starts() {
+    let folder = tempfile::tempdir().expect("folder");
+    let page = page(&[(PathBuf::from("runs/all/results.json"), everything())], folder.path());
+    // 37 of 40 against 2 of 40, none solved by the floor alone: 2 × 0.5^35. 25 of 40 against 37 of 40: 25 both, 12 only
+    // the first, 0 only the other.
+    for words in [
+        "dataset protocol · counting: strict, held for 5 steps",
+        "once the goal was satisfied for 5 steps in a row",
+        "One start was solved already; it was not played and does not count",
+        "above the random floor of 5.0 % (p &lt; 0.001)",
+        "lewm-tiny \u{2212} random",
+        "pldm \u{2212} lewm-tiny",
+        "\u{2212}30.0 [\u{2212}",
+        "<td class=\"n\">25</td><td class=\"n\"><b>0</b></td><td class=\"n\"><b>12</b></td><td class=\"n\">3</td>",
+        "swm reproduce all/results.json",
+        "lewm-tiny, in distribution: cost",
+        "40 plans",
+        "solved (37)",
+        "not solved (3)",
+        "model steps of 5 environment steps",
+    ] {
+        assert!(page.contains(words), "the page lacks: {words}");
+    }
+    assert!(!page.contains("agent.color shifted: cost") && !page.contains("pldm, in distribution: cost"));
+    // The shifted run counts a start less than its floor: they did not play the same starts, and intervals decide.
+    assert!(page.contains("not told apart from the random floor of 5.0 %<"));
+}
+
+#[test]
+fn compat_counting_says_so_and_what_strict_makes_of_it() {
+    let folder = tempfile::tempdir().expect("folder");
+    let mut results = results();
+    results.counting = Counting::Compat { envs: 8 };
+    results.runs.truncate(3);
+    for run in &mut results.runs {
+        run.episodes[39].solved_at_start = true;
+        *run = Run::new(&run.condition, &run.policy, results.counting, run.episodes.clone(), Timing::default());
+    }
+    results.runs[2].strict = Some(Counting::default().rate(&results.runs[2].episodes));
+    results.comparisons = Comparison::all(&results.runs, results.counting);
+    let file = folder.path().join("results.json");
+    std::fs::write(&file, serde_json::to_string(&results).expect("JSON")).expect("file");
+    let results = read_results(&file).expect("compat results agree with themselves");
+    let page = page(&[(file, results)], &folder.path().join("report"));
+    for words in [
+        "every start counts, solved already or not (1 were)",
+        "The first to finish of 8 environments",
+        "92.5 % (37/40)",
+        "strict 94.9 %",
+        "from a start that was solved already",
+    ] {
+        assert!(page.contains(words), "the page lacks: {words}");
+    }
 }
 
 #[test]
@@ -251,7 +336,17 @@ fn results_are_read_back_and_wrong_files_say_what_is_wrong() {
     assert!(lacking.contains("another layout") && lacking.contains("success"), "{lacking}");
     let doctored = wrong(&|v| v["runs"][0]["success"]["successes"] = 39.into());
     assert!(doctored.contains("claims 39 successes in 40, its episodes show 2 in 40"), "{doctored}");
+    let doctored = wrong(&|v| v["comparisons"][1]["only_a"] = 36.into());
+    assert!(doctored.contains("its episodes do not show what it says of lewm-tiny and random"), "{doctored}");
     assert!(wrong(&|v| *v = serde_json::json!({"loss": 1})).contains("no result file"));
+
+    // What was written before countings and comparisons were is read as what it was.
+    let mut older = good.clone();
+    let fields = older.as_object_mut().expect("an object");
+    fields.remove("counting").and(fields.remove("comparisons")).expect("both were there");
+    std::fs::write(&path, older.to_string()).expect("file");
+    let older = read_results(&path).expect("readable");
+    assert_eq!((older.counting, older.runs, older.comparisons), (Counting::default(), results().runs, vec![]));
 
     std::fs::write(&path, "{\"manifest\": ").expect("file");
     assert!(read_results(&path).expect_err("torn").to_string().contains("no JSON document"));

@@ -1,0 +1,114 @@
+//! Policies against each other on the same starts: a plot of the differences, and the counts behind it.
+
+use crate::chart::{Scale, Svg};
+use crate::group::{Group, Row};
+use crate::text::{escape, p_value, points, shorten};
+use std::fmt::Write as _;
+use swm_core::results::Paired;
+
+/// Width of the plot.
+const WIDE: f64 = 920.0;
+/// Where the whiskers begin, right of the names.
+const LABELS: f64 = 270.0;
+/// Height of a row, and of a condition's name.
+const ROW: f64 = 30.0;
+
+/// Differences of success rates with their intervals, one row a pair. None where nobody played the same starts.
+pub(crate) fn plot(group: &Group<'_>) -> Option<String> {
+    let pairs = all(group);
+    let rows: usize = pairs.iter().map(|(_, pairs)| pairs.len()).sum();
+    if rows == 0 {
+        return None;
+    }
+    #[allow(clippy::cast_precision_loss)]
+    let bottom = 8.0 + (pairs.len() + rows) as f64 * ROW;
+    let right = WIDE - 250.0;
+    let ends = || pairs.iter().flat_map(|(_, pairs)| pairs).flat_map(|(_, _, t)| [t.low * 100.0, t.high * 100.0]);
+    let (low, high) = (ends().fold(0.0, f64::min), ends().fold(0.0, f64::max));
+    let (scale, ticks) = Scale::nice(low, high, LABELS, right, 6);
+    let mut svg = Svg::new(WIDE, bottom + 40.0);
+    svg.x_axis(scale, &ticks, [8.0, bottom], "");
+    svg.text("tick middle", [(LABELS + right) / 2.0, bottom + 34.0], "difference of success rates, percentage points");
+    svg.line("zero", [scale.at(0.0), 8.0], [scale.at(0.0), bottom]);
+    let mut y = 8.0;
+    for (condition, pairs) in &pairs {
+        svg.text("head", [0.0, y + 21.0], &shorten(condition, 60));
+        y += ROW;
+        for (a, b, table) in pairs {
+            let middle = y + ROW / 2.0;
+            let names = format!("{} \u{2212} {}", shorten(&a.label, 20), shorten(&b.label, 20));
+            svg.text("label end", [LABELS - 14.0, middle + 4.5], &names);
+            let [low, high, at] = [table.low, table.high, table.difference].map(|share| scale.at(share * 100.0));
+            let whisker = format!("whisker {}", a.class);
+            svg.line(&whisker, [low, middle], [high, middle]);
+            for x in [low, high] {
+                svg.line(&whisker, [x, middle - 5.0], [x, middle + 5.0]);
+            }
+            svg.dot(&format!("point {}", a.class), [at, middle], 5.5, &words(a, b, table));
+            let [low, high] = [table.low, table.high].map(points);
+            let value = format!("{} [{low}, {high}], {}", points(table.difference), p_value(table.p));
+            svg.text("value", [right + 14.0, middle + 4.5], &value);
+            y += ROW;
+        }
+    }
+    let told = pairs.iter().flat_map(|(_, pairs)| pairs).map(|(a, b, table)| words(a, b, table));
+    Some(svg.finish(&format!("Differences on the same starts: {}", told.collect::<Vec<_>>().join("; "))))
+}
+
+/// The counts behind the differences.
+pub(crate) fn table(group: &Group<'_>) -> String {
+    let mut html = "<div class=\"wide\" role=\"region\" aria-label=\"Paired comparisons\" tabindex=\"0\">\n<table>\n\
+         <caption>Starts by who solved them. Only those that one solved and the other did not tell two policies \
+         apart.</caption>\n<thead>\n<tr>\
+         <th scope=\"col\">Condition</th><th scope=\"col\">First</th><th scope=\"col\">Second</th>\
+         <th scope=\"col\" class=\"n\">Both</th><th scope=\"col\" class=\"n\">Only the first</th>\
+         <th scope=\"col\" class=\"n\">Only the second</th><th scope=\"col\" class=\"n\">Neither</th>\
+         <th scope=\"col\" class=\"n\">McNemar’s p</th></tr>\n</thead>\n"
+        .to_owned();
+    for (condition, pairs) in all(group) {
+        html.push_str("<tbody>\n");
+        for (i, (a, b, table)) in pairs.iter().enumerate() {
+            html.push_str("<tr>");
+            if i == 0 {
+                let (rows, name) = (pairs.len(), escape(condition));
+                let _ = write!(html, "<th scope=\"rowgroup\" rowspan=\"{rows}\">{name}</th>");
+            }
+            let Paired { both, only_a, only_b, neither, .. } = table;
+            let name = |row: &Row<'_>| format!("<span class=\"swatch {}\"></span>{}", row.class, escape(&row.label));
+            let p = p_value(table.p);
+            let p = p.strip_prefix("p\u{a0}=\u{a0}").unwrap_or(p.trim_start_matches("p\u{a0}"));
+            let _ = writeln!(
+                html,
+                "<th scope=\"row\">{}</th><td>{}</td><td class=\"n\">{both}</td><td class=\"n\"><b>{only_a}</b></td>\
+                 <td class=\"n\"><b>{only_b}</b></td><td class=\"n\">{neither}</td><td class=\"n\">{}</td></tr>",
+                name(a),
+                name(b),
+                escape(p)
+            );
+        }
+        html.push_str("</tbody>\n");
+    }
+    html.push_str("</table>\n</div>\n");
+    html
+}
+
+/// A condition's name and its pairs.
+type Pairs<'g, 'a> = (&'a str, Vec<(&'g Row<'a>, &'g Row<'a>, Paired)>);
+
+/// Every pair, by condition; conditions without any are left out.
+fn all<'g, 'a>(group: &'g Group<'a>) -> Vec<Pairs<'g, 'a>> {
+    let pairs = group.conditions.iter().map(|condition| (condition.name, condition.pairs(group.counting)));
+    pairs.filter(|(_, pairs)| !pairs.is_empty()).collect()
+}
+
+fn words(a: &Row<'_>, b: &Row<'_>, table: &Paired) -> String {
+    format!(
+        "{} less {}: {} points, 95 % interval {} to {}, {}",
+        a.label,
+        b.label,
+        points(table.difference),
+        points(table.low),
+        points(table.high),
+        p_value(table.p)
+    )
+}

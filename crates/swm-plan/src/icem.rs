@@ -6,6 +6,9 @@
 //! on both moments. Candidates are `[envs, samples, horizon, dim]` and clipped to the bounds. The defaults are the
 //! reference's (`solver/icem.py`); the paper names none.
 //!
+//! The colour runs along the model steps; the actions of an action block are numbers of one step, each with noise of its
+//! own, as in the reference.
+//!
 //! Of the original publication, the stable-worldmodel paper leaves out that the population shrinks from iteration to
 //! iteration, that elites outlive a replan, and that the best action ever seen is executed; so does this file.
 //!

@@ -5,12 +5,14 @@
 //! - [`starts`] and [`evaluate`]: from where to play and towards which goal, and how often it is reached.
 //! - [`request`], [`runner`] and [`reproduce`]: all that decides an evaluation as one value, running it for several
 //!   policies on the same starts, and running it again.
-//! - [`bench`](mod@bench): how fast all that is, beside the reference where it is installed.
+//! - [`bench`](mod@bench) and [`bench_plan`](mod@bench_plan): how fast all that is, beside the reference where it is
+//!   installed.
 //!
 //! An episode is decided by its own key. Neither the number of environments, nor that of threads, nor what
 //! was played before in the same slot changes a byte of it.
 
 pub mod bench;
+pub mod bench_plan;
 pub mod collect;
 pub mod evaluate;
 mod filming;
@@ -24,6 +26,7 @@ mod witness;
 pub mod world;
 
 pub use bench::{BenchConfig, BenchReport, bench_envs};
+pub use bench_plan::{PlanBenchConfig, PlanBenchReport, bench_plan, planner_overhead};
 pub use collect::{CollectConfig, Collected};
 pub use evaluate::EvalConfig;
 pub use filming::Videos;

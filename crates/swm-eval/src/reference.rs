@@ -7,8 +7,9 @@ use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use swm_core::{Error, Result};
 
 const SCRIPT: &str = include_str!("reference.py");
+const PLAN_SCRIPT: &str = include_str!("reference_plan.py");
 
-/// A Python process that holds one world of the reference.
+/// A Python process that holds one world, or one solver, of the reference.
 pub(crate) struct Reference {
     process: Child,
     ask: ChildStdin,
@@ -33,12 +34,25 @@ impl Reference {
     /// # Errors
     /// When Python cannot be started or the reference is not usable there; with its last words.
     pub fn start(python: &Path, size: Size<'_>) -> Result<Self> {
+        let numbers = [size.envs, size.image.0, size.image.1, size.episode_steps].map(|n| n.to_string());
+        Self::spawn(python, SCRIPT, &[&[size.env.to_owned()][..], &numbers].concat())
+    }
+
+    /// Starts it with a CEM solver and a model that costs nothing: environments, samples, iterations, elites, horizon,
+    /// numbers of a model step.
+    ///
+    /// # Errors
+    /// As [`Reference::start`].
+    pub fn start_solver(python: &Path, numbers: [usize; 6]) -> Result<Self> {
+        Self::spawn(python, PLAN_SCRIPT, &numbers.map(|n| n.to_string()))
+    }
+
+    fn spawn(python: &Path, script: &str, arguments: &[String]) -> Result<Self> {
         let log = tempfile::tempfile().map_err(|e| Error::io("a temporary file", "making it", e))?;
         let errors = log.try_clone().map_err(|e| Error::io("a temporary file", "sharing it", e))?;
-        let numbers = [size.envs, size.image.0, size.image.1, size.episode_steps].map(|n| n.to_string());
         let mut process = Command::new(python)
-            .args(["-u", "-c", SCRIPT, size.env])
-            .args(numbers)
+            .args(["-u", "-c", script])
+            .args(arguments)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
             .stderr(errors)
@@ -67,13 +81,18 @@ impl Reference {
         self.rate(&format!("collect\t{}\t{episodes}\t{seed}", path.display()))
     }
 
+    /// Plans for about so long: iterations of the solver a second.
+    pub fn solve(&mut self, seconds: f64) -> Result<f64> {
+        self.rate(&format!("solve\t{seconds}"))
+    }
+
     fn rate(&mut self, request: &str) -> Result<f64> {
         let lost = |error| Error::external("asking the reference", error);
         writeln!(self.ask, "{request}").and_then(|()| self.ask.flush()).map_err(lost)?;
         let words = self.answer()?;
         let numbers: Vec<f64> = words.iter().filter_map(|word| word.parse().ok()).collect();
         match numbers[..] {
-            [steps, seconds] if seconds > 0.0 => Ok(steps / seconds),
+            [count, seconds] if seconds > 0.0 => Ok(count / seconds),
             _ => Err(Error::external("asking the reference", format!("it answered {words:?}"))),
         }
     }

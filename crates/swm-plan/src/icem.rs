@@ -2,7 +2,7 @@
 //!
 //! Pinneri et al., *Sample-efficient Cross-Entropy Method for Real-time Planning* (CoRL 2020), as algorithm "Improved
 //! Cross-Entropy Method Solver" of the stable-worldmodel paper: [`Cem`](crate::Cem) with noise that is coloured along the
-//! model steps ([`Colour`]), the best elites of one iteration among the candidates of the next, and momentum
+//! model steps (`colour.rs`), the best elites of one iteration among the candidates of the next, and momentum
 //! on both moments. Candidates are `[envs, samples, horizon, dim]` and clipped to the bounds. The defaults are the
 //! reference's (`solver/icem.py`); the paper names none.
 //!

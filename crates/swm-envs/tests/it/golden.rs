@@ -44,6 +44,14 @@ impl Golden {
         array.into_vec().unwrap_or_else(|error| panic!("{name}: {error}"))
     }
 
+    /// A picture: height, width, and its RGB bytes.
+    pub fn picture(&mut self, name: &str) -> (usize, usize, Vec<u8>) {
+        let array = self.0.by_name(name).expect("a readable archive").unwrap_or_else(|| panic!("no array '{name}'"));
+        let &[height, width, 3] = array.shape() else { panic!("{name} is no RGB picture") };
+        let side = |n| usize::try_from(n).expect("a size");
+        (side(height), side(width), array.into_vec().unwrap_or_else(|error| panic!("{name}: {error}")))
+    }
+
     /// A request that pins every factor to what was recorded.
     pub fn variation(&mut self) -> VariationRequest {
         let text = self.read::<String>("variation").concat();

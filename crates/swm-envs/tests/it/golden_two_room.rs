@@ -8,10 +8,12 @@ fn close(what: &str, got: &[f64], wanted: &[f64]) {
     assert!(got.len() == wanted.len() && apart <= 1e-5, "{what}: {got:?}, not {wanted:?}");
 }
 
-fn frame(env: &mut dyn Env) -> Vec<u8> {
-    let mut rgb = vec![0; 224 * 224 * 3];
-    env.render(FrameMut::new(224, 224, &mut rgb));
-    rgb
+/// How much a frame differs from a recorded one.
+fn difference(env: &mut dyn Env, golden: &mut Golden, name: &str) -> f64 {
+    let (height, width, wanted) = golden.picture(name);
+    let mut rgb = vec![0; height * width * 3];
+    env.render(FrameMut::new(width, height, &mut rgb));
+    picture_difference(&rgb, &wanted)
 }
 
 #[test]
@@ -31,8 +33,8 @@ fn rollouts_follow_the_reference() {
         let mut env = (swm_envs::two_room::ENTRY.make)();
         env.reset(0, &options).expect("recorded values are possible");
 
-        let difference = picture_difference(&frame(&mut *env), &golden.read("frame_first"));
-        assert!(difference <= 3.0, "{name}: first frame differs by {difference}");
+        let first = difference(&mut *env, &mut golden, "frame_first");
+        assert!(first <= 3.0, "{name}: first frame differs by {first}");
 
         let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
         let mut follows = |env: &dyn Env, t: usize| {
@@ -53,7 +55,7 @@ fn rollouts_follow_the_reference() {
             assert_eq!(transition.terminated, terminations[t], "{name}, terminated {t}");
         }
 
-        let difference = picture_difference(&frame(&mut *env), &golden.read("frame_last"));
-        assert!(difference <= 3.0, "{name}: last frame differs by {difference}");
+        let last = difference(&mut *env, &mut golden, "frame_last");
+        assert!(last <= 3.0, "{name}: last frame differs by {last}");
     }
 }

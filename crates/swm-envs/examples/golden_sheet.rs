@@ -1,0 +1,182 @@
+//! Pictures of the Python reference beside ours: `docs/worlds.png`, and the table of `docs/worlds.md`.
+//!
+//!     cargo run --release -p swm-envs --example golden_sheet
+//!
+//! Reads the recorded rollouts the golden tests read (`SWM_GOLDEN`, by default `../shared/reference/golden`): for each
+//! world the first one with default factors and the first one with all of them varied.
+
+#[path = "../tests/it/golden.rs"]
+mod golden;
+
+use golden::{Golden, picture_difference};
+use std::fmt::Write as _;
+use std::fs::File;
+use std::io::Write as _;
+use std::path::Path;
+use swm_core::{Action, Env, EnvEntry, FrameMut, ResetOptions, Result, Space};
+use swm_envs::ENVS;
+
+/// Pixels of a cell, of the gap between two, and of the line of labels above a row.
+const CELL: usize = 150;
+const GAP: usize = 6;
+const LABELS: usize = 18;
+/// Golden, ours and their difference, for the first and the last frame.
+const COLUMNS: usize = 6;
+/// Differences are drawn so many times as strong.
+const STRONGER: u8 = 8;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let docs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs");
+    let mut pairs = vec![];
+    for entry in ENVS.rows {
+        for kind in ["default", "all"] {
+            let files = golden::files(&format!("{}-{kind}-", entry.id.replace('/', "_")));
+            if let Some(file) = files.first() {
+                pairs.push((format!("{} {kind}", entry.id), compare(entry, Golden::open(file))?));
+            }
+        }
+    }
+    let width = COLUMNS * (CELL + GAP) + GAP;
+    let mut sheet = Sheet { width, rgb: vec![] };
+    let mut table = String::from("| world | factors | first frame | last frame |\n| --- | --- | --- | --- |\n");
+    for (name, frames) in &pairs {
+        let differences = frames.each_ref().map(|frame| picture_difference(&frame.golden, &frame.ours));
+        sheet.row(name, frames, &differences);
+        let (id, kind) = name.split_once(' ').unwrap_or((name, ""));
+        writeln!(table, "| `{id}` | {kind} | {:.3} | {:.3} |", differences[0], differences[1])?;
+    }
+    sheet.save(&docs.join("worlds.png"))?;
+    let page = docs.join("worlds.md");
+    let text = std::fs::read_to_string(&page)?;
+    let words = text.split_once("| world |").map_or(text.as_str(), |(words, _)| words);
+    std::fs::write(&page, format!("{words}{table}"))?;
+    std::io::stdout().write_all(table.as_bytes())?;
+    Ok(())
+}
+
+/// The same frame, twice.
+struct Frames {
+    height: usize,
+    width: usize,
+    golden: Vec<u8>,
+    ours: Vec<u8>,
+}
+
+/// The first and the last frame of a rollout.
+fn compare(entry: &EnvEntry, mut golden: Golden) -> Result<[Frames; 2]> {
+    let mut env = (entry.make)();
+    env.reset(0, &start(entry, &*env, &mut golden))?;
+    let first = frames(&mut *env, &mut golden, "frame_first");
+    let n = env.spec().action_dim();
+    if let Space::Box { .. } = env.spec().action_space {
+        golden.read::<f32>("action").chunks_exact(n).try_for_each(|a| env.step(Action::Continuous(a)).map(drop))?;
+    } else {
+        golden.read::<i64>("action").chunks_exact(n).try_for_each(|a| env.step(Action::Discrete(a)).map(drop))?;
+    }
+    Ok([first, frames(&mut *env, &mut golden, "frame_last")])
+}
+
+/// How a recorded rollout began.
+fn start(entry: &EnvEntry, env: &dyn Env, golden: &mut Golden) -> ResetOptions {
+    let names = golden.names();
+    let has = |name: &&&str| names.iter().any(|known| known == **name);
+    let mut variation = golden.variation();
+    let n = env.spec().columns.iter().find(|column| column.name == "state").map_or(0, |column| column.len());
+    let mut read = |choices: &[&str]| choices.iter().find(has).map(|name| golden.read::<f64>(name)[..n].to_vec());
+    let goal_state = read(&["info.goal_state", "goal_state"]);
+    let state = match entry.id {
+        // Its factors say where everything starts; what is recorded is the state one physics step later.
+        id if id.starts_with("swm/PushT") => None,
+        // It keeps the agent's place in this factor, as it was when the factors were recorded.
+        "swm/SimplePointMaze-v0" => {
+            variation.variation_values.extend(read(&["obs"]).map(|place| ("agent.position".to_owned(), place)));
+            None
+        }
+        _ => read(&["start", "info.state"]),
+    };
+    ResetOptions { variation, state, goal_state }
+}
+
+fn frames(env: &mut dyn Env, golden: &mut Golden, name: &str) -> Frames {
+    let (height, width, golden) = golden.picture(name);
+    let mut ours = vec![0; golden.len()];
+    env.render(FrameMut::new(width, height, &mut ours));
+    Frames { height, width, golden, ours }
+}
+
+/// A white sheet that grows downwards.
+struct Sheet {
+    width: usize,
+    rgb: Vec<u8>,
+}
+
+impl Sheet {
+    /// Adds the frames of one rollout, side by side, under a line that says what they are.
+    fn row(&mut self, name: &str, frames: &[Frames; 2], differences: &[f64; 2]) {
+        let top = self.rgb.len() / 3 / self.width;
+        let height = frames.iter().map(|frame| CELL * frame.height / frame.width).max().unwrap_or(0);
+        self.rgb.resize((top + LABELS + height + GAP) * self.width * 3, 255);
+        for (i, (frame, difference)) in frames.iter().zip(differences).enumerate() {
+            let left = GAP + 3 * i * (CELL + GAP);
+            // The name takes the room of two pictures.
+            let label = if i == 0 { name.trim_start_matches("swm/") } else { "last frame" };
+            self.words(label, left, top + 5);
+            self.words(&format!("difference {difference:.3}"), left + 2 * (CELL + GAP), top + 5);
+            let apart: Vec<u8> =
+                frame.golden.iter().zip(&frame.ours).map(|(a, b)| a.abs_diff(*b).saturating_mul(STRONGER)).collect();
+            for (k, rgb) in [&frame.golden, &frame.ours, &apart].into_iter().enumerate() {
+                self.picture(frame, rgb, left + k * (CELL + GAP), top + LABELS);
+            }
+        }
+    }
+
+    /// Draws a picture, shrunk to a cell: every pixel is the mean of those it covers.
+    fn picture(&mut self, Frames { height, width, .. }: &Frames, rgb: &[u8], left: usize, top: usize) {
+        let rows = CELL * height / width;
+        for (y, x) in (0..rows).flat_map(|y| (0..CELL).map(move |x| (y, x))) {
+            let (ys, xs) = (y * height / rows..(y + 1) * height / rows, x * width / CELL..(x + 1) * width / CELL);
+            let to = ((top + y) * self.width + left + x) * 3;
+            for c in 0..3 {
+                let sum: usize =
+                    ys.clone().flat_map(|v| xs.clone().map(move |u| usize::from(rgb[(v * width + u) * 3 + c]))).sum();
+                #[allow(clippy::cast_possible_truncation)]
+                let mean = (sum / (ys.len() * xs.len()).max(1)) as u8;
+                self.rgb[to + c] = mean;
+            }
+        }
+    }
+
+    /// Writes words in letters of 3 x 5 dots, two pixels wide each.
+    fn words(&mut self, words: &str, left: usize, top: usize) {
+        for (i, letter) in words.to_uppercase().chars().enumerate() {
+            let dots = FONT.iter().find(|(known, _)| *known == letter).map_or(0, |(_, dots)| *dots);
+            for (y, x) in (0..10).flat_map(|y| (0..6).map(move |x| (y, x))) {
+                if dots >> (14 - (y / 2 * 3 + x / 2)) & 1 == 1 {
+                    let at = ((top + y) * self.width + left + 8 * i + x) * 3;
+                    self.rgb[at..at + 3].fill(0);
+                }
+            }
+        }
+    }
+
+    #[allow(clippy::cast_possible_truncation)]
+    fn save(&self, path: &Path) -> Result<(), Box<dyn std::error::Error>> {
+        let height = self.rgb.len() / 3 / self.width;
+        let mut encoder = png::Encoder::new(File::create(path)?, self.width as u32, height as u32);
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_compression(png::Compression::High);
+        encoder.write_header()?.write_image_data(&self.rgb)?;
+        Ok(())
+    }
+}
+
+/// Letters of five rows, an octal digit each.
+#[rustfmt::skip]
+const FONT: &[(char, u16)] = &[
+    ('A', 0o25755), ('B', 0o65656), ('C', 0o34443), ('D', 0o65556), ('E', 0o74647), ('F', 0o74644), ('G', 0o34553),
+    ('H', 0o55755), ('I', 0o72227), ('J', 0o11152), ('K', 0o55655), ('L', 0o44447), ('M', 0o57755), ('N', 0o65555),
+    ('O', 0o25552), ('P', 0o65644), ('Q', 0o25563), ('R', 0o65655), ('S', 0o34216), ('T', 0o72222), ('U', 0o55557),
+    ('V', 0o55552), ('W', 0o55775), ('X', 0o55255), ('Y', 0o55222), ('Z', 0o71247), ('0', 0o75557), ('1', 0o26227),
+    ('2', 0o61247), ('3', 0o61216), ('4', 0o55711), ('5', 0o74616), ('6', 0o34757), ('7', 0o71222), ('8', 0o75757),
+    ('9', 0o75716), ('-', 0o00700), ('.', 0o00002), (',', 0o00024), (':', 0o02020), ('/', 0o11244),
+];

@@ -17,6 +17,9 @@ pub struct EnvSpec {
     pub action_space: Space,
     /// The columns [`Env::observe`] writes, in order; `state` is always among them.
     pub columns: Vec<ColumnSpec>,
+    /// What an agent observes: columns, and between which bounds they usually lie. Worlds may leave them, as the
+    /// reference's do. A single one is the observation itself.
+    pub observation_space: Vec<(&'static str, Space)>,
     /// Its factors of variation.
     pub variation_space: VariationSpace,
     /// Steps after which an episode is truncated, unless the caller says otherwise.
@@ -114,7 +117,8 @@ impl<'a> Action<'a> {
 pub struct Transition {
     /// The reward.
     pub reward: f64,
-    /// The episode is over because of where the world is: the goal is reached.
+    /// The episode is over because of where the world is: the goal is reached, or cannot be any more. Which of the two,
+    /// [`Env::is_success`] says.
     pub terminated: bool,
     /// The episode is over because of the clock.
     pub truncated: bool,

@@ -39,6 +39,13 @@ pub struct Classic<W: World> {
     current: bool,
 }
 
+/// The bounds of a `state` column, in single precision as the reference has them.
+#[allow(clippy::cast_possible_truncation)]
+fn observed<W: World>() -> Space {
+    let (low, high) = W::OBSERVED.iter().map(|&(low, high)| (f64::from(low as f32), f64::from(high as f32))).unzip();
+    Space::Box { shape: vec![W::OBSERVED.len()], dtype: DType::Float32, low, high }
+}
+
 impl<W: World> Classic<W> {
     /// The world with every factor at its default.
     pub fn new() -> Self {
@@ -46,10 +53,11 @@ impl<W: World> Classic<W> {
             id: W::ID,
             action_space: W::action_space(),
             columns: vec![
-                ColumnSpec::new("state", DType::Float32, [W::OBSERVED]),
-                ColumnSpec::new("goal_state", DType::Float32, [W::OBSERVED]),
+                ColumnSpec::new("state", DType::Float32, [W::OBSERVED.len()]),
+                ColumnSpec::new("goal_state", DType::Float32, [W::OBSERVED.len()]),
                 ColumnSpec::new("physics", DType::Float32, [W::PHYSICS.len()]),
             ],
+            observation_space: vec![("state", observed::<W>())],
             variation_space: factors::space::<W>(),
             max_episode_steps: W::LIMIT,
         };
@@ -108,8 +116,8 @@ impl<W: World> Classic<W> {
     /// A goal as everybody else sees it: through the `goal_state` column.
     fn seen(&self, state: &W::State) -> Result<W::State> {
         let mut row = [0.0; MAX_OBSERVED];
-        W::observe(state, &mut row[..W::OBSERVED]);
-        W::parse("a sampled goal", &row.map(f64::from)[..W::OBSERVED])
+        W::observe(state, &mut row[..W::OBSERVED.len()]);
+        W::parse("a sampled goal", &row.map(f64::from)[..W::OBSERVED.len()])
     }
 }
 

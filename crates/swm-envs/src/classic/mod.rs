@@ -27,8 +27,8 @@ trait World: Send + Sized + 'static {
     const ID: &'static str;
     /// Steps after which an episode is truncated.
     const LIMIT: usize;
-    /// Numbers of the `state` column.
-    const OBSERVED: usize;
+    /// Bounds of the numbers of the `state` column.
+    const OBSERVED: &'static [(f64, f64)];
     /// Width and height the reference draws it at.
     const SIZE: (usize, usize);
     /// The factors `physics.*`, in sampling order.

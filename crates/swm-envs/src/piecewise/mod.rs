@@ -99,6 +99,7 @@ fn spec() -> EnvSpec {
             ColumnSpec::new("observation", DType::Float32, [4]),
             ColumnSpec::new("dynamics", DType::Float32, [Dynamics::LEN]),
         ],
+        observation_space: vec![("observation", Space::uniform_box([4], DType::Float32, 0.0, SIZE))],
         variation_space: variation_space(),
         max_episode_steps: 100,
     }

@@ -109,6 +109,7 @@ fn spec() -> EnvSpec {
             ColumnSpec::new("observation", DType::Float32, [2]),
             ColumnSpec::new("layout", DType::Float32, [Layout::LEN]),
         ],
+        observation_space: vec![("observation", Space::uniform_box([2], DType::Float32, 0.0, 5.0))],
         variation_space: variation_space(),
         max_episode_steps: 100,
     }

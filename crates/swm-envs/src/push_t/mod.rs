@@ -95,7 +95,15 @@ impl PushT {
         let goal = start_of(&factors);
         let world = settle(world_of(&factors), &goal);
         let goal_scene = Scene::of(&world);
-        let spec = EnvSpec { id, action_space, columns: columns(), variation_space, max_episode_steps: 200 };
+        let observation_space = observation_space();
+        let spec = EnvSpec {
+            id,
+            action_space,
+            columns: columns(),
+            observation_space,
+            variation_space,
+            max_episode_steps: 200,
+        };
         let (renderer, shapes) = (Renderer::new(&factors), shapes_of(&factors));
         Self { spec, factors, world, goal, goal_scene, contacts: 0, shapes, renderer }
     }
@@ -114,6 +122,21 @@ impl PushT {
         self.shapes = shapes_of(&factors);
         self.factors = factors;
     }
+}
+
+/// The reference's bounds; agents may go beyond them, as there.
+fn observation_space() -> Vec<(&'static str, Space)> {
+    let (side, speed) = (512.0, 512.0);
+    let space = |low: &[f64], high: &[f64]| Space::Box {
+        shape: vec![low.len()],
+        dtype: DType::Float64,
+        low: low.to_vec(),
+        high: high.to_vec(),
+    };
+    vec![
+        ("proprio", space(&[0.0, 0.0, -speed, -speed], &[side, side, speed, speed])),
+        ("state", space(&[0.0, 0.0, 0.0, 0.0, 0.0, -speed, -speed], &[side, side, side, side, TAU, speed, speed])),
+    ]
 }
 
 impl Default for PushT {

@@ -111,6 +111,7 @@ fn spec() -> EnvSpec {
             ColumnSpec::new("observation", DType::Float32, [4 + 2 * MAX_DOORS]),
             ColumnSpec::new("layout", DType::Float32, [Layout::LEN]),
         ],
+        observation_space: vec![("observation", Space::uniform_box([4 + 2 * MAX_DOORS], DType::Float32, 0.0, SIZE))],
         variation_space: variation_space(),
         max_episode_steps: 100,
     }

@@ -42,6 +42,7 @@ impl Line {
                 ColumnSpec::new("goal_state", DType::Float64, [1]),
                 ColumnSpec::new("noise", DType::Float32, []),
             ],
+            observation_space: vec![],
             variation_space,
             max_episode_steps: 12,
         };

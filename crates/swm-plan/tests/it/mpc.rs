@@ -66,7 +66,8 @@ fn spec(high: f64) -> EnvSpec {
         id: "test/Line-v0",
         action_space: Space::uniform_box([1], DType::Float32, -high, high),
         columns: vec![],
-        variation_space: VariationSpace::new(vec![], &[]),
+        observation_space: vec![],
+            variation_space: VariationSpace::new(vec![], &[]),
         max_episode_steps: 100,
     }
 }

@@ -77,6 +77,7 @@ fn describe(row: &EnvEntry) -> Value {
     json!({
         "summary": row.summary,
         "action_space": space(&spec.action_space),
+        "observation_space": observation(spec),
         "info": info,
         "variation": variation(&spec.variation_space),
         "sampling_order": sampling_order(&spec.variation_space),
@@ -84,6 +85,18 @@ fn describe(row: &EnvEntry) -> Value {
         "max_episode_steps": spec.max_episode_steps,
         "experts": row.experts.iter().map(|e| json!({"id": e.id, "summary": e.summary})).collect::<Vec<_>>(),
     })
+}
+
+/// What an agent observes: a space, or several by name.
+fn observation(spec: &EnvSpec) -> Value {
+    match &spec.observation_space[..] {
+        [(_, one)] => space(one),
+        several => {
+            let spaces: Map<String, Value> =
+                several.iter().map(|(name, one)| ((*name).to_owned(), space(one))).collect();
+            json!({"type": "Dict", "spaces": spaces})
+        }
+    }
 }
 
 /// Every factor by its key.

@@ -3,7 +3,7 @@
 use crate::{Swm, text};
 use serde_json::Value;
 
-/// Facts of the reference's two environments, cut from `reference/envs.json`.
+/// Facts of the reference's environments in two dimensions, cut from `reference/envs.json`; no bound is null.
 const REFERENCE: &str = include_str!("reference_envs.json");
 
 #[test]
@@ -13,6 +13,7 @@ fn environments_declare_the_factors_of_the_reference() {
     for (id, wanted) in theirs.as_object().expect("an object") {
         let found = &ours[id];
         assert_eq!(found["action_space"], wanted["action_space"], "{id}");
+        assert!(same(&found["observation_space"], &wanted["observation_space"]), "{id}");
         assert_eq!(found["sampling_order"], wanted["sampling_order"], "{id}");
         assert_eq!(found["default_variations"], wanted["default_variations"], "{id}");
         let names = |value: &Value| -> Vec<String> {
@@ -32,6 +33,9 @@ fn environments_declare_the_factors_of_the_reference() {
 fn same(a: &Value, b: &Value) -> bool {
     match (a, b) {
         (Value::Array(a), Value::Array(b)) => a.len() == b.len() && a.iter().zip(b).all(|(a, b)| same(a, b)),
+        (Value::Object(a), Value::Object(b)) => {
+            a.len() == b.len() && a.iter().all(|(key, a)| b.get(key).is_some_and(|b| same(a, b)))
+        }
         (Value::Number(a), Value::Number(b)) => a.as_f64() == b.as_f64(),
         (a, b) => a == b,
     }

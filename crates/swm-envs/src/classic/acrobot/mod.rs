@@ -33,7 +33,8 @@ const NEAR: f64 = 0.2;
 impl World for Acrobot {
     const ID: &'static str = "swm/AcrobotControl-v1";
     const LIMIT: usize = 500;
-    const OBSERVED: usize = 6;
+    const OBSERVED: &'static [(f64, f64)] =
+        &[(-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0), (-4.0 * PI, 4.0 * PI), (-9.0 * PI, 9.0 * PI)];
     const SIZE: (usize, usize) = render::SIZE;
     const PHYSICS: &'static [Parameter] = &[
         Parameter("link_com_pos_1", [0.25, 0.75], 0.5),

@@ -30,13 +30,16 @@ const START: f64 = 0.05;
 const GOAL: [f64; 2] = [0.5, 1.5];
 /// How near to the goal the cart, in metres, and the pole, in radians, must be.
 const NEAR: [f64; 2] = [0.1, 0.1];
+/// Twice the tilt at which an episode ends, in radians: what the reference names as the bound of an observation.
+const TILT: f64 = 24.0 * std::f64::consts::PI / 180.0;
 /// States asked for are bounded by this: far beyond what anyone can make of an episode.
 const FAR: f64 = 1000.0;
 
 impl World for CartPole {
     const ID: &'static str = "swm/CartPoleControl-v1";
     const LIMIT: usize = 500;
-    const OBSERVED: usize = 4;
+    const OBSERVED: &'static [(f64, f64)] =
+        &[(-4.8, 4.8), (f64::NEG_INFINITY, f64::INFINITY), (-TILT, TILT), (f64::NEG_INFINITY, f64::INFINITY)];
     const SIZE: (usize, usize) = render::SIZE;
     const PHYSICS: &'static [Parameter] = &[
         Parameter("force_mag", [5.0, 15.0], 10.0),
@@ -84,7 +87,7 @@ impl World for CartPole {
     }
 
     fn states() -> Space {
-        Space::uniform_box([Self::OBSERVED], DType::Float64, -FAR, FAR)
+        Space::uniform_box([Self::OBSERVED.len()], DType::Float64, -FAR, FAR)
     }
 
     fn shown(observed: &[f64]) -> Self::State {

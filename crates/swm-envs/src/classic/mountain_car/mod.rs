@@ -146,7 +146,7 @@ impl<V: Variant> MountainCar<V> {
 impl<V: Variant> World for MountainCar<V> {
     const ID: &'static str = V::ID;
     const LIMIT: usize = V::LIMIT;
-    const OBSERVED: usize = 2;
+    const OBSERVED: &'static [(f64, f64)] = &[(-1.2, 0.6), (-0.07, 0.07)];
     const SIZE: (usize, usize) = render::SIZE;
     const PHYSICS: &'static [Parameter] = V::PHYSICS;
     const VISUALS: &'static [Paint] = &[Paint("bg", [0.6, 1.0], [255; 3]), Paint("fg", [0.0, 0.4], render::INK)];

@@ -35,7 +35,7 @@ const NEAR: [f64; 2] = [0.2, 1.0];
 impl World for Pendulum {
     const ID: &'static str = "swm/PendulumControl-v1";
     const LIMIT: usize = 200;
-    const OBSERVED: usize = 3;
+    const OBSERVED: &'static [(f64, f64)] = &[(-1.0, 1.0), (-1.0, 1.0), (-8.0, 8.0)];
     const SIZE: (usize, usize) = render::SIZE;
     const PHYSICS: &'static [Parameter] = &[
         Parameter("dt", [0.025, 0.1], 0.05),

@@ -5,6 +5,7 @@
 //! - [`starts`] and [`evaluate`]: from where to play and towards which goal, and how often it is reached.
 //! - [`request`], [`runner`] and [`reproduce`]: all that decides an evaluation as one value, running it for several
 //!   policies on the same starts, and running it again.
+//! - [`prediction`]: how well a model predicts what was recorded, beside whether its plans succeeded.
 //! - [`bench`](mod@bench) and [`bench_plan`](mod@bench_plan): how fast all that is, beside the reference where it is
 //!   installed.
 //!
@@ -17,6 +18,7 @@ pub mod collect;
 pub mod evaluate;
 mod filming;
 mod judge;
+pub mod prediction;
 mod reference;
 pub mod reproduce;
 pub mod request;
@@ -30,6 +32,7 @@ pub use bench_plan::{PlanBenchConfig, PlanBenchReport, bench_plan, planner_overh
 pub use collect::{CollectConfig, Collected};
 pub use evaluate::EvalConfig;
 pub use filming::Videos;
+pub use prediction::Predictor;
 pub use reproduce::{Difference, Reproduction, reproduce};
 pub use request::{Acts, Choice, Condition, EvalRequest, HeldOut, Model, PolicyRequest, StartsRequest};
 pub use runner::{Actor, Means, Moment, Resolver};

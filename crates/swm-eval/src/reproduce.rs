@@ -1,6 +1,7 @@
 //! Running an evaluation again from its results, and saying exactly what differs.
 
 use crate::World;
+use crate::prediction::Predictor;
 use crate::request::{EvalRequest, PolicyRequest};
 use crate::runner::{Actor, Means, Moment, Resolver};
 use serde::Serialize;
@@ -113,6 +114,10 @@ impl Resolver for Checked<'_> {
         }
         Ok(actor)
     }
+
+    fn predictor(&self, request: &PolicyRequest) -> Result<Option<Box<dyn Predictor>>> {
+        self.resolver.predictor(request)
+    }
 }
 
 /// What differs between two results, times and videos aside.
@@ -171,7 +176,7 @@ fn outcomes(results: &Results) -> BTreeMap<(String, usize), String> {
 
 /// What a run says beyond its episodes and what follows from them. How searches went is told only where it was traced.
 fn rest(results: &Results) -> BTreeMap<String, String> {
-    results.runs.iter().map(|run| (name(run), json(&(run.success, run.strict)))).collect()
+    results.runs.iter().map(|run| (name(run), json(&(run.success, run.strict, &run.prediction)))).collect()
 }
 
 fn json(value: &impl Serialize) -> String {

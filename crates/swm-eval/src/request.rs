@@ -38,6 +38,10 @@ pub struct EvalRequest {
     pub counting: Counting,
     /// What is varied, one evaluation each.
     pub conditions: Vec<Condition>,
+    /// How many model steps far the models' predictions are compared with the recorded trajectories that the starts were
+    /// taken from, if they are.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub prediction: Option<usize>,
 }
 
 /// A named thing with settings: a solver, a wrapper.
@@ -181,10 +185,17 @@ impl EvalRequest {
     /// Checks what can be checked before anything is opened.
     ///
     /// # Errors
-    /// When there is no condition, or two policies or conditions share a name.
+    /// When there is no condition, two policies or conditions share a name, or predictions are to be compared with nothing.
     pub fn check(&self) -> Result<()> {
         if self.conditions.is_empty() {
             return Err(Error::config("conditions of an evaluation", "there is none", "name at least one"));
+        }
+        if self.prediction.is_some() && self.starts == StartsRequest::Episodic {
+            return Err(Error::config(
+                "prediction errors",
+                "they are those of recorded trajectories, and the environment draws the starts",
+                "take starts from a dataset",
+            ));
         }
         unique("policy", self.policies.iter().map(|policy| policy.name.as_str()))?;
         unique("condition", self.conditions.iter().map(|condition| condition.name.as_str()))

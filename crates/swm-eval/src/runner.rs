@@ -1,5 +1,6 @@
 //! Running an [`EvalRequest`]: every policy, the random floor first, on the same starts, condition by condition.
 
+use crate::prediction::{Predictor, predict_run};
 use crate::request::{Acts, EvalRequest, HeldOut, PolicyRequest, StartsRequest};
 use crate::witness::Witness;
 use crate::{Control, EvalConfig, Progress, Starts, Videos, World, WorldConfig};
@@ -33,6 +34,14 @@ pub trait Resolver {
     /// # Errors
     /// When what it names is not there or does not fit the world.
     fn policy(&self, request: &PolicyRequest, world: &World) -> Result<Actor>;
+
+    /// The model of a policy, to look at its predictions; none where it has no model or shows none.
+    ///
+    /// # Errors
+    /// As [`Resolver::policy`].
+    fn predictor(&self, _request: &PolicyRequest) -> Result<Option<Box<dyn Predictor>>> {
+        Ok(None)
+    }
 }
 
 /// A policy, and where it came from.
@@ -140,6 +149,12 @@ impl EvalRequest {
                 let mut control = Control { stop: means.stop.clone(), progress: Some(progress) };
                 let mut run = world.evaluate(&mut *actor.policy, &starts, &config, &mut control)?;
                 drop(control);
+                if let Some((horizon, reader)) = request.prediction.zip(dataset.as_deref())
+                    && let Some(mut predictor) = resolver.predictor(policy)?
+                {
+                    let threads = world.pool().threads();
+                    run.prediction = Some(threads.install(|| predict_run(&mut *predictor, reader, &run, horizon))?);
+                }
                 run.searches = actor.searches.as_mut().and_then(|traces| Searches::of(&traces()));
                 watch(Moment::Ends(&run));
                 runs.push(run);

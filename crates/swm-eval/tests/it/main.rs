@@ -7,4 +7,5 @@ mod evaluating;
 mod lance;
 mod line;
 mod memory;
+mod predicting;
 mod requesting;

@@ -3,6 +3,7 @@
 use crate::evaluating::recorded;
 use crate::line::{Line, Walker};
 use crate::memory::MemoryReader;
+use crate::predicting::Drifting;
 use serde_json::json;
 use std::sync::Arc;
 use swm_core::results::{Counting, Run};
@@ -10,8 +11,8 @@ use swm_core::{Env, Error, Policy, Result, Results, VariationRequest};
 use swm_data::{Part, Reader, Split};
 use swm_eval::reproduce::{Kind, differences};
 use swm_eval::{
-    Actor, Acts, Condition, EvalRequest, HeldOut, Means, Moment, PolicyRequest, Resolver, StartsRequest, World,
-    reproduce,
+    Actor, Acts, Condition, EvalRequest, HeldOut, Means, Moment, PolicyRequest, Predictor, Resolver, StartsRequest,
+    World, reproduce,
 };
 
 /// Knows the line, one dataset, and a walker with weights.
@@ -42,6 +43,11 @@ impl Resolver for Known {
         let walker: Box<dyn Policy> = Box::new(Walker);
         Ok(Actor { weights: Some(self.weights.clone()), ..Actor::from(walker) })
     }
+
+    fn predictor(&self, request: &PolicyRequest) -> Result<Option<Box<dyn Predictor>>> {
+        let shows = request.acts != Acts::Random;
+        Ok(shows.then(|| Box::new(Drifting { drift: 0.1 }) as Box<dyn Predictor>))
+    }
 }
 
 fn request() -> EvalRequest {
@@ -67,12 +73,13 @@ fn request() -> EvalRequest {
                 },
             },
         ],
+        prediction: None,
     }
 }
 
 fn held_out(part: Part) -> StartsRequest {
     let held_out = Some(HeldOut { part, split: Split { validation: 0.3, test: 0.3, seed: 1 } });
-    StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 3, held_out }
+    StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 4, held_out }
 }
 
 fn run(request: &EvalRequest, envs: usize, threads: usize) -> Results {
@@ -177,6 +184,25 @@ fn results_can_be_made_again() {
         assert_eq!(second.differences, []);
         assert!(second.holds());
     }
+}
+
+#[test]
+fn predictions_are_told_apart_by_what_came_of_the_start() {
+    let asked = EvalRequest { starts: held_out(Part::Train), prediction: Some(2), budget: Some(4), ..request() };
+    let found = run(&asked, 4, 1);
+    assert_eq!((&found.runs[0].prediction, &found.runs[2].prediction), (&None, &None), "the floor has no model");
+    for run in [&found.runs[1], &found.runs[3]] {
+        let prediction = run.prediction.as_ref().expect("asked for");
+        for (trajectory, episode) in prediction.trajectories.iter().zip(&run.episodes) {
+            assert_eq!(Some(trajectory.start), episode.start);
+            assert_eq!(trajectory.success, (!episode.solved_at_start).then_some(episode.success));
+        }
+        let told: usize = prediction.groups[1..].iter().map(|group| group.trajectory.n).sum();
+        assert_eq!((prediction.groups[0].trajectory.n, told), (24, run.success.n));
+    }
+    assert_eq!(again(&filed(&found), &Known::new()).expect("again").differences, []);
+    let error = EvalRequest { prediction: Some(2), ..request() }.run(&Known::new(), &Means::default(), &mut |_| {});
+    assert!(error.expect_err("nothing recorded").to_string().contains("take starts from a dataset"));
 }
 
 #[test]

@@ -1,0 +1,156 @@
+//! Prediction errors of a model whose error can be written down: it knows the line and drifts off it.
+
+use crate::evaluating::recorded;
+use crate::memory::MemoryReader;
+use swm_core::results::Prediction;
+use swm_core::{Batch, Error, Result};
+use swm_data::{Reader as _, StepRange};
+use swm_eval::Starts;
+use swm_eval::prediction::{Predictor, predict, predict_recorded};
+
+/// Latents are `(x, 7)`. It moves as the line does, and is `drift` further off after every model step.
+pub struct Drifting {
+    pub drift: f32,
+}
+
+impl Predictor for Drifting {
+    fn frameskip(&self) -> usize {
+        2
+    }
+
+    fn columns(&self) -> Vec<String> {
+        vec!["state".to_owned()]
+    }
+
+    fn latent_dim(&self) -> usize {
+        2
+    }
+
+    fn encode(&mut self, rows: &Batch, latents: &mut [f32]) -> Result<()> {
+        for (latent, &x) in latents.chunks_exact_mut(2).zip(rows.get::<f64>("state")?) {
+            latent.copy_from_slice(&[x as f32, 7.0]);
+        }
+        Ok(())
+    }
+
+    fn rollout(&mut self, start: &[f32], actions: &[f32], horizon: usize, latents: &mut [f32]) -> Result<()> {
+        for (i, trajectory) in latents.chunks_exact_mut(2 * horizon).enumerate() {
+            let mut x = start[2 * i];
+            for (k, latent) in trajectory.chunks_exact_mut(2).enumerate() {
+                for push in &actions[2 * (i * horizon + k)..][..2] {
+                    x = (x + push.clamp(-1.0, 1.0)).clamp(-5.0, 5.0);
+                }
+                latent.copy_from_slice(&[x + self.drift * (k + 1) as f32, 7.0]);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Where the line is after `k` model steps from every pick, and the variance of that.
+fn seen(reader: &MemoryReader, picks: &[[usize; 2]], horizon: usize) -> (Vec<f64>, f64) {
+    let ranges: Vec<StepRange> = picks
+        .iter()
+        .flat_map(|&[episode, start]| (1..=horizon).map(move |k| StepRange::new(episode, start + 2 * k, 1)))
+        .collect();
+    let rows = reader.read(&["state"], &ranges).expect("rows");
+    let x = rows.get::<f64>("state").expect("states").to_vec();
+    let mean = x.iter().sum::<f64>() / x.len() as f64;
+    let variance = x.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / x.len() as f64;
+    (x, variance)
+}
+
+#[test]
+fn errors_are_what_they_are_known_to_be() {
+    let reader = recorded(40);
+    let picks = Starts::choose(&reader, 50, 6, 2).expect("picks");
+    let (_, variance) = seen(&reader, &picks, 3);
+    let found = predict(&mut Drifting { drift: 0.5 }, &reader, &picks, 3, |i| Some(i % 3 == 0)).expect("errors");
+    // One of two numbers is off by 0.5 k; the other one is constant.
+    assert!((found.variance - variance / 2.0).abs() < 1e-5 * variance, "{} {variance}", found.variance);
+    for (trajectory, pick) in found.trajectories.iter().zip(&picks) {
+        assert_eq!(trajectory.start, *pick);
+        for (k, error) in trajectory.errors.iter().enumerate() {
+            let known = (0.5 * (k + 1) as f64).powi(2) / variance;
+            assert!((error - known).abs() < 1e-5 * known, "step {k}: {error}, not {known}");
+        }
+    }
+    let sizes: Vec<(Option<bool>, usize)> = found.groups.iter().map(|g| (g.success, g.trajectory.n)).collect();
+    assert_eq!(sizes, [(None, 50), (Some(true), 17), (Some(false), 33)]);
+    let exact = predict(&mut Drifting { drift: 0.0 }, &reader, &picks, 3, |_| None).expect("errors");
+    assert!(exact.groups[0].trajectory.p95 < 1e-12, "{:?}", exact.groups[0]);
+    assert_eq!(exact.groups.len(), 1, "nothing is known of their success");
+}
+
+/// Always predicts the same.
+struct Constant(f32);
+
+impl Predictor for Constant {
+    fn frameskip(&self) -> usize {
+        2
+    }
+
+    fn columns(&self) -> Vec<String> {
+        Drifting { drift: 0.0 }.columns()
+    }
+
+    fn latent_dim(&self) -> usize {
+        2
+    }
+
+    fn encode(&mut self, rows: &Batch, latents: &mut [f32]) -> Result<()> {
+        Drifting { drift: 0.0 }.encode(rows, latents)
+    }
+
+    fn rollout(&mut self, _: &[f32], _: &[f32], _: usize, latents: &mut [f32]) -> Result<()> {
+        latents.chunks_exact_mut(2).for_each(|latent| latent.copy_from_slice(&[self.0, 7.0]));
+        Ok(())
+    }
+}
+
+#[test]
+fn predicting_the_mean_has_an_error_of_one() {
+    let reader = recorded(40);
+    let picks = Starts::choose(&reader, 33, 4, 0).expect("picks");
+    let (x, _) = seen(&reader, &picks, 2);
+    let mean = x.iter().sum::<f64>() / x.len() as f64;
+    let found = predict(&mut Constant(mean as f32), &reader, &picks, 2, |_| None).expect("errors");
+    assert!((found.groups[0].trajectory.mean - 1.0).abs() < 1e-6, "{:?}", found.groups[0]);
+}
+
+#[test]
+fn recorded_success_tells_trajectories_apart() {
+    let reader = recorded(60);
+    let episodes: Vec<usize> = (10..60).collect();
+    let look = || -> Prediction {
+        predict_recorded(&mut Drifting { drift: 0.1 }, &reader, &episodes, 40, 2, 9).expect("errors")
+    };
+    let found = look();
+    assert_eq!(found, look(), "decided by the seed");
+    let ends_well = |episode: usize| {
+        let length = reader.episodes()[episode].length;
+        let rows = reader.read(&["success"], &[StepRange::new(episode, 0, length)]).expect("rows");
+        rows.bytes(0).contains(&1)
+    };
+    for trajectory in &found.trajectories {
+        assert!(trajectory.start[0] >= 10, "of the chosen episodes");
+        assert_eq!(trajectory.success, Some(ends_well(trajectory.start[0])));
+    }
+    assert_eq!(found.groups.len(), 3, "some reached their goal and some did not");
+}
+
+#[test]
+fn what_cannot_be_predicted_is_refused_in_words() {
+    let reader = recorded(10);
+    let refused = |drift: f32, picks: &[[usize; 2]], horizon| -> Error {
+        predict(&mut Drifting { drift }, &reader, picks, horizon, |_| None).expect_err("refused")
+    };
+    let [none, far] = [refused(0.0, &[], 2), refused(0.0, &[[3, 4]], 50)].map(|error| error.to_string());
+    assert!(none.contains("0 trajectories of 2 model steps"), "{none}");
+    assert!(far.contains("50 model steps of 2 from step 4 of episode 3") && far.contains("more than 104"), "{far}");
+    let picks = Starts::choose(&reader, 5, 4, 0).expect("picks");
+    let error = refused(f32::NAN, &picks, 2).to_string();
+    assert!(error.contains(&format!("model step 1 from step {} of episode {}", picks[0][1], picks[0][0])), "{error}");
+    let error = refused(0.0, &picks[..1], 1).to_string();
+    assert!(error.contains("collapsed"), "one observation alone has no variance: {error}");
+}

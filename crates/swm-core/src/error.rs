@@ -169,7 +169,9 @@ pub fn nearest<'a>(given: &str, known: impl IntoIterator<Item = &'a str>) -> Vec
             // A part of a name is nearer the more of the name it covers.
             #[allow(clippy::cast_precision_loss)]
             let bonus = if contains { 0.15 * short as f64 / long as f64 } else { 0.0 };
-            (strsim::jaro_winkler(&wanted, &folded) + bonus, name)
+            // Two letters swapped, or one wrong, say little about a name of three to the other measure.
+            let slip = if strsim::osa_distance(&wanted, &folded) == 1 { 0.9 } else { 0.0 };
+            ((strsim::jaro_winkler(&wanted, &folded) + bonus).max(slip), name)
         })
         .filter(|(score, _)| *score > 0.75)
         .collect();

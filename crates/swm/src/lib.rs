@@ -13,6 +13,7 @@ pub use swm_plan as plan;
 pub use swm_report as report;
 
 pub mod home;
+pub mod predictor;
 pub mod resolver;
 
 /// Every environment of this build.

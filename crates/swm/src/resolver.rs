@@ -1,6 +1,7 @@
 //! [`Home`]: what the names in an evaluation's request stand for: environments, wrappers and solvers of this build,
 //! datasets and checkpoints at home.
 
+use crate::predictor::LewmPredictor;
 use crate::{ENVS, home};
 use std::cell::RefCell;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -8,7 +9,7 @@ use swm_core::policy::ExpertPolicy;
 use swm_core::{CostModel, Env, EnvEntry, Error, Named as _, Policy, RandomPolicy, Result};
 use swm_data::Reader;
 use swm_envs::wrappers::{GoalPicture, Stack, WRAPPERS};
-use swm_eval::{Actor, Acts, Choice, EvalRequest, Model, PolicyRequest, Resolver, World};
+use swm_eval::{Actor, Acts, Choice, EvalRequest, Model, PolicyRequest, Predictor, Resolver, World};
 use swm_models::inverse::{InverseCheckpoint, InversePolicy};
 use swm_models::lewm::LewmCost;
 use swm_models::{Checkpoint, Device};
@@ -18,10 +19,19 @@ use swm_plan::{ActionScale, MpcConfig, MpcPolicy, PlanRecord, SOLVERS, Score, Si
 /// Knows what is built in and what is at home.
 #[derive(Default)]
 pub struct Home {
-    /// The wrappers last asked for, made once: what they read from files is shared by all environments.
-    stack: RefCell<Option<(Vec<Choice>, Arc<Stack>)>>,
+    /// The wrappers last asked for, made once: what they read from files is shared by all environments, a simulator's
+    /// included.
+    stack: RefCell<Option<Wrapping>>,
     /// Every plan, with the name of the policy that made it; none where nobody asked for traces.
     traces: Option<Traces>,
+}
+
+/// Wrappers, and what they do to the picture of the goal.
+#[derive(Clone)]
+struct Wrapping {
+    choices: Vec<Choice>,
+    stack: Arc<Stack>,
+    goal: GoalPicture,
 }
 
 /// Plans and who made them.
@@ -39,23 +49,22 @@ impl Home {
         std::mem::take(&mut *traces.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
-    fn stack(&self, wrappers: &[Choice]) -> Result<Arc<Stack>> {
-        if let Some((known, stack)) = &*self.stack.borrow()
-            && known == wrappers
+    fn wrapping(&self, request: &EvalRequest) -> Result<Wrapping> {
+        let goal = if request.wrap_goal { GoalPicture::Wrapped } else { GoalPicture::Clean };
+        if let Some(known) = &*self.stack.borrow()
+            && known.choices == request.wrappers
+            && known.goal == goal
         {
-            return Ok(Arc::clone(stack));
+            return Ok(known.clone());
         }
-        let made: Result<Vec<_>> = wrappers
-            .iter()
-            .map(|choice| {
-                let entry = WRAPPERS.get(&choice.id)?;
-                let settings = choice.settings.as_object().cloned().unwrap_or_default();
-                entry.make(&settings.into_iter().collect())
-            })
-            .collect();
-        let stack = Arc::new(Stack::new(made?));
-        *self.stack.borrow_mut() = Some((wrappers.to_vec(), Arc::clone(&stack)));
-        Ok(stack)
+        let made = request.wrappers.iter().map(|choice| {
+            let settings = choice.settings.as_object().cloned().unwrap_or_default();
+            WRAPPERS.get(&choice.id)?.make(&settings.into_iter().collect())
+        });
+        let stack = Arc::new(Stack::new(made.collect::<Result<_>>()?));
+        let wrapping = Wrapping { choices: request.wrappers.clone(), stack, goal };
+        *self.stack.borrow_mut() = Some(wrapping.clone());
+        Ok(wrapping)
     }
 
     /// A policy that plans; its plans are traced where that was asked for.
@@ -76,9 +85,8 @@ impl Home {
 
 impl Resolver for Home {
     fn env(&self, request: &EvalRequest) -> Result<Box<dyn Env>> {
-        let env = (ENVS.get(&request.env)?.make)();
-        let goal = if request.wrap_goal { GoalPicture::Wrapped } else { GoalPicture::Clean };
-        Ok(self.stack(&request.wrappers)?.wrap(env, goal))
+        let (entry, wrapping) = (ENVS.get(&request.env)?, self.wrapping(request)?);
+        Ok(wrapping.stack.wrap((entry.make)(), wrapping.goal))
     }
 
     fn dataset(&self, name: &str) -> Result<Arc<dyn Reader>> {
@@ -113,7 +121,12 @@ impl Resolver for Home {
                     Model::Simulator { score } => {
                         let score = parse_score(score)?;
                         let scale = ActionScale::unscaled(spec);
-                        let cost = SimulatorCost::new(entry.make, scale.clone(), mpc.action_block, score)?;
+                        let wrapping = self.stack.borrow().clone();
+                        let make = move || match &wrapping {
+                            Some(Wrapping { stack, goal, .. }) => stack.wrap((entry.make)(), *goal),
+                            None => (entry.make)(),
+                        };
+                        let cost = SimulatorCost::new(make, scale.clone(), mpc.action_block, score)?;
                         let cost = objective.apply(Box::new(cost))?;
                         let policy = MpcPolicy::new(solver, cost, mpc, scale, spec, slots)?;
                         Ok(self.planning(&request.name, policy))
@@ -134,6 +147,12 @@ impl Resolver for Home {
                 }
             }
         }
+    }
+
+    fn predictor(&self, request: &PolicyRequest) -> Result<Option<Box<dyn Predictor>>> {
+        let Acts::Plan { model: Model::Checkpoint(given), .. } = &request.acts else { return Ok(None) };
+        let checkpoint = Checkpoint::load(&home::find_checkpoint(given)?, &Device::flex())?;
+        Ok(Some(Box::new(LewmPredictor::new(checkpoint))))
     }
 }
 

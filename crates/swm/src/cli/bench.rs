@@ -4,7 +4,7 @@ use super::{Context, emit, emit_json, table};
 use clap::{Args, Subcommand};
 use swm::ENVS;
 use swm_core::EnvEntry;
-use swm_eval::{BenchConfig, bench_envs};
+use swm_eval::{BenchConfig, PlanBenchConfig, bench_envs, bench_plan};
 
 /// Arguments of `swm bench`.
 #[derive(Args)]
@@ -18,6 +18,38 @@ enum What {
     /// Steps a second of worlds: stepping with rendering, and collecting into Lance. The reference runs in turn
     /// with ours where SWM_REFERENCE_PYTHON names a Python that has it
     Envs(EnvsArgs),
+    /// Iterations a second of CEM with a model that costs nothing, beside the reference's, and the planner's share of the
+    /// time beside a model that costs what a LeWM does
+    Plan(PlanArgs),
+}
+
+#[derive(Args)]
+struct PlanArgs {
+    /// Environments planned in one call
+    #[arg(long, value_delimiter = ',', default_value = "1,16")]
+    envs: Vec<usize>,
+    /// Pairs of turns, ours and the reference's
+    #[arg(long, default_value_t = 5)]
+    pairs: usize,
+    /// Seconds of a turn
+    #[arg(long, default_value_t = 1.0)]
+    seconds: f64,
+}
+
+/// Measures planners.
+fn plan(args: &PlanArgs, context: &Context) -> anyhow::Result<()> {
+    let report = bench_plan(&PlanBenchConfig {
+        envs: args.envs.clone(),
+        pairs: args.pairs,
+        seconds: args.seconds,
+        threads: context.threads,
+        ..PlanBenchConfig::default()
+    })?;
+    if context.json {
+        return emit_json(&report);
+    }
+    emit(&report.to_string());
+    Ok(())
 }
 
 #[derive(Args)]
@@ -46,7 +78,10 @@ struct EnvsArgs {
 
 /// Measures.
 pub fn bench(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
-    let What::Envs(args) = &args.what;
+    let args = match &args.what {
+        What::Envs(args) => args,
+        What::Plan(args) => return plan(args, context),
+    };
     let entries: Vec<&EnvEntry> = match &args.envs[..] {
         [] => ENVS.rows.iter().collect(),
         ids => ids.iter().map(|id| ENVS.get(id)).collect::<swm_core::Result<_>>()?,

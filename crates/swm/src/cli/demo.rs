@@ -121,6 +121,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
             Condition { name: "in distribution".to_owned(), variation: VariationRequest::default() },
             Condition { name: format!("{} shifted", SHIFT.0), variation: shift },
         ],
+        prediction: None,
     };
     let (found, file) = eval::run(&request, &Home::tracing(), args.envs, (&results, 3), context)?;
 

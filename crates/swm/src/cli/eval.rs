@@ -68,6 +68,9 @@ pub struct EvalArgs {
     /// Episodes of each policy to film
     #[arg(long, default_value_t = 0, value_name = "EPISODES")]
     videos: usize,
+    /// Compare the models' predictions with the recorded trajectories, so many model steps far, apart by success
+    #[arg(long, value_name = "STEPS", requires = "dataset")]
+    predict: Option<usize>,
     /// Keep how the search of every plan went, in traces.json beside the results
     #[arg(long)]
     trace: bool,
@@ -145,6 +148,7 @@ impl EvalArgs {
                 Protocol::Compat => Counting::Compat { envs: self.envs },
             },
             conditions: vec![Condition { name: self.describe(), variation: self.variation.request()? }],
+            prediction: self.predict,
         })
     }
 
@@ -363,6 +367,30 @@ pub fn summary(results: &Results) -> String {
         &["condition", "policy", "success [95 %]", "n", "solved at start", "median steps", "plan, median (p95)"],
         rows,
     );
+    let predicted = results.runs.iter().filter_map(|run| Some((run, run.prediction.as_ref()?)));
+    let rows: Vec<Vec<String>> = predicted
+        .flat_map(|(run, prediction)| {
+            prediction.groups.iter().map(move |group| {
+                let of = group.success.map_or("all", |success| if success { "successes" } else { "failures" });
+                let last = group.steps.last().map_or(f64::NAN, |step| step.mean);
+                vec![
+                    run.condition.clone(),
+                    run.policy.clone(),
+                    of.to_owned(),
+                    group.trajectory.n.to_string(),
+                    format!("{:.3}", group.trajectory.mean),
+                    format!("{last:.3}"),
+                ]
+            })
+        })
+        .collect();
+    if !rows.is_empty() {
+        text.push('\n');
+        text.push_str(&table(
+            &["condition", "model", "trajectories of", "n", "prediction error", "at the last step"],
+            rows,
+        ));
+    }
     if !results.comparisons.is_empty() {
         let rows = results.comparisons.iter().map(|comparison| {
             let found = &comparison.table;

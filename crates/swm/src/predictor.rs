@@ -1,0 +1,72 @@
+//! [`LewmPredictor`]: a LeWM whose predictions are compared with recorded trajectories.
+
+use rayon::prelude::*;
+use swm_core::{Batch, Error, Result};
+use swm_eval::Predictor;
+use swm_models::lewm::{Rollout, pixels};
+use swm_models::{Checkpoint, Device};
+
+/// Rows encoded, and trajectories predicted, at once: each by itself, so that its latents do not depend on the others.
+pub struct LewmPredictor {
+    checkpoint: Checkpoint,
+    rollout: Rollout,
+}
+
+impl LewmPredictor {
+    /// The predictor of a trained model.
+    pub fn new(checkpoint: Checkpoint) -> Self {
+        Self { rollout: Rollout::new(&checkpoint.model), checkpoint }
+    }
+}
+
+impl Predictor for LewmPredictor {
+    fn frameskip(&self) -> usize {
+        self.checkpoint.config.data.frameskip
+    }
+
+    fn columns(&self) -> Vec<String> {
+        vec!["pixels".to_owned()]
+    }
+
+    fn latent_dim(&self) -> usize {
+        self.checkpoint.config.model.latent
+    }
+
+    fn encode(&mut self, rows: &Batch, latents: &mut [f32]) -> Result<()> {
+        let (config, model) = (&self.checkpoint.config.model, &self.checkpoint.model);
+        pixels::check(config, rows.schema(), "pixels")?;
+        let bytes = config.image * config.image * 3;
+        let work = latents.par_chunks_exact_mut(config.latent).zip(rows.get::<u8>("pixels")?.par_chunks_exact(bytes));
+        work.try_for_each(|(latent, rgb)| {
+            let encoded = model.encode(pixels::patches(config, rgb, &Device::flex())?);
+            let numbers: Vec<f32> = encoded.into_data().iter().collect();
+            latent.copy_from_slice(&numbers);
+            Ok(())
+        })
+    }
+
+    fn rollout(&mut self, start: &[f32], actions: &[f32], horizon: usize, latents: &mut [f32]) -> Result<()> {
+        let (latent, scale) = (self.checkpoint.config.model.latent, &self.checkpoint.action);
+        let numbers = self.frameskip() * scale.dim();
+        let n = start.len() / latent;
+        if actions.len() != n * horizon * numbers {
+            return Err(Error::mismatch(
+                "the actions of predicted trajectories",
+                format!("{} numbers", actions.len()),
+                format!("{n} trajectories x {horizon} model steps x {numbers}, as the model was trained"),
+            ));
+        }
+        let work = latents.par_chunks_exact_mut(horizon * latent).zip(start.par_chunks_exact(latent));
+        work.zip(actions.par_chunks_exact(horizon * numbers)).for_each(|((latents, start), actions)| {
+            let mut scaled = vec![0.0; actions.len()];
+            for (to, from) in scaled.chunks_exact_mut(scale.dim()).zip(actions.chunks_exact(scale.dim())) {
+                scale.to_model(from, to);
+            }
+            let predicted = self.rollout.run(start, &scaled, 1, horizon);
+            for (to, from) in latents.chunks_exact_mut(latent).zip(&predicted[1..]) {
+                to.copy_from_slice(from);
+            }
+        });
+        Ok(())
+    }
+}

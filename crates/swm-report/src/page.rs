@@ -63,8 +63,12 @@ pub fn write_report_with(results: &[(PathBuf, Results)], options: &ReportOptions
 /// The page as text; `metrics` takes the place of the log that `options` names.
 pub fn render(results: &[(PathBuf, Results)], options: &ReportOptions, metrics: Option<&Metrics>) -> String {
     let groups = Group::all(results);
-    let mut envs: Vec<&str> = groups.iter().map(|group| group.env).collect();
-    envs.dedup();
+    let mut envs: Vec<&str> = vec![];
+    for group in &groups {
+        if !envs.contains(&group.env) {
+            envs.push(group.env);
+        }
+    }
     let title = options.title.clone().unwrap_or_else(|| format!("Evaluation in {}", envs.join(", ")));
     let mut html = format!(
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n\
@@ -228,7 +232,10 @@ fn counting_words(group: &Group<'_>) -> String {
         }
         Counting::Compat { envs } => {
             let first = match group.protocol {
-                "episodic" => format!(" The first to finish of {envs} environments side by side count."),
+                "episodic" => format!(
+                    " The first to finish of {envs} environments side by side count, so policies need not play the same \
+                     starts; only those that do are compared start by start."
+                ),
                 _ => String::new(),
             };
             format!(

@@ -9,7 +9,7 @@ use swm_core::results::Paired;
 /// Width of the plot.
 const WIDE: f64 = 920.0;
 /// Where the whiskers begin, right of the names.
-const LABELS: f64 = 270.0;
+const LABELS: f64 = 340.0;
 /// Height of a row, and of a condition's name.
 const ROW: f64 = 30.0;
 
@@ -36,7 +36,7 @@ pub(crate) fn plot(group: &Group<'_>) -> Option<String> {
         y += ROW;
         for (a, b, table) in pairs {
             let middle = y + ROW / 2.0;
-            let names = format!("{} \u{2212} {}", shorten(&a.label, 20), shorten(&b.label, 20));
+            let names = format!("{} \u{2212} {}", shorten(&a.label, 24), shorten(&b.label, 24));
             svg.text("label end", [LABELS - 14.0, middle + 4.5], &names);
             let [low, high, at] = [table.low, table.high, table.difference].map(|share| scale.at(share * 100.0));
             let whisker = format!("whisker {}", a.class);

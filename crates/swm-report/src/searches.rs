@@ -8,10 +8,11 @@ use swm_core::results::{Band, Searches};
 /// Width of a plot, of which two stand side by side.
 const HALF: f64 = 440.0;
 
-/// The plots of every run of a condition that was traced.
+/// The plots of every run of a condition that was traced and searched in more than one iteration.
 pub(crate) fn plots(condition: &Condition<'_>) -> String {
     let traced = condition.rows.iter().filter_map(|row| Some((row, row.run.searches.as_ref()?)));
     traced
+        .filter(|(_, searches)| searches.best.len() > 1)
         .map(|(row, searches)| {
             let title = format!("{}, {}", row.label, condition.name);
             let costs = [("mean of elites", &searches.mean), ("best", &searches.best)];
@@ -42,7 +43,8 @@ fn bands(row: &Row<'_>, title: &str, curves: &[(&str, &Vec<Band>)], searches: &S
     let (y, levels) = Scale::nice(low.min(0.0), high, bottom, top, 4);
     let (nice, ticks) = Scale::nice(1.0, longest.max(2) as f64, left, right, 5);
     let x = Scale { low: 1.0, high: longest.max(2) as f64, ..nice };
-    let ticks: Vec<f64> = ticks.into_iter().filter(|tick| (x.low..=x.high).contains(tick)).collect();
+    let ticks: Vec<f64> =
+        ticks.into_iter().filter(|tick| (x.low..=x.high).contains(tick) && tick.fract() == 0.0).collect();
     let mut svg = Svg::new(HALF, bottom + 42.0);
     svg.text("head", [0.0, 16.0], &shorten(title, 58));
     svg.y_axis(y, &levels, [left, right], "");

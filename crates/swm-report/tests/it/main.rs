@@ -269,6 +269,19 @@ fn several_files_of_one_world_stand_side_by_side() {
 }
 
 #[test]
+fn other_worlds_and_countings_stand_apart() {
+    let folder = tempfile::tempdir().expect("folder");
+    let (first, other) = (results(), Results { env: "swm/PushT-v1".to_owned(), ..results() });
+    let compat = Results { counting: Counting::Compat { envs: 8 }, ..results() };
+    let files = [first, other, compat].map(|results| (PathBuf::from("results.json"), results));
+    let page = page(&files, folder.path());
+    assert!(page.contains("<h1>Evaluation in swm/TwoRoom-v1, swm/PushT-v1</h1>"), "each world is named once");
+    for heading in ["swm/TwoRoom-v1 · episodic, strict", "swm/TwoRoom-v1 · episodic, compat with 8 environments"] {
+        assert!(page.contains(&format!("<h2>{heading}</h2>")), "{heading}");
+    }
+}
+
+#[test]
 fn videos_are_carried_and_missing_ones_named() {
     let folder = tempfile::tempdir().expect("folder");
     std::fs::create_dir_all(folder.path().join("videos")).expect("folder");

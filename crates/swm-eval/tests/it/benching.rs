@@ -6,7 +6,17 @@ use swm_eval::{BenchConfig, bench_envs};
 
 fn config() -> BenchConfig {
     let (sizes, python) = (vec![8], None);
-    BenchConfig { envs: 2, sizes, bare: true, threads: 1, pairs: 3, seconds: 0.01, episode_steps: 5, episodes: 0, python }
+    BenchConfig {
+        envs: 2,
+        sizes,
+        bare: true,
+        threads: 1,
+        pairs: 3,
+        seconds: 0.01,
+        episode_steps: 5,
+        episodes: 0,
+        python,
+    }
 }
 
 #[test]

@@ -180,9 +180,8 @@ pub fn scripted(entry: &EnvEntry, name: &str, world: &World) -> Result<Box<dyn P
 /// # Errors
 /// When there is no such score.
 pub fn parse_score(name: &str) -> Result<Score> {
-    serde_json::from_value(name.into()).map_err(|_| {
-        Error::unknown("score", name, ["terminal", "running", "reach"], "it judges plans of the simulator")
-    })
+    serde_json::from_value(name.into())
+        .map_err(|_| Error::config("the simulator's score", format!("'{name}'"), "choose terminal, running or reach"))
 }
 
 /// Refuses a checkpoint trained on another environment.

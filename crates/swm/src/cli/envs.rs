@@ -144,10 +144,13 @@ fn space(space: &Space) -> Value {
     }
 }
 
-/// A value as a scalar or a list, in whole numbers where its type is whole.
+/// A value as a scalar or as lists within lists, in whole numbers where its type is whole; null where there is no bound.
 #[allow(clippy::cast_possible_truncation)]
 fn shaped(space: &Space, value: &[f64]) -> Value {
     let whole = matches!(space, Space::Discrete { .. } | Space::MultiDiscrete { .. } | Space::Rgb);
-    let number = |&v: &f64| if whole { json!(v as i64) } else { json!(v) };
-    if space.shape().is_empty() { number(&value[0]) } else { value.iter().map(number).collect() }
+    let mut values: Vec<Value> = value.iter().map(|&v| if whole { json!(v as i64) } else { json!(v) }).collect();
+    for &size in space.shape().iter().rev() {
+        values = values.chunks(size.max(1)).map(|row| Value::Array(row.to_vec())).collect();
+    }
+    values.pop().unwrap_or_default()
 }

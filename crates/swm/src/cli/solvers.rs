@@ -89,6 +89,10 @@ pub fn parse(text: &str) -> Result<(&'static SolverEntry, Value)> {
             return Err(Error::unknown("solver setting", &key, known.iter().map(String::as_str), hint));
         }
         let place = key.split('.').fold(&mut settings, |at, part| &mut at[part]);
+        if !place.is_null() && std::mem::discriminant(place) != std::mem::discriminant(&value) {
+            let fix = format!("give a value like its default, {}", plain(place));
+            return Err(Error::config(format!("solver setting {key}"), plain(&value), fix));
+        }
         *place = value;
     }
     (entry.make)(&settings)?;

@@ -105,8 +105,8 @@ fn policies_are_compared_on_the_same_starts_and_reproduced() {
     swm.refuses(&["train", "inverse", "--data", "rooms"], 2, &["--encoder"]);
     assert_eq!(swm.json(&["checkpoints"])[0]["family"], "inverse");
 
-    let eval = ["eval", "small", "direct", "simulator", "expert", "--episodes", "4", "--budget", "20", "--trace"];
-    let solver = ["--solver", "icem,samples=12,iterations=2,elites=4,keep=2", "--receding-horizon", "2"];
+    let eval = ["eval", "small", "direct", "simulator", "expert", "--episodes", "4", "--budget", "60", "--trace"];
+    let solver = ["--solver", "icem,samples=32,iterations=2,elites=8,keep=2", "--receding-horizon", "2"];
     let found = swm.json(&[&eval[..], &solver, &noise, &["--wrap-goal", "-o", "found"]].concat());
     let runs = found["runs"].as_array().expect("runs");
     let names: Vec<_> = runs.iter().map(|run| run["policy"].as_str().expect("a name")).collect();

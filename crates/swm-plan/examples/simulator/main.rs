@@ -1,0 +1,55 @@
+//! How often planners with perfect dynamics reach the goal: the upper bound of every model, and what the search itself
+//! misses.
+//!
+//!     cargo run --release -p swm-plan --example simulator [PART OF A WORLD] [SOLVER] [STARTS] [SETTINGS]
+//!
+//! A start that already satisfies its goal is counted apart and not played. SETTINGS is JSON that is laid over those of
+//! `rows.rs`, as in `{"solver": {"samples": 100}, "mpc": {"horizon": 3}}`.
+
+mod play;
+mod rows;
+
+use play::{play, starts};
+use serde_json::Value;
+use std::io::Write as _;
+
+/// Starts of each row unless the command line says otherwise.
+const STARTS: usize = 100;
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let part = |i: usize| arguments.get(i).map_or(String::new(), |part| part.to_lowercase());
+    let (world, solver) = (part(0), part(1));
+    let n = arguments.get(2).map_or(Ok(STARTS), |number| number.parse())?;
+    let changes: Value = arguments.get(3).map_or(Ok(Value::Null), |text| serde_json::from_str(text))?;
+    let mut out = std::io::stdout();
+    writeln!(
+        out,
+        "| world | starts | solver | solved before | success | 95 % | steps, median | a plan, median | all |"
+    )?;
+    writeln!(out, "| --- | --- | --- | --- | --- | --- | --- | --- | --- |")?;
+    for task in rows::TASKS.iter().filter(|task| task.entry.id.to_lowercase().contains(&world)) {
+        let starts = starts(task.entry, task.protocol, n)?;
+        for id in rows::SOLVERS.into_iter().filter(|id| solver.is_empty() || *id == solver) {
+            let planner = rows::planner(task, id, &changes)?;
+            let found = play(task.entry, &starts, &planner, task.budget)?;
+            let success = &found.success;
+            writeln!(
+                out,
+                "| `{}` | {:?} | `{id}` | {} | {} of {} | {:.1}–{:.1} % | {:.0} | {:.2} s | {:.0} s |",
+                task.entry.id,
+                task.protocol,
+                found.solved,
+                success.successes,
+                success.n,
+                100.0 * success.low,
+                100.0 * success.high,
+                found.steps.map_or(f64::NAN, |steps| steps.median),
+                found.plan.map_or(f64::NAN, |plan| plan.median),
+                found.seconds,
+            )?;
+            out.flush()?;
+        }
+    }
+    Ok(())
+}

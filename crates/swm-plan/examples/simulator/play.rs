@@ -1,0 +1,153 @@
+//! Plays planners with perfect dynamics and counts strictly: a start that already satisfies its goal is not played.
+
+use rand::seq::index::sample;
+use std::time::Instant;
+use swm_core::pool::threads;
+use swm_core::results::{Proportion, Summary};
+use swm_core::{Action, Batch, EnvEntry, EnvPool, Key, Policy, ResetOptions, Result, Schema, Space};
+use swm_plan::{ActionScale, MpcConfig, MpcPolicy, SOLVERS, Score, SimulatorCost};
+
+/// From where an episode is played and towards which goal.
+pub struct Start {
+    seed: u64,
+    /// A start row and a goal row; what the reset chooses for none.
+    rows: Option<Batch>,
+}
+
+/// Where starts come from.
+#[derive(Clone, Copy, Debug)]
+pub enum Protocol {
+    /// Start and goal as the environment resets.
+    Episodic,
+    /// Both from an episode of the environment's first expert, so many steps apart.
+    Demonstrated(usize),
+}
+
+/// Who plans, and how.
+#[derive(Clone)]
+pub struct Planner {
+    /// The solver's id.
+    pub solver: &'static str,
+    /// Its settings.
+    pub settings: serde_json::Value,
+    /// How far, and how much of it is executed.
+    pub mpc: MpcConfig,
+    /// What a candidate is judged by.
+    pub score: Score,
+}
+
+/// What came of it.
+pub struct Outcome {
+    /// Starts that were already solved.
+    pub solved: usize,
+    /// How often the goal was reached from the others.
+    pub success: Proportion,
+    /// Steps to the goal among successes.
+    pub steps: Option<Summary>,
+    /// Seconds of one plan, while others are planned on the same cores.
+    pub plan: Option<Summary>,
+    /// Seconds all together.
+    pub seconds: f64,
+}
+
+/// Environments that are played, and planned for, at the same time.
+const SLOTS: usize = 25;
+
+/// The first `n` starts of an environment.
+pub fn starts(entry: &EnvEntry, protocol: Protocol, n: usize) -> Result<Vec<Start>> {
+    let Protocol::Demonstrated(offset) = protocol else {
+        return Ok((0..n as u64).map(|seed| Start { seed, rows: None }).collect());
+    };
+    let demonstrations = (0..n as u64).map(|seed| demonstrate(entry, seed)).collect::<Result<Vec<Batch>>>()?;
+    let lengths = demonstrations.iter().map(|rows| rows.rows().saturating_sub(offset));
+    let all: Vec<(usize, usize)> = lengths.enumerate().flat_map(|(e, len)| (0..len).map(move |t| (e, t))).collect();
+    let picks = sample(&mut Key::new(0).with("starts").rng(), all.len(), n);
+    let start = |(seed, pick): (usize, usize)| {
+        let (demonstration, t) = all[pick];
+        let from = &demonstrations[demonstration];
+        let mut rows = Batch::zeros(from.schema(), 2);
+        rows.copy_row(0, from, t)?;
+        rows.copy_row(1, from, t + offset)?;
+        Ok(Start { seed: seed as u64, rows: Some(rows) })
+    };
+    picks.into_iter().enumerate().map(start).collect()
+}
+
+/// The rows of one episode of the first expert.
+fn demonstrate(entry: &EnvEntry, seed: u64) -> Result<Batch> {
+    let mut env = (entry.make)();
+    let mut expert = (entry.experts[0].make)();
+    env.reset(seed, &ResetOptions::default())?;
+    expert.begin(Key::new(seed).with("expert"));
+    let limit = env.spec().max_episode_steps;
+    let mut rows = Batch::zeros(&Schema::new(env.spec().columns.clone())?, limit + 1);
+    let mut action = vec![0.0; env.spec().action_dim()];
+    let mut step = 0;
+    env.observe(&mut rows.row_mut(step));
+    while step < limit && !env.is_success() {
+        expert.act(rows.row(step), &mut action)?;
+        let numbers: Vec<f32> = action.iter().map(|&v| v as f32).collect();
+        let integers: Vec<i64> = action.iter().map(|&v| v as i64).collect();
+        match env.spec().action_space {
+            Space::Box { .. } => env.step(Action::Continuous(&numbers))?,
+            _ => env.step(Action::Discrete(&integers))?,
+        };
+        step += 1;
+        env.observe(&mut rows.row_mut(step));
+    }
+    rows.resize(step + 1);
+    Ok(rows)
+}
+
+/// Plays every start once, for at most `budget` steps.
+pub fn play(entry: &EnvEntry, starts: &[Start], planner: &Planner, budget: usize) -> Result<Outcome> {
+    let begun = Instant::now();
+    let (mut solved, mut played, mut successes, mut latencies) = (0, 0, vec![], vec![]);
+    for starts in starts.chunks(SLOTS) {
+        let envs = starts.iter().map(|_| (entry.make)()).collect();
+        let mut pool = EnvPool::new(envs, None, Some(budget), threads(0)?)?;
+        let slots: Vec<usize> = (0..starts.len()).collect();
+        pool.restart(&slots, |slot, env| {
+            env.reset(starts[slot].seed, &ResetOptions::default())?;
+            starts[slot].rows.as_ref().map_or(Ok(()), |rows| env.restore_from(rows.row(0), rows.row(1)))
+        })?;
+        let mut policy = planner.policy(entry, &pool)?;
+        let mut active: Vec<bool> = slots.iter().map(|&slot| !pool.env(slot).is_success()).collect();
+        solved += active.iter().filter(|&&active| !active).count();
+        played += active.iter().filter(|&&active| active).count();
+        slots.iter().for_each(|&slot| policy.begin(slot, Key::new(starts[slot].seed)));
+        let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()])?, pool.len());
+        for step in 1..=budget {
+            if !active.contains(&true) {
+                break;
+            }
+            policy.see(&pool, &active)?;
+            let infos = pool.infos();
+            pool.threads().install(|| policy.act(infos, &active, &mut actions))?;
+            pool.step(&actions, &active)?;
+            for (slot, active) in active.iter_mut().enumerate().filter(|(_, active)| **active) {
+                if pool.env(slot).is_success() {
+                    successes.push(step as f64);
+                    *active = false;
+                }
+            }
+        }
+        latencies.extend(policy.take_latencies());
+    }
+    Ok(Outcome {
+        solved,
+        success: Proportion::wilson(successes.len(), played),
+        steps: Summary::of(&successes),
+        plan: Summary::of(&latencies),
+        seconds: begun.elapsed().as_secs_f64(),
+    })
+}
+
+impl Planner {
+    fn policy(&self, entry: &EnvEntry, pool: &EnvPool) -> Result<MpcPolicy> {
+        let solver = (SOLVERS.get(self.solver)?.make)(&self.settings)?;
+        let scale = ActionScale::unscaled(pool.spec());
+        let model = SimulatorCost::new(entry.make, scale.clone(), self.mpc.action_block, self.score)?;
+        MpcPolicy::new(solver, Box::new(model), self.mpc.clone(), scale, pool.spec(), pool.len())
+    }
+}

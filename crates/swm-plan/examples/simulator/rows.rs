@@ -1,0 +1,68 @@
+//! What is planned with what.
+
+use super::play::{Planner, Protocol};
+use serde_json::{Value, json};
+use swm_core::{EnvEntry, Error, Result};
+use swm_envs::{push_t, two_room};
+use swm_plan::{MpcConfig, Score};
+
+/// A world, where its starts come from, and the steps an episode may take.
+pub struct Task {
+    pub entry: &'static EnvEntry,
+    pub protocol: Protocol,
+    pub budget: usize,
+    pub settings: fn(&str) -> Value,
+}
+
+pub static TASKS: [Task; 2] = [
+    Task { entry: &two_room::ENTRY, protocol: Protocol::Episodic, budget: 100, settings: two_room },
+    Task { entry: &push_t::ENTRY, protocol: Protocol::Demonstrated(25), budget: 50, settings: push_t },
+];
+
+pub const SOLVERS: [&str; 3] = ["cem", "icem", "mppi"];
+
+/// Any solver will do: a tenth of the paper's candidates, judged by how soon they get there.
+fn two_room(_: &str) -> Value {
+    json!({ "score": "reach", "solver": { "samples": 100, "iterations": 10, "elites": 10 } })
+}
+
+/// The horizon is the paper's 25 steps, planned one by one, so that noise can be coloured along them.
+///
+/// The search is hard because pushing is: most candidates do not touch the block, and those that do rarely push it the
+/// right way. Replanning often helps every solver more than searching long, because CEM's spread collapses around the
+/// first push that is any good. MPPI keeps its spread, and iCEM's coloured noise walks straight instead of trembling.
+fn push_t(solver: &str) -> Value {
+    let (solver, receding_horizon) = match solver {
+        "cem" => (json!({ "samples": 300, "iterations": 5, "elites": 30, "sigma": 0.7 }), 1),
+        "icem" => (json!({ "samples": 300, "iterations": 10, "elites": 30, "sigma": 0.7, "beta": 2.0 }), 5),
+        _ => (json!({ "samples": 300, "iterations": 10, "elites": 30, "sigma": 0.4, "temperature": 0.1 }), 5),
+    };
+    let mpc = json!({ "horizon": 25, "action_block": 1, "receding_horizon": receding_horizon });
+    json!({ "score": "reach", "solver": solver, "mpc": mpc })
+}
+
+/// The planner of a row, with these settings laid over its own.
+pub fn planner(task: &Task, solver: &'static str, changes: &Value) -> Result<Planner> {
+    let mut settings = (task.settings)(solver);
+    lay_over(&mut settings, changes);
+    let wrong = |error: serde_json::Error| Error::config("settings", error.to_string(), "see the example's rows");
+    let part = |name: &str| settings.get(name).cloned().filter(|value| !value.is_null());
+    Ok(Planner {
+        solver,
+        settings: part("solver").unwrap_or_else(|| json!({})),
+        mpc: part("mpc").map_or(Ok(MpcConfig::default()), |mpc| serde_json::from_value(mpc).map_err(wrong))?,
+        score: part("score").map_or(Ok(Score::default()), |score| serde_json::from_value(score).map_err(wrong))?,
+    })
+}
+
+fn lay_over(value: &mut Value, changes: &Value) {
+    match (value, changes) {
+        (Value::Object(value), Value::Object(changes)) => {
+            for (key, change) in changes {
+                lay_over(value.entry(key.clone()).or_insert(Value::Null), change);
+            }
+        }
+        (_, Value::Null) => {}
+        (value, change) => *value = change.clone(),
+    }
+}

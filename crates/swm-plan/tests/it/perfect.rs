@@ -1,0 +1,35 @@
+//! With perfect dynamics, planners reach their goals. The example `simulator` plays the same with more starts.
+
+// Times are for the example.
+#[allow(dead_code)]
+#[path = "../../examples/simulator/play.rs"]
+mod play;
+#[path = "../../examples/simulator/rows.rs"]
+mod rows;
+
+use play::{Outcome, play, starts};
+use rows::Task;
+use serde_json::Value;
+
+fn run(task: &Task, solver: &'static str, n: usize) -> Outcome {
+    let starts = starts(task.entry, task.protocol, n).expect("starts");
+    let planner = rows::planner(task, solver, &Value::Null).expect("settings");
+    play(task.entry, &starts, &planner, task.budget).expect("an outcome")
+}
+
+#[test]
+fn two_room_is_solved() {
+    for solver in rows::SOLVERS {
+        let found = run(&rows::TASKS[0], solver, 40);
+        assert!(found.success.rate >= 0.95, "{solver}: {:?}", found.success);
+    }
+}
+
+#[test]
+fn push_t_is_solved_from_demonstrations() {
+    // CEM takes five times as long.
+    for solver in ["icem", "mppi"] {
+        let found = run(&rows::TASKS[1], solver, 5);
+        assert!(found.success.rate >= 0.8, "{solver}: {:?}", found.success);
+    }
+}

@@ -33,7 +33,7 @@ fn two_room(_: &str) -> Value {
 /// first push that is any good. MPPI keeps its spread, and iCEM's coloured noise walks straight instead of trembling.
 fn push_t(solver: &str) -> Value {
     let (solver, receding_horizon) = match solver {
-        "cem" => (json!({ "samples": 300, "iterations": 5, "elites": 30, "sigma": 0.7 }), 1),
+        "cem" => (json!({ "samples": 300, "iterations": 5, "elites": 20, "sigma": 0.7 }), 1),
         "icem" => (json!({ "samples": 300, "iterations": 10, "elites": 30, "sigma": 0.7, "beta": 2.0 }), 5),
         _ => (json!({ "samples": 300, "iterations": 10, "elites": 30, "sigma": 0.4, "temperature": 0.1 }), 5),
     };

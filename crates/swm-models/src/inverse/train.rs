@@ -30,6 +30,8 @@ pub struct InverseConfig {
     pub hidden: usize,
     /// Clips in a batch.
     pub batch_size: usize,
+    /// Whether the episodes that [`swm_data::Split::default`] holds out are left out.
+    pub hold_out: bool,
     /// Steps between two lines of the log.
     pub log_every: usize,
     /// The optimizer.
@@ -140,6 +142,7 @@ fn run(
 
     std::fs::create_dir_all(out).map_err(|error| Error::io(out, "creating a folder", error))?;
     let mut log = log::Log::new(out, false)?;
+    let episodes = crate::train::trained_on(config.hold_out, &*reader)?;
     let loader = Loader::new(
         reader,
         LoaderConfig {
@@ -152,6 +155,7 @@ fn run(
             seed: config.seed,
             threads: 1,
             drop_last: true,
+            episodes,
             ..LoaderConfig::default()
         },
     )?;

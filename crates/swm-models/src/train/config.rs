@@ -44,6 +44,10 @@ pub struct DataConfig {
     pub frameskip: usize,
     /// Clips in a batch.
     pub batch_size: usize,
+    /// Whether the episodes that [`swm_data::Split::default`] holds out, a tenth for validation and a tenth for tests, are
+    /// left out, so that `swm eval --split test` starts from what was never trained on.
+    #[serde(default)]
+    pub hold_out: bool,
 }
 
 /// A named configuration.

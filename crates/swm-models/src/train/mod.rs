@@ -22,7 +22,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 use swm_core::{DType, Error, Key, Manifest, Result};
-use swm_data::{ClipSpec, Loader, LoaderConfig, Reader, column_stats};
+use swm_data::{ClipSpec, Loader, LoaderConfig, Part, Reader, Split, column_stats};
 use swm_plan::ActionScale;
 
 /// What does not decide the numbers of a run.
@@ -178,6 +178,7 @@ impl<'a> Run<'a> {
             fresh(&device)
         };
 
+        let episodes = trained_on(config.data.hold_out, &*reader)?;
         let loader = Loader::new(
             reader,
             LoaderConfig {
@@ -192,6 +193,7 @@ impl<'a> Run<'a> {
                 threads: options.loader_threads,
                 prefetch: options.prefetch,
                 drop_last: true,
+                episodes,
                 ..LoaderConfig::default()
             },
         )?;
@@ -369,6 +371,25 @@ pub fn prepare(
     }
     let shape = [batch.rows(), config.data.num_steps, config.data.frameskip * dim];
     Ok(TrainBatch { patches, actions: Tensor::from_data(TensorData::new(actions, shape), device) })
+}
+
+/// The positions of the episodes a model is trained on: all, or those that are not held out.
+///
+/// # Errors
+/// When every episode is held out.
+pub(crate) fn trained_on(hold_out: bool, reader: &dyn Reader) -> Result<Option<Vec<usize>>> {
+    if !hold_out {
+        return Ok(None);
+    }
+    let split = Split::default();
+    match split.episodes(reader, Part::Train) {
+        Ok(episodes) => Ok(Some(episodes)),
+        Err(_) => Err(Error::config(
+            "hold_out",
+            format!("all {} episodes of the dataset are held out", reader.episodes().len()),
+            "collect more episodes, or train on all of them with hold_out=false",
+        )),
+    }
 }
 
 /// The scale of a dataset's actions, and the numbers in one.

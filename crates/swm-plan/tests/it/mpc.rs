@@ -67,7 +67,7 @@ fn spec(high: f64) -> EnvSpec {
         action_space: Space::uniform_box([1], DType::Float32, -high, high),
         columns: vec![],
         observation_space: vec![],
-            variation_space: VariationSpace::new(vec![], &[]),
+        variation_space: VariationSpace::new(vec![], &[]),
         max_episode_steps: 100,
     }
 }

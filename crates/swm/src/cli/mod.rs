@@ -63,7 +63,7 @@ enum Command {
     /// List the checkpoints at home, or show one
     Checkpoints(checkpoints::CheckpointsArgs),
     /// Evaluate a checkpoint, the expert or the random floor
-    Eval(eval::EvalArgs),
+    Eval(Box<eval::EvalArgs>),
     /// Run an evaluation again from its results and say what differs
     Reproduce(eval::ReproduceArgs),
     /// Make one self-contained HTML page of results

@@ -105,7 +105,7 @@ impl PlannerArgs {
         };
         let described = json!({
             "terms": read("--term", "term", &self.terms)?,
-            "constraints": read("--limit", "limit_on", &self.limits)?,
+            "constraints": read("--limit", "constraint", &self.limits)?,
         });
         serde_json::from_value(described).map_err(|error| {
             Error::config(

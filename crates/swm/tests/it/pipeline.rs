@@ -119,6 +119,19 @@ fn policies_are_compared_on_the_same_starts_and_reproduced() {
         serde_json::from_slice(&std::fs::read(swm.path("found/traces.json")).expect("traces")).expect("JSON");
     assert!(traces[0]["policy"] == "small" && traces[0]["best"].as_array().map(Vec::len) == Some(2), "{}", traces[0]);
 
+    // Gradients, latents, terms and constraints reach the solvers that ask for them.
+    for planner in [
+        &["--solver", "gd,samples=4,iterations=2,optimizer.step=0.2", "--term", "control,weight=0.01"][..],
+        &["--solver", "grasp,iterations=4,sync_every=2,sync_iterations=1"],
+        &["--solver", "lagrangian,samples=4,iterations=2,outer_iterations=2", "--limit", "action_norm,limit=1,block=5"],
+    ] {
+        let planned =
+            swm.json(&[&["eval", "small", "--episodes", "2", "--budget", "10", "-o", "other"], planner].concat());
+        assert_eq!(planned["runs"][1]["timing"]["plan_seconds"]["n"].as_u64(), Some(2), "{planner:?}");
+    }
+    swm.refuses(&["eval", "small", "--episodes", "2", "--solver", "lagrangian"], 2, &["needs constraints", "gd"]);
+    swm.refuses(&["eval", "small", "--episodes", "2", "--solver", "pgd"], 2, &["discrete", "cem"]);
+
     let again = swm.json(&["reproduce", "found", "--threads", "1", "--envs", "3"]);
     assert_eq!((&again["holds"], &again["differences"]), (&Value::Bool(true), &Value::Array(vec![])));
     // Other weights under the same name are found out before anything is played.

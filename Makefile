@@ -60,7 +60,7 @@ $(VENV)/ready:
 # The published reference, for parity and speed: heavy (it brings torch), and only wanted by `make bench`.
 reference: setup
 	python3 -m venv $(CACHE)/reference
-	$(CACHE)/reference/bin/python -m pip install --quiet stable-worldmodel opencv-python-headless imageio pygame pymunk shapely
+	$(CACHE)/reference/bin/python -m pip install --quiet stable-worldmodel opencv-python-headless imageio matplotlib pygame pymunk shapely
 
 clean:
 	rm -rf $(CACHE)

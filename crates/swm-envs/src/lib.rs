@@ -6,6 +6,8 @@ mod factors;
 pub mod piecewise;
 pub mod point_maze;
 pub mod push_t;
+#[cfg(test)]
+mod trial;
 pub mod two_room;
 pub mod wrappers;
 

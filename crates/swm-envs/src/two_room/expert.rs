@@ -107,42 +107,13 @@ impl Expert for Explorer {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::trial::{play, reached_of_200};
     use crate::two_room::ENTRY;
-    use swm_core::{Action, Batch, ResetOptions, Schema, VariationRequest};
-
-    /// Plays one episode; the places visited, and whether it ended in success.
-    fn play(expert: &ExpertEntry, seed: u64, options: &ResetOptions, goal: bool, steps: usize) -> (Vec<Place>, bool) {
-        let (mut env, mut expert) = ((ENTRY.make)(), (expert.make)());
-        env.reset(seed, options).expect("a reset");
-        if goal {
-            env.sample_goal(Key::new(seed)).expect("a goal");
-        }
-        expert.begin(Key::new(seed));
-        let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("columns"), 1);
-        let (mut action, mut places) = ([0.0; 2], vec![]);
-        for _ in 0..steps {
-            env.observe(&mut row.row_mut(0));
-            expert.act(row.row(0), &mut action).expect("an action");
-            places.push(place(row.row(0), "state").expect("a state"));
-            if env.step(Action::Continuous(&action.map(|a| a as f32))).expect("a step").terminated {
-                return (places, true);
-            }
-        }
-        (places, false)
-    }
+    use swm_core::ResetOptions;
 
     #[test]
     fn the_expert_reaches_the_target() {
-        let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
-        let all = ResetOptions { variation: all, ..ResetOptions::default() };
-        let mut in_reach = 0;
-        for seed in 0..200 {
-            let reaches = |options: &ResetOptions, goal, steps| play(&EXPERTS[0], seed, options, goal, steps).1;
-            assert!(reaches(&ResetOptions::default(), false, 100), "seed {seed}");
-            assert!(reaches(&ResetOptions::default(), true, 100), "seed {seed}, sampled goal");
-            assert!(reaches(&all, true, 400), "seed {seed}, everything varied, sampled goal");
-            in_reach += u32::from(reaches(&all, false, 400));
-        }
+        let in_reach = reached_of_200(&ENTRY, 100, 400);
         // Eight of these targets lie deep in the wall, or behind doors too near the border for the agent.
         assert_eq!(in_reach, 192, "everything varied, targets anywhere");
     }
@@ -154,7 +125,7 @@ mod tests {
         let mut seen = std::collections::BTreeSet::new();
         let (mut crossings, mut touches) = (0, 0);
         for seed in 0..50 {
-            let (places, _) = play(&EXPERTS[1], seed, &apart, false, 100);
+            let (places, _) = play(&ENTRY, &EXPERTS[1], seed, &apart, false, 100);
             #[allow(clippy::cast_possible_truncation)]
             seen.extend(places.iter().map(|p| p.map(|v| (v / 16.0) as i64)));
             crossings += places.windows(2).filter(|p| (p[0][0] < 112.0) != (p[1][0] < 112.0)).count();

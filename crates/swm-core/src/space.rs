@@ -141,9 +141,9 @@ impl Space {
             Self::Box { shape, dtype, low, high } => {
                 let same = |v: &[f64]| v.windows(2).all(|w| w[0] == w[1]);
                 let (low, high) = if !low.is_empty() && same(low) && same(high) {
-                    (low[0].to_string(), high[0].to_string())
+                    (self.written(&low[..1]), self.written(&high[..1]))
                 } else {
-                    (format!("{low:?}"), format!("{high:?}"))
+                    (format!("[{}]", self.written(low)), format!("[{}]", self.written(high)))
                 };
                 let shape = if shape.is_empty() { "one".to_owned() } else { format!("{shape:?}") };
                 format!("{shape} {} in {low} ..= {high}", dtype.name())
@@ -156,6 +156,16 @@ impl Space {
             }
             Self::Rgb => "a colour: 3 integers in 0 ..= 255".to_owned(),
         }
+    }
+
+    /// Numbers of this space as people write them: single precision without the digits it does not have.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn written(&self, numbers: &[f64]) -> String {
+        let write = |&number: &f64| match self.dtype() {
+            DType::Float32 => (number as f32).to_string(),
+            _ => number.to_string(),
+        };
+        numbers.iter().map(write).collect::<Vec<_>>().join(", ")
     }
 }
 

@@ -53,7 +53,7 @@ pub fn fovs(args: &FovsArgs, as_json: bool) -> anyhow::Result<()> {
         vec![
             factor.key.clone(),
             factor.space.describe(),
-            format!("{:?}", factor.init_value),
+            factor.space.written(&factor.init_value),
             if space.defaults().contains(&factor.key) { "sampled".to_owned() } else { String::new() },
         ]
     });

@@ -122,6 +122,10 @@ impl EvalRequest {
         if let Some(reader) = &dataset {
             manifest.hashes.insert("dataset".to_owned(), reader.content_hash()?);
         }
+        // What is not there or does not fit is found before anything is played.
+        for policy in request.policies.iter().filter(|policy| policy.acts != Acts::Random) {
+            resolver.policy(policy, &world)?;
+        }
         let (mut witness, mut runs) = (Witness::default(), vec![]);
         for condition in &request.conditions {
             let starts = request.starts(dataset.as_deref(), world.spec(), condition.variation.clone())?;

@@ -35,7 +35,7 @@ impl Bounds<'_> {
 /// When the solver cannot solve such a problem with such a model (the error names those that can), the horizon is 0, or
 /// bounds or first guess are wrong.
 pub fn continuous<'a>(solver: &str, cost: &mut dyn CostModel, problem: &PlanProblem<'a>) -> Result<Bounds<'a>> {
-    pairing(solver, cost, problem.space)?;
+    pairing(solver, cost, Actions::of_plan(problem.space))?;
     let PlanSpace::Continuous { low, high } = problem.space else {
         return Err(misfit(solver, "these actions are not continuous", "register it for the actions it plans"));
     };
@@ -63,7 +63,7 @@ pub fn continuous<'a>(solver: &str, cost: &mut dyn CostModel, problem: &PlanProb
 /// When the solver cannot solve such a problem with such a model (the error names those that can), the horizon is 0, or
 /// choices or first guess are wrong.
 pub fn discrete<'a>(solver: &str, cost: &mut dyn CostModel, problem: &PlanProblem<'a>) -> Result<&'a [usize]> {
-    pairing(solver, cost, problem.space)?;
+    pairing(solver, cost, Actions::of_plan(problem.space))?;
     let PlanSpace::Discrete { choices } = problem.space else {
         return Err(misfit(solver, "these actions are not discrete", "register it for the actions it plans"));
     };
@@ -147,12 +147,11 @@ pub fn check_costs(costs: &[f32], samples: usize, iteration: usize) -> Result<()
     })
 }
 
-/// Checks that a solver can plan such actions with such a model.
-fn pairing(solver: &str, cost: &mut dyn CostModel, space: PlanSpace<'_>) -> Result<()> {
-    let actions = match space {
-        PlanSpace::Continuous { .. } => Actions::Continuous,
-        PlanSpace::Discrete { .. } => Actions::Discrete,
-    };
+/// Checks that the solver of this id can plan such actions with such a model.
+///
+/// # Errors
+/// When it cannot; names the solvers that can.
+pub fn pairing(solver: &str, cost: &mut dyn CostModel, actions: Actions) -> Result<()> {
     let offers = offers(cost);
     let Some(obstacle) = obstacle(SOLVERS.get(solver)?, actions, &offers) else {
         return Ok(());

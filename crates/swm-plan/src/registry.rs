@@ -4,7 +4,7 @@ use crate::{AugmentedLagrangian, CategoricalCem, Cem, GradientDescent, Grasp, IC
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use swm_core::registry::Named;
-use swm_core::{Error, Registry, Result, Solver};
+use swm_core::{Error, PlanSpace, Registry, Result, Solver, Space};
 
 /// How a solver searches.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -24,6 +24,21 @@ pub enum Actions {
     Continuous,
     /// Choices among a few.
     Discrete,
+}
+
+impl Actions {
+    /// How actions of such a space are planned.
+    pub fn of(space: &Space) -> Self {
+        if matches!(space, Space::Box { .. }) { Self::Continuous } else { Self::Discrete }
+    }
+
+    /// What a plan of such a space is made of.
+    pub fn of_plan(space: PlanSpace<'_>) -> Self {
+        match space {
+            PlanSpace::Continuous { .. } => Self::Continuous,
+            PlanSpace::Discrete { .. } => Self::Discrete,
+        }
+    }
 }
 
 /// What a solver asks of a model beyond a cost.

@@ -14,6 +14,8 @@ use swm_models::inverse::{InverseCheckpoint, InversePolicy};
 use swm_models::lewm::LewmCost;
 use swm_models::{Checkpoint, Device};
 use swm_plan::objective::ObjectiveConfig;
+use swm_plan::problem::pairing;
+use swm_plan::registry::Actions;
 use swm_plan::{ActionScale, MpcConfig, MpcPolicy, PlanRecord, SOLVERS, Score, SimulatorCost, TraceLog};
 
 /// Knows what is built in and what is at home.
@@ -108,7 +110,8 @@ impl Resolver for Home {
                 Ok(Actor { weights, libraries, device: Some(device), ..Actor::from(policy) })
             }
             Acts::Plan { model, solver, mpc, objective } => {
-                let solver = (SOLVERS.get(&solver.id)?.make)(&solver.settings)?;
+                let (id, solver) = (&solver.id, (SOLVERS.get(&solver.id)?.make)(&solver.settings)?);
+                let actions = Actions::of(&spec.action_space);
                 let wrong = |what: &str, error: serde_json::Error| {
                     Error::config(what, error.to_string(), "`swm eval --help` lists what there is")
                 };
@@ -127,7 +130,8 @@ impl Resolver for Home {
                             None => (entry.make)(),
                         };
                         let cost = SimulatorCost::new(make, scale.clone(), mpc.action_block, score)?;
-                        let cost = objective.apply(Box::new(cost))?;
+                        let mut cost = objective.apply(Box::new(cost))?;
+                        pairing(id, &mut *cost, actions)?;
                         let policy = MpcPolicy::new(solver, cost, mpc, scale, spec, slots)?;
                         Ok(self.planning(&request.name, policy))
                     }
@@ -135,7 +139,8 @@ impl Resolver for Home {
                         let checkpoint = Checkpoint::load(&home::find_checkpoint(given)?, &Device::flex())?;
                         fits(checkpoint.env.as_deref(), given, entry)?;
                         let cost: Box<dyn CostModel> = Box::new(LewmCost::new(&checkpoint));
-                        let (cost, scale) = (objective.apply(cost)?, checkpoint.action.clone());
+                        let (mut cost, scale) = (objective.apply(cost)?, checkpoint.action.clone());
+                        pairing(id, &mut *cost, actions)?;
                         let policy = MpcPolicy::new(solver, cost, mpc, scale, spec, slots)?;
                         Ok(Actor {
                             weights: Some(checkpoint.hash().to_owned()),

@@ -3,7 +3,7 @@
 use super::solvers;
 use clap::Args;
 use serde_json::{Map, Value, json};
-use swm_core::{EnvEntry, Error, Result, Space};
+use swm_core::{EnvEntry, Error, Result};
 use swm_eval::{Acts, Choice, Model};
 use swm_plan::objective::ObjectiveConfig;
 use swm_plan::registry::Actions;
@@ -58,10 +58,7 @@ impl PlannerArgs {
             });
             return choices.collect();
         }
-        let actions = match (entry.make)().spec().action_space {
-            Space::Box { .. } => Actions::Continuous,
-            _ => Actions::Discrete,
-        };
+        let actions = Actions::of(&(entry.make)().spec().action_space);
         let first = match actions {
             Actions::Continuous => SOLVERS.get("cem")?,
             Actions::Discrete => {

@@ -130,7 +130,9 @@ fn policies_are_compared_on_the_same_starts_and_reproduced() {
         assert_eq!(planned["runs"][1]["timing"]["plan_seconds"]["n"].as_u64(), Some(2), "{planner:?}");
     }
     swm.refuses(&["eval", "small", "--episodes", "2", "--solver", "lagrangian"], 2, &["needs constraints", "gd"]);
-    swm.refuses(&["eval", "small", "--episodes", "2", "--solver", "pgd"], 2, &["discrete", "cem"]);
+    let unfit = ["eval", "small", "--episodes", "2", "--solver", "pgd"];
+    swm.refuses(&unfit, 2, &["discrete", "cem"]);
+    assert!(!text(&swm.run(&unfit).stderr).contains("random"), "it is found before the floor is played");
 
     let again = swm.json(&["reproduce", "found", "--threads", "1", "--envs", "3"]);
     assert_eq!((&again["holds"], &again["differences"]), (&Value::Bool(true), &Value::Array(vec![])));

@@ -174,10 +174,10 @@ impl EvalArgs {
             Kind::Plans { model: Some(given), block, history } => (Model::Checkpoint(given), block, history),
         };
         let solvers = self.planner.solvers(entry)?;
-        let several = solvers.len() > 1;
-        let named = |solver: &str| if several { format!("{name} ({solver})") } else { name.clone() };
-        let policies = solvers.into_iter().map(|solver| {
-            let name = named(&solver.id);
+        // Several solvers are told apart by what was written, settings included.
+        let words = &self.planner.solvers;
+        let policies = solvers.into_iter().enumerate().map(|(i, solver)| {
+            let name = if words.len() > 1 { format!("{name} ({})", words[i]) } else { name.clone() };
             let acts = self.planner.plan(model.clone(), solver, block, history)?;
             Ok((PolicyRequest { name, acts }, image))
         });

@@ -154,6 +154,10 @@ fn protocols_splits_and_settings_are_checked() {
     assert!(test["runs"][0]["episodes"][0]["start"].is_array());
     let compat = run(&["--protocol", "compat"]);
     assert!(compat["manifest"]["config"]["counting"]["compat"]["envs"].is_u64());
+    let searches = ["eval", "simulator", "--env", "swm/TwoRoom-v1", "--episodes", "3", "--budget", "10", "-o", "found"];
+    let small = ["--solver", "cem,samples=8,elites=2,iterations=2", "--solver", "cem,samples=9,elites=2,iterations=2"];
+    let found = swm.json(&[&searches[..], &small].concat());
+    assert_eq!(found["runs"][2]["policy"], "simulator (cem,samples=9,elites=2,iterations=2)");
     let held = run(&["--hold", "3"]);
     assert_eq!(held["counting"]["strict"]["hold"], 3);
     swm.refuses(&[&expert[..], &["--split", "rest"]].concat(), 2, &["rest"]);

@@ -36,7 +36,7 @@ pub(crate) fn plot(group: &Group<'_>) -> Option<String> {
         y += ROW;
         for (a, b, table) in pairs {
             let middle = y + ROW / 2.0;
-            let names = format!("{} \u{2212} {}", shorten(&a.label, 24), shorten(&b.label, 24));
+            let names = format!("{} \u{2212} {}", shorten(&a.label, 22), shorten(&b.label, 22));
             svg.text("label end", [LABELS - 14.0, middle + 4.5], &names);
             let [low, high, at] = [table.low, table.high, table.difference].map(|share| scale.at(share * 100.0));
             let whisker = format!("whisker {}", a.class);

@@ -13,6 +13,8 @@ const WIDE: f64 = 920.0;
 const HALF: f64 = 440.0;
 /// Where labelled rows begin.
 const LABELS: f64 = 200.0;
+/// Letters of a name that have room there.
+const NAME: usize = 23;
 /// Height of a labelled row.
 const ROW: f64 = 30.0;
 
@@ -52,7 +54,7 @@ pub(crate) fn success(group: &Group<'_>) -> String {
                 percent(p.low),
                 percent(p.high)
             );
-            svg.text("label end", [LABELS - 14.0, y + 4.5], &shorten(&row.label, 26));
+            svg.text("label end", [LABELS - 14.0, y + 4.5], &shorten(&row.label, NAME));
             let (low, high) = (scale.at(p.low * 100.0), scale.at(p.high * 100.0));
             svg.line(&format!("whisker {}", row.class), [low, y], [high, y]);
             for x in [low, high] {
@@ -136,7 +138,7 @@ pub(crate) fn episodes(group: &Group<'_>) -> String {
         svg.text("head", [0.0, top + 20.0], &shorten(condition.name, 60));
         top += 34.0;
         for row in &condition.rows {
-            svg.text("label end", [LABELS - 14.0, top + 9.5], &shorten(&row.label, 26));
+            svg.text("label end", [LABELS - 14.0, top + 9.5], &shorten(&row.label, NAME));
             for (i, episode) in row.run.episodes.iter().enumerate() {
                 #[allow(clippy::cast_precision_loss)]
                 let corner = [LABELS + (i % A_LINE) as f64 * CELL, top + (i / A_LINE) as f64 * CELL];
@@ -176,7 +178,7 @@ pub(crate) fn latency(group: &Group<'_>) -> Option<String> {
         #[allow(clippy::cast_precision_loss)]
         let y = 6.0 + (i as f64 + 0.5) * 40.0;
         let (median, p95) = (scale.at(seconds.median * 1e3), scale.at(seconds.p95 * 1e3));
-        svg.text("label end", [LABELS - 14.0, y - 2.0], &shorten(&row.label, 26));
+        svg.text("label end", [LABELS - 14.0, y - 2.0], &shorten(&row.label, NAME));
         svg.text("tick end", [LABELS - 14.0, y + 12.0], &shorten(condition, 30));
         let tip = format!("{} plans, mean {}", seconds.n, duration(seconds.mean));
         svg.rect(&format!("bar {}", row.class), [LABELS, y - 8.0], [median - LABELS, 16.0], &tip);

@@ -1,7 +1,7 @@
 //! Factor values as bytes, and out of dataset rows: what every environment's `snapshot`, `restore` and
 //! `restore_from` need.
 
-use swm_core::{Error, FactorValues, Key, Result, RowRef, VariationRequest, VariationSpace};
+use swm_core::{Error, FactorValues, Key, Result, RowRef, Snapshot, VariationRequest, VariationSpace};
 
 /// The column that holds a factor in a dataset: `variation_agent_color` for `agent.color`.
 pub fn column(key: &str) -> String {
@@ -48,15 +48,60 @@ fn snapped(value: f64, (low, high): (f64, f64)) -> f64 {
 }
 
 /// Appends every value, in sampling order, to `bytes`.
-pub fn write(values: &FactorValues, bytes: &mut Vec<u8>) {
+fn write(values: &FactorValues, bytes: &mut Vec<u8>) {
     for (_, value) in values.iter() {
         bytes.extend(value.iter().flat_map(|v| v.to_le_bytes()));
     }
 }
 
 /// Bytes that [`write`] appends for a space.
-pub fn byte_len(space: &VariationSpace) -> usize {
+fn byte_len(space: &VariationSpace) -> usize {
     space.factors().iter().map(|factor| factor.space.len() * size_of::<f64>()).sum()
+}
+
+/// A snapshot: the environment's id, its factors, and whatever bytes its state is.
+pub fn snapshot(id: &str, values: &FactorValues, state: impl IntoIterator<Item = u8>) -> Snapshot {
+    let mut bytes = id.as_bytes().to_vec();
+    write(values, &mut bytes);
+    bytes.extend(state);
+    Snapshot(bytes)
+}
+
+/// The factors of a [`snapshot`], `None` where they are the `current` ones, and the bytes of its state.
+///
+/// # Errors
+/// When it is of another environment, too short, or holds impossible values.
+pub fn restored<'a>(
+    id: &str,
+    space: &VariationSpace,
+    current: &FactorValues,
+    snapshot: &'a Snapshot,
+) -> Result<(Option<FactorValues>, &'a [u8])> {
+    match snapshot.0.strip_prefix(id.as_bytes()) {
+        Some(body) => read_changed(space, current, body),
+        None => Err(foreign(id, "a snapshot of another environment")),
+    }
+}
+
+/// A snapshot that is none of this environment.
+pub fn foreign(id: &str, given: impl Into<String>) -> Error {
+    Error::mismatch("restoring a snapshot", given, format!("one of {id}"))
+}
+
+/// The bytes of two places, where an agent is and where it should go.
+pub fn places_to_bytes(agent: [f32; 2], goal: [f32; 2]) -> impl Iterator<Item = u8> {
+    agent.into_iter().chain(goal).flat_map(f32::to_le_bytes)
+}
+
+/// The two places of [`places_to_bytes`].
+///
+/// # Errors
+/// When these are not their bytes.
+pub fn places_from_bytes(id: &str, bytes: &[u8]) -> Result<[[f32; 2]; 2]> {
+    match bytes.as_chunks() {
+        (&[ax, ay, gx, gy], []) => Ok([[ax, ay], [gx, gy]].map(|place| place.map(f32::from_le_bytes))),
+        _ => Err(foreign(id, format!("{} bytes of places", bytes.len()))),
+    }
 }
 
 /// As [`read`], but `None` for the values of `current`. Whoever plans in a simulator restores one episode's states
@@ -64,7 +109,7 @@ pub fn byte_len(space: &VariationSpace) -> usize {
 ///
 /// # Errors
 /// As [`read`].
-pub fn read_changed<'a>(
+fn read_changed<'a>(
     space: &VariationSpace,
     current: &FactorValues,
     bytes: &'a [u8],
@@ -83,7 +128,7 @@ pub fn read_changed<'a>(
 ///
 /// # Errors
 /// When there are too few bytes or they hold impossible values.
-pub fn read<'a>(space: &VariationSpace, bytes: &'a [u8]) -> Result<(FactorValues, &'a [u8])> {
+fn read<'a>(space: &VariationSpace, bytes: &'a [u8]) -> Result<(FactorValues, &'a [u8])> {
     let Some((mut head, rest)) = bytes.split_at_checked(byte_len(space)) else {
         let (given, expected) = (format!("{} bytes", bytes.len()), format!("at least {}", byte_len(space)));
         return Err(Error::mismatch("restoring the factors of a snapshot", given, expected));

@@ -172,27 +172,23 @@ impl<W: World> Env for Classic<W> {
     }
 
     fn snapshot(&self) -> Snapshot {
-        let mut bytes = W::ID.as_bytes().to_vec();
-        values::write(&self.factors, &mut bytes);
-        for number in self.state.as_ref().iter().chain(self.goal.as_ref()) {
-            bytes.extend(number.to_le_bytes());
-        }
-        Snapshot(bytes)
+        let numbers = self.state.as_ref().iter().chain(self.goal.as_ref());
+        values::snapshot(W::ID, &self.factors, numbers.flat_map(|number| number.to_le_bytes()))
     }
 
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let wrong = |given| Error::mismatch("restoring a snapshot", given, format!("one of {}", W::ID));
-        let body = snapshot.0.strip_prefix(W::ID.as_bytes());
-        let body = body.ok_or_else(|| wrong("a snapshot of another environment".to_owned()))?;
-        let (factors, rest) = values::read(&self.spec.variation_space, body)?;
+        let (factors, rest) = values::restored(W::ID, &self.spec.variation_space, &self.factors, snapshot)?;
         let (mut state, mut goal) = (W::State::default(), W::State::default());
         let numbers = state.as_mut().iter_mut().chain(goal.as_mut());
         let (chunks, tail) = rest.as_chunks();
         if chunks.len() != numbers.size_hint().0 || !tail.is_empty() {
-            return Err(wrong(format!("{} bytes of state and goal", rest.len())));
+            return Err(values::foreign(W::ID, format!("{} bytes of state and goal", rest.len())));
         }
         numbers.zip(chunks).for_each(|(number, &bytes)| *number = f64::from_le_bytes(bytes));
-        self.arrange(factors, state, goal);
+        match factors {
+            Some(factors) => self.arrange(factors, state, goal),
+            None => (self.state, self.goal) = (state, goal),
+        }
         Ok(())
     }
 

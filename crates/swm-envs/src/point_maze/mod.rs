@@ -270,24 +270,19 @@ impl Env for PointMaze {
     }
 
     fn snapshot(&self) -> Snapshot {
-        let mut bytes = ENTRY.id.as_bytes().to_vec();
-        factors::write(&self.factors, &mut bytes);
-        for number in self.agent.center.into_iter().chain(self.scene.goal.center) {
-            bytes.extend(number.to_le_bytes());
-        }
-        Snapshot(bytes)
+        factors::snapshot(ENTRY.id, &self.factors, factors::places_to_bytes(self.agent.center, self.scene.goal.center))
     }
 
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let wrong = |given| Error::mismatch("restoring a snapshot", given, format!("one of {}", ENTRY.id));
-        let body = snapshot.0.strip_prefix(ENTRY.id.as_bytes());
-        let body = body.ok_or_else(|| wrong("a snapshot of another environment".to_owned()))?;
-        let (factors, places) = factors::read(&self.spec.variation_space, body)?;
-        let numbers: Vec<f32> = places.as_chunks().0.iter().map(|&number| f32::from_le_bytes(number)).collect();
-        let [ax, ay, gx, gy] = numbers[..] else {
-            return Err(wrong(format!("{} bytes of places", places.len())));
-        };
-        self.arrange(factors, [ax, ay], [gx, gy]);
+        let (factors, places) = factors::restored(ENTRY.id, &self.spec.variation_space, &self.factors, snapshot)?;
+        let [agent, goal] = factors::places_from_bytes(ENTRY.id, places)?;
+        match factors {
+            Some(factors) => self.arrange(factors, agent, goal),
+            None => {
+                self.agent.center = agent;
+                self.aim(goal);
+            }
+        }
         Ok(())
     }
 

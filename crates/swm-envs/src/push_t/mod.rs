@@ -218,8 +218,7 @@ impl Env for PushT {
     }
 
     fn snapshot(&self) -> Snapshot {
-        let mut bytes = self.spec.id.as_bytes().to_vec();
-        factors::write(&self.factors, &mut bytes);
+        let Snapshot(mut bytes) = factors::snapshot(self.spec.id, &self.factors, []);
         put(&mut bytes, &self.goal);
         put(&mut bytes, &[self.contacts as u64]);
         self.world.save(&mut bytes);
@@ -228,9 +227,8 @@ impl Env for PushT {
 
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
         let id = self.spec.id;
-        let foreign = || Error::mismatch("restoring a snapshot", "other bytes", format!("a snapshot of {id}"));
-        let bytes = snapshot.0.strip_prefix(id.as_bytes()).ok_or_else(foreign)?;
-        let (factors, mut bytes) = factors::read_changed(&self.spec.variation_space, &self.factors, bytes)?;
+        let foreign = || factors::foreign(id, "other bytes");
+        let (factors, mut bytes) = factors::restored(id, &self.spec.variation_space, &self.factors, snapshot)?;
         let goal = take_array::<f64, 7>(&mut bytes).ok_or_else(foreign)?;
         let [contacts] = take_array::<u64, 1>(&mut bytes).ok_or_else(foreign)?;
         let goal = checked(&goal, "goal of a snapshot")?;

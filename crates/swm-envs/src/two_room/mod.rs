@@ -259,23 +259,12 @@ impl Env for TwoRoom {
     }
 
     fn snapshot(&self) -> Snapshot {
-        let mut bytes = ENTRY.id.as_bytes().to_vec();
-        factors::write(&self.factors, &mut bytes);
-        for number in self.agent.center.into_iter().chain(self.goal) {
-            bytes.extend(number.to_le_bytes());
-        }
-        Snapshot(bytes)
+        factors::snapshot(ENTRY.id, &self.factors, factors::places_to_bytes(self.agent.center, self.goal))
     }
 
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let wrong = |given| Error::mismatch("restoring a snapshot", given, format!("one of {}", ENTRY.id));
-        let body = snapshot.0.strip_prefix(ENTRY.id.as_bytes());
-        let body = body.ok_or_else(|| wrong("a snapshot of another environment".to_owned()))?;
-        let (factors, places) = factors::read_changed(&self.spec.variation_space, &self.factors, body)?;
-        let (&[ax, ay, gx, gy], []) = places.as_chunks() else {
-            return Err(wrong(format!("{} bytes of places", places.len())));
-        };
-        let [agent, goal] = [[ax, ay], [gx, gy]].map(|place| place.map(f32::from_le_bytes));
+        let (factors, places) = factors::restored(ENTRY.id, &self.spec.variation_space, &self.factors, snapshot)?;
+        let [agent, goal] = factors::places_from_bytes(ENTRY.id, places)?;
         match factors {
             Some(factors) => self.arrange(factors, agent, goal),
             None => {

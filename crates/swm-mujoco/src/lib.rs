@@ -2,11 +2,20 @@
 //!
 //! MuJoCo's library and the models of the worlds are no part of the program: [`assets`] fetches them, [`link`] loads the
 //! library when a world first needs it. Tests and programs share one copy of the assets through `SWM_ASSETS`
-//! (`SWM_ASSETS=~/.cache/swm/assets` on a developer's machine; `make assets` fills it).
+//! (`SWM_ASSETS=~/.cache/swm/assets` on a developer's machine).
+//!
+//! Read [`physics`] (a model and its state), [`render`] (its picture), [`env`] (what all worlds share), and then a family.
 
 pub mod assets;
+mod env;
 mod ffi;
 pub mod link;
-mod physics;
+pub mod physics;
+pub mod render;
 
-pub use physics::{Physics, compile, compile_file, shared};
+pub use physics::Physics;
+
+use swm_core::{EnvEntry, Registry};
+
+/// Every environment of this crate. (M2, M3: add `pub mod dmc;`, `pub mod ogbench;` above and your rows here yourselves.)
+pub static ENVS: Registry<EnvEntry> = Registry { kind: "environment", hint: "`swm envs` lists them", rows: &[] };

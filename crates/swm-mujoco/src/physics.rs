@@ -7,13 +7,15 @@
 //! exit. Both set [`Physics::is_unstable`], which stays set until the next reset, and a world ends its episode.
 #![allow(unsafe_code, reason = "calls of MuJoCo's functions on the model and data that `Physics` owns")]
 
+use crate::render::Look;
 use crate::{ffi, link};
 use mujoco_rs::mujoco_c::{mjData, mjModel, mjtDisableBit, mjtIntegrator, mjtState, mjtWarning};
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
 use mujoco_rs::wrappers::{MjData, MjModel};
 use std::collections::BTreeMap;
+use std::hash::{DefaultHasher, Hasher};
 use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 use swm_core::{Error, Result};
 
 /// What decides how a world goes on, in this order: time, `qpos`, `qvel`, `act`, `qacc_warmstart`, `ctrl`, `eq_active`,
@@ -71,6 +73,35 @@ pub fn shared(name: &str, compile: impl FnOnce() -> Result<MjModel>) -> Result<A
     Ok(model)
 }
 
+/// A state of a model, at its beginning.
+fn make_data(model: Box<MjModel>) -> Result<MjData<Box<MjModel>>> {
+    MjData::try_new(model).map_err(|error| Error::external("making a MuJoCo state", error))
+}
+
+/// A number for an original model, never given to another one while the process lives.
+fn group_of(original: &Arc<MjModel>) -> u64 {
+    /// The models that have numbers, and the next number. A weak pointer keeps its address from being used again.
+    static GROUPS: Mutex<(Vec<(Weak<MjModel>, u64)>, u64)> = Mutex::new((Vec::new(), 0));
+    let mut groups = GROUPS.lock().unwrap_or_else(PoisonError::into_inner);
+    let (known, next) = &mut *groups;
+    known.retain(|(model, _)| model.strong_count() > 0);
+    match known.iter().find(|(model, _)| model.as_ptr() == Arc::as_ptr(original)) {
+        Some((_, number)) => *number,
+        None => {
+            known.push((Arc::downgrade(original), *next));
+            *next += 1;
+            *next - 1
+        }
+    }
+}
+
+/// The bytes of a texture.
+fn texture(model: &MjModel, place: usize) -> &[u8] {
+    let begin = usize::try_from(model.tex_adr()[place]).unwrap_or(0);
+    let end = model.tex_adr().get(place + 1).map_or(model.tex_data().len(), |&next| usize::try_from(next).unwrap_or(0));
+    &model.tex_data()[begin..end]
+}
+
 /// How the quantities derived from the state (poses, velocities, sensors) came about: what [`Physics::load`] repeats.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Settled {
@@ -93,6 +124,13 @@ pub struct Physics {
     before: Vec<f64>,
     settled: Settled,
     unstable: bool,
+    /// Whether the model differs from the original.
+    edited: bool,
+    look: Look,
+    /// Whether `look` may be out of date.
+    repainted: bool,
+    /// The model whose textures are the usual ones of the group: these have the number 0.
+    usual: Arc<MjModel>,
 }
 
 impl Physics {
@@ -102,9 +140,17 @@ impl Physics {
     /// When there is no memory for it.
     pub fn new(original: Arc<MjModel>) -> Result<Self> {
         let copy = Box::new(MjModel::clone(&original));
-        let before = vec![0.0; original.state_size(STATE)];
-        let data = MjData::try_new(copy).map_err(|error| Error::external("making a MuJoCo state", error))?;
-        let mut physics = Self { data, original, before, settled: Settled::Forward, unstable: false };
+        let mut physics = Self {
+            before: vec![0.0; original.state_size(STATE)],
+            data: make_data(copy)?,
+            settled: Settled::Forward,
+            unstable: false,
+            edited: false,
+            look: Look { group: group_of(&original), textures: vec![0; original.tex_adr().len()].into() },
+            repainted: false,
+            usual: Arc::clone(&original),
+            original,
+        };
         physics.forward();
         Ok(physics)
     }
@@ -121,6 +167,7 @@ impl Physics {
 
     /// The model, to edit: sizes, colours, masses, never the number of anything, and never the model as a whole.
     pub(crate) fn model_mut(&mut self) -> &mut MjModel {
+        self.edited = true;
         // SAFETY: this crate edits numbers in the model's arrays, and exchanges models in `replace_model` alone.
         unsafe { self.data.model_mut() }
     }
@@ -137,6 +184,9 @@ impl Physics {
 
     /// Undoes every edit of the model.
     pub fn restore_model(&mut self) {
+        if !std::mem::take(&mut self.edited) {
+            return;
+        }
         let original = std::ptr::from_ref(self.original.ffi());
         let (model, _) = self.raw();
         // SAFETY: both are valid models of equal sizes, of which the first is ours alone.
@@ -144,14 +194,45 @@ impl Physics {
         debug_assert!(copied.is_some(), "models of equal sizes");
     }
 
-    /// Takes another compiled model in place of the original one: the same world from an edited description. Whoever
-    /// changes densities or shapes needs one, because masses, inertias and textures are computed when a model is compiled.
+    /// Takes another compiled model in place of the original one: the same world from an edited description, with the same
+    /// meshes and textures of the same sizes. Whoever changes densities or shapes needs one, because masses, inertias and
+    /// textures are computed when a model is compiled. The state is the model's initial one.
     ///
     /// # Errors
     /// When there is no memory for its state.
     pub fn replace_model(&mut self, original: Arc<MjModel>) -> Result<()> {
-        *self = Self::new(original)?;
+        self.data = make_data(Box::new(MjModel::clone(&original)))?;
+        self.before.resize(original.state_size(STATE), 0.0);
+        self.original = original;
+        (self.unstable, self.edited, self.repainted) = (false, false, true);
+        self.forward();
         Ok(())
+    }
+
+    /// To be called after an edit of texture data, so that pictures follow.
+    pub(crate) fn repaint(&mut self) {
+        self.repainted = true;
+    }
+
+    /// Brings [`Physics::look`] up to date.
+    pub(crate) fn refresh_look(&mut self) {
+        if std::mem::take(&mut self.repainted) {
+            let (model, usual) = (self.data.model(), &self.usual);
+            let textures = (0..model.tex_adr().len()).map(|i| match (texture(model, i), texture(usual, i)) {
+                (now, usual) if now == usual => 0,
+                (now, _) => {
+                    let mut hasher = DefaultHasher::new();
+                    hasher.write(now);
+                    hasher.finish().max(1)
+                }
+            });
+            self.look.textures = textures.collect();
+        }
+    }
+
+    /// What a renderer needs to know of the model.
+    pub(crate) fn look(&self) -> &Look {
+        &self.look
     }
 
     /// Recomputes what the model derives from its reference pose, after edits of masses or sizes.
@@ -247,7 +328,7 @@ impl Physics {
     }
 
     /// The pointers MuJoCo wants.
-    fn raw(&mut self) -> (*mut mjModel, *mut mjData) {
+    pub(crate) fn raw(&mut self) -> (*mut mjModel, *mut mjData) {
         // SAFETY: the pointers are used for calls of MuJoCo alone, one after the other.
         unsafe { (std::ptr::from_mut(self.data.model_mut().ffi_mut()), std::ptr::from_mut(self.data.ffi_mut())) }
     }
@@ -316,6 +397,28 @@ impl Physics {
         }
         self.reset();
         self.data.set_state(state, STATE).map_err(|error| Error::external("restoring a MuJoCo state", error))
+    }
+
+    /// Numbers of `qpos` and `qvel`.
+    pub fn pose_len(&self) -> usize {
+        self.data.qpos().len() + self.data.qvel().len()
+    }
+
+    /// Puts `qpos` and `qvel`, leaves the rest of the state, and computes what is derived from it.
+    ///
+    /// # Errors
+    /// When it has another length, or a number is not finite.
+    pub fn set_pose(&mut self, pose: &[f64]) -> Result<()> {
+        let mut state = vec![0.0; self.state_len()];
+        self.state(&mut state);
+        match state.get_mut(1..=self.pose_len()).filter(|place| place.len() == pose.len()) {
+            Some(place) => place.copy_from_slice(pose),
+            None => {
+                let (given, expected) = (format!("{} numbers", pose.len()), self.pose_len().to_string());
+                return Err(Error::mismatch("putting qpos and qvel", given, expected));
+            }
+        }
+        self.set_state(&state)
     }
 
     /// Numbers of [`Physics::save`].

@@ -1,0 +1,138 @@
+//! Pictures of a world: RGB, depth and segmentation, through any camera, at any size, straight into the caller's buffer.
+//!
+//! A [`Stage`] turns a world into MuJoCo's abstract scene (geoms, lights, cameras) on the thread that owns the world. A
+//! [`Renderer`] draws scenes. There is one for the process: MuJoCo's own, in OpenGL through EGL ([`egl`]).
+
+mod egl;
+mod stage;
+
+pub(crate) use stage::Stage;
+
+use crate::Physics;
+use mujoco_rs::mujoco_c::mjvScene;
+use mujoco_rs::wrappers::MjModel;
+use std::sync::{Arc, OnceLock};
+use swm_core::{Error, Result};
+
+/// From where a world is seen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Camera {
+    /// The free camera, where the model puts it at first.
+    Free,
+    /// A camera of the model, by its place.
+    Fixed(usize),
+}
+
+/// What to draw, and where: `height` rows of `width` pixels, the upper row first.
+pub enum Picture<'a> {
+    /// Red, green, blue: three bytes a pixel.
+    Rgb(&'a mut [u8]),
+    /// Distance along the line of sight of the camera's middle, in metres.
+    Depth(&'a mut [f32]),
+    /// The geom at each pixel by its place in the model, -1 where there is none.
+    Segmentation(&'a mut [i32]),
+}
+
+impl Picture<'_> {
+    /// Numbers it has room for.
+    fn len(&self) -> usize {
+        match self {
+            Self::Rgb(bytes) => bytes.len(),
+            Self::Depth(metres) => metres.len(),
+            Self::Segmentation(geoms) => geoms.len(),
+        }
+    }
+
+    /// Numbers of one pixel.
+    fn channels(&self) -> usize {
+        match self {
+            Self::Rgb(_) => 3,
+            Self::Depth(_) | Self::Segmentation(_) => 1,
+        }
+    }
+}
+
+/// What a renderer keeps of a model from picture to picture: which model, and what its textures are.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Look {
+    /// Models of one group have the same meshes, and textures of the same sizes.
+    pub group: u64,
+    /// A number for the content of each texture; equal contents have equal numbers.
+    pub textures: Arc<[u64]>,
+}
+
+/// What a renderer is given: an abstract scene and the model it is of.
+pub(crate) struct Scene<'a> {
+    pub abstracted: &'a mut mjvScene,
+    pub model: &'a MjModel,
+    pub look: &'a Look,
+}
+
+/// Draws scenes. Any thread may ask; the call returns when the picture is there.
+pub(crate) trait Renderer: Send + Sync {
+    /// What draws, for logs and manifests: `egl (llvmpipe …)`.
+    fn name(&self) -> &str;
+
+    /// Draws a scene.
+    ///
+    /// # Errors
+    /// When the graphics library fails.
+    fn draw(&self, scene: Scene<'_>, width: usize, height: usize, picture: Picture<'_>) -> Result<()>;
+}
+
+static RENDERER: OnceLock<Result<egl::Egl, String>> = OnceLock::new();
+
+/// The name of the renderer, if a picture was asked for.
+pub(crate) fn used() -> Option<&'static str> {
+    RENDERER.get()?.as_ref().ok().map(Renderer::name)
+}
+
+/// The renderer of this process, made when the first picture is asked for.
+///
+/// # Errors
+/// When this machine has none: says what to install.
+pub(crate) fn renderer() -> Result<&'static dyn Renderer> {
+    let made = RENDERER.get_or_init(|| {
+        let made = egl::Egl::new().map_err(|error| error.to_string());
+        match &made {
+            Ok(renderer) => tracing::info!("pictures of MuJoCo's worlds are drawn by {}", renderer.name()),
+            Err(problem) => tracing::warn!("no renderer: {problem}"),
+        }
+        made
+    });
+    match made {
+        Ok(renderer) => Ok(renderer),
+        Err(problem) => Err(Error::config(
+            "drawing a MuJoCo world",
+            problem,
+            "install EGL (Debian: apt install libegl1 libegl-mesa0 libgl1-mesa-dri), or work from states, without pictures",
+        )),
+    }
+}
+
+/// Draws a world. `stage` is made at the first picture, and kept.
+///
+/// # Errors
+/// When there is no renderer, the buffer does not fit, or the graphics library fails.
+pub(crate) fn draw(
+    stage: &mut Option<Box<Stage>>,
+    physics: &mut Physics,
+    camera: Camera,
+    (width, height): (usize, usize),
+    picture: Picture<'_>,
+) -> Result<()> {
+    let expected = width * height * picture.channels();
+    if picture.len() != expected {
+        let given = format!("room for {}", picture.len());
+        return Err(Error::mismatch(format!("drawing {width} x {height} pixels"), given, expected.to_string()));
+    }
+    if expected == 0 {
+        return Ok(());
+    }
+    let renderer = renderer()?;
+    let stage = stage.get_or_insert_with(|| Box::new(Stage::new(physics.model())));
+    stage.set(physics, camera, matches!(picture, Picture::Segmentation(_)))?;
+    physics.refresh_look();
+    let scene = Scene { abstracted: stage.scene(), model: physics.model(), look: physics.look() };
+    renderer.draw(scene, width, height, picture)
+}

@@ -1,0 +1,191 @@
+//! EGL, opened when the first picture is asked for: devices, and contexts without a window.
+//! Constants and signatures are those of the EGL 1.5 specification and its device and platform extensions.
+
+use libloading::os::unix::{Library as Shared, RTLD_GLOBAL, RTLD_NOW};
+use std::ffi::{CStr, c_char, c_int, c_void};
+use swm_core::{Error, Result};
+
+type Pointer = *mut c_void;
+type Bool = u32;
+
+const TRUE: Bool = 1;
+const NONE: c_int = 0x3038;
+const EXTENSIONS: c_int = 0x3055;
+const OPENGL_API: u32 = 0x30A2;
+const PLATFORM_DEVICE: u32 = 0x313F;
+const PLATFORM_SURFACELESS: u32 = 0x31DD;
+/// Eight bits a colour and of opacity, depth, stencil, a buffer beside the screen, OpenGL.
+const CONFIG: [c_int; 17] =
+    [0x3024, 8, 0x3023, 8, 0x3022, 8, 0x3021, 8, 0x3025, 24, 0x3026, 8, 0x3033, 0x0001, 0x3040, 0x0008, NONE];
+const PBUFFER: [c_int; 5] = [0x3057, 1, 0x3056, 1, NONE];
+const GL_RENDERER: u32 = 0x1F01;
+
+/// The functions needed of EGL.
+pub struct Library {
+    get_proc_address: unsafe extern "C" fn(*const c_char) -> Pointer,
+    get_display: unsafe extern "C" fn(Pointer) -> Pointer,
+    initialize: unsafe extern "C" fn(Pointer, *mut c_int, *mut c_int) -> Bool,
+    choose_config: unsafe extern "C" fn(Pointer, *const c_int, *mut Pointer, c_int, *mut c_int) -> Bool,
+    bind_api: unsafe extern "C" fn(u32) -> Bool,
+    create_context: unsafe extern "C" fn(Pointer, Pointer, Pointer, *const c_int) -> Pointer,
+    create_pbuffer: unsafe extern "C" fn(Pointer, Pointer, *const c_int) -> Pointer,
+    make_current: unsafe extern "C" fn(Pointer, Pointer, Pointer, Pointer) -> Bool,
+    get_error: unsafe extern "C" fn() -> c_int,
+    /// Keeps the functions where they are.
+    _shared: Shared,
+}
+
+/// A device that was opened.
+#[derive(Clone, Copy)]
+pub struct Display {
+    pointer: Pointer,
+    /// Whether a graphics card is behind it, as far as it says.
+    pub hardware: bool,
+}
+
+// SAFETY: EGL allows a display to be used from any thread.
+unsafe impl Send for Display {}
+
+impl Library {
+    /// Opens EGL. Its symbols become visible to all: MuJoCo looks for OpenGL's functions through them.
+    ///
+    /// # Errors
+    /// When it is not installed.
+    pub fn open() -> Result<Self> {
+        let failed = |error: libloading::Error| Error::external("opening libEGL.so.1", error);
+        // SAFETY: opening EGL runs the initialisers of a system library.
+        let shared = unsafe { Shared::open(Some("libEGL.so.1"), RTLD_NOW | RTLD_GLOBAL) }.map_err(failed)?;
+        // SAFETY: each is called as its specification declares it.
+        unsafe {
+            Ok(Self {
+                get_proc_address: *shared.get("eglGetProcAddress").map_err(failed)?,
+                get_display: *shared.get("eglGetDisplay").map_err(failed)?,
+                initialize: *shared.get("eglInitialize").map_err(failed)?,
+                choose_config: *shared.get("eglChooseConfig").map_err(failed)?,
+                bind_api: *shared.get("eglBindAPI").map_err(failed)?,
+                create_context: *shared.get("eglCreateContext").map_err(failed)?,
+                create_pbuffer: *shared.get("eglCreatePbufferSurface").map_err(failed)?,
+                make_current: *shared.get("eglMakeCurrent").map_err(failed)?,
+                get_error: *shared.get("eglGetError").map_err(failed)?,
+                _shared: shared,
+            })
+        }
+    }
+
+    /// A function that is no part of EGL itself.
+    ///
+    /// # Safety
+    /// `F` must be a pointer to functions of its signature.
+    unsafe fn extension<F: Copy>(&self, name: &CStr) -> Option<F> {
+        // SAFETY: EGL answers for any name.
+        let address = unsafe { (self.get_proc_address)(name.as_ptr()) };
+        // SAFETY: a function's address, not null, has the size of any function pointer; the caller knows the signature.
+        (!address.is_null()).then(|| unsafe { std::mem::transmute_copy(&address) })
+    }
+
+    /// Opens the device that `MUJOCO_EGL_DEVICE_ID` names, else the first one that can draw, graphics cards first.
+    ///
+    /// # Errors
+    /// When none can.
+    pub fn display(&self) -> Result<Display> {
+        let mut devices = self.devices();
+        match std::env::var("MUJOCO_EGL_DEVICE_ID").ok().filter(|text| !text.is_empty()) {
+            Some(text) => {
+                let chosen = text.parse().ok().and_then(|place: usize| devices.get(place).copied());
+                devices = vec![chosen.ok_or_else(|| {
+                    let problem = format!("'{text}' is no device: there are {}", devices.len());
+                    Error::config("MUJOCO_EGL_DEVICE_ID", problem, "give a number from 0 on, or leave it unset")
+                })?];
+            }
+            None => devices.sort_by_key(|display| !display.hardware),
+        }
+        let opened = devices.into_iter().find(|display| {
+            // SAFETY: the display is one that EGL returned; EGL allows nulls where no version is wanted.
+            let open =
+                unsafe { (self.initialize)(display.pointer, std::ptr::null_mut(), std::ptr::null_mut()) } == TRUE;
+            open && self.config(*display).is_some()
+        });
+        opened.ok_or_else(|| {
+            Error::external("EGL", "no device can draw: neither a graphics card's driver nor Mesa is there")
+        })
+    }
+
+    /// The displays of all devices, and Mesa's without any.
+    fn devices(&self) -> Vec<Display> {
+        type QueryDevices = unsafe extern "C" fn(c_int, *mut Pointer, *mut c_int) -> Bool;
+        type QueryString = unsafe extern "C" fn(Pointer, c_int) -> *const c_char;
+        type PlatformDisplay = unsafe extern "C" fn(u32, Pointer, *const c_int) -> Pointer;
+        let mut found = vec![];
+        // SAFETY: signatures are those of EGL_EXT_device_enumeration, EGL_EXT_device_query and EGL_EXT_platform_base; each
+        // is called with the devices EGL itself returned, and with room for as many as is said.
+        unsafe {
+            let query: Option<QueryDevices> = self.extension(c"eglQueryDevicesEXT");
+            let describe: Option<QueryString> = self.extension(c"eglQueryDeviceStringEXT");
+            let Some(platform) = self.extension::<PlatformDisplay>(c"eglGetPlatformDisplayEXT") else {
+                let pointer = (self.get_display)(std::ptr::null_mut());
+                return if pointer.is_null() { vec![] } else { vec![Display { pointer, hardware: false }] };
+            };
+            let (mut devices, mut count) = ([std::ptr::null_mut(); 32], 0);
+            if let Some(query) = query
+                && query(32, devices.as_mut_ptr(), &raw mut count) == TRUE
+            {
+                for device in devices.into_iter().take(usize::try_from(count).unwrap_or(0)) {
+                    let words = describe.map_or(std::ptr::null(), |describe| describe(device, EXTENSIONS));
+                    let software = !words.is_null() && CStr::from_ptr(words).to_string_lossy().contains("_software");
+                    let pointer = platform(PLATFORM_DEVICE, device, std::ptr::null());
+                    if !pointer.is_null() {
+                        found.push(Display { pointer, hardware: !software });
+                    }
+                }
+            }
+            let pointer = platform(PLATFORM_SURFACELESS, std::ptr::null_mut(), std::ptr::null());
+            if !pointer.is_null() {
+                found.push(Display { pointer, hardware: false });
+            }
+        }
+        found
+    }
+
+    /// A configuration of the display that OpenGL can draw with.
+    fn config(&self, display: Display) -> Option<Pointer> {
+        let (mut config, mut count) = (std::ptr::null_mut(), 0);
+        // SAFETY: there is room for the one configuration that is asked for.
+        let chosen =
+            unsafe { (self.choose_config)(display.pointer, CONFIG.as_ptr(), &raw mut config, 1, &raw mut count) };
+        (chosen == TRUE && count > 0).then_some(config)
+    }
+
+    /// Makes a context and binds it to this thread, for good. Returns what draws, in OpenGL's words.
+    ///
+    /// # Errors
+    /// When EGL refuses.
+    pub fn make_current(&self, display: Display) -> Result<String> {
+        let refused = |what: &str| {
+            // SAFETY: asks for the error of this thread.
+            let code = unsafe { (self.get_error)() };
+            Error::external("EGL", format!("{what} failed with {code:#x}"))
+        };
+        let null = std::ptr::null_mut();
+        let config = self.config(display).ok_or_else(|| refused("choosing a configuration"))?;
+        // SAFETY: display and configuration are EGL's own; lists end in NONE. The context is current when OpenGL is asked.
+        unsafe {
+            if (self.bind_api)(OPENGL_API) != TRUE {
+                return Err(refused("choosing OpenGL"));
+            }
+            let context = (self.create_context)(display.pointer, config, null, std::ptr::null());
+            if context.is_null() {
+                return Err(refused("making a context"));
+            }
+            if (self.make_current)(display.pointer, null, null, context) != TRUE {
+                // Older drivers want a surface, though nothing is drawn to it.
+                let surface = (self.create_pbuffer)(display.pointer, config, PBUFFER.as_ptr());
+                if surface.is_null() || (self.make_current)(display.pointer, surface, surface, context) != TRUE {
+                    return Err(refused("making a context current"));
+                }
+            }
+            let get_string: Option<unsafe extern "C" fn(u32) -> *const c_char> = self.extension(c"glGetString");
+            let name = get_string.map_or(std::ptr::null(), |get_string| get_string(GL_RENDERER));
+            Ok(if name.is_null() { "unknown".to_owned() } else { CStr::from_ptr(name).to_string_lossy().into_owned() })
+        }
+    }
+}

@@ -502,11 +502,15 @@ mod shared {
         pub fn at<T: Element>(&mut self, index: usize) -> &mut [T] {
             let column = &self.schema.columns()[index];
             assert!(T::is(column.dtype), "column '{}' holds {}", column.name, column.dtype.name());
-            let n = column.row_bytes();
+            bytemuck::cast_slice_mut(self.bytes(index))
+        }
+
+        /// The bytes of column `index`, to write.
+        pub fn bytes(&mut self, index: usize) -> &mut [u8] {
+            let n = self.schema.columns()[index].row_bytes();
             // SAFETY: the batch is mutably borrowed while rows exist, so its buffers neither move nor are
             // reached otherwise; each holds `rows * n` bytes, and rows are disjoint ranges of them.
-            let bytes = unsafe { std::slice::from_raw_parts_mut(self.starts[index].0.add(self.row * n), n) };
-            bytemuck::cast_slice_mut(bytes)
+            unsafe { std::slice::from_raw_parts_mut(self.starts[index].0.add(self.row * n), n) }
         }
 
         /// Writes the numbers of column `index`.

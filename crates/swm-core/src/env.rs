@@ -6,13 +6,16 @@
 //! ([`Env::restore_from`]), and it can always make a reachable goal ([`Env::sample_goal`]).
 
 use crate::batch::{ColumnSpec, RowMut, RowRef};
+use crate::view::View;
 use crate::{Error, FactorValues, Key, Result, Space, VariationRequest, VariationSpace};
+use std::collections::BTreeMap;
 
 /// What never changes about an environment.
 #[derive(Clone)]
 pub struct EnvSpec {
-    /// Its registered id, such as `swm/PushT-v1`.
-    pub id: &'static str,
+    /// Its registered id with the options that differ from their defaults, such as `swm/PushT-v1` or
+    /// `swm/OGBCube-v0,env_type=double` ([`crate::EnvChoice::id`]).
+    pub id: String,
     /// The actions it takes: a `Float32` box, a discrete space or a multi-discrete one.
     pub action_space: Space,
     /// The columns [`Env::observe`] writes, in order; `state` is always among them.
@@ -24,6 +27,8 @@ pub struct EnvSpec {
     pub variation_space: VariationSpace,
     /// Steps after which an episode is truncated, unless the caller says otherwise.
     pub max_episode_steps: usize,
+    /// The names of its cameras, the default first; none where there is only one way to look at it.
+    pub cameras: Vec<String>,
 }
 
 impl EnvSpec {
@@ -171,10 +176,39 @@ pub trait Env: Send {
     fn observe(&self, row: &mut RowMut<'_>);
 
     /// Draws the world as it is.
-    fn render(&mut self, frame: FrameMut<'_>);
+    ///
+    /// # Errors
+    /// When there is nothing to draw with: a renderer that is missing, or refuses.
+    fn render(&mut self, frame: FrameMut<'_>) -> Result<()>;
 
     /// Draws the world as it would look at the goal.
-    fn render_goal(&mut self, frame: FrameMut<'_>);
+    ///
+    /// # Errors
+    /// As [`Env::render`].
+    fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()>;
+
+    /// Writes what a view of the world shows, in the form of its [`View::column`]. Worlds with one camera know no view
+    /// but that of [`Env::render`].
+    ///
+    /// # Errors
+    /// When there is no such camera, or no such modality; and as [`Env::render`].
+    fn render_view(&mut self, view: &View, height: usize, width: usize, out: &mut [u8]) -> Result<()> {
+        if *view == View::default() {
+            return self.render(FrameMut::new(width, height, out));
+        }
+        Err(view.unknown(self.spec()))
+    }
+
+    /// The libraries that decide its numbers and pictures, such as `mujoco` or `renderer`, with their versions: what
+    /// datasets and results made with it record.
+    fn libraries(&self) -> BTreeMap<String, String> {
+        BTreeMap::new()
+    }
+
+    /// What is the same in every step of this episode and no number, such as the XML of its scene: stored once with it.
+    fn constants(&self) -> BTreeMap<String, Vec<u8>> {
+        BTreeMap::new()
+    }
 
     /// The factors of this episode.
     fn factors(&self) -> &FactorValues;

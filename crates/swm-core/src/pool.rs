@@ -2,12 +2,12 @@
 //!
 //! Everything the environments produce lands in one [`Batch`], `infos`, written in place: the environment's own
 //! columns, then `reward`, `terminated`, `truncated`, `success`, `step_idx`, and, where pictures are asked for,
-//! `pixels` and `goal`. What an environment produces depends on its seed and its actions only, never on the
+//! `pixels`, `goal` and other views. What an environment produces depends on its seed and its actions only, never on the
 //! number of threads or of neighbours.
 
 use crate::batch::{Batch, ColumnSpec, DType, RowMut, Schema};
 use crate::pace::Pace;
-use crate::{Action, Env, EnvSpec, Error, FrameMut, ResetOptions, Result};
+use crate::{Action, Env, EnvSpec, Error, FrameMut, ResetOptions, Result, View};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -23,7 +23,6 @@ pub struct Reset {
 }
 
 /// Columns the pool adds behind the environment's own.
-#[derive(Clone, Copy)]
 struct Places {
     reward: usize,
     terminated: usize,
@@ -31,6 +30,8 @@ struct Places {
     success: usize,
     step: usize,
     pixels: Option<(usize, usize, usize)>,
+    /// The views behind `pixels` and `goal`.
+    views: Vec<View>,
 }
 
 /// Many environments of one kind.
@@ -69,6 +70,23 @@ impl EnvPool {
         max_episode_steps: Option<usize>,
         threads: Arc<rayon::ThreadPool>,
     ) -> Result<Self> {
+        Self::with_views(envs, image, vec![], max_episode_steps, threads)
+    }
+
+    /// As [`EnvPool::new`], with further views of the worlds, each in its own [`View::column`] behind `goal`.
+    ///
+    /// # Errors
+    /// As [`EnvPool::new`], and when views are asked for without a picture's size, or one of them twice.
+    pub fn with_views(
+        envs: Vec<Box<dyn Env>>,
+        image: Option<(usize, usize)>,
+        views: Vec<View>,
+        max_episode_steps: Option<usize>,
+        threads: Arc<rayon::ThreadPool>,
+    ) -> Result<Self> {
+        if image.is_none() && !views.is_empty() {
+            return Err(Error::config("views", "asked for without a size", "give the size of the pictures"));
+        }
         let Some(first) = envs.first() else {
             return Err(Error::config("number of environments", "0", "ask for at least 1"));
         };
@@ -83,6 +101,7 @@ impl EnvPool {
         if let Some((height, width)) = image {
             columns.push(ColumnSpec::image("pixels", height, width));
             columns.push(ColumnSpec::image("goal", height, width));
+            columns.extend(views.iter().map(|view| view.column(height, width)));
         }
         let places = Places {
             reward,
@@ -91,6 +110,7 @@ impl EnvPool {
             success: reward + 3,
             step: reward + 4,
             pixels: image.map(|(height, width)| (reward + 5, height, width)),
+            views,
         };
         let max_episode_steps = max_episode_steps.unwrap_or(spec.max_episode_steps);
         let schema = Schema::new(columns)?;
@@ -156,8 +176,7 @@ impl EnvPool {
         self.each(false, |i, slot, places, row| {
             let Some(reset) = wanted[i] else { return Ok(()) };
             slot.env.reset(reset.seed, &reset.options)?;
-            slot.start(places, row);
-            Ok(())
+            slot.start(places, row)
         })
     }
 
@@ -175,8 +194,7 @@ impl EnvPool {
                 return Ok(());
             }
             change(i, &mut *slot.env)?;
-            slot.start(places, row);
-            Ok(())
+            slot.start(places, row)
         })
     }
 
@@ -222,8 +240,7 @@ impl EnvPool {
             row.set(places.reward, &[transition.reward as f32]);
             row.set(places.terminated, &[u8::from(transition.terminated)]);
             row.set(places.truncated, &[u8::from(transition.truncated)]);
-            slot.look(places, row);
-            Ok(())
+            slot.look(places, row)
         });
         self.pace.note(begun, if alone { 1 } else { self.threads.current_num_threads() }, stepping);
         stepped
@@ -234,9 +251,9 @@ impl EnvPool {
     fn each(
         &mut self,
         alone: bool,
-        work: impl Fn(usize, &mut Slot, Places, &mut RowMut<'_>) -> Result<()> + Sync,
+        work: impl Fn(usize, &mut Slot, &Places, &mut RowMut<'_>) -> Result<()> + Sync,
     ) -> Result<()> {
-        let (places, slots, infos) = (self.places, &mut self.slots, &mut self.infos);
+        let (places, slots, infos) = (&self.places, &mut self.slots, &mut self.infos);
         if alone {
             for (i, slot) in slots.iter_mut().enumerate() {
                 slot.failed = work(i, slot, places, &mut infos.row_mut(i)).err();
@@ -260,25 +277,32 @@ impl EnvPool {
 
 impl Slot {
     /// Fills a row after a reset.
-    fn start(&mut self, places: Places, row: &mut RowMut<'_>) {
+    fn start(&mut self, places: &Places, row: &mut RowMut<'_>) -> Result<()> {
         self.steps = 0;
         row.set(places.reward, &[0.0f32]);
         row.set(places.terminated, &[0u8]);
         row.set(places.truncated, &[0u8]);
-        self.look(places, row);
-        if let Some((pixels, height, width)) = places.pixels {
-            self.env.render_goal(FrameMut::new(width, height, row.at::<u8>(pixels + 1)));
+        self.look(places, row)?;
+        match places.pixels {
+            Some((pixels, height, width)) => {
+                self.env.render_goal(FrameMut::new(width, height, row.at::<u8>(pixels + 1)))
+            }
+            None => Ok(()),
         }
     }
 
     /// Fills the parts of a row that follow the world.
-    fn look(&mut self, places: Places, row: &mut RowMut<'_>) {
+    fn look(&mut self, places: &Places, row: &mut RowMut<'_>) -> Result<()> {
         self.env.observe(row);
         row.set(places.success, &[u8::from(self.env.is_success())]);
         #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
         row.set(places.step, &[self.steps as i32]);
         if let Some((pixels, height, width)) = places.pixels {
-            self.env.render(FrameMut::new(width, height, row.at::<u8>(pixels)));
+            self.env.render(FrameMut::new(width, height, row.at::<u8>(pixels)))?;
+            for (i, view) in places.views.iter().enumerate() {
+                self.env.render_view(view, height, width, row.bytes(pixels + 2 + i))?;
+            }
         }
+        Ok(())
     }
 }

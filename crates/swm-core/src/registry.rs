@@ -34,14 +34,55 @@ impl<T: Named> Registry<T> {
     }
 }
 
+/// Two lists as one, for registries that several crates fill.
+pub const fn join<T: Copy, const N: usize>(first: &[T], second: &[T]) -> [T; N] {
+    assert!(first.len() + second.len() == N && !first.is_empty(), "as long as both together");
+    let mut all = [first[0]; N];
+    let mut i = 0;
+    while i < N {
+        all[i] = if i < first.len() { first[i] } else { second[i - first.len()] };
+        i += 1;
+    }
+    all
+}
+
+/// Something about an environment that is chosen when it is made, such as its task.
+#[derive(Clone, Copy, Debug)]
+pub struct EnvOption {
+    /// Its name, such as `task`.
+    pub key: &'static str,
+    /// What it decides, in a sentence.
+    pub summary: &'static str,
+    /// What it may be; the first is the default.
+    pub values: &'static [&'static str],
+}
+
+/// A value for each of an environment's options.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Choices(Vec<(&'static str, &'static str)>);
+
+impl Choices {
+    /// What was chosen for an option.
+    ///
+    /// # Panics
+    /// When the environment has no such option.
+    pub fn get(&self, key: &str) -> &'static str {
+        let chosen = self.0.iter().find(|(known, _)| *known == key);
+        chosen.unwrap_or_else(|| panic!("{key} is an option of the environment")).1
+    }
+}
+
 /// An environment that can be made.
+#[derive(Clone, Copy)]
 pub struct EnvEntry {
     /// Its id, such as `swm/PushT-v1`.
     pub id: &'static str,
     /// What one does there, in a sentence.
     pub summary: &'static str,
-    /// Makes one.
-    pub make: fn() -> Box<dyn Env>,
+    /// What can be chosen when it is made.
+    pub options: &'static [EnvOption],
+    /// Makes one. Its [`crate::EnvSpec::id`] is that of [`EnvChoice::id`].
+    pub make: fn(&EnvChoice) -> Result<Box<dyn Env>>,
     /// Who can demonstrate it; the first is the default expert.
     pub experts: &'static [ExpertEntry],
 }
@@ -52,7 +93,88 @@ impl Named for EnvEntry {
     }
 }
 
+impl EnvEntry {
+    /// One with the default of every option.
+    ///
+    /// # Errors
+    /// When something it needs is missing on this machine.
+    pub fn env(&self) -> Result<Box<dyn Env>> {
+        EnvChoice::from(self).env()
+    }
+}
+
+/// A row of the registry of environments, and what was chosen of its options.
+#[derive(Clone)]
+pub struct EnvChoice {
+    /// The row.
+    pub entry: EnvEntry,
+    /// The values of its options.
+    pub choices: Choices,
+}
+
+impl From<&EnvEntry> for EnvChoice {
+    fn from(entry: &EnvEntry) -> Self {
+        Self {
+            entry: *entry,
+            choices: Choices(entry.options.iter().map(|option| (option.key, option.values[0])).collect()),
+        }
+    }
+}
+
+impl EnvChoice {
+    /// The id with the options that differ from their defaults, as [`Registry::choose`] reads it.
+    pub fn id(&self) -> String {
+        let mut id = self.entry.id.to_owned();
+        for (option, (key, value)) in self.entry.options.iter().zip(&self.choices.0) {
+            if *value != option.values[0] {
+                id.push_str(&format!(",{key}={value}"));
+            }
+        }
+        id
+    }
+
+    /// Makes one.
+    ///
+    /// # Errors
+    /// When something it needs is missing on this machine.
+    pub fn env(&self) -> Result<Box<dyn Env>> {
+        (self.entry.make)(self)
+    }
+}
+
+impl Registry<EnvEntry> {
+    /// Reads `ID` or `ID,option=value,…`.
+    ///
+    /// # Errors
+    /// When there is no such environment, option or value; names the nearest.
+    pub fn choose(&self, text: &str) -> Result<EnvChoice> {
+        let mut parts = text.split(',');
+        let mut chosen = EnvChoice::from(self.get(parts.next().unwrap_or_default())?);
+        for part in parts {
+            let (key, value) = part.split_once('=').unwrap_or((part, ""));
+            let options = chosen.entry.options;
+            let keys = || options.iter().map(|option| option.key);
+            let place = keys().position(|known| known == key).ok_or_else(|| {
+                let hint = if options.is_empty() { "it has none" } else { "write ID,option=value" };
+                Error::unknown("option of the environment", key, keys(), format!("{}: {hint}", chosen.entry.id))
+            })?;
+            let values = options[place].values;
+            let value = values.iter().find(|known| **known == value).ok_or_else(|| {
+                Error::unknown(
+                    "value of the option",
+                    value,
+                    values.iter().copied(),
+                    format!("{key} of {}", chosen.entry.id),
+                )
+            })?;
+            chosen.choices.0[place].1 = value;
+        }
+        Ok(chosen)
+    }
+}
+
 /// A scripted policy that can be made.
+#[derive(Clone, Copy)]
 pub struct ExpertEntry {
     /// Its name, such as `expert` or `weak`.
     pub id: &'static str,

@@ -94,7 +94,7 @@ struct Player {
 
 impl Player {
     fn new(entry: &EnvEntry, expert: &ExpertEntry) -> Result<Self> {
-        let env = (entry.make)();
+        let env = entry.env().expect("an environment");
         let row = Batch::zeros(&Schema::new(env.spec().columns.clone())?, 1);
         Ok(Self { env, expert: (expert.make)(), row, tally: Tally::default() })
     }

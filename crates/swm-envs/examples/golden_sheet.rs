@@ -64,7 +64,7 @@ struct Frames {
 
 /// The first and the last frame of a rollout.
 fn compare(entry: &EnvEntry, mut golden: Golden) -> Result<[Frames; 2]> {
-    let mut env = (entry.make)();
+    let mut env = entry.env().expect("an environment");
     env.reset(0, &start(entry, &*env, &mut golden))?;
     let first = frames(&mut *env, &mut golden, "frame_first");
     let n = env.spec().action_dim();
@@ -100,7 +100,7 @@ fn start(entry: &EnvEntry, env: &dyn Env, golden: &mut Golden) -> ResetOptions {
 fn frames(env: &mut dyn Env, golden: &mut Golden, name: &str) -> Frames {
     let (height, width, golden) = golden.picture(name);
     let mut ours = vec![0; golden.len()];
-    env.render(FrameMut::new(width, height, &mut ours));
+    env.render(FrameMut::new(width, height, &mut ours)).expect("a picture");
     Frames { height, width, golden, ours }
 }
 

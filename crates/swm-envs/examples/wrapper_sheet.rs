@@ -38,11 +38,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for (row, texts) in rows.iter().enumerate() {
         let stack = Stack::parse(texts)?;
         for (world, entry) in [push_t::ENTRY, two_room::ENTRY].iter().enumerate() {
-            let mut env = stack.wrap((entry.make)(), GoalPicture::Clean);
+            let mut env = stack.wrap(entry.env().expect("an environment"), GoalPicture::Clean);
             for (column, (seed, steps)) in [(1, 0), (1, 10), (2, 0)].into_iter().enumerate() {
                 play(&mut *env, seed, steps)?;
                 let mut rgb = vec![0; 3 * SIDE * SIDE];
-                env.render(FrameMut::new(SIDE, SIDE, &mut rgb));
+                env.render(FrameMut::new(SIDE, SIDE, &mut rgb)).expect("a picture");
                 let left = (3 * world + column) * (SIDE + GAP);
                 for (y, line) in rgb.chunks_exact(3 * SIDE).enumerate() {
                     let start = 3 * ((row * (SIDE + GAP) + y) * width + left);

@@ -36,10 +36,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
 /// Pictures a second, without drawing and copying them.
 fn rate(wrapper: &mut dyn VisualWrapper, side: usize, noisy: bool) -> Result<f64> {
-    let mut env = (push_t::ENTRY.make)();
+    let mut env = push_t::ENTRY.env().expect("an environment");
     env.reset(0, &ResetOptions::default())?;
     let mut original = vec![0; 3 * side * side];
-    env.render(FrameMut::new(side, side, &mut original));
+    env.render(FrameMut::new(side, side, &mut original)).expect("a picture");
     if noisy {
         parse("noise")?.apply(&mut FrameMut::new(side, side, &mut original), View::Step(0));
     }

@@ -11,7 +11,7 @@ pub(crate) fn play(
     goal: bool,
     steps: usize,
 ) -> (Vec<[f64; 2]>, bool) {
-    let (mut env, mut expert) = ((entry.make)(), (expert.make)());
+    let (mut env, mut expert) = (entry.env().expect("an environment"), (expert.make)());
     env.reset(seed, options).expect("a reset");
     if goal {
         env.sample_goal(Key::new(seed)).expect("a goal");

@@ -31,8 +31,8 @@ pub enum Score {
 
 /// The simulator as a model.
 pub struct SimulatorCost {
-    make: Box<dyn Fn() -> Box<dyn Env> + Send + Sync>,
-    id: &'static str,
+    make: Box<dyn Fn() -> Result<Box<dyn Env>> + Send + Sync>,
+    id: String,
     codec: ActionCodec,
     score: Score,
     /// The worlds that were shown since they were last observed, by slot.
@@ -53,13 +53,13 @@ struct Simulator {
 const GROUP: usize = 8;
 
 impl SimulatorCost {
-    /// A model of the worlds that `make` makes, such as [`swm_core::EnvEntry::make`]. Scale and block are those of the
+    /// A model of the worlds that `make` makes, such as [`swm_core::EnvChoice::env`]. Scale and block are those of the
     /// policy: a simulator has no units of its own, so [`ActionScale::unscaled`] will do.
     ///
     /// # Errors
-    /// When the scale does not fit the environment, or a model step has no action.
+    /// When the scale does not fit the environment, or a model step has no action, and what `make` returns.
     pub fn new(
-        make: impl Fn() -> Box<dyn Env> + Send + Sync + 'static,
+        make: impl Fn() -> Result<Box<dyn Env>> + Send + Sync + 'static,
         scale: ActionScale,
         action_block: usize,
         score: Score,
@@ -67,17 +67,17 @@ impl SimulatorCost {
         if action_block == 0 {
             return Err(Error::config("a simulator's action block", "0", "choose at least 1"));
         }
-        let first = Simulator { env: make(), action: Decoded::default() };
+        let first = Simulator { env: make()?, action: Decoded::default() };
         let spec = first.env.spec();
-        let (id, codec) = (spec.id, ActionCodec::new(spec, scale, action_block)?);
+        let (id, codec) = (spec.id.clone(), ActionCodec::new(spec, scale, action_block)?);
         let idle = Mutex::new(vec![first]);
         Ok(Self { make: Box::new(make), id, codec, score, shown: vec![], present: vec![], idle })
     }
 
     /// A simulator nobody uses; one that fails is not put back, because it may be in any state.
-    fn borrow(&self) -> Simulator {
+    fn borrow(&self) -> Result<Simulator> {
         let idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner).pop();
-        idle.unwrap_or_else(|| Simulator { env: (self.make)(), action: Decoded::default() })
+        idle.map_or_else(|| Ok(Simulator { env: (self.make)()?, action: Decoded::default() }), Ok)
     }
 
     fn put_back(&self, simulator: Simulator) {
@@ -110,7 +110,7 @@ impl SimulatorCost {
 impl CostModel for SimulatorCost {
     fn see(&mut self, slot: usize, env: &dyn Env) -> Result<()> {
         if env.spec().id != self.id {
-            return Err(Error::mismatch("showing a world to a simulator", env.spec().id, self.id));
+            return Err(Error::mismatch("showing a world to a simulator", &env.spec().id, &self.id));
         }
         if slot >= self.shown.len() {
             self.shown.resize(slot + 1, None);
@@ -147,7 +147,7 @@ impl CostModel for SimulatorCost {
         let (this, len) = (&*self, horizon * dim);
         let groups = actions.par_chunks(GROUP * len).zip(costs.par_chunks_mut(GROUP)).enumerate();
         groups.try_for_each(|(group, (actions, costs))| {
-            let mut simulator = this.borrow();
+            let mut simulator = this.borrow()?;
             for (i, (actions, cost)) in actions.chunks_exact(len).zip(costs).enumerate() {
                 let start = &this.present[(group * GROUP + i) / samples];
                 #[allow(clippy::cast_possible_truncation)]

@@ -50,7 +50,7 @@ impl<W: World> Classic<W> {
     /// The world with every factor at its default.
     pub fn new() -> Self {
         let spec = EnvSpec {
-            id: W::ID,
+            id: W::ID.to_owned(),
             action_space: W::action_space(),
             columns: vec![
                 ColumnSpec::new("state", DType::Float32, [W::OBSERVED.len()]),
@@ -60,6 +60,7 @@ impl<W: World> Classic<W> {
             observation_space: vec![("state", observed::<W>())],
             variation_space: factors::space::<W>(),
             max_episode_steps: W::LIMIT,
+            cameras: vec![],
         };
         let none = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
         let factors = spec.variation_space.resolve(&none, Key::new(0)).expect("defaults are in their spaces");
@@ -159,12 +160,14 @@ impl<W: World> Env for Classic<W> {
         row.set(columns::PHYSICS, &self.physics);
     }
 
-    fn render(&mut self, frame: FrameMut<'_>) {
+    fn render(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.show(self.state, frame);
+        Ok(())
     }
 
-    fn render_goal(&mut self, frame: FrameMut<'_>) {
+    fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.show(self.goal, frame);
+        Ok(())
     }
 
     fn factors(&self) -> &FactorValues {

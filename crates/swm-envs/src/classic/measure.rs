@@ -19,7 +19,7 @@ pub struct Tally {
 pub fn tally(entry: &EnvEntry, all: bool, sampled: bool) -> Tally {
     let variation = VariationRequest { variation: all.then(|| vec!["all".to_owned()]), ..VariationRequest::default() };
     let options = ResetOptions { variation, ..ResetOptions::default() };
-    let (mut env, mut expert) = ((entry.make)(), (entry.experts[0].make)());
+    let (mut env, mut expert) = (entry.env().expect("an environment"), (entry.experts[0].make)());
     let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("columns"), 1);
     let mut tally = Tally::default();
     for seed in 0..200 {

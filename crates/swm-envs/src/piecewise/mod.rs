@@ -20,7 +20,8 @@ use swm_core::{
 pub const ENTRY: EnvEntry = EnvEntry {
     id: "swm/Piecewise-v0",
     summary: "walk to the target through zones that each drift their own way",
-    make: || Box::new(Piecewise::new()),
+    options: &[],
+    make: |_| Ok(Box::new(Piecewise::new())),
     experts: expert::EXPERTS,
 };
 
@@ -89,7 +90,7 @@ mod columns {
 
 fn spec() -> EnvSpec {
     EnvSpec {
-        id: ENTRY.id,
+        id: ENTRY.id.to_owned(),
         action_space: Space::uniform_box([2], DType::Float32, -1.0, 1.0),
         columns: vec![
             ColumnSpec::new("state", DType::Float32, [2]),
@@ -102,6 +103,7 @@ fn spec() -> EnvSpec {
         observation_space: vec![("observation", Space::uniform_box([4], DType::Float32, 0.0, SIZE))],
         variation_space: variation_space(),
         max_episode_steps: 100,
+        cameras: vec![],
     }
 }
 
@@ -210,12 +212,14 @@ impl Env for Piecewise {
         row.set(columns::DYNAMICS, &self.dynamics.to_row());
     }
 
-    fn render(&mut self, frame: FrameMut<'_>) {
+    fn render(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.renderer.draw(&self.scene, &self.agent, frame);
+        Ok(())
     }
 
-    fn render_goal(&mut self, frame: FrameMut<'_>) {
+    fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.renderer.draw(&self.scene, &Disc { center: self.goal, ..self.agent }, frame);
+        Ok(())
     }
 
     fn factors(&self) -> &FactorValues {

@@ -19,7 +19,8 @@ use swm_core::{
 pub const ENTRY: EnvEntry = EnvEntry {
     id: "swm/SimplePointMaze-v0",
     summary: "walk around rectangular walls to the goal",
-    make: || Box::new(PointMaze::new()),
+    options: &[],
+    make: |_| Ok(Box::new(PointMaze::new())),
     experts: expert::EXPERTS,
 };
 
@@ -101,7 +102,7 @@ mod columns {
 fn spec() -> EnvSpec {
     let limit = f64::from(MAX_ACTION);
     EnvSpec {
-        id: ENTRY.id,
+        id: ENTRY.id.to_owned(),
         action_space: Space::uniform_box([2], DType::Float32, -limit, limit),
         columns: vec![
             ColumnSpec::new("state", DType::Float32, [2]),
@@ -112,6 +113,7 @@ fn spec() -> EnvSpec {
         observation_space: vec![("observation", Space::uniform_box([2], DType::Float32, 0.0, 5.0))],
         variation_space: variation_space(),
         max_episode_steps: 100,
+        cameras: vec![],
     }
 }
 
@@ -257,12 +259,14 @@ impl Env for PointMaze {
         row.set(columns::LAYOUT, &self.layout.to_row());
     }
 
-    fn render(&mut self, frame: FrameMut<'_>) {
+    fn render(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.renderer.draw(&self.scene, &self.agent, frame);
+        Ok(())
     }
 
-    fn render_goal(&mut self, frame: FrameMut<'_>) {
+    fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.renderer.draw(&self.scene, &Disc { center: self.scene.goal.center, ..self.agent }, frame);
+        Ok(())
     }
 
     fn factors(&self) -> &FactorValues {

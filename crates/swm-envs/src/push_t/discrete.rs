@@ -12,7 +12,8 @@ use swm_core::{EnvEntry, ExpertEntry, Result, RowRef, Space};
 pub const ENTRY: EnvEntry = EnvEntry {
     id: "swm/PushT-Discrete-v1",
     summary: "push a block to a goal pose, by steps from a polar grid",
-    make: || Box::new(PushT::with_actions(ENTRY.id, space())),
+    options: &[],
+    make: |_| Ok(Box::new(PushT::with_actions(ENTRY.id, space()))),
     experts: EXPERTS,
 };
 

@@ -23,7 +23,8 @@ use swm_core::{
 pub const ENTRY: EnvEntry = EnvEntry {
     id: "swm/PushT-v1",
     summary: "push a block to a goal pose",
-    make: || Box::new(PushT::new()),
+    options: &[],
+    make: |_| Ok(Box::new(PushT::new())),
     experts: EXPERTS,
 };
 
@@ -100,12 +101,13 @@ impl PushT {
         let goal_scene = Scene::of(&world);
         let observation_space = observation_space();
         let spec = EnvSpec {
-            id,
+            id: id.to_owned(),
             action_space,
             columns: columns(),
             observation_space,
             variation_space,
             max_episode_steps: 200,
+            cameras: vec![],
         };
         let (renderer, shapes) = (Renderer::new(&factors), shapes_of(&factors));
         Self { spec, factors, world, goal, goal_scene, contacts: 0, shapes, renderer }
@@ -205,12 +207,14 @@ impl Env for PushT {
         row.set(10, &[x, y, self.world.bodies[AGENT].angle]);
     }
 
-    fn render(&mut self, frame: FrameMut<'_>) {
+    fn render(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.renderer.draw(&Scene::of(&self.world), frame);
+        Ok(())
     }
 
-    fn render_goal(&mut self, frame: FrameMut<'_>) {
+    fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.renderer.draw(&self.goal_scene, frame);
+        Ok(())
     }
 
     fn factors(&self) -> &FactorValues {
@@ -218,7 +222,7 @@ impl Env for PushT {
     }
 
     fn snapshot(&self) -> Snapshot {
-        let Snapshot(mut bytes) = factors::snapshot(self.spec.id, &self.factors, []);
+        let Snapshot(mut bytes) = factors::snapshot(&self.spec.id, &self.factors, []);
         put(&mut bytes, &self.goal);
         put(&mut bytes, &[self.contacts as u64]);
         self.world.save(&mut bytes);
@@ -226,9 +230,9 @@ impl Env for PushT {
     }
 
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let id = self.spec.id;
-        let foreign = || factors::foreign(id, "other bytes");
-        let (factors, mut bytes) = factors::restored(id, &self.spec.variation_space, &self.factors, snapshot)?;
+        let foreign = || factors::foreign(&self.spec.id, "other bytes");
+        let (factors, mut bytes) =
+            factors::restored(&self.spec.id, &self.spec.variation_space, &self.factors, snapshot)?;
         let goal = take_array::<f64, 7>(&mut bytes).ok_or_else(foreign)?;
         let [contacts] = take_array::<u64, 1>(&mut bytes).ok_or_else(foreign)?;
         let goal = checked(&goal, "goal of a snapshot")?;
@@ -239,7 +243,7 @@ impl Env for PushT {
         if self.world.load(&mut bytes).is_none() || !bytes.is_empty() {
             // Half a world is none: the episode begins anew, at its goal.
             self.begin(self.factors.clone(), goal);
-            return Err(foreign());
+            return Err(factors::foreign(&self.spec.id, "other bytes"));
         }
         self.contacts = contacts;
         Ok(())

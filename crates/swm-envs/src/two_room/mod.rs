@@ -18,7 +18,8 @@ use swm_core::{
 pub const ENTRY: EnvEntry = EnvEntry {
     id: "swm/TwoRoom-v1",
     summary: "walk from room to room through the doors of the wall between them, to the target",
-    make: || Box::new(TwoRoom::new()),
+    options: &[],
+    make: |_| Ok(Box::new(TwoRoom::new())),
     experts: expert::EXPERTS,
 };
 
@@ -101,7 +102,7 @@ mod columns {
 
 fn spec() -> EnvSpec {
     EnvSpec {
-        id: ENTRY.id,
+        id: ENTRY.id.to_owned(),
         action_space: Space::uniform_box([2], DType::Float32, -1.0, 1.0),
         columns: vec![
             ColumnSpec::new("state", DType::Float32, [2]),
@@ -114,6 +115,7 @@ fn spec() -> EnvSpec {
         observation_space: vec![("observation", Space::uniform_box([4 + 2 * MAX_DOORS], DType::Float32, 0.0, SIZE))],
         variation_space: variation_space(),
         max_episode_steps: 100,
+        cameras: vec![],
     }
 }
 
@@ -246,12 +248,14 @@ impl Env for TwoRoom {
         row.set(columns::LAYOUT, &self.layout.to_row());
     }
 
-    fn render(&mut self, frame: FrameMut<'_>) {
+    fn render(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.renderer.draw(&self.scene, &self.agent, frame);
+        Ok(())
     }
 
-    fn render_goal(&mut self, frame: FrameMut<'_>) {
+    fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.renderer.draw(&self.scene, &Disc { center: self.goal, ..self.agent }, frame);
+        Ok(())
     }
 
     fn factors(&self) -> &FactorValues {

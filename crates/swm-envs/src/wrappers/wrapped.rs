@@ -112,16 +112,18 @@ impl Env for Wrapped {
         self.env.observe(row);
     }
 
-    fn render(&mut self, mut frame: FrameMut<'_>) {
-        self.env.render(FrameMut { rgb: &mut *frame.rgb, ..frame });
+    fn render(&mut self, mut frame: FrameMut<'_>) -> Result<()> {
+        self.env.render(FrameMut { rgb: &mut *frame.rgb, ..frame })?;
         self.apply(&mut frame, View::Step(self.step));
+        Ok(())
     }
 
-    fn render_goal(&mut self, mut frame: FrameMut<'_>) {
-        self.env.render_goal(FrameMut { rgb: &mut *frame.rgb, ..frame });
+    fn render_goal(&mut self, mut frame: FrameMut<'_>) -> Result<()> {
+        self.env.render_goal(FrameMut { rgb: &mut *frame.rgb, ..frame })?;
         if self.goal == GoalPicture::Wrapped {
             self.apply(&mut frame, View::Goal);
         }
+        Ok(())
     }
 
     fn factors(&self) -> &FactorValues {

@@ -67,7 +67,7 @@ fn steps_and_frames_allocate_nothing() {
         for (seed, variation) in
             [None, Some(vec!["all".to_owned()]), Some(vec!["all".to_owned()])].into_iter().enumerate()
         {
-            let mut env = (entry.make)();
+            let mut env = entry.env().expect("an environment");
             let variation = VariationRequest { variation, ..VariationRequest::default() };
             env.reset(seed as u64, &ResetOptions { variation, ..ResetOptions::default() }).expect("a reset");
             let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
@@ -85,8 +85,8 @@ fn steps_and_frames_allocate_nothing() {
                     env.step(action).expect("an action of the action space");
                     env.observe(&mut row.row_mut(0));
                     for (side, rgb) in &mut frames {
-                        env.render(FrameMut::new(*side, *side, rgb));
-                        env.render_goal(FrameMut::new(*side, *side, rgb));
+                        env.render(FrameMut::new(*side, *side, rgb)).expect("a picture");
+                        env.render_goal(FrameMut::new(*side, *side, rgb)).expect("a picture");
                     }
                     std::hint::black_box((env.is_success(), env.goal_distance()));
                 });

@@ -31,7 +31,7 @@ struct Probe {
 
 impl Probe {
     fn new(entry: &EnvEntry) -> Self {
-        let env = (entry.make)();
+        let env = entry.env().expect("an environment");
         let schema = Schema::new(env.spec().columns.clone()).expect("columns have their own names");
         Self { env, row: Batch::zeros(&schema, 1) }
     }
@@ -55,14 +55,14 @@ impl Probe {
     fn picture(&mut self) -> Vec<u8> {
         let (height, width) = SIZE;
         let mut rgb = vec![0; height * width * 3];
-        self.env.render(FrameMut::new(width, height, &mut rgb));
+        self.env.render(FrameMut::new(width, height, &mut rgb)).expect("a picture");
         rgb
     }
 
     fn goal_picture(&mut self) -> Vec<u8> {
         let (height, width) = SIZE;
         let mut rgb = vec![0; height * width * 3];
-        self.env.render_goal(FrameMut::new(width, height, &mut rgb));
+        self.env.render_goal(FrameMut::new(width, height, &mut rgb)).expect("a picture");
         rgb
     }
 
@@ -106,7 +106,7 @@ fn assert_finite(batch: &Batch, what: &str) {
 #[test]
 fn rows_declare_what_they_are() {
     for entry in ENVS.rows {
-        let (env, id) = ((entry.make)(), entry.id);
+        let (env, id) = (entry.env().expect("an environment"), entry.id);
         let spec = env.spec();
         assert_eq!(spec.id, id);
         assert_eq!(ENVS.rows.iter().filter(|other| other.id == id).count(), 1, "{id} is listed once");
@@ -131,7 +131,7 @@ fn rows_declare_what_they_are() {
 
 /// Plays episodes with random actions in a pool; what every episode produced, step after step, as bytes.
 fn play(entry: &EnvEntry, slots: &[u64], workers: usize, steps: usize) -> Vec<Vec<u8>> {
-    let envs = slots.iter().map(|_| (entry.make)()).collect();
+    let envs = slots.iter().map(|_| entry.env().expect("an environment")).collect();
     let mut pool = EnvPool::new(envs, Some(SIZE), Some(steps), threads(workers).expect("threads")).expect("a pool");
     let mut policy = RandomPolicy::new(pool.spec(), slots.len());
     let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), slots.len());
@@ -224,9 +224,9 @@ fn rows_and_pictures_are_written_completely() {
                 let mut rgb = vec![fill; height * width * 3];
                 let frame = FrameMut::new(width, height, &mut rgb);
                 if goal {
-                    probe.env.render_goal(frame)
+                    probe.env.render_goal(frame).expect("a picture")
                 } else {
-                    probe.env.render(frame)
+                    probe.env.render(frame).expect("a picture")
                 }
                 rgb
             };
@@ -473,7 +473,7 @@ const IDLE: &[(&str, &str, &str)] = &[
 #[test]
 fn factors_change_what_they_name() {
     for entry in ENVS.rows {
-        let space = (entry.make)().spec().variation_space.clone();
+        let space = entry.env().expect("an environment").spec().variation_space.clone();
         let defaults = shown(&space);
         // Some factors show beside certain values of others only, such as the angle of what is round by default.
         let mut contexts = vec![defaults.clone()];
@@ -645,7 +645,7 @@ fn impossible_resets_are_errors() {
             assert!(error.contains(words), "{}: {error}", entry.id);
         };
         refuse(ResetOptions { variation: vary(&["no.such.factor"]), ..ResetOptions::default() }, "no.such.factor");
-        let space = (entry.make)().spec().variation_space.clone();
+        let space = entry.env().expect("an environment").spec().variation_space.clone();
         for factor in space.factors() {
             let low = factor.space.bounds(0).0 - 1.0;
             for value in [vec![low; factor.space.len()], vec![f64::NAN; factor.space.len()], vec![]] {
@@ -670,7 +670,7 @@ fn experts_stay_in_the_action_space_and_follow_their_key() {
     for entry in ENVS.rows {
         for expert in entry.experts {
             let run = |slots: usize| {
-                let envs = (0..slots).map(|_| (entry.make)()).collect();
+                let envs = (0..slots).map(|_| entry.env().expect("an environment")).collect();
                 let mut pool = EnvPool::new(envs, None, None, threads(2).expect("threads")).expect("a pool");
                 let spec = pool.spec().clone();
                 let mut policy = ExpertPolicy::new(&spec, (0..slots).map(|_| (expert.make)()).collect());

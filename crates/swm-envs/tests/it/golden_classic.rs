@@ -5,7 +5,7 @@ use swm_core::{Action, Batch, Env, FrameMut, ResetOptions, Schema, Space};
 
 fn frame(env: &mut dyn Env, (width, height): (usize, usize)) -> Vec<u8> {
     let mut rgb = vec![0; width * height * 3];
-    env.render(FrameMut::new(width, height, &mut rgb));
+    env.render(FrameMut::new(width, height, &mut rgb)).expect("a picture");
     rgb
 }
 
@@ -16,7 +16,7 @@ fn follow(id: &str, size: (usize, usize)) {
     for file in files {
         let mut golden = Golden::open(&file);
         let name = file.display();
-        let mut env = (swm_envs::ENVS.get(id).expect("a registered world").make)();
+        let mut env = swm_envs::ENVS.get(id).expect("a registered world").env().expect("an environment");
         let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
         let states = golden.read::<f64>("info.state");
         // Where it was recorded, the start in double precision.

@@ -10,7 +10,7 @@ fn close(what: &str, got: &[f64], wanted: &[f64]) {
 
 fn frame(env: &mut dyn Env) -> Vec<u8> {
     let mut rgb = vec![0; 224 * 224 * 3];
-    env.render(FrameMut::new(224, 224, &mut rgb));
+    env.render(FrameMut::new(224, 224, &mut rgb)).expect("a picture");
     rgb
 }
 
@@ -28,7 +28,7 @@ fn rollouts_follow_the_reference() {
             state: Some(states[..2].to_vec()),
             goal_state: Some(goals[..2].to_vec()),
         };
-        let mut env = (swm_envs::piecewise::ENTRY.make)();
+        let mut env = swm_envs::piecewise::ENTRY.env().expect("an environment");
         env.reset(0, &options).expect("recorded values are possible");
 
         let difference = picture_difference(&frame(&mut *env), &golden.read("frame_first"));

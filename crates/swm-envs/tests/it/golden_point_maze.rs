@@ -13,7 +13,7 @@ fn close(what: &str, got: &[f64], wanted: &[f64]) {
 
 fn frame(env: &mut dyn Env) -> Vec<u8> {
     let mut rgb = vec![0; SIDE * SIDE * 3];
-    env.render(FrameMut::new(SIDE, SIDE, &mut rgb));
+    env.render(FrameMut::new(SIDE, SIDE, &mut rgb)).expect("a picture");
     rgb
 }
 
@@ -28,7 +28,7 @@ fn rollouts_follow_the_reference() {
         let mut variation = golden.variation();
         // The reference keeps the agent's place in this factor: what was recorded is where it was when they were asked.
         variation.variation_values.insert("agent.position".to_owned(), states[..2].to_vec());
-        let mut env = (swm_envs::point_maze::ENTRY.make)();
+        let mut env = swm_envs::point_maze::ENTRY.env().expect("an environment");
         env.reset(0, &ResetOptions { variation, ..ResetOptions::default() }).expect("recorded values are possible");
 
         let difference = picture_difference(&frame(&mut *env), &golden.read("frame_first"));

@@ -12,7 +12,7 @@ struct Probe {
 
 impl Probe {
     fn new(entry: &EnvEntry, options: &ResetOptions) -> Self {
-        let mut env = (entry.make)();
+        let mut env = entry.env().expect("an environment");
         env.reset(0, options).expect("recorded values are possible");
         let schema = Schema::new(env.spec().columns.clone()).expect("a schema");
         Self { env, row: Batch::zeros(&schema, 1) }
@@ -25,7 +25,7 @@ impl Probe {
 
     fn frame(&mut self) -> Vec<u8> {
         let mut rgb = vec![0; 224 * 224 * 3];
-        self.env.render(FrameMut::new(224, 224, &mut rgb));
+        self.env.render(FrameMut::new(224, 224, &mut rgb)).expect("a picture");
         rgb
     }
 }

@@ -12,7 +12,7 @@ fn close(what: &str, got: &[f64], wanted: &[f64]) {
 fn difference(env: &mut dyn Env, golden: &mut Golden, name: &str) -> f64 {
     let (height, width, wanted) = golden.picture(name);
     let mut rgb = vec![0; height * width * 3];
-    env.render(FrameMut::new(width, height, &mut rgb));
+    env.render(FrameMut::new(width, height, &mut rgb)).expect("a picture");
     picture_difference(&rgb, &wanted)
 }
 
@@ -30,7 +30,7 @@ fn rollouts_follow_the_reference() {
             state: Some(states[..2].to_vec()),
             goal_state: Some(goals[..2].to_vec()),
         };
-        let mut env = (swm_envs::two_room::ENTRY.make)();
+        let mut env = swm_envs::two_room::ENTRY.env().expect("an environment");
         env.reset(0, &options).expect("recorded values are possible");
 
         let first = difference(&mut *env, &mut golden, "frame_first");

@@ -179,18 +179,18 @@ fn still() -> ResetOptions {
 }
 
 fn wrapped<S: AsRef<str>>(texts: &[S], goal: GoalPicture) -> Box<dyn Env> {
-    Stack::parse(texts).expect("wrappers").wrap((two_room::ENTRY.make)(), goal)
+    Stack::parse(texts).expect("wrappers").wrap(two_room::ENTRY.env().expect("an environment"), goal)
 }
 
 fn picture(env: &mut dyn Env) -> Vec<u8> {
     let mut rgb = vec![0; 3 * SIZE[0] * SIZE[1]];
-    env.render(FrameMut::new(SIZE[0], SIZE[1], &mut rgb));
+    env.render(FrameMut::new(SIZE[0], SIZE[1], &mut rgb)).expect("a picture");
     rgb
 }
 
 fn goal_picture(env: &mut dyn Env) -> Vec<u8> {
     let mut rgb = vec![0; 3 * SIZE[0] * SIZE[1]];
-    env.render_goal(FrameMut::new(SIZE[0], SIZE[1], &mut rgb));
+    env.render_goal(FrameMut::new(SIZE[0], SIZE[1], &mut rgb)).expect("a picture");
     rgb
 }
 
@@ -224,13 +224,16 @@ fn a_restored_snapshot_continues_bit_for_bit() {
             env.restore(&snapshot).expect("its own snapshot");
             assert!(follow(env) == wanted, "{text}: a restored environment goes on otherwise");
         }
-        let bare = (two_room::ENTRY.make)().snapshot().0;
+        let bare = two_room::ENTRY.env().expect("an environment").snapshot().0;
         let cut = snapshot.0[..20].to_vec();
         let stranger = wrapped(&["grayscale"], GoalPicture::Clean).snapshot().0;
         for foreign in [bare, cut, stranger, vec![]] {
             assert!(env.restore(&Snapshot(foreign)).is_err(), "{text}: a foreign snapshot is refused");
         }
-        assert!((two_room::ENTRY.make)().restore(&snapshot).is_err(), "{text}: a bare environment takes it");
+        assert!(
+            two_room::ENTRY.env().expect("an environment").restore(&snapshot).is_err(),
+            "{text}: a bare environment takes it"
+        );
     }
 }
 
@@ -238,7 +241,10 @@ fn a_restored_snapshot_continues_bit_for_bit() {
 fn everything_but_the_picture_is_the_environments_own() {
     for entry in ENVS.rows {
         let stack = Stack::parse(&["noise", "occlusion"]).expect("wrappers");
-        let (mut env, mut bare) = (stack.wrap((entry.make)(), GoalPicture::Clean), (entry.make)());
+        let (mut env, mut bare) = (
+            stack.wrap(entry.env().expect("an environment"), GoalPicture::Clean),
+            entry.env().expect("an environment"),
+        );
         assert_eq!(env.spec().id, bare.spec().id);
         let schema = Schema::new(bare.spec().columns.clone()).expect("a schema");
         let [mut mine, mut other] = [Batch::zeros(&schema, 1), Batch::zeros(&schema, 1)];
@@ -261,9 +267,12 @@ fn everything_but_the_picture_is_the_environments_own() {
         assert_eq!(picture(&mut *env), before, "{}: a refused reset changes nothing", entry.id);
     }
     let none = Stack::parse::<&str>(&[]).expect("no wrapper");
-    let mut env = none.wrap((two_room::ENTRY.make)(), GoalPicture::Wrapped);
-    assert!((two_room::ENTRY.make)().restore(&env.snapshot()).is_ok(), "an empty stack is not there");
-    assert_eq!(picture(&mut *env), picture(&mut *(two_room::ENTRY.make)()));
+    let mut env = none.wrap(two_room::ENTRY.env().expect("an environment"), GoalPicture::Wrapped);
+    assert!(
+        two_room::ENTRY.env().expect("an environment").restore(&env.snapshot()).is_ok(),
+        "an empty stack is not there"
+    );
+    assert_eq!(picture(&mut *env), picture(&mut *two_room::ENTRY.env().expect("an environment")));
 }
 
 #[test]
@@ -324,7 +333,10 @@ fn threads_and_neighbours_do_not_matter() {
     let texts = ["color-jitter", "moving-patch", "noise", "random-shift,resample=step"];
     let play = |seeds: &[u64], workers: usize| -> Vec<Vec<u8>> {
         let stack = Stack::parse(&texts).expect("wrappers");
-        let envs = seeds.iter().map(|_| stack.wrap((two_room::ENTRY.make)(), GoalPicture::Wrapped)).collect();
+        let envs = seeds
+            .iter()
+            .map(|_| stack.wrap(two_room::ENTRY.env().expect("an environment"), GoalPicture::Wrapped))
+            .collect();
         let image = Some((SIZE[1], SIZE[0]));
         let mut pool = EnvPool::new(envs, image, None, threads(workers).expect("threads")).expect("a pool");
         let resets: Vec<Reset> =

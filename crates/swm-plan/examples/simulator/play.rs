@@ -75,7 +75,7 @@ pub fn starts(entry: &EnvEntry, protocol: Protocol, n: usize) -> Result<Vec<Star
 
 /// The rows of one episode of the first expert.
 fn demonstrate(entry: &EnvEntry, seed: u64) -> Result<Batch> {
-    let mut env = (entry.make)();
+    let mut env = entry.env().expect("an environment");
     let mut expert = (entry.experts[0].make)();
     env.reset(seed, &ResetOptions::default())?;
     expert.begin(Key::new(seed).with("expert"));
@@ -104,7 +104,7 @@ pub fn play(entry: &EnvEntry, starts: &[Start], planner: &Planner, budget: usize
     let begun = Instant::now();
     let (mut solved, mut played, mut successes, mut latencies) = (0, 0, vec![], vec![]);
     for starts in starts.chunks(SLOTS) {
-        let envs = starts.iter().map(|_| (entry.make)()).collect();
+        let envs = starts.iter().map(|_| entry.env().expect("an environment")).collect();
         let mut pool = EnvPool::new(envs, None, Some(budget), threads(0)?)?;
         let slots: Vec<usize> = (0..starts.len()).collect();
         pool.restart(&slots, |slot, env| {
@@ -147,7 +147,15 @@ impl Planner {
     fn policy(&self, entry: &EnvEntry, pool: &EnvPool) -> Result<MpcPolicy> {
         let solver = (SOLVERS.get(self.solver)?.make)(&self.settings)?;
         let scale = ActionScale::unscaled(pool.spec());
-        let model = SimulatorCost::new(entry.make, scale.clone(), self.mpc.action_block, self.score)?;
+        let model = SimulatorCost::new(
+            {
+                let entry = *entry;
+                move || entry.env()
+            },
+            scale.clone(),
+            self.mpc.action_block,
+            self.score,
+        )?;
         MpcPolicy::new(solver, Box::new(model), self.mpc.clone(), scale, pool.spec(), pool.len())
     }
 }

@@ -63,12 +63,13 @@ impl CostModel for Watching {
 
 fn spec(high: f64) -> EnvSpec {
     EnvSpec {
-        id: "test/Line-v0",
+        id: "test/Line-v0".to_owned(),
         action_space: Space::uniform_box([1], DType::Float32, -high, high),
         columns: vec![],
         observation_space: vec![],
         variation_space: VariationSpace::new(vec![], &[]),
         max_episode_steps: 100,
+        cameras: vec![],
     }
 }
 

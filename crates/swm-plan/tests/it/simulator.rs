@@ -10,7 +10,7 @@ const HORIZON: usize = 3;
 const BLOCK: usize = 2;
 
 fn pool(entry: &EnvEntry, envs: usize) -> EnvPool {
-    let envs = (0..envs).map(|_| (entry.make)()).collect();
+    let envs = (0..envs).map(|_| entry.env().expect("an environment")).collect();
     let mut pool = EnvPool::new(envs, None, None, threads(1).expect("a thread")).expect("a pool");
     let resets = (0..pool.len()).map(|slot| Reset { slot, seed: slot as u64, options: ResetOptions::default() });
     pool.reset(&resets.collect::<Vec<_>>()).expect("a reset");
@@ -19,8 +19,16 @@ fn pool(entry: &EnvEntry, envs: usize) -> EnvPool {
 
 /// A simulator that was shown these slots.
 fn simulator(entry: &EnvEntry, pool: &EnvPool, slots: &[usize], score: Score) -> SimulatorCost {
-    let mut simulator =
-        SimulatorCost::new(entry.make, ActionScale::unscaled(pool.spec()), BLOCK, score).expect("a simulator");
+    let mut simulator = SimulatorCost::new(
+        {
+            let entry = *entry;
+            move || entry.env()
+        },
+        ActionScale::unscaled(pool.spec()),
+        BLOCK,
+        score,
+    )
+    .expect("a simulator");
     slots.iter().for_each(|&slot| simulator.see(slot, pool.env(slot)).expect("its own world"));
     simulator.observe(pool.infos(), slots).expect("worlds that were shown");
     simulator
@@ -46,7 +54,7 @@ fn a_cost_is_what_the_world_itself_would_say() {
         for score in [Score::Terminal, Score::Running] {
             let costs = costs(&mut simulator(entry, &pool, &[1], score), &actions, 1, samples);
             for (candidate, cost) in actions.chunks_exact(HORIZON * BLOCK * 2).zip(costs) {
-                let mut world = (entry.make)();
+                let mut world = entry.env().expect("an environment");
                 world.restore(&pool.env(1).snapshot()).expect("a snapshot");
                 let distances: Vec<f64> = candidate
                     .chunks_exact(2)
@@ -123,6 +131,6 @@ fn a_simulator_refuses_worlds_it_does_not_know() {
     assert!(again.contains("was not shown"), "{again}");
     let wide = Candidates { actions: &[0.0; 6], envs: 1, samples: 1, horizon: 1, dim: 6 };
     assert!(simulator.cost(wide, &mut [0.0]).expect_err("too wide").to_string().contains("6 numbers"));
-    let none = SimulatorCost::new(two_room::ENTRY.make, ActionScale::identity(2), 0, Score::Terminal);
+    let none = SimulatorCost::new(|| two_room::ENTRY.env(), ActionScale::identity(2), 0, Score::Terminal);
     assert!(none.err().expect("no actions").to_string().contains("action block"));
 }

@@ -14,7 +14,8 @@ use swm_core::{DType, EnvEntry, ExpertEntry, Result, Rng, Space, Transition};
 pub const ENTRY: EnvEntry = EnvEntry {
     id: Acrobot::ID,
     summary: "swing the end of two links above a line, with a motor in the joint between them",
-    make: || Box::new(Classic::<Acrobot>::new()),
+    options: &[],
+    make: |_| Ok(Box::new(Classic::<Acrobot>::new())),
     experts: &[ExpertEntry {
         id: "expert",
         summary: "turns the joint the way it turns, which adds energy until the end is high enough",

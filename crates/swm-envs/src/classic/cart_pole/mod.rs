@@ -13,7 +13,8 @@ use swm_core::{DType, EnvEntry, ExpertEntry, Rng, Space, Transition};
 pub const ENTRY: EnvEntry = EnvEntry {
     id: CartPole::ID,
     summary: "push a cart left or right so that the pole on it stays up, and take it to a place",
-    make: || Box::new(Classic::<CartPole>::new()),
+    options: &[],
+    make: |_| Ok(Box::new(Classic::<CartPole>::new())),
     experts: &[ExpertEntry {
         id: "expert",
         summary: "drives the cart to the goal without letting the pole fall (state feedback)",

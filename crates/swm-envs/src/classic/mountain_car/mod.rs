@@ -14,7 +14,8 @@ use swm_core::{DType, EnvEntry, ExpertEntry, Rng, Space, Transition};
 pub const ENTRY: EnvEntry = EnvEntry {
     id: Discrete::ID,
     summary: "swing a car with a weak motor out of a valley, up to the flag",
-    make: || Box::new(Classic::<MountainCar<Discrete>>::new()),
+    options: &[],
+    make: |_| Ok(Box::new(Classic::<MountainCar<Discrete>>::new())),
     experts: &[ExpertEntry { make: || Box::new(Controller::<MountainCar<Discrete>>::new()), ..PUMP }],
 };
 
@@ -22,7 +23,8 @@ pub const ENTRY: EnvEntry = EnvEntry {
 pub const CONTINUOUS: EnvEntry = EnvEntry {
     id: Continuous::ID,
     summary: "swing a car with a weak motor out of a valley, up to the flag, with little power",
-    make: || Box::new(Classic::<MountainCar<Continuous>>::new()),
+    options: &[],
+    make: |_| Ok(Box::new(Classic::<MountainCar<Continuous>>::new())),
     experts: &[ExpertEntry { make: || Box::new(Controller::<MountainCar<Continuous>>::new()), ..PUMP }],
 };
 

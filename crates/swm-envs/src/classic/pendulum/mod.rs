@@ -14,7 +14,8 @@ use swm_core::{DType, EnvEntry, ExpertEntry, Result, Rng, Space, Transition};
 pub const ENTRY: EnvEntry = EnvEntry {
     id: Pendulum::ID,
     summary: "swing a rod up with a motor too weak to lift it, and hold it upright",
-    make: || Box::new(Classic::<Pendulum>::new()),
+    options: &[],
+    make: |_| Ok(Box::new(Classic::<Pendulum>::new())),
     experts: &[ExpertEntry {
         id: "expert",
         summary: "pumps energy into the rod until it can be caught, then holds it (state feedback)",

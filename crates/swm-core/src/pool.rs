@@ -149,6 +149,11 @@ impl EnvPool {
         self.places.pixels.map(|(_, height, width)| (height, width))
     }
 
+    /// What is drawn besides `pixels` and `goal`.
+    pub fn views(&self) -> &[View] {
+        &self.places.views
+    }
+
     /// The worker threads.
     pub fn threads(&self) -> &Arc<rayon::ThreadPool> {
         &self.threads

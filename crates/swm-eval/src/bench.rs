@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm_core::pool::Reset;
 use swm_core::results::Summary;
-use swm_core::{Action, EnvEntry, Error, Key, RandomPolicy, ResetOptions, Result, Space, VariationRequest};
+use swm_core::{Action, EnvChoice, Error, Key, RandomPolicy, ResetOptions, Result, Space, VariationRequest};
 use swm_data::{ImageCodec, WriteOptions, create};
 
 /// The environment variable that names a Python with the reference.
@@ -103,7 +103,7 @@ pub struct BenchRow {
 /// # Errors
 /// When a number makes no sense, a world fails, or the reference fails after it had started. A reference that does
 /// not start is no error: [`BenchReport::reference`] says why.
-pub fn bench_envs(entries: &[&EnvEntry], config: &BenchConfig) -> Result<BenchReport> {
+pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchReport> {
     if config.pairs == 0 || !(config.seconds > 0.0 && config.seconds.is_finite()) {
         let given = format!("{} pairs of turns of {} seconds", config.pairs, config.seconds);
         return Err(Error::config("benchmark", given, "ask for at least 1 pair of more than 0 seconds"));
@@ -114,13 +114,13 @@ pub fn bench_envs(entries: &[&EnvEntry], config: &BenchConfig) -> Result<BenchRe
         reference: format!("not compared: set {REFERENCE_PYTHON} to a Python that has stable-worldmodel"),
         rows: vec![],
     };
-    for entry in entries {
+    for env in choices {
         if config.bare {
-            let mut reference = report.start(entry, 64, config);
-            let mut ours = Ours::new(entry, None, config)?;
+            let mut reference = report.start(env, 64, config);
+            let mut ours = Ours::new(env, None, config)?;
             ours.step(config.seconds / 4.0)?;
             report.rows.push(BenchRow::measure(
-                entry,
+                env,
                 None,
                 "step",
                 config.pairs,
@@ -128,22 +128,22 @@ pub fn bench_envs(entries: &[&EnvEntry], config: &BenchConfig) -> Result<BenchRe
                 reference.as_mut().map(|reference| |_| reference.bare(config.seconds)),
             )?);
             report.rows.push(BenchRow::measure(
-                entry,
+                env,
                 None,
                 "step, one thread",
                 config.pairs,
-                |turn| alone(entry, turn as u64, config),
+                |turn| alone(env, turn as u64, config),
                 reference.as_mut().map(|reference| |_| reference.bare(config.seconds)),
             )?);
         }
         for &size in &config.sizes {
-            let mut reference = report.start(entry, size, config);
-            let mut ours = Ours::new(entry, Some(size), config)?;
+            let mut reference = report.start(env, size, config);
+            let mut ours = Ours::new(env, Some(size), config)?;
             // The first turn of each warms up and is not counted.
             ours.step(config.seconds / 4.0)?;
             reference.as_mut().map(|reference| reference.step(config.seconds / 4.0)).transpose()?;
             report.rows.push(BenchRow::measure(
-                entry,
+                env,
                 Some(size),
                 "step + render",
                 config.pairs,
@@ -166,7 +166,7 @@ pub fn bench_envs(entries: &[&EnvEntry], config: &BenchConfig) -> Result<BenchRe
                 [("png", "collect, png", ImageCodec::Png), ("jpeg", "collect, jpeg", ImageCodec::Jpeg { quality: 95 })];
             for (name, what, codec) in codecs {
                 report.rows.push(BenchRow::measure(
-                    entry,
+                    env,
                     Some(size),
                     what,
                     config.pairs,
@@ -198,12 +198,13 @@ struct Ours {
 }
 
 impl Ours {
-    fn new(entry: &EnvEntry, size: Option<usize>, config: &BenchConfig) -> Result<Self> {
+    fn new(env: &EnvChoice, size: Option<usize>, config: &BenchConfig) -> Result<Self> {
         let mut world = World::new(
-            entry,
+            env,
             WorldConfig {
                 envs: config.envs,
                 image: size.map(|size| (size, size)),
+                views: vec![],
                 max_episode_steps: Some(config.episode_steps),
                 threads: config.threads,
             },
@@ -256,9 +257,9 @@ impl Ours {
 
 impl BenchReport {
     /// The reference with a world of this size, where there is one; says why where there is not.
-    fn start(&mut self, entry: &EnvEntry, size: usize, config: &BenchConfig) -> Option<Reference> {
+    fn start(&mut self, env: &EnvChoice, size: usize, config: &BenchConfig) -> Option<Reference> {
         let wanted =
-            Size { env: entry.id, envs: config.envs, image: (size, size), episode_steps: config.episode_steps };
+            Size { env: &env.id(), envs: config.envs, image: (size, size), episode_steps: config.episode_steps };
         match Reference::start(config.python.as_ref()?, wanted) {
             Ok(started) => {
                 self.reference.clone_from(&started.version);
@@ -273,11 +274,11 @@ impl BenchReport {
 }
 
 /// Environment steps a second of one environment on this thread, nothing observed, random actions drawn beforehand.
-fn alone(entry: &EnvEntry, seed: u64, config: &BenchConfig) -> Result<f64> {
+fn alone(env: &EnvChoice, seed: u64, config: &BenchConfig) -> Result<f64> {
     const ACTIONS: usize = 4096;
     /// Steps between two looks at the clock.
     const ROUND: usize = 1000;
-    let mut env = (entry.make)();
+    let mut env = env.env()?;
     let space = env.spec().action_space.clone();
     let mut rng = Key::new(seed).with("bench").rng();
     let drawn: Vec<Vec<f64>> = (0..ACTIONS).map(|_| space.sample(&mut rng)).collect();
@@ -311,7 +312,7 @@ fn alone(entry: &EnvEntry, seed: u64, config: &BenchConfig) -> Result<f64> {
 impl BenchRow {
     /// Alternates turns of ours and, where there is one, of the reference. A turn is given its number.
     fn measure(
-        entry: &EnvEntry,
+        env: &EnvChoice,
         size: Option<usize>,
         what: &'static str,
         pairs: usize,
@@ -327,7 +328,7 @@ impl BenchRow {
         }
         let ratios: Vec<f64> = our_turns.iter().zip(&their_turns).map(|(ours, theirs)| ours / theirs).collect();
         Ok(Self {
-            env: entry.id.to_owned(),
+            env: env.id(),
             what,
             size,
             steps_per_second: Summary::of(&our_turns).map_or(0.0, |turns| turns.median),

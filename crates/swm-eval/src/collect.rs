@@ -31,7 +31,7 @@ use swm_core::pool::Reset;
 use swm_core::{
     Batch, ColumnSpec, DType, EnvPool, EnvSpec, Error, Key, Manifest, Policy, Result, Schema, VariationRequest,
 };
-use swm_data::Writer;
+use swm_data::{Constants, Writer};
 
 /// What to collect.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -84,9 +84,10 @@ impl World {
             "max_episode_steps": self.pool().max_episode_steps(),
             "variation": config.variation,
             "image": image,
+            "views": self.pool().views().iter().map(ToString::to_string).collect::<Vec<_>>(),
             "goal": config.goal,
         });
-        Manifest::new("collect", config.seed, what)
+        Manifest { libraries: self.pool().env(0).libraries(), ..Manifest::new("collect", config.seed, what) }
     }
 
     /// Plays episodes until the dataset behind `writer` has `config.episodes`. The writer must have the columns
@@ -108,7 +109,7 @@ impl World {
         let first = writer.episodes();
         let threads = self.pool().threads().clone();
         scope(|scope| {
-            let (to_writer, from_world) = sync_channel::<Batch>(UNDERWAY);
+            let (to_writer, from_world) = sync_channel::<Finished>(UNDERWAY);
             let (back, written) = channel();
             let writing = scope.spawn(move || write_all(writer, &from_world, &back, &threads));
             let mut collecting = Collecting {
@@ -147,9 +148,9 @@ pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
     if stored.seed != wanted.seed {
         return differs("seed", stored.seed.to_string(), wanted.seed.to_string());
     }
-    for what in ["env", "policy", "max_episode_steps", "variation", "image", "goal"] {
+    for what in ["env", "policy", "max_episode_steps", "variation", "image", "views", "goal"] {
         let (stored, wanted) = (&stored.config[what], &wanted.config[what]);
-        if stored != wanted {
+        if stored != wanted && !(what == "views" && stored.is_null()) {
             return differs(what, stored.to_string(), wanted.to_string());
         }
     }
@@ -160,12 +161,12 @@ pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
 /// that its setting bounds the encoding of pictures as well.
 fn write_all(
     mut writer: Box<dyn Writer>,
-    episodes: &Receiver<Batch>,
+    episodes: &Receiver<Finished>,
     back: &Sender<Batch>,
     threads: &rayon::ThreadPool,
 ) -> Result<()> {
-    for episode in episodes {
-        threads.install(|| writer.write_episode(&episode))?;
+    for Finished { rows: episode, constants } in episodes {
+        threads.install(|| writer.write_episode_with(&episode, &constants))?;
         // Nobody listens any more when the world failed; what it finished is stored nevertheless.
         let _ = back.send(episode);
     }
@@ -273,6 +274,12 @@ struct Recording {
     rows: Batch,
 }
 
+/// An episode on its way to the writer.
+struct Finished {
+    rows: Batch,
+    constants: Constants,
+}
+
 struct Collecting<'a> {
     layout: Layout,
     config: &'a CollectConfig,
@@ -282,29 +289,29 @@ struct Collecting<'a> {
     next: usize,
     recordings: Vec<Option<Recording>>,
     /// Episodes `handed ..`, those that are finished.
-    finished: VecDeque<Option<Batch>>,
+    finished: VecDeque<Option<Finished>>,
     /// Episodes given to the writer.
     handed: usize,
     /// Episodes the writer has stored.
     stored: usize,
     steps: usize,
-    to_writer: SyncSender<Batch>,
+    to_writer: SyncSender<Finished>,
     written: Receiver<Batch>,
     /// Batches to record into, whatever they hold.
     spare: Vec<Batch>,
 }
 
 impl Collecting<'_> {
-    fn finish(&mut self, Recording { number, rows, .. }: Recording) -> Result<()> {
+    fn finish(&mut self, Recording { number, rows, .. }: Recording, constants: Constants) -> Result<()> {
         let place = number - self.handed;
         if self.finished.len() <= place {
             self.finished.resize_with(place + 1, || None);
         }
-        self.finished[place] = Some(rows);
+        self.finished[place] = Some(Finished { rows, constants });
         while let Some(Some(_)) = self.finished.front() {
-            let rows = self.finished.pop_front().flatten();
+            let episode = self.finished.pop_front().flatten();
             // The writer hangs up only when it failed, and then its own error is the one to tell.
-            let sent = rows.is_none_or(|rows| self.to_writer.send(rows).is_ok());
+            let sent = episode.is_none_or(|episode| self.to_writer.send(episode).is_ok());
             if !sent {
                 return Err(Error::Interrupted);
             }
@@ -405,7 +412,7 @@ impl Play for Collecting<'_> {
         let seed = reset_seed(self.key(recording.number));
         recording.rows.resize(recording.length);
         layout.fill_constants(&mut recording.rows, pool, slot, seed);
-        self.finish(recording)?;
+        self.finish(recording, pool.env(slot).constants())?;
         Ok(false)
     }
 }

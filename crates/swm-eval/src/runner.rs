@@ -109,6 +109,7 @@ impl EvalRequest {
             WorldConfig {
                 envs: request.side_by_side(means),
                 image: request.image.map(|[height, width]| (height, width)),
+                views: vec![],
                 max_episode_steps: request.budget,
                 threads: means.threads,
             },
@@ -119,6 +120,7 @@ impl EvalRequest {
             StartsRequest::Dataset { dataset, .. } => Some(resolver.dataset(dataset)?),
         };
         let mut manifest = request.manifest()?;
+        manifest.libraries = world.pool().env(0).libraries();
         if let Some(reader) = &dataset {
             manifest.hashes.insert("dataset".to_owned(), reader.content_hash()?);
         }

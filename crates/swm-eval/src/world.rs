@@ -5,16 +5,18 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use swm_core::pool::{Reset, threads};
 use swm_core::{
-    Batch, Env, EnvEntry, EnvPool, EnvSpec, Error, Key, Policy, ResetOptions, Result, Schema, VariationRequest,
+    Batch, Env, EnvChoice, EnvPool, EnvSpec, Error, Key, Policy, ResetOptions, Result, Schema, VariationRequest, View,
 };
 
 /// How big a world is and what it draws.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WorldConfig {
     /// Environments played at the same time.
     pub envs: usize,
     /// The `(height, width)` of pictures, if any are drawn.
     pub image: Option<(usize, usize)>,
+    /// What is drawn besides the default camera's colours, at the same size.
+    pub views: Vec<View>,
     /// Steps after which an episode is truncated; the environment's own number for `None`.
     pub max_episode_steps: Option<usize>,
     /// Worker threads; as many as the machine offers for 0.
@@ -24,7 +26,7 @@ pub struct WorldConfig {
 impl Default for WorldConfig {
     /// Eight environments at the paper's picture size, on all cores.
     fn default() -> Self {
-        Self { envs: 8, image: Some((224, 224)), max_episode_steps: None, threads: 0 }
+        Self { envs: 8, image: Some((224, 224)), views: vec![], max_episode_steps: None, threads: 0 }
     }
 }
 
@@ -76,8 +78,9 @@ impl World {
     /// # Errors
     /// When no environment is asked for, pictures have no pixels, episodes have no steps, or threads cannot
     /// be started.
-    pub fn new(entry: &EnvEntry, config: WorldConfig) -> Result<Self> {
-        Self::of(|| Ok((entry.make)()), config)
+    pub fn new(env: impl Into<EnvChoice>, config: WorldConfig) -> Result<Self> {
+        let env = env.into();
+        Self::of(|| env.env(), config)
     }
 
     /// As [`World::new`], of environments that `make` makes: with wrappers around them, or of none of the registry.
@@ -95,7 +98,8 @@ impl World {
             return Err(Error::config("steps of an episode", "0", "ask for at least 1"));
         }
         let envs: Result<Vec<Box<dyn Env>>> = std::iter::repeat_with(make).take(config.envs).collect();
-        let pool = EnvPool::new(envs?, config.image, config.max_episode_steps, threads(config.threads)?)?;
+        let pool =
+            EnvPool::with_views(envs?, config.image, config.views, config.max_episode_steps, threads(config.threads)?)?;
         let actions = Batch::zeros(&Schema::new([pool.spec().action_column()])?, pool.len());
         Ok(Self { pool, actions })
     }

@@ -9,6 +9,7 @@ pub use swm_data as data;
 pub use swm_envs as envs;
 pub use swm_eval as eval;
 pub use swm_models as models;
+pub use swm_mujoco as mujoco;
 pub use swm_plan as plan;
 pub use swm_report as report;
 
@@ -16,5 +17,11 @@ pub mod home;
 pub mod predictor;
 pub mod resolver;
 
-/// Every environment of this build.
-pub use swm_envs::ENVS;
+use swm_core::EnvEntry;
+use swm_core::registry::{Registry, join};
+
+/// Every environment of this build: those of two dimensions, then those on MuJoCo.
+pub static ENVS: Registry<EnvEntry> = Registry { rows: &ROWS, ..swm_envs::ENVS };
+
+const ROWS: [EnvEntry; swm_envs::ENVS.rows.len() + swm_mujoco::ENVS.rows.len()] =
+    join(swm_envs::ENVS.rows, swm_mujoco::ENVS.rows);

@@ -6,7 +6,7 @@ use crate::{ENVS, home};
 use std::cell::RefCell;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::policy::ExpertPolicy;
-use swm_core::{CostModel, Env, EnvEntry, Error, Named as _, Policy, RandomPolicy, Result};
+use swm_core::{CostModel, Env, EnvEntry, EnvSpec, Error, Named as _, Policy, RandomPolicy, Result};
 use swm_data::Reader;
 use swm_envs::wrappers::{GoalPicture, Stack, WRAPPERS};
 use swm_eval::{Actor, Acts, Choice, EvalRequest, Model, PolicyRequest, Predictor, Resolver, World};
@@ -87,8 +87,8 @@ impl Home {
 
 impl Resolver for Home {
     fn env(&self, request: &EvalRequest) -> Result<Box<dyn Env>> {
-        let (entry, wrapping) = (ENVS.get(&request.env)?, self.wrapping(request)?);
-        Ok(wrapping.stack.wrap((entry.make)(), wrapping.goal))
+        let (env, wrapping) = (ENVS.choose(&request.env)?.env()?, self.wrapping(request)?);
+        Ok(wrapping.stack.wrap(env, wrapping.goal))
     }
 
     fn dataset(&self, name: &str) -> Result<Arc<dyn Reader>> {
@@ -97,13 +97,13 @@ impl Resolver for Home {
 
     fn policy(&self, request: &PolicyRequest, world: &World) -> Result<Actor> {
         let (spec, slots) = (world.spec(), world.pool().len());
-        let entry = ENVS.get(spec.id)?;
+        let env = ENVS.choose(&spec.id)?;
         match &request.acts {
             Acts::Random => Ok(Actor::from(Box::new(RandomPolicy::new(spec, slots)) as Box<dyn Policy>)),
-            Acts::Expert { id } => scripted(entry, id, world).map(Actor::from),
+            Acts::Expert { id } => scripted(&env.entry, id, world).map(Actor::from),
             Acts::Direct { checkpoint: given, .. } => {
                 let checkpoint = InverseCheckpoint::load(&home::find_checkpoint(given)?, &Device::flex())?;
-                fits(checkpoint.world.env.as_deref(), given, entry)?;
+                fits(checkpoint.world.env.as_deref(), given, spec)?;
                 let weights = Some(checkpoint.hash().to_owned());
                 let (libraries, device) = (checkpoint.manifest.libraries.clone(), checkpoint.manifest.device.clone());
                 let policy: Box<dyn Policy> = Box::new(InversePolicy::new(checkpoint, spec, slots)?);
@@ -126,8 +126,8 @@ impl Resolver for Home {
                         let scale = ActionScale::unscaled(spec);
                         let wrapping = self.stack.borrow().clone();
                         let make = move || match &wrapping {
-                            Some(Wrapping { stack, goal, .. }) => stack.wrap((entry.make)(), *goal),
-                            None => (entry.make)(),
+                            Some(Wrapping { stack, goal, .. }) => Ok(stack.wrap(env.env()?, *goal)),
+                            None => env.env(),
                         };
                         let cost = SimulatorCost::new(make, scale.clone(), mpc.action_block, score)?;
                         let mut cost = objective.apply(Box::new(cost))?;
@@ -137,7 +137,7 @@ impl Resolver for Home {
                     }
                     Model::Checkpoint(given) => {
                         let checkpoint = Checkpoint::load(&home::find_checkpoint(given)?, &Device::flex())?;
-                        fits(checkpoint.env.as_deref(), given, entry)?;
+                        fits(checkpoint.env.as_deref(), given, spec)?;
                         let cost: Box<dyn CostModel> = Box::new(LewmCost::new(&checkpoint));
                         let (mut cost, scale) = (objective.apply(cost)?, checkpoint.action.clone());
                         pairing(id, &mut *cost, actions)?;
@@ -190,12 +190,12 @@ pub fn parse_score(name: &str) -> Result<Score> {
 }
 
 /// Refuses a checkpoint trained on another environment.
-fn fits(trained_on: Option<&str>, name: &str, entry: &EnvEntry) -> Result<()> {
+fn fits(trained_on: Option<&str>, name: &str, spec: &EnvSpec) -> Result<()> {
     match trained_on {
-        Some(env) if env != entry.id => Err(Error::config(
+        Some(env) if env != spec.id => Err(Error::config(
             format!("checkpoint {name}"),
-            format!("it was trained on {env}, not on {}", entry.id),
-            format!("evaluate it with --env {env}, or train one on {}", entry.id),
+            format!("it was trained on {env}, not on {}", spec.id),
+            format!("evaluate it with --env {env}, or train one on {}", spec.id),
         )),
         _ => Ok(()),
     }

@@ -9,7 +9,7 @@ use swm_eval::collect::check_continues;
 use swm_eval::{CollectConfig, Collected, Control, World, WorldConfig};
 
 fn world(envs: usize, threads: usize) -> World {
-    let config = WorldConfig { envs, image: Some((2, 3)), max_episode_steps: None, threads };
+    let config = WorldConfig { envs, image: Some((2, 3)), views: vec![], max_episode_steps: None, threads };
     World::new(&ENTRY, config).expect("a world")
 }
 

@@ -9,7 +9,7 @@ use swm_eval::{CollectConfig, Control, EvalConfig, Starts, Videos, World, WorldC
 use swm_plan::{ActionScale, Cem, MpcConfig, MpcPolicy};
 
 pub fn world(envs: usize, threads: usize) -> World {
-    let config = WorldConfig { envs, image: Some((4, 4)), max_episode_steps: Some(12), threads };
+    let config = WorldConfig { envs, image: Some((4, 4)), views: vec![], max_episode_steps: Some(12), threads };
     World::new(&ENTRY, config).expect("a world")
 }
 
@@ -232,7 +232,7 @@ fn wrong_requests_say_so() {
     assert!(starts(vec![[0, 0]], 1, pinned(&[("agent.y", 1.0)])).contains("agent.x"));
     let error = Starts::choose(&reader, 1000, 2, 0).expect_err("too many").to_string();
     assert!(error.contains("1000") && error.contains("collect more"), "{error}");
-    let blind = WorldConfig { envs: 1, image: None, max_episode_steps: None, threads: 1 };
+    let blind = WorldConfig { envs: 1, image: None, views: vec![], max_episode_steps: None, threads: 1 };
     let videos = Videos { root: "nowhere".into(), prefix: "v".to_owned(), count: 1, fps: 10 };
     let config = EvalConfig { videos: Some(videos), ..EvalConfig::default() };
     let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("starts");

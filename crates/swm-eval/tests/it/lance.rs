@@ -8,7 +8,7 @@ use swm_envs::two_room::ENTRY;
 use swm_eval::{CollectConfig, Collected, Control, EvalConfig, Starts, World, WorldConfig};
 
 fn world(envs: usize, threads: usize) -> World {
-    World::new(&ENTRY, WorldConfig { envs, image: Some((28, 28)), max_episode_steps: Some(60), threads })
+    World::new(&ENTRY, WorldConfig { envs, image: Some((28, 28)), views: vec![], max_episode_steps: Some(60), threads })
         .expect("a world")
 }
 
@@ -76,7 +76,7 @@ fn recorded_goals_are_within_the_experts_reach() {
 fn a_dataset_of_another_world_is_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("line.lance");
-    let line = WorldConfig { envs: 1, image: None, max_episode_steps: None, threads: 1 };
+    let line = WorldConfig { envs: 1, image: None, views: vec![], max_episode_steps: None, threads: 1 };
     let mut line = World::new(&crate::line::ENTRY, line).expect("a world");
     let config = CollectConfig { episodes: 1, ..CollectConfig::default() };
     let writer = swm_data::create(&path, &line.collect_schema(false).expect("schema"), WriteOptions::default());

@@ -7,8 +7,13 @@ use swm_core::{
     ResetOptions, Result, Rng, RowMut, RowRef, Snapshot, Space, Transition, VariationSpace,
 };
 
-pub const ENTRY: EnvEntry =
-    EnvEntry { id: "test/Line-v0", summary: "Reach a point on a line.", make: || Box::new(Line::new()), experts: &[] };
+pub const ENTRY: EnvEntry = EnvEntry {
+    id: "test/Line-v0",
+    summary: "Reach a point on a line.",
+    options: &[],
+    make: |_| Ok(Box::new(Line::new())),
+    experts: &[],
+};
 
 /// Nearer than this is there.
 pub const NEAR: f64 = 0.25;
@@ -35,7 +40,7 @@ impl Line {
         );
         let factors = variation_space.resolve(&Default::default(), Key::new(0)).expect("defaults");
         let spec = EnvSpec {
-            id: ENTRY.id,
+            id: ENTRY.id.to_owned(),
             action_space: Space::uniform_box([1], DType::Float32, -1.0, 1.0),
             columns: vec![
                 ColumnSpec::new("state", DType::Float64, [1]),
@@ -45,6 +50,7 @@ impl Line {
             observation_space: vec![],
             variation_space,
             max_episode_steps: 12,
+            cameras: vec![],
         };
         Self { spec, factors, x: 0.0, goal: 0.0, noise: 0.0, rng: Key::new(0).rng() }
     }
@@ -85,12 +91,14 @@ impl Env for Line {
         row.set(2, &[self.noise as f32]);
     }
 
-    fn render(&mut self, frame: FrameMut<'_>) {
+    fn render(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.paint(self.x, frame);
+        Ok(())
     }
 
-    fn render_goal(&mut self, frame: FrameMut<'_>) {
+    fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.paint(self.goal, frame);
+        Ok(())
     }
 
     fn factors(&self) -> &FactorValues {

@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex};
 use swm_core::{Batch, ColumnSpec, DType, Error, Manifest, Result, Schema};
-use swm_data::{Episode, Reader, StepRange, Writer};
+use swm_data::{Constants, Episode, Reader, StepRange, Writer};
 
 #[derive(Clone, Default)]
 pub struct Memory {
@@ -41,7 +41,7 @@ impl Memory {
 }
 
 impl Writer for Memory {
-    fn write_episode(&mut self, episode: &Batch) -> Result<()> {
+    fn write_episode_with(&mut self, episode: &Batch, _constants: &Constants) -> Result<()> {
         let mut episodes = self.episodes.lock().expect("no panic");
         if self.full_at == Some(episodes.len()) {
             let full = std::io::Error::from(std::io::ErrorKind::StorageFull);

@@ -3,7 +3,7 @@
 use super::{Context, emit, emit_json, table};
 use clap::{Args, Subcommand};
 use swm::ENVS;
-use swm_core::EnvEntry;
+use swm_core::EnvChoice;
 use swm_eval::{BenchConfig, PlanBenchConfig, bench_envs, bench_plan};
 
 /// Arguments of `swm bench`.
@@ -82,9 +82,9 @@ pub fn bench(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
         What::Envs(args) => args,
         What::Plan(args) => return plan(args, context),
     };
-    let entries: Vec<&EnvEntry> = match &args.envs[..] {
-        [] => ENVS.rows.iter().collect(),
-        ids => ids.iter().map(|id| ENVS.get(id)).collect::<swm_core::Result<_>>()?,
+    let entries: Vec<EnvChoice> = match &args.envs[..] {
+        [] => ENVS.rows.iter().map(EnvChoice::from).collect(),
+        ids => ids.iter().map(|id| ENVS.choose(id)).collect::<swm_core::Result<_>>()?,
     };
     let report = bench_envs(
         &entries,

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm::resolver::scripted;
 use swm::{ENVS, home};
-use swm_core::{EnvEntry, Error, Result};
+use swm_core::{EnvChoice, Error, Result, View};
 use swm_data::{ImageCodec, WriteMode, WriteOptions};
 use swm_eval::collect::check_continues;
 use swm_eval::{CollectConfig, Collected, Control, World, WorldConfig};
@@ -17,7 +17,7 @@ use swm_eval::{CollectConfig, Collected, Control, World, WorldConfig};
 /// Arguments of `swm collect`.
 #[derive(Args)]
 pub struct CollectArgs {
-    /// The environment, such as swm/TwoRoom-v1
+    /// The environment, such as swm/TwoRoom-v1; options behind it: swm/OGBCube-v0,env_type=double
     env: String,
     /// The dataset to write: a path or a name
     #[arg(short, long, value_name = "DATASET")]
@@ -40,6 +40,9 @@ pub struct CollectArgs {
     /// Store no pictures
     #[arg(long, conflicts_with = "image")]
     no_pixels: bool,
+    /// Another picture to store: CAMERA, depth, segmentation, or CAMERA:depth (`swm envs ENV` names the cameras)
+    #[arg(long = "view", value_name = "VIEW", conflicts_with = "no_pixels")]
+    views: Vec<String>,
     /// Steps after which an episode is truncated (default: the environment's own)
     #[arg(long, value_name = "STEPS")]
     max_steps: Option<usize>,
@@ -71,7 +74,7 @@ enum Codec {
 /// A collection, as `swm collect` and `swm demo` ask for it.
 pub struct Collection<'a> {
     /// The environment.
-    pub entry: &'static EnvEntry,
+    pub env: EnvChoice,
     /// Where to.
     pub path: &'a Path,
     /// Who acts.
@@ -92,12 +95,13 @@ pub struct Collection<'a> {
 pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
     let path = home::dataset(&args.output);
     let collection = Collection {
-        entry: ENVS.get(&args.env)?,
+        env: ENVS.choose(&args.env)?,
         path: &path,
         policy: &args.policy,
         world: WorldConfig {
             envs: args.envs,
             image: (!args.no_pixels).then_some(args.image),
+            views: args.views.iter().map(|view| View::parse(view)).collect::<Result<_>>()?,
             max_episode_steps: args.max_steps,
             threads: context.threads,
         },
@@ -129,10 +133,10 @@ pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
 
 /// Runs a collection with a progress bar.
 pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> {
-    let Collection { entry, path, config, .. } = collection;
+    let Collection { env, path, config, .. } = collection;
     let (stack, goal) = collection.wrappers.stack()?;
-    let mut world = World::of(|| Ok(stack.wrap((entry.make)(), goal)), collection.world)?;
-    let mut policy = scripted(entry, collection.policy, &world)?;
+    let mut world = World::of(|| Ok(stack.wrap(env.env()?, goal)), collection.world.clone())?;
+    let mut policy = scripted(&env.entry, collection.policy, &world)?;
     // A wrong factor is found before anything of an older dataset is replaced.
     world.spec().variation_space.resolve(&config.variation, swm_core::Key::new(config.seed))?;
     let mut manifest = world.collect_manifest(config);
@@ -145,7 +149,7 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
         match collection.mode {
             WriteMode::Overwrite => {}
             WriteMode::Append => {
-                if let Some(stored) = swm_data::open(path)?.manifest() {
+                if let Some(stored) = swm_data::open(*path)?.manifest() {
                     check_continues(&stored, &manifest)?;
                     let (stored, wanted) = (&stored.config["codec"], &manifest.config["codec"]);
                     if stored != wanted {
@@ -167,7 +171,7 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
         }
     }
     let writer = swm_data::create(
-        path,
+        *path,
         &world.collect_schema(config.goal)?,
         WriteOptions {
             mode: collection.mode,

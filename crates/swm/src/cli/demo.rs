@@ -54,7 +54,7 @@ const RECEDING_HORIZON: usize = 2;
 /// Collects, trains, evaluates and reports.
 pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     let begun = Instant::now();
-    let entry = ENVS.get(ENV)?;
+    let env = ENVS.choose(ENV)?;
     let output = args.output.clone().unwrap_or_else(|| home::home().join("demo"));
     let (data, model, results) = (output.join("rooms.lance"), output.join("lewm-rooms"), output.join("results"));
     let mut config = TrainConfig::load("tiny", &args.settings)?;
@@ -67,9 +67,15 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     }
 
     complain("1/4 collect: an exploring policy wanders through two rooms\n");
-    let world = WorldConfig { envs: 16, image: Some(image), max_episode_steps: Some(100), threads: context.threads };
+    let world = WorldConfig {
+        envs: 16,
+        image: Some(image),
+        max_episode_steps: Some(100),
+        threads: context.threads,
+        ..WorldConfig::default()
+    };
     let collection = Collection {
-        entry,
+        env,
         path: &data,
         policy: "explore",
         world,

@@ -1,14 +1,18 @@
 //! `swm envs` and `swm fovs`: what worlds there are and what can be varied in them.
 
-use super::{emit, emit_json, table};
+use super::{complain, emit, emit_json, table};
 use clap::Args;
 use serde_json::{Map, Value, json};
+use std::collections::BTreeSet;
 use swm::ENVS;
-use swm_core::{EnvEntry, EnvSpec, Space, VariationSpace};
+use swm_core::{EnvChoice, EnvEntry, EnvSpec, Space, VariationSpace};
 
 /// Arguments of `swm envs`.
 #[derive(Args)]
-pub struct EnvsArgs {}
+pub struct EnvsArgs {
+    /// One to show in full, such as swm/TwoRoom-v1
+    env: Option<String>,
+}
 
 /// Arguments of `swm fovs`.
 #[derive(Args)]
@@ -18,29 +22,79 @@ pub struct FovsArgs {
 }
 
 /// Lists the environments.
-pub fn envs(_args: &EnvsArgs, as_json: bool) -> anyhow::Result<()> {
-    if as_json {
-        let all: Map<String, Value> = ENVS.rows.iter().map(|row| (row.id.to_owned(), describe(row))).collect();
-        return emit_json(&all);
+pub fn envs(args: &EnvsArgs, as_json: bool) -> anyhow::Result<()> {
+    if let Some(id) = &args.env {
+        return show(&ENVS.choose(id)?, as_json);
     }
-    let rows = ENVS.rows.iter().map(|row| {
-        let env = (row.make)();
-        let spec = env.spec();
-        vec![
-            row.id.to_owned(),
-            spec.action_space.describe(),
-            spec.variation_space.factors().len().to_string(),
-            row.experts.iter().map(|e| e.id).collect::<Vec<_>>().join(", "),
-            row.summary.to_owned(),
-        ]
-    });
+    if as_json {
+        let all = ENVS.rows.iter().map(|row| match row.env() {
+            Ok(env) => (row.id.to_owned(), describe(row, env.spec())),
+            Err(error) => (row.id.to_owned(), json!({"summary": row.summary, "missing": error.to_string()})),
+        });
+        return emit_json(&all.collect::<Map<String, Value>>());
+    }
+    let mut missing = BTreeSet::new();
+    let rows: Vec<Vec<String>> = ENVS
+        .rows
+        .iter()
+        .map(|row| {
+            let (action, factors) = match row.env() {
+                Ok(env) => {
+                    let spec = env.spec();
+                    (spec.action_space.describe(), spec.variation_space.factors().len().to_string())
+                }
+                Err(error) => {
+                    missing.insert(error.to_string());
+                    ("missing".to_owned(), String::new())
+                }
+            };
+            vec![
+                row.id.to_owned(),
+                action,
+                factors,
+                row.experts.iter().map(|e| e.id).collect::<Vec<_>>().join(", "),
+                row.summary.to_owned(),
+            ]
+        })
+        .collect();
     emit(&table(&["environment", "action", "factors", "experts", "task"], rows));
+    missing.iter().for_each(|error| complain(&format!("missing: {error}\n")));
+    Ok(())
+}
+
+/// Shows one environment: its options, cameras, columns and experts.
+fn show(choice: &EnvChoice, as_json: bool) -> anyhow::Result<()> {
+    let (row, env) = (&choice.entry, choice.env()?);
+    let spec = env.spec();
+    if as_json {
+        return emit_json(&describe(row, spec));
+    }
+    let list = |words: Vec<String>| if words.is_empty() { "none".to_owned() } else { words.join(", ") };
+    let columns =
+        spec.columns.iter().map(|column| format!("{} {}{:?}", column.name, column.dtype.name(), column.shape));
+    let mut rows = vec![
+        vec!["task".to_owned(), row.summary.to_owned()],
+        vec!["action".to_owned(), spec.action_space.describe()],
+        vec!["columns".to_owned(), list(columns.collect())],
+        vec!["steps".to_owned(), spec.max_episode_steps.to_string()],
+        vec!["factors".to_owned(), format!("{} (`swm fovs {}`)", spec.variation_space.factors().len(), spec.id)],
+        vec!["cameras".to_owned(), list(spec.cameras.clone())],
+    ];
+    rows.extend(row.options.iter().map(|option| {
+        let values = option.values.join(", ");
+        vec![
+            format!("option {}", option.key),
+            format!("{}: {values} (now {})", option.summary, choice.choices.get(option.key)),
+        ]
+    }));
+    rows.extend(row.experts.iter().map(|e| vec![format!("expert {}", e.id), e.summary.to_owned()]));
+    emit(&table(&[&spec.id, ""], rows));
     Ok(())
 }
 
 /// Lists the factors of variation of one environment.
 pub fn fovs(args: &FovsArgs, as_json: bool) -> anyhow::Result<()> {
-    let env = (ENVS.get(&args.env)?.make)();
+    let env = ENVS.choose(&args.env)?.env()?;
     let space = &env.spec().variation_space;
     if as_json {
         return emit_json(&json!({
@@ -62,9 +116,7 @@ pub fn fovs(args: &FovsArgs, as_json: bool) -> anyhow::Result<()> {
 }
 
 /// One environment, with the fields a Python user knows.
-fn describe(row: &EnvEntry) -> Value {
-    let env = (row.make)();
-    let spec: &EnvSpec = env.spec();
+fn describe(row: &EnvEntry, spec: &EnvSpec) -> Value {
     let info: Map<String, Value> = spec
         .columns
         .iter()
@@ -83,6 +135,8 @@ fn describe(row: &EnvEntry) -> Value {
         "sampling_order": sampling_order(&spec.variation_space),
         "default_variations": spec.variation_space.defaults(),
         "max_episode_steps": spec.max_episode_steps,
+        "cameras": spec.cameras,
+        "options": row.options.iter().map(|o| json!({"key": o.key, "summary": o.summary, "values": o.values})).collect::<Vec<_>>(),
         "experts": row.experts.iter().map(|e| json!({"id": e.id, "summary": e.summary})).collect::<Vec<_>>(),
     })
 }

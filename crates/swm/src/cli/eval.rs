@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use swm::resolver::{Home, parse_score};
 use swm::{ENVS, home};
 use swm_core::results::{Counting, Proportion, Run};
-use swm_core::{EnvEntry, Error, Result, Results};
+use swm_core::{EnvChoice, Error, Result, Results};
 use swm_data::{Part, Split};
 use swm_eval::reproduce::{Reproduction, reproduce as run_again};
 use swm_eval::{Acts, Condition, EvalRequest, HeldOut, Means, Model, Moment, PolicyRequest, StartsRequest};
@@ -117,15 +117,15 @@ impl EvalArgs {
         let Some(env) = self.env.clone().or(trained_on) else {
             return Err(Error::config("--env", "no environment is given", "name one (`swm envs` lists them)"));
         };
-        let entry = ENVS.get(&env)?;
+        let chosen = ENVS.choose(&env)?;
         let mut policies = vec![];
         for found in found {
-            policies.extend(self.acts(entry, found)?);
+            policies.extend(self.acts(&chosen, found)?);
         }
         let image = policies.iter().find_map(|(_, image)| *image);
         Ok(EvalRequest {
             version: EvalRequest::VERSION,
-            env,
+            env: chosen.id(),
             wrappers: self.wrappers.choices()?,
             wrap_goal: self.wrappers.wrap_goal,
             image: Some(image.unwrap_or([self.image.0, self.image.1])),
@@ -162,7 +162,7 @@ impl EvalArgs {
 
     /// What a word of the command line stands for in an environment: one policy, or one for every solver.
     #[allow(clippy::type_complexity)]
-    fn acts(&self, entry: &EnvEntry, found: Found) -> Result<Vec<(PolicyRequest, Option<[usize; 2]>)>> {
+    fn acts(&self, env: &EnvChoice, found: Found) -> Result<Vec<(PolicyRequest, Option<[usize; 2]>)>> {
         let Found { name, kind, image, .. } = found;
         let image = image.map(|side| [side, side]);
         let (model, block, history) = match kind {
@@ -173,7 +173,7 @@ impl EvalArgs {
             }
             Kind::Plans { model: Some(given), block, history } => (Model::Checkpoint(given), block, history),
         };
-        let solvers = self.planner.solvers(entry)?;
+        let solvers = self.planner.solvers(env)?;
         // Several solvers are told apart by what was written, settings included.
         let words = &self.planner.solvers;
         let policies = solvers.into_iter().enumerate().map(|(i, solver)| {
@@ -205,11 +205,11 @@ enum Kind {
 /// Finds out what a word stands for.
 fn find(given: &str, env: Option<&str>) -> Result<Found> {
     let scripted = |acts| Found { name: given.to_owned(), kind: Kind::Acts(acts), env: None, image: None };
-    let entry = env.map(|id| ENVS.get(id)).transpose()?;
+    let env = env.map(|id| ENVS.choose(id)).transpose()?;
     if given == "random" {
         return Ok(scripted(Acts::Random));
     }
-    if given == "expert" || entry.is_some_and(|entry| entry.experts.iter().any(|expert| expert.id == given)) {
+    if given == "expert" || env.is_some_and(|env| env.entry.experts.iter().any(|expert| expert.id == given)) {
         return Ok(scripted(Acts::Expert { id: given.to_owned() }));
     }
     if given == "simulator" {

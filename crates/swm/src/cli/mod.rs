@@ -1,5 +1,6 @@
 //! The command line: one file a group of commands, each a thin front of the crates.
 
+mod assets;
 mod bench;
 mod checkpoints;
 mod collect;
@@ -38,10 +39,12 @@ pub struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    /// List the environments
+    /// List the environments, or show one
     Envs(envs::EnvsArgs),
     /// List an environment's factors of variation
     Fovs(envs::FovsArgs),
+    /// List, install and verify what 3-D worlds need: MuJoCo's library, models, meshes
+    Assets(assets::AssetsArgs),
     /// List the visual wrappers and their settings
     Wrappers,
     /// List the solvers, what they plan and what they ask of a model
@@ -116,6 +119,7 @@ impl Cli {
         match self.command {
             Command::Envs(args) => envs::envs(&args, json),
             Command::Fovs(args) => envs::fovs(&args, json),
+            Command::Assets(args) => assets::assets(&args, json),
             Command::Wrappers => wrappers::wrappers(json),
             Command::Solvers => solvers::solvers(json),
             Command::Datasets => datasets::datasets(json),

@@ -3,7 +3,7 @@
 use super::solvers;
 use clap::Args;
 use serde_json::{Map, Value, json};
-use swm_core::{EnvEntry, Error, Result};
+use swm_core::{EnvChoice, Error, Result};
 use swm_eval::{Acts, Choice, Model};
 use swm_plan::objective::ObjectiveConfig;
 use swm_plan::registry::Actions;
@@ -50,7 +50,7 @@ impl PlannerArgs {
     ///
     /// # Errors
     /// When a solver or a setting is unknown.
-    pub fn solvers(&self, entry: &EnvEntry) -> Result<Vec<Choice>> {
+    pub fn solvers(&self, env: &EnvChoice) -> Result<Vec<Choice>> {
         if !self.solvers.is_empty() {
             let choices = self.solvers.iter().map(|text| {
                 let (entry, settings) = solvers::parse(text)?;
@@ -58,7 +58,7 @@ impl PlannerArgs {
             });
             return choices.collect();
         }
-        let actions = Actions::of(&(entry.make)().spec().action_space);
+        let actions = Actions::of(&env.env()?.spec().action_space);
         let first = match actions {
             Actions::Continuous => SOLVERS.get("cem")?,
             Actions::Discrete => {

@@ -1,0 +1,134 @@
+//! [`Location`]: where a dataset is, a path on this machine or a URI of an object store.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+use swm_core::{Error, Result};
+use url::Url;
+
+/// The schemes of object stores.
+const SCHEMES: [&str; 5] = ["s3", "gs", "az", "http", "https"];
+
+/// Where a dataset is.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub enum Location {
+    /// On this machine.
+    Path(PathBuf),
+    /// In an object store: `s3://bucket/key`, `gs://bucket/key`, `az://container/key`, `http(s)://host/path`.
+    Uri(Url),
+}
+
+impl Location {
+    /// Reads a path or a URI. `file://` URIs are paths.
+    ///
+    /// # Errors
+    /// When it has the form of a URI, and its scheme is none of an object store's or the rest makes no sense.
+    pub fn parse(given: &str) -> Result<Self> {
+        let Some((scheme, rest)) = given.split_once("://") else { return Ok(Self::Path(given.into())) };
+        if scheme == "file" {
+            return Ok(Self::Path(rest.into()));
+        }
+        if !SCHEMES.contains(&scheme) {
+            let fix = "use a path, or a URI that begins with s3://, gs://, az://, http:// or https://";
+            return Err(Error::config("dataset", format!("nothing is known about {scheme}://"), fix));
+        }
+        let url = Url::parse(given)
+            .map_err(|error| Error::config("dataset", format!("{given} is no URI: {error}"), "check its spelling"))?;
+        Ok(Self::Uri(url))
+    }
+
+    /// The path, if it is on this machine.
+    pub fn path(&self) -> Option<&Path> {
+        match self {
+            Self::Path(path) => Some(path),
+            Self::Uri(_) => None,
+        }
+    }
+
+    /// The path.
+    ///
+    /// # Errors
+    /// When it is in an object store, which `format` cannot use.
+    pub fn local(&self, format: &str) -> Result<&Path> {
+        self.path().ok_or_else(|| {
+            let fix = "copy it to this machine, or use the format lance or hdf5, which are read from object stores";
+            Error::config("dataset", format!("the format {format} is not read from {self}"), fix)
+        })
+    }
+
+    /// What an error message calls it.
+    pub fn label(&self) -> PathBuf {
+        match self {
+            Self::Path(path) => path.clone(),
+            Self::Uri(url) => url.as_str().into(),
+        }
+    }
+
+    /// The last part of it: a file's or folder's name.
+    pub fn name(&self) -> &str {
+        match self {
+            Self::Path(path) => path.file_name().and_then(|name| name.to_str()).unwrap_or_default(),
+            Self::Uri(url) => url.path().trim_end_matches('/').rsplit('/').next().unwrap_or_default(),
+        }
+    }
+
+    /// Whether its name ends in `.suffix`, in any case of letters.
+    pub fn has_suffix(&self, suffix: &str) -> bool {
+        self.name().rsplit_once('.').is_some_and(|(stem, end)| !stem.is_empty() && end.eq_ignore_ascii_case(suffix))
+    }
+}
+
+impl fmt::Display for Location {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Path(path) => write!(f, "{}", path.display()),
+            Self::Uri(url) => write!(f, "{url}"),
+        }
+    }
+}
+
+impl From<&Path> for Location {
+    fn from(path: &Path) -> Self {
+        Self::Path(path.to_owned())
+    }
+}
+
+impl From<&PathBuf> for Location {
+    fn from(path: &PathBuf) -> Self {
+        Self::Path(path.clone())
+    }
+}
+
+impl From<PathBuf> for Location {
+    fn from(path: PathBuf) -> Self {
+        Self::Path(path)
+    }
+}
+
+impl From<&Self> for Location {
+    fn from(location: &Self) -> Self {
+        location.clone()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn paths_and_uris_are_told_apart() -> Result<()> {
+        let path = Location::parse("runs/pusht.lance")?;
+        assert_eq!(path.path(), Some(Path::new("runs/pusht.lance")));
+        assert_eq!(Location::parse("file:///tmp/a.h5")?, Location::Path("/tmp/a.h5".into()));
+        let uri = Location::parse("s3://bucket/runs/pusht.LANCE/")?;
+        assert!(uri.path().is_none() && uri.has_suffix("lance") && uri.name() == "pusht.LANCE");
+        assert_eq!(uri.to_string(), "s3://bucket/runs/pusht.LANCE/");
+        assert!(!Location::parse("runs/.lance")?.has_suffix("lance"), "a hidden file without a name");
+        Ok(())
+    }
+
+    #[test]
+    fn what_is_no_object_store_is_said() {
+        let error = Location::parse("ftp://host/a.lance").expect_err("an unknown scheme").to_string();
+        assert!(error.contains("ftp://") && error.contains("s3://"), "{error}");
+    }
+}

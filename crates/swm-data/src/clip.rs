@@ -72,7 +72,16 @@ impl Clips {
     /// # Errors
     /// When a position does not exist, or none of the episodes is long enough.
     pub fn new(spec: &ClipSpec, episodes: &[Episode], positions: &[usize]) -> Result<Self> {
-        let span = spec.span();
+        Self::reaching(spec, spec.span(), episodes, positions)
+    }
+
+    /// The clips whose episode goes on until `reach` rows from their first one at least, such as for a goal that comes
+    /// after them.
+    ///
+    /// # Errors
+    /// As [`Clips::new`].
+    pub fn reaching(spec: &ClipSpec, reach: usize, episodes: &[Episode], positions: &[usize]) -> Result<Self> {
+        let (span, reach) = (spec.span(), reach.max(spec.span()));
         let mut clips = Self { span, episodes: vec![], total: 0 };
         for &position in positions {
             let Some(episode) = episodes.get(position) else {
@@ -82,9 +91,9 @@ impl Clips {
                     format!("positions below {}", episodes.len()),
                 ));
             };
-            if episode.length >= span {
+            if episode.length >= reach {
                 clips.episodes.push((position, clips.total));
-                clips.total += episode.length - span + 1;
+                clips.total += episode.length - reach + 1;
             }
         }
         if clips.total == 0 {
@@ -92,7 +101,7 @@ impl Clips {
             return Err(Error::config(
                 "clips",
                 format!(
-                    "none of the {} episodes is long enough for {} steps with frameskip {} ({span} rows); the longest has {longest}",
+                    "none of the {} episodes is long enough for {} steps with frameskip {} ({reach} rows); the longest has {longest}",
                     positions.len(),
                     spec.num_steps,
                     spec.frameskip

@@ -2,31 +2,46 @@
 //!
 //! - [`format`](mod@format): the contracts ([`Reader`], [`Writer`], [`Format`]) and the list of formats.
 //! - [`lance`]: the default format, which the Python `lance` package and the reference read as well.
-//! - [`clip`] and [`loader`]: windows of episodes, shuffled and prefetched as batches.
+//! - [`clip`], [`goals`] and [`loader`]: windows of episodes and where they lead, shuffled and prefetched as batches;
+//!   [`cache`]: decoded rows kept for the next epoch.
+//! - [`views`]: datasets made of datasets; [`replay`]: the latest episodes of a running collection.
 //! - [`image`]: how pictures are stored.
 //! - [`preview`] and [`video`]: frames as pictures and videos for people.
 //! - [`stats`]: column statistics.
 //! - [`Split`]: which episodes are held out.
 
+pub mod cache;
 pub mod clip;
+mod column_files;
+mod episodes;
 pub mod format;
+pub mod goals;
 pub mod image;
 mod jpeg;
 pub mod lance;
-
 pub mod loader;
+mod location;
+pub mod objects;
+mod numbers;
 pub mod preview;
+mod qoi;
+pub mod replay;
 mod split;
 pub mod stats;
 pub mod video;
+pub mod views;
 
+pub use cache::CacheConfig;
 pub use clip::{ClipSpec, Clips};
 pub use format::{
-    CommitPolicy, Episode, FORMATS, Format, Reader, StepRange, WriteMode, WriteOptions, Writer, create, open,
+    CommitPolicy, Constants, Episode, FORMATS, Format, Reader, StepRange, WriteMode, WriteOptions, Writer, create, open,
 };
+pub use goals::{GoalMixture, GoalSpec};
 pub use image::ImageCodec;
-pub use loader::{Loader, LoaderConfig};
+pub use location::Location;
+pub use loader::{Epoch, Loaded, Loader, LoaderConfig};
 pub use preview::{Picture, contact_sheet, write_png};
+pub use replay::{ReplayBuffer, ReplayConfig, ReplayLoader};
 pub use split::{Part, Split};
 pub use stats::{ColumnStats, column_stats, split};
 pub use video::{integer_scale, write_mp4, write_mp4_scaled};

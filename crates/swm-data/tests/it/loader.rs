@@ -4,7 +4,7 @@ use crate::sample::{rows, write};
 use std::path::PathBuf;
 use std::sync::Arc;
 use swm_core::{Batch, DType};
-use swm_data::{ClipSpec, Loader, LoaderConfig, Reader, WriteMode, open};
+use swm_data::{CacheConfig, ClipSpec, Loaded, Loader, LoaderConfig, Reader, WriteMode, open};
 
 const EPISODES: usize = 9;
 
@@ -21,14 +21,14 @@ fn config(num_steps: usize, frameskip: usize) -> LoaderConfig {
         clip: ClipSpec { num_steps, frameskip, columns },
         batch_size: 4,
         seed: 11,
-        cache_bytes: 0,
+        cache: CacheConfig::Off,
         ..LoaderConfig::default()
     }
 }
 
 fn load(reader: &Arc<dyn Reader>, config: LoaderConfig, epoch: u64, first: usize) -> Vec<Batch> {
     let loader = Loader::new(Arc::clone(reader), config).expect("a loader");
-    let batches: Vec<Batch> = loader.epoch(epoch, first).map(|batch| batch.expect("a batch")).collect();
+    let batches: Vec<Batch> = loader.epoch(epoch, first).map(|batch| batch.expect("a batch").into_batch()).collect();
     assert_eq!(batches.len(), loader.batches_per_epoch() - first);
     batches
 }
@@ -96,8 +96,10 @@ fn the_order_depends_on_seed_and_epoch_alone() {
     let base = load(&reader, config(3, 1), 5, 0);
     for threads in [0, 1, 4] {
         for prefetch in [1, 3] {
-            for cache_bytes in [0, 1 << 30] {
-                let config = LoaderConfig { threads, prefetch, cache_bytes, ..config(3, 1) };
+            for cache in
+                [CacheConfig::Off, CacheConfig::Memory { bytes: 1 << 30 }, CacheConfig::Memory { bytes: 20_000 }]
+            {
+                let config = LoaderConfig { threads, prefetch, cache, ..config(3, 1) };
                 assert!(bytes(&load(&reader, config.clone(), 5, 0)) == bytes(&base), "{threads} {prefetch}");
                 assert!(bytes(&load(&other, config.clone(), 5, 0)) == bytes(&base), "other files");
                 assert!(bytes(&load(&reader, config, 5, 4)) == bytes(&base[4..]), "resumed");
@@ -114,9 +116,9 @@ fn the_order_depends_on_seed_and_epoch_alone() {
 fn episodes_batches_and_cache_are_as_configured() {
     let (_folder, path) = dataset(2);
     let reader = open(&path).expect("opens");
-    let some = LoaderConfig { episodes: Some(vec![7, 2]), cache_bytes: 1 << 30, ..config(2, 1) };
+    let cache = CacheConfig::Memory { bytes: 1 << 30 };
+    let some = LoaderConfig { episodes: Some(vec![7, 2]), cache, ..config(2, 1) };
     let loader = Loader::new(Arc::clone(&reader), some.clone()).expect("a loader");
-    assert!(loader.is_cached());
     assert_eq!(loader.clips(), rows(2) + rows(7) - 2);
     let mut episodes: Vec<usize> = clips(&load(&reader, some.clone(), 0, 0)).iter().map(|c| c.0).collect();
     episodes.sort_unstable();
@@ -126,20 +128,50 @@ fn episodes_batches_and_cache_are_as_configured() {
     assert!(full.iter().all(|batch| batch.rows() == 4));
     // An epoch may be left early, and one past the end is empty.
     let loader = Loader::new(Arc::clone(&reader), config(1, 1)).expect("a loader");
-    assert!(!loader.is_cached());
     assert_eq!(loader.epoch(0, 0).take(2).count(), 2);
     assert_eq!(loader.epoch(0, loader.batches_per_epoch()).count(), 0);
     assert_eq!(loader.schema().columns()[0].shape, [1, 16, 24, 3]);
-    // Batches that come back are filled anew.
-    let fresh: Vec<Batch> = loader.epoch(1, 0).map(|batch| batch.expect("a batch")).collect();
-    let again = loader.epoch(1, 0).map(|batch| {
-        let batch = batch.expect("a batch");
-        let copy = batch.clone();
-        loader.recycle(batch);
-        copy
-    });
-    assert!(bytes(&again.collect::<Vec<_>>()) == bytes(&fresh));
     assert_eq!(loader.schema().columns()[2].dtype, DType::Float64);
+}
+
+#[test]
+fn memory_is_reused_and_two_epochs_can_be_read_at_once() {
+    let (_folder, path) = dataset(2);
+    let reader = open(&path).expect("opens");
+    let loader = Loader::new(Arc::clone(&reader), config(1, 1)).expect("a loader");
+    let read = |epoch: u64| -> Vec<Batch> {
+        loader.epoch(epoch, 0).map(|batch| batch.expect("a batch").into_batch()).collect()
+    };
+    let (first, second) = (read(1), read(2));
+    // Batches that were dropped are filled anew, with as many rows as the next one has.
+    let addresses = || -> Vec<(usize, Vec<u8>)> {
+        let look = |batch: Loaded| (batch.bytes(0).as_ptr() as usize, batch.bytes(0).to_vec());
+        loader.epoch(1, 0).map(|batch| look(batch.expect("a batch"))).collect()
+    };
+    let (once, twice) = (addresses(), addresses());
+    assert!(once.iter().chain(&twice).zip(first.iter().chain(&first)).all(|((_, a), b)| a == b.bytes(0)));
+    let mut places: Vec<usize> = once.iter().chain(&twice).map(|(place, _)| *place).collect();
+    places.sort_unstable();
+    places.dedup();
+    assert!(places.len() <= loader.prefetch() + 3, "{} buffers for {} batches", places.len(), 2 * once.len());
+    let both: Vec<(Loaded, Loaded)> =
+        loader.epoch(1, 0).zip(loader.epoch(2, 0)).map(|(a, b)| (a.expect("a batch"), b.expect("a batch"))).collect();
+    let split =
+        |pick: fn(&(Loaded, Loaded)) -> &Loaded| both.iter().map(|pair| Batch::clone(pick(pair))).collect::<Vec<_>>();
+    assert!(bytes(&split(|pair| &pair.0)) == bytes(&first) && bytes(&split(|pair| &pair.1)) == bytes(&second));
+}
+
+#[test]
+fn what_is_loaded_ahead_fits_its_budget() {
+    let (_folder, path) = dataset(2);
+    let reader = open(&path).expect("opens");
+    let ahead = |prefetch_bytes| {
+        let config = LoaderConfig { prefetch: 8, prefetch_bytes, ..config(2, 1) };
+        Loader::new(Arc::clone(&reader), config).expect("a loader").prefetch()
+    };
+    // Four clips of two pictures, actions and states.
+    let batch = 4 * 2 * (16 * 24 * 3 + 8 + 24);
+    assert_eq!([0, batch, 3 * batch - 1, 1 << 30].map(ahead), [1, 1, 2, 8]);
 }
 
 #[test]

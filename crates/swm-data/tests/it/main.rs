@@ -3,9 +3,14 @@
 // Tests say on standard output why they are skipped; the child process of one of them reports there.
 #![allow(clippy::print_stdout)]
 
+mod cache;
 mod damage;
 mod foreign;
+mod fuzz;
+mod goals;
 mod interruption;
 mod lance;
 mod loader;
+mod replay;
 mod sample;
+mod views;

@@ -1,0 +1,156 @@
+//! Decoded rows that are kept: the same bytes, fewer decoded, and never those of other data.
+
+use crate::sample::write;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use swm_core::{Manifest, Result, Schema};
+use swm_data::{CacheConfig, Episode, Reader, StepRange, WriteMode, open};
+
+/// A dataset that counts the rows of pictures it is asked for.
+struct Counting {
+    inner: Arc<dyn Reader>,
+    rows: AtomicUsize,
+}
+
+impl Counting {
+    fn open(path: &Path) -> Arc<Self> {
+        Arc::new(Self { inner: open(path).expect("opens"), rows: AtomicUsize::new(0) })
+    }
+
+    fn decoded(&self) -> usize {
+        self.rows.swap(0, Ordering::Relaxed)
+    }
+}
+
+impl Reader for Counting {
+    fn schema(&self) -> &Schema {
+        self.inner.schema()
+    }
+
+    fn episodes(&self) -> &[Episode] {
+        self.inner.episodes()
+    }
+
+    fn read_column(&self, column: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        if column == "pixels" {
+            self.rows.fetch_add(ranges.iter().map(|range| range.length).sum(), Ordering::Relaxed);
+        }
+        self.inner.read_column(column, ranges, out)
+    }
+
+    fn manifest(&self) -> Option<Manifest> {
+        self.inner.manifest()
+    }
+
+    fn footprint(&self) -> Result<Vec<(String, u64)>> {
+        self.inner.footprint()
+    }
+
+    fn content_hash(&self) -> Result<String> {
+        self.inner.content_hash()
+    }
+}
+
+const PICTURE: usize = 16 * 24 * 3;
+
+fn over(reader: &Arc<Counting>, cache: &CacheConfig) -> Arc<dyn Reader> {
+    cache.over(Arc::clone(reader) as Arc<dyn Reader>, &["pixels", "state"]).expect("a cache")
+}
+
+/// Every picture and state, single rows in a mixed order.
+fn all(reader: &dyn Reader) -> (Vec<u8>, Vec<u8>) {
+    let rows = |e: usize| (0..reader.episodes()[e].length).map(move |t| StepRange::new(e, t, 1));
+    let mut ranges: Vec<StepRange> = (0..reader.episodes().len()).rev().flat_map(rows).collect();
+    ranges.push(StepRange::new(2, 1, 3));
+    let batch = reader.read(&["pixels", "state"], &ranges).expect("reads");
+    (batch.bytes(0).to_vec(), batch.bytes(1).to_vec())
+}
+
+fn dataset(folder: &Path) -> (PathBuf, usize) {
+    let path = folder.join("d.lance");
+    write(&path, WriteMode::Create, 3, 0..6);
+    (path, (5..11).sum::<usize>())
+}
+
+#[test]
+fn rows_are_decoded_once_and_only_as_many_kept_as_fit() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (path, rows) = dataset(folder.path());
+    let reader = Counting::open(&path);
+    let expected = all(&*reader);
+    reader.decoded();
+    let states = rows * 24;
+    for (room, kept) in [(0, 0), (10, 10), (1000, rows)] {
+        for cache in [
+            CacheConfig::Memory { bytes: states + room * PICTURE },
+            CacheConfig::Disk { folder: folder.path().join(format!("cache-{room}")), bytes: states + room * PICTURE },
+        ] {
+            let cached = over(&reader, &cache);
+            assert!(all(&*cached) == expected, "{cache:?}");
+            assert_eq!(reader.decoded(), rows + 3, "the first time {cache:?}");
+            assert!(all(&*cached) == expected, "{cache:?}");
+            // The three rows that are asked for twice are among the kept ones only where all are.
+            let decoded = reader.decoded();
+            let again = if kept == rows { 0..=0 } else { rows - kept..=rows + 3 - kept };
+            assert!(again.contains(&decoded), "{decoded} of {rows} with {cache:?}");
+            let wrong = cached.read(&["pixels"], &[StepRange::new(0, 3, 4)]).expect_err("no such rows").to_string();
+            assert!(wrong.contains("rows below 5"), "{wrong}");
+            reader.decoded();
+        }
+    }
+}
+
+#[test]
+fn a_cache_on_disk_serves_the_next_run_and_other_processes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (path, _) = dataset(folder.path());
+    let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
+    let reader = Counting::open(&path);
+    let expected = all(&*over(&reader, &cache));
+    reader.decoded();
+    let first = over(&reader, &cache);
+    assert!(all(&*first) == expected && reader.decoded() == 0, "a new run finds it");
+    // A second one at the same time holds no lock, and reads what is there all the same.
+    let second = over(&reader, &cache);
+    assert!(all(&*second) == expected && reader.decoded() == 0);
+    drop((first, second));
+
+    // Other content, under the same path: nothing of the old is used.
+    write(&path, WriteMode::Overwrite, 3, 1..7);
+    let changed = Counting::open(&path);
+    let fresh = all(&*changed);
+    changed.decoded();
+    assert!(all(&*over(&changed, &cache)) == fresh && changed.decoded() > 0);
+}
+
+#[test]
+fn a_cache_that_was_damaged_is_decoded_again() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (path, rows) = dataset(folder.path());
+    let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
+    let reader = Counting::open(&path);
+    let expected = all(&*over(&reader, &cache));
+    reader.decoded();
+    let files = || -> Vec<PathBuf> {
+        let mut found = vec![];
+        for dataset in std::fs::read_dir(folder.path().join("cache")).expect("the cache").flatten() {
+            found.extend(std::fs::read_dir(dataset.path()).expect("its files").flatten().map(|entry| entry.path()));
+        }
+        found
+    };
+    let rows_file = files().into_iter().find(|file| file.extension().is_some_and(|end| end == "rows")).expect("rows");
+    // A byte of the third row flips.
+    let mut bytes = std::fs::read(&rows_file).expect("reads");
+    bytes[2 * PICTURE + 7] ^= 1;
+    std::fs::write(&rows_file, &bytes).expect("writes");
+    assert!(all(&*over(&reader, &cache)) == expected);
+    assert_eq!(reader.decoded(), 1);
+    assert!(all(&*over(&reader, &cache)) == expected && reader.decoded() == 0, "it is mended");
+    // Both files are cut.
+    for file in files() {
+        std::fs::write(&file, b"").expect("writes");
+    }
+    assert!(all(&*over(&reader, &cache)) == expected);
+    assert_eq!(reader.decoded(), rows + 3);
+}

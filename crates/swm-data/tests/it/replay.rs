@@ -1,0 +1,138 @@
+//! The replay buffer: it forgets the oldest, is read while it is filled, and can be put away.
+
+use crate::sample::{check, episode, rows, schema};
+use swm_core::{Batch, Key};
+use swm_data::{ClipSpec, Constants, GoalMixture, GoalSpec, ReplayBuffer, ReplayConfig, WriteMode, WriteOptions, open};
+
+fn config(num_steps: usize) -> ReplayConfig {
+    let columns = ["state", "action", "pixels"].map(str::to_owned).to_vec();
+    ReplayConfig { clip: ClipSpec { num_steps, frameskip: 1, columns }, batch_size: 32, ..ReplayConfig::default() }
+}
+
+fn filled(episodes: std::ops::Range<usize>, capacity: usize) -> ReplayBuffer {
+    let buffer = ReplayBuffer::new(&schema(), capacity).expect("a buffer");
+    let mut writer = buffer.writer();
+    for e in episodes {
+        let constants = Constants::from([("scene".to_owned(), vec![e as u8])]);
+        writer.write_episode_with(&episode(e), &constants).expect("writes");
+    }
+    writer.finish().expect("finishes");
+    buffer
+}
+
+/// Episode and row of every first step.
+fn places(batch: &Batch) -> Vec<(usize, usize)> {
+    let state = |row| batch.row(row).get::<f64>("state").expect("states").to_vec();
+    (0..batch.rows()).map(|row| (state(row)[0] as usize, state(row)[1] as usize)).collect()
+}
+
+#[test]
+fn the_oldest_episodes_leave_and_snapshots_stay() {
+    let buffer = filled(0..6, 30);
+    // Episodes have 5, 6, 7, 8, 9 and 10 rows.
+    assert_eq!((buffer.rows(), buffer.episodes(), buffer.added()), (27, 3, 6));
+    let before = buffer.snapshot();
+    check(&*before, 3);
+    assert_eq!(before.episodes()[0].index, 3);
+    assert_eq!(before.constants(1).expect("constants")["scene"], [4]);
+    buffer.add(&episode(6), &Constants::new()).expect("fits");
+    assert_eq!((buffer.rows(), buffer.episodes(), buffer.snapshot().episodes()[0].index), (30, 3, 4));
+    check(&*before, 3);
+    assert_ne!(before.content_hash().expect("a hash"), buffer.snapshot().content_hash().expect("a hash"));
+    assert_eq!(buffer.writer().episodes(), 7, "a collection goes on behind what was forgotten");
+
+    let small = ReplayBuffer::new(&schema(), 6).expect("a buffer");
+    assert!(small.add(&episode(2), &Constants::new()).expect_err("too long").to_string().contains("capacity"));
+    let mut broken = episode(0);
+    broken.get_mut::<f32>("action").expect("actions").fill(0.5);
+    assert!(small.add(&broken, &Constants::new()).expect_err("no last row").to_string().contains("NaN"));
+    assert!(ReplayBuffer::new(&schema(), 0).is_err());
+}
+
+#[test]
+fn windows_are_equally_likely_and_a_key_draws_the_same_again() {
+    let buffer = filled(0..6, 100);
+    let loader = buffer.loader(ReplayConfig { batch_size: 9000, ..config(3) }).expect("a loader");
+    let batch = loader.sample(Key::new(1)).expect("samples");
+    assert_eq!(places(&batch), places(&loader.sample(Key::new(1)).expect("samples")));
+    let mut count = vec![[0_i32; 10]; 6];
+    for (e, start) in places(&batch) {
+        assert!(start + 3 <= rows(e), "over the end of an episode");
+        count[e][start] += 1;
+    }
+    // 33 windows: five standard deviations of 9000 draws at 1 of 33.
+    let counts = count.iter().flatten().filter(|&&n| n > 0);
+    assert_eq!(counts.clone().count(), 33);
+    assert!(counts.clone().all(|n| n.abs_diff(273) < 82), "{count:?}");
+    // The latest twelve rows are those of the last two episodes.
+    let recent = buffer.loader(ReplayConfig { recent: Some(12), ..config(1) }).expect("a loader");
+    assert!(places(&recent.sample(Key::new(2)).expect("samples")).iter().all(|&(e, _)| e >= 4));
+    let goal =
+        GoalSpec { name: "goal".into(), columns: vec!["state".into()], anchor: None, mixture: GoalMixture::LAST };
+    let goals = buffer.loader(ReplayConfig { goals: vec![goal], ..config(1) }).expect("a loader");
+    let batch = goals.sample(Key::new(0)).expect("samples");
+    for (row, (e, _)) in places(&batch).into_iter().enumerate() {
+        let goal = batch.row(row).get::<f64>("goal_state").expect("goals");
+        assert_eq!((goal[0] as usize, goal[1] as usize + 1), (e, rows(e)));
+    }
+}
+
+#[test]
+fn it_is_read_while_it_grows() {
+    let buffer = filled(0..2, 200);
+    let loader = buffer.loader(ReplayConfig { threads: 2, ..config(2) }).expect("a loader");
+    let writer = buffer.clone();
+    let writing = std::thread::spawn(move || {
+        for e in 2..300 {
+            writer.add(&episode(e), &Constants::new()).expect("adds");
+        }
+    });
+    let mut latest = 0;
+    for batch in loader.batches(0) {
+        let batch = batch.expect("a batch");
+        let places = places(&batch);
+        // Every window is whole, whatever was forgotten meanwhile.
+        for (row, &(e, start)) in places.iter().enumerate() {
+            let state = batch.row(row).get::<f64>("state").expect("states");
+            assert_eq!([state[3], state[4]], [e as f64, start as f64 + 1.0]);
+            let pixel = batch.row(row).get::<u8>("pixels").expect("pictures")[0];
+            assert_eq!(usize::from(pixel), (3 * start + 20 * e) % 256);
+        }
+        let oldest = places.iter().map(|place| place.0).min().unwrap_or(0);
+        latest = latest.max(oldest);
+        if oldest > 250 {
+            break;
+        }
+    }
+    assert!(latest > 250, "it sees what came");
+    writing.join().expect("the writer ends");
+    // One that holds no window says so, and its stream ends.
+    let empty = ReplayBuffer::new(&schema(), 10).expect("a buffer").loader(config(1)).expect("a loader");
+    let mut batches = empty.batches(0);
+    assert!(batches.next().is_some_and(|batch| batch.is_err()) && batches.next().is_none());
+}
+
+#[test]
+fn it_is_put_away_and_taken_out() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("buffer.lance");
+    let buffer = filled(0..6, 30);
+    let state = |buffer: &ReplayBuffer| (buffer.rows(), buffer.episodes(), buffer.added());
+    // Lance, in this build, stores no constants.
+    let plain = ReplayBuffer::new(&schema(), 30).expect("a buffer");
+    (0..6).for_each(|e| plain.add(&episode(e), &Constants::new()).expect("adds"));
+    assert_eq!(state(&plain), state(&buffer));
+    let options = WriteOptions { mode: WriteMode::Create, ..WriteOptions::default() };
+    plain.save(&path, options).expect("saves");
+    let reader = open(&path).expect("opens");
+    let again = ReplayBuffer::restore(&*reader, 30).expect("restores");
+    assert_eq!(state(&again), state(&plain));
+    assert_eq!(again.snapshot().episodes(), plain.snapshot().episodes());
+    let drawn = |buffer: &ReplayBuffer| {
+        let batch = buffer.loader(config(2)).expect("a loader").sample(Key::new(5)).expect("samples");
+        (batch.bytes(0).to_vec(), batch.bytes(1).to_vec(), batch.bytes(2).to_vec())
+    };
+    assert!(drawn(&again) == drawn(&plain), "it goes on as it would have");
+    let less = ReplayBuffer::restore(&*reader, 20).expect("restores");
+    assert_eq!(state(&less), (19, 2, 6), "the latest that fit");
+}

@@ -4,6 +4,7 @@
 use super::convert::{blob, cast, convert, whole_numbers};
 use super::schema::{self, EPISODE, Kind, STEP, StoredColumn};
 use super::store::{self, Store, damaged, table_folder, wait};
+use crate::Location;
 use crate::format::{Episode, Reader, StepRange};
 use crate::image;
 use arrow_array::ArrayRef;
@@ -35,7 +36,8 @@ const SMALL_FILE: u64 = 1 << 20;
 const ROWS_PER_PIECE: u32 = 4096;
 
 /// Opens a table.
-pub fn open(path: &Path) -> Result<Arc<dyn Reader>> {
+pub fn open(location: &Location) -> Result<Arc<dyn Reader>> {
+    let path = location.local("lance")?;
     Ok(Arc::new(LanceReader::open(path)?))
 }
 

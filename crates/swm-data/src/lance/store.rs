@@ -1,5 +1,6 @@
 //! A Lance table on disk: where it is, its newest version, and how a new version is committed.
 
+use crate::Location;
 use arrow_schema::Schema as ArrowSchema;
 use lance_core::cache::LanceCache;
 use lance_encoding::decoder::DecoderPlugins;
@@ -86,8 +87,8 @@ fn explain(path: &Path, action: &str, error: &lance_core::Error) -> Error {
 const FOLDERS: [&str; 3] = ["_versions", "_transactions", "data"];
 
 /// Whether a path names a Lance table: it ends in `.lance`, or is a folder that holds one that does.
-pub fn looks_like(path: &Path) -> bool {
-    has_suffix(path) || tables_in(path).is_ok_and(|tables| !tables.is_empty())
+pub fn looks_like(location: &Location) -> bool {
+    location.path().is_some_and(|path| has_suffix(path) || tables_in(path).is_ok_and(|tables| !tables.is_empty()))
 }
 
 fn has_suffix(path: &Path) -> bool {

@@ -6,8 +6,9 @@
 
 use super::schema::{self, EPISODE, Kind, STEP, StoredColumn};
 use super::store::{self, Store, Version, table_folder, wait};
+use crate::Location;
 use crate::clip::ACTION;
-use crate::format::{CommitPolicy, WriteMode, WriteOptions, Writer};
+use crate::format::{CommitPolicy, Constants, WriteMode, WriteOptions, Writer};
 use crate::image::ImageCodec;
 use arrow_array::{ArrayRef, BinaryArray, FixedSizeListArray, Float32Array, Int32Array, RecordBatch};
 use arrow_buffer::{Buffer, OffsetBuffer, ScalarBuffer};
@@ -38,7 +39,8 @@ const WAITING: usize = 2;
 const KEPT_VERSIONS: usize = 8;
 
 /// Creates, continues or replaces a table.
-pub fn create(path: &Path, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
+pub fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
+    let path = location.local("lance")?;
     options.codec.check()?;
     let mut columns = schema::columns_to_write(schema)?;
     let folder = table_folder(path)?;
@@ -67,7 +69,7 @@ pub fn create(path: &Path, schema: &Schema, options: WriteOptions) -> Result<Box
             table.remove_replaced(&old);
         }
         (WriteMode::Append, Some(old)) => {
-            let known = super::reader::open(&folder)?;
+            let known = super::reader::open(&Location::from(&folder))?;
             columns = continued(&folder, columns, &old, known.schema())?;
             episodes = known.episodes().len();
             next = known.episodes().iter().map(|episode| episode.index + 1).max().unwrap_or(0);
@@ -177,7 +179,10 @@ struct LanceWriter {
 }
 
 impl Writer for LanceWriter {
-    fn write_episode(&mut self, episode: &Batch) -> Result<()> {
+    fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
+        if let Some(name) = constants.keys().next() {
+            return Err(Error::config("episode constant", format!("{name} cannot be stored in Lance"), "leave it out"));
+        }
         if *episode.schema() != self.incoming {
             let words = |schema: &Schema| {
                 let columns: Vec<String> =

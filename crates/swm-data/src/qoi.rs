@@ -1,0 +1,270 @@
+//! The QOI picture format (specification 1.0, qoiformat.org): lossless, and the fastest to decode of those that other
+//! programs open as well.
+//!
+//! A picture is a sequence of operations on the last pixel: repeat it, take one of 64 seen before, change it a little,
+//! or replace it. Drawn pictures are mostly runs, which are found and filled here many bytes at a time.
+
+use swm_core::{Error, Result};
+
+/// Bytes of the header.
+const HEADER: usize = 14;
+/// What follows the last operation.
+const END: [u8; 8] = [0, 0, 0, 0, 0, 0, 0, 1];
+
+// The operations, by their first byte. Those of two bits hold a payload of six.
+const INDEX: u8 = 0x00;
+const DIFF: u8 = 0x40;
+const LUMA: u8 = 0x80;
+const RUN: u8 = 0xc0;
+const RGB: u8 = 0xfe;
+const RGBA: u8 = 0xff;
+
+/// The longest run that one operation holds, and that operation.
+const LONGEST: usize = 62;
+#[allow(clippy::cast_possible_truncation)]
+const LONGEST_RUN: u8 = RUN | (LONGEST as u8 - 1);
+
+/// Red, green, blue, opacity.
+type Pixel = [u8; 4];
+
+/// The pixel before the first.
+const START: Pixel = [0, 0, 0, 255];
+
+/// The place of a pixel among those seen before: (3 r + 5 g + 7 b + 11 a) mod 64.
+fn slot(pixel: Pixel) -> usize {
+    // One product adds all four at its top. What it adds below stays below: at most 4590 · 2^40.
+    let bytes = u64::from(u32::from_le_bytes(pixel));
+    let spread = (bytes & 0xff00_ff00) << 32 | bytes & 0x00ff_00ff;
+    (spread.wrapping_mul(0x0300_0700_0005_000b) >> 56) as usize % 64
+}
+
+/// Encodes an RGB picture of `[height, width, 3]` bytes, appending to `out`.
+pub fn encode(rgb: &[u8], height: u16, width: u16, out: &mut Vec<u8>) {
+    out.extend_from_slice(b"qoif");
+    out.extend_from_slice(&u32::from(width).to_be_bytes());
+    out.extend_from_slice(&u32::from(height).to_be_bytes());
+    out.extend_from_slice(&[3, 0]);
+    let mut seen = [[0; 4]; 64];
+    let mut last = START;
+    let mut at = 0;
+    while let Some(&[r, g, b]) = rgb[at..].first_chunk() {
+        let pixel = [r, g, b, 255];
+        if pixel == last {
+            let mut run = 1 + repeats(rgb, at + 3);
+            at += 3 * run;
+            while run >= LONGEST {
+                out.push(LONGEST_RUN);
+                run -= LONGEST;
+            }
+            if run > 0 {
+                #[allow(clippy::cast_possible_truncation)] // below 62
+                out.push(RUN | (run as u8 - 1));
+            }
+            continue;
+        }
+        at += 3;
+        let slot = slot(pixel);
+        if seen[slot] == pixel {
+            #[allow(clippy::cast_possible_truncation)] // below 64
+            out.push(INDEX | slot as u8);
+        } else {
+            seen[slot] = pixel;
+            let [dr, dg, db] = std::array::from_fn(|i| pixel[i].wrapping_sub(last[i]));
+            let small = |d: u8| d.wrapping_add(2) < 4;
+            let (dr_dg, db_dg) = (dr.wrapping_sub(dg).wrapping_add(8), db.wrapping_sub(dg).wrapping_add(8));
+            if small(dr) && small(dg) && small(db) {
+                let two = |d: u8| d.wrapping_add(2);
+                out.push(DIFF | two(dr) << 4 | two(dg) << 2 | two(db));
+            } else if dg.wrapping_add(32) < 64 && dr_dg < 16 && db_dg < 16 {
+                out.extend_from_slice(&[LUMA | dg.wrapping_add(32), dr_dg << 4 | db_dg]);
+            } else {
+                out.extend_from_slice(&[RGB, r, g, b]);
+            }
+        }
+        last = pixel;
+    }
+    out.extend_from_slice(&END);
+}
+
+/// How many pixels from byte `at` on equal the one before them.
+fn repeats(rgb: &[u8], at: usize) -> usize {
+    const WIDE: usize = 32;
+    let mut end = at;
+    // Equal to itself moved by a pixel: one colour.
+    while let (Some(a), Some(b)) = (rgb[end - 3..].first_chunk::<WIDE>(), rgb[end..].first_chunk::<WIDE>()) {
+        if a != b {
+            break;
+        }
+        end += WIDE;
+    }
+    while end < rgb.len() && rgb[end] == rgb[end - 3] {
+        end += 1;
+    }
+    (end - at) / 3
+}
+
+/// The height and width that a header states.
+///
+/// # Errors
+/// When it is no header, or states no picture.
+pub fn size(bytes: &[u8]) -> Result<(usize, usize)> {
+    let header = bytes.first_chunk::<HEADER>();
+    let Some(&[b'q', b'o', b'i', b'f', w0, w1, w2, w3, h0, h1, h2, h3, 3 | 4, 0 | 1]) = header else {
+        let start = &bytes[..bytes.len().min(HEADER)];
+        return Err(Error::mismatch("reading a QOI header", format!("{start:02x?}"), "qoif, a size, 3 or 4 channels"));
+    };
+    let side = |bytes| u32::from_be_bytes(bytes) as usize;
+    Ok((side([h0, h1, h2, h3]), side([w0, w1, w2, w3])))
+}
+
+/// Decodes a picture whose header was checked against the `[height, width, 3]` bytes of `out`. Transparency is dropped.
+///
+/// # Errors
+/// When the operations do not fill the picture exactly.
+pub fn decode(bytes: &[u8], out: &mut [u8]) -> Result<()> {
+    let damaged =
+        |problem| Error::mismatch("decoding a QOI picture", problem, "operations for every pixel, and an end");
+    let Some(mut rest) = bytes.get(HEADER..).and_then(|rest| rest.strip_suffix(&END)) else {
+        return Err(damaged("one that is cut off"));
+    };
+    let mut seen = [[0; 4]; 64];
+    let mut pixel = START;
+    let mut at = 0;
+    while at < out.len() {
+        let Some((&op, after)) = rest.split_first() else { return Err(damaged("too few operations")) };
+        rest = after;
+        match op {
+            ..DIFF => pixel = seen[usize::from(op)],
+            DIFF..LUMA => {
+                let change = |shift: u8| (op >> shift & 3).wrapping_sub(2);
+                let [r, g, b, a] = pixel;
+                pixel = [r.wrapping_add(change(4)), g.wrapping_add(change(2)), b.wrapping_add(change(0)), a];
+                seen[slot(pixel)] = pixel;
+            }
+            LUMA..RUN => {
+                let Some((&reds, after)) = rest.split_first() else { return Err(damaged("too few operations")) };
+                rest = after;
+                let green = (op & 63).wrapping_sub(32);
+                let [r, g, b, a] = pixel;
+                let other = |nibble: u8| green.wrapping_add(nibble).wrapping_sub(8);
+                pixel = [r.wrapping_add(other(reds >> 4)), g.wrapping_add(green), b.wrapping_add(other(reds & 15)), a];
+                seen[slot(pixel)] = pixel;
+            }
+            RUN..RGB => {
+                // A long run is several operations; filled at once, it costs one.
+                let mut run = usize::from(op - RUN) + 1;
+                while let Some((&more @ RUN..RGB, after)) = rest.split_first() {
+                    rest = after;
+                    run += usize::from(more - RUN) + 1;
+                }
+                let Some(place) = out.get_mut(at..at + 3 * run) else { return Err(damaged("too long a run")) };
+                fill(place, pixel);
+                at += place.len();
+                continue;
+            }
+            RGB => {
+                let Some((&[r, g, b], after)) = rest.split_first_chunk() else {
+                    return Err(damaged("too few operations"));
+                };
+                rest = after;
+                pixel = [r, g, b, pixel[3]];
+                seen[slot(pixel)] = pixel;
+            }
+            RGBA => {
+                let Some((&rgba, after)) = rest.split_first_chunk() else {
+                    return Err(damaged("too few operations"));
+                };
+                rest = after;
+                pixel = rgba;
+                seen[slot(pixel)] = pixel;
+            }
+        }
+        // Four bytes cost less than three; the next pixel overwrites the last.
+        match out[at..].first_chunk_mut() {
+            Some(place) => *place = pixel,
+            None => out[at..].copy_from_slice(&pixel[..3]),
+        }
+        at += 3;
+    }
+    if rest.is_empty() { Ok(()) } else { Err(damaged("too many operations")) }
+}
+
+/// Repeats a pixel.
+fn fill(place: &mut [u8], [r, g, b, _]: Pixel) {
+    const WIDE: usize = 48;
+    let pattern: [u8; WIDE] = std::array::from_fn(|i| [r, g, b][i % 3]);
+    let (chunks, rest) = place.as_chunks_mut::<WIDE>();
+    chunks.fill(pattern);
+    rest.copy_from_slice(&pattern[..rest.len()]);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn round(rgb: &[u8], height: u16, width: u16) -> Vec<u8> {
+        let mut bytes = vec![7];
+        encode(rgb, height, width, &mut bytes);
+        assert_eq!(bytes.remove(0), 7, "appends");
+        assert_eq!(size(&bytes).expect("a header"), (height.into(), width.into()));
+        let mut back = vec![0; rgb.len()];
+        decode(&bytes, &mut back).expect("decodes");
+        assert!(back == rgb, "{height} x {width} came back otherwise");
+        bytes
+    }
+
+    #[test]
+    fn operations_are_those_of_the_specification() {
+        // Two of the start's colour, one near it, one less near, one far, the first again, and a run of 63.
+        let mut pixels = vec![[0, 0, 0], [0, 0, 0], [1, 255, 1], [11, 9, 9], [200, 0, 7], [1, 255, 1]];
+        pixels.extend([[9, 9, 9]; 64]);
+        let bytes = round(pixels.as_flattened(), 7, 10);
+        let luma = [LUMA | 42, (8 << 4) | 6];
+        // 3 · 1 + 5 · 255 + 7 · 1 + 11 · 255 = 4090 = 63 · 64 + 58.
+        let expected = [&[RUN | 1, DIFF | 0b11_01_11][..], &luma, &[RGB, 200, 0, 7, INDEX | 58]].concat();
+        assert_eq!(bytes[HEADER..HEADER + expected.len()], expected);
+        assert_eq!(bytes[bytes.len() - 10..], [&[LONGEST_RUN, RUN][..], &END].concat());
+    }
+
+    #[test]
+    fn foreign_pictures_may_have_four_channels() {
+        let mut bytes = [&b"qoif"[..], &2_u32.to_be_bytes(), &1_u32.to_be_bytes(), &[4, 1]].concat();
+        bytes.extend([RGBA, 10, 20, 30, 40, DIFF | 0b11_10_01]);
+        bytes.extend(END);
+        let mut out = [0; 6];
+        decode(&bytes, &mut out).expect("decodes");
+        assert_eq!(out, [10, 20, 30, 11, 20, 29]);
+    }
+
+    #[test]
+    fn what_does_not_fill_the_picture_exactly_is_refused() {
+        let rgb: Vec<u8> = (0..300_u32).map(|i| (i * i / 7) as u8).collect();
+        let bytes = round(&rgb, 10, 10);
+        let refused = |bytes: &[u8], pixels: usize| decode(bytes, &mut vec![0; 3 * pixels]).is_err();
+        assert!((0..bytes.len()).all(|end| refused(&bytes[..end], 100)));
+        assert!(refused(&bytes, 99) && refused(&bytes, 101) && !refused(&bytes, 100));
+        assert!(refused(&[&bytes[..], &[0]].concat(), 100));
+        let flat = round(&[7; 300], 10, 10);
+        assert!(refused(&flat, 40), "a run beyond the end");
+    }
+
+    proptest! {
+        #[test]
+        fn every_picture_comes_back(
+            seed in prop::collection::vec((any::<[u8; 3]>(), 1_usize..150), 1..40),
+            noise in prop::collection::vec((0_usize..2000, any::<u8>()), 0..200),
+            width in 1_u16..90,
+        ) {
+            // Runs of colours, disturbed in places by a little and by much.
+            let mut rgb: Vec<u8> = seed.iter().flat_map(|(pixel, run)| pixel.repeat(*run)).collect();
+            let len = rgb.len();
+            for (at, value) in noise {
+                rgb[at % len] = if value % 2 == 0 { rgb[at % len].wrapping_add(value % 5) } else { value };
+            }
+            let height = rgb.len() / 3 / usize::from(width) + 1;
+            rgb.resize(height * usize::from(width) * 3, 77);
+            round(&rgb, height as u16, width);
+        }
+    }
+}

@@ -7,6 +7,7 @@
 //! Read [`physics`] (a model and its state), [`render`] (its picture), [`env`] (what all worlds share), and then a family.
 
 pub mod assets;
+pub mod dmc;
 mod env;
 mod ffi;
 pub mod link;
@@ -17,5 +18,5 @@ pub use physics::Physics;
 
 use swm_core::{EnvEntry, Registry};
 
-/// Every environment of this crate. (M2, M3: add `pub mod dmc;`, `pub mod ogbench;` above and your rows here yourselves.)
-pub static ENVS: Registry<EnvEntry> = Registry { kind: "environment", hint: "`swm envs` lists them", rows: &[] };
+/// Every environment of this crate. (M3: add `pub mod ogbench;` above and your rows here yourself.)
+pub static ENVS: Registry<EnvEntry> = Registry { kind: "environment", hint: "`swm envs` lists them", rows: &dmc::ENTRIES };

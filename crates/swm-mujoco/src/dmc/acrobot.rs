@@ -1,15 +1,19 @@
 //! Two links hang from a bar; a motor between them must swing the tip up to a target. Model after Coulom 2002.
 
-use super::blueprint::{Edit, Shape};
+use super::blueprint::Edit;
+use super::env::Seen;
 use super::names::Names;
 use super::reward::Tolerance;
-use super::{Domain, factors, start};
+use super::{Domain, distance, entry, factors, start, task_names};
 use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
-use swm_core::{Factor, Result, Rng};
+use swm_core::{EnvEntry, Factor, Result, Rng};
+
+/// The registry's row.
+pub const ENTRY: EnvEntry = entry::<Acrobot>(&[]);
 
 /// Radius of the target, in metres.
-const TARGET: f32 = 0.2;
+const SIZE: f64 = 0.2;
 
 /// Whether rewards are given near the target, too.
 #[derive(Clone, Copy)]
@@ -28,8 +32,11 @@ pub struct Acrobot {
 impl Domain for Acrobot {
     type Task = Task;
     const ID: &'static str = "swm/AcrobotDMControl-v0";
+    const SUMMARY: &'static str = "Swing the tip of two hanging links up to a target, with one motor between them";
     const MODEL: &'static str = "acrobot.xml";
-    const TASKS: &'static [(&'static str, Task)] = &[("swingup_sparse", Task::SwingUpSparse), ("swingup", Task::SwingUp)];
+    const TASKS: &'static [(&'static str, Task)] =
+        &[("swingup_sparse", Task::SwingUpSparse), ("swingup", Task::SwingUp)];
+    const NAMES: &'static [&'static str] = &task_names::<_, 2>(Self::TASKS);
     const SUBSTEPS: usize = 1;
 
     fn factors() -> Vec<Factor> {
@@ -48,14 +55,11 @@ impl Domain for Acrobot {
 
     fn edit(edit: &mut Edit<'_>, _task: Task) -> Result<()> {
         edit.scene("light")?;
+        edit.gravity();
         edit.density("upper_arm", "agent.upper_arm_density")?;
         edit.density("lower_arm", "agent.lower_arm_density")?;
         edit.paint("target", "target.color", 1.0)?;
-        let size = match edit.shape("target.shape") {
-            Shape::Box => [TARGET; 3].to_vec(),
-            Shape::Sphere => vec![TARGET],
-        };
-        edit.site("target", edit.shape("target.shape"), &size)
+        edit.target_site(SIZE)
     }
 
     fn new(model: &MjModel, task: Task) -> Result<Self> {
@@ -74,11 +78,16 @@ impl Domain for Acrobot {
         Ok(())
     }
 
-    fn observe(&self, physics: &Physics, seen: &mut Vec<f64>) {
+    fn observe(&self, physics: &Physics, seen: &mut Seen<'_>) {
         let frames = physics.data().xmat();
         seen.extend(self.arms.map(|arm| frames[arm][2]));
         seen.extend(self.arms.map(|arm| frames[arm][8]));
         seen.extend(physics.data().qvel());
+    }
+
+    fn destination(&self, _physics: &Physics, qpos: &mut [f64]) -> bool {
+        qpos.fill(0.0);
+        true
     }
 
     fn reward(&self, physics: &Physics) -> f64 {

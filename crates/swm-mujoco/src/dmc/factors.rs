@@ -38,6 +38,11 @@ pub fn floor_friction() -> Factor {
     number("floor.friction", 0.0, 1.0, 1.0)
 }
 
+/// How the floor is tilted about the y-axis, in degrees.
+pub fn floor_rotation() -> Factor {
+    Factor::new("floor.rotation_y", Space::uniform_box([1], DType::Float64, -10.0, 10.0), [0.0])
+}
+
 /// The pull of gravity, in m/s².
 pub fn gravity() -> [Factor; 3] {
     let pull = |axis, low, high, default: f64| {

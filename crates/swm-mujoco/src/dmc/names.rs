@@ -9,7 +9,13 @@ pub struct Names<'a>(pub &'a MjModel);
 
 impl Names<'_> {
     fn id(&self, kind: MjtObjBase, what: &str, name: &str) -> Result<usize> {
-        self.0.name_to_id(kind, name).ok_or_else(|| Error::mismatch("reading a model of the suite", format!("no {what} '{name}'"), format!("a {what} '{name}': `swm assets verify dm_control` checks the files")))
+        self.0.name_to_id(kind, name).ok_or_else(|| {
+            Error::mismatch(
+                "reading a model of the suite",
+                format!("no {what} '{name}'"),
+                format!("a {what} '{name}': `swm assets verify dm_control` checks the files"),
+            )
+        })
     }
 
     /// The place of a body.

@@ -4,6 +4,7 @@
 //! - [`lance`]: the default format, which the Python `lance` package and the reference read as well.
 //! - [`clip`], [`goals`] and [`loader`]: windows of episodes and where they lead, shuffled and prefetched as batches;
 //!   [`cache`]: decoded rows kept for the next epoch.
+//! - [`convert`](mod@convert): from any format to any other, resumed and verified.
 //! - [`views`]: datasets made of datasets; [`replay`]: the latest episodes of a running collection.
 //! - [`image`]: how pictures are stored.
 //! - [`preview`] and [`video`]: frames as pictures and videos for people.
@@ -12,6 +13,7 @@
 
 pub mod cache;
 pub mod clip;
+pub mod convert;
 mod column_files;
 mod episodes;
 pub mod format;
@@ -33,6 +35,7 @@ pub mod views;
 
 pub use cache::CacheConfig;
 pub use clip::{ClipSpec, Clips};
+pub use convert::{ConvertMode, ConvertOptions, Converted, checksum, convert};
 pub use format::{
     CommitPolicy, Constants, Episode, FORMATS, Format, Reader, StepRange, WriteMode, WriteOptions, Writer, create, open,
 };

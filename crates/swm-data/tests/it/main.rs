@@ -4,6 +4,7 @@
 #![allow(clippy::print_stdout)]
 
 mod cache;
+mod convert;
 mod damage;
 mod foreign;
 mod fuzz;

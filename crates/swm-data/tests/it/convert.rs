@@ -1,0 +1,199 @@
+//! From any format to any other: resumed, verified, and refused where the target holds something else.
+
+use crate::sample::{check, episode, options, schema, write};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
+use swm_data::convert::Stage;
+use swm_data::{
+    ConvertMode, ConvertOptions, Converted, FORMATS, ImageCodec, Location, Reader, WriteMode, WriteOptions, checksum,
+    convert, create, open,
+};
+
+fn run(source: &Path, target: &Path, options: &ConvertOptions) -> Result<Converted> {
+    convert(&open(source)?, &Location::from(target), options, &mut |_, _, _| true)
+}
+
+fn lossless(mode: ConvertMode) -> ConvertOptions {
+    ConvertOptions { mode, codec: ImageCodec::Png, ..ConvertOptions::default() }
+}
+
+/// The episodes `0..9`, pictures lossless.
+fn source(folder: &Path) -> PathBuf {
+    let path = folder.join("source.lance");
+    let mut writer = create(&path, &schema(), WriteOptions { codec: ImageCodec::Png, ..options(WriteMode::Create) })
+        .expect("creates");
+    (0..9).for_each(|e| writer.write_episode(&episode(e)).expect("writes"));
+    writer.finish().expect("finishes");
+    path
+}
+
+/// A place whose name every format accepts as its own.
+fn place(folder: &Path, format: &str) -> PathBuf {
+    folder.join(match format {
+        "lance" | "lance-video" => format!("to-{format}.lance"),
+        "hdf5" => "to.h5".to_owned(),
+        other => format!("to-{other}"),
+    })
+}
+
+#[test]
+fn every_format_gives_back_what_it_got() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = source(folder.path());
+    let from = open(&path).expect("opens");
+    let sum = checksum(&*from).expect("a checksum");
+    for format in FORMATS.rows {
+        let target = place(folder.path(), format.id);
+        let wanted = ConvertOptions { format: Some(format.id.to_owned()), ..lossless(ConvertMode::Create) };
+        let report = run(&path, &target, &wanted).unwrap_or_else(|error| panic!("{}: {error}", format.id));
+        assert_eq!((report.episodes, report.kept, report.last_actions), (9, 0, 0), "{}", format.id);
+        assert_eq!(report.checksum.as_deref(), Some(&sum[..]), "{}", format.id);
+        let to = (format.open)(&Location::from(&target)).expect("opens");
+        check(&*to, 0);
+        assert_eq!(to.manifest().map(|manifest| manifest.seed), from.manifest().map(|manifest| manifest.seed));
+        for column in &report.columns {
+            let picture = ["pixels", "goal"].contains(&&column.column[..]);
+            let kept = column.exact || column.psnr.is_some_and(|psnr| picture && psnr > 25.0);
+            assert!(kept, "{}: {column:?}", format.id);
+        }
+        if report.columns.iter().all(|column| column.exact) {
+            assert_eq!(checksum(&*to).expect("a checksum"), sum, "{}", format.id);
+        }
+        // There and back again.
+        let back = folder.path().join(format!("back-{}.lance", format.id));
+        run(&target, &back, &lossless(ConvertMode::Create)).unwrap_or_else(|error| panic!("{}: {error}", format.id));
+        check(&*open(&back).expect("opens"), 0);
+    }
+}
+
+#[test]
+fn lossy_pictures_are_judged() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = source(folder.path());
+    let jpeg = ConvertOptions { codec: ImageCodec::Jpeg { quality: 95 }, ..ConvertOptions::default() };
+    let report = run(&path, &folder.path().join("fine.lance"), &jpeg).expect("near enough");
+    let pictures = report.columns.iter().find(|column| column.column == "pixels").expect("pictures");
+    assert!(
+        !pictures.exact && pictures.max_error >= 1.0 && pictures.psnr.is_some_and(|psnr| psnr > 30.0),
+        "{pictures:?}"
+    );
+    assert!(report.columns.iter().filter(|column| column.column == "state").all(|column| column.exact));
+    let strict = ConvertOptions { least_psnr: 90.0, ..jpeg };
+    let error = run(&path, &folder.path().join("strict.lance"), &strict).expect_err("not near enough").to_string();
+    assert!(error.contains("dB") && error.contains("codec"), "{error}");
+    let unverified = ConvertOptions { verify: false, ..strict };
+    let report = run(&path, &folder.path().join("unverified.lance"), &unverified).expect("converts");
+    assert!(report.checksum.is_none() && report.columns.is_empty());
+}
+
+#[test]
+fn a_stopped_conversion_goes_on_and_other_data_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = source(folder.path());
+    let target = folder.path().join("target.lance");
+    for stop in [1, 4, 9] {
+        let mut stages = vec![];
+        let mut progress = |stage, done, _| {
+            stages.push(stage);
+            stage != Stage::Writing || done < stop
+        };
+        let stopped = convert(
+            &open(&path).expect("opens"),
+            &Location::from(&target),
+            &lossless(ConvertMode::Resume),
+            &mut progress,
+        );
+        assert!(matches!(stopped, Err(Error::Interrupted)), "{stopped:?}");
+        assert_eq!(open(&target).expect("opens").episodes().len(), stop, "what was written is kept");
+        assert_eq!(stages.contains(&Stage::Comparing), stop > 1);
+    }
+    // What a killed process leaves may end anywhere, as this does.
+    let report = run(&path, &target, &lossless(ConvertMode::Resume)).expect("compares");
+    assert_eq!((report.episodes, report.kept, report.rows), (9, 9, 0));
+    assert_eq!(
+        report.checksum,
+        run(&path, &folder.path().join("whole.lance"), &lossless(ConvertMode::Create)).expect("converts").checksum
+    );
+    check(&*open(&target).expect("opens"), 0);
+
+    let other = folder.path().join("other.lance");
+    write(&other, WriteMode::Create, 2, 1..3);
+    let error = run(&path, &other, &lossless(ConvertMode::Resume)).expect_err("other data");
+    assert!(error.is_usage() && error.to_string().contains("not the beginning of the source"), "{error}");
+    assert!(run(&path, &other, &lossless(ConvertMode::Create)).is_err());
+    let longer = folder.path().join("longer.lance");
+    write(&longer, WriteMode::Create, 20, 0..12);
+    let error = run(&path, &longer, &lossless(ConvertMode::Resume)).expect_err("too many").to_string();
+    assert!(error.contains("12 episodes, more than the source's 9"), "{error}");
+    let report = run(&path, &other, &lossless(ConvertMode::Append)).expect("appends");
+    assert_eq!((report.episodes, open(&other).expect("opens").episodes().len()), (11, 11));
+    assert_eq!(run(&path, &other, &lossless(ConvertMode::Overwrite)).expect("overwrites").episodes, 9);
+    check(&*open(&other).expect("opens"), 0);
+}
+
+/// A foreign dataset whose last rows have actions.
+struct Foreign(Schema);
+
+impl Reader for Foreign {
+    fn schema(&self) -> &Schema {
+        &self.0
+    }
+
+    fn episodes(&self) -> &[swm_data::Episode] {
+        &[swm_data::Episode { index: 4, length: 3 }, swm_data::Episode { index: 7, length: 2 }]
+    }
+
+    fn read_column(&self, _: &str, ranges: &[swm_data::StepRange], out: &mut [u8]) -> Result<()> {
+        let mut at = 0;
+        for range in ranges {
+            for row in range.start..range.start + range.length {
+                out[at..at + 4].copy_from_slice(&(row as f32 + 0.5).to_ne_bytes());
+                at += 4;
+            }
+        }
+        Ok(())
+    }
+
+    fn manifest(&self) -> Option<swm_core::Manifest> {
+        None
+    }
+
+    fn footprint(&self) -> Result<Vec<(String, u64)>> {
+        Ok(vec![])
+    }
+
+    fn content_hash(&self) -> Result<String> {
+        Ok(String::new())
+    }
+}
+
+#[test]
+fn actions_that_lead_nowhere_are_left_out_and_told() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let target = folder.path().join("target.lance");
+    let schema = Schema::new([ColumnSpec::new("action", DType::Float32, [1])]).expect("schema");
+    let reader: Arc<dyn Reader> = Arc::new(Foreign(schema));
+    let report =
+        convert(&reader, &Location::from(&target), &ConvertOptions::default(), &mut |_, _, _| true).expect("converts");
+    assert_eq!((report.episodes, report.last_actions), (2, 2));
+    let read = open(&target).expect("opens");
+    let batch: Batch = read.read(&["action"], &[swm_data::StepRange::new(0, 0, 3)]).expect("reads");
+    let actions = batch.get::<f32>("action").expect("actions");
+    assert!(actions[..2] == [0.5, 1.5] && actions[2].is_nan());
+}
+
+#[test]
+fn double_precision_survives_or_its_rounding_is_told() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("fine.lance");
+    let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [1])]).expect("schema");
+    let mut batch = Batch::zeros(&schema, 4);
+    batch.get_mut::<f64>("state").expect("states").copy_from_slice(&[0.1, -1.0 / 3.0, 1e-9, 7.0]);
+    let buffer = swm_data::ReplayBuffer::new(&schema, 10).expect("a buffer");
+    buffer.add(&batch, &swm_data::Constants::new()).expect("adds");
+    let report = convert(&buffer.snapshot(), &Location::from(&path), &ConvertOptions::default(), &mut |_, _, _| true)
+        .expect("converts");
+    let state = &report.columns[0];
+    assert!(state.exact || (state.max_error > 0.0 && state.max_error < 1e-7), "{state:?}");
+}

@@ -83,7 +83,7 @@ impl Context {
     fn new(model: &MjModel, look: &Look) -> Result<Self> {
         let mut inner = Box::new_uninit();
         let model: *const mjModel = model.ffi();
-        let _turn = COUNTING.lock().unwrap_or_else(PoisonError::into_inner);
+        let turn = COUNTING.lock().unwrap_or_else(PoisonError::into_inner);
         // SAFETY: the first call fills the context, the second makes it for a valid model.
         let inner = unsafe {
             mjr_defaultContext(inner.as_mut_ptr());
@@ -94,12 +94,11 @@ impl Context {
             })?;
             inner
         };
-        let mut context = Self { inner, look: look.clone() };
-        context.aim()?;
-        Ok(context)
+        drop(turn);
+        Ok(Self { inner, look: look.clone() })
     }
 
-    /// Draws into memory, not to a window.
+    /// Draws into its own memory: not to a window, nor where another context of this thread drew last.
     fn aim(&mut self) -> Result<()> {
         let context = &raw mut *self.inner;
         // SAFETY: the context was made.
@@ -116,8 +115,8 @@ impl Context {
             let context = &raw mut *self.inner;
             // SAFETY: the context was made.
             link::guard("resizing a buffer", || unsafe { ffi::mjr_resizeOffscreen(width, height, context) })?;
-            self.aim()?;
         }
+        self.aim()?;
         // What MuJoCo takes from the model when a context is made.
         let (vis, extent) = (model.vis(), model.stat().extent as f32);
         self.inner.lineWidth = vis.global.linewidth;

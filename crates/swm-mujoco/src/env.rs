@@ -31,9 +31,15 @@ pub(crate) struct Step {
 
 /// What makes a world this one. Coordinates and columns are the task's own affair.
 pub(crate) trait Task: Send {
-    /// Makes the model that of these factors. It comes as it was compiled; [`Physics::replace_model`] takes another one where
-    /// an edit of the model is not enough. Not called again while factors stay the same.
+    /// Makes the model that of these factors. It comes as it was compiled, unless [`Task::overwrites`];
+    /// [`Physics::replace_model`] takes another one where an edit of the model is not enough. Not called again while factors stay the same.
     fn arrange(&mut self, physics: &mut Physics, factors: &FactorValues) -> Result<()>;
+
+    /// Whether [`Task::arrange`] sets every number of the model that the task ever edits. If so, the model is not put back first,
+    /// which takes long where it has many meshes.
+    fn overwrites(&self) -> bool {
+        false
+    }
 
     /// Begins an episode. The state is the model's initial one ([`Physics::reset`]), and must be settled (forward) on return.
     fn start(&mut self, physics: &mut Physics, factors: &FactorValues, key: Key) -> Result<()>;
@@ -62,6 +68,10 @@ pub(crate) trait Task: Send {
 
     /// Puts the world where the goal is reached, for a picture: the world puts the state back.
     fn show_goal(&mut self, physics: &mut Physics);
+
+    /// Makes the model, and the physics' state that is about to be put back, show the goal and what the task remembers: after a
+    /// goal was taken, chosen or shown.
+    fn mark_goal(&self, _physics: &mut Physics, _state: &mut [f64]) {}
 
     /// Whether the goal is reached now.
     fn is_success(&self, physics: &Physics) -> bool;
@@ -118,7 +128,9 @@ impl<T: Task> World<T> {
         if factors.iter().eq(self.factors.iter()) {
             return Ok(());
         }
-        self.physics.restore_model();
+        if !self.task.overwrites() {
+            self.physics.restore_model();
+        }
         self.task.arrange(&mut self.physics, &factors)?;
         self.factors = factors;
         Ok(())
@@ -161,18 +173,16 @@ impl<T: Task> World<T> {
     fn aim(&mut self, goal: &[f64]) -> Result<()> {
         let (memory, physics) = self.parts("goal state", goal)?;
         finite("a goal state", goal)?;
-        match memory {
-            Some(memory) => self.task.aim(&mut self.physics, physics, memory),
-            None => {
-                // The rest of the state is the present one.
-                let mut state = vec![0.0; self.state_len()];
-                let (now, memory) = state.split_at_mut(self.physics.state_len());
-                self.physics.state(now);
-                now[1..=physics.len()].copy_from_slice(physics);
-                self.task.remember(memory);
-                self.task.aim(&mut self.physics, now, memory)
-            }
+        if let Some(memory) = memory {
+            return self.aside(|task, world, _| task.aim(world, physics, memory))?;
         }
+        // The rest of the state is the present one.
+        let mut state = vec![0.0; self.state_len()];
+        let (now, memory) = state.split_at_mut(self.physics.state_len());
+        self.physics.state(now);
+        now[1..=physics.len()].copy_from_slice(physics);
+        self.task.remember(memory);
+        self.aside(|task, world, _| task.aim(world, now, memory))?
     }
 
     /// Does something with the physics and puts its state back.
@@ -181,6 +191,7 @@ impl<T: Task> World<T> {
         scratch.clear();
         self.physics.save(&mut scratch);
         let done = act(&mut self.task, &mut self.physics, &mut self.stage);
+        self.task.mark_goal(&mut self.physics, Physics::saved_state(&mut scratch));
         let back = self.physics.load(&scratch);
         self.scratch = scratch;
         back.map(|()| done)

@@ -10,6 +10,7 @@ unsafe extern "C-unwind" {
     pub fn mj_step(m: *const mjModel, d: *mut mjData);
     pub fn mj_step1(m: *const mjModel, d: *mut mjData);
     pub fn mj_step2(m: *const mjModel, d: *mut mjData);
+    pub fn mj_rnePostConstraint(m: *const mjModel, d: *mut mjData);
     pub fn mj_forward(m: *const mjModel, d: *mut mjData);
     pub fn mj_resetData(m: *const mjModel, d: *mut mjData);
     pub fn mj_setConst(m: *mut mjModel, d: *mut mjData);

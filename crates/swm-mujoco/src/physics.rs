@@ -275,6 +275,13 @@ impl Physics {
         self.notice();
     }
 
+    /// Computes the forces on bodies (`cfrc_ext`) as they were in the last step. They are not kept by [`Physics::save`].
+    pub fn contact_forces(&mut self) {
+        let (model, data) = self.raw();
+        // SAFETY: both are valid and belong to each other.
+        self.guarded("computing contact forces", || unsafe { ffi::mj_rnePostConstraint(model, data) });
+    }
+
     /// Lets `steps` time steps pass, at least one, as DeepMind Control does: the first half of the first step, up to where
     /// controls enter, was computed by the call before, and poses and velocities are up to date afterwards.
     pub fn step_control(&mut self, steps: usize) {
@@ -431,6 +438,11 @@ impl Physics {
         into.push(f64::from(u8::from(self.unstable)));
         into.push(f64::from(self.settled as u8));
         into.extend(&self.before);
+    }
+
+    /// The state in what [`Physics::save`] wrote: the one from which the derived quantities came about.
+    pub(crate) fn saved_state(saved: &mut [f64]) -> &mut [f64] {
+        saved.get_mut(2..).unwrap_or_default()
     }
 
     /// Puts back what [`Physics::save`] wrote, on the same model with the same edits.

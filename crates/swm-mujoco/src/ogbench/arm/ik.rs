@@ -3,7 +3,7 @@
 //! The iteration is OGBench's `DiffIKController`: at most 20 steps, none of which turns a joint by more than 45°, until
 //! place and turn are within 10⁻⁴ m and rad.
 
-use super::pose::{Pose, Quat, Vec3, about, cross, inverse, log, mul, norm, normalized, sub};
+use super::pose::{Pose, Vec3, about, cross, inverse, log, mul, norm, normalized, rotate, sub};
 
 /// Joints of the arm.
 pub const JOINTS: usize = 6;
@@ -65,7 +65,7 @@ impl Chain {
         for ((link, &angle), axis) in self.links.iter().zip(joints).zip(&mut axes) {
             pose = pose.then(link.at);
             pose.turn = normalized(mul(pose.turn, about(link.axis, angle)));
-            *axis = (super::pose::rotate(pose.turn, link.axis), pose.place);
+            *axis = (rotate(pose.turn, link.axis), pose.place);
         }
         let flange = pose.then(self.flange);
         let mut jacobian = [[0.0; JOINTS]; 6];
@@ -99,10 +99,11 @@ fn solve(mut matrix: [[f64; 6]; 6], mut right: [f64; 6]) -> [f64; 6] {
         let pivot = (column..6).max_by(|a, b| size(a).total_cmp(&size(b)).then(b.cmp(a))).unwrap_or(column);
         matrix.swap(column, pivot);
         right.swap(column, pivot);
+        let above = matrix[column];
         for row in column + 1..6 {
-            let factor = matrix[row][column] / matrix[column][column];
-            for k in column..6 {
-                matrix[row][k] -= factor * matrix[column][k];
+            let factor = matrix[row][column] / above[column];
+            for (entry, above) in matrix[row][column..].iter_mut().zip(&above[column..]) {
+                *entry -= factor * above;
             }
             right[row] -= factor * right[column];
         }
@@ -114,16 +115,14 @@ fn solve(mut matrix: [[f64; 6]; 6], mut right: [f64; 6]) -> [f64; 6] {
     right
 }
 
-/// A link at `place`, turned by `turn`.
-#[cfg(test)]
-fn link(place: Vec3, turn: Quat, axis: Vec3) -> Link {
-    Link { at: Pose { place, turn: normalized(turn) }, axis }
-}
-
 #[cfg(test)]
 mod tests {
-    use super::super::pose::{IDENTITY, distance};
+    use super::super::pose::{IDENTITY, Quat, distance};
     use super::*;
+
+    fn link(place: Vec3, turn: Quat, axis: Vec3) -> Link {
+        Link { at: Pose { place, turn: normalized(turn) }, axis }
+    }
 
     /// The UR5e's measures.
     fn arm() -> Chain {

@@ -1,0 +1,199 @@
+//! The table: floor and walls, the arm with its gripper, cubes, and for the scene its buttons, drawer and window.
+//!
+//! OGBench puts these together from its MJCF files with `dm_control.mjcf`; here MuJoCo's own model editing does, in the
+//! order that gives every body, geom and material the same number. The compiled models are equal, names of unnamed things
+//! aside.
+#![allow(unsafe_code, reason = "`mjs_attach`, which `mujoco-rs` does not wrap")]
+
+use super::setup::{Bounds, Setup};
+use crate::{assets, link};
+use mujoco_rs::mujoco_c::{_mjtGeomBase, mjs_attach, mjtCone, mjtIntegrator};
+use mujoco_rs::wrappers::MjModel;
+use mujoco_rs::wrappers::mj_editing::{MjSpec, MjsBody, SpecElement, SpecItem, SpecObject};
+use mujoco_rs::wrappers::mj_model::MjtObjBase;
+use std::ffi::CStr;
+use std::path::PathBuf;
+use swm_core::{Error, Result};
+
+/// Half the metres between two cubes of the model; episodes put them elsewhere.
+const SPACING: f64 = 0.05;
+
+/// Stiffness and damping of the arm's position actuators.
+const GAINS: [(f64, f64); 6] =
+    [(4500.0, 450.0), (4500.0, 450.0), (4500.0, 450.0), (2000.0, 200.0), (2000.0, 200.0), (500.0, 50.0)];
+
+/// Seconds of a physics step.
+const TIMESTEP: f64 = 0.002;
+
+/// What one sees through, where an agent sees pictures, and how much of it.
+const TRANSPARENT: [(&str, f32); 9] = [
+    ("ur5e/robotiq/metal", 0.1),
+    ("ur5e/robotiq/silicone", 0.1),
+    ("ur5e/robotiq/gray", 0.1),
+    ("ur5e/robotiq/black", 0.1),
+    ("ur5e/robotiq/pad_gray", 0.5),
+    ("ur5e/black", 0.1),
+    ("ur5e/jointgray", 0.1),
+    ("ur5e/linkgray", 0.1),
+    ("ur5e/lightblue", 0.1),
+];
+
+/// Whose pictures a model is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Look {
+    /// An agent that is told the state.
+    Solid,
+    /// An agent that sees: the arm is transparent and does not hide the cubes.
+    Transparent,
+}
+
+/// Compiles the model.
+///
+/// # Errors
+/// When MuJoCo or the files of OGBench are not installed, or MuJoCo refuses them.
+pub fn compile(setup: &Setup, look: Look) -> Result<MjModel> {
+    link::load()?;
+    let files = Files(assets::path("ogbench")?.join("ogbench/manipspace/descriptions"));
+    let mut arena = files.read("floor_wall.xml")?;
+    settle_options(&mut arena);
+    // The arm's body stands before those of the objects, but its meshes and materials come behind theirs: so its place is
+    // made now, and the arm attached at the end.
+    arena.world_body_mut().add_body().with_name("ur5e/");
+    for cube in 0..setup.cubes {
+        let mut spec = files.read("cube.xml")?;
+        number_cube(&mut spec, cube, setup.cubes)?;
+        attach(arena.world_body_mut(), spec, c"")?;
+    }
+    for file in if setup.fixtures { &["buttons.xml", "drawer.xml", "window.xml"][..] } else { &[] } {
+        attach(arena.world_body_mut(), files.read(file)?, c"")?;
+    }
+    let arm = files.arm()?;
+    attach(body(&mut arena, "ur5e/")?, arm, c"ur5e/")?;
+    let world = arena.world_body_mut();
+    for camera in setup.cameras {
+        let made = world.add_camera().with_name(camera.name).with_pos(camera.place);
+        made.alt_mut().set_xy_axis(&camera.axes);
+    }
+    bounding_box(world, "object_bounds", &lifted(setup.object_bounds), [0.6, 0.3, 0.3, 0.2]);
+    bounding_box(world, "arm_bounds", &setup.arm_bounds, [0.3, 0.6, 0.3, 0.2]);
+    let mut model = arena.compile().map_err(|error| Error::external("compiling OGBench's table", error))?;
+    tune(&mut model, look);
+    Ok(model)
+}
+
+/// OGBench's description files.
+struct Files(PathBuf);
+
+impl Files {
+    fn read(&self, file: &str) -> Result<MjSpec> {
+        let path = self.0.join(file);
+        MjSpec::from_xml(&path).map_err(|error| Error::external(format!("reading {}", path.display()), error))
+    }
+
+    /// The arm with the gripper on its flange.
+    fn arm(&self) -> Result<MjSpec> {
+        let mut arm = self.read("universal_robots_ur5e/ur5e.xml")?;
+        let refused = |error| Error::external("preparing OGBench's arm", error);
+        if let Some(light) = arm.light_mut("spotlight") {
+            // SAFETY: the light is of this description, and nothing refers to it.
+            unsafe { light.delete() }.map_err(refused)?;
+        }
+        if let Some(key) = arm.key_mut("home") {
+            // SAFETY: as above.
+            unsafe { key.delete() }.map_err(refused)?;
+        }
+        let Some(flange) = arm.site("attachment_site") else { return Err(missing("attachment_site")) };
+        let (place, turn) = (*flange.pos(), *flange.quat());
+        body(&mut arm, "wrist_3_link")?.add_body().with_name("robotiq/").with_pos(place).with_quat(turn);
+        attach(body(&mut arm, "robotiq/")?, self.read("robotiq_2f85/2f85.xml")?, c"robotiq/")?;
+        Ok(arm)
+    }
+}
+
+fn missing(name: &str) -> Error {
+    Error::external("reading OGBench's descriptions", format!("there is no '{name}'"))
+}
+
+fn body<'a>(spec: &'a mut MjSpec, name: &str) -> Result<&'a mut MjsBody> {
+    spec.body_mut(name).ok_or_else(|| missing(name))
+}
+
+/// Makes everything of `child` a part of `parent`, under names with a prefix.
+fn attach(parent: &mut MjsBody, mut child: MjSpec, prefix: &CStr) -> Result<()> {
+    let frame = parent.add_frame().element_mut_pointer();
+    // SAFETY: both are elements of live descriptions; MuJoCo counts who refers to the child, which may be dropped after.
+    let attached = unsafe { mjs_attach(frame, child.ffi_mut().element, prefix.as_ptr(), c"".as_ptr()) };
+    match attached.is_null() {
+        false => Ok(()),
+        true => Err(Error::external("putting OGBench's table together", "a part cannot be attached")),
+    }
+}
+
+/// What `dm_control` gathers from all files, and what the environment sets.
+fn settle_options(arena: &mut MjSpec) {
+    let option = arena.option_mut();
+    option.timestep = TIMESTEP;
+    option.cone = mjtCone::mjCONE_ELLIPTIC as i32;
+    option.impratio = 10.0;
+    option.integrator = mjtIntegrator::mjINT_IMPLICITFAST as i32;
+    let stat = arena.stat_mut();
+    (stat.center, stat.extent, stat.meansize) = ([0.3, 0.0, 0.15], 0.7, 0.04);
+    let visual = arena.visual_mut();
+    (visual.global.elevation, visual.global.azimuth) = (-20.0, 180.0);
+    (visual.map.znear, visual.map.zfar) = (0.1, 10.0);
+}
+
+/// Gives the cube of `cube.xml` its number and its place among `cubes`.
+#[allow(clippy::cast_precision_loss)]
+fn number_cube(spec: &mut MjSpec, cube: usize, cubes: usize) -> Result<()> {
+    let aside = 2.0 * SPACING * cube as f64 - SPACING * (cubes as f64 - 1.0);
+    let named = |stem: &str| format!("{stem}_{cube}");
+    let taken = |error| Error::external("numbering OGBench's cubes", error);
+    for stem in ["object", "object_target"] {
+        let body = body(spec, &format!("{stem}_0"))?;
+        body.pos_mut()[1] = aside;
+        body.set_name(&named(stem)).map_err(taken)?;
+    }
+    for stem in ["object", "target_object"] {
+        let geom = spec.geom_mut(&format!("{stem}_0")).ok_or_else(|| missing(stem))?;
+        geom.set_name(&named(stem)).map_err(taken)?;
+    }
+    let joint = spec.joint_mut("object_joint_0").ok_or_else(|| missing("object_joint_0"))?;
+    joint.set_name(&named("object_joint")).map_err(taken)?;
+    let site = spec.site_mut("com_0").ok_or_else(|| missing("com_0"))?;
+    site.set_name(&named("com")).map_err(taken)
+}
+
+/// Places of objects, at the height of a cube's middle.
+fn lifted([low, high]: Bounds<2>) -> Bounds<3> {
+    [[low[0], low[1], 0.02], [high[0], high[1], 0.02]]
+}
+
+/// A box that shows bounds, in a group that is not drawn unless asked for.
+fn bounding_box(world: &mut MjsBody, name: &str, [low, high]: &Bounds<3>, color: [f32; 4]) {
+    let each = |f: fn(f64, f64) -> f64| std::array::from_fn(|i| f(low[i], high[i]));
+    let site = world.add_site().with_name(name);
+    *site.pos_mut() = each(|low, high| (low + high) / 2.0);
+    *site.size_mut() = each(|low, high| (high - low) / 2.0 + 1e-7);
+    *site.rgba_mut() = color;
+    site.set_type(_mjtGeomBase::mjGEOM_BOX);
+    site.set_group(4);
+}
+
+/// The arm's gains, and its look.
+fn tune(model: &mut MjModel, look: Look) {
+    for (i, (stiffness, damping)) in GAINS.into_iter().enumerate() {
+        // The damping stays in the actuator's bias as the file has it: the reference writes it to the gains, where it does
+        // nothing.
+        // SAFETY: any finite gain is valid.
+        let gain = unsafe { &mut model.actuator_gainprm_mut()[i] };
+        (gain[0], gain[2]) = (stiffness, -damping);
+        model.actuator_biasprm_mut()[i][1] = -stiffness;
+    }
+    if look == Look::Transparent {
+        for (name, alpha) in TRANSPARENT {
+            let Some(id) = model.name_to_id(MjtObjBase::mjOBJ_MATERIAL, name) else { continue };
+            model.mat_rgba_mut()[id][3] = alpha;
+        }
+    }
+}

@@ -1,0 +1,166 @@
+//! The factors of a table, and how the compiled model is edited for them. Names, bounds, defaults and order are the
+//! reference's.
+
+use super::parts::Parts;
+use super::setup::{CUBE_COLORS, Camera, FRONT, SIDE, Setup};
+use crate::Physics;
+use crate::ogbench::arm::find;
+use crate::ogbench::arm::pose::{Quat, Vec3, cross, norm, normalized, scale, sub};
+use crate::ogbench::floor;
+use mujoco_rs::mujoco_c::_mjtObjBase::{mjOBJ_CAMERA, mjOBJ_LIGHT, mjOBJ_MATERIAL};
+use std::f64::consts::TAU;
+use swm_core::{DType, Factor, FactorValues, Result, Space, VariationSpace};
+
+/// Kilograms in a cubic metre of a cube.
+const DENSITY: f64 = 1240.0;
+/// Half an edge of a cube: single precision in the reference.
+const HALF_EDGE: f64 = 0.02_f32 as f64;
+/// The colour of the gripper.
+const PURPLE: [f64; 3] = [0.61, 0.28, 0.82];
+/// What has the colour of the gripper.
+const GRIPPER: [&str; 2] = ["ur5e/robotiq/black", "ur5e/robotiq/pad_gray"];
+/// A lock that is closed.
+const LOCK: [f64; 3] = CUBE_COLORS[0];
+
+/// The factors of a table that is seen by the first of `cameras`, or by both.
+pub fn space(setup: &Setup, cameras: usize) -> VariationSpace {
+    let n = setup.cubes;
+    let boxed = |shape: &[usize], low: &[f64], high: &[f64]| Space::Box {
+        shape: shape.to_vec(),
+        dtype: DType::Float64,
+        low: low.to_vec(),
+        high: high.to_vec(),
+    };
+    let same = |shape: &[usize], low, high| Space::uniform_box(shape, DType::Float64, low, high);
+    let [low, high] = setup.object_bounds;
+    let places = || boxed(&[n, 2], &low.repeat(n), &high.repeat(n));
+    let [arm_low, arm_high] = setup.arm_bounds;
+    let middle: Vec<f64> = (0..3).map(|i| (arm_low[i] + arm_high[i]) / 2.0).collect();
+    let (color, turn) = (|shape: &[usize]| same(shape, 0.0, 1.0), setup.factors.camera_turn);
+    let mut factors = vec![
+        Factor::new("agent.color", color(&[3]), PURPLE),
+        Factor::new("agent.ee_start_position", boxed(&[3], &arm_low, &arm_high), middle),
+        Factor::new("camera.angle_delta", same(&[cameras, 2], -turn, turn), vec![0.0; 2 * cameras]),
+        Factor::new("cube.color", color(&[n, 3]), CUBE_COLORS[..n].concat()),
+        Factor::new("cube.goal_position", places(), setup.factors.cube.repeat(n)),
+        Factor::new("cube.goal_yaw", same(&[n], 0.0, TAU), vec![0.0; n]),
+        Factor::new("cube.size", same(&[n], 0.01, 0.03), vec![HALF_EDGE; n]),
+        Factor::new("cube.start_position", places(), setup.factors.cube.repeat(n)),
+        Factor::new("cube.start_yaw", same(&[n], 0.0, TAU), vec![0.0; n]),
+        Factor::new("floor.color", color(&[2, 3]), floor::COLORS.concat()),
+        Factor::new("light.intensity", color(&[1]), [setup.factors.light]),
+    ];
+    if setup.fixtures {
+        factors.push(Factor::new("lock_color", color(&[2, 3]), [LOCK, LOCK].concat()));
+    }
+    VariationSpace::new(factors, setup.factors.defaults)
+}
+
+/// The colours of the locks.
+pub fn lock_colors(factors: &FactorValues) -> [[f32; 3]; 2] {
+    let value = factors.get("lock_color");
+    [color(&value[..3]), color(&value[3..])]
+}
+
+#[allow(clippy::cast_possible_truncation)]
+fn color(value: &[f64]) -> [f32; 3] {
+    [value[0] as f32, value[1] as f32, value[2] as f32]
+}
+
+/// Edits the model for these factors.
+///
+/// # Errors
+/// When the model lacks what they name.
+pub fn apply(physics: &mut Physics, setup: &Setup, parts: &Parts, factors: &FactorValues) -> Result<()> {
+    let find = |physics: &Physics, kind, name: &str| find(physics.model(), kind, name);
+    for name in GRIPPER {
+        let material = find(physics, mjOBJ_MATERIAL, name)?;
+        physics.model_mut().mat_rgba_mut()[material][..3].copy_from_slice(&color(factors.get("agent.color")));
+    }
+    let light = find(physics, mjOBJ_LIGHT, "global")?;
+    #[allow(clippy::cast_possible_truncation)]
+    let intensity = factors.scalar("light.intensity") as f32;
+    physics.model_mut().light_diffuse_mut()[light] = [intensity; 3];
+    let turns = factors.get("camera.angle_delta");
+    for (name, turn) in [FRONT, SIDE].into_iter().zip(turns.chunks_exact(2)) {
+        let at = find(physics, mjOBJ_CAMERA, name)?;
+        let Some(camera) = setup.cameras.iter().find(|camera| camera.name == name) else { continue };
+        physics.model_mut().cam_quat_mut()[at] = turned(camera, [turn[0], turn[1]]);
+    }
+    for (i, cube) in parts.cubes.iter().enumerate() {
+        let paint = color(&factors.get("cube.color")[3 * i..][..3]);
+        let half = factors.get("cube.size")[i];
+        for (body, geom) in cube.bodies.into_iter().zip(cube.geoms) {
+            physics.model_mut().geom_rgba_mut()[geom][..3].copy_from_slice(&paint);
+            resize(physics, body, geom, half);
+        }
+    }
+    physics.set_const();
+    set_means(physics);
+    floor::paint(physics, factors.get("floor.color"))
+}
+
+/// The means that the compiler computes once: MuJoCo's solver stops at a share of the mean inertia.
+#[allow(clippy::cast_precision_loss)]
+fn set_means(physics: &mut Physics) {
+    let mean = |numbers: &[f64]| numbers.iter().sum::<f64>() / numbers.len() as f64;
+    let (inertia, mass) = (mean(physics.model().dof_m0()), mean(&physics.model().body_mass()[1..]));
+    let means = physics.data_mut().model_stat_mut();
+    (means.meaninertia, means.meanmass) = (inertia, mass);
+}
+
+/// Makes a body that is one cube of this half edge: its size, what its collisions are looked for with, and its inertia.
+fn resize(physics: &mut Physics, body: usize, geom: usize, half: f64) {
+    let model = physics.model_mut();
+    let bounds = [0.0, 0.0, 0.0, half, half, half];
+    model.geom_size_mut()[geom] = [half; 3];
+    model.geom_rbound_mut()[geom] = norm(&[half; 3]);
+    model.geom_aabb_mut()[geom] = bounds;
+    let tree = model.body_bvhadr()[body];
+    if let Ok(node) = usize::try_from(tree) {
+        model.bvh_aabb_mut()[node] = bounds;
+    }
+    let mass = DENSITY * 8.0 * half.powi(3);
+    model.body_mass_mut()[body] = mass;
+    model.body_inertia_mut()[body] = [mass / 12.0 * (8.0 * half * half); 3];
+}
+
+/// The turn of a camera whose axes are turned by yaw and then by pitch, in degrees.
+fn turned(camera: &Camera, [yaw, pitch]: [f64; 2]) -> Quat {
+    let ((sy, cy), (sp, cp)) = (yaw.to_radians().sin_cos(), pitch.to_radians().sin_cos());
+    let turn = |[x, y, z]: Vec3| {
+        let [x, y] = [cy * x - sy * y, sy * x + cy * y];
+        [x, cp * y - sp * z, sp * y + cp * z]
+    };
+    let [ax, ay, az, bx, by, bz] = camera.axes;
+    let (right, up) = (turn([ax, ay, az]), turn([bx, by, bz]));
+    frame(right, up)
+}
+
+/// The rotation whose first axis is `right`, and whose second is as near to `up` as can be.
+fn frame(right: Vec3, up: Vec3) -> Quat {
+    let unit = |v: Vec3| scale(v, 1.0 / norm(&v));
+    let right = unit(right);
+    let along: f64 = right.iter().zip(&up).map(|(a, b)| a * b).sum();
+    let up = unit(sub(up, scale(right, along)));
+    let back = cross(right, up);
+    matrix_to_quat([right, up, back])
+}
+
+/// The rotation of three columns: the largest of the four numbers first, as MuJoCo does.
+fn matrix_to_quat([x, y, z]: [Vec3; 3]) -> Quat {
+    let q = if x[0] + y[1] + z[2] > 0.0 {
+        let w = 0.5 * (1.0 + x[0] + y[1] + z[2]).sqrt();
+        [w, 0.25 * (y[2] - z[1]) / w, 0.25 * (z[0] - x[2]) / w, 0.25 * (x[1] - y[0]) / w]
+    } else if x[0] > y[1] && x[0] > z[2] {
+        let a = 0.5 * (1.0 + x[0] - y[1] - z[2]).sqrt();
+        [0.25 * (y[2] - z[1]) / a, a, 0.25 * (y[0] + x[1]) / a, 0.25 * (z[0] + x[2]) / a]
+    } else if y[1] > z[2] {
+        let b = 0.5 * (1.0 - x[0] + y[1] - z[2]).sqrt();
+        [0.25 * (z[0] - x[2]) / b, 0.25 * (y[0] + x[1]) / b, b, 0.25 * (z[1] + y[2]) / b]
+    } else {
+        let c = 0.5 * (1.0 - x[0] - y[1] + z[2]).sqrt();
+        [0.25 * (x[1] - y[0]) / c, 0.25 * (z[0] + x[2]) / c, 0.25 * (z[1] + y[2]) / c, c]
+    };
+    normalized(q)
+}

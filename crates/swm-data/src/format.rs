@@ -5,9 +5,9 @@
 //! the action taken *from* it. The last row of an episode is its final observation; its action is NaN (float)
 //! or -1 (integer).
 
-use crate::{ImageCodec, lance};
+use crate::{ImageCodec, Location, lance};
 
-use std::path::Path;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 use swm_core::{Batch, ColumnSpec, Error, Manifest, Named, Registry, Result, Schema};
@@ -55,16 +55,28 @@ pub struct WriteOptions {
     pub commit: CommitPolicy,
 }
 
+/// What is the same in every step of an episode and no number, such as the XML of its scene: named bytes (text is
+/// UTF-8).
+pub type Constants = BTreeMap<String, Vec<u8>>;
+
 /// Stores episodes as they finish. What was committed survives a killed process; dropping a writer commits
 /// the rest as well, but only [`Writer::finish`] can say that it failed.
 pub trait Writer: Send {
-    /// Adds one complete episode. The columns `episode_idx` and `step_idx`, should the batch carry them, are
-    /// numbered by the writer.
+    /// Adds one complete episode and what is the same in all of its steps. The columns `episode_idx` and `step_idx`,
+    /// should the batch carry them, are numbered by the writer.
     ///
     /// # Errors
     /// When the columns differ from the writer's schema, the episode breaks the time convention (the last
     /// action NaN or -1, all others finite), a number does not fit its stored type, or the disk refuses.
-    fn write_episode(&mut self, episode: &Batch) -> Result<()>;
+    fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()>;
+
+    /// Adds one complete episode without [`Constants`].
+    ///
+    /// # Errors
+    /// As [`Writer::write_episode_with`].
+    fn write_episode(&mut self, episode: &Batch) -> Result<()> {
+        self.write_episode_with(episode, &Constants::new())
+    }
 
     /// Episodes in the dataset: those present before, and those written, committed or about to be.
     fn episodes(&self) -> usize;
@@ -132,6 +144,24 @@ pub trait Reader: Send + Sync {
         Ok(batch)
     }
 
+    /// What is the same in every step of the episode at this position of [`Reader::episodes`]; nothing, unless the
+    /// format stores it.
+    ///
+    /// # Errors
+    /// When the stored data are damaged.
+    fn constants(&self, _episode: usize) -> Result<Constants> {
+        Ok(Constants::new())
+    }
+
+    /// What is wrong with the dataset though its rows can be read, and only the format can tell: rows that belong to no
+    /// episode, stored step numbers that do not count up, files that nothing refers to. `swm doctor` asks.
+    ///
+    /// # Errors
+    /// When the stored data are damaged.
+    fn irregularities(&self) -> Result<Vec<String>> {
+        Ok(vec![])
+    }
+
     /// Where the data come from, where that was recorded.
     fn manifest(&self) -> Option<Manifest>;
 
@@ -156,12 +186,12 @@ pub struct Format {
     pub id: &'static str,
     /// What it is, in a sentence.
     pub summary: &'static str,
-    /// Whether a path looks like it, existing or about to be created.
-    pub detect: fn(&Path) -> bool,
+    /// Whether a location looks like it, existing or about to be created.
+    pub detect: fn(&Location) -> bool,
     /// Opens a dataset.
-    pub open: fn(&Path) -> Result<Arc<dyn Reader>>,
+    pub open: fn(&Location) -> Result<Arc<dyn Reader>>,
     /// Creates, continues or replaces a dataset.
-    pub create: fn(&Path, &Schema, WriteOptions) -> Result<Box<dyn Writer>>,
+    pub create: fn(&Location, &Schema, WriteOptions) -> Result<Box<dyn Writer>>,
 }
 
 impl Named for Format {
@@ -174,35 +204,39 @@ impl Named for Format {
 pub static FORMATS: Registry<Format> =
     Registry { kind: "dataset format", hint: "`swm formats` lists them", rows: &[lance::FORMAT] };
 
-fn detect(path: &Path) -> Option<&'static Format> {
-    FORMATS.rows.iter().find(|format| (format.detect)(path))
+fn detect(location: &Location) -> Option<&'static Format> {
+    FORMATS.rows.iter().find(|format| (format.detect)(location))
 }
 
 /// Opens a dataset of any format.
 ///
 /// # Errors
 /// When there is none, it is of no known format, or it is damaged.
-pub fn open(path: &Path) -> Result<Arc<dyn Reader>> {
-    if let Some(format) = detect(path) {
-        return (format.open)(path);
+pub fn open(location: impl Into<Location>) -> Result<Arc<dyn Reader>> {
+    let location = location.into();
+    if let Some(format) = detect(&location) {
+        return (format.open)(&location);
     }
-    let problem = match path.try_exists() {
-        Ok(true) => "is no dataset of a known format",
-        _ => "there is no such dataset",
+    let problem = match location.path().map(|path| path.try_exists()) {
+        Some(Ok(false)) => "there is no such dataset",
+        _ => "is no dataset of a known format",
     };
     let known: Vec<&str> = FORMATS.rows.iter().map(Named::id).collect();
-    Err(Error::corrupt(path, problem, format!("a dataset is a folder NAME.lance (formats: {})", known.join(", "))))
+    let fix = format!("`swm formats` says how each is recognised ({})", known.join(", "));
+    Err(Error::corrupt(location.label(), problem, fix))
 }
 
-/// Creates, continues or replaces a dataset whose episodes have these columns.
+/// Creates, continues or replaces a dataset whose episodes have these columns, in the format that the location's name
+/// says. Where it says none, take one from [`FORMATS`].
 ///
 /// # Errors
-/// When the path names no known format, the dataset exists and must not, the schema differs from the one
+/// When the location names no known format, the dataset exists and must not, the schema differs from the one
 /// to continue, or the folder cannot be written.
-pub fn create(path: &Path, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
-    let Some(format) = detect(path) else {
-        let problem = format!("{} names no format", path.display());
+pub fn create(location: impl Into<Location>, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
+    let location = location.into();
+    let Some(format) = detect(&location) else {
+        let problem = format!("{location} names no format");
         return Err(Error::config("dataset path", problem, "end it in .lance"));
     };
-    (format.create)(path, schema, options)
+    (format.create)(&location, schema, options)
 }

@@ -5,6 +5,7 @@
 //! - [`clip`], [`goals`] and [`loader`]: windows of episodes and where they lead, shuffled and prefetched as batches;
 //!   [`cache`]: decoded rows kept for the next epoch.
 //! - [`convert`](mod@convert): from any format to any other, resumed and verified.
+//! - [`doctor`]: what is wrong with a dataset, and which models it can train.
 //! - [`views`]: datasets made of datasets; [`replay`]: the latest episodes of a running collection.
 //! - [`image`]: how pictures are stored.
 //! - [`preview`] and [`video`]: frames as pictures and videos for people.
@@ -14,6 +15,7 @@
 pub mod cache;
 pub mod clip;
 pub mod convert;
+pub mod doctor;
 mod column_files;
 mod episodes;
 pub mod format;

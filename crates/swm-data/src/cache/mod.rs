@@ -211,6 +211,10 @@ impl Reader for CachedReader {
         self.inner.constants(episode)
     }
 
+    fn irregularities(&self) -> Result<Vec<String>> {
+        self.inner.irregularities()
+    }
+
     fn manifest(&self) -> Option<Manifest> {
         self.inner.manifest()
     }

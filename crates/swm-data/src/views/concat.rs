@@ -121,6 +121,11 @@ impl Reader for Concat {
         self.parts[part].constants(episode)
     }
 
+    fn irregularities(&self) -> Result<Vec<String>> {
+        let found: Result<Vec<Vec<String>>> = self.parts.iter().map(|part| part.irregularities()).collect();
+        Ok(found?.concat())
+    }
+
     /// That of the parts, if they agree; or one that holds theirs, and what they agree in of their configurations.
     fn manifest(&self) -> Option<Manifest> {
         let manifests: Vec<Manifest> = self.parts.iter().filter_map(|part| part.manifest()).collect();

@@ -71,6 +71,10 @@ impl Reader for Merge {
         Ok(constants)
     }
 
+    fn irregularities(&self) -> Result<Vec<String>> {
+        self.base.irregularities()
+    }
+
     fn manifest(&self) -> Option<Manifest> {
         self.base.manifest()
     }

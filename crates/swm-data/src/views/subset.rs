@@ -92,6 +92,10 @@ impl Reader for Subset {
         self.reader.constants(self.position(episode)?)
     }
 
+    fn irregularities(&self) -> Result<Vec<String>> {
+        self.reader.irregularities()
+    }
+
     fn manifest(&self) -> Option<Manifest> {
         self.reader.manifest()
     }

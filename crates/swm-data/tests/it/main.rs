@@ -6,6 +6,7 @@
 mod cache;
 mod convert;
 mod damage;
+mod doctor;
 mod foreign;
 mod fuzz;
 mod goals;

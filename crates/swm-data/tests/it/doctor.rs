@@ -1,0 +1,264 @@
+//! Datasets broken on purpose: each break is found, told, and left out of a repaired dataset.
+
+use crate::sample::{episode, rows, schema, write};
+use std::sync::Arc;
+use swm_core::{Batch, ColumnSpec, Error, Manifest, Result, Schema};
+use swm_data::doctor::{Diagnosis, Severity, examine, repair};
+use swm_data::{Constants, ConvertOptions, Episode, Location, Reader, StepRange, WriteMode, open};
+
+/// The episodes of the sample, given by whatever has broken them.
+#[derive(Default)]
+struct Broken {
+    schema: Option<Schema>,
+    episodes: Vec<Episode>,
+    rows: Vec<Batch>,
+    /// Episodes whose pictures cannot be read.
+    damaged: Vec<usize>,
+    irregular: Vec<String>,
+}
+
+impl Broken {
+    fn new(count: usize, breaking: impl Fn(usize, &mut Batch)) -> Self {
+        let mut broken = Self { schema: Some(schema()), ..Self::default() };
+        for e in 0..count {
+            let mut batch = episode(e);
+            breaking(e, &mut batch);
+            broken.episodes.push(Episode { index: e as i64, length: batch.rows() });
+            broken.rows.push(batch);
+        }
+        broken
+    }
+}
+
+impl Reader for Broken {
+    fn schema(&self) -> &Schema {
+        self.schema.as_ref().expect("a schema")
+    }
+
+    fn episodes(&self) -> &[Episode] {
+        &self.episodes
+    }
+
+    fn read_column(&self, column: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        let index = self.schema().index(column)?;
+        let n = self.schema().columns()[index].row_bytes();
+        let mut at = 0;
+        for range in ranges {
+            if column == "pixels" && self.damaged.contains(&range.episode) {
+                return Err(Error::external("decoding a picture", "it is cut off"));
+            }
+            let bytes = &self.rows[range.episode].bytes(index)[range.start * n..(range.start + range.length) * n];
+            out[at..at + bytes.len()].copy_from_slice(bytes);
+            at += bytes.len();
+        }
+        Ok(())
+    }
+
+    fn constants(&self, episode: usize) -> Result<Constants> {
+        Ok(Constants::from([("scene".to_owned(), vec![episode as u8])]))
+    }
+
+    fn irregularities(&self) -> Result<Vec<String>> {
+        Ok(self.irregular.clone())
+    }
+
+    fn manifest(&self) -> Option<Manifest> {
+        None
+    }
+
+    fn footprint(&self) -> Result<Vec<(String, u64)>> {
+        Ok(vec![])
+    }
+
+    fn content_hash(&self) -> Result<String> {
+        Ok("none".to_owned())
+    }
+}
+
+fn diagnose(reader: &dyn Reader) -> Diagnosis {
+    examine(reader, &mut |_| true).expect("examines")
+}
+
+/// The one problem that is there: its words and episodes.
+fn problem(diagnosis: &Diagnosis) -> (String, Vec<usize>) {
+    let problems: Vec<_> = diagnosis.findings.iter().filter(|found| found.severity == Severity::Problem).collect();
+    assert_eq!(problems.len(), 1, "{problems:?}");
+    (problems[0].what.clone(), problems[0].episodes.clone())
+}
+
+#[test]
+fn what_was_collected_is_clean() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write(&path, WriteMode::Create, 2, 0..8);
+    let diagnosis = diagnose(&*open(&path).expect("opens"));
+    assert_eq!((diagnosis.problems(), diagnosis.findings.len(), diagnosis.sound.len()), (0, 0, 8), "{diagnosis:?}");
+    assert_eq!(diagnosis.rows, (0..8).map(rows).sum::<usize>());
+    // Eleven rows are no clip of 4 frames and frameskip 5.
+    let fits: Vec<&str> = diagnosis.models.iter().filter(|fit| fit.fits()).map(|fit| fit.model).collect();
+    assert_eq!(fits, ["TD-MPC2", "GCBC", "GCIVL", "GCIQL"]);
+    assert!(diagnosis.models[0].missing[0].contains("the longest has 11"), "{:?}", diagnosis.models[0]);
+}
+
+#[test]
+fn every_break_is_found_where_it_is() {
+    type Breaking = fn(usize, &mut Batch);
+    let breaks: [(&str, Breaking); 7] = [
+        ("'reward' has a number that is not finite", |e, rows| {
+            if e == 2 {
+                rows.get_mut::<f32>("reward").expect("rewards")[1] = f32::NAN;
+            }
+        }),
+        ("'state' has a number that is not finite", |e, rows| {
+            if e == 2 {
+                rows.get_mut::<f64>("state").expect("states")[4] = f64::INFINITY;
+            }
+        }),
+        ("no action in a row that is not the last", |e, rows| {
+            if e == 2 {
+                rows.get_mut::<f32>("action").expect("actions")[2..4].fill(f32::NAN);
+            }
+        }),
+        ("an action is not finite", |e, rows| {
+            if e == 2 {
+                rows.get_mut::<f32>("action").expect("actions")[3] = f32::NAN;
+            }
+        }),
+        ("step 1 stands in row 2", |e, rows| {
+            if e == 2 {
+                rows.get_mut::<i64>("step_idx").expect("steps")[2] = 1;
+            }
+        }),
+        ("step 3 stands in row 0", |e, rows| {
+            if e == 2 {
+                rows.get_mut::<i64>("step_idx").expect("steps").iter_mut().for_each(|step| *step += 3);
+            }
+        }),
+        ("it has no rows", |e, rows| {
+            if e == 2 {
+                rows.resize(0);
+            }
+        }),
+    ];
+    for (words, breaking) in breaks {
+        let (what, episodes) = problem(&diagnose(&Broken::new(4, breaking)));
+        assert!(what.contains(words), "{what} instead of {words}");
+        assert_eq!(episodes, [2], "{words}");
+    }
+    let mut broken = Broken::new(4, |_, _| {});
+    broken.damaged = vec![1, 3];
+    let diagnosis = diagnose(&broken);
+    let (what, episodes) = problem(&diagnosis);
+    assert!(what.contains("'pixels' cannot be read") && what.contains("cut off"), "{what}");
+    assert_eq!((episodes, diagnosis.sound), (vec![1, 3], vec![0, 2]));
+    let mut broken = Broken::new(4, |_, _| {});
+    broken.episodes[3].index = 1;
+    let (what, episodes) = problem(&diagnose(&broken));
+    assert!(what.contains("the number 1 stands for another episode") && episodes == [3], "{what}");
+    let mut broken = Broken::new(4, |_, _| {});
+    broken.irregular = vec!["3 rows belong to no episode".to_owned()];
+    let diagnosis = diagnose(&broken);
+    assert_eq!(problem(&diagnosis), ("3 rows belong to no episode".to_owned(), vec![]));
+    assert_eq!(diagnosis.sound.len(), 4, "the episodes are sound");
+    assert!(problem(&diagnose(&Broken::new(0, |_, _| {}))).0.contains("no episode"));
+}
+
+#[test]
+fn what_is_odd_and_sound_is_a_note() {
+    let notes = |broken: Broken| -> Vec<String> {
+        let diagnosis = diagnose(&broken);
+        assert_eq!(diagnosis.problems(), 0, "{diagnosis:?}");
+        diagnosis.findings.into_iter().map(|found| found.what).collect()
+    };
+    let acting = Broken::new(3, |_, rows| rows.get_mut::<f32>("action").expect("actions").fill(0.5));
+    assert!(notes(acting)[0].contains("the last row has an action"));
+    let single = Broken::new(3, |e, rows| {
+        if e == 1 {
+            *rows = Batch::zeros(&schema(), 1);
+            rows.get_mut::<f32>("action").expect("actions").fill(f32::NAN);
+        }
+    });
+    assert!(notes(single)[0].contains("no step"));
+    let mut silent = Broken::new(3, |_, _| {});
+    let columns: Vec<ColumnSpec> = schema().columns().iter().filter(|c| c.name != "reward").cloned().collect();
+    let schema = Schema::new(columns).expect("schema");
+    silent.rows = silent.rows.iter().map(|rows| without_reward(&schema, rows)).collect();
+    silent.schema = Some(schema);
+    let diagnosis = diagnose(&silent);
+    assert_eq!(diagnosis.findings[0].what, "there is no reward");
+    let tdmpc2 = diagnosis.models.iter().find(|fit| fit.model == "TD-MPC2").expect("listed");
+    assert_eq!(tdmpc2.missing, ["there is no 'reward'"]);
+}
+
+fn without_reward(schema: &Schema, rows: &Batch) -> Batch {
+    let mut batch = Batch::zeros(schema, rows.rows());
+    for (i, column) in schema.columns().iter().enumerate() {
+        let from = rows.schema().index(&column.name).expect("a column");
+        batch.bytes_mut(i).copy_from_slice(rows.bytes(from));
+    }
+    batch
+}
+
+#[test]
+fn what_is_sound_makes_a_new_dataset() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let target = folder.path().join("mended.lance");
+    let broken = Broken::new(6, |e, rows| {
+        if e == 1 {
+            rows.get_mut::<f32>("reward").expect("rewards").fill(f32::NAN);
+        }
+        if e == 4 {
+            // Rows and more from nowhere, as a writer leaves them that numbered twice.
+            rows.get_mut::<i64>("step_idx").expect("steps").fill(0);
+        }
+    });
+    let mut broken = Plain(broken);
+    broken.0.damaged = vec![2];
+    let reader: Arc<dyn Reader> = Arc::new(broken);
+    let diagnosis = diagnose(&*reader);
+    assert_eq!((diagnosis.problems(), &diagnosis.sound[..]), (3, &[0, 3, 5][..]));
+    let to = Location::from(&target);
+    let report = repair(&reader, &diagnosis, &to, &ConvertOptions::default(), &mut |_, _, _| true).expect("repairs");
+    assert_eq!(report.episodes, 3);
+    let mended = open(&target).expect("opens");
+    assert_eq!(diagnose(&*mended).problems(), 0);
+    for (position, e) in [0, 3, 5].into_iter().enumerate() {
+        let read = mended.read(&["state"], &[StepRange::new(position, 0, rows(e))]).expect("reads");
+        assert_eq!(read.bytes(0), episode(e).bytes(2));
+    }
+    let hopeless: Arc<dyn Reader> = Arc::new(Broken::new(2, |_, rows| rows.resize(0)));
+    let diagnosis = diagnose(&*hopeless);
+    let refused = repair(&hopeless, &diagnosis, &to, &ConvertOptions::default(), &mut |_, _, _| true);
+    assert!(refused.expect_err("nothing is left").to_string().contains("none of its 2 episodes"));
+    let stopped = examine(&*mended, &mut |_| false);
+    assert!(matches!(stopped, Err(Error::Interrupted)));
+}
+
+/// Without constants, which Lance cannot keep in this build.
+struct Plain(Broken);
+
+impl Reader for Plain {
+    fn schema(&self) -> &Schema {
+        self.0.schema()
+    }
+
+    fn episodes(&self) -> &[Episode] {
+        self.0.episodes()
+    }
+
+    fn read_column(&self, column: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        self.0.read_column(column, ranges, out)
+    }
+
+    fn manifest(&self) -> Option<Manifest> {
+        None
+    }
+
+    fn footprint(&self) -> Result<Vec<(String, u64)>> {
+        Ok(vec![])
+    }
+
+    fn content_hash(&self) -> Result<String> {
+        self.0.content_hash()
+    }
+}

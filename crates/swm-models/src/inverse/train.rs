@@ -167,7 +167,7 @@ fn run(
             if stop.load(Ordering::Relaxed) {
                 return Err(Error::Interrupted);
             }
-            let pairs = Pairs::draw(world, config.offset, &batch?, key.with("goals").at(step as u64))?;
+            let pairs = Pairs::draw(world, config.offset, &*batch?, key.with("goals").at(step as u64))?;
             let share = config.schedule.share(step);
             let norm;
             (model, loss, norm) = learn(model, &mut optimizer, share, pairs)?;

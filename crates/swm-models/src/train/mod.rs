@@ -226,7 +226,7 @@ impl<'a> Run<'a> {
                 let asked = Instant::now();
                 let Some(batch) = batches.next() else { break };
                 waited += asked.elapsed().as_secs_f64();
-                let (losses, lr, gradient_norm) = self.learn(&batch?)?;
+                let (losses, lr, gradient_norm) = self.learn(&*batch?)?;
                 self.done += 1;
 
                 let elapsed = begun.elapsed().as_secs_f64();

@@ -143,11 +143,6 @@ impl ObjectFile {
         Ok(Self { store, path, label, len: meta.size })
     }
 
-    /// A file whose size is known.
-    pub(crate) fn known(store: Arc<dyn ObjectStore>, path: StorePath, label: PathBuf, len: u64) -> Self {
-        Self { store, path, label, len }
-    }
-
     /// How many bytes it has.
     pub fn len(&self) -> u64 {
         self.len

@@ -1,16 +1,28 @@
 //! The default format: Lance tables, through the crates below Lance's query engine.
 //!
 //! One row a step, episodes one after another. `episode_idx` and `step_idx` are 32-bit integers, pictures are
-//! encoded bytes, every other column is a fixed-size list of `float32` (a scalar is a list of one), and `.` in
-//! a name becomes `_`: the layout of the reference's `LanceWriter`, so its reader and the Python `lance`
-//! package open what is written here, and the other way round. The original names, types and shapes are kept
-//! in the table's metadata, which foreign readers ignore.
+//! encoded bytes, every other column is a fixed-size list of `float32` (a scalar is a list of one; columns of `float64`
+//! keep their precision), and `.` in a name becomes `_`: the layout of the reference's `LanceWriter`, so its reader and
+//! the Python `lance` package open what is written here, and the other way round. The original names, types and shapes
+//! are kept in the table's metadata, and what is the same in all steps of an episode in its data file, both of which
+//! foreign readers ignore.
+//!
+//! A table is a folder on this machine, or a prefix in an object store. Every version is one object that is created on
+//! the condition that there is none of its name, so of two writers that commit at once one is told to look again.
+//! Readers of several machines need nothing but the store; several machines write one dataset with [`create_shard`].
 
 mod convert;
+mod encode;
+mod pictures;
 mod reader;
+mod record;
 mod schema;
+mod shard;
 mod store;
+mod table;
 mod writer;
+
+pub use shard::{Shard, commit_shards, create_shard};
 
 use crate::format::Format;
 

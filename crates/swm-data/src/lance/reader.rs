@@ -1,13 +1,19 @@
 //! Reading episodes: all ranges of a batch are sorted, merged and read together, pictures are decoded in
 //! parallel into the batch.
+//!
+//! Pictures are read from where they lie ([`Places`]). Numbers are small: those of a data file are decoded whole when
+//! the first of them is wanted, and kept. What is laid out otherwise, or does not fit, is left to Lance's decoder.
 
 use super::convert::{blob, cast, convert, whole_numbers};
+use super::pictures::{Place, Places};
+use super::record::{CONSTANTS_KEY, ContentHash, EPISODES_KEY, Record};
 use super::schema::{self, EPISODE, Kind, STEP, StoredColumn};
-use super::store::{self, Store, damaged, table_folder, wait};
-use crate::Location;
-use crate::format::{Episode, Reader, StepRange};
-use crate::image;
+use super::store::{self, Store, damaged, wait};
+use crate::format::{Constants, Episode, Reader, StepRange};
+use crate::objects;
+use crate::{Location, image};
 use arrow_array::ArrayRef;
+use bytes::Bytes;
 use futures::{StreamExt as _, TryStreamExt as _};
 use lance_core::datatypes::Schema as LanceSchema;
 use lance_encoding::decoder::FilterExpression;
@@ -16,18 +22,19 @@ use lance_file::versions::reader_projection_from_field_ids;
 use lance_io::ReadBatchParams;
 use lance_table::format::{DataFile, Manifest as Table};
 use rayon::prelude::*;
+use std::cell::RefCell;
 use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::fs::File;
 use std::ops::Range;
+use std::os::unix::fs::FileExt as _;
 use std::path::Path;
 use std::slice;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use swm_core::{Error, Manifest, Result, Schema};
 
-/// Data files that are kept open. Each takes a file descriptor, of which a process commonly has 1024.
-const OPEN_FILES: usize = 128;
-
-/// Data files that one read has open at a time, be they kept or not.
-const FILES_AT_ONCE: usize = 64;
+/// Data files that are kept open, and files that one read has open at a time. Each takes up to two file descriptors,
+/// of which a process commonly has 1024.
+const OPEN_FILES: usize = 32;
 
 /// Data files up to this size are checked before even the numbers of their episodes are read.
 const SMALL_FILE: u64 = 1 << 20;
@@ -35,13 +42,16 @@ const SMALL_FILE: u64 = 1 << 20;
 /// Rows per decoded piece; more only costs memory.
 const ROWS_PER_PIECE: u32 = 4096;
 
+/// Bytes of decoded numbers that are kept. A hundred thousand steps of sixty numbers take a quarter of it.
+const KEPT_NUMBERS: usize = 128 << 20;
+
 /// Opens a table.
 pub fn open(location: &Location) -> Result<Arc<dyn Reader>> {
-    let path = location.local("lance")?;
-    Ok(Arc::new(LanceReader::open(path)?))
+    Ok(Arc::new(LanceReader::open(location)?))
 }
 
-struct LanceReader {
+/// A table of episodes.
+pub struct LanceReader {
     store: Store,
     table: Arc<Table>,
     schema: Schema,
@@ -51,17 +61,56 @@ struct LanceReader {
     first_rows: Vec<u64>,
     /// The first row of each fragment, and the end.
     fragment_rows: Vec<u64>,
-    files: Mutex<OpenFiles>,
+    files: Mutex<Recent<FileReader>>,
+    /// Data files of this machine, open for reading.
+    handles: Mutex<Recent<File>>,
+    /// Where pictures are, by fragment and name of the column; `None` where Lance must look.
+    places: Mutex<HashMap<(usize, String), Option<Arc<Places>>>>,
+    numbers: Mutex<Numbers>,
     /// Data files whose content was checked.
     verified: Mutex<HashSet<String>>,
 }
 
-#[derive(Default)]
-struct OpenFiles {
-    by_path: HashMap<String, Arc<FileReader>>,
+/// What was used last, by the path of a data file, up to [`OPEN_FILES`].
+struct Recent<T> {
+    by_path: HashMap<String, Arc<T>>,
     /// Oldest first.
     order: VecDeque<String>,
 }
+
+impl<T> Default for Recent<T> {
+    fn default() -> Self {
+        Self { by_path: HashMap::new(), order: VecDeque::new() }
+    }
+}
+
+impl<T> Recent<T> {
+    fn get(&self, path: &str) -> Option<Arc<T>> {
+        self.by_path.get(path).map(Arc::clone)
+    }
+
+    fn keep(&mut self, path: &str, file: &Arc<T>) {
+        if self.by_path.insert(path.to_owned(), Arc::clone(file)).is_some() {
+            return;
+        }
+        self.order.push_back(path.to_owned());
+        if self.order.len() > OPEN_FILES
+            && let Some(oldest) = self.order.pop_front()
+        {
+            self.by_path.remove(&oldest);
+        }
+    }
+}
+
+/// Decoded numbers, by fragment and name of the column.
+#[derive(Default)]
+struct Numbers {
+    kept: HashMap<(usize, String), Arc<Vec<u8>>>,
+    bytes: usize,
+}
+
+/// A row of the table, and the place in a batch that wants it.
+type Wanted<'a> = (u64, &'a mut [u8]);
 
 /// Consecutive rows of one fragment, as stored.
 struct Piece {
@@ -69,27 +118,44 @@ struct Piece {
     rows: usize,
 }
 
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // What is guarded is valid at every step, so a thread that panicked did no harm.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 impl LanceReader {
-    fn open(path: &Path) -> Result<Self> {
-        let folder = table_folder(path)?;
-        let store = Store::new(&folder)?;
+    /// Opens a table.
+    ///
+    /// # Errors
+    /// When there is none, or it is damaged.
+    pub fn open(location: &Location) -> Result<Self> {
+        let store = Store::new(location)?;
         let Some(version) = store.latest()? else {
-            let problem = if folder.is_dir() { "the folder holds no Lance table" } else { "there is no such dataset" };
-            return Err(Error::corrupt(&folder, problem, "check the path; `swm datasets` lists those at home"));
+            let there = store.remote || store.label.is_dir();
+            let problem = if there { "it holds no Lance table" } else { "there is no such dataset" };
+            return Err(Error::corrupt(&store.label, problem, "check the path; `swm datasets` lists those at home"));
         };
-        let table = version.manifest;
+        Self::of(store, version.manifest)
+    }
+
+    /// The table in one of its versions.
+    ///
+    /// # Errors
+    /// When it is damaged.
+    pub fn of(store: Store, table: Arc<Table>) -> Result<Self> {
+        let label = store.label.clone();
         let mut fragment_rows = vec![0];
         for fragment in table.fragments.iter() {
             if fragment.deletion_file.is_some() {
                 return Err(Error::corrupt(
-                    &folder,
+                    &label,
                     "some of its rows are marked as deleted",
                     "compact it first (in Python: lance.dataset(path).optimize.compact_files())",
                 ));
             }
-            let rows = fragment.physical_rows.ok_or_else(|| damaged(&folder, "a fragment has no row count"))?;
+            let rows = fragment.physical_rows.ok_or_else(|| damaged(&label, "a fragment has no row count"))?;
             let last: u64 = fragment_rows[fragment_rows.len() - 1];
-            fragment_rows.push(last + rows as u64);
+            fragment_rows.push(last.saturating_add(rows as u64));
         }
         let mut reader = Self {
             store,
@@ -100,9 +166,12 @@ impl LanceReader {
             first_rows: vec![],
             fragment_rows,
             files: Mutex::default(),
+            handles: Mutex::default(),
+            places: Mutex::default(),
+            numbers: Mutex::default(),
             verified: Mutex::default(),
         };
-        let (columns, schema) = schema::columns_to_read(&folder, &reader.table.schema, |column| {
+        let (columns, schema) = schema::columns_to_read(&label, &reader.table.schema, |column| {
             let pieces = reader.pieces(column, slice::from_ref(&(0..1.min(reader.rows()))))?;
             pieces.first().map(|piece| blob(&piece.values, 0).map(<[u8]>::to_vec)).transpose()
         })?;
@@ -111,12 +180,22 @@ impl LanceReader {
         Ok(reader)
     }
 
+    /// The number of the next episode.
+    pub fn next_episode(&self) -> i64 {
+        self.episodes.last().map_or(0, |episode| episode.index + 1)
+    }
+
     fn folder(&self) -> &Path {
-        &self.store.folder
+        &self.store.label
     }
 
     fn rows(&self) -> u64 {
         self.fragment_rows[self.fragment_rows.len() - 1]
+    }
+
+    /// The fragment that holds a row.
+    fn fragment_of(&self, row: u64) -> usize {
+        self.fragment_rows.partition_point(|&first| first <= row) - 1
     }
 
     /// Reads where episodes begin and end.
@@ -180,7 +259,7 @@ impl LanceReader {
         let mut jobs: Vec<(usize, Vec<Range<u64>>)> = vec![];
         for range in ranges.iter().filter(|range| !range.is_empty()) {
             let mut start = range.start;
-            let mut fragment = self.fragment_rows.partition_point(|&first| first <= start) - 1;
+            let mut fragment = self.fragment_of(start);
             while start < range.end {
                 let (first, end) = (self.fragment_rows[fragment], self.fragment_rows[fragment + 1]);
                 let part = start - first..range.end.min(end) - first;
@@ -194,7 +273,7 @@ impl LanceReader {
             }
         }
         let mut pieces = vec![];
-        for jobs in jobs.chunks(FILES_AT_ONCE) {
+        for jobs in jobs.chunks(OPEN_FILES) {
             pieces.extend(self.read_pieces(stored_name, jobs)?);
         }
         Ok(pieces)
@@ -245,26 +324,31 @@ impl LanceReader {
 
     /// Checks a file against the hash in its name, once, before anything in it is decoded: Lance trusts what
     /// it reads, so a flipped bit could make it ask for any amount of memory. A large file is left alone
-    /// until its data are asked for, as opening a dataset must not read all of it.
+    /// until its data are asked for, as opening a dataset must not read all of it. Object stores check what they hold
+    /// themselves.
     fn verify(&self, file: &DataFile, data_wanted: bool) -> Result<()> {
-        let Some(expected) = store::hash_in_name(&file.path) else { return Ok(()) };
-        let lock = || self.verified.lock().unwrap_or_else(PoisonError::into_inner);
-        if lock().contains(&file.path) {
+        let Some(expected) = store::hash_in_name(&file.path).filter(|_| !self.store.remote) else { return Ok(()) };
+        if lock(&self.verified).contains(&file.path) {
             return Ok(());
         }
-        let path = self.folder().join("data").join(&file.path);
-        let io = |e: std::io::Error| match e.kind() {
-            std::io::ErrorKind::NotFound => damaged(&path, "a data file is missing"),
-            _ => Error::io(&path, "checking a data file", e),
-        };
+        let path = self.store.local(&self.store.data_path(&file.path));
+        let io = |e: std::io::Error| self.missing(&path, e);
         if !data_wanted && std::fs::metadata(&path).map_err(io)?.len() > SMALL_FILE {
             return Ok(());
         }
         if store::hash_file(&path).map_err(io)? != expected {
             return Err(damaged(&path, "its content does not match the hash in its name"));
         }
-        lock().insert(file.path.clone());
+        lock(&self.verified).insert(file.path.clone());
         Ok(())
+    }
+
+    fn missing(&self, path: &Path, error: std::io::Error) -> Error {
+        match error.kind() {
+            std::io::ErrorKind::NotFound => damaged(path, "a data file is missing"),
+            std::io::ErrorKind::UnexpectedEof => damaged(path, "a data file is too short"),
+            _ => Error::io(path, "reading a data file", error),
+        }
     }
 
     /// The open file of a fragment that holds a column, and where in it.
@@ -285,24 +369,65 @@ impl LanceReader {
     }
 
     fn file(&self, file: &DataFile) -> Result<Arc<FileReader>> {
-        let lock = || self.files.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(reader) = lock().by_path.get(&file.path) {
-            return Ok(Arc::clone(reader));
+        if let Some(reader) = lock(&self.files).get(&file.path) {
+            return Ok(reader);
         }
         let (store, data_file) = (self.store.clone(), file.clone());
         let path = self.folder().join("data").join(&file.path);
         let reader = wait(&path, "opening a data file", async move { store.open_file(&data_file).await })?;
         let reader = Arc::new(reader);
-        let mut files = lock();
-        if files.by_path.insert(file.path.clone(), Arc::clone(&reader)).is_none() {
-            files.order.push_back(file.path.clone());
-            if files.order.len() > OPEN_FILES
-                && let Some(oldest) = files.order.pop_front()
-            {
-                files.by_path.remove(&oldest);
-            }
-        }
+        lock(&self.files).keep(&file.path, &reader);
         Ok(reader)
+    }
+
+    /// A data file of this machine, open for reading.
+    fn handle(&self, path: &str) -> Result<Arc<File>> {
+        if let Some(file) = lock(&self.handles).get(path) {
+            return Ok(file);
+        }
+        let place = self.store.local(&self.store.data_path(path));
+        let file = Arc::new(File::open(&place).map_err(|e| self.missing(&place, e))?);
+        lock(&self.handles).keep(path, &file);
+        Ok(file)
+    }
+
+    /// Bytes of data files: for each path its ranges.
+    fn bytes(&self, wanted: Vec<(String, Vec<Range<u64>>)>) -> Result<Vec<Vec<Bytes>>> {
+        let store = self.store.clone();
+        wait(self.folder(), "reading data files", async move {
+            futures::stream::iter(wanted.into_iter().map(|(path, ranges)| {
+                let (file, store) = (store.data_path(&path), store.clone());
+                async move { objects::fetch(&*store.inner(), &file, &ranges).await.map_err(lance_core::Error::from) }
+            }))
+            .buffered(16)
+            .try_collect()
+            .await
+        })
+    }
+
+    /// Where the pictures of a column are in a fragment; `None` where they are not laid out one by one.
+    fn places(&self, fragment: usize, column: &str) -> Result<Option<Arc<Places>>> {
+        let key = (fragment, column.to_owned());
+        if let Some(known) = lock(&self.places).get(&key) {
+            return Ok(known.clone());
+        }
+        let (file, _) = self.data_file(fragment, column)?;
+        self.verify(file, true)?;
+        let (reader, projection) = self.locate(fragment, column)?;
+        let metadata = reader.metadata();
+        let found = match projection.column_indices[..] {
+            [index] => match metadata.column_infos.get(index as usize) {
+                Some(info) => Places::read(info, metadata.file_size_bytes, |ranges| {
+                    let mut lists = self.bytes(vec![(file.path.clone(), ranges.to_vec())])?;
+                    Ok::<_, Error>(lists.pop().unwrap_or_default())
+                })?,
+                None => None,
+            },
+            _ => None,
+        };
+        let found = found.map(Arc::new);
+        lock(&self.places).insert(key, found.clone());
+        Ok(found)
     }
 
     /// `episode_idx` or `step_idx`, which need no reading.
@@ -353,54 +478,16 @@ impl Reader for LanceReader {
         let rows: usize = ranges.iter().map(|range| range.length).sum();
         self.check_length(name, rows, out)?;
         // Every wanted row with its place in `out`, in the order of the table.
-        let mut wanted: Vec<(u64, &mut [u8])> = Vec::with_capacity(rows);
+        let mut wanted: Vec<Wanted> = Vec::with_capacity(rows);
         let mut places = out.chunks_exact_mut(column.spec.row_bytes());
         for range in ranges {
             wanted.extend(self.table_rows(range)?.zip(places.by_ref()));
         }
         wanted.sort_by_key(|(row, _)| *row);
-        let mut merged: Vec<Range<u64>> = vec![];
-        for &(row, _) in &wanted {
-            match merged.last_mut() {
-                Some(range) if row < range.end => {}
-                Some(range) if row == range.end => range.end += 1,
-                _ => merged.push(row..row + 1),
-            }
-        }
-        let pieces = self.pieces(&column.name, &merged)?;
-        // One group for every stored row: the places that want it.
-        let mut groups = wanted.chunk_by_mut(|a, b| a.0 == b.0);
         match column.kind {
-            Kind::Numbers => {
-                let mut row = vec![];
-                for piece in &pieces {
-                    row.resize(piece.rows * column.spec.row_bytes(), 0);
-                    convert(&piece.values, column.spec.len(), column.spec.dtype, &mut row)
-                        .map_err(|problem| damaged(self.folder(), format!("column '{name}': {problem}")))?;
-                    for (value, group) in row.chunks_exact(column.spec.row_bytes()).zip(groups.by_ref()) {
-                        group.iter_mut().for_each(|(_, place)| place.copy_from_slice(value));
-                    }
-                }
-            }
-            Kind::Image => {
-                let mut jobs = Vec::with_capacity(rows);
-                for piece in &pieces {
-                    for (i, group) in (0..piece.rows).zip(groups.by_ref()) {
-                        jobs.push((blob(&piece.values, i)?, group));
-                    }
-                }
-                let (height, width) = (column.spec.shape[0], column.spec.shape[1]);
-                jobs.into_par_iter().with_max_len(1).try_for_each(|(bytes, group)| {
-                    let Some(((row, first), others)) = group.split_first_mut() else { return Ok(()) };
-                    image::decode(bytes, height, width, first).map_err(|problem| {
-                        damaged(self.folder(), format!("picture of row {row}, column '{name}': {problem}"))
-                    })?;
-                    others.iter_mut().for_each(|(_, place)| place.copy_from_slice(first));
-                    Ok(())
-                })?;
-            }
+            Kind::Numbers(_) => self.read_numbers(column, &mut wanted),
+            Kind::Image => self.read_pictures(column, &mut wanted),
         }
-        Ok(())
     }
 
     fn manifest(&self) -> Option<Manifest> {
@@ -418,11 +505,28 @@ impl Reader for LanceReader {
             }
         }
         let known: u64 = columns.values().sum();
-        let rest = folder_size(self.folder())?.saturating_sub(known);
+        let whole: u64 = self.store.list("")?.iter().map(|file| file.size).sum();
+        let rest = whole.saturating_sub(known);
         let mut parts: Vec<(String, u64)> = columns.into_iter().collect();
         parts.push(("(versions and file metadata)".to_owned(), rest));
         parts.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
         Ok(parts)
+    }
+
+    fn constants(&self, episode: usize) -> Result<Constants> {
+        let Some(&row) = self.first_rows.get(episode) else {
+            let problem = format!("the episode in position {episode}");
+            return Err(Error::mismatch(
+                "reading constants",
+                problem,
+                format!("positions below {}", self.episodes.len()),
+            ));
+        };
+        let fragment = self.fragment_of(row);
+        let Some((reader, record)) = self.record(fragment)? else { return Ok(Constants::new()) };
+        let Some(values) = self.buffer(&reader, CONSTANTS_KEY)? else { return Ok(Constants::new()) };
+        let position = episode - self.first_rows.partition_point(|&first| first < self.fragment_rows[fragment]);
+        record.constants(position, &values).map_err(|problem| damaged(self.folder(), problem))
     }
 
     fn content_hash(&self) -> Result<String> {
@@ -431,45 +535,249 @@ impl Reader for LanceReader {
             hasher.update(&(bytes.len() as u64).to_le_bytes());
             hasher.update(bytes);
         };
-        for episode in &self.episodes {
-            add(&episode.index.to_le_bytes());
-            add(&(episode.length as u64).to_le_bytes());
-        }
         for column in &self.columns {
             add(schema::json(&column.spec)?.as_bytes());
-            let mut start = 0;
-            while start < self.rows() {
-                let end = (start + u64::from(ROWS_PER_PIECE)).min(self.rows());
-                for piece in self.pieces(&column.name, slice::from_ref(&(start..end)))? {
-                    match column.kind {
-                        Kind::Image => {
-                            for row in 0..piece.rows {
-                                add(blob(&piece.values, row)?);
-                            }
-                        }
-                        Kind::Numbers => {
-                            let mut bytes = vec![0; column.spec.row_bytes() * piece.rows];
-                            convert(&piece.values, column.spec.len(), column.spec.dtype, &mut bytes)
-                                .map_err(|problem| damaged(self.folder(), problem))?;
-                            bytes.chunks_exact(column.spec.row_bytes()).for_each(&mut add);
-                        }
-                    }
-                }
-                start = end;
+        }
+        let mut at = 0;
+        for (fragment, rows) in self.fragment_rows.windows(2).enumerate() {
+            let first = at;
+            while at < self.episodes.len() && self.first_rows[at] < rows[1] {
+                at += 1;
+            }
+            for (episode, hash) in self.episodes[first..at].iter().zip(self.hashes(fragment, first..at)?) {
+                add(&episode.index.to_le_bytes());
+                add(&(episode.length as u64).to_le_bytes());
+                add(hash.as_bytes());
             }
         }
         Ok(hasher.finalize().to_hex().to_string())
     }
 }
 
-/// Bytes of all files below a folder.
-fn folder_size(folder: &Path) -> Result<u64> {
-    let io = |e| Error::io(folder, "listing the folder", e);
-    let mut size = 0;
-    for entry in std::fs::read_dir(folder).map_err(io)? {
-        let entry = entry.map_err(io)?;
-        let metadata = entry.metadata().map_err(io)?;
-        size += if metadata.is_dir() { folder_size(&entry.path())? } else { metadata.len() };
+impl LanceReader {
+    /// The hashes of a fragment's episodes: as recorded, where the fragment was written here, so that a large dataset
+    /// need not be read for them.
+    fn hashes(&self, fragment: usize, episodes: Range<usize>) -> Result<Vec<String>> {
+        if let Some((_, record)) = self.record(fragment)? {
+            let stored = self.episodes[episodes.clone()].iter().map(|episode| episode.length as u64);
+            if stored.eq(record.episodes.iter().map(|episode| episode.rows)) {
+                return Ok(record.episodes.into_iter().map(|episode| episode.hash).collect());
+            }
+        }
+        episodes.map(|episode| self.hash_of(episode)).collect()
     }
-    Ok(size)
+
+    /// The hash of an episode, from all that is stored of it.
+    fn hash_of(&self, episode: usize) -> Result<String> {
+        let rows = self.table_rows(&StepRange::new(episode, 0, self.episodes[episode].length))?;
+        let mut hash = ContentHash::new();
+        for column in &self.columns {
+            for piece in self.pieces(&column.name, slice::from_ref(&rows))? {
+                hash.add(column, &piece.values).map_err(|problem| damaged(self.folder(), problem))?;
+            }
+        }
+        Ok(hash.finish(&self.constants(episode)?))
+    }
+
+    /// What a fragment's data file records of its episodes, and the file.
+    fn record(&self, fragment: usize) -> Result<Option<(Arc<FileReader>, Record)>> {
+        for file in &self.table.fragments[fragment].files {
+            self.verify(file, false)?;
+            let reader = self.file(file)?;
+            if let Some(stored) = self.buffer(&reader, EPISODES_KEY)? {
+                let record = Record::decode(&stored).map_err(|problem| damaged(self.folder(), problem))?;
+                return Ok(Some((reader, record)));
+            }
+        }
+        Ok(None)
+    }
+
+    /// The global buffer whose number is in the file's metadata.
+    fn buffer(&self, reader: &Arc<FileReader>, key: &str) -> Result<Option<Bytes>> {
+        let Some(number) = reader.schema().metadata.get(key).and_then(|number| number.parse::<u32>().ok()) else {
+            return Ok(None);
+        };
+        let reader = Arc::clone(reader);
+        let read = async move { reader.read_global_buffer(number).await.map(Some) };
+        wait(self.folder(), "reading the record of its episodes", read)
+    }
+
+    fn read_numbers(&self, column: &StoredColumn, wanted: &mut [Wanted]) -> Result<()> {
+        self.keep_numbers(column, wanted)?;
+        let n = column.spec.row_bytes();
+        let mut others = vec![];
+        for rows in wanted.chunk_by_mut(|a, b| self.fragment_of(a.0) == self.fragment_of(b.0)) {
+            let fragment = self.fragment_of(rows[0].0);
+            let kept = lock(&self.numbers).kept.get(&(fragment, column.name.clone())).map(Arc::clone);
+            match kept {
+                Some(values) => {
+                    for (row, place) in rows {
+                        let at = (*row - self.fragment_rows[fragment]) as usize * n;
+                        place.copy_from_slice(&values[at..at + n]);
+                    }
+                }
+                None => others.extend(rows),
+            }
+        }
+        let pieces = self.pieces(&column.name, &merged(&others))?;
+        // One group for every stored row: the places that want it.
+        let mut groups = others.chunk_by_mut(|a, b| a.0 == b.0);
+        let mut bytes = vec![];
+        for piece in &pieces {
+            bytes.resize(piece.rows * n, 0);
+            self.convert(column, piece, &mut bytes)?;
+            for (value, group) in bytes.chunks_exact(n).zip(groups.by_ref()) {
+                group.iter_mut().for_each(|(_, place)| place.copy_from_slice(value));
+            }
+        }
+        Ok(())
+    }
+
+    fn convert(&self, column: &StoredColumn, piece: &Piece, out: &mut [u8]) -> Result<()> {
+        convert(&piece.values, column.spec.len(), column.spec.dtype, out)
+            .map_err(|problem| damaged(self.folder(), format!("column '{}': {problem}", column.spec.name)))
+    }
+
+    /// Decodes the numbers of all fragments that have a wanted row, as long as there is room for them.
+    fn keep_numbers(&self, column: &StoredColumn, wanted: &[Wanted]) -> Result<()> {
+        let n = column.spec.row_bytes();
+        let mut ranges: Vec<Range<u64>> = vec![];
+        {
+            let numbers = lock(&self.numbers);
+            let mut room = KEPT_NUMBERS.saturating_sub(numbers.bytes);
+            for rows in wanted.chunk_by(|a, b| self.fragment_of(a.0) == self.fragment_of(b.0)) {
+                let fragment = self.fragment_of(rows[0].0);
+                let range = self.fragment_rows[fragment]..self.fragment_rows[fragment + 1];
+                let size = (range.end - range.start).saturating_mul(n as u64);
+                let known = numbers.kept.contains_key(&(fragment, column.name.clone()));
+                if !known && size <= room as u64 {
+                    room -= size as usize;
+                    ranges.push(range);
+                }
+            }
+        }
+        let mut pieces = self.pieces(&column.name, &ranges)?.into_iter();
+        for range in ranges {
+            let mut values = vec![0; (range.end - range.start) as usize * n];
+            let mut at = 0;
+            while at < values.len() {
+                let Some(piece) = pieces.next() else { break };
+                let end = (at + piece.rows * n).min(values.len());
+                self.convert(column, &piece, &mut values[at..end])?;
+                at = end;
+            }
+            let mut numbers = lock(&self.numbers);
+            numbers.bytes += values.len();
+            let key = (self.fragment_of(range.start), column.name.clone());
+            if let Some(twice) = numbers.kept.insert(key, Arc::new(values)) {
+                numbers.bytes -= twice.len();
+            }
+        }
+        Ok(())
+    }
+
+    fn read_pictures(&self, column: &StoredColumn, wanted: &mut [Wanted]) -> Result<()> {
+        let mut laid_out = vec![];
+        let mut others: Vec<&mut Wanted> = vec![];
+        for rows in wanted.chunk_by_mut(|a, b| self.fragment_of(a.0) == self.fragment_of(b.0)) {
+            let fragment = self.fragment_of(rows[0].0);
+            match self.places(fragment, &column.name)? {
+                Some(places) => laid_out.push((fragment, places, rows)),
+                None => others.extend(rows),
+            }
+        }
+        for fragments in laid_out.chunks_mut(OPEN_FILES) {
+            self.read_laid_out(column, fragments)?;
+        }
+        let pieces = self.pieces(&column.name, &merged(&others))?;
+        let mut groups = others.chunk_by_mut(|a, b| a.0 == b.0);
+        let mut jobs = vec![];
+        for piece in &pieces {
+            for (i, group) in (0..piece.rows).zip(groups.by_ref()) {
+                jobs.push((blob(&piece.values, i)?, group));
+            }
+        }
+        jobs.into_par_iter().with_max_len(1).try_for_each(|(bytes, group)| {
+            let Some(((row, first), others)) = group.split_first_mut().map(|(a, b)| ((a.0, &mut *a.1), b)) else {
+                return Ok(());
+            };
+            self.decode(column, row, bytes, first)?;
+            others.iter_mut().for_each(|(_, place)| place.copy_from_slice(first));
+            Ok(())
+        })
+    }
+
+    /// Reads and decodes pictures whose places are known, of some fragments.
+    fn read_laid_out(
+        &self,
+        column: &StoredColumn,
+        fragments: &mut [(usize, Arc<Places>, &mut [Wanted])],
+    ) -> Result<()> {
+        let mut paths = vec![];
+        let mut jobs = vec![];
+        for (at, (fragment, places, rows)) in fragments.iter_mut().enumerate() {
+            paths.push(self.data_file(*fragment, &column.name)?.0.path.clone());
+            for group in rows.chunk_by_mut(|a, b| a.0 == b.0) {
+                let row = group[0].0;
+                let place = places.find(row - self.fragment_rows[*fragment]).ok_or_else(|| {
+                    damaged(self.folder(), format!("row {row} of column '{}' is not in its data file", column.name))
+                })?;
+                jobs.push((at, place, group));
+            }
+        }
+        let finish = |place: &Place, bytes: &[u8], group: &mut [Wanted]| {
+            let Some(((row, first), others)) = group.split_first_mut() else { return Ok(()) };
+            let picture = place.picture(bytes).ok_or_else(|| {
+                damaged(self.folder(), format!("row {row} of column '{}' states another length", column.name))
+            })?;
+            self.decode(column, *row, picture, first)?;
+            others.iter_mut().for_each(|(_, place)| place.copy_from_slice(first));
+            Ok(())
+        };
+        if self.store.remote {
+            let mut ranges: Vec<_> = paths.into_iter().map(|path| (path, vec![])).collect();
+            jobs.iter().for_each(|(at, place, _)| ranges[*at].1.push(place.bytes.clone()));
+            let fetched = self.bytes(ranges)?.into_iter().flatten();
+            let jobs: Vec<_> = jobs.into_iter().zip(fetched).collect();
+            return jobs
+                .into_par_iter()
+                .with_max_len(1)
+                .try_for_each(|((_, place, group), bytes)| finish(&place, &bytes, group));
+        }
+        let files = paths.iter().map(|path| self.handle(path)).collect::<Result<Vec<_>>>()?;
+        jobs.into_par_iter().with_max_len(1).try_for_each(|(at, place, group)| {
+            SCRATCH.with_borrow_mut(|scratch| {
+                scratch.resize((place.bytes.end - place.bytes.start) as usize, 0);
+                files[at]
+                    .read_exact_at(scratch, place.bytes.start)
+                    .map_err(|e| self.missing(Path::new(&paths[at]), e))?;
+                finish(&place, scratch, group)
+            })
+        })
+    }
+
+    fn decode(&self, column: &StoredColumn, row: u64, bytes: &[u8], out: &mut [u8]) -> Result<()> {
+        let (height, width) = (column.spec.shape[0], column.spec.shape[1]);
+        image::decode(bytes, height, width, out).map_err(|problem| {
+            damaged(self.folder(), format!("picture of row {row}, column '{}': {problem}", column.spec.name))
+        })
+    }
+}
+
+thread_local! {
+    /// An encoded picture, between reading and decoding.
+    static SCRATCH: RefCell<Vec<u8>> = const { RefCell::new(vec![]) };
+}
+
+/// The ranges of rising rows.
+fn merged(wanted: &[&mut Wanted]) -> Vec<Range<u64>> {
+    let mut merged: Vec<Range<u64>> = vec![];
+    for &&mut (row, _) in wanted {
+        match merged.last_mut() {
+            Some(range) if row < range.end => {}
+            Some(range) if row == range.end => range.end += 1,
+            _ => merged.push(row..row + 1),
+        }
+    }
+    merged
 }

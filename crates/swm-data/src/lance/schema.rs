@@ -42,8 +42,30 @@ pub struct StoredColumn {
 pub enum Kind {
     /// Encoded pictures.
     Image,
-    /// Numbers: a scalar, or a fixed-size list.
-    Numbers,
+    /// Numbers: a scalar, or a fixed-size list. Where they are written here, of this precision.
+    Numbers(Precision),
+}
+
+/// What numbers are written as.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Precision {
+    /// `float32`, as the reference writes all numbers.
+    Single,
+    /// `float64`, so that nothing is rounded.
+    Double,
+}
+
+impl Precision {
+    fn of(dtype: DType) -> Self {
+        if dtype == DType::Float64 { Self::Double } else { Self::Single }
+    }
+
+    fn data_type(self) -> DataType {
+        match self {
+            Self::Single => DataType::Float32,
+            Self::Double => DataType::Float64,
+        }
+    }
 }
 
 /// The name of a column in the table: Lance reads `.` as a path into a structure.
@@ -72,7 +94,7 @@ pub fn columns_to_write(schema: &Schema) -> Result<Vec<StoredColumn>> {
         if spec.is_empty() {
             return Err(Error::config("schema", format!("column '{}' holds no number", spec.name), "leave it out"));
         }
-        let kind = if spec.is_image() { Kind::Image } else { Kind::Numbers };
+        let kind = if spec.is_image() { Kind::Image } else { Kind::Numbers(Precision::of(spec.dtype)) };
         columns.push(StoredColumn { spec: spec.clone(), name, kind });
     }
     if columns.is_empty() {
@@ -85,19 +107,37 @@ pub fn columns_to_write(schema: &Schema) -> Result<Vec<StoredColumn>> {
 pub fn arrow_schema(columns: &[StoredColumn]) -> ArrowSchema {
     let mut fields = vec![Field::new(EPISODE, DataType::Int32, true), Field::new(STEP, DataType::Int32, true)];
     for column in columns {
-        let data_type = match column.kind {
-            Kind::Image => DataType::Binary,
+        fields.push(match column.kind {
+            Kind::Image => Field::new(&column.name, DataType::Binary, true).with_metadata(plain_values()),
             #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
-            Kind::Numbers => DataType::FixedSizeList(list_item(), column.spec.len() as i32),
-        };
-        fields.push(Field::new(&column.name, data_type, true));
+            Kind::Numbers(precision) => {
+                let list = DataType::FixedSizeList(list_item(precision), column.spec.len() as i32);
+                Field::new(&column.name, list, true)
+            }
+        });
     }
     ArrowSchema::new(fields)
 }
 
+/// How Lance is to store pictures: as they are, since they are compressed already; each on its own, unless a few stand
+/// for many, such as the goals of episodes.
+fn plain_values() -> HashMap<String, String> {
+    let settings = [("lance-encoding:compression", "none"), ("lance-encoding:dict-size-ratio", "0.25")];
+    settings.map(|(key, value)| (key.to_owned(), value.to_owned())).into()
+}
+
 /// The field of a list's numbers.
-pub fn list_item() -> Arc<Field> {
-    Arc::new(Field::new("item", DataType::Float32, true))
+pub fn list_item(precision: Precision) -> Arc<Field> {
+    Arc::new(Field::new("item", precision.data_type(), true))
+}
+
+/// What a table holds in a column of numbers that is to be continued.
+pub fn stored_precision(data_type: &DataType) -> Option<Precision> {
+    match data_type {
+        DataType::FixedSizeList(item, _) if *item.data_type() == DataType::Float32 => Some(Precision::Single),
+        DataType::FixedSizeList(item, _) if *item.data_type() == DataType::Float64 => Some(Precision::Double),
+        _ => None,
+    }
 }
 
 /// The table's metadata.
@@ -190,10 +230,10 @@ pub fn columns_to_read(
                 let Some(dtype) = number_type(item) else { continue };
                 match known {
                     Some(spec) if !spec.is_image() && spec.len() == shape.iter().product::<usize>() => {
-                        (spec.clone(), Kind::Numbers)
+                        (spec.clone(), Kind::Numbers(Precision::of(dtype)))
                     }
                     Some(_) => return Err(contradiction(&format!("{other}"))),
-                    None => (ColumnSpec::new(name, dtype, shape), Kind::Numbers),
+                    None => (ColumnSpec::new(name, dtype, shape), Kind::Numbers(Precision::of(dtype))),
                 }
             }
         };

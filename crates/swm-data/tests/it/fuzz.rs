@@ -18,6 +18,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 use swm_core::{Key, Result, Rng};
 use swm_data::{StepRange, open};
@@ -74,7 +75,7 @@ pub fn dataset<T: PartialEq>(name: &str, sound: &Path, cases: u64, read: impl Fn
             }
         };
         let words = format!("{} {change}", file.strip_prefix(folder.path()).unwrap_or(file).display());
-        let restore = || std::fs::write(file, &bytes).expect("writes");
+        let restore = move || std::fs::write(file, &bytes).expect("writes");
         (words, || read(&copy), restore)
     })
 }
@@ -175,6 +176,9 @@ fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
     expected: &T,
     prepare: impl Fn(u64, &mut Rng) -> (String, R, C),
 ) -> Report {
+    // One at a time: requests for memory are watched on all threads.
+    static ONE: Mutex<()> = Mutex::new(());
+    let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
     let mut report = Report::default();
     let (progress, watched) = channel();
     let watchdog = std::thread::spawn(move || watch(&watched));

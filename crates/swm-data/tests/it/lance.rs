@@ -4,7 +4,7 @@ use crate::sample::{COLUMNS, check, episode, manifest, options, rows, schema, wr
 use rand::Rng as _;
 use std::path::Path;
 use swm_core::{Batch, ColumnSpec, DType, Error, Key, Schema};
-use swm_data::{ImageCodec, StepRange, WriteMode, WriteOptions, column_stats, create, open};
+use swm_data::{CommitPolicy, Constants, ImageCodec, StepRange, WriteMode, WriteOptions, column_stats, create, open};
 
 fn failure(path: &Path, schema: &Schema, mode: WriteMode) -> String {
     match create(path, schema, options(mode)) {
@@ -198,13 +198,15 @@ fn the_content_hash_knows_content_not_files() {
 fn pictures_can_be_lossless() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
-    let lossless = WriteOptions { codec: ImageCodec::Png, ..options(WriteMode::Create) };
-    let mut writer = create(&path, &schema(), lossless).expect("creates");
-    writer.write_episode(&episode(1)).expect("writes");
-    writer.finish().expect("finishes");
-    let reader = open(&path).expect("opens");
-    let read = reader.read(&["pixels"], &[StepRange::new(0, 0, rows(1))]).expect("reads");
-    assert_eq!(read.bytes(0), episode(1).bytes(0));
+    for (number, codec) in [ImageCodec::Png, ImageCodec::Qoi].into_iter().enumerate() {
+        let lossless = WriteOptions { codec, ..options(WriteMode::Append) };
+        let mut writer = create(&path, &schema(), lossless).expect("creates");
+        writer.write_episode(&episode(1)).expect("writes");
+        writer.finish().expect("finishes");
+        let reader = open(&path).expect("opens");
+        let read = reader.read(&["pixels"], &[StepRange::new(number, 0, rows(1))]).expect("reads");
+        assert_eq!(read.bytes(0), episode(1).bytes(0));
+    }
     let silly = WriteOptions { codec: ImageCodec::Jpeg { quality: 0 }, ..options(WriteMode::Create) };
     let error = create(&folder.path().join("e.lance"), &schema(), silly).err().expect("refused");
     assert!(error.is_usage());
@@ -228,17 +230,109 @@ fn many_threads_read_at_once() {
 }
 
 #[test]
-fn one_writer_at_a_time() {
+fn writers_that_append_at_once_both_survive() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    let threads = 4;
+    let each = 25;
+    std::thread::scope(|scope| {
+        for thread in 0..threads {
+            let path = &path;
+            scope.spawn(move || {
+                let commit = CommitPolicy { episodes: 1, ..CommitPolicy::default() };
+                let options = WriteOptions { commit, ..options(WriteMode::Append) };
+                let mut writer = create(path, &schema(), options).expect("continues");
+                for e in 0..each {
+                    writer.write_episode(&episode(thread * each + e)).expect("writes");
+                }
+                writer.finish().expect("finishes");
+            });
+        }
+    });
+    let reader = open(&path).expect("opens");
+    let numbers: Vec<i64> = reader.episodes().iter().map(|episode| episode.index).collect();
+    assert_eq!(numbers, (0..(threads * each) as i64).collect::<Vec<_>>());
+    // Which episode each is, by its state.
+    let firsts: Vec<StepRange> = (0..threads * each).map(|at| StepRange::new(at, 0, 1)).collect();
+    let read = reader.read(&["state"], &firsts).expect("reads");
+    let mut found: Vec<usize> = read.get::<f64>("state").expect("states").chunks(3).map(|s| s[0] as usize).collect();
+    for thread in 0..threads {
+        let own: Vec<usize> = found.iter().copied().filter(|e| e / each == thread).collect();
+        assert!(own.is_sorted(), "those of one writer keep their order");
+    }
+    found.sort_unstable();
+    assert_eq!(found, (0..threads * each).collect::<Vec<_>>());
+    assert_eq!(std::fs::read_dir(path.join("data")).expect("a folder").count(), threads * each, "no file is left over");
+}
+
+#[test]
+fn a_writer_whose_dataset_was_replaced_fails_cleanly() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     let mut first = create(&path, &schema(), options(WriteMode::Append)).expect("creates");
-    let mut second = create(&path, &schema(), options(WriteMode::Append)).expect("continues");
-    first.write_episode(&episode(0)).expect("writes");
-    first.finish().expect("finishes");
-    second.write_episode(&episode(0)).expect("takes it");
-    let error = second.finish().expect_err("the first was faster").to_string();
-    assert!(error.contains("another process"), "{error}");
-    check(&*open(&path).expect("opens"), 0);
+    let other = Schema::new([ColumnSpec::new("other", DType::Float32, [])]).expect("schema");
+    create(&path, &other, options(WriteMode::Overwrite)).expect("replaces").finish().expect("finishes");
+    first.write_episode(&episode(0)).expect("takes it");
+    let error = first.finish().expect_err("its columns are gone").to_string();
+    assert!(error.contains("another process replaced"), "{error}");
+    assert!(open(&path).expect("opens").episodes().is_empty());
+}
+
+#[test]
+fn doubles_are_exact_and_older_tables_stay_single() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [2])]).expect("schema");
+    let mut batch = Batch::zeros(&schema, 3);
+    let values = [0.1, 1e300, f64::MIN_POSITIVE, -7.0, f64::NAN, 1.0 / 3.0];
+    batch.get_mut::<f64>("state").expect("states").copy_from_slice(&values);
+    let mut writer = create(&path, &schema, options(WriteMode::Create)).expect("creates");
+    writer.write_episode(&batch).expect("writes");
+    writer.finish().expect("finishes");
+    let all = [StepRange::new(0, 0, 3)];
+    let bits = |reader: &dyn swm_data::Reader| -> Vec<u64> {
+        let read = reader.read(&["state"], &all).expect("reads");
+        read.get::<f64>("state").expect("states").iter().map(|v| v.to_bits()).collect()
+    };
+    assert_eq!(bits(&*open(&path).expect("opens")), values.map(f64::to_bits));
+    // A table of the first version, which held all numbers in single precision, is continued as it is.
+    let old = folder.path().join("old.lance");
+    crate::fuzz::copy_all(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/single.lance"), &old);
+    let there = open(&old).expect("opens").episodes().len();
+    write(&old, WriteMode::Append, 1, there..there + 2);
+    let reader = open(&old).expect("opens");
+    assert_eq!(reader.episodes().len(), there + 2);
+    check(&*reader, 0);
+}
+
+#[test]
+fn constants_come_back() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    let scene = |e: usize| {
+        let xml = format!("<mujoco><body pos=\"{}\"/></mujoco>", e / 2).repeat(50).into_bytes();
+        Constants::from([("scene.xml".to_owned(), xml), ("raw".to_owned(), vec![e as u8, 0, 255])])
+    };
+    let commit = CommitPolicy { episodes: 4, ..CommitPolicy::default() };
+    let mut writer = create(&path, &schema(), WriteOptions { commit, ..options(WriteMode::Create) }).expect("creates");
+    for e in 0..10 {
+        let constants = if e == 5 { Constants::new() } else { scene(e) };
+        writer.write_episode_with(&episode(e), &constants).expect("writes");
+    }
+    writer.finish().expect("finishes");
+    let reader = open(&path).expect("opens");
+    check(&*reader, 0);
+    for e in 0..10 {
+        let expected = if e == 5 { Constants::new() } else { scene(e) };
+        assert_eq!(reader.constants(e).expect("reads"), expected, "episode {e}");
+    }
+    assert!(reader.constants(10).is_err());
+    // They are part of the content.
+    let plain = folder.path().join("plain.lance");
+    write(&plain, WriteMode::Create, 4, 0..10);
+    let plain = open(&plain).expect("opens");
+    assert_eq!(plain.constants(0).expect("reads"), Constants::new());
+    assert_ne!(plain.content_hash().expect("a hash"), reader.content_hash().expect("a hash"));
 }
 
 #[test]

@@ -1,0 +1,125 @@
+//! Datasets that several machines write together.
+
+use crate::sample::{check, episode, options, schema, write};
+use std::path::Path;
+use swm_core::{ColumnSpec, DType, Schema};
+use swm_data::lance::{Shard, commit_shards, create_shard};
+use swm_data::{CommitPolicy, Constants, Location, WriteMode, WriteOptions, Writer, open};
+
+fn part(path: &Path, mode: WriteMode, index: usize, count: usize) -> swm_core::Result<Box<dyn Writer>> {
+    let commit = CommitPolicy { episodes: 2, ..CommitPolicy::default() };
+    create_shard(&Location::from(path), &schema(), WriteOptions { commit, ..options(mode) }, Shard { index, count })
+}
+
+fn write_part(path: &Path, index: usize, count: usize, episodes: std::ops::Range<usize>) {
+    let mut writer = part(path, WriteMode::Create, index, count).expect("begins");
+    for e in episodes {
+        let constants = Constants::from([("number".to_owned(), e.to_string().into_bytes())]);
+        writer.write_episode_with(&episode(e), &constants).expect("writes");
+    }
+    writer.finish().expect("finishes");
+}
+
+fn failure(path: &Path) -> String {
+    commit_shards(&Location::from(path)).expect_err("refused").to_string()
+}
+
+#[test]
+fn parts_become_one_version() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    assert!(failure(&path).contains("none to commit"));
+    // In any order, and on several threads as on several machines.
+    std::thread::scope(|scope| {
+        scope.spawn(|| write_part(&path, 2, 3, 7..12));
+        scope.spawn(|| write_part(&path, 0, 3, 0..5));
+    });
+    assert!(failure(&path).contains("part 1 of 3 is missing"));
+    assert!(open(&path).is_err(), "nothing is seen before the commit");
+    write_part(&path, 1, 3, 5..7);
+    assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 12);
+
+    let reader = open(&path).expect("opens");
+    check(&*reader, 0);
+    assert_eq!(reader.episodes().iter().map(|e| e.index).collect::<Vec<_>>(), (0..12).collect::<Vec<_>>());
+    for e in [0, 4, 5, 11] {
+        assert_eq!(reader.constants(e).expect("reads")["number"], e.to_string().into_bytes());
+    }
+    assert!(failure(&path).contains("none to commit"), "the log is gone");
+    // The content is that of one writer's.
+    let whole = folder.path().join("whole.lance");
+    write(&whole, WriteMode::Create, 100, 0..12);
+    let columns = ["pixels", "state", "episode_idx", "step_idx"];
+    let all: Vec<_> = (0..12).map(|e| swm_data::StepRange::new(e, 0, reader.episodes()[e].length)).collect();
+    let read = |reader: &dyn swm_data::Reader| reader.read(&columns, &all).expect("reads");
+    let (parts, one) = (read(&*reader), read(&*open(&whole).expect("opens")));
+    assert!((0..columns.len()).all(|column| parts.bytes(column) == one.bytes(column)));
+
+    // More parts, after those that are there; then an ordinary writer after them.
+    write_part(&path, 0, 2, 12..14);
+    write_part(&path, 1, 2, 14..16);
+    assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 4);
+    write(&path, WriteMode::Append, 1, 16..18);
+    let reader = open(&path).expect("opens");
+    assert_eq!(reader.episodes().len(), 18);
+    check(&*reader, 0);
+}
+
+#[test]
+fn a_part_that_was_interrupted_is_continued_or_begun_again() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write_part(&path, 1, 2, 4..6);
+    let mut writer = part(&path, WriteMode::Create, 0, 2).expect("begins");
+    for e in 0..2 {
+        writer.write_episode(&episode(e)).expect("writes");
+    }
+    drop(writer);
+    assert!(failure(&path).contains("part 0 of 2 is not finished"));
+    assert!(part(&path, WriteMode::Create, 0, 2).err().expect("refused").to_string().contains("begun already"));
+    let mut writer = part(&path, WriteMode::Append, 0, 2).expect("continues");
+    assert_eq!(writer.episodes(), 2);
+    for e in 2..4 {
+        writer.write_episode(&episode(e)).expect("writes");
+    }
+    writer.finish().expect("finishes");
+    commit_shards(&Location::from(&path)).expect("commits");
+    check(&*open(&path).expect("opens"), 0);
+
+    write_part(&path, 0, 1, 0..3);
+    let mut writer = part(&path, WriteMode::Overwrite, 0, 1).expect("begins again");
+    writer.write_episode(&episode(6)).expect("writes");
+    writer.finish().expect("finishes");
+    assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 1);
+    check(&*open(&path).expect("opens"), 0);
+}
+
+#[test]
+fn a_commit_that_was_killed_before_it_cleaned_up_is_not_repeated() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write_part(&path, 0, 1, 0..3);
+    crate::fuzz::copy_all(&path.join("_shards"), &folder.path().join("kept"));
+    assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 3);
+    crate::fuzz::copy_all(&folder.path().join("kept"), &path.join("_shards"));
+    assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 0);
+    assert_eq!(open(&path).expect("opens").episodes().len(), 3);
+    assert!(failure(&path).contains("none to commit"));
+}
+
+#[test]
+fn parts_that_do_not_fit_are_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    let location = Location::from(&path);
+    assert!(part(&path, WriteMode::Create, 3, 3).err().expect("refused").to_string().contains("no part 3 of 3"));
+    write_part(&path, 0, 2, 0..2);
+    write_part(&path, 0, 3, 0..2);
+    assert!(failure(&path).contains("some are parts of"));
+    drop(part(&path, WriteMode::Overwrite, 0, 3).expect("begins again"));
+    std::fs::remove_dir_all(path.join("_shards/0-of-3")).expect("removes");
+    let other = Schema::new([ColumnSpec::new("other", DType::Float32, [])]).expect("schema");
+    let shard = Shard { index: 1, count: 2 };
+    create_shard(&location, &other, options(WriteMode::Create), shard).expect("begins").finish().expect("finishes");
+    assert!(failure(&path).contains("writing a part of"));
+}

@@ -200,7 +200,7 @@ struct Ours {
 impl Ours {
     fn new(env: &EnvChoice, size: Option<usize>, config: &BenchConfig) -> Result<Self> {
         let mut world = World::new(
-            env,
+            env.clone(),
             WorldConfig {
                 envs: config.envs,
                 image: size.map(|size| (size, size)),

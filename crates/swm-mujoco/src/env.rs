@@ -41,6 +41,9 @@ pub(crate) trait Task: Send {
         false
     }
 
+    /// What a reset asks for, before [`Task::start`]: for tasks that draw what nobody asks for.
+    fn heed(&mut self, _asked: &VariationRequest) {}
+
     /// Begins an episode. The state is the model's initial one ([`Physics::reset`]), and must be settled (forward) on return.
     fn start(&mut self, physics: &mut Physics, factors: &FactorValues, key: Key) -> Result<()>;
 
@@ -59,8 +62,8 @@ pub(crate) trait Task: Send {
     /// Takes back what it remembered. The model is that of the factors; the state is not there yet.
     fn recall(&mut self, physics: &mut Physics, memory: &[f64]);
 
-    /// Takes its goal from a state somewhere else: numbers of [`Physics::state`] (see [`Physics::state_places`]) and the memory
-    /// there.
+    /// Takes its goal from a state somewhere else: numbers of [`Physics::state`], and the memory there. It may put that state to
+    /// look at it: the world puts the present one back.
     fn aim(&mut self, physics: &mut Physics, state: &[f64], memory: &[f64]) -> Result<()>;
 
     /// Chooses a reachable goal that is not reached. It may use the physics to find one: the world puts the state back.
@@ -206,8 +209,10 @@ fn cameras(model: &MjModel, default: Camera) -> Vec<(String, Camera)> {
     };
     let mut all: Vec<_> = (0..count).map(|place| (name(place), Camera::Fixed(place))).collect();
     all.push(("free".to_owned(), Camera::Free));
-    let first = all.iter().position(|(_, camera)| *camera == default).unwrap_or(0);
-    all[..=first].rotate_right(1);
+    match all.iter().position(|(_, camera)| *camera == default) {
+        Some(first) => all[..=first].rotate_right(1),
+        None => all.insert(0, ("default".to_owned(), default)),
+    }
     all
 }
 
@@ -230,6 +235,7 @@ impl<T: Task> Env for World<T> {
 
     fn reset(&mut self, seed: u64, options: &ResetOptions) -> Result<()> {
         self.arrange(self.spec.variation_space.resolve(&options.variation, Key::new(seed))?)?;
+        self.task.heed(&options.variation);
         self.begin(seed)?;
         if let Some(state) = &options.state {
             self.put(state)?;

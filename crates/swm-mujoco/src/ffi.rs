@@ -3,7 +3,9 @@
 //! `mujoco-rs` declares them `extern "C"`, through which nothing may unwind.
 #![allow(unsafe_code, reason = "declarations of foreign functions")]
 
-use mujoco_rs::mujoco_c::{mjData, mjModel, mjrContext, mjrRect, mjvCamera, mjvOption, mjvPerturb, mjvScene};
+use mujoco_rs::mujoco_c::{
+    mjContact, mjData, mjModel, mjrContext, mjrRect, mjvCamera, mjvOption, mjvPerturb, mjvScene,
+};
 use std::ffi::c_int;
 
 unsafe extern "C-unwind" {
@@ -14,6 +16,30 @@ unsafe extern "C-unwind" {
     pub fn mj_forward(m: *const mjModel, d: *mut mjData);
     pub fn mj_resetData(m: *const mjModel, d: *mut mjData);
     pub fn mj_setConst(m: *mut mjModel, d: *mut mjData);
+    pub fn mj_checkPos(m: *const mjModel, d: *mut mjData);
+    pub fn mj_checkVel(m: *const mjModel, d: *mut mjData);
+    pub fn mj_checkAcc(m: *const mjModel, d: *mut mjData);
+    pub fn mj_kinematics(m: *const mjModel, d: *mut mjData);
+    pub fn mj_comPos(m: *const mjModel, d: *mut mjData);
+    pub fn mj_camlight(m: *const mjModel, d: *mut mjData);
+    pub fn mj_flex(m: *const mjModel, d: *mut mjData);
+    pub fn mj_tendon(m: *const mjModel, d: *mut mjData);
+    pub fn mj_makeM(m: *const mjModel, d: *mut mjData);
+    pub fn mj_factorM(m: *const mjModel, d: *mut mjData);
+    pub fn mj_collision(m: *const mjModel, d: *mut mjData);
+    pub fn mj_addContact(m: *const mjModel, d: *mut mjData, con: *const mjContact) -> c_int;
+    pub fn mj_makeConstraint(m: *const mjModel, d: *mut mjData);
+    pub fn mj_island(m: *const mjModel, d: *mut mjData);
+    pub fn mj_projectConstraint(m: *const mjModel, d: *mut mjData);
+    pub fn mj_transmission(m: *const mjModel, d: *mut mjData);
+    pub fn mj_sensorPos(m: *const mjModel, d: *mut mjData);
+    pub fn mj_fwdVelocity(m: *const mjModel, d: *mut mjData);
+    pub fn mj_sensorVel(m: *const mjModel, d: *mut mjData);
+    pub fn mj_fwdActuation(m: *const mjModel, d: *mut mjData);
+    pub fn mj_fwdAcceleration(m: *const mjModel, d: *mut mjData);
+    pub fn mj_fwdConstraint(m: *const mjModel, d: *mut mjData);
+    pub fn mj_sensorAcc(m: *const mjModel, d: *mut mjData);
+    pub fn mj_Euler(m: *const mjModel, d: *mut mjData);
     pub fn mj_copyModel(dest: *mut mjModel, src: *const mjModel) -> *mut mjModel;
 
     pub fn mjv_updateScene(

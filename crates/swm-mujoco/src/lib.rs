@@ -9,14 +9,21 @@
 pub mod assets;
 pub mod dmc;
 mod env;
+pub mod fetch;
 mod ffi;
 pub mod link;
+pub mod ogbench;
 pub mod physics;
 pub mod render;
 
 pub use physics::Physics;
 
+use swm_core::registry::join;
 use swm_core::{EnvEntry, Registry};
 
-/// Every environment of this crate. (M3: add `pub mod ogbench;` above and your rows here yourself.)
-pub static ENVS: Registry<EnvEntry> = Registry { kind: "environment", hint: "`swm envs` lists them", rows: &dmc::ENTRIES };
+/// Every environment of this crate.
+pub static ENVS: Registry<EnvEntry> = Registry {
+    kind: "environment",
+    hint: "`swm envs` lists them",
+    rows: &join::<_, 26>(&join::<_, 24>(&dmc::ENTRIES, &fetch::ENTRIES), &ogbench::ENTRIES),
+};

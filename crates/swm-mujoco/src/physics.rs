@@ -9,12 +9,17 @@
 
 use crate::render::Look;
 use crate::{ffi, link};
-use mujoco_rs::mujoco_c::{mjData, mjModel, mjtDisableBit, mjtIntegrator, mjtState, mjtWarning};
+use mujoco_rs::mujoco_c::{
+    mj_jacSite, mjContact, mjData, mjModel, mjNEQDATA, mjtConstraint, mjtDisableBit, mjtEq, mjtIntegrator, mjtState,
+    mjtWarning,
+};
 use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
+use mujoco_rs::wrappers::mj_model::MjtObjBase;
 use mujoco_rs::wrappers::{MjData, MjModel};
 use std::collections::BTreeMap;
 use std::hash::{DefaultHasher, Hasher};
 use std::path::Path;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 use swm_core::{Error, Result};
 
@@ -73,6 +78,24 @@ pub fn shared(name: &str, compile: impl FnOnce() -> Result<MjModel>) -> Result<A
     Ok(model)
 }
 
+/// Edits the numbers of every weld of a model: anchor, relative place, relative turn, torque scale.
+pub(crate) fn edit_welds(model: &mut MjModel, edit: impl Fn(&mut [f64; mjNEQDATA as usize])) {
+    let welds: Vec<bool> = model.eq_type().iter().map(|kind| *kind == mjtEq::mjEQ_WELD).collect();
+    // SAFETY: the data of welds holds no places of anything else.
+    let data = unsafe { model.eq_data_mut() };
+    data.iter_mut().zip(welds).filter(|(_, weld)| *weld).for_each(|(data, _)| edit(data));
+}
+
+/// An array that MuJoCo keeps.
+///
+/// # Safety
+/// There must be `count` values, and they must not change while they are borrowed.
+unsafe fn array<'a, T>(first: *const T, count: i32) -> &'a [T] {
+    let count = usize::try_from(count).unwrap_or(0);
+    // SAFETY: the caller's promise; where there is none, there is nothing to point to.
+    if first.is_null() || count == 0 { &[] } else { unsafe { std::slice::from_raw_parts(first, count) } }
+}
+
 /// A state of a model, at its beginning.
 fn make_data(model: Box<MjModel>) -> Result<MjData<Box<MjModel>>> {
     MjData::try_new(model).map_err(|error| Error::external("making a MuJoCo state", error))
@@ -80,19 +103,17 @@ fn make_data(model: Box<MjModel>) -> Result<MjData<Box<MjModel>>> {
 
 /// A number for an original model, never given to another one while the process lives.
 fn group_of(original: &Arc<MjModel>) -> u64 {
-    /// The models that have numbers, and the next number. A weak pointer keeps its address from being used again.
-    static GROUPS: Mutex<(Vec<(Weak<MjModel>, u64)>, u64)> = Mutex::new((Vec::new(), 0));
+    /// The models that have numbers, by number. A weak pointer keeps its address from being used again.
+    static GROUPS: Mutex<BTreeMap<u64, Weak<MjModel>>> = Mutex::new(BTreeMap::new());
+    static NEXT: AtomicU64 = AtomicU64::new(0);
     let mut groups = GROUPS.lock().unwrap_or_else(PoisonError::into_inner);
-    let (known, next) = &mut *groups;
-    known.retain(|(model, _)| model.strong_count() > 0);
-    match known.iter().find(|(model, _)| model.as_ptr() == Arc::as_ptr(original)) {
-        Some((_, number)) => *number,
-        None => {
-            known.push((Arc::downgrade(original), *next));
-            *next += 1;
-            *next - 1
-        }
-    }
+    groups.retain(|_, model| model.strong_count() > 0);
+    let known = groups.iter().find(|(_, model)| model.as_ptr() == Arc::as_ptr(original)).map(|(number, _)| *number);
+    known.unwrap_or_else(|| {
+        let number = NEXT.fetch_add(1, Ordering::Relaxed);
+        groups.insert(number, Arc::downgrade(original));
+        number
+    })
 }
 
 /// The bytes of a texture.
@@ -100,6 +121,17 @@ fn texture(model: &MjModel, place: usize) -> &[u8] {
     let begin = usize::try_from(model.tex_adr()[place]).unwrap_or(0);
     let end = model.tex_adr().get(place + 1).map_or(model.tex_data().len(), |&next| usize::try_from(next).unwrap_or(0));
     &model.tex_data()[begin..end]
+}
+
+/// The place of a named thing in a model.
+///
+/// # Errors
+/// When the model has none of that name.
+pub fn place(model: &MjModel, kind: MjtObjBase, name: &str) -> Result<usize> {
+    model.name_to_id(kind, name).ok_or_else(|| {
+        let known = (0..).map_while(|i| model.id_to_name(kind, i));
+        Error::unknown("part of a MuJoCo model", name, known, "the model is not the one this program was written for")
+    })
 }
 
 /// How the quantities derived from the state (poses, velocities, sensors) came about: what [`Physics::load`] repeats.
@@ -116,6 +148,31 @@ enum Settled {
     Control,
 }
 
+/// Places and orientations (row after row) of all geoms.
+pub(crate) type Poses<'a> = (&'a [[f64; 3]], &'a [[f64; 9]]);
+
+/// An equality constraint's row, as it is when its reference acceleration is due.
+pub(crate) struct Row {
+    /// Stiffness, damping, impedance, and the impedance's slope.
+    pub kbip: [f64; 4],
+    /// How far it is violated.
+    pub position: f64,
+    /// From where on it acts.
+    pub margin: f64,
+    /// How fast.
+    pub velocity: f64,
+}
+
+/// Takes part in every time step, between the stages MuJoCo goes through. For worlds without activations, flexes and tendons,
+/// integrated by Euler's method.
+pub(crate) trait Stages: Send + Sync {
+    /// Given the contacts that were found, those of a pair of geoms in a row, appends the contacts there should be.
+    fn collided(&self, model: &MjModel, poses: Poses<'_>, found: &[mjContact], contacts: &mut Vec<mjContact>);
+
+    /// The reference acceleration of an equality constraint.
+    fn referred(&self, row: &Row) -> f64;
+}
+
 /// A model and its state.
 pub struct Physics {
     data: MjData<Box<MjModel>>,
@@ -124,6 +181,9 @@ pub struct Physics {
     before: Vec<f64>,
     settled: Settled,
     unstable: bool,
+    stages: Option<Arc<dyn Stages>>,
+    /// Reused for contacts between stages.
+    contacts: Vec<mjContact>,
     /// Whether the model differs from the original.
     edited: bool,
     look: Look,
@@ -145,6 +205,8 @@ impl Physics {
             data: make_data(copy)?,
             settled: Settled::Forward,
             unstable: false,
+            stages: None,
+            contacts: vec![],
             edited: false,
             look: Look { group: group_of(&original), textures: vec![0; original.tex_adr().len()].into() },
             repainted: false,
@@ -266,9 +328,7 @@ impl Physics {
     /// Lets `steps` time steps pass, at least one, each `mj_step`: derived quantities lag the state by one step, as in Gymnasium.
     pub fn step(&mut self, steps: usize) {
         for _ in 1..steps {
-            let (model, data) = self.raw();
-            // SAFETY: both are valid and belong to each other.
-            self.guarded("stepping", || unsafe { ffi::mj_step(model, data) });
+            self.whole_step();
         }
         self.note(Settled::Step);
         self.settle();
@@ -326,12 +386,96 @@ impl Physics {
                 ffi::mj_forward(model, data);
                 (*model).opt.disableflags = flags;
             }),
-            Settled::Step => self.guarded("stepping", || unsafe { ffi::mj_step(model, data) }),
+            Settled::Step => self.whole_step(),
             Settled::Control => self.guarded("stepping", || unsafe {
                 ffi::mj_step(model, data);
                 ffi::mj_step1(model, data);
             }),
         };
+    }
+
+    /// One time step.
+    fn whole_step(&mut self) -> Option<()> {
+        let (model, data) = self.raw();
+        let Some(stages) = self.stages.clone() else {
+            // SAFETY: both are valid and belong to each other.
+            return self.guarded("stepping", || unsafe { ffi::mj_step(model, data) });
+        };
+        // SAFETY: as above; the stages are those of `mj_step`, in their order.
+        self.guarded("stepping", || unsafe {
+            ffi::mj_checkPos(model, data);
+            ffi::mj_checkVel(model, data);
+        })?;
+        self.staged(&*stages)?;
+        // SAFETY: as above.
+        self.guarded("stepping", || unsafe {
+            ffi::mj_checkAcc(model, data);
+            ffi::mj_Euler(model, data);
+        })
+    }
+
+    /// What `mj_forward` does, with somebody taking part between the stages.
+    fn staged(&mut self, stages: &dyn Stages) -> Option<()> {
+        let (model, data) = self.raw();
+        // SAFETY, here and below: model and data are valid and belong to each other; stages come in the order of `mj_forward`.
+        self.guarded("computing poses", || unsafe {
+            ffi::mj_kinematics(model, data);
+            ffi::mj_comPos(model, data);
+            ffi::mj_camlight(model, data);
+            ffi::mj_flex(model, data);
+            ffi::mj_tendon(model, data);
+            ffi::mj_makeM(model, data);
+            ffi::mj_factorM(model, data);
+            ffi::mj_collision(model, data);
+        })?;
+        self.contacts.clear();
+        let poses = (self.data.geom_xpos(), self.data.geom_xmat());
+        // SAFETY: there are as many contacts as it says.
+        let found = unsafe { array((*data).contact, (*data).ncon) };
+        stages.collided(self.data.model(), poses, found, &mut self.contacts);
+        let contacts = std::mem::take(&mut self.contacts);
+        let done = self.guarded("computing constraints", || unsafe {
+            // Those that fit take the places of those that were found; MuJoCo makes room for others.
+            let found = usize::try_from((*data).ncon).unwrap_or(0);
+            let (fitting, more) = contacts.split_at(contacts.len().min(found));
+            for (place, contact) in fitting.iter().enumerate() {
+                (*data).contact.add(place).write(contact.clone());
+            }
+            (*data).ncon = i32::try_from(fitting.len()).unwrap_or(0);
+            for contact in more {
+                ffi::mj_addContact(model, data, contact);
+            }
+            ffi::mj_makeConstraint(model, data);
+            ffi::mj_island(model, data);
+            ffi::mj_projectConstraint(model, data);
+            ffi::mj_transmission(model, data);
+            ffi::mj_sensorPos(model, data);
+            ffi::mj_fwdVelocity(model, data);
+            ffi::mj_sensorVel(model, data);
+            for (row, kind) in array((*data).efc_type, (*data).nefc).iter().enumerate() {
+                if *kind == mjtConstraint::mjCNSTR_EQUALITY as i32 {
+                    let at = |numbers: *mut f64| *numbers.add(row);
+                    let row_now = Row {
+                        kbip: *(*data).efc_KBIP.add(4 * row).cast(),
+                        position: at((*data).efc_pos),
+                        margin: at((*data).efc_margin),
+                        velocity: at((*data).efc_vel),
+                    };
+                    *(*data).efc_aref.add(row) = stages.referred(&row_now);
+                }
+            }
+            ffi::mj_fwdActuation(model, data);
+            ffi::mj_fwdAcceleration(model, data);
+            ffi::mj_fwdConstraint(model, data);
+            ffi::mj_sensorAcc(model, data);
+        });
+        self.contacts = contacts;
+        done
+    }
+
+    /// Lets somebody take part in every time step from now on.
+    pub(crate) fn attend(&mut self, stages: Arc<dyn Stages>) {
+        self.stages = Some(stages);
     }
 
     /// The pointers MuJoCo wants.
@@ -365,6 +509,42 @@ impl Physics {
     /// Whether the numbers ran away since the last reset.
     pub fn is_unstable(&self) -> bool {
         self.unstable
+    }
+
+    /// Draws a geom in a colour of its own from now on, not in that of its material.
+    pub(crate) fn paint(&mut self, geom: usize, rgb: [f32; 3]) {
+        let model = self.model_mut();
+        model.geom_rgba_mut()[geom][..3].copy_from_slice(&rgb);
+        // SAFETY: -1 says that there is no material.
+        unsafe { model.geom_matid_mut()[geom] = -1 };
+    }
+
+    /// Linear and angular velocity of a site, in metres and radians a second: its Jacobian, at the poses as they were
+    /// derived, times the present `qvel`.
+    pub fn site_velocity(&self, site: usize) -> ([f64; 3], [f64; 3]) {
+        let velocities = self.data.qvel();
+        let mut here = [0.0; 6 * 32];
+        let mut there = vec![];
+        let jacobian = match here.get_mut(..6 * velocities.len()) {
+            Some(here) => here,
+            None => {
+                there.resize(6 * velocities.len(), 0.0);
+                &mut there[..]
+            }
+        };
+        let (linear, angular) = jacobian.split_at_mut(3 * velocities.len());
+        // SAFETY: there is room for two matrices of three rows, and the model knows the site.
+        unsafe {
+            let site = i32::try_from(site).unwrap_or(0);
+            mj_jacSite(self.model().ffi(), self.data.ffi(), linear.as_mut_ptr(), angular.as_mut_ptr(), site);
+        }
+        let times = |matrix: &[f64]| {
+            std::array::from_fn(|i| {
+                let row = &matrix[i * velocities.len()..(i + 1) * velocities.len()];
+                row.iter().zip(velocities).map(|(a, b)| a * b).sum()
+            })
+        };
+        (times(linear), times(angular))
     }
 
     /// Numbers of [`Physics::state`].

@@ -15,10 +15,21 @@ use std::sync::{Arc, OnceLock};
 use swm_core::{Error, Result};
 
 /// From where a world is seen.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Camera {
     /// The free camera, where the model puts it at first.
     Free,
+    /// A camera around a place.
+    Orbit {
+        /// The place, in metres.
+        lookat: [f64; 3],
+        /// Metres from it.
+        distance: f64,
+        /// Degrees around the vertical.
+        azimuth: f64,
+        /// Degrees above the horizon, negative when the camera looks down.
+        elevation: f64,
+    },
     /// A camera of the model, by its place.
     Fixed(usize),
 }

@@ -62,6 +62,12 @@ impl Stage {
                 self.camera.type_ = mjtCamera::mjCAMERA_FREE as i32;
                 self.camera.fixedcamid = -1;
             }
+            Camera::Orbit { lookat, distance, azimuth, elevation } => {
+                self.camera.type_ = mjtCamera::mjCAMERA_FREE as i32;
+                self.camera.fixedcamid = -1;
+                self.camera.lookat = lookat;
+                (self.camera.distance, self.camera.azimuth, self.camera.elevation) = (distance, azimuth, elevation);
+            }
         }
         let (model, data) = physics.raw();
         // SAFETY: model and data belong to each other; the scene was made for models of these sizes.

@@ -1,0 +1,251 @@
+//! Every recorded rollout of a MuJoCo world, step by step: states, observations, rewards, infos, and the first and last
+//! picture. Reads `SWM_GOLDEN` and the folder beside this test.
+
+use crate::recorded::{self, Golden, picture_difference};
+use std::collections::BTreeMap;
+use std::path::Path;
+use swm_core::{Action, Batch, Env, FrameMut, ResetOptions, Schema, VariationRequest};
+use swm_mujoco::ENVS;
+
+/// What is peculiar to the recordings of a family of worlds.
+struct Family {
+    /// How the names of its ids go on behind `swm/`, or end.
+    named: fn(&str) -> bool,
+    /// How far numbers may be apart, relative to those above 1.
+    tolerance: f64,
+    /// The factors that reached the model when this was recorded.
+    factors: fn(&str, VariationRequest) -> VariationRequest,
+    /// Fills in what the task remembers, at the start: its part of the `state` column.
+    memory: fn(&mut Golden, &mut [f64]),
+    /// Seconds of a step: velocities of joints are compared as distances in this time.
+    step: f64,
+    /// Rows of the recording that can be compared.
+    until: fn(&str, &mut Golden) -> usize,
+    /// Names of infos that are called differently here.
+    renamed: &'static [(&'static str, &'static str)],
+}
+
+const FAMILIES: &[Family] = &[Family {
+    named: |id| id.starts_with("swm/Fetch"),
+    // Recorded with MuJoCo 3.3.2.
+    tolerance: 1e-4,
+    // Asked to vary `all`, the reference samples every factor and applies none but this: it looks for their keys in the list.
+    factors: |file, mut request| {
+        if file.contains("-all-") {
+            request.variation_values.retain(|key, _| key == "block.mass");
+        }
+        request
+    },
+    memory: |golden, memory| memory.copy_from_slice(&golden.numbers("info.goal_state")[..3]),
+    step: 0.04,
+    until: fetch_until,
+    renamed: &[("state", "observation")],
+}];
+
+/// All rows, but of Slide those before the gripper touches the puck: a cylinder's contacts are found by iteration, whose last
+/// digits are another version's, and a strike makes them centimetres.
+fn fetch_until(file: &str, golden: &mut Golden) -> usize {
+    let known = golden.numbers("info.proprio");
+    // The puck's velocity is given relative to the gripper's, in metres per action.
+    let speeds: Vec<f64> = known.chunks_exact(25).map(|row| (row[14] + row[20]).hypot(row[15] + row[21])).collect();
+    match file.contains("FetchSlide") {
+        true => speeds.windows(2).position(|pair| pair[1] - pair[0] > 5e-3).map_or(usize::MAX, |before| before + 1),
+        false => usize::MAX,
+    }
+}
+
+/// Infos that are no columns of the world: its name, and success, which the pool writes.
+const NO_COLUMNS: [&str; 3] = ["env_name", "success", "is_success"];
+
+/// Mean absolute difference of pictures, of 255.
+const PICTURES: f64 = 3.0;
+
+/// The parts of the physics in the `state` column, as recorded.
+const START: [&str; 9] =
+    ["time", "qpos", "qvel", "act", "qacc_warmstart", "ctrl", "eq_active", "mocap_pos", "mocap_quat"];
+
+#[test]
+fn rollouts_follow_the_reference() {
+    let mut problems = vec![];
+    for family in FAMILIES {
+        let mut compared = 0;
+        for row in ENVS.rows.iter().filter(|row| (family.named)(row.id)) {
+            for file in recorded::files(&format!("{}-", row.id.replace('/', "_"))) {
+                compared += 1;
+                let env = row.env().unwrap_or_else(|error| panic!("{}: {error}", row.id));
+                problems.extend(Comparison::new(family, env, &file).run());
+            }
+        }
+        assert!(compared > 0, "no rollouts of a family are there");
+    }
+    assert!(problems.is_empty(), "{}", problems.join("\n"));
+}
+
+/// The largest difference of one array, and where.
+#[derive(Clone, Copy)]
+struct Apart {
+    by: f64,
+    step: usize,
+}
+
+struct Comparison<'a> {
+    family: &'a Family,
+    name: String,
+    env: Box<dyn Env>,
+    row: Batch,
+    golden: Golden,
+    apart: BTreeMap<String, Apart>,
+}
+
+impl<'a> Comparison<'a> {
+    fn new(family: &'a Family, env: Box<dyn Env>, file: &Path) -> Self {
+        let row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
+        let name = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        Self { family, name, env, row, golden: Golden::open(file), apart: BTreeMap::new() }
+    }
+
+    /// Plays the rollout; a sentence for each array that is too far away.
+    fn run(mut self) -> Vec<String> {
+        let names = self.golden.names();
+        let variation = (self.family.factors)(&self.name, self.golden.variation());
+        let mut options = ResetOptions { variation, ..ResetOptions::default() };
+        self.env.reset(0, &options).unwrap_or_else(|error| panic!("{}: {error}", self.name));
+        options.state = Some(self.start(&names));
+        self.env.reset(0, &options).unwrap_or_else(|error| panic!("{}: {error}", self.name));
+
+        let infos: Vec<(String, Vec<f64>)> = names
+            .iter()
+            .filter_map(|array| array.strip_prefix("info."))
+            .filter(|info| !NO_COLUMNS.contains(info))
+            .map(|info| (info.to_owned(), self.golden.numbers(&format!("info.{info}"))))
+            .collect();
+        let sights: Vec<(String, Vec<f64>)> = names
+            .iter()
+            .filter(|array| *array == "obs" || array.starts_with("obs."))
+            .map(|array| (array.clone(), self.golden.numbers(array)))
+            .collect();
+        let positions = self.golden.numbers("qpos_qvel");
+        let (rewards, endings) = (self.golden.numbers("reward"), self.golden.numbers("terminated"));
+        let n = self.env.spec().action_dim();
+        let actions: Vec<f32> = self.golden.numbers("action").iter().map(|&a| a as f32).collect();
+
+        let pose = positions.len() / (rewards.len() + 1);
+        let until = (self.family.until)(&self.name, &mut self.golden);
+        self.picture("frame_first", &names);
+        for step in 0..=rewards.len() {
+            self.env.observe(&mut self.row.row_mut(0));
+            let compared = step < until;
+            if compared {
+                self.poses(step, &positions[step * pose..(step + 1) * pose]);
+            }
+            for (info, recorded) in infos.iter().filter(|_| compared) {
+                let renamed = self.family.renamed.iter().find(|(theirs, _)| theirs == info);
+                let ours = self.column(renamed.map_or(info, |(_, ours)| ours));
+                self.note(info, step, &ours, recorded);
+            }
+            for (array, recorded) in sights.iter().filter(|_| compared) {
+                let ours = self.seen(array.strip_prefix("obs."));
+                self.note(array, step, &ours, recorded);
+            }
+            let Some(&reward) = rewards.get(step) else { break };
+            let action = Action::Continuous(&actions[step * n..(step + 1) * n]);
+            let transition = self.env.step(action).unwrap_or_else(|error| panic!("{}: {error}", self.name));
+            if step + 1 < until {
+                self.apart_at("reward", step, (transition.reward - reward).abs() / reward.abs().max(1.0));
+                let ended = (f64::from(u8::from(transition.terminated)) - endings[step]).abs();
+                self.apart_at("terminated", step, ended);
+            }
+        }
+        self.picture("frame_last", &names);
+        let limit = |array: &str| if array.starts_with("frame") { PICTURES } else { self.family.tolerance };
+        let worst = self.apart.iter().map(|(array, apart)| format!("{array} {:.1e}", apart.by));
+        let rows = until.min(rewards.len() + 1);
+        eprintln!("{}, {rows} rows: {}", self.name, worst.collect::<Vec<_>>().join(", "));
+        self.apart
+            .iter()
+            .filter(|(array, apart)| apart.by.is_nan() || apart.by > limit(array))
+            .map(|(array, apart)| format!("{}: {array} is {:.2e} away at step {}", self.name, apart.by, apart.step))
+            .collect()
+    }
+
+    /// The recorded start as a `state` column.
+    fn start(&mut self, names: &[String]) -> Vec<f64> {
+        self.env.observe(&mut self.row.row_mut(0));
+        let mut state = self.column("state");
+        let mut physics = vec![];
+        for part in START {
+            let array = format!("start.{part}");
+            if names.contains(&array) {
+                physics.extend(self.golden.numbers(&array));
+            } else if part == "qacc_warmstart" || part == "qvel" {
+                panic!("{} lacks {array}", self.name);
+            }
+        }
+        let (head, memory) = state.split_at_mut(physics.len());
+        head.copy_from_slice(&physics);
+        (self.family.memory)(&mut self.golden, memory);
+        state
+    }
+
+    fn column(&self, name: &str) -> Vec<f64> {
+        self.row.row(0).to_f64(name).unwrap_or_else(|error| panic!("{}: {error}", self.name))
+    }
+
+    /// What an agent observes: one part of it, or all in their order.
+    fn seen(&self, part: Option<&str>) -> Vec<f64> {
+        let parts: Vec<&str> = match part {
+            Some(part) => vec![part],
+            None => self.env.spec().observation_space.iter().map(|(name, _)| *name).collect(),
+        };
+        parts.into_iter().flat_map(|part| self.column(part)).collect()
+    }
+
+    /// Compares coordinates, and velocities as distances in a step.
+    fn poses(&mut self, step: usize, theirs: &[f64]) {
+        let coordinates = self.golden.numbers("start.qpos").len();
+        let scaled = |all: &[f64]| -> Vec<f64> {
+            let scale = |i| if i < coordinates { 1.0 } else { self.family.step };
+            all.iter().enumerate().map(|(i, x)| x * scale(i)).collect()
+        };
+        let (ours, theirs) = (scaled(&self.column("state")[1..=theirs.len()]), scaled(theirs));
+        self.note("qpos_qvel", step, &ours, &[vec![0.0; step * ours.len()], theirs].concat());
+    }
+
+    /// Compares the numbers of a step.
+    fn note(&mut self, array: &str, step: usize, ours: &[f64], recorded: &[f64]) {
+        let Some(theirs) = recorded.get(step * ours.len()..(step + 1) * ours.len()) else {
+            return self.apart_at(array, step, f64::NAN);
+        };
+        let apart = |(a, b): (&f64, &f64)| match (a.is_nan(), b.is_nan()) {
+            (true, true) => 0.0,
+            _ => (a - b).abs() / b.abs().max(1.0),
+        };
+        let most = ours.iter().zip(theirs).map(apart).fold(0.0, |a: f64, b| if b.is_nan() { b } else { a.max(b) });
+        self.apart_at(array, step, most);
+    }
+
+    fn apart_at(&mut self, array: &str, step: usize, by: f64) {
+        let known = self.apart.entry(array.to_owned()).or_insert(Apart { by, step });
+        if by.is_nan() || by > known.by {
+            *known = Apart { by, step };
+        }
+    }
+
+    fn picture(&mut self, array: &str, names: &[String]) {
+        if names.iter().any(|name| name == array) {
+            let (height, width, wanted) = self.golden.picture(array);
+            let mut rgb = vec![0; wanted.len()];
+            self.env.render(FrameMut::new(width, height, &mut rgb)).unwrap_or_else(|error| panic!("{error}"));
+            if let Some(folder) = std::env::var_os("SWM_GOLDEN_PICTURES") {
+                let file = Path::new(&folder).join(format!("{}-{array}.png", self.name));
+                let both: Vec<u8> =
+                    wanted.chunks(3 * width).zip(rgb.chunks(3 * width)).flat_map(|(a, b)| [a, b].concat()).collect();
+                let out = std::fs::File::create(file).expect("a file");
+                let mut encoder = png::Encoder::new(out, 2 * width as u32, height as u32);
+                encoder.set_color(png::ColorType::Rgb);
+                encoder.write_header().expect("a header").write_image_data(&both).expect("a picture");
+            }
+            self.apart_at(array, 0, picture_difference(&rgb, &wanted));
+        }
+    }
+}

@@ -97,6 +97,16 @@ fn single(number: f64) -> f64 {
 }
 
 impl Edit<'_> {
+    /// Makes the textures that no factor changes so small that painting them takes no time.
+    pub fn shrink_sky(&mut self) {
+        for name in ["skybox", "background", "ball"] {
+            if let Some(texture) = self.spec.texture_mut(name) {
+                texture.set_width(1);
+                texture.set_height(1);
+            }
+        }
+    }
+
     /// What all worlds have: the colours of floor and agent, and a lamp.
     #[allow(clippy::cast_possible_truncation)]
     pub fn scene(&mut self, lamp: &str) -> Result<()> {

@@ -1,6 +1,7 @@
 //! The task of any [`Domain`], in the physics that all worlds share.
 
 use super::Domain;
+use super::adopt::adopt;
 use super::blueprint::Blueprint;
 use super::goal::Coordinates;
 use crate::Physics;
@@ -63,8 +64,6 @@ pub struct Control<D: Domain> {
     coordinates: Coordinates,
     /// The controls that the actions -1 and 1 stand for.
     ranges: Vec<[f64; 2]>,
-    /// The model where every factor has its default.
-    usual: Arc<MjModel>,
     /// All rewards of the episode, added.
     score: f64,
     /// Where the task's target is.
@@ -130,7 +129,6 @@ pub(super) fn parts<D: Domain>(choice: &EnvChoice) -> Result<(EnvSpec, Arc<MjMod
         blueprint,
         coordinates,
         ranges,
-        usual: Arc::clone(&model),
         score: 0.0,
         target: vec![0.0; D::TARGET],
         goal: vec![0.0; nq + nv],
@@ -139,6 +137,16 @@ pub(super) fn parts<D: Domain>(choice: &EnvChoice) -> Result<(EnvSpec, Arc<MjMod
 }
 
 impl<D: Domain> Control<D> {
+    /// Compiles the model of these factors; without its sky, all but at once.
+    pub(super) fn compile(&self, factors: &FactorValues, sky: bool) -> Result<MjModel> {
+        self.blueprint.compile(factors, |edit| {
+            if !sky {
+                edit.shrink_sky();
+            }
+            D::edit(edit, self.task)
+        })
+    }
+
     /// Holds an action, in double precision.
     pub(super) fn hold(&mut self, physics: &mut Physics, action: impl Iterator<Item = f64>) -> Step {
         for ((control, &[low, high]), action) in physics.data_mut().ctrl_mut().iter_mut().zip(&self.ranges).zip(action)
@@ -158,10 +166,10 @@ impl<D: Domain> Control<D> {
         Step { reward, terminated }
     }
 
-    /// Where random actions lead within some steps, if that is somewhere new.
-    fn wander(&mut self, physics: &mut Physics, rng: &mut Rng) -> bool {
+    /// Where random actions lead within some steps: `qpos` and `qvel`, if that is somewhere new where the world can stay.
+    fn wander(&self, physics: &mut Physics, rng: &mut Rng) -> Option<Vec<f64>> {
         let from = physics.data().qpos().to_vec();
-        let (score, mut left) = (self.score, 0);
+        let mut left = 0;
         for _ in 0..rng.random_range(GOAL_STEPS) {
             // An action is held for some steps: random ones in each step would cancel out.
             if left == 0 {
@@ -173,16 +181,10 @@ impl<D: Domain> Control<D> {
             left -= 1;
             physics.step_control(D::SUBSTEPS * REPEAT);
         }
-        self.score = score;
-        self.goal.clear();
-        self.goal.extend_from_slice(physics.data().qpos());
-        self.goal.extend_from_slice(physics.data().qvel());
-        !physics.is_unstable() && !self.near(physics, &from)
-    }
-
-    /// Whether a configuration is as near to the goal as it must be.
-    fn near(&self, physics: &Physics, qpos: &[f64]) -> bool {
-        self.coordinates.reached(qpos, &self.goal[..physics.data().qpos().len()], D::NEAR)
+        let there = physics.data().qpos();
+        let new = !self.coordinates.reached(&from, there, D::NEAR);
+        let fine = new && self.coordinates.can_stay(there, D::NEAR / 2.0) && !physics.is_unstable();
+        fine.then(|| [there, physics.data().qvel()].concat())
     }
 
     /// Takes walks until one leads to a new goal.
@@ -190,7 +192,8 @@ impl<D: Domain> Control<D> {
         let mut here = vec![];
         physics.save(&mut here);
         for attempt in 0..GOAL_TRIES {
-            if self.wander(physics, &mut key.at(attempt).rng()) {
+            if let Some(goal) = self.wander(physics, &mut key.at(attempt).rng()) {
+                self.goal = goal;
                 return Ok(());
             }
             physics.load(&here)?;
@@ -205,14 +208,12 @@ impl<D: Domain> Control<D> {
 
 impl<D: Domain> Task for Control<D> {
     fn arrange(&mut self, physics: &mut Physics, factors: &FactorValues) -> Result<()> {
-        let task = self.task;
-        let usual =
-            factors.factors().iter().zip(factors.iter()).all(|(factor, (_, value))| factor.init_value == *value);
-        if !usual {
-            physics.replace_model(Arc::new(self.blueprint.compile(factors, |edit| D::edit(edit, task))?))?;
-        } else if !Arc::ptr_eq(physics.original(), &self.usual) {
-            physics.replace_model(Arc::clone(&self.usual))?;
+        if factors.iter().zip(factors.factors()).all(|((_, value), factor)| *value == factor.init_value) {
+            physics.restore_model();
+        } else {
+            adopt(physics.model_mut(), &self.compile(factors, false)?)?;
         }
+        physics.repaint();
         self.domain.adapt(physics);
         Ok(())
     }
@@ -240,7 +241,7 @@ impl<D: Domain> Task for Control<D> {
         self.domain.target(physics, &mut self.target);
         self.goal.fill(0.0);
         let nq = physics.data().qpos().len();
-        if self.domain.destination(physics, &mut self.goal[..nq]) {
+        if self.domain.destination(physics, &mut self.goal[..nq]) && !self.is_success(physics) {
             return Ok(());
         }
         let mut here = vec![];
@@ -305,7 +306,8 @@ impl<D: Domain> Task for Control<D> {
 
     fn is_success(&self, physics: &Physics) -> bool {
         let qpos = physics.data().qpos();
-        self.domain.reached(physics, &self.goal[..qpos.len()]).unwrap_or_else(|| self.near(physics, qpos))
+        let goal = &self.goal[..qpos.len()];
+        self.domain.reached(physics, goal).unwrap_or_else(|| self.coordinates.reached(qpos, goal, D::NEAR))
     }
 
     fn goal_distance(&self, physics: &Physics) -> f64 {

@@ -16,31 +16,44 @@ enum Coordinate {
 }
 
 /// The coordinates that goals ask for.
-pub struct Coordinates(Vec<Coordinate>);
+pub struct Coordinates {
+    asked: Vec<Coordinate>,
+    /// Those of joints with limits, by their place in `qpos`, and the limits.
+    limits: Vec<(usize, [f64; 2])>,
+}
 
 impl Coordinates {
     /// Those of every joint that is not idle. Of a free body these are its height and its orientation: where it is on the
     /// floor is neither observed nor asked for.
     #[allow(clippy::cast_sign_loss)]
     pub fn new(model: &MjModel, idle: &[&str]) -> Self {
-        let mut all = vec![];
+        let (mut asked, mut limits) = (vec![], vec![]);
         for joint in 0..model.jnt_type().len() {
             if model.id_to_name(MjtObjBase::mjOBJ_JOINT, joint).is_some_and(|name| idle.contains(&name)) {
                 continue;
             }
             let at = model.jnt_qposadr()[joint] as usize;
+            if model.jnt_limited()[joint] {
+                limits.push((at, model.jnt_range()[joint]));
+            }
             match model.jnt_type()[joint] {
-                MjtJoint::mjJNT_FREE => all.extend([Coordinate::Number(at + 2), Coordinate::Turn(at + 3)]),
-                MjtJoint::mjJNT_HINGE if !model.jnt_limited()[joint] => all.push(Coordinate::Angle(at)),
-                _ => all.push(Coordinate::Number(at)),
+                MjtJoint::mjJNT_FREE => asked.extend([Coordinate::Number(at + 2), Coordinate::Turn(at + 3)]),
+                MjtJoint::mjJNT_HINGE if !model.jnt_limited()[joint] => asked.push(Coordinate::Angle(at)),
+                _ => asked.push(Coordinate::Number(at)),
             }
         }
-        Self(all)
+        Self { asked, limits }
+    }
+
+    /// Whether every joint is within its limits, or no more than this beyond. Limits give way: where a joint was thrown against
+    /// them it cannot stay.
+    pub fn can_stay(&self, qpos: &[f64], beyond: f64) -> bool {
+        self.limits.iter().all(|&(at, [low, high])| (low - beyond..=high + beyond).contains(&qpos[at]))
     }
 
     /// How far apart two configurations are in each coordinate, in radians or metres.
     fn differences<'a>(&'a self, here: &'a [f64], there: &'a [f64]) -> impl Iterator<Item = f64> + 'a {
-        self.0.iter().map(move |coordinate| match *coordinate {
+        self.asked.iter().map(move |coordinate| match *coordinate {
             Coordinate::Number(at) => (here[at] - there[at]).abs(),
             Coordinate::Angle(at) => ((here[at] - there[at] + PI).rem_euclid(2.0 * PI) - PI).abs(),
             Coordinate::Turn(at) => angle_between(&here[at..at + 4], &there[at..at + 4]),

@@ -4,6 +4,7 @@
 //! environment of any of them.
 
 mod acrobot;
+mod adopt;
 mod ball_in_cup;
 mod blueprint;
 mod cartpole;

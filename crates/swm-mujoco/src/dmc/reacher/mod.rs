@@ -1,5 +1,7 @@
 //! An arm of two links in a plane reaches for a target.
 
+mod expert;
+
 use super::blueprint::Edit;
 use super::env::Seen;
 use super::names::Names;
@@ -12,7 +14,7 @@ use std::f64::consts::PI;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
 /// The registry's row.
-pub const ENTRY: EnvEntry = entry::<Reacher>(&[]);
+pub const ENTRY: EnvEntry = entry::<Reacher>(expert::EXPERTS);
 
 /// Lengths of the links, from the shoulder to the wrist and on to the finger, in metres.
 const LINKS: [f64; 2] = [0.12, 0.12];

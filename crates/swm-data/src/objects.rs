@@ -8,12 +8,13 @@
 use crate::Location;
 use futures::FutureExt as _;
 use object_store::path::Path as StorePath;
-use object_store::{ObjectStore, ObjectStoreExt as _};
+use object_store::{ObjectStore, ObjectStoreExt as _, RetryConfig};
 use std::future::Future;
 use std::ops::Range;
 use std::panic::AssertUnwindSafe;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock, mpsc};
+use std::time::Duration;
 use swm_core::{Error, Result};
 use tokio::runtime::Runtime;
 use url::Url;
@@ -27,6 +28,11 @@ const GAP: u64 = 128 << 10;
 
 /// Requests in flight for one read.
 const REQUESTS: usize = 32;
+
+/// How long a store that does not answer is asked again: about six seconds in all.
+fn patience() -> RetryConfig {
+    RetryConfig { max_retries: 6, retry_timeout: Duration::from_secs(60), ..RetryConfig::default() }
+}
 
 /// Asynchronous code runs on two threads of its own, made at first use.
 fn runtime() -> Result<&'static Runtime> {
@@ -82,24 +88,24 @@ fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
         "s3" => {
             // An endpoint that says http:// means it.
             let builder = object_store::aws::AmazonS3Builder::from_env().with_url(url.as_str()).with_allow_http(true);
-            Ok(Arc::new(builder.build().map_err(wrong)?))
+            Ok(Arc::new(builder.with_retry(patience()).build().map_err(wrong)?))
         }
         #[cfg(feature = "gs")]
         "gs" => {
             let builder = object_store::gcp::GoogleCloudStorageBuilder::from_env().with_url(url.as_str());
-            Ok(Arc::new(builder.build().map_err(wrong)?))
+            Ok(Arc::new(builder.with_retry(patience()).build().map_err(wrong)?))
         }
         #[cfg(feature = "az")]
         "az" => {
             let builder = object_store::azure::MicrosoftAzureBuilder::from_env().with_url(url.as_str());
-            Ok(Arc::new(builder.with_allow_http(true).build().map_err(wrong)?))
+            Ok(Arc::new(builder.with_allow_http(true).with_retry(patience()).build().map_err(wrong)?))
         }
         #[cfg(feature = "http")]
         "http" | "https" => {
             let options = object_store::ClientOptions::new().with_allow_http(true);
             let server = &url[..url::Position::BeforePath];
             let builder = object_store::http::HttpBuilder::new().with_url(server).with_client_options(options);
-            Ok(Arc::new(builder.build().map_err(wrong)?))
+            Ok(Arc::new(builder.with_retry(patience()).build().map_err(wrong)?))
         }
         scheme => {
             let feature = if scheme == "https" { "http" } else { scheme };

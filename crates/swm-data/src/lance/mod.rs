@@ -16,12 +16,14 @@ mod encode;
 mod pictures;
 mod reader;
 mod record;
+mod salvage;
 mod schema;
 mod shard;
 mod store;
 mod table;
 mod writer;
 
+pub use salvage::salvage;
 pub use shard::{Shard, commit_shards, create_shard};
 
 use crate::format::Format;

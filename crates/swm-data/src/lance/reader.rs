@@ -9,7 +9,7 @@ use super::pictures::{Place, Places};
 use super::record::{CONSTANTS_KEY, ContentHash, EPISODES_KEY, Record};
 use super::schema::{self, EPISODE, Kind, STEP, StoredColumn};
 use super::store::{self, Store, damaged, wait};
-use crate::format::{Constants, Episode, Reader, StepRange};
+use crate::format::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::objects;
 use crate::{Location, image};
 use arrow_array::ArrayRef;
@@ -488,6 +488,33 @@ impl Reader for LanceReader {
             Kind::Numbers(_) => self.read_numbers(column, &mut wanted),
             Kind::Image => self.read_pictures(column, &mut wanted),
         }
+    }
+
+    /// Steps are numbered by their places here; what is stored should say the same. Where two episodes were written under one
+    /// number, it does not.
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
+        let mut found = vec![];
+        if self.table.schema.field(STEP).is_none() {
+            return Ok(found);
+        }
+        let (mut episode, mut expected, mut sound) = (0, 0, true);
+        for piece in self.pieces(STEP, slice::from_ref(&(0..self.rows())))? {
+            let mut steps = vec![0_i64; piece.rows];
+            whole_numbers(&piece.values, &mut steps)?;
+            for step in steps {
+                if step != expected && sound {
+                    let what = format!("the stored steps do not count up from 0: {step} stands in row {expected}");
+                    found.push(Irregularity { episode: Some(episode), what });
+                    sound = false;
+                }
+                expected += 1;
+                #[allow(clippy::cast_possible_wrap)]
+                if expected == self.episodes[episode].length as i64 {
+                    (episode, expected, sound) = (episode + 1, 0, true);
+                }
+            }
+        }
+        Ok(found)
     }
 
     fn manifest(&self) -> Option<Manifest> {

@@ -83,6 +83,7 @@ pub fn create_shard(
         return Err(Error::config("shard", problem, "parts are counted from 0"));
     }
     let store = Store::new(location)?;
+    store.check_writable()?;
     let version = store.latest()?;
     let mut columns = schema::columns_to_write(schema)?;
     let fresh = fresh(&columns, schema, &options)?;

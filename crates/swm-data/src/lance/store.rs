@@ -148,6 +148,18 @@ impl Store {
         Ok(Self { label: location.label(), remote: true, lists, base, objects: Arc::new(objects) })
     }
 
+    /// Checks that it is a place to write to.
+    ///
+    /// # Errors
+    /// When it is a web server's.
+    pub fn check_writable(&self) -> Result<()> {
+        if self.lists {
+            return Ok(());
+        }
+        let problem = format!("{} cannot be written: it is read over HTTP", self.label.display());
+        Err(Error::config("dataset", problem, "write to a path or to s3://, gs:// or az://"))
+    }
+
     /// The newest version; `None` where there is no table yet.
     ///
     /// # Errors

@@ -34,6 +34,7 @@ const WAITING: usize = 2;
 pub fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     options.codec.check()?;
     let store = Store::new(location)?;
+    store.check_writable()?;
     for _ in 0..TRIES {
         // Somebody else may make, continue or replace it at this moment: then there is another state to begin from.
         if let Some(begun) = begin(&store, schema, &options)? {

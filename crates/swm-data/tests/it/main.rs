@@ -15,6 +15,7 @@ mod lance;
 mod lance_shards;
 mod lance_video;
 mod loader;
+mod objects;
 mod preview;
 mod replay;
 mod sample;

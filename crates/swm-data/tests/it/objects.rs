@@ -1,0 +1,204 @@
+//! Datasets in object stores, against a real S3 server on loopback. A store's address and credentials are in the
+//! environment, so what uses it runs in processes of its own.
+
+use crate::sample::{check, episode, options, schema, write};
+use hyper_util::rt::{TokioExecutor, TokioIo};
+use s3s::auth::SimpleAuth;
+use s3s::service::S3ServiceBuilder;
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use swm_data::lance::{Shard, commit_shards, create_shard};
+use swm_data::objects::ObjectFile;
+use swm_data::{CommitPolicy, Constants, Location, StepRange, WriteMode, WriteOptions, create, open};
+
+/// Where a child process finds its dataset; only set for it.
+const TARGET: &str = "SWM_TEST_OBJECTS";
+const KEYS: [&str; 2] = ["AKEXAMPLE", "secret/example"];
+
+/// Serves the folders of a folder as buckets, to anybody or to those with the keys; gives its address. It ends with
+/// the program.
+fn serve(root: &Path, keys: bool) -> String {
+    let mut service = S3ServiceBuilder::new(s3s_fs::FileSystem::new(root).expect("a root"));
+    if keys {
+        service.set_auth(SimpleAuth::from_single(KEYS[0], KEYS[1]));
+    }
+    let service = service.build();
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+    let address = listener.local_addr().expect("an address");
+    listener.set_nonblocking(true).expect("as the runtime wants it");
+    std::thread::spawn(move || {
+        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
+        runtime.expect("a runtime").block_on(async move {
+            let listener = tokio::net::TcpListener::from_std(listener).expect("listens");
+            while let Ok((socket, _)) = listener.accept().await {
+                let server = hyper_util::server::conn::auto::Builder::new(TokioExecutor::new());
+                let service = service.clone();
+                tokio::spawn(async move {
+                    let _ = server.serve_connection(TokioIo::new(socket), service).await;
+                });
+            }
+        });
+    });
+    format!("http://{address}")
+}
+
+/// A process that runs one of the children below.
+fn child(test: &str, endpoint: &str, target: &str) -> Command {
+    let mut command = Command::new(std::env::current_exe().expect("this program"));
+    command.args(["--exact", &format!("objects::{test}"), "--nocapture"]).env(TARGET, target);
+    command.env("AWS_ENDPOINT_URL", endpoint).env("AWS_REGION", "us-east-1");
+    command.env("AWS_ACCESS_KEY_ID", KEYS[0]).env("AWS_SECRET_ACCESS_KEY", KEYS[1]);
+    command.stdout(Stdio::piped()).stderr(Stdio::piped());
+    command
+}
+
+fn finished(output: &Output) -> String {
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(output.status.success(), "{text}\n{}", String::from_utf8_lossy(&output.stderr));
+    text
+}
+
+fn target() -> Option<Location> {
+    Some(Location::parse(&std::env::var(TARGET).ok()?).expect("a location"))
+}
+
+fn write_to(location: &Location, mode: WriteMode, episodes: std::ops::Range<usize>) {
+    let commit = CommitPolicy { episodes: 2, ..CommitPolicy::default() };
+    let mut writer = create(location, &schema(), WriteOptions { commit, ..options(mode) }).expect("creates");
+    for e in episodes {
+        let constants = Constants::from([("number".to_owned(), e.to_string().into_bytes())]);
+        writer.write_episode_with(&episode(e), &constants).expect("writes");
+    }
+    writer.finish().expect("finishes");
+}
+
+/// Not a test of its own: writes, appends, replaces and reads a dataset.
+#[test]
+fn child_that_writes_and_reads() {
+    let Some(location) = target() else { return };
+    assert!(open(&location).is_err(), "nothing is there");
+    write_to(&location, WriteMode::Create, 0..5);
+    let error = create(&location, &schema(), options(WriteMode::Create)).err().expect("refused").to_string();
+    assert!(error.contains("exists already"), "{error}");
+    write_to(&location, WriteMode::Append, 5..9);
+    let reader = open(&location).expect("opens");
+    assert_eq!(reader.episodes().len(), 9);
+    check(&*reader, 0);
+    assert_eq!(reader.constants(7).expect("reads")["number"], b"7");
+    assert!(reader.footprint().expect("a footprint").iter().map(|(_, bytes)| bytes).sum::<u64>() > 5_000);
+
+    write_to(&location, WriteMode::Overwrite, 2..4);
+    let reader = open(&location).expect("opens");
+    assert_eq!(reader.episodes().len(), 2);
+    check(&*reader, 2);
+
+    for index in 0..2 {
+        let shard = Shard { index, count: 2 };
+        let mut writer = create_shard(&location, &schema(), options(WriteMode::Create), shard).expect("begins");
+        writer.write_episode(&episode(4 + index)).expect("writes");
+        writer.finish().expect("finishes");
+    }
+    assert_eq!(commit_shards(&location).expect("commits"), 2);
+    let reader = open(&location).expect("opens");
+    check(&*reader, 2);
+    println!("hash {}", reader.content_hash().expect("a hash"));
+}
+
+#[test]
+fn a_bucket_holds_datasets() {
+    let folder = tempfile::tempdir().expect("a folder");
+    std::fs::create_dir(folder.path().join("bucket")).expect("a bucket");
+    let endpoint = serve(folder.path(), true);
+    let output = child("child_that_writes_and_reads", &endpoint, "s3://bucket/runs/d.lance").output().expect("runs");
+    let text = finished(&output);
+    // What is in the bucket is the dataset as it would be on this machine.
+    let reader = open(&folder.path().join("bucket/runs/d.lance")).expect("opens");
+    check(&*reader, 2);
+    assert!(text.contains(&reader.content_hash().expect("a hash")), "{text}");
+    assert_eq!(std::fs::read_dir(folder.path().join("bucket/runs/d.lance/data")).expect("a folder").count(), 5);
+
+    let mut wrong = child("child_that_reads", &endpoint, "s3://bucket/runs/d.lance");
+    wrong.env("AWS_SECRET_ACCESS_KEY", "no");
+    let text = finished(&wrong.output().expect("runs"));
+    assert!(text.contains("failed: s3://bucket/runs/d.lance"), "{text}");
+    let text = finished(&child("child_that_reads", &endpoint, "s3://bucket/none.lance").output().expect("runs"));
+    assert!(text.contains("it holds no Lance table"), "{text}");
+}
+
+/// Not a test of its own: opens a dataset, and says how that went.
+#[test]
+fn child_that_reads() {
+    let Some(location) = target() else { return };
+    match open(&location) {
+        Ok(reader) => {
+            check(&*reader, 0);
+            println!("read {} episodes", reader.episodes().len());
+        }
+        Err(error) => println!("failed: {error}"),
+    }
+}
+
+/// Not a test of its own: appends one episode at a time.
+#[test]
+fn child_that_appends() {
+    let Some(location) = target() else { return };
+    let commit = CommitPolicy { episodes: 1, ..CommitPolicy::default() };
+    let options = WriteOptions { commit, ..options(WriteMode::Append) };
+    let mut writer = create(&location, &schema(), options).expect("continues");
+    for e in 0..12 {
+        writer.write_episode(&episode(e)).expect("writes");
+    }
+    writer.finish().expect("finishes");
+}
+
+#[test]
+fn processes_that_append_to_a_bucket_at_once_all_survive() {
+    let folder = tempfile::tempdir().expect("a folder");
+    std::fs::create_dir(folder.path().join("bucket")).expect("a bucket");
+    let endpoint = serve(folder.path(), true);
+    let children: Vec<_> = (0..3)
+        .map(|_| child("child_that_appends", &endpoint, "s3://bucket/d.lance").spawn().expect("starts"))
+        .collect();
+    for child in children {
+        finished(&child.wait_with_output().expect("ends"));
+    }
+    let reader = open(&folder.path().join("bucket/d.lance")).expect("opens");
+    let numbers: Vec<i64> = reader.episodes().iter().map(|episode| episode.index).collect();
+    assert_eq!(numbers, (0..36).collect::<Vec<_>>());
+    let firsts: Vec<StepRange> = (0..36).map(|at| StepRange::new(at, 0, 1)).collect();
+    let states = reader.read(&["state"], &firsts).expect("reads");
+    let mut found: Vec<f64> = states.get::<f64>("state").expect("states").chunks(3).map(|s| s[0]).collect();
+    found.sort_by(f64::total_cmp);
+    assert_eq!(found, (0..36).map(|at| f64::from(at / 3)).collect::<Vec<_>>());
+}
+
+#[test]
+fn a_web_server_is_read_and_not_written() {
+    let folder = tempfile::tempdir().expect("a folder");
+    write(&folder.path().join("bucket/d.lance"), WriteMode::Create, 2, 0..5);
+    let endpoint = serve(folder.path(), false);
+    let location = Location::parse(&format!("{endpoint}/bucket/d.lance")).expect("a location");
+    let reader = open(&location).expect("opens");
+    assert_eq!(reader.episodes().len(), 5);
+    check(&*reader, 0);
+    let error = create(&location, &schema(), options(WriteMode::Append)).err().expect("refused").to_string();
+    assert!(error.contains("cannot be written"), "{error}");
+    let gone = Location::parse(&format!("{endpoint}/bucket/none.lance")).expect("a location");
+    assert!(open(&gone).is_err());
+
+    let bytes: Vec<u8> = (0..400_000_u32).map(|i| (i * i >> 5) as u8).collect();
+    std::fs::write(folder.path().join("bucket/file.h5"), &bytes).expect("writes");
+    let file = Location::parse(&format!("{endpoint}/bucket/file.h5")).expect("a location");
+    let file = ObjectFile::open(&file).expect("opens");
+    assert_eq!(file.len(), 400_000);
+    let parts = file.read(&[300_000..400_000, 5..9]).expect("reads");
+    assert!(parts[0] == bytes[300_000..] && parts[1] == bytes[5..9]);
+}
+
+#[test]
+fn a_store_that_does_not_answer_is_no_damage() {
+    let nobody = std::net::TcpListener::bind("127.0.0.1:0").expect("a port").local_addr().expect("an address");
+    let location = Location::parse(&format!("http://{nobody}/d.lance")).expect("a location");
+    let error = open(&location).err().expect("nobody is there").to_string();
+    assert!(!error.contains("damaged") && error.contains(&nobody.to_string()), "{error}");
+}

@@ -42,6 +42,8 @@ pub struct ConvertOptions {
     pub verify: bool,
     /// The least peak signal-to-noise ratio of a column of pictures, in decibels.
     pub least_psnr: f64,
+    /// When written episodes are committed: what a killed conversion has to write again.
+    pub commit: CommitPolicy,
 }
 
 impl Default for ConvertOptions {
@@ -52,6 +54,7 @@ impl Default for ConvertOptions {
             codec: ImageCodec::default(),
             verify: true,
             least_psnr: 25.0,
+            commit: CommitPolicy::default(),
         }
     }
 }
@@ -175,8 +178,7 @@ pub fn convert(
             ConvertMode::Create => WriteMode::Create,
             ConvertMode::Overwrite => WriteMode::Overwrite,
         };
-        let write =
-            WriteOptions { mode, codec: options.codec, manifest: reader.manifest(), commit: CommitPolicy::default() };
+        let write = WriteOptions { mode, codec: options.codec, manifest: reader.manifest(), commit: options.commit };
         source.copy(target, format, write, first..all, &mut sums, &mut report, options.verify, progress)?;
     }
     report.episodes = base + all;

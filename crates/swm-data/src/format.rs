@@ -115,6 +115,15 @@ impl StepRange {
     }
 }
 
+/// Something wrong that only the format can tell.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Irregularity {
+    /// The position of the episode it is about, if it is about one.
+    pub episode: Option<usize>,
+    /// What it is.
+    pub what: String,
+}
+
 /// Reads episodes. Safe to share: reads from several threads do not disturb each other.
 pub trait Reader: Send + Sync {
     /// The columns: `episode_idx`, `step_idx`, then those that were written, with the types they had.
@@ -158,7 +167,7 @@ pub trait Reader: Send + Sync {
     ///
     /// # Errors
     /// When the stored data are damaged.
-    fn irregularities(&self) -> Result<Vec<String>> {
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
         Ok(vec![])
     }
 

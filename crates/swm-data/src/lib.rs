@@ -39,7 +39,7 @@ pub use cache::CacheConfig;
 pub use clip::{ClipSpec, Clips};
 pub use convert::{ConvertMode, ConvertOptions, Converted, checksum, convert};
 pub use format::{
-    CommitPolicy, Constants, Episode, FORMATS, Format, Reader, StepRange, WriteMode, WriteOptions, Writer, create, open,
+    CommitPolicy, Constants, Episode, FORMATS, Format, Irregularity, Reader, StepRange, WriteMode, WriteOptions, Writer, create, open,
 };
 pub use goals::{GoalMixture, GoalSpec};
 pub use image::ImageCodec;
@@ -48,5 +48,5 @@ pub use loader::{Epoch, Loaded, Loader, LoaderConfig};
 pub use preview::{Picture, contact_sheet, write_png};
 pub use replay::{ReplayBuffer, ReplayConfig, ReplayLoader};
 pub use split::{Part, Split};
-pub use stats::{ColumnStats, column_stats, split};
+pub use stats::{ColumnStats, column_quantiles, column_stats, split};
 pub use video::{integer_scale, write_mp4, write_mp4_scaled};

@@ -9,7 +9,7 @@ mod disk;
 mod memory;
 
 use crate::episodes::Rows;
-use crate::format::{Constants, Episode, Reader, StepRange};
+use crate::format::{Constants, Episode, Irregularity, Reader, StepRange};
 use disk::DiskRows;
 use memory::MemoryRows;
 use std::ops::Range;
@@ -211,7 +211,7 @@ impl Reader for CachedReader {
         self.inner.constants(episode)
     }
 
-    fn irregularities(&self) -> Result<Vec<String>> {
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
         self.inner.irregularities()
     }
 

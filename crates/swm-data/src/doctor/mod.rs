@@ -13,7 +13,7 @@ use crate::convert::Stage;
 use crate::episodes::{EPISODE, STEP};
 use crate::format::{Reader, StepRange};
 use crate::views::subset;
-use crate::{ConvertOptions, Converted, Location, convert};
+use crate::{ConvertOptions, Converted, Location, convert, lance, open};
 use serde::Serialize;
 use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
@@ -56,10 +56,32 @@ pub struct Diagnosis {
 }
 
 impl Diagnosis {
+    /// Adds what was lost before anything was read.
+    pub fn add_lost(&mut self, lost: Vec<String>) {
+        let finding = |what| Finding { severity: Severity::Problem, what, episodes: vec![] };
+        self.findings.splice(0..0, lost.into_iter().map(finding));
+    }
+
     /// How many problems there are.
     pub fn problems(&self) -> usize {
         self.findings.iter().filter(|finding| finding.severity == Severity::Problem).count()
     }
+}
+
+/// Opens a dataset, or what is left of one that cannot be opened, and says what is lost.
+///
+/// # Errors
+/// When nothing of it can be opened.
+pub fn open_what_is_left(location: &Location) -> Result<(Arc<dyn Reader>, Vec<String>)> {
+    open(location).map(|reader| (reader, vec![])).or_else(|error| {
+        if !(lance::FORMAT.detect)(location) {
+            return Err(error);
+        }
+        match lance::salvage(location) {
+            Ok((reader, lost)) if !lost.is_empty() => Ok((reader, lost)),
+            _ => Err(error),
+        }
+    })
 }
 
 /// Reads everything and says what is wrong. `progress` is told the episodes done, and stops the work by saying `false`.
@@ -69,7 +91,7 @@ impl Diagnosis {
 pub fn examine(reader: &dyn Reader, progress: &mut dyn FnMut(usize) -> bool) -> Result<Diagnosis> {
     let mut found = Findings::default();
     match reader.irregularities() {
-        Ok(irregularities) => irregularities.into_iter().for_each(|what| found.problem(None, what)),
+        Ok(irregularities) => irregularities.into_iter().for_each(|it| found.problem(it.episode, it.what)),
         Err(error) => found.problem(None, error.to_string()),
     }
     let episodes = reader.episodes();

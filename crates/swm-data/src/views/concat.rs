@@ -2,7 +2,7 @@
 
 use super::view_hash;
 use crate::episodes::{EPISODE, Rows, STEP, numbering, words};
-use crate::format::{Constants, Episode, Reader, StepRange};
+use crate::format::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::loader::lock;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -121,9 +121,15 @@ impl Reader for Concat {
         self.parts[part].constants(episode)
     }
 
-    fn irregularities(&self) -> Result<Vec<String>> {
-        let found: Result<Vec<Vec<String>>> = self.parts.iter().map(|part| part.irregularities()).collect();
-        Ok(found?.concat())
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
+        let mut found = vec![];
+        for (part, first) in self.parts.iter().zip(&self.first_episodes) {
+            found.extend(part.irregularities()?.into_iter().map(|Irregularity { episode, what }| Irregularity {
+                episode: episode.map(|episode| first + episode),
+                what,
+            }));
+        }
+        Ok(found)
     }
 
     /// That of the parts, if they agree; or one that holds theirs, and what they agree in of their configurations.

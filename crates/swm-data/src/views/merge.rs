@@ -1,7 +1,7 @@
 //! [`merge`]: columns of another dataset beside those of one with the same episodes.
 
 use super::view_hash;
-use crate::format::{Constants, Episode, Reader, StepRange};
+use crate::format::{Constants, Episode, Irregularity, Reader, StepRange};
 use std::sync::Arc;
 use swm_core::{Error, Manifest, Result, Schema};
 
@@ -71,7 +71,7 @@ impl Reader for Merge {
         Ok(constants)
     }
 
-    fn irregularities(&self) -> Result<Vec<String>> {
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
         self.base.irregularities()
     }
 

@@ -2,7 +2,7 @@
 
 use super::view_hash;
 use crate::episodes::{EPISODE, STEP};
-use crate::format::{Constants, Episode, Reader, StepRange};
+use crate::format::{Constants, Episode, Irregularity, Reader, StepRange};
 use std::sync::Arc;
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
 
@@ -92,8 +92,17 @@ impl Reader for Subset {
         self.reader.constants(self.position(episode)?)
     }
 
-    fn irregularities(&self) -> Result<Vec<String>> {
-        self.reader.irregularities()
+    /// Those of the dataset as a whole and of the episodes that are chosen.
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
+        let place = |episode| match &self.positions {
+            Some(positions) => positions.iter().position(|&position| position == episode),
+            None => Some(episode),
+        };
+        let found = self.reader.irregularities()?.into_iter().filter_map(|found| match found.episode {
+            Some(episode) => place(episode).map(|episode| Irregularity { episode: Some(episode), ..found }),
+            None => Some(found),
+        });
+        Ok(found.collect())
     }
 
     fn manifest(&self) -> Option<Manifest> {

@@ -1,13 +1,16 @@
 //! From any format to any other: resumed, verified, and refused where the target holds something else.
 
 use crate::sample::{check, episode, options, schema, write};
+use rand::Rng as _;
+use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 use std::sync::Arc;
-use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
+use swm_core::{Batch, ColumnSpec, DType, Error, Key, Result, Schema};
 use swm_data::convert::Stage;
 use swm_data::{
-    ConvertMode, ConvertOptions, Converted, FORMATS, ImageCodec, Location, Reader, WriteMode, WriteOptions, checksum,
-    convert, create, open,
+    CommitPolicy, ConvertMode, ConvertOptions, Converted, FORMATS, ImageCodec, Location, Reader, WriteMode,
+    WriteOptions, checksum, convert, create, open,
 };
 
 fn run(source: &Path, target: &Path, options: &ConvertOptions) -> Result<Converted> {
@@ -130,6 +133,62 @@ fn a_stopped_conversion_goes_on_and_other_data_are_refused() {
     assert_eq!((report.episodes, open(&other).expect("opens").episodes().len()), (11, 11));
     assert_eq!(run(&path, &other, &lossless(ConvertMode::Overwrite)).expect("overwrites").episodes, 9);
     check(&*open(&other).expect("opens"), 0);
+}
+
+/// What the child process converts to; only set for it. Its source is beside it.
+const TARGET: &str = "SWM_TEST_CONVERT_TARGET";
+
+/// Not a test of its own: the process that the test below kills. A line for every episode.
+#[test]
+fn child_that_converts() {
+    let Some(target) = std::env::var_os(TARGET).map(PathBuf::from) else { return };
+    let commit = CommitPolicy { episodes: 2, ..CommitPolicy::default() };
+    let source = open(target.with_file_name("source.lance")).expect("opens");
+    let options = ConvertOptions { commit, ..lossless(ConvertMode::Resume) };
+    let mut progress = |stage, done, _| {
+        println!("{stage:?} {done}");
+        true
+    };
+    let report = convert(&source, &Location::from(&target), &options, &mut progress).expect("converts");
+    println!("done {}", report.checksum.expect("verified"));
+}
+
+#[test]
+fn a_killed_conversion_goes_on() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("source.lance");
+    write(&path, WriteMode::Create, 40, 0..40);
+    let expected = checksum(&*open(&path).expect("opens")).expect("a checksum");
+    let target = folder.path().join("target.lance");
+    let mut moments = Key::new(7).rng();
+    let (mut kills, mut finished, mut continued) = (0, 0, false);
+    while kills < 50 || finished == 0 {
+        let mut command = Command::new(std::env::current_exe().expect("this program"));
+        command.args(["--exact", "convert::child_that_converts", "--nocapture"]).env(TARGET, &target);
+        let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("starts");
+        let mut lines = BufReader::new(child.stdout.take().expect("its output")).lines();
+        // Killed after so many lines, unless it is through before.
+        let kill_after = if kills < 50 { moments.random_range(0..60) } else { usize::MAX };
+        let mut done = None;
+        for line in lines.by_ref().map(|line| line.expect("text")).take(kill_after) {
+            continued |= line.contains("Comparing");
+            done = line.split_once("done ").map(|(_, checksum)| checksum.trim().to_owned()).or(done);
+        }
+        let _ = child.kill();
+        child.wait().expect("gone");
+        kills += usize::from(done.is_none());
+        if target.exists() {
+            // Whatever it left is whole episodes, in order.
+            check(&*open(&target).expect("opens"), 0);
+        }
+        if let Some(checksum) = done {
+            assert_eq!(checksum, expected);
+            assert_eq!(open(&target).expect("opens").episodes().len(), 40);
+            std::fs::remove_dir_all(&target).expect("removed");
+            finished += 1;
+        }
+    }
+    assert!(continued, "some of the fifty were killed half way");
 }
 
 /// A foreign dataset whose last rows have actions.

@@ -1,10 +1,11 @@
 //! Datasets broken on purpose: each break is found, told, and left out of a repaired dataset.
 
 use crate::sample::{episode, rows, schema, write};
+use std::path::Path;
 use std::sync::Arc;
 use swm_core::{Batch, ColumnSpec, Error, Manifest, Result, Schema};
-use swm_data::doctor::{Diagnosis, Severity, examine, repair};
-use swm_data::{Constants, ConvertOptions, Episode, Location, Reader, StepRange, WriteMode, open};
+use swm_data::doctor::{Diagnosis, Severity, examine, open_what_is_left, repair};
+use swm_data::{Constants, ConvertOptions, Episode, Irregularity, Location, Reader, StepRange, WriteMode, open};
 
 /// The episodes of the sample, given by whatever has broken them.
 #[derive(Default)]
@@ -14,7 +15,7 @@ struct Broken {
     rows: Vec<Batch>,
     /// Episodes whose pictures cannot be read.
     damaged: Vec<usize>,
-    irregular: Vec<String>,
+    irregular: Vec<Irregularity>,
 }
 
 impl Broken {
@@ -58,7 +59,7 @@ impl Reader for Broken {
         Ok(Constants::from([("scene".to_owned(), vec![episode as u8])]))
     }
 
-    fn irregularities(&self) -> Result<Vec<String>> {
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
         Ok(self.irregular.clone())
     }
 
@@ -98,6 +99,47 @@ fn what_was_collected_is_clean() {
     let fits: Vec<&str> = diagnosis.models.iter().filter(|fit| fit.fits()).map(|fit| fit.model).collect();
     assert_eq!(fits, ["TD-MPC2", "GCBC", "GCIVL", "GCIQL"]);
     assert!(diagnosis.models[0].missing[0].contains("the longest has 11"), "{:?}", diagnosis.models[0]);
+}
+
+#[test]
+fn a_number_that_stands_for_two_episodes_is_found_in_a_table() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/broken.lance");
+    let reader = open(&path).expect("opens");
+    let diagnosis = diagnose(&*reader);
+    let problems: Vec<_> = diagnosis.findings.iter().filter(|found| found.severity == Severity::Problem).collect();
+    assert!(problems.iter().all(|found| found.episodes == [1]), "{problems:?}");
+    assert!(problems.iter().any(|found| found.what.contains("0 stands in row 2")), "{problems:?}");
+    assert!(problems.iter().any(|found| found.what.contains("no action in a row that is not the last")));
+    assert_eq!(diagnosis.sound, [0, 2]);
+}
+
+#[test]
+fn what_is_left_of_a_table_is_repaired() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    write(&path, WriteMode::Create, 2, 0..8);
+    // One of the four data files is cut, so that the table does not open.
+    let data = std::fs::read_dir(path.join("data")).expect("a folder").flatten();
+    let mut files: Vec<_> = data.map(|entry| entry.path()).collect();
+    files.sort();
+    let bytes = std::fs::read(&files[1]).expect("reads");
+    std::fs::write(&files[1], &bytes[..bytes.len() / 2]).expect("writes");
+    let location = Location::from(&path);
+    assert!(open(&location).is_err());
+    let (reader, lost) = open_what_is_left(&location).expect("most is left");
+    assert!(lost.len() == 1 && lost[0].contains("are lost"), "{lost:?}");
+    let mut diagnosis = diagnose(&*reader);
+    assert_eq!((diagnosis.episodes, diagnosis.problems()), (6, 0));
+    diagnosis.add_lost(lost);
+    assert_eq!(diagnosis.problems(), 1);
+    let target = Location::from(folder.path().join("mended.lance"));
+    repair(&reader, &diagnosis, &target, &ConvertOptions::default(), &mut |_, _, _| true).expect("repairs");
+    let mended = open(&target).expect("opens");
+    assert_eq!((diagnose(&*mended).problems(), mended.episodes().len()), (0, 6));
+    // Where nothing opens, the error is that of opening.
+    files.iter().for_each(|file| std::fs::write(file, b"").expect("writes"));
+    assert!(open_what_is_left(&location).map(|(reader, _)| reader.episodes().len()).unwrap_or(0) == 0);
+    assert!(open_what_is_left(&Location::from(folder.path().join("nothing.lance"))).is_err());
 }
 
 #[test]
@@ -156,10 +198,13 @@ fn every_break_is_found_where_it_is() {
     let (what, episodes) = problem(&diagnose(&broken));
     assert!(what.contains("the number 1 stands for another episode") && episodes == [3], "{what}");
     let mut broken = Broken::new(4, |_, _| {});
-    broken.irregular = vec!["3 rows belong to no episode".to_owned()];
+    broken.irregular = vec![Irregularity { episode: None, what: "3 rows belong to no episode".to_owned() }];
     let diagnosis = diagnose(&broken);
     assert_eq!(problem(&diagnosis), ("3 rows belong to no episode".to_owned(), vec![]));
     assert_eq!(diagnosis.sound.len(), 4, "the episodes are sound");
+    let mut broken = Broken::new(4, |_, _| {});
+    broken.irregular = vec![Irregularity { episode: Some(1), what: "its stored steps restart".to_owned() }];
+    assert_eq!(diagnose(&broken).sound, [0, 2, 3], "and this one is not");
     assert!(problem(&diagnose(&Broken::new(0, |_, _| {}))).0.contains("no episode"));
 }
 

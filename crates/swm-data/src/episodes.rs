@@ -11,6 +11,9 @@ pub(crate) const EPISODE: &str = "episode_idx";
 /// See [`EPISODE`].
 pub(crate) const STEP: &str = "step_idx";
 
+/// A row and where it is wanted.
+pub(crate) type Wanted<'a> = ((usize, usize), &'a mut [u8]);
+
 /// Episodes one after another in a table of rows.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Rows {
@@ -21,13 +24,6 @@ pub(crate) struct Rows {
 }
 
 impl Rows {
-    /// Episodes of these lengths, numbered from 0.
-    pub fn new(lengths: impl IntoIterator<Item = usize>) -> Self {
-        let mut rows = Self::default();
-        lengths.into_iter().for_each(|length| rows.push(length));
-        rows
-    }
-
     /// Episodes of these lengths that begin in these rows.
     ///
     /// # Errors
@@ -123,6 +119,23 @@ impl Rows {
             format!("room for {} bytes", out.len()),
             format!("{expected} for {rows} rows"),
         ))
+    }
+
+    /// Every wanted row, as `(position of its episode, step)`, with its place in `out`, in stored order.
+    ///
+    /// # Errors
+    /// When a row does not exist, or `out` has another length.
+    pub fn wanted<'a>(&self, column: &ColumnSpec, ranges: &[StepRange], out: &'a mut [u8]) -> Result<Vec<Wanted<'a>>> {
+        let rows = Self::check_room(column, ranges, out)?;
+        let mut wanted = Vec::with_capacity(rows);
+        let mut places = out.chunks_exact_mut(column.row_bytes());
+        for range in ranges {
+            self.range(range)?;
+            let steps = range.start..range.start + range.length;
+            wanted.extend(steps.map(|step| (range.episode, step)).zip(places.by_ref()));
+        }
+        wanted.sort_by_key(|(row, _)| *row);
+        Ok(wanted)
     }
 
     /// Fills `out` with a column of [`numbering`].

@@ -210,8 +210,16 @@ impl Named for Format {
 }
 
 /// Every layout there is. The first one that recognises a path is used.
-pub static FORMATS: Registry<Format> =
-    Registry { kind: "dataset format", hint: "`swm formats` lists them", rows: &[lance::FORMAT] };
+pub static FORMATS: Registry<Format> = Registry {
+    kind: "dataset format",
+    hint: "`swm formats` lists them",
+    rows: &[
+        lance::FORMAT,
+        crate::folder::FORMAT,
+        #[cfg(feature = "hdf5")]
+        crate::hdf5::FORMAT,
+    ],
+};
 
 fn detect(location: &Location) -> Option<&'static Format> {
     FORMATS.rows.iter().find(|format| (format.detect)(location))

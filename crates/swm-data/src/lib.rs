@@ -18,8 +18,11 @@ pub mod convert;
 pub mod doctor;
 mod column_files;
 mod episodes;
+pub mod folder;
 pub mod format;
 pub mod goals;
+#[cfg(feature = "hdf5")]
+pub mod hdf5;
 pub mod image;
 mod jpeg;
 pub mod lance;

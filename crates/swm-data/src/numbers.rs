@@ -47,7 +47,8 @@ impl Stored {
 
     /// Whether the stored bytes are those of the column.
     pub fn is_plain(self) -> bool {
-        (!self.big_endian || self.size == 1) && self.dtype().is_some_and(|dtype| dtype.size() == self.size)
+        let little = Self { big_endian: self.big_endian && self.size > 1, ..self };
+        self.dtype().is_some_and(|dtype| little == Self::of(dtype))
     }
 
     /// Converts stored numbers to the bytes of a column of [`Stored::dtype`]; there are as many of one as of the other.

@@ -25,7 +25,7 @@ mod reader;
 mod writer;
 
 pub(crate) use reader::ColumnFiles;
-pub(crate) use writer::ColumnFilesWriter;
+pub(crate) use writer::{ColumnFilesWriter, lock, replace};
 
 use crate::format::Constants;
 use serde::{Deserialize, Serialize};
@@ -66,6 +66,13 @@ struct Pending {
 /// Whether a folder holds column files, complete or begun.
 pub(crate) fn is_there(folder: &Path) -> bool {
     file(folder, LENGTHS).is_file()
+}
+
+/// Whether the subfolders of a folder hold videos rather than pictures.
+pub(crate) fn holds_videos(folder: &Path) -> bool {
+    let entries = |folder: &Path| folder.read_dir().into_iter().flatten().flatten();
+    let is_video = |path: &Path| path.extension().is_some_and(|suffix| suffix.eq_ignore_ascii_case("mp4"));
+    entries(folder).any(|entry| entries(&entry.path()).next().is_some_and(|first| is_video(&first.path())))
 }
 
 /// The archive of a column.

@@ -302,7 +302,7 @@ impl Drop for ColumnFilesWriter {
 }
 
 /// Locks a folder against other writers, until the file is dropped or the process ends.
-fn lock(folder: &Path) -> Result<File> {
+pub(crate) fn lock(folder: &Path) -> Result<File> {
     let file = File::open(folder).map_err(|e| Error::io(folder, "opening the folder", e))?;
     match file.try_lock() {
         Ok(()) => Ok(file),
@@ -315,7 +315,7 @@ fn lock(folder: &Path) -> Result<File> {
 }
 
 /// Removes a dataset. It is renamed first, so that nothing is ever half there.
-fn replace(folder: &Path) -> Result<()> {
+pub(crate) fn replace(folder: &Path) -> Result<()> {
     let _lock = lock(folder)?;
     let mut aside = folder.as_os_str().to_owned();
     aside.push(format!(".replaced-{}", uuid::Uuid::new_v4().simple()));

@@ -7,9 +7,13 @@ mod cache;
 mod convert;
 mod damage;
 mod doctor;
+mod folder;
 mod foreign;
+mod format_suite;
 mod fuzz;
 mod goals;
+#[cfg(feature = "hdf5")]
+mod hdf5;
 mod interruption;
 mod lance;
 mod lance_shards;

@@ -1,0 +1,114 @@
+//! Bitshuffle: the first bits of all numbers, then their second bits, and so on; in blocks, which may be compressed.
+
+use super::{Input, lz4_block, zstd_frame};
+
+/// What a block is compressed with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Codec {
+    None,
+    Lz4,
+    Zstd,
+}
+
+impl Codec {
+    /// The codec of the filter's setting.
+    pub fn new(setting: u32) -> Result<Self, String> {
+        match setting {
+            0 => Ok(Self::None),
+            2 => Ok(Self::Lz4),
+            3 => Ok(Self::Zstd),
+            _ => Err(format!("its chunks are bitshuffled and compressed with codec {setting}")),
+        }
+    }
+}
+
+/// Bytes of a block, of the filter's own choosing.
+fn default_block(size: usize) -> usize {
+    (8192 / size / 8 * 8).max(128) * size
+}
+
+/// Decodes what the filter wrote to exactly `out`.
+pub fn decode(from: &[u8], size: usize, codec: Codec, out: &mut [u8]) -> Result<(), String> {
+    let mut input = Input(from);
+    let block = if codec == Codec::None {
+        default_block(size)
+    } else {
+        let (total, block) = (input.u64_be()?, input.u32_be()? as usize);
+        if total != out.len() as u64 || block == 0 {
+            return Err(format!(
+                "bitshuffle: it says it holds {total} bytes in blocks of {block}; they are {}",
+                out.len()
+            ));
+        }
+        block
+    };
+    // Bits of eight numbers share a byte; what is left over is stored as it is.
+    let eight = 8 * size;
+    let block = (block / eight * eight).max(eight);
+    let whole = out.len() / eight * eight;
+    let (blocks, rest) = out.split_at_mut(whole);
+    let mut bits = vec![];
+    for place in blocks.chunks_mut(block) {
+        bits.resize(place.len(), 0);
+        match codec {
+            Codec::None => bits.copy_from_slice(input.take(place.len())?),
+            Codec::Lz4 | Codec::Zstd => {
+                let length = input.u32_be()? as usize;
+                let bytes = input.take(length)?;
+                if codec == Codec::Lz4 { lz4_block(bytes, &mut bits)? } else { zstd_frame(bytes, &mut bits)? }
+            }
+        }
+        undo(&bits, size, place);
+    }
+    rest.copy_from_slice(input.take(rest.len())?);
+    Ok(())
+}
+
+/// Puts shuffled bits of a multiple of eight numbers back in their order.
+pub fn undo(from: &[u8], size: usize, out: &mut [u8]) {
+    // One row a bit: the bits of that place of all numbers, the first in the lowest bit.
+    let row = out.len() / size / 8;
+    for byte in 0..size {
+        let rows: [&[u8]; 8] = std::array::from_fn(|bit| &from[(byte * 8 + bit) * row..(byte * 8 + bit + 1) * row]);
+        for eight in 0..row {
+            let bits = transpose(u64::from_le_bytes(std::array::from_fn(|bit| rows[bit][eight])));
+            for (i, value) in bits.to_le_bytes().into_iter().enumerate() {
+                out[(eight * 8 + i) * size + byte] = value;
+            }
+        }
+    }
+}
+
+/// Transposes eight rows of eight bits (Hacker's Delight, 7-3).
+fn transpose(mut x: u64) -> u64 {
+    let mut swap = |mask: u64, shift: u32| {
+        let t = (x ^ x >> shift) & mask;
+        x ^= t ^ t << shift;
+    };
+    swap(0x00aa_00aa_00aa_00aa, 7);
+    swap(0x0000_cccc_0000_cccc, 14);
+    swap(0x0000_0000_f0f0_f0f0, 28);
+    x
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bits_return_to_their_numbers() {
+        for size in [1, 2, 4, 8] {
+            let bytes: Vec<u8> = (0..size * 24).map(|i| (i * 37 + 11) as u8).collect();
+            let mut bits = vec![0_u8; bytes.len()];
+            for number in 0..24 {
+                for bit in 0..size * 8 {
+                    let set = bytes[number * size + bit / 8] >> (bit % 8) & 1;
+                    bits[bit * 3 + number / 8] |= set << (number % 8);
+                }
+            }
+            let mut out = vec![0; bytes.len()];
+            undo(&bits, size, &mut out);
+            assert_eq!(out, bytes);
+        }
+    }
+}

@@ -1,0 +1,118 @@
+//! Blosc (version 1): blocks, shuffled and compressed with one of several codecs.
+//!
+//! A header of 16 bytes (versions, flags, the size of a number, lengths of all, of a block, and of the chunk), the
+//! beginning of every block, then the blocks. A block is one stream, or one for each byte of a number; each has its
+//! length before it, and is stored when that is what it holds.
+
+use super::{Input, bitshuffle, copy_match, inflate, lz4_block, shuffle, zstd_frame};
+
+mod flag {
+    pub const SHUFFLE: u8 = 1;
+    pub const STORED: u8 = 2;
+    pub const BITSHUFFLE: u8 = 4;
+    pub const ONE_STREAM: u8 = 16;
+}
+
+const HEADER: usize = 16;
+
+/// Decodes to exactly `out`.
+pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
+    let mut input = Input(from);
+    let [version, _, flags, size] = input.array()?;
+    let mut number = || input.array().map(u32::from_le_bytes).map(|n| n as usize);
+    let (total, block, length) = (number()?, number()?, number()?);
+    let size = usize::from(size).max(1);
+    if !(1..=2).contains(&version) || total != out.len() || length != from.len() || block == 0 && total > 0 {
+        return Err(format!(
+            "Blosc: version {version}, {total} bytes in {length}, where {} are in {}",
+            out.len(),
+            from.len()
+        ));
+    }
+    if flags & flag::STORED != 0 {
+        let bytes = from.get(HEADER..HEADER + total).ok_or("Blosc: it is cut off")?;
+        out.copy_from_slice(bytes);
+        return Ok(());
+    }
+    let blocks = total.div_ceil(block.max(1));
+    let starts = Input(input.take(4 * blocks)?).0;
+    let mut scratch = vec![];
+    for (place, start) in out.chunks_mut(block).zip(starts.as_chunks::<4>().0) {
+        let start = u32::from_le_bytes(*start) as usize;
+        let mut input = Input(from.get(start..).ok_or("Blosc: a block is outside the chunk")?);
+        // The last block is one stream when it is shorter.
+        let streams = if flags & flag::ONE_STREAM != 0 || place.len() < block { 1 } else { size };
+        let shuffled = (flags & flag::SHUFFLE != 0 && size > 1) || flags & flag::BITSHUFFLE != 0;
+        scratch.resize(place.len(), 0);
+        let target = if shuffled { &mut *scratch } else { &mut *place };
+        let part = target.len() / streams;
+        if part * streams != target.len() || part == 0 {
+            return Err(format!("Blosc: a block of {} bytes in {streams} streams", target.len()));
+        }
+        for stream in target.chunks_exact_mut(part) {
+            let length = u32::from_le_bytes(input.array()?) as usize;
+            let bytes = input.take(length)?;
+            if length == part {
+                stream.copy_from_slice(bytes);
+                continue;
+            }
+            match flags >> 5 {
+                0 => blosclz(bytes, stream)?,
+                1 => lz4_block(bytes, stream)?,
+                3 => inflate(bytes, stream)?,
+                4 => zstd_frame(bytes, stream)?,
+                codec => return Err(format!("Blosc: codec {codec} (Snappy is 2) is not understood")),
+            }
+        }
+        if flags & flag::BITSHUFFLE != 0 {
+            // Only whole groups of eight numbers are shuffled, or nothing.
+            if place.len().is_multiple_of(8 * size) {
+                bitshuffle::undo(&scratch, size, place);
+            } else {
+                place.copy_from_slice(&scratch);
+            }
+        } else if shuffled {
+            shuffle::undo(&scratch, size, place)?;
+        }
+    }
+    Ok(())
+}
+
+/// BloscLZ, a descendant of FastLZ: as LZF, but a long length has any number of bytes, and the largest distance is
+/// followed by two bytes of what it is beyond that.
+fn blosclz(from: &[u8], out: &mut [u8]) -> Result<(), String> {
+    const FAR: usize = 8191;
+    let mut input = Input(from);
+    let mut at = 0;
+    // The first instruction is literals, whatever its upper bits say.
+    let mut control = usize::from(input.array::<1>()?[0] & 31);
+    loop {
+        if control < 32 {
+            let literals = input.take(control + 1)?;
+            let place = out.get_mut(at..at + literals.len()).ok_or("BloscLZ: it holds too much")?;
+            place.copy_from_slice(literals);
+            at += literals.len();
+        } else {
+            let mut length = (control >> 5) + 2;
+            if length == 7 + 2 {
+                loop {
+                    let [more] = input.array()?;
+                    length = length.checked_add(usize::from(more)).ok_or("BloscLZ: a length is too large")?;
+                    if more != 255 {
+                        break;
+                    }
+                }
+            }
+            let [low] = input.array()?;
+            let mut distance = (control & 31) << 8 | usize::from(low);
+            if distance == FAR {
+                distance += usize::from(u16::from_be_bytes(input.array()?));
+            }
+            copy_match(out, at, distance + 1, length)?;
+            at += length;
+        }
+        let Ok([next]) = input.array() else { break };
+        control = usize::from(next);
+    }
+    if at == out.len() { Ok(()) } else { Err(format!("BloscLZ: it ends after {at} of {} bytes", out.len())) }
+}

@@ -1,0 +1,165 @@
+//! LZF, Marc Lehmann's fast codec, which h5py brings along: every h5py reads it without plugins.
+//!
+//! A stream of instructions. A byte below 32 is followed by one literal more than it says. Any other begins a match: its
+//! upper three bits are the length less 2, where 7 is followed by a byte to add; its lower five and the next byte are the
+//! distance less 1.
+
+use super::copy_match;
+
+const MAX_LITERALS: usize = 32;
+const MAX_DISTANCE: usize = 1 << 13;
+const MAX_LENGTH: usize = 264;
+/// Positions that are remembered, by a hash of the three bytes there.
+const TABLE_BITS: u32 = 14;
+
+/// Decodes to exactly `out`.
+pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
+    let cut = || "LZF: it is cut off".to_owned();
+    let (mut i, mut at) = (0, 0);
+    while let Some(&control) = from.get(i) {
+        let control = usize::from(control);
+        i += 1;
+        if control < MAX_LITERALS {
+            let length = control + 1;
+            let literals = from.get(i..i + length).ok_or_else(cut)?;
+            let place = out.get_mut(at..at + length).ok_or("LZF: it holds too much")?;
+            place.copy_from_slice(literals);
+            (i, at) = (i + length, at + length);
+        } else {
+            let mut length = control >> 5;
+            if length == 7 {
+                length += usize::from(*from.get(i).ok_or_else(cut)?);
+                i += 1;
+            }
+            let distance = ((control & 31) << 8 | usize::from(*from.get(i).ok_or_else(cut)?)) + 1;
+            i += 1;
+            copy_match(out, at, distance, length + 2)?;
+            at += length + 2;
+        }
+    }
+    if at == out.len() { Ok(()) } else { Err(format!("LZF: it ends after {at} of {} bytes", out.len())) }
+}
+
+/// What an encoder remembers; kept to be used again.
+pub struct Encoder(Box<[u32; 1 << TABLE_BITS]>);
+
+impl Default for Encoder {
+    fn default() -> Self {
+        Self(Box::new([0; 1 << TABLE_BITS]))
+    }
+}
+
+impl Encoder {
+    /// Appends the encoded bytes to `out`, and says whether they are fewer; where not, nothing is appended.
+    pub fn encode(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> bool {
+        let begin = out.len();
+        self.0.fill(0);
+        let (mut at, mut literals) = (0, 0);
+        while at + 2 < bytes.len() {
+            let key = [bytes[at], bytes[at + 1], bytes[at + 2]];
+            let hash = (u32::from_le_bytes([key[0], key[1], key[2], 0]).wrapping_mul(0x9e37_79b1)) >> (32 - TABLE_BITS);
+            // Positions are stored one higher, as 0 means none.
+            let slot = &mut self.0[hash as usize];
+            let before = (*slot as usize).checked_sub(1);
+            #[allow(clippy::cast_possible_truncation)] // chunks are below 4 GiB
+            {
+                *slot = at as u32 + 1;
+            }
+            let found = before.filter(|&before| at - before <= MAX_DISTANCE && bytes[before..before + 3] == key);
+            let Some(before) = found else {
+                at += 1;
+                continue;
+            };
+            let longest = MAX_LENGTH.min(bytes.len() - at);
+            let same = common(&bytes[before..], &bytes[at..at + longest]);
+            put_literals(&bytes[literals..at], out);
+            put_match(at - before, same, out);
+            at += same;
+            literals = at;
+            if out.len() - begin >= bytes.len() {
+                break;
+            }
+        }
+        put_literals(&bytes[literals..], out);
+        let smaller = out.len() - begin < bytes.len();
+        if !smaller {
+            out.truncate(begin);
+        }
+        smaller
+    }
+}
+
+/// How many bytes are equal, eight at a time.
+fn common(a: &[u8], b: &[u8]) -> usize {
+    let words = a.as_chunks::<8>().0.iter().zip(b.as_chunks::<8>().0);
+    for (i, (x, y)) in words.enumerate() {
+        let differ = u64::from_le_bytes(*x) ^ u64::from_le_bytes(*y);
+        if differ != 0 {
+            return i * 8 + differ.trailing_zeros() as usize / 8;
+        }
+    }
+    let whole = a.len().min(b.len()) / 8 * 8;
+    whole + a[whole..].iter().zip(&b[whole..]).take_while(|(x, y)| x == y).count()
+}
+
+#[allow(clippy::cast_possible_truncation)] // all fit their bits
+fn put_literals(literals: &[u8], out: &mut Vec<u8>) {
+    for run in literals.chunks(MAX_LITERALS) {
+        out.push(run.len() as u8 - 1);
+        out.extend(run);
+    }
+}
+
+#[allow(clippy::cast_possible_truncation)] // all fit their bits
+fn put_match(distance: usize, length: usize, out: &mut Vec<u8>) {
+    let (distance, length) = (distance - 1, length - 2);
+    if length < 7 {
+        out.push((length << 5 | distance >> 8) as u8);
+    } else {
+        out.extend([(7 << 5 | distance >> 8) as u8, (length - 7) as u8]);
+    }
+    out.push(distance as u8);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn what_is_encoded_is_decoded(
+            seed in prop::collection::vec(any::<u8>(), 1..40),
+            repeats in 0_usize..300,
+            noise in prop::collection::vec(any::<u8>(), 0..9000),
+            tail in prop::collection::vec(0_u8..3, 0..600),
+        ) {
+            let mut bytes: Vec<u8> = seed.iter().copied().cycle().take(seed.len() * repeats).collect();
+            bytes.extend(&noise);
+            bytes.extend(&tail);
+            bytes.extend(seed.iter().copied().cycle().take(1000));
+            let mut encoder = Encoder::default();
+            let mut encoded = vec![9];
+            if encoder.encode(&bytes, &mut encoded) {
+                let mut out = vec![0; bytes.len()];
+                prop_assert_eq!(decode(&encoded[1..], &mut out), Ok(()));
+                prop_assert_eq!(out, bytes);
+            } else {
+                prop_assert_eq!(encoded, [9]);
+            }
+        }
+    }
+
+    #[test]
+    fn noise_stays_as_it_is_and_damage_is_found() {
+        let mut encoder = Encoder::default();
+        let mut out = vec![];
+        assert!(!encoder.encode(&[1, 2, 3, 4], &mut out) && out.is_empty());
+        assert!(encoder.encode(&[7; 1000], &mut out) && out.len() < 20, "{out:?}");
+        for cut in 0..out.len() {
+            assert!(decode(&out[..cut], &mut [0; 1000]).is_err());
+        }
+        assert!(decode(&out, &mut [0; 999]).is_err() && decode(&out, &mut [0; 1001]).is_err());
+        assert!(decode(&[0x20, 0], &mut [0; 3]).expect_err("before the beginning").contains("before"));
+    }
+}

@@ -1,0 +1,356 @@
+//! The files we write: the oldest structures of HDF5 (superblock 0, headers 1, B-trees 1), which every version of the
+//! library reads. They carry no checksums of their own, so each change that matters is one number written in its place,
+//! and a file is sound at every moment, also when the writer is killed.
+//!
+//! ```text
+//! superblock                               end of the file
+//! root group                               attribute: a reference to the record
+//! its B-tree, heap, and table of names
+//! headers of the record, of ep_len, of ep_offset, of the columns
+//!                                          rows; where the B-tree of chunks is
+//! chunks and nodes of B-trees, in the order in which they came
+//! ```
+//!
+//! The numbers and names come from the specification of the format (version 3.0, "HDF5 File Format Specification").
+
+use super::filters::{fletcher32, id};
+use super::source::Source;
+use swm_core::{ColumnSpec, DType, Error, Result};
+
+/// An address of nothing.
+pub(super) const UNDEFINED: u64 = u64::MAX;
+/// How every HDF5 file begins.
+pub(super) const SIGNATURE: [u8; 8] = *b"\x89HDF\r\n\x1a\n";
+/// Where the superblock says where the file ends.
+pub(super) const END_AT: u64 = 40;
+/// The root group's header, and the attribute in it that refers to the record.
+pub(super) const ROOT: u64 = 96;
+/// See [`ROOT`].
+const ATTRIBUTE: &str = "stable_worldmodel.record";
+/// Room in the root's header, so that other programs which add attributes leave ours where it is.
+const ROOM: usize = 64;
+/// The least half of a node of a group's B-tree; the library's default.
+const GROUP_K: u16 = 16;
+
+/// Rows of small numbers gather in chunks of about this size.
+const CHUNK_BYTES: usize = 8192;
+/// Rows of at least this size are chunks of their own, and compressed.
+const LARGE_ROW: usize = 1024;
+
+pub(super) const LENGTHS: &str = "ep_len";
+pub(super) const OFFSETS: &str = "ep_offset";
+
+/// Kinds of messages in headers.
+mod message {
+    pub const NOTHING: u16 = 0;
+    pub const DATASPACE: u16 = 1;
+    pub const DATATYPE: u16 = 3;
+    pub const FILL_VALUE: u16 = 5;
+    pub const LAYOUT: u16 = 8;
+    pub const FILTERS: u16 = 11;
+    pub const ATTRIBUTE: u16 = 12;
+    pub const SYMBOL_TABLE: u16 = 17;
+}
+
+/// A dataset as its header says it is.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Table {
+    pub spec: ColumnSpec,
+    /// Rows of a chunk.
+    pub chunk_rows: usize,
+    /// Whether chunks are compressed (they are rows then), or only summed.
+    pub compressed: bool,
+    /// Where its number of rows is in the file.
+    pub rows_at: u64,
+    /// Where the address of its B-tree is.
+    pub tree_at: u64,
+}
+
+impl Table {
+    fn new(spec: ColumnSpec) -> Self {
+        let row = spec.row_bytes();
+        let compressed = row >= LARGE_ROW;
+        let chunk_rows = if compressed { 1 } else { 1 << (CHUNK_BYTES / row).ilog2() };
+        Self { spec, chunk_rows, compressed, rows_at: 0, tree_at: 0 }
+    }
+
+    /// Its header is there.
+    fn is_at(&mut self, at: u64) {
+        let before: usize = messages(self)[..3].iter().map(|(_, data)| 8 + data.len()).sum();
+        self.rows_at = at + 16 + 8 + 8;
+        self.tree_at = at + 16 + before as u64 + 8 + 3;
+    }
+
+    /// Bytes of a chunk before it is compressed or summed.
+    pub fn chunk_bytes(&self) -> usize {
+        self.chunk_rows * self.spec.row_bytes()
+    }
+
+    /// Sides of the dataset and of its numbers, as keys of B-trees count.
+    pub fn sides(&self) -> usize {
+        self.spec.shape.len() + 2
+    }
+}
+
+/// The beginning of a file: everything that does not grow.
+pub(super) struct Layout {
+    /// The bytes, of a file without episodes.
+    pub bytes: Vec<u8>,
+    /// The record, the episodes' lengths and beginnings, then the columns.
+    pub tables: Vec<Table>,
+}
+
+impl Layout {
+    /// The file of these columns.
+    ///
+    /// # Errors
+    /// When a name or a shape cannot be stored.
+    pub fn new(columns: &[ColumnSpec]) -> Result<Self> {
+        for column in columns {
+            let problem = match &*column.name {
+                "" | "." => "is no name in an HDF5 file",
+                LENGTHS | OFFSETS => "is used by the format",
+                name if name.contains(['/', '\0']) => "has letters that a name in an HDF5 file must not have",
+                _ if column.is_empty() => "holds no number",
+                _ if column.row_bytes() > 64 << 20 || column.shape.len() > 30 => "has rows that are too large",
+                _ => continue,
+            };
+            let problem = format!("the column '{}' {problem}", column.name);
+            return Err(Error::config("schema", problem, "rename it, or leave it out"));
+        }
+        let counters = [(LENGTHS, DType::Int32), (OFFSETS, DType::Int64)];
+        let tables: Vec<Table> = std::iter::once(ColumnSpec::new("", DType::U8, []))
+            .chain(counters.map(|(name, dtype)| ColumnSpec::new(name, dtype, [])))
+            .chain(columns.iter().cloned())
+            .map(Table::new)
+            .collect();
+        Ok(Self::of(tables))
+    }
+
+    fn of(mut tables: Vec<Table>) -> Self {
+        // Names in the heap, each at a multiple of eight; the first is empty.
+        let mut heap = vec![0; 8];
+        let mut names: Vec<(&str, u64, usize)> = vec![];
+        for (i, table) in tables.iter().enumerate().skip(1) {
+            names.push((&table.spec.name, heap.len() as u64, i));
+            heap.extend(table.spec.name.as_bytes());
+            heap.resize((heap.len() + 1).next_multiple_of(8), 0);
+        }
+        names.sort_by_key(|(name, ..)| name.as_bytes());
+        let last = names.last().map_or(0, |&(_, at, _)| at);
+        let entries: Vec<(u64, usize)> = names.iter().map(|&(_, at, table)| (at, table)).collect();
+
+        let leaf_k = entries.len().div_ceil(2).max(4);
+        let root_size = 16 + header_size(&root_messages(0, 0, 0));
+        let tree = ROOT + root_size as u64;
+        let tree_size = 24 + 8 * (4 * u64::from(GROUP_K) + 1);
+        let heap_at = tree + tree_size;
+        let heap_data = heap_at + 32;
+        let symbols = heap_data + heap.len() as u64;
+        let mut at = symbols + 8 + 40 * 2 * leaf_k as u64;
+        let mut headers = vec![];
+        for table in &mut tables {
+            // A header does not cross a boundary of 512 bytes where it has a number that changes.
+            let bytes = header(&messages(table));
+            if at % 512 + bytes.len() as u64 > 512 {
+                at = at.next_multiple_of(512);
+            }
+            table.is_at(at);
+            headers.push((at, bytes));
+            at += headers[headers.len() - 1].1.len() as u64;
+        }
+
+        let mut out = superblock(leaf_k as u16, at, tree, heap_at);
+        out.extend(header(&root_messages(tree, heap_at, headers[0].0)));
+        // A B-tree of one child.
+        out.extend(b"TREE\0\0");
+        out.extend(1_u16.to_le_bytes());
+        for value in [UNDEFINED, UNDEFINED, 0, symbols, last] {
+            out.extend(value.to_le_bytes());
+        }
+        out.resize(heap_at as usize, 0);
+        out.extend(b"HEAP\0\0\0\0");
+        // No free list: 1 means none.
+        for value in [heap.len() as u64, 1, heap_data] {
+            out.extend(value.to_le_bytes());
+        }
+        out.extend(&heap);
+        out.extend(b"SNOD\x01\0");
+        out.extend((entries.len() as u16).to_le_bytes());
+        for (name, table) in entries {
+            out.extend(name.to_le_bytes());
+            out.extend(headers[table].0.to_le_bytes());
+            out.extend([0; 24]);
+        }
+        for (at, bytes) in headers {
+            out.resize(at as usize, 0);
+            out.extend(bytes);
+        }
+        Self { bytes: out, tables }
+    }
+
+    /// Whether a file begins as one of ours does, but for the numbers that change.
+    pub fn is_that_of(&self, file: &[u8]) -> bool {
+        if file.len() != self.bytes.len() {
+            return false;
+        }
+        let mut changing = vec![(END_AT, 8), (ROOT, 16), (ROOT + ROOT_BYTES, 8 + ROOM as u64)];
+        changing.extend(self.tables.iter().flat_map(|table| [(table.rows_at, 8), (table.tree_at, 8)]));
+        changing.sort_unstable();
+        let mut at = 0;
+        changing.push((file.len() as u64, 0));
+        changing.into_iter().all(|(begin, size)| {
+            let same = file[at..begin as usize] == self.bytes[at..begin as usize];
+            at = (begin + size) as usize;
+            same
+        })
+    }
+}
+
+/// Bytes of the root's header before its room.
+const ROOT_BYTES: u64 = 16 + 8 + 16 + 8 + 8 + 32 + 8 + 8 + 8;
+
+/// The record of a file that we wrote.
+///
+/// # Errors
+/// When the file is cut off.
+pub(super) fn record(source: &Source) -> Result<Option<Table>, String> {
+    let mut root = [0; ROOT_BYTES as usize];
+    if source.size() < ROOT + ROOT_BYTES {
+        return Ok(None);
+    }
+    source.read(ROOT, &mut root).map_err(|e| e.to_string())?;
+    let number = |at: usize| u64::from_le_bytes(std::array::from_fn(|i| root[at + i]));
+    let (tree, heap, record) = (number(24), number(32), number(root.len() - 8));
+    let ours = header(&root_messages(tree, heap, record));
+    if root[16..] != ours[16..root.len()] {
+        return Ok(None);
+    }
+    let mut table = Table::new(ColumnSpec::new("", DType::U8, []));
+    table.is_at(record);
+    Ok(Some(table))
+}
+
+fn superblock(leaf_k: u16, end: u64, tree: u64, heap: u64) -> Vec<u8> {
+    let mut out = SIGNATURE.to_vec();
+    // Versions; addresses and lengths take eight bytes.
+    out.extend([0, 0, 0, 0, 0, 8, 8, 0]);
+    out.extend(leaf_k.to_le_bytes());
+    out.extend(GROUP_K.to_le_bytes());
+    out.extend(0_u32.to_le_bytes());
+    // Where addresses begin, free space, the end, drivers; then the root group: its name, its header.
+    for value in [0, UNDEFINED, end, UNDEFINED, 0, ROOT, 1, tree, heap] {
+        out.extend(value.to_le_bytes());
+    }
+    out
+}
+
+type Message = (u16, Vec<u8>);
+
+fn header_size(messages: &[Message]) -> usize {
+    messages.iter().map(|(_, data)| 8 + data.len()).sum()
+}
+
+/// A header, version 1.
+fn header(messages: &[Message]) -> Vec<u8> {
+    let mut out = vec![1, 0];
+    out.extend((messages.len() as u16).to_le_bytes());
+    out.extend(1_u32.to_le_bytes());
+    out.extend((header_size(messages) as u32).to_le_bytes());
+    out.extend([0; 4]);
+    for (kind, data) in messages {
+        out.extend(kind.to_le_bytes());
+        out.extend((data.len() as u16).to_le_bytes());
+        // A type never changes.
+        out.extend([u8::from(*kind == message::DATATYPE), 0, 0, 0]);
+        out.extend(data);
+    }
+    out
+}
+
+fn root_messages(tree: u64, heap: u64, record: u64) -> Vec<Message> {
+    let group = [tree, heap].iter().flat_map(|value| value.to_le_bytes()).collect();
+    // An object reference, a scalar.
+    let reference = [0x17, 0, 0, 0, 8, 0, 0, 0];
+    let mut attribute = vec![1, 0];
+    for size in [ATTRIBUTE.len() + 1, reference.len(), 8] {
+        attribute.extend((size as u16).to_le_bytes());
+    }
+    attribute.extend(ATTRIBUTE.as_bytes());
+    attribute.resize((attribute.len() + 1).next_multiple_of(8), 0);
+    attribute.extend(reference);
+    attribute.extend([1, 0, 0, 0, 0, 0, 0, 0]);
+    attribute.extend(record.to_le_bytes());
+    vec![(message::SYMBOL_TABLE, group), (message::ATTRIBUTE, attribute), (message::NOTHING, vec![0; ROOM])]
+}
+
+/// The messages of a dataset; the layout is the fourth.
+fn messages(table: &Table) -> Vec<Message> {
+    let shape = &table.spec.shape;
+    let rank = shape.len() as u8 + 1;
+    let sides = |first: u64| std::iter::once(first).chain(shape.iter().map(|&side| side as u64));
+    let mut dataspace = vec![1, rank, 1, 0, 0, 0, 0, 0];
+    dataspace.extend(sides(0).chain(sides(UNDEFINED)).flat_map(u64::to_le_bytes));
+
+    // Version 3, chunked.
+    let mut layout = vec![3, 2, rank + 1];
+    layout.extend(UNDEFINED.to_le_bytes());
+    let chunk = std::iter::once(table.chunk_rows).chain(shape.iter().copied()).chain([table.spec.dtype.size()]);
+    layout.extend(chunk.flat_map(|side| (side as u32).to_le_bytes()));
+    layout.resize(layout.len().next_multiple_of(8), 0);
+
+    let mut filters = vec![1, 1 + u8::from(table.compressed), 0, 0, 0, 0, 0, 0];
+    if table.compressed {
+        // Optional: what does not become smaller is stored as it is. Its settings are versions and the chunk's size.
+        filter(&mut filters, id::LZF, b"lzf\0\0\0\0\0", 1, &[4, 0x105, table.chunk_bytes() as u32]);
+    }
+    filter(&mut filters, id::FLETCHER32, b"fletcher32\0\0\0\0\0\0", 0, &[]);
+    vec![
+        (message::DATASPACE, dataspace),
+        (message::DATATYPE, datatype(table.spec.dtype)),
+        // Space comes with the chunks, and what was never written reads as 0.
+        (message::FILL_VALUE, vec![2, 3, 2, 1, 0, 0, 0, 0]),
+        (message::LAYOUT, layout),
+        (message::FILTERS, filters),
+    ]
+}
+
+fn filter(out: &mut Vec<u8>, id: u16, name: &[u8], flags: u16, settings: &[u32]) {
+    for value in [id, name.len() as u16, flags, settings.len() as u16] {
+        out.extend(value.to_le_bytes());
+    }
+    out.extend(name);
+    settings.iter().for_each(|value| out.extend(value.to_le_bytes()));
+    out.resize(out.len().next_multiple_of(8), 0);
+}
+
+/// The message of a number type.
+fn datatype(dtype: DType) -> Vec<u8> {
+    let whole = |signed: u8, size: u8| vec![0x10, signed << 3, 0, 0, size, 0, 0, 0, 0, 0, size * 8, 0, 0, 0, 0, 0];
+    let real = |size: u8, sign: u8, [exponent, exponent_bits, fraction_bits]: [u8; 3], bias: u32| {
+        let mut out =
+            vec![0x11, 0x20, sign, 0, size, 0, 0, 0, 0, 0, size * 8, 0, exponent, exponent_bits, 0, fraction_bits];
+        out.extend(bias.to_le_bytes());
+        out.extend([0; 4]);
+        out
+    };
+    match dtype {
+        DType::Bool => {
+            // As h5py does it: FALSE and TRUE, over a signed byte.
+            let mut out = vec![0x18, 2, 0, 0, 1, 0, 0, 0, 0x10, 8, 0, 0, 1, 0, 0, 0, 0, 0, 8, 0];
+            out.extend(b"FALSE\0\0\0TRUE\0\0\0\0\0\x01");
+            out.resize(out.len().next_multiple_of(8), 0);
+            out
+        }
+        DType::U8 => whole(0, 1),
+        DType::Int32 => whole(1, 4),
+        DType::Int64 => whole(1, 8),
+        DType::Float32 => real(4, 31, [23, 8, 23], 127),
+        DType::Float64 => real(8, 63, [52, 11, 52], 1023),
+    }
+}
+
+/// Bytes that a chunk which is not compressed takes.
+pub(super) fn summed_bytes(table: &Table) -> usize {
+    table.chunk_bytes() + fletcher32::SIZE
+}

@@ -1,0 +1,77 @@
+//! The format `hdf5`: one file, as the reference's `HDF5Dataset` and every HDF5 library read it.
+//!
+//! A dataset `[rows, shape…]` for each column, all episodes one after another, and `ep_len` and `ep_offset` with the
+//! rows of every episode and its first row. Types, names and shapes are those of the columns.
+//!
+//! **Reading.** `hdf5-pure` reads the structure of a file. Chunks we read ourselves: those that a batch wants are planned
+//! together, read once each, and decoded on all threads, mostly straight to their place in the batch. Any layout of
+//! chunks is understood, and the filters that h5py and hdf5plugin are used with (`filters/`). `s3://` and `http://`
+//! locations are read by ranges, all those of a batch at once.
+//!
+//! **Writing.** Pictures are chunks of one row, compressed with LZF, which h5py reads without plugins: on drawn pictures
+//! it is as fast as no compression and takes a tenth of the space. Numbers gather in chunks of 8 KiB. Every chunk carries
+//! Fletcher's checksum, so that damage is found, by other programs as well. The structure is of the oldest kind (see
+//! `layout`), because it can be changed safely in place: chunks are written first, then what refers to them, then the
+//! lengths of the columns, and the length of `ep_len` at last, which commits the episodes. A file is sound at every
+//! moment; what a killed writer left behind is not counted, and overwritten by the next.
+//!
+//! A writer holds the lock of the file. h5py asks for a lock to read as well, unless `HDF5_USE_FILE_LOCKING=FALSE`.
+//!
+//! To continue a file that another program laid out, it is first copied to our layout, and then takes its place.
+
+mod column;
+mod filters;
+mod layout;
+mod reader;
+mod record;
+mod source;
+mod table;
+mod tree;
+mod writer;
+
+use crate::format::Format;
+use crate::location::Location;
+use std::path::{Path, PathBuf};
+use swm_core::{Error, Result};
+
+/// The registry row.
+pub const FORMAT: Format = Format {
+    id: "hdf5",
+    summary: "one file NAME.h5 or NAME.hdf5; opens in h5py and in the reference",
+    detect,
+    open: reader::open,
+    create: writer::create,
+};
+
+/// What the names of files end in.
+const SUFFIXES: [&str; 2] = ["h5", "hdf5"];
+
+fn detect(location: &Location) -> bool {
+    let folder = location.path().filter(|path| path.is_dir());
+    SUFFIXES.iter().any(|suffix| location.has_suffix(suffix)) || folder.is_some_and(|path| !files(path).is_empty())
+}
+
+/// The files of a folder that are of this format, by name.
+fn files(folder: &Path) -> Vec<PathBuf> {
+    let entries = folder.read_dir().into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut files: Vec<PathBuf> = entries
+        .filter(|path| {
+            path.extension().is_some_and(|end| SUFFIXES.iter().any(|suffix| end.eq_ignore_ascii_case(suffix)))
+        })
+        .collect();
+    files.sort();
+    files
+}
+
+/// The file of a dataset: itself, or the only one in a folder, which the reference allows as well.
+fn file(location: &Location) -> Result<Location> {
+    let Some(folder) = location.path().filter(|path| path.is_dir()) else { return Ok(location.clone()) };
+    match &files(folder)[..] {
+        [file] => Ok(Location::from(file)),
+        [] => Err(Error::corrupt(folder, "it is a folder without .h5 files", "name the file")),
+        many => {
+            let problem = format!("it holds {} .h5 files", many.len());
+            Err(Error::corrupt(folder, problem, "name the one you mean"))
+        }
+    }
+}

@@ -1,0 +1,228 @@
+//! A dataset that we write: rows become chunks, and commits make them count.
+
+use super::filters::{fletcher32, lzf};
+use super::layout::{Table, summed_bytes};
+use super::source::Source;
+use super::tree::{Entry, Tree, read_u64};
+use rayon::prelude::*;
+use std::cell::RefCell;
+use std::fs::File;
+use std::io;
+use std::os::unix::fs::FileExt as _;
+
+/// The filter that is left out of a chunk: the first, LZF.
+const NOT_COMPRESSED: u32 = 1;
+
+/// Nodes of B-trees are put next to each other, in pieces of the file of this size.
+const PIECE: u64 = 32 << 10;
+
+thread_local! {
+    static ENCODER: RefCell<lzf::Encoder> = RefCell::default();
+}
+
+/// Where what is new is put: at the end of the file.
+pub(super) struct Space {
+    /// The end of the file.
+    pub end: u64,
+    nodes: std::ops::Range<u64>,
+}
+
+impl Space {
+    pub fn new(end: u64) -> Self {
+        Self { end: end.next_multiple_of(8), nodes: 0..0 }
+    }
+
+    fn take(&mut self, size: usize) -> u64 {
+        let at = self.end;
+        self.end = (at + size as u64).next_multiple_of(8);
+        at
+    }
+
+    fn take_node(&mut self, size: usize) -> u64 {
+        let size = size.next_multiple_of(8) as u64;
+        if self.nodes.end - self.nodes.start < size {
+            let at = self.take(PIECE.max(size) as usize);
+            self.nodes = at..self.end;
+        }
+        self.nodes.start += size;
+        self.nodes.start - size
+    }
+}
+
+/// Writes the rows of a dataset.
+pub(super) struct TableWriter {
+    pub table: Table,
+    rows: u64,
+    tree: Tree,
+    /// Rows of the chunk that is not full, and how many bytes of them are stored.
+    open: Vec<u8>,
+    stored: usize,
+    /// Places of former versions of chunks that were not full: free now, and free after the next commit.
+    free: Vec<u64>,
+    freed: Vec<u64>,
+    /// The chunks of an episode, encoded.
+    encoded: Vec<Vec<u8>>,
+    writing: Vec<u8>,
+}
+
+impl TableWriter {
+    pub fn new(table: Table) -> Self {
+        let tree = Tree::new(&table);
+        Self {
+            table,
+            rows: 0,
+            tree,
+            open: vec![],
+            stored: 0,
+            free: vec![],
+            freed: vec![],
+            encoded: vec![],
+            writing: vec![],
+        }
+    }
+
+    /// Continues after the first `rows` rows.
+    ///
+    /// # Errors
+    /// When they are damaged.
+    pub fn load(table: Table, source: &Source, rows: u64) -> Result<Self, String> {
+        let tree = Tree::load(&table, source, rows)?;
+        let mut writer = Self { rows, tree, ..Self::new(table) };
+        if let Some(last) = writer.tree.last()
+            && last.row + writer.table.chunk_rows as u64 > rows
+        {
+            writer.open = read_chunk(&writer.table, source, &last)?;
+            writer.open.truncate((rows - last.row) as usize * writer.table.spec.row_bytes());
+            writer.stored = writer.open.len();
+        }
+        Ok(writer)
+    }
+
+    /// Adds rows. Chunks that they fill are written at once.
+    pub fn append(&mut self, file: &File, space: &mut Space, rows: &[u8]) -> io::Result<()> {
+        self.rows += (rows.len() / self.table.spec.row_bytes()) as u64;
+        if self.table.compressed {
+            return self.append_compressed(file, space, rows);
+        }
+        let mut rest = rows;
+        while !rest.is_empty() {
+            let (now, later) = rest.split_at(rest.len().min(self.table.chunk_bytes() - self.open.len()));
+            self.open.extend(now);
+            rest = later;
+            if self.open.len() == self.table.chunk_bytes() {
+                self.store_open(file, space)?;
+                self.open.clear();
+                self.stored = 0;
+            }
+        }
+        Ok(())
+    }
+
+    fn append_compressed(&mut self, file: &File, space: &mut Space, rows: &[u8]) -> io::Result<()> {
+        let size = self.table.spec.row_bytes();
+        let count = rows.len() / size;
+        if self.encoded.len() < count {
+            self.encoded.resize_with(count, Vec::new);
+        }
+        let smaller: Vec<bool> = rows
+            .par_chunks_exact(size)
+            .zip(&mut self.encoded)
+            .with_max_len(1)
+            .map(|(row, out)| {
+                out.clear();
+                let smaller = ENCODER.with_borrow_mut(|encoder| encoder.encode(row, out));
+                if !smaller {
+                    out.extend(row);
+                }
+                out.extend(fletcher32::sum(out).to_le_bytes());
+                smaller
+            })
+            .collect();
+        let total: usize = self.encoded[..count].iter().map(Vec::len).sum();
+        let mut address = space.take(total);
+        self.writing.clear();
+        self.encoded[..count].iter().for_each(|chunk| self.writing.extend(chunk));
+        file.write_all_at(&self.writing, address)?;
+        let first = self.rows - count as u64;
+        for ((chunk, smaller), row) in self.encoded.iter().zip(smaller).zip(first..) {
+            let skipped = if smaller { 0 } else { NOT_COMPRESSED };
+            let entry = Entry { size: chunk.len() as u32, skipped, row, address };
+            self.tree.push(entry, &mut |size| space.take_node(size));
+            address += chunk.len() as u64;
+        }
+        Ok(())
+    }
+
+    /// Writes the open chunk, as far as it is filled, beside its former version.
+    fn store_open(&mut self, file: &File, space: &mut Space) -> io::Result<()> {
+        let size = summed_bytes(&self.table);
+        let address = self.free.pop().unwrap_or_else(|| space.take(size));
+        self.writing.clear();
+        self.writing.extend(&self.open);
+        self.writing.resize(self.table.chunk_bytes(), 0);
+        self.writing.extend(fletcher32::sum(&self.writing).to_le_bytes());
+        file.write_all_at(&self.writing, address)?;
+        if self.stored > 0 {
+            self.freed.extend(self.tree.move_last(address));
+        } else {
+            let row = self.tree.last().map_or(0, |last| last.row + self.table.chunk_rows as u64);
+            let entry = Entry { size: size as u32, skipped: 0, row, address };
+            self.tree.push(entry, &mut |size| space.take_node(size));
+        }
+        self.stored = self.open.len();
+        Ok(())
+    }
+
+    /// Writes what nothing refers to yet.
+    pub fn write_new(&mut self, file: &File, space: &mut Space) -> io::Result<()> {
+        if self.open.len() > self.stored {
+            self.store_open(file, space)?;
+        }
+        self.tree.write_new(file)
+    }
+
+    /// Lets the B-tree refer to it.
+    pub fn write_changes(&mut self, file: &File) -> io::Result<()> {
+        self.tree.write_changes(file)
+    }
+
+    /// Lets the rows count.
+    pub fn write_rows(&mut self, file: &File) -> io::Result<()> {
+        file.write_all_at(&self.rows.to_le_bytes(), self.table.rows_at)?;
+        self.free.append(&mut self.freed);
+        Ok(())
+    }
+}
+
+/// All rows of a dataset that we wrote and did not compress.
+///
+/// # Errors
+/// When it is damaged.
+pub(super) fn read_all(table: &Table, source: &Source) -> Result<Vec<u8>, String> {
+    let rows = read_u64(source, table.rows_at)?;
+    let size = table.spec.row_bytes();
+    let mut all = vec![];
+    for entry in Tree::chunks(table, source)? {
+        if entry.row != (all.len() / size) as u64 {
+            return Err(format!("a chunk begins in row {} instead of {}", entry.row, all.len() / size));
+        }
+        all.extend(read_chunk(table, source, &entry)?);
+    }
+    let wanted = usize::try_from(rows).ok().and_then(|rows| rows.checked_mul(size));
+    let Some(wanted) = wanted.filter(|&wanted| wanted <= all.len()) else {
+        return Err(format!("it has {rows} rows, and chunks for {}", all.len() / size));
+    };
+    all.truncate(wanted);
+    Ok(all)
+}
+
+fn read_chunk(table: &Table, source: &Source, entry: &Entry) -> Result<Vec<u8>, String> {
+    if entry.size as usize != summed_bytes(table) || entry.skipped != 0 {
+        return Err(format!("a chunk has {} bytes instead of {}", entry.size, summed_bytes(table)));
+    }
+    let mut bytes = vec![0; entry.size as usize];
+    source.read(entry.address, &mut bytes).map_err(|e| e.to_string())?;
+    let summed = fletcher32::check(&bytes)?;
+    bytes.truncate(summed);
+    Ok(bytes)
+}

@@ -1,0 +1,259 @@
+//! What every format that stores columns as they are must do, whatever its files: the modes, the time convention,
+//! constants, one writer at a time, and episodes that stay when the writer is killed.
+
+use crate::sample::{self, episode, manifest, schema};
+use rand::Rng as _;
+use std::io::{BufRead as _, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+use swm_core::{Batch, ColumnSpec, DType, Key, Result, Schema};
+use swm_data::{CommitPolicy, Constants, ImageCodec, Reader, StepRange, WriteMode, WriteOptions, Writer, create, open};
+
+/// How often a group of episodes is committed here.
+const GROUP: usize = 2;
+
+pub fn writer(path: &Path, mode: WriteMode) -> Result<Box<dyn Writer>> {
+    let commit = CommitPolicy { episodes: GROUP, ..CommitPolicy::default() };
+    create(path, &schema(), WriteOptions { mode, codec: ImageCodec::Png, manifest: Some(manifest(3)), commit })
+}
+
+/// A scene that every third episode shares, and a note of its own.
+fn constants(e: usize) -> Constants {
+    let scene = format!("<mujoco model='{}'/>", e % 3);
+    Constants::from([("scene.xml".to_owned(), scene.into_bytes()), ("note".to_owned(), vec![e as u8; e])])
+}
+
+pub fn write(path: &Path, mode: WriteMode, episodes: std::ops::Range<usize>) {
+    let mut writer = writer(path, mode).expect("creates");
+    for e in episodes {
+        writer.write_episode_with(&episode(e), &constants(e)).expect("writes");
+    }
+    writer.finish().expect("finishes");
+}
+
+/// Checks that the dataset holds exactly the episodes `first..`, bit for bit.
+pub fn check(reader: &dyn Reader, first: usize) {
+    let names: Vec<&str> = schema().columns().iter().map(|column| column.name.clone().leak() as &str).collect();
+    for (position, stored) in reader.episodes().iter().enumerate() {
+        let expected = episode(first + position);
+        assert_eq!((stored.index, stored.length), (position as i64, expected.rows()));
+        let read = reader.read(&names, &[StepRange::new(position, 0, stored.length)]).expect("reads");
+        for column in 0..names.len() {
+            assert!(read.bytes(column) == expected.bytes(column), "{} of episode {position}", names[column]);
+        }
+    }
+}
+
+fn check_constants(reader: &dyn Reader, first: usize) {
+    for position in 0..reader.episodes().len() {
+        assert_eq!(reader.constants(position).expect("reads"), constants(first + position));
+    }
+}
+
+/// Everything below but what kills processes.
+pub fn all(name: &str) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join(name);
+    modes(&path);
+    rows_in_any_order(&path);
+    wrong_episodes(&path);
+    let other = |prefix: &str| folder.path().join(format!("{prefix}{name}"));
+    one_writer_at_a_time(&other("busy-"));
+    what_is_committed_is_read_while_it_is_written(&other("growing-"));
+    numbers_of_every_type(&other("types-"));
+    assert!(open(&folder.path().join(format!("none-{name}"))).is_err(), "there is none");
+}
+
+fn modes(path: &Path) {
+    write(path, WriteMode::Create, 0..5);
+    let reader = open(path).expect("opens");
+    assert_eq!(reader.episodes().len(), 5);
+    assert_eq!(reader.schema().columns()[0], ColumnSpec::new("episode_idx", DType::Int32, []));
+    assert_eq!(reader.schema().column("step_idx").expect("is there").dtype, DType::Int64, "as it was declared");
+    let others = |columns: &[ColumnSpec]| -> Vec<ColumnSpec> {
+        columns.iter().filter(|column| !column.name.ends_with("_idx")).cloned().collect()
+    };
+    assert_eq!(others(reader.schema().columns()), others(schema().columns()));
+    check(&*reader, 0);
+    check_constants(&*reader, 0);
+    assert_eq!(reader.manifest(), Some(manifest(3)));
+    let parts = reader.footprint().expect("lists");
+    assert!(parts.iter().any(|(part, size)| part == "pixels" && *size > 0), "{parts:?}");
+    let five = reader.content_hash().expect("hashes");
+
+    let there = writer(path, WriteMode::Create).err().expect("it is there").to_string();
+    assert!(there.contains("exists already") && there.contains("append"), "{there}");
+    write(path, WriteMode::Append, 5..9);
+    let reader = open(path).expect("opens");
+    assert_eq!(reader.episodes().len(), 9);
+    check(&*reader, 0);
+    check_constants(&*reader, 0);
+    assert_ne!(reader.content_hash().expect("hashes"), five);
+
+    let few = Schema::new(schema().columns()[..3].to_vec()).expect("schema");
+    let options = WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
+    let error = create(path, &few, options).err().expect("other columns").to_string();
+    assert!(error.contains("variation.agent.color") && error.contains("the columns it has"), "{error}");
+
+    write(path, WriteMode::Overwrite, 3..5);
+    let reader = open(path).expect("opens");
+    assert_eq!(reader.episodes().len(), 2);
+    check(&*reader, 3);
+    check_constants(&*reader, 3);
+    write(path, WriteMode::Overwrite, 0..5);
+    assert_eq!(open(path).expect("opens").content_hash().expect("hashes"), five, "equal content has equal hashes");
+}
+
+fn rows_in_any_order(path: &Path) {
+    let reader = open(path).expect("opens");
+    let ranges = [
+        StepRange::new(3, 2, 4),
+        StepRange::new(0, 4, 1),
+        StepRange::new(3, 3, 2),
+        StepRange::new(1, 0, 6),
+        StepRange::new(0, 0, 0),
+    ];
+    let names = ["pixels", "state", "episode_idx", "step_idx", "success"];
+    let read = reader.read(&names, &ranges).expect("reads");
+    let rows: Vec<(usize, usize)> =
+        ranges.iter().flat_map(|range| (range.start..range.start + range.length).map(|t| (range.episode, t))).collect();
+    assert_eq!(read.rows(), rows.len());
+    for (row, &(e, t)) in rows.iter().enumerate() {
+        let expected = episode(e);
+        for name in ["pixels", "success"] {
+            let (a, b) = (read.row(row).get::<u8>(name), expected.row(t).get::<u8>(name));
+            assert!(a.expect("bytes") == b.expect("bytes"), "{name} of row {row}");
+        }
+        assert_eq!(read.row(row).get::<f64>("state").expect("numbers"), [e as f64, t as f64, -0.5]);
+        assert_eq!(read.row(row).get::<i32>("episode_idx").expect("a number"), [e as i32]);
+        assert_eq!(read.row(row).get::<i64>("step_idx").expect("a number"), [t as i64]);
+    }
+    let error = |name: &str, range| reader.read(&[name], &[range]).expect_err("is not there").to_string();
+    assert!(error("pixels", StepRange::new(1, 4, 3)).contains("rows below 6"));
+    assert!(error("state", StepRange::new(5, 0, 1)).contains("positions below 5"));
+    assert!(error("stat", StepRange::new(0, 0, 1)).contains("state"));
+}
+
+fn wrong_episodes(path: &Path) {
+    let mut writer = writer(path, WriteMode::Append).expect("continues");
+    let mut missing = episode(0);
+    let last = missing.rows() - 1;
+    missing.row_mut(last).set(1, &[0.5_f32, 0.5]);
+    assert!(writer.write_episode(&missing).expect_err("an action").to_string().contains("final observation"));
+    let empty = Batch::zeros(&schema(), 0);
+    assert!(writer.write_episode(&empty).expect_err("empty").to_string().contains("no rows"));
+    let few = Batch::zeros(&Schema::new(schema().columns()[1..].to_vec()).expect("schema"), 3);
+    assert!(writer.write_episode(&few).expect_err("no pixels").to_string().contains("pixels"));
+    assert_eq!(writer.episodes(), 5, "nothing of these was taken");
+    writer.finish().expect("finishes");
+    assert_eq!(open(path).expect("opens").episodes().len(), 5);
+}
+
+fn one_writer_at_a_time(path: &Path) {
+    let first = writer(path, WriteMode::Create).expect("creates");
+    for mode in [WriteMode::Append, WriteMode::Overwrite] {
+        let error = writer(path, mode).err().expect("somebody writes there").to_string();
+        assert!(error.contains("somebody else writes"), "{error}");
+    }
+    drop(first);
+    write(path, WriteMode::Append, 0..1);
+}
+
+fn what_is_committed_is_read_while_it_is_written(path: &Path) {
+    let mut writer = writer(path, WriteMode::Create).expect("creates");
+    assert_eq!(open(path).expect("opens").episodes().len(), 0);
+    for e in 0..7 {
+        writer.write_episode_with(&episode(e), &constants(e)).expect("writes");
+        let reader = open(path).expect("opens");
+        let committed = (e + 1) / GROUP * GROUP;
+        assert_eq!(reader.episodes().len(), committed);
+        check(&*reader, 0);
+        check_constants(&*reader, 0);
+    }
+    drop(writer);
+    let reader = open(path).expect("opens");
+    assert_eq!(reader.episodes().len(), 7, "dropping commits the rest");
+    check(&*reader, 0);
+}
+
+fn numbers_of_every_type(path: &Path) {
+    let types = [DType::Bool, DType::U8, DType::Int32, DType::Int64, DType::Float32, DType::Float64];
+    let shapes: [&[usize]; 3] = [&[], &[1], &[2, 3]];
+    let specs: Vec<ColumnSpec> = types
+        .iter()
+        .flat_map(|dtype| {
+            shapes.map(|shape| ColumnSpec::new(format!("{}{}", dtype.name(), shape.len()), *dtype, shape))
+        })
+        .collect();
+    let schema = Schema::new(specs).expect("schema");
+    let mut batch = Batch::zeros(&schema, 300);
+    for (index, column) in schema.columns().iter().enumerate() {
+        let limit = if column.dtype == DType::Bool { 2 } else { 251 };
+        batch.bytes_mut(index).iter_mut().enumerate().for_each(|(i, byte)| *byte = ((i * 7 + index) % limit) as u8);
+    }
+    let mut writer = create(path, &schema, WriteOptions::default()).expect("creates");
+    writer.write_episode(&batch).expect("writes");
+    writer.write_episode(&batch).expect("writes");
+    writer.finish().expect("finishes");
+    let reader = open(path).expect("opens");
+    assert_eq!(reader.schema().columns()[2..], *schema.columns());
+    let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();
+    let read = reader.read(&names, &[StepRange::new(1, 0, 300)]).expect("reads");
+    (0..names.len()).for_each(|column| assert!(read.bytes(column) == batch.bytes(column), "{}", names[column]));
+}
+
+/// Kills a writer at moments that a key decides; every time, all that was committed is there, and the next continues.
+pub fn killed(name: &str, moments: u64) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join(name);
+    let mut stored = 0;
+    for moment in 0..moments {
+        let mut rng = Key::new(5).with(name).at(moment).rng();
+        let mut child = child(&path).spawn().expect("starts");
+        let mut lines = BufReader::new(child.stdout.take().expect("its output")).lines();
+        let mut last = None;
+        for _ in 0..rng.random_range(0..12) {
+            let line = lines.next().expect("more lines").expect("text");
+            last = line.rsplit_once("episode ").map(|(_, e)| e.parse::<usize>().expect("a number")).or(last);
+        }
+        // Somewhere in what follows.
+        let until = Instant::now() + Duration::from_micros(rng.random_range(0..8000));
+        while Instant::now() < until {
+            std::hint::spin_loop();
+        }
+        child.kill().expect("killed");
+        child.wait().expect("gone");
+        let now = match open(&path) {
+            Ok(reader) => {
+                // Loosely: the child stores JPEG where the format encodes pictures.
+                sample::check(&*reader, 0);
+                reader.episodes().len()
+            }
+            Err(error) => {
+                assert!(stored == 0 && last.is_none(), "moment {moment}: {error}");
+                0
+            }
+        };
+        // Three episodes make a group.
+        let said = last.map_or(0, |last| last + 1);
+        assert!(now >= stored && now + 3 > said, "moment {moment}: {now} episodes after {stored}; {said} were written");
+        stored = now;
+    }
+    assert!(stored > moments as usize, "{stored} episodes");
+    let mut writer = writer(&path, WriteMode::Append).expect("continues");
+    writer.write_episode(&episode(stored)).expect("writes");
+    writer.finish().expect("finishes");
+    let reader = open(&path).expect("opens");
+    assert_eq!(reader.episodes().len(), stored + 1);
+    sample::check(&*reader, 0);
+}
+
+/// A process that writes episodes until it is killed.
+fn child(path: &Path) -> Command {
+    let program: PathBuf = std::env::current_exe().expect("this program");
+    let mut command = Command::new(program);
+    command.args(["--exact", "interruption::child_that_writes", "--nocapture"]);
+    command.env("SWM_TEST_CHILD_TARGET", path).stdout(Stdio::piped()).stderr(Stdio::null());
+    command
+}

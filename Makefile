@@ -4,23 +4,27 @@
 # One cache of compiled crates for every checkout on the machine.
 export CARGO_TARGET_DIR ?= $(HOME)/.cache/swm/target
 CACHE := $(HOME)/.cache/swm
-# A small Python environment with the `lance` package: tests open our datasets with it.
-VENV := $(CACHE)/venv-lance-14.0.2
+# A small Python environment with the `lance` and `h5py` packages: tests open our datasets with it.
+VENV := $(CACHE)/venv-formats-1
+# What 3-D worlds need of others (`swm assets`), one copy for every checkout on the machine.
+export SWM_ASSETS ?= $(CACHE)/assets
+SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test check build setup setup-python reference bench clean
+.PHONY: help demo test check build assets setup setup-python reference bench clean
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
 	@echo 'make test       all checks and all tests'
-	@echo 'make build      the swm binary: $(CARGO_TARGET_DIR)/release/swm'
+	@echo 'make build      the swm binary: $(SWM)'
+	@echo 'make assets     MuJoCo, its models and meshes, into $(SWM_ASSETS)'
 	@echo 'make bench      our benchmarks, against the reference where `make reference` installed it'
 
 demo: build
-	$(CARGO_TARGET_DIR)/release/swm demo
+	$(SWM) demo
 
-test: check setup-python
+test: check setup-python assets
 	SWM_LANCE_PYTHON=$(VENV)/bin/python $(CARGO) test --release --workspace
 
 check: setup
@@ -30,10 +34,18 @@ check: setup
 build: setup
 	$(CARGO) build --release --workspace --bins --tests
 
-bench: build
-	SWM_REFERENCE_PYTHON=$(CACHE)/reference/bin/python $(CARGO_TARGET_DIR)/release/swm bench envs
+bench: assets
+	SWM_REFERENCE_PYTHON=$(CACHE)/reference/bin/python $(SWM) bench envs
+	SWM_REFERENCE_PYTHON=$(CACHE)/reference/bin/python $(SWM) bench data
 
-# What the build and the tests need: protoc for Lance, a C compiler for zstd, ffmpeg for videos.
+# Fetched once; every file is compared with its checksum at every call.
+assets: build
+	@$(SWM) assets verify mujoco dm_control ogbench gymnasium-robotics >/dev/null 2>&1 || $(SWM) assets install
+
+# What the build and the tests need: protoc for Lance, a C compiler for zstd, FFmpeg's libraries (and libclang, to read
+# their headers) for videos, Mesa for pictures of 3-D worlds where there is no GPU.
+PACKAGES := libavcodec-dev libavformat-dev libavutil-dev libswscale-dev libclang-dev pkg-config \
+	libegl1 libegl-mesa0 libgl1-mesa-dri
 setup:
 	@command -v $(CARGO) >/dev/null || { echo 'cargo is missing: install a Rust toolchain (1.95 or newer)'; exit 1; }
 	@missing=''; \
@@ -41,6 +53,9 @@ setup:
 	  command -v $${pair%%:*} >/dev/null || missing="$$missing $${pair##*:}"; \
 	done; \
 	[ -e /usr/include/google/protobuf/any.proto ] || missing="$$missing libprotobuf-dev"; \
+	for package in $(PACKAGES); do \
+	  dpkg-query -W -f='$${Status}' $$package 2>/dev/null | grep -q 'ok installed' || missing="$$missing $$package"; \
+	done; \
 	if [ -n "$$missing" ]; then \
 	  echo "installing Debian packages:$$missing"; \
 	  $(SUDO) apt-get update -qq && DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends $$missing; \
@@ -54,7 +69,7 @@ $(VENV)/ready:
 	@python3 -c 'import ensurepip, venv' 2>/dev/null || { $(SUDO) apt-get update -qq; \
 	  DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends python3-venv; }
 	python3 -m venv --clear $(VENV)
-	$(VENV)/bin/python -m pip install --quiet pylance==14.0.2 numpy
+	$(VENV)/bin/python -m pip install --quiet pylance==14.0.2 numpy h5py==3.16.0 hdf5plugin==7.1.0 pillow
 	touch $@
 
 # The published reference, for parity and speed: heavy (it brings torch), and only wanted by `make bench`.

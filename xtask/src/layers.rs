@@ -45,12 +45,12 @@ pub const RULES: &[Rule] = &[
     },
     Rule::Never {
         crates: &["swm-eval"],
-        forbidden: |name| name == "swm-models" || name == "swm-envs",
+        forbidden: |name| ["swm-models", "swm-envs", "swm-mujoco"].contains(&name),
         words: "evaluation knows models and environments by their contracts only",
     },
     Rule::Only {
         users: &["swm"],
-        crates: &["swm-envs", "swm-models"],
+        crates: &["swm-envs", "swm-mujoco", "swm-models"],
         words: "only the facade knows concrete families",
     },
 ];
@@ -98,12 +98,13 @@ mod tests {
         let mut packages: Vec<(&str, Vec<&str>)> = vec![
             ("swm-core", vec!["serde"]),
             ("swm-envs", vec!["swm-core"]),
+            ("swm-mujoco", vec!["swm-core", "mujoco-rs"]),
             ("swm-plan", vec!["swm-core"]),
             ("swm-report", vec!["swm-core"]),
             ("swm-data", vec!["swm-core", "lance-file"]),
             ("swm-models", vec!["swm-core", "swm-data", "swm-plan", "burn"]),
             ("swm-eval", vec!["swm-core", "swm-data"]),
-            ("swm", vec!["swm-core", "swm-envs", "swm-models", "swm-eval", "swm-report"]),
+            ("swm", vec!["swm-core", "swm-envs", "swm-mujoco", "swm-models", "swm-eval", "swm-report"]),
             ("serde", vec![]),
             ("burn", vec!["burn-core"]),
             ("burn-core", vec![]),
@@ -138,6 +139,7 @@ mod tests {
             ("swm-eval", "swm-models", "swm-eval → swm-models (evaluation"),
             ("swm-data", "swm-envs", "swm-eval → swm-data → swm-envs (evaluation"),
             ("swm-models", "swm-envs", "swm-models → swm-envs (only the facade"),
+            ("swm-report", "swm-mujoco", "swm-report → swm-mujoco (only the facade"),
             ("swm-report", "swm-models", "swm-report → swm-models (only the facade"),
             (
                 "lance-file",

@@ -78,7 +78,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
         env,
         path: &data,
         policy: "explore",
-        world,
+        world: world.clone(),
         config: CollectConfig {
             episodes: args.episodes,
             seed: args.seed,

@@ -62,6 +62,18 @@ pub(crate) trait Task: Send {
     /// Takes back what it remembered. The model is that of the factors; the state is not there yet.
     fn recall(&mut self, physics: &mut Physics, memory: &[f64]);
 
+    /// Numbers of [`Task::remember_goal`].
+    fn goal_len(&self) -> usize {
+        0
+    }
+
+    /// Writes the goal: with it, snapshots go on towards the goal they were taken with. The `state` column does without, as a
+    /// state is the same wherever one wants to go.
+    fn remember_goal(&self, _into: &mut [f64]) {}
+
+    /// Takes back the goal it remembered.
+    fn recall_goal(&mut self, _goal: &[f64]) {}
+
     /// Takes its goal from a state somewhere else: numbers of [`Physics::state`], and the memory there. It may put that state to
     /// look at it: the world puts the present one back.
     fn aim(&mut self, physics: &mut Physics, state: &[f64], memory: &[f64]) -> Result<()>;
@@ -72,9 +84,9 @@ pub(crate) trait Task: Send {
     /// Puts the world where the goal is reached, for a picture: the world puts the state back.
     fn show_goal(&mut self, physics: &mut Physics);
 
-    /// Makes the model, and the physics' state that is about to be put back, show the goal and what the task remembers: after a
-    /// goal was taken, chosen or shown.
-    fn mark_goal(&self, _physics: &mut Physics, _state: &mut [f64]) {}
+    /// Makes the model show the goal and what the task remembers, for a state of the physics that is about to be put back: after
+    /// a goal was taken, chosen, recalled or shown. The physics' own state may be anything afterwards.
+    fn mark_goal(&mut self, _physics: &mut Physics, _state: &[f64]) {}
 
     /// Whether the goal is reached now.
     fn is_success(&self, physics: &Physics) -> bool;
@@ -166,6 +178,7 @@ impl<T: Task> World<T> {
             Some(memory) => {
                 finite("a state", memory)?;
                 self.task.recall(&mut self.physics, memory);
+                self.task.mark_goal(&mut self.physics, physics);
                 self.physics.set_state(physics)
             }
             None => self.physics.set_pose(physics),
@@ -194,7 +207,7 @@ impl<T: Task> World<T> {
         scratch.clear();
         self.physics.save(&mut scratch);
         let done = act(&mut self.task, &mut self.physics, &mut self.stage);
-        self.task.mark_goal(&mut self.physics, Physics::saved_state(&mut scratch));
+        self.task.mark_goal(&mut self.physics, Physics::saved_state(&scratch));
         let back = self.physics.load(&scratch);
         self.scratch = scratch;
         back.map(|()| done)
@@ -308,8 +321,10 @@ impl<T: Task> Env for World<T> {
     fn snapshot(&self) -> Snapshot {
         let mut numbers = Vec::with_capacity(self.physics.saved_len() + self.state_len());
         self.physics.save(&mut numbers);
-        let mut memory = vec![0.0; self.state_len() - self.physics.state_len()];
-        self.task.remember(&mut memory);
+        let mut memory = vec![0.0; self.state_len() - self.physics.state_len() + self.task.goal_len()];
+        let (head, goal) = memory.split_at_mut(self.state_len() - self.physics.state_len());
+        self.task.remember(head);
+        self.task.remember_goal(goal);
         numbers.extend(memory);
         factors::snapshot(&self.spec.id, &self.factors, numbers.into_iter().flat_map(f64::to_le_bytes))
     }
@@ -318,7 +333,8 @@ impl<T: Task> Env for World<T> {
         let (changed, bytes) = factors::restored(&self.spec.id, &self.spec.variation_space, &self.factors, snapshot)?;
         let saved = self.physics.saved_len();
         let (numbers, rest) = bytes.as_chunks();
-        let expected = saved + self.state_len() - self.physics.state_len();
+        let memory = self.state_len() - self.physics.state_len();
+        let expected = saved + memory + self.task.goal_len();
         if numbers.len() != expected || !rest.is_empty() {
             return Err(factors::foreign(&self.spec.id, format!("{} bytes of state", bytes.len())));
         }
@@ -327,8 +343,11 @@ impl<T: Task> Env for World<T> {
         if let Some(factors) = changed {
             self.arrange(factors)?;
         }
-        let (physics, memory) = self.scratch.split_at(saved);
+        let (physics, rest) = self.scratch.split_at(saved);
+        let (memory, goal) = rest.split_at(memory);
         self.task.recall(&mut self.physics, memory);
+        self.task.recall_goal(goal);
+        self.task.mark_goal(&mut self.physics, Physics::saved_state(physics));
         self.physics.load(physics)
     }
 

@@ -621,8 +621,8 @@ impl Physics {
     }
 
     /// The state in what [`Physics::save`] wrote: the one from which the derived quantities came about.
-    pub(crate) fn saved_state(saved: &mut [f64]) -> &mut [f64] {
-        saved.get_mut(2..).unwrap_or_default()
+    pub(crate) fn saved_state(saved: &[f64]) -> &[f64] {
+        saved.get(2..).unwrap_or_default()
     }
 
     /// Puts back what [`Physics::save`] wrote, on the same model with the same edits.

@@ -34,3 +34,17 @@ pub fn paint(physics: &mut Physics, colors: &[f64]) -> Result<()> {
     physics.repaint();
     Ok(())
 }
+
+/// Paints the floor so that its colour says where one is: red grows with the rows, green with the columns.
+#[allow(clippy::cast_possible_truncation)]
+pub fn encode(physics: &mut Physics, texture: usize) {
+    const BRIGHTEST: usize = 192;
+    let model = physics.model_mut();
+    let sizes = [model.tex_adr()[texture], model.tex_width()[texture].into(), model.tex_height()[texture].into()];
+    let [from, width, height] = sizes.map(|size| usize::try_from(size).unwrap_or(0));
+    let texels = model.tex_data_mut()[from..from + 3 * width * height].as_chunks_mut::<3>().0;
+    for (place, texel) in texels.iter_mut().enumerate() {
+        *texel = [(place / width * BRIGHTEST / height) as u8, (place % width * BRIGHTEST / width) as u8, 128];
+    }
+    physics.repaint();
+}

@@ -1,6 +1,7 @@
 //! The worlds of OGBench: tables with an arm, and mazes.
 mod arm;
 mod floor;
+mod maze;
 mod table;
 
 use mujoco_rs::wrappers::MjModel;
@@ -8,7 +9,7 @@ use std::sync::Arc;
 use swm_core::{EnvEntry, Result};
 
 /// The registry rows.
-pub const ENTRIES: [EnvEntry; 2] = [
+pub const ENTRIES: [EnvEntry; 3] = [
     EnvEntry {
         id: "swm/OGBCube-v0",
         summary: "an arm puts cubes where they should go, on a table",
@@ -23,9 +24,16 @@ pub const ENTRIES: [EnvEntry; 2] = [
         make: table::make_scene,
         experts: &[],
     },
+    EnvEntry {
+        id: "swm/OGBMaze-v0",
+        summary: "a point or an ant finds the way through a maze",
+        options: maze::OPTIONS,
+        make: maze::make,
+        experts: maze::EXPERTS,
+    },
 ];
 
 /// The models of these worlds as they are compiled, by name: for whoever compares them with the reference's.
-pub fn models() -> impl Iterator<Item = (&'static str, Result<Arc<MjModel>>)> {
-    table::models()
+pub fn models() -> impl Iterator<Item = (String, Result<Arc<MjModel>>)> {
+    table::models().chain(maze::models())
 }

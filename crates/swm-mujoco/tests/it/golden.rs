@@ -23,24 +23,89 @@ struct Family {
     until: fn(&str, &mut Golden) -> usize,
     /// Names of infos that are called differently here.
     renamed: &'static [(&'static str, &'static str)],
+    /// Makes the goal's `state` column of the start's, where the goal is none of the state.
+    goal: fn(&mut Golden, &mut [f64]),
 }
 
-const FAMILIES: &[Family] = &[Family {
-    named: |id| id.starts_with("swm/Fetch"),
-    // Recorded with MuJoCo 3.3.2.
-    tolerance: 1e-4,
-    // Asked to vary `all`, the reference samples every factor and applies none but this: it looks for their keys in the list.
-    factors: |file, mut request| {
-        if file.contains("-all-") {
-            request.variation_values.retain(|key, _| key == "block.mass");
-        }
-        request
+const FAMILIES: &[Family] = &[
+    Family {
+        named: |id| id.starts_with("swm/Fetch"),
+        // Recorded with MuJoCo 3.3.2.
+        tolerance: 1e-4,
+        // Asked to vary `all`, the reference samples every factor and applies none but this: it looks for their keys in the list.
+        factors: |file, mut request| {
+            if file.contains("-all-") {
+                request.variation_values.retain(|key, _| key == "block.mass");
+            }
+            request
+        },
+        memory: |golden, memory| memory.copy_from_slice(&golden.numbers("info.goal_state")[..3]),
+        step: 0.04,
+        until: fetch_until,
+        renamed: &[("state", "observation")],
+        goal: |_, _| {},
     },
-    memory: |golden, memory| memory.copy_from_slice(&golden.numbers("info.goal_state")[..3]),
-    step: 0.04,
-    until: fetch_until,
-    renamed: &[("state", "observation")],
-}];
+    Family {
+        named: |id| id.starts_with("swm/OGBCube") || id.starts_with("swm/OGBScene"),
+        tolerance: 1e-6,
+        factors: |_, request| request,
+        memory: table_memory,
+        step: 0.05,
+        until: table_until,
+        renamed: &[],
+        goal: table_goal,
+    },
+    Family {
+        named: |id| id.starts_with("swm/OGBMaze"),
+        tolerance: 1e-6,
+        factors: |_, request| request,
+        memory: |golden, memory| {
+            let pose = golden.numbers("qpos_qvel");
+            let n = memory.len() - 1;
+            memory[1..].copy_from_slice(&pose[..n]);
+        },
+        step: 0.1,
+        until: |_, _| usize::MAX,
+        renamed: &[],
+        goal: |golden, state| {
+            // Where nobody recorded the goal, nobody reached it: it is out of sight.
+            let known = golden.names().iter().any(|name| name == "goal.xy");
+            let goal = if known { golden.numbers("goal.xy") } else { vec![1e3, 1e3] };
+            state[1..3].copy_from_slice(&goal);
+        },
+    },
+];
+
+/// What a table remembers: contact, locks now and before, and the pose before.
+fn table_memory(golden: &mut Golden, memory: &mut [f64]) {
+    memory[0] = golden.numbers("info.proprio/gripper_contact")[0];
+    if golden.names().iter().any(|name| name == "info.button_states") {
+        memory[1..3].copy_from_slice(&golden.numbers("info.button_states")[..2]);
+        memory[3..5].copy_from_slice(&golden.numbers("info.prev_button_states")[..2]);
+    }
+    let [nq, nv] = ["start.qpos", "start.qvel"].map(|part| golden.numbers(part).len());
+    memory[5..5 + nq].copy_from_slice(&golden.numbers("info.prev_qpos")[..nq]);
+    memory[5 + nq..].copy_from_slice(&golden.numbers("info.prev_qvel")[..nv]);
+}
+
+/// Cubes where their markers are; locks, drawer and window as observed at the goal.
+fn table_goal(golden: &mut Golden, state: &mut [f64]) {
+    let (places, turns) = (golden.numbers("start.mocap_pos"), golden.numbers("start.mocap_quat"));
+    let (poses, joints) = (golden.numbers("start.qpos").len(), state.len());
+    let fixtures = golden.names().iter().any(|name| name == "info.button_states");
+    let (cubes, target) = (places.len() / 3, golden.numbers("info.target"));
+    // Cubes stand behind the 14 joints of the arm and its gripper.
+    for cube in 0..cubes {
+        let at = &mut state[1 + 14 + 7 * cube..][..7];
+        at[..3].copy_from_slice(&places[3 * cube..][..3]);
+        at[3..].copy_from_slice(&turns[4 * cube..][..4]);
+    }
+    if fixtures {
+        let memory = joints - (5 + poses + golden.numbers("start.qvel").len());
+        (state[memory + 1], state[memory + 2]) = (target[29], target[33]);
+        (state[poses - 1], state[poses]) = (target[36] / 18.0, target[38] / 15.0);
+    }
+}
 
 /// All rows, but of Slide those before the gripper touches the puck: a cylinder's contacts are found by iteration, whose last
 /// digits are another version's, and a strike makes them centimetres.
@@ -54,8 +119,9 @@ fn fetch_until(file: &str, golden: &mut Golden) -> usize {
     }
 }
 
-/// Infos that are no columns of the world: its name, and success, which the pool writes.
-const NO_COLUMNS: [&str; 3] = ["env_name", "success", "is_success"];
+/// Infos that are no columns of the world, or cannot be compared: its name, success, which the pool writes, and what was observed
+/// at a goal of which no state was recorded.
+const NO_COLUMNS: [&str; 4] = ["env_name", "success", "is_success", "target"];
 
 /// Mean absolute difference of pictures, of 255.
 const PICTURES: f64 = 3.0;
@@ -70,15 +136,75 @@ fn rollouts_follow_the_reference() {
     for family in FAMILIES {
         let mut compared = 0;
         for row in ENVS.rows.iter().filter(|row| (family.named)(row.id)) {
-            for file in recorded::files(&format!("{}-", row.id.replace('/', "_"))) {
+            for file in recorded::files(&row.id.replace('/', "_")) {
                 compared += 1;
-                let env = row.env().unwrap_or_else(|error| panic!("{}: {error}", row.id));
+                let env = recorded_in(&file).unwrap_or_else(|error| panic!("{}: {error}", row.id));
                 problems.extend(Comparison::new(family, env, &file).run());
             }
         }
         assert!(compared > 0, "no rollouts of a family are there");
     }
     assert!(problems.is_empty(), "{}", problems.join("\n"));
+}
+
+/// The world of a file: `swm_ID,option=value-default-SEED.npz`.
+fn recorded_in(file: &Path) -> swm_core::Result<Box<dyn Env>> {
+    let name = file.file_stem().unwrap_or_default().to_string_lossy();
+    let end = ["-all-", "-each-", "-default-"].into_iter().find_map(|kind| name.rfind(kind)).unwrap_or(name.len());
+    ENVS.choose(&name[..end].replacen('_', "/", 1))?.env()
+}
+
+/// The recorded start as a `state` column.
+fn start(env: &dyn Env, family: &Family, golden: &mut Golden) -> Vec<f64> {
+    let mut state = column(env, "state");
+    let (names, mut physics) = (golden.names(), vec![]);
+    for part in START {
+        let array = format!("start.{part}");
+        if names.contains(&array) {
+            physics.extend(golden.numbers(&array));
+        } else {
+            assert!(!["qacc_warmstart", "qvel"].contains(&part), "{array} is not recorded");
+        }
+    }
+    let (head, memory) = state.split_at_mut(physics.len());
+    head.copy_from_slice(&physics);
+    (family.memory)(golden, memory);
+    state
+}
+
+/// One column as it is now.
+fn column(env: &dyn Env, name: &str) -> Vec<f64> {
+    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
+    env.observe(&mut row.row_mut(0));
+    row.row(0).to_f64(name).expect("a column")
+}
+
+/// All rows before the world parts from itself: where a gripper's mesh meets a button, the contacts that MuJoCo finds jump with the
+/// last digit of a pose, and the reference does not follow its own recording.
+fn table_until(name: &str, golden: &mut Golden) -> usize {
+    let family = &FAMILIES[1];
+    let options = ResetOptions { variation: golden.variation(), ..ResetOptions::default() };
+    let actions: Vec<f32> = golden.numbers("action").iter().map(|&a| a as f32).collect();
+    let pose = golden.numbers("start.qpos").len();
+    let mut play = |nudge: f64| -> Vec<Vec<f64>> {
+        let mut env = recorded_in(Path::new(name)).expect("a world");
+        env.reset(0, &options).expect("a reset");
+        let mut state = start(&*env, family, golden);
+        state[1] += nudge;
+        env.reset(0, &ResetOptions { state: Some(state), ..options.clone() }).expect("a reset");
+        let mut step = |action| {
+            env.step(Action::Continuous(action)).expect("a step");
+            column(&*env, "state")[1..=pose].to_vec()
+        };
+        actions.chunks_exact(5).map(&mut step).collect()
+    };
+    let usual = play(0.0);
+    let parted = [1e-13, -1e-13, 1e-14].into_iter().filter_map(|nudge| {
+        let apart = |(a, b): (&Vec<f64>, &Vec<f64>)| a.iter().zip(b).any(|(a, b)| (a - b).abs() > 1e-7);
+        usual.iter().zip(&play(nudge)).position(apart)
+    });
+    // Row t + 1 follows action t.
+    parted.min().map_or(usize::MAX, |step| step + 1)
 }
 
 /// The largest difference of one array, and where.
@@ -110,7 +236,11 @@ impl<'a> Comparison<'a> {
         let variation = (self.family.factors)(&self.name, self.golden.variation());
         let mut options = ResetOptions { variation, ..ResetOptions::default() };
         self.env.reset(0, &options).unwrap_or_else(|error| panic!("{}: {error}", self.name));
-        options.state = Some(self.start(&names));
+        let start = start(&*self.env, self.family, &mut self.golden);
+        let mut goal = start.clone();
+        (self.family.goal)(&mut self.golden, &mut goal);
+        options.goal_state = (goal != start).then_some(goal);
+        options.state = Some(start);
         self.env.reset(0, &options).unwrap_or_else(|error| panic!("{}: {error}", self.name));
 
         let infos: Vec<(String, Vec<f64>)> = names
@@ -141,7 +271,12 @@ impl<'a> Comparison<'a> {
             for (info, recorded) in infos.iter().filter(|_| compared) {
                 let renamed = self.family.renamed.iter().find(|(theirs, _)| theirs == info);
                 let ours = self.column(renamed.map_or(info, |(_, ours)| ours));
-                self.note(info, step, &ours, recorded);
+                // Mazes say nothing at a reset.
+                match (recorded.len() == rewards.len() * ours.len(), step) {
+                    (true, 0) => {}
+                    (true, _) => self.note(info, step - 1, &ours, recorded),
+                    (false, _) => self.note(info, step, &ours, recorded),
+                }
             }
             for (array, recorded) in sights.iter().filter(|_| compared) {
                 let ours = self.seen(array.strip_prefix("obs."));
@@ -166,25 +301,6 @@ impl<'a> Comparison<'a> {
             .filter(|(array, apart)| apart.by.is_nan() || apart.by > limit(array))
             .map(|(array, apart)| format!("{}: {array} is {:.2e} away at step {}", self.name, apart.by, apart.step))
             .collect()
-    }
-
-    /// The recorded start as a `state` column.
-    fn start(&mut self, names: &[String]) -> Vec<f64> {
-        self.env.observe(&mut self.row.row_mut(0));
-        let mut state = self.column("state");
-        let mut physics = vec![];
-        for part in START {
-            let array = format!("start.{part}");
-            if names.contains(&array) {
-                physics.extend(self.golden.numbers(&array));
-            } else if part == "qacc_warmstart" || part == "qvel" {
-                panic!("{} lacks {array}", self.name);
-            }
-        }
-        let (head, memory) = state.split_at_mut(physics.len());
-        head.copy_from_slice(&physics);
-        (self.family.memory)(&mut self.golden, memory);
-        state
     }
 
     fn column(&self, name: &str) -> Vec<f64> {

@@ -9,7 +9,7 @@ mod setup;
 mod start;
 mod tasks;
 
-use super::arm::pose::{Quat, Vec3};
+use super::arm::pose::{Pose, Quat, Vec3};
 use super::arm::{ACTION, Arm, find};
 use crate::env::{Step, Task, World};
 use crate::render::Camera;
@@ -103,7 +103,8 @@ fn make(setup: &'static Setup, choice: &EnvChoice) -> Result<Box<dyn Env>> {
         (_, Ok(0)) => Mode::One(USUAL_TASK - 1),
         (_, Ok(task)) => Mode::One(task - 1),
     };
-    let table = Table::new(setup, &model, mode, chosen("permute_blocks") == "true", chosen("terminate_at_goal") == "true")?;
+    let table =
+        Table::new(setup, &model, mode, chosen("permute_blocks") == "true", chosen("terminate_at_goal") == "true")?;
     let observation = observe::observation_len(setup.cubes, setup.fixtures);
     let unbounded = Space::uniform_box([observation], DType::Float64, f64::NEG_INFINITY, f64::INFINITY);
     let spec = EnvSpec {
@@ -164,8 +165,9 @@ struct Goal {
     pose: Vec<f64>,
     /// How firmly the gripper holds something there.
     contact: f64,
-    /// What one observes there.
+    /// What one observes there, once it was looked at.
     target: Vec<f64>,
+    seen: bool,
 }
 
 impl Table {
@@ -191,6 +193,7 @@ impl Table {
                 pose,
                 contact: 0.0,
                 target: vec![0.0; observe::observation_len(setup.cubes, setup.fixtures)],
+                seen: false,
             },
         })
     }
@@ -265,15 +268,22 @@ impl Table {
         }
     }
 
-    /// Puts the cubes' markers where the goal wants the cubes.
-    fn mark(&self, physics: &mut Physics) {
+    /// Puts the cubes' markers where the goal wants the cubes, as a part of the state: where an episode begins.
+    fn move_marks(&self, physics: &mut Physics) {
         for (cube, &(place, turn)) in self.parts.cubes.iter().zip(&self.goal.cubes) {
-            cube.mark(physics, place, turn);
+            let at = Pose { place, turn };
+            cube.mark(physics, at, at);
+            physics.data_mut().mocap_pos_mut()[cube.mocap] = place;
+            physics.data_mut().mocap_quat_mut()[cube.mocap] = turn;
         }
     }
 
-    /// Observes the goal: the state may be anything afterwards.
+    /// Observes the goal, whose pose is that of the physics afterwards. The reference observes none where it collects data.
     fn look_at_goal(&mut self, physics: &mut Physics) {
+        self.goal.seen = true;
+        if self.mode == Mode::Collect {
+            return;
+        }
         let (buttons, contact) = (self.buttons, self.contact);
         self.show_goal(physics);
         (self.buttons, self.contact) = (self.goal.fixed.buttons, self.goal.contact);
@@ -285,8 +295,18 @@ impl Table {
     }
 }
 
-/// Numbers of a [`Table`]'s memory before those whose count depends on the model.
-const MEMORY: usize = 11;
+/// Numbers of a [`Table`]'s memory before the pose, and of its goal before the cubes.
+const MEMORY: usize = 5;
+const GOAL: usize = 6;
+
+/// Locks as numbers, and back.
+fn numbers(buttons: [u8; 2]) -> [f64; 2] {
+    buttons.map(f64::from)
+}
+
+fn locks(numbers: &[f64]) -> [u8; 2] {
+    [u8::from(numbers[0] > 0.5), u8::from(numbers[1] > 0.5)]
+}
 
 impl Task for Table {
     fn overwrites(&self) -> bool {
@@ -322,48 +342,58 @@ impl Task for Table {
     }
 
     fn memory_len(&self, model: &MjModel) -> usize {
-        MEMORY + 7 * self.setup.cubes + 2 * (model.qpos0().len() + model.dof_damping().len())
+        MEMORY + model.qpos0().len() + model.dof_damping().len()
     }
 
     fn remember(&self, into: &mut [f64]) {
-        let two = |buttons: [u8; 2]| buttons.map(f64::from);
-        let ([a, b], [c, d], [e, f]) = (two(self.buttons), two(self.previous_buttons), two(self.goal.fixed.buttons));
-        let Fixed { drawer, window, .. } = self.goal.fixed;
+        let ([a, b], [c, d]) = (numbers(self.buttons), numbers(self.previous_buttons));
+        let (head, previous) = into.split_at_mut(MEMORY);
+        head.copy_from_slice(&[self.contact, a, b, c, d]);
+        previous.copy_from_slice(&self.previous);
+    }
+
+    fn recall(&mut self, _: &mut Physics, memory: &[f64]) {
+        let (head, previous) = memory.split_at(MEMORY);
+        self.contact = head[0];
+        (self.buttons, self.previous_buttons) = (locks(&head[1..]), locks(&head[3..]));
+        self.previous.copy_from_slice(previous);
+    }
+
+    fn goal_len(&self) -> usize {
+        GOAL + 7 * self.setup.cubes + self.goal.pose.len()
+    }
+
+    fn remember_goal(&self, into: &mut [f64]) {
+        let (Fixed { buttons, drawer, window }, contact) = (self.goal.fixed, self.goal.contact);
+        let [a, b] = numbers(buttons);
         #[allow(clippy::cast_precision_loss)]
         let subject = self.goal.subject.number() as f64;
-        let (head, rest) = into.split_at_mut(MEMORY);
-        head.copy_from_slice(&[self.contact, subject, a, b, c, d, e, f, drawer, window, self.goal.contact]);
-        let (cubes, rest) = rest.split_at_mut(7 * self.setup.cubes);
+        let (head, rest) = into.split_at_mut(GOAL);
+        head.copy_from_slice(&[subject, a, b, drawer, window, contact]);
+        let (cubes, pose) = rest.split_at_mut(7 * self.setup.cubes);
         for (numbers, (place, turn)) in cubes.chunks_exact_mut(7).zip(&self.goal.cubes) {
             numbers[..3].copy_from_slice(place);
             numbers[3..].copy_from_slice(turn);
         }
-        let (pose, previous) = rest.split_at_mut(self.goal.pose.len());
         pose.copy_from_slice(&self.goal.pose);
-        previous.copy_from_slice(&self.previous);
     }
 
     #[allow(clippy::cast_possible_truncation)]
-    fn recall(&mut self, physics: &mut Physics, memory: &[f64]) {
-        let (head, rest) = memory.split_at(MEMORY);
-        let two = |at: usize| [u8::from(head[at] > 0.5), u8::from(head[at + 1] > 0.5)];
-        (self.contact, self.goal.subject) = (head[0], Subject::from_number(head[1] as i64));
-        (self.buttons, self.previous_buttons) = (two(2), two(4));
-        self.goal.fixed = Fixed { buttons: two(6), drawer: head[8], window: head[9] };
-        let (cubes, rest) = rest.split_at(7 * self.setup.cubes);
+    fn recall_goal(&mut self, goal: &[f64]) {
+        let (head, rest) = goal.split_at(GOAL);
+        let (cubes, pose) = rest.split_at(7 * self.setup.cubes);
+        self.goal.subject = Subject::from_number(head[0] as i64);
+        self.goal.fixed = Fixed { buttons: locks(&head[1..]), drawer: head[3], window: head[4] };
         for (numbers, (place, turn)) in cubes.chunks_exact(7).zip(&mut self.goal.cubes) {
             place.copy_from_slice(&numbers[..3]);
             turn.copy_from_slice(&numbers[3..]);
         }
-        let (pose, previous) = rest.split_at(self.goal.pose.len());
-        self.previous.copy_from_slice(previous);
         // Whoever plans restores one episode's states thousands of times, all with the same goal.
-        if self.goal.pose != pose || self.goal.contact != head[10] {
+        if self.goal.pose != pose || self.goal.contact != head[5] {
             self.goal.pose.copy_from_slice(pose);
-            self.goal.contact = head[10];
-            self.look_at_goal(physics);
+            self.goal.contact = head[5];
+            self.goal.seen = false;
         }
-        self.dress(physics);
     }
 
     fn aim(&mut self, physics: &mut Physics, state: &[f64], memory: &[f64]) -> Result<()> {
@@ -374,7 +404,7 @@ impl Task for Table {
             *goal = (cube.place(pose), cube.turn(pose));
         }
         if let Some(fixtures) = self.parts.fixtures {
-            self.goal.fixed = fixtures.read(pose, [u8::from(memory[2] > 0.5), u8::from(memory[3] > 0.5)]);
+            self.goal.fixed = fixtures.read(pose, locks(&memory[1..]));
         }
         self.look_at_goal(physics);
         Ok(())
@@ -384,14 +414,18 @@ impl Task for Table {
         self.choose_goal(physics, key)
     }
 
-    fn mark_goal(&self, physics: &mut Physics, state: &mut [f64]) {
+    fn mark_goal(&mut self, physics: &mut Physics, state: &[f64]) {
+        if !self.goal.seen {
+            self.look_at_goal(physics);
+        }
         self.dress(physics);
         // Places and turns of what is moved by hand stand at the end of a state.
-        let from = state.len() - 7 * self.setup.cubes;
-        let (places, turns) = state[from..].split_at_mut(3 * self.setup.cubes);
-        for (cube, (place, turn)) in self.parts.cubes.iter().zip(&self.goal.cubes) {
-            places[3 * cube.mocap..][..3].copy_from_slice(place);
-            turns[4 * cube.mocap..][..4].copy_from_slice(turn);
+        let n = self.setup.cubes;
+        let (places, turns) = state[state.len() - 7 * n..].split_at(3 * n);
+        for (cube, &(place, turn)) in self.parts.cubes.iter().zip(&self.goal.cubes) {
+            let place_now = std::array::from_fn(|i| places[3 * cube.mocap + i]);
+            let turn_now = std::array::from_fn(|i| turns[4 * cube.mocap + i]);
+            cube.mark(physics, Pose { place: place_now, turn: turn_now }, Pose { place, turn });
         }
     }
 
@@ -399,7 +433,7 @@ impl Task for Table {
         let (qpos, qvel) = self.goal.pose.split_at(physics.data().qpos().len());
         physics.data_mut().qpos_mut().copy_from_slice(qpos);
         physics.data_mut().qvel_mut().copy_from_slice(qvel);
-        self.mark(physics);
+        self.move_marks(physics);
         if let Some(fixtures) = self.parts.fixtures {
             fixtures.lock(physics, self.goal.fixed.buttons, &self.lock_colors);
         }
@@ -420,6 +454,6 @@ impl Task for Table {
 }
 
 /// The models of all tables as they are compiled, by name.
-pub fn models() -> impl Iterator<Item = (&'static str, Result<Arc<MjModel>>)> {
-    setup::CUBES.iter().chain([&setup::SCENE]).map(|setup| (setup.name, model(setup, Look::Solid)))
+pub fn models() -> impl Iterator<Item = (String, Result<Arc<MjModel>>)> {
+    setup::CUBES.iter().chain([&setup::SCENE]).map(|setup| (setup.name.to_owned(), model(setup, Look::Solid)))
 }

@@ -3,7 +3,7 @@
 use super::setup::{Fixed, Setup};
 use crate::Physics;
 use crate::ogbench::arm::find;
-use crate::ogbench::arm::pose::{Quat, Vec3};
+use crate::ogbench::arm::pose::{IDENTITY, Pose, Quat, Vec3};
 use mujoco_rs::mujoco_c::_mjtObjBase::{mjOBJ_BODY, mjOBJ_GEOM, mjOBJ_JOINT, mjOBJ_MATERIAL, mjOBJ_SITE};
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{Error, Result};
@@ -154,10 +154,13 @@ impl Cube {
         qpos[3..7].copy_from_slice(&turn);
     }
 
-    /// Puts the marker of its goal somewhere.
-    pub fn mark(&self, physics: &mut Physics, place: Vec3, turn: Quat) {
-        physics.data_mut().mocap_pos_mut()[self.mocap] = place;
-        physics.data_mut().mocap_quat_mut()[self.mocap] = turn;
+    /// Makes the marker appear at its goal while the body it belongs to is elsewhere: that body is a part of the state, which is
+    /// the same wherever cubes should go.
+    pub fn mark(&self, physics: &mut Physics, body: Pose, goal: Pose) {
+        let inner = if body == goal { Pose { place: [0.0; 3], turn: IDENTITY } } else { body.inverse().then(goal) };
+        let model = physics.model_mut();
+        model.geom_pos_mut()[self.geoms[1]] = inner.place;
+        model.geom_quat_mut()[self.geoms[1]] = inner.turn;
     }
 
     /// Makes the marker visible or not.

@@ -103,7 +103,7 @@ impl Table {
         for (cube, &(place, turn)) in self.parts.cubes.iter().zip(&self.goal.cubes) {
             cube.put(physics, place, turn);
         }
-        self.mark(physics);
+        self.move_marks(physics);
         self.put_fixtures(physics, fixed);
         self.dress(physics);
         physics.forward();
@@ -114,15 +114,13 @@ impl Table {
         self.take_goal(physics);
     }
 
-    /// Takes the present pose for the goal's, and what one observes now for what one observes there.
-    fn take_goal(&mut self, physics: &Physics) {
+    /// Takes the present pose for the goal's. Derived quantities are those of the goal afterwards.
+    fn take_goal(&mut self, physics: &mut Physics) {
         let (qpos, qvel) = (physics.data().qpos(), physics.data().qvel());
         self.goal.pose[..qpos.len()].copy_from_slice(qpos);
         self.goal.pose[qpos.len()..].copy_from_slice(qvel);
         self.goal.contact = self.contact;
-        let mut target = std::mem::take(&mut self.goal.target);
-        self.observation(physics, &mut target);
-        self.goal.target = target;
+        self.look_at_goal(physics);
     }
 
     /// Puts the gripper somewhere, turned by chance.
@@ -153,7 +151,7 @@ impl Table {
         };
         self.put_fixtures(physics, fixed);
         self.choose_subject(physics, factors, rng);
-        self.mark(physics);
+        self.move_marks(physics);
         // The pose at the goal: this one, with the subject where it should be.
         let start = physics.data().qpos().to_vec();
         if let Subject::Cube(i) = self.goal.subject {
@@ -165,8 +163,6 @@ impl Table {
         }
         self.take_goal(physics);
         physics.data_mut().qpos_mut().copy_from_slice(&start);
-        // The reference observes no goal here.
-        self.goal.target.fill(0.0);
     }
 
     /// Something to do, as the reference draws it when it collects data.

@@ -21,9 +21,12 @@ pub use physics::Physics;
 use swm_core::registry::join;
 use swm_core::{EnvEntry, Registry};
 
+const TWO: usize = dmc::ENTRIES.len() + fetch::ENTRIES.len();
+const THREE: usize = TWO + ogbench::ENTRIES.len();
+
 /// Every environment of this crate.
 pub static ENVS: Registry<EnvEntry> = Registry {
     kind: "environment",
     hint: "`swm envs` lists them",
-    rows: &join::<_, 26>(&join::<_, 24>(&dmc::ENTRIES, &fetch::ENTRIES), &ogbench::ENTRIES),
+    rows: &join::<_, THREE>(&join::<_, TWO>(&dmc::ENTRIES, &fetch::ENTRIES), &ogbench::ENTRIES),
 };

@@ -65,7 +65,7 @@ pub struct LanceReader {
     /// Data files of this machine, open for reading.
     handles: Mutex<Recent<File>>,
     /// Where pictures are, by fragment and name of the column; `None` where Lance must look.
-    places: Mutex<HashMap<(usize, String), Option<Arc<Places>>>>,
+    places: Mutex<HashMap<(usize, String), Option<Arc<LaidOut>>>>,
     numbers: Mutex<Numbers>,
     /// Data files whose content was checked.
     verified: Mutex<HashSet<String>>,
@@ -100,6 +100,13 @@ impl<T> Recent<T> {
             self.by_path.remove(&oldest);
         }
     }
+}
+
+/// The pictures of one column in one data file.
+struct LaidOut {
+    /// The data file.
+    path: String,
+    places: Places,
 }
 
 /// Decoded numbers, by fragment and name of the column.
@@ -406,7 +413,7 @@ impl LanceReader {
     }
 
     /// Where the pictures of a column are in a fragment; `None` where they are not laid out one by one.
-    fn places(&self, fragment: usize, column: &str) -> Result<Option<Arc<Places>>> {
+    fn places(&self, fragment: usize, column: &str) -> Result<Option<Arc<LaidOut>>> {
         let key = (fragment, column.to_owned());
         if let Some(known) = lock(&self.places).get(&key) {
             return Ok(known.clone());
@@ -425,7 +432,7 @@ impl LanceReader {
             },
             _ => None,
         };
-        let found = found.map(Arc::new);
+        let found = found.map(|places| Arc::new(LaidOut { path: file.path.clone(), places }));
         lock(&self.places).insert(key, found.clone());
         Ok(found)
     }
@@ -709,7 +716,7 @@ impl LanceReader {
         for rows in wanted.chunk_by_mut(|a, b| self.fragment_of(a.0) == self.fragment_of(b.0)) {
             let fragment = self.fragment_of(rows[0].0);
             match self.places(fragment, &column.name)? {
-                Some(places) => laid_out.push((fragment, places, rows)),
+                Some(pictures) => laid_out.push((self.fragment_rows[fragment], pictures, rows)),
                 None => others.extend(rows),
             }
         }
@@ -735,18 +742,14 @@ impl LanceReader {
     }
 
     /// Reads and decodes pictures whose places are known, of some fragments.
-    fn read_laid_out(
-        &self,
-        column: &StoredColumn,
-        fragments: &mut [(usize, Arc<Places>, &mut [Wanted])],
-    ) -> Result<()> {
+    fn read_laid_out(&self, column: &StoredColumn, fragments: &mut [(u64, Arc<LaidOut>, &mut [Wanted])]) -> Result<()> {
         let mut paths = vec![];
         let mut jobs = vec![];
-        for (at, (fragment, places, rows)) in fragments.iter_mut().enumerate() {
-            paths.push(self.data_file(*fragment, &column.name)?.0.path.clone());
+        for (at, (first_row, pictures, rows)) in fragments.iter_mut().enumerate() {
+            paths.push(pictures.path.clone());
             for group in rows.chunk_by_mut(|a, b| a.0 == b.0) {
                 let row = group[0].0;
-                let place = places.find(row - self.fragment_rows[*fragment]).ok_or_else(|| {
+                let place = pictures.places.find(row - *first_row).ok_or_else(|| {
                     damaged(self.folder(), format!("row {row} of column '{}' is not in its data file", column.name))
                 })?;
                 jobs.push((at, place, group));

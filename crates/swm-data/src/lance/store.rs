@@ -362,11 +362,6 @@ impl Store {
         &*self.objects.inner
     }
 
-    /// Where files are created.
-    pub fn objects(&self) -> &Arc<ObjectStore> {
-        &self.objects
-    }
-
     /// Opens a data file for reading. Must run inside [`wait`].
     pub async fn open_file(&self, file: &DataFile) -> lance_core::Result<FileReader> {
         let scheduler = ScanScheduler::new(Arc::clone(&self.objects), SchedulerConfig::max_bandwidth(&self.objects));

@@ -6,7 +6,8 @@ use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use swm_core::{Batch, ColumnSpec, DType, Schema};
-use swm_data::{ImageCodec, StepRange, WriteMode, WriteOptions, create, open};
+use swm_data::lance::{Shard, commit_shards, create_shard};
+use swm_data::{Constants, ImageCodec, Location, StepRange, WriteMode, WriteOptions, create, open};
 
 fn interop() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop")
@@ -116,14 +117,29 @@ fn our_datasets_open_in_the_reference() {
     write(&ours, WriteMode::Create, 2, 0..5);
     write(&ours, WriteMode::Append, 100, 5..8);
     let theirs = continued(folder.path());
-    let lossless = folder.path().join("lossless.lance");
-    let mut writer =
-        create(&lossless, &schema(), WriteOptions { codec: ImageCodec::Png, ..options(WriteMode::Create) })
-            .expect("creates");
-    writer.write_episode(&episode(0)).expect("writes");
-    writer.finish().expect("finishes");
+    let lossless = [("png", ImageCodec::Png), ("qoi", ImageCodec::Qoi)].map(|(name, codec)| {
+        let path = folder.path().join(name).with_extension("lance");
+        let mut writer =
+            create(&path, &schema(), WriteOptions { codec, ..options(WriteMode::Create) }).expect("creates");
+        let constants = Constants::from([("scene.xml".to_owned(), b"<mujoco/>".to_vec())]);
+        writer.write_episode_with(&episode(0), &constants).expect("writes");
+        writer.finish().expect("finishes");
+        path
+    });
+    // What two machines wrote, and one committed.
+    let parts = folder.path().join("parts.lance");
+    for index in 0..2 {
+        let shard = Shard { index, count: 2 };
+        let location = Location::from(&parts);
+        let mut writer = create_shard(&location, &schema(), options(WriteMode::Create), shard).expect("begins");
+        for e in 4 * index..4 * (index + 1) {
+            writer.write_episode(&episode(e)).expect("writes");
+        }
+        writer.finish().expect("finishes");
+    }
+    assert_eq!(commit_shards(&Location::from(&parts)).expect("commits"), 8);
     let mut command = Command::new(python);
-    command.arg("-B").arg(interop().join("check.py")).args([&ours, &theirs, &lossless]);
+    command.arg("-B").arg(interop().join("check.py")).args([&ours, &theirs, &lossless[0], &lossless[1], &parts]);
     let output = command.output().expect("Python runs");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let text = String::from_utf8(output.stdout).expect("text");
@@ -158,9 +174,12 @@ fn our_datasets_open_in_the_reference() {
         let mean = seen[0]["pixel_means"][i].as_f64().expect("a mean");
         assert!((mean - means[i]).abs() < 4.0, "{mean} {}", means[i]);
     }
-    for (i, mean) in numbers(&seen[2]["pixel_means"]).into_iter().enumerate() {
-        assert!((mean.expect("a mean") - means[i]).abs() < 1e-9, "lossless");
+    for seen in &seen[2..4] {
+        for (i, mean) in numbers(&seen["pixel_means"]).into_iter().enumerate() {
+            assert!((mean.expect("a mean") - means[i]).abs() < 1e-9, "lossless");
+        }
     }
+    assert_eq!(seen[4], seen[0], "parts are as good as one");
     // Both see the same clips: 2 steps with frameskip 2 take 4 rows.
     let clips: usize = (0..8).map(|e| rows(e) - 3).sum();
     assert_eq!(seen[0]["clips"], clips);

@@ -1,0 +1,196 @@
+//! A process that writes is killed (SIGKILL) at random moments: every committed episode is readable, the next run
+//! continues, and what is left behind disturbs nobody.
+//!
+//! The suite kills a few times; `cargo test --release -p swm-data --test it kill -- --ignored` at fifty moments of each
+//! kind of writing.
+
+use crate::sample::{check, episode, options, schema};
+use rand::Rng as _;
+use std::io::{BufRead as _, BufReader, Lines};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdout, Command, Stdio};
+use std::time::{Duration, Instant};
+use swm_core::Key;
+use swm_data::lance::{Shard, commit_shards, create_shard};
+use swm_data::{CommitPolicy, Constants, Location, WriteMode, WriteOptions, Writer, create, open};
+
+/// Where the child process writes; only set for it.
+const TARGET: &str = "SWM_TEST_KILLED";
+
+/// A child, and its output, which must stay open as long as it prints.
+struct Running {
+    child: Child,
+    _output: Lines<BufReader<ChildStdout>>,
+}
+
+/// Starts one of the children below, and waits until it is at work.
+fn start(test: &str, path: &Path) -> Running {
+    let mut command = Command::new(std::env::current_exe().expect("this program"));
+    command.args(["--exact", &format!("kill::{test}"), "--nocapture"]).env(TARGET, path);
+    let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("starts");
+    let mut output = BufReader::new(child.stdout.take().expect("its output")).lines();
+    let begun = output.any(|line| line.is_ok_and(|line| line.contains("begun")));
+    assert!(begun, "the child ended before it began");
+    Running { child, _output: output }
+}
+
+/// Kills a child after a moment that the key decides; gives whether it was still at work.
+fn kill(mut running: Running, key: Key, longest: Duration) -> bool {
+    // The moment itself is what is tested, so it passes without a sleep that the scheduler may stretch.
+    let end = Instant::now() + longest.mul_f64(key.rng().random());
+    while Instant::now() < end {
+        std::hint::spin_loop();
+    }
+    running.child.kill().expect("killed");
+    !running.child.wait().expect("gone").success()
+}
+
+fn target() -> Option<PathBuf> {
+    std::env::var_os(TARGET).map(PathBuf::from)
+}
+
+fn often() -> CommitPolicy {
+    CommitPolicy { episodes: 2, interval: Duration::from_millis(5), ..CommitPolicy::default() }
+}
+
+fn write_on(mut writer: Box<dyn Writer>, until: usize) {
+    println!("begun");
+    for e in writer.episodes()..until {
+        let constants = Constants::from([("number".to_owned(), e.to_string().into_bytes())]);
+        writer.write_episode_with(&episode(e), &constants).expect("writes");
+    }
+    writer.finish().expect("finishes");
+}
+
+/// Not a test of its own: makes or continues a dataset, without an end.
+#[test]
+fn child_that_appends() {
+    let Some(path) = target() else { return };
+    let options = WriteOptions { commit: often(), ..options(WriteMode::Append) };
+    write_on(create(&path, &schema(), options).expect("continues"), 1_000_000);
+}
+
+/// Not a test of its own: replaces a dataset by ten episodes, again and again.
+#[test]
+fn child_that_replaces() {
+    let Some(path) = target() else { return };
+    loop {
+        let options = WriteOptions { commit: often(), ..options(WriteMode::Overwrite) };
+        write_on(create(&path, &schema(), options).expect("replaces"), 10);
+    }
+}
+
+/// Not a test of its own: writes one part of two, continues what another process began of the other, and commits them.
+#[test]
+fn child_that_writes_parts() {
+    let Some(path) = target() else { return };
+    println!("begun");
+    for index in 0..2 {
+        let options = WriteOptions { commit: often(), ..options(WriteMode::Append) };
+        let shard = Shard { index, count: 2 };
+        let mut writer = create_shard(&Location::from(&path), &schema(), options, shard).expect("continues");
+        for e in writer.episodes()..6 {
+            writer.write_episode(&episode(6 * index + e)).expect("writes");
+        }
+        writer.finish().expect("finishes");
+    }
+    commit_shards(&Location::from(&path)).expect("commits");
+}
+
+/// Everything is readable, and episodes are numbered without a gap.
+fn check_all(path: &Path, constants: bool) -> usize {
+    let reader = open(path).expect("opens");
+    check(&*reader, 0);
+    for (at, stored) in reader.episodes().iter().enumerate() {
+        assert_eq!(stored.index, at as i64);
+        if constants {
+            assert_eq!(reader.constants(at).expect("reads")["number"], at.to_string().into_bytes());
+        }
+    }
+    reader.content_hash().expect("a hash");
+    reader.episodes().len()
+}
+
+fn killed_appends(moments: u64) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    let mut stored = 0;
+    for moment in 0..moments {
+        let child = start("child_that_appends", &path);
+        assert!(kill(child, Key::new(0).with("append").at(moment), Duration::from_millis(120)), "it has no end");
+        let now = check_all(&path, true);
+        assert!(now >= stored, "{now} episodes, and there were {stored}");
+        stored = now;
+    }
+    assert!(stored > 0);
+    // The next run continues, and what was left behind stays unseen.
+    let mut writer = create(&path, &schema(), options(WriteMode::Append)).expect("continues");
+    let constants = Constants::from([("number".to_owned(), stored.to_string().into_bytes())]);
+    writer.write_episode_with(&episode(stored), &constants).expect("writes");
+    writer.finish().expect("finishes");
+    assert_eq!(check_all(&path, true), stored + 1);
+}
+
+fn killed_replacements(moments: u64) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance");
+    for moment in 0..moments {
+        let child = start("child_that_replaces", &path);
+        assert!(kill(child, Key::new(0).with("replace").at(moment), Duration::from_millis(120)), "it has no end");
+        assert!(check_all(&path, true) <= 10);
+    }
+}
+
+fn killed_parts(moments: u64) {
+    let folder = tempfile::tempdir().expect("a folder");
+    for moment in 0..moments {
+        let path = folder.path().join(format!("{moment}.lance"));
+        let child = start("child_that_writes_parts", &path);
+        if kill(child, Key::new(0).with("parts").at(moment), Duration::from_millis(60)) {
+            // Another run ends what this one began; unless it was killed between the commit and its end.
+            let committed = open(&path).is_ok();
+            if committed {
+                assert_eq!(check_all(&path, false), 12, "all or nothing");
+                let _ = commit_shards(&Location::from(&path));
+            } else {
+                let status = start("child_that_writes_parts", &path).child.wait().expect("ends");
+                assert!(status.success(), "moment {moment}");
+            }
+        }
+        assert_eq!(check_all(&path, false), 12, "moment {moment}");
+        assert!(!path.join("_shards/0-of-2/done.json").exists(), "the log is gone");
+    }
+}
+
+#[test]
+fn a_killed_append_keeps_what_was_committed() {
+    killed_appends(4);
+}
+
+#[test]
+fn a_killed_replacement_leaves_one_of_both() {
+    killed_replacements(4);
+}
+
+#[test]
+fn a_killed_part_is_continued() {
+    killed_parts(4);
+}
+
+#[test]
+#[ignore = "takes a minute"]
+fn fifty_killed_appends_keep_what_was_committed() {
+    killed_appends(50);
+}
+
+#[test]
+#[ignore = "takes a minute"]
+fn fifty_killed_replacements_leave_one_of_both() {
+    killed_replacements(50);
+}
+
+#[test]
+#[ignore = "takes a minute"]
+fn fifty_killed_parts_are_continued() {
+    killed_parts(50);
+}

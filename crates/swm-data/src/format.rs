@@ -5,7 +5,7 @@
 //! the action taken *from* it. The last row of an episode is its final observation; its action is NaN (float)
 //! or -1 (integer).
 
-use crate::{ImageCodec, Location, lance};
+use crate::{ImageCodec, Location, lance, lance_video, lerobot, video};
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -214,10 +214,14 @@ pub static FORMATS: Registry<Format> = Registry {
     kind: "dataset format",
     hint: "`swm formats` lists them",
     rows: &[
+        // Before `lance`, whose tables are within its folders.
+        lance_video::FORMAT,
         lance::FORMAT,
+        video::FORMAT,
         crate::folder::FORMAT,
         #[cfg(feature = "hdf5")]
         crate::hdf5::FORMAT,
+        lerobot::FORMAT,
     ],
 };
 

@@ -8,7 +8,7 @@
 //! - [`doctor`]: what is wrong with a dataset, and which models it can train.
 //! - [`views`]: datasets made of datasets; [`replay`]: the latest episodes of a running collection.
 //! - [`image`]: how pictures are stored.
-//! - [`preview`] and [`video`]: frames as pictures and videos for people.
+//! - [`preview`](mod@preview): frames as pictures and videos for people.
 //! - [`stats`]: column statistics.
 //! - [`Split`]: which episodes are held out.
 
@@ -18,6 +18,7 @@ pub mod convert;
 pub mod doctor;
 mod column_files;
 mod episodes;
+mod ffmpeg;
 pub mod folder;
 pub mod format;
 pub mod goals;
@@ -26,6 +27,8 @@ pub mod hdf5;
 pub mod image;
 mod jpeg;
 pub mod lance;
+mod lance_video;
+mod lerobot;
 pub mod loader;
 mod location;
 pub mod objects;
@@ -35,7 +38,7 @@ mod qoi;
 pub mod replay;
 mod split;
 pub mod stats;
-pub mod video;
+mod video;
 pub mod views;
 
 pub use cache::CacheConfig;
@@ -48,8 +51,9 @@ pub use goals::{GoalMixture, GoalSpec};
 pub use image::ImageCodec;
 pub use location::Location;
 pub use loader::{Epoch, Loaded, Loader, LoaderConfig};
-pub use preview::{Picture, contact_sheet, write_png};
+pub use preview::{
+    Picture, PreviewOptions, contact_sheet, integer_scale, preview, write_mp4, write_mp4_scaled, write_png,
+};
 pub use replay::{ReplayBuffer, ReplayConfig, ReplayLoader};
 pub use split::{Part, Split};
 pub use stats::{ColumnStats, column_quantiles, column_stats, split};
-pub use video::{integer_scale, write_mp4, write_mp4_scaled};

@@ -58,8 +58,8 @@ impl Filming {
     }
 
     /// Writes the videos of those of the `counted` episodes that were filmed, named by their place among these, and
-    /// returns their paths, relative to the root. A video that cannot be written (`ffmpeg`
-    /// is missing, the disk is full) costs a warning: the figures stand without it.
+    /// returns their paths, relative to the root. A video that cannot be written (this build
+    /// has no videos, the disk is full) costs a warning: the figures stand without it.
     pub fn write(self, counted: &[usize]) -> Vec<String> {
         let (height, width) = self.size;
         let scale = swm_data::integer_scale(width, height, WATCHABLE);

@@ -15,9 +15,11 @@ mod goals;
 #[cfg(feature = "hdf5")]
 mod hdf5;
 mod interruption;
+mod kill;
 mod lance;
 mod lance_shards;
 mod lance_video;
+mod lerobot;
 mod loader;
 mod objects;
 mod preview;

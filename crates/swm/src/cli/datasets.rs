@@ -7,8 +7,8 @@ use std::path::PathBuf;
 use swm::home::{names_in, open_dataset as open};
 use swm::{data, home};
 use swm_core::results::Summary;
-use swm_core::{Error, Result};
-use swm_data::{Reader, StepRange};
+use swm_core::Result;
+use swm_data::Reader;
 
 /// Arguments of `swm inspect`.
 #[derive(Args)]
@@ -28,9 +28,9 @@ pub struct PreviewArgs {
     /// How many episodes, spread over the dataset
     #[arg(long, default_value_t = 4)]
     episodes: usize,
-    /// The picture column
-    #[arg(long, default_value = "pixels")]
-    column: String,
+    /// A picture column, which may be given several times; all of them, side by side, without it
+    #[arg(long)]
+    column: Vec<String>,
     /// Frames in a second of video
     #[arg(long, default_value_t = 15)]
     fps: u32,
@@ -134,41 +134,12 @@ pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
 
 /// Makes a video of some episodes and a contact sheet of all of them.
 pub fn preview(args: &PreviewArgs, as_json: bool) -> anyhow::Result<()> {
-    /// Frames of an episode on the contact sheet.
-    const SHEET_COLUMNS: usize = 8;
     let reader = open(&args.dataset)?;
-    let column = reader.schema().column(&args.column)?;
-    let [height, width, 3] = column.shape[..] else {
-        anyhow::bail!(Error::mismatch(
-            format!("previewing column '{}'", args.column),
-            format!("{} {:?}", column.dtype.name(), column.shape),
-            "pictures: uint8 [height, width, 3]",
-        ));
-    };
-    std::fs::create_dir_all(&args.output).map_err(|e| Error::io(&args.output, "creating the folder", e))?;
-    let total = reader.episodes().len();
-    let chosen: Vec<usize> = (0..args.episodes.min(total)).map(|i| i * total / args.episodes.min(total)).collect();
-    let scale = data::video::integer_scale(width, height, 256);
-    let progress = Progress::new("preview", chosen.len());
-    let (mut written, mut sheet) = (vec![], vec![]);
-    for (done, &episode) in chosen.iter().enumerate() {
-        let length = reader.episodes()[episode].length;
-        let batch = reader.read(&[&args.column], &[StepRange::new(episode, 0, length)])?;
-        let frames: Vec<&[u8]> = batch.bytes(0).chunks(width * height * 3).collect();
-        let path = args.output.join(format!("episode_{episode}.mp4"));
-        data::video::write_mp4_scaled(&path, width, height, args.fps, scale, &frames)?;
-        written.push(path);
-        let last = (length - 1).max(1);
-        sheet.extend((0..SHEET_COLUMNS).map(|i| frames[(i * last / (SHEET_COLUMNS - 1)).min(length - 1)].to_vec()));
-        progress.at(done + 1, "");
-    }
-    if !sheet.is_empty() {
-        let picture = data::preview::contact_sheet(width, height, &sheet, SHEET_COLUMNS, 1)?;
-        let path = args.output.join("contact_sheet.png");
-        data::preview::write_png(&path, picture.width, picture.height, &picture.rgb)?;
-        written.push(path);
-    }
-    progress.done(&format!("{} episodes in {}", chosen.len(), args.output.display()));
+    let episodes = args.episodes.min(reader.episodes().len());
+    let progress = Progress::new("preview", episodes);
+    let options = data::PreviewOptions { episodes, columns: args.column.clone(), fps: args.fps };
+    let written = data::preview(&*reader, &args.output, &options, |done| progress.at(done, ""))?;
+    progress.done(&format!("{episodes} episodes in {}", args.output.display()));
     if as_json {
         return emit_json(&json!({"files": written}));
     }

@@ -1,0 +1,417 @@
+//! Frames by number: all frames of a batch are asked for together, each run from a key frame is decoded once, runs are
+//! decoded in parallel.
+
+use super::colour;
+use super::mp4::{self, Codec, Index};
+use ffmpeg_next::codec::{self, Compliance, threading};
+use ffmpeg_next::decoder::{self, Check};
+use ffmpeg_next::format::Pixel;
+use ffmpeg_next::software::scaling;
+use ffmpeg_next::{Dictionary, Discard, Packet, ffi, frame};
+use rayon::prelude::*;
+use std::fs::File;
+use std::io::{Read as _, Seek as _, SeekFrom};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use swm_core::{Error, Result};
+
+/// Decoders that wait for the next run. Each holds a few decoded pictures.
+const IDLE_DECODERS: usize = 32;
+
+/// Where a video's bytes are.
+#[derive(Clone, Debug)]
+pub enum Source {
+    /// In a file.
+    File(PathBuf),
+    /// In memory, and what error messages call it.
+    Memory(PathBuf, Arc<[u8]>),
+}
+
+/// A source that is being read.
+enum Open<'a> {
+    File(File),
+    Memory(&'a [u8]),
+}
+
+impl Source {
+    fn label(&self) -> &Path {
+        let (Self::File(path) | Self::Memory(path, _)) = self;
+        path
+    }
+
+    fn open(&self) -> Result<(Open<'_>, u64)> {
+        Ok(match self {
+            Self::File(path) => {
+                let io = |e| Error::io(path, "opening a video", e);
+                let file = File::open(path).map_err(io)?;
+                let length = file.metadata().map_err(io)?.len();
+                (Open::File(file), length)
+            }
+            Self::Memory(_, bytes) => (Open::Memory(bytes), bytes.len() as u64),
+        })
+    }
+}
+
+impl Open<'_> {
+    /// Fills `bytes` from `offset` on.
+    fn read(&mut self, offset: u64, bytes: &mut [u8]) -> std::result::Result<(), String> {
+        match self {
+            Self::File(file) => {
+                let read = file.seek(SeekFrom::Start(offset)).and_then(|_| file.read_exact(bytes));
+                read.map_err(|e| format!("cannot be read: {e}"))
+            }
+            Self::Memory(all) => {
+                let from = usize::try_from(offset).ok().and_then(|at| all.get(at..)?.get(..bytes.len()));
+                bytes.copy_from_slice(from.ok_or("ends too early")?);
+                Ok(())
+            }
+        }
+    }
+}
+
+/// An MP4 file whose tables were read. Nothing is kept open.
+#[derive(Debug)]
+pub struct Video {
+    source: Source,
+    index: Index,
+}
+
+impl Video {
+    /// Reads where the frames are.
+    ///
+    /// # Errors
+    /// When the file cannot be read, is no plain MP4, or has a codec that we do not decode.
+    pub fn open(source: Source) -> Result<Self> {
+        let (mut open, length) = source.open()?;
+        let index = Index::read(length, |offset, bytes| open.read(offset, bytes));
+        let index = index.map_err(|problem| damaged(source.label(), &problem))?;
+        Ok(Self { source, index })
+    }
+
+    /// How many frames there are.
+    pub fn frames(&self) -> usize {
+        self.index.frames.len()
+    }
+
+    /// Height and width.
+    pub fn size(&self) -> (usize, usize) {
+        (self.index.height, self.index.width)
+    }
+
+    /// Bytes that keeping it takes.
+    pub fn memory(&self) -> usize {
+        let index = &self.index;
+        let tables = index.samples.len() * size_of::<mp4::Sample>() + index.frames.len() * 12;
+        let sums = index.sums.as_ref().map_or(0, |sums| 4 * sums.len());
+        let bytes = if let Source::Memory(_, bytes) = &self.source { bytes.len() } else { 0 };
+        size_of::<Self>() + tables + sums + bytes
+    }
+
+    /// Calls `each` with the coded picture of every one of these frames.
+    ///
+    /// # Errors
+    /// When the file is damaged.
+    pub fn coded(&self, frames: impl IntoIterator<Item = usize>, mut each: impl FnMut(&[u8])) -> Result<()> {
+        let (mut open, _) = self.source.open()?;
+        let mut bytes = vec![];
+        for frame in frames {
+            let sample = self.index.frames.get(frame).map(|&i| i as usize);
+            let sample = sample.ok_or_else(|| self.lacks(frame))?;
+            let place = self.index.samples[sample];
+            bytes.resize(place.size as usize, 0);
+            let read = open.read(place.offset, &mut bytes).and_then(|()| self.index.check(sample, &bytes));
+            read.map_err(|problem| damaged(self.source.label(), &problem))?;
+            each(&bytes);
+        }
+        Ok(())
+    }
+
+    /// The error of a video that is not what it should be.
+    pub fn damaged(&self, problem: &str) -> Error {
+        damaged(self.source.label(), problem)
+    }
+
+    fn lacks(&self, frame: usize) -> Error {
+        self.damaged(&format!("has {} frames, and frame {frame} was asked for", self.frames()))
+    }
+
+    /// The frame shown nearest to a time, and how far from it, both in seconds. None where there are no frames.
+    pub fn frame_at(&self, seconds: f64) -> Option<(usize, f64)> {
+        let frame = self.index.frame_at(seconds)?;
+        Some((frame, (self.index.seconds(frame) - seconds).abs()))
+    }
+}
+
+/// The error of a video that is not what it should be.
+fn damaged(path: &Path, problem: &str) -> Error {
+    let fix = "restore it from a copy, or write it anew with `ffmpeg -i IN -c:v libx264 OUT.mp4`";
+    Error::corrupt(path, format!("the video {problem}"), fix)
+}
+
+/// A frame that is wanted, and where to.
+pub struct Wanted<'a> {
+    pub video: &'a Video,
+    /// Its number, in the order of presentation.
+    pub frame: usize,
+    /// `[height, width, 3]` bytes.
+    pub out: &'a mut [u8],
+}
+
+/// A frame of one run.
+struct Job<'a> {
+    video: &'a Video,
+    /// The sample at which decoding begins.
+    key: usize,
+    sample: usize,
+    out: &'a mut [u8],
+}
+
+/// Decoders that are kept between reads. Files of one dataset have the same parameters, so one decoder serves many.
+#[derive(Default)]
+pub struct Decoders {
+    /// Last used last.
+    idle: Mutex<Vec<Decoder>>,
+}
+
+impl Decoders {
+    /// Decodes frames of any videos, on the threads of the current rayon pool.
+    ///
+    /// # Errors
+    /// When a frame does not exist or its `out` has another size, or a video is damaged.
+    pub fn read(&self, wanted: Vec<Wanted<'_>>) -> Result<()> {
+        let mut jobs = Vec::with_capacity(wanted.len());
+        for Wanted { video, frame, out } in wanted {
+            let index = &video.index;
+            let Some(&sample) = index.frames.get(frame) else {
+                return Err(video.lacks(frame));
+            };
+            if out.len() != index.width * index.height * 3 {
+                let problem = format!(
+                    "has {} x {} pixels, unlike the {} bytes a frame of its dataset takes",
+                    index.width,
+                    index.height,
+                    out.len()
+                );
+                return Err(damaged(video.source.label(), &problem));
+            }
+            let sample = sample as usize;
+            jobs.push(Job { video, key: index.key_before(sample), sample, out });
+        }
+        let place = |job: &Job<'_>| (std::ptr::from_ref(job.video) as usize, job.key, job.sample);
+        jobs.sort_unstable_by_key(place);
+        let runs: Vec<&mut [Job<'_>]> =
+            jobs.chunk_by_mut(|a, b| (place(a).0, place(a).1) == (place(b).0, place(b).1)).collect();
+        runs.into_par_iter().with_max_len(1).try_for_each(|run| {
+            let Some(Job { video, .. }) = run.first() else { return Ok(()) };
+            let video = *video;
+            let mut decoder = self.take(&video.index)?;
+            // After a failure the decoder's state is anybody's guess; it is dropped.
+            decoder.run(video, run).map_err(|problem| damaged(video.source.label(), &problem))?;
+            self.give_back(decoder);
+            Ok(())
+        })
+    }
+
+    fn take(&self, index: &Index) -> Result<Decoder> {
+        let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
+        match idle.iter().rposition(|decoder| decoder.serves(index)) {
+            Some(i) => Ok(idle.remove(i)),
+            None => {
+                drop(idle);
+                Decoder::new(index)
+            }
+        }
+    }
+
+    fn give_back(&self, decoder: Decoder) {
+        let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
+        if idle.len() == IDLE_DECODERS {
+            idle.remove(0);
+        }
+        idle.push(decoder);
+    }
+}
+
+/// One of FFmpeg's decoders and its memory.
+struct Decoder {
+    codec: Codec,
+    extradata: Arc<[u8]>,
+    size: (usize, usize),
+    inner: decoder::Video,
+    frame: frame::Video,
+    coded: Vec<u8>,
+}
+
+impl Decoder {
+    fn new(index: &Index) -> Result<Self> {
+        super::quiet();
+        let id = match index.codec {
+            Codec::H264 => codec::Id::H264,
+            Codec::Hevc => codec::Id::HEVC,
+            Codec::Vp9 => codec::Id::VP9,
+            Codec::Av1 => codec::Id::AV1,
+        };
+        let failed = |e: ffmpeg_next::Error| Error::external("opening a video decoder", e);
+        // FFmpeg's own AV1 decoder needs special hardware.
+        let named = (index.codec == Codec::Av1).then(|| decoder::find_by_name("libdav1d")).flatten();
+        let Some(found) = named.or_else(|| decoder::find(id)) else {
+            return Err(Error::external(
+                "opening a video decoder",
+                format!("this machine's FFmpeg has no decoder for {:?}; install one with it", index.codec),
+            ));
+        };
+        let mut context = codec::Context::new_with_codec(found);
+        set_extradata(&mut context, &index.extradata);
+        // Runs are decoded in parallel, not what is within them. Strict: a stream that does not say how far its pictures
+        // are reordered is not taken to mean "not at all". What is damaged is refused, not concealed.
+        context.set_threading(threading::Config::count(1));
+        context.compliance(Compliance::Strict);
+        let mut decoder = context.decoder();
+        decoder.check(Check::CRC | Check::BITSTREAM | Check::BUFFER | Check::EXPLODE);
+        // Damaged headers may promise any size; coded pictures are padded to whole blocks.
+        let mut options = Dictionary::new();
+        options.set("max_pixels", &((index.width + 256) * (index.height + 256)).to_string());
+        let inner = decoder.open_as_with(found, options).and_then(|opened| opened.video()).map_err(failed)?;
+        Ok(Self {
+            codec: index.codec,
+            extradata: Arc::clone(&index.extradata),
+            size: (index.width, index.height),
+            inner,
+            frame: frame::Video::empty(),
+            coded: vec![],
+        })
+    }
+
+    fn serves(&self, index: &Index) -> bool {
+        self.codec == index.codec
+            && self.size == (index.width, index.height)
+            && (Arc::ptr_eq(&self.extradata, &index.extradata) || self.extradata == index.extradata)
+    }
+
+    /// Decodes the frames of one run, which are in decoding order.
+    fn run(&mut self, video: &Video, jobs: &mut [Job<'_>]) -> Result<(), String> {
+        let (Some(first), Some(last)) = (jobs.first().map(|job| job.key), jobs.last().map(|job| job.sample)) else {
+            return Ok(());
+        };
+        let (mut open, _) = video.source.open().map_err(|e| e.to_string())?;
+        let samples = &video.index.samples[first..=last];
+        let mut missing = jobs.len();
+        let mut reducer = Reducer::default();
+        // Samples that lie side by side are read together.
+        let mut at = first;
+        for group in samples.chunk_by(|a, b| a.offset + u64::from(a.size) == b.offset) {
+            let mut coded = std::mem::take(&mut self.coded);
+            coded.resize(group.iter().map(|sample| sample.size as usize).sum(), 0);
+            open.read(group[0].offset, &mut coded)?;
+            let mut rest = &coded[..];
+            for sample in group {
+                let (bytes, others) = rest.split_at(sample.size as usize);
+                rest = others;
+                video.index.check(at, bytes)?;
+                // A picture that is not wanted and to which no other refers is not decoded.
+                let wanted = jobs.binary_search_by_key(&at, |job| job.sample).is_ok();
+                self.inner.skip_frame(if wanted { Discard::Default } else { Discard::NonReference });
+                let mut packet = Packet::copy(bytes);
+                #[allow(clippy::cast_possible_wrap)]
+                packet.set_pts(Some(at as i64));
+                self.inner.send_packet(&packet).map_err(|e| format!("cannot be decoded in coded picture {at}: {e}"))?;
+                self.receive(video, jobs, &mut missing, &mut reducer)?;
+                at += 1;
+            }
+            self.coded = coded;
+        }
+        if missing > 0 {
+            self.inner.send_eof().map_err(|e| format!("cannot be decoded to its end: {e}"))?;
+            self.receive(video, jobs, &mut missing, &mut reducer)?;
+        }
+        self.inner.flush();
+        if missing > 0 {
+            return Err(format!(
+                "is damaged: of the frames from coded picture {first} to {last}, {missing} are missing"
+            ));
+        }
+        Ok(())
+    }
+
+    /// Takes what the decoder has finished, and puts it where it is wanted.
+    fn receive(
+        &mut self,
+        video: &Video,
+        jobs: &mut [Job<'_>],
+        missing: &mut usize,
+        reducer: &mut Reducer,
+    ) -> Result<(), String> {
+        loop {
+            match self.inner.receive_frame(&mut self.frame) {
+                Ok(()) => {}
+                Err(ffmpeg_next::Error::Eof | ffmpeg_next::Error::Other { errno: ffi::EAGAIN }) => return Ok(()),
+                Err(error) => return Err(format!("cannot be decoded: {error}")),
+            }
+            let Some(sample) = self.frame.pts().and_then(|pts| usize::try_from(pts).ok()) else { continue };
+            let begin = jobs.partition_point(|job| job.sample < sample);
+            let end = jobs.partition_point(|job| job.sample <= sample);
+            let Some((Job { out, .. }, others)) = jobs[begin..end].split_first_mut() else { continue };
+            if self.frame.is_corrupt() || self.frame.has_decode_errors() {
+                return Err(format!("is damaged in coded picture {sample}"));
+            }
+            let (height, width) = video.size();
+            let frame =
+                if colour::is_native(self.frame.format()) { &self.frame } else { reducer.reduce(&self.frame)? };
+            if !colour::to_rgb(frame, width, height, out) {
+                let found = format!("{} x {}", frame.width(), frame.height());
+                return Err(format!("has a frame of {found} pixels, unlike the {width} x {height} its header says"));
+            }
+            others.iter_mut().for_each(|other| other.out.copy_from_slice(out));
+            *missing = missing.saturating_sub(end - begin);
+        }
+    }
+}
+
+/// Brings frames of rare formats (10 bits, packed) to one that is converted directly.
+#[derive(Default)]
+struct Reducer {
+    made: Option<(scaling::Context, frame::Video)>,
+}
+
+impl Reducer {
+    fn reduce(&mut self, frame: &frame::Video) -> Result<&frame::Video, String> {
+        let (from, width, height) = (frame.format(), frame.width(), frame.height());
+        let same = |made: &(scaling::Context, frame::Video)| {
+            let input = made.0.input();
+            (input.format, input.width, input.height) == (from, width, height)
+        };
+        if !self.made.as_ref().is_some_and(same) {
+            let flags = scaling::Flags::BILINEAR | scaling::Flags::ACCURATE_RND;
+            let scaler = scaling::Context::get(from, width, height, Pixel::YUV444P, width, height, flags);
+            let scaler = scaler.map_err(|e| format!("has pixels that nothing converts: {e}"))?;
+            self.made = Some((scaler, frame::Video::empty()));
+        }
+        let Some((scaler, reduced)) = &mut self.made else { return Err("has pixels that nothing converts".to_owned()) };
+        scaler.run(frame, reduced).map_err(|e| format!("has pixels that cannot be converted: {e}"))?;
+        reduced.set_color_space(frame.color_space());
+        reduced.set_color_range(frame.color_range());
+        Ok(reduced)
+    }
+}
+
+/// Gives a decoder the parameters that stand in the file's header instead of its pictures.
+#[allow(unsafe_code)]
+fn set_extradata(context: &mut codec::Context, bytes: &[u8]) {
+    if bytes.is_empty() {
+        return;
+    }
+    let Ok(length) = i32::try_from(bytes.len()) else { return };
+    // The wrapper sets these only by opening a file with libavformat, whose parsers we keep away from damaged files.
+    // SAFETY: the memory comes from FFmpeg's allocator, has the zeroed padding that decoders read, is filled within its
+    // length, and belongs to the context from here on, which frees it. The context was not opened yet and has none.
+    unsafe {
+        let memory = ffi::av_mallocz(bytes.len() + ffi::AV_INPUT_BUFFER_PADDING_SIZE as usize).cast::<u8>();
+        if memory.is_null() {
+            return;
+        }
+        std::ptr::copy_nonoverlapping(bytes.as_ptr(), memory, bytes.len());
+        let context = context.as_mut_ptr();
+        (*context).extradata = memory;
+        (*context).extradata_size = length;
+    }
+}

@@ -1,0 +1,244 @@
+//! Frames in, an MP4 file out.
+
+use super::colour;
+use super::mp4;
+use crate::image::ImageCodec;
+use ffmpeg_next::codec::{self, Flags, threading};
+use ffmpeg_next::color::{Range, Space};
+use ffmpeg_next::format::{self, Pixel};
+use ffmpeg_next::{Dictionary, Packet, Rational, encoder, frame};
+use std::io::{Cursor, Seek, SeekFrom, Write};
+use std::sync::{Arc, Mutex, PoisonError};
+use swm_core::{Error, Result};
+
+/// How frames become a video.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Encoding {
+    pub codec: VideoCodec,
+    pub quality: Quality,
+    /// Frames from one key frame to the next. A random frame costs half of them to decode.
+    pub gop: u32,
+    /// Whether pictures may depend on later ones, and other tools that make files smaller and decoding slower.
+    pub small: bool,
+}
+
+/// With what a video is encoded.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum VideoCodec {
+    H264,
+    Av1,
+}
+
+/// What is lost.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Quality {
+    /// Nothing: the very pixels come back.
+    Lossless,
+    /// More, the higher the constant rate factor.
+    Crf(u8),
+}
+
+impl Encoding {
+    /// For training: any frame is near a key frame, and decodes fast. What pictures lose follows from how they would be
+    /// stored one by one.
+    pub fn training(codec: ImageCodec) -> Self {
+        let quality = match codec {
+            // Quality 95 becomes 18, which looks like the source.
+            ImageCodec::Jpeg { quality } => Quality::Crf((8 + 2 * 100_u8.saturating_sub(quality.max(50))).min(51)),
+            _ => Quality::Lossless,
+        };
+        Self { codec: VideoCodec::H264, quality, gop: TRAINING_GOP, small: false }
+    }
+
+    /// For people: small files that browsers play.
+    pub const fn viewing() -> Self {
+        Self { codec: VideoCodec::H264, quality: Quality::Crf(18), gop: 250, small: true }
+    }
+
+    /// The encoder's name, the pixels it is given, and its options.
+    fn settings(self, even: bool) -> (&'static str, Pixel, Vec<(&'static str, String)>) {
+        let pixels = if even { Pixel::YUV420P } else { Pixel::YUV444P };
+        match (self.codec, self.quality) {
+            // Lossless keeps red, green and blue as they are.
+            (VideoCodec::H264, Quality::Lossless) => {
+                ("libx264rgb", Pixel::RGB24, vec![("qp", "0".to_owned()), ("preset", "veryfast".to_owned())])
+            }
+            (VideoCodec::H264, Quality::Crf(crf)) => {
+                let mut options = vec![("crf", crf.to_string()), ("preset", "medium".to_owned())];
+                if !self.small {
+                    options.push(("tune", "fastdecode".to_owned()));
+                }
+                ("libx264", pixels, options)
+            }
+            (VideoCodec::Av1, quality) => {
+                let crf = if let Quality::Crf(crf) = quality { crf } else { 0 };
+                let options = vec![("crf", crf.to_string()), ("cpu-used", "8".to_owned()), ("row-mt", "0".to_owned())];
+                ("libaom-av1", pixels, options)
+            }
+        }
+    }
+}
+
+/// Frames from one key frame to the next in videos for training.
+const TRAINING_GOP: u32 = 8;
+
+/// Encodes frames (each `height * width * 3` bytes, RGB) as an MP4 file in memory, sealed with checksums. Equal frames
+/// give equal bytes with the same libraries.
+///
+/// # Errors
+/// When there is no frame, a frame or a number has a wrong size, or FFmpeg has no such encoder.
+pub fn encode<I>(width: usize, height: usize, fps: u32, encoding: Encoding, frames: I) -> Result<Vec<u8>>
+where
+    I: IntoIterator,
+    I::Item: AsRef<[u8]>,
+{
+    if width == 0 || height == 0 || fps == 0 || encoding.gop == 0 {
+        let problem = format!("{width} x {height} pixels at {fps} frames a second, a key frame every {}", encoding.gop);
+        return Err(Error::config("video", problem, "give each of them at least 1"));
+    }
+    let mut film = Film::begin(width, height, fps, encoding)?;
+    let mut count = 0;
+    for rgb in frames {
+        let rgb = rgb.as_ref();
+        if rgb.len() != width * height * 3 {
+            let expected = format!("{}, for {width} x {height} RGB pixels", width * height * 3);
+            return Err(Error::mismatch(format!("frame {count} of a video"), format!("{} bytes", rgb.len()), expected));
+        }
+        film.add(rgb, count)?;
+        count += 1;
+    }
+    if count == 0 {
+        return Err(Error::config("video", "there is no frame to write", "record at least one step"));
+    }
+    film.finish()
+}
+
+fn failed(error: ffmpeg_next::Error) -> Error {
+    Error::external("encoding a video with FFmpeg", error)
+}
+
+/// A video that is being written.
+pub struct Film {
+    encoder: encoder::video::Encoder,
+    output: format::context::Output,
+    file: Memory,
+    frame: frame::Video,
+    packet: Packet,
+    /// Of the encoder, and of the file.
+    units: [Rational; 2],
+}
+
+impl Film {
+    /// A video of frames of `width` by `height` pixels.
+    pub fn begin(width: usize, height: usize, fps: u32, encoding: Encoding) -> Result<Self> {
+        super::quiet();
+        let even = width.is_multiple_of(2) && height.is_multiple_of(2);
+        let (name, pixels, settings) = encoding.settings(even);
+        let Some(codec) = encoder::find_by_name(name) else {
+            let problem = format!("this machine's FFmpeg has no encoder {name}; install one built with it");
+            return Err(Error::external("encoding a video", problem));
+        };
+        let number = |n: usize| u32::try_from(n).map_err(|_| Error::config("video", format!("{n} pixels"), "fewer"));
+        let (wide, high) = (number(width)?, number(height)?);
+        let file = Memory::default();
+        let stream = format::context::StreamIo::from_write_seek(file.clone()).map_err(failed)?;
+        let mut output = format::output_to_stream(stream, None, Some("mp4")).map_err(failed)?;
+        let mut context = codec::Context::new_with_codec(codec).encoder().video().map_err(failed)?;
+        context.set_width(wide);
+        context.set_height(high);
+        context.set_format(pixels);
+        // Said, because players guess it from the size otherwise.
+        if pixels != Pixel::RGB24 {
+            context.set_colorspace(Space::SMPTE170M);
+            context.set_color_range(Range::MPEG);
+        }
+        let rate = Rational::new(i32::try_from(fps).unwrap_or(i32::MAX), 1);
+        context.set_time_base(rate.invert());
+        context.set_frame_rate(Some(rate));
+        context.set_gop(encoding.gop);
+        if !encoding.small {
+            context.set_max_b_frames(0);
+        }
+        // One thread and no dates, so that equal frames give equal bytes.
+        context.set_threading(threading::Config::count(1));
+        context.set_flags(Flags::BITEXACT | Flags::GLOBAL_HEADER);
+        let mut options = Dictionary::new();
+        settings.iter().for_each(|(key, value)| options.set(key, value));
+        let encoder = context.open_as_with(codec, options).map_err(failed)?;
+        let mut stream = output.add_stream_with(&encoder).map_err(failed)?;
+        stream.set_time_base(rate.invert());
+        stream.set_avg_frame_rate(rate);
+        let mut options = Dictionary::new();
+        options.set("fflags", "+bitexact");
+        drop(output.write_header_with(options).map_err(failed)?);
+        let unit = output.stream(0).map_or(rate.invert(), |stream| stream.time_base());
+        let frame = frame::Video::new(pixels, wide, high);
+        Ok(Self { encoder, output, file, frame, packet: Packet::empty(), units: [rate.invert(), unit] })
+    }
+
+    /// Adds frame `number`, the next one.
+    pub fn add(&mut self, rgb: &[u8], number: i64) -> Result<()> {
+        // The encoder may still hold the last frame's memory.
+        let mut frame = frame::Video::new(self.frame.format(), self.frame.width(), self.frame.height());
+        colour::from_rgb(rgb, &mut frame);
+        frame.set_pts(Some(number));
+        self.frame = frame;
+        self.encoder.send_frame(&self.frame).map_err(failed)?;
+        self.receive()
+    }
+
+    /// Moves what the encoder has finished into the file.
+    fn receive(&mut self) -> Result<()> {
+        loop {
+            match self.encoder.receive_packet(&mut self.packet) {
+                Ok(()) => {}
+                Err(ffmpeg_next::Error::Eof | ffmpeg_next::Error::Other { errno: ffmpeg_next::ffi::EAGAIN }) => {
+                    return Ok(());
+                }
+                Err(error) => return Err(failed(error)),
+            }
+            self.packet.set_stream(0);
+            self.packet.set_duration(1);
+            self.packet.rescale_ts(self.units[0], self.units[1]);
+            self.packet.write_interleaved(&mut self.output).map_err(failed)?;
+        }
+    }
+
+    /// The file.
+    pub fn finish(mut self) -> Result<Vec<u8>> {
+        self.encoder.send_eof().map_err(failed)?;
+        self.receive()?;
+        self.output.write_trailer().map_err(failed)?;
+        drop(self.output);
+        let mut file = std::mem::take(&mut *self.file.lock()).into_inner();
+        mp4::seal(&mut file)
+            .map_err(|problem| Error::external("encoding a video", format!("FFmpeg's file {problem}")))?;
+        Ok(file)
+    }
+}
+
+/// A file in memory, which FFmpeg fills and we take.
+#[derive(Clone, Default)]
+struct Memory(Arc<Mutex<Cursor<Vec<u8>>>>);
+
+impl Memory {
+    fn lock(&self) -> std::sync::MutexGuard<'_, Cursor<Vec<u8>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Write for Memory {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.lock().write(bytes)
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Seek for Memory {
+    fn seek(&mut self, to: SeekFrom) -> std::io::Result<u64> {
+        self.lock().seek(to)
+    }
+}

@@ -1,0 +1,478 @@
+//! Where the frames of an MP4 file are: its sample tables (ISO/IEC 14496-12), read without a library.
+//!
+//! Frame-exact access needs to know every coded picture's place, size, presentation time and whether decoding can begin
+//! there. Reading the tables takes microseconds where demultiplexing takes the whole file, and a damaged table is met
+//! by safe code.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+/// Bytes of a file's tables at most: an hour of video has less than one of these megabytes.
+const LARGEST_TABLES: u64 = 256 << 20;
+
+/// The box that [`seal`] appends: checksums of our own files.
+const SEAL: [u8; 16] = *b"swm frame sums 1";
+
+type Result<T> = std::result::Result<T, String>;
+
+/// The codec of a video.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Codec {
+    H264,
+    Hevc,
+    Vp9,
+    Av1,
+}
+
+/// One coded picture, in decoding order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Sample {
+    pub offset: u64,
+    pub size: u32,
+    /// When it is shown, in the track's units.
+    pub time: i64,
+    /// Whether decoding can begin here.
+    pub key: bool,
+}
+
+/// The video track of a file.
+#[derive(Clone, Debug)]
+pub struct Index {
+    pub codec: Codec,
+    /// What the decoder needs to begin: the record in the file's sample entry.
+    pub extradata: Arc<[u8]>,
+    pub width: usize,
+    pub height: usize,
+    /// In decoding order.
+    pub samples: Vec<Sample>,
+    /// The sample of each frame, in the order of presentation. Samples that the edit list hides are not among them.
+    pub frames: Vec<u32>,
+    /// When each frame is shown, from the beginning of the presentation, in the track's units.
+    pub times: Vec<i64>,
+    /// The track's units in a second.
+    pub timescale: u32,
+    /// The sums of the samples, where the file was sealed.
+    pub sums: Option<Vec<u32>>,
+}
+
+impl Index {
+    /// Reads the tables of a file of `length` bytes; `read(offset, bytes)` fills `bytes` from there.
+    pub fn read(length: u64, mut read: impl FnMut(u64, &mut [u8]) -> Result<()>) -> Result<Self> {
+        let (mut moov, mut seal, mut first) = (None, None, true);
+        let mut at = 0;
+        while at + 8 <= length {
+            let mut header = [0; 16];
+            read(at, &mut header[..8])?;
+            let kind = [header[4], header[5], header[6], header[7]];
+            let (mut size, mut begin) =
+                (u64::from(u32::from_be_bytes([header[0], header[1], header[2], header[3]])), 8);
+            if size == 1 && at + 16 <= length {
+                read(at + 8, &mut header[8..])?;
+                size = u64::from_be_bytes(header[8..].try_into().unwrap_or_default());
+                begin = 16;
+            } else if size == 0 {
+                size = length - at;
+            }
+            if first && !matches!(&kind, b"ftyp" | b"moov" | b"mdat" | b"free" | b"skip" | b"wide" | b"uuid") {
+                return Err("is no MP4 file".to_owned());
+            }
+            first = false;
+            if size < begin || size > length - at {
+                return Err(format!("ends within its box '{}'", kind.escape_ascii()));
+            }
+            let mut body = |limit: u64| -> Result<Vec<u8>> {
+                if size - begin > limit {
+                    return Err(format!("its box '{}' is absurdly large", kind.escape_ascii()));
+                }
+                let mut bytes = vec![0; usize::try_from(size - begin).map_err(|e| e.to_string())?];
+                read(at + begin, &mut bytes)?;
+                Ok(bytes)
+            };
+            match &kind {
+                b"moov" => moov = Some(body(LARGEST_TABLES)?),
+                b"uuid" => {
+                    let bytes = body(LARGEST_TABLES)?;
+                    seal = bytes.strip_prefix(&SEAL).map(<[u8]>::to_vec).or(seal);
+                }
+                b"moof" => return Err("is cut into fragments".to_owned()),
+                _ => {}
+            }
+            at += size;
+        }
+        let moov = moov.ok_or("holds no sample tables (box 'moov')")?;
+        let mut index = Self::of_moov(&moov, length)?;
+        if let Some(seal) = seal {
+            let mut sums = seal.chunks_exact(4).map(|b| u32::from_be_bytes([b[0], b[1], b[2], b[3]]));
+            if sums.next() != Some(sum(&moov)) || seal.len() != 4 * (index.samples.len() + 1) {
+                return Err("its sample tables do not match their checksum".to_owned());
+            }
+            index.sums = Some(sums.collect());
+        }
+        Ok(index)
+    }
+
+    fn of_moov(moov: &[u8], length: u64) -> Result<Self> {
+        let movie_scale = timescale(find(moov, b"mvhd")?.ok_or("its movie has no header")?)?;
+        if find(moov, b"mvex")?.is_some() {
+            return Err("is cut into fragments".to_owned());
+        }
+        for child in Boxes(moov) {
+            let (kind, trak) = child?;
+            if &kind != b"trak" {
+                continue;
+            }
+            let Some(mdia) = find(trak, b"mdia")? else { continue };
+            let handler = find(mdia, b"hdlr")?.and_then(|hdlr| hdlr.get(8..12));
+            if handler == Some(b"vide".as_slice()) {
+                return Self::of_track(trak, mdia, movie_scale, length);
+            }
+        }
+        Err("holds no video".to_owned())
+    }
+
+    fn of_track(trak: &[u8], mdia: &[u8], movie_scale: u32, length: u64) -> Result<Self> {
+        let timescale = timescale(find(mdia, b"mdhd")?.ok_or("its video has no header")?)?;
+        let minf = find(mdia, b"minf")?.ok_or("its video has no tables")?;
+        let stbl = find(minf, b"stbl")?.ok_or("its video has no tables")?;
+        let (codec, extradata, width, height) = description(find(stbl, b"stsd")?.ok_or("its video has no codec")?)?;
+        let samples = samples(stbl, length)?;
+        let edit = edit(trak, movie_scale, timescale)?;
+        let mut frames: Vec<u32> = (0..u32::try_from(samples.len()).map_err(|e| e.to_string())?).collect();
+        frames.retain(|&i| edit.shown.contains(&samples[i as usize].time));
+        frames.sort_by_key(|&i| samples[i as usize].time);
+        let times = frames.iter().map(|&i| samples[i as usize].time.saturating_add(edit.shift)).collect();
+        Ok(Self { codec, extradata, width, height, samples, frames, times, timescale, sums: None })
+    }
+
+    /// The sample at which decoding must begin to see this one: the last key sample before it that is not shown after
+    /// it.
+    pub fn key_before(&self, sample: usize) -> usize {
+        let shown = self.samples[sample].time;
+        let begins = |i: &usize| self.samples[*i].key && self.samples[*i].time <= shown;
+        (0..=sample).rev().find(begins).unwrap_or(0)
+    }
+
+    /// Checks what was read of a sample.
+    pub fn check(&self, sample: usize, bytes: &[u8]) -> Result<()> {
+        if bytes.is_empty() {
+            return Err(format!("is damaged: its coded picture {sample} is empty"));
+        }
+        match &self.sums {
+            Some(sums) if sums[sample] != sum(bytes) => {
+                Err(format!("is damaged in coded picture {sample}: its checksum differs"))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// When a frame is shown, in seconds.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn seconds(&self, frame: usize) -> f64 {
+        self.times[frame] as f64 / f64::from(self.timescale)
+    }
+
+    /// The frame that is shown nearest to a time in seconds.
+    pub fn frame_at(&self, seconds: f64) -> Option<usize> {
+        #[allow(clippy::cast_precision_loss)]
+        let after = self.times.partition_point(|&time| time as f64 / f64::from(self.timescale) < seconds);
+        let candidates = [after.checked_sub(1), (after < self.times.len()).then_some(after)];
+        let distance = |frame: &usize| (self.seconds(*frame) - seconds).abs();
+        candidates.into_iter().flatten().min_by(|a, b| distance(a).total_cmp(&distance(b)))
+    }
+}
+
+/// Appends the checksums of the samples and the tables to a finished file, in a box that players skip.
+pub fn seal(file: &mut Vec<u8>) -> Result<()> {
+    let read = |file: &[u8], offset: u64, bytes: &mut [u8]| {
+        let from = usize::try_from(offset).ok().and_then(|at| file.get(at..)?.get(..bytes.len()));
+        bytes.copy_from_slice(from.ok_or("ends too early")?);
+        Ok(())
+    };
+    let index = Index::read(file.len() as u64, |offset, bytes| read(file, offset, bytes))?;
+    let moov = Boxes(file).flatten().find(|(kind, _)| kind == b"moov").ok_or("holds no sample tables")?.1;
+    let mut content = SEAL.to_vec();
+    content.extend(sum(moov).to_be_bytes());
+    let mut bytes = vec![];
+    for sample in &index.samples {
+        bytes.resize(sample.size as usize, 0);
+        read(file, sample.offset, &mut bytes)?;
+        content.extend(sum(&bytes).to_be_bytes());
+    }
+    file.extend(u32::try_from(content.len() + 8).map_err(|e| e.to_string())?.to_be_bytes());
+    file.extend(b"uuid");
+    file.extend(content);
+    Ok(())
+}
+
+/// A checksum against damage, not against malice. Every step is one-to-one, so that the 64 bits differ whenever one
+/// word does.
+pub fn sum(bytes: &[u8]) -> u32 {
+    const ODD: u64 = 0x9e37_79b9_7f4a_7c15;
+    let mut sum = ODD ^ bytes.len() as u64;
+    let mut add = |word: [u8; 8]| {
+        sum = (sum ^ u64::from_le_bytes(word)).wrapping_mul(ODD);
+        sum ^= sum >> 32;
+    };
+    let (words, rest) = bytes.as_chunks::<8>();
+    words.iter().copied().for_each(&mut add);
+    let mut last = [0; 8];
+    last[..rest.len()].copy_from_slice(rest);
+    add(last);
+    (sum >> 32) as u32 ^ sum as u32
+}
+
+/// The boxes within a box.
+struct Boxes<'a>(&'a [u8]);
+
+impl<'a> Iterator for Boxes<'a> {
+    type Item = Result<([u8; 4], &'a [u8])>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let (&[a, b, c, d, k, i, n, e], rest) = self.0.split_first_chunk::<8>()?;
+        let kind = [k, i, n, e];
+        let (size, body) = match u32::from_be_bytes([a, b, c, d]) {
+            0 => (rest.len(), rest),
+            1 => {
+                let Some((large, body)) = rest.split_first_chunk::<8>() else { return self.cut(kind) };
+                (usize::try_from(u64::from_be_bytes(*large).saturating_sub(16)).unwrap_or(usize::MAX), body)
+            }
+            size => ((size as usize).saturating_sub(8), rest),
+        };
+        match body.split_at_checked(size) {
+            Some((body, rest)) => {
+                self.0 = rest;
+                Some(Ok((kind, body)))
+            }
+            None => self.cut(kind),
+        }
+    }
+}
+
+impl<'a> Boxes<'a> {
+    fn cut(&mut self, kind: [u8; 4]) -> Option<Result<([u8; 4], &'a [u8])>> {
+        self.0 = &[];
+        Some(Err(format!("its box '{}' is cut short", kind.escape_ascii())))
+    }
+}
+
+/// The first box of that kind.
+fn find<'a>(parent: &'a [u8], kind: &[u8; 4]) -> Result<Option<&'a [u8]>> {
+    for child in Boxes(parent) {
+        let (found, body) = child?;
+        if found == *kind {
+            return Ok(Some(body));
+        }
+    }
+    Ok(None)
+}
+
+/// Big-endian numbers, one after another.
+struct Numbers<'a>(&'a [u8]);
+
+impl Numbers<'_> {
+    fn bytes<const N: usize>(&mut self) -> Result<[u8; N]> {
+        let (first, rest) = self.0.split_first_chunk::<N>().ok_or("one of its tables is cut short")?;
+        self.0 = rest;
+        Ok(*first)
+    }
+
+    fn u32(&mut self) -> Result<u32> {
+        Ok(u32::from_be_bytes(self.bytes()?))
+    }
+
+    fn u64(&mut self) -> Result<u64> {
+        Ok(u64::from_be_bytes(self.bytes()?))
+    }
+
+    fn i32(&mut self) -> Result<i32> {
+        Ok(i32::from_be_bytes(self.bytes()?))
+    }
+
+    fn i64(&mut self) -> Result<i64> {
+        Ok(i64::from_be_bytes(self.bytes()?))
+    }
+
+    /// The number of entries that follow, each of `size` bytes.
+    fn count(&mut self, size: usize) -> Result<usize> {
+        let count = self.u32()? as usize;
+        if count.checked_mul(size).is_none_or(|bytes| bytes > self.0.len()) {
+            return Err("one of its tables is cut short".to_owned());
+        }
+        Ok(count)
+    }
+}
+
+/// A box that begins with a version and flags: the version, and what follows.
+fn versioned(body: &[u8]) -> Result<(u8, Numbers<'_>)> {
+    let mut numbers = Numbers(body);
+    let [version, ..] = numbers.bytes::<4>()?;
+    Ok((version, numbers))
+}
+
+/// Units in a second, of a header of a movie or a track.
+fn timescale(header: &[u8]) -> Result<u32> {
+    let (version, mut numbers) = versioned(header)?;
+    // When it was made and when it was changed.
+    if version == 1 { numbers.bytes::<16>().map(drop) } else { numbers.bytes::<8>().map(drop) }?;
+    match numbers.u32()? {
+        0 => Err("its clock does not tick".to_owned()),
+        timescale => Ok(timescale),
+    }
+}
+
+/// Codec, decoder record, width and height.
+fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize)> {
+    /// Bytes of a visual sample entry before its boxes, and where its size stands.
+    const ENTRY: usize = 78;
+    const SIZE: usize = 24;
+    let (_, numbers) = versioned(stsd)?;
+    let entries = numbers.0.get(4..).unwrap_or_default();
+    let (kind, entry) = Boxes(entries).next().ok_or("its video has no codec")??;
+    let (codec, record) = match &kind {
+        b"avc1" | b"avc3" => (Codec::H264, b"avcC"),
+        b"hvc1" | b"hev1" => (Codec::Hevc, b"hvcC"),
+        b"vp09" => (Codec::Vp9, b"vpcC"),
+        b"av01" => (Codec::Av1, b"av1C"),
+        other => {
+            return Err(format!("has the codec '{}', which is none of H.264, H.265, VP9, AV1", other.escape_ascii()));
+        }
+    };
+    let (fixed, boxes) = entry.split_at_checked(ENTRY).ok_or("the description of its codec is cut short")?;
+    let size = |at: usize| usize::from(u16::from_be_bytes([fixed[at], fixed[at + 1]]));
+    // Boxes of other makers may follow in forms of their own; only ours must be whole.
+    let record = Boxes(boxes).flatten().find(|(kind, _)| kind == record).map_or(&[][..], |(_, body)| body);
+    // A decoder takes VP9 without a record.
+    let extradata = if codec == Codec::Vp9 { &[] } else { record };
+    let (width, height) = (size(SIZE), size(SIZE + 2));
+    if width == 0 || height == 0 {
+        return Err("its pictures have no size".to_owned());
+    }
+    Ok((codec, extradata.into(), width, height))
+}
+
+/// What the presentation shows of a track.
+struct Edit {
+    /// The track's times that are shown.
+    shown: Range<i64>,
+    /// What turns them into times of the presentation.
+    shift: i64,
+}
+
+/// The edit list. One piece of the track, perhaps after a pause, is what encoders write to hide their delay; more is
+/// film editing, of which a dataset needs none.
+fn edit(trak: &[u8], movie_scale: u32, timescale: u32) -> Result<Edit> {
+    let mut edit = Edit { shown: i64::MIN..i64::MAX, shift: 0 };
+    let Some(edts) = find(trak, b"edts")? else { return Ok(edit) };
+    let Some(elst) = find(edts, b"elst")? else { return Ok(edit) };
+    let (version, mut numbers) = versioned(elst)?;
+    let (mut start, mut pieces) = (0_i64, 0);
+    for _ in 0..numbers.count(if version == 1 { 20 } else { 12 })? {
+        let (duration, from) = if version == 1 {
+            (numbers.u64()?, numbers.i64()?)
+        } else {
+            (numbers.u32()?.into(), numbers.i32()?.into())
+        };
+        numbers.u32()?; // its speed
+        let units = u128::from(duration) * u128::from(timescale) / u128::from(movie_scale);
+        let units = i64::try_from(units).unwrap_or(i64::MAX);
+        if from >= 0 {
+            let end = if duration == 0 { i64::MAX } else { from.saturating_add(units) };
+            edit = Edit { shown: from..end, shift: start.saturating_sub(from) };
+            pieces += 1;
+        }
+        start = start.saturating_add(units);
+    }
+    if pieces > 1 { Err("is edited from several pieces".to_owned()) } else { Ok(edit) }
+}
+
+/// All samples, in decoding order.
+fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
+    let table = |kind: &[u8; 4]| find(stbl, kind)?.ok_or(format!("its table '{}' is missing", kind.escape_ascii()));
+    // Sizes.
+    let (_, mut sizes) = versioned(table(b"stsz")?)?;
+    let same = sizes.u32()?;
+    let count = if same == 0 { sizes.count(4)? } else { sizes.u32()? as usize };
+    if same != 0 && u64::from(same) * count as u64 > length {
+        return Err("is shorter than its pictures".to_owned());
+    }
+    let mut samples = vec![Sample { offset: 0, size: same, time: 0, key: false }; count];
+    if same == 0 {
+        for sample in &mut samples {
+            sample.size = sizes.u32()?;
+        }
+    }
+    // Decoding times, and what shifts them to presentation times.
+    let (_, mut durations) = versioned(table(b"stts")?)?;
+    let (mut at, mut time) = (0, 0_i64);
+    for _ in 0..durations.count(8)? {
+        let (n, duration) = (durations.u32()? as usize, durations.u32()?);
+        for sample in samples.iter_mut().skip(at).take(n) {
+            sample.time = time;
+            time = time.saturating_add(duration.into());
+        }
+        at = at.saturating_add(n);
+    }
+    if at < count {
+        return Err("some of its pictures have no time".to_owned());
+    }
+    if let Some(ctts) = find(stbl, b"ctts")? {
+        let (_, mut shifts) = versioned(ctts)?;
+        let mut at = 0_usize;
+        for _ in 0..shifts.count(8)? {
+            // Version 0 says unsigned, but writers of negative shifts exist.
+            let (n, shift) = (shifts.u32()? as usize, shifts.i32()?);
+            samples
+                .iter_mut()
+                .skip(at)
+                .take(n)
+                .for_each(|sample| sample.time = sample.time.saturating_add(shift.into()));
+            at = at.saturating_add(n);
+        }
+    }
+    // Where decoding can begin: everywhere, unless a table says where.
+    match find(stbl, b"stss")? {
+        None => samples.iter_mut().for_each(|sample| sample.key = true),
+        Some(stss) => {
+            let (_, mut keys) = versioned(stss)?;
+            for _ in 0..keys.count(4)? {
+                let number = keys.u32()? as usize;
+                let sample = number.checked_sub(1).and_then(|i| samples.get_mut(i));
+                sample.ok_or("names a key picture that does not exist")?.key = true;
+            }
+        }
+    }
+    // Places: samples follow each other within chunks, which have the places.
+    let (wide, chunks) = match find(stbl, b"stco")? {
+        Some(stco) => (false, stco),
+        None => (true, table(b"co64")?),
+    };
+    let (_, mut chunks) = versioned(chunks)?;
+    let n = chunks.count(if wide { 8 } else { 4 })?;
+    let (_, mut table) = versioned(table(b"stsc")?)?;
+    // Runs of chunks: the first chunk (from 1), the samples in each, and which description, of which we read one.
+    let mut runs = vec![];
+    for _ in 0..table.count(12)? {
+        runs.push((table.u32()? as usize, table.u32()? as usize));
+        table.u32()?;
+    }
+    let (mut run, mut at) = (0, 0);
+    for chunk in 1..=n {
+        while runs.get(run + 1).is_some_and(|&(first, _)| first <= chunk) {
+            run += 1;
+        }
+        let per_chunk = runs.get(run).map_or(0, |&(_, samples)| samples);
+        let mut offset = if wide { chunks.u64()? } else { chunks.u32()?.into() };
+        for sample in samples.iter_mut().skip(at).take(per_chunk) {
+            sample.offset = offset;
+            offset = offset.checked_add(sample.size.into()).ok_or("a picture lies beyond its end")?;
+            if offset > length {
+                return Err("ends before its last picture".to_owned());
+            }
+        }
+        at = at.saturating_add(per_chunk);
+    }
+    if at < count {
+        return Err("some of its pictures have no place".to_owned());
+    }
+    Ok(samples)
+}

@@ -1,0 +1,309 @@
+//! `meta/info.json`: what a dataset holds and how its files are named.
+
+use serde::de::{MapAccess, Visitor};
+use serde::ser::SerializeMap as _;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde_json::Value;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema};
+
+/// The version that is written.
+pub const VERSION: &str = "v3.0";
+
+/// Where files of version 3.0 are.
+pub const DATA_PATH: &str = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet";
+/// See [`DATA_PATH`].
+pub const VIDEO_PATH: &str = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4";
+/// See [`DATA_PATH`].
+pub const EPISODES_PATH: &str = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet";
+
+/// The content of `meta/info.json`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Info {
+    pub codebase_version: String,
+    #[serde(default)]
+    pub robot_type: Option<String>,
+    pub total_episodes: usize,
+    pub total_frames: usize,
+    #[serde(default)]
+    pub total_tasks: usize,
+    #[serde(default = "thousand")]
+    pub chunks_size: usize,
+    #[serde(default = "hundred")]
+    pub data_files_size_in_mb: usize,
+    #[serde(default = "hundred")]
+    pub video_files_size_in_mb: usize,
+    pub fps: serde_json::Number,
+    #[serde(default)]
+    pub splits: BTreeMap<String, String>,
+    pub data_path: String,
+    #[serde(default)]
+    pub video_path: Option<String>,
+    pub features: Features,
+    /// What we record for ourselves.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stable_worldmodel: Option<Recorded>,
+}
+
+fn thousand() -> usize {
+    1000
+}
+
+fn hundred() -> usize {
+    100
+}
+
+/// What we record for ourselves.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Recorded {
+    pub schema: Schema,
+    pub manifest: Option<Manifest>,
+    /// The last action of an episode repeats the one before, and stands for none.
+    pub last_action_repeats: bool,
+}
+
+/// Features by name, in the order of the file: the first camera is the main one.
+#[derive(Clone, Debug, Default)]
+pub struct Features(pub Vec<(String, Feature)>);
+
+/// One feature.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Feature {
+    pub dtype: String,
+    pub shape: Vec<usize>,
+    #[serde(default)]
+    pub names: Value,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub info: Option<Value>,
+}
+
+impl Serialize for Features {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(Some(self.0.len()))?;
+        for (name, feature) in &self.0 {
+            map.serialize_entry(name, feature)?;
+        }
+        map.end()
+    }
+}
+
+impl<'de> Deserialize<'de> for Features {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Entries;
+        impl<'de> Visitor<'de> for Entries {
+            type Value = Features;
+
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("features by name")
+            }
+
+            fn visit_map<M: MapAccess<'de>>(self, mut map: M) -> Result<Features, M::Error> {
+                let mut entries = vec![];
+                while let Some(entry) = map.next_entry()? {
+                    entries.push(entry);
+                }
+                Ok(Features(entries))
+            }
+        }
+        deserializer.deserialize_map(Entries)
+    }
+}
+
+/// How the values of a column are stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// In the data files.
+    Numbers,
+    /// As encoded pictures in the data files.
+    Pictures,
+    /// In videos; the place among the features that are.
+    Video(usize),
+}
+
+/// A column as readers see it.
+#[derive(Clone, Debug)]
+pub struct Column {
+    pub spec: ColumnSpec,
+    /// The feature's name.
+    pub native: String,
+    pub kind: Kind,
+}
+
+impl Info {
+    /// Reads the file of a dataset.
+    ///
+    /// # Errors
+    /// When it is missing, is no such file, or is of a version that is not read.
+    pub fn read(root: &Path) -> Result<Self> {
+        let path = root.join("meta").join("info.json");
+        let bytes = std::fs::read(&path).map_err(|e| match e.kind() {
+            std::io::ErrorKind::NotFound => {
+                let problem = if root.exists() { "it holds no meta/info.json" } else { "there is no such dataset" };
+                Error::corrupt(root, problem, "check the path; `swm datasets` lists those at home")
+            }
+            _ => Error::io(&path, "reading what the dataset holds", e),
+        })?;
+        let info: Self = serde_json::from_slice(&bytes).map_err(|e| damaged(&path, format!("is unreadable: {e}")))?;
+        if !info.is_v3() && info.codebase_version != "v2.1" && info.codebase_version != "v2.0" {
+            let problem = format!("LeRobot's version {} is not read", info.codebase_version);
+            return Err(Error::corrupt(&path, problem, "convert it with LeRobot's own tools to v2.1 or v3.0"));
+        }
+        if info.chunks_size == 0 || info.fps().is_none() {
+            return Err(damaged(&path, "its chunks or frames a second are none".to_owned()));
+        }
+        Ok(info)
+    }
+
+    pub fn is_v3(&self) -> bool {
+        self.codebase_version == VERSION
+    }
+
+    /// Frames a second, if that is a rate.
+    pub fn fps(&self) -> Option<f64> {
+        self.fps.as_f64().filter(|fps| fps.is_finite() && *fps > 0.0)
+    }
+
+    /// Names of the features that are stored as videos.
+    pub fn video_keys(&self) -> Vec<&str> {
+        self.features.0.iter().filter(|(_, feature)| feature.dtype == "video").map(|(name, _)| name.as_str()).collect()
+    }
+
+    /// The columns. Text, and what has a shape that we have no column for, is left out.
+    ///
+    /// # Errors
+    /// When the shape of a camera makes no sense.
+    pub fn columns(&self, root: &Path) -> Result<Vec<Column>> {
+        let (mut columns, mut videos, mut primary) = (vec![], 0, true);
+        for (native, feature) in &self.features.0 {
+            let recorded = self.stable_worldmodel.as_ref().and_then(|recorded| {
+                let columns = recorded.schema.columns().iter();
+                columns.clone().find(|column| native_name(column, &recorded.schema) == *native)
+            });
+            let camera = feature.dtype == "video" || feature.dtype == "image";
+            let (spec, kind) = if camera {
+                let (height, width) = feature.size().ok_or_else(|| {
+                    damaged(root, format!("the camera '{native}' has pictures of {:?}", feature.shape))
+                })?;
+                let name = if std::mem::take(&mut primary) { "pixels" } else { native };
+                let kind = if feature.dtype == "video" { Kind::Video(videos) } else { Kind::Pictures };
+                videos += usize::from(feature.dtype == "video");
+                (ColumnSpec::image(name, height, width), kind)
+            } else {
+                let Some(dtype) = feature.number() else { continue };
+                let name = if native == "observation.state" { "proprio" } else { native };
+                let shape = if feature.shape == [1] { vec![] } else { feature.shape.clone() };
+                (ColumnSpec::new(name, dtype, shape), Kind::Numbers)
+            };
+            let spec = match recorded {
+                Some(known) if known.len() == spec.len() && known.is_image() == camera => known.clone(),
+                // Ours have a few more, which the writer was not given.
+                _ if self.stable_worldmodel.is_some() => continue,
+                _ => spec,
+            };
+            let counts = native == "episode_index" || native == "frame_index";
+            let absurd =
+                spec.shape.iter().try_fold(1_usize, |n, &side| n.checked_mul(side)).is_none_or(|n| n > 1 << 28);
+            if absurd {
+                return Err(damaged(root, format!("the feature '{native}' has the shape {:?}", feature.shape)));
+            }
+            if !counts && !spec.is_empty() {
+                columns.push(Column { spec, native: native.clone(), kind });
+            }
+        }
+        if let Some(recorded) = &self.stable_worldmodel {
+            let place = |column: &Column| recorded.schema.find(&column.spec.name);
+            columns.sort_by_key(place);
+        }
+        Ok(columns)
+    }
+
+    /// A file of the dataset: its template with the numbers filled in.
+    ///
+    /// # Errors
+    /// When the template leads out of the dataset.
+    pub fn file(&self, root: &Path, template: &str, key: &str, numbers: &[(&str, usize)]) -> Result<PathBuf> {
+        let name = fill(template, key, numbers);
+        let inside = Path::new(&name).components().all(|part| matches!(part, std::path::Component::Normal(_)));
+        if inside { Ok(root.join(name)) } else { Err(damaged(root, format!("'{name}' is no file within it"))) }
+    }
+}
+
+impl Feature {
+    /// Height and width of a camera's pictures: the names say in which order, else the place of the colours.
+    fn size(&self) -> Option<(usize, usize)> {
+        let [a, b, c] = self.shape[..] else { return None };
+        let named = |name: &str| self.names.as_array()?.iter().position(|found| found.as_str() == Some(name));
+        let sides = match (named("height"), named("width")) {
+            (Some(height), Some(width)) => (*self.shape.get(height)?, *self.shape.get(width)?),
+            _ if c == 3 || c == 1 => (a, b),
+            _ if a == 3 || a == 1 => (b, c),
+            _ => return None,
+        };
+        (sides.0 > 0 && sides.1 > 0 && sides.0 < 1 << 16 && sides.1 < 1 << 16).then_some(sides)
+    }
+
+    /// The type of column that holds its numbers without loss.
+    fn number(&self) -> Option<DType> {
+        Some(match self.dtype.as_str() {
+            "bool" => DType::Bool,
+            "uint8" => DType::U8,
+            "int8" | "int16" | "uint16" | "int32" => DType::Int32,
+            "uint32" | "int64" | "uint64" => DType::Int64,
+            "float16" | "float32" => DType::Float32,
+            "float64" => DType::Float64,
+            _ => return None,
+        })
+    }
+}
+
+/// The feature that a column of ours is stored as.
+pub fn native_name(column: &ColumnSpec, schema: &Schema) -> String {
+    let state = if schema.find("proprio").is_some() { "proprio" } else { "state" };
+    match &*column.name {
+        name if column.is_image() => format!("observation.images.{name}"),
+        name if name == state => "observation.state".to_owned(),
+        name => name.to_owned(),
+    }
+}
+
+/// The error of a dataset that contradicts itself.
+pub fn damaged(path: &Path, problem: String) -> Error {
+    Error::corrupt(path, problem, "restore it from a copy, or rebuild the dataset")
+}
+
+/// A template in Python's notation, with the numbers and the key filled in.
+pub fn fill(template: &str, key: &str, numbers: &[(&str, usize)]) -> String {
+    let mut filled = String::new();
+    let mut rest = template;
+    while let Some((before, after)) = rest.split_once('{') {
+        filled.push_str(before);
+        let Some((field, after)) = after.split_once('}') else { break };
+        let (name, form) = field.split_once(':').unwrap_or((field, ""));
+        if name == "video_key" || name == "image_key" {
+            filled.push_str(key);
+        } else if let Some((_, number)) = numbers.iter().find(|(known, _)| *known == name) {
+            // Such as `03d`.
+            let width = form.trim_end_matches('d').trim_start_matches('0').parse::<usize>().unwrap_or(0).min(20);
+            filled.push_str(&format!("{number:0width$}"));
+        }
+        rest = after;
+    }
+    filled.push_str(rest);
+    filled
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn templates_are_filled() {
+        let numbers = [("chunk_index", 2), ("file_index", 1234)];
+        assert_eq!(
+            fill(VIDEO_PATH, "observation.images.top", &numbers),
+            "videos/observation.images.top/chunk-002/file-1234.mp4"
+        );
+        assert_eq!(fill("a{unknown}b{", "", &numbers), "ab");
+    }
+}

@@ -1,0 +1,133 @@
+//! Between Arrow's arrays and the bytes of our columns.
+
+use arrow_array::cast::AsArray as _;
+use arrow_array::types::{
+    ArrowPrimitiveType, Float16Type, Float32Type, Float64Type, Int8Type, Int16Type, Int32Type, Int64Type, UInt8Type,
+    UInt16Type, UInt32Type, UInt64Type,
+};
+use arrow_array::{Array, ArrayRef, BooleanArray, FixedSizeListArray, PrimitiveArray};
+use arrow_buffer::{ArrowNativeType, ScalarBuffer};
+use arrow_schema::{DataType, Field};
+use std::sync::Arc;
+use swm_core::{ColumnSpec, DType, Error, Result};
+
+/// Appends the numbers of an array, `column.len()` of them in every row, as bytes of the column's type.
+///
+/// # Errors
+/// When rows have more or fewer numbers, some are missing, or it holds something else; in words.
+pub fn append(array: &dyn Array, column: &ColumnSpec, out: &mut Vec<u8>) -> Result<(), String> {
+    let expected = array.len() * column.len();
+    let mut leaf: ArrayRef = arrow_array::make_array(array.to_data());
+    loop {
+        if leaf.null_count() > 0 {
+            return Err("some values are missing".to_owned());
+        }
+        leaf = match leaf.data_type() {
+            DataType::List(_) => {
+                let list = leaf.as_list::<i32>();
+                check_offsets(list.value_offsets())?;
+                let (first, last) = (list.value_offsets()[0] as usize, list.value_offsets()[list.len()] as usize);
+                list.values().slice(first, last - first)
+            }
+            DataType::FixedSizeList(..) => Arc::clone(leaf.as_fixed_size_list().values()),
+            _ => break,
+        };
+    }
+    if leaf.len() != expected {
+        return Err(format!("it has {} numbers instead of {expected}", leaf.len()));
+    }
+    match leaf.data_type() {
+        DataType::Boolean => {
+            let values = leaf.as_boolean().values().iter().map(i64::from);
+            put(values, column.dtype, out, |v| v, |v| v as f64);
+        }
+        DataType::Int8 => whole::<Int8Type>(&leaf, column, out),
+        DataType::Int16 => whole::<Int16Type>(&leaf, column, out),
+        DataType::Int32 => whole::<Int32Type>(&leaf, column, out),
+        DataType::Int64 => whole::<Int64Type>(&leaf, column, out),
+        DataType::UInt8 => whole::<UInt8Type>(&leaf, column, out),
+        DataType::UInt16 => whole::<UInt16Type>(&leaf, column, out),
+        DataType::UInt32 => whole::<UInt32Type>(&leaf, column, out),
+        DataType::UInt64 => whole::<UInt64Type>(&leaf, column, out),
+        DataType::Float16 => {
+            real(leaf.as_primitive::<Float16Type>().values().iter().map(|v| f64::from(*v)), column, out)
+        }
+        DataType::Float32 => {
+            real(leaf.as_primitive::<Float32Type>().values().iter().map(|v| f64::from(*v)), column, out)
+        }
+        DataType::Float64 => real(leaf.as_primitive::<Float64Type>().values().iter().copied(), column, out),
+        other => return Err(format!("it holds {other}, which are no numbers")),
+    }
+    Ok(())
+}
+
+/// Damaged files could promise lists that end before they begin.
+fn check_offsets(offsets: &[i32]) -> Result<(), String> {
+    let steady = offsets.windows(2).all(|pair| pair[1] - pair[0] == offsets[1] - offsets[0]);
+    if steady { Ok(()) } else { Err("its rows have different lengths".to_owned()) }
+}
+
+#[allow(clippy::cast_precision_loss, clippy::cast_possible_wrap)]
+fn whole<T: ArrowPrimitiveType>(leaf: &ArrayRef, column: &ColumnSpec, out: &mut Vec<u8>)
+where
+    T::Native: ArrowNativeType + TryInto<i64>,
+{
+    // Of unsigned numbers of 64 bits, those below 2^63 keep their value.
+    let values = leaf.as_primitive::<T>().values().iter().map(|&v| v.try_into().unwrap_or(i64::MAX));
+    put(values, column.dtype, out, |v| v, |v| v as f64);
+}
+
+#[allow(clippy::cast_possible_truncation)]
+fn real(values: impl Iterator<Item = f64>, column: &ColumnSpec, out: &mut Vec<u8>) {
+    put(values, column.dtype, out, |v| v as i64, |v| v);
+}
+
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+fn put<V: Copy>(
+    values: impl Iterator<Item = V>,
+    dtype: DType,
+    out: &mut Vec<u8>,
+    whole: impl Fn(V) -> i64,
+    real: impl Fn(V) -> f64,
+) {
+    match dtype {
+        DType::Bool => out.extend(values.map(|v| u8::from(real(v) != 0.0))),
+        DType::U8 => out.extend(values.map(|v| whole(v) as u8)),
+        DType::Int32 => values.for_each(|v| out.extend((whole(v) as i32).to_ne_bytes())),
+        DType::Int64 => values.for_each(|v| out.extend(whole(v).to_ne_bytes())),
+        DType::Float32 => values.for_each(|v| out.extend((real(v) as f32).to_ne_bytes())),
+        DType::Float64 => values.for_each(|v| out.extend(real(v).to_ne_bytes())),
+    }
+}
+
+/// The array of a column's bytes, and its field.
+///
+/// # Errors
+/// When a row has more numbers than Arrow counts.
+pub fn array(name: &str, column: &ColumnSpec, bytes: &[u8]) -> Result<(Field, ArrayRef)> {
+    let flat: ArrayRef = match column.dtype {
+        DType::Bool => Arc::new(BooleanArray::from(bytes.iter().map(|&v| v != 0).collect::<Vec<bool>>())),
+        DType::U8 => Arc::new(primitive::<UInt8Type, 1>(bytes, |[v]| v)),
+        DType::Int32 => Arc::new(primitive::<Int32Type, 4>(bytes, i32::from_ne_bytes)),
+        DType::Int64 => Arc::new(primitive::<Int64Type, 8>(bytes, i64::from_ne_bytes)),
+        DType::Float32 => Arc::new(primitive::<Float32Type, 4>(bytes, f32::from_ne_bytes)),
+        DType::Float64 => Arc::new(primitive::<Float64Type, 8>(bytes, f64::from_ne_bytes)),
+    };
+    let flat_type = flat.data_type().clone();
+    if column.len() == 1 {
+        return Ok((Field::new(name, flat_type, false), flat));
+    }
+    let failed = |e: &dyn std::fmt::Display| Error::external(format!("storing column '{}'", column.name), e);
+    let length = i32::try_from(column.len()).map_err(|e| failed(&e))?;
+    let item = Arc::new(Field::new("element", flat_type, false));
+    let list = FixedSizeListArray::try_new(Arc::clone(&item), length, flat, None).map_err(|e| failed(&e))?;
+    Ok((Field::new(name, DataType::FixedSizeList(item, length), false), Arc::new(list)))
+}
+
+fn primitive<T: ArrowPrimitiveType, const N: usize>(
+    bytes: &[u8],
+    number: impl Fn([u8; N]) -> T::Native,
+) -> PrimitiveArray<T> {
+    let values: Vec<T::Native> = bytes.as_chunks::<N>().0.iter().map(|&chunk| number(chunk)).collect();
+    PrimitiveArray::new(ScalarBuffer::from(values), None)
+}

@@ -1,0 +1,147 @@
+//! `meta/stats.json`: minimum, maximum, mean and deviation of every feature, which LeRobot's policies normalise with.
+//! They grow with the dataset: what is stored and what comes are merged, not computed anew. Quantiles are left out.
+
+use serde_json::{Value, json};
+use swm_core::{ColumnSpec, Result};
+
+/// What is known of one feature.
+#[derive(Clone, Debug)]
+pub struct Stats {
+    /// Rows, or frames.
+    count: f64,
+    /// For every number of a row, or every colour.
+    dims: Vec<Dim>,
+    camera: bool,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Dim {
+    min: f64,
+    max: f64,
+    mean: f64,
+    /// Sum of squared distances from the mean.
+    spread: f64,
+}
+
+const NOTHING: Dim = Dim { min: f64::INFINITY, max: f64::NEG_INFINITY, mean: 0.0, spread: 0.0 };
+
+impl Stats {
+    pub fn new(column: &ColumnSpec) -> Self {
+        let camera = column.is_image();
+        Self { count: 0.0, dims: vec![NOTHING; if camera { 3 } else { column.len() }], camera }
+    }
+
+    /// Adds rows of numbers, `f64` values row after row; of a camera, its pixels.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn add(&mut self, values: impl Iterator<Item = f64> + Clone, rows: usize) {
+        let width = self.dims.len();
+        let mut added = vec![NOTHING; width];
+        let mut sums = vec![(0.0, 0.0, 0.0); width];
+        for (i, value) in values.enumerate() {
+            let (dim, sum) = (&mut added[i % width], &mut sums[i % width]);
+            dim.min = dim.min.min(value);
+            dim.max = dim.max.max(value);
+            // Welford's update, exact enough for any number of pixels.
+            sum.0 += 1.0;
+            let from = value - sum.1;
+            sum.1 += from / sum.0;
+            sum.2 += from * (value - sum.1);
+        }
+        for (dim, (n, mean, spread)) in added.iter_mut().zip(&sums) {
+            dim.mean = *mean;
+            // Per row: a camera has many values in one.
+            dim.spread = if *n > 0.0 { spread / n * rows as f64 } else { 0.0 };
+        }
+        self.merge(&added, rows as f64);
+    }
+
+    fn merge(&mut self, other: &[Dim], count: f64) {
+        let total = self.count + count;
+        if total == 0.0 {
+            return;
+        }
+        for (dim, other) in self.dims.iter_mut().zip(other) {
+            let apart = other.mean - dim.mean;
+            dim.min = dim.min.min(other.min);
+            dim.max = dim.max.max(other.max);
+            dim.spread += other.spread + apart * apart * self.count * count / total;
+            dim.mean += apart * count / total;
+        }
+        self.count = total;
+    }
+
+    /// As LeRobot stores it: pictures from 0 to 1, as `[3, 1, 1]`.
+    pub fn to_json(&self) -> Value {
+        let scale = if self.camera { 255.0 } else { 1.0 };
+        let list = |value: &dyn Fn(&Dim) -> f64| -> Value {
+            let values = self.dims.iter().map(|dim| value(dim) / scale);
+            if self.camera { values.map(|v| json!([[v]])).collect() } else { values.map(|v| json!(v)).collect() }
+        };
+        json!({
+            "min": list(&|dim| dim.min),
+            "max": list(&|dim| dim.max),
+            "mean": list(&|dim| dim.mean),
+            "std": list(&|dim| (dim.spread / self.count.max(1.0)).sqrt()),
+            "count": [self.count],
+        })
+    }
+
+    /// Takes over what is stored, if it is of this feature.
+    pub fn continue_from(&mut self, stored: &Value) -> Option<()> {
+        let scale = if self.camera { 255.0 } else { 1.0 };
+        let list = |name: &str| -> Option<Vec<f64>> {
+            let values = stored[name].as_array()?.iter();
+            values.map(|v| Some(if self.camera { v[0][0].as_f64()? } else { v.as_f64()? } * scale)).collect()
+        };
+        let count = stored["count"][0].as_f64()?;
+        let (min, max, mean, std) = (list("min")?, list("max")?, list("mean")?, list("std")?);
+        if [&min, &max, &mean, &std].iter().any(|list| list.len() != self.dims.len()) {
+            return None;
+        }
+        let dims = (0..min.len())
+            .map(|i| Dim { min: min[i], max: max[i], mean: mean[i], spread: std[i] * std[i] * count })
+            .collect::<Vec<_>>();
+        self.merge(&dims, count);
+        Some(())
+    }
+}
+
+/// All statistics, as a file.
+///
+/// # Errors
+/// When they cannot be written as JSON.
+pub fn file<'a>(features: impl Iterator<Item = (&'a str, &'a Stats)>) -> Result<Vec<u8>> {
+    let all: serde_json::Map<String, Value> =
+        features.map(|(name, stats)| (name.to_owned(), stats.to_json())).collect();
+    serde_json::to_vec_pretty(&all).map_err(|e| swm_core::Error::external("describing the dataset", e))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use swm_core::DType;
+
+    #[test]
+    fn parts_give_what_the_whole_gives() {
+        let column = ColumnSpec::new("state", DType::Float64, [2]);
+        let values: Vec<f64> = (0..40).map(|i| f64::from(i * i % 17) + if i % 2 == 0 { 100.0 } else { -3.0 }).collect();
+        let mut whole = Stats::new(&column);
+        whole.add(values.iter().copied(), 20);
+        let mut first = Stats::new(&column);
+        first.add(values[..14].iter().copied(), 7);
+        let mut second = Stats::new(&column);
+        second.continue_from(&first.to_json()).expect("is of this feature");
+        second.add(values[14..].iter().copied(), 13);
+        let (a, b) = (whole.to_json(), second.to_json());
+        for name in ["min", "max", "mean", "std", "count"] {
+            for i in 0..a[name].as_array().expect("a list").len() {
+                let (a, b) = (a[name][i].as_f64().expect("a number"), b[name][i].as_f64().expect("a number"));
+                assert!((a - b).abs() < 1e-9, "{name}: {a} {b}");
+            }
+        }
+        let even: Vec<f64> = values.iter().step_by(2).copied().collect();
+        let mean = even.iter().sum::<f64>() / 20.0;
+        assert!((a["mean"][0].as_f64().expect("a number") - mean).abs() < 1e-9);
+        assert!(Stats::new(&ColumnSpec::image("pixels", 4, 4)).continue_from(&a).is_none());
+    }
+}

@@ -1,0 +1,101 @@
+//! Parquet files: columns out of them, and columns into them.
+
+use super::info::damaged;
+use arrow_array::cast::AsArray as _;
+use arrow_array::{Array, RecordBatch};
+use arrow_schema::Schema as ArrowSchema;
+use parquet::arrow::arrow_reader::{ArrowReaderOptions, ParquetRecordBatchReaderBuilder, RowSelection};
+use parquet::arrow::{ArrowWriter, ProjectionMask};
+use parquet::basic::Compression;
+use parquet::file::metadata::KeyValue;
+use parquet::file::properties::WriterProperties;
+use std::fs::File;
+use std::ops::Range;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
+use std::sync::Arc;
+use swm_core::{Error, Result};
+
+/// Rows that are decoded at a time.
+const ROWS: usize = 4096;
+
+/// Reads columns of a file; rows of some rising ranges, or all of them. `None` for a column that is not there.
+///
+/// # Errors
+/// When the file cannot be read or is damaged, and also when that makes the library panic.
+pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> Result<Vec<RecordBatch>> {
+    let file = File::open(path).map_err(|e| match e.kind() {
+        std::io::ErrorKind::NotFound => damaged(path, "the file is missing".to_owned()),
+        _ => Error::io(path, "opening a table", e),
+    })?;
+    let failed = |e: &dyn std::fmt::Display| damaged(path, format!("the table is damaged: {e}"));
+    let work = || -> Result<Vec<RecordBatch>> {
+        // Without the Arrow schema that other programs put into the file: what Parquet says is enough, and what it
+        // adds is a second thing to be damaged.
+        let options = ArrowReaderOptions::new().with_skip_arrow_metadata(true);
+        let builder = ParquetRecordBatchReaderBuilder::try_new_with_options(file, options).map_err(|e| failed(&e))?;
+        let total = usize::try_from(builder.metadata().file_metadata().num_rows()).map_err(|e| failed(&e))?;
+        let fields = builder.parquet_schema().root_schema().get_fields();
+        let places: Vec<usize> =
+            columns.iter().filter_map(|name| fields.iter().position(|field| field.name() == *name)).collect();
+        let mask = ProjectionMask::roots(builder.parquet_schema(), places);
+        let mut builder = builder.with_projection(mask).with_batch_size(ROWS);
+        if let Some(rows) = rows {
+            if rows.last().is_some_and(|range| range.end > total) {
+                return Err(failed(&format!("it has {total} rows")));
+            }
+            builder = builder.with_row_selection(RowSelection::from_consecutive_ranges(rows.into_iter(), total));
+        }
+        let reader = builder.build().map_err(|e| failed(&e))?;
+        reader.map(|batch| batch.map_err(|e| failed(&e))).collect()
+    };
+    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| Err(failed(&"its content makes no sense")))
+}
+
+/// Whole numbers of a column.
+///
+/// # Errors
+/// When there is no such column, or it holds something else.
+pub fn whole_numbers(path: &Path, batches: &[RecordBatch], column: &str) -> Result<Vec<i64>> {
+    let mut numbers = vec![];
+    for batch in batches {
+        let values = batch.column_by_name(column).and_then(|array| {
+            array.as_primitive_opt::<arrow_array::types::Int64Type>().filter(|array| array.null_count() == 0)
+        });
+        let values = values.ok_or_else(|| damaged(path, format!("it has no whole numbers '{column}'")))?;
+        numbers.extend_from_slice(values.values());
+    }
+    Ok(numbers)
+}
+
+/// Writes a file under a passing name, then gives it its own.
+///
+/// # Errors
+/// When the disk refuses.
+pub fn write(path: &Path, schema: &Arc<ArrowSchema>, batch: &RecordBatch) -> Result<()> {
+    let failed = |e: parquet::errors::ParquetError| Error::external(format!("writing {}", path.display()), e);
+    // Readers other than Arrow's look for the schema's metadata here.
+    let metadata = schema.metadata().iter().map(|(key, value)| KeyValue::new(key.clone(), value.clone())).collect();
+    let properties =
+        WriterProperties::builder().set_compression(Compression::SNAPPY).set_key_value_metadata(Some(metadata)).build();
+    let mut bytes = vec![];
+    let mut writer = ArrowWriter::try_new(&mut bytes, Arc::clone(schema), Some(properties)).map_err(failed)?;
+    writer.write(batch).map_err(failed)?;
+    writer.close().map_err(failed)?;
+    put(path, &bytes)
+}
+
+/// Writes a file beside its place, then moves it there.
+///
+/// # Errors
+/// When the disk refuses.
+pub fn put(path: &Path, bytes: &[u8]) -> Result<()> {
+    let io = |e| Error::io(path, "writing a file of the dataset", e);
+    if let Some(folder) = path.parent() {
+        std::fs::create_dir_all(folder).map_err(io)?;
+    }
+    let mut passing = path.as_os_str().to_owned();
+    passing.push(".tmp");
+    std::fs::write(&passing, bytes).map_err(io)?;
+    std::fs::rename(&passing, path).map_err(io)
+}

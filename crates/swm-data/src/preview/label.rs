@@ -1,0 +1,81 @@
+//! Letters on pictures: small ones, of 3 by 5 points, for numbers of episodes and names of columns.
+
+/// Points across and down.
+const SIZE: (usize, usize) = (3, 5);
+
+/// The rows of a letter, from the top; the bits of a row, from the left.
+fn glyph(letter: char) -> [u8; 5] {
+    match letter.to_ascii_lowercase() {
+        '0' => [7, 5, 5, 5, 7],
+        '1' => [2, 6, 2, 2, 7],
+        '2' => [7, 1, 7, 4, 7],
+        '3' => [7, 1, 3, 1, 7],
+        '4' => [5, 5, 7, 1, 1],
+        '5' => [7, 4, 7, 1, 7],
+        '6' => [7, 4, 7, 5, 7],
+        '7' => [7, 1, 2, 2, 2],
+        '8' => [7, 5, 7, 5, 7],
+        '9' => [7, 5, 7, 1, 7],
+        'a' => [2, 5, 7, 5, 5],
+        'b' => [6, 5, 6, 5, 6],
+        'c' => [3, 4, 4, 4, 3],
+        'd' => [6, 5, 5, 5, 6],
+        'e' => [7, 4, 6, 4, 7],
+        'f' => [7, 4, 6, 4, 4],
+        'g' => [3, 4, 5, 5, 3],
+        'h' => [5, 5, 7, 5, 5],
+        'i' => [7, 2, 2, 2, 7],
+        'j' => [1, 1, 1, 5, 2],
+        'k' => [5, 5, 6, 5, 5],
+        'l' => [4, 4, 4, 4, 7],
+        'm' => [5, 7, 7, 5, 5],
+        'n' => [6, 5, 5, 5, 5],
+        'o' => [2, 5, 5, 5, 2],
+        'p' => [6, 5, 6, 4, 4],
+        'q' => [2, 5, 5, 2, 1],
+        'r' => [6, 5, 6, 5, 5],
+        's' => [3, 4, 2, 1, 6],
+        't' => [7, 2, 2, 2, 2],
+        'u' => [5, 5, 5, 5, 7],
+        'v' => [5, 5, 5, 5, 2],
+        'w' => [5, 5, 7, 7, 5],
+        'x' => [5, 5, 2, 5, 5],
+        'y' => [5, 5, 2, 2, 2],
+        'z' => [7, 1, 2, 4, 7],
+        '.' => [0, 0, 0, 0, 2],
+        '_' => [0, 0, 0, 0, 7],
+        '-' => [0, 0, 7, 0, 0],
+        '/' => [1, 1, 2, 4, 4],
+        ' ' => [0; 5],
+        _ => [7, 7, 7, 7, 7],
+    }
+}
+
+/// Pixels that a line of text takes from top to bottom, with points of `scale` pixels.
+pub(super) const fn height(scale: usize) -> usize {
+    (SIZE.1 + 2) * scale
+}
+
+/// Pixels that a text takes from left to right.
+pub(super) fn width(text: &str, scale: usize) -> usize {
+    (text.chars().count() * (SIZE.0 + 1) + 1) * scale
+}
+
+/// Writes a text in white on a picture `wide` pixels wide, its upper left corner at `(left, top)`; what does not fit is
+/// cut off at `right`.
+pub(super) fn draw(rgb: &mut [u8], wide: usize, (left, top): (usize, usize), right: usize, scale: usize, text: &str) {
+    for (i, letter) in text.chars().enumerate() {
+        let (x, y) = (left + (i * (SIZE.0 + 1) + 1) * scale, top + scale);
+        if x + SIZE.0 * scale > right.min(wide) {
+            return;
+        }
+        for (row, bits) in glyph(letter).into_iter().enumerate() {
+            for point in (0..SIZE.0).filter(|point| bits >> (SIZE.0 - 1 - point) & 1 == 1) {
+                for line in 0..scale {
+                    let at = ((y + row * scale + line) * wide + x + point * scale) * 3;
+                    rgb[at..at + scale * 3].fill(255);
+                }
+            }
+        }
+    }
+}

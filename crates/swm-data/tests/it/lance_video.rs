@@ -1,0 +1,122 @@
+//! The format `lance-video`. The long runs:
+//!
+//! ```text
+//! cargo test --release --workspace --test it -- --ignored lance_video::
+//! ```
+
+use crate::sample::{check, episode, manifest, schema};
+use crate::{format_suite, fuzz};
+use std::io::{BufRead as _, BufReader};
+use std::process::{Command, Stdio};
+use swm_core::Schema;
+use swm_data::{CommitPolicy, Constants, ImageCodec, WriteMode, WriteOptions, create, open};
+
+fn write(path: &std::path::Path, mode: WriteMode, codec: ImageCodec, episodes: std::ops::Range<usize>) {
+    let commit = CommitPolicy { episodes: 2, ..CommitPolicy::default() };
+    let options = WriteOptions { mode, codec, manifest: Some(manifest(3)), commit };
+    let mut writer = create(path, &schema(), options).expect("creates");
+    for e in episodes {
+        let constants = Constants::from([("scene.xml".to_owned(), format!("<{e}/>").into_bytes())]);
+        writer.write_episode_with(&episode(e), &constants).expect("writes");
+    }
+    writer.finish().expect("finishes");
+}
+
+#[test]
+fn episodes_come_back_with_their_pictures() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for (name, codec) in [("a", ImageCodec::Png), ("b", ImageCodec::Jpeg { quality: 95 })] {
+        let path = folder.path().join(format!("{name}.lance-video"));
+        write(&path, WriteMode::Create, codec, 0..5);
+        write(&path, WriteMode::Append, codec, 5..8);
+        let reader = open(&path).expect("opens");
+        assert_eq!(reader.episodes().len(), 8);
+        let names = |schema: &Schema| -> Vec<String> {
+            schema.columns().iter().map(|c| c.name.clone()).filter(|name| name != "step_idx").collect()
+        };
+        assert_eq!(names(reader.schema())[1..], names(&schema()));
+        check(&*reader, 0);
+        if codec == ImageCodec::Png {
+            format_suite::check(&*reader, 0);
+        }
+        assert_eq!(reader.constants(6).expect("reads"), Constants::from([("scene.xml".to_owned(), b"<6/>".to_vec())]));
+        assert_eq!(reader.manifest(), Some(manifest(3)));
+        let hash = reader.content_hash().expect("hashes");
+        write(&path, WriteMode::Overwrite, codec, 3..5);
+        let reader = open(&path).expect("opens");
+        assert_eq!(reader.episodes().len(), 2);
+        check(&*reader, 3);
+        assert_ne!(reader.content_hash().expect("hashes"), hash);
+        let there = create(&path, &schema(), WriteOptions::default()).err().expect("it is there").to_string();
+        assert!(there.contains("exists already"), "{there}");
+        let few = Schema::new(schema().columns()[..4].to_vec()).expect("schema");
+        let options = WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
+        assert!(create(&path, &few, options).is_err(), "other columns");
+    }
+    assert!(open(&folder.path().join("none.lance-video")).is_err(), "there is none");
+    let pictures = Schema::new(schema().columns()[..1].to_vec()).expect("schema");
+    let path = folder.path().join("pictures.lance-video");
+    let error = create(&path, &pictures, WriteOptions::default()).err().expect("no numbers").to_string();
+    assert!(error.contains("format video"), "{error}");
+}
+
+/// Kills a writer after some episodes; what it committed is there, and the next one continues.
+fn killed(moments: usize) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance-video");
+    write(&path, WriteMode::Create, ImageCodec::Jpeg { quality: 95 }, 0..2);
+    let mut stored = 2;
+    for moment in 0..moments {
+        let mut command = Command::new(std::env::current_exe().expect("this program"));
+        command.args(["--exact", "interruption::child_that_writes", "--nocapture"]);
+        command.env("SWM_TEST_CHILD_TARGET", &path).stdout(Stdio::piped()).stderr(Stdio::null());
+        let mut child = command.spawn().expect("starts");
+        let mut lines = BufReader::new(child.stdout.take().expect("its output")).lines();
+        let mut seen = 0;
+        while seen < 3 + 5 * moment % 11 {
+            seen += usize::from(lines.next().expect("more lines").expect("text").contains("episode "));
+        }
+        child.kill().expect("killed");
+        child.wait().expect("gone");
+        let reader = open(&path).expect("still opens");
+        check(&*reader, 0);
+        // Three episodes make a group; more may wait for the committing thread.
+        let now = reader.episodes().len();
+        assert!(now >= stored && now + 9 > stored + seen, "{now} episodes after {stored} and {seen}");
+        stored = now;
+    }
+    write(&path, WriteMode::Append, ImageCodec::Jpeg { quality: 95 }, stored..stored + 1);
+    let reader = open(&path).expect("opens");
+    assert_eq!(reader.episodes().len(), stored + 1);
+    check(&*reader, 0);
+}
+
+#[test]
+fn a_killed_writer_keeps_committed_episodes() {
+    killed(3);
+}
+
+#[test]
+#[ignore = "a minute"]
+fn a_writer_killed_at_50_moments_keeps_committed_episodes() {
+    killed(50);
+}
+
+fn damaged(cases: u64) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.lance-video");
+    write(&path, WriteMode::Create, ImageCodec::Png, 0..3);
+    let report = fuzz::dataset("lance-video", &path, cases, fuzz::read_everything);
+    assert!(report.refused > 0, "{report:?}");
+}
+
+#[test]
+fn damaged_tables_are_refused() {
+    damaged(300);
+}
+
+#[test]
+#[ignore = "minutes"]
+fn tables_damaged_in_10000_ways_are_refused() {
+    damaged(10_000);
+}

@@ -1,0 +1,157 @@
+//! The format `lerobot`, on datasets that LeRobot's own package wrote (`tests/interop/lerobot_export.py`), and ours in
+//! its hands. The long runs:
+//!
+//! ```text
+//! cargo test --release --workspace --test it -- --ignored lerobot::
+//! ```
+
+use crate::video::{THEIR_LENGTHS, check_frames, interop};
+use crate::{format_suite, fuzz, sample};
+use std::process::Command;
+use swm_core::{ColumnSpec, DType};
+use swm_data::{CommitPolicy, Constants, ImageCodec, StepRange, WriteMode, WriteOptions, create, open};
+
+#[test]
+fn it_does_what_formats_do() {
+    format_suite::all("d.lerobot");
+}
+
+#[test]
+fn a_killed_writer_keeps_committed_episodes() {
+    format_suite::killed("d.lerobot", 4);
+}
+
+#[test]
+#[ignore = "a minute"]
+fn a_writer_killed_at_50_moments_keeps_committed_episodes() {
+    format_suite::killed("d.lerobot", 50);
+}
+
+#[test]
+fn datasets_of_lerobot_open_here() {
+    for name in ["lerobot-v30-h264", "lerobot-v30-av1", "lerobot-v21"] {
+        let reader = open(&interop().join(name)).expect("opens");
+        assert_eq!(reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), THEIR_LENGTHS, "{name}");
+        check_frames(&*reader, "pixels", &format!("{name}-top.png"), 0);
+        check_frames(&*reader, "observation.images.wrist", &format!("{name}-wrist.png"), 0);
+        let schema = reader.schema();
+        assert_eq!(schema.column("pixels").expect("a camera"), &ColumnSpec::image("pixels", 48, 64));
+        assert_eq!(schema.column("proprio").expect("the state"), &ColumnSpec::new("proprio", DType::Float32, [3]));
+        assert_eq!(schema.column("next.done").expect("a flag"), &ColumnSpec::new("next.done", DType::Bool, []));
+        let tasks = ["push the block", "open the drawer", "push the block"];
+        for (e, &length) in THEIR_LENGTHS.iter().enumerate() {
+            let names = ["observation.state", "action", "next.reward", "next.done", "task_index", "frame_index"];
+            let read = reader.read(&names, &[StepRange::new(e, 0, length)]).expect("reads");
+            for t in 0..length {
+                let (row, time) = (read.row(t), t as f32);
+                assert_eq!(row.get::<f32>("observation.state").expect("numbers"), [e as f32, time, -0.5]);
+                assert_eq!(row.get::<f32>("action").expect("numbers"), [e as f32 + time / 4.0, -time]);
+                assert_eq!(row.get::<f32>("next.reward").expect("a number"), [time / 2.0]);
+                assert_eq!(row.get::<u8>("next.done").expect("a flag"), [u8::from(t + 1 == length)]);
+                assert_eq!(row.get::<i64>("task_index").expect("a number"), [(e % 2) as i64]);
+                assert_eq!(row.get::<i32>("frame_index").expect("a number"), [t as i32]);
+            }
+            let task = Constants::from([("task".to_owned(), tasks[e].as_bytes().to_vec())]);
+            assert_eq!(reader.constants(e).expect("reads"), task);
+        }
+        let hash = reader.content_hash().expect("hashes");
+        assert_eq!(hash, open(&interop().join(name)).expect("opens").content_hash().expect("hashes"));
+        let mut writer = create(
+            &interop().join(name),
+            &swm_core::Schema::new(schema.columns()[2..].to_vec()).expect("a schema"),
+            WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() },
+        );
+        assert!(writer.as_mut().err().expect("not ours").to_string().contains("convert it"), "{name}");
+    }
+}
+
+#[test]
+fn pictures_in_tables_are_read() {
+    let reader = open(&interop().join("lerobot-v30-h264")).expect("opens");
+    let name = "observation.images.still";
+    let ranges = [StepRange::new(2, 3, 2), StepRange::new(0, 10, 1), StepRange::new(2, 3, 1)];
+    let read = reader.read(&[name], &ranges).expect("reads");
+    for (row, (e, t)) in [(2, 3), (2, 4), (0, 10), (2, 3)].into_iter().enumerate() {
+        let frame = read.row(row).get::<u8>(name).expect("a picture").to_vec();
+        for y in 0..24 {
+            for x in 0..32 {
+                let block = (4 + t..12 + t).contains(&y) && (8 + 2 * t..20 + 2 * t).contains(&x);
+                let expected = if block { [250, 220 - 50 * e, 20] } else { [3 * y + 40 * e, 3 * x, 60 + 10 * t] };
+                let found = &frame[(y * 32 + x) * 3..][..3];
+                assert_eq!(found, expected.map(|v| v.min(255) as u8), "({x}, {y}) of row {row}");
+            }
+        }
+    }
+}
+
+fn damaged(name: &str, cases: u64) {
+    let report = fuzz::dataset(name, &interop().join(name), cases, fuzz::read_everything);
+    assert!(report.refused > 0, "{report:?}");
+}
+
+#[test]
+fn damaged_datasets_are_survived() {
+    ["lerobot-v30-h264", "lerobot-v21"].iter().for_each(|name| damaged(name, 200));
+}
+
+#[test]
+#[ignore = "minutes"]
+fn datasets_damaged_in_10000_ways_are_survived() {
+    ["lerobot-v30-h264", "lerobot-v30-av1", "lerobot-v21"].iter().for_each(|name| damaged(name, 4000));
+}
+
+#[test]
+fn our_datasets_open_in_lerobot() {
+    let Some(python) = std::env::var_os("SWM_LEROBOT_PYTHON") else {
+        println!("SKIPPED: set SWM_LEROBOT_PYTHON to a Python with lerobot 0.4");
+        return;
+    };
+    let folder = tempfile::tempdir().expect("a folder");
+    for (name, codec, tolerance) in
+        [("lossless.lerobot", ImageCodec::Png, 0.51), ("lossy.lerobot", ImageCodec::Jpeg { quality: 95 }, 5.0)]
+    {
+        let path = folder.path().join(name);
+        for (mode, episodes) in [(WriteMode::Create, 0..3), (WriteMode::Append, 3..5)] {
+            let commit = CommitPolicy { episodes: 2, ..CommitPolicy::default() };
+            let options = WriteOptions { mode, codec, commit, ..WriteOptions::default() };
+            let mut writer = create(&path, &sample::schema(), options).expect("creates");
+            for e in episodes {
+                let task = Constants::from([("task".to_owned(), format!("task {}", e % 2).into_bytes())]);
+                writer.write_episode_with(&sample::episode(e), &task).expect("writes");
+            }
+            writer.finish().expect("finishes");
+        }
+        let mut command = Command::new(&python);
+        let output =
+            command.arg("-B").arg(interop().join("lerobot_check.py")).arg(&path).output().expect("Python runs");
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let seen: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        assert_eq!(seen["episodes"], 5);
+        let rows = seen["rows"].as_array().expect("rows");
+        let mut next = 0;
+        for e in 0..5 {
+            let episode = sample::episode(e);
+            for t in 0..episode.rows() {
+                let row = &rows[next];
+                assert_eq!(row["state"], serde_json::json!([e as f64, t as f64, -0.5]));
+                let acted = t.min(episode.rows() - 2);
+                assert_eq!(row["action"], serde_json::json!([e as f64, acted as f64 / 4.0]));
+                assert_eq!(row["task"], format!("task {}", e % 2));
+                assert_eq!((&row["episode_index"], &row["frame_index"]), (&e.into(), &t.into()));
+                for column in ["pixels", "goal"] {
+                    let ours = episode.row(t).get::<u8>(column).expect("pictures").to_vec();
+                    let theirs = row[column].as_array().expect("bytes");
+                    assert_eq!(theirs.len(), ours.len());
+                    let off: f64 = theirs
+                        .iter()
+                        .zip(&ours)
+                        .map(|(a, &b)| (a.as_f64().expect("a byte") - f64::from(b)).abs())
+                        .sum();
+                    assert!(off / ours.len() as f64 <= tolerance, "{name}, {column} of {e}, {t}: {off}");
+                }
+                next += 1;
+            }
+        }
+        assert_eq!(rows.len(), next);
+    }
+}

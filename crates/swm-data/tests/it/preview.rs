@@ -1,0 +1,34 @@
+//! Videos and contact sheets of datasets, whatever their format.
+
+use crate::sample::{options, schema};
+use crate::{fuzz, sample};
+use swm_data::{PreviewOptions, WriteMode, create, open, preview};
+
+#[test]
+fn every_camera_of_some_episodes_is_shown() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for name in ["d.lance", "d.video", "d.lance-video"] {
+        let path = folder.path().join(name);
+        let mut writer = create(&path, &schema(), options(WriteMode::Create)).expect("creates");
+        (0..6).for_each(|e| writer.write_episode(&sample::episode(e)).expect("writes"));
+        writer.finish().expect("finishes");
+        let reader = open(&path).expect("opens");
+        let out = folder.path().join(format!("{name}-preview"));
+        let mut told = vec![];
+        let options = PreviewOptions { episodes: 3, ..PreviewOptions::default() };
+        let written = preview(&*reader, &out, &options, |done| told.push(done)).expect("previews");
+        let names: Vec<&str> = written.iter().filter_map(|path| path.file_name()?.to_str()).collect();
+        assert_eq!(names, ["episode_0.mp4", "episode_2.mp4", "episode_4.mp4", "contact_sheet.png"]);
+        assert_eq!(told, [1, 2, 3]);
+        assert_eq!(fuzz::files(&out).len(), 4, "nothing else is left");
+        let png = std::io::BufReader::new(std::fs::File::open(&written[3]).expect("opens"));
+        let png = png::Decoder::new(png).read_info().expect("a picture");
+        // Eight strips of two cameras of 24 pixels, or of a line of text if that is wider; two lines of text above.
+        let strip = (22 * 4 + 1, 16 + 2 * 7);
+        assert_eq!((png.info().width, png.info().height), (8 * (strip.0 + 2) + 2, 3 * (strip.1 + 2) + 2));
+        let one = PreviewOptions { columns: vec!["goal".to_owned()], ..options };
+        assert_eq!(preview(&*reader, &out, &one, |_| ()).expect("previews").len(), 4);
+        let wrong = PreviewOptions { columns: vec!["state".to_owned()], ..PreviewOptions::default() };
+        assert!(preview(&*reader, &out, &wrong, |_| ()).expect_err("numbers").to_string().contains("pictures"));
+    }
+}

@@ -1,0 +1,176 @@
+//! The format `video`. The long runs:
+//!
+//! ```text
+//! cargo test --release --workspace --test it -- --ignored video::
+//! ```
+
+use crate::{format_suite, fuzz};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use swm_data::{ImageCodec, Reader, StepRange, WriteMode, WriteOptions, create, open};
+
+#[test]
+fn it_does_what_formats_do() {
+    format_suite::all("d.video");
+}
+
+#[test]
+fn a_killed_writer_keeps_committed_episodes() {
+    format_suite::killed("d.video", 4);
+}
+
+#[test]
+#[ignore = "a minute"]
+fn a_writer_killed_at_50_moments_keeps_committed_episodes() {
+    format_suite::killed("d.video", 50);
+}
+
+fn damaged(cases: u64) {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.video");
+    format_suite::write(&path, WriteMode::Create, 0..3);
+    let report = fuzz::dataset("video", &path, cases, fuzz::read_everything);
+    // A video in the place of another is one that nothing tells apart.
+    let changed: Vec<&String> = report.changed.iter().filter(|change| !change.contains("replaced by")).collect();
+    assert!(changed.is_empty(), "{changed:?}");
+    assert!(report.refused as u64 > cases / 2, "{report:?}");
+}
+
+#[test]
+fn damaged_folders_are_refused() {
+    damaged(400);
+}
+
+#[test]
+#[ignore = "minutes"]
+fn folders_damaged_in_10000_ways_are_refused() {
+    damaged(10_000);
+}
+
+/// Videos without our checksums: the decoder sees what is damaged.
+fn foreign_damaged(cases: u64) {
+    let report = fuzz::dataset("reference-video", &interop().join("reference-video"), cases, fuzz::read_everything);
+    assert!(report.refused as u64 > cases / 2, "{report:?}");
+}
+
+#[test]
+fn damaged_foreign_videos_are_survived() {
+    foreign_damaged(400);
+}
+
+#[test]
+#[ignore = "minutes"]
+fn foreign_videos_damaged_in_10000_ways_are_survived() {
+    foreign_damaged(10_000);
+}
+
+pub fn interop() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop")
+}
+
+/// The lengths of the episodes in the datasets that other programs wrote.
+pub const THEIR_LENGTHS: [usize; 3] = [11, 14, 9];
+
+/// Compares the first, third and last frame of every episode with what another program decoded, which is stored as a
+/// PNG of them one below the other.
+pub fn check_frames(reader: &dyn Reader, column: &str, png: &str, tolerance: u8) {
+    let file = std::io::BufReader::new(std::fs::File::open(interop().join(png)).expect("opens"));
+    let mut decoder = png::Decoder::new(file).read_info().expect("a PNG");
+    let mut expected = vec![0; decoder.output_buffer_size().expect("a size")];
+    decoder.next_frame(&mut expected).expect("a picture");
+    let ranges: Vec<StepRange> = THEIR_LENGTHS
+        .iter()
+        .enumerate()
+        .flat_map(|(e, length)| [0, 2, length - 1].map(|t| StepRange::new(e, t, 1)))
+        .collect();
+    let read = reader.read(&[column], &ranges).expect("reads");
+    assert_eq!(read.bytes(0).len(), expected.len());
+    let worst = read.bytes(0).iter().zip(&expected).map(|(a, b)| a.abs_diff(*b)).max().expect("pixels");
+    assert!(worst <= tolerance, "{column}: off by {worst}");
+    // Backwards and twice, which decodes runs out of order.
+    let back: Vec<StepRange> = ranges.iter().rev().chain(&ranges[..2]).copied().collect();
+    let again = reader.read(&[column], &back).expect("reads");
+    let size = read.bytes(0).len() / ranges.len();
+    for (i, frame) in again.bytes(0).chunks_exact(size).enumerate() {
+        let same = ranges.iter().position(|range| *range == back[i]).expect("is there");
+        assert!(frame == &read.bytes(0)[same * size..][..size], "{column}: frame {:?}", back[i]);
+    }
+}
+
+#[test]
+fn the_reference_s_videos_open_here() {
+    let reader = open(&interop().join("reference-video")).expect("opens");
+    assert_eq!(reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), THEIR_LENGTHS);
+    check_frames(&*reader, "pixels", "reference-video-pixels.png", 0);
+    for (e, &length) in THEIR_LENGTHS.iter().enumerate() {
+        let read = reader.read(&["state", "action", "success"], &[StepRange::new(e, 0, length)]).expect("reads");
+        for t in 0..length {
+            assert_eq!(read.row(t).get::<f64>("state").expect("numbers"), [e as f64, t as f64, -0.5]);
+            let action = read.row(t).get::<f32>("action").expect("numbers").to_vec();
+            assert!(if t + 1 == length { action[0].is_nan() } else { action == [e as f32, t as f32 / 4.0] });
+            assert_eq!(read.row(t).get::<u8>("success").expect("a flag"), [u8::from(t % 3 == 0)]);
+        }
+    }
+}
+
+#[test]
+fn a_video_of_the_reference_is_continued_here() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("reference-video");
+    fuzz::copy_all(&interop().join("reference-video"), &path);
+    let theirs = open(&path).expect("opens");
+    let schema = swm_core::Schema::new(theirs.schema().columns()[2..].to_vec()).expect("a schema");
+    let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();
+    let episode = theirs.read(&names, &[StepRange::new(1, 0, THEIR_LENGTHS[1])]).expect("reads");
+    let options = WriteOptions { mode: WriteMode::Append, codec: ImageCodec::Png, ..WriteOptions::default() };
+    let mut writer = create(&path, &schema, options).expect("continues");
+    writer.write_episode(&episode).expect("writes");
+    writer.finish().expect("finishes");
+    let reader = open(&path).expect("opens");
+    assert_eq!(reader.episodes().len(), 4);
+    check_frames(&*reader, "pixels", "reference-video-pixels.png", 0);
+    let again = reader.read(&names, &[StepRange::new(3, 0, THEIR_LENGTHS[1])]).expect("reads");
+    (0..names.len()).for_each(|column| assert!(again.bytes(column) == episode.bytes(column), "{}", names[column]));
+}
+
+#[test]
+fn our_videos_open_in_the_reference() {
+    let Some(python) = std::env::var_os("SWM_VIDEO_PYTHON") else {
+        println!("SKIPPED: set SWM_VIDEO_PYTHON to a Python with stable-worldmodel and decord");
+        return;
+    };
+    let folder = tempfile::tempdir().expect("a folder");
+    let theirs = open(&interop().join("reference-video")).expect("opens");
+    let schema = swm_core::Schema::new(theirs.schema().columns()[2..].to_vec()).expect("a schema");
+    let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();
+    for (name, codec, tolerance) in
+        [("lossless.video", ImageCodec::Png, 0.0), ("lossy.video", ImageCodec::Jpeg { quality: 95 }, 3.0)]
+    {
+        let path = folder.path().join(name);
+        let mut writer = create(&path, &schema, WriteOptions { codec, ..WriteOptions::default() }).expect("creates");
+        let episodes: Vec<_> =
+            (0..3).map(|e| theirs.read(&names, &[StepRange::new(e, 0, THEIR_LENGTHS[e])]).expect("reads")).collect();
+        episodes.iter().for_each(|episode| writer.write_episode(episode).expect("writes"));
+        writer.finish().expect("finishes");
+        let ours = open(&path).expect("opens");
+        let output = Command::new(&python).arg("-B").arg(interop().join("video_check.py")).arg(&path).output();
+        let output = output.expect("Python runs");
+        assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+        let seen: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+        for (e, episode) in episodes.iter().enumerate() {
+            let bytes = episode.bytes(episode.schema().index("pixels").expect("a column"));
+            let here = ours.read(&["pixels"], &[StepRange::new(e, 0, episode.rows())]).expect("reads");
+            let there: Vec<u8> = seen[e]["pixels"]
+                .as_array()
+                .expect("bytes")
+                .iter()
+                .map(|v| v.as_u64().and_then(|v| u8::try_from(v).ok()).expect("a byte"))
+                .collect();
+            assert!(there == here.bytes(0), "{name}: the same file gives the same pictures here and there");
+            let off: f64 = there.iter().zip(bytes).map(|(a, &b)| f64::from(a.abs_diff(b))).sum();
+            assert!(off / bytes.len() as f64 <= tolerance, "{name}: {}", off / bytes.len() as f64);
+            let state: Vec<f64> = (0..episode.rows()).flat_map(|t| [e as f64, t as f64, -0.5]).collect();
+            assert_eq!(seen[e]["state"], serde_json::json!(state));
+        }
+    }
+}

@@ -6,13 +6,14 @@
 //! - [`request`], [`runner`] and [`reproduce`]: all that decides an evaluation as one value, running it for several
 //!   policies on the same starts, and running it again.
 //! - [`prediction`]: how well a model predicts what was recorded, beside whether its plans succeeded.
-//! - [`bench`](mod@bench) and [`bench_plan`](mod@bench_plan): how fast all that is, beside the reference where it is
-//!   installed.
+//! - [`bench`](mod@bench), [`bench_data`](mod@bench_data) and [`bench_plan`](mod@bench_plan): how fast all that is, beside
+//!   the reference where it is installed.
 //!
 //! An episode is decided by its own key. Neither the number of environments, nor that of threads, nor what
 //! was played before in the same slot changes a byte of it.
 
 pub mod bench;
+pub mod bench_data;
 pub mod bench_plan;
 pub mod collect;
 pub mod evaluate;
@@ -28,6 +29,7 @@ mod witness;
 pub mod world;
 
 pub use bench::{BenchConfig, BenchReport, bench_envs};
+pub use bench_data::{DataBenchConfig, DataBenchReport, bench_data};
 pub use bench_plan::{PlanBenchConfig, PlanBenchReport, bench_plan, planner_overhead};
 pub use collect::{CollectConfig, Collected};
 pub use evaluate::EvalConfig;

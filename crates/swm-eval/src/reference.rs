@@ -5,11 +5,13 @@ use std::io::{BufRead as _, BufReader, Read as _, Seek as _, Write as _};
 use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use swm_core::{Error, Result};
+use swm_data::ClipSpec;
 
 const SCRIPT: &str = include_str!("reference.py");
 const PLAN_SCRIPT: &str = include_str!("reference_plan.py");
+const DATA_SCRIPT: &str = include_str!("reference_data.py");
 
-/// A Python process that holds one world, or one solver, of the reference.
+/// A Python process that holds one world, one solver, or the datasets of the reference.
 pub(crate) struct Reference {
     process: Child,
     ask: ChildStdin,
@@ -45,6 +47,14 @@ impl Reference {
     /// As [`Reference::start`].
     pub fn start_solver(python: &Path, numbers: [usize; 6]) -> Result<Self> {
         Self::spawn(python, PLAN_SCRIPT, &numbers.map(|n| n.to_string()))
+    }
+
+    /// Starts it to load and convert datasets.
+    ///
+    /// # Errors
+    /// As [`Reference::start`].
+    pub fn start_data(python: &Path) -> Result<Self> {
+        Self::spawn(python, DATA_SCRIPT, &[])
     }
 
     fn spawn(python: &Path, script: &str, arguments: &[String]) -> Result<Self> {
@@ -86,10 +96,32 @@ impl Reference {
         self.rate(&format!("solve\t{seconds}"))
     }
 
+    /// Loads shuffled batches of clips with the columns `pixels` and `action` for about so long: clips a second.
+    pub fn load(
+        &mut self,
+        format: &str,
+        path: &Path,
+        workers: usize,
+        clip: &ClipSpec,
+        batch: usize,
+        seconds: f64,
+    ) -> Result<f64> {
+        let (path, steps, skip) = (path.display(), clip.num_steps, clip.frameskip);
+        self.rate(&format!("load\t{format}\t{path}\t{workers}\t{steps}\t{skip}\t{batch}\t{seconds}"))
+    }
+
+    /// Converts a dataset: conversions a second.
+    pub fn convert(&mut self, source: &Path, format: &str, target: &Path) -> Result<f64> {
+        self.rate(&format!("convert\t{}\t{format}\t{}", source.display(), target.display()))
+    }
+
     fn rate(&mut self, request: &str) -> Result<f64> {
         let lost = |error| Error::external("asking the reference", error);
         writeln!(self.ask, "{request}").and_then(|()| self.ask.flush()).map_err(lost)?;
         let words = self.answer()?;
+        if let Some(("error", why)) = words.split_first().map(|(first, why)| (first.as_str(), why)) {
+            return Err(Error::external("the reference", why.join(" ")));
+        }
         let numbers: Vec<f64> = words.iter().filter_map(|word| word.parse().ok()).collect();
         match numbers[..] {
             [count, seconds] if seconds > 0.0 => Ok(count / seconds),

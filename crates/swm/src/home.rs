@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use swm_core::{Error, Result};
-use swm_data::Reader;
+use swm_data::{Location, Reader};
 
 /// The folder everything without a path of its own lives in.
 pub fn home() -> PathBuf {
@@ -23,9 +23,22 @@ pub fn checkpoints() -> PathBuf {
     home().join("checkpoints")
 }
 
+/// What names under [`datasets`] may end in, and need not be given with; the first is what a new one gets.
+const SUFFIXES: [&str; 4] = ["lance", "h5", "hdf5", ""];
+
 /// The place of a dataset given as a path or as a name under [`datasets`].
 pub fn dataset(given: &str) -> PathBuf {
-    named(given, datasets(), "lance")
+    let home = datasets();
+    let named_so = SUFFIXES.iter().map(|suffix| named(given, home.clone(), suffix)).find(|path| path.exists());
+    named_so.unwrap_or_else(|| named(given, home, SUFFIXES[0]))
+}
+
+/// Where a dataset is that is given as a path, as a URI, or as a name under [`datasets`].
+///
+/// # Errors
+/// When it has the form of a URI and is none of an object store.
+pub fn location(given: &str) -> Result<Location> {
+    if given.contains("://") { Location::parse(given) } else { Ok(dataset(given).into()) }
 }
 
 /// The place of a checkpoint given as a path or as a name under [`checkpoints`].
@@ -33,16 +46,24 @@ pub fn checkpoint(given: &str) -> PathBuf {
     named(given, checkpoints(), "")
 }
 
-/// Opens a dataset by path or name.
+/// Opens a dataset by path, URI or name.
 ///
 /// # Errors
 /// When there is none (naming the nearest), or it is damaged.
 pub fn open_dataset(given: &str) -> Result<Arc<dyn Reader>> {
-    let path = dataset(given);
-    if !path.exists() {
-        return Err(unknown("dataset", given, &path, &datasets()));
+    swm_data::open(find_dataset(given)?)
+}
+
+/// Where a dataset is that is there, given by path, URI or name.
+///
+/// # Errors
+/// When there is none, naming the nearest. What a URI points to is not looked at.
+pub fn find_dataset(given: &str) -> Result<Location> {
+    let location = location(given)?;
+    match location.path() {
+        Some(path) if !path.exists() => Err(unknown("dataset", given, path, &datasets())),
+        _ => Ok(location),
     }
-    swm_data::open(&path)
 }
 
 /// The folder of a checkpoint that is there, by path or name.
@@ -67,7 +88,10 @@ pub fn names_in(folder: &Path) -> Vec<String> {
     let mut names: Vec<String> = entries
         .filter_map(|entry| entry.file_name().into_string().ok())
         .filter(|name| !name.starts_with('.'))
-        .map(|name| name.strip_suffix(".lance").map(str::to_owned).unwrap_or(name))
+        .map(|name| match name.rsplit_once('.') {
+            Some((stem, suffix)) if SUFFIXES.contains(&suffix) => stem.to_owned(),
+            _ => name,
+        })
         .collect();
     names.sort();
     names

@@ -4,7 +4,7 @@ use crate::sample::{episode, rows, schema, write};
 use std::path::Path;
 use std::sync::Arc;
 use swm_core::{Batch, ColumnSpec, Error, Manifest, Result, Schema};
-use swm_data::doctor::{Diagnosis, Severity, examine, open_what_is_left, repair};
+use swm_data::doctor::{Diagnosis, Finding, Severity, examine, open_what_is_left, repair};
 use swm_data::{Constants, ConvertOptions, Episode, Irregularity, Location, Reader, StepRange, WriteMode, open};
 
 /// The episodes of the sample, given by whatever has broken them.
@@ -110,6 +110,20 @@ fn a_number_that_stands_for_two_episodes_is_found_in_a_table() {
     assert!(problems.iter().all(|found| found.episodes == [1]), "{problems:?}");
     assert!(problems.iter().any(|found| found.what.contains("0 stands in row 2")), "{problems:?}");
     assert!(problems.iter().any(|found| found.what.contains("no action in a row that is not the last")));
+    assert_eq!(diagnosis.sound, [0, 2]);
+}
+
+#[test]
+#[cfg(feature = "hdf5")]
+fn steps_that_restart_and_rows_of_two_episodes_are_found_in_a_file() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/broken.h5");
+    let diagnosis = diagnose(&*open(&path).expect("opens"));
+    let of = |episode: usize| {
+        let here = |found: &&Finding| found.severity == Severity::Problem && found.episodes.contains(&episode);
+        diagnosis.findings.iter().filter(here).map(|found| found.what.clone()).collect::<Vec<_>>()
+    };
+    assert_eq!(of(1), ["the stored steps do not count up from 0: 0 stands in row 2"]);
+    assert!(of(3).contains(&"some of its rows are also those of episode 2".to_owned()), "{:?}", of(3));
     assert_eq!(diagnosis.sound, [0, 2]);
 }
 

@@ -4,7 +4,8 @@ use super::{Context, emit, emit_json, table};
 use clap::{Args, Subcommand};
 use swm::ENVS;
 use swm_core::EnvChoice;
-use swm_eval::{BenchConfig, PlanBenchConfig, bench_envs, bench_plan};
+use swm_data::Location;
+use swm_eval::{BenchConfig, DataBenchConfig, PlanBenchConfig, bench_data, bench_envs, bench_plan};
 
 /// Arguments of `swm bench`.
 #[derive(Args)]
@@ -21,6 +22,68 @@ enum What {
     /// Iterations a second of CEM with a model that costs nothing, beside the reference's, and the planner's share of the
     /// time beside a model that costs what a LeWM does
     Plan(PlanArgs),
+    /// Clips a second from every format, and conversions; the use of memory over epochs
+    Data(DataArgs),
+}
+
+#[derive(Args)]
+struct DataArgs {
+    /// The environment whose pictures are loaded
+    #[arg(default_value = "swm/PushT-v1")]
+    env: String,
+    /// Formats to load from (default: all)
+    #[arg(long, value_delimiter = ',')]
+    formats: Vec<String>,
+    /// Episodes of the datasets
+    #[arg(long, default_value_t = 40)]
+    episodes: usize,
+    /// Steps of an episode
+    #[arg(long, default_value_t = 100)]
+    steps: usize,
+    /// Picture size
+    #[arg(long, default_value_t = 224)]
+    size: usize,
+    /// Pairs of turns, ours and the reference's
+    #[arg(long, default_value_t = 5)]
+    pairs: usize,
+    /// Seconds of a turn
+    #[arg(long, default_value_t = 2.0)]
+    seconds: f64,
+    /// Epochs over which the use of memory is watched
+    #[arg(long, default_value_t = 10)]
+    epochs: usize,
+    /// A folder of an object store to load from beside this machine's disk, such as s3://bucket/bench; the environment says
+    /// how it is reached (AWS_ENDPOINT_URL …)
+    #[arg(long, value_name = "URI")]
+    remote: Option<String>,
+    /// Leave out converting
+    #[arg(long)]
+    load_only: bool,
+}
+
+/// Measures loading and converting.
+fn data(args: &DataArgs, context: &Context) -> anyhow::Result<()> {
+    let report = bench_data(
+        &ENVS.choose(&args.env)?,
+        &DataBenchConfig {
+            episodes: args.episodes,
+            steps: args.steps,
+            size: args.size,
+            pairs: args.pairs,
+            seconds: args.seconds,
+            formats: args.formats.clone(),
+            convert: !args.load_only,
+            epochs: args.epochs,
+            remote: args.remote.as_deref().map(Location::parse).transpose()?,
+            threads: if context.threads > 0 { context.threads } else { DataBenchConfig::default().threads },
+            ..DataBenchConfig::default()
+        },
+    )?;
+    if context.json {
+        return emit_json(&report);
+    }
+    emit(&report.to_string());
+    Ok(())
 }
 
 #[derive(Args)]
@@ -81,6 +144,7 @@ pub fn bench(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
     let args = match &args.what {
         What::Envs(args) => args,
         What::Plan(args) => return plan(args, context),
+        What::Data(args) => return data(args, context),
     };
     let entries: Vec<EnvChoice> = match &args.envs[..] {
         [] => ENVS.rows.iter().map(EnvChoice::from).collect(),

@@ -1,4 +1,4 @@
-//! `swm datasets`, `inspect` and `preview`: what data there are and what they look like.
+//! `swm datasets`, `formats` and `preview`: what data there are and what they look like.
 
 use super::{Progress, emit, emit_json, table};
 use clap::Args;
@@ -6,16 +6,8 @@ use serde_json::{Value, json};
 use std::path::PathBuf;
 use swm::home::{names_in, open_dataset as open};
 use swm::{data, home};
-use swm_core::results::Summary;
 use swm_core::Result;
 use swm_data::Reader;
-
-/// Arguments of `swm inspect`.
-#[derive(Args)]
-pub struct InspectArgs {
-    /// The dataset: a path or a name
-    dataset: String,
-}
 
 /// Arguments of `swm preview`.
 #[derive(Args)]
@@ -82,7 +74,7 @@ pub fn formats(as_json: bool) -> anyhow::Result<()> {
 }
 
 /// The numbers of a dataset that cost nothing to know.
-fn summary(reader: &dyn Reader) -> Result<Value> {
+pub fn summary(reader: &dyn Reader) -> Result<Value> {
     let manifest = reader.manifest();
     Ok(json!({
         "env": manifest.as_ref().map_or("?", |m| m.config["env"].as_str().unwrap_or("?")),
@@ -90,46 +82,6 @@ fn summary(reader: &dyn Reader) -> Result<Value> {
         "steps": reader.episodes().iter().map(|episode| episode.length).sum::<usize>(),
         "bytes": reader.footprint()?.iter().map(|(_, bytes)| bytes).sum::<u64>(),
     }))
-}
-
-/// Says what is in a dataset.
-pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
-    let reader = open(&args.dataset)?;
-    let mut found = summary(&*reader)?;
-    #[allow(clippy::cast_precision_loss)]
-    let lengths: Vec<f64> = reader.episodes().iter().map(|episode| episode.length as f64).collect();
-    found["lengths"] = json!(Summary::of(&lengths));
-    found["columns"] = json!(reader.schema());
-    found["footprint"] = json!(reader.footprint()?.into_iter().collect::<std::collections::BTreeMap<_, _>>());
-    found["content_hash"] = json!(reader.content_hash()?);
-    found["manifest"] = json!(reader.manifest());
-    if as_json {
-        return emit_json(&found);
-    }
-    emit(&format!(
-        "{} episodes, {} rows, {} on disk\n",
-        found["episodes"],
-        found["steps"],
-        bytes(found["bytes"].as_u64().unwrap_or_default())
-    ));
-    if let Some(lengths) = Summary::of(&lengths) {
-        emit(&format!(
-            "episode length: mean {:.1}, median {}, 95th percentile {}\n",
-            lengths.mean, lengths.median, lengths.p95
-        ));
-    }
-    let columns = reader.schema().columns().iter();
-    emit(&table(
-        &["column", "type", "shape of a row"],
-        columns.map(|c| vec![c.name.clone(), c.dtype.name().to_owned(), format!("{:?}", c.shape)]),
-    ));
-    emit(&table(&["part", "on disk"], reader.footprint()?.into_iter().map(|(part, size)| vec![part, bytes(size)])));
-    emit(&format!("content hash: {}\n", found["content_hash"].as_str().unwrap_or_default()));
-    match reader.manifest() {
-        Some(manifest) => emit(&format!("manifest: {}\n", serde_json::to_string_pretty(&manifest)?)),
-        None => emit("no manifest: this dataset was not collected by stable-worldmodel\n"),
-    }
-    Ok(())
 }
 
 /// Makes a video of some episodes and a contact sheet of all of them.

@@ -5,10 +5,13 @@ mod bench;
 mod checkpoints;
 mod collect;
 mod config;
+mod convert;
 mod datasets;
 mod demo;
+mod doctor;
 mod envs;
 mod eval;
+mod inspect;
 mod models;
 mod planner;
 mod progress;
@@ -56,9 +59,13 @@ enum Command {
     /// List the dataset formats
     Formats,
     /// Say what is in a dataset
-    Inspect(datasets::InspectArgs),
+    Inspect(inspect::InspectArgs),
     /// Make a video and a contact sheet of some episodes of a dataset
     Preview(datasets::PreviewArgs),
+    /// Write a dataset in another format or codec, and compare what comes out
+    Convert(convert::ConvertArgs),
+    /// Say what is wrong with a dataset and which models it can train; write a new one of what is sound
+    Doctor(doctor::DoctorArgs),
     /// List the models and their presets
     Models,
     /// Train a model on a dataset
@@ -124,11 +131,13 @@ impl Cli {
             Command::Solvers => solvers::solvers(json),
             Command::Datasets => datasets::datasets(json),
             Command::Formats => datasets::formats(json),
-            Command::Inspect(args) => datasets::inspect(&args, json),
+            Command::Inspect(args) => inspect::inspect(&args, json),
             Command::Preview(args) => datasets::preview(&args, json),
             Command::Models => models::models(json),
             Command::Checkpoints(args) => checkpoints::checkpoints(&args, json),
             Command::Report(args) => report::report(&args, json),
+            Command::Convert(args) => convert::convert(&args, &Context::new(json, self.threads)),
+            Command::Doctor(args) => doctor::doctor(&args, &Context::new(json, self.threads)),
             Command::Collect(args) => collect::collect(&args, &Context::new(json, self.threads)),
             Command::Train(args) => train::train(&args, &Context::new(json, self.threads)),
             Command::Eval(args) => eval::eval(&args, &Context::new(json, self.threads)),

@@ -2,6 +2,7 @@
 #![allow(missing_docs, clippy::print_stdout)]
 
 mod collecting;
+mod data;
 mod listing;
 mod pipeline;
 mod python;

@@ -1,0 +1,95 @@
+//! Datasets from the command line: converted, looked at, examined and repaired.
+
+use crate::{Swm, text};
+use std::path::Path;
+
+fn collect(swm: &Swm, name: &str) {
+    swm.json(&["collect", "swm/TwoRoom-v1", "-o", name, "--image", "32", "--episodes", "5", "--max-steps", "30"]);
+}
+
+#[test]
+fn a_dataset_is_converted_and_is_the_same() {
+    let swm = Swm::new();
+    collect(&swm, "rooms");
+    let report = swm.json(&["convert", "rooms", "copy", "--codec", "png"]);
+    assert_eq!((&report["episodes"], &report["kept"]), (&5.into(), &0.into()));
+    let columns = report["columns"].as_array().expect("columns");
+    assert!(columns.iter().all(|column| column["exact"] == true), "{columns:?}");
+    let checksum = |name: &str| swm.json(&["inspect", name, "--checksum"])["checksum"].clone();
+    assert_eq!(checksum("rooms"), checksum("copy"));
+    assert_eq!(checksum("copy"), report["checksum"]);
+    assert_eq!(swm.json(&["convert", "rooms", "copy"])["kept"], 5, "it is there already");
+    let words = text(&swm.run(&["convert", "rooms", "jpeg", "--codec", "jpeg", "--quality", "90"]).stdout);
+    assert!(words.contains("'pixels' is lossy") && words.contains("verified") && words.contains(" dB"), "{words}");
+
+    swm.refuses(&["convert", "rooms", "copy", "--mode", "error"], 2, &["exists already"]);
+    swm.refuses(&["convert", "rooms", "other", "--format", "lanse"], 2, &["did you mean lance"]);
+    swm.refuses(&["convert", "romos", "other"], 2, &["did you mean rooms"]);
+    swm.refuses(&["convert", "rooms", "ftp://host/there.lance"], 2, &["ftp://"]);
+    collect(&swm, "others");
+    swm.json(&[
+        "collect",
+        "swm/TwoRoom-v1",
+        "-o",
+        "others",
+        "--overwrite",
+        "--image",
+        "32",
+        "--episodes",
+        "2",
+        "--seed",
+        "9",
+    ]);
+    swm.refuses(&["convert", "rooms", "others"], 2, &["not the beginning of the source", "overwrite"]);
+    assert_eq!(swm.json(&["convert", "rooms", "others", "--mode", "append"])["episodes"], 7);
+
+    let inspected = text(&swm.run(&["inspect", "rooms"]).stdout);
+    for word in ["5 episodes", "rows of an episode", "█", "pixels", "made by collect", "swm/TwoRoom-v1", "content hash"]
+    {
+        assert!(inspected.contains(word), "{word}: {inspected}");
+    }
+    let listed = swm.json(&["datasets"]);
+    let names: Vec<&str> = listed.as_array().expect("datasets").iter().filter_map(|d| d["name"].as_str()).collect();
+    assert_eq!(names, ["copy", "jpeg", "others", "rooms"]);
+}
+
+#[test]
+fn a_broken_dataset_is_told_and_mended() {
+    let swm = Swm::new();
+    collect(&swm, "rooms");
+    let clean = swm.json(&["doctor", "rooms"]);
+    assert_eq!((&clean["problems"], clean["sound"].as_array().map(Vec::len)), (&0.into(), Some(5)));
+    let lewm = clean["models"].as_array().expect("models").iter().find(|fit| fit["model"] == "LeWM").expect("listed");
+    assert_eq!(lewm["missing"].as_array().map(Vec::len), Some(0), "{lewm}");
+    let words = text(&swm.run(&["doctor", "rooms"]).stdout);
+    assert!(words.contains("no problems") && words.contains("TD-MPC2"), "{words}");
+
+    // A data file is cut: what is read from it fails, the dataset as a whole may.
+    let file = largest(&swm.path("datasets/rooms.lance/data"));
+    let bytes = std::fs::read(&file).expect("readable");
+    std::fs::write(&file, &bytes[..bytes.len() / 2]).expect("writable");
+    let output = swm.run(&["doctor", "rooms"]);
+    assert!(text(&output.stdout).contains("problem") || text(&output.stderr).contains("rooms"));
+    assert_eq!(output.status.code(), Some(1), "{}", text(&output.stderr));
+    assert!(!text(&output.stderr).contains("panicked"));
+    swm.refuses(&["doctor", "romos"], 2, &["did you mean rooms"]);
+}
+
+fn largest(folder: &Path) -> std::path::PathBuf {
+    let entries = std::fs::read_dir(folder).expect("a folder").flatten();
+    entries.map(|entry| entry.path()).max_by_key(|path| path.metadata().map_or(0, |m| m.len())).expect("a file")
+}
+
+#[test]
+fn loading_is_measured() {
+    let swm = Swm::new();
+    let small =
+        ["--episodes", "14", "--steps", "24", "--size", "32", "--pairs", "1", "--seconds", "0.05", "--epochs", "2"];
+    let found = swm.json(&[&["bench", "data", "swm/TwoRoom-v1"][..], &small].concat());
+    let rates = found["rates"].as_array().expect("rates");
+    let named = |name: &str| rates.iter().find(|row| row["what"] == name).unwrap_or_else(|| panic!("{name}: {found}"));
+    assert!(named("lance, lossless")["rate"].as_f64().expect("a rate") > 0.0);
+    assert!(named("lance, jpeg, all kept on disk")["ours"][0].as_f64().expect("a rate") > 0.0);
+    assert_eq!(found["resident"].as_array().map(Vec::len), Some(2));
+    swm.refuses(&["bench", "data", "--pairs", "0"], 2, &["at least 1 pair"]);
+}

@@ -131,7 +131,12 @@ impl Column {
         if row_bytes.is_none_or(|n| n > LARGEST_CHUNK) {
             return Err(format!("its rows have the shape {sides:?}, which is too large"));
         }
-        let layout = guard("its layout", || dataset.layout())?;
+        let layout = guard("its layout", || dataset.layout()).map_err(|problem| match problem {
+            newest if newest.contains("layout version: 5") => {
+                format!("{newest} (HDF5 2 with libver='latest'; `h5repack --high=3` makes it readable)")
+            }
+            other => other,
+        })?;
         let place = match layout {
             Layout::Contiguous { address, .. } => {
                 let bytes = sides.iter().product::<usize>() as u64 * stored.size as u64;

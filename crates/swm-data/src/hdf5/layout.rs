@@ -15,6 +15,7 @@
 
 use super::filters::{fletcher32, id};
 use super::source::Source;
+use super::tree::read_u64;
 use swm_core::{ColumnSpec, DType, Error, Result};
 
 /// An address of nothing.
@@ -23,6 +24,8 @@ pub(super) const UNDEFINED: u64 = u64::MAX;
 pub(super) const SIGNATURE: [u8; 8] = *b"\x89HDF\r\n\x1a\n";
 /// Where the superblock says where the file ends.
 pub(super) const END_AT: u64 = 40;
+/// Where it says where the root's B-tree is.
+const ROOT_TREE_AT: u64 = 80;
 /// The root group's header, and the attribute in it that refers to the record.
 pub(super) const ROOT: u64 = 96;
 /// See [`ROOT`].
@@ -224,6 +227,11 @@ pub(super) fn record(source: &Source) -> Result<Option<Table>, String> {
     let (tree, heap, record) = (number(24), number(32), number(root.len() - 8));
     let ours = header(&root_messages(tree, heap, record));
     if root[16..] != ours[16..root.len()] {
+        // No other program puts the root's B-tree there; the superblock says where it is as well.
+        let place = ROOT + ROOT_BYTES + 8 + ROOM as u64;
+        if tree == place || read_u64(source, ROOT_TREE_AT)? == place {
+            return Err("the header of its root is damaged".to_owned());
+        }
         return Ok(None);
     }
     let mut table = Table::new(ColumnSpec::new("", DType::U8, []));

@@ -6,10 +6,10 @@ use super::record::Record;
 use super::source::Source;
 use super::table;
 use crate::episodes::{EPISODE, Rows, STEP, content_hash, numbering};
-use crate::format::{Constants, Episode, Reader, StepRange};
+use crate::format::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::location::Location;
 use std::sync::Arc;
-use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema};
+use swm_core::{Batch, ColumnSpec, DType, Error, Manifest, Result, Schema};
 
 /// Rows that are hashed at once.
 const ROWS_AT_ONCE: usize = 64;
@@ -144,6 +144,38 @@ impl Reader for Hdf5Reader {
 
     fn constants(&self, episode: usize) -> Result<Constants> {
         Ok(self.record.constants(episode))
+    }
+
+    /// Episodes that share rows, and stored steps that do not count up from 0: here steps are numbered by their places.
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
+        let mut found = vec![];
+        let mut order: Vec<usize> = (0..self.episodes().len()).collect();
+        order.sort_by_key(|&episode| self.rows.first()[episode]);
+        for pair in order.windows(2) {
+            if self.rows.first()[pair[0]] + self.episodes()[pair[0]].length as u64 > self.rows.first()[pair[1]] {
+                let what = format!("some of its rows are also those of episode {}", pair[0]);
+                found.push(Irregularity { episode: Some(pair[1]), what });
+            }
+        }
+        let Some(column) = self.columns.iter().find(|column| column.spec.name == STEP && column.spec.len() == 1) else {
+            return Ok(found);
+        };
+        let mut steps = Batch::zeros(&Schema::new([column.spec.clone()])?, 0);
+        let row_of = |(episode, step): (usize, usize)| self.rows.first()[episode] + step as u64;
+        for (position, episode) in self.episodes().iter().enumerate() {
+            steps.resize(episode.length);
+            let range = [StepRange::new(position, 0, episode.length)];
+            let mut wanted = self.rows.wanted(&column.spec, &range, steps.bytes_mut(0))?;
+            column.read(&self.source, &mut wanted, row_of).map_err(|problem| self.fail(STEP, &problem))?;
+            #[allow(clippy::cast_precision_loss)]
+            if let Some((row, step)) =
+                steps.to_f32(STEP)?.into_iter().enumerate().find(|&(row, step)| step != row as f32)
+            {
+                let what = format!("the stored steps do not count up from 0: {step} stands in row {row}");
+                found.push(Irregularity { episode: Some(position), what });
+            }
+        }
+        Ok(found)
     }
 
     fn manifest(&self) -> Option<Manifest> {

@@ -5,7 +5,11 @@
 //! ```
 
 use crate::{format_suite, fuzz};
-use swm_data::{WriteMode, open};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use swm_core::{Batch, ColumnSpec, DType, Schema};
+use swm_data::{CommitPolicy, Reader, StepRange, WriteMode, WriteOptions, create, open};
 
 #[test]
 fn it_does_what_formats_do() {
@@ -28,8 +32,8 @@ fn damaged(cases: u64) {
     let path = folder.path().join("d.h5");
     format_suite::write(&path, WriteMode::Create, 0..3);
     let report = fuzz::dataset("hdf5", &path, cases, fuzz::read_everything);
-    println!("{} refused, {} same, {} changed", report.refused, report.same, report.changed.len());
-    println!("{:#?}", report.changed);
+    assert!(report.changed.is_empty(), "{:#?}", report.changed);
+    assert!(report.refused as u64 > cases / 2, "{} refused, {} the same", report.refused, report.same);
 }
 
 #[test]
@@ -46,8 +50,6 @@ fn files_damaged_in_10000_ways_are_refused() {
 #[test]
 fn many_chunks_need_trees_of_several_levels() {
     // 64 chunks a leaf, 4096 below a node of the second level: three levels, in groups that end anywhere.
-    use swm_core::{Batch, ColumnSpec, DType, Schema};
-    use swm_data::{CommitPolicy, StepRange, WriteOptions, create};
     let schema = Schema::new([ColumnSpec::new("large", DType::U8, [2048]), ColumnSpec::new("small", DType::Int64, [])]);
     let schema = schema.expect("schema");
     let folder = tempfile::tempdir().expect("a folder");
@@ -81,4 +83,240 @@ fn many_chunks_need_trees_of_several_levels() {
         }
     }
     assert_eq!(row, total);
+}
+
+fn interop(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop").join(name)
+}
+
+/// Episodes of the files that `hdf5_export.py` writes, and their pictures and numbers in row `t` of the file.
+const LENGTHS: [usize; 3] = [6, 7, 8];
+
+fn picture(t: usize) -> Vec<u8> {
+    let mut rgb = vec![];
+    for y in 0..6 {
+        for x in 0..8 {
+            let third = if (x + y) % 5 == 0 { 200 } else { 30 };
+            rgb.extend([(10 * y + t) as u8, (4 * x + 7 * t) as u8, third]);
+        }
+    }
+    rgb
+}
+
+fn numbers(t: usize) -> [i64; 5] {
+    std::array::from_fn(|k| (t * 100 + k * k) as i64)
+}
+
+/// Reads a column whole, and checks that it is read the same row by row, in any order.
+fn column(reader: &dyn Reader, name: &str) -> Batch {
+    let all: Vec<StepRange> = LENGTHS.iter().enumerate().map(|(e, &length)| StepRange::new(e, 0, length)).collect();
+    let whole = reader.read(&[name], &all).unwrap_or_else(|e| panic!("{name}: {e}"));
+    let mut rows: Vec<StepRange> = (0..3).flat_map(|e| (0..LENGTHS[e]).map(move |t| StepRange::new(e, t, 1))).collect();
+    rows.reverse();
+    let single = reader.read(&[name], &rows).expect("reads");
+    for t in 0..21 {
+        let row =
+            |batch: &Batch, t: usize| batch.bytes(0).chunks_exact(batch.bytes(0).len() / 21).nth(t).map(<[u8]>::to_vec);
+        assert_eq!(row(&whole, t), row(&single, 20 - t), "{name}");
+    }
+    whole
+}
+
+fn has_pictures(reader: &dyn Reader, name: &str) {
+    let read = column(reader, name);
+    (0..21).for_each(|t| assert_eq!(read.row(t).get::<u8>(name).expect("pictures"), picture(t), "{name}, row {t}"));
+}
+
+fn has_numbers(reader: &dyn Reader, name: &str) {
+    let read = column(reader, name);
+    for t in 0..21 {
+        let expected = numbers(t).map(|number| number as f64);
+        assert_eq!(read.row(t).to_f64(name).expect("numbers"), expected, "{name}, row {t}");
+    }
+}
+
+#[test]
+fn a_file_of_the_reference_opens_here() {
+    let reader = open(&interop("hdf5-reference.h5")).expect("opens");
+    assert_eq!(reader.episodes().iter().map(|episode| episode.length).collect::<Vec<_>>(), LENGTHS);
+    has_pictures(&*reader, "pixels");
+    let types =
+        [("pixels", DType::U8), ("action", DType::Float32), ("reward", DType::Float64), ("step_idx", DType::Int64)];
+    for (name, dtype) in types {
+        assert_eq!(reader.schema().column(name).expect("is there").dtype, dtype);
+    }
+    let ends = [5, 12, 20];
+    let (action, reward, step) = (column(&*reader, "action"), column(&*reader, "reward"), column(&*reader, "step_idx"));
+    for t in 0..21 {
+        let given = action.row(t).to_f64("action").expect("numbers");
+        if ends.contains(&t) {
+            assert!(given.iter().all(|value| value.is_nan()));
+        } else {
+            assert_eq!(given, [numbers(t)[0] as f64, numbers(t)[1] as f64]);
+        }
+        assert_eq!(reward.row(t).to_f64("reward").expect("a number"), [numbers(t)[0] as f64]);
+        let first = if t < 6 {
+            0
+        } else if t < 13 {
+            6
+        } else {
+            13
+        };
+        assert_eq!(step.row(t).to_f64("step_idx").expect("a number"), [(t - first) as f64]);
+    }
+    for k in 0..5 {
+        let name = format!("variation.{k}");
+        let read = column(&*reader, &name);
+        (0..21).for_each(|t| assert_eq!(read.row(t).get::<i64>(&name).expect("a number"), [numbers(t)[k]]));
+    }
+}
+
+#[test]
+fn every_filter_of_h5py_and_hdf5plugin_is_undone() {
+    let reader = open(&interop("hdf5-filters.h5")).expect("opens");
+    let names: Vec<String> = reader.schema().columns()[2..].iter().map(|column| column.name.clone()).collect();
+    assert_eq!(names.len(), 2 * 26);
+    for name in names {
+        if name.starts_with("pictures") { has_pictures(&*reader, &name) } else { has_numbers(&*reader, &name) }
+    }
+}
+
+#[test]
+fn every_layout_is_read() {
+    let reader = open(&interop("hdf5-layouts.h5")).expect("opens");
+    for name in ["contiguous", "one chunk", "fixed", "growing", "growing blocks"] {
+        has_pictures(&*reader, name);
+    }
+    for dtype in ["u2", "i2", ">i4", "u4", "u8", ">f8"] {
+        has_numbers(&*reader, &format!("numbers {dtype}"));
+    }
+    let read = column(&*reader, "numbers i1");
+    (0..21).for_each(|t| {
+        assert_eq!(read.row(t).get::<i32>("numbers i1").expect("numbers")[3], numbers(t)[3] as i32 % 100)
+    });
+    let read = column(&*reader, "numbers f2");
+    // 11 bits of precision, and even above 2048.
+    (0..20).for_each(|t| assert_eq!(read.row(t).get::<f32>("numbers f2").expect("numbers")[0], (t * 100) as f32));
+    let read = column(&*reader, "truth");
+    (0..21).for_each(|t| assert_eq!(read.row(t).get::<u8>("truth").expect("a truth"), [u8::from(t % 3 == 0)]));
+    assert!(reader.schema().column("text").is_err(), "text is left out");
+
+    let reader = open(&interop("hdf5-trees.h5")).expect("opens");
+    has_pictures(&*reader, "growing");
+    has_pictures(&*reader, "blocks");
+    let read = column(&*reader, "partly written");
+    for t in 0..21 {
+        let expected = if t < 16 { numbers(t).map(|number| number as f64) } else { [0.0; 5] };
+        assert_eq!(read.row(t).to_f64("partly written").expect("numbers"), expected, "row {t}");
+    }
+}
+
+#[test]
+fn damaged_files_of_others_are_refused_or_read() {
+    // They have no checksums: what is changed is not always noticed, but never harms.
+    for name in ["hdf5-reference.h5", "hdf5-filters.h5", "hdf5-layouts.h5", "hdf5-trees.h5"] {
+        let report = fuzz::dataset(name, &interop(name), 150, fuzz::read_everything);
+        assert!(report.refused > 20, "{name}: {report:?}");
+    }
+}
+
+#[test]
+#[ignore = "minutes"]
+fn files_of_others_damaged_in_10000_ways_are_refused_or_read() {
+    for name in ["hdf5-reference.h5", "hdf5-filters.h5", "hdf5-layouts.h5", "hdf5-trees.h5"] {
+        let report = fuzz::dataset(name, &interop(name), 2500, fuzz::read_everything);
+        println!("{name}: {} refused, {} same, {} changed", report.refused, report.same, report.changed.len());
+        assert!(report.refused > 200, "{name}: {report:?}");
+    }
+}
+
+/// The columns of `hdf5-reference.h5`, and an episode of them.
+fn theirs() -> Batch {
+    let reader = open(&interop("hdf5-reference.h5")).expect("opens");
+    let columns: Vec<ColumnSpec> = reader.schema().columns()[1..].to_vec();
+    let names: Vec<&str> = columns.iter().map(|column| &*column.name).collect();
+    reader.read(&names, &[StepRange::new(1, 0, LENGTHS[1])]).expect("reads")
+}
+
+#[test]
+fn a_file_of_the_reference_is_continued_here() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("continued.h5");
+    std::fs::copy(interop("hdf5-reference.h5"), &path).expect("copies");
+    let episode = theirs();
+    for round in 1..3 {
+        let options = WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
+        let mut writer = create(&path, episode.schema(), options).expect("continues");
+        writer.write_episode(&episode).expect("writes");
+        writer.finish().expect("finishes");
+        let reader = open(&path).expect("opens");
+        assert_eq!(reader.episodes().len(), 3 + round);
+        has_pictures(&*reader, "pixels");
+        let names: Vec<&str> = episode.schema().columns().iter().map(|column| &*column.name).collect();
+        let read = reader.read(&names, &[StepRange::new(2 + round, 0, LENGTHS[1])]).expect("reads");
+        (0..names.len()).for_each(|at| assert!(read.bytes(at) == episode.bytes(at), "{}", names[at]));
+    }
+}
+
+/// Runs `hdf5_check.py`, if there is a Python for it.
+fn check(mode: &str, path: &Path) -> Option<Value> {
+    let Some(python) = std::env::var_os("SWM_LANCE_PYTHON").or_else(|| std::env::var_os("SWM_REFERENCE_PYTHON")) else {
+        println!("SKIPPED: set SWM_LANCE_PYTHON to a Python with numpy and h5py");
+        return None;
+    };
+    let output = Command::new(python).arg("-B").arg(interop("hdf5_check.py")).arg(mode).arg(path).output();
+    let output = output.expect("Python runs");
+    let errors = String::from_utf8_lossy(&output.stderr);
+    if errors.contains("ModuleNotFoundError") {
+        println!("SKIPPED: {}", errors.lines().last().unwrap_or_default());
+        return None;
+    }
+    assert!(output.status.success(), "{errors}");
+    Some(serde_json::from_slice(&output.stdout).expect("JSON"))
+}
+
+/// Checks what h5py says of the columns against ours.
+fn agrees(path: &Path, seen: &Value) {
+    let reader = open(path).expect("opens");
+    let all: Vec<StepRange> =
+        reader.episodes().iter().enumerate().map(|(at, episode)| StepRange::new(at, 0, episode.length)).collect();
+    for column in &reader.schema().columns()[1..] {
+        let read = reader.read(&[&column.name], &all).expect("reads");
+        let seen = &seen["columns"][&column.name];
+        let dtype = seen["dtype"].as_str().expect("a type");
+        assert_eq!(dtype, column.dtype.name(), "{}", column.name);
+        assert_eq!(seen["shape"][0], read.rows(), "{}", column.name);
+        let (mut sum, mut weighted) = (0.0, 0.0);
+        for t in 0..read.rows() {
+            let row: f64 =
+                read.row(t).to_f64(&column.name).expect("numbers").iter().filter(|value| !value.is_nan()).sum();
+            sum += row;
+            weighted += row * (t % 1000 + 1) as f64;
+        }
+        for (ours, theirs) in [(sum, &seen["sum"]), (weighted, &seen["weighted"])] {
+            let theirs = theirs.as_f64().expect("a number");
+            assert!((ours - theirs).abs() <= 1e-9 * ours.abs(), "{}: {ours} {theirs}", column.name);
+        }
+    }
+}
+
+#[test]
+fn our_files_open_in_h5py_and_what_it_appends_opens_here() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("ours.h5");
+    format_suite::write(&path, WriteMode::Create, 0..40);
+    format_suite::write(&path, WriteMode::Append, 40..77);
+    let Some(seen) = check("read", &path) else { return };
+    agrees(&path, &seen);
+    assert!(seen["record"].as_str().expect("text").contains("variation.agent.color"));
+    let Some(seen) = check("append", &path) else { return };
+    assert_eq!(open(&path).expect("opens").episodes().len(), 78);
+    agrees(&path, &seen);
+    // And we continue it after h5py did.
+    let mut writer = format_suite::writer(&path, WriteMode::Append).expect("continues");
+    writer.write_episode(&crate::sample::episode(0)).expect("writes");
+    writer.finish().expect("finishes");
+    let seen = check("read", &path).expect("it was there before");
+    agrees(&path, &seen);
+    assert_eq!(open(&path).expect("opens").episodes().len(), 79);
 }

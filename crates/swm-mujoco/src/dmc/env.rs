@@ -218,6 +218,10 @@ impl<D: Domain> Task for Control<D> {
         Ok(())
     }
 
+    fn overwrites(&self) -> bool {
+        true
+    }
+
     fn start(&mut self, physics: &mut Physics, _factors: &FactorValues, key: Key) -> Result<()> {
         let mut attempt = 0;
         loop {
@@ -266,24 +270,31 @@ impl<D: Domain> Task for Control<D> {
     }
 
     fn memory_len(&self, _model: &MjModel) -> usize {
-        1 + D::TARGET + self.goal.len()
+        1 + D::TARGET
     }
 
     fn remember(&self, into: &mut [f64]) {
-        let (score, rest) = into.split_at_mut(1);
-        let (target, goal) = rest.split_at_mut(D::TARGET);
-        score[0] = self.score;
-        target.copy_from_slice(&self.target);
-        goal.copy_from_slice(&self.goal);
+        into[0] = self.score;
+        into[1..].copy_from_slice(&self.target);
     }
 
     fn recall(&mut self, physics: &mut Physics, memory: &[f64]) {
-        let (target, goal) = memory[1..].split_at(D::TARGET);
         self.score = memory[0];
-        self.target.copy_from_slice(target);
+        self.target.copy_from_slice(&memory[1..]);
         if D::TARGET > 0 {
-            self.domain.place(physics, target);
+            self.domain.place(physics, &self.target);
         }
+    }
+
+    fn goal_len(&self) -> usize {
+        self.goal.len()
+    }
+
+    fn remember_goal(&self, into: &mut [f64]) {
+        into.copy_from_slice(&self.goal);
+    }
+
+    fn recall_goal(&mut self, goal: &[f64]) {
         self.goal.copy_from_slice(goal);
     }
 

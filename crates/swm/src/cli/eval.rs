@@ -62,6 +62,9 @@ pub struct EvalArgs {
     /// Picture size where no checkpoint decides it: 64 or HEIGHTxWIDTH
     #[arg(long, default_value = "64", value_parser = image_size)]
     image: (usize, usize),
+    /// Draw nothing: where no policy looks at pictures, and on machines that cannot draw a world of three dimensions
+    #[arg(long, conflicts_with_all = ["image", "videos"])]
+    no_pixels: bool,
     /// Where to write results.json and the videos
     #[arg(short, long, default_value = "results", value_name = "DIR")]
     output: PathBuf,
@@ -123,12 +126,16 @@ impl EvalArgs {
             policies.extend(self.acts(&chosen, found)?);
         }
         let image = policies.iter().find_map(|(_, image)| *image);
+        if self.no_pixels && image.is_some() {
+            let problem = "a checkpoint among the policies looks at pictures";
+            return Err(Error::config("--no-pixels", problem, "leave it out"));
+        }
         Ok(EvalRequest {
             version: EvalRequest::VERSION,
             env: chosen.id(),
             wrappers: self.wrappers.choices()?,
             wrap_goal: self.wrappers.wrap_goal,
-            image: Some(image.unwrap_or([self.image.0, self.image.1])),
+            image: (!self.no_pixels).then(|| image.unwrap_or([self.image.0, self.image.1])),
             policies: policies.into_iter().map(|(policy, _)| policy).collect(),
             starts: match &self.dataset {
                 None => StartsRequest::Episodic,

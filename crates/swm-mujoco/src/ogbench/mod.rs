@@ -15,14 +15,14 @@ pub const ENTRIES: [EnvEntry; 3] = [
         summary: "an arm puts cubes where they should go, on a table",
         options: table::CUBE_OPTIONS,
         make: table::make_cube,
-        experts: &[],
+        experts: table::EXPERTS,
     },
     EnvEntry {
         id: "swm/OGBScene-v0",
         summary: "an arm moves a cube, presses buttons that lock a drawer and a window, and opens and closes these",
         options: table::SCENE_OPTIONS,
         make: table::make_scene,
-        experts: &[],
+        experts: table::EXPERTS,
     },
     EnvEntry {
         id: "swm/OGBMaze-v0",

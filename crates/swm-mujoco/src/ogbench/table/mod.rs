@@ -1,6 +1,7 @@
 //! A table with an arm, cubes, and in the scene buttons, a drawer and a window: `swm/OGBCube-v0` and `swm/OGBScene-v0`.
 
 mod arena;
+mod expert;
 mod factors;
 mod goal;
 mod observe;
@@ -8,6 +9,8 @@ mod parts;
 mod setup;
 mod start;
 mod tasks;
+
+pub use expert::EXPERTS;
 
 use super::arm::pose::{Pose, Quat, Vec3};
 use super::arm::{ACTION, Arm, find};

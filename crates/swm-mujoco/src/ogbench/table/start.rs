@@ -25,7 +25,7 @@ pub const AWAY: Vec3 = [0.0, 0.0, -0.3];
 const IN_OPEN_DRAWER: Vec3 = [0.33, -0.24, 0.066];
 const IN_CLOSED_DRAWER: Vec3 = [0.33, -0.356, 0.065986];
 /// Where drawer and window are when they are open.
-const OPEN: [f64; 2] = [-0.16, 0.2];
+pub const OPEN: [f64; 2] = [-0.16, 0.2];
 /// How often the reference, collecting data, puts a cube on another one, and into an open drawer.
 const STACK: f64 = 0.5;
 const INTO_DRAWER: f64 = 0.3;

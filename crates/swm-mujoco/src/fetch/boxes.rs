@@ -299,6 +299,7 @@ mod tests {
 
     /// Boxes on the edge of a table and the contacts that MuJoCo 3.3.2 found: two boxes, the normal, places and distances.
     #[rustfmt::skip]
+    #[allow(clippy::type_complexity)]
     fn recorded() -> [(Solid, Solid, Vector, Vec<(Vector, f64)>); 2] { [
         (
             Solid { at: [1.3, 0.75, 0.2], turn: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], half: [0.25, 0.35, 0.2] },

@@ -90,7 +90,7 @@ fn seen([x, y]: [f64; 2], sight: &Sight) -> (f64, f64) {
 fn behind(sight: &Sight, direction: [f64; 2], back: f64, height: f64) -> Option<[f64; 4]> {
     let (ahead, left) = seen(direction, sight);
     let [x, y] = [0, 1].map(|i| sight.object[i] - back * direction[i]);
-    if ahead < 0.01 - 0.04 && left.abs() < 0.015 && sight.gripper[2] < height + 0.02 {
+    if ahead < -0.03 && ahead > -back - 0.03 && left.abs() < 0.015 && sight.gripper[2] < height + 0.02 {
         return None;
     }
     let above = height + 0.08;
@@ -128,14 +128,14 @@ fn slide(sight: &Sight) -> [f64; 4] {
         return if ahead > -0.15 { [-direction[0], -direction[1], 0.0, 0.0] } else { [0.0; 4] };
     }
     if speed < 1e-3
-        && let Some(action) = behind(sight, direction, 0.07, 0.41)
+        && let Some(action) = behind(sight, direction, 0.07, 0.415)
     {
         return action;
     }
     let (_, aside) = seen(direction, sight);
     let pace = wanted / STEP;
     let to = [0, 1].map(|i| direction[i] * pace - [-direction[1], direction[0]][i] * 2.0 * aside / STEP);
-    [to[0], to[1], (0.41 - sight.gripper[2]) / STEP, 0.0]
+    [to[0], to[1], (0.415 - sight.gripper[2]) / STEP, 0.0]
 }
 
 fn pick(sight: &Sight) -> [f64; 4] {
@@ -181,12 +181,22 @@ mod tests {
         count
     }
 
+    /// `SEEDS=200 cargo nextest run --release -p swm-mujoco experts --no-capture` makes the table of the README.
     #[test]
     fn experts_solve_their_tasks() {
-        let seeds: u64 = std::env::var("SEEDS").ok().and_then(|text| text.parse().ok()).unwrap_or(20);
-        for entry in ENTRIES.iter().step_by(3) {
-            let (usual, all) = (solved(entry, seeds, false), solved(entry, seeds, true));
-            eprintln!("{}: {usual} and {all} of {seeds}", entry.id);
+        let seeds: u64 = std::env::var("SEEDS").ok().and_then(|text| text.parse().ok()).unwrap_or(10);
+        // Of 100 seeds, with default factors and with all varied; a strike of the puck is a matter of luck, too.
+        let least = [("Reach", 95, 95), ("Push", 90, 80), ("Slide", 15, 0), ("PickAndPlace", 90, 80)];
+        for (entry, (name, usual, all)) in ENTRIES.iter().step_by(3).zip(least) {
+            assert!(entry.id.contains(name));
+            let reached = [solved(entry, seeds, false), solved(entry, seeds, true)];
+            #[allow(clippy::print_stderr, reason = "the table of the README")]
+            {
+                eprintln!("{}: {} of {seeds}, {} with all factors varied", entry.id, reached[0], reached[1]);
+            }
+            for (reached, least) in reached.into_iter().zip([usual, all]) {
+                assert!(u64::from(reached) * 100 >= least * seeds, "{}: {reached} of {seeds}", entry.id);
+            }
         }
     }
 }

@@ -295,7 +295,10 @@ impl<'a> Comparison<'a> {
         let limit = |array: &str| if array.starts_with("frame") { PICTURES } else { self.family.tolerance };
         let worst = self.apart.iter().map(|(array, apart)| format!("{array} {:.1e}", apart.by));
         let rows = until.min(rewards.len() + 1);
-        eprintln!("{}, {rows} rows: {}", self.name, worst.collect::<Vec<_>>().join(", "));
+        #[allow(clippy::print_stderr, reason = "the table for whoever runs it with --no-capture")]
+        {
+            eprintln!("{}, {rows} rows: {}", self.name, worst.collect::<Vec<_>>().join(", "));
+        }
         self.apart
             .iter()
             .filter(|(array, apart)| apart.by.is_nan() || apart.by > limit(array))

@@ -62,6 +62,11 @@ impl Npz {
         self.archive.index_for_name(member).is_some()
     }
 
+    /// Whether there is nothing but the array.
+    pub fn is_plain(&self) -> bool {
+        self.archive.len() == 1
+    }
+
     /// The bytes of a member.
     ///
     /// # Errors

@@ -54,8 +54,10 @@ impl ColumnFiles {
         let recorded: Recorded = if lengths_file.has(RECORDED) {
             serde_json::from_slice(&lengths_file.member(RECORDED)?)
                 .map_err(|e| damaged(format!("what {LENGTHS}.npz records is unreadable: {e}")))?
-        } else {
+        } else if lengths_file.is_plain() {
             Recorded::default()
+        } else {
+            return Err(damaged(format!("{LENGTHS}.npz holds something that nobody writes")));
         };
         let in_files = usize::try_from(rows.total()).map_err(|e| damaged(e.to_string()))?;
         let (mut columns, left_out) = columns(folder, &recorded, in_files)?;

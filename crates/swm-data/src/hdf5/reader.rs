@@ -40,10 +40,15 @@ impl Hdf5Reader {
         let damaged = |problem: String| damaged(&source, problem);
         let file = guard("opening it as HDF5", || hdf5_pure::File::from_source(source.clone())).map_err(damaged)?;
         let names = guard("listing its datasets", || file.root().datasets()).map_err(damaged)?;
+        let record = layout::record(&source).map_err(damaged)?;
+        let record = record.map(|found| table::read_all(&found, &source)).transpose();
+        let record = record.map_err(|e| damaged(format!("its record: {e}")))?;
         let column = |name: &str| {
             let dataset = guard("its header", || file.dataset(name));
             let column = dataset.and_then(|dataset| Column::new(name, dataset, source.size()));
-            column.map_err(|problem| damaged(format!("column '{name}': {problem}")))
+            let mut column = column.map_err(|problem| damaged(format!("column '{name}': {problem}")))?;
+            column.iter_mut().for_each(|column| column.ours = record.is_some());
+            Ok(column)
         };
         let counts = |name: &str| -> Result<Vec<i64>> {
             let missing = || damaged(format!("it has no list of numbers '{name}', which says where episodes are"));
@@ -71,13 +76,17 @@ impl Hdf5Reader {
             }
             columns.push(column);
         }
-        let record = match layout::record(&source).map_err(damaged)? {
-            Some(found) => {
-                let bytes = table::read_all(&found, &source).map_err(|e| damaged(format!("its record: {e}")))?;
-                Record::parse(bytes, rows.episodes().len()).map_err(damaged)?
-            }
+        let record = match record {
+            Some(bytes) => Record::parse(bytes, rows.episodes().len()).map_err(damaged)?,
             None => Record::default(),
         };
+        for written in record.schema.iter().flat_map(Schema::columns) {
+            let same = |column: &&Column| column.spec == *written && column.is_plain();
+            if !columns.iter().any(|column| same(&column)) {
+                let problem = format!("column '{}' is not as it was written, or missing", written.name);
+                return Err(damaged(problem));
+            }
+        }
         let known = record.schema.as_ref().map(Schema::columns).unwrap_or_default();
         let place = |column: &Column| known.iter().position(|k| k.name == column.spec.name).unwrap_or(known.len());
         columns.sort_by(|a, b| place(a).cmp(&place(b)).then_with(|| a.spec.name.cmp(&b.spec.name)));

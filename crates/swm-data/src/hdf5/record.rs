@@ -19,6 +19,8 @@ enum Line {
     Manifest(Box<Manifest>),
     /// A constant of this many bytes, which follow; they are numbered.
     Constant(usize),
+    /// A writer ended properly, after so many episodes.
+    Closed(usize),
     /// The constants of an episode, by their numbers.
     Episode { number: usize, constants: BTreeMap<String, usize> },
 }
@@ -50,6 +52,10 @@ impl Record {
             match line {
                 Line::Schema(schema) => record.schema = Some(schema),
                 Line::Manifest(manifest) => record.manifest = Some(*manifest),
+                Line::Closed(count) if count > episodes => {
+                    return Err(format!("it has {episodes} episodes; {count} were written"));
+                }
+                Line::Closed(_) => {}
                 Line::Constant(size) => {
                     let end = at.checked_add(size).filter(|&end| end <= bytes.len());
                     let end = end.ok_or("its record is cut off in a constant")?;
@@ -65,6 +71,9 @@ impl Record {
                 }
             }
             record.committed = at;
+        }
+        if record.committed == at && at < bytes.len() {
+            return Err("its record is cut off".to_owned());
         }
         record.bytes = bytes;
         Ok(record)
@@ -100,6 +109,11 @@ impl RecordWriter {
     /// The line of a manifest.
     pub fn manifest(manifest: &Manifest) -> Result<Vec<u8>> {
         line(&Line::Manifest(Box::new(manifest.clone())))
+    }
+
+    /// The line at the end.
+    pub fn closed(episodes: usize) -> Result<Vec<u8>> {
+        line(&Line::Closed(episodes))
     }
 
     /// The lines of an episode; constants that are there are not stored again.

@@ -145,6 +145,8 @@ struct Hdf5Writer {
     /// The end of the file at the last commit, and the episodes since.
     committed_end: u64,
     in_group: usize,
+    /// Whether episodes came since the file was last closed.
+    unclosed: bool,
     rows: Rows,
     record: RecordWriter,
     /// Whether something failed to be written.
@@ -224,6 +226,7 @@ impl Hdf5Writer {
             policy: CommitPolicy::default(),
             last_commit: Instant::now(),
             in_group: 0,
+            unclosed: false,
             rows: Rows::default(),
             record: RecordWriter::default(),
             failed: false,
@@ -268,6 +271,7 @@ impl Hdf5Writer {
         self.put(OFFSETS, &first.to_le_bytes())?;
         self.put(LENGTHS, &length.to_le_bytes())?;
         self.in_group += 1;
+        self.unclosed = true;
         self.failed = false;
         Ok(())
     }
@@ -300,6 +304,18 @@ impl Hdf5Writer {
         file.sync_data()
     }
 
+    /// Commits what is left, and that it is all.
+    fn close(&mut self) -> Result<()> {
+        if self.in_group == 0 && !self.unclosed {
+            return Ok(());
+        }
+        self.failed = true;
+        self.record(&RecordWriter::closed(self.rows.episodes().len())?)?;
+        self.commit()?;
+        self.unclosed = false;
+        Ok(())
+    }
+
     fn lost() -> Error {
         Error::external("writing an episode", "an earlier one failed to be written; nothing more is kept")
     }
@@ -326,15 +342,14 @@ impl Writer for Hdf5Writer {
         if self.failed {
             return Err(Self::lost());
         }
-        if self.in_group > 0 { self.commit() } else { Ok(()) }
+        self.close()
     }
 }
 
 impl Drop for Hdf5Writer {
     fn drop(&mut self) {
         if !self.failed
-            && self.in_group > 0
-            && let Err(error) = self.commit()
+            && let Err(error) = self.close()
         {
             tracing::error!(dataset = %self.path.display(), "the last episodes are lost: {error}");
         }

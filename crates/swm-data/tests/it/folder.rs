@@ -4,8 +4,12 @@
 //! cargo test --release --workspace --test it -- --ignored folder::
 //! ```
 
-use crate::{format_suite, fuzz};
-use swm_data::{WriteMode, open};
+use crate::{format_suite, fuzz, sample};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use swm_core::{Batch, Schema};
+use swm_data::{StepRange, WriteMode, WriteOptions, create, open};
 
 #[test]
 fn it_does_what_formats_do() {
@@ -51,7 +55,7 @@ fn what_an_interrupted_writer_left_may_be_damaged() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.folder");
     let mut writer = format_suite::writer(&path, WriteMode::Create).expect("creates");
-    (0..4).for_each(|e| writer.write_episode(&crate::sample::episode(e)).expect("writes"));
+    (0..4).for_each(|e| writer.write_episode(&sample::episode(e)).expect("writes"));
     let journal = std::fs::read(path.join("ep_len.journal")).expect("a journal");
     let whole = open(&path).expect("opens").episodes().len();
     assert_eq!(whole, 4);
@@ -69,5 +73,92 @@ fn what_an_interrupted_writer_left_may_be_damaged() {
         let reader = open(&copy).expect("what was whole is read");
         assert!(reader.episodes().len() < 4);
         format_suite::check(&*reader, 0);
+    }
+}
+
+fn interop(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop").join(name)
+}
+
+#[test]
+fn a_folder_of_the_reference_opens_here_and_is_refused_to_be_continued() {
+    let path = interop("folder-reference");
+    let reader = open(&path).expect("opens");
+    let lengths: Vec<usize> = reader.episodes().iter().map(|episode| episode.length).collect();
+    assert_eq!(lengths, [2, 3]);
+    let names: Vec<&str> = reader.schema().columns()[2..].iter().map(|column| &*column.name).collect();
+    assert_eq!(names, ["action", "pixels", "reward", "small", "variation.agent"], "text is left out");
+    let all = [StepRange::new(0, 0, 2), StepRange::new(1, 0, 3)];
+    let read = reader.read(&names, &all).expect("reads");
+    for t in 0..5 {
+        let row = read.row(t);
+        let numbers = |name: &str| row.to_f64(name).expect("numbers");
+        let last = t == 1 || t == 4;
+        assert!(if last { numbers("action")[0].is_nan() } else { numbers("action") == [t as f64 / 4.0, -(t as f64)] });
+        assert_eq!(numbers("reward"), [t as f64 * 0.5]);
+        assert_eq!(numbers("small"), [t as f64 - 3.0]);
+        assert_eq!(numbers("variation.agent"), [t as f64; 3]);
+        let mut off = 0.0;
+        for (i, rgb) in row.get::<u8>("pixels").expect("pictures").chunks(3).enumerate() {
+            let expected = [(8 * (i / 24) + t) as u8, (4 * (i % 24) + 7 * t) as u8, 90];
+            off += rgb.iter().zip(expected).map(|(&a, b)| f64::from(a.abs_diff(b))).sum::<f64>();
+        }
+        // The first is a PNG.
+        assert!(if t == 0 { off == 0.0 } else { off / 1152.0 < 6.0 }, "row {t}: {off}");
+    }
+    assert!(reader.manifest().is_none() && reader.constants(1).expect("none").is_empty());
+
+    let folder = tempfile::tempdir().expect("a folder");
+    let copy = folder.path().join("copy.folder");
+    fuzz::copy_all(&path, &copy);
+    let schema = Schema::new(reader.schema().columns()[2..].to_vec()).expect("schema");
+    let options = || WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
+    let error = create(&copy, &schema, options()).err().expect("text cannot be continued").to_string();
+    assert!(error.contains("'task'"), "{error}");
+    std::fs::remove_file(copy.join("task.npz")).expect("removes");
+    let mut writer = create(&copy, &schema, options()).expect("continues");
+    let mut episode = reader.read(&names, &[StepRange::new(1, 0, 3)]).expect("reads");
+    episode = {
+        let mut batch = Batch::zeros(&schema, 3);
+        (0..names.len()).for_each(|at| batch.bytes_mut(at).copy_from_slice(episode.bytes(at)));
+        batch
+    };
+    writer.write_episode(&episode).expect("writes");
+    writer.finish().expect("finishes");
+    let continued = open(&copy).expect("opens");
+    assert_eq!(continued.episodes().len(), 3);
+    let read = continued.read(&names, &[StepRange::new(2, 0, 3), StepRange::new(0, 0, 2)]).expect("reads");
+    let before = reader.read(&names, &[StepRange::new(1, 0, 3), StepRange::new(0, 0, 2)]).expect("reads");
+    (0..names.len()).for_each(|at| assert!(read.bytes(at) == before.bytes(at), "{}", names[at]));
+}
+
+#[test]
+fn our_folders_open_in_the_reference() {
+    let Some(python) = std::env::var_os("SWM_REFERENCE_PYTHON") else {
+        println!("SKIPPED: set SWM_REFERENCE_PYTHON to a Python with stable-worldmodel");
+        return;
+    };
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("ours.folder");
+    format_suite::write(&path, WriteMode::Create, 0..5);
+    format_suite::write(&path, WriteMode::Append, 5..8);
+    let output =
+        Command::new(python).arg("-B").arg(interop("folder_check.py")).arg(&path).output().expect("Python runs");
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let seen: Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(seen["lengths"], serde_json::json!((0..8).map(sample::rows).collect::<Vec<_>>()));
+    assert_eq!(seen["clips"], (0..8).map(|e| sample::rows(e) - 3).sum::<usize>());
+    let mut names: Vec<String> = sample::schema().columns().iter().map(|column| column.name.clone()).collect();
+    names.sort();
+    assert_eq!(seen["columns"], serde_json::json!(names));
+    // The last clip: rows of the last episode.
+    let first = sample::rows(7) - 4;
+    assert_eq!(seen["state"], serde_json::json!([[7.0, first as f64, -0.5], [7.0, first as f64 + 2.0, -0.5]]));
+    let last = sample::episode(7);
+    for step in 0..2 {
+        let frame = last.row(first + 2 * step).get::<u8>("pixels").expect("pictures");
+        let mean = frame.iter().map(|&value| f64::from(value)).sum::<f64>() / frame.len() as f64;
+        let theirs = seen["pixels"][step].as_f64().expect("a mean");
+        assert!((mean - theirs).abs() < 1e-9, "lossless: {mean} {theirs}");
     }
 }

@@ -8,14 +8,16 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 use swm_core::{Batch, ColumnSpec, DType, Key, Result, Schema};
-use swm_data::{CommitPolicy, Constants, ImageCodec, Reader, StepRange, WriteMode, WriteOptions, Writer, create, open};
+use swm_data::{
+    CommitPolicy, Constants, ImageCodec, Location, Reader, StepRange, WriteMode, WriteOptions, Writer, create, open,
+};
 
 /// How often a group of episodes is committed here.
 const GROUP: usize = 2;
 
-pub fn writer(path: &Path, mode: WriteMode) -> Result<Box<dyn Writer>> {
+pub fn writer(location: impl Into<Location>, mode: WriteMode) -> Result<Box<dyn Writer>> {
     let commit = CommitPolicy { episodes: GROUP, ..CommitPolicy::default() };
-    create(path, &schema(), WriteOptions { mode, codec: ImageCodec::Png, manifest: Some(manifest(3)), commit })
+    create(location, &schema(), WriteOptions { mode, codec: ImageCodec::Png, manifest: Some(manifest(3)), commit })
 }
 
 /// A scene that every third episode shares, and a note of its own.

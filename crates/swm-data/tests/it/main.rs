@@ -14,6 +14,8 @@ mod fuzz;
 mod goals;
 #[cfg(feature = "hdf5")]
 mod hdf5;
+#[cfg(all(feature = "hdf5", feature = "s3", feature = "http"))]
+mod hdf5_objects;
 mod interruption;
 mod kill;
 mod lance;

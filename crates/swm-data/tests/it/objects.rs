@@ -17,7 +17,7 @@ const KEYS: [&str; 2] = ["AKEXAMPLE", "secret/example"];
 
 /// Serves the folders of a folder as buckets, to anybody or to those with the keys; gives its address. It ends with
 /// the program.
-fn serve(root: &Path, keys: bool) -> String {
+pub fn serve(root: &Path, keys: bool) -> String {
     let mut service = S3ServiceBuilder::new(s3s_fs::FileSystem::new(root).expect("a root"));
     if keys {
         service.set_auth(SimpleAuth::from_single(KEYS[0], KEYS[1]));
@@ -43,7 +43,7 @@ fn serve(root: &Path, keys: bool) -> String {
 }
 
 /// A process that runs one of the children below.
-fn child(test: &str, endpoint: &str, target: &str) -> Command {
+pub fn child(test: &str, endpoint: &str, target: &str) -> Command {
     let mut command = Command::new(std::env::current_exe().expect("this program"));
     command.args(["--exact", &format!("objects::{test}"), "--nocapture"]).env(TARGET, target);
     command.env("AWS_ENDPOINT_URL", endpoint).env("AWS_REGION", "us-east-1");
@@ -52,7 +52,7 @@ fn child(test: &str, endpoint: &str, target: &str) -> Command {
     command
 }
 
-fn finished(output: &Output) -> String {
+pub fn finished(output: &Output) -> String {
     let text = String::from_utf8_lossy(&output.stdout).into_owned();
     assert!(output.status.success(), "{text}\n{}", String::from_utf8_lossy(&output.stderr));
     text

@@ -9,6 +9,8 @@ use super::copy_match;
 const MAX_LITERALS: usize = 32;
 const MAX_DISTANCE: usize = 1 << 13;
 const MAX_LENGTH: usize = 264;
+/// Matches up to this length are copied in one go.
+const SHORT: usize = 16;
 /// Positions that are remembered, by a hash of the three bytes there.
 const TABLE_BITS: u32 = 14;
 
@@ -22,8 +24,14 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
         if control < MAX_LITERALS {
             let length = control + 1;
             let literals = from.get(i..i + length).ok_or_else(cut)?;
-            let place = out.get_mut(at..at + length).ok_or("LZF: it holds too much")?;
-            place.copy_from_slice(literals);
+            if length > out.len() - at {
+                return Err("LZF: it holds too much".to_owned());
+            }
+            // Where there is room, the longest run is copied always, which takes two moves instead of a call.
+            match (from[i..].first_chunk::<MAX_LITERALS>(), out[at..].first_chunk_mut::<MAX_LITERALS>()) {
+                (Some(literals), Some(place)) => *place = *literals,
+                _ => out[at..at + length].copy_from_slice(literals),
+            }
             (i, at) = (i + length, at + length);
         } else {
             let mut length = control >> 5;
@@ -33,8 +41,17 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
             }
             let distance = ((control & 31) << 8 | usize::from(*from.get(i).ok_or_else(cut)?)) + 1;
             i += 1;
-            copy_match(out, at, distance, length + 2)?;
-            at += length + 2;
+            length += 2;
+            // As above, for the many short matches.
+            match out.split_at_mut_checked(at) {
+                Some((before, place))
+                    if length <= SHORT && (SHORT..=at).contains(&distance) && place.len() >= SHORT =>
+                {
+                    place[..SHORT].copy_from_slice(&before[at - distance..at - distance + SHORT]);
+                }
+                _ => copy_match(out, at, distance, length)?,
+            }
+            at += length;
         }
     }
     if at == out.len() { Ok(()) } else { Err(format!("LZF: it ends after {at} of {} bytes", out.len())) }
@@ -50,9 +67,11 @@ impl Default for Encoder {
 }
 
 impl Encoder {
-    /// Appends the encoded bytes to `out`, and says whether they are fewer; where not, nothing is appended.
+    /// Appends the encoded bytes to `out`, and says whether that saves a third. Where not, nothing is appended: bytes as
+    /// they are take less time to read.
     pub fn encode(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> bool {
         let begin = out.len();
+        let most = bytes.len() / 3 * 2;
         self.0.fill(0);
         let (mut at, mut literals) = (0, 0);
         while at + 2 < bytes.len() {
@@ -76,12 +95,12 @@ impl Encoder {
             put_match(at - before, same, out);
             at += same;
             literals = at;
-            if out.len() - begin >= bytes.len() {
+            if out.len() - begin > most {
                 break;
             }
         }
         put_literals(&bytes[literals..], out);
-        let smaller = out.len() - begin < bytes.len();
+        let smaller = out.len() - begin <= most;
         if !smaller {
             out.truncate(begin);
         }

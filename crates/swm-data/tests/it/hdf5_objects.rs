@@ -1,0 +1,41 @@
+//! HDF5 files in object stores, read by ranges of bytes.
+
+use crate::{format_suite, objects};
+use swm_data::{Location, StepRange, WriteMode, open};
+
+#[test]
+fn a_file_in_a_bucket_and_on_a_web_server_is_read() {
+    let folder = tempfile::tempdir().expect("a folder");
+    std::fs::create_dir(folder.path().join("bucket")).expect("a bucket");
+    let path = folder.path().join("bucket/d.h5");
+    format_suite::write(&path, WriteMode::Create, 0..30);
+
+    let web = objects::serve(folder.path(), false);
+    let location = Location::parse(&format!("{web}/bucket/d.h5")).expect("a location");
+    let reader = open(&location).expect("opens");
+    assert_eq!(reader.episodes().len(), 30);
+    format_suite::check(&*reader, 0);
+    let here = open(&path).expect("opens");
+    assert_eq!(reader.content_hash().expect("hashes"), here.content_hash().expect("hashes"));
+    assert_eq!(reader.constants(7).expect("reads"), here.constants(7).expect("reads"));
+    // A batch in random order, some rows twice.
+    let ranges: Vec<StepRange> = (0..60).map(|i| StepRange::new(i * 7 % 30, i % 4, 2)).collect();
+    let names = ["pixels", "action", "state"];
+    let (near, far) = (here.read(&names, &ranges).expect("reads"), reader.read(&names, &ranges).expect("reads"));
+    (0..3).for_each(|column| assert!(near.bytes(column) == far.bytes(column), "{}", names[column]));
+
+    let bucket = objects::serve(folder.path(), true);
+    let output = objects::child("child_that_reads", &bucket, "s3://bucket/d.h5").output().expect("runs");
+    let text = objects::finished(&output);
+    assert!(text.contains("read 30 episodes"), "{text}");
+    let output = objects::child("child_that_reads", &bucket, "s3://bucket/none.h5").output().expect("runs");
+    let text = objects::finished(&output);
+    assert!(text.contains("failed: s3://bucket/none.h5"), "{text}");
+}
+
+#[test]
+fn nothing_is_written_to_a_web_server() {
+    let location = Location::parse("http://127.0.0.1:9/d.h5").expect("a location");
+    let error = format_suite::writer(&location, WriteMode::Create).err().expect("refused").to_string();
+    assert!(error.contains("hdf5") && error.contains("copy it"), "{error}");
+}

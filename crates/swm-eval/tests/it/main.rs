@@ -8,4 +8,5 @@ mod lance;
 mod line;
 mod memory;
 mod predicting;
+mod replaying;
 mod requesting;

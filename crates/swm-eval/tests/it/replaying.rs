@@ -1,0 +1,57 @@
+//! The online regime: a world collects into a replay buffer, a learner reads what is there.
+
+use crate::line::ENTRY;
+use crate::memory::Memory;
+use std::thread::scope;
+use swm_core::{RandomPolicy, VariationRequest};
+use swm_data::{ClipSpec, ReplayBuffer, ReplayConfig};
+use swm_eval::{CollectConfig, Control, World, WorldConfig};
+
+fn world() -> World {
+    let config = WorldConfig { envs: 3, image: Some((2, 3)), threads: 1, ..WorldConfig::default() };
+    World::new(&ENTRY, config).expect("a world")
+}
+
+fn config(episodes: usize) -> CollectConfig {
+    let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
+    CollectConfig { episodes, seed: 11, variation, policy: "random".to_owned(), goal: false }
+}
+
+#[test]
+fn a_world_collects_while_a_learner_reads_and_goes_on_later() {
+    let mut world = world();
+    let mut policy = RandomPolicy::new(world.spec(), 3);
+    let buffer = ReplayBuffer::new(&world.collect_schema(false).expect("schema"), 120).expect("a buffer");
+    let into = |world: &mut World, policy: &mut RandomPolicy, episodes| {
+        world.collect(policy, buffer.writer(), &config(episodes), &mut Control::default()).expect("collected")
+    };
+    into(&mut world, &mut policy, 5);
+    let columns = ["state", "action", "reward"].map(str::to_owned).to_vec();
+    let clip = ClipSpec { num_steps: 2, frameskip: 1, columns };
+    let loader = buffer.loader(ReplayConfig { clip, batch_size: 16, ..ReplayConfig::default() }).expect("a loader");
+    scope(|scope| {
+        let reading = scope.spawn(|| {
+            // Until episodes that were collected meanwhile have pushed out the first ones.
+            loader.batches(0).take(100_000).take_while(|batch| batch.is_ok() && buffer.added() < 60).count()
+        });
+        let collected = into(&mut world, &mut policy, 60);
+        assert_eq!((collected.episodes, collected.added), (60, 55), "it goes on behind the first five");
+        assert!(reading.join().is_ok());
+    });
+    // What is kept are the last episodes of the same collection into a dataset.
+    let memory = Memory::default();
+    let mut again = self::world();
+    let mut policy = RandomPolicy::new(again.spec(), 3);
+    again.collect(&mut policy, memory.writer(), &config(60), &mut Control::default()).expect("collected");
+    let expected = memory.episodes.lock().expect("lock");
+    let kept = buffer.snapshot();
+    assert!(kept.episodes().len() < 60 && buffer.rows() <= 120);
+    for (position, episode) in kept.episodes().iter().enumerate() {
+        let whole = [swm_data::StepRange::new(position, 0, episode.length)];
+        let read = kept.read(&["state", "reward"], &whole).expect("reads");
+        let of = &expected[episode.index as usize];
+        for (i, name) in ["state", "reward"].into_iter().enumerate() {
+            assert_eq!(read.bytes(i), of.bytes(of.schema().index(name).expect("a column")), "{name}");
+        }
+    }
+}

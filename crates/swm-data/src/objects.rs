@@ -5,6 +5,10 @@
 //! `AWS_SKIP_SIGNATURE=true` for public buckets; `GOOGLE_APPLICATION_CREDENTIALS`; `AZURE_STORAGE_ACCOUNT_NAME`,
 //! `AZURE_STORAGE_ACCOUNT_KEY`. Each kind of store is a feature of this crate.
 
+mod blocks;
+
+pub(crate) use blocks::{Blocks, Pieces};
+
 use crate::Location;
 use futures::FutureExt as _;
 use object_store::path::Path as StorePath;

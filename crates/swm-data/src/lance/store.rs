@@ -121,7 +121,7 @@ pub struct Store {
     /// Whether it is in an object store.
     pub remote: bool,
     /// Whether objects can be listed; a web server commonly cannot.
-    lists: bool,
+    pub lists: bool,
     base: StorePath,
     objects: Arc<ObjectStore>,
 }

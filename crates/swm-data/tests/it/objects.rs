@@ -181,6 +181,7 @@ fn a_web_server_is_read_and_not_written() {
     let reader = open(&location).expect("opens");
     assert_eq!(reader.episodes().len(), 5);
     check(&*reader, 0);
+    assert!(reader.footprint().is_ok_and(|parts| !parts.is_empty()), "without a list of files");
     let error = create(&location, &schema(), options(WriteMode::Append)).err().expect("refused").to_string();
     assert!(error.contains("cannot be written"), "{error}");
     let gone = Location::parse(&format!("{endpoint}/bucket/none.lance")).expect("a location");

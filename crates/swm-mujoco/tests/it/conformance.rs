@@ -4,6 +4,53 @@
 use swm_conformance::Worlds;
 use swm_mujoco::ENVS;
 
+/// What the reference announces and never applies.
+const ANNOUNCED: &str = "the reference never applies it";
+/// What has a mass needs no density.
+const MASS: &str = "its mass is given";
+/// Sites of groups that are not drawn.
+const HIDDEN: &str = "it is in a group that is not drawn";
+/// A planar world along whose y-axis nothing moves.
+const PLANAR: &str = "nothing moves along y";
+
+/// What shows later than a few steps from the start.
+const UNTOUCHED: &str = "nothing touches it so early";
+
+/// Factors that change nothing, in the reference as here, or not so early.
+const IDLE: &[(&str, &str, &str)] = &[
+    ("swm/AcrobotDMControl-v0", "agent.lower_arm_density", MASS),
+    ("swm/AcrobotDMControl-v0", "agent.upper_arm_density", MASS),
+    ("swm/AcrobotDMControl-v0", "agent.upper_arm_locked", ANNOUNCED),
+    ("swm/AcrobotDMControl-v0", "gravity.y", PLANAR),
+    ("swm/AcrobotDMControl-v0", "target.color", HIDDEN),
+    ("swm/AcrobotDMControl-v0", "target.shape", HIDDEN),
+    ("swm/BallInCupDMControl-v0", "ball.color", ANNOUNCED),
+    ("swm/BallInCupDMControl-v0", "rendering.render_target", HIDDEN),
+    ("swm/BallInCupDMControl-v0", "target.color", HIDDEN),
+    ("swm/BallInCupDMControl-v0", "target.shape", HIDDEN),
+    ("swm/CartpoleDMControl-v0", "agent.cart_shape", ANNOUNCED),
+    ("swm/CartpoleDMControl-v0", "agent.pole_density", MASS),
+    ("swm/CartpoleDMControl-v0", "gravity.y", PLANAR),
+    ("swm/CheetahDMControl-v0", "agent.back_foot_locked", ANNOUNCED),
+    ("swm/CheetahDMControl-v0", "gravity.y", PLANAR),
+    ("swm/FingerDMControl-v0", "spinner.density", UNTOUCHED),
+    ("swm/FingerDMControl-v0", "spinner.friction", UNTOUCHED),
+    ("swm/HopperDMControl-v0", "agent.foot_locked", ANNOUNCED),
+    ("swm/HopperDMControl-v0", "floor.friction", UNTOUCHED),
+    ("swm/HopperDMControl-v0", "gravity.y", PLANAR),
+    ("swm/HumanoidDMControl-v0", "agent.left_knee_locked", ANNOUNCED),
+    ("swm/ManipulatorDMControl-v0", "agent.upper_arm_length", ANNOUNCED),
+    ("swm/PendulumDMControl-v0", "agent.mass_density", MASS),
+    ("swm/PendulumDMControl-v0", "agent.mass_shape", ANNOUNCED),
+    ("swm/PendulumDMControl-v0", "agent.pole_density", MASS),
+    ("swm/PendulumDMControl-v0", "gravity.y", PLANAR),
+    ("swm/QuadrupedDMControl-v0", "agent.knee_back_left_locked", ANNOUNCED),
+    ("swm/QuadrupedDMControl-v0", "floor.friction", UNTOUCHED),
+    ("swm/ReacherDMControl-v0", "agent.finger_locked", ANNOUNCED),
+    ("swm/WalkerDMControl-v0", "agent.right_knee_locked", ANNOUNCED),
+    ("swm/WalkerDMControl-v0", "gravity.y", PLANAR),
+];
+
 static WORLDS: Worlds = Worlds {
     demonstrated: false,
     size: (24, 32),
@@ -14,7 +61,7 @@ static WORLDS: Worlds = Worlds {
     contexts: 1,
     requests: 1,
     resets: 20,
-    idle: &[],
+    idle: IDLE,
     ..Worlds::of(ENVS.rows)
 };
 

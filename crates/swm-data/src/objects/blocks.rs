@@ -228,7 +228,7 @@ mod tests {
                 let kept = blocks.kept();
                 assert!(kept.bytes <= 200 && kept.order.len() == kept.blocks.len());
             }
-            let gone = Pieces { path: "none".into(), size: 10, ranges: vec![0..4] };
+            let gone = Pieces { path: "none".into(), size: 10, ranges: vec![0..4, 5..6] };
             assert!(blocks.read(&store, &[gone]).await.is_err());
         });
     }

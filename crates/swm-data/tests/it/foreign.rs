@@ -70,7 +70,7 @@ fn floats(bytes: &[u8]) -> Vec<f32> {
 #[test]
 fn a_dataset_of_the_reference_opens_here() {
     check_theirs(&interop().join("reference.lance"), 3);
-    let text = open(&interop().join("reference-text.lance")).expect("opens");
+    let text = open(interop().join("reference-text.lance")).expect("opens");
     let names: Vec<&str> = text.schema().columns().iter().map(|c| c.name.as_str()).collect();
     assert_eq!(names, ["episode_idx", "step_idx", "state"], "text is left out");
 }

@@ -76,7 +76,7 @@ fn wrong_columns_and_rows_say_what_is_right() {
     assert!(wrong("state", StepRange::new(0, 3, 3)).contains("rows below 5"));
     let short = reader.read_column("state", &[StepRange::new(0, 0, 1)], &mut [0; 5]).expect_err("too small");
     assert!(short.to_string().contains("24 for 1 rows"), "{short}");
-    let missing = open(&folder.path().join("none.lance")).err().expect("no dataset").to_string();
+    let missing = open(folder.path().join("none.lance")).err().expect("no dataset").to_string();
     assert!(missing.contains("there is no such dataset"), "{missing}");
     let unknown = open(Path::new("/nowhere/at.all")).err().expect("no dataset").to_string();
     assert!(unknown.contains("no such dataset") && unknown.contains("lance"), "{unknown}");
@@ -156,7 +156,7 @@ fn another_schema_is_not_appended() {
 #[test]
 fn episodes_that_break_the_convention_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
-    let mut writer = create(&folder.path().join("d.lance"), &schema(), options(WriteMode::Create)).expect("creates");
+    let mut writer = create(folder.path().join("d.lance"), &schema(), options(WriteMode::Create)).expect("creates");
     let mut refuse = |change: &dyn Fn(&mut Batch), words: &str| {
         let mut bad = episode(2);
         change(&mut bad);
@@ -172,7 +172,7 @@ fn episodes_that_break_the_convention_are_refused() {
     writer.finish().expect("finishes");
 
     let discrete = Schema::new([ColumnSpec::new("action", DType::Int64, [])]).expect("schema");
-    let mut writer = create(&folder.path().join("i.lance"), &discrete, options(WriteMode::Create)).expect("creates");
+    let mut writer = create(folder.path().join("i.lance"), &discrete, options(WriteMode::Create)).expect("creates");
     let mut batch = Batch::zeros(&discrete, 3);
     assert!(writer.write_episode(&batch).expect_err("refused").to_string().contains("-1"));
     batch.get_mut::<i64>("action").expect("actions")[2] = -1;
@@ -189,7 +189,7 @@ fn the_content_hash_knows_content_not_files() {
     write(&path("b.lance"), WriteMode::Create, 100, 0..3);
     write(&path("b.lance"), WriteMode::Append, 100, 3..5);
     write(&path("c.lance"), WriteMode::Create, 1, 1..6);
-    let hash = |name: &str| open(&path(name)).expect("opens").content_hash().expect("a hash");
+    let hash = |name: &str| open(path(name)).expect("opens").content_hash().expect("a hash");
     assert_eq!(hash("a.lance"), hash("b.lance"));
     assert_ne!(hash("a.lance"), hash("c.lance"));
 }
@@ -208,7 +208,7 @@ fn pictures_can_be_lossless() {
         assert_eq!(read.bytes(0), episode(1).bytes(0));
     }
     let silly = WriteOptions { codec: ImageCodec::Jpeg { quality: 0 }, ..options(WriteMode::Create) };
-    let error = create(&folder.path().join("e.lance"), &schema(), silly).err().expect("refused");
+    let error = create(folder.path().join("e.lance"), &schema(), silly).err().expect("refused");
     assert!(error.is_usage());
 }
 

@@ -112,7 +112,7 @@ fn a_bucket_holds_datasets() {
     let output = child("child_that_writes_and_reads", &endpoint, "s3://bucket/runs/d.lance").output().expect("runs");
     let text = finished(&output);
     // What is in the bucket is the dataset as it would be on this machine.
-    let reader = open(&folder.path().join("bucket/runs/d.lance")).expect("opens");
+    let reader = open(folder.path().join("bucket/runs/d.lance")).expect("opens");
     check(&*reader, 2);
     assert!(text.contains(&reader.content_hash().expect("a hash")), "{text}");
     assert_eq!(std::fs::read_dir(folder.path().join("bucket/runs/d.lance/data")).expect("a folder").count(), 5);
@@ -162,7 +162,7 @@ fn processes_that_append_to_a_bucket_at_once_all_survive() {
     for child in children {
         finished(&child.wait_with_output().expect("ends"));
     }
-    let reader = open(&folder.path().join("bucket/d.lance")).expect("opens");
+    let reader = open(folder.path().join("bucket/d.lance")).expect("opens");
     let numbers: Vec<i64> = reader.episodes().iter().map(|episode| episode.index).collect();
     assert_eq!(numbers, (0..36).collect::<Vec<_>>());
     let firsts: Vec<StepRange> = (0..36).map(|at| StepRange::new(at, 0, 1)).collect();
@@ -187,7 +187,7 @@ fn a_web_server_is_read_and_not_written() {
     let gone = Location::parse(&format!("{endpoint}/bucket/none.lance")).expect("a location");
     assert!(open(&gone).is_err());
 
-    let bytes: Vec<u8> = (0..400_000_u32).map(|i| (i * i >> 5) as u8).collect();
+    let bytes: Vec<u8> = (0..400_000_u32).map(|i| ((i * i) >> 5) as u8).collect();
     std::fs::write(folder.path().join("bucket/file.h5"), &bytes).expect("writes");
     let file = Location::parse(&format!("{endpoint}/bucket/file.h5")).expect("a location");
     let file = ObjectFile::open(&file).expect("opens");

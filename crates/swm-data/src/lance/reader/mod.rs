@@ -48,14 +48,17 @@ pub struct LanceReader {
     files: Mutex<Recent<FileReader>>,
     /// Data files of this machine, open for reading.
     handles: Mutex<Recent<File>>,
-    /// Where pictures are, by fragment and name of the column; `None` where Lance must look.
-    places: Mutex<HashMap<(usize, String), Option<Arc<LaidOut>>>>,
+    /// Where pictures are.
+    places: Mutex<Places>,
     numbers: Mutex<Numbers>,
     /// What was fetched from an object store.
     blocks: Arc<Blocks>,
     /// Data files whose content was checked.
     verified: Mutex<HashSet<String>>,
 }
+
+/// By fragment and name of the column; `None` where pictures are laid out otherwise and Lance must look.
+type Places = HashMap<(usize, String), Option<Arc<LaidOut>>>;
 
 /// A row of the table, and the place in a batch that wants it.
 type Wanted<'a> = (u64, &'a mut [u8]);

@@ -17,7 +17,7 @@ use swm_core::ColumnSpec;
 /// Chunks larger than this are refused: nobody writes them, and damaged files promise any size.
 const LARGEST_CHUNK: u64 = 128 << 20;
 
-/// Rows of a contiguous dataset that are read at once.
+/// Bytes of a contiguous dataset that are read at once.
 const RUN: u64 = 1 << 20;
 
 thread_local! {
@@ -232,7 +232,7 @@ impl Column {
         match &self.place {
             Place::Compact => {
                 let all = guard("its data", || self.dataset.read_raw())?;
-                self.from_memory(&all, 0, wanted, &row_of)
+                self.copy_rows(&all, 0, wanted, &row_of)
             }
             Place::Contiguous(None) => {
                 wanted.iter_mut().for_each(|(_, place)| place.fill(0));
@@ -287,7 +287,7 @@ impl Column {
         runs.into_par_iter().enumerate().try_for_each(|(i, run)| {
             let first = row_of(run[0].0);
             if let Some(bytes) = fetched.get(i) {
-                return self.from_memory(bytes, first, run, row_of);
+                return self.copy_rows(bytes, first, run, row_of);
             }
             if let ([(_, place)], true) = (&mut *run, self.stored.is_plain()) {
                 return source.read(ranges[i].start, place).map_err(|e| e.to_string());
@@ -295,13 +295,13 @@ impl Column {
             BUFFERS.with_borrow_mut(|buffers| {
                 buffers.stored.resize((ranges[i].end - ranges[i].start) as usize, 0);
                 source.read(ranges[i].start, &mut buffers.stored).map_err(|e| e.to_string())?;
-                self.from_memory(&buffers.stored, first, run, row_of)
+                self.copy_rows(&buffers.stored, first, run, row_of)
             })
         })
     }
 
     /// Copies wanted rows from stored ones, the first of which is row `first`.
-    fn from_memory(
+    fn copy_rows(
         &self,
         stored: &[u8],
         first: u64,
@@ -342,7 +342,7 @@ impl Column {
             if let Some((tail, decoded)) = &index.tail
                 && *tail == row
             {
-                return self.from_memory(decoded, row * grid.rows, group, row_of);
+                return self.copy_rows(decoded, row * grid.rows, group, row_of);
             }
             BUFFERS.with_borrow_mut(|buffers| {
                 let Buffers { stored, chunk, numbers, scratch } = buffers;
@@ -365,7 +365,7 @@ impl Column {
                         grid.place(found.number, chunk, numbers);
                     }
                 }
-                self.from_memory(numbers, row * grid.rows, group, row_of)
+                self.copy_rows(numbers, row * grid.rows, group, row_of)
             })
         })
     }

@@ -8,12 +8,13 @@
 //! chunks is understood, and the filters that h5py and hdf5plugin are used with (`filters/`). `s3://` and `http://`
 //! locations are read by ranges, all those of a batch at once.
 //!
-//! **Writing.** Pictures are chunks of one row, compressed with LZF, which h5py reads without plugins: on drawn pictures
-//! it is as fast as no compression and takes a tenth of the space. Numbers gather in chunks of 8 KiB. Every chunk carries
-//! Fletcher's checksum, so that damage is found, by other programs as well. The structure is of the oldest kind (see
-//! `layout`), because it can be changed safely in place: chunks are written first, then what refers to them, then the
-//! lengths of the columns, and the length of `ep_len` at last, which commits the episodes. A file is sound at every
-//! moment; what a killed writer left behind is not counted, and overwritten by the next.
+//! **Writing.** Pictures are chunks of one row, compressed with LZF, which h5py reads without plugins: drawn pictures take
+//! a fiftieth of their space and are read faster than uncompressed ones. A chunk that would not become a third smaller
+//! (noise, photographs) is stored as it is. Numbers gather in chunks of 8 KiB. Every chunk carries Fletcher's checksum, so
+//! that damage is found, by other programs as well. The structure is of the oldest kind (see `layout`), because it can be
+//! changed safely in place: chunks are written first, then what refers to them, then the lengths of the columns, and the
+//! length of `ep_len` at last, which commits the episodes. A file is sound at every moment; what a killed writer left
+//! behind is not counted, and overwritten by the next.
 //!
 //! A writer holds the lock of the file. h5py asks for a lock to read as well, unless `HDF5_USE_FILE_LOCKING=FALSE`.
 //!

@@ -41,8 +41,8 @@ pub fn check(reader: &dyn Reader, first: usize) {
         let expected = episode(first + position);
         assert_eq!((stored.index, stored.length), (position as i64, expected.rows()));
         let read = reader.read(&names, &[StepRange::new(position, 0, stored.length)]).expect("reads");
-        for column in 0..names.len() {
-            assert!(read.bytes(column) == expected.bytes(column), "{} of episode {position}", names[column]);
+        for (column, name) in names.iter().enumerate() {
+            assert!(read.bytes(column) == expected.bytes(column), "{name} of episode {position}");
         }
     }
 }
@@ -64,7 +64,7 @@ pub fn all(name: &str) {
     one_writer_at_a_time(&other("busy-"));
     what_is_committed_is_read_while_it_is_written(&other("growing-"));
     numbers_of_every_type(&other("types-"));
-    assert!(open(&folder.path().join(format!("none-{name}"))).is_err(), "there is none");
+    assert!(open(folder.path().join(format!("none-{name}"))).is_err(), "there is none");
 }
 
 fn modes(path: &Path) {

@@ -137,7 +137,7 @@ fn has_numbers(reader: &dyn Reader, name: &str) {
 
 #[test]
 fn a_file_of_the_reference_opens_here() {
-    let reader = open(&interop("hdf5-reference.h5")).expect("opens");
+    let reader = open(interop("hdf5-reference.h5")).expect("opens");
     assert_eq!(reader.episodes().iter().map(|episode| episode.length).collect::<Vec<_>>(), LENGTHS);
     has_pictures(&*reader, "pixels");
     let types =
@@ -173,7 +173,7 @@ fn a_file_of_the_reference_opens_here() {
 
 #[test]
 fn every_filter_of_h5py_and_hdf5plugin_is_undone() {
-    let reader = open(&interop("hdf5-filters.h5")).expect("opens");
+    let reader = open(interop("hdf5-filters.h5")).expect("opens");
     let names: Vec<String> = reader.schema().columns()[2..].iter().map(|column| column.name.clone()).collect();
     assert_eq!(names.len(), 2 * 26);
     for name in names {
@@ -183,7 +183,7 @@ fn every_filter_of_h5py_and_hdf5plugin_is_undone() {
 
 #[test]
 fn every_layout_is_read() {
-    let reader = open(&interop("hdf5-layouts.h5")).expect("opens");
+    let reader = open(interop("hdf5-layouts.h5")).expect("opens");
     for name in ["contiguous", "one chunk", "fixed", "growing", "growing blocks"] {
         has_pictures(&*reader, name);
     }
@@ -201,7 +201,7 @@ fn every_layout_is_read() {
     (0..21).for_each(|t| assert_eq!(read.row(t).get::<u8>("truth").expect("a truth"), [u8::from(t % 3 == 0)]));
     assert!(reader.schema().column("text").is_err(), "text is left out");
 
-    let reader = open(&interop("hdf5-trees.h5")).expect("opens");
+    let reader = open(interop("hdf5-trees.h5")).expect("opens");
     has_pictures(&*reader, "growing");
     has_pictures(&*reader, "blocks");
     let read = column(&*reader, "partly written");
@@ -232,7 +232,7 @@ fn files_of_others_damaged_in_10000_ways_are_refused_or_read() {
 
 /// The columns of `hdf5-reference.h5`, and an episode of them.
 fn theirs() -> Batch {
-    let reader = open(&interop("hdf5-reference.h5")).expect("opens");
+    let reader = open(interop("hdf5-reference.h5")).expect("opens");
     let columns: Vec<ColumnSpec> = reader.schema().columns()[1..].to_vec();
     let names: Vec<&str> = columns.iter().map(|column| &*column.name).collect();
     reader.read(&names, &[StepRange::new(1, 0, LENGTHS[1])]).expect("reads")

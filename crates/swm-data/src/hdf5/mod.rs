@@ -11,7 +11,8 @@
 //! **Writing.** Pictures are chunks of one row, compressed with LZF, which h5py reads without plugins: drawn pictures take
 //! a fiftieth of their space and are read faster than uncompressed ones. A chunk that would not become a third smaller
 //! (noise, photographs) is stored as it is. Numbers gather in chunks of 8 KiB. Every chunk carries Fletcher's checksum, so
-//! that damage is found, by other programs as well. The structure is of the oldest kind (see `layout`), because it can be
+//! that damage is found, by other programs as well (all but words of 0xffff where 0x0000 stood, to which that sum is
+//! blind). The structure is of the oldest kind (see `layout`), because it can be
 //! changed safely in place: chunks are written first, then what refers to them, then the lengths of the columns, and the
 //! length of `ep_len` at last, which commits the episodes. A file is sound at every moment; what a killed writer left
 //! behind is not counted, and overwritten by the next.

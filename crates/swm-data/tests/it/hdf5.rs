@@ -32,7 +32,10 @@ fn damaged(cases: u64) {
     let path = folder.path().join("d.h5");
     format_suite::write(&path, WriteMode::Create, 0..3);
     let report = fuzz::dataset("hdf5", &path, cases, fuzz::read_everything);
-    assert!(report.changed.is_empty(), "{:#?}", report.changed);
+    // Fletcher's sum is modulo 65535: it does not tell words of 0xffff from those of 0x0000.
+    let blind = |change: &&String| change.contains("[ff, ff] written") || change.contains("[ff, ff, ff, ff] written");
+    let (unseen, changed): (Vec<&String>, Vec<&String>) = report.changed.iter().partition(blind);
+    assert!(changed.is_empty() && unseen.len() as u64 <= 1 + cases / 2000, "{changed:#?} {unseen:#?}");
     assert!(report.refused as u64 > cases / 2, "{} refused, {} the same", report.refused, report.same);
 }
 

@@ -98,6 +98,8 @@ pub(super) fn parts<D: Domain>(choice: &EnvChoice) -> Result<(EnvSpec, Arc<MjMod
     let mut seen = Seen { row: &mut row, written: 0 };
     domain.observe(&physics, &mut seen);
     let observed = seen.written;
+    let mut target = vec![0.0; D::TARGET];
+    domain.target(&physics, &mut target);
 
     let (nq, nv) = (physics.data().qpos().len(), physics.data().qvel().len());
     let ranges = model.actuator_ctrlrange().to_vec();
@@ -123,16 +125,8 @@ pub(super) fn parts<D: Domain>(choice: &EnvChoice) -> Result<(EnvSpec, Arc<MjMod
         cameras: vec![],
     };
     let coordinates = Coordinates::new(&model, D::IDLE);
-    let control = Control {
-        domain,
-        task,
-        blueprint,
-        coordinates,
-        ranges,
-        score: 0.0,
-        target: vec![0.0; D::TARGET],
-        goal: vec![0.0; nq + nv],
-    };
+    let control =
+        Control { domain, task, blueprint, coordinates, ranges, score: 0.0, target, goal: vec![0.0; nq + nv] };
     Ok((spec, model, control))
 }
 
@@ -215,6 +209,8 @@ impl<D: Domain> Task for Control<D> {
         }
         physics.repaint();
         self.domain.adapt(physics);
+        // A target stays where it is, whatever the model was compiled with.
+        self.domain.place(physics, &self.target);
         Ok(())
     }
 
@@ -281,9 +277,7 @@ impl<D: Domain> Task for Control<D> {
     fn recall(&mut self, physics: &mut Physics, memory: &[f64]) {
         self.score = memory[0];
         self.target.copy_from_slice(&memory[1..]);
-        if D::TARGET > 0 {
-            self.domain.place(physics, &self.target);
-        }
+        self.domain.place(physics, &self.target);
     }
 
     fn goal_len(&self) -> usize {

@@ -3,7 +3,7 @@
 
 use super::colour;
 use super::mp4::{self, Codec, Index};
-use ffmpeg_next::codec::{self, Compliance, threading};
+use ffmpeg_next::codec::{self, Compliance, Flags, threading};
 use ffmpeg_next::decoder::{self, Check};
 use ffmpeg_next::format::Pixel;
 use ffmpeg_next::software::scaling;
@@ -204,7 +204,7 @@ impl Decoders {
         runs.into_par_iter().with_max_len(1).try_for_each(|run| {
             let Some(Job { video, .. }) = run.first() else { return Ok(()) };
             let video = *video;
-            let mut decoder = self.take(&video.index)?;
+            let mut decoder = self.take(video)?;
             // After a failure the decoder's state is anybody's guess; it is dropped.
             decoder.run(video, run).map_err(|problem| damaged(video.source.label(), &problem))?;
             self.give_back(decoder);
@@ -212,13 +212,30 @@ impl Decoders {
         })
     }
 
-    fn take(&self, index: &Index) -> Result<Decoder> {
+    /// Checks that the first frame has the size that the header says. Who makes room for pictures of an unknown file
+    /// asks this first.
+    ///
+    /// # Errors
+    /// When it has another, or cannot be decoded.
+    pub fn check_size(&self, video: &Video) -> Result<()> {
+        let mut decoder = self.take(video)?;
+        let found = decoder.first_size(video).map_err(|problem| video.damaged(&problem))?;
+        if found != video.size() {
+            return Err(
+                video.damaged(&format!("has frames of {found:?} pixels, unlike the {:?} of its header", video.size()))
+            );
+        }
+        self.give_back(decoder);
+        Ok(())
+    }
+
+    fn take(&self, video: &Video) -> Result<Decoder> {
         let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
-        match idle.iter().rposition(|decoder| decoder.serves(index)) {
+        match idle.iter().rposition(|decoder| decoder.serves(&video.index)) {
             Some(i) => Ok(idle.remove(i)),
             None => {
                 drop(idle);
-                Decoder::new(index)
+                Decoder::new(video)
             }
         }
     }
@@ -243,15 +260,15 @@ struct Decoder {
 }
 
 impl Decoder {
-    fn new(index: &Index) -> Result<Self> {
-        super::quiet();
+    fn new(video: &Video) -> Result<Self> {
+        let index = &video.index;
+        super::prepare();
         let id = match index.codec {
             Codec::H264 => codec::Id::H264,
             Codec::Hevc => codec::Id::HEVC,
             Codec::Vp9 => codec::Id::VP9,
             Codec::Av1 => codec::Id::AV1,
         };
-        let failed = |e: ffmpeg_next::Error| Error::external("opening a video decoder", e);
         // FFmpeg's own AV1 decoder needs special hardware.
         let named = (index.codec == Codec::Av1).then(|| decoder::find_by_name("libdav1d")).flatten();
         let Some(found) = named.or_else(|| decoder::find(id)) else {
@@ -266,12 +283,15 @@ impl Decoder {
         // are reordered is not taken to mean "not at all". What is damaged is refused, not concealed.
         context.set_threading(threading::Config::count(1));
         context.compliance(Compliance::Strict);
+        // Frames after a key frame that forgets nothing are held back otherwise; we know which ones it suffices for.
+        context.set_flags(Flags::OUTPUT_CORRUPT);
         let mut decoder = context.decoder();
         decoder.check(Check::CRC | Check::BITSTREAM | Check::BUFFER | Check::EXPLODE);
         // Damaged headers may promise any size; coded pictures are padded to whole blocks.
         let mut options = Dictionary::new();
         options.set("max_pixels", &((index.width + 256) * (index.height + 256)).to_string());
-        let inner = decoder.open_as_with(found, options).and_then(|opened| opened.video()).map_err(failed)?;
+        let inner = decoder.open_as_with(found, options).and_then(|opened| opened.video());
+        let inner = inner.map_err(|e| video.damaged(&format!("has a header that the decoder refuses: {e}")))?;
         Ok(Self {
             codec: index.codec,
             extradata: Arc::clone(&index.extradata),
@@ -331,6 +351,20 @@ impl Decoder {
             ));
         }
         Ok(())
+    }
+
+    /// Height and width of the first frame.
+    fn first_size(&mut self, video: &Video) -> Result<(usize, usize), String> {
+        let (mut open, _) = video.source.open().map_err(|e| e.to_string())?;
+        let Some(sample) = video.index.samples.first() else { return Err("has no frame".to_owned()) };
+        self.coded.resize(sample.size as usize, 0);
+        open.read(sample.offset, &mut self.coded)?;
+        video.index.check(0, &self.coded)?;
+        self.inner.skip_frame(Discard::Default);
+        let sent = self.inner.send_packet(&Packet::copy(&self.coded)).and_then(|()| self.inner.send_eof());
+        sent.and_then(|()| self.inner.receive_frame(&mut self.frame)).map_err(|e| format!("cannot be decoded: {e}"))?;
+        self.inner.flush();
+        Ok((self.frame.height() as usize, self.frame.width() as usize))
     }
 
     /// Takes what the decoder has finished, and puts it where it is wanted.
@@ -413,5 +447,76 @@ fn set_extradata(context: &mut codec::Context, bytes: &[u8]) {
         let context = context.as_mut_ptr();
         (*context).extradata = memory;
         (*context).extradata_size = length;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The frames of `tests/interop/odd-NAME.mp4`, as another program decoded them, and the video.
+    fn odd(name: &str) -> (Vec<u8>, Video) {
+        let place = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop").join(format!("odd-{name}"));
+        let file = std::io::BufReader::new(File::open(place.with_extension("png")).expect("opens"));
+        let mut png = png::Decoder::new(file).read_info().expect("a PNG");
+        let mut expected = vec![0; png.output_buffer_size().expect("a size")];
+        png.next_frame(&mut expected).expect("a picture");
+        (expected, Video::open(Source::File(place.with_extension("mp4"))).expect("opens"))
+    }
+
+    #[test]
+    fn any_frame_of_any_video_is_found() {
+        let decoders = Decoders::default();
+        for (name, tolerance) in [("times", 0), ("hevc", 0), ("deep", 2)] {
+            let (expected, video) = odd(name);
+            assert_eq!((video.frames(), video.size()), (14, (32, 48)), "{name}");
+            let size = 32 * 48 * 3;
+            let bytes: Arc<[u8]> = std::fs::read(video.source.label()).expect("reads").into();
+            let same = Video::open(Source::Memory("a blob".into(), bytes)).expect("opens");
+            // Each alone, then all at once, backwards, from a file and from memory, and some twice.
+            let orders: [Vec<usize>; 3] = [(0..14).collect(), (0..14).rev().collect(), vec![9, 3, 9, 13, 0, 3]];
+            for (i, order) in orders.into_iter().enumerate() {
+                let mut out = vec![7; order.len() * size];
+                let video = if i == 1 { &same } else { &video };
+                let frames = order.iter().zip(out.chunks_exact_mut(size));
+                let wanted: Vec<Wanted<'_>> = frames.map(|(&frame, out)| Wanted { video, frame, out }).collect();
+                if i == 0 {
+                    wanted.into_iter().for_each(|wanted| decoders.read(vec![wanted]).expect("decodes"));
+                } else {
+                    decoders.read(wanted).expect("decodes");
+                }
+                for (&frame, found) in order.iter().zip(out.chunks_exact(size)) {
+                    let worst = found.iter().zip(&expected[frame * size..]).map(|(a, b)| a.abs_diff(*b)).max();
+                    assert!(worst <= Some(tolerance), "{name}, frame {frame}: off by {worst:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn frames_are_found_by_time() {
+        let (_, video) = odd("times");
+        for t in 0..14 {
+            let time = f64::from(350 + 40 * t + 11 * t * t) / 1000.0;
+            let (frame, away) = video.frame_at(time + 0.004).expect("has frames");
+            assert_eq!(frame, t as usize);
+            assert!((away - 0.004).abs() < 1e-3, "{away}");
+        }
+        assert_eq!(video.frame_at(-5.0).map(|(frame, _)| frame), Some(0));
+        assert_eq!(video.frame_at(99.0).map(|(frame, _)| frame), Some(13));
+    }
+
+    #[test]
+    fn what_is_not_there_is_said() {
+        let (_, video) = odd("times");
+        let mut out = vec![0; 32 * 48 * 3];
+        let error = |frame, out: &mut [u8]| {
+            let wanted = vec![Wanted { video: &video, frame, out }];
+            Decoders::default().read(wanted).expect_err("fails").to_string()
+        };
+        assert!(error(14, &mut out).contains("14 frames"));
+        assert!(error(0, &mut out[1..]).contains("48 x 32"));
+        let png = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/odd-times.png");
+        assert!(Video::open(Source::File(png)).expect_err("a picture").to_string().contains("no MP4"));
     }
 }

@@ -1,4 +1,4 @@
-//! Frames in, an MP4 file out.
+//! Frames in, an MP4 file of H.264 out.
 
 use super::colour;
 use super::mp4;
@@ -14,19 +14,11 @@ use swm_core::{Error, Result};
 /// How frames become a video.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Encoding {
-    pub codec: VideoCodec,
     pub quality: Quality,
     /// Frames from one key frame to the next. A random frame costs half of them to decode.
     pub gop: u32,
     /// Whether pictures may depend on later ones, and other tools that make files smaller and decoding slower.
     pub small: bool,
-}
-
-/// With what a video is encoded.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum VideoCodec {
-    H264,
-    Av1,
 }
 
 /// What is lost.
@@ -47,33 +39,28 @@ impl Encoding {
             ImageCodec::Jpeg { quality } => Quality::Crf((8 + 2 * 100_u8.saturating_sub(quality.max(50))).min(51)),
             _ => Quality::Lossless,
         };
-        Self { codec: VideoCodec::H264, quality, gop: TRAINING_GOP, small: false }
+        Self { quality, gop: TRAINING_GOP, small: false }
     }
 
     /// For people: small files that browsers play.
     pub const fn viewing() -> Self {
-        Self { codec: VideoCodec::H264, quality: Quality::Crf(18), gop: 250, small: true }
+        Self { quality: Quality::Crf(18), gop: 250, small: true }
     }
 
     /// The encoder's name, the pixels it is given, and its options.
     fn settings(self, even: bool) -> (&'static str, Pixel, Vec<(&'static str, String)>) {
         let pixels = if even { Pixel::YUV420P } else { Pixel::YUV444P };
-        match (self.codec, self.quality) {
-            // Lossless keeps red, green and blue as they are.
-            (VideoCodec::H264, Quality::Lossless) => {
+        match self.quality {
+            // Red, green and blue stay as they are.
+            Quality::Lossless => {
                 ("libx264rgb", Pixel::RGB24, vec![("qp", "0".to_owned()), ("preset", "veryfast".to_owned())])
             }
-            (VideoCodec::H264, Quality::Crf(crf)) => {
+            Quality::Crf(crf) => {
                 let mut options = vec![("crf", crf.to_string()), ("preset", "medium".to_owned())];
                 if !self.small {
                     options.push(("tune", "fastdecode".to_owned()));
                 }
                 ("libx264", pixels, options)
-            }
-            (VideoCodec::Av1, quality) => {
-                let crf = if let Quality::Crf(crf) = quality { crf } else { 0 };
-                let options = vec![("crf", crf.to_string()), ("cpu-used", "8".to_owned()), ("row-mt", "0".to_owned())];
-                ("libaom-av1", pixels, options)
             }
         }
     }
@@ -131,7 +118,7 @@ pub struct Film {
 impl Film {
     /// A video of frames of `width` by `height` pixels.
     pub fn begin(width: usize, height: usize, fps: u32, encoding: Encoding) -> Result<Self> {
-        super::quiet();
+        super::prepare();
         let even = width.is_multiple_of(2) && height.is_multiple_of(2);
         let (name, pixels, settings) = encoding.settings(even);
         let Some(codec) = encoder::find_by_name(name) else {

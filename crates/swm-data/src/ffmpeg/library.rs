@@ -54,6 +54,32 @@ impl<K: Clone + Eq + Hash + Send + Sync> Library<K> {
         Ok(video)
     }
 
+    /// Height and width of a video's pictures: its first frame has the size that its header says.
+    ///
+    /// # Errors
+    /// When it has not, or the video cannot be opened.
+    pub fn size(&self, key: &K, source: impl FnOnce() -> Result<Source>) -> Result<(usize, usize)> {
+        let video = self.get(key, source)?;
+        self.decoders.check_size(&video)?;
+        Ok(video.size())
+    }
+
+    /// What is wrong with the video of an episode's column, in words: it cannot be opened, or has not a frame for every
+    /// row.
+    pub fn irregularity(
+        &self,
+        key: &K,
+        source: impl FnOnce() -> Result<Source>,
+        column: &str,
+        rows: usize,
+    ) -> Option<String> {
+        match self.get(key, source) {
+            Ok(video) if video.frames() == rows => None,
+            Ok(video) => Some(format!("the video of '{column}' has {} frames for {rows} rows", video.frames())),
+            Err(error) => Some(error.to_string()),
+        }
+    }
+
     /// Decodes rows of pictures. Each is wanted as `(its video, what says which frame, where to)`; equal videos follow
     /// each other. `source` opens a video, `frame` finds the frame in it.
     ///

@@ -52,9 +52,14 @@ pub fn absent(what: &str, feature: &str) -> swm_core::Error {
     swm_core::Error::config(what, format!("this build lacks the feature {feature}"), fix)
 }
 
-/// Keeps FFmpeg's libraries from writing to standard error: what went wrong is said in our errors.
+/// Prepares FFmpeg's libraries, once: errors get their words, and nothing is written to standard error, as what went
+/// wrong is said in our errors.
 #[cfg(feature = "ffmpeg")]
-fn quiet() {
+fn prepare() {
     static ONCE: std::sync::Once = std::sync::Once::new();
-    ONCE.call_once(|| ffmpeg_next::log::set_level(ffmpeg_next::log::Level::Quiet));
+    ONCE.call_once(|| {
+        // It only fills a table of words; nothing in it can fail.
+        let _ = ffmpeg_next::init();
+        ffmpeg_next::log::set_level(ffmpeg_next::log::Level::Quiet);
+    });
 }

@@ -3,7 +3,7 @@
 use super::{SCHEMA, VIDEO, table};
 use crate::episodes::Rows;
 use crate::ffmpeg::{Library, Source};
-use crate::format::{Constants, Episode, Reader, StepRange};
+use crate::format::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::lance;
 use crate::location::Location;
 use std::path::PathBuf;
@@ -90,6 +90,20 @@ impl Reader for LanceVideoReader {
         let mut constants = self.numbers.constants(episode)?;
         constants.retain(|name, _| name != SCHEMA && !name.starts_with(VIDEO));
         Ok(constants)
+    }
+
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
+        let cameras = self.schema.columns().iter().enumerate().filter(|(_, column)| column.is_image());
+        let found = cameras.flat_map(|(index, column)| {
+            self.episodes().iter().enumerate().filter_map(move |(position, episode)| {
+                let key = (index, position);
+                let what = self.library.irregularity(&key, || self.source(&key), &column.name, episode.length)?;
+                Some(Irregularity { episode: Some(position), what })
+            })
+        });
+        let mut all = self.numbers.irregularities()?;
+        all.extend(found);
+        Ok(all)
     }
 
     fn manifest(&self) -> Option<Manifest> {

@@ -278,7 +278,7 @@ pub fn fill(template: &str, key: &str, numbers: &[(&str, usize)]) -> String {
     let mut rest = template;
     while let Some((before, after)) = rest.split_once('{') {
         filled.push_str(before);
-        let Some((field, after)) = after.split_once('}') else { break };
+        let (field, after) = after.split_once('}').unwrap_or((after, ""));
         let (name, form) = field.split_once(':').unwrap_or((field, ""));
         if name == "video_key" || name == "image_key" {
             filled.push_str(key);

@@ -91,6 +91,19 @@ impl LerobotReader {
         let recorded = info.stable_worldmodel.as_ref().map(|recorded| recorded.schema.columns()).unwrap_or_default();
         let specs: Vec<ColumnSpec> =
             numbering(recorded).into_iter().chain(columns.iter().map(|column| column.spec.clone())).collect();
+        // Room is made for pictures of the promised size.
+        let library = Library::default();
+        for column in &columns {
+            if let (Kind::Video(feature), Some(place)) = (column.kind, places.iter().find(|place| place.length > 0)) {
+                let path = &place.videos[feature].0;
+                let size = library.size(path, || Ok(Source::File(path.clone())))?;
+                if [size.0, size.1] != column.spec.shape[..2] {
+                    let problem =
+                        format!("camera '{}' has pictures of {size:?}, not {:?}", column.native, column.spec.shape);
+                    return Err(damaged(root, problem));
+                }
+            }
+        }
         Ok(Self {
             root: root.to_owned(),
             fps,
@@ -102,7 +115,7 @@ impl LerobotReader {
             places,
             files,
             timestamps: OnceLock::new(),
-            library: Library::default(),
+            library,
             info,
         })
     }
@@ -311,7 +324,12 @@ impl Reader for LerobotReader {
     fn read(&self, columns: &[&str], ranges: &[StepRange]) -> Result<Batch> {
         // As the trait's own, but native names are known as well.
         let spec = |name: &&str| -> Result<ColumnSpec> {
-            let known = &self.specs[self.index(name)?];
+            let index = self.index(name)?;
+            let known = &self.specs[index];
+            // Nothing is made room for before the files have it.
+            if let Some(place) = index.checked_sub(2).filter(|&place| self.columns[place].kind == Kind::Numbers) {
+                self.data(place)?;
+            }
             Ok(ColumnSpec::new(*name, known.dtype, known.shape.clone()))
         };
         let specs: Result<Vec<ColumnSpec>> = columns.iter().map(spec).collect();

@@ -3,8 +3,8 @@
 use super::file;
 use crate::column_files::{ColumnFiles, is_there};
 use crate::episodes::content_hash;
-use crate::ffmpeg::{Library, Source, Video};
-use crate::format::{Constants, Episode, Reader, StepRange};
+use crate::ffmpeg::{Library, Source};
+use crate::format::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::location::Location;
 use std::path::Path;
 use std::sync::Arc;
@@ -66,6 +66,18 @@ impl Reader for VideoReader {
         self.files.constants(episode)
     }
 
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
+        let cameras = self.schema.columns().iter().enumerate().filter(|(_, column)| column.is_image());
+        let found = cameras.flat_map(|(index, column)| {
+            self.episodes().iter().enumerate().filter_map(move |(position, episode)| {
+                let key = (index, position);
+                let what = self.library.irregularity(&key, || self.source(&key), &column.name, episode.length)?;
+                Some(Irregularity { episode: Some(position), what })
+            })
+        });
+        Ok(found.collect())
+    }
+
     fn manifest(&self) -> Option<Manifest> {
         self.files.manifest()
     }
@@ -107,7 +119,8 @@ fn foreign_pictures(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
         let entry = entry.map_err(io)?;
         let Ok(name) = entry.file_name().into_string() else { continue };
         if entry.path().is_dir() {
-            let (height, width) = Video::open(Source::File(file(folder, &name, first)))?.size();
+            let source = Source::File(file(folder, &name, first));
+            let (height, width) = Library::default().size(&(), || Ok(source))?;
             columns.push(ColumnSpec::image(name, height, width));
         }
     }

@@ -64,6 +64,23 @@ fn foreign_videos_damaged_in_10000_ways_are_survived() {
     foreign_damaged(10_000);
 }
 
+#[test]
+fn videos_of_other_lengths_are_told() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("d.video");
+    format_suite::write(&path, WriteMode::Create, 0..4);
+    let found = |path: &Path| open(path).expect("opens").irregularities().expect("looks");
+    assert_eq!(found(&path), []);
+    std::fs::copy(path.join("pixels/ep_3.mp4"), path.join("pixels/ep_1.mp4")).expect("copies");
+    std::fs::remove_file(path.join("goal/ep_2.mp4")).expect("removes");
+    let found = found(&path);
+    assert_eq!(found.iter().map(|found| found.episode).collect::<Vec<_>>(), [Some(1), Some(2)]);
+    assert!(found[0].what.contains("8 frames for 6 rows"), "{found:?}");
+    let message =
+        open(&path).expect("opens").read(&["goal"], &[StepRange::new(2, 0, 1)]).expect_err("is gone").to_string();
+    assert!(message.contains("ep_2.mp4"), "{message}");
+}
+
 pub fn interop() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop")
 }

@@ -34,6 +34,7 @@ const GAP: u64 = 128 << 10;
 const REQUESTS: usize = 32;
 
 /// How long a store that does not answer is asked again: about six seconds in all.
+#[cfg_attr(not(any(feature = "s3", feature = "gs", feature = "az", feature = "http")), allow(unused))]
 fn patience() -> RetryConfig {
     RetryConfig { max_retries: 6, retry_timeout: Duration::from_secs(60), ..RetryConfig::default() }
 }
@@ -82,6 +83,7 @@ pub fn store(location: &Location) -> Result<(Arc<dyn ObjectStore>, StorePath)> {
     }
 }
 
+#[cfg_attr(not(any(feature = "s3", feature = "gs", feature = "az", feature = "http")), allow(unused))]
 fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
     let wrong = |e: object_store::Error| {
         let fix = "the environment says how it is reached, such as AWS_ENDPOINT_URL, AWS_REGION and AWS_ACCESS_KEY_ID";

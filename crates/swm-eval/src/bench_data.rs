@@ -133,10 +133,10 @@ const JPEG: ImageCodec = ImageCodec::Jpeg { quality: 95 };
 const LAYOUTS: [Layout; 6] = [
     layout("lance, jpeg", "lance", JPEG, "jpeg.lance", "lance", "theirs.lance"),
     layout("lance, lossless", "lance", LOSSLESS, "lossless.lance", "lance", "theirs.lance"),
-    layout("lance-video", "lance-video", LOSSLESS, "video.lance", "lance", "theirs.lance"),
+    layout("lance-video", "lance-video", LOSSLESS, "ours.lance-video", "lance", "theirs.lance"),
     layout("hdf5", "hdf5", LOSSLESS, "ours.h5", "hdf5", "theirs.h5"),
-    layout("video", "video", LOSSLESS, "video", "video", "their-video"),
-    layout("folder", "folder", JPEG, "folder", "folder", "their-folder"),
+    layout("video", "video", LOSSLESS, "ours.video", "video", "their-video"),
+    layout("folder", "folder", JPEG, "ours.folder", "folder", "their-folder"),
 ];
 
 /// What pictures are stored as unless somebody asks for something else.

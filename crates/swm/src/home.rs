@@ -24,7 +24,7 @@ pub fn checkpoints() -> PathBuf {
 }
 
 /// What names under [`datasets`] may end in, and need not be given with; the first is what a new one gets.
-const SUFFIXES: [&str; 4] = ["lance", "h5", "hdf5", ""];
+const SUFFIXES: [&str; 8] = ["lance", "h5", "hdf5", "lance-video", "video", "folder", "lerobot", ""];
 
 /// The place of a dataset given as a path or as a name under [`datasets`].
 pub fn dataset(given: &str) -> PathBuf {
@@ -97,6 +97,19 @@ pub fn names_in(folder: &Path) -> Vec<String> {
     names
 }
 
+/// Where a dataset of a format is to be written that is given as a path, as a URI, or as a name under [`datasets`].
+///
+/// # Errors
+/// As [`location`].
+pub fn target(given: &str, format: Option<&str>) -> Result<Location> {
+    match format {
+        Some(format) if !given.contains("://") => {
+            Ok(named(given, datasets(), if format == "hdf5" { "h5" } else { format }).into())
+        }
+        _ => location(given),
+    }
+}
+
 /// What has a folder in it, an extension, or exists is a path; the rest are names.
 fn named(given: &str, folder: PathBuf, extension: &str) -> PathBuf {
     let path = Path::new(given);
@@ -115,6 +128,10 @@ mod tests {
         assert_eq!(dataset("a/b.lance"), Path::new("a/b.lance"));
         assert_eq!(dataset("./b"), Path::new("./b"));
         assert_eq!(dataset("rooms"), datasets().join("rooms.lance"));
+        let written = |name, format| target(name, format).expect("a place").to_string();
+        assert_eq!(written("rooms", Some("hdf5")), datasets().join("rooms.h5").to_string_lossy());
+        assert_eq!(written("a/rooms", Some("video")), "a/rooms");
+        assert_eq!(written("rooms", None), datasets().join("rooms.lance").to_string_lossy());
         assert_eq!(checkpoint("lewm-rooms"), checkpoints().join("lewm-rooms"));
     }
 }

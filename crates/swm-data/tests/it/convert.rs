@@ -34,9 +34,8 @@ fn source(folder: &Path) -> PathBuf {
 /// A place whose name every format accepts as its own.
 fn place(folder: &Path, format: &str) -> PathBuf {
     folder.join(match format {
-        "lance" | "lance-video" => format!("to-{format}.lance"),
         "hdf5" => "to.h5".to_owned(),
-        other => format!("to-{other}"),
+        other => format!("to.{other}"),
     })
 }
 

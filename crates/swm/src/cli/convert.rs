@@ -32,7 +32,7 @@ pub struct ConvertArgs {
 pub struct TargetArgs {
     /// The format (default: the one the target's name says); `swm formats` lists them
     #[arg(long, value_name = "NAME")]
-    format: Option<String>,
+    pub format: Option<String>,
     /// How pictures are stored, where the format leaves a choice
     #[arg(long, value_enum, default_value_t = Codec::Qoi)]
     codec: Codec,
@@ -90,7 +90,7 @@ pub fn convert(args: &ConvertArgs, context: &Context) -> anyhow::Result<()> {
     };
     let options = ConvertOptions { verify: !args.no_verify, ..args.target_args.options(mode) };
     let reader = home::open_dataset(&args.source)?;
-    let target = home::location(&args.target)?;
+    let target = home::target(&args.target, args.target_args.format.as_deref())?;
     let begun = Instant::now();
     let report = swm_data::convert(&reader, &target, &options, &mut progress(context))?;
     if context.json {

@@ -50,7 +50,7 @@ pub fn doctor(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
         emit(&report(&diagnosis));
     }
     if let Some(target) = &args.repair {
-        let target = home::location(target)?;
+        let target = home::target(target, args.target.format.as_deref())?;
         let begun = Instant::now();
         let options = args.target.options(ConvertMode::Resume);
         let converted = repair(&reader, &diagnosis, &target, &options, &mut progress(context))?;

@@ -39,6 +39,11 @@ const STATE: u32 = mjtState::mjSTATE_TIME as u32
 const UNSTABLE: [mjtWarning; 4] =
     [mjtWarning::mjWARN_BADQPOS, mjtWarning::mjWARN_BADQVEL, mjtWarning::mjWARN_BADQACC, mjtWarning::mjWARN_BADCTRL];
 
+/// Numbers of a state of this model ([`Physics::state`]).
+pub fn state_len(model: &MjModel) -> usize {
+    model.state_size(STATE)
+}
+
 /// Compiles a model from a file.
 ///
 /// # Errors

@@ -1,4 +1,4 @@
-//! The worlds of OGBench: tables with an arm, and mazes.
+#![doc = include_str!("README.md")]
 mod arm;
 mod floor;
 mod maze;

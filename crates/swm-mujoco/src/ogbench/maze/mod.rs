@@ -116,6 +116,7 @@ pub fn make(choice: &EnvChoice) -> Result<Box<dyn Env>> {
         action_space: Space::uniform_box([actions], DType::Float32, -1.0, 1.0),
         columns: vec![
             float("observation", observation),
+            float("goal_state", physics::state_len(&model) + MEMORY + nq + nv),
             float("xy", 2),
             float("prev_qpos", nq),
             float("prev_qvel", nv),
@@ -203,6 +204,11 @@ fn xy(physics: &Physics) -> Xy {
     [physics.data().qpos()[0], physics.data().qpos()[1]]
 }
 
+/// A number that single precision, in which datasets may keep states, holds.
+fn luck(rng: &mut Rng) -> u32 {
+    rng.random_range(0..1 << 24)
+}
+
 fn apart(a: Xy, b: Xy) -> f64 {
     (a[0] - b[0]).hypot(a[1] - b[1])
 }
@@ -237,7 +243,7 @@ impl Maze {
         if entrances.iter().any(|&entrance| apart(xy(physics), middle(entrance)) <= TAKEN) {
             let mut rng = Key::new(u64::from(self.luck)).with("teleport").rng();
             let exit = middle(exits[rng.random_range(0..exits.len())]);
-            self.luck = rng.random();
+            self.luck = luck(&mut rng);
             physics.data_mut().qpos_mut()[..2].copy_from_slice(&exit);
             physics.forward();
         }
@@ -303,7 +309,7 @@ impl Task for Maze {
         let mut near = |cell, by: f64| middle(cell).map(|at| at + rng.random_range(-by..=by));
         let start = near(start, JITTER);
         let goal = near(goal, if self.jitter_goal { JITTER } else { 0.0 });
-        self.luck = rng.random();
+        self.luck = luck(rng);
         // First the pose at the goal, then the start.
         self.unsettle(physics, rng);
         physics.forward();
@@ -339,10 +345,15 @@ impl Task for Maze {
             observation[qpos.len()..].copy_from_slice(qvel);
         }
         let (previous_qpos, previous_qvel) = self.previous.split_at(qpos.len());
+        let (state, memory) = row.at::<f64>(FIRST + 1).split_at_mut(physics.state_len());
+        physics.state(state);
+        state[1..=self.goal_pose.len()].copy_from_slice(&self.goal_pose);
+        memory[0] = f64::from(self.luck);
+        memory[MEMORY..].copy_from_slice(&self.goal_pose);
         let columns =
             [&xy(physics)[..], previous_qpos, previous_qvel, qpos, qvel, &self.goal, &self.ways.next(xy(physics))];
         for (i, numbers) in columns.into_iter().enumerate() {
-            row.set(FIRST + 1 + i, numbers);
+            row.set(FIRST + 2 + i, numbers);
         }
     }
 

@@ -164,3 +164,37 @@ fn matrix_to_quat([x, y, z]: [Vec3; 3]) -> Quat {
     };
     normalized(q)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::arena::{self, Look};
+    use super::super::setup::CUBES;
+    use super::*;
+    use std::sync::Arc;
+    use swm_core::{Key, VariationRequest};
+
+    #[test]
+    fn factors_leave_nothing_of_those_before() -> Result<()> {
+        let setup = &CUBES[0];
+        let model = Arc::new(arena::compile(setup, Look::Solid)?);
+        let space = space(setup, 1);
+        let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
+        let bytes = |seeds: &[u64]| -> Result<Vec<u8>> {
+            let mut physics = Physics::new(Arc::clone(&model))?;
+            let parts = Parts::new(physics.model(), setup)?;
+            for &seed in seeds {
+                apply(&mut physics, setup, &parts, &space.resolve(&all, Key::new(seed))?)?;
+                physics.reset();
+                physics.forward();
+            }
+            let mut bytes = vec![0; physics.model().size()];
+            physics.model().save_to_buffer(&mut bytes).expect("a buffer of that size");
+            Ok(bytes)
+        };
+        let (fresh, used) = (bytes(&[1])?, bytes(&[90, 1])?);
+        let apart: Vec<usize> =
+            fresh.iter().zip(&used).enumerate().filter(|(_, (a, b))| a != b).map(|(i, _)| i).collect();
+        assert!(apart.is_empty(), "bytes {:?} of {}", &apart[..apart.len().min(20)], fresh.len());
+        Ok(())
+    }
+}

@@ -1,12 +1,13 @@
 //! What one is told about a table: the observation, and columns of everything in it. Names and scales are the
 //! reference's.
 
-use super::Table;
+use super::{MEMORY, Table};
 use crate::Physics;
-use crate::env::FIRST;
+use crate::env::{FIRST, Task as _};
 use crate::ogbench::arm::CONTROLS;
 use crate::ogbench::arm::ik::JOINTS;
 use crate::ogbench::arm::pose::{Vec3, yaw, yaw_of_matrix};
+use crate::physics::state_len;
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{ColumnSpec, DType, RowMut};
 
@@ -65,11 +66,13 @@ impl Columns<'_, '_> {
 impl Table {
     /// The columns of this table on this model.
     pub(super) fn columns(&self, model: &MjModel) -> Vec<ColumnSpec> {
+        let state = state_len(model) + self.memory_len(model);
         let (nq, nv) = (model.qpos0().len(), model.dof_damping().len());
         let observation = observation_len(self.setup.cubes, self.setup.fixtures);
         let mut columns = vec![];
         let mut float = |name: &str, n: usize| columns.push(ColumnSpec::new(name, DType::Float64, [n]));
         float("observation", observation);
+        float("goal_state", state);
         float("proprio/joint_pos", JOINTS);
         float("proprio/joint_vel", JOINTS);
         float("proprio/effector_pos", 3);
@@ -143,12 +146,24 @@ impl Table {
         }
     }
 
+    /// Writes the goal in the layout of the `state` column: the present state, but for the pose and the locks.
+    fn write_goal(&self, physics: &Physics, into: &mut [f64]) {
+        let (state, memory) = into.split_at_mut(physics.state_len());
+        physics.state(state);
+        state[1..=self.goal.pose.len()].copy_from_slice(&self.goal.pose);
+        let [a, b] = self.goal.fixed.buttons.map(f64::from);
+        let (head, previous) = memory.split_at_mut(MEMORY);
+        head.copy_from_slice(&[self.goal.contact, a, b, a, b]);
+        previous.copy_from_slice(&self.goal.pose);
+    }
+
     /// Writes all columns.
     pub(super) fn write(&self, physics: &Physics, row: &mut RowMut<'_>) {
         let (data, feel) = (physics.data(), self.arm.feel(physics, self.contact));
         let (qpos, qvel) = (data.qpos(), data.qvel());
         self.observation(physics, row.at::<f64>(FIRST));
-        let mut columns = Columns { row, next: FIRST + 1 };
+        self.write_goal(physics, row.at::<f64>(FIRST + 1));
+        let mut columns = Columns { row, next: FIRST + 2 };
         columns.set(&qpos[..JOINTS]);
         columns.set(&qvel[..JOINTS]);
         columns.set(&feel.place);

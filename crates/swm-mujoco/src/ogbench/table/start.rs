@@ -243,6 +243,7 @@ impl Table {
                 || (now.window - fixed.window).abs() > NEAR;
             if moved {
                 let gripper = within(self.setup.arm_bounds, rng);
+                physics.reset();
                 self.settle_goal(physics, &gripper, cubes, fixed, rng);
                 (self.buttons, self.contact, self.previous) = (buttons, contact, previous);
                 return Ok(());

@@ -78,6 +78,11 @@ pub(crate) trait Task: Send {
     /// look at it: the world puts the present one back.
     fn aim(&mut self, physics: &mut Physics, state: &[f64], memory: &[f64]) -> Result<()>;
 
+    /// Takes a goal in words of its own, such as a place, where these are ones; the world puts the state back.
+    fn aim_at(&mut self, _physics: &mut Physics, _goal: &[f64]) -> Option<Result<()>> {
+        None
+    }
+
     /// Chooses a reachable goal that is not reached. It may use the physics to find one: the world puts the state back.
     fn sample_goal(&mut self, physics: &mut Physics, key: Key) -> Result<()>;
 
@@ -187,8 +192,13 @@ impl<T: Task> World<T> {
 
     /// Takes the goal from a state that somebody asks for.
     fn aim(&mut self, goal: &[f64]) -> Result<()> {
-        let (memory, physics) = self.parts("goal state", goal)?;
         finite("a goal state", goal)?;
+        if ![self.state_len(), self.physics.pose_len()].contains(&goal.len())
+            && let Some(aimed) = self.aside(|task, world, _| task.aim_at(world, goal))?
+        {
+            return aimed;
+        }
+        let (memory, physics) = self.parts("goal state", goal)?;
         if let Some(memory) = memory {
             return self.aside(|task, world, _| task.aim(world, physics, memory))?;
         }

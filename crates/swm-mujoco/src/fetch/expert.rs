@@ -1,4 +1,4 @@
-//! Who can demonstrate the tasks: controllers that read where gripper, object and goal are (`proprio` and `goal_state`), and
+//! Who can demonstrate the tasks: controllers that read where gripper, object and goal are (`proprio` and `desired_goal`), and
 //! remember nothing.
 
 use super::task::known_len;
@@ -37,7 +37,7 @@ impl Expert for Controller {
     fn begin(&mut self, _key: Key) {}
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
-        let (known, goal) = (row.get::<f64>("proprio")?, row.get::<f64>("goal_state")?);
+        let (known, goal) = (row.get::<f64>("proprio")?, row.get::<f64>("desired_goal")?);
         let at = |place: usize| [known[place], known[place + 1], known[place + 2]];
         let sight = match known.len() {
             n if n == known_len(false) => {

@@ -49,8 +49,9 @@ fn make(choice: &EnvChoice, kind: &'static Kind, reward: Reward, sight: Sight) -
     let everything = |n: usize, dtype| Space::uniform_box([n], dtype, f64::NEG_INFINITY, f64::INFINITY);
     let mut columns = vec![
         ColumnSpec::new("proprio", DType::Float64, [known]),
-        ColumnSpec::new("goal_state", DType::Float64, [3]),
+        ColumnSpec::new("goal_state", DType::Float64, [setup.qpos.len() + setup.qvel.len()]),
         ColumnSpec::new("achieved_goal", DType::Float64, [3]),
+        ColumnSpec::new("desired_goal", DType::Float64, [3]),
     ];
     let observation_space = match sight {
         Sight::Flat => {
@@ -59,7 +60,6 @@ fn make(choice: &EnvChoice, kind: &'static Kind, reward: Reward, sight: Sight) -
         }
         Sight::Parted => {
             columns.push(ColumnSpec::new("observation", DType::Float64, [known]));
-            columns.push(ColumnSpec::new("desired_goal", DType::Float64, [3]));
             vec![
                 ("observation", everything(known, DType::Float64)),
                 ("achieved_goal", everything(3, DType::Float64)),

@@ -17,8 +17,8 @@ const REACH_OF_ACTION: f32 = 0.05;
 /// Samples from which a goal is chosen.
 const GOAL_TRIES: usize = 256;
 
-/// Steps in which the gripper is led to a goal, for its picture.
-const SHOWING: usize = 25;
+/// Steps in which the gripper is led to a goal, to know a pose there.
+const LEADING: usize = 25;
 
 type Place = [f64; 3];
 
@@ -58,6 +58,8 @@ pub struct Fetch {
     /// The place of the object in `qpos`.
     block: usize,
     goal: Place,
+    /// `qpos` and `qvel` where it is reached.
+    goal_pose: Vec<f64>,
     /// Whether the reset asked for the object's place, its angle, and the goal: otherwise they are drawn.
     asked: [bool; 3],
 }
@@ -92,6 +94,7 @@ impl Fetch {
             fingers: [joint("robot0:r_gripper_finger_joint")?, joint("robot0:l_gripper_finger_joint")?],
             block: if kind.has_object() { joint("object0:joint")?.0 } else { 0 },
             goal: setup.gripper,
+            goal_pose: [&setup.qpos[..], &setup.qvel].concat(),
             asked: [false; 3],
             kind,
             reward,
@@ -109,14 +112,28 @@ impl Fetch {
         distance(self.achieved(world), self.goal)
     }
 
-    /// Moves the goal, and the target that shows it.
+    /// Moves the goal to a place, and finds a pose where it is reached: the state is another one afterwards.
     fn set_goal(&mut self, world: &mut Physics, goal: Place) {
         self.goal = goal;
-        let body = usize::try_from(world.model().site_bodyid()[self.target]).unwrap_or(0);
-        // The body does not move and is not turned.
-        let origin = world.data().xpos()[body];
-        world.model_mut().site_pos_mut()[self.target] = std::array::from_fn(|i| goal[i] - origin[i]);
-        world.data_mut().site_xpos_mut()[self.target] = goal;
+        if self.object.is_some() {
+            world.data_mut().qpos_mut()[self.block..self.block + 3].copy_from_slice(&goal);
+            world.forward();
+        } else {
+            for _ in 0..LEADING {
+                let at = self.achieved(world);
+                #[allow(clippy::cast_possible_truncation)]
+                let towards = |i: usize| ((goal[i] - at[i]) as f32 / REACH_OF_ACTION).clamp(-1.0, 1.0);
+                self.advance(world, [towards(0), towards(1), towards(2), 0.0]);
+            }
+        }
+        self.note_pose(world);
+    }
+
+    /// Takes the present pose for one where the goal is reached.
+    fn note_pose(&mut self, world: &Physics) {
+        self.goal_pose.clear();
+        self.goal_pose.extend(world.data().qpos());
+        self.goal_pose.extend(world.data().qvel());
     }
 
     /// Draws a goal around a place.
@@ -256,8 +273,11 @@ impl Task for Fetch {
         world.forward();
         let drawn = self.draw_goal(middle, &mut rng);
         let given = factors.get("goal.start_position");
+        let mut start = vec![0.0; world.state_len()];
+        world.state(&mut start);
         self.set_goal(world, if goal { [given[0], given[1], given[2]] } else { drawn });
-        Ok(())
+        self.mark_goal(world, &start);
+        world.set_state(&start)
     }
 
     fn step(&mut self, world: &mut Physics, action: &[f32]) -> Step {
@@ -276,38 +296,62 @@ impl Task for Fetch {
         let known = &mut known[..known_len(self.object.is_some())];
         self.known(world, known);
         row.set(FIRST, known);
-        row.set(FIRST + 1, &self.goal);
+        row.set(FIRST + 1, &self.goal_pose);
         row.set(FIRST + 2, &self.achieved(world));
+        row.set(FIRST + 3, &self.goal);
         match self.sight {
             #[allow(clippy::cast_possible_truncation)]
             Sight::Flat => {
-                let seen = row.at::<f32>(FIRST + 3);
+                let seen = row.at::<f32>(FIRST + 4);
                 seen.iter_mut().zip(known.iter().chain(&self.goal)).for_each(|(to, from)| *to = *from as f32);
             }
-            Sight::Parted => {
-                row.set(FIRST + 3, known);
-                row.set(FIRST + 4, &self.goal);
-            }
+            Sight::Parted => row.set(FIRST + 4, known),
         }
     }
 
     fn memory_len(&self, _model: &MjModel) -> usize {
-        self.goal.len()
+        0
     }
 
-    fn remember(&self, into: &mut [f64]) {
-        into.copy_from_slice(&self.goal);
+    fn remember(&self, _into: &mut [f64]) {}
+
+    fn recall(&mut self, _world: &mut Physics, _memory: &[f64]) {}
+
+    fn goal_len(&self) -> usize {
+        self.goal.len() + self.goal_pose.len()
     }
 
-    fn recall(&mut self, world: &mut Physics, memory: &[f64]) {
-        self.set_goal(world, [memory[0], memory[1], memory[2]]);
+    fn remember_goal(&self, into: &mut [f64]) {
+        let (place, pose) = into.split_at_mut(self.goal.len());
+        place.copy_from_slice(&self.goal);
+        pose.copy_from_slice(&self.goal_pose);
+    }
+
+    fn recall_goal(&mut self, goal: &[f64]) {
+        let (place, pose) = goal.split_at(self.goal.len());
+        self.goal.copy_from_slice(place);
+        self.goal_pose.copy_from_slice(pose);
+    }
+
+    fn mark_goal(&mut self, world: &mut Physics, _state: &[f64]) {
+        let body = usize::try_from(world.model().site_bodyid()[self.target]).unwrap_or(0);
+        // The body does not move and is not turned.
+        let origin = world.model().body_pos()[body];
+        let goal = self.goal;
+        world.model_mut().site_pos_mut()[self.target] = std::array::from_fn(|i| goal[i] - origin[i]);
     }
 
     fn aim(&mut self, world: &mut Physics, state: &[f64], _memory: &[f64]) -> Result<()> {
         world.set_state(state)?;
-        let goal = self.achieved(world);
-        self.set_goal(world, goal);
+        self.goal = self.achieved(world);
+        self.note_pose(world);
         Ok(())
+    }
+
+    fn aim_at(&mut self, world: &mut Physics, goal: &[f64]) -> Option<Result<()>> {
+        let &[x, y, z] = goal else { return None };
+        self.set_goal(world, [x, y, z]);
+        Some(Ok(()))
     }
 
     fn sample_goal(&mut self, world: &mut Physics, key: Key) -> Result<()> {
@@ -326,17 +370,8 @@ impl Task for Fetch {
     }
 
     fn show_goal(&mut self, world: &mut Physics) {
-        if self.object.is_some() {
-            world.data_mut().qpos_mut()[self.block..self.block + 3].copy_from_slice(&self.goal);
-            world.forward();
-            return;
-        }
-        for _ in 0..SHOWING {
-            let at = self.achieved(world);
-            #[allow(clippy::cast_possible_truncation)]
-            let towards = |i: usize| ((self.goal[i] - at[i]) as f32 / REACH_OF_ACTION).clamp(-1.0, 1.0);
-            self.advance(world, [towards(0), towards(1), towards(2), 0.0]);
-        }
+        let shown = world.set_pose(&self.goal_pose);
+        debug_assert!(shown.is_ok(), "a pose of this model");
     }
 
     fn is_success(&self, world: &Physics) -> bool {

@@ -23,8 +23,8 @@ struct Family {
     until: fn(&str, &mut Golden) -> usize,
     /// Names of infos that are called differently here.
     renamed: &'static [(&'static str, &'static str)],
-    /// Makes the goal's `state` column of the start's, where the goal is none of the state.
-    goal: fn(&mut Golden, &mut [f64]),
+    /// Makes the goal's `state` column (or a place) of the start's, where the goal is none of the state.
+    goal: fn(&mut Golden, &mut Vec<f64>),
 }
 
 const FAMILIES: &[Family] = &[
@@ -39,11 +39,11 @@ const FAMILIES: &[Family] = &[
             }
             request
         },
-        memory: |golden, memory| memory.copy_from_slice(&golden.numbers("info.goal_state")[..3]),
+        memory: |_, _| {},
         step: 0.04,
         until: fetch_until,
-        renamed: &[("state", "observation")],
-        goal: |_, _| {},
+        renamed: &[("state", "observation"), ("goal_state", "desired_goal")],
+        goal: |golden, goal| *goal = golden.numbers("info.goal_state")[..3].to_vec(),
     },
     Family {
         named: |id| id.starts_with("swm/OGBCube") || id.starts_with("swm/OGBScene"),
@@ -53,7 +53,7 @@ const FAMILIES: &[Family] = &[
         step: 0.05,
         until: table_until,
         renamed: &[],
-        goal: table_goal,
+        goal: |golden, state| table_goal(golden, state),
     },
     Family {
         named: |id| id.starts_with("swm/OGBMaze"),

@@ -200,7 +200,7 @@ fn table_until(name: &str, golden: &mut Golden) -> usize {
     };
     let usual = play(0.0);
     let parted = [1e-13, -1e-13, 1e-14].into_iter().filter_map(|nudge| {
-        let apart = |(a, b): (&Vec<f64>, &Vec<f64>)| a.iter().zip(b).any(|(a, b)| (a - b).abs() > 1e-7);
+        let apart = |(a, b): (&Vec<f64>, &Vec<f64>)| a.iter().zip(b).any(|(a, b)| (a - b).abs() > 1e-8);
         usual.iter().zip(&play(nudge)).position(apart)
     });
     // Row t + 1 follows action t.

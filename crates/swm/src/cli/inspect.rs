@@ -42,7 +42,9 @@ pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
     ));
     emit(&histogram(&lengths));
     let footprint = reader.footprint()?;
-    let on_disk = |name: &str| footprint.iter().find(|(part, _)| part == name).map(|(_, size)| *size);
+    // Lance knows no dots in names.
+    let stored = |part: &str, name: &str| part == name || part == name.replace('.', "_");
+    let on_disk = |name: &str| footprint.iter().find(|(part, _)| stored(part, name)).map(|(_, size)| *size);
     let columns = reader.schema().columns().iter().map(|column| {
         let size = on_disk(&column.name);
         vec![
@@ -53,7 +55,8 @@ pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
         ]
     });
     emit(&table(&["column", "type", "shape of a row", "on disk"], columns));
-    let others = footprint.iter().filter(|(part, _)| reader.schema().find(part).is_none());
+    let columns = reader.schema().columns();
+    let others = footprint.iter().filter(|(part, _)| !columns.iter().any(|column| stored(part, &column.name)));
     for (part, size) in others {
         emit(&format!("{part}: {}\n", bytes(*size)));
     }

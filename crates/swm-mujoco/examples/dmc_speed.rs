@@ -22,9 +22,10 @@ fn busy() -> std::io::Result<Duration> {
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let suite = assets::path("dm_control")?.join("dm_control/suite");
     // Steps of an environment in a round, and time steps of the physics in one of them.
-    for (id, file, steps, substeps) in
-        [("swm/CheetahDMControl-v0", "cheetah.xml", 10_000u32, 2), ("swm/HumanoidDMControl-v0", "humanoid.xml", 400, 10)]
-    {
+    for (id, file, steps, substeps) in [
+        ("swm/CheetahDMControl-v0", "cheetah.xml", 10_000u32, 2),
+        ("swm/HumanoidDMControl-v0", "humanoid.xml", 400, 10),
+    ] {
         let entry = ENVS.get(id)?;
         let mut env = entry.env()?;
         let space = env.spec().action_space.clone();

@@ -163,7 +163,7 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
             };
             // The reference stores JPEG of quality 95; ours does by default what is lossless, or the same on request.
             let codecs =
-                [("png", "collect, png", ImageCodec::Png), ("jpeg", "collect, jpeg", ImageCodec::Jpeg { quality: 95 })];
+                [("qoi", "collect, qoi", ImageCodec::Qoi), ("jpeg", "collect, jpeg", ImageCodec::Jpeg { quality: 95 })];
             for (name, what, codec) in codecs {
                 report.rows.push(BenchRow::measure(
                     env,

@@ -46,6 +46,8 @@ pub struct CollectConfig {
     pub policy: String,
     /// Whether to store the picture of the goal in every row.
     pub goal: bool,
+    /// The number of the first episode: above 0 where several machines collect a part each.
+    pub first: usize,
 }
 
 /// What was collected.
@@ -355,7 +357,7 @@ impl Play for Collecting<'_> {
     }
 
     fn key(&self, episode: usize) -> Key {
-        episode_key(self.config.seed, episode)
+        episode_key(self.config.seed, self.config.first + episode)
     }
 
     fn start(&mut self, pool: &mut EnvPool, starting: &[(usize, usize)]) -> Result<()> {

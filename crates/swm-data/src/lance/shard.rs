@@ -212,7 +212,7 @@ impl Log {
             };
             if part.done.as_ref().is_none_or(|done| done.groups != part.groups.len()) {
                 let problem = format!("part {index} of {count} is not finished");
-                return unfinished(problem, "continue it (--append), then commit again");
+                return unfinished(problem, "continue it (--resume), then commit again");
             }
             if let (Some(first), Some(begun)) = (complete.first(), &part.begun) {
                 first.check_columns(store, begun)?;

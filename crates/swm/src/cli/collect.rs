@@ -1,6 +1,6 @@
 //! `swm collect`: run a policy and store its episodes.
 
-use super::config::{VariationArgs, image_size};
+use super::config::{CodecArgs, VariationArgs, image_size};
 use super::wrappers::WrapperArgs;
 use super::{Context, Progress, emit, emit_json};
 use clap::Args;
@@ -10,7 +10,8 @@ use std::time::Instant;
 use swm::resolver::scripted;
 use swm::{ENVS, home};
 use swm_core::{EnvChoice, Error, Result, View};
-use swm_data::{ImageCodec, WriteMode, WriteOptions};
+use swm_data::lance::{Shard, create_shard};
+use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions};
 use swm_eval::collect::check_continues;
 use swm_eval::{CollectConfig, Collected, Control, World, WorldConfig};
 
@@ -46,12 +47,14 @@ pub struct CollectArgs {
     /// Steps after which an episode is truncated (default: the environment's own)
     #[arg(long, value_name = "STEPS")]
     max_steps: Option<usize>,
-    /// How pictures are stored: png (lossless) or jpeg (what the reference writes)
-    #[arg(long, value_enum, default_value_t = Codec::Png)]
-    codec: Codec,
-    /// Quality of jpeg, 1 to 100
-    #[arg(long, default_value_t = 95, value_parser = clap::value_parser!(u8).range(1..=100))]
-    quality: u8,
+    /// Its format, where the name does not say it (`swm formats` lists them)
+    #[arg(long, value_name = "NAME")]
+    format: Option<String>,
+    /// Collect the part I of N, counted from 0, of a Lance dataset; `swm datasets commit` makes one of all parts
+    #[arg(long, value_name = "I/N", value_parser = shard, conflicts_with = "format")]
+    shard: Option<Shard>,
+    #[command(flatten)]
+    codec: CodecArgs,
     /// Continue an interrupted collection
     #[arg(long, conflicts_with = "overwrite")]
     resume: bool,
@@ -64,11 +67,13 @@ pub struct CollectArgs {
     variation: VariationArgs,
 }
 
-/// How pictures are stored.
-#[derive(Clone, Copy, clap::ValueEnum)]
-enum Codec {
-    Png,
-    Jpeg,
+/// Reads `I/N`.
+fn shard(text: &str) -> std::result::Result<Shard, String> {
+    let parts = text.split_once('/').and_then(|(index, count)| Some((index.parse().ok()?, count.parse().ok()?)));
+    match parts {
+        Some((index, count)) if index < count => Ok(Shard { index, count }),
+        _ => Err(format!("'{text}' is no part: write 0/4 for the first of four")),
+    }
 }
 
 /// A collection, as `swm collect` and `swm demo` ask for it.
@@ -76,7 +81,11 @@ pub struct Collection<'a> {
     /// The environment.
     pub env: EnvChoice,
     /// Where to.
-    pub path: &'a Path,
+    pub location: &'a Location,
+    /// The format, where the location does not say it.
+    pub format: Option<&'a str>,
+    /// Which part of the dataset, if not all.
+    pub shard: Option<Shard>,
     /// Who acts.
     pub policy: &'a str,
     /// Environments, pictures, threads.
@@ -93,10 +102,12 @@ pub struct Collection<'a> {
 
 /// Runs a policy and stores its episodes.
 pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
-    let path = home::dataset(&args.output);
+    let location = home::target(&args.output, args.format.as_deref())?;
     let collection = Collection {
         env: ENVS.choose(&args.env)?,
-        path: &path,
+        location: &location,
+        format: args.format.as_deref(),
+        shard: args.shard,
         policy: &args.policy,
         world: WorldConfig {
             envs: args.envs,
@@ -110,30 +121,27 @@ pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
             seed: args.seed,
             variation: args.variation.request()?,
             policy: args.policy.clone(),
-            goal: false,
+            ..CollectConfig::default()
         },
         mode: match (args.resume, args.overwrite) {
             (true, _) => WriteMode::Append,
             (_, true) => WriteMode::Overwrite,
             _ => WriteMode::Create,
         },
-        codec: match args.codec {
-            Codec::Png => ImageCodec::Png,
-            Codec::Jpeg => ImageCodec::Jpeg { quality: args.quality },
-        },
+        codec: args.codec.codec(),
         wrappers: args.wrappers.clone(),
     };
     let collected = run(&collection, context)?;
     if context.json {
-        return emit_json(&json!({"dataset": path, "collected": collected}));
+        return emit_json(&json!({"dataset": location.to_string(), "collected": collected}));
     }
-    emit(&format!("{}\n", path.display()));
+    emit(&format!("{location}\n"));
     Ok(())
 }
 
 /// Runs a collection with a progress bar.
 pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> {
-    let Collection { env, path, config, .. } = collection;
+    let Collection { env, location, config, .. } = collection;
     let (stack, goal) = collection.wrappers.stack()?;
     let mut world = World::of(|| Ok(stack.wrap(env.env()?, goal)), collection.world.clone())?;
     let mut policy = scripted(&env.entry, collection.policy, &world)?;
@@ -145,11 +153,15 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
         manifest.config["wrappers"] = json!(collection.wrappers.choices()?);
         manifest.config["wrap_goal"] = json!(collection.wrappers.wrap_goal);
     }
-    if path.exists() {
+    let there = match location.path() {
+        Some(path) => path.exists(),
+        None => swm_data::open(*location).is_ok(),
+    };
+    if collection.shard.is_none() && there {
         match collection.mode {
             WriteMode::Overwrite => {}
             WriteMode::Append => {
-                if let Some(stored) = swm_data::open(*path)?.manifest() {
+                if let Some(stored) = swm_data::open(*location)?.manifest() {
                     check_continues(&stored, &manifest)?;
                     let (stored, wanted) = (&stored.config["codec"], &manifest.config["codec"]);
                     if stored != wanted {
@@ -163,23 +175,30 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
             }
             WriteMode::Create => {
                 return Err(Error::config(
-                    format!("dataset {}", path.display()),
+                    format!("dataset {location}"),
                     "there is one already",
                     "continue it with --resume, replace it with --overwrite, or name another",
                 ));
             }
         }
     }
-    let writer = swm_data::create(
-        *path,
-        &world.collect_schema(config.goal)?,
-        WriteOptions {
-            mode: collection.mode,
-            codec: collection.codec,
-            manifest: Some(manifest),
-            ..WriteOptions::default()
-        },
-    )?;
+    let schema = world.collect_schema(config.goal)?;
+    let options = WriteOptions {
+        mode: collection.mode,
+        codec: collection.codec,
+        manifest: Some(manifest),
+        ..WriteOptions::default()
+    };
+    // A part has a run of the episodes, so that the whole has them in order.
+    let part = collection.shard.map_or(0..config.episodes, |Shard { index, count }| {
+        config.episodes * index / count..config.episodes * (index + 1) / count
+    });
+    let writer = match (collection.shard, collection.format) {
+        (Some(shard), _) => create_shard(location, &schema, options, shard)?,
+        (None, Some(format)) => (FORMATS.get(format)?.create)(location, &schema, options)?,
+        (None, None) => swm_data::create(*location, &schema, options)?,
+    };
+    let config = &CollectConfig { episodes: part.len(), first: part.start, ..config.clone() };
     let progress = Progress::new("collect", config.episodes);
     let begun = Instant::now();
     #[allow(clippy::cast_precision_loss)]
@@ -191,9 +210,8 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     let collected = world.collect(&mut *policy, writer, config, &mut control)?;
     drop(control);
     progress.done(&format!(
-        "{} episodes in {} ({} new, {} steps, {})",
+        "{} episodes in {location} ({} new, {} steps, {})",
         collected.episodes,
-        path.display(),
         collected.added,
         collected.steps,
         speed(collected.steps)

@@ -1,8 +1,42 @@
 //! Words of the command line that several commands share.
 
-use clap::Args;
+use clap::{Args, ValueEnum};
 use std::collections::BTreeMap;
 use swm_core::{Error, Result, VariationRequest};
+use swm_data::ImageCodec;
+
+/// How pictures are stored, where the format leaves a choice.
+#[derive(Args)]
+pub struct CodecArgs {
+    /// How pictures are stored, where the format leaves a choice
+    #[arg(long, value_enum, default_value_t = Codec::Qoi)]
+    codec: Codec,
+    /// Quality of jpeg, 1 to 100
+    #[arg(long, default_value_t = 95, value_parser = clap::value_parser!(u8).range(1..=100))]
+    quality: u8,
+}
+
+/// How pictures are stored.
+#[derive(Clone, Copy, ValueEnum)]
+enum Codec {
+    /// Lossless, the fastest
+    Qoi,
+    /// Lossless, read by everything
+    Png,
+    /// Lossy, what the reference writes
+    Jpeg,
+}
+
+impl CodecArgs {
+    /// What they ask for.
+    pub fn codec(&self) -> ImageCodec {
+        match self.codec {
+            Codec::Qoi => ImageCodec::Qoi,
+            Codec::Png => ImageCodec::Png,
+            Codec::Jpeg => ImageCodec::Jpeg { quality: self.quality },
+        }
+    }
+}
 
 /// Which factors of variation differ between episodes.
 #[derive(Args, Clone, Default)]

@@ -1,5 +1,6 @@
 //! `swm convert`: a dataset in another format or codec, and what it takes to say that it is the same.
 
+use super::config::CodecArgs;
 use super::datasets::bytes;
 use super::{Context, Progress, emit, emit_json};
 use clap::{Args, ValueEnum};
@@ -8,7 +9,7 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 use swm::home;
 use swm_data::convert::Stage;
-use swm_data::{ConvertMode, ConvertOptions, Converted, ImageCodec, Location};
+use swm_data::{ConvertMode, ConvertOptions, Converted, Location};
 
 /// Arguments of `swm convert`.
 #[derive(Args)]
@@ -33,12 +34,8 @@ pub struct TargetArgs {
     /// The format (default: the one the target's name says); `swm formats` lists them
     #[arg(long, value_name = "NAME")]
     pub format: Option<String>,
-    /// How pictures are stored, where the format leaves a choice
-    #[arg(long, value_enum, default_value_t = Codec::Qoi)]
-    codec: Codec,
-    /// Quality of jpeg, 1 to 100
-    #[arg(long, default_value_t = 95, value_parser = clap::value_parser!(u8).range(1..=100))]
-    quality: u8,
+    #[command(flatten)]
+    codec: CodecArgs,
     /// The least signal-to-noise ratio of lossy pictures, in dB; less is an error
     #[arg(long, default_value_t = ConvertOptions::default().least_psnr, value_name = "DB")]
     least_psnr: f64,
@@ -50,11 +47,7 @@ impl TargetArgs {
         ConvertOptions {
             format: self.format.clone(),
             mode,
-            codec: match self.codec {
-                Codec::Qoi => ImageCodec::Qoi,
-                Codec::Png => ImageCodec::Png,
-                Codec::Jpeg => ImageCodec::Jpeg { quality: self.quality },
-            },
+            codec: self.codec.codec(),
             least_psnr: self.least_psnr,
             ..ConvertOptions::default()
         }
@@ -67,17 +60,6 @@ enum Mode {
     Error,
     Overwrite,
     Append,
-}
-
-/// How pictures are stored.
-#[derive(Clone, Copy, ValueEnum)]
-enum Codec {
-    /// Lossless, the fastest
-    Qoi,
-    /// Lossless, read by everything
-    Png,
-    /// Lossy, what the reference writes
-    Jpeg,
 }
 
 /// Converts.

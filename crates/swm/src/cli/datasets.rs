@@ -1,13 +1,14 @@
 //! `swm datasets`, `formats` and `preview`: what data there are and what they look like.
 
 use super::{Progress, emit, emit_json, table};
-use clap::Args;
+use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 use swm::home::{names_in, open_dataset as open};
 use swm::{data, home};
 use swm_core::Result;
 use swm_data::Reader;
+use swm_data::lance::commit_shards;
 
 /// Arguments of `swm preview`.
 #[derive(Args)]
@@ -28,8 +29,33 @@ pub struct PreviewArgs {
     fps: u32,
 }
 
-/// Lists the datasets at home.
-pub fn datasets(as_json: bool) -> anyhow::Result<()> {
+/// Arguments of `swm datasets`.
+#[derive(Args)]
+pub struct DatasetsArgs {
+    #[command(subcommand)]
+    command: Option<DatasetsCommand>,
+}
+
+#[derive(Subcommand)]
+enum DatasetsCommand {
+    /// Make one version of the parts that `swm collect --shard` wrote
+    Commit {
+        /// The dataset: a path, a URI or a name
+        dataset: String,
+    },
+}
+
+/// Lists the datasets at home, or commits parts.
+pub fn datasets(args: &DatasetsArgs, as_json: bool) -> anyhow::Result<()> {
+    if let Some(DatasetsCommand::Commit { dataset }) = &args.command {
+        let location = home::location(dataset)?;
+        let added = commit_shards(&location)?;
+        if as_json {
+            return emit_json(&json!({"dataset": location.to_string(), "added": added}));
+        }
+        emit(&format!("{added} episodes added to {location}\n"));
+        return Ok(());
+    }
     let folder = home::datasets();
     let found: Vec<Value> = names_in(&folder)
         .into_iter()

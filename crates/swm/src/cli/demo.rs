@@ -10,6 +10,7 @@ use std::time::Instant;
 use swm::resolver::Home;
 use swm::{ENVS, home};
 use swm_core::VariationRequest;
+use swm_data::Location;
 use swm_core::results::Counting;
 use swm_data::{ImageCodec, WriteMode};
 use swm_eval::{Acts, Choice, CollectConfig, Condition, EvalRequest, Model, PolicyRequest, StartsRequest, WorldConfig};
@@ -76,7 +77,9 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     };
     let collection = Collection {
         env,
-        path: &data,
+        location: &Location::from(&data),
+        format: None,
+        shard: None,
         policy: "explore",
         world: world.clone(),
         config: CollectConfig {

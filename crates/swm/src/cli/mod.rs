@@ -54,8 +54,8 @@ enum Command {
     Solvers,
     /// Run a policy and store its episodes
     Collect(collect::CollectArgs),
-    /// List the datasets at home
-    Datasets,
+    /// List the datasets at home, or make one of the parts that several machines wrote
+    Datasets(datasets::DatasetsArgs),
     /// List the dataset formats
     Formats,
     /// Say what is in a dataset
@@ -129,7 +129,7 @@ impl Cli {
             Command::Assets(args) => assets::assets(&args, json),
             Command::Wrappers => wrappers::wrappers(json),
             Command::Solvers => solvers::solvers(json),
-            Command::Datasets => datasets::datasets(json),
+            Command::Datasets(args) => datasets::datasets(&args, json),
             Command::Formats => datasets::formats(json),
             Command::Inspect(args) => inspect::inspect(&args, json),
             Command::Preview(args) => datasets::preview(&args, json),

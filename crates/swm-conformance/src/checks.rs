@@ -1,5 +1,6 @@
 //! The checks. Each goes through every row and panics, with the environment's id, where one does not keep a promise.
 
+use crate::Worlds;
 use swm_core::batch::{Batch, ColumnSpec, DType, Schema};
 use swm_core::policy::{ExpertPolicy, Policy, RandomPolicy};
 use swm_core::pool::{Reset, threads};
@@ -7,7 +8,6 @@ use swm_core::{
     Action, Env, EnvEntry, EnvPool, Factor, FrameMut, Key, ResetOptions, Snapshot, Space, VariationRequest,
     VariationSpace,
 };
-use crate::Worlds;
 
 fn vary(keys: &[&str]) -> VariationRequest {
     VariationRequest {
@@ -138,7 +138,8 @@ pub fn rows_declare_what_they_are(worlds: &Worlds) {
 /// Plays episodes with random actions in a pool; what every episode produced, step after step, as bytes.
 fn play(worlds: &Worlds, entry: &EnvEntry, slots: &[u64], workers: usize, steps: usize) -> Vec<Vec<u8>> {
     let envs = slots.iter().map(|_| entry.env().expect("an environment")).collect();
-    let mut pool = EnvPool::new(envs, Some(worlds.size), Some(steps), threads(workers).expect("threads")).expect("a pool");
+    let mut pool =
+        EnvPool::new(envs, Some(worlds.size), Some(steps), threads(workers).expect("threads")).expect("a pool");
     let mut policy = RandomPolicy::new(pool.spec(), slots.len());
     let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), slots.len());
     let resets: Vec<Reset> = slots
@@ -175,12 +176,17 @@ fn play(worlds: &Worlds, entry: &EnvEntry, slots: &[u64], workers: usize, steps:
 pub fn results_do_not_depend_on_threads_or_neighbours(worlds: &Worlds) {
     for entry in worlds.rows {
         let episodes = [0, 1, 2, 3, 4];
-        let one_thread = play(worlds, entry, &episodes, 1, 8);
-        assert!(one_thread == play(worlds, entry, &episodes, 4, 8), "{}: four threads differ from one", entry.id);
+        let steps = usize::try_from(worlds.steps).expect("a few steps");
+        let one_thread = play(worlds, entry, &episodes, 1, steps);
+        assert!(one_thread == play(worlds, entry, &episodes, 4, steps), "{}: four threads differ from one", entry.id);
         assert!(one_thread[0] != one_thread[2], "{}: two seeds give two episodes", entry.id);
-        let backwards = play(worlds, entry, &[4, 3, 2, 1, 0], 2, 8);
+        let backwards = play(worlds, entry, &[4, 3, 2, 1, 0], 2, steps);
         for (i, &episode) in episodes.iter().enumerate() {
-            assert!(one_thread[i] == play(worlds, entry, &[episode], 1, 8)[0], "{}: episode {episode} alone", entry.id);
+            assert!(
+                one_thread[i] == play(worlds, entry, &[episode], 1, steps)[0],
+                "{}: episode {episode} alone",
+                entry.id
+            );
             assert!(one_thread[i] == backwards[4 - i], "{}: episode {episode} in another slot", entry.id);
         }
     }
@@ -196,7 +202,8 @@ pub fn environments_share_nothing_and_forget_the_past(worlds: &Worlds) {
         };
         let wanted = [alone(1), alone(2)];
         // Taking turns with another one, in environments with a past.
-        let mut pair = [Probe::reset(worlds, entry, 90, &all_varied()), Probe::reset(worlds, entry, 91, &ResetOptions::default())];
+        let mut pair =
+            [Probe::reset(worlds, entry, 90, &all_varied()), Probe::reset(worlds, entry, 91, &ResetOptions::default())];
         for (i, probe) in pair.iter_mut().enumerate() {
             (0..5).for_each(|t| {
                 probe.step(key, 100 + t);
@@ -292,7 +299,7 @@ pub fn what_follows_a_restore_followed_the_snapshot(worlds: &Worlds) {
             let snapshot = probe.env.snapshot();
             let follow = |probe: &mut Probe| {
                 let mut seen = probe.everything();
-                for t in 5..15 {
+                for t in 5..5 + worlds.steps {
                     let transition = probe.step(key, t);
                     seen.extend(transition.reward.to_le_bytes());
                     seen.extend([u8::from(transition.terminated), u8::from(transition.truncated)]);
@@ -302,7 +309,9 @@ pub fn what_follows_a_restore_followed_the_snapshot(worlds: &Worlds) {
             };
             let wanted = follow(&mut probe);
             let mut other = Probe::reset(worlds, entry, 77, &all_varied());
-            for (probe, who) in [(&mut probe, "the same"), (&mut other, "another"), (&mut Probe::new(worlds, entry), "a new")] {
+            for (probe, who) in
+                [(&mut probe, "the same"), (&mut other, "another"), (&mut Probe::new(worlds, entry), "a new")]
+            {
                 probe.env.restore(&snapshot).expect("an own snapshot");
                 assert!(probe.env.snapshot() == snapshot, "{}: {who} environment", entry.id);
                 assert!(follow(probe) == wanted, "{}: {who} environment goes on differently", entry.id);
@@ -520,7 +529,9 @@ pub fn random_variations_never_fail(worlds: &Worlds) {
             keys.extend(factor.key.split_once('.').map(|(group, _)| group.to_owned()));
         }
         keys.dedup();
-        let requests = (0..10 * worlds.requests).map(|_| "all").chain(keys.iter().flat_map(|key| vec![key.as_str(); worlds.requests]));
+        let requests = (0..10 * worlds.requests)
+            .map(|_| "all")
+            .chain(keys.iter().flat_map(|key| vec![key.as_str(); worlds.requests]));
         for (seed, key) in (0..).zip(requests) {
             let options = ResetOptions { variation: vary(&[key]), ..ResetOptions::default() };
             let what = format!("{}, '{key}', seed {seed}", entry.id);

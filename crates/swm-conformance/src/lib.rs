@@ -20,6 +20,8 @@ pub struct Worlds {
     pub size: (usize, usize),
     /// Sizes at which pictures are written completely.
     pub sizes: &'static [(usize, usize)],
+    /// Steps over which episodes are compared, picture by picture.
+    pub steps: u64,
     /// Goals sampled for each.
     pub goals: u64,
     /// Rows restored for each.
@@ -44,6 +46,7 @@ impl Worlds {
             demonstrated: true,
             size: (72, 96),
             sizes: &[(1, 1), (7, 13), (64, 64), (96, 33), (224, 224), (256, 300)],
+            steps: 8,
             goals: 40,
             rows_restored: 10,
             values: 12,

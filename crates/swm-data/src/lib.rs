@@ -14,9 +14,9 @@
 
 pub mod cache;
 pub mod clip;
+mod column_files;
 pub mod convert;
 pub mod doctor;
-mod column_files;
 mod episodes;
 mod ffmpeg;
 pub mod folder;
@@ -31,8 +31,8 @@ mod lance_video;
 mod lerobot;
 pub mod loader;
 mod location;
-pub mod objects;
 mod numbers;
+pub mod objects;
 pub mod preview;
 mod qoi;
 pub mod replay;
@@ -45,12 +45,13 @@ pub use cache::CacheConfig;
 pub use clip::{ClipSpec, Clips};
 pub use convert::{ConvertMode, ConvertOptions, Converted, checksum, convert};
 pub use format::{
-    CommitPolicy, Constants, Episode, FORMATS, Format, Irregularity, Reader, StepRange, WriteMode, WriteOptions, Writer, create, open,
+    CommitPolicy, Constants, Episode, FORMATS, Format, Irregularity, Reader, StepRange, WriteMode, WriteOptions,
+    Writer, create, open,
 };
 pub use goals::{GoalMixture, GoalSpec};
 pub use image::ImageCodec;
-pub use location::Location;
 pub use loader::{Epoch, Loaded, Loader, LoaderConfig};
+pub use location::Location;
 pub use preview::{
     Picture, PreviewOptions, contact_sheet, integer_scale, preview, write_mp4, write_mp4_scaled, write_png,
 };

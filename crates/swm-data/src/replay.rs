@@ -170,8 +170,8 @@ impl ReplayBuffer {
         let kept = episodes.iter().rev().take_while(fits).count().max(1).min(episodes.len());
         let added = reader.manifest().and_then(|manifest| manifest.config["replay"]["added"].as_u64());
         lock(&buffer.0.state).added = added.unwrap_or(episodes.len() as u64).saturating_sub(kept as u64);
-        for position in episodes.len() - kept..episodes.len() {
-            let rows = reader.read(&names, &[StepRange::new(position, 0, episodes[position].length)])?;
+        for (position, episode) in episodes.iter().enumerate().skip(episodes.len() - kept) {
+            let rows = reader.read(&names, &[StepRange::new(position, 0, episode.length)])?;
             buffer.add(&rows, &reader.constants(position)?)?;
         }
         Ok(buffer)

@@ -53,7 +53,7 @@ fn episodes_come_back_with_their_pictures() {
         let options = WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
         assert!(create(&path, &few, options).is_err(), "other columns");
     }
-    assert!(open(&folder.path().join("none.lance-video")).is_err(), "there is none");
+    assert!(open(folder.path().join("none.lance-video")).is_err(), "there is none");
     let pictures = Schema::new(schema().columns()[..1].to_vec()).expect("schema");
     let path = folder.path().join("pictures.lance-video");
     let error = create(&path, &pictures, WriteOptions::default()).err().expect("no numbers").to_string();

@@ -30,7 +30,7 @@ fn a_writer_killed_at_50_moments_keeps_committed_episodes() {
 #[test]
 fn datasets_of_lerobot_open_here() {
     for name in ["lerobot-v30-h264", "lerobot-v30-av1", "lerobot-v21"] {
-        let reader = open(&interop().join(name)).expect("opens");
+        let reader = open(interop().join(name)).expect("opens");
         assert_eq!(reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), THEIR_LENGTHS, "{name}");
         check_frames(&*reader, "pixels", &format!("{name}-top.png"), 0);
         check_frames(&*reader, "observation.images.wrist", &format!("{name}-wrist.png"), 0);
@@ -55,9 +55,9 @@ fn datasets_of_lerobot_open_here() {
             assert_eq!(reader.constants(e).expect("reads"), task);
         }
         let hash = reader.content_hash().expect("hashes");
-        assert_eq!(hash, open(&interop().join(name)).expect("opens").content_hash().expect("hashes"));
+        assert_eq!(hash, open(interop().join(name)).expect("opens").content_hash().expect("hashes"));
         let mut writer = create(
-            &interop().join(name),
+            interop().join(name),
             &swm_core::Schema::new(schema.columns()[2..].to_vec()).expect("a schema"),
             WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() },
         );
@@ -67,7 +67,7 @@ fn datasets_of_lerobot_open_here() {
 
 #[test]
 fn pictures_in_tables_are_read() {
-    let reader = open(&interop().join("lerobot-v30-h264")).expect("opens");
+    let reader = open(interop().join("lerobot-v30-h264")).expect("opens");
     let name = "observation.images.still";
     let ranges = [StepRange::new(2, 3, 2), StepRange::new(0, 10, 1), StepRange::new(2, 3, 1)];
     let read = reader.read(&[name], &ranges).expect("reads");

@@ -7,6 +7,7 @@ use s3s::auth::SimpleAuth;
 use s3s::service::S3ServiceBuilder;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
+use std::sync::Arc;
 use swm_data::lance::{Shard, commit_shards, create_shard};
 use swm_data::objects::ObjectFile;
 use swm_data::{CommitPolicy, Constants, Location, StepRange, WriteMode, WriteOptions, create, open};
@@ -16,7 +17,8 @@ const TARGET: &str = "SWM_TEST_OBJECTS";
 const KEYS: [&str; 2] = ["AKEXAMPLE", "secret/example"];
 
 /// Serves the folders of a folder as buckets, to anybody or to those with the keys; gives its address. It ends with
-/// the program.
+/// the program. This server looks whether an object is there and then writes it, which S3 does in one step: so what is
+/// written is written one after the other.
 pub fn serve(root: &Path, keys: bool) -> String {
     let mut service = S3ServiceBuilder::new(s3s_fs::FileSystem::new(root).expect("a root"));
     if keys {
@@ -28,13 +30,22 @@ pub fn serve(root: &Path, keys: bool) -> String {
     listener.set_nonblocking(true).expect("as the runtime wants it");
     std::thread::spawn(move || {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
+        let writing = Arc::new(tokio::sync::Mutex::new(()));
         runtime.expect("a runtime").block_on(async move {
             let listener = tokio::net::TcpListener::from_std(listener).expect("listens");
             while let Ok((socket, _)) = listener.accept().await {
                 let server = hyper_util::server::conn::auto::Builder::new(TokioExecutor::new());
-                let service = service.clone();
+                let (service, writing) = (service.clone(), Arc::clone(&writing));
+                let orderly = hyper::service::service_fn(move |request| {
+                    let (service, writing) = (service.clone(), Arc::clone(&writing));
+                    async move {
+                        let writes = request.method() == hyper::Method::PUT;
+                        let _turn = if writes { Some(writing.lock().await) } else { None };
+                        hyper::service::Service::call(&service, request).await
+                    }
+                });
                 tokio::spawn(async move {
-                    let _ = server.serve_connection(TokioIo::new(socket), service).await;
+                    let _ = server.serve_connection(TokioIo::new(socket), orderly).await;
                 });
             }
         });

@@ -116,7 +116,7 @@ pub fn check_frames(reader: &dyn Reader, column: &str, png: &str, tolerance: u8)
 
 #[test]
 fn the_reference_s_videos_open_here() {
-    let reader = open(&interop().join("reference-video")).expect("opens");
+    let reader = open(interop().join("reference-video")).expect("opens");
     assert_eq!(reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), THEIR_LENGTHS);
     check_frames(&*reader, "pixels", "reference-video-pixels.png", 0);
     for (e, &length) in THEIR_LENGTHS.iter().enumerate() {
@@ -157,7 +157,7 @@ fn our_videos_open_in_the_reference() {
         return;
     };
     let folder = tempfile::tempdir().expect("a folder");
-    let theirs = open(&interop().join("reference-video")).expect("opens");
+    let theirs = open(interop().join("reference-video")).expect("opens");
     let schema = swm_core::Schema::new(theirs.schema().columns()[2..].to_vec()).expect("a schema");
     let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();
     for (name, codec, tolerance) in

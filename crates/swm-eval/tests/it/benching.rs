@@ -47,7 +47,8 @@ fn ratios_are_those_of_neighbouring_turns() {
     file.write_all(script.as_bytes()).expect("written");
     file.set_permissions(std::fs::Permissions::from_mode(0o755)).expect("executable");
     drop(file);
-    let report = bench_envs(&[EnvChoice::from(&ENTRY)], &BenchConfig { python: Some(python), ..config() }).expect("a report");
+    let report =
+        bench_envs(&[EnvChoice::from(&ENTRY)], &BenchConfig { python: Some(python), ..config() }).expect("a report");
     assert_eq!(report.reference, "1.2.3");
     for row in &report.rows {
         assert_eq!(row.reference, [5.0; 3]);

@@ -55,6 +55,7 @@ static WORLDS: Worlds = Worlds {
     demonstrated: false,
     size: (24, 32),
     sizes: &[(1, 1), (13, 7)],
+    steps: 2,
     goals: 2,
     rows_restored: 1,
     values: 1,

@@ -91,7 +91,7 @@ fn wrong_requests_are_refused_with_reasons() {
     let ask = |more: &[&str], code, words: &[&str]| swm.refuses(&with(ROOMS, more), code, words);
     ask(&[], 2, &["rooms", "--resume", "--overwrite"]);
     ask(&["--resume", "--pin", "agent.speed=4"], 2, &["variation", "agent.speed"]);
-    ask(&["--resume", "--codec", "jpeg"], 2, &["--codec", "png"]);
+    ask(&["--resume", "--codec", "jpeg"], 2, &["--codec", "qoi"]);
     ask(&["--overwrite", "--variation", "agent.colour"], 2, &["did you mean agent.color"]);
     ask(&["--overwrite", "--pin", "agent.color=1,2,300"], 2, &["agent.color", "0 ..= 255"]);
     ask(&["--overwrite", "--pin", "agent.color=red"], 2, &["KEY=NUMBER"]);

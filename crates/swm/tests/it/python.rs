@@ -41,6 +41,6 @@ fn the_python_lance_package_opens_a_collected_dataset() {
     // The last action of each episode is missing.
     assert_eq!(seen["nan_actions"], 3);
     assert!(seen["largest_action"].as_f64().is_some_and(|a| a <= 1.0), "{seen}");
-    assert_eq!(seen["state"], "fixed_size_list<item: float>[7]");
-    assert_eq!(seen["picture"], serde_json::json!([0x89, b'P', b'N', b'G']));
+    assert_eq!(seen["state"], "fixed_size_list<item: double>[7]");
+    assert_eq!(seen["picture"], serde_json::json!([b'q', b'o', b'i', b'f']));
 }

@@ -159,7 +159,8 @@ mod tests {
 
     #[test]
     fn the_flange_arrives() {
-        let (arm, home) = (arm(), [-1.5708, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]);
+        use std::f64::consts::FRAC_PI_2 as RIGHT;
+        let (arm, home) = (arm(), [-RIGHT, -RIGHT, RIGHT, -RIGHT, -RIGHT, 0.0]);
         let (start, _) = arm.forward(&home);
         let target = Pose { place: [start.place[0] + 0.1, start.place[1] - 0.2, start.place[2] - 0.1], ..start };
         let (reached, _) = arm.forward(&arm.solve(target, home));

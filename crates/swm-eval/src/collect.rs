@@ -12,7 +12,7 @@
 //!
 //! | column | |
 //! | --- | --- |
-//! | those of the environment | the observation |
+//! | those of the environment | the observation; a `/` in a name becomes `.`, because most formats cannot hold it |
 //! | `pixels` (and `goal`, if asked for) | pictures, in worlds that draw |
 //! | `action`, `reward`, `terminated`, `truncated`, `success` | the step |
 //! | `variation.<key>` | every factor of variation, constant over the episode |
@@ -198,7 +198,7 @@ impl Layout {
         };
         for (from, column) in infos.columns().iter().enumerate().filter(|(_, column)| copied(&column.name)) {
             observed.push((from, columns.len()));
-            columns.push(column.clone());
+            columns.push(ColumnSpec { name: column.name.replace('/', "."), ..column.clone() });
         }
         let action = columns.len();
         columns.push(spec.action_column());

@@ -223,7 +223,8 @@ impl Table {
     /// drawer and window one way or the other. The state is the goal's afterwards.
     pub(super) fn choose_goal(&mut self, physics: &mut Physics, key: Key) -> Result<()> {
         let rng = &mut key.rng();
-        let (buttons, contact, previous) = (self.buttons, self.contact, self.previous.clone());
+        let now_and_before = [self.buttons, self.previous_buttons];
+        let (contact, previous) = (self.contact, self.previous.clone());
         let now = self.fixed(physics.data().qpos());
         let places: Vec<Vec3> = self.parts.cubes.iter().map(|cube| cube.place(physics.data().qpos())).collect();
         for _ in 0..TRIES {
@@ -245,7 +246,8 @@ impl Table {
                 let gripper = within(self.setup.arm_bounds, rng);
                 physics.reset();
                 self.settle_goal(physics, &gripper, cubes, fixed, rng);
-                (self.buttons, self.contact, self.previous) = (buttons, contact, previous);
+                [self.buttons, self.previous_buttons] = now_and_before;
+                (self.contact, self.previous) = (contact, previous);
                 return Ok(());
             }
         }

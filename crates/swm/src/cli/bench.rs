@@ -137,6 +137,9 @@ struct EnvsArgs {
     /// Episodes the reference collects in a turn; 0 leaves collecting out
     #[arg(long, default_value_t = 8)]
     episodes: usize,
+    /// Steps of an episode, on both sides: the fewer, the more resets count
+    #[arg(long, default_value_t = 50)]
+    episode_steps: usize,
 }
 
 /// Measures.
@@ -156,6 +159,7 @@ pub fn bench(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
             envs: args.num_envs,
             sizes: args.sizes.clone(),
             bare: !args.pictures_only,
+            episode_steps: args.episode_steps,
             threads: context.threads,
             pairs: args.pairs,
             seconds: args.seconds,

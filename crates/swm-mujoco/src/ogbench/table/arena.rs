@@ -7,7 +7,7 @@
 
 use super::setup::{Bounds, Setup};
 use crate::{assets, link};
-use mujoco_rs::mujoco_c::{_mjtGeomBase, mjs_attach, mjtCone, mjtIntegrator, mjtSameFrame};
+use mujoco_rs::mujoco_c::{_mjtGeomBase, mjs_attach, mjtCone, mjtIntegrator};
 use mujoco_rs::wrappers::MjModel;
 use mujoco_rs::wrappers::mj_editing::{MjSpec, MjsBody, SpecElement, SpecItem, SpecObject};
 use mujoco_rs::wrappers::mj_model::MjtObjBase;
@@ -78,7 +78,6 @@ pub fn compile(setup: &Setup, look: Look) -> Result<MjModel> {
     bounding_box(world, "arm_bounds", &setup.arm_bounds, [0.3, 0.6, 0.3, 0.2]);
     let mut model = arena.compile().map_err(|error| Error::external("compiling OGBench's table", error))?;
     tune(&mut model, look);
-    free_markers(&mut model);
     Ok(model)
 }
 
@@ -179,18 +178,6 @@ fn bounding_box(world: &mut MjsBody, name: &str, [low, high]: &Bounds<3>, color:
     *site.rgba_mut() = color;
     site.set_type(_mjtGeomBase::mjGEOM_BOX);
     site.set_group(4);
-}
-
-/// Lets geoms of markers be elsewhere than their bodies: MuJoCo takes a short cut where both were at the same place.
-fn free_markers(model: &mut MjModel) {
-    let markers: Vec<usize> =
-        model.body_mocapid().iter().enumerate().filter(|(_, id)| **id >= 0).map(|(i, _)| i).collect();
-    let bodies = model.geom_bodyid().to_vec();
-    for (geom, body) in bodies.into_iter().enumerate() {
-        if usize::try_from(body).is_ok_and(|body| markers.contains(&body)) {
-            model.geom_sameframe_mut()[geom] = mjtSameFrame::mjSAMEFRAME_NONE;
-        }
-    }
 }
 
 /// The arm's gains, and its look.

@@ -8,6 +8,7 @@ use crate::ogbench::arm::find;
 use crate::ogbench::arm::pose::{Quat, Vec3, cross, norm, normalized, scale, sub};
 use crate::ogbench::floor;
 use mujoco_rs::mujoco_c::_mjtObjBase::{mjOBJ_CAMERA, mjOBJ_LIGHT, mjOBJ_MATERIAL};
+use mujoco_rs::mujoco_c::mjtSameFrame;
 use std::f64::consts::TAU;
 use swm_core::{DType, Factor, FactorValues, Result, Space, VariationSpace};
 
@@ -96,6 +97,10 @@ pub fn apply(physics: &mut Physics, setup: &Setup, parts: &Parts, factors: &Fact
         }
     }
     physics.set_const();
+    // Marks stand elsewhere than their bodies: MuJoCo takes a short cut where both were at the same place.
+    for cube in &parts.cubes {
+        physics.model_mut().geom_sameframe_mut()[cube.geoms[1]] = mjtSameFrame::mjSAMEFRAME_NONE;
+    }
     set_means(physics);
     floor::paint(physics, factors.get("floor.color"))
 }

@@ -78,7 +78,7 @@ impl Egl {
             let (library, queue, answer) = (Arc::clone(&library), Arc::clone(&queue), answer.clone());
             std::thread::Builder::new()
                 .name(format!("render-{i}"))
-                .spawn(move || draw_forever(&library, display, &queue, &answer))
+                .spawn(move || draw_forever(library, display, &queue, &answer))
                 .map_err(|error| Error::external("starting a thread that draws", error))?;
         }
         drop(answer);
@@ -125,10 +125,14 @@ impl Renderer for Egl {
     }
 }
 
-/// The life of a thread that draws: a context, and then job after job.
-fn draw_forever(library: &Library, display: Display, queue: &Queue, answer: &Sender<Result<String>>) {
-    let device = match library.make_current(display) {
-        Ok(device) => device,
+/// The life of a thread that draws: it sees whether it can, and then does job after job.
+fn draw_forever(library: Arc<Library>, display: Display, queue: &Queue, answer: &Sender<Result<String>>) {
+    let device = match library.canvas(display) {
+        Ok(canvas) => {
+            let device = library.device();
+            library.discard(&canvas);
+            device
+        }
         Err(error) => {
             // Nobody listens any more where another thread came first.
             let _unheard = answer.send(Err(error));
@@ -136,7 +140,7 @@ fn draw_forever(library: &Library, display: Display, queue: &Queue, answer: &Sen
         }
     };
     let _unheard = answer.send(Ok(device));
-    let mut contexts = Contexts::default();
+    let mut contexts = Contexts::new(library, display);
     loop {
         let mut jobs = lock(&queue.jobs);
         let job = loop {

@@ -1,5 +1,6 @@
 //! What a thread that draws keeps of the models it draws: MuJoCo's contexts, with meshes and textures on the device.
 
+use super::library::{Canvas, Display, Library};
 use crate::render::{Look, Picture, Scene};
 use crate::{ffi, link};
 use mujoco_rs::mujoco_c::{
@@ -7,7 +8,7 @@ use mujoco_rs::mujoco_c::{
 };
 use mujoco_rs::wrappers::MjModel;
 use std::ffi::c_int;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
 
 /// Contexts a thread keeps; the one unused for longest makes room. Each holds a shadow map of 64 MB, and more.
@@ -17,21 +18,30 @@ const MOST: usize = 4;
 static COUNTING: Mutex<()> = Mutex::new(());
 
 /// The contexts of one thread, the one used last at the end.
-#[derive(Default)]
 pub struct Contexts {
+    library: Arc<Library>,
+    display: Display,
     kept: Vec<Context>,
     /// Where coloured geoms are read to.
     scratch: Vec<u8>,
 }
 
-/// A context for models of one group.
+/// A context for models of one group. Each has a canvas of its own: MuJoCo leaves lights and the shadow map in OpenGL's
+/// state, and would light one model as another.
 struct Context {
+    library: Arc<Library>,
+    canvas: Canvas,
     inner: Box<mjrContext>,
     /// What was sent to the device.
     look: Look,
 }
 
 impl Contexts {
+    /// None yet, and where they will be made.
+    pub fn new(library: Arc<Library>, display: Display) -> Self {
+        Self { library, display, kept: vec![], scratch: vec![] }
+    }
+
     /// Draws a scene into the caller's buffer.
     ///
     /// # Errors
@@ -46,12 +56,16 @@ impl Contexts {
         let rect = mjrRect { left: 0, bottom: 0, width: size(width)?, height: size(height)? };
         let Scene { abstracted, model, look } = scene;
         let mut context = match self.kept.iter().position(|context| context.look.group == look.group) {
-            Some(place) => self.kept.remove(place),
+            Some(place) => {
+                let context = self.kept.remove(place);
+                self.library.bind(&context.canvas)?;
+                context
+            }
             None => {
                 if self.kept.len() == MOST {
                     self.kept.remove(0);
                 }
-                Context::new(model, look)?
+                Context::new(Arc::clone(&self.library), self.display, model, look)?
             }
         };
         context.fit(model, look, rect)?;
@@ -79,8 +93,20 @@ impl Contexts {
 }
 
 impl Context {
-    /// A context for a model; OpenGL is current on this thread.
-    fn new(model: &MjModel, look: &Look) -> Result<Self> {
+    /// A context for a model, its canvas bound to this thread.
+    fn new(library: Arc<Library>, display: Display, model: &MjModel, look: &Look) -> Result<Self> {
+        let canvas = library.canvas(display)?;
+        match Self::make(model) {
+            Ok(inner) => Ok(Self { library, canvas, inner, look: look.clone() }),
+            Err(error) => {
+                library.discard(&canvas);
+                Err(error)
+            }
+        }
+    }
+
+    /// MuJoCo's part of it, on the canvas that is bound.
+    fn make(model: &MjModel) -> Result<Box<mjrContext>> {
         let mut inner = Box::new_uninit();
         let model: *const mjModel = model.ffi();
         let turn = COUNTING.lock().unwrap_or_else(PoisonError::into_inner);
@@ -95,7 +121,7 @@ impl Context {
             inner
         };
         drop(turn);
-        Ok(Self { inner, look: look.clone() })
+        Ok(inner)
     }
 
     /// Draws into its own memory: not to a window, nor where another context of this thread drew last.
@@ -159,8 +185,11 @@ impl Drop for Context {
     fn drop(&mut self) {
         let _turn = COUNTING.lock().unwrap_or_else(PoisonError::into_inner);
         let context = &raw mut *self.inner;
-        // SAFETY: the context was made on this thread. An error while it goes is of no consequence to anybody.
-        let _gone = link::guard("freeing a context", || unsafe { ffi::mjr_freeContext(context) });
+        if self.library.bind(&self.canvas).is_ok() {
+            // SAFETY: the context was made on this thread. An error while it goes is of no consequence to anybody.
+            let _gone = link::guard("freeing a context", || unsafe { ffi::mjr_freeContext(context) });
+        }
+        self.library.discard(&self.canvas);
     }
 }
 

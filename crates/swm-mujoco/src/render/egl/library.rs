@@ -30,6 +30,8 @@ pub struct Library {
     create_context: unsafe extern "C" fn(Pointer, Pointer, Pointer, *const c_int) -> Pointer,
     create_pbuffer: unsafe extern "C" fn(Pointer, Pointer, *const c_int) -> Pointer,
     make_current: unsafe extern "C" fn(Pointer, Pointer, Pointer, Pointer) -> Bool,
+    destroy_surface: unsafe extern "C" fn(Pointer, Pointer) -> Bool,
+    destroy_context: unsafe extern "C" fn(Pointer, Pointer) -> Bool,
     get_error: unsafe extern "C" fn() -> c_int,
     /// Keeps the functions where they are.
     _shared: Shared,
@@ -45,6 +47,14 @@ pub struct Display {
 
 // SAFETY: EGL allows a display to be used from any thread.
 unsafe impl Send for Display {}
+
+/// An OpenGL context, with the state that is OpenGL's own: lights, textures, the shadow map. Used by one thread.
+pub struct Canvas {
+    display: Pointer,
+    context: Pointer,
+    /// What older drivers want to be there; null for others.
+    surface: Pointer,
+}
 
 impl Library {
     /// Opens EGL. Its symbols become visible to all: MuJoCo looks for OpenGL's functions through them.
@@ -66,6 +76,8 @@ impl Library {
                 create_context: *shared.get("eglCreateContext").map_err(failed)?,
                 create_pbuffer: *shared.get("eglCreatePbufferSurface").map_err(failed)?,
                 make_current: *shared.get("eglMakeCurrent").map_err(failed)?,
+                destroy_surface: *shared.get("eglDestroySurface").map_err(failed)?,
+                destroy_context: *shared.get("eglDestroyContext").map_err(failed)?,
                 get_error: *shared.get("eglGetError").map_err(failed)?,
                 _shared: shared,
             })
@@ -155,37 +167,77 @@ impl Library {
         (chosen == TRUE && count > 0).then_some(config)
     }
 
-    /// Makes a context and binds it to this thread, for good. Returns what draws, in OpenGL's words.
+    /// The error of what EGL refused on this thread.
+    fn refused(&self, what: &str) -> Error {
+        // SAFETY: asks for the error of this thread.
+        let code = unsafe { (self.get_error)() };
+        Error::external("EGL", format!("{what} failed with {code:#x}"))
+    }
+
+    /// Makes an OpenGL context and binds it to this thread.
     ///
     /// # Errors
     /// When EGL refuses.
-    pub fn make_current(&self, display: Display) -> Result<String> {
-        let refused = |what: &str| {
-            // SAFETY: asks for the error of this thread.
-            let code = unsafe { (self.get_error)() };
-            Error::external("EGL", format!("{what} failed with {code:#x}"))
-        };
+    pub fn canvas(&self, display: Display) -> Result<Canvas> {
         let null = std::ptr::null_mut();
-        let config = self.config(display).ok_or_else(|| refused("choosing a configuration"))?;
-        // SAFETY: display and configuration are EGL's own; lists end in NONE. The context is current when OpenGL is asked.
+        let config = self.config(display).ok_or_else(|| self.refused("choosing a configuration"))?;
+        let display = display.pointer;
+        // SAFETY: display and configuration are EGL's own; lists end in NONE.
         unsafe {
             if (self.bind_api)(OPENGL_API) != TRUE {
-                return Err(refused("choosing OpenGL"));
+                return Err(self.refused("choosing OpenGL"));
             }
-            let context = (self.create_context)(display.pointer, config, null, std::ptr::null());
+            let context = (self.create_context)(display, config, null, std::ptr::null());
             if context.is_null() {
-                return Err(refused("making a context"));
+                return Err(self.refused("making a context"));
             }
-            if (self.make_current)(display.pointer, null, null, context) != TRUE {
+            let mut canvas = Canvas { display, context, surface: null };
+            if self.bind(&canvas).is_err() {
                 // Older drivers want a surface, though nothing is drawn to it.
-                let surface = (self.create_pbuffer)(display.pointer, config, PBUFFER.as_ptr());
-                if surface.is_null() || (self.make_current)(display.pointer, surface, surface, context) != TRUE {
-                    return Err(refused("making a context current"));
+                canvas.surface = (self.create_pbuffer)(display, config, PBUFFER.as_ptr());
+                if let Err(error) = self.bind(&canvas) {
+                    self.discard(&canvas);
+                    return Err(error);
                 }
             }
+            Ok(canvas)
+        }
+    }
+
+    /// What OpenGL calls go to on this thread from now on.
+    ///
+    /// # Errors
+    /// When EGL refuses.
+    pub fn bind(&self, canvas: &Canvas) -> Result<()> {
+        let Canvas { display, context, surface } = *canvas;
+        // SAFETY: all three are EGL's own, and used by this thread alone.
+        match unsafe { (self.make_current)(display, surface, surface, context) } {
+            TRUE => Ok(()),
+            _ => Err(self.refused("making a context current")),
+        }
+    }
+
+    /// Gives a context back; nothing is bound to this thread afterwards.
+    pub fn discard(&self, canvas: &Canvas) {
+        let Canvas { display, context, surface } = *canvas;
+        let null = std::ptr::null_mut();
+        // SAFETY: as in `bind`; neither is used again.
+        unsafe {
+            (self.make_current)(display, null, null, null);
+            if !surface.is_null() {
+                (self.destroy_surface)(display, surface);
+            }
+            (self.destroy_context)(display, context);
+        }
+    }
+
+    /// What draws, in OpenGL's words; a canvas is bound.
+    pub fn device(&self) -> String {
+        // SAFETY: the signature is OpenGL's; it answers with text that stays.
+        unsafe {
             let get_string: Option<unsafe extern "C" fn(u32) -> *const c_char> = self.extension(c"glGetString");
             let name = get_string.map_or(std::ptr::null(), |get_string| get_string(GL_RENDERER));
-            Ok(if name.is_null() { "unknown".to_owned() } else { CStr::from_ptr(name).to_string_lossy().into_owned() })
+            if name.is_null() { "unknown".to_owned() } else { CStr::from_ptr(name).to_string_lossy().into_owned() }
         }
     }
 }

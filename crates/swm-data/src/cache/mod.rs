@@ -12,6 +12,7 @@ use crate::episodes::Rows;
 use crate::format::{Constants, Episode, Irregularity, Reader, StepRange};
 use disk::DiskRows;
 use memory::MemoryRows;
+use std::cell::RefCell;
 use std::ops::Range;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -146,6 +147,11 @@ impl CachedReader {
     }
 }
 
+thread_local! {
+    /// Where a loader's thread decodes what is not kept; fresh memory for every batch would cost as much as decoding.
+    static DECODED: RefCell<Vec<u8>> = const { RefCell::new(vec![]) };
+}
+
 impl Reader for CachedReader {
     fn schema(&self) -> &Schema {
         self.inner.schema()
@@ -196,13 +202,16 @@ impl Reader for CachedReader {
                     missing.iter().zip(out.chunks_exact(n)).for_each(|((_, row, _), bytes)| kept.put(*row, bytes));
                     return Ok(());
                 }
-                let mut decoded = vec![0; missing.len() * n];
-                self.inner.read_column(column, &ranges, &mut decoded)?;
-                for ((place, row, _), bytes) in missing.iter().zip(decoded.chunks_exact(n)) {
+                // Taken while it is used: the reader below may be a cache as well.
+                let mut decoded = DECODED.take();
+                decoded.resize(missing.len() * n, 0);
+                let read = self.inner.read_column(column, &ranges, &mut decoded);
+                for ((place, row, _), bytes) in missing.iter().zip(decoded.chunks_exact(n)).filter(|_| read.is_ok()) {
                     out[place * n..(place + 1) * n].copy_from_slice(bytes);
                     kept.put(*row, bytes);
                 }
-                Ok(())
+                DECODED.set(decoded);
+                read
             }
         }
     }

@@ -1,76 +1,14 @@
-//! Parity with the published LeWM: weights under their published names, outputs, rollouts, costs, losses and
-//! gradients of the reference implementation. Reads every `lewm-*.safetensors` of the folder named by
-//! `SWM_GOLDEN_MODELS`, or of `tests/golden` (written by `export_lewm.py` beside it), or of the shared reference.
+//! LeWM: outputs, rollouts, costs, losses and gradients.
 
-use burn::tensor::{Device, Tensor, TensorData};
-use safetensors::SafeTensors;
-use std::collections::BTreeMap;
-use std::path::PathBuf;
+use super::{Golden, TOLERANCE, check, error, files, values};
+use burn::tensor::{Device, Tensor};
 use swm_core::Key;
 use swm_models::lewm::step::{SigregConfig, TrainBatch, step};
 use swm_models::lewm::{EncoderConfig, Lewm, LewmConfig, Rollout};
-use swm_models::nn::parameters::{self, HostTensor, Named};
+use swm_models::nn::parameters;
 use swm_models::nn::{PredictorConfig, VitConfig};
 
-const TOLERANCE: f32 = 1e-4;
-
-struct Golden {
-    config: serde_json::Value,
-    tensors: BTreeMap<String, HostTensor>,
-}
-
 impl Golden {
-    fn read(path: &std::path::Path) -> Self {
-        let bytes = std::fs::read(path).expect("the file is readable");
-        let (_, metadata) = SafeTensors::read_metadata(&bytes).expect("a safetensors file");
-        let config = &metadata.metadata().as_ref().expect("metadata")["config"];
-        let tensors = SafeTensors::deserialize(&bytes).expect("a safetensors file");
-        let tensors = tensors
-            .iter()
-            .filter(|(_, view)| view.dtype() == safetensors::Dtype::F32)
-            .map(|(name, view)| {
-                let values =
-                    view.data().chunks(4).map(|b| f32::from_le_bytes(b.try_into().expect("4 bytes"))).collect();
-                (name.to_owned(), HostTensor { shape: view.shape().to_vec(), values })
-            })
-            .collect();
-        Self { config: serde_json::from_str(config).expect("JSON"), tensors }
-    }
-
-    fn size(&self, name: &str) -> usize {
-        usize::try_from(self.config[name].as_u64().expect(name)).expect("a size")
-    }
-
-    fn get(&self, name: &str) -> &HostTensor {
-        self.tensors.get(name).unwrap_or_else(|| panic!("no tensor {name}"))
-    }
-
-    fn tensor<const D: usize>(&self, name: &str) -> Tensor<D> {
-        let host = self.get(name);
-        let shape: [usize; D] = host.shape.clone().try_into().expect("rank");
-        Tensor::from_data(TensorData::new(host.values.clone(), shape), &Device::flex())
-    }
-
-    fn group(&self, prefix: &str) -> Named<HostTensor> {
-        let strip =
-            |(name, tensor): (&String, &HostTensor)| Some((name.strip_prefix(prefix)?.to_owned(), tensor.clone()));
-        self.tensors.iter().filter_map(strip).collect()
-    }
-
-    /// Pictures `[…, 3, image, image]`, already normalised, as patches.
-    fn patches(&self, name: &str) -> Tensor<3> {
-        let (image, patch) = (self.size("image"), self.size("patch"));
-        let (host, grid) = (self.get(name), image / patch);
-        let frames = host.values.len() / (3 * image * image);
-        let frames_tensor =
-            Tensor::<1>::from_data(TensorData::new(host.values.clone(), [host.values.len()]), &Device::flex());
-        frames_tensor.reshape([frames, 3, grid, patch, grid, patch]).permute([0, 2, 4, 1, 3, 5]).reshape([
-            frames,
-            grid * grid,
-            3 * patch * patch,
-        ])
-    }
-
     fn config(&self) -> LewmConfig {
         let dim = self.size("dim");
         LewmConfig {
@@ -109,47 +47,9 @@ impl Golden {
     }
 }
 
-/// The largest difference, relative to the largest number (or to `floor`, where all are tiny).
-fn error(ours: &[f32], theirs: &[f32], floor: f32) -> f32 {
-    assert_eq!(ours.len(), theirs.len());
-    let scale = theirs.iter().fold(floor, |m, v| m.max(v.abs()));
-    ours.iter().zip(theirs).fold(0.0f32, |m, (a, b)| m.max((a - b).abs())) / scale
-}
-
-fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().iter::<f32>().collect()
-}
-
-fn check(golden: &Golden, name: &str, ours: &[f32]) {
-    let error = error(ours, &golden.get(name).values, 1e-6);
-    println!("{name}: {error:.1e}");
-    assert!(error < TOLERANCE, "{name} differs by {error:.1e}");
-}
-
-fn files() -> Vec<PathBuf> {
-    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
-    let folders = match std::env::var_os("SWM_GOLDEN_MODELS") {
-        Some(folder) => vec![PathBuf::from(folder)],
-        None => vec![root.join("tests/golden"), root.join("../../../shared/reference/models")],
-    };
-    let mut files: Vec<PathBuf> = folders
-        .iter()
-        .filter_map(|folder| std::fs::read_dir(folder).ok())
-        .flatten()
-        .map(|entry| entry.expect("a folder entry").path())
-        .filter(|path| {
-            let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
-            name.starts_with("lewm-") && name.ends_with(".safetensors")
-        })
-        .collect();
-    files.sort();
-    assert!(!files.is_empty(), "no lewm-*.safetensors in {folders:?}: set SWM_GOLDEN_MODELS to a folder that has one");
-    files
-}
-
 #[test]
 fn golden_evaluation() {
-    for file in files() {
+    for file in files("lewm") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
         let model = golden.model();
@@ -210,7 +110,7 @@ fn golden_evaluation() {
 
 #[test]
 fn golden_training() {
-    for file in files() {
+    for file in files("lewm") {
         println!("{}", file.display());
         let golden = Golden::read(&file);
         let projections = golden.tensor::<2>("i.sigreg_projections");

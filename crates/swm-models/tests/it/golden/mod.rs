@@ -1,0 +1,113 @@
+//! Parity with the published models: weights under their published names, outputs, losses and gradients of the
+//! reference implementation. Every test reads each `<model>-*.safetensors` of the folder named by `SWM_GOLDEN_MODELS`, or
+//! of `tests/golden` (written by the exporters beside them) and of the shared reference.
+
+mod lewm;
+
+use burn::tensor::{Device, Tensor, TensorData};
+use safetensors::SafeTensors;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use swm_models::nn::parameters::{HostTensor, Named};
+
+const TOLERANCE: f32 = 1e-4;
+
+struct Golden {
+    config: serde_json::Value,
+    tensors: BTreeMap<String, HostTensor>,
+}
+
+impl Golden {
+    fn read(path: &std::path::Path) -> Self {
+        let bytes = std::fs::read(path).expect("the file is readable");
+        let (_, metadata) = SafeTensors::read_metadata(&bytes).expect("a safetensors file");
+        let config = &metadata.metadata().as_ref().expect("metadata")["config"];
+        let tensors = SafeTensors::deserialize(&bytes).expect("a safetensors file");
+        let tensors = tensors
+            .iter()
+            .filter(|(_, view)| view.dtype() == safetensors::Dtype::F32)
+            .map(|(name, view)| {
+                let values =
+                    view.data().chunks(4).map(|b| f32::from_le_bytes(b.try_into().expect("4 bytes"))).collect();
+                (name.to_owned(), HostTensor { shape: view.shape().to_vec(), values })
+            })
+            .collect();
+        Self { config: serde_json::from_str(config).expect("JSON"), tensors }
+    }
+
+    fn size(&self, name: &str) -> usize {
+        usize::try_from(self.config[name].as_u64().expect(name)).expect("a size")
+    }
+
+    fn get(&self, name: &str) -> &HostTensor {
+        self.tensors.get(name).unwrap_or_else(|| panic!("no tensor {name}"))
+    }
+
+    fn tensor<const D: usize>(&self, name: &str) -> Tensor<D> {
+        let host = self.get(name);
+        let shape: [usize; D] = host.shape.clone().try_into().expect("rank");
+        Tensor::from_data(TensorData::new(host.values.clone(), shape), &Device::flex())
+    }
+
+    fn group(&self, prefix: &str) -> Named<HostTensor> {
+        let strip =
+            |(name, tensor): (&String, &HostTensor)| Some((name.strip_prefix(prefix)?.to_owned(), tensor.clone()));
+        self.tensors.iter().filter_map(strip).collect()
+    }
+
+    /// Pictures `[…, 3, image, image]`, already normalised, as patches.
+    fn patches(&self, name: &str) -> Tensor<3> {
+        let (image, patch) = (self.size("image"), self.size("patch"));
+        let (host, grid) = (self.get(name), image / patch);
+        let frames = host.values.len() / (3 * image * image);
+        let frames_tensor =
+            Tensor::<1>::from_data(TensorData::new(host.values.clone(), [host.values.len()]), &Device::flex());
+        frames_tensor.reshape([frames, 3, grid, patch, grid, patch]).permute([0, 2, 4, 1, 3, 5]).reshape([
+            frames,
+            grid * grid,
+            3 * patch * patch,
+        ])
+    }
+}
+
+/// The largest difference, relative to the largest number (or to `floor`, where all are tiny).
+fn error(ours: &[f32], theirs: &[f32], floor: f32) -> f32 {
+    assert_eq!(ours.len(), theirs.len());
+    let scale = theirs.iter().fold(floor, |m, v| m.max(v.abs()));
+    ours.iter().zip(theirs).fold(0.0f32, |m, (a, b)| m.max((a - b).abs())) / scale
+}
+
+fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
+    tensor.into_data().iter::<f32>().collect()
+}
+
+fn check(golden: &Golden, name: &str, ours: &[f32]) {
+    let error = error(ours, &golden.get(name).values, 1e-6);
+    println!("{name}: {error:.1e}");
+    assert!(error < TOLERANCE, "{name} differs by {error:.1e}");
+}
+
+/// The recorded files of a model.
+fn files(model: &str) -> Vec<PathBuf> {
+    let root = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
+    let folders = match std::env::var_os("SWM_GOLDEN_MODELS") {
+        Some(folder) => vec![PathBuf::from(folder)],
+        None => vec![root.join("tests/golden"), root.join("../../../shared/reference/models")],
+    };
+    let mut files: Vec<PathBuf> = folders
+        .iter()
+        .filter_map(|folder| std::fs::read_dir(folder).ok())
+        .flatten()
+        .map(|entry| entry.expect("a folder entry").path())
+        .filter(|path| {
+            let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+            name.starts_with(&format!("{model}-")) && name.ends_with(".safetensors")
+        })
+        .collect();
+    files.sort();
+    assert!(
+        !files.is_empty(),
+        "no {model}-*.safetensors in {folders:?}: set SWM_GOLDEN_MODELS to a folder that has one"
+    );
+    files
+}

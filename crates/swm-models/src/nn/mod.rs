@@ -3,15 +3,20 @@
 //! generator.
 
 pub mod activation;
+pub mod backbone;
+pub mod dino;
 pub mod linear;
 pub mod mlp;
 pub mod norm;
 pub mod parameters;
+pub mod positions;
 pub mod predictor;
 pub mod pyramid;
 pub mod vit;
 
 pub use activation::{Activation, Noise};
+pub use backbone::{Backbone, BackboneConfig};
+pub use dino::{Dino, DinoConfig};
 pub use linear::Linear;
 pub use mlp::{Embedder, Projector};
 pub use norm::{BatchNorm, BatchStatistics, LayerNorm};

@@ -1,6 +1,7 @@
 //! A vision transformer (Dosovitskiy et al. 2021, pre-norm, class token, learned positions), named as the
-//! published checkpoints name it.
+//! published checkpoints name it. Pictures of other sizes than it was made for get interpolated positions.
 
+use super::positions::{Resampling, positions};
 use super::{Activation, Init, LayerNorm, Linear};
 use burn::module::{Module, Param};
 use burn::tensor::{Tensor, activation};
@@ -22,7 +23,7 @@ pub struct VitConfig {
     pub mlp: usize,
 }
 
-/// A vision transformer that returns its class token.
+/// A vision transformer.
 #[derive(Module, Debug)]
 pub struct Vit {
     /// Patches, class token and positions.
@@ -126,11 +127,31 @@ pub struct Dense {
 }
 
 /// The spread of initial weights.
-const STD: f32 = 0.02;
+pub(super) const STD: f32 = 0.02;
 /// What the layer normalisations add to the variance.
 const EPSILON: f64 = 1e-12;
 
 impl VitConfig {
+    /// The published sizes, by features of a token; the feed-forward part is four times as wide.
+    const fn sized(patch: usize, dim: usize, depth: usize, heads: usize) -> Self {
+        Self { patch, dim, depth, heads, mlp: 4 * dim }
+    }
+
+    /// ViT-tiny.
+    pub const fn tiny(patch: usize) -> Self {
+        Self::sized(patch, 192, 12, 3)
+    }
+
+    /// ViT-small.
+    pub const fn small(patch: usize) -> Self {
+        Self::sized(patch, 384, 12, 6)
+    }
+
+    /// ViT-base.
+    pub const fn base(patch: usize) -> Self {
+        Self::sized(patch, 768, 12, 12)
+    }
+
     /// A transformer for square pictures of `image` pixels.
     pub fn init(&self, init: &Init, image: usize) -> Vit {
         let (dim, tokens) = (self.dim, (image / self.patch).pow(2));
@@ -138,14 +159,9 @@ impl VitConfig {
             |init: &Init, inputs, outputs| Dense { dense: Linear::normal(&init.of("dense"), inputs, outputs, STD) };
         let layer = |index| {
             let init = init.of("layer").at(index);
-            let part = |name| Linear::normal(&init.of(name), dim, dim, STD);
             Layer {
                 layernorm_before: LayerNorm::new(&init, dim, EPSILON),
-                attention: Attention {
-                    attention: Qkv { query: part("query"), key: part("key"), value: part("value") },
-                    output: dense(&init.of("attention"), dim, dim),
-                    heads: self.heads,
-                },
+                attention: Attention::new(&init, dim, self.heads),
                 layernorm_after: LayerNorm::new(&init, dim, EPSILON),
                 intermediate: dense(&init.of("intermediate"), dim, self.mlp),
                 output: dense(&init.of("output"), self.mlp, dim),
@@ -164,41 +180,100 @@ impl VitConfig {
 }
 
 impl Vit {
+    /// The class token.
+    ///
     /// # Shapes
     /// `[frames, patches, 3 * patch * patch]` to `[frames, dim]`.
     pub fn forward(&self, patches: Tensor<3>) -> Tensor<2> {
-        let [frames, count, numbers] = patches.dims();
-        let [_, _, dim] = self.embeddings.cls_token.dims();
-        let tokens = self.embeddings.patch_embeddings.projection.forward(patches.reshape([frames * count, numbers]));
-        let class = self.embeddings.cls_token.val().expand([frames, 1, dim]);
-        let mut tokens = Tensor::cat(vec![class, tokens.reshape([frames, count, dim])], 1)
-            + self.embeddings.position_embeddings.val();
-        for layer in &self.encoder.layer {
-            tokens = layer.forward(tokens);
+        let class = self.run(patches, Some(1));
+        let [frames, _, dim] = class.dims();
+        class.reshape([frames, dim])
+    }
+
+    /// All tokens: the class token, then one a patch.
+    ///
+    /// # Shapes
+    /// `[frames, patches, 3 * patch * patch]` to `[frames, 1 + patches, dim]`.
+    pub fn tokens(&self, patches: Tensor<3>) -> Tensor<3> {
+        self.run(patches, None)
+    }
+
+    /// The first `asked` tokens, or all. Others are not computed where nothing asked for depends on them.
+    fn run(&self, patches: Tensor<3>, asked: Option<usize>) -> Tensor<3> {
+        let Embeddings { cls_token, position_embeddings, patch_embeddings } = &self.embeddings;
+        let projection = &patch_embeddings.projection;
+        let mut tokens = embed(patches, projection, cls_token, position_embeddings, Resampling::Bicubic);
+        for (index, layer) in self.encoder.layer.iter().enumerate() {
+            tokens = layer.forward(tokens, asked.filter(|_| index + 1 == self.encoder.layer.len()));
         }
-        self.layernorm.forward(tokens.slice([0..frames, 0..1, 0..dim])).reshape([frames, dim])
+        self.layernorm.forward(match asked {
+            Some(asked) => leading(tokens, asked),
+            None => tokens,
+        })
     }
 }
 
+/// The first tokens.
+pub(super) fn leading(tokens: Tensor<3>, count: usize) -> Tensor<3> {
+    let [frames, _, dim] = tokens.dims();
+    tokens.slice([0..frames, 0..count, 0..dim])
+}
+
+/// Patches as tokens behind a class token, with positions (of learnt ones, resampled to the patches' grid).
+///
+/// # Shapes
+/// `[frames, patches, 3 * patch * patch]` to `[frames, 1 + patches, dim]`.
+pub(super) fn embed(
+    patches: Tensor<3>,
+    projection: &Projection,
+    class: &Param<Tensor<3>>,
+    learnt: &Param<Tensor<3>>,
+    resampling: Resampling,
+) -> Tensor<3> {
+    let [frames, count, numbers] = patches.dims();
+    let [_, _, dim] = class.dims();
+    let tokens = projection.forward(patches.reshape([frames * count, numbers])).reshape([frames, count, dim]);
+    Tensor::cat(vec![class.val().expand([frames, 1, dim]), tokens], 1) + positions(learnt.val(), count, resampling)
+}
+
 impl Layer {
-    fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        let x = x.clone() + self.attention.forward(self.layernorm_before.forward(x));
+    /// All tokens, or the first `asked`.
+    fn forward(&self, x: Tensor<3>, asked: Option<usize>) -> Tensor<3> {
+        let mixed = self.attention.forward(self.layernorm_before.forward(x.clone()), asked);
+        let x = match asked {
+            Some(asked) => leading(x, asked),
+            None => x,
+        } + mixed;
         let hidden = self.intermediate.dense.forward(self.layernorm_after.forward(x.clone()));
         x + self.output.dense.forward(Activation::Gelu.forward(hidden))
     }
 }
 
 impl Attention {
+    /// Attention of `heads` heads, drawn as its layers are.
+    pub(super) fn new(init: &Init, dim: usize, heads: usize) -> Self {
+        let part = |name| Linear::normal(&init.of(name), dim, dim, STD);
+        Self {
+            attention: Qkv { query: part("query"), key: part("key"), value: part("value") },
+            output: Dense { dense: Linear::normal(&init.of("attention").of("dense"), dim, dim, STD) },
+            heads,
+        }
+    }
+
+    /// What all tokens, or the first `asked`, attend to.
     #[allow(clippy::cast_precision_loss)]
-    fn forward(&self, x: Tensor<3>) -> Tensor<3> {
+    pub(super) fn forward(&self, x: Tensor<3>, asked: Option<usize>) -> Tensor<3> {
         let [frames, tokens, dim] = x.dims();
-        let width = dim / self.heads;
-        let split =
-            |layer: &Linear| layer.forward(x.clone()).reshape([frames, tokens, self.heads, width]).swap_dims(1, 2);
-        let (query, key, value) =
-            (split(&self.attention.query), split(&self.attention.key), split(&self.attention.value));
+        let (asked, width) = (asked.unwrap_or(tokens), dim / self.heads);
+        let split = |layer: &Linear, x: Tensor<3>| {
+            let [_, count, _] = x.dims();
+            layer.forward(x).reshape([frames, count, self.heads, width]).swap_dims(1, 2)
+        };
+        let parts = &self.attention;
+        let query = split(&parts.query, leading(x.clone(), asked));
+        let (key, value) = (split(&parts.key, x.clone()), split(&parts.value, x));
         let scores = query.matmul(key.transpose()) / (width as f64).sqrt();
         let mixed = activation::softmax(scores, 3).matmul(value);
-        self.output.dense.forward(mixed.swap_dims(1, 2).reshape([frames, tokens, dim]))
+        self.output.dense.forward(mixed.swap_dims(1, 2).reshape([frames, asked, dim]))
     }
 }

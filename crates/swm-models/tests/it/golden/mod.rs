@@ -3,6 +3,7 @@
 //! of `tests/golden` (written by the exporters beside them) and of the shared reference.
 
 mod lewm;
+mod vit;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use safetensors::SafeTensors;
@@ -55,9 +56,14 @@ impl Golden {
         self.tensors.iter().filter_map(strip).collect()
     }
 
-    /// Pictures `[…, 3, image, image]`, already normalised, as patches.
+    /// Pictures of the configured size, already normalised, as patches.
     fn patches(&self, name: &str) -> Tensor<3> {
-        let (image, patch) = (self.size("image"), self.size("patch"));
+        self.cut(name, self.size("image"))
+    }
+
+    /// Pictures `[…, 3, image, image]`, already normalised, as patches.
+    fn cut(&self, name: &str, image: usize) -> Tensor<3> {
+        let patch = self.size("patch");
         let (host, grid) = (self.get(name), image / patch);
         let frames = host.values.len() / (3 * image * image);
         let frames_tensor =

@@ -1,0 +1,150 @@
+//! [`Backbone`]: any of the picture encoders, behind one door.
+
+use super::{Dino, DinoConfig, Init, Pyramid, PyramidConfig, Vit, VitConfig};
+use burn::module::Module;
+use burn::tensor::Tensor;
+use serde::{Deserialize, Serialize};
+use swm_core::{Error, Result};
+
+/// Which picture encoder, and its size.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum BackboneConfig {
+    /// A vision transformer.
+    Vit(VitConfig),
+    /// DINOv2.
+    Dinov2(DinoConfig),
+    /// Convolutions of disjoint patches: small and fast.
+    Pyramid(PyramidConfig),
+}
+
+/// A picture encoder.
+#[derive(Module, Debug)]
+#[allow(clippy::large_enum_variant)]
+pub enum Backbone {
+    /// A vision transformer.
+    Vit(Vit),
+    /// DINOv2.
+    Dinov2(Dino),
+    /// Convolutions of disjoint patches.
+    Pyramid(Pyramid),
+}
+
+impl BackboneConfig {
+    /// Side of the patches the picture is cut into.
+    pub fn patch(&self) -> usize {
+        match self {
+            Self::Vit(vit) => vit.patch,
+            Self::Dinov2(dino) => dino.patch,
+            Self::Pyramid(pyramid) => pyramid.stages.first().map_or(0, |stage| stage.patch),
+        }
+    }
+
+    /// Features of a picture, or of a patch.
+    pub fn dim(&self) -> usize {
+        match self {
+            Self::Vit(vit) => vit.dim,
+            Self::Dinov2(dino) => dino.dim,
+            Self::Pyramid(pyramid) => pyramid.dim,
+        }
+    }
+
+    /// How many [`Backbone::patches`] a square picture of `image` pixels has.
+    pub fn patches(&self, image: usize) -> usize {
+        match self {
+            Self::Vit(_) | Self::Dinov2(_) => (image / self.patch().max(1)).pow(2),
+            Self::Pyramid(_) => 1,
+        }
+    }
+
+    /// Checks that the sizes fit each other and square pictures of `image` pixels. `at` is where the settings stand.
+    ///
+    /// # Errors
+    /// Naming the first that does not.
+    pub fn check(&self, at: &str, image: usize) -> Result<()> {
+        let wrong = |what: &str, problem: String, fix: &str| Err(Error::config(format!("{at}.{what}"), problem, fix));
+        let transformer = |name: &str, sizes: [(&str, usize); 5], dim: usize, heads: usize| {
+            if let Some((what, _)) = sizes.iter().find(|(_, size)| *size == 0) {
+                return wrong(&format!("{name}.{what}"), "0".to_owned(), "give at least 1");
+            }
+            if !dim.is_multiple_of(heads) {
+                let problem = format!("{dim} features do not split into {heads} heads");
+                return wrong(&format!("{name}.heads"), problem, "choose a divisor of `dim`");
+            }
+            Ok(())
+        };
+        let patches = match self {
+            Self::Vit(VitConfig { patch, dim, depth, heads, mlp }) => {
+                let sizes = [("patch", *patch), ("dim", *dim), ("depth", *depth), ("heads", *heads), ("mlp", *mlp)];
+                transformer("vit", sizes, *dim, *heads)?;
+                vec![*patch]
+            }
+            Self::Dinov2(DinoConfig { patch, dim, depth, heads, mlp, grid, .. }) => {
+                let sizes = [("patch", *patch), ("dim", *dim), ("depth", *depth), ("heads", *heads), ("mlp", *mlp)];
+                transformer("dinov2", sizes, *dim, *heads)?;
+                if *grid == 0 {
+                    return wrong("dinov2.grid", "0".to_owned(), "give at least 1");
+                }
+                vec![*patch]
+            }
+            Self::Pyramid(pyramid) => {
+                if pyramid.hidden == 0 || pyramid.dim == 0 || pyramid.stages.iter().any(|stage| stage.channels == 0) {
+                    return wrong("pyramid", "a size is 0".to_owned(), "give at least 1");
+                }
+                if pyramid.stages.is_empty() {
+                    return wrong("pyramid.stages", "none".to_owned(), "give at least one");
+                }
+                pyramid.stages.iter().map(|stage| stage.patch).collect()
+            }
+        };
+        let mut side = image;
+        for patch in patches {
+            if patch == 0 || !side.is_multiple_of(patch) || side == 0 {
+                let problem = format!("a side of {side} does not split into patches of {patch}");
+                return Err(Error::config(at, problem, "choose patches whose product divides the picture's side"));
+            }
+            side /= patch;
+        }
+        Ok(())
+    }
+
+    /// The encoder, for square pictures of `image` pixels.
+    pub fn init(&self, init: &Init, image: usize) -> Backbone {
+        match self {
+            Self::Vit(vit) => Backbone::Vit(vit.init(init, image)),
+            Self::Dinov2(dino) => Backbone::Dinov2(dino.init(init)),
+            Self::Pyramid(pyramid) => Backbone::Pyramid(pyramid.init(init, image)),
+        }
+    }
+}
+
+impl Backbone {
+    /// The features of pictures: the class token of a transformer.
+    ///
+    /// # Shapes
+    /// `[frames, patches, 3 * patch * patch]` to `[frames, dim]`.
+    pub fn forward(&self, patches: Tensor<3>) -> Tensor<2> {
+        match self {
+            Self::Vit(vit) => vit.forward(patches),
+            Self::Dinov2(dino) => dino.forward(patches),
+            Self::Pyramid(pyramid) => pyramid.forward(patches),
+        }
+    }
+
+    /// The features of every patch; a pyramid has those of the picture alone, as one patch.
+    ///
+    /// # Shapes
+    /// `[frames, patches, 3 * patch * patch]` to `[frames, patches, dim]`.
+    pub fn patches(&self, patches: Tensor<3>) -> Tensor<3> {
+        match self {
+            Self::Vit(vit) => {
+                let [frames, count, _] = patches.dims();
+                let tokens = vit.tokens(patches);
+                let [_, all, dim] = tokens.dims();
+                tokens.slice([0..frames, all - count..all, 0..dim])
+            }
+            Self::Dinov2(dino) => dino.patches(patches),
+            Self::Pyramid(pyramid) => pyramid.forward(patches).unsqueeze_dim(1),
+        }
+    }
+}

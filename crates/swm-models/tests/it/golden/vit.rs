@@ -1,0 +1,70 @@
+//! Backbones: tokens of pictures of the size they were made for and of another, and gradients.
+
+use super::{Golden, TOLERANCE, check, error, files, values};
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use swm_core::Key;
+use swm_models::nn::{Dino, DinoConfig, Init, Vit, VitConfig, parameters};
+
+/// Everything that `tokens` of a module is compared in.
+fn compare<M: Module>(golden: &Golden, module: M, tokens: impl Fn(&M, Tensor<3>) -> Tensor<3>) {
+    let weights = golden.group("w.");
+    let shapes = parameters::shapes(&module);
+    let published = weights.iter().map(|(name, weight)| (name.clone(), weight.shape.clone())).collect();
+    assert_eq!(shapes, published, "names and shapes of the published weights");
+    let module = parameters::load(module, &weights);
+    check(golden, "o.tokens", &values(tokens(&module, golden.patches("i.pixels"))));
+    let patches = |side: usize| golden.cut("i.other", side);
+    let module = module.train();
+    let other = tokens(&module, patches(golden.size("other")).autodiff());
+    check(golden, "o.other", &values(other.clone().inner()));
+    let all = other.square().mean().backward();
+    let gradients = parameters::gradients(&module, &all);
+    let theirs = golden.group("g.");
+    let largest = theirs.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));
+    for (name, gradient) in &theirs {
+        let ours = values(gradients.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
+        // A softmax takes the bias of keys out again: its gradient is zero but for rounding.
+        let floor = if name.ends_with(".key.bias") { largest } else { 1e-6 };
+        let error = error(&ours, &gradient.values, floor);
+        assert!(error < TOLERANCE, "gradient of {name} differs by {error:.1e}");
+    }
+    assert_eq!(gradients.len(), theirs.len());
+}
+
+#[test]
+fn golden_vit() {
+    for file in files("vit") {
+        println!("{}", file.display());
+        let golden = Golden::read(&file);
+        let size = |name| golden.size(name);
+        let config = VitConfig {
+            patch: size("patch"),
+            dim: size("dim"),
+            depth: size("depth"),
+            heads: size("heads"),
+            mlp: size("mlp"),
+        };
+        let vit = config.init(&Init::new(Key::new(0), &Device::flex()), size("image"));
+        compare(&golden, vit, Vit::tokens);
+    }
+}
+
+#[test]
+fn golden_dinov2() {
+    for file in files("dinov2") {
+        println!("{}", file.display());
+        let golden = Golden::read(&file);
+        let size = |name| golden.size(name);
+        let config = DinoConfig {
+            patch: size("patch"),
+            dim: size("dim"),
+            depth: size("depth"),
+            heads: size("heads"),
+            mlp: size("mlp"),
+            grid: size("grid"),
+            registers: size("registers"),
+        };
+        compare(&golden, config.init(&Init::new(Key::new(0), &Device::flex())), Dino::tokens);
+    }
+}

@@ -26,9 +26,9 @@ fn median(mut times: Vec<f64>) -> f64 {
 }
 
 fn main() {
-    let config = TrainConfig::load("paper", &[]).expect("a preset");
+    let config = TrainConfig::<Lewm>::load("paper", &[]).expect("a preset");
     let latent = config.model.latent;
-    let model = Lewm::new(&config.model, NUMBERS, Key::new(0), &Device::flex());
+    let model = Lewm::init(&config.model, NUMBERS, Key::new(0), &Device::flex());
     let rollout = Rollout::new(&model);
     let start = vec![0.1; latent];
     let actions: Vec<f32> = (0..SAMPLES * HORIZON * NUMBERS).map(|i| (i * 37 % 101) as f32 / 101.0 - 0.5).collect();

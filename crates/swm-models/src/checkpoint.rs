@@ -2,45 +2,45 @@
 //!
 //! | file | what |
 //! | --- | --- |
-//! | `config.json` | family, configuration, action scale, environment |
+//! | `config.json` | family, configuration, facts of the data |
 //! | `weights.safetensors` | weights under their published names |
 //! | `optimizer.safetensors`, `state.json` | what training needs to continue exactly |
+//! | `raw.safetensors` | the weights that are trained, where those to use are their average |
 //! | `manifest.json` | where it came from, and the hashes of the files above |
 //!
 //! A new checkpoint is written beside the old one and takes its place by renaming, so a killed process leaves one
 //! of the two.
 
-use crate::lewm::Lewm;
 use crate::nn::parameters::{self, HostTensor, Named};
-use crate::train::TrainConfig;
+use crate::train::run::Position;
+use crate::train::{Facts, TrainConfig, Trainable};
 use burn::tensor::Device;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Key, Manifest, Result, manifest};
-use swm_plan::ActionScale;
 
 /// A trained model and all that is needed to use it.
 #[derive(Clone, Debug)]
-pub struct Checkpoint {
+pub struct Checkpoint<M: Trainable> {
     /// The model.
-    pub model: Lewm,
+    pub model: M,
     /// How it was trained.
-    pub config: TrainConfig,
-    /// Between environment actions and the model's.
-    pub action: ActionScale,
-    /// The environment its data came from, where the dataset says so.
-    pub env: Option<String>,
+    pub config: TrainConfig<M>,
+    /// What it knows of the data it was trained on.
+    pub facts: Facts,
     /// Where it came from; `hashes["weights"]` names the checkpoint.
     pub manifest: Manifest,
 }
 
 /// What training needs to continue exactly.
-pub struct TrainState {
-    /// Steps done.
-    pub step: usize,
+pub(crate) struct TrainState<M> {
+    /// How far it is.
+    pub position: Position,
     /// The state of the optimizer.
     pub moments: Named<HostTensor>,
+    /// The weights that are trained, where those of the checkpoint are their average.
+    pub raw: Option<M>,
 }
 
 /// The content of `config.json`.
@@ -48,27 +48,22 @@ pub struct TrainState {
 struct Card {
     family: String,
     env: Option<String>,
-    image: usize,
+    /// The side of the pictures it sees.
+    image: Option<usize>,
     action_block: usize,
-    action: ActionScale,
+    facts: Facts,
     config: serde_json::Value,
 }
 
-/// The content of `state.json`.
-#[derive(Serialize, Deserialize)]
-struct Position {
-    step: usize,
-}
-
-const FAMILY: &str = "lewm";
 const FOLDER: &str = "checkpoint";
 const CONFIG: &str = "config.json";
 const MANIFEST: &str = "manifest.json";
 const WEIGHTS: &str = "weights.safetensors";
+const RAW: &str = "raw.safetensors";
 const OPTIMIZER: &str = "optimizer.safetensors";
 const STATE: &str = "state.json";
 
-impl Checkpoint {
+impl<M: Trainable> Checkpoint<M> {
     /// Whether a folder holds a checkpoint.
     pub fn exists(run: &Path) -> bool {
         locate(run).is_some()
@@ -79,17 +74,28 @@ impl Checkpoint {
         self.manifest.hashes.get("weights").map_or("", String::as_str)
     }
 
-    /// Saves into the run folder `run`, which keeps the last checkpoint only. Returns the hash of the weights.
+    /// Numbers of one model step's actions: those of an environment's action, times the frameskip.
+    pub fn actions(&self) -> usize {
+        self.config.data.frameskip * self.facts.action.dim()
+    }
+
+    /// Saves it into the run folder `run`, which keeps the last checkpoint only. Returns the hash of the weights.
     ///
     /// # Errors
     /// When the disk refuses; the checkpoint that was there is kept.
-    pub fn save(&mut self, run: &Path, state: Option<&TrainState>) -> Result<String> {
+    pub fn save_to(&mut self, run: &Path) -> Result<String> {
+        std::fs::create_dir_all(run).map_err(|error| Error::io(run, "creating a folder", error))?;
+        self.save(run, None)
+    }
+
+    /// As [`Checkpoint::save_to`], with what training needs to continue.
+    pub(crate) fn save(&mut self, run: &Path, state: Option<&TrainState<M>>) -> Result<String> {
         let card = Card {
-            family: FAMILY.to_owned(),
-            env: self.env.clone(),
-            image: self.config.model.image,
+            family: M::FAMILY.to_owned(),
+            env: self.facts.env.clone(),
+            image: M::picture(&self.config.model),
             action_block: self.config.data.frameskip,
-            action: self.action.clone(),
+            facts: self.facts.clone(),
             config: json(&self.config)?,
         };
         let mut more = vec![];
@@ -97,7 +103,12 @@ impl Checkpoint {
             let optimizer = pack(&state.moments)?;
             self.manifest.hashes.insert("optimizer".to_owned(), manifest::hash(&optimizer));
             more.push((OPTIMIZER, optimizer));
-            more.push((STATE, text(&Position { step: state.step })?.into_bytes()));
+            more.push((STATE, text(&state.position)?.into_bytes()));
+            if let Some(raw) = &state.raw {
+                let raw = pack(&parameters::values(raw))?;
+                self.manifest.hashes.insert("raw".to_owned(), manifest::hash(&raw));
+                more.push((RAW, raw));
+            }
         }
         install(run, &card, &mut self.manifest, &parameters::values(&self.model), &more)
     }
@@ -107,27 +118,36 @@ impl Checkpoint {
     /// # Errors
     /// When there is none, it is of another family, it is damaged, or its weights do not fit its configuration.
     pub fn load(run: &Path, device: &Device) -> Result<Self> {
-        let Stored { folder, card, manifest, config } = Stored::<TrainConfig>::read(run, FAMILY)?;
+        Ok(Self::read(run, device)?.0)
+    }
+
+    /// The checkpoint and its folder.
+    fn read(run: &Path, device: &Device) -> Result<(Self, PathBuf)> {
+        let Stored { folder, card, manifest, config } = Stored::<TrainConfig<M>>::read(run, M::FAMILY)?;
         config.check()?;
         let card: Card =
             serde_json::from_value(card).map_err(|error| broken(&folder.join(CONFIG), error.to_string()))?;
-        let actions = config.data.frameskip * card.action.dim();
-        let model = fill(Lewm::new(&config.model, actions, Key::new(0), device), &folder, &manifest)?;
-        Ok(Self { model, config, action: card.action, env: card.env, manifest })
+        let model = M::new(&config, &card.facts, Key::new(0), device)?;
+        let model = fill(model, &folder.join(WEIGHTS), manifest.hashes.get("weights"))?;
+        Ok((Self { model, config, facts: card.facts, manifest }, folder))
     }
 
     /// Loads the checkpoint and what training needs to continue.
     ///
     /// # Errors
     /// As [`Checkpoint::load`], and when the checkpoint was saved without that.
-    pub fn load_to_resume(run: &Path, device: &Device) -> Result<(Self, TrainState)> {
-        let checkpoint = Self::load(run, device)?;
-        let folder = locate(run).unwrap_or_else(|| run.to_owned());
+    pub(crate) fn load_to_resume(run: &Path, device: &Device) -> Result<(Self, TrainState<M>)> {
+        let (checkpoint, folder) = Self::read(run, device)?;
         let path = folder.join(STATE);
-        let position: Position = serde_json::from_slice(&read(&path)?)
+        let position = serde_json::from_slice(&read(&path)?)
             .map_err(|error| Error::corrupt(&path, error.to_string(), "train again from the beginning"))?;
-        let moments = unpack(&folder.join(OPTIMIZER), checkpoint.manifest.hashes.get("optimizer"))?;
-        Ok((checkpoint, TrainState { step: position.step, moments }))
+        let hashes = &checkpoint.manifest.hashes;
+        let moments = unpack(&folder.join(OPTIMIZER), hashes.get("optimizer"))?;
+        let raw = match checkpoint.config.optim.ema > 0.0 {
+            true => Some(fill(checkpoint.model.clone(), &folder.join(RAW), hashes.get("raw"))?),
+            false => None,
+        };
+        Ok((checkpoint, TrainState { position, moments, raw }))
     }
 }
 
@@ -219,23 +239,22 @@ pub(crate) fn install(
     Ok(hash)
 }
 
-/// A model with the weights of a checkpoint's folder.
-pub(crate) fn fill<M: burn::module::Module>(model: M, folder: &Path, manifest: &Manifest) -> Result<M> {
-    let path = folder.join(WEIGHTS);
-    let weights = unpack(&path, manifest.hashes.get("weights"))?;
+/// A model with the weights of a file of a checkpoint.
+pub(crate) fn fill<M: burn::module::Module>(model: M, path: &Path, hash: Option<&String>) -> Result<M> {
+    let weights = unpack(path, hash)?;
     let wanted = parameters::shapes(&model);
     for (name, shape) in &wanted {
         match weights.get(name) {
             Some(tensor) if &tensor.shape == shape => {}
             Some(tensor) => {
                 let problem = format!("'{name}' is {:?}, but {CONFIG} makes it {shape:?}", tensor.shape);
-                return Err(broken(&path, problem));
+                return Err(broken(path, problem));
             }
-            None => return Err(broken(&path, format!("'{name}' is missing, which {CONFIG} asks for"))),
+            None => return Err(broken(path, format!("'{name}' is missing, which {CONFIG} asks for"))),
         }
     }
     if let Some(name) = weights.keys().find(|name| !wanted.contains_key(*name)) {
-        return Err(broken(&path, format!("'{name}' is no weight of the model that {CONFIG} describes")));
+        return Err(broken(path, format!("'{name}' is no weight of the model that {CONFIG} describes")));
     }
     Ok(parameters::load(model, &weights))
 }

@@ -23,6 +23,11 @@ pub fn checkpoints() -> PathBuf {
     home().join("checkpoints")
 }
 
+/// Where weights of others are kept, once downloaded.
+pub fn weights() -> PathBuf {
+    home().join("weights")
+}
+
 /// What names under [`datasets`] may end in, and need not be given with; the first is what a new one gets.
 const SUFFIXES: [&str; 8] = ["lance", "h5", "hdf5", "lance-video", "video", "folder", "lerobot", ""];
 

@@ -13,6 +13,7 @@ pub use swm_mujoco as mujoco;
 pub use swm_plan as plan;
 pub use swm_report as report;
 
+pub mod families;
 pub mod home;
 pub mod predictor;
 pub mod resolver;

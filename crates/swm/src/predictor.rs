@@ -3,18 +3,18 @@
 use rayon::prelude::*;
 use swm_core::{Batch, Error, Result};
 use swm_eval::Predictor;
-use swm_models::lewm::{Rollout, pixels};
+use swm_models::lewm::{Lewm, Rollout, pixels};
 use swm_models::{Checkpoint, Device};
 
 /// Rows encoded, and trajectories predicted, at once: each by itself, so that its latents do not depend on the others.
 pub struct LewmPredictor {
-    checkpoint: Checkpoint,
+    checkpoint: Checkpoint<Lewm>,
     rollout: Rollout,
 }
 
 impl LewmPredictor {
     /// The predictor of a trained model.
-    pub fn new(checkpoint: Checkpoint) -> Self {
+    pub fn new(checkpoint: Checkpoint<Lewm>) -> Self {
         Self { rollout: Rollout::new(&checkpoint.model), checkpoint }
     }
 }
@@ -46,7 +46,7 @@ impl Predictor for LewmPredictor {
     }
 
     fn rollout(&mut self, start: &[f32], actions: &[f32], horizon: usize, latents: &mut [f32]) -> Result<()> {
-        let (latent, scale) = (self.checkpoint.config.model.latent, &self.checkpoint.action);
+        let (latent, scale) = (self.checkpoint.config.model.latent, &self.checkpoint.facts.action);
         let numbers = self.frameskip() * scale.dim();
         let n = start.len() / latent;
         if actions.len() != n * horizon * numbers {

@@ -1,18 +1,16 @@
 //! [`Home`]: what the names in an evaluation's request stand for: environments, wrappers and solvers of this build,
 //! datasets and checkpoints at home.
 
-use crate::predictor::LewmPredictor;
+use crate::families::load;
 use crate::{ENVS, home};
 use std::cell::RefCell;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::policy::ExpertPolicy;
-use swm_core::{CostModel, Env, EnvEntry, EnvSpec, Error, Named as _, Policy, RandomPolicy, Result};
+use swm_core::{Env, EnvEntry, EnvSpec, Error, Named as _, Policy, RandomPolicy, Result};
 use swm_data::Reader;
 use swm_envs::wrappers::{GoalPicture, Stack, WRAPPERS};
 use swm_eval::{Actor, Acts, Choice, EvalRequest, Model, PolicyRequest, Predictor, Resolver, World};
-use swm_models::inverse::{InverseCheckpoint, InversePolicy};
-use swm_models::lewm::LewmCost;
-use swm_models::{Checkpoint, Device};
+use swm_models::Device;
 use swm_plan::objective::ObjectiveConfig;
 use swm_plan::problem::pairing;
 use swm_plan::registry::Actions;
@@ -102,12 +100,19 @@ impl Resolver for Home {
             Acts::Random => Ok(Actor::from(Box::new(RandomPolicy::new(spec, slots)) as Box<dyn Policy>)),
             Acts::Expert { id } => scripted(&env.entry, id, world).map(Actor::from),
             Acts::Direct { checkpoint: given, .. } => {
-                let checkpoint = InverseCheckpoint::load(&home::find_checkpoint(given)?, &Device::flex())?;
-                fits(checkpoint.world.env.as_deref(), given, spec)?;
-                let weights = Some(checkpoint.hash().to_owned());
-                let (libraries, device) = (checkpoint.manifest.libraries.clone(), checkpoint.manifest.device.clone());
-                let policy: Box<dyn Policy> = Box::new(InversePolicy::new(checkpoint, spec, slots)?);
-                Ok(Actor { weights, libraries, device: Some(device), ..Actor::from(policy) })
+                let loaded = load(&home::find_checkpoint(given)?, &Device::flex())?;
+                let card = loaded.card()?;
+                fits(card.facts.env.as_deref(), given, spec)?;
+                let policy = loaded.policy(spec, slots).ok_or_else(|| {
+                    let problem = format!("a {} predicts and does not act", card.family);
+                    Error::config(format!("checkpoint {given}"), problem, "plan in it (`swm eval` does)")
+                })??;
+                Ok(Actor {
+                    weights: Some(card.weights),
+                    libraries: card.manifest.libraries,
+                    device: Some(card.manifest.device),
+                    ..Actor::from(policy)
+                })
             }
             Acts::Plan { model, solver, mpc, objective } => {
                 let (id, solver) = (&solver.id, (SOLVERS.get(&solver.id)?.make)(&solver.settings)?);
@@ -136,16 +141,20 @@ impl Resolver for Home {
                         Ok(self.planning(&request.name, policy))
                     }
                     Model::Checkpoint(given) => {
-                        let checkpoint = Checkpoint::load(&home::find_checkpoint(given)?, &Device::flex())?;
-                        fits(checkpoint.env.as_deref(), given, spec)?;
-                        let cost: Box<dyn CostModel> = Box::new(LewmCost::new(&checkpoint));
-                        let (mut cost, scale) = (objective.apply(cost)?, checkpoint.action.clone());
+                        let loaded = load(&home::find_checkpoint(given)?, &Device::flex())?;
+                        let card = loaded.card()?;
+                        fits(card.facts.env.as_deref(), given, spec)?;
+                        let cost = loaded.cost().ok_or_else(|| {
+                            let problem = format!("a {} acts and does not predict", card.family);
+                            Error::config(format!("checkpoint {given}"), problem, "let it act (`swm eval` does)")
+                        })?;
+                        let (mut cost, scale) = (objective.apply(cost)?, card.facts.action);
                         pairing(id, &mut *cost, actions)?;
                         let policy = MpcPolicy::new(solver, cost, mpc, scale, spec, slots)?;
                         Ok(Actor {
-                            weights: Some(checkpoint.hash().to_owned()),
-                            libraries: checkpoint.manifest.libraries.clone(),
-                            device: Some(checkpoint.manifest.device.clone()),
+                            weights: Some(card.weights),
+                            libraries: card.manifest.libraries,
+                            device: Some(card.manifest.device),
                             ..self.planning(&request.name, policy)
                         })
                     }
@@ -156,8 +165,7 @@ impl Resolver for Home {
 
     fn predictor(&self, request: &PolicyRequest) -> Result<Option<Box<dyn Predictor>>> {
         let Acts::Plan { model: Model::Checkpoint(given), .. } = &request.acts else { return Ok(None) };
-        let checkpoint = Checkpoint::load(&home::find_checkpoint(given)?, &Device::flex())?;
-        Ok(Some(Box::new(LewmPredictor::new(checkpoint))))
+        Ok(load(&home::find_checkpoint(given)?, &Device::flex())?.predictor())
     }
 }
 

@@ -3,6 +3,7 @@
 
 use super::{InverseConfig, InverseModel};
 use crate::checkpoint::{self, Checkpoint};
+use crate::lewm::Lewm;
 use crate::nn::parameters;
 use burn::tensor::Device;
 use std::path::Path;
@@ -12,7 +13,7 @@ use swm_core::{Key, Manifest, Result};
 #[derive(Clone, Debug)]
 pub struct InverseCheckpoint {
     /// The world model whose encoder it sees through.
-    pub world: Checkpoint,
+    pub world: Checkpoint<Lewm>,
     /// The network.
     pub model: InverseModel,
     /// How it was trained.
@@ -36,8 +37,8 @@ impl InverseCheckpoint {
     /// # Errors
     /// When the disk refuses.
     pub fn save(&mut self, run: &Path) -> Result<String> {
-        self.world.save(&run.join(WORLD), None)?;
-        let card = serde_json::json!({"family": FAMILY, "env": self.world.env, "config": self.config});
+        self.world.save_to(&run.join(WORLD))?;
+        let card = serde_json::json!({"family": FAMILY, "env": self.world.facts.env, "config": self.config});
         checkpoint::install(run, &card, &mut self.manifest, &parameters::values(&self.model), &[])
     }
 
@@ -47,11 +48,12 @@ impl InverseCheckpoint {
     /// When there is none, it is of another family, it is damaged, or its weights do not fit its configuration.
     pub fn load(run: &Path, device: &Device) -> Result<Self> {
         let stored = checkpoint::Stored::<InverseConfig>::read(run, FAMILY)?;
-        let world = Checkpoint::load(&run.join(WORLD), device)?;
+        let world = Checkpoint::<Lewm>::load(&run.join(WORLD), device)?;
         let config = stored.config;
-        let actions = world.config.data.frameskip * world.action.dim();
+        let actions = world.actions();
         let model = InverseModel::new(world.config.model.latent, config.hidden, actions, Key::new(0), device);
-        let model = checkpoint::fill(model, &stored.folder, &stored.manifest)?;
+        let model =
+            checkpoint::fill(model, &stored.folder.join("weights.safetensors"), stored.manifest.hashes.get("weights"))?;
         Ok(Self { world, model, config, manifest: stored.manifest })
     }
 }

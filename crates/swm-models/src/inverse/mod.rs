@@ -14,4 +14,4 @@ mod train;
 pub use checkpoint::InverseCheckpoint;
 pub use model::InverseModel;
 pub use policy::InversePolicy;
-pub use train::{InverseConfig, InverseProgress, InverseSummary, train};
+pub use train::{InverseConfig, train};

@@ -34,7 +34,7 @@ impl InversePolicy {
     /// # Errors
     /// When the network was trained for other actions.
     pub fn new(checkpoint: InverseCheckpoint, spec: &EnvSpec, slots: usize) -> Result<Self> {
-        checkpoint.world.action.check(spec)?;
+        checkpoint.world.facts.action.check(spec)?;
         #[allow(clippy::cast_possible_truncation)]
         let bounds = (0..spec.action_dim())
             .map(|i| {
@@ -65,9 +65,9 @@ fn decide(checkpoint: &InverseCheckpoint, slot: &mut Slot, infos: &Batch, row: u
     let said = checkpoint.model.forward(Tensor::from_data(TensorData::new(pair, [1, width]), &device));
     let model = said.into_data().try_into_vec_as_f32();
     let mut actions = vec![0.0; model.len()];
-    let dim = world.action.dim();
+    let dim = world.facts.action.dim();
     for (to, from) in actions.chunks_exact_mut(dim).zip(model.chunks_exact(dim)) {
-        world.action.to_env(from, to);
+        world.facts.action.to_env(from, to);
     }
     Ok(actions)
 }

@@ -3,20 +3,20 @@
 use super::checkpoint::FAMILY;
 use super::{InverseCheckpoint, InverseModel};
 use crate::checkpoint::Checkpoint;
-use crate::lewm::pixels;
+use crate::lewm::{Lewm, pixels};
 use crate::nn::parameters::{self, IntoF32};
-use crate::train::{AdamW, OptimConfig, ScheduleConfig, config, log};
+use crate::train::{AdamW, Group, Observer, OptimConfig, Progress, ScheduleConfig, TrainSummary, config, log};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::Rng as _;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 use swm_core::{Error, Key, Manifest, Result};
-use swm_data::{ClipSpec, Loader, LoaderConfig, Reader};
+use swm_data::{ClipSpec, Loader, LoaderConfig, Part, Reader};
 
 /// Everything that decides the numbers of a run, apart from the encoder and the data.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -40,15 +40,16 @@ pub struct InverseConfig {
     pub schedule: ScheduleConfig,
 }
 
-const PRESET: &str = include_str!("../presets/inverse.toml");
-
 impl InverseConfig {
+    /// The configuration that comes with the program, as TOML.
+    pub const PRESET: &str = include_str!("../../presets/inverse.toml");
+
     /// The configuration that comes with the program, changed by `key=value` words with dots.
     ///
     /// # Errors
     /// When there is no such key (naming the nearest), or a value does not fit.
     pub fn load(words: &[String]) -> Result<Self> {
-        let config: Self = config::layered(PRESET, words, &[PRESET])?;
+        let config: Self = config::layered(Self::PRESET, words, &[Self::PRESET])?;
         let least = [
             ("offset", config.offset),
             ("hidden", config.hidden),
@@ -71,32 +72,6 @@ impl InverseConfig {
     }
 }
 
-/// How far a run is.
-#[derive(Clone, Copy, Debug)]
-pub struct InverseProgress {
-    /// Steps done.
-    pub step: usize,
-    /// Steps in all.
-    pub steps: usize,
-    /// The loss of the last step.
-    pub loss: f64,
-}
-
-/// How a run ended.
-#[derive(Clone, Debug, Serialize)]
-pub struct InverseSummary {
-    /// The checkpoint.
-    pub checkpoint: PathBuf,
-    /// The hash of its weights.
-    pub weights: String,
-    /// Steps done.
-    pub steps: usize,
-    /// The loss of the last step: mean squared error of normalised actions, 1 for a guess of their mean.
-    pub loss: f64,
-    /// Seconds in all.
-    pub seconds: f64,
-}
-
 /// Trains on a dataset with the columns `pixels` and `action`, through the encoder of `world`; the checkpoint and the
 /// logs go to `out`.
 ///
@@ -105,14 +80,14 @@ pub struct InverseSummary {
 /// is saved then), or the disk refuses.
 pub fn train(
     config: &InverseConfig,
-    world: &Checkpoint,
+    world: &Checkpoint<Lewm>,
     reader: Arc<dyn Reader>,
     out: &Path,
     threads: usize,
-    observer: &mut (dyn FnMut(InverseProgress) + Send),
+    observer: &mut dyn Observer,
     stop: &AtomicBool,
-) -> Result<InverseSummary> {
-    if Checkpoint::exists(out) {
+) -> Result<TrainSummary> {
+    if Checkpoint::<Lewm>::exists(out) {
         return Err(Error::config(
             out.display().to_string(),
             "holds a training run already",
@@ -123,17 +98,18 @@ pub fn train(
     swm_core::pool::threads(threads)?.install(|| run(config, world, reader, out, observer, stop))
 }
 
+#[allow(clippy::cast_precision_loss)]
 fn run(
     config: &InverseConfig,
-    world: &Checkpoint,
+    world: &Checkpoint<Lewm>,
     reader: Arc<dyn Reader>,
     out: &Path,
-    observer: &mut (dyn FnMut(InverseProgress) + Send),
+    observer: &mut dyn Observer,
     stop: &AtomicBool,
-) -> Result<InverseSummary> {
+) -> Result<TrainSummary> {
     let begun = Instant::now();
     let key = Key::new(config.seed).with(FAMILY);
-    let (block, dim, latent) = (world.config.data.frameskip, world.action.dim(), world.config.model.latent);
+    let (block, dim, latent) = (world.config.data.frameskip, world.facts.action.dim(), world.config.model.latent);
     let mut manifest = Manifest::new("train", config.seed, serde_json::to_value(config).unwrap_or_default());
     manifest.libraries = world.manifest.libraries.clone();
     manifest.device = world.manifest.device.clone();
@@ -142,7 +118,7 @@ fn run(
 
     std::fs::create_dir_all(out).map_err(|error| Error::io(out, "creating a folder", error))?;
     let mut log = log::Log::new(out, false)?;
-    let episodes = crate::train::trained_on(config.hold_out, &*reader)?;
+    let episodes = crate::train::episodes(config.hold_out, Part::Train, &*reader)?;
     let loader = Loader::new(
         reader,
         LoaderConfig {
@@ -162,8 +138,13 @@ fn run(
     let mut model = InverseModel::new(latent, config.hidden, block * dim, key.with("init"), &Device::flex());
     let mut optimizer = AdamW::new(config.optim.clone());
     let (mut step, mut epoch, mut loss) = (0, 0, f64::NAN);
+    let (mut waited, mut clips_per_second) = (0.0, 0.0);
     while step < config.schedule.steps {
-        for batch in loader.epoch(epoch, 0) {
+        let mut batches = loader.epoch(epoch, 0);
+        loop {
+            let asked = Instant::now();
+            let Some(batch) = batches.next() else { break };
+            waited += asked.elapsed().as_secs_f64();
             if stop.load(Ordering::Relaxed) {
                 return Err(Error::Interrupted);
             }
@@ -172,7 +153,19 @@ fn run(
             let norm;
             (model, loss, norm) = learn(model, &mut optimizer, share, pairs)?;
             step += 1;
-            observer(InverseProgress { step, steps: config.schedule.steps, loss });
+            let elapsed = begun.elapsed().as_secs_f64();
+            clips_per_second = (step * config.batch_size) as f64 / elapsed;
+            observer.progress(&Progress {
+                step,
+                steps: config.schedule.steps,
+                epoch,
+                metrics: vec![("loss", loss)],
+                validation: None,
+                lr: config.optim.lr * share,
+                gradient_norm: norm,
+                clips_per_second,
+                data_wait: waited / elapsed,
+            });
             if step.is_multiple_of(config.log_every) || step == config.schedule.steps {
                 let lr = config.optim.lr * share;
                 log.write(step, &[("loss", loss), ("lr", lr), ("gradient_norm", norm)])?;
@@ -185,12 +178,19 @@ fn run(
     }
     let mut checkpoint = InverseCheckpoint { world: world.clone(), model, config: config.clone(), manifest };
     let weights = checkpoint.save(out)?;
-    Ok(InverseSummary {
+    let seconds = begun.elapsed().as_secs_f64();
+    Ok(TrainSummary {
         checkpoint: out.to_owned(),
         weights,
         steps: step,
-        loss,
-        seconds: begun.elapsed().as_secs_f64(),
+        interrupted: false,
+        stopped_early: false,
+        best: None,
+        metrics: [("loss".to_owned(), loss)].into(),
+        parameters: checkpoint.model.num_params(),
+        clips_per_second,
+        data_wait: waited / seconds,
+        seconds,
     })
 }
 
@@ -208,8 +208,8 @@ const FRAMES: usize = 64;
 
 impl Pairs {
     /// One pair for every frame of every clip but its last: the goal is one of the later frames, at random.
-    fn draw(world: &Checkpoint, offset: usize, batch: &swm_core::Batch, key: Key) -> Result<Self> {
-        let (config, dim) = (&world.config.model, world.action.dim());
+    fn draw(world: &Checkpoint<Lewm>, offset: usize, batch: &swm_core::Batch, key: Key) -> Result<Self> {
+        let (config, dim) = (&world.config.model, world.facts.action.dim());
         let (latent, actions) = (config.latent, world.config.data.frameskip * dim);
         let frame = config.image * config.image * 3;
         let encoded: Result<Vec<Vec<f32>>> = batch
@@ -235,7 +235,7 @@ impl Pairs {
                 let from = &taken[(clip * (offset + 1) + present) * actions..][..actions];
                 let to = &mut pairs.actions[(clip * offset + present) * actions..][..actions];
                 for (to, from) in to.chunks_exact_mut(dim).zip(from.chunks_exact(dim)) {
-                    world.action.to_model(from, to);
+                    world.facts.action.to_model(from, to);
                 }
             }
         }
@@ -261,6 +261,6 @@ fn learn(model: InverseModel, optimizer: &mut AdamW, share: f64, pairs: Pairs) -
         });
     }
     let gradients = parameters::gradients(&trained, &loss.backward());
-    let (model, norm) = optimizer.step(model, share, gradients);
+    let (model, norm) = optimizer.step(model, share, gradients, |_| Group::default());
     Ok((model, value, norm))
 }

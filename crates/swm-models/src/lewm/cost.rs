@@ -37,12 +37,12 @@ pub(super) struct Scene {
 
 impl LewmCost {
     /// The cost of a trained model.
-    pub fn new(checkpoint: &Checkpoint) -> Self {
+    pub fn new(checkpoint: &Checkpoint<Lewm>) -> Self {
         Self {
             model: checkpoint.model.clone(),
             rollout: Rollout::new(&checkpoint.model),
             config: checkpoint.config.model.clone(),
-            actions: checkpoint.config.data.frameskip * checkpoint.action.dim(),
+            actions: checkpoint.actions(),
             scenes: vec![],
         }
     }

@@ -9,6 +9,7 @@ pub mod model;
 pub mod pixels;
 pub mod rollout;
 pub mod step;
+mod train;
 
 pub use config::{EncoderConfig, LewmConfig};
 pub use cost::LewmCost;

@@ -44,7 +44,7 @@ pub struct Lewm {
 
 impl Lewm {
     /// A model of `actions` numbers an action (of all environment steps in a model step), drawn from `key`.
-    pub fn new(config: &LewmConfig, actions: usize, key: Key, device: &Device) -> Self {
+    pub fn init(config: &LewmConfig, actions: usize, key: Key, device: &Device) -> Self {
         let init = Init::new(key, device);
         let features = config.encoder.dim();
         let project = |name| Projector::new(&init.of(name), features, config.projector, config.latent);

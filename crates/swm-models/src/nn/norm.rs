@@ -1,6 +1,6 @@
 //! Normalisation layers.
 
-use super::Init;
+use super::{Init, Named};
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor, module};
 
@@ -58,6 +58,20 @@ pub struct BatchNorm {
 pub struct BatchStatistics {
     mean: Tensor<1>,
     variance: Tensor<1>,
+}
+
+impl BatchStatistics {
+    /// Puts them among other tensors, under `name`.
+    pub fn store(self, name: &str, tensors: &mut Named<Tensor<1>>) {
+        tensors.insert(format!("{name}.mean"), self.mean);
+        tensors.insert(format!("{name}.variance"), self.variance);
+    }
+
+    /// Takes out again what [`BatchStatistics::store`] put there.
+    pub fn take(name: &str, tensors: &mut Named<Tensor<1>>) -> Option<Self> {
+        let mut tensor = |part: &str| tensors.remove(&format!("{name}.{part}"));
+        Some(Self { mean: tensor("mean")?, variance: tensor("variance")? })
+    }
 }
 
 impl BatchNorm {

@@ -133,6 +133,37 @@ pub fn load<M: Module>(module: M, values: &Named<HostTensor>) -> M {
     })
 }
 
+/// Moves every parameter and buffer of `average` towards those of `module`: `keep` of the one, the rest of the other.
+pub fn blend<M: Module>(average: M, module: &M, keep: f64) -> M {
+    let mut news = Named::new();
+    // Collects the tensors of the module, flat, as they are.
+    let _ = map(module.clone(), |name, value| {
+        news.insert(name.to_owned(), value.clone());
+        value
+    });
+    map(average, |name, old| match news.remove(name) {
+        Some(new) => old * keep + new * (1.0 - keep),
+        None => old,
+    })
+}
+
+/// How many numbers of a module are trained: those of parameters that need a gradient.
+pub fn trained<M: Module>(module: &M) -> usize {
+    struct Visitor(usize);
+    impl ModuleVisitor for Visitor {
+        fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+            let value = param.val();
+            if value.is_require_grad() {
+                self.0 += value.dims().iter().product::<usize>();
+            }
+        }
+    }
+    let mut visitor = Visitor(0);
+    // Only a module in training knows.
+    module.clone().train().visit(&mut visitor);
+    visitor.0
+}
+
 /// Reads numbers that are known to be single precision.
 pub(crate) trait IntoF32 {
     /// The numbers.

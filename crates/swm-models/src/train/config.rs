@@ -2,8 +2,7 @@
 
 use super::optim::OptimConfig;
 use super::schedule::ScheduleConfig;
-use crate::lewm::LewmConfig;
-use crate::lewm::step::SigregConfig;
+use super::trainable::Trainable;
 use figment::Figment;
 use figment::providers::{Format as _, Serialized, Toml};
 use serde::{Deserialize, Serialize};
@@ -11,27 +10,54 @@ use std::path::Path;
 use swm_core::{Error, Result};
 
 /// Everything that decides the numbers of a training run.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TrainConfig {
-    /// Decides initial weights, order of the data, directions and dropout.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields, bound = "")]
+pub struct TrainConfig<M: Trainable> {
+    /// Decides initial weights, order of the data and everything else that is drawn.
     pub seed: u64,
     /// The model.
-    pub model: LewmConfig,
+    pub model: M::Config,
+    /// Its loss.
+    pub loss: M::Loss,
     /// What it is trained on.
     pub data: DataConfig,
-    /// The regulariser.
-    pub sigreg: SigregConfig,
     /// The optimizer.
     pub optim: OptimConfig,
     /// The learning rate over time.
     pub schedule: ScheduleConfig,
-    /// Parts the encoder's batch is cut into, which can run in parallel. Changes the last bits of the numbers.
+    /// Looking at episodes it is not trained on.
+    #[serde(default)]
+    pub validation: ValidationConfig,
+    /// Parts a batch is cut into, which can run in parallel. Changes the last bits of the numbers.
     pub shards: usize,
     /// Steps between two lines of the log.
     pub log_every: usize,
     /// Steps between two checkpoints; 0 saves at the end only.
     pub save_every: usize,
+}
+
+impl<M: Trainable> Clone for TrainConfig<M> {
+    fn clone(&self) -> Self {
+        let Self { seed, model, loss, data, optim, schedule, validation, shards, log_every, save_every } = self;
+        Self {
+            seed: *seed,
+            model: model.clone(),
+            loss: loss.clone(),
+            data: data.clone(),
+            optim: optim.clone(),
+            schedule: schedule.clone(),
+            validation: validation.clone(),
+            shards: *shards,
+            log_every: *log_every,
+            save_every: *save_every,
+        }
+    }
+}
+
+impl<M: Trainable> std::fmt::Debug for TrainConfig<M> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&toml::to_string(self).unwrap_or_default())
+    }
 }
 
 /// What a model is trained on.
@@ -50,47 +76,44 @@ pub struct DataConfig {
     pub hold_out: bool,
 }
 
+/// Looking at the episodes held out for validation.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ValidationConfig {
+    /// Steps between two looks; 0 never looks.
+    pub every: usize,
+    /// Batches of a look, always the same ones.
+    pub batches: usize,
+    /// Looks without a lower loss after which training stops; 0 trains to the end.
+    pub patience: usize,
+}
+
+impl Default for ValidationConfig {
+    fn default() -> Self {
+        Self { every: 0, batches: 8, patience: 0 }
+    }
+}
+
 /// A named configuration.
+#[derive(Debug)]
 pub struct Preset {
     /// Its name.
     pub id: &'static str,
     /// What it is for, in a sentence.
     pub summary: &'static str,
-    toml: &'static str,
+    /// The configuration.
+    pub toml: &'static str,
 }
 
-/// The configurations that come with the program.
-pub static PRESETS: &[Preset] = &[
-    Preset {
-        id: "tiny",
-        summary: "64 px, a small convolutional encoder: trains in half a minute on two CPU cores",
-        toml: include_str!("../presets/tiny.toml"),
-    },
-    Preset {
-        id: "paper",
-        summary: "224 px, ViT-tiny/14, predictor of 6 layers: the published size, for a GPU",
-        toml: include_str!("../presets/paper.toml"),
-    },
-];
-
-impl TrainConfig {
+impl<M: Trainable> TrainConfig<M> {
     /// The configuration of a preset (its name, or the path of a TOML file), changed by `key=value` words with
     /// dots, such as `optim.lr=3e-4`.
     ///
     /// # Errors
     /// When there is no such preset or key (naming the nearest), or a value does not fit.
     pub fn load(preset: &str, words: &[String]) -> Result<Self> {
-        let text = match PRESETS.iter().find(|row| row.id == preset) {
-            Some(row) => row.toml.to_owned(),
-            None if Path::new(preset).extension().is_some_and(|end| end == "toml") => {
-                std::fs::read_to_string(preset).map_err(|error| Error::io(preset, "reading a configuration", error))?
-            }
-            None => {
-                let hint = "or give the path of a .toml file";
-                return Err(Error::unknown("preset", preset, PRESETS.iter().map(|row| row.id), hint));
-            }
-        };
-        let presets: Vec<&str> = PRESETS.iter().map(|preset| preset.toml).collect();
+        let text = preset_text(M::PRESETS, preset)?;
+        let presets: Vec<&str> = M::PRESETS.iter().map(|preset| preset.toml).chain([OPTIONAL]).collect();
         let config: Self = layered(&text, words, &presets)?;
         config.check()?;
         Ok(config)
@@ -109,34 +132,17 @@ impl TrainConfig {
     /// # Errors
     /// Naming the first that does not.
     pub fn check(&self) -> Result<()> {
-        self.model.check()?;
         let least = [
-            ("data.num_steps", self.data.num_steps, 2),
+            ("data.num_steps", self.data.num_steps, 1),
             ("data.frameskip", self.data.frameskip, 1),
             ("data.batch_size", self.data.batch_size, 2),
-            ("sigreg.directions", self.sigreg.directions, 1),
-            ("sigreg.knots", self.sigreg.knots, 2),
+            ("optim.accumulate", self.optim.accumulate, 1),
             ("schedule.steps", self.schedule.steps, 1),
+            ("validation.batches", self.validation.batches, 1),
             ("shards", self.shards, 1),
             ("log_every", self.log_every, 1),
         ];
-        for (what, value, least) in least {
-            if value < least {
-                return Err(Error::config(what, value.to_string(), format!("give at least {least}")));
-            }
-        }
-        let history = self.model.predictor.history;
-        if self.data.num_steps - 1 < history {
-            return Err(Error::config(
-                "data.num_steps",
-                format!(
-                    "{} frames train only {} of the {history} steps of history",
-                    self.data.num_steps,
-                    self.data.num_steps - 1
-                ),
-                format!("give at least {}, or lower model.predictor.history", history + 1),
-            ));
-        }
+        at_least(&least)?;
         let positive =
             [("optim.lr", self.optim.lr), ("optim.epsilon", self.optim.epsilon), ("optim.clip", self.optim.clip)];
         for (what, value) in positive {
@@ -144,7 +150,56 @@ impl TrainConfig {
                 return Err(Error::config(what, value.to_string(), "give a positive number"));
             }
         }
-        Ok(())
+        if !(0.0..1.0).contains(&self.optim.ema) {
+            let fix = "give a share of at least 0 (no average) and below 1";
+            return Err(Error::config("optim.ema", self.optim.ema.to_string(), fix));
+        }
+        if self.validation.every > 0 && !self.data.hold_out {
+            return Err(Error::config(
+                "validation.every",
+                "no episodes are held out to look at",
+                "say data.hold_out=true, or validation.every=0",
+            ));
+        }
+        if self.validation.patience > 0 && self.validation.every == 0 {
+            return Err(Error::config(
+                "validation.patience",
+                "nothing is looked at to be patient about",
+                "give validation.every, or validation.patience=0",
+            ));
+        }
+        M::check(self)
+    }
+}
+
+/// Checks that sizes are not below what makes sense: `(name, given, least)`.
+///
+/// # Errors
+/// Naming the first that is.
+pub fn at_least(sizes: &[(&str, usize, usize)]) -> Result<()> {
+    match sizes.iter().find(|(_, given, least)| given < least) {
+        Some((what, given, least)) => Err(Error::config(*what, given.to_string(), format!("give at least {least}"))),
+        None => Ok(()),
+    }
+}
+
+/// The keys that a preset may leave out.
+const OPTIONAL: &str = "optim.accumulate = 1\noptim.ema = 0.0\nvalidation = { every = 0, batches = 8, patience = 0 }\n";
+
+/// The TOML of a preset, or of a file.
+///
+/// # Errors
+/// When there is neither.
+pub(crate) fn preset_text(presets: &[Preset], preset: &str) -> Result<String> {
+    match presets.iter().find(|row| row.id == preset) {
+        Some(row) => Ok(row.toml.to_owned()),
+        None if Path::new(preset).extension().is_some_and(|end| end == "toml") => {
+            std::fs::read_to_string(preset).map_err(|error| Error::io(preset, "reading a configuration", error))
+        }
+        None => {
+            let hint = "or give the path of a .toml file";
+            Err(Error::unknown("preset", preset, presets.iter().map(|row| row.id), hint))
+        }
     }
 }
 
@@ -215,26 +270,31 @@ fn flatten(prefix: &str, value: &toml::Value, keys: &mut Vec<String>) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::lewm::Lewm;
+
+    type Config = TrainConfig<Lewm>;
 
     #[test]
     fn presets_load_and_words_change_them() {
-        for preset in PRESETS {
-            let config = TrainConfig::load(preset.id, &[]).expect(preset.id);
-            assert_eq!(toml::from_str::<TrainConfig>(&config.to_toml().expect("TOML")).expect("the same"), config);
+        for preset in Lewm::PRESETS {
+            let config = Config::load(preset.id, &[]).expect(preset.id);
+            let text = config.to_toml().expect("TOML");
+            let again = toml::from_str::<Config>(&text).expect("the same");
+            assert_eq!(again.to_toml().expect("TOML"), text);
         }
         let words = ["optim.lr=3e-4".to_owned(), "model.latent=16".to_owned(), "optim.betas=[0.9, 0.99]".to_owned()];
-        let config = TrainConfig::load("tiny", &words).expect("fine");
+        let config = Config::load("tiny", &words).expect("fine");
         assert_eq!((config.optim.lr, config.model.latent, config.optim.betas[1]), (3e-4, 16, 0.99));
     }
 
     #[test]
     fn wrong_words_say_what_is_wrong() {
-        let message = |word: &str| TrainConfig::load("tiny", &[word.to_owned()]).expect_err("wrong").to_string();
+        let message = |word: &str| Config::load("tiny", &[word.to_owned()]).expect_err("wrong").to_string();
         assert!(message("optim.rl=1").contains("did you mean optim.lr"), "{}", message("optim.rl=1"));
         assert!(message("optim.lr=fast").contains("optim.lr"), "{}", message("optim.lr=fast"));
         assert!(message("optim.lr").contains("key=value"));
         assert!(message("model.image=60").contains("patches"), "{}", message("model.image=60"));
         assert!(message("data.num_steps=1").contains("at least 2"));
-        assert!(TrainConfig::load("tniy", &[]).expect_err("wrong").to_string().contains("did you mean tiny"));
+        assert!(Config::load("tniy", &[]).expect_err("wrong").to_string().contains("did you mean tiny"));
     }
 }

@@ -4,10 +4,12 @@
 //! one clips the whole gradient and keys its state by parameter name, so that it can be stored beside the
 //! weights.
 
+use super::trainable::Group;
 use crate::nn::parameters::{self, HostTensor, IntoF32, Named};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// The optimizer's settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -21,8 +23,19 @@ pub struct OptimConfig {
     pub betas: [f64; 2],
     /// Added to the root of the running square.
     pub epsilon: f64,
-    /// The largest global gradient norm; larger gradients are scaled down to it.
+    /// The largest gradient norm (of all parameters, or of each of the model's groups); larger gradients are scaled down to it.
     pub clip: f64,
+    /// Batches whose gradients are averaged for one step.
+    #[serde(default = "one")]
+    pub accumulate: usize,
+    /// The weights that are used in the end are a running average of those trained: the share of the average that a step
+    /// keeps, such as 0.999; 0 for none.
+    #[serde(default)]
+    pub ema: f64,
+}
+
+fn one() -> usize {
+    1
 }
 
 /// The running gradient and its running square, flat.
@@ -73,21 +86,34 @@ impl AdamW {
     }
 
     /// One step at a share of the largest learning rate; returns the module and the gradient's norm before clipping.
+    /// `group` says how a parameter is treated.
     #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
-    pub fn step<M: Module>(&mut self, module: M, share: f64, mut gradients: Named<Tensor<1>>) -> (M, f64) {
-        let square: f64 = gradients.values().map(|g| f64::from(g.clone().square().sum().into_scalar::<f32>())).sum();
-        let norm = square.sqrt();
-        // A little more than the norm, as PyTorch does, so that 0 divides nothing.
-        let scale = (self.config.clip / (norm + 1e-6)).min(1.0);
+    pub fn step<M: Module>(
+        &mut self,
+        module: M,
+        share: f64,
+        mut gradients: Named<Tensor<1>>,
+        group: fn(&str) -> Group,
+    ) -> (M, f64) {
+        // The square of each group's norm, in the order of names.
+        let mut squares: BTreeMap<usize, f64> = BTreeMap::new();
+        for (name, gradient) in &gradients {
+            let square = f64::from(gradient.clone().square().sum().into_scalar::<f32>());
+            *squares.entry(group(name).clip).or_default() += square;
+        }
+        let norm = squares.values().sum::<f64>().sqrt();
         self.steps += 1;
         let [beta1, beta2] = self.config.betas;
-        let lr = self.config.lr * share;
-        let step = lr / (1.0 - beta1.powi(self.steps as i32));
+        let rest = 1.0 - beta1.powi(self.steps as i32);
         let root = (1.0 - beta2.powi(self.steps as i32)).sqrt();
         let moments = &mut self.moments;
-        let (decay, epsilon) = (1.0 - lr * self.config.weight_decay, self.config.epsilon);
+        let config = &self.config;
         let module = parameters::map(module, |name, value| {
             let Some(gradient) = gradients.remove(name) else { return value };
+            let group = group(name);
+            let lr = config.lr * share * group.lr;
+            // A little more than the norm, as PyTorch does, so that 0 divides nothing.
+            let scale = config.clip / (squares[&group.clip].sqrt() + 1e-6);
             let gradient = if scale < 1.0 { gradient * scale } else { gradient };
             let (first, second) = match moments.remove(name) {
                 Some(Moments { first, second }) => (
@@ -96,9 +122,9 @@ impl AdamW {
                 ),
                 None => (gradient.clone() * (1.0 - beta1), gradient.square() * (1.0 - beta2)),
             };
-            let update = first.clone() / (second.clone().sqrt() / root + epsilon);
+            let update = first.clone() / (second.clone().sqrt() / root + config.epsilon);
             moments.insert(name.to_owned(), Moments { first, second });
-            value * decay - update * step
+            value * (1.0 - lr * config.weight_decay) - update * (lr / rest)
         });
         (module, norm)
     }

@@ -3,6 +3,7 @@
 use crate::training::{config, run};
 use burn::tensor::Device;
 use std::path::Path;
+use swm_models::lewm::Lewm;
 use swm_models::{Checkpoint, TrainOptions};
 
 fn edit(path: &Path, change: impl FnOnce(&mut serde_json::Value)) {
@@ -15,13 +16,13 @@ fn edit(path: &Path, change: impl FnOnce(&mut serde_json::Value)) {
 fn damage_and_mismatches_are_named() {
     let folder = tempfile::tempdir().expect("a folder");
     let trained = folder.path().join("run");
-    let load = |path: &Path| Checkpoint::load(path, &Device::flex());
+    let load = |path: &Path| Checkpoint::<Lewm>::load(path, &Device::flex());
     let message = |path: &Path| load(path).expect_err("unusable").to_string();
     assert!(message(&trained).contains("no checkpoint"));
 
     run(&config(&["schedule.steps=1"]), &trained, &TrainOptions::default(), 0).expect("trained");
     let checkpoint = load(&trained).expect("whole");
-    assert_eq!(checkpoint.env.as_deref(), Some("test/Dots-v0"));
+    assert_eq!(checkpoint.facts.env.as_deref(), Some("test/Dots-v0"));
     assert_eq!(checkpoint.hash().len(), 64);
 
     let inner = trained.join("checkpoint");

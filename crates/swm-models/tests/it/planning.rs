@@ -6,6 +6,7 @@ use burn::tensor::Device;
 use swm_core::{Batch, Candidates, ColumnSpec, CostModel, DType, Key, Manifest, Schema};
 use swm_models::Checkpoint;
 use swm_models::lewm::{Lewm, LewmCost};
+use swm_models::train::Facts;
 use swm_plan::ActionScale;
 
 const ENVS: usize = 3;
@@ -13,9 +14,9 @@ const SAMPLES: usize = 37;
 const HORIZON: usize = 4;
 const DIM: usize = 4;
 
-fn checkpoint() -> Checkpoint {
+fn checkpoint() -> Checkpoint<Lewm> {
     let config = config(&[]);
-    let model = Lewm::new(&config.model, DIM, Key::new(3), &Device::flex());
+    let model = Lewm::init(&config.model, DIM, Key::new(3), &Device::flex());
     // Modulations are zero before training; without them actions have no effect.
     let mut values = swm_models::nn::parameters::values(&model);
     for (name, tensor) in &mut values {
@@ -26,9 +27,9 @@ fn checkpoint() -> Checkpoint {
         }
     }
     let model = swm_models::nn::parameters::load(model, &values);
-    let action = ActionScale::identity(2);
+    let facts = Facts { action: ActionScale::identity(2), columns: Default::default(), env: None };
     let manifest = Manifest::new("train", 0, serde_json::Value::Null);
-    Checkpoint { model, config, action, env: None, manifest }
+    Checkpoint { model, config, facts, manifest }
 }
 
 fn infos(history: bool) -> Batch {

@@ -5,10 +5,11 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use swm_core::Result;
+use swm_models::lewm::Lewm;
 use swm_models::{Observer, Progress, TrainConfig, TrainOptions, TrainSummary, train};
 
 /// A model of a few thousand parameters.
-pub fn config(words: &[&str]) -> TrainConfig {
+pub fn config(words: &[&str]) -> TrainConfig<Lewm> {
     let small = [
         "model.image=16",
         "model.latent=4",
@@ -24,7 +25,7 @@ pub fn config(words: &[&str]) -> TrainConfig {
         "data.frameskip=2",
         "data.num_steps=4",
         "data.batch_size=16",
-        "sigreg.directions=16",
+        "loss.directions=16",
         "schedule.steps=10",
         "schedule.warmup=2",
         "log_every=5",
@@ -42,7 +43,7 @@ impl Observer for StopAt<'_> {
     }
 }
 
-pub fn run(config: &TrainConfig, out: &Path, options: &TrainOptions, stop_at: usize) -> Result<TrainSummary> {
+pub fn run(config: &TrainConfig<Lewm>, out: &Path, options: &TrainOptions, stop_at: usize) -> Result<TrainSummary> {
     let stop = AtomicBool::new(false);
     train(config, Arc::new(Dots::new(6, 0)), out, options, &mut StopAt(stop_at, &stop), &stop)
 }

@@ -1,49 +1,93 @@
-//! `swm checkpoints`: which models were trained here, and where one came from.
+//! `swm checkpoints`: which models were trained here, where one came from, and whether it is whole.
 
 use super::{emit, emit_json, table};
-use clap::Args;
+use clap::{Args, Subcommand};
 use serde_json::{Value, json};
+use std::path::PathBuf;
+use swm::families::{self, Card};
 use swm::home::{self, names_in};
-use swm_core::{Manifest, Result};
-use swm_models::inverse::InverseCheckpoint;
-use swm_models::{Checkpoint, Device, checkpoint};
-use swm_plan::ActionScale;
+use swm_core::{Error, Result};
+use swm_models::{Device, checkpoint};
 
 /// Arguments of `swm checkpoints`.
 #[derive(Args)]
+#[command(args_conflicts_with_subcommands = true)]
 pub struct CheckpointsArgs {
-    /// Show and verify this one: a path or a name
+    #[command(subcommand)]
+    command: Option<What>,
+    /// Show this one: a path or a name
     checkpoint: Option<String>,
 }
 
-/// Lists the checkpoints at home, or shows one.
+#[derive(Subcommand)]
+enum What {
+    /// List those at home
+    List,
+    /// Show how one was trained
+    Show {
+        /// A path or a name
+        checkpoint: String,
+    },
+    /// Load them and compare their hashes
+    Verify {
+        /// Paths or names (default: all at home)
+        checkpoints: Vec<String>,
+    },
+    /// Remove one with its logs
+    Remove {
+        /// A path or a name
+        checkpoint: String,
+    },
+}
+
+/// Lists, shows, verifies or removes checkpoints.
 pub fn checkpoints(args: &CheckpointsArgs, as_json: bool) -> anyhow::Result<()> {
-    if let Some(name) = &args.checkpoint {
-        let path = home::find_checkpoint(name)?;
-        let card = Card::load(name)?;
-        if as_json {
-            return emit_json(&json!({
-                "path": path,
-                "family": card.family,
-                "weights": card.weights,
-                "env": card.env,
-                "config": card.config,
-                "action": card.action,
-                "manifest": card.manifest,
-            }));
-        }
-        emit(&format!("{}\n{}, weights {}\n", path.display(), card.family, card.weights));
-        emit(&format!("trained on {}\n", card.env.as_deref().unwrap_or("an unknown environment")));
-        emit(&card.toml);
-        return Ok(());
+    match (&args.command, &args.checkpoint) {
+        (Some(What::Show { checkpoint }), _) | (None, Some(checkpoint)) => show(checkpoint, as_json),
+        (Some(What::List) | None, None | Some(_)) => list(as_json),
+        (Some(What::Verify { checkpoints }), _) => verify(checkpoints, as_json),
+        (Some(What::Remove { checkpoint }), _) => remove(checkpoint, as_json),
     }
+}
+
+/// Loads a checkpoint by path or name, which verifies it.
+fn load(given: &str) -> Result<(PathBuf, Card)> {
+    let path = home::find_checkpoint(given)?;
+    let card = families::load(&path, &Device::flex())?.card()?;
+    Ok((path, card))
+}
+
+fn show(given: &str, as_json: bool) -> anyhow::Result<()> {
+    let (path, card) = load(given)?;
+    if as_json {
+        return emit_json(&json!({
+            "path": path,
+            "family": card.family,
+            "weights": card.weights,
+            "env": card.facts.env,
+            "config": card.config,
+            "facts": card.facts,
+            "manifest": card.manifest,
+        }));
+    }
+    emit(&format!("{}\n{}, weights {}\n", path.display(), card.family, card.weights));
+    emit(&format!("trained on {}\n", card.facts.env.as_deref().unwrap_or("an unknown environment")));
+    emit(&card.toml);
+    Ok(())
+}
+
+fn list(as_json: bool) -> anyhow::Result<()> {
     let folder = home::checkpoints();
     let found: Vec<Value> = names_in(&folder)
         .into_iter()
-        .map(|name| match Card::load(&name) {
-            Ok(Card { family, env, weights, image, .. }) => {
-                json!({"name": name, "family": family, "env": env, "weights": weights, "image": image})
-            }
+        .map(|name| match load(&name) {
+            Ok((_, card)) => json!({
+                "name": name,
+                "family": card.family,
+                "env": card.facts.env,
+                "weights": card.weights,
+                "image": card.image,
+            }),
             Err(error) => json!({"name": name, "error": error.to_string()}),
         })
         .collect();
@@ -61,7 +105,7 @@ pub fn checkpoints(args: &CheckpointsArgs, as_json: bool) -> anyhow::Result<()> 
             text(&found["name"]),
             text(&found["family"]),
             text(&found["env"]),
-            format!("{} px", found["image"]),
+            found["image"].as_u64().map_or("–".to_owned(), |side| format!("{side} px")),
             text(&found["weights"]).chars().take(12).collect(),
         ],
     });
@@ -69,46 +113,48 @@ pub fn checkpoints(args: &CheckpointsArgs, as_json: bool) -> anyhow::Result<()> 
     Ok(())
 }
 
-/// What there is to say about a checkpoint of any family.
-struct Card {
-    family: &'static str,
-    env: Option<String>,
-    weights: String,
-    /// The side of the pictures it sees.
-    image: usize,
-    config: Value,
-    toml: String,
-    action: ActionScale,
-    manifest: Manifest,
+fn verify(given: &[String], as_json: bool) -> anyhow::Result<()> {
+    let all = names_in(&home::checkpoints());
+    let given = if given.is_empty() { &all } else { given };
+    let found: Vec<(&String, Result<(PathBuf, Card)>)> = given.iter().map(|name| (name, load(name))).collect();
+    let damaged = found.iter().filter(|(_, card)| card.is_err()).count();
+    if as_json {
+        let rows: Vec<Value> = found
+            .iter()
+            .map(|(name, card)| match card {
+                Ok((_, card)) => json!({"name": name, "whole": true, "weights": card.weights}),
+                Err(error) => json!({"name": name, "whole": false, "error": error.to_string()}),
+            })
+            .collect();
+        emit_json(&rows)?;
+    } else {
+        for (name, card) in &found {
+            match card {
+                Ok((_, card)) => emit(&format!("{name}: whole, weights {}\n", card.weights)),
+                Err(error) => emit(&format!("{name}: {error}\n")),
+            }
+        }
+    }
+    if damaged > 0 {
+        anyhow::bail!(Error::config(
+            "checkpoints",
+            format!("{damaged} of {} cannot be used", found.len()),
+            "train them again, or `swm checkpoints remove` them"
+        ));
+    }
+    Ok(())
 }
 
-impl Card {
-    /// Loads a checkpoint by path or name, which verifies it.
-    fn load(given: &str) -> Result<Self> {
-        let path = home::find_checkpoint(given)?;
-        if checkpoint::family(&path).as_deref() == Some("inverse") {
-            let found = InverseCheckpoint::load(&path, &Device::flex())?;
-            return Ok(Self {
-                family: "inverse",
-                weights: found.hash().to_owned(),
-                image: found.world.config.model.image,
-                config: json!(found.config),
-                toml: found.config.to_toml()?,
-                env: found.world.env,
-                action: found.world.action,
-                manifest: found.manifest,
-            });
-        }
-        let found = Checkpoint::load(&path, &Device::flex())?;
-        Ok(Self {
-            family: "lewm",
-            weights: found.hash().to_owned(),
-            image: found.config.model.image,
-            config: json!(found.config),
-            toml: found.config.to_toml()?,
-            env: found.env,
-            action: found.action,
-            manifest: found.manifest,
-        })
+fn remove(given: &str, as_json: bool) -> anyhow::Result<()> {
+    let path = home::find_checkpoint(given)?;
+    // Only what is a run's folder: a mistyped path must not take anything else away.
+    if checkpoint::family(&path).is_none() {
+        anyhow::bail!(Error::corrupt(&path, "there is no checkpoint", "give the folder that `swm train` wrote to"));
     }
+    std::fs::remove_dir_all(&path).map_err(|error| Error::io(&path, "removing a checkpoint", error))?;
+    if as_json {
+        return emit_json(&json!({"removed": path}));
+    }
+    emit(&format!("removed {}\n", path.display()));
+    Ok(())
 }

@@ -7,6 +7,7 @@ use clap::Args;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::time::Instant;
+use swm::families::TrainOn;
 use swm::resolver::Home;
 use swm::{ENVS, home};
 use swm_core::VariationRequest;
@@ -14,7 +15,8 @@ use swm_core::results::Counting;
 use swm_data::Location;
 use swm_data::{ImageCodec, WriteMode};
 use swm_eval::{Acts, Choice, CollectConfig, Condition, EvalRequest, Model, PolicyRequest, StartsRequest, WorldConfig};
-use swm_models::{Checkpoint, Device, TrainConfig};
+use swm_models::lewm::Lewm;
+use swm_models::{Checkpoint, Device, TrainConfig, TrainOptions};
 use swm_plan::{Cem, MpcConfig};
 use swm_report::ReportOptions;
 
@@ -58,7 +60,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     let env = ENVS.choose(ENV)?;
     let output = args.output.clone().unwrap_or_else(|| home::home().join("demo"));
     let (data, model, results) = (output.join("rooms.lance"), output.join("lewm-rooms"), output.join("results"));
-    let mut config = TrainConfig::load("tiny", &args.settings)?;
+    let mut config = TrainConfig::<Lewm>::load("tiny", &args.settings)?;
     config.seed = args.seed;
     let image = (config.model.image, config.model.image);
     for old in [&model, &results] {
@@ -95,8 +97,10 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     collect::run(&collection, context)?;
 
     complain("2/4 train: a small LeWM learns to predict what it will see\n");
-    train::run(&config, home::open_dataset(&data.to_string_lossy())?, &model, false, context)?;
-    let checkpoint = Checkpoint::load(&model, &Device::flex())?;
+    let options = TrainOptions { threads: context.threads, ..TrainOptions::default() };
+    let reader = home::open_dataset(&data.to_string_lossy())?;
+    train::run(&config, TrainOn { reader, encoder: None, out: &model, options }, context)?;
+    let checkpoint = Checkpoint::<Lewm>::load(&model, &Device::flex())?;
 
     complain("3/4 plan and evaluate: CEM over the model, beside the random floor\n");
     let shift =

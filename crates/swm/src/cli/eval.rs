@@ -9,14 +9,13 @@ use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use swm::resolver::{Home, parse_score};
-use swm::{ENVS, home};
+use swm::{ENVS, families, home};
 use swm_core::results::{Counting, Proportion, Run};
 use swm_core::{EnvChoice, Error, Result, Results};
 use swm_data::{Part, Split};
 use swm_eval::reproduce::{Reproduction, reproduce as run_again};
 use swm_eval::{Acts, Condition, EvalRequest, HeldOut, Means, Model, Moment, PolicyRequest, StartsRequest};
-use swm_models::inverse::InverseCheckpoint;
-use swm_models::{Checkpoint, Device, checkpoint};
+use swm_models::Device;
 
 /// Arguments of `swm eval`.
 #[derive(Args)]
@@ -225,15 +224,13 @@ fn find(given: &str, env: Option<&str>) -> Result<Found> {
     }
     let path = home::find_checkpoint(given)?;
     let name = Path::new(given).file_name().map_or(given.to_owned(), |name| name.to_string_lossy().into_owned());
-    if checkpoint::family(&path).as_deref() == Some("inverse") {
-        let found = InverseCheckpoint::load(&path, &Device::flex())?;
-        let kind = Kind::Acts(Acts::Direct { checkpoint: given.to_owned(), settings: Value::Null });
-        return Ok(Found { name, kind, env: found.world.env, image: Some(found.world.config.model.image) });
-    }
-    let found = Checkpoint::load(&path, &Device::flex())?;
-    let (model, block) = (Some(given.to_owned()), found.config.data.frameskip);
-    let kind = Kind::Plans { model, block, history: found.config.model.predictor.history };
-    Ok(Found { name, kind, env: found.env, image: Some(found.config.model.image) })
+    let found = families::load(&path, &Device::flex())?;
+    let card = found.card()?;
+    let kind = match found.cost() {
+        Some(_) => Kind::Plans { model: Some(given.to_owned()), block: card.action_block, history: card.history },
+        None => Kind::Acts(Acts::Direct { checkpoint: given.to_owned(), settings: Value::Null }),
+    };
+    Ok(Found { name, kind, env: card.facts.env, image: card.image })
 }
 
 /// Evaluates with a progress bar and writes `results.json`; `films` is where to, and how many episodes of each run.

@@ -1,14 +1,14 @@
 //! `swm train`: train a model on a dataset.
 
-use super::{Context, Progress, emit, emit_json, models::MODELS};
+use super::{Context, Progress, emit, emit_json};
 use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use swm::families::{FAMILIES, TrainOn, Training};
 use swm::home;
 use swm_core::{Error, Result};
 use swm_data::Reader;
-use swm_models::inverse::InverseConfig;
-use swm_models::{Checkpoint, Device, Observer, TrainConfig, TrainOptions, TrainSummary};
+use swm_models::{Observer, TrainOptions, TrainSummary, device};
 
 /// Arguments of `swm train`.
 #[derive(Args)]
@@ -18,15 +18,18 @@ pub struct TrainArgs {
     /// The dataset: a path or a name
     #[arg(long, value_name = "DATASET")]
     data: Option<String>,
-    /// The size and schedule: a preset's name or a TOML file
-    #[arg(long, default_value = "tiny")]
-    preset: String,
+    /// The size and schedule: a preset's name or a TOML file (default: the model's first preset)
+    #[arg(long)]
+    preset: Option<String>,
     /// Where to write the checkpoint and the logs: a path or a name (default: the model's and dataset's names)
     #[arg(short, long, value_name = "CHECKPOINT")]
     output: Option<String>,
     /// The checkpoint whose frozen encoder is used: a path or a name (inverse only)
     #[arg(long, value_name = "CHECKPOINT")]
     encoder: Option<String>,
+    /// Where it computes: cpu, vulkan[:I], cuda[:I], auto
+    #[arg(long, default_value = "cpu")]
+    device: String,
     /// Continue the run that is there
     #[arg(long)]
     resume: bool,
@@ -40,30 +43,31 @@ pub struct TrainArgs {
 
 /// Trains a model.
 pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
-    let known = MODELS.iter().map(|(id, _)| *id);
-    if !known.clone().any(|id| id == args.model) {
-        anyhow::bail!(Error::unknown("model", &args.model, known, "`swm models` lists them"));
-    }
-    if args.model == "inverse" {
-        return inverse(args, context);
-    }
-    if args.encoder.is_some() {
-        anyhow::bail!(Error::config(
-            "--encoder",
-            "lewm trains an encoder of its own",
-            "leave it out, or train inverse"
-        ));
-    }
-    let config = TrainConfig::load(&args.preset, &args.settings)?;
+    let family = FAMILIES.get(&args.model)?;
+    let preset = args.preset.as_deref().unwrap_or(family.presets[0].id);
+    let config = (family.config)(preset, &args.settings)?;
     if args.print_config {
         if context.json {
-            return emit_json(&config);
+            return emit_json(&config.json());
         }
-        emit(&config.to_toml()?);
+        emit(&config.toml()?);
         return Ok(());
     }
+    if args.encoder.is_some() && !family.borrows {
+        let problem = format!("{} trains an encoder of its own", family.id);
+        anyhow::bail!(Error::config("--encoder", problem, "leave it out, or train inverse"));
+    }
+    let encoder = args.encoder.as_deref().map(home::find_checkpoint).transpose()?;
     let (reader, out) = args.places()?;
-    let summary = run(&config, reader, &out, args.resume, context)?;
+    let options = TrainOptions {
+        resume: args.resume,
+        device: device::parse(&args.device)?,
+        threads: context.threads,
+        cache: home::weights(),
+        ..TrainOptions::default()
+    };
+    let on = TrainOn { reader, encoder: encoder.as_deref(), out: &out, options };
+    let summary = run(&*config, on, context)?;
     if context.json {
         return emit_json(&summary);
     }
@@ -85,64 +89,15 @@ impl TrainArgs {
     }
 }
 
-/// Trains an inverse-dynamics policy on the encoder of a checkpoint.
-fn inverse(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
-    let config = InverseConfig::load(&args.settings)?;
-    if args.print_config {
-        if context.json {
-            return emit_json(&config);
-        }
-        emit(&config.to_toml()?);
-        return Ok(());
-    }
-    let Some(encoder) = &args.encoder else {
-        let fix = "name a checkpoint with --encoder (`swm checkpoints` lists them)";
-        anyhow::bail!(Error::config(
-            "--encoder",
-            "an inverse-dynamics policy sees through another model's encoder",
-            fix
-        ));
-    };
-    if args.resume {
-        let fix = "leave out --resume and choose another --output";
-        anyhow::bail!(Error::config(
-            "--resume",
-            "training an inverse-dynamics policy takes seconds and begins anew",
-            fix
-        ));
-    }
-    let world = Checkpoint::load(&home::find_checkpoint(encoder)?, &Device::flex())?;
-    let (reader, out) = args.places()?;
-    let mut bar = Progress::new("train", config.schedule.steps);
-    let watched = &mut bar;
-    // Borrowed for itself alone: the bar may move to the thread that trains, but not be shared with it.
-    let mut watch = |at: swm_models::inverse::InverseProgress| {
-        let bar: &mut Progress = &mut *watched;
-        bar.at(at.step, format!("loss {:.3}", at.loss));
-    };
-    let summary =
-        swm_models::inverse::train(&config, &world, reader, &out, context.threads, &mut watch, &context.stop)?;
-    bar.done(&format!("{} steps in {:.0} s, {}", summary.steps, summary.seconds, out.display()));
-    if context.json {
-        return emit_json(&summary);
-    }
-    emit(&format!("{}\n", summary.checkpoint.display()));
-    Ok(())
-}
-
 /// Trains with a progress bar.
-pub fn run(
-    config: &TrainConfig,
-    reader: Arc<dyn Reader>,
-    out: &Path,
-    resume: bool,
-    context: &Context,
-) -> Result<TrainSummary> {
-    let mut bar = Bar(Progress::new("train", config.schedule.steps));
-    let options = TrainOptions { resume, threads: context.threads, ..TrainOptions::default() };
-    let summary = swm_models::train(config, reader, out, &options, &mut bar, &context.stop)?;
+pub fn run(config: &dyn Training, on: TrainOn<'_>, context: &Context) -> Result<TrainSummary> {
+    let out = on.out.to_owned();
+    let mut bar = Bar(Progress::new("train", config.steps()));
+    let summary = config.train(on, &mut bar, &context.stop)?;
+    let early = if summary.stopped_early { ", stopped early" } else { "" };
+    let best = summary.best.map_or(String::new(), |(step, loss)| format!(", best {loss:.4} after step {step}"));
     bar.0.done(&format!(
-        "{} steps in {:.0} s ({} parameters, {:.0} clips/s, {:.0} % of it waiting for data), {}",
+        "{} steps in {:.0} s{early}{best} ({} parameters, {:.0} clips/s, {:.0} % of it waiting for data), {}",
         summary.steps,
         summary.seconds,
         summary.parameters,
@@ -163,15 +118,19 @@ pub fn log_of(checkpoint: &Path) -> PathBuf {
 
 struct Bar(Progress);
 
+/// Metrics the bar has room for.
+const SHOWN: usize = 4;
+
 impl Observer for Bar {
     fn progress(&mut self, at: &swm_models::Progress) {
+        let shown: Vec<String> =
+            at.metrics.iter().take(SHOWN).map(|(name, value)| format!("{name} {value:.4}")).collect();
+        let validation = at.validation.map_or(String::new(), |loss| format!(", held out {loss:.4}"));
         self.0.at(
             at.step,
             format!(
-                "loss {:.3} (prediction {:.4}, SIGReg {:.2}), {:.0} clips/s, waits {:.0} %",
-                at.losses.total,
-                at.losses.prediction,
-                at.losses.sigreg,
+                "{}{validation}, {:.0} clips/s, waits {:.0} %",
+                shown.join(" "),
                 at.clips_per_second,
                 100.0 * at.data_wait
             ),

@@ -38,7 +38,7 @@ impl Golden {
     }
 
     fn model(&self) -> Lewm {
-        let model = Lewm::new(&self.config(), self.size("action_dim"), Key::new(0), &Device::flex());
+        let model = Lewm::init(&self.config(), self.size("action_dim"), Key::new(0), &Device::flex());
         let weights = self.group("w.");
         for (name, shape) in parameters::shapes(&model) {
             assert_eq!(weights.get(&name).map(|w| &w.shape), Some(&shape), "published weight {name}");

@@ -1,0 +1,89 @@
+//! How a LeWM is trained: the loop's side of [`super::step`].
+
+use super::step::{self, SigregConfig, StepOutput as Found, TrainBatch};
+use super::{Lewm, LewmConfig, loss, pixels};
+use crate::nn::{BatchStatistics, Named};
+use crate::train::{Facts, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
+use burn::tensor::{Device, Tensor};
+use swm_core::{Batch, Error, Key, Result, Schema};
+use swm_data::{ClipSpec, LoaderConfig};
+
+impl Trainable for Lewm {
+    const FAMILY: &'static str = "lewm";
+    const SUMMARY: &'static str =
+        "LeWorldModel: encoder and predictor trained end to end, kept from collapsing by SIGReg";
+    const PRESETS: &'static [Preset] = &[
+        Preset {
+            id: "tiny",
+            summary: "64 px, a small convolutional encoder: trains in half a minute on two CPU cores",
+            toml: include_str!("../../presets/lewm/tiny.toml"),
+        },
+        Preset {
+            id: "paper",
+            summary: "224 px, ViT-tiny/14, predictor of 6 layers: the published size, for a GPU",
+            toml: include_str!("../../presets/lewm/paper.toml"),
+        },
+    ];
+    type Config = LewmConfig;
+    type Loss = SigregConfig;
+
+    fn check(config: &TrainConfig<Self>) -> Result<()> {
+        config.model.check()?;
+        at_least(&[
+            ("data.num_steps", config.data.num_steps, 2),
+            ("loss.directions", config.loss.directions, 1),
+            ("loss.knots", config.loss.knots, 2),
+        ])?;
+        let (frames, history) = (config.data.num_steps, config.model.predictor.history);
+        if frames - 1 < history {
+            return Err(Error::config(
+                "data.num_steps",
+                format!("{frames} frames train only {} of the {history} steps of history", frames - 1),
+                format!("give at least {}, or lower model.predictor.history", history + 1),
+            ));
+        }
+        Ok(())
+    }
+
+    fn picture(config: &LewmConfig) -> Option<usize> {
+        Some(config.image)
+    }
+
+    fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
+        pixels::check(&config.model, schema, "pixels")?;
+        let columns = vec!["pixels".to_owned(), "action".to_owned()];
+        let clip = ClipSpec { num_steps: config.data.num_steps, frameskip: config.data.frameskip, columns };
+        Ok(LoaderConfig { clip, ..LoaderConfig::default() })
+    }
+
+    fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
+        Ok(Self::init(&config.model, config.data.frameskip * facts.action.dim(), key, device))
+    }
+
+    fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
+        let StepContext { config, facts, key, device, training } = context;
+        let directions = loss::directions(key.with("sigreg"), config.model.latent, config.loss.directions);
+        let batch = TrainBatch {
+            patches: pixels::patches(&config.model, batch.get::<u8>("pixels")?, device)?,
+            actions: facts.actions(batch, config.data.num_steps, config.data.frameskip, device)?,
+        };
+        let mut noise = key.with("dropout").rng();
+        let noise = training.then_some(&mut noise);
+        let Found { losses, gradients, statistics: [projector, pred_proj], .. } =
+            step::step(self, &batch, &config.loss, &directions, config.shards, noise);
+        let mut buffers = Named::new();
+        projector.store("projector", &mut buffers);
+        pred_proj.store("pred_proj", &mut buffers);
+        let metrics = vec![("loss", losses.total), ("prediction", losses.prediction), ("sigreg", losses.sigreg)];
+        Ok(StepOutput { metrics, gradients, buffers })
+    }
+
+    fn after(mut self, _: &StepContext<'_, Self>, mut buffers: Named<Tensor<1>>) -> Self {
+        for (name, part) in [("projector", &mut self.projector), ("pred_proj", &mut self.pred_proj)] {
+            if let Some(statistics) = BatchStatistics::take(name, &mut buffers) {
+                part.track(statistics);
+            }
+        }
+        self
+    }
+}

@@ -1,0 +1,299 @@
+//! [`FAMILIES`]: the model families of this build, and what the program can do with a model of each: train it, load it,
+//! plan in it, let it act, hold its predictions against recordings.
+
+use crate::predictor::LewmPredictor;
+use serde_json::{Value, json};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use swm_core::{CostModel, EnvSpec, Error, Manifest, Named, Policy, Registry, Result};
+use swm_data::Reader;
+use swm_eval::Predictor;
+use swm_models::inverse::{self, InverseCheckpoint, InverseConfig, InversePolicy};
+use swm_models::lewm::{Lewm, LewmCost};
+use swm_models::train::{Facts, Preset};
+use swm_models::{Checkpoint, Device, Observer, TrainConfig, TrainOptions, TrainSummary, Trainable, checkpoint};
+
+/// The families, in the order in which they are listed.
+pub static FAMILIES: Registry<Family> =
+    Registry { kind: "model", hint: "`swm models` lists them", rows: &[family::<Lewm>(), INVERSE] };
+
+/// A model family.
+pub struct Family {
+    /// Its name.
+    pub id: &'static str,
+    /// What it is, in a sentence.
+    pub summary: &'static str,
+    /// Its configurations; the first is what is meant when none is named.
+    pub presets: &'static [Preset],
+    /// Whether it sees through the encoder of another checkpoint.
+    pub borrows: bool,
+    /// A complete configuration, from a preset and `key=value` words.
+    pub config: fn(&str, &[String]) -> Result<Box<dyn Training>>,
+    /// Loads a checkpoint.
+    pub load: fn(&Path, &Device) -> Result<Box<dyn Loaded>>,
+}
+
+impl Named for Family {
+    fn id(&self) -> &'static str {
+        self.id
+    }
+}
+
+/// What a checkpoint holds, whatever its family.
+pub struct Card {
+    /// The family.
+    pub family: &'static str,
+    /// The hash of the weights.
+    pub weights: String,
+    /// How it was trained, as JSON.
+    pub config: Value,
+    /// The same, as TOML.
+    pub toml: String,
+    /// What it knows of its data.
+    pub facts: Facts,
+    /// The side of the pictures it sees, if it sees any.
+    pub image: Option<usize>,
+    /// Environment steps in a model step.
+    pub action_block: usize,
+    /// Frames it looks at to predict.
+    pub history: usize,
+    /// Where it came from.
+    pub manifest: Manifest,
+}
+
+/// A checkpoint of any family.
+pub trait Loaded {
+    /// What it holds.
+    ///
+    /// # Errors
+    /// Never for a configuration that was loaded.
+    fn card(&self) -> Result<Card>;
+
+    /// The cost of a plan in it; none for a model that acts without planning.
+    fn cost(&self) -> Option<Box<dyn CostModel>>;
+
+    /// A policy that acts as it says, without planning, in `slots` environments; none for a model that only predicts.
+    ///
+    /// # Errors
+    /// When the environment has other actions than the model was trained for.
+    fn policy(&self, spec: &EnvSpec, slots: usize) -> Option<Result<Box<dyn Policy>>>;
+
+    /// Its predictions, to be held against recordings; none for a model without a rollout of latents.
+    fn predictor(&self) -> Option<Box<dyn Predictor>>;
+}
+
+/// A configuration to train with.
+pub trait Training {
+    /// It, as TOML.
+    ///
+    /// # Errors
+    /// Never for a configuration that was loaded.
+    fn toml(&self) -> Result<String>;
+
+    /// It, as JSON.
+    fn json(&self) -> Value;
+
+    /// Steps to train.
+    fn steps(&self) -> usize;
+
+    /// Trains on `reader`; the checkpoint and the logs go to `out`. `encoder` is the checkpoint to see through, for
+    /// families that do.
+    ///
+    /// # Errors
+    /// As [`swm_models::train`].
+    fn train(&self, on: TrainOn<'_>, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainSummary>;
+}
+
+/// What a model is trained on and with.
+pub struct TrainOn<'a> {
+    /// The dataset.
+    pub reader: Arc<dyn Reader>,
+    /// The checkpoint whose encoder it sees through, for families that do.
+    pub encoder: Option<&'a Path>,
+    /// Where the checkpoint and the logs go.
+    pub out: &'a Path,
+    /// What does not decide the numbers.
+    pub options: TrainOptions,
+}
+
+/// What a model of a family can be used for.
+trait Usable: Trainable {
+    /// Frames it looks at to predict.
+    fn history(_config: &TrainConfig<Self>) -> usize {
+        1
+    }
+
+    /// As [`Loaded::cost`].
+    fn cost(_checkpoint: &Checkpoint<Self>) -> Option<Box<dyn CostModel>> {
+        None
+    }
+
+    /// As [`Loaded::policy`].
+    fn policy(_checkpoint: &Checkpoint<Self>, _spec: &EnvSpec, _slots: usize) -> Option<Result<Box<dyn Policy>>> {
+        None
+    }
+
+    /// As [`Loaded::predictor`].
+    fn predictor(_checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Predictor>> {
+        None
+    }
+}
+
+impl Usable for Lewm {
+    fn history(config: &TrainConfig<Self>) -> usize {
+        config.model.predictor.history
+    }
+
+    fn cost(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn CostModel>> {
+        Some(Box::new(LewmCost::new(checkpoint)))
+    }
+
+    fn predictor(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Predictor>> {
+        Some(Box::new(LewmPredictor::new(checkpoint.clone())))
+    }
+}
+
+/// The row of a family.
+const fn family<M: Usable>() -> Family {
+    Family {
+        id: M::FAMILY,
+        summary: M::SUMMARY,
+        presets: M::PRESETS,
+        borrows: false,
+        config: |preset, words| Ok(Box::new(TrainConfig::<M>::load(preset, words)?)),
+        load: |run, device| Ok(Box::new(Checkpoint::<M>::load(run, device)?)),
+    }
+}
+
+impl<M: Usable> Training for TrainConfig<M> {
+    fn toml(&self) -> Result<String> {
+        self.to_toml()
+    }
+
+    fn json(&self) -> Value {
+        json!(self)
+    }
+
+    fn steps(&self) -> usize {
+        self.schedule.steps
+    }
+
+    fn train(&self, on: TrainOn<'_>, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainSummary> {
+        swm_models::train(self, on.reader, on.out, &on.options, observer, stop)
+    }
+}
+
+impl<M: Usable> Loaded for Checkpoint<M> {
+    fn card(&self) -> Result<Card> {
+        Ok(Card {
+            family: M::FAMILY,
+            weights: self.hash().to_owned(),
+            config: json!(self.config),
+            toml: self.config.to_toml()?,
+            facts: self.facts.clone(),
+            image: M::picture(&self.config.model),
+            action_block: self.config.data.frameskip,
+            history: M::history(&self.config),
+            manifest: self.manifest.clone(),
+        })
+    }
+
+    fn cost(&self) -> Option<Box<dyn CostModel>> {
+        M::cost(self)
+    }
+
+    fn policy(&self, spec: &EnvSpec, slots: usize) -> Option<Result<Box<dyn Policy>>> {
+        M::policy(self, spec, slots)
+    }
+
+    fn predictor(&self) -> Option<Box<dyn Predictor>> {
+        M::predictor(self)
+    }
+}
+
+/// The checkpoint in a folder, of whatever family it is.
+///
+/// # Errors
+/// When there is none, its family is unknown here, it is damaged, or its weights do not fit its configuration.
+pub fn load(run: &Path, device: &Device) -> Result<Box<dyn Loaded>> {
+    let Some(family) = checkpoint::family(run) else {
+        return Err(Error::corrupt(run, "there is no checkpoint", "give the folder that `swm train` wrote to"));
+    };
+    (FAMILIES.get(&family)?.load)(run, device)
+}
+
+/// Inverse dynamics, which is trained in a way of its own: on the latents of another checkpoint.
+const INVERSE: Family = Family {
+    id: "inverse",
+    summary: "inverse dynamics on the frozen encoder of another checkpoint: acts without planning, the cheap baseline",
+    presets: &[Preset {
+        id: "tiny",
+        summary: "trains in seconds on two CPU cores, given --encoder",
+        toml: InverseConfig::PRESET,
+    }],
+    borrows: true,
+    config: |_, words| Ok(Box::new(InverseConfig::load(words)?)),
+    load: |run, device| Ok(Box::new(InverseCheckpoint::load(run, device)?)),
+};
+
+impl Training for InverseConfig {
+    fn toml(&self) -> Result<String> {
+        self.to_toml()
+    }
+
+    fn json(&self) -> Value {
+        json!(self)
+    }
+
+    fn steps(&self) -> usize {
+        self.schedule.steps
+    }
+
+    fn train(&self, on: TrainOn<'_>, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainSummary> {
+        let Some(encoder) = on.encoder else {
+            return Err(Error::config(
+                "--encoder",
+                "an inverse-dynamics policy sees through another model's encoder",
+                "name a checkpoint with --encoder (`swm checkpoints` lists them)",
+            ));
+        };
+        if on.options.resume {
+            return Err(Error::config(
+                "--resume",
+                "training an inverse-dynamics policy takes seconds and begins anew",
+                "leave out --resume and choose another --output",
+            ));
+        }
+        let world = Checkpoint::<Lewm>::load(encoder, &on.options.device)?;
+        inverse::train(self, &world, on.reader, on.out, on.options.threads, observer, stop)
+    }
+}
+
+impl Loaded for InverseCheckpoint {
+    fn card(&self) -> Result<Card> {
+        Ok(Card {
+            family: INVERSE.id,
+            weights: self.hash().to_owned(),
+            config: json!(self.config),
+            toml: self.config.to_toml()?,
+            facts: self.world.facts.clone(),
+            image: Lewm::picture(&self.world.config.model),
+            action_block: self.world.config.data.frameskip,
+            history: 1,
+            manifest: self.manifest.clone(),
+        })
+    }
+
+    fn cost(&self) -> Option<Box<dyn CostModel>> {
+        None
+    }
+
+    fn policy(&self, spec: &EnvSpec, slots: usize) -> Option<Result<Box<dyn Policy>>> {
+        Some(InversePolicy::new(self.clone(), spec, slots).map(|policy| Box::new(policy) as Box<dyn Policy>))
+    }
+
+    fn predictor(&self) -> Option<Box<dyn Predictor>> {
+        None
+    }
+}

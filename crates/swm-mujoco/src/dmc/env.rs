@@ -160,11 +160,12 @@ impl<D: Domain> Control<D> {
         Step { reward, terminated }
     }
 
-    /// Where random actions lead within some steps: `qpos` and `qvel`, if that is somewhere new where the world can stay.
+    /// Where random actions lead: `qpos` and `qvel`, as soon as that is somewhere new where the world can stay, after as many
+    /// steps as are drawn.
     fn wander(&self, physics: &mut Physics, rng: &mut Rng) -> Option<Vec<f64>> {
         let from = physics.data().qpos().to_vec();
-        let mut left = 0;
-        for _ in 0..rng.random_range(GOAL_STEPS) {
+        let (enough, mut left) = (rng.random_range(GOAL_STEPS), 0);
+        for step in 1..=*GOAL_STEPS.end() {
             // An action is held for some steps: random ones in each step would cancel out.
             if left == 0 {
                 left = rng.random_range(1..=5);
@@ -174,11 +175,16 @@ impl<D: Domain> Control<D> {
             }
             left -= 1;
             physics.step_control(D::SUBSTEPS * REPEAT);
+            if physics.is_unstable() {
+                return None;
+            }
+            let there = physics.data().qpos();
+            let new = || !self.coordinates.reached(&from, there, D::NEAR);
+            if step >= enough && self.coordinates.can_stay(there, D::NEAR / 2.0) && new() {
+                return Some([there, physics.data().qvel()].concat());
+            }
         }
-        let there = physics.data().qpos();
-        let new = !self.coordinates.reached(&from, there, D::NEAR);
-        let fine = new && self.coordinates.can_stay(there, D::NEAR / 2.0) && !physics.is_unstable();
-        fine.then(|| [there, physics.data().qvel()].concat())
+        None
     }
 
     /// Takes walks until one leads to a new goal.

@@ -318,8 +318,10 @@ impl<T: Task> Env for World<T> {
     fn libraries(&self) -> BTreeMap<String, String> {
         let mut libraries = BTreeMap::from([("mujoco".to_owned(), link::VERSION.to_owned())]);
         // Named only where pictures were drawn: whoever works from states needs none.
-        if let Some(name) = render::used() {
-            libraries.insert("renderer".to_owned(), name.to_owned());
+        if self.stage.is_some()
+            && let Ok(name) = render::name()
+        {
+            libraries.insert("renderer".to_owned(), name);
         }
         libraries
     }

@@ -1,9 +1,12 @@
 //! Pictures of a world: RGB, depth and segmentation, through any camera, at any size, straight into the caller's buffer.
 //!
 //! A [`Stage`] turns a world into MuJoCo's abstract scene (geoms, lights, cameras) on the thread that owns the world. A
-//! [`Renderer`] draws scenes. There is one for the process: MuJoCo's own, in OpenGL through EGL ([`egl`]).
+//! [`Renderer`] draws scenes: MuJoCo's own, in OpenGL through EGL ([`egl`]), or ours, on the CPU ([`cpu`]). [`Choice`] says which.
 
+mod cpu;
 mod egl;
+#[cfg(test)]
+pub(crate) mod likeness;
 mod stage;
 
 pub(crate) use stage::Stage;
@@ -11,6 +14,8 @@ pub(crate) use stage::Stage;
 use crate::Physics;
 use mujoco_rs::mujoco_c::mjvScene;
 use mujoco_rs::wrappers::MjModel;
+use std::cell::Cell;
+use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Arc, OnceLock};
 use swm_core::{Error, Result};
 
@@ -91,19 +96,80 @@ pub(crate) trait Renderer: Send + Sync {
     fn draw(&self, scene: Scene<'_>, width: usize, height: usize, picture: Picture<'_>) -> Result<()>;
 }
 
-static RENDERER: OnceLock<Result<egl::Egl, String>> = OnceLock::new();
-
-/// The name of the renderer, if a picture was asked for.
-pub(crate) fn used() -> Option<&'static str> {
-    RENDERER.get()?.as_ref().ok().map(Renderer::name)
+/// Which renderer draws.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Choice {
+    /// MuJoCo's own where a graphics card is, ours elsewhere.
+    #[default]
+    Auto,
+    /// MuJoCo's own, in OpenGL through EGL: on a graphics card, or in Mesa's software, which is slow.
+    Egl,
+    /// Ours, on the CPU.
+    Cpu,
 }
 
-/// The renderer of this process, made when the first picture is asked for.
+/// What this process chose, as a number.
+static CHOSEN: AtomicU8 = AtomicU8::new(Choice::Auto as u8);
+
+thread_local! {
+    /// What this thread chose for a while.
+    static HERE: Cell<Option<Choice>> = const { Cell::new(None) };
+}
+
+/// Chooses the renderer of all pictures that are drawn from now on.
+pub fn choose(choice: Choice) {
+    CHOSEN.store(choice as u8, Ordering::Relaxed);
+}
+
+/// Chooses the renderer of the pictures that `draw` asks for on this thread.
+pub fn with<T>(choice: Choice, draw: impl FnOnce() -> T) -> T {
+    /// Puts back what was chosen before, also when `draw` panics.
+    struct Back(Option<Choice>);
+    impl Drop for Back {
+        fn drop(&mut self) {
+            HERE.set(self.0);
+        }
+    }
+    let _back = Back(HERE.replace(Some(choice)));
+    draw()
+}
+
+/// The renderer that draws now.
+fn chosen() -> Choice {
+    HERE.get().unwrap_or_else(|| match CHOSEN.load(Ordering::Relaxed) {
+        chosen if chosen == Choice::Egl as u8 => Choice::Egl,
+        chosen if chosen == Choice::Cpu as u8 => Choice::Cpu,
+        _ => Choice::Auto,
+    })
+}
+
+static EGL: OnceLock<Result<egl::Egl, String>> = OnceLock::new();
+static CPU: cpu::Cpu = cpu::Cpu;
+
+/// What draws, with its device: what manifests say.
 ///
 /// # Errors
-/// When this machine has none: says what to install.
+/// When EGL was chosen and this machine has none: says what to install.
+pub fn name() -> Result<String> {
+    renderer().map(|renderer| renderer.name().to_owned())
+}
+
+/// The renderer to draw with.
+///
+/// # Errors
+/// When EGL was chosen and this machine has none: says what to install.
 pub(crate) fn renderer() -> Result<&'static dyn Renderer> {
-    let made = RENDERER.get_or_init(|| {
+    /// Whether there is a graphics card; asked once.
+    static HARDWARE: OnceLock<bool> = OnceLock::new();
+    let egl = match chosen() {
+        Choice::Cpu => false,
+        Choice::Egl => true,
+        Choice::Auto => *HARDWARE.get_or_init(egl::hardware),
+    };
+    if !egl {
+        return Ok(&CPU);
+    }
+    let made = EGL.get_or_init(|| {
         let made = egl::Egl::new().map_err(|error| error.to_string());
         match &made {
             Ok(renderer) => tracing::info!("pictures of MuJoCo's worlds are drawn by {}", renderer.name()),
@@ -113,10 +179,14 @@ pub(crate) fn renderer() -> Result<&'static dyn Renderer> {
     });
     match made {
         Ok(renderer) => Ok(renderer),
+        Err(problem) if chosen() == Choice::Auto => {
+            tracing::debug!("drawing on the CPU: {problem}");
+            Ok(&CPU)
+        }
         Err(problem) => Err(Error::config(
-            "drawing a MuJoCo world",
+            "drawing a MuJoCo world with EGL",
             problem,
-            "install EGL (Debian: apt install libegl1 libegl-mesa0 libgl1-mesa-dri), or work from states, without pictures",
+            "install EGL (Debian: apt install libegl1 libegl-mesa0 libgl1-mesa-dri), or draw with the renderer cpu",
         )),
     }
 }

@@ -25,6 +25,11 @@ const MOST_THREADS: usize = 8;
 /// As many suffice to keep a graphics card busy.
 const HARDWARE_THREADS: usize = 4;
 
+/// Whether there is a graphics card that can draw.
+pub(crate) fn hardware() -> bool {
+    Library::open().and_then(|library| library.display()).is_ok_and(|display| display.hardware)
+}
+
 /// The renderer: a queue, and threads that draw from it.
 pub(crate) struct Egl {
     name: String,

@@ -1,11 +1,13 @@
 //! Every recorded rollout of a MuJoCo world, step by step: states, observations, rewards, infos, and the first and last
 //! picture. Reads `SWM_GOLDEN` and the folder beside this test.
 
+use crate::likeness::Likeness;
 use crate::recorded::{self, Golden, picture_difference};
 use std::collections::BTreeMap;
 use std::path::Path;
 use swm_core::{Action, Batch, Env, FrameMut, ResetOptions, Schema, VariationRequest};
 use swm_mujoco::ENVS;
+use swm_mujoco::render::{self, Choice};
 
 /// What is peculiar to the recordings of a family of worlds.
 struct Family {
@@ -354,16 +356,14 @@ impl<'a> Comparison<'a> {
         if names.iter().any(|name| name == array) {
             let (height, width, wanted) = self.golden.picture(array);
             let mut rgb = vec![0; wanted.len()];
-            self.env.render(FrameMut::new(width, height, &mut rgb)).unwrap_or_else(|error| panic!("{error}"));
-            if let Some(folder) = std::env::var_os("SWM_GOLDEN_PICTURES") {
-                let file = Path::new(&folder).join(format!("{}-{array}.png", self.name));
-                let both: Vec<u8> =
-                    wanted.chunks(3 * width).zip(rgb.chunks(3 * width)).flat_map(|(a, b)| [a, b].concat()).collect();
-                let out = std::fs::File::create(file).expect("a file");
-                let mut encoder = png::Encoder::new(out, 2 * width as u32, height as u32);
-                encoder.set_color(png::ColorType::Rgb);
-                encoder.write_header().expect("a header").write_image_data(&both).expect("a picture");
+            let frame = FrameMut::new(width, height, &mut rgb);
+            render::with(Choice::Cpu, || self.env.render(frame)).unwrap_or_else(|error| panic!("{error}"));
+            let name = format!("{}-{array}", self.name);
+            if !Likeness::note(&name, &rgb, &wanted, width).suffices() {
+                self.apart_at(&format!("{array} (cpu)"), 0, f64::INFINITY);
             }
+            let frame = FrameMut::new(width, height, &mut rgb);
+            render::with(Choice::Egl, || self.env.render(frame)).unwrap_or_else(|error| panic!("{error}"));
             self.apart_at(array, 0, picture_difference(&rgb, &wanted));
         }
     }

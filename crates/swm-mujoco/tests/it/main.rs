@@ -2,5 +2,7 @@
 
 mod conformance;
 mod golden;
+#[path = "../../src/render/likeness.rs"]
+mod likeness;
 mod recorded;
 mod views;

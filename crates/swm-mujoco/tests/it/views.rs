@@ -2,6 +2,7 @@
 
 use swm_core::{Batch, Env, FrameMut, Modality, ResetOptions, Result, Schema, View};
 use swm_mujoco::ENVS;
+use swm_mujoco::render::{self, Choice};
 
 const HEIGHT: usize = 24;
 const WIDTH: usize = 32;
@@ -14,6 +15,10 @@ fn see(env: &mut dyn Env, view: &View) -> Result<Vec<f64>> {
 
 #[test]
 fn views_show_what_they_say() {
+    render::with(Choice::Cpu, || views_of_all("cpu ("));
+}
+
+fn views_of_all(renderer: &str) {
     for entry in ENVS.rows {
         let mut env = entry.env().unwrap_or_else(|error| panic!("{}: {error}", entry.id));
         env.reset(0, &ResetOptions::default()).expect("a reset");
@@ -39,6 +44,38 @@ fn views_show_what_they_say() {
         assert!(see(&mut *env, &unknown).is_err(), "{}", entry.id);
         let libraries = env.libraries();
         assert_eq!(libraries.get("mujoco").map(String::as_str), Some(swm_mujoco::link::VERSION));
-        assert!(libraries["renderer"].starts_with("egl ("), "{libraries:?}");
+        assert!(libraries["renderer"].starts_with(renderer), "{libraries:?}");
     }
+}
+
+/// The side of pictures in which both renderers are compared.
+const SIDE: usize = 96;
+
+#[test]
+#[allow(clippy::print_stderr, clippy::cast_precision_loss, reason = "the table for whoever runs it with --no-capture")]
+fn both_renderers_see_the_same_geoms_at_the_same_distances() {
+    let mut problems = vec![];
+    for entry in ENVS.rows.iter().filter(|entry| !entry.id.contains("Dense") && !entry.id.contains("Dict")) {
+        let mut env = entry.env().unwrap_or_else(|error| panic!("{}: {error}", entry.id));
+        env.reset(1, &ResetOptions::default()).expect("a reset");
+        let mut see = |choice, modality| {
+            let view = View { camera: None, modality };
+            let mut row = Batch::zeros(&Schema::new([view.column(SIDE, SIDE)]).expect("a schema"), 1);
+            render::with(choice, || env.render_view(&view, SIDE, SIDE, row.row_mut(0).bytes(0)))
+                .unwrap_or_else(|error| panic!("{}: {error}", entry.id));
+            row.row(0).to_f64(&view.to_string()).expect("numbers")
+        };
+        let [ours, theirs] = [Choice::Cpu, Choice::Egl].map(|choice| see(choice, Modality::Segmentation));
+        let [near, known] = [Choice::Cpu, Choice::Egl].map(|choice| see(choice, Modality::Depth));
+        let equal = ours.iter().zip(&theirs).filter(|(a, b)| a == b).count() as f64 / ours.len() as f64;
+        // At rims, one may see another surface of the same geom.
+        let both: Vec<(f64, f64)> =
+            (0..ours.len()).filter(|&i| ours[i] == theirs[i] && ours[i] >= 0.0).map(|i| (near[i], known[i])).collect();
+        let close = both.iter().filter(|(a, b)| (a - b).abs() <= 0.01 * b).count() as f64 / both.len().max(1) as f64;
+        eprintln!("{}: geoms {equal:.4}, distances {close:.4}", entry.id);
+        if equal < 0.99 || close < 0.99 {
+            problems.push(format!("{}: geoms {equal:.4}, distances {close:.4}", entry.id));
+        }
+    }
+    assert!(problems.is_empty(), "{problems:#?}");
 }

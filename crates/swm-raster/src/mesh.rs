@@ -1,0 +1,208 @@
+//! [`Mesh`]: triangles, and coarser versions of them for small pictures.
+//!
+//! A version merges all vertices of a cell of a cubic grid. One whose cells are smaller than a part of a pixel cannot be told
+//! from the original, but a robot of 100,000 triangles has some thousands in a small picture.
+
+use crate::vector::{V3, add, scale, sub, unit};
+use std::collections::HashMap;
+
+/// Cells along the longest side of the coarsest version.
+const COARSEST: usize = 8;
+
+/// A mesh, prepared once.
+#[derive(Clone, Debug)]
+pub struct Mesh {
+    /// From fine to coarse.
+    levels: Vec<Level>,
+    low: V3,
+    high: V3,
+}
+
+/// One version.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Level {
+    /// The side of the cells whose vertices were merged; 0 for the original.
+    pub cell: f32,
+    /// Where vertices are.
+    pub places: Vec<V3>,
+    /// By corner: directions of the surface, of length 1 (`normals[corner.normal]`).
+    pub normals: Vec<V3>,
+    /// By corner: texture coordinates; empty where there are none.
+    pub coordinates: Vec<[f32; 2]>,
+    /// Triangles, counterclockwise seen from outside: places in `places`.
+    pub faces: Vec<[u32; 3]>,
+    /// Places in `normals` and `coordinates`.
+    pub corners: Vec<[u32; 3]>,
+}
+
+/// A corner of a triangle.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Corner {
+    /// Its place.
+    pub place: V3,
+    /// The direction of the surface there.
+    pub normal: V3,
+    /// Where it is on a texture.
+    pub coordinates: [f32; 2],
+}
+
+impl Mesh {
+    /// A mesh of triangles, counterclockwise seen from outside. Those with numbers that are not finite are left out.
+    pub fn new(triangles: impl IntoIterator<Item = [Corner; 3]>) -> Self {
+        let mut level = Level::default();
+        let (mut places, mut looks) = (HashMap::new(), HashMap::new());
+        let index = |i: usize| u32::try_from(i).unwrap_or(u32::MAX);
+        for triangle in triangles {
+            if triangle.iter().any(|c| c.place.iter().chain(&c.normal).chain(&c.coordinates).any(|x| !x.is_finite())) {
+                continue;
+            }
+            level.faces.push(triangle.map(|corner| {
+                *places.entry(corner.place.map(f32::to_bits)).or_insert_with(|| {
+                    level.places.push(corner.place);
+                    index(level.places.len() - 1)
+                })
+            }));
+            level.corners.push(triangle.map(|corner| {
+                let look = (corner.normal.map(f32::to_bits), corner.coordinates.map(f32::to_bits));
+                *looks.entry(look).or_insert_with(|| {
+                    level.normals.push(unit(corner.normal));
+                    level.coordinates.push(corner.coordinates);
+                    index(level.normals.len() - 1)
+                })
+            }));
+        }
+        let fold = |with: fn(f32, f32) -> f32, from: f32| {
+            level.places.iter().fold([from; 3], |a, b| std::array::from_fn(|k| with(a[k], b[k])))
+        };
+        let (low, high) = match level.places.is_empty() {
+            true => ([0.0; 3], [0.0; 3]),
+            false => (fold(f32::min, f32::INFINITY), fold(f32::max, f32::NEG_INFINITY)),
+        };
+        let mut levels = vec![level];
+        let side = sub(high, low).into_iter().fold(0.0, f32::max);
+        let mut cells = 512;
+        while cells >= COARSEST && side > 0.0 {
+            let coarser = levels[0].merged(low, side / f32::from(u16::try_from(cells).unwrap_or(u16::MAX)));
+            // Only what saves work is kept.
+            if levels.last().is_some_and(|last| coarser.faces.len() * 3 < last.faces.len() * 2) {
+                levels.push(coarser);
+            }
+            cells /= 2;
+        }
+        Self { levels, low, high }
+    }
+
+    /// The corners of a box around it.
+    pub(crate) fn bounds(&self) -> (V3, V3) {
+        (self.low, self.high)
+    }
+
+    /// The number of the coarsest version whose cells are at most so large.
+    pub(crate) fn level_for(&self, cell: f32) -> usize {
+        self.levels.iter().rposition(|level| level.cell <= cell).unwrap_or(0)
+    }
+
+    /// A version by its number.
+    pub(crate) fn level(&self, number: usize) -> &Level {
+        &self.levels[number.min(self.levels.len() - 1)]
+    }
+
+    /// Triangles of every version, from fine to coarse.
+    pub fn triangles(&self) -> impl Iterator<Item = usize> + '_ {
+        self.levels.iter().map(|level| level.faces.len())
+    }
+}
+
+impl Level {
+    /// The version whose vertices are those of cells of this size, each in the mean of its vertices. Directions are merged only
+    /// with those that point the same way, so that thin plates keep two sides.
+    #[allow(clippy::cast_possible_truncation)]
+    fn merged(&self, low: V3, cell: f32) -> Self {
+        let index = |i: usize| u32::try_from(i).unwrap_or(u32::MAX);
+        let key =
+            |place: V3| place.map(|x| x).iter().zip(low).map(|(x, low)| ((x - low) / cell) as i32).collect::<Vec<_>>();
+        let (mut cells, mut sums) = (HashMap::new(), Vec::<(V3, f32)>::new());
+        let merged: Vec<u32> = self
+            .places
+            .iter()
+            .map(|&place| {
+                let at = *cells.entry(key(place)).or_insert_with(|| {
+                    sums.push(([0.0; 3], 0.0));
+                    index(sums.len() - 1)
+                });
+                let sum = &mut sums[at as usize];
+                *sum = (add(sum.0, place), sum.1 + 1.0);
+                at
+            })
+            .collect();
+        let mut new = Self { cell, ..Self::default() };
+        new.places = sums.iter().map(|(sum, count)| scale(*sum, 1.0 / count)).collect();
+        let (mut looks, mut directions) = (HashMap::new(), Vec::<(V3, [f32; 2], f32)>::new());
+        let mut seen = std::collections::HashSet::new();
+        for (face, corners) in self.faces.iter().zip(&self.corners) {
+            let face = face.map(|place| merged[place as usize]);
+            let [a, b, c] = face;
+            if a == b || b == c || a == c {
+                continue;
+            }
+            let first = (0..3).min_by_key(|&k| face[k]).unwrap_or(0);
+            let turned = [face[first], face[(first + 1) % 3], face[(first + 2) % 3]];
+            if !seen.insert(turned) {
+                continue;
+            }
+            new.faces.push(face);
+            new.corners.push(std::array::from_fn(|k| {
+                let (normal, coordinates) = (self.normals[corners[k] as usize], self.coordinates[corners[k] as usize]);
+                // Six ways to point: the axis it is nearest to, and its sign.
+                let axis = (0..3).max_by(|&i, &j| normal[i].abs().total_cmp(&normal[j].abs())).unwrap_or(0);
+                let at = *looks.entry((face[k], axis, normal[axis] > 0.0)).or_insert_with(|| {
+                    directions.push(([0.0; 3], [0.0; 2], 0.0));
+                    index(directions.len() - 1)
+                });
+                let sum = &mut directions[at as usize];
+                *sum = (add(sum.0, normal), [sum.1[0] + coordinates[0], sum.1[1] + coordinates[1]], sum.2 + 1.0);
+                at
+            }));
+        }
+        new.normals = directions.iter().map(|(normal, ..)| unit(*normal)).collect();
+        new.coordinates = directions.iter().map(|(_, sum, count)| sum.map(|x| x / count)).collect();
+        new
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fine_mesh_has_coarser_versions() {
+        let mut triangles = vec![];
+        let corner = |i: u8, j: u8| Corner {
+            place: [f32::from(i), f32::from(j), 0.0],
+            normal: [0.0, 0.0, 1.0],
+            coordinates: [0.0; 2],
+        };
+        for i in 0..100 {
+            for j in 0..100 {
+                triangles.push([corner(i, j), corner(i + 1, j), corner(i, j + 1)]);
+                triangles.push([corner(i + 1, j), corner(i + 1, j + 1), corner(i, j + 1)]);
+            }
+        }
+        let mesh = Mesh::new(triangles);
+        let counts: Vec<usize> = mesh.triangles().collect();
+        assert_eq!(counts[0], 20_000);
+        assert!(counts.windows(2).all(|pair| pair[1] < pair[0]) && *counts.last().expect("one") < 300, "{counts:?}");
+        assert_eq!(mesh.level_for(0.0), 0);
+        assert!(mesh.level_for(100.0) == counts.len() - 1);
+        for number in 0..counts.len() {
+            let level = mesh.level(number);
+            assert!(level.faces.iter().flatten().all(|&i| (i as usize) < level.places.len()));
+            assert!(level.corners.iter().flatten().all(|&i| (i as usize) < level.normals.len()));
+        }
+    }
+
+    #[test]
+    fn an_empty_mesh_is_one() {
+        assert_eq!(Mesh::new([]).triangles().collect::<Vec<_>>(), [0]);
+    }
+}

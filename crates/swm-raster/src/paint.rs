@@ -1,0 +1,568 @@
+//! From what is nearest to colours: the fragments of a picture, gathered by geom and lit many at once.
+
+use crate::cast::Posed;
+use crate::layers::{Layers, NOTHING, Region, TRIANGLE};
+use crate::light::{Lamp, Matter};
+use crate::scene::{Assets, Axis, Geom, Mapping, Scene, Shape};
+use crate::shadow::Shadow;
+use crate::simd::vectorised;
+use crate::vector::{V3, add, dot, rotate, scale, sub, unrotate};
+use crate::view::{Rays, View};
+
+/// Fragments lit at once.
+const MANY: usize = 128;
+
+/// Rows whose fragments are gathered at once.
+const BAND: usize = 16;
+
+/// Quads along the side of a box, between whose corners light is interpolated.
+const QUADS: usize = 4;
+
+/// One number for each of many fragments.
+type Lane = [f32; MANY];
+
+/// What a geom shows of a pixel.
+#[derive(Clone, Copy, Debug, Default)]
+struct Fragment {
+    geom: u32,
+    id: u32,
+    x: u16,
+    y: u16,
+    /// Samples of the pixel, a bit each.
+    samples: u8,
+}
+
+impl Fragment {
+    /// Where it is looked at: in the middle of its samples, which is inside a convex shape even at its rim.
+    #[inline]
+    #[allow(clippy::cast_precision_loss)]
+    fn place(&self, pattern: &[[f32; 2]]) -> [f32; 2] {
+        let (x, y) = (f32::from(self.x), f32::from(self.y));
+        if self.samples.count_ones() as usize == pattern.len() {
+            return [x + 0.5, y + 0.5];
+        }
+        let mut sum = [0.0; 2];
+        for (_, offset) in pattern.iter().enumerate().filter(|(sample, _)| self.samples >> sample & 1 == 1) {
+            sum = [sum[0] + offset[0], sum[1] + offset[1]];
+        }
+        let share = 1.0 / self.samples.count_ones() as f32;
+        [x + share * sum[0], y + share * sum[1]]
+    }
+}
+
+/// Fragments of one geom.
+struct Batch {
+    n: usize,
+    x: Lane,
+    y: Lane,
+    /// Distances along the rays, and then what is needed only once.
+    depth: Lane,
+    place: [Lane; 3],
+    local: [Lane; 3],
+    normal: [Lane; 3],
+    coordinates: [Lane; 2],
+    tint: [Lane; 3],
+    /// Light of one pass.
+    pass: [Lane; 3],
+    sum: [Lane; 3],
+}
+
+/// How many lamps there are, and what each pass of lighting is: all lamps without shadows, and then one with shadows each.
+pub(crate) struct Lamps<'a> {
+    /// Lamps without shadows.
+    pub plain: &'a [Lamp],
+    /// Lamps with shadows, and these.
+    pub shadowed: &'a [(Lamp, usize)],
+    pub shadows: &'a [Shadow],
+}
+
+/// What is the same for all fragments.
+pub(crate) struct Look<'a> {
+    pub scene: &'a Scene,
+    pub assets: &'a Assets,
+    pub view: &'a View,
+    pub lamps: Lamps<'a>,
+    /// What colours are multiplied with.
+    pub dimmed: f32,
+}
+
+/// Scratch of painting.
+pub(crate) struct Painter {
+    fragments: Vec<Fragment>,
+    sorted: Vec<Fragment>,
+    /// By geom: fragments, and then where the next one goes.
+    counts: Vec<usize>,
+    present: Vec<u32>,
+    batch: Box<Batch>,
+    lattices: Lattices,
+}
+
+impl Default for Painter {
+    fn default() -> Self {
+        const ZERO: Lane = [0.0; MANY];
+        Self {
+            fragments: vec![],
+            sorted: vec![],
+            counts: vec![],
+            present: vec![],
+            batch: Box::new(Batch {
+                n: 0,
+                x: ZERO,
+                y: ZERO,
+                depth: ZERO,
+                place: [ZERO; 3],
+                local: [ZERO; 3],
+                normal: [ZERO; 3],
+                coordinates: [ZERO; 2],
+                tint: [ZERO; 3],
+                pass: [ZERO; 3],
+                sum: [ZERO; 3],
+            }),
+            lattices: Lattices::default(),
+        }
+    }
+}
+
+/// Light at the corners of the grids of planes and boxes, computed when it is needed first.
+#[derive(Default)]
+struct Lattices {
+    /// By geom: where its corners begin; `u32::MAX` for those that have none yet.
+    starts: Vec<u32>,
+    /// By corner and pass.
+    colours: Vec<V3>,
+    known: Vec<bool>,
+}
+
+impl Painter {
+    /// Forgets the light of the last picture; `geoms` are in this one.
+    pub fn start(&mut self, geoms: usize) {
+        self.lattices.starts.clear();
+        self.lattices.starts.resize(geoms, u32::MAX);
+        self.lattices.colours.clear();
+        self.lattices.known.clear();
+        self.counts.clear();
+        self.counts.resize(geoms, 0);
+    }
+
+    /// Paints what is in the layers, within a region. `show` is given each fragment's pixel, the part of it that is covered, and its
+    /// colour.
+    pub fn paint(
+        &mut self,
+        layers: &Layers,
+        look: &Look<'_>,
+        [x0, y0, x1, y1]: Region,
+        mut show: impl FnMut(usize, f32, V3),
+    ) {
+        #[allow(clippy::cast_precision_loss)]
+        let share = 1.0 / layers.samples as f32;
+        let mut y = y0;
+        while y < y1 {
+            let next = (y + BAND).min(y1);
+            self.gather(layers, [x0, y, x1, next]);
+            let mut begin = 0;
+            for k in 0..self.present.len() {
+                let number = self.present[k];
+                // After sorting, counts are where the runs end.
+                let end = self.counts[number as usize];
+                self.counts[number as usize] = 0;
+                let geom = &look.scene.geoms[number as usize];
+                let posed = Posed::new(geom, look.view);
+                for from in (begin..end).step_by(MANY) {
+                    let fragments = &self.sorted[from..end.min(from + MANY)];
+                    self.batch.shade(&mut self.lattices, fragments, (number, geom, posed.as_ref()), layers, look);
+                    #[allow(clippy::cast_precision_loss)]
+                    for (i, fragment) in fragments.iter().enumerate() {
+                        let colour = [0, 1, 2].map(|k| self.batch.sum[k][i]);
+                        let pixel = usize::from(fragment.y) * layers.width + usize::from(fragment.x);
+                        show(pixel, fragment.samples.count_ones() as f32 * share, colour);
+                    }
+                }
+                begin = end;
+            }
+            y = next;
+        }
+    }
+
+    /// Gathers the fragments of a region, those of a geom together.
+    #[allow(clippy::cast_possible_truncation)]
+    fn gather(&mut self, layers: &Layers, [x0, y0, x1, y1]: Region) {
+        self.fragments.clear();
+        self.present.clear();
+        for y in y0..y1 {
+            let first = layers.place(y, 0);
+            for x in x0..x1 {
+                let id = |sample: usize| layers.ids[first + sample * layers.width + x];
+                let mut seen = [NOTHING; 4];
+                let mut count = 0;
+                for sample in 0..layers.samples {
+                    let id = id(sample);
+                    if id == NOTHING {
+                        continue;
+                    }
+                    let geom = layers.geom(id);
+                    // A pixel shows a geom once, whatever triangles of it.
+                    match seen[..count].iter().position(|&known| known == geom) {
+                        Some(at) => {
+                            let last = self.fragments.len() - count + at;
+                            self.fragments[last].samples |= 1 << sample;
+                        }
+                        None => {
+                            seen[count] = geom;
+                            count += 1;
+                            self.fragments.push(Fragment { geom, id, x: x as u16, y: y as u16, samples: 1 << sample });
+                            let known = &mut self.counts[geom as usize];
+                            if *known == 0 {
+                                self.present.push(geom);
+                            }
+                            *known += 1;
+                        }
+                    }
+                }
+            }
+        }
+        self.present.sort_unstable();
+        let mut begin = 0;
+        for &geom in &self.present {
+            let count = &mut self.counts[geom as usize];
+            (begin, *count) = (begin + *count, begin);
+        }
+        self.sorted.resize(self.fragments.len(), Fragment::default());
+        for fragment in &self.fragments {
+            let place = &mut self.counts[fragment.geom as usize];
+            self.sorted[*place] = *fragment;
+            *place += 1;
+        }
+    }
+}
+
+impl Batch {
+    /// The colours of fragments, in `sum`.
+    fn shade(
+        &mut self,
+        lattices: &mut Lattices,
+        fragments: &[Fragment],
+        (number, geom, posed): (u32, &Geom, Option<&Posed>),
+        layers: &Layers,
+        look: &Look<'_>,
+    ) {
+        let n = fragments.len();
+        self.n = n;
+        for (i, fragment) in fragments.iter().enumerate() {
+            [self.x[i], self.y[i]] = fragment.place(layers.pattern);
+        }
+        match posed {
+            Some(posed) => self.analytic(geom, posed),
+            None => self.triangles(geom, fragments, layers, look),
+        }
+        let rays = look.view.rays();
+        self.tint(geom, look, &rays);
+        let matter = Matter::new(geom, look.dimmed);
+        let lit_at_corners = matches!(geom.shape, Shape::Plane(..) | Shape::Box(_));
+        let passes = 1 + look.lamps.shadowed.len();
+        let start = if lit_at_corners { lattices.of(number, geom, passes) } else { 0 };
+        for pass in 0..passes {
+            if lit_at_corners {
+                self.light_of_corners(lattices, start, (pass, passes), geom, &matter, look);
+            } else {
+                self.light(pass, &matter, look);
+            }
+            if pass == 0 {
+                for (sum, light) in self.sum.iter_mut().zip(&self.pass) {
+                    sum[..n].copy_from_slice(&light[..n]);
+                }
+            } else {
+                let (lamp, shadow) = &look.lamps.shadowed[pass - 1];
+                let shadow = &look.lamps.shadows[*shadow];
+                for i in 0..n {
+                    let (place, normal) = (self.place.each_ref().map(|l| l[i]), self.normal.each_ref().map(|l| l[i]));
+                    if shadow.reaches(number, place, normal, lamp.from(place)) {
+                        for k in 0..3 {
+                            self.sum[k][i] += self.pass[k][i];
+                        }
+                    }
+                }
+            }
+        }
+        for (sum, tint) in self.sum.iter_mut().zip(&self.tint) {
+            for (sum, tint) in sum[..n].iter_mut().zip(&tint[..n]) {
+                *sum *= tint;
+            }
+        }
+    }
+
+    /// Places and directions on a shape.
+    fn analytic(&mut self, geom: &Geom, posed: &Posed) {
+        let n = self.n;
+        let [px, py, pz] = &mut self.local;
+        let [nx, ny, nz] = &mut self.normal;
+        posed.surface(
+            &self.x[..n],
+            &self.y[..n],
+            &mut self.depth[..n],
+            [&mut px[..n], &mut py[..n], &mut pz[..n]],
+            [&mut nx[..n], &mut ny[..n], &mut nz[..n]],
+        );
+        to_world(geom, posed.sizes, n, &mut self.local, &mut self.normal, &mut self.place);
+    }
+
+    /// Places and directions on a mesh.
+    fn triangles(&mut self, geom: &Geom, fragments: &[Fragment], layers: &Layers, look: &Look<'_>) {
+        let Shape::Mesh(mesh) = geom.shape else { return };
+        let mesh = &look.assets.meshes[mesh];
+        for (i, fragment) in fragments.iter().enumerate() {
+            let triangle = &layers.triangles[(fragment.id & !TRIANGLE) as usize];
+            let level = mesh.level(triangle.level as usize);
+            let (face, corners) = (level.faces[triangle.face as usize], level.corners[triangle.face as usize]);
+            // The middle of the pixel may be outside the triangle: then a place on its rim is taken.
+            let (shares, _) = triangle.at(self.x[i], self.y[i]);
+            let shares = shares.map(|share| share.clamp(0.0, 1.0));
+            let sum = shares[0] + shares[1] + shares[2];
+            let shares = shares.map(|share| share / if sum > 0.0 { sum } else { 1.0 });
+            let mix = |of: [V3; 3]| -> V3 {
+                std::array::from_fn(|k| shares[0] * of[0][k] + shares[1] * of[1][k] + shares[2] * of[2][k])
+            };
+            let local = mix(face.map(|place| level.places[place as usize]));
+            let normal = rotate(&geom.rotation, mix(corners.map(|corner| level.normals[corner as usize])));
+            let by = 1.0 / dot(normal, normal).max(1e-20).sqrt();
+            let place = add(geom.position, rotate(&geom.rotation, local));
+            for k in 0..3 {
+                (self.local[k][i], self.place[k][i], self.normal[k][i]) = (local[k], place[k], normal[k] * by);
+            }
+            for k in 0..2 {
+                let of = corners.map(|corner| level.coordinates[corner as usize][k]);
+                self.coordinates[k][i] = shares[0] * of[0] + shares[1] * of[1] + shares[2] * of[2];
+            }
+        }
+    }
+
+    /// The colours of the texture.
+    fn tint(&mut self, geom: &Geom, look: &Look<'_>, rays: &Rays) {
+        let n = self.n;
+        let Some((paint, texture)) =
+            geom.paint.and_then(|paint| Some((paint, look.assets.textures.get(paint.texture)?)))
+        else {
+            self.tint.iter_mut().for_each(|lane| lane[..n].fill(1.0));
+            return;
+        };
+        let local = |a: V3| unrotate(&geom.rotation, a);
+        let eye = local(sub(look.view.position, geom.position));
+        let steps: [[V3; 2]; 2] = [0, 1].map(|k| [local(rays.origins[k]), local(rays.directions[k])]);
+        let [forward, ahead] = [local(rays.direction), local(look.view.forward)];
+        for i in 0..n {
+            let place = [0, 1, 2].map(|k| self.local[k][i]);
+            let normal = local([0, 1, 2].map(|k| self.normal[k][i]));
+            let depth = dot(sub(place, eye), ahead);
+            let direction: V3 =
+                std::array::from_fn(|k| forward[k] + self.x[i] * steps[0][1][k] + self.y[i] * steps[1][1][k]);
+            // How far the place moves on the surface from this pixel to the next.
+            let facing = dot(normal, direction);
+            let facing = if facing.abs() > 1e-6 { facing } else { 1e-6 };
+            let moved = steps.map(|[origin, turn]| {
+                let free = add(origin, scale(turn, depth));
+                sub(free, scale(direction, dot(normal, free) / facing))
+            });
+            let colour = match paint.mapping {
+                Mapping::Flat { scale: by, offset } => texture.flat_at(
+                    by[0] * place[0] + offset[0],
+                    by[1] * place[1] + offset[1],
+                    [0, 1].map(|k| (by[k] * moved[0][k]).abs().max((by[k] * moved[1][k]).abs())),
+                ),
+                Mapping::Cube(by) => {
+                    let multiply = |a: V3| [a[0] * by[0], a[1] * by[1], a[2] * by[2]];
+                    texture.cube_at(multiply(place), multiply(moved[0]), multiply(moved[1]))
+                }
+                Mapping::Sides(repeat) => {
+                    // The axes that run to the right and up on this side.
+                    let [u, v] = side_axes(normal);
+                    let Shape::Box(halves) = geom.shape else { continue };
+                    let by = [0.5 * repeat[0] / halves[u].max(1e-6), 0.5 * repeat[1] / halves[v].max(1e-6)];
+                    texture.flat_at(
+                        by[0] * place[u] + 0.5 * repeat[0],
+                        0.5 * repeat[1] - by[1] * place[v],
+                        [(0, u), (1, v)].map(|(k, axis)| by[k] * moved[0][axis].abs().max(moved[1][axis].abs())),
+                    )
+                }
+                // A mesh's coordinates are taken as they are: its triangles are small.
+                Mapping::Own => texture.flat_at(self.coordinates[0][i], self.coordinates[1][i], [0.0; 2]),
+            };
+            for (lane, colour) in self.tint.iter_mut().zip(colour) {
+                lane[i] = colour;
+            }
+        }
+    }
+
+    /// Light at every fragment.
+    fn light(&mut self, pass: usize, matter: &Matter, look: &Look<'_>) {
+        let n = self.n;
+        let dark = if pass == 0 { matter.dark(look.scene) } else { [0.0; 3] };
+        for (lane, dark) in self.pass.iter_mut().zip(dark) {
+            lane[..n].fill(dark);
+        }
+        let (places, normals) = (self.place.each_ref().map(|l| &l[..n]), self.normal.each_ref().map(|l| &l[..n]));
+        match pass {
+            0 => {
+                for lamp in look.lamps.plain {
+                    let sums = self.pass.each_mut().map(|l| &mut l[..n]);
+                    lamp.add(matter, look.view.position, places, normals, sums);
+                }
+            }
+            pass => {
+                let sums = self.pass.each_mut().map(|l| &mut l[..n]);
+                look.lamps.shadowed[pass - 1].0.add(matter, look.view.position, places, normals, sums);
+            }
+        }
+        for lane in &mut self.pass {
+            lane[..n].iter_mut().for_each(|x| *x = x.min(1.0));
+        }
+    }
+
+    /// Light at the corners of the grid around every fragment, interpolated.
+    fn light_of_corners(
+        &mut self,
+        lattices: &mut Lattices,
+        start: usize,
+        (pass, passes): (usize, usize),
+        geom: &Geom,
+        matter: &Matter,
+        look: &Look<'_>,
+    ) {
+        let mut last = (usize::MAX, [[0.0; 3]; 4]);
+        for i in 0..self.n {
+            let grid = Grid::at(geom, self.local.each_ref().map(|l| l[i]), self.normal.each_ref().map(|l| l[i]));
+            if grid.first != last.0 {
+                let corners = [0, 1, grid.row, grid.row + 1].map(|step| {
+                    let corner = start + (grid.first + step) * passes + pass;
+                    if !lattices.known[corner] {
+                        lattices.known[corner] = true;
+                        lattices.colours[corner] = corner_light(grid.corner(geom, step), pass, matter, look);
+                    }
+                    lattices.colours[corner]
+                });
+                last = (grid.first, corners);
+            }
+            let [a, b, c, d] = last.1;
+            let [u, v] = grid.within;
+            for k in 0..3 {
+                let (low, high) = (a[k] + u * (b[k] - a[k]), c[k] + u * (d[k] - c[k]));
+                self.pass[k][i] = low + v * (high - low);
+            }
+        }
+    }
+}
+
+/// The axes of a box's side that look to the right and up on its texture.
+fn side_axes(normal: V3) -> [usize; 2] {
+    if normal[0].abs() > 0.5 {
+        [1, 2]
+    } else if normal[1].abs() > 0.5 {
+        [0, 2]
+    } else {
+        [0, 1]
+    }
+}
+
+/// The light of a pass at a corner of a grid.
+fn corner_light((place, normal): (V3, V3), pass: usize, matter: &Matter, look: &Look<'_>) -> V3 {
+    let light =
+        match pass {
+            0 => look.lamps.plain.iter().fold(matter.dark(look.scene), |sum, lamp| {
+                add(sum, lamp.at(matter, look.view.position, place, normal))
+            }),
+            pass => look.lamps.shadowed[pass - 1].0.at(matter, look.view.position, place, normal),
+        };
+    light.map(|x| x.min(1.0))
+}
+
+/// The cell of a grid that a place is in.
+struct Grid {
+    axes: [Axis; 2],
+    /// The cell, along both axes.
+    cell: [usize; 2],
+    /// Its first corner.
+    first: usize,
+    /// Corners of a row.
+    row: usize,
+    /// How far inside the cell.
+    within: [f32; 2],
+    /// Of a box: the axis across its side, and where on it that is.
+    side: (usize, f32),
+}
+
+impl Grid {
+    /// The cell of a place on a plane or a box, in local coordinates, where the surface (in the world) looks so.
+    #[inline]
+    fn at(geom: &Geom, place: V3, normal: V3) -> Self {
+        let (axes, side, at, begin) = match geom.shape {
+            Shape::Box(halves) => {
+                let normal = unrotate(&geom.rotation, normal);
+                let side = if normal[0].abs() > 0.5 {
+                    0
+                } else if normal[1].abs() > 0.5 {
+                    1
+                } else {
+                    2
+                };
+                let (u, v) = ((side + 1) % 3, (side + 2) % 3);
+                let up = normal[side] > 0.0;
+                let begin = (2 * side + usize::from(up)) * (QUADS + 1) * (QUADS + 1);
+                let axes = [Axis::even(halves[u], QUADS), Axis::even(halves[v], QUADS)];
+                (axes, (side, if up { halves[side] } else { -halves[side] }), [place[u], place[v]], begin)
+            }
+            Shape::Plane(x, y) => ([x, y], (2, 0.0), [place[0], place[1]], 0),
+            _ => ([Axis::even(1.0, 1); 2], (2, 0.0), [0.0; 2], 0),
+        };
+        let ((i, s), (j, t)) = (axes[0].cell(at[0]), axes[1].cell(at[1]));
+        let row = axes[0].cells + 1;
+        Self { axes, cell: [i, j], first: begin + j * row + i, row, within: [s, t], side }
+    }
+
+    /// A corner of the cell in the world, and how the surface looks there.
+    fn corner(&self, geom: &Geom, step: usize) -> (V3, V3) {
+        let (i, j) = (self.cell[0] + usize::from(step % self.row == 1), self.cell[1] + usize::from(step >= self.row));
+        let (side, at) = self.side;
+        let (mut place, mut normal) = ([0.0; 3], [0.0; 3]);
+        place[side] = at;
+        place[(side + 1) % 3] = self.axes[0].line(i);
+        place[(side + 2) % 3] = self.axes[1].line(j);
+        normal[side] = if at < 0.0 { -1.0 } else { 1.0 };
+        (add(geom.position, rotate(&geom.rotation, place)), rotate(&geom.rotation, normal))
+    }
+}
+
+impl Lattices {
+    /// Where the corners of a geom begin.
+    fn of(&mut self, number: u32, geom: &Geom, passes: usize) -> usize {
+        let start = &mut self.starts[number as usize];
+        if *start == u32::MAX {
+            let corners = match geom.shape {
+                Shape::Plane(x, y) => (x.cells + 1) * (y.cells + 1),
+                _ => 6 * (QUADS + 1) * (QUADS + 1),
+            };
+            *start = u32::try_from(self.colours.len()).unwrap_or(0);
+            self.colours.resize(self.colours.len() + corners * passes, [0.0; 3]);
+            self.known.resize(self.colours.len(), false);
+        }
+        *start as usize
+    }
+}
+
+vectorised! {
+    /// Unit coordinates to local and world ones, and directions of surfaces to unit vectors in the world.
+    fn to_world(
+        geom: &Geom, sizes: V3, n: usize, local: &mut [Lane; 3], normal: &mut [Lane; 3], place: &mut [Lane; 3],
+    ) {
+        let [lx, ly, lz] = local;
+        let [nx, ny, nz] = normal;
+        let [px, py, pz] = place;
+        let by = sizes.map(|size| 1.0 / size);
+        for i in 0..n.min(MANY) {
+            let at = [lx[i] * sizes[0], ly[i] * sizes[1], lz[i] * sizes[2]];
+            (lx[i], ly[i], lz[i]) = (at[0], at[1], at[2]);
+            let [x, y, z] = add(geom.position, rotate(&geom.rotation, at));
+            (px[i], py[i], pz[i]) = (x, y, z);
+            let [x, y, z] = rotate(&geom.rotation, [nx[i] * by[0], ny[i] * by[1], nz[i] * by[2]]);
+            let length = (x * x + y * y + z * z).max(1e-30).sqrt();
+            (nx[i], ny[i], nz[i]) = (x / length, y / length, z / length);
+        }
+    }
+}

@@ -1,0 +1,124 @@
+//! Where a lamp does not shine: the scene seen from there, nearest things only.
+//!
+//! The map covers what casts shadows and no more, so that it is sharp although it is small. A convex shape is never in its
+//! own shadow, but where it turns away from the lamp; only meshes need a margin against rounding.
+
+use crate::layers::{Layers, NOTHING, pattern, touched};
+use crate::scene::{Assets, Light, Scene, Shape};
+use crate::vector::{V3, across, cross, dot, unit};
+use crate::view::View;
+
+/// Texels of a side of the map that the fixed pipeline draws: a finer one is not needed.
+const FINEST: usize = 4096;
+
+/// The cosine up to which a surface is edge-on to the light.
+const EDGE_ON: f32 = 0.01;
+
+/// What one light does not reach.
+#[derive(Default)]
+pub(crate) struct Shadow {
+    layers: Layers,
+    view: Option<View>,
+    /// By geom: whether it may be in its own shadow.
+    hollow: Vec<bool>,
+}
+
+impl Shadow {
+    /// Draws the map of a light, of at most `side` texels a side. The part in front of `scene.camera.near` casts no shadows.
+    pub fn cast(&mut self, scene: &Scene, assets: &Assets, light: &Light, side: usize) {
+        self.view = None;
+        let forward = unit(light.direction);
+        if !light.position.iter().chain(&light.direction).all(|x| x.is_finite()) || forward == [0.0; 3] {
+            return;
+        }
+        let up = across(forward);
+        let reach = match light.directional {
+            true => scene.shadow_reach,
+            false => (0.5 * (2.0 * light.cutoff * scene.shadow_angle).min(160.0).to_radians()).tan(),
+        };
+        if !(reach > 0.0 && reach.is_finite()) {
+            return;
+        }
+        #[allow(clippy::cast_precision_loss)]
+        let dense = FINEST as f32 / (2.0 * reach);
+        let whole = View {
+            position: light.position,
+            right: cross(forward, up),
+            up,
+            forward,
+            left: -reach,
+            top: reach,
+            dense: [dense; 2],
+            near: scene.camera.near,
+            orthographic: light.directional,
+            width: FINEST,
+            height: FINEST,
+            mirrored: false,
+        };
+        let casters = || scene.geoms.iter().filter(|geom| geom.casts && !matches!(geom.shape, Shape::Plane(..)));
+        let mut region = [usize::MAX, usize::MAX, 0, 0];
+        for [x0, y0, x1, y1] in casters().filter_map(|geom| touched(geom, assets, &whole)) {
+            region = [region[0].min(x0), region[1].min(y0), region[2].max(x1), region[3].max(y1)];
+        }
+        let [x0, y0, x1, y1] = region;
+        if x0 >= x1 || y0 >= y1 {
+            return;
+        }
+        let (wide, high) = (x1 - x0, y1 - y0);
+        let longest = wide.max(high);
+        let (width, height) = match longest > side {
+            true => ((wide * side).div_ceil(longest), (high * side).div_ceil(longest)),
+            false => (wide, high),
+        };
+        #[allow(clippy::cast_precision_loss)]
+        let view = View {
+            left: whole.left + x0 as f32 / dense,
+            top: whole.top - y0 as f32 / dense,
+            dense: [dense * width as f32 / wide as f32, dense * height as f32 / high as f32],
+            width,
+            height,
+            ..whole
+        };
+        self.layers.start(width, height, pattern(1));
+        self.layers.clear(scene.camera.far);
+        self.hollow.clear();
+        self.hollow.extend(scene.geoms.iter().map(|geom| matches!(geom.shape, Shape::Mesh(_))));
+        for (number, geom) in (0u32..).zip(&scene.geoms) {
+            if geom.casts && !matches!(geom.shape, Shape::Plane(..)) {
+                self.layers.draw(number, geom, (assets, &view), None, true);
+            }
+        }
+        self.view = Some(view);
+    }
+
+    /// Whether light from direction `to` reaches a place on a surface of a geom.
+    #[inline]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    pub fn reaches(&self, geom: u32, place: V3, normal: V3, to: V3) -> bool {
+        let facing = dot(normal, to);
+        // What turns away is in its own shadow; along an edge-on surface, ambient light passes.
+        if facing < -EDGE_ON {
+            return false;
+        }
+        let Some(view) = &self.view else { return true };
+        let ([x, y, w], depth) = view.project(place);
+        let by = 1.0 / w;
+        let (x, y) = (x * by, y * by);
+        if !(x >= 0.0 && y >= 0.0 && x < view.width as f32 && y < view.height as f32 && depth > view.near) {
+            return true;
+        }
+        let at = y as usize * view.width + x as usize;
+        let id = self.layers.ids[at];
+        if id == NOTHING {
+            return true;
+        }
+        let caster = self.layers.geom(id);
+        if caster == geom && !self.hollow.get(caster as usize).copied().unwrap_or(true) {
+            return true;
+        }
+        // A texel shows its middle: half a texel beside it, a slanted surface is that much nearer.
+        let slope = ((1.0 - facing * facing).max(0.0).sqrt() / facing.max(0.05)).min(8.0);
+        let margin = (0.5 + slope) / view.pixels_at(depth);
+        depth <= self.layers.depths[at] + margin
+    }
+}

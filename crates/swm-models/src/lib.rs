@@ -3,17 +3,23 @@
 //! - [`nn`]: building blocks, under PyTorch's parameter names; [`pixels`]: from bytes to numbers.
 //! - [`train`](mod@train): the training loop for every [`Trainable`] model, presets, logs.
 //! - [`lewm`]: the LeWM family: model, loss, planning cost.
+//! - [`pldm`]: the PLDM family: LeWM's model under VICReg's losses, temporal alignment and inverse dynamics.
+//! - [`dino_wm`]: the DINO-WM family: a frozen encoder of patches, a predictor of the patches of the next frame.
 //! - [`inverse`]: an inverse-dynamics policy on a frozen encoder, the baseline without planning.
+//! - [`weights`]: weights of others, from files and the Hugging Face hub, and for PyTorch.
 //! - [`checkpoint`]: trained models on disk.
 //! - [`device`]: where they compute.
 
 pub mod checkpoint;
 pub mod device;
+pub mod dino_wm;
 pub mod inverse;
 pub mod lewm;
 pub mod nn;
 pub mod pixels;
+pub mod pldm;
 pub mod train;
+pub mod weights;
 
 pub use burn::tensor::Device;
 pub use checkpoint::Checkpoint;

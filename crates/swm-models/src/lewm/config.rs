@@ -16,6 +16,9 @@ pub struct LewmConfig {
     pub pixel_std: [f32; 3],
     /// Numbers in a latent.
     pub latent: usize,
+    /// Numbers that the first layer of the action encoder makes of an action's; 0 for as many as there are.
+    #[serde(default)]
+    pub smoothed: usize,
     /// Hidden features of the projections behind encoder and predictor.
     pub projector: usize,
     /// The encoder.

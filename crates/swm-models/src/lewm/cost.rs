@@ -38,13 +38,12 @@ pub(super) struct Scene {
 impl LewmCost {
     /// The cost of a trained model.
     pub fn new(checkpoint: &Checkpoint<Lewm>) -> Self {
-        Self {
-            model: checkpoint.model.clone(),
-            rollout: Rollout::new(&checkpoint.model),
-            config: checkpoint.config.model.clone(),
-            actions: checkpoint.actions(),
-            scenes: vec![],
-        }
+        Self::of(&checkpoint.model, &checkpoint.config.model, checkpoint.actions())
+    }
+
+    /// The cost of a model of these sizes, whose actions are `actions` numbers.
+    pub fn of(model: &Lewm, config: &LewmConfig, actions: usize) -> Self {
+        Self { model: model.clone(), rollout: Rollout::new(model), config: config.clone(), actions, scenes: vec![] }
     }
 
     /// Checks that everything needed is there.

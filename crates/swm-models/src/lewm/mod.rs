@@ -4,12 +4,14 @@
 pub mod config;
 pub mod cost;
 mod gradient;
+pub mod import;
+pub(crate) mod joint;
 pub mod loss;
 pub mod model;
 pub mod pixels;
 pub mod rollout;
 pub mod step;
-mod train;
+pub(crate) mod train;
 
 pub use config::{EncoderConfig, LewmConfig};
 pub use cost::LewmCost;

@@ -49,13 +49,14 @@ impl Lewm {
         let features = config.encoder.dim();
         let project = |name| Projector::new(&init.of(name), features, config.projector, config.latent);
         let part = init.of("encoder");
+        let smoothed = if config.smoothed == 0 { actions } else { config.smoothed };
         Self {
             encoder: match &config.encoder {
                 EncoderConfig::Vit(vit) => Encoder::Vit(vit.init(&part, config.image)),
                 EncoderConfig::Pyramid(pyramid) => Encoder::Pyramid(pyramid.init(&part, config.image)),
             },
             projector: project("projector"),
-            action_encoder: Embedder::new(&init.of("action_encoder"), actions, config.latent),
+            action_encoder: Embedder::new(&init.of("action_encoder"), actions, smoothed, config.latent),
             predictor: config.predictor.init(&init.of("predictor"), config.latent),
             pred_proj: Projector::new(&init.of("pred_proj"), config.latent, config.projector, config.latent),
         }

@@ -3,7 +3,7 @@
 use super::step::{self, SigregConfig, StepOutput as Found, TrainBatch};
 use super::{Lewm, LewmConfig, loss, pixels};
 use crate::nn::{BatchStatistics, Named};
-use crate::train::{Facts, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
+use crate::train::{DataConfig, Facts, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
 use burn::tensor::{Device, Tensor};
 use swm_core::{Batch, Error, Key, Result, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
@@ -28,21 +28,8 @@ impl Trainable for Lewm {
     type Loss = SigregConfig;
 
     fn check(config: &TrainConfig<Self>) -> Result<()> {
-        config.model.check()?;
-        at_least(&[
-            ("data.num_steps", config.data.num_steps, 2),
-            ("loss.directions", config.loss.directions, 1),
-            ("loss.knots", config.loss.knots, 2),
-        ])?;
-        let (frames, history) = (config.data.num_steps, config.model.predictor.history);
-        if frames - 1 < history {
-            return Err(Error::config(
-                "data.num_steps",
-                format!("{frames} frames train only {} of the {history} steps of history", frames - 1),
-                format!("give at least {}, or lower model.predictor.history", history + 1),
-            ));
-        }
-        Ok(())
+        check(&config.model, &config.data)?;
+        at_least(&[("loss.directions", config.loss.directions, 1), ("loss.knots", config.loss.knots, 2)])
     }
 
     fn picture(config: &LewmConfig) -> Option<usize> {
@@ -50,10 +37,7 @@ impl Trainable for Lewm {
     }
 
     fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
-        pixels::check(&config.model, schema, "pixels")?;
-        let columns = vec!["pixels".to_owned(), "action".to_owned()];
-        let clip = ClipSpec { num_steps: config.data.num_steps, frameskip: config.data.frameskip, columns };
-        Ok(LoaderConfig { clip, ..LoaderConfig::default() })
+        loading(&config.model, &config.data, schema)
     }
 
     fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
@@ -63,27 +47,78 @@ impl Trainable for Lewm {
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
         let StepContext { config, facts, key, device, training } = context;
         let directions = loss::directions(key.with("sigreg"), config.model.latent, config.loss.directions);
-        let batch = TrainBatch {
-            patches: pixels::patches(&config.model, batch.get::<u8>("pixels")?, device)?,
-            actions: facts.actions(batch, config.data.num_steps, config.data.frameskip, device)?,
-        };
+        let batch = prepare(&config.model, &config.data, facts, batch, device)?;
         let mut noise = key.with("dropout").rng();
         let noise = training.then_some(&mut noise);
-        let Found { losses, gradients, statistics: [projector, pred_proj], .. } =
+        let Found { losses, gradients, statistics, .. } =
             step::step(self, &batch, &config.loss, &directions, config.shards, noise);
-        let mut buffers = Named::new();
-        projector.store("projector", &mut buffers);
-        pred_proj.store("pred_proj", &mut buffers);
+        let buffers = stored(statistics);
         let metrics = vec![("loss", losses.total), ("prediction", losses.prediction), ("sigreg", losses.sigreg)];
         Ok(StepOutput { metrics, gradients, buffers })
     }
 
-    fn after(mut self, _: &StepContext<'_, Self>, mut buffers: Named<Tensor<1>>) -> Self {
-        for (name, part) in [("projector", &mut self.projector), ("pred_proj", &mut self.pred_proj)] {
+    fn after(mut self, _: &StepContext<'_, Self>, buffers: Named<Tensor<1>>) -> Self {
+        self.track(buffers);
+        self
+    }
+}
+
+/// Checks that the sizes fit each other and the clips.
+pub(crate) fn check(model: &LewmConfig, data: &DataConfig) -> Result<()> {
+    model.check()?;
+    at_least(&[("data.num_steps", data.num_steps, 2)])?;
+    let (frames, history) = (data.num_steps, model.predictor.history);
+    if frames - 1 < history {
+        return Err(Error::config(
+            "data.num_steps",
+            format!("{frames} frames train only {} of the {history} steps of history", frames - 1),
+            format!("give at least {}, or lower model.predictor.history", history + 1),
+        ));
+    }
+    Ok(())
+}
+
+/// Clips of pictures and actions.
+pub(crate) fn loading(model: &LewmConfig, data: &DataConfig, schema: &Schema) -> Result<LoaderConfig> {
+    pixels::check(model, schema, "pixels")?;
+    let columns = vec!["pixels".to_owned(), "action".to_owned()];
+    let clip = ClipSpec { num_steps: data.num_steps, frameskip: data.frameskip, columns };
+    Ok(LoaderConfig { clip, ..LoaderConfig::default() })
+}
+
+/// A batch of such clips, normalised.
+pub(crate) fn prepare(
+    model: &LewmConfig,
+    data: &DataConfig,
+    facts: &Facts,
+    batch: &Batch,
+    device: &Device,
+) -> Result<TrainBatch> {
+    Ok(TrainBatch {
+        patches: pixels::patches(model, batch.get::<u8>("pixels")?, device)?,
+        actions: facts.actions(batch, data.num_steps, data.frameskip, device)?,
+    })
+}
+
+/// The parts whose statistics follow the batches.
+const TRACKED: [&str; 2] = ["projector", "pred_proj"];
+
+/// Batch statistics as the loop carries them.
+pub(crate) fn stored(statistics: [BatchStatistics; 2]) -> Named<Tensor<1>> {
+    let mut buffers = Named::new();
+    for (name, statistics) in TRACKED.into_iter().zip(statistics) {
+        statistics.store(name, &mut buffers);
+    }
+    buffers
+}
+
+impl Lewm {
+    /// Moves the running statistics towards [`stored`] ones.
+    pub(crate) fn track(&mut self, mut buffers: Named<Tensor<1>>) {
+        for (name, part) in TRACKED.into_iter().zip([&mut self.projector, &mut self.pred_proj]) {
             if let Some(statistics) = BatchStatistics::take(name, &mut buffers) {
                 part.track(statistics);
             }
         }
-        self
     }
 }

@@ -82,17 +82,17 @@ pub struct EmbedderNet {
 }
 
 impl Embedder {
-    /// An embedder of `inputs` numbers, with `4 outputs` hidden features.
+    /// An embedder of `inputs` numbers, of which the convolution makes `smoothed`, with `4 outputs` hidden features.
     #[allow(clippy::cast_precision_loss)]
-    pub fn new(init: &Init, inputs: usize, outputs: usize) -> Self {
+    pub fn new(init: &Init, inputs: usize, smoothed: usize, outputs: usize) -> Self {
         let (tap, bound) = (init.of("patch_embed"), 1.0 / (inputs as f32).sqrt());
         Self {
             patch_embed: Tap {
-                weight: tap.uniform("weight", [inputs, inputs, 1], bound),
-                bias: tap.uniform("bias", [inputs], bound),
+                weight: tap.uniform("weight", [smoothed, inputs, 1], bound),
+                bias: tap.uniform("bias", [smoothed], bound),
             },
             embed: EmbedderNet {
-                _0: Linear::new(&init.of("0"), inputs, 4 * outputs),
+                _0: Linear::new(&init.of("0"), smoothed, 4 * outputs),
                 _2: Linear::new(&init.of("2"), 4 * outputs, outputs),
             },
         }

@@ -4,6 +4,7 @@
 
 pub mod activation;
 pub mod backbone;
+pub mod by_name;
 pub mod dino;
 pub mod linear;
 pub mod mlp;
@@ -16,6 +17,7 @@ pub mod vit;
 
 pub use activation::{Activation, Noise};
 pub use backbone::{Backbone, BackboneConfig};
+pub use by_name::ByName;
 pub use dino::{Dino, DinoConfig};
 pub use linear::Linear;
 pub use mlp::{Embedder, Projector};

@@ -152,6 +152,16 @@ impl VitConfig {
         Self::sized(patch, 768, 12, 12)
     }
 
+    /// ViT-large.
+    pub const fn large(patch: usize) -> Self {
+        Self::sized(patch, 1024, 24, 16)
+    }
+
+    /// ViT-huge.
+    pub const fn huge(patch: usize) -> Self {
+        Self::sized(patch, 1280, 32, 16)
+    }
+
     /// A transformer for square pictures of `image` pixels.
     pub fn init(&self, init: &Init, image: usize) -> Vit {
         let (dim, tokens) = (self.dim, (image / self.patch).pow(2));

@@ -6,4 +6,5 @@ mod checkpoints;
 mod dots;
 mod golden;
 mod planning;
+mod reference;
 mod training;

@@ -2,8 +2,11 @@
 //! reference implementation. Every test reads each `<model>-*.safetensors` of the folder named by `SWM_GOLDEN_MODELS`, or
 //! of `tests/golden` (written by the exporters beside them) and of the shared reference.
 
+mod dino_wm;
 mod lewm;
+mod pldm;
 mod vit;
+mod weights;
 
 use burn::tensor::{Device, Tensor, TensorData};
 use safetensors::SafeTensors;
@@ -13,13 +16,13 @@ use swm_models::nn::parameters::{HostTensor, Named};
 
 const TOLERANCE: f32 = 1e-4;
 
-struct Golden {
+pub struct Golden {
     config: serde_json::Value,
     tensors: BTreeMap<String, HostTensor>,
 }
 
 impl Golden {
-    fn read(path: &std::path::Path) -> Self {
+    pub fn read(path: &std::path::Path) -> Self {
         let bytes = std::fs::read(path).expect("the file is readable");
         let (_, metadata) = SafeTensors::read_metadata(&bytes).expect("a safetensors file");
         let config = &metadata.metadata().as_ref().expect("metadata")["config"];
@@ -44,7 +47,7 @@ impl Golden {
         self.tensors.get(name).unwrap_or_else(|| panic!("no tensor {name}"))
     }
 
-    fn tensor<const D: usize>(&self, name: &str) -> Tensor<D> {
+    pub fn tensor<const D: usize>(&self, name: &str) -> Tensor<D> {
         let host = self.get(name);
         let shape: [usize; D] = host.shape.clone().try_into().expect("rank");
         Tensor::from_data(TensorData::new(host.values.clone(), shape), &Device::flex())
@@ -56,8 +59,29 @@ impl Golden {
         self.tensors.iter().filter_map(strip).collect()
     }
 
+    /// Compares gradients with all recorded ones. Parameters whose names end as one of `idle` have no effect, because a
+    /// batch normalisation or a softmax takes them out again: their gradients are zero but for rounding, and are held
+    /// against the largest of all.
+    fn check_gradients(&self, ours: &Named<Tensor<1>>, idle: &[&str]) {
+        let theirs = self.group("g.");
+        let largest = theirs.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));
+        let mut worst = (0.0, String::new());
+        for (name, gradient) in &theirs {
+            let ours = values(ours.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
+            let floor = if idle.iter().any(|end| name.ends_with(end)) { largest } else { 1e-12 };
+            let error = error(&ours, &gradient.values, floor);
+            if error > worst.0 {
+                worst = (error, name.clone());
+            }
+        }
+        println!("worst gradient: {:.1e} ({})", worst.0, worst.1);
+        assert!(worst.0 < TOLERANCE, "gradient of {} differs by {:.1e}", worst.1, worst.0);
+        let names = |all: Vec<&String>| all.into_iter().cloned().collect::<Vec<_>>();
+        assert_eq!(names(ours.keys().collect()), names(theirs.keys().collect()), "parameters with gradients");
+    }
+
     /// Pictures of the configured size, already normalised, as patches.
-    fn patches(&self, name: &str) -> Tensor<3> {
+    pub fn patches(&self, name: &str) -> Tensor<3> {
         self.cut(name, self.size("image"))
     }
 
@@ -83,11 +107,11 @@ fn error(ours: &[f32], theirs: &[f32], floor: f32) -> f32 {
     ours.iter().zip(theirs).fold(0.0f32, |m, (a, b)| m.max((a - b).abs())) / scale
 }
 
-fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
+pub fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     tensor.into_data().iter::<f32>().collect()
 }
 
-fn check(golden: &Golden, name: &str, ours: &[f32]) {
+pub fn check(golden: &Golden, name: &str, ours: &[f32]) {
     let error = error(ours, &golden.get(name).values, 1e-6);
     println!("{name}: {error:.1e}");
     assert!(error < TOLERANCE, "{name} differs by {error:.1e}");

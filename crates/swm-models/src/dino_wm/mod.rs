@@ -1,0 +1,16 @@
+//! DINO-WM (Zhou et al. 2024, arXiv 2411.04983): a frozen encoder of patches, and a predictor of the patches of the next
+//! frame. See `docs/models/dino-wm.md`.
+
+pub mod config;
+pub mod cost;
+pub mod import;
+pub mod model;
+pub mod predictor;
+pub mod step;
+mod train;
+
+pub use config::{ColumnConfig, DinoWmConfig};
+pub use cost::DinoWmCost;
+pub use model::{ColumnEncoder, DinoWm, PatchDecoder};
+pub use predictor::{FramePredictor, FramePredictorConfig};
+pub use train::DinoWmLoss;

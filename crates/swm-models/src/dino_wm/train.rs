@@ -1,0 +1,168 @@
+//! How a DINO-WM is trained: the loop's side of [`super::step`].
+
+use super::config::{ACTION, DinoWmConfig};
+use super::model::DinoWm;
+use super::step::{Found, TrainBatch, step};
+use crate::nn::{Backbone, Named};
+use crate::pixels::{self, Pixels};
+use crate::train::{Facts, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least, shards};
+use crate::weights;
+use burn::tensor::{Device, Tensor, TensorData};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+use swm_core::{Batch, DType, Error, Key, Result, Schema};
+use swm_data::{ClipSpec, LoaderConfig};
+
+/// The loss of a DINO-WM has no settings.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DinoWmLoss {}
+
+impl Trainable for DinoWm {
+    const FAMILY: &'static str = "dino_wm";
+    const SUMMARY: &'static str = "DINO-WM: predicts the patches of the next frame in the features of a frozen encoder";
+    const PRESETS: &'static [Preset] = &[
+        Preset {
+            id: "tiny",
+            summary: "64 px, a small encoder with random weights: to try things out on two CPU cores",
+            toml: include_str!("../../presets/dino_wm/tiny.toml"),
+        },
+        Preset {
+            id: "paper",
+            summary: "224 px, DINOv2-small, predictor of 6 layers: the published size, for a GPU",
+            toml: include_str!("../../presets/dino_wm/paper.toml"),
+        },
+    ];
+    type Config = DinoWmConfig;
+    type Loss = DinoWmLoss;
+
+    fn check(config: &TrainConfig<Self>) -> Result<()> {
+        config.model.check()?;
+        at_least(&[("data.num_steps", config.data.num_steps, 2)])?;
+        let (frames, history) = (config.data.num_steps, config.model.predictor.history);
+        if frames - 1 < history {
+            return Err(Error::config(
+                "data.num_steps",
+                format!("{frames} frames train only {} of the {history} steps of history", frames - 1),
+                format!("give at least {}, or lower model.predictor.history", history + 1),
+            ));
+        }
+        Ok(())
+    }
+
+    fn picture(config: &DinoWmConfig) -> Option<usize> {
+        Some(config.image)
+    }
+
+    fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
+        pixels::check(config.model.image, schema, "pixels")?;
+        let mut columns = vec!["pixels".to_owned()];
+        for column in &config.model.columns {
+            let spec = schema.column(&column.name)?;
+            if spec.dtype != DType::Float32 {
+                return Err(Error::mismatch(
+                    format!("reading the column '{}' of model.columns", column.name),
+                    spec.dtype.name(),
+                    "float32 (take it out of model.columns, or convert the dataset)",
+                ));
+            }
+            columns.push(column.name.clone());
+        }
+        let clip = ClipSpec { num_steps: config.data.num_steps, frameskip: config.data.frameskip, columns };
+        Ok(LoaderConfig { clip, ..LoaderConfig::default() })
+    }
+
+    fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
+        let numbers: Result<Vec<usize>> = config
+            .model
+            .columns
+            .iter()
+            .map(|column| match column.name.as_str() {
+                ACTION => Ok(config.data.frameskip * facts.action.dim()),
+                name => Ok(facts.column(name)?.dim()),
+            })
+            .collect();
+        Ok(Self::init(&config.model, &numbers?, key, device))
+    }
+
+    fn pretrained(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
+        let from = &config.model.weights;
+        if from.is_empty() {
+            return Ok(self);
+        }
+        let path = weights::locate(from, cache)?;
+        let found = weights::names::published(weights::read(&path)?, "");
+        let what = "model.encoder";
+        self.backbone = match self.backbone {
+            Backbone::Vit(vit) => Backbone::Vit(weights::fill(vit, &found, &path, what)?),
+            Backbone::Dinov2(dino) => Backbone::Dinov2(weights::fill(dino, &found, &path, what)?),
+            Backbone::Pyramid(pyramid) => Backbone::Pyramid(weights::fill(pyramid, &found, &path, what)?),
+        };
+        Ok(self)
+    }
+
+    fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
+        let StepContext { config, facts, key, device, training } = context;
+        let (model, data) = (&config.model, &config.data);
+        let rgb = batch.get::<u8>("pixels")?;
+        let columns: Result<Vec<Tensor<3>>> = model
+            .columns
+            .iter()
+            .map(|column| match column.name.as_str() {
+                ACTION => facts.actions(batch, data.num_steps, data.frameskip, device),
+                name => normalised(facts, name, batch.get::<f32>(name)?, [batch.rows(), data.num_steps], device),
+            })
+            .collect();
+        let columns = columns?;
+        shards::mean(batch.rows(), config.shards, |range| {
+            let bytes = rgb.len() / batch.rows();
+            let part = TrainBatch {
+                patches: model.cut(&rgb[range.start * bytes..range.end * bytes], device)?,
+                columns: columns
+                    .iter()
+                    .map(|column| {
+                        let [_, steps, numbers] = column.dims();
+                        column.clone().slice([range.clone(), 0..steps, 0..numbers])
+                    })
+                    .collect(),
+            };
+            let mut noise = key.with("dropout").at(range.start as u64).rng();
+            let Found { losses, gradients } = step(self, &part, training.then_some(&mut noise));
+            Ok(StepOutput { metrics: losses, gradients, buffers: Named::new() })
+        })
+    }
+}
+
+impl DinoWmConfig {
+    /// Pictures as normalised patches.
+    ///
+    /// # Shapes
+    /// `[frames, image, image, 3]` bytes to `[frames, patches, 3 * patch * patch]`.
+    pub(super) fn cut(&self, rgb: &[u8], device: &Device) -> Result<Tensor<3>> {
+        let seen = Pixels { side: self.image, mean: self.pixel_mean, std: self.pixel_std };
+        pixels::patches(&seen, self.encoder.patch(), rgb, device)
+    }
+}
+
+/// A column in units of its spread around its mean; what is missing is 0, its mean.
+///
+/// # Shapes
+/// `[clips, steps, numbers]`.
+pub(super) fn normalised(
+    facts: &Facts,
+    name: &str,
+    values: &[f32],
+    [clips, steps]: [usize; 2],
+    device: &Device,
+) -> Result<Tensor<3>> {
+    let column = facts.column(name)?;
+    let (mean, spread) = (&column.mean, column.spread());
+    #[allow(clippy::cast_possible_truncation)]
+    let scaled = |(index, value): (usize, &f32)| {
+        let index = index % mean.len();
+        let scaled = ((f64::from(*value) - mean[index]) / spread[index]) as f32;
+        if scaled.is_nan() { 0.0 } else { scaled }
+    };
+    let scaled: Vec<f32> = values.iter().enumerate().map(scaled).collect();
+    Ok(Tensor::from_data(TensorData::new(scaled, [clips, steps, column.dim()]), device))
+}

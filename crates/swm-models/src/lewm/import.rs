@@ -1,0 +1,143 @@
+//! LeWM checkpoints of the reference implementation, both ways. A PLDM's are the same but for the class.
+
+use super::config::{EncoderConfig, LewmConfig};
+use super::model::Lewm;
+use crate::checkpoint::Checkpoint;
+use crate::nn::parameters::{self, HostTensor, Named};
+use crate::nn::{PredictorConfig, VitConfig};
+use crate::pixels::Pixels;
+use crate::train::{Facts, TrainConfig};
+use crate::weights::reference::{Reference, write};
+use crate::weights::{self, BATCHES_TRACKED, Naming, names};
+use burn::tensor::Device;
+use serde_json::{Value, json};
+use std::path::Path;
+use swm_core::{Error, Key, Manifest, Result};
+
+/// Names of modules in the reference, of this family.
+const MODULES: &str = "stable_worldmodel.wm.lewm.module";
+const CLASS: &str = "stable_worldmodel.wm.lewm.LeWM";
+
+/// A LeWM that the reference trained: a folder with `weights.pt` and `config.json`, or that file. What it does not
+/// store is how actions were normalised, so `facts` must be those of its dataset.
+///
+/// # Errors
+/// When it is another model, of a kind that is not known here, or damaged, or its actions are not a whole number of
+/// those in `facts`.
+pub fn import(from: &Path, facts: Facts) -> Result<Checkpoint<Lewm>> {
+    let (model, sizes, frameskip) = world(Reference::open(from, "LeWM")?, &facts)?;
+    let mut config = TrainConfig::<Lewm>::load("paper", &[])?;
+    config.data.num_steps = sizes.predictor.history + 1;
+    config.data.frameskip = frameskip;
+    config.model = sizes;
+    config.check()?;
+    let manifest = Manifest::new("import", 0, json!({ "from": from.display().to_string() }));
+    Ok(Checkpoint { model, config, facts, manifest })
+}
+
+/// Writes `weights.pt` and `config.json` that the reference's `load_pretrained` reads.
+///
+/// # Errors
+/// When the encoder is none that the reference has, or the disk refuses.
+pub fn export(checkpoint: &Checkpoint<Lewm>, folder: &Path, naming: Naming) -> Result<()> {
+    let actions = checkpoint.actions();
+    let config = tree(&checkpoint.config.model, actions, CLASS, MODULES)?;
+    write(folder, &config, &state(&checkpoint.model, naming))
+}
+
+/// The world model of a checkpoint, its size, and environment steps in a model step.
+pub(crate) fn world(mut reference: Reference, facts: &Facts) -> Result<(Lewm, LewmConfig, usize)> {
+    let (vit, image) = reference.vit("encoder")?;
+    for part in ["projector", "pred_proj"] {
+        let norm = reference.class(&format!("{part}.norm_fn"));
+        if norm != "BatchNorm1d" {
+            return Err(reference.wrong(format!("its {part} has '{norm}' where BatchNorm1d is known")));
+        }
+    }
+    let size = |at: &str| reference.size(at);
+    let latent = size("projector.output_dim")?;
+    let (mean, std) = Pixels::IMAGENET;
+    let predictor = PredictorConfig {
+        history: size("predictor.num_frames")?,
+        dim: size("predictor.hidden_dim")?,
+        depth: size("predictor.depth")?,
+        heads: size("predictor.heads")?,
+        dim_head: reference.size_or("predictor.dim_head", Some(64))?,
+        mlp: size("predictor.mlp_dim")?,
+        dropout: reference.rate("predictor.dropout"),
+        emb_dropout: reference.rate("predictor.emb_dropout"),
+    };
+    let config = LewmConfig {
+        image,
+        pixel_mean: mean,
+        pixel_std: std,
+        latent,
+        smoothed: reference.size_or("action_encoder.smoothed_dim", Some(10))?,
+        projector: size("projector.hidden_dim")?,
+        encoder: EncoderConfig::Vit(vit),
+        predictor,
+    };
+    let actions = size("action_encoder.input_dim")?;
+    let dim = facts.action.dim();
+    if dim == 0 || !actions.is_multiple_of(dim) {
+        return Err(Error::mismatch(
+            "importing a checkpoint",
+            format!("{dim} numbers an action in the dataset"),
+            format!("a divisor of {actions}, the numbers of a model step's actions"),
+        ));
+    }
+    let model = Lewm::init(&config, actions, Key::new(0), &Device::flex());
+    let model = weights::fill(model, &reference.weights, &reference.path, "config.json")?;
+    Ok((model, config, actions / dim))
+}
+
+/// The state dict of a world model, as the reference's class has it.
+pub(crate) fn state(model: &Lewm, naming: Naming) -> Named<HostTensor> {
+    let mut weights = names::named(parameters::values(model), "encoder.", naming);
+    for part in ["projector", "pred_proj"] {
+        let counter = HostTensor { shape: vec![], values: vec![0.0] };
+        weights.insert(format!("{part}.net.1.{BATCHES_TRACKED}"), counter);
+    }
+    weights
+}
+
+/// The tree of classes that a world model is made with.
+pub(crate) fn tree(config: &LewmConfig, actions: usize, class: &str, modules: &str) -> Result<Value> {
+    let EncoderConfig::Vit(VitConfig { patch, dim, depth, heads, mlp }) = &config.encoder else {
+        return Err(Error::config(
+            "exporting a model",
+            "the reference has no encoder like 'pyramid'",
+            "train with model.encoder.vit, such as the preset `paper` does",
+        ));
+    };
+    let (predictor, latent) = (&config.predictor, config.latent);
+    let project = |inputs: usize| {
+        json!({
+            "_target_": format!("{modules}.MLP"),
+            "input_dim": inputs, "hidden_dim": config.projector, "output_dim": latent,
+            "norm_fn": { "_target_": "torch.nn.BatchNorm1d", "_partial_": true },
+        })
+    };
+    Ok(json!({
+        "_target_": class,
+        "encoder": {
+            "_target_": "stable_pretraining.backbone.utils.vit_hf",
+            "size": "tiny", "patch_size": patch, "image_size": config.image, "pretrained": false, "use_mask_token": false,
+            "hidden_size": dim, "num_hidden_layers": depth, "num_attention_heads": heads, "intermediate_size": mlp,
+        },
+        "predictor": {
+            "_target_": format!("{modules}.Predictor"),
+            "num_frames": predictor.history, "input_dim": latent, "hidden_dim": predictor.dim, "output_dim": latent,
+            "depth": predictor.depth, "heads": predictor.heads, "dim_head": predictor.dim_head,
+            "mlp_dim": predictor.mlp, "dropout": predictor.dropout, "emb_dropout": predictor.emb_dropout,
+        },
+        "action_encoder": {
+            "_target_": format!("{modules}.Embedder"),
+            "input_dim": actions,
+            "smoothed_dim": if config.smoothed == 0 { actions } else { config.smoothed },
+            "emb_dim": latent,
+        },
+        "projector": project(*dim),
+        "pred_proj": project(latent),
+    }))
+}

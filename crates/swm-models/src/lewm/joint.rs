@@ -1,0 +1,111 @@
+//! The training step that joint-embedding models share: everything but their regulariser.
+//!
+//! The encoder works on a fixed number of shards of the batch, in parallel; what follows it sees the whole batch.
+//! The split is part of the configuration, never of the machine, and gradients are summed in the order of the
+//! shards, so the numbers do not depend on the number of threads.
+
+use super::model::{Encoder, Lewm};
+use super::step::TrainBatch;
+use crate::nn::parameters::{self, Named};
+use crate::nn::{BatchStatistics, Noise};
+use burn::module::Module;
+use burn::tensor::{Gradients, Tensor};
+use rayon::prelude::*;
+use swm_core::Rng;
+
+/// What a step found.
+pub(crate) struct Found {
+    /// Mean squared error of the predicted latents.
+    pub prediction: f64,
+    /// Gradients by parameter of the model, flat.
+    pub gradients: Named<Tensor<1>>,
+    /// Those of whatever else the regulariser is made of.
+    pub others: Gradients,
+    /// Batch statistics of the projections behind the encoder and the predictor.
+    pub statistics: [BatchStatistics; 2],
+}
+
+/// Prediction error and gradients of a batch, its loss being the prediction error plus what `regularise` makes of the
+/// latents `[clips, steps, latent]`, a number that is differentiated.
+///
+/// `model` is without autodiff; `shards` is at least 1.
+pub(crate) fn step(
+    model: &Lewm,
+    batch: &TrainBatch,
+    shards: usize,
+    noise: Option<&mut Rng>,
+    regularise: impl FnOnce(&Tensor<3>) -> Tensor<1>,
+) -> Found {
+    let [clips, steps, _] = batch.actions.dims();
+    let frames = clips * steps;
+
+    // Every shard differentiates its own copy of the encoder: their graphs share nothing.
+    let size = frames.div_ceil(shards.max(1));
+    let ranges: Vec<_> = (0..frames).step_by(size).map(|start| start..(start + size).min(frames)).collect();
+    let encoded: Vec<(Encoder, Tensor<2>)> = ranges
+        .par_iter()
+        .map(|range| {
+            let encoder = model.encoder.clone().train();
+            let [_, count, numbers] = batch.patches.dims();
+            let patches = batch.patches.clone().slice([range.clone(), 0..count, 0..numbers]).autodiff();
+            let features = encoder.forward(patches);
+            (encoder, features)
+        })
+        .collect();
+
+    // The rest of the model, from the features on.
+    let head = model.clone().train();
+    let features = Tensor::cat(encoded.iter().map(|(_, f)| f.clone().inner()).collect(), 0).autodiff().require_grad();
+    let (latents, projector_statistics) = head.projector.forward_train(features.clone());
+    let [_, latent] = latents.dims();
+    let latents = latents.reshape([clips, steps, latent]);
+    let pull = regularise(&latents);
+    // Every window of the history's length that has a next frame. One window where the clip is one longer than the
+    // history, as published.
+    let history = head.predictor.config().history.min(steps - 1);
+    let windows = |x: &Tensor<3>, offset: usize| {
+        let [_, _, width] = x.dims();
+        let starts = 0..steps - history;
+        Tensor::cat(
+            starts.map(|s| x.clone().slice([0..clips, s + offset..s + offset + history, 0..width])).collect(),
+            0,
+        )
+    };
+    let conditions = head.embed_actions(windows(&batch.actions, 0).autodiff());
+    let (predicted, pred_proj_statistics) = head.predict_train(windows(&latents, 0), conditions, &mut Noise(noise));
+    let prediction = (predicted - windows(&latents, 1)).square().mean();
+    let prediction_value: f32 = prediction.clone().inner().into_scalar();
+
+    let mut all = (prediction + pull).backward();
+    let features_gradient = features.grad_remove(&mut all);
+    let mut gradients = parameters::gradients(&head, &all);
+
+    if let Some(features_gradient) = features_gradient {
+        let [_, width] = features_gradient.dims();
+        let shards: Vec<Named<Tensor<1>>> = encoded
+            .into_par_iter()
+            .zip(&ranges)
+            .map(|((encoder, features), range)| {
+                let gradient = features_gradient.clone().slice([range.clone(), 0..width]).autodiff();
+                let all = (features * gradient).sum().backward();
+                parameters::gradients(&encoder, &all)
+            })
+            .collect();
+        for shard in shards {
+            for (name, gradient) in shard {
+                let name = format!("encoder.{name}");
+                let sum = match gradients.remove(&name) {
+                    Some(sum) => sum + gradient,
+                    None => gradient,
+                };
+                gradients.insert(name, sum);
+            }
+        }
+    }
+    Found {
+        prediction: f64::from(prediction_value),
+        gradients,
+        others: all,
+        statistics: [projector_statistics, pred_proj_statistics],
+    }
+}

@@ -1,0 +1,79 @@
+//! [`ByName`]: modules under names that are data, such as a column's.
+
+use burn::module::{Content, Devices, Module, ModuleDisplay, ModuleDisplayDefault, ModuleMapper, ModuleVisitor};
+use burn::tensor::Device;
+use std::fmt::Debug;
+
+/// Modules under names that are only known when the model is made, in a fixed order. A parameter's path goes through the
+/// name, as in a `ModuleDict` of PyTorch.
+#[derive(Clone, Debug)]
+pub struct ByName<M>(pub Vec<(String, M)>);
+
+impl<M> ByName<M> {
+    /// Names and modules.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, &M)> {
+        self.0.iter().map(|(name, module)| (name.as_str(), module))
+    }
+
+    fn each(self, change: impl Fn(M) -> M) -> Self {
+        Self(self.0.into_iter().map(|(name, module)| (name, change(module))).collect())
+    }
+}
+
+const CONTAINER: &str = "ByName";
+
+impl<M: Module> Module for ByName<M> {
+    fn collect_devices(&self, devices: Devices) -> Devices {
+        self.0.iter().fold(devices, |devices, (_, module)| module.collect_devices(devices))
+    }
+
+    fn fork(self, device: &Device) -> Self {
+        self.each(|module| module.fork(device))
+    }
+
+    fn to_device(self, device: &Device) -> Self {
+        self.each(|module| module.to_device(device))
+    }
+
+    fn num_params(&self) -> usize {
+        self.0.iter().map(|(_, module)| module.num_params()).sum()
+    }
+
+    fn visit<V: ModuleVisitor>(&self, visitor: &mut V) {
+        for (name, module) in &self.0 {
+            visitor.enter_module(name, CONTAINER);
+            module.visit(visitor);
+            visitor.exit_module(name, CONTAINER);
+        }
+    }
+
+    fn map<P: ModuleMapper>(self, mapper: &mut P) -> Self {
+        let mut map = |(name, module): (String, M)| {
+            mapper.enter_module(&name, CONTAINER);
+            let module = module.map(mapper);
+            mapper.exit_module(&name, CONTAINER);
+            (name, module)
+        };
+        Self(self.0.into_iter().map(&mut map).collect())
+    }
+
+    fn valid(&self) -> Self {
+        Self(self.0.iter().map(|(name, module)| (name.clone(), module.valid())).collect())
+    }
+
+    fn train(self) -> Self {
+        self.each(Module::train)
+    }
+
+    fn materialize(self) -> Self {
+        self.each(Module::materialize)
+    }
+}
+
+impl<M: Module + ModuleDisplay> ModuleDisplayDefault for ByName<M> {
+    fn content(&self, content: Content) -> Option<Content> {
+        self.0.iter().fold(content, |content, (name, module)| content.add(name, module)).optional()
+    }
+}
+
+impl<M: Module + ModuleDisplay> ModuleDisplay for ByName<M> {}

@@ -1,0 +1,44 @@
+//! PLDM checkpoints of the reference implementation, both ways. They hold the world model; the inverse dynamics, which
+//! its training keeps apart, begin anew where training goes on.
+
+use super::model::{Idm, Pldm};
+use crate::checkpoint::Checkpoint;
+use crate::lewm::import::{state, tree, world};
+use crate::nn::Init;
+use crate::train::{Facts, TrainConfig};
+use crate::weights::Naming;
+use crate::weights::reference::{Reference, write};
+use burn::tensor::Device;
+use serde_json::json;
+use std::path::Path;
+use swm_core::{Key, Manifest, Result};
+
+/// Names of modules in the reference, of this family.
+const MODULES: &str = "stable_worldmodel.wm.pldm.module";
+const CLASS: &str = "stable_worldmodel.wm.pldm.pldm.PLDM";
+
+/// As [`crate::lewm::import::import`], of a PLDM.
+///
+/// # Errors
+/// As that does.
+pub fn import(from: &Path, facts: Facts) -> Result<Checkpoint<Pldm>> {
+    let (model, sizes, frameskip) = world(Reference::open(from, "PLDM")?, &facts)?;
+    let mut config = TrainConfig::<Pldm>::load("paper", &[])?;
+    config.data.num_steps = sizes.predictor.history + 1;
+    config.data.frameskip = frameskip;
+    let init = Init::new(Key::new(config.seed), &Device::flex()).of("idm");
+    let idm = Idm::new(&init, sizes.latent, config.loss.idm_hidden, frameskip * facts.action.dim());
+    config.model = sizes;
+    config.check()?;
+    let manifest = Manifest::new("import", 0, json!({ "from": from.display().to_string() }));
+    Ok(Checkpoint { model: Pldm { model, idm }, config, facts, manifest })
+}
+
+/// As [`crate::lewm::import::export`], of a PLDM.
+///
+/// # Errors
+/// As that does.
+pub fn export(checkpoint: &Checkpoint<Pldm>, folder: &Path, naming: Naming) -> Result<()> {
+    let config = tree(&checkpoint.config.model, checkpoint.actions(), CLASS, MODULES)?;
+    write(folder, &config, &state(&checkpoint.model.model, naming))
+}

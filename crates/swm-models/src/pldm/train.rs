@@ -1,0 +1,77 @@
+//! How a PLDM is trained: the loop's side of [`super::step`].
+
+use super::loss::PldmLoss;
+use super::model::Pldm;
+use super::step::{StepOutput as Found, step};
+use crate::checkpoint::Checkpoint;
+use crate::lewm::{LewmConfig, LewmCost, train as lewm};
+use crate::nn::Named;
+use crate::train::{Facts, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
+use burn::tensor::{Device, Tensor};
+use swm_core::{Batch, Error, Key, Result, Schema};
+use swm_data::LoaderConfig;
+
+impl Trainable for Pldm {
+    const FAMILY: &'static str = "pldm";
+    const SUMMARY: &'static str =
+        "PLDM: a LeWM's model, kept from collapsing by variance, covariance, temporal alignment and inverse dynamics";
+    const PRESETS: &'static [Preset] = &[
+        Preset {
+            id: "tiny",
+            summary: "64 px, a small convolutional encoder: trains in a minute on two CPU cores",
+            toml: include_str!("../../presets/pldm/tiny.toml"),
+        },
+        Preset {
+            id: "paper",
+            summary: "224 px, ViT-tiny/14, predictor of 6 layers: the published size, for a GPU",
+            toml: include_str!("../../presets/pldm/paper.toml"),
+        },
+    ];
+    type Config = LewmConfig;
+    type Loss = PldmLoss;
+
+    fn check(config: &TrainConfig<Self>) -> Result<()> {
+        lewm::check(&config.model, &config.data)?;
+        at_least(&[("model.latent", config.model.latent, 2), ("loss.idm_hidden", config.loss.idm_hidden, 1)])?;
+        if config.loss.temp_straight != 0.0 && config.data.num_steps < 3 {
+            return Err(Error::config(
+                "loss.temp_straight",
+                format!("clips of {} frames have no path that could be straight", config.data.num_steps),
+                "give data.num_steps of at least 3, or the weight 0",
+            ));
+        }
+        Ok(())
+    }
+
+    fn picture(config: &LewmConfig) -> Option<usize> {
+        Some(config.image)
+    }
+
+    fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
+        lewm::loading(&config.model, &config.data, schema)
+    }
+
+    fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
+        let actions = config.data.frameskip * facts.action.dim();
+        Ok(Self::init(&config.model, actions, config.loss.idm_hidden, key, device))
+    }
+
+    fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
+        let StepContext { config, facts, key, device, training } = context;
+        let batch = lewm::prepare(&config.model, &config.data, facts, batch, device)?;
+        let mut noise = key.with("dropout").rng();
+        let noise = training.then_some(&mut noise);
+        let Found { losses, gradients, statistics, .. } = step(self, &batch, &config.loss, config.shards, noise);
+        Ok(StepOutput { metrics: losses, gradients, buffers: lewm::stored(statistics) })
+    }
+
+    fn after(mut self, _: &StepContext<'_, Self>, buffers: Named<Tensor<1>>) -> Self {
+        self.model.track(buffers);
+        self
+    }
+}
+
+/// The planning cost of a trained PLDM: its world model plans as a LeWM does.
+pub fn cost(checkpoint: &Checkpoint<Pldm>) -> LewmCost {
+    LewmCost::of(&checkpoint.model.model, &checkpoint.config.model, checkpoint.actions())
+}

@@ -1,0 +1,174 @@
+//! Checkpoints of the reference implementation: a state dict (`weights.pt`) beside a `config.json`, which is a tree of
+//! classes (`_target_`) and the sizes they are made with.
+
+use super::keys::Keys;
+use super::{BATCHES_TRACKED, names, read, torch};
+use crate::nn::parameters::{HostTensor, Named};
+use crate::nn::{DinoConfig, VitConfig};
+use serde::Serialize;
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use swm_core::{Error, Result};
+
+/// A checkpoint of the reference, read.
+pub(crate) struct Reference {
+    /// The file of weights.
+    pub path: PathBuf,
+    /// The tree of classes, from the model down.
+    pub config: Value,
+    /// Its keys, in the order of the file.
+    pub keys: Keys,
+    /// The state dict, without the counters of batch normalisations.
+    pub weights: Named<HostTensor>,
+}
+
+const CONFIG: &str = "config.json";
+const TARGET: &str = "_target_";
+
+impl Reference {
+    /// Reads a folder with a `config.json` and one file of weights, or such a file beside a `config.json`, of a model
+    /// whose class is called `class`.
+    ///
+    /// # Errors
+    /// When a file is missing or damaged, there are several files of weights, or it is another model.
+    pub fn open(from: &Path, class: &str) -> Result<Self> {
+        if !from.exists() {
+            let fix = "give the folder of a checkpoint, or its file of weights";
+            return Err(Error::corrupt(from, "there is nothing", fix));
+        }
+        let folder = if from.is_dir() { from } else { from.parent().unwrap_or(Path::new("")) };
+        let path = if from.is_dir() { only_weights(folder)? } else { from.to_owned() };
+        let beside = folder.join(CONFIG);
+        let text = std::fs::read(&beside).map_err(|error| Error::io(&beside, "reading a checkpoint", error))?;
+        let wrong = |problem: String| {
+            Error::corrupt(&beside, problem, format!("give a checkpoint of the reference's class {class}"))
+        };
+        let mut config: Value = serde_json::from_slice(&text).map_err(|error| wrong(error.to_string()))?;
+        let mut keys: Keys = serde_json::from_slice(&text).map_err(|error| wrong(error.to_string()))?;
+        // Early versions stored the whole configuration of the run.
+        if config.get(TARGET).is_none() && config["model"].get(TARGET).is_some() {
+            config = config["model"].take();
+            keys = keys.0.into_iter().find_map(|(name, keys)| (name == "model").then_some(keys)).unwrap_or_default();
+        }
+        let found = config[TARGET].as_str().unwrap_or("nothing with a _target_").to_owned();
+        if found.rsplit('.').next() != Some(class) {
+            return Err(wrong(format!("it describes {found}")));
+        }
+        let mut weights = read(&path)?;
+        weights.retain(|name, _| !name.ends_with(BATCHES_TRACKED));
+        Ok(Self { path, config, keys, weights })
+    }
+
+    /// The size at a path with dots, such as `predictor.depth`.
+    pub fn size(&self, at: &str) -> Result<usize> {
+        self.size_or(at, None)
+    }
+
+    /// As [`Reference::size`], with the value that is meant where there is none.
+    pub fn size_or(&self, at: &str, default: Option<usize>) -> Result<usize> {
+        let found = self.at(at).and_then(Value::as_u64).and_then(|size| usize::try_from(size).ok());
+        found.or(default).ok_or_else(|| self.wrong(format!("{CONFIG} says no number for {at}")))
+    }
+
+    /// The rate at a path with dots; 0 where there is none.
+    #[allow(clippy::cast_possible_truncation)]
+    pub fn rate(&self, at: &str) -> f32 {
+        self.at(at).and_then(Value::as_f64).unwrap_or(0.0) as f32
+    }
+
+    /// What stands at a path with dots.
+    pub fn at(&self, path: &str) -> Option<&Value> {
+        path.split('.').try_fold(&self.config, |value, key| value.get(key)).filter(|value| !value.is_null())
+    }
+
+    /// The class at a path with dots, without its module.
+    pub fn class(&self, at: &str) -> &str {
+        let target = self.at(at).and_then(|value| value[TARGET].as_str()).unwrap_or("");
+        target.rsplit('.').next().unwrap_or_default()
+    }
+
+    /// Something about the checkpoint that this program cannot use.
+    pub fn wrong(&self, problem: String) -> Error {
+        Error::corrupt(&self.path, problem, "give a checkpoint that the reference's own training wrote")
+    }
+
+    /// The shape of a weight.
+    pub fn shape(&self, name: &str) -> Result<&[usize]> {
+        let found = self.weights.get(name).map(|weight| weight.shape.as_slice());
+        found.ok_or_else(|| self.wrong(format!("'{name}' is missing")))
+    }
+
+    /// The size and the picture's side of the vision transformer at a path with dots; its weights get their published
+    /// names.
+    pub fn vit(&mut self, at: &str) -> Result<(VitConfig, usize)> {
+        if self.class(at) != "vit_hf" {
+            return Err(self.wrong(format!("its encoder is '{}', not the vision transformer 'vit_hf'", self.class(at))));
+        }
+        let patch = self.size_or(&format!("{at}.patch_size"), Some(16))?;
+        let image = self.size_or(&format!("{at}.image_size"), Some(224))?;
+        let named = self.at(&format!("{at}.size")).and_then(Value::as_str).unwrap_or("tiny").to_owned();
+        let size = match named.as_str() {
+            "tiny" => VitConfig::tiny(patch),
+            "small" => VitConfig::small(patch),
+            "base" => VitConfig::base(patch),
+            "large" => VitConfig::large(patch),
+            "huge" => VitConfig::huge(patch),
+            _ => return Err(self.wrong(format!("there is no vision transformer of the size '{named}'"))),
+        };
+        let config = VitConfig {
+            patch,
+            dim: self.size_or(&format!("{at}.hidden_size"), Some(size.dim))?,
+            depth: self.size_or(&format!("{at}.num_hidden_layers"), Some(size.depth))?,
+            heads: self.size_or(&format!("{at}.num_attention_heads"), Some(size.heads))?,
+            mlp: self.size_or(&format!("{at}.intermediate_size"), Some(size.mlp))?,
+        };
+        let prefix = format!("{at}.");
+        let weights = std::mem::take(&mut self.weights);
+        self.weights = names::published(weights, &prefix);
+        // Of use while masked pictures are learnt from, and not there otherwise.
+        self.weights.remove(&format!("{prefix}embeddings.mask_token"));
+        Ok((config, image))
+    }
+
+    /// The size of the DINOv2 whose weights begin with `prefix`, which get their published names.
+    pub fn dinov2(&mut self, prefix: &str) -> Result<DinoConfig> {
+        let weights = std::mem::take(&mut self.weights);
+        self.weights = names::published(weights, prefix);
+        let of = |name: &str| self.shape(&format!("{prefix}{name}"));
+        let projection = of("embeddings.patch_embeddings.projection.weight")?;
+        let [dim, _, patch, _] = *projection else {
+            return Err(self.wrong("its encoder does not begin with a convolution".to_owned()));
+        };
+        let mlp = of("encoder.layer.0.mlp.fc1.weight")?[0];
+        let grid = (of("embeddings.position_embeddings")?.get(1).copied().unwrap_or(1) - 1).isqrt();
+        let registers = of("embeddings.register_tokens").map_or(0, |shape| shape.get(1).copied().unwrap_or(0));
+        let layer = |name: &String| name.strip_prefix(prefix).is_some_and(|name| name.ends_with(".norm1.weight"));
+        let depth = self.weights.keys().filter(|name| layer(name)).count();
+        // All that were published have heads of 64 features.
+        Ok(DinoConfig { patch, dim, depth, heads: (dim / 64).max(1), mlp, grid, registers })
+    }
+}
+
+/// The one file of weights in a folder.
+fn only_weights(folder: &Path) -> Result<PathBuf> {
+    let entries = std::fs::read_dir(folder).map_err(|error| Error::io(folder, "looking for weights", error))?;
+    let weights = |path: &PathBuf| path.extension().is_some_and(|end| end == "pt" || end == "safetensors");
+    let mut files: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).filter(weights).collect();
+    files.sort();
+    match files.as_slice() {
+        [file] => Ok(file.clone()),
+        [] => {
+            Err(Error::corrupt(folder, "there is no .pt file", "give the folder of a checkpoint, or the file itself"))
+        }
+        _ => Err(Error::corrupt(folder, "there are several files of weights", "name the one you mean")),
+    }
+}
+
+/// Writes a checkpoint that the reference's `load_pretrained` reads: `weights.pt` and `config.json`.
+pub(crate) fn write(folder: &Path, config: &impl Serialize, weights: &Named<HostTensor>) -> Result<()> {
+    std::fs::create_dir_all(folder).map_err(|error| Error::io(folder, "creating a folder", error))?;
+    torch::write(&folder.join("weights.pt"), weights)?;
+    let path = folder.join(CONFIG);
+    let text = serde_json::to_string_pretty(config).map_err(|error| Error::external("writing JSON", error))?;
+    std::fs::write(&path, text).map_err(|error| Error::io(&path, "writing a checkpoint", error))
+}

@@ -1,0 +1,60 @@
+//! Files of weights that PyTorch wrote, and such as it reads.
+
+use std::path::{Path, PathBuf};
+use swm_models::nn::parameters::{HostTensor, Named};
+use swm_models::weights;
+
+fn file(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden").join(name)
+}
+
+#[test]
+fn golden_files_of_weights() {
+    let wanted = weights::read(&file("weights-single.safetensors")).expect("single precision throughout");
+    assert_eq!(wanted["norm.num_batches_tracked"], HostTensor { shape: vec![], values: vec![7.0] });
+    for name in ["weights-zip.pt", "weights-legacy.pth", "weights-training.ckpt", "weights-same.safetensors"] {
+        assert_eq!(weights::read(&file(name)).expect(name), wanted, "{name}");
+    }
+}
+
+#[test]
+fn state_dicts_go_there_and_back() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("weights.pt");
+    let tensor = |shape: &[usize], first: f32| HostTensor {
+        shape: shape.to_vec(),
+        values: (0..shape.iter().product()).map(|i| first + i as f32).collect(),
+    };
+    let state: Named<HostTensor> = [
+        ("a.weight", tensor(&[3, 2, 1], 0.5)),
+        ("a.bias", tensor(&[70], -3.0)),
+        ("norm.num_batches_tracked", tensor(&[], 300.0)),
+        ("ünïcode", tensor(&[0], 0.0)),
+    ]
+    .into_iter()
+    .map(|(name, tensor)| (name.to_owned(), tensor))
+    .collect();
+    weights::torch::write(&path, &state).expect("the disk is fine");
+    assert_eq!(weights::read(&path).expect("ours"), state);
+}
+
+#[test]
+fn files_that_are_no_weights_say_so() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let message = |name: &str, bytes: &[u8]| {
+        let path = folder.path().join(name);
+        std::fs::write(&path, bytes).expect("the disk is fine");
+        weights::read(&path).expect_err("no weights").to_string()
+    };
+    assert!(message("weights.txt", b"").contains(".safetensors, .pt"));
+    assert!(message("weights.pt", b"not a pickle").contains("torch.save"));
+    assert!(message("weights.safetensors", b"short").contains("save the state dict again"));
+    // A pickle that would run a program is refused, not run.
+    let attack = b"\x80\x02cos\nsystem\nX\x04\x00\x00\x00true\x85R.";
+    assert!(message("attack.pt", attack).contains("torch.save"), "{}", message("attack.pt", attack));
+    let missing = weights::read(&folder.path().join("none.pt")).expect_err("no file").to_string();
+    assert!(missing.contains("reading weights"), "{missing}");
+    // Cut off in the middle.
+    let whole = std::fs::read(file("weights-zip.pt")).expect("the fixture");
+    assert!(message("cut.pt", &whole[..whole.len() / 2]).contains("torch.save"));
+}

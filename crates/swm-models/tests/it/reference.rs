@@ -1,0 +1,133 @@
+//! Checkpoints of the reference implementation load, compute what they did there, and go back.
+
+use crate::golden::{Golden, check, values};
+use burn::tensor::Tensor;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use swm_models::dino_wm::{self, DinoWm};
+use swm_models::lewm::{self, Lewm};
+use swm_models::nn::Noise;
+use swm_models::nn::parameters;
+use swm_models::pldm;
+use swm_models::train::{ColumnFacts, Facts};
+use swm_models::weights::{self, Naming};
+use swm_plan::ActionScale;
+
+fn folder(family: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/reference").join(family)
+}
+
+fn facts(action: usize) -> Facts {
+    let numbers = |value: f64| vec![value; 3];
+    let proprio =
+        ColumnFacts { shape: vec![3], mean: numbers(0.0), std: numbers(1.0), min: numbers(-1.0), max: numbers(1.0) };
+    Facts {
+        action: ActionScale::identity(action),
+        columns: BTreeMap::from([("proprio".to_owned(), proprio)]),
+        env: None,
+    }
+}
+
+/// What was recorded of a checkpoint.
+fn recorded(family: &str) -> Golden {
+    Golden::read(&folder("..").join(format!("reference-{family}.safetensors")))
+}
+
+fn world(golden: &Golden, model: &Lewm) {
+    let [clips, steps, _] = golden.tensor::<3>("i.action").dims();
+    let latents = model.encode(golden.patches("i.pixels"));
+    let [_, latent] = latents.dims();
+    let latents = latents.reshape([clips, steps, latent]);
+    check(golden, "o.emb", &values(latents.clone()));
+    check(golden, "o.pred", &values(model.predict(latents, model.embed_actions(golden.tensor("i.action")))));
+}
+
+#[test]
+fn lewm_checkpoints_load() {
+    let checkpoint = lewm::import::import(&folder("lewm"), facts(2)).expect("it loads");
+    assert_eq!((checkpoint.config.data.frameskip, checkpoint.config.model.image), (2, 8));
+    world(&recorded("lewm"), &checkpoint.model);
+}
+
+#[test]
+fn pldm_checkpoints_load() {
+    // The file itself may be named, too.
+    let checkpoint = pldm::import::import(&folder("pldm").join("weights.pt"), facts(4)).expect("it loads");
+    assert_eq!((checkpoint.config.data.frameskip, checkpoint.config.model.predictor.history), (1, 3));
+    world(&recorded("pldm"), &checkpoint.model.model);
+}
+
+fn dino_wm_checkpoint() -> swm_models::Checkpoint<DinoWm> {
+    dino_wm::import::import(&folder("prejepa"), facts(2)).expect("it loads")
+}
+
+#[test]
+fn dino_wm_checkpoints_load() {
+    let (golden, checkpoint) = (recorded("prejepa"), dino_wm_checkpoint());
+    let names: Vec<&str> = checkpoint.config.model.columns.iter().map(|column| column.name.as_str()).collect();
+    assert_eq!((names, checkpoint.config.data.frameskip), (vec!["proprio", "action"], 2));
+    let model = &checkpoint.model;
+    let columns: Vec<Tensor<3>> = vec![golden.tensor("i.proprio"), golden.tensor("i.action")];
+    let features = model.backbone.patches(golden.patches("i.pixels"));
+    let ([clips, steps, _], [_, patches, width]) = (columns[0].dims(), features.dims());
+    let frames = model.embed(features.reshape([clips, steps, patches, width]), &columns);
+    check(&golden, "o.emb", &values(frames.clone()));
+    check(&golden, "o.pred", &values(model.predict(frames, &mut Noise::off())));
+}
+
+#[test]
+fn exported_checkpoints_load_again() {
+    let out = tempfile::tempdir().expect("a folder");
+    for naming in [Naming::Published, Naming::Transformers5] {
+        let there = out.path().join(format!("lewm-{naming:?}"));
+        let lewm = lewm::import::import(&folder("lewm"), facts(2)).expect("it loads");
+        lewm::import::export(&lewm, &there, naming).expect("it is written");
+        let again = lewm::import::import(&there, facts(2)).expect("it loads");
+        assert_eq!(again.config.model, lewm.config.model);
+        assert_eq!(parameters::values(&again.model), parameters::values(&lewm.model));
+
+        let there = out.path().join(format!("pldm-{naming:?}"));
+        let pldm = pldm::import::import(&folder("pldm"), facts(2)).expect("it loads");
+        pldm::import::export(&pldm, &there, naming).expect("it is written");
+        let again = pldm::import::import(&there, facts(2)).expect("it loads");
+        assert_eq!(parameters::values(&again.model), parameters::values(&pldm.model));
+    }
+    // What was published under old names comes back as it was, but for counters.
+    let mut theirs = weights::read(&folder("pldm").join("weights.pt")).expect("theirs");
+    let mut ours = weights::read(&out.path().join("pldm-Published/weights.pt")).expect("ours");
+    for all in [&mut theirs, &mut ours] {
+        all.retain(|name, _| !name.ends_with("num_batches_tracked"));
+    }
+    assert_eq!(ours, theirs);
+
+    // The reference makes the encoder from a published one, so a small one has no place in its config.json; the state
+    // dict is theirs.
+    let checkpoint = dino_wm_checkpoint();
+    let refused = dino_wm::import::export(&checkpoint, &out.path().join("dino"), Naming::Published);
+    assert!(refused.expect_err("no published encoder").to_string().contains("DINOv2-small"));
+    let ours = dino_wm::import::state(&checkpoint.model, Naming::Transformers5);
+    let theirs = weights::read(&folder("prejepa").join("weights.pt")).expect("theirs");
+    let theirs: parameters::Named<_> = theirs
+        .into_iter()
+        .map(|(name, tensor)| (name.replacen("backbone.backbone.", "backbone.", 1), tensor))
+        .collect();
+    assert_eq!(ours, theirs);
+}
+
+#[test]
+fn what_does_not_fit_is_told() {
+    let message = |found: swm_core::Result<swm_models::Checkpoint<Lewm>>| found.expect_err("wrong").to_string();
+    let other = message(lewm::import::import(&folder("pldm"), facts(2)));
+    assert!(other.contains("PLDM") && other.contains("class LeWM"), "{other}");
+    let actions = message(lewm::import::import(&folder("lewm"), facts(3)));
+    assert!(actions.contains("3 numbers an action") && actions.contains("divisor of 4"), "{actions}");
+    let none = message(lewm::import::import(Path::new("nowhere"), facts(2)));
+    assert!(none.contains("nowhere"), "{none}");
+    // Weights of another size than config.json says.
+    let out = tempfile::tempdir().expect("a folder");
+    let text = std::fs::read_to_string(folder("lewm").join("config.json")).expect("there");
+    std::fs::write(out.path().join("config.json"), text.replace("\"depth\": 2", "\"depth\": 1")).expect("written");
+    std::fs::copy(folder("lewm").join("weights.pt"), out.path().join("weights.pt")).expect("copied");
+    let mismatch = message(lewm::import::import(out.path(), facts(2)));
+    assert!(mismatch.contains("layers.1") && mismatch.contains("config.json"), "{mismatch}");
+}

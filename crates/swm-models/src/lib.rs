@@ -3,6 +3,8 @@
 //! - [`nn`]: building blocks, under PyTorch's parameter names; [`pixels`]: from bytes to numbers.
 //! - [`train`](mod@train): the training loop for every [`Trainable`] model, presets, logs.
 //! - [`lewm`]: the LeWM family: model, loss, planning cost.
+//! - [`tdmpc2`]: TD-MPC2, a world model of rewards and values; [`sac`]: soft actor-critic, which demonstrates.
+//! - [`online`]: playing and learning by turns.
 //! - [`pldm`]: the PLDM family: LeWM's model under VICReg's losses, temporal alignment and inverse dynamics.
 //! - [`dino_wm`]: the DINO-WM family: a frozen encoder of patches, a predictor of the patches of the next frame.
 //! - [`inverse`]: an inverse-dynamics policy on a frozen encoder, the baseline without planning.
@@ -16,8 +18,11 @@ pub mod dino_wm;
 pub mod inverse;
 pub mod lewm;
 pub mod nn;
+pub mod online;
 pub mod pixels;
 pub mod pldm;
+pub mod sac;
+pub mod tdmpc2;
 pub mod train;
 pub mod weights;
 

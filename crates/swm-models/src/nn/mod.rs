@@ -6,25 +6,31 @@ pub mod activation;
 pub mod backbone;
 pub mod by_name;
 pub mod dino;
+mod given;
 pub mod linear;
 pub mod mlp;
 pub mod norm;
+pub mod normed;
 pub mod parameters;
 pub mod positions;
 pub mod predictor;
 pub mod pyramid;
+pub mod two_hot;
 pub mod vit;
 
 pub use activation::{Activation, Noise};
 pub use backbone::{Backbone, BackboneConfig};
 pub use by_name::ByName;
 pub use dino::{Dino, DinoConfig};
+pub use given::given;
 pub use linear::Linear;
 pub use mlp::{Embedder, Projector};
 pub use norm::{BatchNorm, BatchStatistics, LayerNorm};
+pub use normed::{Dynamics, Ensemble, Head, NormedLinear};
 pub use parameters::Named;
 pub use predictor::{Predictor, PredictorConfig};
 pub use pyramid::{Pyramid, PyramidConfig, Stage};
+pub use two_hot::Bins;
 pub use vit::{Vit, VitConfig};
 
 use burn::module::Param;
@@ -91,4 +97,13 @@ impl Init {
         let values: Vec<f32> = (0..shape.iter().product()).map(|_| next()).collect();
         Param::from_tensor(Tensor::from_data(TensorData::new(values, shape), &self.device))
     }
+}
+
+/// Standard normal numbers, `[keys, width]`, each row decided by its key.
+pub fn normal(keys: &[Key], width: usize) -> Vec<f32> {
+    let row = |key: &Key| {
+        let mut rng = key.rng();
+        (0..width).map(move |_| StandardNormal.sample(&mut rng))
+    };
+    keys.iter().flat_map(row).collect()
 }

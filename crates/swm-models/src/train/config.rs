@@ -3,6 +3,7 @@
 use super::optim::OptimConfig;
 use super::schedule::ScheduleConfig;
 use super::trainable::Trainable;
+use crate::online::OnlineSettings;
 use figment::Figment;
 use figment::providers::{Format as _, Serialized, Toml};
 use serde::{Deserialize, Serialize};
@@ -28,6 +29,9 @@ pub struct TrainConfig<M: Trainable> {
     /// Looking at episodes it is not trained on.
     #[serde(default)]
     pub validation: ValidationConfig,
+    /// How playing and learning take turns, for a model that can learn by playing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub online: Option<OnlineSettings>,
     /// Parts a batch is cut into, which can run in parallel. Changes the last bits of the numbers.
     pub shards: usize,
     /// Steps between two lines of the log.
@@ -38,7 +42,7 @@ pub struct TrainConfig<M: Trainable> {
 
 impl<M: Trainable> Clone for TrainConfig<M> {
     fn clone(&self) -> Self {
-        let Self { seed, model, loss, data, optim, schedule, validation, shards, log_every, save_every } = self;
+        let Self { seed, model, loss, data, optim, schedule, validation, online, shards, log_every, save_every } = self;
         Self {
             seed: *seed,
             model: model.clone(),
@@ -47,6 +51,7 @@ impl<M: Trainable> Clone for TrainConfig<M> {
             optim: optim.clone(),
             schedule: schedule.clone(),
             validation: validation.clone(),
+            online: online.clone(),
             shards: *shards,
             log_every: *log_every,
             save_every: *save_every,

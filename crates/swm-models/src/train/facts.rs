@@ -46,11 +46,12 @@ impl ColumnFacts {
 }
 
 impl Facts {
-    /// The facts of a dataset; `columns` are those a model sees. Pictures among them are left out.
+    /// The facts of a dataset; `columns` are those a model sees. Pictures among them are left out. Actions are scaled to
+    /// mean 0 and spread 1, or, if `bounded`, to lie between -1 and 1.
     ///
     /// # Errors
     /// When there is no column of continuous actions, a column is missing, or the data are damaged.
-    pub fn of(reader: &dyn Reader, columns: &[String]) -> Result<Self> {
+    pub fn of(reader: &dyn Reader, columns: &[String], bounded: bool) -> Result<Self> {
         let schema = reader.schema();
         let facts = |spec: &ColumnSpec| {
             let stats = column_stats(reader, &spec.name, None)?;
@@ -81,11 +82,16 @@ impl Facts {
             }
         }
         let env = reader.manifest().and_then(|manifest| Some(manifest.config.get("env")?.as_str()?.to_owned()));
-        Ok(Self {
-            action: ActionScale { mean: single(&action.mean), std: single(&action.spread()) },
-            columns: seen,
-            env,
-        })
+        let action = if bounded {
+            let of =
+                |low: f64, high: f64| if high > low { [(high + low) / 2.0, (high - low) / 2.0] } else { [low, 1.0] };
+            let both: Vec<[f64; 2]> = action.min.iter().zip(&action.max).map(|(&low, &high)| of(low, high)).collect();
+            let part = |i: usize| single(&both.iter().map(|pair| pair[i]).collect::<Vec<_>>());
+            ActionScale { mean: part(0), std: part(1) }
+        } else {
+            ActionScale { mean: single(&action.mean), std: single(&action.spread()) }
+        };
+        Ok(Self { action, columns: seen, env })
     }
 
     /// The facts of a column.

@@ -5,7 +5,7 @@
 
 pub mod config;
 mod facts;
-mod failure;
+pub(crate) mod failure;
 pub mod log;
 pub mod optim;
 pub(crate) mod run;

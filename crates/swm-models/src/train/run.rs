@@ -78,7 +78,7 @@ impl<'a, M: Trainable> Run<'a, M> {
         let wanted = M::loading(config, reader.schema())?;
         let columns: Vec<String> =
             wanted.clip.columns.iter().chain(wanted.goals.iter().flat_map(|goal| &goal.columns)).cloned().collect();
-        let facts = Facts::of(&*reader, &columns)?;
+        let facts = Facts::of(&*reader, &columns, M::BOUNDED)?;
         let mut manifest = Manifest::new("train", config.seed, serde_json::to_value(config).unwrap_or_default());
         manifest.libraries.insert("burn".to_owned(), "0.22.1".to_owned());
         manifest.hashes.insert("dataset".to_owned(), reader.content_hash()?);
@@ -328,7 +328,7 @@ impl<'a, M: Trainable> Run<'a, M> {
 }
 
 /// Whether something that happens every so many steps, and at the end, is due.
-fn due(every: usize, done: usize, steps: usize) -> bool {
+pub(crate) fn due(every: usize, done: usize, steps: usize) -> bool {
     every > 0 && (done.is_multiple_of(every) || done == steps)
 }
 
@@ -380,14 +380,14 @@ pub(super) fn add(sum: &mut Named<Tensor<1>>, more: Named<Tensor<1>>) {
 
 /// Means of what happened since the last line of the log.
 #[derive(Default)]
-struct Window {
+pub(crate) struct Window {
     metrics: Vec<(&'static str, f64)>,
     norm: f64,
     count: usize,
 }
 
 impl Window {
-    fn add(&mut self, metrics: &[(&'static str, f64)], norm: f64) {
+    pub fn add(&mut self, metrics: &[(&'static str, f64)], norm: f64) {
         if self.count == 0 {
             self.metrics = metrics.iter().map(|&(name, _)| (name, 0.0)).collect();
         }
@@ -400,7 +400,7 @@ impl Window {
 
     /// The means and the mean gradient norm; begins anew.
     #[allow(clippy::cast_precision_loss)]
-    fn take(&mut self) -> (Vec<(&'static str, f64)>, f64) {
+    pub fn take(&mut self) -> (Vec<(&'static str, f64)>, f64) {
         let Self { metrics, norm, count } = std::mem::take(self);
         let count = count.max(1) as f64;
         (metrics.into_iter().map(|(name, sum)| (name, sum / count)).collect(), norm / count)
@@ -408,7 +408,7 @@ impl Window {
 }
 
 /// Checks that a stored run and the one asked for are the same.
-fn same_run(path: &Path, stored: &Manifest, wanted: &Manifest) -> Result<()> {
+pub(crate) fn same_run(path: &Path, stored: &Manifest, wanted: &Manifest) -> Result<()> {
     let problem = if stored.config != wanted.config {
         let differing = differences("", &stored.config, &wanted.config);
         format!("the run there has another configuration ({})", differing.join(", "))

@@ -22,6 +22,9 @@ pub trait Trainable: Module + Sync + 'static {
     const SUMMARY: &'static str;
     /// The configurations that come with the program; the first is what is meant when none is named.
     const PRESETS: &'static [Preset];
+    /// Whether actions lie between -1 and 1 in its units, which stand for the smallest and the largest of the data, instead of
+    /// having mean 0 and spread 1.
+    const BOUNDED: bool = false;
     /// Its sizes: the table `model` of a configuration.
     type Config: Serialize + DeserializeOwned + Clone + Debug + PartialEq + Send + Sync;
     /// Weights and settings of its loss: the table `loss`.

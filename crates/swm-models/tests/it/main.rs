@@ -5,6 +5,7 @@
 mod checkpoints;
 mod dots;
 mod golden;
+mod online;
 mod planning;
 mod reference;
 mod training;

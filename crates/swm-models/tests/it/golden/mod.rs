@@ -5,6 +5,7 @@
 mod dino_wm;
 mod lewm;
 mod pldm;
+mod tdmpc2;
 mod vit;
 mod weights;
 
@@ -17,6 +18,8 @@ use swm_models::nn::parameters::{HostTensor, Named};
 const TOLERANCE: f32 = 1e-4;
 
 pub struct Golden {
+    /// The metadata `config`, as it is written and as it reads.
+    text: String,
     config: serde_json::Value,
     tensors: BTreeMap<String, HostTensor>,
 }
@@ -36,7 +39,7 @@ impl Golden {
                 (name.to_owned(), HostTensor { shape: view.shape().to_vec(), values })
             })
             .collect();
-        Self { config: serde_json::from_str(config).expect("JSON"), tensors }
+        Self { text: config.clone(), config: serde_json::from_str(config).expect("JSON"), tensors }
     }
 
     fn size(&self, name: &str) -> usize {

@@ -1,0 +1,57 @@
+//! Online training: playing and learning by turns, in one process.
+//!
+//! A round is one step of every world, then as many gradient steps as the settings say. Episodes go to a replay buffer when
+//! they end; batches are drawn from it uniformly. Everything is decided by the seed: an episode by its number, a batch by the
+//! number of its gradient step and what the buffer holds then. Neither threads nor the machine's speed have a say.
+//!
+//! What an episode's clock cut short is not its end: only `terminated` stops a value from looking further.
+
+mod collector;
+mod evaluation;
+mod learner;
+mod live;
+mod reflex;
+mod run;
+mod settings;
+mod world;
+
+pub use live::Live;
+pub use reflex::{Reflex, ReflexPolicy};
+pub use run::{OnlineSummary, train_online};
+pub use settings::OnlineSettings;
+pub use world::facts;
+
+use crate::train::{Facts, TrainConfig, Trainable};
+use swm_core::{EnvSpec, Error, Policy, Result, Schema};
+
+/// A model that learns by playing.
+pub trait Agent: Trainable {
+    /// Who acts with the weights that `live` holds, whatever they are at the moment; `explore` also tries what it does not
+    /// think best.
+    ///
+    /// # Errors
+    /// When the model does not fit the world.
+    fn policy(
+        config: &TrainConfig<Self>,
+        facts: &Facts,
+        live: Live<Self>,
+        spec: &EnvSpec,
+        slots: usize,
+        explore: bool,
+    ) -> Result<Box<dyn Policy>>;
+}
+
+/// Checks that there are rewards to learn from.
+///
+/// # Errors
+/// Naming the column that is missing.
+pub(crate) fn has_rewards(schema: &Schema) -> Result<()> {
+    match ["reward", "terminated"].into_iter().find(|name| schema.find(name).is_none()) {
+        None => Ok(()),
+        Some(name) => Err(Error::config(
+            format!("the column '{name}'"),
+            "the dataset has none",
+            "train on a dataset with rewards, such as `swm collect` writes",
+        )),
+    }
+}

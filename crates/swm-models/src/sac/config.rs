@@ -1,0 +1,71 @@
+//! The sizes of a SAC and the settings of its loss.
+
+use crate::train::config::at_least;
+use serde::{Deserialize, Serialize};
+use swm_core::{Error, Result};
+
+/// The sizes of a [`super::Sac`].
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SacConfig {
+    /// The columns it observes, one after another.
+    pub columns: Vec<String>,
+    /// Hidden features of both hidden layers of every network.
+    pub hidden: usize,
+}
+
+impl SacConfig {
+    /// Checks that there is something to see and to compute with.
+    ///
+    /// # Errors
+    /// Naming what is missing.
+    pub fn check(&self) -> Result<()> {
+        at_least(&[("model.hidden", self.hidden, 1)])?;
+        if self.columns.is_empty() {
+            return Err(Error::config("model.columns", "nothing is observed", "name a column, such as [\"state\"]"));
+        }
+        if self.columns.iter().any(|column| column == "pixels") {
+            return Err(Error::config(
+                "model.columns",
+                "'pixels' is a column of pictures",
+                "name columns of numbers, or train tdmpc2, which sees pictures",
+            ));
+        }
+        Ok(())
+    }
+}
+
+/// The settings of the losses.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SacLoss {
+    /// What a reward one step later is worth, γ.
+    pub discount: f64,
+    /// The share of the new in target networks, τ.
+    pub tau: f64,
+    /// The entropy a number of an action is to keep; -1 as published.
+    pub entropy: f64,
+    /// The temperature of the beginning, α.
+    pub temperature: f64,
+}
+
+impl SacLoss {
+    /// Checks that the settings make sense.
+    ///
+    /// # Errors
+    /// Naming the first that does not.
+    pub fn check(&self) -> Result<()> {
+        let positive = [("loss.discount", self.discount, 1.0), ("loss.tau", self.tau, 1.0)];
+        let positive = positive.into_iter().chain([("loss.temperature", self.temperature, f64::MAX)]);
+        for (what, value, most) in positive {
+            if !(value > 0.0 && value <= most) {
+                let fix = if most > 1.0 { "choose a number above 0" } else { "choose a number above 0, at most 1" };
+                return Err(Error::config(what, value.to_string(), fix));
+            }
+        }
+        if !self.entropy.is_finite() {
+            return Err(Error::config("loss.entropy", self.entropy.to_string(), "choose a number, such as -1"));
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,158 @@
+//! How a SAC is trained: the loop's side of [`super::step`].
+
+use super::config::{SacConfig, SacLoss};
+use super::model::Sac;
+use super::step::{Transitions, step};
+use crate::nn::parameters::{self, IntoF32 as _};
+use crate::nn::{Named, normal};
+use crate::online::{Agent, Live, Reflex, ReflexPolicy};
+use crate::train::{Facts, Group, Preset, StepContext, StepOutput, TrainConfig, Trainable};
+use burn::tensor::{Device, Tensor, TensorData};
+use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result, RowRef, Schema};
+use swm_data::{ClipSpec, LoaderConfig};
+
+impl Trainable for Sac {
+    const FAMILY: &'static str = "sac";
+    const SUMMARY: &'static str =
+        "soft actor-critic: a policy for continuous control that learns by playing, to demonstrate";
+    const PRESETS: &'static [Preset] = &[
+        Preset {
+            id: "tiny",
+            summary: "128 hidden features: learns to swing a pendulum up in minutes on two CPU cores",
+            toml: include_str!("../../presets/sac/tiny.toml"),
+        },
+        Preset {
+            id: "paper",
+            summary: "256 hidden features, the published settings",
+            toml: include_str!("../../presets/sac/paper.toml"),
+        },
+    ];
+    const BOUNDED: bool = true;
+    type Config = SacConfig;
+    type Loss = SacLoss;
+
+    fn check(config: &TrainConfig<Self>) -> Result<()> {
+        config.model.check()?;
+        config.loss.check()?;
+        if (config.data.num_steps, config.data.frameskip) != (2, 1) {
+            let given = format!("{} frames, {} steps apart", config.data.num_steps, config.data.frameskip);
+            return Err(Error::config(
+                "data.num_steps",
+                given,
+                "choose 2 frames and a frameskip of 1, which are one transition",
+            ));
+        }
+        if config.online.as_ref().is_some_and(|online| online.planner.is_some()) {
+            let fix = "leave the table out: this is a policy without a model to plan in";
+            return Err(Error::config("online.planner", "it is given to a SAC", fix));
+        }
+        Ok(())
+    }
+
+    fn picture(_: &SacConfig) -> Option<usize> {
+        None
+    }
+
+    fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
+        crate::online::has_rewards(schema)?;
+        let columns = config.model.columns.iter().map(String::as_str).chain(["action", "reward", "terminated"]);
+        let clip = ClipSpec { num_steps: 2, frameskip: 1, columns: columns.map(str::to_owned).collect() };
+        clip.schema(schema)?;
+        Ok(LoaderConfig { clip, ..LoaderConfig::default() })
+    }
+
+    fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
+        let widths: Result<Vec<usize>> =
+            config.model.columns.iter().map(|column| Ok(facts.column(column)?.dim())).collect();
+        Ok(Self::init(&config.model, &config.loss, widths?.iter().sum(), facts.action.dim(), key, device))
+    }
+
+    fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
+        let (config, device) = (context.config, context.device);
+        let (rows, width, inputs) = (batch.rows(), context.facts.action.dim(), self.inputs());
+        let columns = config.model.columns.iter().map(|column| {
+            let numbers = batch.to_f32(column)?;
+            let width = numbers.len() / (2 * rows).max(1);
+            Ok(Tensor::<3>::from_data(TensorData::new(numbers, [rows, 2, width]), device))
+        });
+        let seen = Tensor::cat(columns.collect::<Result<Vec<_>>>()?, 2);
+        let frame = |i| seen.clone().slice([0..rows, i..i + 1]).reshape([rows, inputs]);
+        let first = |name: &str| {
+            let column = Tensor::<2>::from_data(TensorData::new(batch.to_f32(name)?, [rows, 2]), device);
+            Ok::<_, Error>(column.slice([0..rows, 0..1]).reshape([rows]))
+        };
+        let noise = |purpose: &str| {
+            let numbers = normal(&[context.key.with(purpose)], rows * width);
+            Tensor::from_data(TensorData::new(numbers, [rows, width]), device)
+        };
+        let actions = context.facts.actions(batch, 2, 1, device)?.slice([0..rows, 0..1]).reshape([rows, width]);
+        let batch = Transitions {
+            observations: frame(0),
+            actions,
+            rewards: first("reward")?,
+            terminated: first("terminated")?,
+            next: frame(1),
+            noise: [noise("next actions"), noise("actions")],
+        };
+        let found = step(self, &batch, &config.loss);
+        let metrics = vec![
+            ("loss", found.critic + found.actor),
+            ("critic", found.critic),
+            ("actor", found.actor),
+            ("q", found.q),
+            ("entropy", found.entropy),
+            ("temperature", found.temperature),
+        ];
+        Ok(StepOutput { metrics, gradients: found.gradients, buffers: Named::new() })
+    }
+
+    fn after(mut self, context: &StepContext<'_, Self>, _: Named<Tensor<1>>) -> Self {
+        self.critic_target = parameters::blend(self.critic_target, &self.critic, 1.0 - context.config.loss.tau);
+        self
+    }
+
+    /// Gradients of Q functions, policy and temperature are clipped apart.
+    fn group(name: &str) -> Group {
+        let clip = ["critic.", "actor."].iter().position(|part| name.starts_with(part)).unwrap_or(2);
+        Group { clip, ..Group::default() }
+    }
+}
+
+impl Reflex for Sac {
+    fn act(&self, config: &TrainConfig<Self>, row: RowRef<'_>, key: Option<Key>) -> Result<Vec<f32>> {
+        let device = self.log_ent_coef.val().device();
+        let mut seen = vec![];
+        for column in &config.model.columns {
+            #[allow(clippy::cast_possible_truncation)]
+            seen.extend(row.to_f64(column)?.into_iter().map(|v| v as f32));
+        }
+        let inputs = self.inputs();
+        if seen.len() != inputs {
+            let given = format!("{} numbers in {}", seen.len(), config.model.columns.join(", "));
+            return Err(Error::mismatch("acting", given, format!("{inputs}, as the policy was trained")));
+        }
+        let (mean, log_std) = self.actor.forward(Tensor::from_data(TensorData::new(seen, [1, inputs]), &device));
+        let raw = match key {
+            None => mean,
+            Some(key) => {
+                let width = mean.dims()[1];
+                let noise = Tensor::from_data(TensorData::new(normal(&[key], width), [1, width]), &device);
+                mean + log_std.exp() * noise
+            }
+        };
+        Ok(raw.tanh().into_data().try_into_vec_as_f32())
+    }
+}
+
+impl Agent for Sac {
+    fn policy(
+        config: &TrainConfig<Self>,
+        facts: &Facts,
+        live: Live<Self>,
+        spec: &EnvSpec,
+        slots: usize,
+        explore: bool,
+    ) -> Result<Box<dyn Policy>> {
+        Ok(Box::new(ReflexPolicy::new(config, facts, live, spec, slots, explore)?))
+    }
+}

@@ -1,0 +1,115 @@
+//! [`Rollouts`]: what candidate action sequences bring, without a graph.
+
+use super::model::Tdmpc2;
+use super::step::numbers;
+use crate::nn::parameters::IntoF32;
+use crate::nn::{Ensemble, Noise, normal};
+use burn::tensor::{Tensor, TensorData};
+use rayon::prelude::*;
+use swm_core::Key;
+
+/// Candidates that are rolled out together; the parts of a population run in parallel.
+const PART: usize = 128;
+
+/// A model made ready for rollouts.
+pub struct Rollouts {
+    model: Tdmpc2,
+    critics: Ensemble,
+    discount: f64,
+    uncertainty: f64,
+}
+
+impl Rollouts {
+    /// `discount` per step; `uncertainty` is what disagreement of the Q functions costs, per unit of value.
+    pub fn new(model: &Tdmpc2, discount: f64, uncertainty: f64) -> Self {
+        let critics = Ensemble::of(&model.qs.iter().collect::<Vec<_>>());
+        Self { model: model.clone(), critics, discount, uncertainty }
+    }
+
+    /// The model.
+    pub fn model(&self) -> &Tdmpc2 {
+        &self.model
+    }
+
+    /// Writes the costs of candidates `[samples, horizon, actions]` from one latent: the discounted rewards of their steps
+    /// and the value of the policy's action behind them, negated.
+    pub fn cost(&self, latent: &[f32], candidates: &[f32], horizon: usize, costs: &mut [f32]) {
+        let width = horizon * self.model.actions();
+        let parts = costs.par_chunks_mut(PART).zip(candidates.par_chunks(PART * width));
+        parts.for_each(|(costs, candidates)| costs.copy_from_slice(&self.part(latent, candidates, horizon)));
+    }
+
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_wrap, clippy::cast_possible_truncation)]
+    fn part(&self, latent: &[f32], candidates: &[f32], horizon: usize) -> Vec<f32> {
+        let model = &self.model;
+        let (device, bins, width) = (model.device(), model.config().bins, model.actions());
+        let samples = candidates.len() / (horizon * width);
+        let candidates =
+            Tensor::<3>::from_data(TensorData::new(candidates.to_vec(), [samples, horizon, width]), &device);
+        let start = Tensor::<2>::from_data(TensorData::new(latent.to_vec(), [1, latent.len()]), &device);
+        let mut latents = start.expand([samples, latent.len()]);
+        let mut inputs = vec![];
+        // The chance that the episode goes on, 1 or 0, and what is worth what.
+        let mut alive = Tensor::<1>::ones([samples], &device);
+        let mut weights = vec![];
+        for step in 0..horizon {
+            let actions = candidates.clone().slice([0..samples, step..step + 1]).reshape([samples, width]);
+            let input = Tensor::cat(vec![latents, actions], 1);
+            latents = model.next(input.clone());
+            inputs.push(input);
+            weights.push(alive.clone() * self.discount.powi(step as i32));
+            if let Some(head) = &model.termination {
+                let logits: Tensor<1> = head.forward(latents.clone()).squeeze_dim(1);
+                alive = alive * logits.lower_elem(0.0).float();
+            }
+        }
+        let rewards = bins.numbers(model.reward.forward(Tensor::cat(inputs, 0))) * Tensor::cat(weights, 0);
+        let gained: Tensor<1> = rewards.reshape([horizon, samples]).sum_dim(0).squeeze_dim(0);
+
+        let policy = model.policy(latents.clone()).mean.tanh();
+        let q = numbers(bins, self.critics.forward(Tensor::cat(vec![latents, policy], 1), 0.0, &mut Noise::off()));
+        let [count, _] = q.dims();
+        let mean = q.clone().mean_dim(0);
+        let unbiased = (count as f64 - 1.0).max(1.0);
+        let std = ((q - mean.clone()).square().sum_dim(0) / unbiased).sqrt();
+        let value: Tensor<1> = (mean.clone() - mean.abs() * std * self.uncertainty).squeeze_dim(0);
+        (gained + value * alive * self.discount.powi(horizon as i32)).neg().into_data().try_into_vec_as_f32()
+    }
+
+    /// The policy's action at latents `[rows, latent]`: its mean, or drawn by the key of every row.
+    pub fn act(&self, latents: Tensor<2>, keys: Option<&[Key]>) -> Tensor<2> {
+        let gaussian = self.model.policy(latents);
+        match keys {
+            None => gaussian.mean.tanh(),
+            Some(keys) => {
+                let width = self.model.actions();
+                let noise = normal(keys, width);
+                gaussian.sample(Tensor::from_data(TensorData::new(noise, [keys.len(), width]), &self.model.device()))
+            }
+        }
+    }
+
+    /// Action sequences of the policy, `[samples, horizon, actions]`, from the latent that the actions `prefix`, which they
+    /// begin with, lead to. Draws are decided by `key` and the number of the sequence.
+    pub fn propose(&self, latent: &[f32], prefix: &[f32], horizon: usize, key: Key, proposals: &mut [f32]) {
+        let (device, width) = (self.model.device(), self.model.actions());
+        let samples = proposals.len() / (horizon * width);
+        let start = Tensor::<2>::from_data(TensorData::new(latent.to_vec(), [1, latent.len()]), &device);
+        let mut latents = start.expand([samples, latent.len()]);
+        for step in 0..horizon {
+            let actions = match prefix.get(step * width..(step + 1) * width) {
+                Some(given) => Tensor::<2>::from_data(TensorData::new(given.to_vec(), [1, width]), &device)
+                    .expand([samples, width]),
+                None => {
+                    let keys: Vec<Key> = (0..samples as u64).map(|i| key.at(i).at(step as u64)).collect();
+                    self.act(latents.clone(), Some(&keys))
+                }
+            };
+            let numbers = actions.to_data().try_into_vec_as_f32();
+            for (proposal, action) in proposals.chunks_exact_mut(horizon * width).zip(numbers.chunks_exact(width)) {
+                proposal[step * width..(step + 1) * width].copy_from_slice(action);
+            }
+            latents = self.model.next(Tensor::cat(vec![latents, actions], 1));
+        }
+    }
+}

@@ -1,0 +1,199 @@
+//! How a TD-MPC2 is trained on a dataset: the loop's side of [`super::step`].
+
+use super::config::{LossConfig, PIXELS, Tdmpc2Config};
+use super::model::{Observation, Tdmpc2};
+use super::planner::Tdmpc2Policy;
+use super::step::{Draws, TrainBatch, step};
+use crate::nn::parameters::{self, IntoF32 as _};
+use crate::nn::{Named, normal};
+use crate::online::{Agent, Live, Reflex, ReflexPolicy};
+use crate::pixels::{self, Pixels};
+use crate::train::{Facts, Group, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
+use burn::module::Param;
+use burn::tensor::{Device, Tensor, TensorData};
+use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result, RowRef, Schema};
+use swm_data::{ClipSpec, LoaderConfig};
+
+impl Trainable for Tdmpc2 {
+    const FAMILY: &'static str = "tdmpc2";
+    const SUMMARY: &'static str =
+        "TD-MPC2: latents that predict rewards and values, planned through with a policy to start from";
+    const PRESETS: &'static [Preset] = &[
+        Preset {
+            id: "tiny",
+            summary: "small networks on the column `state`: learns to swing a pendulum up in minutes on two CPU cores",
+            toml: include_str!("../../presets/tdmpc2/tiny.toml"),
+        },
+        Preset {
+            id: "paper",
+            summary: "5 million parameters, the published size and settings for tasks with states",
+            toml: include_str!("../../presets/tdmpc2/paper.toml"),
+        },
+    ];
+    const BOUNDED: bool = true;
+    type Config = Tdmpc2Config;
+    type Loss = LossConfig;
+
+    fn check(config: &TrainConfig<Self>) -> Result<()> {
+        config.model.check()?;
+        config.loss.check()?;
+        at_least(&[("data.num_steps", config.data.num_steps, 2)])?;
+        if config.data.frameskip != 1 {
+            let fix = "choose 1: rewards between two frames would be lost";
+            return Err(Error::config("data.frameskip", config.data.frameskip.to_string(), fix));
+        }
+        Ok(())
+    }
+
+    fn picture(config: &Tdmpc2Config) -> Option<usize> {
+        config.pictures().map(|_| config.image)
+    }
+
+    fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
+        if config.model.pictures().is_some() {
+            pixels::check(config.model.image, schema, PIXELS)?;
+        }
+        crate::online::has_rewards(schema)?;
+        let columns = config.model.columns().into_iter().chain(["action", "reward", "terminated"].map(str::to_owned));
+        let clip = ClipSpec { num_steps: config.data.num_steps, frameskip: 1, columns: columns.collect() };
+        clip.schema(schema)?;
+        Ok(LoaderConfig { clip, ..LoaderConfig::default() })
+    }
+
+    fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
+        let widths = config.model.numbers().map(|part| Ok(facts.column(&part.column)?.dim()));
+        Ok(Self::init(&config.model, &widths.collect::<Result<Vec<_>>>()?, facts.action.dim(), key, device))
+    }
+
+    fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
+        let StepContext { config, facts, key, device, training } = context;
+        let steps = config.data.num_steps;
+        let (clips, horizon, width) = (batch.rows(), steps - 1, facts.action.dim());
+        let flat = |name: &str| {
+            let column = Tensor::<2>::from_data(TensorData::new(batch.to_f32(name)?, [clips, steps]), context.device);
+            Ok::<_, Error>(column.swap_dims(0, 1).slice([0..horizon]))
+        };
+        let actions = facts.actions(batch, steps, 1, device)?.swap_dims(0, 1).slice([0..horizon]);
+        let batch = TrainBatch {
+            observations: observe(&config.model, batch, steps, device)?,
+            actions,
+            rewards: flat("reward")?,
+            terminated: flat("terminated")?,
+        };
+        let draws = Draws::new(*key, self, [horizon, clips, width], *training);
+        let found = step(self, &batch, &config.loss, &draws, config.shards);
+        let mut metrics = vec![
+            ("loss", found.total),
+            ("consistency", found.consistency),
+            ("reward", found.reward),
+            ("value", found.value),
+            ("policy", found.policy),
+            ("q", found.q),
+            ("entropy", found.entropy),
+            ("scale", f64::from(found.scale)),
+        ];
+        if self.termination.is_some() {
+            metrics.push(("termination", found.termination));
+        }
+        let scale = Tensor::from_data(TensorData::new(vec![found.scale], [1]), context.device);
+        Ok(StepOutput { metrics, gradients: found.gradients, buffers: Named::from([(SCALE.to_owned(), scale)]) })
+    }
+
+    /// The running spread is replaced; target networks move towards those that were trained.
+    fn after(mut self, context: &StepContext<'_, Self>, mut buffers: Named<Tensor<1>>) -> Self {
+        self.target_qs = parameters::blend(self.target_qs, &self.qs, 1.0 - context.config.loss.tau);
+        if let Some(scale) = buffers.remove(SCALE) {
+            self.scale.value = Param::from_tensor(scale).set_require_grad(false);
+        }
+        self
+    }
+
+    /// Gradients of world and policy are clipped apart; the encoders learn more slowly, as published.
+    fn group(name: &str) -> Group {
+        let encoder = ["cnn.", "pixel_encoder.", "extra_encoders."].iter().any(|part| name.starts_with(part));
+        Group { clip: usize::from(name.starts_with("pi.")), lr: if encoder { ENCODER_LR } else { 1.0 } }
+    }
+}
+
+/// The learning rate of encoders, as a share of the others'.
+const ENCODER_LR: f64 = 0.3;
+const SCALE: &str = "scale.value";
+
+/// Observations of a batch of clips, step after step, each of all clips.
+fn observe(config: &Tdmpc2Config, batch: &Batch, steps: usize, device: &Device) -> Result<Observation> {
+    let clips = batch.rows();
+    let numbers = config.numbers().map(|part| {
+        let numbers = batch.to_f32(&part.column)?;
+        let width = numbers.len() / (clips * steps).max(1);
+        let numbers = Tensor::<3>::from_data(TensorData::new(numbers, [clips, steps, width]), device);
+        Ok(numbers.swap_dims(0, 1).reshape([steps * clips, width]))
+    });
+    let numbers = numbers.collect::<Result<_>>()?;
+    let pictures = config.pictures().map(|_| {
+        let planes = pixels::planes(&eyes(config), batch.get::<u8>(PIXELS)?, device)?;
+        let [frames, colours, side, _] = planes.dims();
+        let planes: Tensor<5> = planes.reshape([clips, steps, colours, side, side]);
+        Ok::<_, Error>(planes.swap_dims(0, 1).reshape([frames, colours, side, side]))
+    });
+    Ok(Observation { pixels: pictures.transpose()?, numbers })
+}
+
+/// Pictures as numbers from -0.5 to 0.5, as published.
+fn eyes(config: &Tdmpc2Config) -> Pixels {
+    Pixels { side: config.image, mean: [0.5; 3], std: [1.0; 3] }
+}
+
+/// What one row shows.
+///
+/// # Errors
+/// When it lacks what the model observes, or shows it in another shape.
+pub(super) fn glance(config: &Tdmpc2Config, model: &Tdmpc2, row: RowRef<'_>) -> Result<Observation> {
+    let device = model.device();
+    let numbers = config.numbers().zip(model.extra_encoders.iter()).map(|(part, (_, encoder))| {
+        let width = encoder._0.weight.dims()[1];
+        #[allow(clippy::cast_possible_truncation)]
+        let numbers: Vec<f32> = row.to_f64(&part.column)?.into_iter().map(|v| v as f32).collect();
+        if numbers.len() != width {
+            let given = format!("{} numbers in '{}'", numbers.len(), part.column);
+            return Err(Error::mismatch("acting", given, format!("{width}, as the model was trained")));
+        }
+        Ok(Tensor::from_data(TensorData::new(numbers, [1, width]), &device))
+    });
+    let numbers = numbers.collect::<Result<_>>()?;
+    let pictures = config.pictures().map(|_| {
+        pixels::check(config.image, row.schema(), PIXELS)?;
+        pixels::planes(&eyes(config), row.get::<u8>(PIXELS)?, &device)
+    });
+    Ok(Observation { pixels: pictures.transpose()?, numbers })
+}
+
+impl Reflex for Tdmpc2 {
+    fn act(&self, config: &TrainConfig<Self>, row: RowRef<'_>, key: Option<Key>) -> Result<Vec<f32>> {
+        let gaussian = self.policy(self.encode(glance(&config.model, self, row)?));
+        let action = match key {
+            None => gaussian.mean.tanh(),
+            Some(key) => {
+                let width = self.actions();
+                let noise = TensorData::new(normal(&[key], width), [1, width]);
+                gaussian.sample(Tensor::from_data(noise, &self.device()))
+            }
+        };
+        Ok(action.into_data().try_into_vec_as_f32())
+    }
+}
+
+impl Agent for Tdmpc2 {
+    fn policy(
+        config: &TrainConfig<Self>,
+        facts: &Facts,
+        live: Live<Self>,
+        spec: &EnvSpec,
+        slots: usize,
+        explore: bool,
+    ) -> Result<Box<dyn Policy>> {
+        Ok(match config.online.as_ref().and_then(|online| online.planner.as_ref()) {
+            Some(planner) => Box::new(Tdmpc2Policy::new(planner, config, facts, live, spec, slots, explore)?),
+            None => Box::new(ReflexPolicy::new(config, facts, live, spec, slots, explore)?),
+        })
+    }
+}

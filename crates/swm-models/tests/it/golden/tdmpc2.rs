@@ -1,0 +1,143 @@
+//! TD-MPC2: latents, predictions, values and costs; losses and gradients of a training step.
+
+use super::{Golden, TOLERANCE, check, error, files, values};
+use burn::tensor::{Device, Tensor};
+use swm_models::nn::{Ensemble, Noise, two_hot};
+use swm_models::tdmpc2::step::{Draws, Step, TrainBatch, step};
+use swm_models::tdmpc2::{LossConfig, Observation, Published, Rollouts, Tdmpc2, Tdmpc2Config};
+
+impl Golden {
+    fn wm(&self, name: &str) -> f64 {
+        self.config["wm"][name].as_f64().expect(name)
+    }
+
+    fn tdmpc2(&self) -> (Tdmpc2, Published) {
+        let published = Published::read(&self.text).expect("a configuration");
+        (published.with(&self.group("w."), &Device::flex()).expect("published weights"), published)
+    }
+}
+
+fn forward_files() -> impl Iterator<Item = Golden> {
+    files("tdmpc2").into_iter().map(|file| Golden::read(&file)).filter(|golden| golden.tensors.contains_key("o.cost"))
+}
+
+#[test]
+fn golden_tdmpc2_forward() {
+    for golden in forward_files() {
+        let (model, published) = golden.tdmpc2();
+        let config = published.model();
+        let z = model.encode(Observation { pixels: None, numbers: vec![golden.tensor("i.state")] });
+        check(&golden, "o.z", &values(z.clone()));
+        let [envs, samples, horizon, width] = golden.tensor::<4>("i.candidates").dims();
+        let first = golden.tensor::<4>("i.candidates").slice([0..envs, 0..1, 0..1, 0..width]).reshape([envs, width]);
+        let input = Tensor::cat(vec![z.clone(), first], 1);
+        check(&golden, "o.next_z", &values(model.next(input.clone())));
+        let logits = model.reward.forward(input.clone());
+        check(&golden, "o.reward_logits", &values(logits.clone()));
+        check(&golden, "o.reward", &values(config.bins.numbers(logits)));
+        check(&golden, "o.pi", &values(model.pi.forward(z.clone())));
+        let critics = Ensemble::of(&model.qs.iter().collect::<Vec<_>>());
+        check(&golden, "o.q_logits", &values(critics.forward(input, 0.0, &mut Noise::off())));
+
+        let numbers = golden.tensor::<1>("i.values");
+        check(&golden, "o.symlog", &values(two_hot::symlog(numbers.clone())));
+        check(&golden, "o.symexp", &values(two_hot::symexp(numbers.clone() * 0.2)));
+        check(&golden, "o.two_hot", &values(config.bins.shares(numbers)));
+
+        let rollouts = Rollouts::new(&model, golden.wm("discount"), golden.wm("uncertainty_penalty"));
+        let (latents, actions) = (values(z), values(golden.tensor::<4>("i.candidates")));
+        let mut costs = vec![0.0; envs * samples];
+        for (env, costs) in costs.chunks_mut(samples).enumerate() {
+            let latent = &latents[env * config.latent()..][..config.latent()];
+            rollouts.cost(
+                latent,
+                &actions[env * samples * horizon * width..][..samples * horizon * width],
+                horizon,
+                costs,
+            );
+        }
+        check(&golden, "o.cost", &costs);
+    }
+}
+
+#[test]
+fn golden_tdmpc2_training() {
+    let mut read = 0;
+    for file in files("tdmpc2") {
+        let golden = Golden::read(&file);
+        if !golden.tensors.contains_key("o.train.loss") {
+            continue;
+        }
+        read += 1;
+        let (model, published) = golden.tdmpc2();
+        let (config, loss) = (published.model(), published.loss());
+        for shards in [1, 3] {
+            let ended = golden.train(&model, &config, &loss, "o.terminated", true, shards);
+            check(&golden, "o.terminated.value", &[ended.value as f32]);
+            let step = golden.train(&model, &config, &loss, "o.train", false, shards);
+            for (name, ours) in [
+                ("loss", step.total),
+                ("consist", step.consistency),
+                ("reward", step.reward),
+                ("value", step.value),
+                ("policy", step.policy),
+                ("scale", f64::from(step.scale)),
+            ] {
+                check(&golden, &format!("o.train.{name}"), &[ours as f32]);
+            }
+            let theirs = golden.group("g.");
+            let weight = |name: &str| if name.starts_with("pi.") { &step.policy } else { &step.total };
+            for (name, gradient) in &theirs {
+                let ours = values(step.gradients.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
+                let error = error(&ours, &gradient.values, 1e-6 * weight(name).abs() as f32);
+                assert!(error < TOLERANCE, "gradient of {name} differs by {error:.1e}");
+            }
+            assert_eq!(step.gradients.len(), theirs.len());
+        }
+    }
+    assert!(read > 0, "no file with the losses of a training step");
+}
+
+impl Golden {
+    /// A training step on the recorded batch and draws.
+    fn train(
+        &self,
+        model: &Tdmpc2,
+        config: &Tdmpc2Config,
+        loss: &LossConfig,
+        draws: &str,
+        terminations: bool,
+        shards: usize,
+    ) -> Step {
+        // From clip after clip to step after step.
+        let turned = |name: &str| {
+            let [clips, steps, width] = self.tensor::<3>(name).dims();
+            self.tensor::<3>(name).swap_dims(0, 1).reshape([steps * clips, width])
+        };
+        let [clips, steps, width] = self.tensor::<3>("i.action").dims();
+        let horizon = steps - 1;
+        let flat = |name: &str| self.tensor::<2>(name).swap_dims(0, 1).slice([0..horizon]);
+        let ended = flat("i.terminated");
+        let batch = TrainBatch {
+            observations: Observation {
+                pixels: None,
+                numbers: config.numbers().map(|part| turned(&format!("i.{}", part.column))).collect(),
+            },
+            actions: turned("i.action").slice([0..horizon * clips]).reshape([horizon, clips, width]),
+            rewards: flat("i.reward"),
+            terminated: if terminations { ended } else { ended.zeros_like() },
+        };
+        let pairs = |name: &str| {
+            let pairs = &self.get(&format!("{draws}.{name}")).values;
+            pairs.chunks(2).map(|pair| [pair[0] as usize, pair[1] as usize]).collect()
+        };
+        let draws = Draws {
+            target: self.tensor(&format!("{draws}.target_noise")),
+            policy: self.tensor(&format!("{draws}.policy_noise")),
+            target_critics: pairs("target_critics"),
+            policy_critics: pairs("policy_critics"),
+            dropout: None,
+        };
+        step(model, &batch, loss, &draws, shards)
+    }
+}

@@ -1,0 +1,177 @@
+//! Online training is exact: the same bytes with any number of threads, continued or not. It learns.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use swm_core::{EnvPool, Result};
+use swm_models::online::{Agent, OnlineSummary, train_online};
+use swm_models::sac::Sac;
+use swm_models::tdmpc2::Tdmpc2;
+use swm_models::{Observer, Progress, TrainConfig, TrainOptions, Trainable, train};
+
+const PENDULUM: &str = "swm/PendulumControl-v1";
+
+/// Networks of a few hundred parameters, episodes of 20 steps.
+fn config<M: Trainable>(words: &[&str]) -> TrainConfig<M> {
+    let family: &[&str] = match M::FAMILY {
+        "sac" => &["model.hidden=8"],
+        _ => &[
+            "model.encoding=[{ column = \"state\", latent = 8 }]",
+            "model.simplex=4",
+            "model.encoder=8",
+            "model.hidden=8",
+            "model.bins.count=7",
+            "model.dropout=0.1",
+            "online.planner.samples=12",
+            "online.planner.elites=4",
+            "online.planner.proposals=3",
+            "online.planner.iterations=2",
+        ],
+    };
+    let small = [
+        "data.batch_size=16",
+        "schedule.steps=24",
+        "online.envs=3",
+        "online.updates=2",
+        "online.warmup=60",
+        "online.capacity=200",
+        "online.evaluate_every=8",
+        "online.evaluate_episodes=4",
+        "log_every=8",
+    ];
+    let words: Vec<String> = family.iter().chain(&small).chain(words).map(|&word| word.to_owned()).collect();
+    TrainConfig::load("tiny", &words).expect("a configuration")
+}
+
+fn worlds(id: &'static str, steps: Option<usize>) -> impl Fn(usize) -> Result<EnvPool> {
+    move |count| {
+        let entry = swm_envs::ENVS.get(id)?;
+        let envs = (0..count).map(|_| entry.env()).collect::<Result<Vec<_>>>()?;
+        EnvPool::new(envs, None, steps, swm_core::pool::threads(2)?)
+    }
+}
+
+/// Stops after a gradient step.
+struct StopAt<'a>(usize, &'a AtomicBool);
+
+impl Observer for StopAt<'_> {
+    fn progress(&mut self, progress: &Progress) {
+        self.1.store(progress.step == self.0, Ordering::Relaxed);
+    }
+}
+
+fn run<M: Agent>(config: &TrainConfig<M>, out: &Path, options: &TrainOptions, stop_at: usize) -> Result<OnlineSummary> {
+    let stop = AtomicBool::new(false);
+    let worlds = worlds(PENDULUM, Some(20));
+    train_online(config, &worlds, out, options, &mut StopAt(stop_at, &stop), &stop)
+}
+
+/// All that is decided by the configuration.
+fn files(run: &Path) -> Vec<Vec<u8>> {
+    let of = |folder: &str, name: &str| std::fs::read(run.join(folder).join(name)).expect(name);
+    let played = std::fs::read_dir(run).expect("a folder").map(|entry| entry.expect("an entry").file_name());
+    let played: Vec<String> =
+        played.map(|name| name.to_string_lossy().into_owned()).filter(|name| name.starts_with("played-")).collect();
+    assert_eq!(played.len(), 1, "{played:?}");
+    let mut files: Vec<Vec<u8>> = ["config.json", "weights.safetensors", "optimizer.safetensors", "state.json"]
+        .map(|name| of("checkpoint", name))
+        .to_vec();
+    files.push(of(&played[0], "place.json"));
+    files
+}
+
+/// The numbers of a log that are decided by the configuration.
+fn lines(run: &Path) -> Vec<serde_json::Value> {
+    let lines = std::fs::read_to_string(run.join("train.jsonl")).expect("lines");
+    let fixed = |line: &str| {
+        let mut line: serde_json::Value = serde_json::from_str(line).expect("JSON");
+        for name in ["clips_per_second", "playing", "seconds"] {
+            line.as_object_mut().expect("an object").remove(name);
+        }
+        line
+    };
+    lines.lines().map(fixed).collect()
+}
+
+fn is_exact<M: Agent>() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let config = config::<M>(&[]);
+    let out = |name: &str| folder.path().join(name);
+    for (name, threads) in [("one", 1), ("three", 3)] {
+        let options = TrainOptions { threads, ..TrainOptions::default() };
+        let summary = run(&config, &out(name), &options, 0).expect("trained");
+        assert_eq!((summary.steps, summary.interrupted), (24, false));
+        // 60 steps of warm-up, then 12 rounds of 3 worlds.
+        assert_eq!(summary.env_steps, 60 + 12 * 3);
+        assert!(summary.evaluated.is_some() && summary.best.is_some());
+    }
+    assert_eq!(files(&out("one")), files(&out("three")));
+    assert_eq!(lines(&out("one")), lines(&out("three")));
+    let other = self::config::<M>(&["seed=1"]);
+    run(&other, &out("other"), &TrainOptions::default(), 0).expect("trained");
+    assert_ne!(files(&out("other"))[1], files(&out("one"))[1]);
+}
+
+#[test]
+fn threads_do_not_change_a_byte_of_an_online_run() {
+    is_exact::<Sac>();
+    is_exact::<Tdmpc2>();
+}
+
+#[test]
+fn a_continued_online_run_ends_in_the_same_bytes() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (whole, halved) = (folder.path().join("whole"), folder.path().join("halved"));
+    let config = config::<Sac>(&[]);
+    let options = TrainOptions::default();
+    run(&config, &whole, &options, 0).expect("trained");
+    let first = run(&config, &halved, &options, 10).expect("trained");
+    assert_eq!((first.steps, first.interrupted), (10, true));
+    let again = run(&config, &halved, &options, 0).expect_err("a run is there").to_string();
+    assert!(again.contains("resume"), "{again}");
+    let resume = TrainOptions { resume: true, ..options };
+    let second = run(&config, &halved, &resume, 0).expect("trained");
+    assert_eq!((second.steps, second.interrupted), (24, false));
+    assert_eq!(files(&whole), files(&halved));
+    let other = run(&self::config::<Sac>(&["optim.lr=1e-4"]), &halved, &resume, 0).expect_err("another").to_string();
+    assert!(other.contains("optim.lr"), "{other}");
+}
+
+#[test]
+fn what_cannot_be_learnt_from_is_refused_in_words() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let refused = |config: &TrainConfig<Sac>, id: &'static str| {
+        let stop = AtomicBool::new(false);
+        let out = folder.path().join("refused");
+        let error = train_online(config, &worlds(id, None), &out, &TrainOptions::default(), &mut (), &stop);
+        error.expect_err("refused").to_string()
+    };
+    let discrete = refused(&config(&[]), "swm/CartPoleControl-v1");
+    assert!(discrete.contains("continuous actions"), "{discrete}");
+    let column = refused(&config(&["model.columns=[\"stat\"]"]), PENDULUM);
+    assert!(column.contains("stat") && column.contains("state"), "{column}");
+    let mut offline = config::<Sac>(&[]);
+    offline.online = None;
+    let missing = refused(&offline, PENDULUM);
+    assert!(missing.contains("online") && missing.contains("--data"), "{missing}");
+
+    let wrong = |word: &str| {
+        let words = [word.to_owned()];
+        TrainConfig::<Tdmpc2>::load("tiny", &words).expect_err("wrong").to_string()
+    };
+    assert!(wrong("model.simplex=7").contains("multiple"), "{}", wrong("model.simplex=7"));
+    assert!(wrong("data.frameskip=5").contains("rewards"), "{}", wrong("data.frameskip=5"));
+    assert!(wrong("loss.discount=1.5").contains("loss.discount"));
+
+    let rewardless = Arc::new(crate::dots::Dots::new(6, 0));
+    let error = train(
+        &config::<Tdmpc2>(&[]),
+        rewardless,
+        &folder.path().join("dots"),
+        &TrainOptions::default(),
+        &mut (),
+        &AtomicBool::new(false),
+    );
+    let error = error.expect_err("no rewards").to_string();
+    assert!(error.contains("'reward'") && error.contains("swm collect"), "{error}");
+}

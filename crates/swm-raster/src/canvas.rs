@@ -5,7 +5,8 @@ use crate::light::Lamp;
 use crate::paint::{Lamps, Look, Painter};
 use crate::scene::{Assets, Scene, Shape};
 use crate::shadow::Shadow;
-use crate::sky::{self, Veil};
+use crate::simd::vectorised;
+use crate::sky::{self, Backdrop, Veil};
 use crate::vector::{V3, add, dot, scale, sub};
 use crate::view::View;
 
@@ -29,6 +30,7 @@ pub struct Canvas {
     plain: Vec<Lamp>,
     shadowed: Vec<(Lamp, usize)>,
     painter: Painter,
+    backdrop: Backdrop,
     colours: Vec<V3>,
     /// Places of geoms one sees through, from near to far, and how far they are.
     clear: Vec<(f32, usize)>,
@@ -135,7 +137,7 @@ impl Canvas {
             self.reflect(scene, assets, view);
             self.painter.start(scene.geoms.len());
         }
-        let Self { main, shadows, plain, shadowed, painter, colours, .. } = self;
+        let Self { main, shadows, plain, shadowed, painter, colours, backdrop, .. } = self;
         let look = Look {
             scene,
             assets,
@@ -143,18 +145,13 @@ impl Canvas {
             lamps: Lamps { plain: plain.as_slice(), shadowed: shadowed.as_slice(), shadows: shadows.as_slice() },
             dimmed: 1.0,
         };
-        behind(scene, assets, view, main, colours);
+        backdrop.paint(scene, assets, view, main, colours);
         painter.paint(main, &look, whole, |pixel, part, colour| {
             colours[pixel] = add(colours[pixel], scale(colour.map(|x| x.min(1.0)), part));
         });
         veil(scene, view, main, colours);
         self.see_through(scene, assets, view);
-        for (bytes, colour) in bytes.as_chunks_mut::<3>().0.iter_mut().zip(&self.colours) {
-            // Conversion saturates, and NaN becomes 0.
-            #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-            let byte = |x: f32| (x * 255.0 + 0.5) as u8;
-            *bytes = colour.map(byte);
-        }
+        to_bytes(&self.colours, bytes.as_chunks_mut::<3>().0);
     }
 
     /// Prepares lights and their shadows.
@@ -315,36 +312,6 @@ fn clear(scene: &Scene, number: usize, view: &View) -> bool {
     scene.geoms[number].rgba[3] < OPAQUE || hind(scene, number, view)
 }
 
-/// Paints the sky where nothing is before it.
-#[allow(clippy::cast_precision_loss)]
-fn behind(scene: &Scene, assets: &Assets, view: &View, main: &mut Layers, colours: &mut [V3]) {
-    let Some(texture) = scene.sky.and_then(|sky| assets.textures.get(sky)) else { return };
-    let (rays, radius) = (view.rays(), sky::radius(scene));
-    let share = 1.0 / main.samples as f32;
-    let endless = scene.geoms.iter().any(|geom| matches!(geom.shape, Shape::Plane(x, y) if x.infinite || y.infinite));
-    for y in 0..view.height {
-        let first = main.place(y, 0);
-        let row = add(rays.direction, scale(rays.directions[1], y as f32 + 0.5));
-        for x in 0..view.width {
-            let direction = add(row, scale(rays.directions[0], x as f32 + 0.5));
-            let mut open = 0.0;
-            for sample in 0..main.samples {
-                let at = first + sample * view.width + x;
-                // The sky is nearer than the far ends of endless planes.
-                if endless && main.depths[at] > sky::depth(radius, direction) {
-                    main.ids[at] = NOTHING;
-                }
-                open += if main.ids[at] == NOTHING { share } else { 0.0 };
-            }
-            if open > 0.0 {
-                let colour = sky::colour(texture, direction, rays.directions[0], rays.directions[1]);
-                let pixel = &mut colours[y * view.width + x];
-                *pixel = add(*pixel, scale(colour, open));
-            }
-        }
-    }
-}
-
 /// Draws haze over the sky and the far ends of planes.
 #[allow(clippy::cast_precision_loss)]
 fn veil(scene: &Scene, view: &View, main: &Layers, colours: &mut [V3]) {
@@ -361,6 +328,16 @@ fn veil(scene: &Scene, view: &View, main: &Layers, colours: &mut [V3]) {
             let open = (0..main.samples).filter(|&sample| main.depths[main.place(y, sample) + x] > depth).count();
             let pixel = &mut colours[y * view.width + x];
             *pixel = sky::over(veil.rgb, opacity * open as f32 * share, *pixel);
+        }
+    }
+}
+
+vectorised! {
+    /// Colours to bytes, rounded.
+    fn to_bytes(colours: &[V3], bytes: &mut [[u8; 3]]) {
+        for (bytes, colour) in bytes.iter_mut().zip(colours) {
+            // Added to 2^23, a number is rounded to a whole one, which is in the lowest bits.
+            *bytes = colour.map(|x| ((x * 255.0).max(0.0).min(255.0) + 8_388_608.0).to_bits() as u8);
         }
     }
 }

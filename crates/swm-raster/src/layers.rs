@@ -13,7 +13,10 @@ pub(crate) const NOTHING: u32 = u32::MAX >> 1;
 pub(crate) const TRIANGLE: u32 = 1 << 31;
 
 /// Cells of coarser meshes are at most so many pixels large.
-const INVISIBLE: f32 = 0.4;
+const INVISIBLE: f32 = 0.6;
+
+/// And so many texels large in maps of shadows.
+const COARSE: f32 = 1.5;
 
 /// Where the samples of a pixel are.
 pub(crate) fn pattern(samples: usize) -> &'static [[f32; 2]] {
@@ -50,7 +53,7 @@ pub(crate) struct Layers {
     pub triangles: Vec<Triangle>,
     /// Scratch: depths of a row.
     row: Vec<f32>,
-    /// Scratch: vertices of a mesh in pixels times `w`, `w`, and depth.
+    /// Scratch: vertices of a mesh in pixels, `w`, and depth.
     vertices: Vec<[f32; 4]>,
 }
 
@@ -107,15 +110,15 @@ impl Layers {
         (y * self.samples + sample) * self.width
     }
 
-    /// Draws a geom over what is there, where it is nearer, and farther than `floor` if there is one. Returns where it may be
-    /// seen.
+    /// Draws a geom over what is there, where it is nearer, and farther than `floor` if there is one. What casts shadows does
+    /// so with both sides, and coarsely. Returns where it may be seen.
     pub fn draw(
         &mut self,
         number: u32,
         geom: &Geom,
         (assets, view): (&Assets, &View),
         floor: Option<&[f32]>,
-        both_sides: bool,
+        caster: bool,
     ) -> Option<Region> {
         let region = touched(geom, assets, view)?;
         match geom.shape {
@@ -125,20 +128,35 @@ impl Layers {
                 let reach = 0.5 * length([high[0] - low[0], high[1] - low[1], high[2] - low[2]]);
                 let middle = add(geom.position, rotate(&geom.rotation, scale(add(low, high), 0.5)));
                 let nearest = view.project(middle).1 - reach;
-                let number_of_level = mesh.level_for(INVISIBLE / view.pixels_at(nearest));
+                let number_of_level = mesh.level_for(if caster { COARSE } else { INVISIBLE } / view.pixels_at(nearest));
                 let level = mesh.level(number_of_level);
                 let place = u32::try_from(number_of_level).unwrap_or(0);
-                self.mesh((number, place), geom, level, view, floor, both_sides);
+                self.mesh((number, place), geom, level, view, floor, caster);
             }
-            _ => self.shape(number, &Posed::new(geom, view)?, region, floor),
+            shape => {
+                let (_, halves) = shape.bounds();
+                let outline = Outline::new(geom, halves, view);
+                self.shape(number, &Posed::new(geom, view)?, region, &outline, floor);
+            }
         }
         Some(region)
     }
 
     #[allow(clippy::cast_precision_loss)]
-    fn shape(&mut self, number: u32, pose: &Posed, [x0, y0, x1, y1]: Region, floor: Option<&[f32]>) {
+    fn shape(
+        &mut self,
+        number: u32,
+        pose: &Posed,
+        [left, y0, right, y1]: Region,
+        outline: &Outline,
+        floor: Option<&[f32]>,
+    ) {
         self.row.resize(self.width, 0.0);
         for y in y0..y1 {
+            let (x0, x1) = outline.span(y, left, right);
+            if x0 >= x1 {
+                continue;
+            }
             for (sample, offset) in self.pattern.iter().enumerate() {
                 let at = self.place(y, sample);
                 let row = pose.row(x0 as f32 + offset[0], y as f32 + offset[1]);
@@ -153,6 +171,7 @@ impl Layers {
         }
     }
 
+    #[allow(clippy::cast_possible_truncation)]
     fn mesh(
         &mut self,
         (number, place): (u32, u32),
@@ -175,51 +194,72 @@ impl Layers {
         to_pixels(&level.places, &turned, [ox, oy, ow, depth], &mut vertices);
         // Rows run downwards, so that what is counterclockwise to the eye is clockwise in pixels.
         let front = if view.mirrored { 1.0 } else { -1.0 };
-        for (face, corners) in level.faces.iter().enumerate() {
-            let corners = corners.map(|corner| vertices[corner as usize]);
-            let number = (number, place, u32::try_from(face).unwrap_or(u32::MAX));
-            self.triangle(number, corners, if both_sides { 0.0 } else { front }, view.near, floor);
+        let front = if both_sides { 0.0 } else { front };
+        for (face, &[a, b, c]) in level.faces.iter().enumerate() {
+            let corners = [vertices[a as usize], vertices[b as usize], vertices[c as usize]];
+            let number = (number, place, face as u32);
+            let [p, q, r] = corners.map(|corner| corner[3] > view.near);
+            if p & q & r {
+                self.triangle(number, corners, front, view.near, floor);
+            } else if p | q | r {
+                self.crossing(number, corners, front, view.near, floor);
+            }
         }
         self.vertices = vertices;
     }
 
-    /// Draws a triangle, if it faces the camera (`front` times its determinant is positive), or from both sides where `front` is 0.
+    /// Draws a triangle in front of the camera, if it faces it (`front` times its area is positive), or from both sides where `front`
+    /// is 0.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    #[inline]
     fn triangle(
         &mut self,
-        (geom, level, face): (u32, u32, u32),
+        number: (u32, u32, u32),
+        [a, b, c]: [[f32; 4]; 3],
+        front: f32,
+        near: f32,
+        floor: Option<&[f32]>,
+    ) {
+        let area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
+        // Nothing faces the camera whose area is no number.
+        if area * front < 0.0 || !(area.abs() > 1e-12) {
+            return;
+        }
+        // Samples keep away from the edges of their pixel.
+        let margin = if self.samples == 1 { 0.5 } else { 0.125 };
+        let low = |k: usize| (a[k].min(b[k]).min(c[k]) + margin) as i32;
+        let high = |k: usize| (a[k].max(b[k]).max(c[k]) + 1.0 - margin) as i32;
+        let (x0, y0) = (low(0).max(0), low(1).max(0));
+        let (x1, y1) = (high(0).min(self.width as i32), high(1).min(self.height as i32));
+        if x0 >= x1 || y0 >= y1 {
+            return;
+        }
+        let base = [x0 as f32, y0 as f32];
+        let by = 1.0 / area;
+        let corner = |p: [f32; 4]| (p[0] - base[0], p[1] - base[1], by / p[2]);
+        let (a, b, c, depths) = (corner(a), corner(b), corner(c), [a[3], b[3], c[3]]);
+        // A corner's share falls to 0 at the opposite side; divided by w, it is linear on the screen.
+        let share = |p: (f32, f32, f32), q: (f32, f32, f32), r: (f32, f32, f32)| {
+            [(q.1 - r.1) * p.2, (r.0 - q.0) * p.2, (q.0 * r.1 - q.1 * r.0) * p.2]
+        };
+        let shares = [share(a, b, c), share(b, c, a), share(c, a, b)];
+        self.fill(number, base, shares, depths, [x0 as usize, y0 as usize, x1 as usize, y1 as usize], near, floor);
+    }
+
+    /// Draws a triangle of which a part is too near to be seen.
+    #[allow(clippy::cast_possible_truncation)]
+    #[cold]
+    fn crossing(
+        &mut self,
+        number: (u32, u32, u32),
         corners: [[f32; 4]; 3],
         front: f32,
         near: f32,
         floor: Option<&[f32]>,
     ) {
-        let mut bounds = [f32::INFINITY, f32::INFINITY, f32::NEG_INFINITY, f32::NEG_INFINITY];
-        let behind = corners.iter().filter(|corner| corner[3] <= near).count();
-        if behind == 3 {
-            return;
-        }
-        if behind == 0 {
-            for [x, y, w, _] in corners {
-                let (x, y) = (x / w, y / w);
-                bounds = [bounds[0].min(x), bounds[1].min(y), bounds[2].max(x), bounds[3].max(y)];
-            }
-        } else {
-            bounds = [0.0, 0.0, self.width as f32, self.height as f32];
-        }
-        // Samples are at least an eighth of a pixel from the edges of their pixel.
-        let low = |x: f32, most: usize| ((x + 0.125).floor() as usize).min(most);
-        let high = |x: f32, most: usize| ((x + 0.875).floor() as usize).min(most);
-        let [x0, y0] = [low(bounds[0], self.width), low(bounds[1], self.height)];
-        let [x1, y1] = [high(bounds[2], self.width), high(bounds[3], self.height)];
-        if x0 >= x1 || y0 >= y1 {
-            return;
-        }
         // A share divided by w is linear on the screen: the inverse of the matrix of the corners.
-        let base = [x0 as f64, y0 as f64];
-        let [a, b, c] = corners.map(|[x, y, w, _]| {
-            let w = f64::from(w);
-            [f64::from(x) - base[0] * w, f64::from(y) - base[1] * w, w]
-        });
+        let [a, b, c] =
+            corners.map(|[x, y, w, _]| [f64::from(x) * f64::from(w), f64::from(y) * f64::from(w), f64::from(w)]);
         let wedge = |a: [f64; 3], b: [f64; 3]| {
             [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
         };
@@ -228,26 +268,45 @@ impl Layers {
         if determinant * f64::from(front) < 0.0 || determinant == 0.0 || !determinant.is_finite() {
             return;
         }
-        let by = 1.0 / determinant;
-        let shares = [bc, ca, ab].map(|row| row.map(|x| (x * by) as f32));
-        let depths = corners.map(|corner| corner[3]);
-        let depth = std::array::from_fn(|k| (0..3).map(|i| shares[i][k] * depths[i]).sum());
-        let triangle = Triangle { geom, level, face, base: [x0 as f32, y0 as f32], shares, depth };
-        let id = TRIANGLE | u32::try_from(self.triangles.len()).unwrap_or(0);
+        let shares = [bc, ca, ab].map(|row| row.map(|x| (x / determinant) as f32));
+        let whole = [0, 0, self.width, self.height];
+        self.fill(number, [0.0; 2], shares, corners.map(|corner| corner[3]), whole, near, floor);
+    }
+
+    /// Draws a triangle by the shares of its corners, divided by `w`, within a region.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss, clippy::too_many_arguments)]
+    #[inline]
+    fn fill(
+        &mut self,
+        (geom, level, face): (u32, u32, u32),
+        base: [f32; 2],
+        shares: [[f32; 3]; 3],
+        depths: [f32; 3],
+        [x0, y0, x1, y1]: Region,
+        near: f32,
+        floor: Option<&[f32]>,
+    ) {
+        let [p, q, r] = shares;
+        let [u, v, w] = depths;
+        let depth = [p[0] * u + q[0] * v + r[0] * w, p[1] * u + q[1] * v + r[1] * w, p[2] * u + q[2] * v + r[2] * w];
+        let sum = [p[0] + q[0] + r[0], p[1] + q[1] + r[1], p[2] + q[2] + r[2]];
+        let id = TRIANGLE | self.triangles.len() as u32;
         let mut drawn = false;
         for y in y0..y1 {
             for (sample, offset) in self.pattern.iter().enumerate() {
                 let at = self.place(y, sample);
-                let dy = (y - y0) as f32 + offset[1];
-                let [s, t, u] = shares.map(|[_, by, c]| by * dy + c);
-                let z = depth[1] * dy + depth[2];
+                let dy = y as f32 - base[1] + offset[1];
+                let row = |line: [f32; 3]| line[1] * dy + line[2];
+                let (p0, q0, r0, sum0, depth0) = (row(p), row(q), row(r), row(sum), row(depth));
                 for x in x0..x1 {
-                    let dx = (x - x0) as f32 + offset[0];
-                    let (s, t, u) = (s + shares[0][0] * dx, t + shares[1][0] * dx, u + shares[2][0] * dx);
-                    if s.min(t).min(u) < 0.0 {
+                    let dx = x as f32 - base[0] + offset[0];
+                    let sum = sum0 + sum[0] * dx;
+                    // Neighbours overlap by a hair, so that no sample falls between them.
+                    let edge = -1e-5 * sum;
+                    if (p0 + p[0] * dx < edge) | (q0 + q[0] * dx < edge) | (r0 + r[0] * dx < edge) | !(sum > 0.0) {
                         continue;
                     }
-                    let far = (z + depth[0] * dx) / (s + t + u);
+                    let far = (depth0 + depth[0] * dx) / sum;
                     if far <= self.depths[at + x] && far > near && floor.is_none_or(|floor| far > floor[at + x]) {
                         self.depths[at + x] = far;
                         self.ids[at + x] = id;
@@ -257,7 +316,7 @@ impl Layers {
             }
         }
         if drawn {
-            self.triangles.push(triangle);
+            self.triangles.push(Triangle { geom, level, face, base, shares, depth });
         }
     }
 
@@ -268,6 +327,55 @@ impl Layers {
             0 => id,
             _ => self.triangles[(id & !TRIANGLE) as usize].geom,
         }
+    }
+}
+
+/// The outline of a box around a geom: where it is in each row.
+struct Outline {
+    /// Its corners in pixels; `None` where one of them is behind the camera.
+    corners: Option<[[f32; 2]; 8]>,
+}
+
+impl Outline {
+    /// Of a box of these halves around a geom.
+    fn new(geom: &Geom, halves: V3, view: &View) -> Self {
+        let mut corners = [[0.0; 2]; 8];
+        for (number, corner) in corners.iter_mut().enumerate() {
+            let local = std::array::from_fn(|k| if number >> k & 1 == 1 { halves[k] } else { -halves[k] });
+            let ([x, y, w], depth) = view.project(add(geom.position, rotate(&geom.rotation, local)));
+            if !(depth > view.near && x.is_finite() && y.is_finite()) {
+                return Self { corners: None };
+            }
+            *corner = [x / w, y / w];
+        }
+        Self { corners: Some(corners) }
+    }
+
+    /// The pixels of a row from `left` to before `right` that it may touch.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    fn span(&self, y: usize, left: usize, right: usize) -> (usize, usize) {
+        let Some(corners) = &self.corners else { return (left, right) };
+        let (top, bottom) = (y as f32, y as f32 + 1.0);
+        let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
+        for a in 0..8 {
+            for b in [a | 1, a | 2, a | 4] {
+                let ([ax, ay], [bx, by]) = (corners[a], corners[b]);
+                if a == b || ay.min(by) > bottom || ay.max(by) < top {
+                    continue;
+                }
+                // The part of the edge within the row.
+                let slope = (bx - ax) / if by == ay { 1.0 } else { by - ay };
+                let at = |y: f32| {
+                    let x = ax + (y - ay) * slope;
+                    x.clamp(ax.min(bx), ax.max(bx))
+                };
+                let (p, q) = if by == ay { (ax, bx) } else { (at(top), at(bottom)) };
+                (low, high) = (low.min(p).min(q), high.max(p).max(q));
+            }
+        }
+        // A hair wider than computed.
+        let (low, high) = ((low - 0.01).max(left as f32), (high + 0.01).min(right as f32));
+        if low < high { (low as usize, (high as usize + 1).min(right)) } else { (left, left) }
     }
 }
 
@@ -318,12 +426,12 @@ vectorised! {
         }
     }
 
-    /// Vertices in pixels.
+    /// Vertices in pixels, `w` and depth.
     fn to_pixels(places: &[V3], axes: &[[f32; 4]; 3], origin: [f32; 4], vertices: &mut [[f32; 4]]) {
         for (place, vertex) in places.iter().zip(vertices) {
-            *vertex = std::array::from_fn(|k| {
-                origin[k] + axes[0][k] * place[0] + axes[1][k] * place[1] + axes[2][k] * place[2]
-            });
+            let at = |k: usize| origin[k] + axes[0][k] * place[0] + axes[1][k] * place[1] + axes[2][k] * place[2];
+            let w = at(2);
+            *vertex = [at(0) / w, at(1) / w, w, at(3)];
         }
     }
 }

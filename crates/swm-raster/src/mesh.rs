@@ -6,8 +6,11 @@
 use crate::vector::{V3, add, scale, sub, unit};
 use std::collections::HashMap;
 
-/// Cells along the longest side of the coarsest version.
-const COARSEST: usize = 8;
+/// Cells along the longest side of the finest of the coarser versions.
+const FINEST: f32 = 512.0;
+
+/// And of the coarsest.
+const COARSEST: f32 = 7.0;
 
 /// A mesh, prepared once.
 #[derive(Clone, Debug)]
@@ -80,14 +83,14 @@ impl Mesh {
         };
         let mut levels = vec![level];
         let side = sub(high, low).into_iter().fold(0.0, f32::max);
-        let mut cells = 512;
+        let mut cells = FINEST;
         while cells >= COARSEST && side > 0.0 {
-            let coarser = levels[0].merged(low, side / f32::from(u16::try_from(cells).unwrap_or(u16::MAX)));
+            let coarser = levels[0].merged(low, side / cells);
             // Only what saves work is kept.
-            if levels.last().is_some_and(|last| coarser.faces.len() * 3 < last.faces.len() * 2) {
+            if levels.last().is_some_and(|last| coarser.faces.len() * 5 < last.faces.len() * 4) {
                 levels.push(coarser);
             }
-            cells /= 2;
+            cells *= std::f32::consts::FRAC_1_SQRT_2;
         }
         Self { levels, low, high }
     }

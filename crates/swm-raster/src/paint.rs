@@ -6,6 +6,7 @@ use crate::light::{Lamp, Matter};
 use crate::scene::{Assets, Axis, Geom, Mapping, Scene, Shape};
 use crate::shadow::Shadow;
 use crate::simd::vectorised;
+use crate::texture::Texture;
 use crate::vector::{V3, add, dot, rotate, scale, sub, unrotate};
 use crate::view::{Rays, View};
 
@@ -17,6 +18,9 @@ const BAND: usize = 16;
 
 /// Quads along the side of a box, between whose corners light is interpolated.
 const QUADS: usize = 4;
+
+/// Light between corners that are at most so many pixels apart is as good as at each pixel.
+const COARSE: f32 = 6.0;
 
 /// One number for each of many fragments.
 type Lane = [f32; MANY];
@@ -61,6 +65,10 @@ struct Batch {
     local: [Lane; 3],
     normal: [Lane; 3],
     coordinates: [Lane; 2],
+    /// Of planes and boxes: the cell of the grid, and how far inside it.
+    cell: [u32; MANY],
+    within: [Lane; 2],
+    scratch: [Lane; 4],
     tint: [Lane; 3],
     /// Light of one pass.
     pass: [Lane; 3],
@@ -90,6 +98,8 @@ pub(crate) struct Look<'a> {
 pub(crate) struct Painter {
     fragments: Vec<Fragment>,
     sorted: Vec<Fragment>,
+    /// By pixel of a row: whether all its samples are alike.
+    uniform: Vec<u32>,
     /// By geom: fragments, and then where the next one goes.
     counts: Vec<usize>,
     present: Vec<u32>,
@@ -103,6 +113,7 @@ impl Default for Painter {
         Self {
             fragments: vec![],
             sorted: vec![],
+            uniform: vec![],
             counts: vec![],
             present: vec![],
             batch: Box::new(Batch {
@@ -114,6 +125,9 @@ impl Default for Painter {
                 local: [ZERO; 3],
                 normal: [ZERO; 3],
                 coordinates: [ZERO; 2],
+                cell: [0; MANY],
+                within: [ZERO; 2],
+                scratch: [ZERO; 4],
                 tint: [ZERO; 3],
                 pass: [ZERO; 3],
                 sum: [ZERO; 3],
@@ -183,38 +197,54 @@ impl Painter {
         }
     }
 
+    #[inline]
+    fn push(&mut self, fragment: Fragment) {
+        self.fragments.push(fragment);
+        let known = &mut self.counts[fragment.geom as usize];
+        if *known == 0 {
+            self.present.push(fragment.geom);
+        }
+        *known += 1;
+    }
+
     /// Gathers the fragments of a region, those of a geom together.
     #[allow(clippy::cast_possible_truncation)]
     fn gather(&mut self, layers: &Layers, [x0, y0, x1, y1]: Region) {
         self.fragments.clear();
         self.present.clear();
+        self.uniform.resize(layers.width, 0);
         for y in y0..y1 {
             let first = layers.place(y, 0);
+            let row = |sample: usize| &layers.ids[first + sample * layers.width..][..layers.width];
+            let front = row(0);
+            self.uniform.fill(u32::MAX);
+            for sample in 1..layers.samples {
+                keep_equal(front, row(sample), &mut self.uniform);
+            }
+            let all = u8::MAX >> (8 - layers.samples);
             for x in x0..x1 {
-                let id = |sample: usize| layers.ids[first + sample * layers.width + x];
-                let mut seen = [NOTHING; 4];
+                if self.uniform[x] != 0 {
+                    let id = front[x];
+                    if id != NOTHING {
+                        let fragment = Fragment { geom: layers.geom(id), id, x: x as u16, y: y as u16, samples: all };
+                        self.push(fragment);
+                    }
+                    continue;
+                }
                 let mut count = 0;
                 for sample in 0..layers.samples {
-                    let id = id(sample);
+                    let id = row(sample)[x];
                     if id == NOTHING {
                         continue;
                     }
                     let geom = layers.geom(id);
                     // A pixel shows a geom once, whatever triangles of it.
-                    match seen[..count].iter().position(|&known| known == geom) {
-                        Some(at) => {
-                            let last = self.fragments.len() - count + at;
-                            self.fragments[last].samples |= 1 << sample;
-                        }
+                    let begin = self.fragments.len() - count;
+                    match self.fragments[begin..].iter_mut().find(|known| known.geom == geom) {
+                        Some(known) => known.samples |= 1 << sample,
                         None => {
-                            seen[count] = geom;
                             count += 1;
-                            self.fragments.push(Fragment { geom, id, x: x as u16, y: y as u16, samples: 1 << sample });
-                            let known = &mut self.counts[geom as usize];
-                            if *known == 0 {
-                                self.present.push(geom);
-                            }
-                            *known += 1;
+                            self.push(Fragment { geom, id, x: x as u16, y: y as u16, samples: 1 << sample });
                         }
                     }
                 }
@@ -257,9 +287,12 @@ impl Batch {
         let rays = look.view.rays();
         self.tint(geom, look, &rays);
         let matter = Matter::new(geom, look.dimmed);
-        let lit_at_corners = matches!(geom.shape, Shape::Plane(..) | Shape::Box(_));
+        let lit_at_corners = self.is_coarse(geom, look.view);
         let passes = 1 + look.lamps.shadowed.len();
         let start = if lit_at_corners { lattices.of(number, geom, passes) } else { 0 };
+        if lit_at_corners {
+            self.cells(geom);
+        }
         for pass in 0..passes {
             if lit_at_corners {
                 self.light_of_corners(lattices, start, (pass, passes), geom, &matter, look);
@@ -344,36 +377,28 @@ impl Batch {
             self.tint.iter_mut().for_each(|lane| lane[..n].fill(1.0));
             return;
         };
-        let local = |a: V3| unrotate(&geom.rotation, a);
-        let eye = local(sub(look.view.position, geom.position));
-        let steps: [[V3; 2]; 2] = [0, 1].map(|k| [local(rays.origins[k]), local(rays.directions[k])]);
-        let [forward, ahead] = [local(rays.direction), local(look.view.forward)];
+        let rays = LocalRays::new(geom, look.view, rays);
+        if let Mapping::Flat { scale, offset } = paint.mapping {
+            let flat = FlatRays { rays, scale, offset };
+            let [s, t, ds, dt] = &mut self.scratch;
+            let (places, normals) = (self.local.each_ref().map(|l| &l[..n]), self.normal.each_ref().map(|l| &l[..n]));
+            flat_coordinates(&flat, &self.x[..n], &self.y[..n], places, normals, s, t, ds, dt);
+            let coordinates = self.scratch.each_ref().map(|l| &l[..n]);
+            flat_colours(texture, coordinates, self.tint.each_mut().map(|l| &mut l[..n]));
+            return;
+        }
         for i in 0..n {
             let place = [0, 1, 2].map(|k| self.local[k][i]);
-            let normal = local([0, 1, 2].map(|k| self.normal[k][i]));
-            let depth = dot(sub(place, eye), ahead);
-            let direction: V3 =
-                std::array::from_fn(|k| forward[k] + self.x[i] * steps[0][1][k] + self.y[i] * steps[1][1][k]);
-            // How far the place moves on the surface from this pixel to the next.
-            let facing = dot(normal, direction);
-            let facing = if facing.abs() > 1e-6 { facing } else { 1e-6 };
-            let moved = steps.map(|[origin, turn]| {
-                let free = add(origin, scale(turn, depth));
-                sub(free, scale(direction, dot(normal, free) / facing))
-            });
+            let normal = [0, 1, 2].map(|k| self.normal[k][i]);
+            let moved = rays.moved(self.x[i], self.y[i], place, normal);
             let colour = match paint.mapping {
-                Mapping::Flat { scale: by, offset } => texture.flat_at(
-                    by[0] * place[0] + offset[0],
-                    by[1] * place[1] + offset[1],
-                    [0, 1].map(|k| (by[k] * moved[0][k]).abs().max((by[k] * moved[1][k]).abs())),
-                ),
                 Mapping::Cube(by) => {
                     let multiply = |a: V3| [a[0] * by[0], a[1] * by[1], a[2] * by[2]];
                     texture.cube_at(multiply(place), multiply(moved[0]), multiply(moved[1]))
                 }
                 Mapping::Sides(repeat) => {
                     // The axes that run to the right and up on this side.
-                    let [u, v] = side_axes(normal);
+                    let [u, v] = side_axes(unrotate(&geom.rotation, normal));
                     let Shape::Box(halves) = geom.shape else { continue };
                     let by = [0.5 * repeat[0] / halves[u].max(1e-6), 0.5 * repeat[1] / halves[v].max(1e-6)];
                     texture.flat_at(
@@ -383,7 +408,9 @@ impl Batch {
                     )
                 }
                 // A mesh's coordinates are taken as they are: its triangles are small.
-                Mapping::Own => texture.flat_at(self.coordinates[0][i], self.coordinates[1][i], [0.0; 2]),
+                Mapping::Own | Mapping::Flat { .. } => {
+                    texture.flat_at(self.coordinates[0][i], self.coordinates[1][i], [0.0; 2])
+                }
             };
             for (lane, colour) in self.tint.iter_mut().zip(colour) {
                 lane[i] = colour;
@@ -416,6 +443,31 @@ impl Batch {
         }
     }
 
+    /// Whether a geom is lit at the corners of a grid whose cells are large enough for that to be seen.
+    fn is_coarse(&self, geom: &Geom, view: &View) -> bool {
+        let cell = match geom.shape {
+            Shape::Plane(x, y) => x.step.max(y.step).max(x.pad).max(y.pad),
+            Shape::Box(halves) => 0.5 * halves.into_iter().fold(0.0, f32::max),
+            _ => return false,
+        };
+        let depth = |i: usize| dot(sub(self.place.each_ref().map(|l| l[i]), view.position), view.forward);
+        cell * view.pixels_at(depth(0).min(depth(self.n - 1))) > COARSE
+    }
+
+    /// The cell a fragment is in.
+    fn grid(&self, geom: &Geom, i: usize) -> Grid {
+        Grid::at(geom, self.local.each_ref().map(|l| l[i]), self.normal.each_ref().map(|l| l[i]))
+    }
+
+    /// Finds the cell of every fragment.
+    fn cells(&mut self, geom: &Geom) {
+        for i in 0..self.n {
+            let grid = self.grid(geom, i);
+            self.cell[i] = u32::try_from(grid.first).unwrap_or(0);
+            [self.within[0][i], self.within[1][i]] = grid.within;
+        }
+    }
+
     /// Light at the corners of the grid around every fragment, interpolated.
     fn light_of_corners(
         &mut self,
@@ -426,10 +478,10 @@ impl Batch {
         matter: &Matter,
         look: &Look<'_>,
     ) {
-        let mut last = (usize::MAX, [[0.0; 3]; 4]);
+        let mut last = (u32::MAX, [[0.0; 3]; 4]);
         for i in 0..self.n {
-            let grid = Grid::at(geom, self.local.each_ref().map(|l| l[i]), self.normal.each_ref().map(|l| l[i]));
-            if grid.first != last.0 {
+            if self.cell[i] != last.0 {
+                let grid = self.grid(geom, i);
                 let corners = [0, 1, grid.row, grid.row + 1].map(|step| {
                     let corner = start + (grid.first + step) * passes + pass;
                     if !lattices.known[corner] {
@@ -438,10 +490,10 @@ impl Batch {
                     }
                     lattices.colours[corner]
                 });
-                last = (grid.first, corners);
+                last = (self.cell[i], corners);
             }
             let [a, b, c, d] = last.1;
-            let [u, v] = grid.within;
+            let [u, v] = [self.within[0][i], self.within[1][i]];
             for k in 0..3 {
                 let (low, high) = (a[k] + u * (b[k] - a[k]), c[k] + u * (d[k] - c[k]));
                 self.pass[k][i] = low + v * (high - low);
@@ -471,6 +523,52 @@ fn corner_light((place, normal): (V3, V3), pass: usize, matter: &Matter, look: &
             pass => look.lamps.shadowed[pass - 1].0.at(matter, look.view.position, place, normal),
         };
     light.map(|x| x.min(1.0))
+}
+
+/// The rays of a view as a geom sees them.
+#[derive(Clone, Copy)]
+struct LocalRays {
+    rotation: [f32; 9],
+    eye: V3,
+    ahead: V3,
+    direction: V3,
+    origins: [V3; 2],
+    directions: [V3; 2],
+}
+
+/// The same, and how a flat texture lies on the geom.
+struct FlatRays {
+    rays: LocalRays,
+    scale: [f32; 2],
+    offset: [f32; 2],
+}
+
+impl LocalRays {
+    fn new(geom: &Geom, view: &View, rays: &Rays) -> Self {
+        let local = |a: V3| unrotate(&geom.rotation, a);
+        Self {
+            rotation: geom.rotation,
+            eye: local(sub(view.position, geom.position)),
+            ahead: local(view.forward),
+            direction: local(rays.direction),
+            origins: rays.origins.map(local),
+            directions: rays.directions.map(local),
+        }
+    }
+
+    /// How far a place moves on its surface, which looks so in the world, from this pixel to the next, to the right and down.
+    #[inline(always)]
+    fn moved(&self, x: f32, y: f32, place: V3, normal: V3) -> [V3; 2] {
+        let normal = unrotate(&self.rotation, normal);
+        let depth = dot(sub(place, self.eye), self.ahead);
+        let direction = add(self.direction, add(scale(self.directions[0], x), scale(self.directions[1], y)));
+        let facing = dot(normal, direction);
+        let facing = 1.0 / if facing.abs() > 1e-6 { facing } else { 1e-6 };
+        [0, 1].map(|k| {
+            let free = add(self.origins[k], scale(self.directions[k], depth));
+            sub(free, scale(direction, dot(normal, free) * facing))
+        })
+    }
 }
 
 /// The cell of a grid that a place is in.
@@ -547,6 +645,40 @@ impl Lattices {
 }
 
 vectorised! {
+    /// Clears what differs.
+    fn keep_equal(a: &[u32], b: &[u32], equal: &mut [u32]) {
+        for ((a, b), equal) in a.iter().zip(b).zip(equal) {
+            *equal &= if a == b { u32::MAX } else { 0 };
+        }
+    }
+
+    /// Coordinates on a flat texture, and how much they change from pixel to pixel, for surfaces of one geom.
+    fn flat_coordinates(
+        flat: &FlatRays, x: &[f32], y: &[f32], places: [&[f32]; 3], normals: [&[f32]; 3],
+        s: &mut [f32], t: &mut [f32], ds: &mut [f32], dt: &mut [f32],
+    ) {
+        let n = x.len();
+        let ([px, py, pz], [nx, ny, nz]) = (places.map(|lane| &lane[..n]), normals.map(|lane| &lane[..n]));
+        let (y, s, t, ds, dt) = (&y[..n], &mut s[..n], &mut t[..n], &mut ds[..n], &mut dt[..n]);
+        for i in 0..n {
+            let place = [px[i], py[i], pz[i]];
+            let [right, down] = flat.rays.moved(x[i], y[i], place, [nx[i], ny[i], nz[i]]);
+            s[i] = flat.scale[0] * place[0] + flat.offset[0];
+            t[i] = flat.scale[1] * place[1] + flat.offset[1];
+            ds[i] = flat.scale[0].abs() * right[0].abs().max(down[0].abs());
+            dt[i] = flat.scale[1].abs() * right[1].abs().max(down[1].abs());
+        }
+    }
+
+    /// The colours of a flat texture.
+    fn flat_colours(texture: &Texture, coordinates: [&[f32]; 4], colours: [&mut [f32]; 3]) {
+        let [s, t, ds, dt] = coordinates;
+        let [r, g, b] = colours;
+        for i in 0..s.len() {
+            [r[i], g[i], b[i]] = texture.flat_at(s[i], t[i], [ds[i], dt[i]]);
+        }
+    }
+
     /// Unit coordinates to local and world ones, and directions of surfaces to unit vectors in the world.
     fn to_world(
         geom: &Geom, sizes: V3, n: usize, local: &mut [Lane; 3], normal: &mut [Lane; 3], place: &mut [Lane; 3],

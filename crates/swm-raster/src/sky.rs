@@ -1,8 +1,12 @@
 //! What is behind everything: a cube texture on a cylinder around the camera, and haze before it.
 
-use crate::scene::{Haze, Scene, Shape};
+use crate::layers::{Layers, NOTHING};
+use crate::scene::{Assets, Geom, Haze, Scene, Shape};
+use crate::simd::vectorised;
 use crate::texture::Texture;
-use crate::vector::{V3, dot, scale, sub, unrotate};
+use crate::vector::{V3, add, dot, scale, sub, unrotate};
+use crate::view::View;
+use std::sync::Arc;
 
 /// How far the sky is: just so near that no part of its cylinder is cut off, as a part of the depth one sees.
 const NEAR: f32 = 0.7;
@@ -21,10 +25,92 @@ pub(crate) fn depth(radius: f32, direction: V3) -> f32 {
 
 /// The sky's colour in a direction, which changes so much from pixel to pixel.
 #[inline]
-pub(crate) fn colour(texture: &Texture, direction: V3, right: V3, down: V3) -> V3 {
+fn colour(texture: &Texture, direction: V3, right: V3, down: V3) -> V3 {
     // The texture's y axis points upwards.
     let turn = |[x, y, z]: V3| [x, z, -y];
     texture.cube_at(turn(direction), turn(right), turn(down))
+}
+
+/// The sky as it was seen last. It is so far away that it stays the same while a camera only moves: its pixels are
+/// looked up once.
+#[derive(Default)]
+pub(crate) struct Backdrop {
+    /// The texture and the rays it was seen along.
+    seen: Option<(Arc<Texture>, V3, [V3; 2])>,
+    size: (usize, usize),
+    /// Colours of pixels; negative where nobody has looked yet.
+    colours: Vec<V3>,
+    /// Scratch: how much of each pixel of a row is open.
+    open: Vec<f32>,
+}
+
+/// Nobody has looked yet.
+const UNSEEN: V3 = [-1.0; 3];
+
+impl Backdrop {
+    /// Paints the sky where nothing is before it.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn paint(&mut self, scene: &Scene, assets: &Assets, view: &View, main: &mut Layers, colours: &mut [V3]) {
+        let Some(texture) = scene.sky.and_then(|sky| assets.textures.get(sky)) else { return };
+        let rays = view.rays();
+        let known = self.seen.as_ref().is_some_and(|(seen, direction, directions)| {
+            Arc::ptr_eq(seen, texture) && *direction == rays.direction && *directions == rays.directions
+        });
+        if !known || self.size != (view.width, view.height) {
+            self.seen = Some((Arc::clone(texture), rays.direction, rays.directions));
+            self.size = (view.width, view.height);
+            self.colours.clear();
+            self.colours.resize(view.width * view.height, UNSEEN);
+        }
+        let infinite = |geom: &Geom| matches!(geom.shape, Shape::Plane(x, y) if x.infinite || y.infinite);
+        let endless = scene.geoms.iter().any(infinite);
+        let radius = radius(scene);
+        let share = 1.0 / main.samples as f32;
+        self.open.resize(view.width, 0.0);
+        for y in 0..view.height {
+            let row = add(rays.direction, scale(rays.directions[1], y as f32 + 0.5));
+            let at = |x: usize| add(row, scale(rays.directions[0], x as f32 + 0.5));
+            self.open.fill(0.0);
+            for sample in 0..main.samples {
+                let first = main.place(y, sample);
+                if endless {
+                    // The sky is nearer than the far ends of endless planes.
+                    for x in 0..view.width {
+                        if main.depths[first + x] > depth(radius, at(x)) {
+                            main.ids[first + x] = NOTHING;
+                        }
+                    }
+                }
+                count_open(&main.ids[first..first + view.width], share, &mut self.open);
+            }
+            let row = y * view.width..(y + 1) * view.width;
+            let (seen, colours) = (&mut self.colours[row.clone()], &mut colours[row]);
+            for (x, (seen, open)) in seen.iter_mut().zip(&self.open).enumerate() {
+                if *open > 0.0 && seen[0] < 0.0 {
+                    *seen = colour(texture, at(x), rays.directions[0], rays.directions[1]);
+                }
+            }
+            shine_through(seen, &self.open, colours);
+        }
+    }
+}
+
+vectorised! {
+    /// Adds a share for every pixel where nothing is.
+    fn count_open(ids: &[u32], share: f32, open: &mut [f32]) {
+        for (open, id) in open.iter_mut().zip(ids) {
+            *open += if *id == NOTHING { share } else { 0.0 };
+        }
+    }
+
+    /// Adds the sky as far as pixels are open.
+    fn shine_through(sky: &[V3], open: &[f32], colours: &mut [V3]) {
+        for ((sky, open), colour) in sky.iter().zip(open).zip(colours) {
+            for k in 0..3 {
+                colour[k] += if *open > 0.0 { open * sky[k] } else { 0.0 };
+            }
+        }
+    }
 }
 
 /// Haze above an infinite plane: a cone that begins on the plane, inside the sky's cylinder, and ends at the height of the eye, on

@@ -12,56 +12,87 @@ pub struct Texture {
 /// One version: RGBA texels in a word each, row after row.
 #[derive(Clone, Debug)]
 struct Level {
-    width: usize,
-    height: usize,
-    texels: Vec<[u8; 4]>,
+    width: i32,
+    height: i32,
+    texels: Vec<u32>,
+}
+
+/// Every other byte of a word: two channels that can be multiplied by up to 256 at once.
+const TWO: u32 = 0x00ff_00ff;
+
+/// Words weighted by numbers that sum to 256, channel by channel.
+#[inline(always)]
+fn weighted<const N: usize>(words: [u32; N], weights: [u32; N]) -> u32 {
+    let (mut even, mut odd) = (0x0080_0080, 0x0080_0080);
+    for (word, weight) in words.into_iter().zip(weights) {
+        even += (word & TWO) * weight;
+        odd += (word >> 8 & TWO) * weight;
+    }
+    (even >> 8 & TWO) | (odd & !TWO)
 }
 
 impl Level {
     /// Half the width and height, at least 1.
     fn halved(&self) -> Self {
         let (width, height) = ((self.width / 2).max(1), (self.height / 2).max(1));
-        let at = |x: usize, y: usize| self.texels[y.min(self.height - 1) * self.width + x.min(self.width - 1)];
-        let mut texels = Vec::with_capacity(width * height);
-        for y in 0..height {
-            for x in 0..width {
-                let four = [at(2 * x, 2 * y), at(2 * x + 1, 2 * y), at(2 * x, 2 * y + 1), at(2 * x + 1, 2 * y + 1)];
-                texels.push(std::array::from_fn(|k| {
-                    let sum: u16 = four.iter().map(|texel| u16::from(texel[k])).sum();
-                    u8::try_from((sum + 2) / 4).unwrap_or(u8::MAX)
-                }));
-            }
-        }
-        Self { width, height, texels }
+        let at = |x: i32, y: i32| self.texels[to_usize(y.min(self.height - 1) * self.width + x.min(self.width - 1))];
+        let texels = (0..width * height).map(|place| {
+            let (x, y) = (2 * (place % width), 2 * (place / width));
+            weighted([at(x, y), at(x + 1, y), at(x, y + 1), at(x + 1, y + 1)], [64; 4])
+        });
+        Self { width, height, texels: texels.collect() }
     }
 
-    /// The colour at coordinates in texels, from 0 to 255.
-    #[inline]
-    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
-    fn look(&self, x: f32, y: f32, repeat: bool) -> [f32; 3] {
-        let (x, y) = (x - 0.5, y - 0.5);
-        let (left, top) = (x.floor(), y.floor());
-        let (fx, fy) = (x - left, y - top);
-        let (x0, y0) = (left as i32, top as i32);
-        let wrap = |i: i32, n: usize| -> usize {
-            let n = n as i32;
-            let i = match repeat {
-                // Nearly all widths are powers of two.
-                true if n & (n - 1) == 0 => i & (n - 1),
-                true => i.rem_euclid(n),
+    /// The colour at coordinates from 0 to 1, between four texels, to a 256th of the way.
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss, clippy::cast_sign_loss)]
+    fn look(&self, s: f32, t: f32, repeat: bool) -> u32 {
+        let (w, h) = (self.width, self.height);
+        let x = (s * (256 * w) as f32) as i32 - 128;
+        let y = (t * (256 * h) as f32) as i32 - 128;
+        let (fx, fy) = ((x & 255) as u32, (y & 255) as u32);
+        let (x, y) = (x >> 8, y >> 8);
+        // The coordinates' ends are a texel apart from the texture at most.
+        let wrap = |i: i32, n: i32| -> i32 {
+            match repeat {
+                true => (if i < 0 {
+                    i + n
+                } else if i >= n {
+                    i - n
+                } else {
+                    i
+                })
+                .clamp(0, n - 1),
                 false => i.clamp(0, n - 1),
-            };
-            usize::try_from(i).unwrap_or(0)
+            }
         };
-        let (xa, xb) = (wrap(x0, self.width), wrap(x0.saturating_add(1), self.width));
-        let (ya, yb) = (wrap(y0, self.height) * self.width, wrap(y0.saturating_add(1), self.height) * self.width);
-        let [a, b, c, d] = [ya + xa, ya + xb, yb + xa, yb + xb].map(|i| self.texels[i].map(f32::from));
-        std::array::from_fn(|k| {
-            let (above, below) = (a[k] + fx * (b[k] - a[k]), c[k] + fx * (d[k] - c[k]));
-            above + fy * (below - above)
-        })
+        let (xa, xb) = (wrap(x, w), wrap(x + 1, w));
+        let (ya, yb) = (wrap(y, h) * w, wrap(y + 1, h) * w);
+        let four = [ya + xa, ya + xb, yb + xa, yb + xb].map(|i| self.texels[to_usize(i)]);
+        let right = fx * fy;
+        let weights = [65536 - 256 * (fx + fy) + right, 256 * fx - right, 256 * fy - right, right];
+        // Rounded so that they still sum to 256.
+        let [_, b, c, d] = weights.map(|weight| weight + 128 >> 8);
+        weighted(four, [256 - b - c - d, b, c, d])
     }
 }
+
+/// A place that is not negative.
+#[inline(always)]
+#[allow(clippy::cast_sign_loss)]
+fn to_usize(i: i32) -> usize {
+    i as usize
+}
+
+/// The faces of a cube, as OpenGL's table has them: which coordinate runs across, along and away, and whether backwards.
+const FACES: [[(usize, f32); 3]; 6] = [
+    [(2, -1.0), (1, -1.0), (0, 1.0)],
+    [(2, 1.0), (1, -1.0), (0, -1.0)],
+    [(0, 1.0), (2, 1.0), (1, 1.0)],
+    [(0, 1.0), (2, -1.0), (1, -1.0)],
+    [(0, 1.0), (1, -1.0), (2, 1.0)],
+    [(0, -1.0), (1, -1.0), (2, -1.0)],
+];
 
 impl Texture {
     /// A flat texture of `channels` (3 or 4) bytes a texel; `None` where the sizes do not fit.
@@ -87,7 +118,7 @@ impl Texture {
 
     /// A white one, flat and a cube's.
     pub fn white() -> Self {
-        Self { faces: vec![vec![Level { width: 1, height: 1, texels: vec![[u8::MAX; 4]] }]; 6] }
+        Self { faces: vec![vec![Level { width: 1, height: 1, texels: vec![u32::MAX] }]; 6] }
     }
 
     /// Whether it is a cube's.
@@ -97,34 +128,26 @@ impl Texture {
 
     /// The colour (0 to 1) at coordinates that repeat from 1 on; `change` is how much they change from a pixel to the next, at
     /// most, in either direction: `[s, t]`.
-    #[inline]
-    #[allow(clippy::cast_precision_loss)]
+    #[inline(always)]
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation)]
     pub(crate) fn flat_at(&self, s: f32, t: f32, change: [f32; 2]) -> [f32; 3] {
         let levels = &self.faces[0];
-        let (width, height) = (levels[0].width as f32, levels[0].height as f32);
-        let rho = (change[0] * width).max(change[1] * height);
-        // What repeats is cut off before it meets the limits of whole numbers.
-        let (s, t) = (s - s.floor(), t - t.floor());
-        Self::blend(levels, s, t, rho, true)
+        let rho = (change[0] * levels[0].width as f32).max(change[1] * levels[0].height as f32);
+        let whole = |x: f32| {
+            let part = x - x as i32 as f32;
+            if part < 0.0 { part + 1.0 } else { part }
+        };
+        Self::blend(levels, whole(s), whole(t), rho, true)
     }
 
     /// The colour (0 to 1) in a direction, which changes so much from a pixel to the next, to the right and down.
     #[inline]
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn cube_at(&self, d: [f32; 3], right: [f32; 3], down: [f32; 3]) -> [f32; 3] {
-        let [x, y, z] = d;
-        let (ax, ay, az) = (x.abs(), y.abs(), z.abs());
-        // The face, and which coordinates run across and down it: OpenGL's table.
-        type Pick = fn([f32; 3]) -> [f32; 3];
-        let (face, pick): (usize, Pick) = if ax >= ay && ax >= az {
-            if x >= 0.0 { (0, |d| [-d[2], -d[1], d[0]]) } else { (1, |d| [d[2], -d[1], -d[0]]) }
-        } else if ay >= az {
-            if y >= 0.0 { (2, |d| [d[0], d[2], d[1]]) } else { (3, |d| [d[0], -d[2], -d[1]]) }
-        } else if z >= 0.0 {
-            (4, |d| [d[0], -d[1], d[2]])
-        } else {
-            (5, |d| [-d[0], -d[1], -d[2]])
-        };
+        let size = d.map(f32::abs);
+        let axis = if size[0] >= size[1] && size[0] >= size[2] { 0 } else { 1 + usize::from(size[2] > size[1]) };
+        let face = 2 * axis + usize::from(d[axis] < 0.0);
+        let pick = |d: [f32; 3]| FACES[face].map(|(axis, sign)| sign * d[axis]);
         let [across, along, major] = pick(d);
         let major = 1.0 / major.max(1e-20);
         let (s, t) = (across * major, along * major);
@@ -139,29 +162,24 @@ impl Texture {
     }
 
     /// The colour between versions, for coordinates from 0 to 1.
-    #[inline]
+    #[inline(always)]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     fn blend(levels: &[Level], s: f32, t: f32, rho: f32, repeat: bool) -> [f32; 3] {
         let last = levels.len() - 1;
         // 3.5 / sqrt(8): a texel a pixel is still the full version.
-        let scaled = (rho * 1.237_436_9).clamp(0.5, 1e9);
-        let exponent = ((scaled.to_bits() >> 23) as i32 - 127).clamp(-1, 30);
-        let mantissa = scaled / f32::from_bits(((exponent + 127) as u32) << 23);
-        let (level, mut between) = match usize::try_from(exponent) {
-            Ok(level) if level < last => (level, (2.0 * mantissa - 3.0).max(0.0)),
-            Ok(_) => (last, 0.0),
-            Err(_) => (0, 0.0),
+        let scaled = if rho > 1.0 { (rho * 1.237_436_9).min(1e9) } else { 1.0 };
+        let exponent = (scaled.to_bits() >> 23) - 127;
+        let mantissa = f32::from_bits(scaled.to_bits() & 0x007f_ffff | 0x3f80_0000);
+        let level = (exponent as usize).min(last);
+        let between = if level < last { ((2.0 * mantissa - 3.0) * 256.0) as i32 } else { 0 };
+        let fine = levels[level].look(s, t, repeat);
+        let seen = match u32::try_from(between) {
+            Ok(between) if between > 0 => {
+                weighted([fine, levels[level + 1].look(s, t, repeat)], [256 - between, between])
+            }
+            _ => fine,
         };
-        if rho <= 1.0 {
-            between = 0.0;
-        }
-        let look = |level: &Level| level.look(s * level.width as f32, t * level.height as f32, repeat);
-        let fine = look(&levels[level]);
-        if between <= 0.0 {
-            return fine.map(|c| c * (1.0 / 255.0));
-        }
-        let coarse = look(&levels[level + 1]);
-        std::array::from_fn(|k| (fine[k] + between * (coarse[k] - fine[k])) * (1.0 / 255.0))
+        [0, 8, 16].map(|shift| (seen >> shift & 255) as f32 * (1.0 / 255.0))
     }
 }
 
@@ -171,8 +189,11 @@ fn pyramid(width: usize, height: usize, channels: usize, bytes: &[u8]) -> Option
     if texels == 0 || !(3..=4).contains(&channels) || texels.checked_mul(channels)? != bytes.len() {
         return None;
     }
-    let texels = bytes.chunks_exact(channels).map(|c| [c[0], c[1], c[2], c.get(3).copied().unwrap_or(255)]).collect();
-    let mut levels = vec![Level { width, height, texels }];
+    // Coordinates are counted in 256ths of texels.
+    let side = |n: usize| i32::try_from(n).ok().filter(|n| *n <= 1 << 14);
+    let word = |c: &[u8]| u32::from_le_bytes([c[0], c[1], c[2], c.get(3).copied().unwrap_or(255)]);
+    let texels = bytes.chunks_exact(channels).map(word).collect();
+    let mut levels = vec![Level { width: side(width)?, height: side(height)?, texels }];
     while let Some(level) = levels.last().filter(|level| level.width > 1 || level.height > 1) {
         levels.push(level.halved());
     }

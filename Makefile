@@ -12,12 +12,13 @@ SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test check build assets setup setup-python reference bench clean
+.PHONY: help demo test check build gpu assets setup setup-python reference bench clean
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
 	@echo 'make test       all checks and all tests'
 	@echo 'make build      the swm binary: $(SWM)'
+	@echo 'make gpu        the same with models on a GPU through Vulkan: $(CARGO_TARGET_DIR)-gpu/release/swm'
 	@echo 'make assets     MuJoCo, its models and meshes, into $(SWM_ASSETS)'
 	@echo 'make bench      our benchmarks, against the reference where `make reference` installed it'
 
@@ -33,6 +34,10 @@ check: setup
 # With the tests, whose needs switch on features of shared dependencies: so `make test` finds them compiled.
 build: setup
 	$(CARGO) build --release --workspace --bins --tests
+
+# The program with models on a GPU through Vulkan, in a folder of its own: other features compile other libraries.
+gpu: setup
+	CARGO_TARGET_DIR=$(CARGO_TARGET_DIR)-gpu $(CARGO) build --release -p swm --bins --features vulkan
 
 bench: assets
 	SWM_REFERENCE_PYTHON=$(CACHE)/reference/bin/python $(SWM) bench envs

@@ -1,11 +1,12 @@
 //! The dynamics of MuJoCo 3.3.2, with which the reference's Fetch worlds were recorded, on the MuJoCo of today.
 //!
-//! Three things changed in between that show in these worlds within a few steps, and are changed back here between the
+//! Four things changed in between that show in these worlds within a few steps, and are changed back here between the
 //! stages of a time step:
 //!
 //! 1. The reference acceleration of a weld now knows that its Jacobian turns. The gripper hangs on a weld.
 //! 2. A mesh lying on a plane now touches it with four vertices, no longer three. The robot's base does.
-//! 3. Boxes now report how deep they overlap; face to face it was half of it. And see [`super::boxes`].
+//! 3. Boxes touch otherwise: see [`super::boxes`].
+//! 4. Margins of two geoms are now added; the greater one counted.
 
 use super::boxes::{Solid, touch};
 use crate::physics::{Poses, Row, Stages, place};
@@ -52,8 +53,9 @@ impl Stages for Era {
         let solid = |geom: usize| Solid { at: places[geom], turn: turns[geom], half: model.geom_size()[geom] };
         let is_box = |geom: usize| model.geom_type()[geom] == MjtGeomBase::mjGEOM_BOX;
         for pair in found.chunk_by(|a, b| a.geom == b.geom) {
-            let (like, margin) = (&pair[0], pair[0].includemargin);
-            let [first, second] = like.geom.map(|geom| usize::try_from(geom).unwrap_or(0));
+            let [first, second] = pair[0].geom.map(|geom| usize::try_from(geom).unwrap_or(0));
+            let margin = model.geom_margin()[first].max(model.geom_margin()[second]);
+            let like = mjContact { includemargin: margin, ..pair[0].clone() };
             if [first, second] == [self.floor, self.base] {
                 let (at, turn) = (places[self.base], turns[self.base]);
                 for foot in self.feet {
@@ -64,13 +66,12 @@ impl Stages for Era {
                     }
                 }
             } else if !(is_box(first) && is_box(second)) {
-                contacts.extend_from_slice(pair);
+                let near = pair.iter().filter(|contact| contact.dist < margin);
+                contacts.extend(near.map(|contact| mjContact { includemargin: margin, ..contact.clone() }));
             } else if let Some(touch) = touch(&solid(first), &solid(second), margin) {
                 let frame = frame(touch.normal);
                 let new = touch.places().iter().map(|&(pos, dist)| mjContact { pos, dist, frame, ..like.clone() });
                 contacts.extend(new);
-            } else {
-                contacts.extend(pair.iter().map(|contact| mjContact { dist: 0.5 * contact.dist, ..contact.clone() }));
             }
         }
     }

@@ -120,8 +120,8 @@ impl Kind {
         let mut model = physics::compile_file(&folder.join(self.file))?;
         // The gripper is welded to where the mocap body is, not to where both are in the model's first pose.
         physics::edit_welds(&mut model, |data| data[..7].copy_from_slice(&[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]));
-        // Only one point where meshes touch, as then.
-        model.opt_mut().disableflags |= mjtDisableBit::mjDSBL_MULTICCD as i32;
+        // As then, only one point where meshes touch, and one system of all constraints, which tells when the solver stops.
+        model.opt_mut().disableflags |= mjtDisableBit::mjDSBL_MULTICCD as i32 | mjtDisableBit::mjDSBL_ISLAND as i32;
         let era: Arc<dyn Stages> = Arc::new(Era::new(&model)?);
         let mut world = Physics::new(Arc::new(model))?;
         world.attend(Arc::clone(&era));

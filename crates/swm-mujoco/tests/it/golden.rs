@@ -109,16 +109,17 @@ fn table_goal(golden: &mut Golden, state: &mut [f64]) {
     }
 }
 
-/// All rows, but of Slide those before the gripper touches the puck: a cylinder's contacts are found by iteration, whose last
-/// digits are another version's, and a strike makes them centimetres.
+/// All rows; of Slide those before the puck is struck, or before the world parts from itself. A puck is a cylinder: where it touches
+/// a finger is found by iteration, whose last digits are another version's, and where it touches the table jumps along its rim.
 fn fetch_until(file: &str, golden: &mut Golden) -> usize {
+    if !file.contains("FetchSlide") {
+        return usize::MAX;
+    }
     let known = golden.numbers("info.proprio");
     // The puck's velocity is given relative to the gripper's, in metres per action.
     let speeds: Vec<f64> = known.chunks_exact(25).map(|row| (row[14] + row[20]).hypot(row[15] + row[21])).collect();
-    match file.contains("FetchSlide") {
-        true => speeds.windows(2).position(|pair| pair[1] - pair[0] > 5e-3).map_or(usize::MAX, |before| before + 1),
-        false => usize::MAX,
-    }
+    let struck = speeds.windows(2).position(|pair| pair[1] - pair[0] > 5e-3).map_or(usize::MAX, |before| before + 1);
+    struck.min(until_it_parts(&FAMILIES[0], file, golden))
 }
 
 /// Infos that are no columns of the world, or cannot be compared: its name, success, which the pool writes, and what was observed
@@ -184,9 +185,15 @@ fn column(env: &dyn Env, name: &str) -> Vec<f64> {
 /// All rows before the world parts from itself: where a gripper's mesh meets a button, the contacts that MuJoCo finds jump with the
 /// last digit of a pose, and the reference does not follow its own recording.
 fn table_until(name: &str, golden: &mut Golden) -> usize {
-    let family = &FAMILIES[1];
-    let options = ResetOptions { variation: golden.variation(), ..ResetOptions::default() };
+    until_it_parts(&FAMILIES[1], name, golden)
+}
+
+/// All rows before the world parts from itself after nudges of the last digits.
+fn until_it_parts(family: &Family, name: &str, golden: &mut Golden) -> usize {
+    let variation = (family.factors)(name, golden.variation());
+    let options = ResetOptions { variation, ..ResetOptions::default() };
     let actions: Vec<f32> = golden.numbers("action").iter().map(|&a| a as f32).collect();
+    let width = actions.len() / golden.numbers("reward").len();
     let pose = golden.numbers("start.qpos").len();
     let mut play = |nudge: f64| -> Vec<Vec<f64>> {
         let mut env = recorded_in(Path::new(name)).expect("a world");
@@ -198,7 +205,7 @@ fn table_until(name: &str, golden: &mut Golden) -> usize {
             env.step(Action::Continuous(action)).expect("a step");
             column(&*env, "state")[1..=pose].to_vec()
         };
-        actions.chunks_exact(5).map(&mut step).collect()
+        actions.chunks_exact(width).map(&mut step).collect()
     };
     let usual = play(0.0);
     let parted = [1e-13, -1e-13, 1e-14].into_iter().filter_map(|nudge| {

@@ -1,8 +1,14 @@
-//! Where two boxes touch whose nearest parts are edges, as MuJoCo 3.3.2 decides and computes it.
+//! Where two boxes touch, as MuJoCo 3.3.2 decides and computes it.
 //!
 //! Later versions take faces for nearest where edges are so by a hair, and the contact's normal then jumps by a tenth of a
-//! degree: enough to send a block elsewhere within 40 actions. What is done here: separating axes; the face of the first
-//! box and the face of the second one that lie along the two edges; the second clipped by the first, seen along the normal.
+//! degree; and where an edge lies on a face they let the face beside it touch as well. Both send a block elsewhere within
+//! 40 actions. What is done here: separating axes decide whether [`faces`] or [`edges`] touch.
+//!
+//! The distance of a contact on a face is half of how deep the boxes overlap there: a slip of that version, kept because its
+//! numbers are the yardstick.
+
+mod edges;
+mod faces;
 
 pub type Vector = [f64; 3];
 
@@ -38,6 +44,10 @@ impl Touch {
     /// Where, and how far apart (negative: how deep).
     pub fn places(&self) -> &[(Vector, f64)] {
         &self.places[..self.count]
+    }
+
+    fn new(normal: Vector) -> Self {
+        Self { normal, places: [([0.0; 3], 0.0); MOST], count: 0 }
     }
 
     /// Drops places that are outside one box and not well inside the other.
@@ -97,6 +107,23 @@ impl Solid {
     }
 }
 
+/// What lies across the axis along which two boxes overlap least.
+enum Nearest {
+    /// A face of one of them.
+    Face(Face),
+    /// An edge of each.
+    Edges(Edges),
+}
+
+/// A face of a box.
+struct Face {
+    /// Whether it is the second box's.
+    of_second: bool,
+    axis: usize,
+    /// At which end of the axis.
+    positive: bool,
+}
+
 /// The two edges between which the boxes overlap least.
 struct Edges {
     /// The axis of the first box along its edge, and that of the second.
@@ -109,29 +136,30 @@ struct Edges {
     inward: bool,
 }
 
-/// The two axes that are not `i`, in the order in which ties are broken.
-fn others(i: usize) -> [usize; 2] {
-    [[1, 2], [0, 2], [1, 0]][i]
-}
-
-/// Finds the edges, if no face's axis separates as well; none where the boxes are further apart than `margin`.
-fn edges(a: &Solid, b: &Solid, margin: f64) -> Option<Edges> {
+/// Finds where the boxes overlap least; none where they are further apart than `margin`.
+fn nearest(a: &Solid, b: &Solid, margin: f64) -> Option<Nearest> {
     let apart = add(b.at, a.at, -1.0);
     let (from_a, from_b) = (a.local(apart), b.local(apart.map(|x| -x)));
     // Axes of the second box as the first one sees them.
     let axes: [Vector; 3] = std::array::from_fn(|j| a.local(b.axis(j)));
     let mut least = margin + 3.0 * (a.half.iter().sum::<f64>() + b.half.iter().sum::<f64>());
-    for i in 0..3 {
-        let shadow_b: f64 = (0..3).map(|j| axes[j][i].abs() * b.half[j]).sum();
-        let shadow_a: f64 = (0..3).map(|j| axes[i][j].abs() * a.half[j]).sum();
-        for overlap in [a.half[i] + shadow_b - from_a[i].abs(), b.half[i] + shadow_a - from_b[i].abs()] {
+    let mut found = None;
+    for axis in 0..3 {
+        let shadow_b: f64 = (0..3).map(|j| axes[j][axis].abs() * b.half[j]).sum();
+        let shadow_a: f64 = (0..3).map(|j| axes[axis][j].abs() * a.half[j]).sum();
+        for (of_second, size, offset) in
+            [(false, a.half[axis] + shadow_b, from_a[axis]), (true, b.half[axis] + shadow_a, from_b[axis])]
+        {
+            let overlap = size - offset.abs();
             if overlap < -margin {
                 return None;
             }
-            least = least.min(overlap);
+            if overlap < least {
+                least = overlap;
+                found = Some(Nearest::Face(Face { of_second, axis, positive: offset >= 0.0 }));
+            }
         }
     }
-    let mut found = None;
     for (i, j) in (0..3).flat_map(|i| (0..3).map(move |j| (i, j))) {
         let across = cross(std::array::from_fn(|k| f64::from(u8::from(k == i))), axes[j]);
         let length = dot(across, across).sqrt();
@@ -152,7 +180,7 @@ fn edges(a: &Solid, b: &Solid, margin: f64) -> Option<Edges> {
             let side_a = |k: usize| k != i && (normal[k] > 0.0) != inward;
             let side_b = |k: usize| k != j && ((axes[3 - k - j][i] > 0.0) != inward) != ((k + 3 - j) % 3 == 1);
             let sides = [std::array::from_fn(side_a), std::array::from_fn(side_b)];
-            found = Some(Edges { along: [i, j], sides, normal, inward });
+            found = Some(Nearest::Edges(Edges { along: [i, j], sides, normal, inward }));
         }
     }
     found
@@ -182,144 +210,62 @@ fn unfacing(axis: usize, positive: bool, v: Vector) -> Vector {
     }
 }
 
-/// The contacts of two boxes that touch with edges; `None` where they touch with a face, or not at all.
+/// The contacts of two boxes; `None` where they are further apart than `margin`.
 pub fn touch(a: &Solid, b: &Solid, margin: f64) -> Option<Touch> {
-    let Edges { along: [i, j], sides, normal, inward } = edges(a, b, margin)?;
-    let axes: [Vector; 3] = std::array::from_fn(|k| a.local(b.axis(k)));
-    let sign = |positive: bool| if positive { 1.0 } else { -1.0 };
-    // Of the two faces at each edge, the one the other edge lies along.
-    let flat = |pair: [usize; 2], steep: &dyn Fn(usize) -> f64| {
-        if steep(pair[0]) < steep(pair[1]) { [pair[1], pair[0]] } else { pair }
+    let mut touch = match nearest(a, b, margin)? {
+        Nearest::Face(face) if face.of_second => faces::touch(b, a, &face, margin),
+        Nearest::Face(face) => faces::touch(a, b, &face, margin),
+        Nearest::Edges(edges) => edges::touch(a, b, &edges, margin)?,
     };
-    let [_, face] = flat(others(i), &|k| axes[j][k].abs());
-    let [wide, up] = flat(others(j), &|k| axes[k][i].abs());
-    let outward = sides[0][face];
-    let view = |v| facing(face, outward, v);
-
-    // From here on the first box's face is the plane z = 0, and its rectangle is around the origin.
-    let [lx, ly, height] = view(a.half).map(f64::abs);
-    let size = [lx, ly];
-    let normal_seen = view(normal);
-    if normal_seen[2].abs() < TINY {
-        return None;
-    }
-    let along_normal = sign(!inward) / normal_seen[2];
-    let seen: [Vector; 3] = axes.map(view);
-    let mut middle = view(a.local(add(b.at, a.at, -1.0)));
-    middle[2] -= height;
-    let corner = |across: bool, end: f64| {
-        let at = add(middle, seen[wide], b.half[wide] * sign(across));
-        add(add(at, seen[up], b.half[up] * sign(sides[1][up])), seen[j], b.half[j] * end)
-    };
-    let near = sides[1][wide];
-    let solid = [corner(near, 1.0), corner(near, -1.0), corner(!near, 1.0), corner(!near, -1.0)];
-    // The second face along the normal on the first one's plane.
-    let shadow = solid.map(|at| add(at, normal_seen, -at[2] / normal_seen[2]));
-    let [along, across] = [1, 2].map(|k| add(shadow[k], shadow[0], -1.0));
-    let [solid_along, solid_across] = [1, 2].map(|k| add(solid[k], solid[0], -1.0));
-
-    let toward = a.world(unfacing(face, outward, normal_seen));
-    let mut touch = Touch { normal: toward.map(|x| x * sign(!inward)), places: [([0.0; 3], 0.0); MOST], count: 0 };
-    let put = |touch: &mut Touch, mut at: Vector, distance: f64| {
-        at[2] += height;
-        touch.add(add(a.world(unfacing(face, outward, at)), a.at, 1.0), distance);
-    };
-
-    // Where the second face's edges cross the rectangle's sides.
-    let lines = [
-        (shadow[0], along, solid[0], solid_along),
-        (shadow[0], across, solid[0], solid_across),
-        (add(shadow[0], along, 1.0), across, add(solid[0], solid_along, 1.0), solid_across),
-        (add(shadow[0], across, 1.0), along, add(solid[0], solid_across, 1.0), solid_along),
-    ];
-    for (start, way, solid_start, solid_way) in lines {
-        for (q, side) in [(0, -1.0), (0, 1.0), (1, -1.0), (1, 1.0)] {
-            if way[q].abs() <= TINY {
-                continue;
-            }
-            let limit = size[q] * side;
-            let part = (limit - start[q]) * (1.0 / way[q]);
-            let other = start[1 - q] + way[1 - q] * part;
-            let distance = (solid_start[2] + solid_way[2] * part) * along_normal;
-            if !(0.0..=1.0).contains(&part) || other.abs() > size[1 - q] || distance > margin {
-                continue;
-            }
-            let mut at = add(solid_start, solid_way, part).map(|x| 0.5 * x);
-            at[q] += 0.5 * limit;
-            at[1 - q] += 0.5 * other;
-            put(&mut touch, at, distance);
-        }
-    }
-    let crossings = touch.count;
-
-    // The rectangle's corners in the second face. Its area divides, at first; after a corner was measured, the square of that
-    // distance does: a slip of that version, kept because its numbers are the yardstick.
-    let mut divisor = along[0] * across[1] - across[0] * along[1];
-    for (cx, cy) in [(-lx, -ly), (-lx, ly), (lx, -ly), (lx, ly)] {
-        let (x, y) = (cx - shadow[0][0], cy - shadow[0][1]);
-        let u = (x * across[1] - y * across[0]) * (1.0 / divisor);
-        let v = (y * along[0] - x * along[1]) * (1.0 / divisor);
-        let out = |part: f64| !(0.0..=1.0).contains(&part);
-        if if crossings == 0 { out(u) && out(v) } else { out(u) || out(v) } {
-            continue;
-        }
-        let (u, v) = (u.clamp(0.0, 1.0), v.clamp(0.0, 1.0));
-        let over = add(add(solid[0].map(|p| p * (1.0 - u - v)), solid[1], u), solid[2], v);
-        let gap = add([cx, cy, 0.0], over, -1.0);
-        divisor = dot(gap, gap);
-        if over[2] > 0.0 && divisor > margin * margin {
-            continue;
-        }
-        put(&mut touch, add([cx, cy, 0.0], over, 1.0).map(|p| 0.5 * p), divisor.sqrt() * sign(over[2] >= 0.0));
-    }
-    let with_corners = touch.count;
-
-    // The second face's corners over the rectangle.
-    for (at, below) in solid.into_iter().zip(shadow) {
-        let out: [bool; 2] = std::array::from_fn(|q| below[q].abs() > size[q]);
-        let skip = if crossings > 0 { out[0] || out[1] } else { with_corners > 0 && out[0] && out[1] };
-        if skip {
-            continue;
-        }
-        let inside: [f64; 2] = std::array::from_fn(|q| below[q].clamp(-size[q], size[q]));
-        let beside: f64 = (0..2).map(|q| (below[q] - inside[q]) * (below[q] - inside[q])).sum();
-        let square = beside + (at[2] * along_normal) * (at[2] * along_normal);
-        if at[2] > 0.0 && square > margin * margin {
-            continue;
-        }
-        put(&mut touch, add([inside[0], inside[1], 0.0], at, 1.0).map(|p| 0.5 * p), square.sqrt() * sign(at[2] >= 0.0));
-    }
     touch.tidy(a, b, margin);
     Some(touch)
+}
+
+/// The sign of a side.
+fn sign(positive: bool) -> f64 {
+    if positive { 1.0 } else { -1.0 }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// Boxes on the edge of a table and the contacts that MuJoCo 3.3.2 found: two boxes, the normal, places and distances.
+    /// Two boxes, the margin, and the contacts that MuJoCo 3.3.2 found: the normal, places and distances. Two blocks on the edge of a
+    /// table, a block on the table, and the edge of a finger on the block.
     #[rustfmt::skip]
     #[allow(clippy::type_complexity)]
-    fn recorded() -> [(Solid, Solid, Vector, Vec<(Vector, f64)>); 2] { [
+    fn recorded() -> [(Solid, Solid, f64, Vector, Vec<(Vector, f64)>); 4] { [
         (
             Solid { at: [1.3, 0.75, 0.2], turn: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], half: [0.25, 0.35, 0.2] },
             Solid { at: [1.2098408181413325, 0.4, 0.4078042959382722], turn: [0.9974973873577402, 0.04987876660607153, -0.05011058627016791, -0.054836995979690564, 0.993167823810557, -0.10300765806155457, 0.04463032698072352, 0.10549778381207725, 0.9934175111826518], half: [0.025, 0.025, 0.025] },
-            [0.0, -0.10562926270422757, 0.9944055806664409],
+            0.0, [0.0, -0.10562926270422757, 0.9944055806664409],
             vec![([1.1860559068584318, 0.4009750744986419, 0.3908205406514098], -0.01846220400822407), ([1.187403117279295, 0.42795157745965096, 0.39224527228974493], -0.015596709956229297), ([1.237277986647182, 0.42532824742324815, 0.39336103046426296], -0.013352639335124539)],
         ),
         (
             Solid { at: [1.3, 0.75, 0.2], turn: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], half: [0.25, 0.35, 0.2] },
             Solid { at: [1.4164430384293576, 1.1, 0.4114707546179414], turn: [-0.3864484694242245, -0.2594499628646019, 0.8850668320806239, -0.8405484329027533, 0.4940818743172233, -0.22217433113639767, -0.37965235732759556, -0.8298004689325842, -0.4090174438026617], half: [0.025, 0.025, 0.025] },
-            [0.0, 0.859223235547094, 0.5116008517350057],
+            0.0, [0.0, 0.859223235547094, 0.5116008517350057],
             vec![([1.4271603686242562, 1.0883804844570448, 0.39308147894215306], -0.02704655801249752), ([1.4224222484241524, 1.0928919888784758, 0.37524126765781535], -0.016545202288432415)],
+        ),
+        (
+            Solid { at: [1.3, 0.75, 0.2], turn: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], half: [0.25, 0.35, 0.2] },
+            Solid { at: [1.2522102998042224, 0.7702269802615085, 0.42412199066107115], turn: [0.6244192627192344, -0.7810867332806334, 0.0020247069309812715, 0.7810888251280729, 0.6244137129798248, -0.0027860909524674046, 0.0009119239082154915, 0.0033211648163572536, 0.9999940691119362], half: [0.025, 0.025, 0.025] },
+            0.0, [0.0, 0.0, 1.0],
+            vec![([1.2560763688949828, 0.7351590690826227, 0.39950815585757926], -0.0004918441424208008), ([1.2872973320309447, 0.7742135103390264, 0.3995309539552846], -0.00046904604471541354), ([1.217022032230951, 0.766379754731614, 0.3995911849779882], -0.00040881502201186947), ([1.248242995366913, 0.8054341959880176, 0.3996139830756935], -0.0003860169243064822)],
+        ),
+        (
+            Solid { at: [1.2981355815759374, 0.7817980743833232, 0.4478617801368972], turn: [-0.024432287090184756, 0.0012092323250069352, 0.9997007557788119, -0.00603830827201627, 0.9999808483119846, -0.0013571449651957972, -0.9996832509253898, -0.006069659498572777, -0.02442451745309403], half: [0.0385, 0.007, 0.0135] },
+            Solid { at: [1.2522102998042224, 0.7702269802615085, 0.42412199066107115], turn: [0.6244192627192344, -0.7810867332806334, 0.0020247069309812715, 0.7810888251280729, 0.6244137129798248, -0.0027860909524674046, 0.0009119239082154915, 0.0033211648163572536, 0.9999940691119362], half: [0.025, 0.025, 0.025] },
+            0.001, [-0.6244192627192345, -0.7810888251280731, -0.0009119239082154917],
+            vec![([1.2850048384727835, 0.7752634795796199, 0.4490697714390081], -0.0005657545304693188), ([1.284300257627332, 0.775346786424612, 0.40974708406991667], -0.0009764976355795055)],
         ),
     ] }
 
     #[test]
-    fn edges_touch_as_then() {
+    fn boxes_touch_as_then() {
         let near = |a: &[f64], b: &[f64]| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-12);
-        for (a, b, normal, places) in recorded() {
-            let touch = touch(&a, &b, 0.0).expect("edges touch");
+        for (a, b, margin, normal, places) in recorded() {
+            let touch = touch(&a, &b, margin).expect("they touch");
             assert!(near(&touch.normal, &normal), "{:?}", touch.normal);
             assert_eq!(touch.places().len(), places.len());
             for (ours, theirs) in touch.places().iter().zip(&places) {
@@ -329,11 +275,13 @@ mod tests {
     }
 
     #[test]
-    fn faces_are_left_to_others() {
+    fn boxes_apart_do_not_touch() {
         let flat = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
         let table = Solid { at: [0.0; 3], turn: flat, half: [1.0, 1.0, 0.2] };
         let block = |z| Solid { at: [0.1, 0.2, z], turn: flat, half: [0.1; 3] };
-        assert!(touch(&table, &block(0.29), 0.0).is_none(), "it stands on a face");
-        assert!(touch(&table, &block(0.31), 0.0).is_none(), "it is above");
+        assert!(touch(&table, &block(0.31), 0.001).is_none());
+        let deep = touch(&table, &block(0.299), 0.0).expect("it stands in the table");
+        assert_eq!(deep.places().len(), 4);
+        assert!(deep.places().iter().all(|(_, distance)| (distance + 0.0005).abs() < 1e-12), "{:?}", deep.places());
     }
 }

@@ -8,6 +8,7 @@
 //! - [`pldm`]: the PLDM family: LeWM's model under VICReg's losses, temporal alignment and inverse dynamics.
 //! - [`dino_wm`]: the DINO-WM family: a frozen encoder of patches, a predictor of the patches of the next frame.
 //! - [`inverse`]: an inverse-dynamics policy on a frozen encoder, the baseline without planning.
+//! - [`fast`]: inference on the CPU, as kernels on plain arrays.
 //! - [`weights`]: weights of others, from files and the Hugging Face hub, and for PyTorch.
 //! - [`checkpoint`]: trained models on disk.
 //! - [`device`]: where they compute.
@@ -15,6 +16,7 @@
 pub mod checkpoint;
 pub mod device;
 pub mod dino_wm;
+pub mod fast;
 pub mod inverse;
 pub mod lewm;
 pub mod nn;

@@ -6,22 +6,29 @@
 //! however many threads there are.
 
 use super::config::LewmConfig;
+use super::encode::FastEncoder;
 use super::model::Lewm;
 use super::pixels;
 use super::rollout::Rollout;
 use crate::checkpoint::Checkpoint;
 use crate::nn::parameters::IntoF32;
-use burn::tensor::Device;
+use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
 use swm_core::{Batch, Candidates, CostModel, DifferentiableCost, Error, LatentDynamics, Result, Schema};
 
 /// The planning cost of a LeWM.
 pub struct LewmCost {
     pub(super) model: Lewm,
-    rollout: Rollout,
+    host: Option<Host>,
     pub(super) config: LewmConfig,
     pub(super) actions: usize,
     pub(super) scenes: Vec<Scene>,
+}
+
+/// The model laid out for the CPU; on other devices, it computes as it is.
+struct Host {
+    rollout: Rollout,
+    encoder: Option<FastEncoder>,
 }
 
 /// Present and goal of one environment.
@@ -43,7 +50,9 @@ impl LewmCost {
 
     /// The cost of a model of these sizes, whose actions are `actions` numbers.
     pub fn of(model: &Lewm, config: &LewmConfig, actions: usize) -> Self {
-        Self { model: model.clone(), rollout: Rollout::new(model), config: config.clone(), actions, scenes: vec![] }
+        let on_host = model.device() == Device::flex();
+        let host = on_host.then(|| Host { rollout: Rollout::new(model), encoder: FastEncoder::new(model, config) });
+        Self { model: model.clone(), host, config: config.clone(), actions, scenes: vec![] }
     }
 
     /// Checks that everything needed is there.
@@ -85,10 +94,13 @@ impl LewmCost {
     /// Present and goal of one environment.
     fn look(&self, infos: &Batch, env: usize) -> Result<Scene> {
         let row = infos.row(env);
-        let device = Device::flex();
+        let device = self.model.device();
         let encode = |rgb: &[u8]| {
-            let latent = self.model.encode(pixels::patches(&self.config, rgb, &device)?);
-            Ok::<_, Error>(latent.into_data().try_into_vec_as_f32())
+            let patches = pixels::patches(&self.config, rgb, &device)?;
+            Ok::<_, Error>(match self.host.as_ref().and_then(|host| host.encoder.as_ref()) {
+                Some(encoder) => encoder.encode(&patches.into_data().try_into_vec_as_f32()),
+                None => self.model.encode(patches).into_data().try_into_vec_as_f32(),
+            })
         };
         // Each picture by itself: what a latent is must not depend on how many are encoded at once.
         let mut start = vec![encode(row.get::<u8>("pixels")?)?];
@@ -111,17 +123,50 @@ impl LewmCost {
 
 impl Scene {
     /// The costs of some candidates, `[samples, horizon, numbers]`.
-    fn cost(&self, rollout: &Rollout, latent: usize, candidates: &[f32], horizon: usize, costs: &mut [f32]) {
-        let samples = costs.len();
+    fn cost(&self, predictor: &Predicts<'_>, candidates: &[f32], horizon: usize, costs: &mut [f32]) {
+        let (samples, latent) = (costs.len(), self.goal.len());
         let steps = self.start.len() / latent - 1 + horizon;
         let mut actions = Vec::with_capacity(samples * self.past.len() + candidates.len());
         for candidate in candidates.chunks_exact(candidates.len() / samples) {
             actions.extend_from_slice(&self.past);
             actions.extend_from_slice(candidate);
         }
-        let latents = rollout.run(&self.start, &actions, samples, steps);
-        for (cost, end) in costs.iter_mut().zip(latents[steps].chunks_exact(latent)) {
+        let last = predictor.last(&self.start, actions, samples, steps);
+        for (cost, end) in costs.iter_mut().zip(last.chunks_exact(latent)) {
             *cost = end.iter().zip(&self.goal).map(|(a, b)| (a - b).powi(2)).sum();
+        }
+    }
+}
+
+/// Who predicts.
+enum Predicts<'a> {
+    Host(&'a Rollout),
+    Device(&'a Lewm),
+}
+
+impl Predicts<'_> {
+    /// The last latents of a rollout, `[samples, latent]`, from `start` `[seen, latent]`, with actions
+    /// `[samples, steps, numbers]`.
+    fn last(&self, start: &[f32], actions: Vec<f32>, samples: usize, steps: usize) -> Vec<f32> {
+        match self {
+            Self::Host(rollout) => rollout.run(start, &actions, samples, steps).pop().unwrap_or_default(),
+            Self::Device(model) => {
+                let device = model.device();
+                let latent = model.latent();
+                let (seen, numbers) = (start.len() / latent, actions.len() / (samples * steps));
+                let start = Tensor::<3>::from_data(TensorData::new(start.to_vec(), [1, seen, latent]), &device);
+                let actions = Tensor::from_data(TensorData::new(actions, [samples, steps, numbers]), &device);
+                let all = model.rollout(start.expand([samples, seen, latent]), actions);
+                all.slice([0..samples, steps..steps + 1, 0..latent]).into_data().try_into_vec_as_f32()
+            }
+        }
+    }
+
+    /// How many of `samples` candidates go together.
+    fn part(&self, samples: usize) -> usize {
+        match self {
+            Self::Host(_) => Rollout::part(samples),
+            Self::Device(_) => samples,
         }
     }
 }
@@ -137,13 +182,16 @@ impl CostModel for LewmCost {
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
         self.fits(&candidates, costs)?;
         let Candidates { actions, samples, horizon, dim, .. } = candidates;
-        let (rollout, scenes, latent) = (&self.rollout, &self.scenes, self.config.latent);
+        let predictor = match &self.host {
+            Some(host) => Predicts::Host(&host.rollout),
+            None => Predicts::Device(&self.model),
+        };
         // Parts are counted from each environment's first candidate.
-        let part = Rollout::part(samples);
+        let (scenes, part) = (&self.scenes, predictor.part(samples));
         costs.par_chunks_mut(samples).zip(actions.par_chunks(samples * horizon * dim)).zip(scenes).for_each(
             |((costs, actions), scene)| {
                 let parts = costs.par_chunks_mut(part).zip(actions.par_chunks(part * horizon * dim));
-                parts.for_each(|(costs, actions)| scene.cost(rollout, latent, actions, horizon, costs));
+                parts.for_each(|(costs, actions)| scene.cost(&predictor, actions, horizon, costs));
             },
         );
         Ok(())

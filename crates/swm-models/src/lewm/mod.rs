@@ -3,6 +3,7 @@
 
 pub mod config;
 pub mod cost;
+pub mod encode;
 mod gradient;
 pub mod import;
 pub(crate) mod joint;

@@ -62,6 +62,17 @@ impl Lewm {
         }
     }
 
+    /// Where it computes.
+    pub fn device(&self) -> Device {
+        self.predictor.pos_embedding.val().device()
+    }
+
+    /// Numbers of a latent.
+    pub fn latent(&self) -> usize {
+        let [_, _, latent] = self.predictor.pos_embedding.dims();
+        latent
+    }
+
     /// The latents of pictures.
     ///
     /// # Shapes

@@ -1,0 +1,196 @@
+//! Functions of many numbers, written so that compilers turn them into vectors: no branches, no calls.
+
+use super::product::LANES;
+use super::simd::{Kernel, Level, dispatch};
+
+/// `x Φ(x)` of every number, to 1e-6.
+pub fn gelu(x: &mut [f32]) {
+    struct Gelu<'a>(&'a mut [f32]);
+    impl Kernel for Gelu<'_> {
+        type Output = ();
+
+        #[inline(always)]
+        fn run<L: Level>(self) {
+            for x in self.0 {
+                *x *= 0.5 + half_erf::<L>(*x);
+            }
+        }
+    }
+    dispatch(Gelu(x));
+}
+
+/// `x / (1 + exp(-x))` of every number.
+pub fn silu(x: &mut [f32]) {
+    struct Silu<'a>(&'a mut [f32]);
+    impl Kernel for Silu<'_> {
+        type Output = ();
+
+        #[inline(always)]
+        fn run<L: Level>(self) {
+            for x in self.0 {
+                let e = exp::<L>(-x.abs());
+                *x *= if *x < 0.0 { e } else { 1.0 } / (1.0 + e);
+            }
+        }
+    }
+    dispatch(Silu(x));
+}
+
+/// `Φ(x) - 1/2`, half the error function of `x / √2`: a rational function of our own fit, off by 2e-7 at most.
+#[inline(always)]
+fn half_erf<L: Level>(x: f32) -> f32 {
+    let x = x.clamp(-5.6, 5.6);
+    let t = x * x;
+    let horner = |coefficients: [f32; 6]| {
+        coefficients[..5].iter().rev().fold(coefficients[5], |sum, coefficient| L::fma(sum, t, *coefficient))
+    };
+    let numerator = horner([0.398_942_23, 0.034_376_13, 4.707_261e-3, 1.738_510_2e-4, 6.356_537_6e-6, 2.214_531_8e-8]);
+    let denominator = horner([1.0, 0.252_833_9, 0.028_940_102, 1.912_979_8e-3, 7.510_203_4e-5, 1.180_212_6e-6]);
+    (x * numerator / denominator).clamp(-0.5, 0.5)
+}
+
+/// The exponential of a number that is not positive: a power of two and a polynomial.
+#[inline(always)]
+pub(super) fn exp<L: Level>(x: f32) -> f32 {
+    /// 1.5 times 2²³: adding it leaves the nearest integer in the low bits.
+    const ROUND: f32 = 12_582_912.0;
+    let x = x.max(-87.0);
+    let shifted = L::fma(x, std::f32::consts::LOG2_E, ROUND);
+    let power = shifted - ROUND;
+    let r = L::fma(power, 2.121_944_4e-4, L::fma(power, -0.693_359_4, x));
+    let coefficients = [1.0, 1.0, 0.5, 0.166_666_57, 0.041_665_796, 8.333_45e-3];
+    let series = coefficients.iter().rev().fold(1.398_2e-3, |sum, coefficient| L::fma(sum, r, *coefficient));
+    let scale = f32::from_bits(shifted.to_bits().wrapping_sub(ROUND.to_bits()).wrapping_add(127) << 23);
+    series * scale
+}
+
+/// The sum, in lanes.
+#[inline(always)]
+pub(super) fn sum(x: &[f32]) -> f32 {
+    let mut lanes = [0.0f32; LANES];
+    let (chunks, rest) = x.as_chunks::<LANES>();
+    for chunk in chunks {
+        for lane in 0..LANES {
+            lanes[lane] += chunk[lane];
+        }
+    }
+    fold(lanes) + rest.iter().sum::<f32>()
+}
+
+/// The scalar product, in lanes.
+#[inline(always)]
+pub(super) fn dot<L: Level>(a: &[f32], b: &[f32]) -> f32 {
+    let mut lanes = [0.0f32; LANES];
+    let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
+    for (a, b) in a.iter().zip(b) {
+        for lane in 0..LANES {
+            lanes[lane] = L::fma(a[lane], b[lane], lanes[lane]);
+        }
+    }
+    fold(lanes) + a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum::<f32>()
+}
+
+/// The sum of all lanes, by halves.
+#[inline(always)]
+fn fold(mut lanes: [f32; LANES]) -> f32 {
+    let mut width = LANES / 2;
+    while width > 0 {
+        for lane in 0..width {
+            lanes[lane] += lanes[lane + width];
+        }
+        width /= 2;
+    }
+    lanes[0]
+}
+
+/// `to += factor * x`.
+#[inline(always)]
+pub(super) fn add_scaled<L: Level>(to: &mut [f32], factor: f32, x: &[f32]) {
+    for (to, x) in to.iter_mut().zip(x) {
+        *to = L::fma(factor, *x, *to);
+    }
+}
+
+/// The softmax of every row of `width` numbers.
+pub fn softmax(x: &mut [f32], width: usize) {
+    struct Softmax<'a>(&'a mut [f32], usize);
+    impl Kernel for Softmax<'_> {
+        type Output = ();
+
+        #[inline(always)]
+        fn run<L: Level>(self) {
+            for row in self.0.chunks_exact_mut(self.1) {
+                let most = most(row);
+                for x in row.iter_mut() {
+                    *x = exp::<L>(*x - most);
+                }
+                let share = 1.0 / sum(row);
+                for x in row {
+                    *x *= share;
+                }
+            }
+        }
+    }
+    dispatch(Softmax(x, width));
+}
+
+/// The largest number.
+#[inline(always)]
+fn most(x: &[f32]) -> f32 {
+    let mut most = [f32::NEG_INFINITY; LANES];
+    let (chunks, rest) = x.as_chunks::<LANES>();
+    for chunk in chunks {
+        for lane in 0..LANES {
+            most[lane] = most[lane].max(chunk[lane]);
+        }
+    }
+    most.iter().chain(rest).copied().fold(f32::NEG_INFINITY, f32::max)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_functions_are_close() {
+        struct Exp(f32);
+        impl Kernel for Exp {
+            type Output = f32;
+
+            #[inline(always)]
+            fn run<L: Level>(self) -> f32 {
+                exp::<L>(self.0)
+            }
+        }
+        for i in -4000..4000 {
+            let x = i as f32 / 200.0;
+            if x <= 0.0 {
+                let y = dispatch(Exp(x));
+                assert!((y - x.exp()).abs() <= 3e-7 * x.exp(), "exp({x}) = {y}");
+            }
+            let mut values = [x];
+            silu(&mut values);
+            assert!((values[0] - x / (1.0 + (-x).exp())).abs() < 2e-6, "silu({x})");
+        }
+        // Φ by Simpson's rule from 0: the density is smooth enough for 2,000 steps.
+        let density = |x: f64| (-x * x / 2.0).exp() / std::f64::consts::TAU.sqrt();
+        for i in -600..=600 {
+            let x = f64::from(i) / 50.0;
+            let h = x / 2000.0;
+            let inner: f64 = (1..2000).map(|k| density(h * f64::from(k)) * if k % 2 == 1 { 4.0 } else { 2.0 }).sum();
+            let phi = 0.5 + h / 3.0 * (density(0.0) + inner + density(x));
+            let mut values = [x as f32];
+            gelu(&mut values);
+            assert!((f64::from(values[0]) - x * phi).abs() < 1e-6, "gelu({x}) = {}, not {}", values[0], x * phi);
+        }
+        let mut rows: Vec<f32> = (0..38).map(|i| (i * 7 % 19) as f32 * 0.3 - 2.0).collect();
+        let given = rows.clone();
+        softmax(&mut rows, 19);
+        for (row, given) in rows.chunks(19).zip(given.chunks(19)) {
+            let all: f32 = given.iter().map(|x| x.exp()).sum();
+            assert!(row.iter().zip(given).all(|(share, x)| (share - x.exp() / all).abs() < 1e-7), "{row:?}");
+        }
+        let numbers: Vec<f32> = (0..37).map(|i| i as f32).collect();
+        assert_eq!(sum(&numbers), 666.0);
+    }
+}

@@ -1,0 +1,213 @@
+//! [`Panels`]: products of rows with a matrix that is used again and again, at the speed of the processor.
+//!
+//! The matrix is laid out once in panels of 32 columns, so that a product reads it in order. A tile of the result, some rows
+//! of a panel, stays in registers while all its terms are added one after the other: what a row comes to does not depend
+//! on how many others there are.
+
+use super::simd::{Kernel, Level, dispatch};
+
+/// Numbers of a vector.
+pub(super) const LANES: usize = 16;
+/// Columns of a panel.
+const WIDTH: usize = 2 * LANES;
+
+/// Vectors of the largest tile.
+const TILE: usize = 24;
+
+/// Numbers that are computed at once.
+#[derive(Clone, Copy, Debug)]
+#[repr(C, align(64))]
+struct Lanes([f32; LANES]);
+
+/// The numbers of a panel in one row of the matrix.
+type Pair = [Lanes; WIDTH / LANES];
+const ZERO: Pair = [Lanes([0.0; LANES]); WIDTH / LANES];
+
+/// A matrix `[inputs, outputs]` and a bias, cut into panels.
+#[derive(Clone, Debug)]
+pub struct Panels {
+    inputs: usize,
+    outputs: usize,
+    /// For each panel, its numbers in all rows; columns that are not there are 0.
+    numbers: Vec<Pair>,
+    /// For each panel, what is added to every row.
+    bias: Vec<Pair>,
+}
+
+impl Panels {
+    /// A matrix without bias; `at` tells the number at an input and an output.
+    pub fn new(inputs: usize, outputs: usize, at: impl Fn(usize, usize) -> f32) -> Self {
+        let mut made = Self { inputs, outputs, numbers: vec![], bias: vec![ZERO; outputs.div_ceil(WIDTH)] };
+        made.fill(inputs, at);
+        made
+    }
+
+    /// The same matrix with a bias, `[outputs]`.
+    #[must_use]
+    pub fn with_bias(mut self, bias: &[f32]) -> Self {
+        for (column, value) in bias.iter().enumerate() {
+            self.bias[column / WIDTH][column % WIDTH / LANES].0[column % LANES] = *value;
+        }
+        self
+    }
+
+    /// Another matrix of as many outputs in the same memory.
+    pub fn fill(&mut self, inputs: usize, at: impl Fn(usize, usize) -> f32) {
+        self.inputs = inputs;
+        self.numbers.clear();
+        self.numbers.resize(self.bias.len() * inputs, ZERO);
+        for (index, panel) in self.numbers.chunks_exact_mut(inputs.max(1)).enumerate() {
+            let first = index * WIDTH;
+            for (input, pair) in panel.iter_mut().enumerate() {
+                for column in 0..WIDTH.min(self.outputs - first) {
+                    pair[column / LANES].0[column % LANES] = at(input, first + column);
+                }
+            }
+        }
+    }
+
+    /// Rows of the matrix.
+    pub fn inputs(&self) -> usize {
+        self.inputs
+    }
+
+    /// Columns of the matrix.
+    pub fn outputs(&self) -> usize {
+        self.outputs
+    }
+
+    /// `y = x W + b`.
+    ///
+    /// # Shapes
+    /// `x` is `[rows, inputs]`, `y` is `[rows, outputs]`.
+    pub fn apply(&self, x: &[f32], y: &mut [f32]) {
+        self.apply_strided(y.len() / self.outputs, (x, self.inputs), (y, self.outputs));
+    }
+
+    /// As [`Panels::apply`], for `rows` that are parts of longer ones: given are the numbers from the first one on, and how
+    /// many there are from row to row.
+    pub fn apply_strided(&self, rows: usize, x: (&[f32], usize), y: (&mut [f32], usize)) {
+        let mut tile = [Lanes([0.0; LANES]); TILE];
+        dispatch(Product { rows, x, y, weights: self, tile: &mut tile });
+    }
+}
+
+/// A product to be computed.
+struct Product<'a> {
+    rows: usize,
+    x: (&'a [f32], usize),
+    y: (&'a mut [f32], usize),
+    weights: &'a Panels,
+    /// The last tile. It lies outside of the kernel, as what is indexed in memory is not kept in registers.
+    tile: &'a mut [Lanes; TILE],
+}
+
+impl Kernel for Product<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<L: Level>(mut self) {
+        let (rows, inputs) = (self.rows, self.weights.inputs);
+        for (index, bias) in self.weights.bias.iter().enumerate() {
+            let panel =
+                Panel { first: index * WIDTH, numbers: &self.weights.numbers[index * inputs..][..inputs], bias };
+            // As many rows at once as registers hold, then fewer.
+            let mut row = 0;
+            if L::ROWS >= 12 {
+                while rows - row >= 12 {
+                    self.tile::<L, 12, 2>(row, panel);
+                    row += 12;
+                }
+                while rows - row >= 4 {
+                    self.tile::<L, 4, 2>(row, panel);
+                    row += 4;
+                }
+            } else {
+                while rows - row >= 6 {
+                    self.tile::<L, 6, 1>(row, panel);
+                    row += 6;
+                }
+            }
+            while row < rows {
+                self.tile::<L, 1, 2>(row, panel);
+                row += 1;
+            }
+        }
+    }
+}
+
+/// One panel.
+#[derive(Clone, Copy)]
+struct Panel<'a> {
+    /// The first of its columns.
+    first: usize,
+    numbers: &'a [Pair],
+    bias: &'a Pair,
+}
+
+impl Product<'_> {
+    /// `R` rows of a panel, `W` vectors at a time.
+    #[inline(always)]
+    fn tile<L: Level, const R: usize, const W: usize>(&mut self, row: usize, panel: Panel<'_>) {
+        let ((x, x_stride), k) = (self.x, panel.numbers.len());
+        let x: [&[f32]; R] = std::array::from_fn(|r| &x[(row + r) * x_stride..][..k]);
+        for half in (0..WIDTH / LANES).step_by(W) {
+            let first = panel.first + half * LANES;
+            if first >= self.weights.outputs {
+                break;
+            }
+            let mut sums: [[Lanes; W]; R] = [std::array::from_fn(|w| panel.bias[half + w]); R];
+            for p in 0..k {
+                let weights: [Lanes; W] = std::array::from_fn(|w| panel.numbers[p][half + w]);
+                for r in 0..R {
+                    let x = x[r][p];
+                    for w in 0..W {
+                        for lane in 0..LANES {
+                            sums[r][w].0[lane] = L::fma(x, weights[w].0[lane], sums[r][w].0[lane]);
+                        }
+                    }
+                }
+            }
+            let Some(held) = self.tile.as_chunks_mut::<W>().0.first_chunk_mut::<R>() else { return };
+            *held = sums;
+            let width = (self.weights.outputs - first).min(W * LANES);
+            for (r, sums) in held.iter().enumerate() {
+                let to = &mut self.y.0[(row + r) * self.y.1 + first..][..width];
+                for (to, sums) in to.chunks_mut(LANES).zip(sums) {
+                    to.copy_from_slice(&sums.0[..to.len()]);
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn products_are_those_of_the_definition_whatever_the_sizes() {
+        let number = |i: usize| (i * 37 % 101) as f32 / 101.0 - 0.5;
+        for rows in [1, 2, 5, 12, 31] {
+            for (inputs, outputs) in [(1, 1), (3, 5), (17, 16), (40, 33), (64, 80)] {
+                let x: Vec<f32> = (0..rows * inputs).map(number).collect();
+                let bias: Vec<f32> = (0..outputs).map(|i| number(i + 7)).collect();
+                let weight = |i, o| number(i * outputs + o + 3);
+                let panels = Panels::new(inputs, outputs, weight).with_bias(&bias);
+                let mut y = vec![f32::NAN; rows * outputs];
+                panels.apply(&x, &mut y);
+                for (place, y) in y.iter().enumerate() {
+                    let (row, output) = (place / outputs, place % outputs);
+                    let terms = (0..inputs).map(|i| f64::from(x[row * inputs + i]) * f64::from(weight(i, output)));
+                    let wanted = f64::from(bias[output]) + terms.sum::<f64>();
+                    assert!((f64::from(*y) - wanted).abs() < 1e-5, "{rows} {inputs} {outputs}: {y} for {wanted}");
+                }
+                // A row alone is the same bytes as among others, and as part of a longer one.
+                let mut alone = vec![f32::NAN; outputs + 2];
+                panels.apply_strided(1, (&x[(rows - 1) * inputs..], inputs), (&mut alone, outputs + 2));
+                assert_eq!(alone[..outputs], y[(rows - 1) * outputs..]);
+                assert!(alone[outputs..].iter().all(|number| number.is_nan()));
+            }
+        }
+    }
+}

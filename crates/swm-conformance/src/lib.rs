@@ -6,6 +6,7 @@
 //! ```
 //! makes a test of each of the [`checks`]. They panic, as tests do.
 
+pub mod allocation;
 pub mod checks;
 
 use swm_core::EnvEntry;

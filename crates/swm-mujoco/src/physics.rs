@@ -126,6 +126,18 @@ fn copy_state(data: &MjData<Box<MjModel>>, into: &mut [f64]) {
     put(data.mocap_quat().as_flattened());
 }
 
+/// Refuses numbers that are not finite.
+fn finite(state: &[f64]) -> Result<()> {
+    match state.iter().position(|value| !value.is_finite()) {
+        None => Ok(()),
+        Some(place) => Err(Error::NotFinite {
+            what: "a MuJoCo state".to_owned(),
+            given: format!("{} at place {place}", state[place]),
+            fix: "take it from the `state` column of a row that was recorded".to_owned(),
+        }),
+    }
+}
+
 /// A number for an original model, never given to another one while the process lives.
 fn group_of(original: &Arc<MjModel>) -> u64 {
     /// The models that have numbers, by number. A weak pointer keeps its address from being used again.
@@ -600,13 +612,7 @@ impl Physics {
             let (given, expected) = (state.len().to_string(), format!("{} numbers", self.state_len()));
             return Err(Error::mismatch("restoring a MuJoCo state", given, expected));
         }
-        if let Some(place) = state.iter().position(|value| !value.is_finite()) {
-            return Err(Error::NotFinite {
-                what: "a MuJoCo state".to_owned(),
-                given: format!("{} at place {place}", state[place]),
-                fix: "take it from the `state` column of a row that was recorded".to_owned(),
-            });
-        }
+        finite(state)?;
         self.reset();
         self.data.set_state(state, STATE).map_err(|error| Error::external("restoring a MuJoCo state", error))
     }
@@ -621,16 +627,18 @@ impl Physics {
     /// # Errors
     /// When it has another length, or a number is not finite.
     pub fn set_pose(&mut self, pose: &[f64]) -> Result<()> {
-        let mut state = vec![0.0; self.state_len()];
-        self.state(&mut state);
-        match state.get_mut(1..=self.pose_len()).filter(|place| place.len() == pose.len()) {
-            Some(place) => place.copy_from_slice(pose),
-            None => {
-                let (given, expected) = (format!("{} numbers", pose.len()), self.pose_len().to_string());
-                return Err(Error::mismatch("putting qpos and qvel", given, expected));
-            }
+        if pose.len() != self.pose_len() {
+            let (given, expected) = (format!("{} numbers", pose.len()), self.pose_len().to_string());
+            return Err(Error::mismatch("putting qpos and qvel", given, expected));
         }
-        self.set_state(&state)
+        finite(pose)?;
+        copy_state(&self.data, &mut self.before);
+        self.before[1..=pose.len()].copy_from_slice(pose);
+        self.reset();
+        let put = self.data.set_state(&self.before, STATE);
+        put.map_err(|error| Error::external("putting qpos and qvel", error))?;
+        self.forward();
+        Ok(())
     }
 
     /// Numbers of [`Physics::save`].

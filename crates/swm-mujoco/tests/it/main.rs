@@ -1,5 +1,6 @@
 //! Integration tests: golden rollouts of the Python reference, and what every environment must keep. They need the assets.
 
+mod allocation;
 mod conformance;
 mod golden;
 #[path = "../../src/render/likeness.rs"]

@@ -45,6 +45,8 @@ pub(crate) struct Layers {
     pub samples: usize,
     /// Where they are in a pixel.
     pub pattern: &'static [[f32; 2]],
+    /// Their least and greatest coordinates.
+    reach: [[f32; 2]; 2],
     /// Depths; before anything is drawn, how far one sees.
     pub depths: Vec<f32>,
     /// Places of geoms, or [`TRIANGLE`] and the place of a triangle.
@@ -92,6 +94,10 @@ impl Layers {
     /// Forgets everything, for a picture of this size.
     pub fn start(&mut self, width: usize, height: usize, pattern: &'static [[f32; 2]]) {
         (self.width, self.height, self.samples, self.pattern) = (width, height, pattern.len(), pattern);
+        let reach = |with: fn(f32, f32) -> f32, from: f32| {
+            pattern.iter().fold([from; 2], |a, b| [with(a[0], b[0]), with(a[1], b[1])])
+        };
+        self.reach = [reach(f32::min, 1.0), reach(f32::max, 0.0)];
         let size = width * height * self.samples;
         self.depths.resize(size, 0.0);
         self.ids.resize(size, NOTHING);
@@ -111,7 +117,7 @@ impl Layers {
     }
 
     /// Draws a geom over what is there, where it is nearer, and farther than `floor` if there is one. What casts shadows does
-    /// so with both sides, and coarsely. Returns where it may be seen.
+    /// so coarsely, and with both sides of meshes that are open. Returns where it may be seen.
     pub fn draw(
         &mut self,
         number: u32,
@@ -131,7 +137,7 @@ impl Layers {
                 let number_of_level = mesh.level_for(if caster { COARSE } else { INVISIBLE } / view.pixels_at(nearest));
                 let level = mesh.level(number_of_level);
                 let place = u32::try_from(number_of_level).unwrap_or(0);
-                self.mesh((number, place), geom, level, view, floor, caster);
+                self.mesh((number, place), geom, level, view, floor, caster && !mesh.is_closed());
             }
             shape => {
                 let (_, halves) = shape.bounds();
@@ -225,10 +231,10 @@ impl Layers {
         if area * front < 0.0 || !(area.abs() > 1e-12) {
             return;
         }
-        // Samples keep away from the edges of their pixel.
-        let margin = if self.samples == 1 { 0.5 } else { 0.125 };
-        let low = |k: usize| (a[k].min(b[k]).min(c[k]) + margin) as i32;
-        let high = |k: usize| (a[k].max(b[k]).max(c[k]) + 1.0 - margin) as i32;
+        // Pixels of which a sample may be inside.
+        let [first, last] = self.reach;
+        let low = |k: usize| (a[k].min(b[k]).min(c[k]) - last[k] + 1.0) as i32;
+        let high = |k: usize| (a[k].max(b[k]).max(c[k]) - first[k] + 1.0) as i32;
         let (x0, y0) = (low(0).max(0), low(1).max(0));
         let (x1, y1) = (high(0).min(self.width as i32), high(1).min(self.height as i32));
         if x0 >= x1 || y0 >= y1 {

@@ -50,8 +50,11 @@ impl Lamp {
     }
 
     /// The direction from a place to the lamp.
+    #[inline(always)]
     pub fn from(&self, place: V3) -> V3 {
-        if self.directional { scale(self.direction, -1.0) } else { unit(sub(self.position, place)) }
+        let way = sub(self.position, place);
+        let by = 1.0 / dot(way, way).max(1e-20).sqrt();
+        if self.directional { scale(self.direction, -1.0) } else { scale(way, by) }
     }
 
     /// What a surface sends to the eye of this lamp's light.

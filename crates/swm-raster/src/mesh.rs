@@ -17,6 +17,8 @@ const COARSEST: f32 = 7.0;
 pub struct Mesh {
     /// From fine to coarse.
     levels: Vec<Level>,
+    /// Whether it has an inside: every edge is one of two triangles.
+    closed: bool,
     low: V3,
     high: V3,
 }
@@ -92,7 +94,13 @@ impl Mesh {
             }
             cells *= std::f32::consts::FRAC_1_SQRT_2;
         }
-        Self { levels, low, high }
+        let closed = levels[0].is_closed();
+        Self { levels, closed, low, high }
+    }
+
+    /// Whether one never sees its triangles from behind, unless from inside.
+    pub(crate) fn is_closed(&self) -> bool {
+        self.closed
     }
 
     /// The corners of a box around it.
@@ -117,6 +125,17 @@ impl Mesh {
 }
 
 impl Level {
+    /// Whether every edge is passed once in either direction.
+    fn is_closed(&self) -> bool {
+        let mut passed = HashMap::new();
+        for [a, b, c] in &self.faces {
+            for (from, to) in [(a, b), (b, c), (c, a)] {
+                *passed.entry((from.min(to), from.max(to))).or_insert(0) += if from < to { 1 } else { -1 };
+            }
+        }
+        passed.values().all(|sum| *sum == 0)
+    }
+
     /// The version whose vertices are those of cells of this size, each in the mean of its vertices. Directions are merged only
     /// with those that point the same way, so that thin plates keep two sides.
     #[allow(clippy::cast_possible_truncation)]

@@ -11,7 +11,7 @@ use crate::vector::{V3, add, dot, rotate, scale, sub, unrotate};
 use crate::view::{Rays, View};
 
 /// Fragments lit at once.
-const MANY: usize = 128;
+pub(crate) const MANY: usize = 128;
 
 /// Rows whose fragments are gathered at once.
 const BAND: usize = 16;
@@ -306,13 +306,12 @@ impl Batch {
             } else {
                 let (lamp, shadow) = &look.lamps.shadowed[pass - 1];
                 let shadow = &look.lamps.shadows[*shadow];
-                for i in 0..n {
-                    let (place, normal) = (self.place.each_ref().map(|l| l[i]), self.normal.each_ref().map(|l| l[i]));
-                    if shadow.reaches(number, place, normal, lamp.from(place)) {
-                        for k in 0..3 {
-                            self.sum[k][i] += self.pass[k][i];
-                        }
-                    }
+                let (places, normals) =
+                    (self.place.each_ref().map(|l| &l[..n]), self.normal.each_ref().map(|l| &l[..n]));
+                let lit = &mut self.scratch[0][..n];
+                shadow.reaches(number, lamp, places, normals, lit);
+                for (sum, light) in self.sum.iter_mut().zip(&self.pass) {
+                    add_lit(&mut sum[..n], &light[..n], lit);
                 }
             }
         }
@@ -326,6 +325,7 @@ impl Batch {
     /// Places and directions on a shape.
     fn analytic(&mut self, geom: &Geom, posed: &Posed) {
         let n = self.n;
+        self.coordinates.iter_mut().for_each(|lane| lane[..n].fill(0.0));
         let [px, py, pz] = &mut self.local;
         let [nx, ny, nz] = &mut self.normal;
         posed.surface(
@@ -399,7 +399,7 @@ impl Batch {
                 Mapping::Sides(repeat) => {
                     // The axes that run to the right and up on this side.
                     let [u, v] = side_axes(unrotate(&geom.rotation, normal));
-                    let Shape::Box(halves) = geom.shape else { continue };
+                    let (_, halves) = geom.shape.bounds();
                     let by = [0.5 * repeat[0] / halves[u].max(1e-6), 0.5 * repeat[1] / halves[v].max(1e-6)];
                     texture.flat_at(
                         by[0] * place[u] + 0.5 * repeat[0],
@@ -461,6 +461,12 @@ impl Batch {
 
     /// Finds the cell of every fragment.
     fn cells(&mut self, geom: &Geom) {
+        if let Shape::Plane(x, y) = geom.shape {
+            let n = self.n;
+            let [u, v] = &mut self.within;
+            let (u, v) = (&mut u[..n], &mut v[..n]);
+            return plane_cells(x, y, &self.local[0][..n], &self.local[1][..n], &mut self.cell[..n], u, v);
+        }
         for i in 0..self.n {
             let grid = self.grid(geom, i);
             self.cell[i] = u32::try_from(grid.first).unwrap_or(0);
@@ -511,6 +517,11 @@ fn side_axes(normal: V3) -> [usize; 2] {
     } else {
         [0, 1]
     }
+}
+
+/// A place in a list.
+fn at_least_0(i: i32) -> usize {
+    usize::try_from(i).unwrap_or(0)
 }
 
 /// The light of a pass at a corner of a grid.
@@ -575,7 +586,7 @@ impl LocalRays {
 struct Grid {
     axes: [Axis; 2],
     /// The cell, along both axes.
-    cell: [usize; 2],
+    cell: [i32; 2],
     /// Its first corner.
     first: usize,
     /// Corners of a row.
@@ -611,12 +622,12 @@ impl Grid {
         };
         let ((i, s), (j, t)) = (axes[0].cell(at[0]), axes[1].cell(at[1]));
         let row = axes[0].cells + 1;
-        Self { axes, cell: [i, j], first: begin + j * row + i, row, within: [s, t], side }
+        Self { axes, cell: [i, j], first: begin + at_least_0(j) * row + at_least_0(i), row, within: [s, t], side }
     }
 
     /// A corner of the cell in the world, and how the surface looks there.
     fn corner(&self, geom: &Geom, step: usize) -> (V3, V3) {
-        let (i, j) = (self.cell[0] + usize::from(step % self.row == 1), self.cell[1] + usize::from(step >= self.row));
+        let (i, j) = (self.cell[0] + i32::from(step % self.row == 1), self.cell[1] + i32::from(step >= self.row));
         let (side, at) = self.side;
         let (mut place, mut normal) = ([0.0; 3], [0.0; 3]);
         place[side] = at;
@@ -645,6 +656,28 @@ impl Lattices {
 }
 
 vectorised! {
+    /// Adds light where there is some.
+    fn add_lit(sums: &mut [f32], light: &[f32], lit: &[f32]) {
+        for ((sum, light), lit) in sums.iter_mut().zip(light).zip(lit) {
+            *sum += light * lit;
+        }
+    }
+
+    /// The cells of places on a plane, and how far inside they are.
+    #[allow(clippy::cast_possible_truncation)]
+    fn plane_cells(
+        x: Axis, y: Axis, px: &[f32], py: &[f32], cells: &mut [u32], u: &mut [f32], v: &mut [f32],
+    ) {
+        let n = px.len();
+        let (py, cells, u, v) = (&py[..n], &mut cells[..n], &mut u[..n], &mut v[..n]);
+        let row = x.cells as u32 + 1;
+        for i in 0..n {
+            let ((column, s), (line, t)) = (x.cell(px[i]), y.cell(py[i]));
+            cells[i] = line as u32 * row + column as u32;
+            (u[i], v[i]) = (s, t);
+        }
+    }
+
     /// Clears what differs.
     fn keep_equal(a: &[u32], b: &[u32], equal: &mut [u32]) {
         for ((a, b), equal) in a.iter().zip(b).zip(equal) {

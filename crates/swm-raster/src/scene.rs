@@ -99,27 +99,24 @@ impl Axis {
     }
 
     /// Where the line before cell `i` is.
+    #[inline(always)]
     #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn line(&self, i: usize) -> f32 {
-        match i {
-            0 => -self.half,
-            i if i >= self.cells => self.half,
-            i => -self.half + self.pad + (i - 1) as f32 * self.step,
-        }
+    pub(crate) fn line(&self, i: i32) -> f32 {
+        let inner = -self.half + self.pad + (i - 1) as f32 * self.step;
+        let inner = if i > 0 { inner } else { -self.half };
+        if i < self.cells as i32 { inner } else { self.half }
     }
 
     /// The cell a place is in, and how far into it, from 0 to 1.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-    pub(crate) fn cell(&self, x: f32) -> (usize, f32) {
-        let from = x + self.half;
-        let cell = match from < self.pad {
-            true => 0,
-            // Conversion saturates, and NaN becomes 0.
-            false => (1 + ((from - self.pad) / self.step) as usize).min(self.cells - 1),
-        };
+    #[inline(always)]
+    #[allow(clippy::cast_possible_truncation)]
+    pub(crate) fn cell(&self, x: f32) -> (i32, f32) {
+        let from = (x + self.half - self.pad) / self.step;
+        // Conversion saturates, and NaN becomes 0.
+        let inner = (from as i32).saturating_add(1).min(self.cells as i32 - 1).max(0);
+        let cell = if from < 0.0 { 0 } else { inner };
         let (low, high) = (self.line(cell), self.line(cell + 1));
-        let within = if high > low { ((x - low) / (high - low)).clamp(0.0, 1.0) } else { 0.0 };
-        (cell, within)
+        (cell, ((x - low) / (high - low).max(1e-12)).max(0.0).min(1.0))
     }
 }
 

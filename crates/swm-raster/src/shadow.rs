@@ -4,7 +4,10 @@
 //! own shadow, but where it turns away from the lamp; only meshes need a margin against rounding.
 
 use crate::layers::{Layers, NOTHING, pattern, touched};
+use crate::light::Lamp;
+use crate::paint::MANY;
 use crate::scene::{Assets, Light, Scene, Shape};
+use crate::simd::vectorised;
 use crate::vector::{V3, across, cross, dot, unit};
 use crate::view::View;
 
@@ -91,34 +94,70 @@ impl Shadow {
         self.view = Some(view);
     }
 
-    /// Whether light from direction `to` reaches a place on a surface of a geom.
+    /// Which of the places on surfaces of a geom the light of a lamp reaches: 1 or 0.
+    pub fn reaches(&self, geom: u32, lamp: &Lamp, places: [&[f32]; 3], normals: [&[f32]; 3], lit: &mut [f32]) {
+        facing(lamp, places, normals, lit);
+        let Some(view) = &self.view else {
+            lit.iter_mut().for_each(|lit| *lit = if *lit < -EDGE_ON { 0.0 } else { 1.0 });
+            return;
+        };
+        let mut texels = [[0.0; MANY]; 3];
+        project(view, places, &mut texels);
+        let [x, y, depths] = &texels;
+        for (i, lit) in lit.iter_mut().enumerate() {
+            let facing = *lit;
+            // What turns away is in its own shadow; along an edge-on surface, ambient light passes.
+            *lit = if facing < -EDGE_ON { 0.0 } else { 1.0 };
+            if x[i] >= 0.0 && facing >= -EDGE_ON && self.darkens(view, geom, [x[i], y[i], depths[i]], facing) {
+                *lit = 0.0;
+            }
+        }
+    }
+
+    /// Whether something is before a place inside the map.
     #[inline]
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-    pub fn reaches(&self, geom: u32, place: V3, normal: V3, to: V3) -> bool {
-        let facing = dot(normal, to);
-        // What turns away is in its own shadow; along an edge-on surface, ambient light passes.
-        if facing < -EDGE_ON {
-            return false;
-        }
-        let Some(view) = &self.view else { return true };
-        let ([x, y, w], depth) = view.project(place);
-        let by = 1.0 / w;
-        let (x, y) = (x * by, y * by);
-        if !(x >= 0.0 && y >= 0.0 && x < view.width as f32 && y < view.height as f32 && depth > view.near) {
-            return true;
-        }
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn darkens(&self, view: &View, geom: u32, [x, y, depth]: V3, facing: f32) -> bool {
         let at = y as usize * view.width + x as usize;
         let id = self.layers.ids[at];
         if id == NOTHING {
-            return true;
+            return false;
         }
         let caster = self.layers.geom(id);
         if caster == geom && !self.hollow.get(caster as usize).copied().unwrap_or(true) {
-            return true;
+            return false;
         }
         // A texel shows its middle: half a texel beside it, a slanted surface is that much nearer.
         let slope = ((1.0 - facing * facing).max(0.0).sqrt() / facing.max(0.05)).min(8.0);
         let margin = (0.5 + slope) / view.pixels_at(depth);
-        depth <= self.layers.depths[at] + margin
+        depth > self.layers.depths[at] + margin
+    }
+}
+
+vectorised! {
+    /// Where places are on the map, and how far from the light; x is -1 outside.
+    #[allow(clippy::cast_precision_loss)]
+    fn project(view: &View, places: [&[f32]; 3], texels: &mut [[f32; MANY]; 3]) {
+        let n = places[0].len().min(MANY);
+        let [px, py, pz] = places.map(|lane| &lane[..n]);
+        let [x, y, depths] = texels;
+        let (width, height) = (view.width as f32, view.height as f32);
+        for i in 0..n {
+            let ([u, v, w], depth) = view.project([px[i], py[i], pz[i]]);
+            let (u, v) = (u / w, v / w);
+            let inside = (u >= 0.0) & (v >= 0.0) & (u < width) & (v < height) & (depth > view.near);
+            x[i] = if inside { u } else { -1.0 };
+            y[i] = v;
+            depths[i] = depth;
+        }
+    }
+
+    /// The cosines between surfaces and the ways to a lamp.
+    fn facing(lamp: &Lamp, places: [&[f32]; 3], normals: [&[f32]; 3], cosines: &mut [f32]) {
+        let n = cosines.len();
+        let ([px, py, pz], [nx, ny, nz]) = (places.map(|lane| &lane[..n]), normals.map(|lane| &lane[..n]));
+        for i in 0..n {
+            cosines[i] = dot([nx[i], ny[i], nz[i]], lamp.from([px[i], py[i], pz[i]]));
+        }
     }
 }

@@ -91,6 +91,7 @@ impl View {
     }
 
     /// Pixel coordinates times `w`, and `w`: the depth, or 1 where rays are parallel; and the depth.
+    #[inline(always)]
     pub fn project(&self, place: V3) -> (V3, f32) {
         let from = sub(place, self.position);
         let depth = dot(from, self.forward);

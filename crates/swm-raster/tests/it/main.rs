@@ -1,0 +1,4 @@
+//! What holds of every scene, however odd, and what simple scenes look like.
+
+mod odd;
+mod plain;

@@ -1,4 +1,7 @@
-//! [`Collector`]: plays worlds side by side, and hands every finished episode to the replay buffer.
+//! [`Collector`]: plays worlds side by side, and hands what happens to the replay buffer, a part of an episode at a time.
+//!
+//! A part ends with an observation that the next one begins with, so no transition is lost; of windows of several steps,
+//! those across the border are.
 
 use serde::{Deserialize, Serialize};
 use swm_core::pool::Reset;
@@ -19,6 +22,8 @@ pub(super) struct Collector {
     actions: Batch,
     active: Vec<bool>,
     key: Key,
+    /// Steps of a part.
+    part: usize,
     /// The number of the next episode.
     next: u64,
     /// Environment steps.
@@ -30,8 +35,11 @@ pub(super) struct Collector {
 /// An episode being played.
 struct Running {
     number: u64,
+    /// The part that is being recorded, and how many of its rows are.
     rows: Batch,
     length: usize,
+    /// All actions of the episode, and its return.
+    actions: Vec<f32>,
     total: f64,
 }
 
@@ -45,8 +53,8 @@ pub(super) struct Place {
 }
 
 impl Collector {
-    /// Records the columns of `replay` in the worlds of `pool`. What is played is decided by `key`.
-    pub fn new(pool: EnvPool, replay: &ReplayBuffer, schema: &Schema, key: Key) -> Result<Self> {
+    /// Records the columns of `replay` in the worlds of `pool`, in parts of `part` steps. What is played is decided by `key`.
+    pub fn new(pool: EnvPool, replay: &ReplayBuffer, schema: &Schema, part: usize, key: Key) -> Result<Self> {
         let infos = pool.infos().schema();
         let mut observed = vec![];
         for (to, column) in schema.columns().iter().enumerate() {
@@ -55,7 +63,8 @@ impl Collector {
             }
         }
         let slots = pool.len();
-        let running = (0..slots).map(|_| Running { number: 0, rows: Batch::zeros(schema, 0), length: 0, total: 0.0 });
+        let rows = || Batch::zeros(schema, 0);
+        let running = (0..slots).map(|_| Running { number: 0, rows: rows(), length: 0, actions: vec![], total: 0.0 });
         Ok(Self {
             replay: replay.clone(),
             observed,
@@ -67,6 +76,7 @@ impl Collector {
             active: vec![true; slots],
             pool,
             key,
+            part,
             next: 0,
             steps: 0,
             returns: vec![],
@@ -90,7 +100,7 @@ impl Collector {
     pub fn play(&mut self, policy: &mut dyn Policy) -> Result<()> {
         policy.see(&self.pool, &self.active)?;
         policy.act(self.pool.infos(), &self.active, &mut self.actions)?;
-        let ended = self.advance()?;
+        let ended = self.advance(true)?;
         self.begin(&ended)?;
         for &slot in &ended {
             policy.begin(slot, self.episode(self.running[slot].number));
@@ -98,14 +108,16 @@ impl Collector {
         Ok(())
     }
 
-    /// Executes the actions in the active slots; returns those whose episode ended.
-    fn advance(&mut self) -> Result<Vec<usize>> {
+    /// Executes the actions in the active slots; returns those whose episode ended. Parts that are complete go to the replay
+    /// buffer if they are `news`.
+    fn advance(&mut self, news: bool) -> Result<Vec<usize>> {
         let Self { pool, running, observed, actions, active, .. } = self;
         for (slot, running) in running.iter_mut().enumerate().filter(|&(slot, _)| active[slot]) {
             running.observe(observed, pool.infos(), slot);
             let (rows, row) = (&mut running.rows, running.length - 1);
             let n = rows.schema().columns()[self.action].row_bytes();
             rows.bytes_mut(self.action)[row * n..][..n].copy_from_slice(&actions.bytes(0)[slot * n..][..n]);
+            running.actions.extend_from_slice(actions.row(slot).at::<f32>(0));
         }
         pool.step(actions, active)?;
         let infos = pool.infos();
@@ -118,18 +130,23 @@ impl Collector {
             let mut row = running.rows.row_mut(running.length - 1);
             row.set(self.reward, &[rewards[slot]]);
             row.set(self.terminated, &[terminated[slot]]);
-            if terminated[slot] + truncated[slot] == 0 {
-                continue;
+            let over = terminated[slot] + truncated[slot] > 0;
+            if over || running.length >= self.part {
+                running.observe(observed, infos, slot);
+                let mut row = running.rows.row_mut(running.length - 1);
+                row.at::<f32>(self.action).fill(f32::NAN);
+                row.set(self.reward, &[0.0f32]);
+                row.set(self.terminated, &[0u8]);
+                running.rows.resize(running.length);
+                if news {
+                    self.replay.add(&running.rows, &Constants::default())?;
+                }
+                running.length = 0;
             }
-            running.observe(observed, infos, slot);
-            let mut row = running.rows.row_mut(running.length - 1);
-            row.at::<f32>(self.action).fill(f32::NAN);
-            row.set(self.reward, &[0.0f32]);
-            row.set(self.terminated, &[0u8]);
-            running.rows.resize(running.length);
-            self.replay.add(&running.rows, &Constants::default())?;
-            self.returns.push(running.total);
-            ended.push(slot);
+            if over {
+                self.returns.push(running.total);
+                ended.push(slot);
+            }
         }
         Ok(ended)
     }
@@ -152,6 +169,7 @@ impl Collector {
         for &slot in slots {
             let running = &mut self.running[slot];
             (running.length, running.total) = (0, 0.0);
+            running.actions.clear();
             let seed = self.key.at(running.number).seed() >> 1;
             resets.push(Reset { slot, seed, options: ResetOptions::default() });
         }
@@ -164,11 +182,7 @@ impl Collector {
 
     /// Where it is.
     pub fn place(&self) -> Place {
-        let width = self.pool.spec().action_dim();
-        let running = self.running.iter().map(|running| {
-            let actions = running.rows.get::<f32>("action").unwrap_or_default();
-            (running.number, actions[..running.length * width].to_vec())
-        });
+        let running = self.running.iter().map(|running| (running.number, running.actions.clone()));
         Place { steps: self.steps, next: self.next, running: running.collect() }
     }
 
@@ -196,7 +210,7 @@ impl Collector {
                     self.actions.row_mut(slot).set(0, action);
                 }
             }
-            if !self.advance()?.is_empty() {
+            if !self.advance(false)?.is_empty() {
                 return Err(Error::mismatch(
                     "continuing",
                     "an episode that ends where it went on before",

@@ -1,7 +1,7 @@
 //! Online training: playing and learning by turns, in one process.
 //!
-//! A round is one step of every world, then as many gradient steps as the settings say. Episodes go to a replay buffer when
-//! they end; batches are drawn from it uniformly. Everything is decided by the seed: an episode by its number, a batch by the
+//! A round is one step of every world, then as many gradient steps as the settings say. What happens goes to a replay buffer
+//! in parts of an episode; batches are drawn from it uniformly. Everything is decided by the seed: an episode by its number, a batch by the
 //! number of its gradient step and what the buffer holds then. Neither threads nor the machine's speed have a say.
 //!
 //! What an episode's clock cut short is not its end: only `terminated` stops a value from looking further.

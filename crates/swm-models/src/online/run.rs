@@ -62,6 +62,10 @@ pub fn train_online<M: Agent>(
         return Err(Error::config("online", "the configuration has no such table", fix));
     };
     settings.check()?;
+    if config.data.num_steps > settings.part + 1 {
+        let given = format!("parts of {} steps hold no clip of {} frames", settings.part, config.data.num_steps);
+        return Err(Error::config("online.part", given, "choose longer parts, or lower data.num_steps"));
+    }
     let (play, judge) = (worlds(settings.envs)?, worlds(settings.envs.min(settings.evaluate_episodes))?);
     let threads = swm_core::pool::threads(options.threads)?;
     // Worlds are not shared between threads, but may move to those that compute.
@@ -135,7 +139,7 @@ impl<'a, M: Agent> Run<'a, M> {
         } else {
             std::fs::create_dir_all(out).map_err(|error| Error::io(out, "creating a folder", error))?;
         }
-        let mut collector = Collector::new(pool, &replay, &schema, key.with("episode"))?;
+        let mut collector = Collector::new(pool, &replay, &schema, settings.part, key.with("episode"))?;
         match &place {
             Some(place) => collector.go_to(place)?,
             None => collector.start()?,

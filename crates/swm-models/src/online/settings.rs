@@ -18,6 +18,9 @@ pub struct OnlineSettings {
     pub warmup: usize,
     /// Rows of the replay buffer; the oldest episodes leave.
     pub capacity: usize,
+    /// Steps after which a part of a running episode goes to the buffer; what is learnt from is that old. Windows that a clip
+    /// of several steps would have across two parts are lost.
+    pub part: usize,
     /// Gradient steps between two evaluations; 0 never evaluates.
     pub evaluate_every: usize,
     /// Episodes of an evaluation, always the same ones.
@@ -36,7 +39,8 @@ impl OnlineSettings {
         at_least(&[
             ("online.envs", self.envs, 1),
             ("online.updates", self.updates, 1),
-            ("online.capacity", self.capacity, 2),
+            ("online.part", self.part, 1),
+            ("online.capacity", self.capacity, self.part + 1),
             ("online.evaluate_episodes", self.evaluate_episodes, 1),
         ])?;
         self.planner.as_ref().map_or(Ok(()), PlannerConfig::check)

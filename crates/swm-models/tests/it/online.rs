@@ -35,6 +35,7 @@ fn config<M: Trainable>(words: &[&str]) -> TrainConfig<M> {
         "online.updates=2",
         "online.warmup=60",
         "online.capacity=200",
+        "online.part=8",
         "online.evaluate_every=8",
         "online.evaluate_episodes=4",
         "log_every=8",

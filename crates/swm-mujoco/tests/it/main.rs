@@ -5,5 +5,6 @@ mod conformance;
 mod golden;
 #[path = "../../src/render/likeness.rs"]
 mod likeness;
+mod link;
 mod recorded;
 mod views;

@@ -9,14 +9,19 @@ use std::sync::atomic::AtomicBool;
 use swm_core::{CostModel, EnvSpec, Error, Manifest, Named, Policy, Registry, Result};
 use swm_data::Reader;
 use swm_eval::Predictor;
+use swm_models::dino_wm::{DinoWm, DinoWmCost};
 use swm_models::inverse::{self, InverseCheckpoint, InverseConfig, InversePolicy};
 use swm_models::lewm::{Lewm, LewmCost};
+use swm_models::pldm::{self, Pldm};
 use swm_models::train::{Facts, Preset};
 use swm_models::{Checkpoint, Device, Observer, TrainConfig, TrainOptions, TrainSummary, Trainable, checkpoint};
 
 /// The families, in the order in which they are listed.
-pub static FAMILIES: Registry<Family> =
-    Registry { kind: "model", hint: "`swm models` lists them", rows: &[family::<Lewm>(), INVERSE] };
+pub static FAMILIES: Registry<Family> = Registry {
+    kind: "model",
+    hint: "`swm models` lists them",
+    rows: &[family::<Lewm>(), family::<Pldm>(), family::<DinoWm>(), INVERSE],
+};
 
 /// A model family.
 pub struct Family {
@@ -150,7 +155,33 @@ impl Usable for Lewm {
     }
 
     fn predictor(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Predictor>> {
-        Some(Box::new(LewmPredictor::new(checkpoint.clone())))
+        let frameskip = checkpoint.config.data.frameskip;
+        Some(Box::new(LewmPredictor::new(&checkpoint.model, &checkpoint.config.model, frameskip, &checkpoint.facts)))
+    }
+}
+
+impl Usable for Pldm {
+    fn history(config: &TrainConfig<Self>) -> usize {
+        config.model.predictor.history
+    }
+
+    fn cost(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn CostModel>> {
+        Some(Box::new(pldm::cost(checkpoint)))
+    }
+
+    fn predictor(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Predictor>> {
+        let (model, frameskip) = (&checkpoint.model.model, checkpoint.config.data.frameskip);
+        Some(Box::new(LewmPredictor::new(model, &checkpoint.config.model, frameskip, &checkpoint.facts)))
+    }
+}
+
+impl Usable for DinoWm {
+    fn history(config: &TrainConfig<Self>) -> usize {
+        config.model.predictor.history
+    }
+
+    fn cost(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn CostModel>> {
+        Some(Box::new(DinoWmCost::new(checkpoint)))
     }
 }
 

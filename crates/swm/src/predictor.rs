@@ -1,27 +1,33 @@
-//! [`LewmPredictor`]: a LeWM whose predictions are compared with recorded trajectories.
+//! [`LewmPredictor`]: a LeWM's model, as a PLDM has one, too, whose predictions are compared with recorded trajectories.
 
 use rayon::prelude::*;
 use swm_core::{Batch, Error, Result};
 use swm_eval::Predictor;
-use swm_models::lewm::{Lewm, Rollout, pixels};
-use swm_models::{Checkpoint, Device};
+use swm_models::Device;
+use swm_models::lewm::{Lewm, LewmConfig, Rollout, pixels};
+use swm_models::train::Facts;
+use swm_plan::ActionScale;
 
 /// Rows encoded, and trajectories predicted, at once: each by itself, so that its latents do not depend on the others.
 pub struct LewmPredictor {
-    checkpoint: Checkpoint<Lewm>,
+    model: Lewm,
+    config: LewmConfig,
+    frameskip: usize,
+    scale: ActionScale,
     rollout: Rollout,
 }
 
 impl LewmPredictor {
     /// The predictor of a trained model.
-    pub fn new(checkpoint: Checkpoint<Lewm>) -> Self {
-        Self { rollout: Rollout::new(&checkpoint.model), checkpoint }
+    pub fn new(model: &Lewm, config: &LewmConfig, frameskip: usize, facts: &Facts) -> Self {
+        let (model, config, scale) = (model.clone(), config.clone(), facts.action.clone());
+        Self { rollout: Rollout::new(&model), model, config, frameskip, scale }
     }
 }
 
 impl Predictor for LewmPredictor {
     fn frameskip(&self) -> usize {
-        self.checkpoint.config.data.frameskip
+        self.frameskip
     }
 
     fn columns(&self) -> Vec<String> {
@@ -29,11 +35,11 @@ impl Predictor for LewmPredictor {
     }
 
     fn latent_dim(&self) -> usize {
-        self.checkpoint.config.model.latent
+        self.config.latent
     }
 
     fn encode(&mut self, rows: &Batch, latents: &mut [f32]) -> Result<()> {
-        let (config, model) = (&self.checkpoint.config.model, &self.checkpoint.model);
+        let (config, model) = (&self.config, &self.model);
         pixels::check(config, rows.schema(), "pixels")?;
         let bytes = config.image * config.image * 3;
         let work = latents.par_chunks_exact_mut(config.latent).zip(rows.get::<u8>("pixels")?.par_chunks_exact(bytes));
@@ -46,7 +52,7 @@ impl Predictor for LewmPredictor {
     }
 
     fn rollout(&mut self, start: &[f32], actions: &[f32], horizon: usize, latents: &mut [f32]) -> Result<()> {
-        let (latent, scale) = (self.checkpoint.config.model.latent, &self.checkpoint.facts.action);
+        let (latent, scale) = (self.config.latent, &self.scale);
         let numbers = self.frameskip() * scale.dim();
         let n = start.len() / latent;
         if actions.len() != n * horizon * numbers {

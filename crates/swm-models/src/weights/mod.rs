@@ -1,17 +1,20 @@
 //! Weights of others: read from safetensors and PyTorch files and from the Hugging Face hub, written for PyTorch.
 //!
 //! - [`read`] a file of any of these kinds: `.safetensors`, `.pt`, `.pth`, `.bin`, `.ckpt`.
+//! - [`fetch`] a file of the Hugging Face hub, or [`locate`] the weights of one of its repositories.
 //! - [`torch::write`] a state dict that `torch.load(weights_only=True)` reads.
 //! - [`names`]: what a vision transformer's weights are called by the versions of `transformers`.
 //! - [`fill`] a module, naming whatever does not fit.
 //!
 //! Nothing in a file is ever executed: of pickles, only what describes tensors is understood.
 
+pub mod hub;
 pub(crate) mod keys;
 pub mod names;
 pub(crate) mod reference;
 pub mod torch;
 
+pub use hub::{fetch, locate};
 pub use names::Naming;
 pub(crate) use torch::BATCHES_TRACKED;
 
@@ -20,7 +23,7 @@ use burn::module::Module;
 use half::{bf16, f16};
 use pytorch_reader::{DType as Torch, PytorchError, PytorchReader};
 use safetensors::{Dtype, SafeTensors};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use swm_core::{Error, Result};
 
 /// The tensors of a file, in single precision; half precision is widened, integers and doubles are converted.
@@ -111,18 +114,6 @@ fn widen(kind: Torch, bytes: &[u8]) -> Vec<f32> {
 
 fn damaged(path: &Path, problem: String) -> Error {
     Error::corrupt(path, problem, "save the state dict again, as safetensors or with torch.save")
-}
-
-/// The file that `from` names: a file here, or the weights of a repository.
-///
-/// # Errors
-/// When there is no such file.
-pub fn locate(from: &str, _cache: &Path) -> Result<PathBuf> {
-    let path = PathBuf::from(from);
-    if path.is_file() {
-        return Ok(path);
-    }
-    Err(Error::config("weights", format!("there is no file '{from}'"), "give a file of weights"))
 }
 
 /// A module with weights in place of its own: each of its parameters and buffers must be there, in its shape, and

@@ -16,8 +16,12 @@ impl Dots {
     pub fn new(episodes: usize, seed: u64) -> Self {
         use rand::Rng as _;
         let schema =
-            Schema::new([ColumnSpec::image("pixels", SIDE, SIDE), ColumnSpec::new("action", DType::Float32, [2])])
-                .expect("two columns");
+            Schema::new([
+                ColumnSpec::image("pixels", SIDE, SIDE),
+                ColumnSpec::new("action", DType::Float32, [2]),
+                ColumnSpec::new("place", DType::Float32, [2]),
+            ])
+            .expect("three columns");
         let mut rows = Batch::zeros(&schema, episodes * LENGTH);
         for episode in 0..episodes {
             let mut rng = Key::new(seed).at(episode as u64).rng();
@@ -28,6 +32,7 @@ impl Dots {
                 let action = [rng.random_range(-1.0..1.0f32), rng.random_range(-1.0..1.0f32)];
                 let last = step + 1 == LENGTH;
                 row.set(1, &if last { [f32::NAN; 2] } else { action });
+                row.set(2, &at);
                 at = std::array::from_fn(|i| (at[i] + action[i]).clamp(1.0, 14.0));
             }
         }

@@ -3,9 +3,12 @@
 #![allow(clippy::print_stdout)] // the measured errors, for `--no-capture`
 
 mod checkpoints;
+mod dino_wm;
 mod dots;
 mod golden;
+mod hub;
 mod online;
 mod planning;
+mod pldm;
 mod reference;
 mod training;

@@ -131,3 +131,26 @@ fn what_does_not_fit_is_told() {
     let mismatch = message(lewm::import::import(out.path(), facts(2)));
     assert!(mismatch.contains("layers.1") && mismatch.contains("config.json"), "{mismatch}");
 }
+
+/// With the interpreter that `SWM_TORCH_PYTHON` names, which has the reference, stable-pretraining and transformers 5.
+#[test]
+#[ignore = "needs SWM_TORCH_PYTHON"]
+fn exported_checkpoints_load_in_the_reference() {
+    let python = std::env::var_os("SWM_TORCH_PYTHON").expect("SWM_TORCH_PYTHON names an interpreter");
+    let out = tempfile::tempdir().expect("a folder");
+    let load = |family: &str| {
+        let golden = folder("..");
+        let status = std::process::Command::new(&python)
+            .arg(golden.join("load_reference.py"))
+            .arg(out.path().join(family))
+            .arg(golden.join(format!("reference-{family}.safetensors")))
+            .status();
+        assert!(status.expect("it runs").success(), "{family}");
+    };
+    let lewm = lewm::import::import(&folder("lewm"), facts(2)).expect("it loads");
+    lewm::import::export(&lewm, &out.path().join("lewm"), Naming::Transformers5).expect("it is written");
+    load("lewm");
+    let pldm = pldm::import::import(&folder("pldm"), facts(2)).expect("it loads");
+    pldm::import::export(&pldm, &out.path().join("pldm"), Naming::Transformers5).expect("it is written");
+    load("pldm");
+}

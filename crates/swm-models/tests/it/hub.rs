@@ -1,0 +1,71 @@
+//! Files of the Hugging Face hub, from a server on loopback.
+
+use std::io::{BufRead as _, BufReader, Write as _};
+use std::net::TcpListener;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use swm_models::weights::hub::Hub;
+
+const FILE: &[u8] = b"not very heavy weights";
+
+/// Serves one file, at the path that the hub has for it; counts what it was asked.
+fn serve() -> (String, Arc<AtomicUsize>) {
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
+    let address = format!("http://{}", listener.local_addr().expect("an address"));
+    let asked = Arc::new(AtomicUsize::new(0));
+    let count = Arc::clone(&asked);
+    std::thread::spawn(move || {
+        for stream in listener.incoming() {
+            let mut stream = stream.expect("a connection");
+            let mut lines = BufReader::new(stream.try_clone().expect("a socket")).lines();
+            let mut next = || lines.next().and_then(Result::ok).unwrap_or_default();
+            let request = next();
+            while !next().is_empty() {}
+            count.fetch_add(1, Ordering::Relaxed);
+            let (status, body) = match request.contains("/owner/name/resolve/main/model.safetensors ") {
+                true => ("206 Partial Content", FILE),
+                false => ("404 Not Found", &b""[..]),
+            };
+            let status = if request.starts_with("HEAD") {
+                status.replace("206 Partial Content", "200 OK")
+            } else {
+                status.to_owned()
+            };
+            let range = format!("Content-Range: bytes 0-{}/{}\r\n", FILE.len() - 1, FILE.len());
+            let head = format!(
+                "HTTP/1.1 {status}\r\nContent-Length: {}\r\nETag: \"1\"\r\nLast-Modified: Sat, 01 Aug 2026 00:00:00 GMT\r\n{}Connection: close\r\n\r\n",
+                body.len(),
+                if request.starts_with("GET") { &range } else { "" },
+            );
+            stream.write_all(head.as_bytes()).expect("an answer");
+            if request.starts_with("GET") {
+                stream.write_all(body).expect("an answer");
+            }
+        }
+    });
+    (address, asked)
+}
+
+#[test]
+fn files_are_fetched_once() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let (address, asked) = serve();
+    let hub = Hub::at(&address, folder.path());
+    let path = hub.fetch("owner/name", "model.safetensors").expect("it is there");
+    assert_eq!(std::fs::read(&path).expect("kept"), FILE);
+    assert!(path.ends_with("models--owner--name/snapshots/main/model.safetensors"), "{}", path.display());
+    let before = asked.load(Ordering::Relaxed);
+    assert_eq!(hub.fetch("owner/name", "model.safetensors").expect("it is here"), path);
+    assert_eq!(asked.load(Ordering::Relaxed), before, "nobody was asked again");
+    let missing = hub.fetch("owner/name", "other.safetensors").expect_err("no such file").to_string();
+    assert!(missing.contains("no such object"), "{missing}");
+}
+
+#[test]
+fn without_a_network_the_error_says_what_to_do() {
+    let folder = tempfile::tempdir().expect("a folder");
+    // A name that can never be resolved.
+    let hub = Hub::at("http://hub.invalid", folder.path());
+    let message = hub.fetch("owner/name", "model.safetensors").expect_err("nobody is there").to_string();
+    assert!(message.contains("is there a network?") && message.contains("give the file's path"), "{message}");
+}

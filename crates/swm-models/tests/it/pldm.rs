@@ -1,0 +1,88 @@
+//! PLDM: training is exact and learns, its cost is that of its world model, wrong settings are told.
+
+use crate::dots::Dots;
+use burn::tensor::Device;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use swm_core::Result;
+use swm_models::pldm::Pldm;
+use swm_models::{Checkpoint, TrainConfig, TrainOptions, TrainSummary, train};
+
+/// A model of a few thousand parameters.
+fn config(words: &[&str]) -> Result<TrainConfig<Pldm>> {
+    let small = [
+        "model.image=16",
+        "model.latent=4",
+        "model.projector=16",
+        "model.encoder.pyramid.stages=[{ patch = 4, channels = 8 }, { patch = 2, channels = 8 }]",
+        "model.encoder.pyramid.hidden=16",
+        "model.encoder.pyramid.dim=16",
+        "model.predictor.dim=16",
+        "model.predictor.history=2",
+        "model.predictor.mlp=32",
+        "model.predictor.dim_head=8",
+        "model.predictor.dropout=0.1",
+        "data.frameskip=2",
+        "data.num_steps=4",
+        "data.batch_size=16",
+        "loss.temp_straight=0.1",
+        "loss.idm_hidden=16",
+        "schedule.steps=10",
+        "schedule.warmup=2",
+        "log_every=5",
+    ];
+    let words: Vec<String> = small.iter().chain(words).map(|&word| word.to_owned()).collect();
+    TrainConfig::load("tiny", &words)
+}
+
+fn run(config: &TrainConfig<Pldm>, out: &Path, threads: usize) -> TrainSummary {
+    let options = TrainOptions { threads, ..TrainOptions::default() };
+    train(config, Arc::new(Dots::new(6, 0)), out, &options, &mut (), &AtomicBool::new(false)).expect("trained")
+}
+
+#[test]
+fn threads_do_not_change_a_byte() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let config = config(&[]).expect("a configuration");
+    let (one, two) = (run(&config, &folder.path().join("1"), 1), run(&config, &folder.path().join("2"), 2));
+    assert_eq!(one.weights, two.weights);
+    let loaded = Checkpoint::<Pldm>::load(&folder.path().join("1"), &Device::flex()).expect("it loads");
+    assert_eq!((loaded.hash(), loaded.config.loss.idm_hidden), (one.weights.as_str(), 16));
+}
+
+#[test]
+fn every_term_is_logged_and_what_is_trained_falls() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let words = ["schedule.steps=300", "log_every=20", "model.predictor.dropout=0", "optim.lr=3e-3", "loss.idm=10"];
+    run(&config(&words).expect("a configuration"), folder.path(), 2);
+    let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
+    let line = |line: Option<&str>| serde_json::from_str::<serde_json::Value>(line.expect("a line")).expect("JSON");
+    let (first, last) = (line(lines.lines().next()), line(lines.lines().last()));
+    let number =
+        |line: &serde_json::Value, name: &str| line[name].as_f64().unwrap_or_else(|| panic!("{name} in {line}"));
+    for name in ["prediction", "std", "std_t", "cov", "cov_t", "temp_align", "idm", "temp_straight"] {
+        assert!(number(&last, name).is_finite(), "{name}");
+    }
+    for name in ["loss", "idm"] {
+        assert!(number(&last, name) < 0.7 * number(&first, name), "{name}: {first}\n{last}");
+    }
+    // Latents that had collapsed would fall short of the spread by all of it.
+    assert!(number(&last, "std") < 0.5, "{last}");
+}
+
+#[test]
+fn wrong_settings_say_what_to_change() {
+    let message = |words: &[&str]| config(words).expect_err("wrong").to_string();
+    assert!(message(&["model.latent=1"]).contains("model.latent"), "{}", message(&["model.latent=1"]));
+    let short = message(&["data.num_steps=2", "model.predictor.history=1"]);
+    assert!(short.contains("loss.temp_straight") && short.contains("data.num_steps of at least 3"), "{short}");
+    assert!(message(&["data.num_steps=2"]).contains("model.predictor.history"));
+    assert!(message(&["loss.stdd=1"]).contains("did you mean loss.std"));
+    let folder = tempfile::tempdir().expect("a folder");
+    let large = config(&["model.image=32"]).expect("a configuration");
+    let reader = Arc::new(Dots::new(2, 0));
+    let trained = train(&large, reader, folder.path(), &TrainOptions::default(), &mut (), &AtomicBool::new(false));
+    let message = trained.expect_err("pictures of 16 pixels").to_string();
+    assert!(message.contains("[32, 32, 3]") && message.contains("model.image"), "{message}");
+}

@@ -3,8 +3,8 @@
 //!
 //! Every iteration scores `proposals` rollouts of the policy beside samples of a Gaussian around the mean; the `elites` with
 //! the lowest cost weigh `exp(-temperature (cost - least))` in the next mean and spread. The mean of the plan before, moved
-//! forward, is where a search begins. What is done is the mean's first action; exploring, that of an elite drawn by weight,
-//! and noise of the last spread. (The official program draws an elite in evaluation, too.)
+//! forward, is where a search begins. What is done is the first action of an elite drawn by weight, exploring with noise of
+//! the last spread. (Not the mean's: where left and right are as good, it would do neither.)
 
 use super::config::Tdmpc2Config;
 use super::model::Tdmpc2;
@@ -209,17 +209,17 @@ impl Slot {
     fn plan(&mut self, planner: &PlannerConfig, rollouts: &Rollouts, latent: &[f32], key: Key, explore: bool) {
         let found = planner.search(rollouts, latent, &self.mean, key);
         let dim = self.action.len();
-        self.action.copy_from_slice(&found.mean[..dim]);
+        let mut draw: f32 = key.with("elite").rng().random();
+        let chosen = found.weights.iter().position(|weight| {
+            draw -= weight;
+            draw < 0.0
+        });
+        let elite = chosen.unwrap_or(0) * self.mean.len();
+        self.action.copy_from_slice(&found.elites[elite..][..dim]);
         if explore {
-            let mut draw: f32 = key.with("elite").rng().random();
-            let chosen = found.weights.iter().position(|weight| {
-                draw -= weight;
-                draw < 0.0
-            });
-            let elite = chosen.unwrap_or(0) * self.mean.len();
             let noise = normal(&[key.with("exploration")], dim);
-            for (i, action) in self.action.iter_mut().enumerate() {
-                *action = (found.elites[elite + i] + noise[i] * found.std[i]).clamp(-1.0, 1.0);
+            for ((action, noise), std) in self.action.iter_mut().zip(noise).zip(&found.std) {
+                *action = (*action + noise * std).clamp(-1.0, 1.0);
             }
         }
         let len = self.mean.len();

@@ -89,7 +89,7 @@ impl World {
             "views": self.pool().views().iter().map(ToString::to_string).collect::<Vec<_>>(),
             "goal": config.goal,
         });
-        Manifest { libraries: self.pool().env(0).libraries(), ..Manifest::new("collect", config.seed, what) }
+        Manifest { libraries: self.libraries(), ..Manifest::new("collect", config.seed, what) }
     }
 
     /// Plays episodes until the dataset behind `writer` has `config.episodes`. The writer must have the columns

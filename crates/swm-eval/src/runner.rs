@@ -120,7 +120,7 @@ impl EvalRequest {
             StartsRequest::Dataset { dataset, .. } => Some(resolver.dataset(dataset)?),
         };
         let mut manifest = request.manifest()?;
-        manifest.libraries = world.pool().env(0).libraries();
+        manifest.libraries = world.libraries();
         if let Some(reader) = &dataset {
             manifest.hashes.insert("dataset".to_owned(), reader.content_hash()?);
         }

@@ -1,6 +1,7 @@
 //! [`World`]: a pool of environments of one kind and the loop that plays a policy in them.
 
 use crate::Starts;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use swm_core::pool::{Reset, threads};
@@ -112,6 +113,15 @@ impl World {
     /// What never changes about the environments.
     pub fn spec(&self) -> &EnvSpec {
         self.pool.spec()
+    }
+
+    /// What decides its numbers and pictures, with versions; a renderer where there are pictures.
+    pub fn libraries(&self) -> BTreeMap<String, String> {
+        let mut libraries = self.pool.env(0).libraries();
+        if self.pool.image().is_none() && self.pool.views().is_empty() {
+            libraries.remove("renderer");
+        }
+        libraries
     }
 
     /// Starts an episode in every slot, keyed by the slot, for loops of one's own.

@@ -36,7 +36,7 @@ fn main() -> swm_core::Result<()> {
             spent += if renderer == "egl" { clock.elapsed() } else { busy() - before };
             count += 1;
         }
-        println!("{env} {size} {renderer}: {:.0} a second", f64::from(count) / spent.as_secs_f64());
+        println!("{env} {size} {renderer}: {:.0} a second, of {count}", f64::from(count) / spent.as_secs_f64());
     }
     Ok(())
 }

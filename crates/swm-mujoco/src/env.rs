@@ -317,10 +317,8 @@ impl<T: Task> Env for World<T> {
 
     fn libraries(&self) -> BTreeMap<String, String> {
         let mut libraries = BTreeMap::from([("mujoco".to_owned(), link::VERSION.to_owned())]);
-        // Named only where pictures were drawn: whoever works from states needs none.
-        if self.stage.is_some()
-            && let Ok(name) = render::name()
-        {
+        // What would draw: whoever works from states leaves it out.
+        if let Ok(name) = render::name() {
             libraries.insert("renderer".to_owned(), name);
         }
         libraries

@@ -108,6 +108,19 @@ pub enum Choice {
     Cpu,
 }
 
+impl std::str::FromStr for Choice {
+    type Err = Error;
+
+    fn from_str(word: &str) -> Result<Self> {
+        match word {
+            "auto" => Ok(Self::Auto),
+            "egl" => Ok(Self::Egl),
+            "cpu" => Ok(Self::Cpu),
+            _ => Err(Error::config("the renderer", word, "choose auto, egl or cpu")),
+        }
+    }
+}
+
 /// What this process chose, as a number.
 static CHOSEN: AtomicU8 = AtomicU8::new(Choice::Auto as u8);
 

@@ -1,11 +1,15 @@
 //! `swm bench`: how fast it is, beside the reference where it is installed.
 
-use super::{Context, emit, emit_json, table};
+use super::{Context, complain, emit, emit_json, table};
 use clap::{Args, Subcommand};
 use swm::ENVS;
 use swm_core::EnvChoice;
 use swm_data::Location;
-use swm_eval::{BenchConfig, DataBenchConfig, PlanBenchConfig, bench_data, bench_envs, bench_plan};
+use swm_eval::bench_render::Drawing;
+use swm_eval::{
+    BenchConfig, DataBenchConfig, PlanBenchConfig, RenderBenchConfig, bench_data, bench_envs, bench_plan, bench_render,
+};
+use swm_mujoco::render::{Choice as Renderer, name, with};
 
 /// Arguments of `swm bench`.
 #[derive(Args)]
@@ -24,6 +28,50 @@ enum What {
     Plan(PlanArgs),
     /// Clips a second from every format, and conversions; the use of memory over epochs
     Data(DataArgs),
+    /// Pictures a second on one thread, by environment and size, drawn by each renderer there is
+    Render(RenderArgs),
+}
+
+#[derive(Args)]
+struct RenderArgs {
+    /// Which environments (default: all of three dimensions)
+    envs: Vec<String>,
+    /// Picture sizes
+    #[arg(long, value_delimiter = ',', default_value = "64,224")]
+    sizes: Vec<usize>,
+    /// Turns of each renderer
+    #[arg(long, default_value_t = 5)]
+    turns: usize,
+    /// Seconds of a turn
+    #[arg(long, default_value_t = 0.5)]
+    seconds: f64,
+}
+
+/// Measures renderers.
+fn render(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
+    let envs: Vec<EnvChoice> = match &args.envs[..] {
+        [] => swm_mujoco::ENVS.rows.iter().map(EnvChoice::from).collect(),
+        ids => ids.iter().map(|id| ENVS.choose(id)).collect::<swm_core::Result<_>>()?,
+    };
+    let cpu = |work: &mut dyn FnMut() -> swm_core::Result<()>| with(Renderer::Cpu, work);
+    let egl = |work: &mut dyn FnMut() -> swm_core::Result<()>| with(Renderer::Egl, work);
+    let mut renderers: Vec<(String, &Drawing<'_>)> = vec![(with(Renderer::Cpu, name)?, &cpu)];
+    match with(Renderer::Egl, name) {
+        Ok(name) => renderers.push((name, &egl)),
+        Err(problem) => complain(&format!("{problem}\n")),
+    }
+    let config = RenderBenchConfig { sizes: args.sizes.clone(), turns: args.turns, seconds: args.seconds };
+    let rows = bench_render(&envs, &renderers, &config)?;
+    if context.json {
+        return emit_json(&rows);
+    }
+    let rows = rows.iter().map(|row| {
+        let speed = format!("{:.0}", row.pictures_per_second);
+        vec![row.env.clone(), format!("{} px", row.size), row.renderer.clone(), speed]
+    });
+    emit(&table(&["environment", "pictures", "renderer", "pictures/s"], rows));
+    emit(&format!("one thread, medians of {} turns\n", args.turns));
+    Ok(())
 }
 
 #[derive(Args)]
@@ -148,6 +196,7 @@ pub fn bench(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
         What::Envs(args) => args,
         What::Plan(args) => return plan(args, context),
         What::Data(args) => return data(args, context),
+        What::Render(args) => return render(args, context),
     };
     let entries: Vec<EnvChoice> = match &args.envs[..] {
         [] => ENVS.rows.iter().map(EnvChoice::from).collect(),

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm::resolver::scripted;
 use swm::{ENVS, home};
-use swm_core::{EnvChoice, Error, Result, View};
+use swm_core::{EnvChoice, Error, Manifest, Result, View};
 use swm_data::lance::{Shard, create_shard};
 use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions};
 use swm_eval::collect::check_continues;
@@ -53,6 +53,9 @@ pub struct CollectArgs {
     /// Collect the part I of N, counted from 0, of a Lance dataset; `swm datasets commit` makes one of all parts
     #[arg(long, value_name = "I/N", value_parser = shard, conflicts_with = "format")]
     shard: Option<Shard>,
+    /// Add to a dataset whose pictures another renderer drew
+    #[arg(long, requires = "resume")]
+    mix_renderers: bool,
     #[command(flatten)]
     codec: CodecArgs,
     /// Continue an interrupted collection
@@ -98,6 +101,8 @@ pub struct Collection<'a> {
     pub codec: ImageCodec,
     /// What pictures pass through before they are stored.
     pub wrappers: WrapperArgs,
+    /// Whether pictures of another renderer may stand beside those that are there.
+    pub mix_renderers: bool,
 }
 
 /// Runs a policy and stores its episodes.
@@ -130,6 +135,7 @@ pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
         },
         codec: args.codec.codec(),
         wrappers: args.wrappers.clone(),
+        mix_renderers: args.mix_renderers,
     };
     let collected = run(&collection, context)?;
     if context.json {
@@ -163,6 +169,9 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
             WriteMode::Append => {
                 if let Some(stored) = swm_data::open(*location)?.manifest() {
                     check_continues(&stored, &manifest)?;
+                    if !collection.mix_renderers {
+                        check_renderer(&stored, &manifest)?;
+                    }
                     let (stored, wanted) = (&stored.config["codec"], &manifest.config["codec"]);
                     if stored != wanted {
                         return Err(Error::config(
@@ -217,6 +226,21 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
         speed(collected.steps)
     ));
     Ok(collected)
+}
+
+/// Checks that the pictures of a dataset were drawn as those to come will be: by the same renderer, on whichever device.
+fn check_renderer(stored: &Manifest, wanted: &Manifest) -> Result<()> {
+    fn kind(manifest: &Manifest) -> Option<&str> {
+        manifest.libraries.get("renderer")?.split(' ').next()
+    }
+    match (kind(stored), kind(wanted)) {
+        (Some(stored), Some(wanted)) if stored != wanted => Err(Error::config(
+            format!("continuing a collection with the renderer {wanted}"),
+            format!("its pictures were drawn by {stored}"),
+            format!("--renderer {stored} draws like them; --mix-renderers adds pictures that look a little different"),
+        )),
+        _ => Ok(()),
+    }
 }
 
 /// What `--output` of a command becomes: the folder, made.

@@ -91,6 +91,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
             ..CollectConfig::default()
         },
         mode: WriteMode::Overwrite,
+        mix_renderers: false,
         codec: ImageCodec::default(),
         wrappers: WrapperArgs::default(),
     };

@@ -38,6 +38,9 @@ pub struct Cli {
     /// Worker threads (default: one for each core); results do not depend on it
     #[arg(long, global = true, default_value_t = 0, hide_default_value = true, value_name = "N")]
     threads: usize,
+    /// What draws worlds of three dimensions: egl (OpenGL), cpu (our own), or auto, which is egl where a graphics card is
+    #[arg(long, global = true, default_value = "auto", hide_default_value = true, value_name = "NAME")]
+    renderer: swm_mujoco::render::Choice,
 }
 
 #[derive(Subcommand)]
@@ -123,6 +126,7 @@ impl Cli {
 
     fn dispatch(self) -> anyhow::Result<()> {
         let json = self.json;
+        swm_mujoco::render::choose(self.renderer);
         match self.command {
             Command::Envs(args) => envs::envs(&args, json),
             Command::Fovs(args) => envs::fovs(&args, json),

@@ -6,5 +6,6 @@ mod golden;
 #[path = "../../src/render/likeness.rs"]
 mod likeness;
 mod link;
+mod readout;
 mod recorded;
 mod views;

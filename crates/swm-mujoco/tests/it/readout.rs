@@ -1,0 +1,114 @@
+//! What is learned from one renderer's pictures holds for the other's: a linear read-out of the state.
+
+use rand::Rng;
+use swm_core::{Action, Batch, FrameMut, Key, ResetOptions, Schema};
+use swm_mujoco::ENVS;
+use swm_mujoco::render::{self, Choice};
+
+const ID: &str = "swm/CheetahDMControl-v0";
+const SIDE: usize = 64;
+/// Pixels are averaged over squares of this side.
+const POOL: usize = 4;
+const EPISODES: u64 = 25;
+const STEPS: usize = 12;
+/// Of the pictures of [`EPISODES`], one in so many is held out.
+const HELD_OUT: usize = 4;
+/// How strongly weights are kept small.
+const RIDGE: f64 = 1.0;
+
+/// Mean colours of squares, about 0, and a constant.
+fn features(rgb: &[u8]) -> Vec<f64> {
+    let side = SIDE / POOL;
+    let mut sums = vec![0.0; side * side * 3];
+    for (i, &byte) in rgb.iter().enumerate() {
+        let (x, y, channel) = (i / 3 % SIDE, i / 3 / SIDE, i % 3);
+        sums[((y / POOL) * side + x / POOL) * 3 + channel] += f64::from(byte) / 255.0 / (POOL * POOL) as f64;
+    }
+    sums.push(1.0);
+    sums
+}
+
+fn dot(a: &[f64], b: &[f64]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+/// Solves a symmetric positive system for several right sides, by elimination.
+fn solve(mut a: Vec<Vec<f64>>, mut b: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
+    let n = a.len();
+    for i in 0..n {
+        let (pivot, known) = (a[i].clone(), b[i].clone());
+        for j in i + 1..n {
+            let by = a[j][i] / pivot[i];
+            a[j].iter_mut().zip(&pivot).for_each(|(x, p)| *x -= by * p);
+            b[j].iter_mut().zip(&known).for_each(|(x, p)| *x -= by * p);
+        }
+    }
+    for i in (0..n).rev() {
+        for k in 0..b[i].len() {
+            let rest: f64 = (i + 1..n).map(|j| a[i][j] * b[j][k]).sum();
+            b[i][k] = (b[i][k] - rest) / a[i][i];
+        }
+    }
+    b
+}
+
+#[test]
+#[ignore = "draws 300 pictures with OpenGL"]
+#[allow(clippy::print_stderr, reason = "the numbers for whoever runs it with --no-capture")]
+fn a_read_out_learned_from_one_renderer_serves_the_other() {
+    let mut env = ENVS.get(ID).and_then(|entry| entry.env()).expect("a world");
+    let (mut poses, mut seen) = (vec![], [vec![], vec![]]);
+    let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
+    for episode in 0..EPISODES {
+        env.reset(episode, &ResetOptions::default()).expect("a reset");
+        let mut rng = Key::new(episode).rng();
+        for _ in 0..STEPS {
+            for _ in 0..3 {
+                let action: Vec<f32> = (0..env.spec().action_dim()).map(|_| rng.random_range(-1.0..1.0)).collect();
+                env.step(Action::Continuous(&action)).expect("a step");
+            }
+            env.observe(&mut row.row_mut(0));
+            // The camera follows: how far it ran is not to be seen.
+            poses.push(row.row(0).to_f64("qpos").expect("a column")[1..].to_vec());
+            for (choice, seen) in [Choice::Egl, Choice::Cpu].into_iter().zip(&mut seen) {
+                let mut rgb = vec![0; SIDE * SIDE * 3];
+                render::with(choice, || env.render(FrameMut::new(SIDE, SIDE, &mut rgb))).expect("a picture");
+                seen.push(features(&rgb));
+            }
+        }
+    }
+    let held_out = |i: &usize| i / STEPS % HELD_OUT == 0;
+    let train: Vec<usize> = (0..poses.len()).filter(|i| !held_out(i)).collect();
+    let test: Vec<usize> = (0..poses.len()).filter(held_out).collect();
+    let error = |learned: &[Vec<f64>], shown: &[Vec<f64>]| -> f64 {
+        // The dual form: a weight for every picture instead of one for every feature.
+        let mut kernel: Vec<Vec<f64>> =
+            train.iter().map(|&i| train.iter().map(|&j| dot(&learned[i], &learned[j])).collect()).collect();
+        kernel.iter_mut().enumerate().for_each(|(i, row)| row[i] += RIDGE);
+        let weights = solve(kernel, train.iter().map(|&i| poses[i].clone()).collect());
+        let squares: f64 = test
+            .iter()
+            .map(|&i| {
+                let alike: Vec<f64> = train.iter().map(|&j| dot(&learned[j], &shown[i])).collect();
+                let read = (0..poses[i].len()).map(|k| weights.iter().zip(&alike).map(|(w, a)| w[k] * a).sum::<f64>());
+                read.zip(&poses[i]).map(|(a, b)| (a - b).powi(2)).sum::<f64>()
+            })
+            .sum();
+        (squares / test.len() as f64).sqrt()
+    };
+    let [egl, cpu] = &seen;
+    for (name, learned, other) in [("egl", egl, cpu), ("cpu", cpu, egl)] {
+        let (own, foreign) = (error(learned, learned), error(learned, other));
+        let mean: Vec<f64> =
+            (0..poses[0].len()).map(|k| train.iter().map(|&i| poses[i][k]).sum::<f64>() / train.len() as f64).collect();
+        let blind =
+            (test.iter().map(|&i| poses[i].iter().zip(&mean).map(|(a, b)| (a - b).powi(2)).sum::<f64>()).sum::<f64>()
+                / test.len() as f64)
+                .sqrt();
+        eprintln!(
+            "learned from {name}: error {own:.4} on its own pictures, {foreign:.4} on the other's, {blind:.4} blind"
+        );
+        assert!(own < 0.7 * blind, "pictures tell where the world is");
+        assert!((foreign - own).abs() < 0.1 * own, "learned from {name}: {own} and {foreign}");
+    }
+}

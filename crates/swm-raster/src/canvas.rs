@@ -159,7 +159,7 @@ impl Canvas {
         self.plain.clear();
         self.shadowed.clear();
         // Texels are to be smaller than pixels.
-        let side = (5 * view.width.max(view.height) / 2).clamp(192, 1024);
+        let side = (2 * view.width.max(view.height)).clamp(192, 1024);
         for light in &scene.lights {
             if scene.shadows && light.shadows {
                 let number = self.shadowed.len();

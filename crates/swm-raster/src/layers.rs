@@ -16,7 +16,7 @@ pub(crate) const TRIANGLE: u32 = 1 << 31;
 const INVISIBLE: f32 = 0.6;
 
 /// And so many texels large in maps of shadows.
-const COARSE: f32 = 1.5;
+const COARSE: f32 = 2.0;
 
 /// Where the samples of a pixel are.
 pub(crate) fn pattern(samples: usize) -> &'static [[f32; 2]] {

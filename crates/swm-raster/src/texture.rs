@@ -52,23 +52,13 @@ impl Level {
         let y = (t * (256 * h) as f32) as i32 - 128;
         let (fx, fy) = ((x & 255) as u32, (y & 255) as u32);
         let (x, y) = (x >> 8, y >> 8);
-        // The coordinates' ends are a texel apart from the texture at most.
-        let wrap = |i: i32, n: i32| -> i32 {
-            match repeat {
-                true => (if i < 0 {
-                    i + n
-                } else if i >= n {
-                    i - n
-                } else {
-                    i
-                })
-                .clamp(0, n - 1),
-                false => i.clamp(0, n - 1),
-            }
-        };
-        let (xa, xb) = (wrap(x, w), wrap(x + 1, w));
-        let (ya, yb) = (wrap(y, h) * w, wrap(y + 1, h) * w);
-        let four = [ya + xa, ya + xb, yb + xa, yb + xb].map(|i| self.texels[to_usize(i)]);
+        // The ends of coordinates are half a texel beyond the texture; what is farther is no number, and black.
+        let first = |i: i32, n: i32| if i < 0 { if repeat { n - 1 } else { 0 } } else { i };
+        let second = |i: i32, n: i32| if i + 1 >= n { if repeat { 0 } else { n - 1 } } else { i + 1 };
+        let (xa, xb) = (first(x, w), second(x, w));
+        let (ya, yb) = (first(y, h).wrapping_mul(w), second(y, h).wrapping_mul(w));
+        let at = |x: i32, y: i32| self.texels.get(y.wrapping_add(x) as usize).copied().unwrap_or(0);
+        let four = [at(xa, ya), at(xb, ya), at(xa, yb), at(xb, yb)];
         let right = fx * fy;
         let weights = [65536 - 256 * (fx + fy) + right, 256 * fx - right, 256 * fy - right, right];
         // Rounded so that they still sum to 256.
@@ -174,7 +164,9 @@ impl Texture {
         let between = if level < last { ((2.0 * mantissa - 3.0) * 256.0) as i32 } else { 0 };
         let fine = levels[level].look(s, t, repeat);
         let seen = match u32::try_from(between) {
-            Ok(between) if between > 0 => {
+            // Less than a few steps of a byte apart, one of them will do.
+            Ok(between) if between > 240 => levels[level + 1].look(s, t, repeat),
+            Ok(between) if between > 16 => {
                 weighted([fine, levels[level + 1].look(s, t, repeat)], [256 - between, between])
             }
             _ => fine,

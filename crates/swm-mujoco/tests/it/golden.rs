@@ -2,7 +2,7 @@
 //! picture. Reads `SWM_GOLDEN` and the folder beside this test.
 
 use crate::likeness::Likeness;
-use crate::recorded::{self, Golden, picture_difference};
+use crate::recorded::{self, Golden};
 use std::collections::BTreeMap;
 use std::path::Path;
 use swm_core::{Action, Batch, Env, FrameMut, ResetOptions, Schema, VariationRequest};
@@ -71,8 +71,7 @@ const FAMILIES: &[Family] = &[
         renamed: &[],
         goal: |golden, state| {
             // Where nobody recorded the goal, nobody reached it: it is out of sight.
-            let known = golden.names().iter().any(|name| name == "goal.xy");
-            let goal = if known { golden.numbers("goal.xy") } else { vec![1e3, 1e3] };
+            let goal = if golden.has("goal.xy") { golden.numbers("goal.xy") } else { vec![1e3, 1e3] };
             state[1..3].copy_from_slice(&goal);
         },
     },
@@ -81,7 +80,7 @@ const FAMILIES: &[Family] = &[
 /// What a table remembers: contact, locks now and before, and the pose before.
 fn table_memory(golden: &mut Golden, memory: &mut [f64]) {
     memory[0] = golden.numbers("info.proprio/gripper_contact")[0];
-    if golden.names().iter().any(|name| name == "info.button_states") {
+    if golden.has("info.button_states") {
         memory[1..3].copy_from_slice(&golden.numbers("info.button_states")[..2]);
         memory[3..5].copy_from_slice(&golden.numbers("info.prev_button_states")[..2]);
     }
@@ -94,7 +93,7 @@ fn table_memory(golden: &mut Golden, memory: &mut [f64]) {
 fn table_goal(golden: &mut Golden, state: &mut [f64]) {
     let (places, turns) = (golden.numbers("start.mocap_pos"), golden.numbers("start.mocap_quat"));
     let (poses, joints) = (golden.numbers("start.qpos").len(), state.len());
-    let fixtures = golden.names().iter().any(|name| name == "info.button_states");
+    let fixtures = golden.has("info.button_states");
     let (cubes, target) = (places.len() / 3, golden.numbers("info.target"));
     // Cubes stand behind the 14 joints of the arm and its gripper.
     for cube in 0..cubes {
@@ -374,4 +373,10 @@ impl<'a> Comparison<'a> {
             self.apart_at(array, 0, picture_difference(&rgb, &wanted));
         }
     }
+}
+
+/// The mean absolute difference of two pictures, of 255.
+fn picture_difference(a: &[u8], b: &[u8]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    a.iter().zip(b).map(|(&a, &b)| f64::from(a.abs_diff(b))).sum::<f64>() / a.len() as f64
 }

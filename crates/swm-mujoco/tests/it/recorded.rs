@@ -1,4 +1,5 @@
-//! Rollouts that the Python reference recorded, read from `SWM_GOLDEN` and from the folder beside this test.
+//! Rollouts that the Python reference recorded, read from `SWM_GOLDEN` and from the folder beside this test. The tests of
+//! `src/dmc/golden.rs` read them as well.
 
 use npyz::npz::NpzArchive;
 use npyz::{DType, TypeChar};
@@ -39,6 +40,11 @@ impl Golden {
         self.0.array_names().map(str::to_owned).collect()
     }
 
+    /// Whether it has an array.
+    pub fn has(&self, name: &str) -> bool {
+        self.names().iter().any(|known| known == name)
+    }
+
     fn array<'a>(&'a mut self, name: &str) -> npyz::NpyFile<impl std::io::Read + 'a> {
         self.0.by_name(name).expect("a readable archive").unwrap_or_else(|| panic!("no array '{name}'"))
     }
@@ -72,11 +78,16 @@ impl Golden {
         (side(height), side(width), array.into_vec().unwrap_or_else(|error| panic!("{name}: {error}")))
     }
 
+    /// A text.
+    pub fn text(&mut self, name: &str) -> String {
+        self.array(name).into_vec::<String>().unwrap_or_else(|error| panic!("{name}: {error}")).concat()
+    }
+
     /// A request that pins every factor to what was recorded.
     pub fn variation(&mut self) -> VariationRequest {
-        let text: Vec<String> = self.array("variation").into_vec().expect("text");
         let mut request = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
-        flatten("", &serde_json::from_str(&text.concat()).expect("JSON"), &mut request.variation_values);
+        let text = self.text("variation");
+        flatten("", &serde_json::from_str(&text).expect("JSON"), &mut request.variation_values);
         request
     }
 }
@@ -98,10 +109,4 @@ fn flatten(key: &str, value: &serde_json::Value, into: &mut BTreeMap<String, Vec
         }
         value => numbers(value, into.entry(key.to_owned()).or_default()),
     }
-}
-
-/// The mean absolute difference of two pictures, of 255.
-pub fn picture_difference(a: &[u8], b: &[u8]) -> f64 {
-    assert_eq!(a.len(), b.len());
-    a.iter().zip(b).map(|(&a, &b)| f64::from(a.abs_diff(b))).sum::<f64>() / a.len() as f64
 }

@@ -1,10 +1,10 @@
 //! [`InverseCheckpoint`]: the network and the world model whose encoder it was trained on, in one run folder. The
 //! network's files lie where those of any checkpoint lie; the world model's checkpoint is a copy in `world/`.
 
-use super::{InverseConfig, InverseModel};
+use super::InverseConfig;
 use crate::checkpoint::{self, Checkpoint};
 use crate::lewm::Lewm;
-use crate::nn::parameters;
+use crate::nn::{Init, Mlp, parameters};
 use burn::tensor::Device;
 use std::path::Path;
 use swm_core::{Key, Manifest, Result};
@@ -14,8 +14,8 @@ use swm_core::{Key, Manifest, Result};
 pub struct InverseCheckpoint {
     /// The world model whose encoder it sees through.
     pub world: Checkpoint<Lewm>,
-    /// The network.
-    pub model: InverseModel,
+    /// The network: from the latents of present and goal, beside each other, to the actions of a model step in model units.
+    pub model: Mlp,
     /// How it was trained.
     pub config: InverseConfig,
     /// Where it came from; `hashes["weights"]` names the network, `hashes["encoder"]` the world model.
@@ -51,7 +51,7 @@ impl InverseCheckpoint {
         let world = Checkpoint::<Lewm>::load(&run.join(WORLD), device)?;
         let config = stored.config;
         let actions = world.actions();
-        let model = InverseModel::new(world.config.model.latent, config.hidden, actions, Key::new(0), device);
+        let model = Mlp::new(&Init::new(Key::new(0), device), 2 * world.config.model.latent, config.hidden, actions);
         let model =
             checkpoint::fill(model, &stored.folder.join("weights.safetensors"), stored.manifest.hashes.get("weights"))?;
         Ok(Self { world, model, config, manifest: stored.manifest })

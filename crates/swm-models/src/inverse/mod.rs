@@ -7,11 +7,9 @@
 //! goal policy, Pathak et al. 2018); PLDM and the paper's benchmark use such a model as a term or a probe.
 
 mod checkpoint;
-mod model;
 mod policy;
 mod train;
 
 pub use checkpoint::InverseCheckpoint;
-pub use model::InverseModel;
 pub use policy::InversePolicy;
 pub use train::{InverseConfig, train};

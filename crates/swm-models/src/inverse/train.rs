@@ -1,10 +1,11 @@
 //! Training the network on a frozen encoder.
 
+use super::InverseCheckpoint;
 use super::checkpoint::FAMILY;
-use super::{InverseCheckpoint, InverseModel};
 use crate::checkpoint::Checkpoint;
 use crate::lewm::{Lewm, pixels};
 use crate::nn::parameters::{self, IntoF32};
+use crate::nn::{Init, Mlp};
 use crate::train::{AdamW, Group, Observer, OptimConfig, Progress, ScheduleConfig, TrainSummary, config, log};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -135,7 +136,7 @@ fn run(
             ..LoaderConfig::default()
         },
     )?;
-    let mut model = InverseModel::new(latent, config.hidden, block * dim, key.with("init"), &Device::flex());
+    let mut model = Mlp::new(&Init::new(key.with("init"), &Device::flex()), 2 * latent, config.hidden, block * dim);
     let mut optimizer = AdamW::new(config.optim.clone());
     let (mut step, mut epoch, mut loss) = (0, 0, f64::NAN);
     let (mut waited, mut clips_per_second) = (0.0, 0.0);
@@ -244,7 +245,7 @@ impl Pairs {
 }
 
 /// One step: the network after it, the loss before it and the norm of the gradient.
-fn learn(model: InverseModel, optimizer: &mut AdamW, share: f64, pairs: Pairs) -> Result<(InverseModel, f64, f64)> {
+fn learn(model: Mlp, optimizer: &mut AdamW, share: f64, pairs: Pairs) -> Result<(Mlp, f64, f64)> {
     let tensor = |numbers: Vec<f32>| {
         let width = numbers.len() / pairs.count;
         Tensor::<2>::from_data(TensorData::new(numbers, [pairs.count, width]), &Device::flex())

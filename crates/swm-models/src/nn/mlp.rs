@@ -106,3 +106,32 @@ impl Embedder {
         self.embed._2.forward(Activation::Silu.forward(self.embed._0.forward(x)))
     }
 }
+
+/// Two hidden layers with GELU. A field `_2` is number 2 of a sequence, as in PyTorch.
+#[derive(Module, Debug)]
+pub struct Mlp {
+    /// Into hidden features.
+    pub _0: Linear,
+    /// From hidden features to hidden features.
+    pub _2: Linear,
+    /// Out of them.
+    pub _4: Linear,
+}
+
+impl Mlp {
+    /// A network.
+    pub fn new(init: &Init, inputs: usize, hidden: usize, outputs: usize) -> Self {
+        Self {
+            _0: Linear::new(&init.of("0"), inputs, hidden),
+            _2: Linear::new(&init.of("2"), hidden, hidden),
+            _4: Linear::new(&init.of("4"), hidden, outputs),
+        }
+    }
+
+    /// # Shapes
+    /// `[rows, inputs]` to `[rows, outputs]`.
+    pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
+        let hidden = Activation::Gelu.forward(self._0.forward(x));
+        self._4.forward(Activation::Gelu.forward(self._2.forward(hidden)))
+    }
+}

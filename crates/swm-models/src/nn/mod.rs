@@ -24,7 +24,7 @@ pub use by_name::ByName;
 pub use dino::{Dino, DinoConfig};
 pub use given::given;
 pub use linear::Linear;
-pub use mlp::{Embedder, Projector};
+pub use mlp::{Embedder, Mlp, Projector};
 pub use norm::{BatchNorm, BatchStatistics, LayerNorm};
 pub use normed::{Dynamics, Ensemble, Head, NormedLinear};
 pub use parameters::Named;

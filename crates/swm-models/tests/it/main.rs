@@ -5,6 +5,7 @@
 mod checkpoints;
 mod dino_wm;
 mod dots;
+mod gcrl;
 mod golden;
 mod hub;
 mod online;

@@ -3,6 +3,7 @@
 //! of `tests/golden` (written by the exporters beside them) and of the shared reference.
 
 mod dino_wm;
+mod gcrl;
 mod lewm;
 mod pldm;
 mod tdmpc2;

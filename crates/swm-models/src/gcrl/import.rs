@@ -1,0 +1,290 @@
+//! Goal-conditioned checkpoints of the reference implementation (its class `GCRL`), both ways.
+//!
+//! Its training scripts store their own settings as `config.json`, `load_pretrained` wants a tree of classes: sizes are
+//! therefore read off the weights, and of the file only what weights do not tell, the attention heads.
+
+use super::config::GcrlConfig;
+use super::loss::LOG_STD;
+use super::model::{Gcbc, Gciql, Gcivl};
+use super::train::GoalConditioned;
+use super::transformer::TransformerConfig;
+use crate::checkpoint::Checkpoint;
+use crate::nn::parameters::{self, HostTensor, Named};
+use crate::nn::{BackboneConfig, DinoConfig, VitConfig};
+use crate::pixels::Pixels;
+use crate::train::{Facts, TrainConfig};
+use crate::weights::reference::write;
+use crate::weights::{self, Naming, names};
+use burn::tensor::Device;
+use serde_json::{Value, json};
+use std::path::Path;
+use swm_core::{Error, Key, Manifest, Result};
+
+const CLASS: &str = "stable_worldmodel.wm.gcrl.GCRL";
+const MODULE: &str = "stable_worldmodel.wm.gcrl.module";
+
+/// A model that the reference trained: a folder with `weights.pt` and `config.json`, or a file of weights beside such a
+/// file. What it does not store is how actions were normalised, so `facts` must be those of its dataset.
+///
+/// A policy's checkpoint holds the values without their slow copy, which then begins as they are.
+///
+/// # Errors
+/// When a part of the family is missing (the critic is not stored with the policies of GCIQL: import those as `gcivl`), it
+/// sees more than pictures, it is damaged, or its actions are not those in `facts`.
+pub fn import<M>(from: &Path, facts: Facts) -> Result<Checkpoint<M>>
+where
+    M: GoalConditioned<Config = GcrlConfig>,
+{
+    let path = if from.is_dir() { from.join("weights.pt") } else { from.to_owned() };
+    let mut found = Found { weights: plain(weights::read(&path)?), path: &path };
+    let settings = path.with_file_name("config.json");
+    let text = std::fs::read(&settings).map_err(|error| Error::io(&settings, "reading a checkpoint", error))?;
+    let settings: Value = serde_json::from_slice(&text).map_err(|error| found.wrong(error.to_string()))?;
+    if found.weights.keys().any(|name| name.starts_with("extra_encoders.")) {
+        return Err(found.wrong("it sees other columns beside pictures".to_owned()));
+    }
+    let sizes = found.sizes(&settings)?;
+    // What belongs to a larger family is left where it is.
+    let model = |config: &TrainConfig<M>| M::new(config, &facts, Key::new(0), &Device::flex());
+    let actions = found.shape("log_stds")?[0];
+    let mut config = TrainConfig::<M>::load("paper", &[])?;
+    let dim = facts.action.dim();
+    if dim == 0 || !actions.is_multiple_of(dim) {
+        return Err(Error::mismatch(
+            "importing a policy",
+            format!("{dim} numbers an action in the dataset"),
+            format!("a divisor of {actions}, what the model says at a time"),
+        ));
+    }
+    config.data.frameskip = actions / dim;
+    config.data.num_steps = config.data.num_steps - config.model.history + sizes.history;
+    config.model = GcrlConfig { weights: path.display().to_string(), ..sizes };
+    config.check()?;
+    let drawn = model(&config)?;
+    let wanted = parameters::shapes(&drawn);
+    found.weights.retain(|name, _| wanted.contains_key(name) || !extra(name));
+    let model = weights::fill(drawn, &found.weights, &path, &format!("a {}", M::FAMILY))?;
+    let manifest = Manifest::new("import", 0, json!({ "from": from.display().to_string() }));
+    Ok(Checkpoint { model, config, facts, manifest })
+}
+
+/// Whether a weight is of a part that only some families have.
+fn extra(name: &str) -> bool {
+    ["value_predictor.", "critic_predictor."].iter().any(|part| name.starts_with(part))
+}
+
+/// Names without wrappers and masks; values and critics as a network and its slow copy.
+fn plain(weights: Named<HostTensor>) -> Named<HostTensor> {
+    let mut plain = Named::new();
+    for (name, weight) in weights {
+        let name = name.replacen(".backbone.", ".", 1);
+        if name.ends_with(".causal_mask") || name == "encoder.embeddings.mask_token" && weight.shape.len() == 3 {
+            continue;
+        }
+        match ["value_predictor", "critic_predictor"]
+            .into_iter()
+            .find_map(|part| Some((part, name.strip_prefix(part)?)))
+        {
+            Some((part, rest)) if !rest.starts_with(".student.") && !rest.starts_with(".teacher.") => {
+                plain.insert(format!("{part}.student{rest}"), weight.clone());
+                plain.insert(format!("{part}.teacher{rest}"), weight);
+            }
+            _ => {
+                plain.insert(name, weight);
+            }
+        }
+    }
+    names::published(plain, "encoder.")
+}
+
+/// Weights and where they were.
+struct Found<'a> {
+    weights: Named<HostTensor>,
+    path: &'a Path,
+}
+
+impl Found<'_> {
+    fn wrong(&self, problem: String) -> Error {
+        Error::corrupt(self.path, problem, "give a checkpoint of the reference's class GCRL")
+    }
+
+    fn shape(&self, name: &str) -> Result<&[usize]> {
+        let shape = self.weights.get(name).map(|weight| weight.shape.as_slice());
+        shape.filter(|shape| !shape.is_empty()).ok_or_else(|| self.wrong(format!("'{name}' is missing")))
+    }
+
+    /// A side of a weight.
+    fn side(&self, name: &str, axis: usize) -> Result<usize> {
+        self.shape(name)?.get(axis).copied().ok_or_else(|| self.wrong(format!("'{name}' has another shape")))
+    }
+
+    /// How many weights have such names.
+    fn count(&self, prefix: &str, end: &str) -> usize {
+        self.weights.keys().filter(|name| name.starts_with(prefix) && name.ends_with(end)).count()
+    }
+
+    fn sizes(&self, settings: &Value) -> Result<GcrlConfig> {
+        let number = |at: [&str; 2]| settings[at[0]][at[1]].as_u64().and_then(|n| usize::try_from(n).ok());
+        let encoder = |name: &str| format!("encoder.{name}");
+        let (dim, patch) = {
+            let name = encoder("embeddings.patch_embeddings.projection.weight");
+            (self.side(&name, 0)?, self.side(&name, 2)?)
+        };
+        // All that were published have heads of 64 features.
+        let heads = number(["encoder", "num_attention_heads"]).unwrap_or((dim / 64).max(1));
+        let encoder = if self.weights.contains_key("encoder.encoder.layer.0.layer_scale1.lambda1") {
+            BackboneConfig::Dinov2(DinoConfig {
+                patch,
+                dim,
+                depth: self.count("encoder.encoder.layer.", ".norm1.weight"),
+                heads,
+                mlp: self.side(&encoder("encoder.layer.0.mlp.fc1.weight"), 0)?,
+                grid: (self.side(&encoder("embeddings.position_embeddings"), 1)? - 1).isqrt(),
+                registers: self.side(&encoder("embeddings.register_tokens"), 1).unwrap_or(0),
+            })
+        } else {
+            BackboneConfig::Vit(VitConfig {
+                patch,
+                dim,
+                depth: self.count("encoder.encoder.layer.", ".layernorm_before.weight"),
+                heads,
+                mlp: self.side(&encoder("encoder.layer.0.intermediate.dense.weight"), 0)?,
+            })
+        };
+        let policy = |name: &str| format!("action_predictor.{name}");
+        let patches = self.side(&policy("pos_embedding_goal"), 1)?;
+        let inner = self.side(&policy("transformer.layers.0.0.to_q.weight"), 0)?;
+        let heads = number(["action_predictor", "heads"]).or(number(["predictor", "heads"])).unwrap_or(inner / 64);
+        if heads == 0 || !inner.is_multiple_of(heads) {
+            return Err(self.wrong(format!("{inner} features do not split into {heads} attention heads")));
+        }
+        let (pixel_mean, pixel_std) = Pixels::IMAGENET;
+        let critic = self.side("critic_predictor.student.q_head.0.bias", 0).unwrap_or(256);
+        Ok(GcrlConfig {
+            image: patches.isqrt() * patch,
+            pixel_mean,
+            pixel_std,
+            history: self.side(&policy("pos_embedding"), 1)? / patches.max(1),
+            frozen: true,
+            weights: String::new(),
+            encoder,
+            head: TransformerConfig {
+                depth: self.count(&policy("transformer.layers."), ".0.norm.weight"),
+                heads,
+                dim_head: inner / heads,
+                mlp: self.side(&policy("transformer.layers.0.1.net.1.weight"), 0)?,
+                dropout: 0.0,
+                emb_dropout: 0.0,
+            },
+            critic,
+        })
+    }
+}
+
+/// A model that the reference can use.
+pub trait Exportable: GoalConditioned {
+    /// The parts beside encoder and policy, with their classes.
+    const PARTS: &'static [(&'static str, &'static str)];
+}
+
+impl Exportable for Gcbc {
+    const PARTS: &'static [(&'static str, &'static str)] = &[];
+}
+
+impl Exportable for Gcivl {
+    const PARTS: &'static [(&'static str, &'static str)] = &[("value_predictor", "Predictor")];
+}
+
+impl Exportable for Gciql {
+    const PARTS: &'static [(&'static str, &'static str)] =
+        &[("value_predictor", "Predictor"), ("critic_predictor", "QPredictor")];
+}
+
+/// Writes `weights.pt` and `config.json` that the reference's `load_pretrained` reads. Values and critic are stored
+/// without their slow copies.
+///
+/// # Errors
+/// When the reference has no encoder like the model's, or the disk refuses.
+pub fn export<M>(checkpoint: &Checkpoint<M>, folder: &Path, naming: Naming) -> Result<()>
+where
+    M: Exportable<Config = GcrlConfig>,
+{
+    let (sizes, actions) = (&checkpoint.config.model, checkpoint.actions());
+    let encoder = match &sizes.encoder {
+        BackboneConfig::Vit(VitConfig { patch, dim, depth, heads, mlp }) => json!({
+            "_target_": "stable_pretraining.backbone.utils.vit_hf",
+            "size": "tiny", "patch_size": patch, "image_size": sizes.image, "pretrained": false, "use_mask_token": false,
+            "hidden_size": dim, "num_hidden_layers": depth, "num_attention_heads": heads, "intermediate_size": mlp,
+        }),
+        BackboneConfig::Dinov2(dino) if matches!(dino.dim, 384 | 768 | 1024) && dino.registers == 0 => {
+            let name = match dino.dim {
+                384 => "facebook/dinov2-small",
+                768 => "facebook/dinov2-base",
+                _ => "facebook/dinov2-large",
+            };
+            json!({ "_target_": "transformers.AutoModel.from_pretrained", "_args_": [name] })
+        }
+        _ => {
+            return Err(Error::config(
+                "exporting a model",
+                "the reference has no such encoder",
+                "train with model.encoder.vit or a published DINOv2",
+            ));
+        }
+    };
+    let (sight, head) = (sizes.sight(), &sizes.head);
+    let class = |class: &str, pool: &str| {
+        json!({
+            "_target_": format!("{MODULE}.{class}"),
+            "num_patches": sight.patches, "num_frames": sight.frames, "dim": sight.dim, "pool_type": pool,
+            "depth": head.depth, "heads": head.heads, "dim_head": head.dim_head, "mlp_dim": head.mlp,
+            "dropout": head.dropout, "emb_dropout": head.emb_dropout,
+        })
+    };
+    let mut policy = class("Predictor", "attention");
+    policy["out_dim"] = json!(actions);
+    let mut tree = json!({
+        "_target_": CLASS, "encoder": encoder, "action_predictor": policy, "history_size": sizes.history,
+        "log_std_min": LOG_STD[0], "log_std_max": LOG_STD[1],
+    });
+    for &(part, kind) in M::PARTS {
+        let mut made = class(kind, "mean");
+        if kind == "QPredictor" {
+            (made["action_dim"], made["q_hidden_dim"]) = (json!(actions), json!(sizes.critic));
+        } else {
+            made["out_dim"] = json!(1);
+        }
+        tree[part] = made;
+    }
+    write(folder, &tree, &state(&checkpoint.model, sizes, naming))
+}
+
+/// The state dict of a model, as the reference's class has it: with the masks of the attention, without slow copies.
+fn state<M: GoalConditioned>(model: &M, sizes: &GcrlConfig, naming: Naming) -> Named<HostTensor> {
+    let sight = sizes.sight();
+    let keys = sight.frames * sight.patches;
+    let mask = |queries: usize| {
+        let frame = |query: usize| query * sight.frames / queries;
+        let seen = |place: usize| place % keys / sight.patches <= frame(place / keys);
+        let values = (0..queries * keys).map(|place| if seen(place) { 1.0 } else { 0.0 }).collect();
+        HostTensor { shape: vec![1, 1, queries, keys], values }
+    };
+    let mut weights = Named::new();
+    for (name, weight) in parameters::values(model) {
+        if name.contains(".teacher.") {
+            continue;
+        }
+        let name = name.replacen(".student.", ".", 1);
+        // Every layer that does not look at the goal has a mask.
+        if let Some(layer) = name.strip_suffix(".0.to_q.weight")
+            && let Some(index) = layer.rsplit('.').next().and_then(|index| index.parse::<usize>().ok())
+        {
+            let gathers = layer.starts_with("action_predictor.") && index + 1 == sizes.head.depth;
+            if gathers || index.is_multiple_of(2) {
+                weights.insert(format!("{layer}.0.causal_mask"), mask(if gathers { sight.frames } else { keys }));
+            }
+        }
+        weights.insert(name, weight);
+    }
+    names::named(weights, "encoder.", naming)
+}

@@ -1,0 +1,17 @@
+//! Goal-conditioned learning from offline data: behavioural cloning (GCBC) and implicit value and Q-learning (GCIVL,
+//! GCIQL), on the patches of a frozen or a trained encoder. They act without planning. See `docs/models/gcrl.md`.
+
+pub mod config;
+pub mod heads;
+pub mod import;
+pub mod loss;
+pub mod model;
+pub mod policy;
+pub mod step;
+mod train;
+pub mod transformer;
+
+pub use config::GcrlConfig;
+pub use model::{Gcbc, Gciql, Gcivl};
+pub use policy::{Actor, GcrlPolicy};
+pub use train::GoalConditioned;

@@ -1,0 +1,319 @@
+//! How goal-conditioned models are trained: the loop's side of [`super::step`].
+
+use super::config::GcrlConfig;
+use super::loss::{CloningLoss, ValueLoss};
+use super::model::{Gcbc, Gciql, Gcivl};
+use super::policy::Actor;
+use super::step::{Clips, Relabelled};
+use crate::checkpoint::Checkpoint;
+use crate::nn::{Backbone, Named, Noise, parameters};
+use crate::train::{Facts, Group, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards};
+use crate::{pixels, weights};
+use burn::tensor::{Device, Tensor, TensorData};
+use std::ops::Range;
+use std::path::Path;
+use swm_core::{Batch, Error, Key, Result, Schema};
+use swm_data::{ClipSpec, GoalMixture, GoalSpec, LoaderConfig};
+
+/// Names of goals: columns of a batch are named after them.
+const GOAL: &str = "goal";
+const POLICY_GOAL: &str = "policy_goal";
+
+const TINY: &str = "64 px, a small convolutional encoder trained along: minutes on two CPU cores";
+const PAPER: &str = "224 px, frozen DINOv2-small, heads of 6 layers, history 3: the published size, for a GPU";
+
+macro_rules! presets {
+    ($family:literal) => {
+        &[
+            Preset { id: "tiny", summary: TINY, toml: include_str!(concat!("../../presets/", $family, "/tiny.toml")) },
+            Preset {
+                id: "paper",
+                summary: PAPER,
+                toml: include_str!(concat!("../../presets/", $family, "/paper.toml")),
+            },
+        ]
+    };
+}
+
+/// A trained goal-conditioned model, whatever it was trained by.
+pub trait GoalConditioned: Trainable {
+    /// What of it acts.
+    fn actor(checkpoint: &Checkpoint<Self>) -> Actor;
+}
+
+macro_rules! acts {
+    ($($model:ty),*) => {
+        $(impl GoalConditioned for $model {
+            fn actor(checkpoint: &Checkpoint<Self>) -> Actor {
+                let model = &checkpoint.model;
+                Actor {
+                    encoder: model.encoder.clone(),
+                    head: model.action_predictor.clone(),
+                    config: model.config.clone(),
+                    scale: checkpoint.facts.action.clone(),
+                }
+            }
+        })*
+    };
+}
+acts!(Gcbc, Gcivl, Gciql);
+
+impl Trainable for Gcbc {
+    const FAMILY: &'static str = "gcbc";
+    const SUMMARY: &'static str = "goal-conditioned behavioural cloning: a policy that imitates what led to a goal";
+    const PRESETS: &'static [Preset] = presets!("gcbc");
+    type Config = GcrlConfig;
+    type Loss = CloningLoss;
+
+    fn check(config: &TrainConfig<Self>) -> Result<()> {
+        config.model.check()?;
+        frames(config.data.num_steps, config.model.history)?;
+        goals(&config.loss.goals, GOAL, &config.model).check(&clip(config.data.num_steps, config.data.frameskip))
+    }
+
+    fn picture(config: &GcrlConfig) -> Option<usize> {
+        Some(config.image)
+    }
+
+    fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
+        pixels::check(config.model.image, schema, "pixels")?;
+        Ok(LoaderConfig {
+            clip: clip(config.data.num_steps, config.data.frameskip),
+            goals: vec![goals(&config.loss.goals, GOAL, &config.model)],
+            ..LoaderConfig::default()
+        })
+    }
+
+    fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
+        Ok(Self::init(&config.model, config.data.frameskip * facts.action.dim(), key, device))
+    }
+
+    fn pretrained(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
+        self.encoder = see_with(self.encoder, &config.model.weights, cache)?;
+        Ok(self)
+    }
+
+    fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
+        let StepContext { config, facts, key, device, training } = context;
+        let read = Read::new(&config.model, facts, (config.data.num_steps, config.data.frameskip), batch, device)?;
+        shards::mean(batch.rows(), config.shards, |range| {
+            let mut rng = key.with("dropout").at(range.start as u64).rng();
+            let mut noise = Noise(training.then_some(&mut rng));
+            Ok(self.losses(&read.clips(range)?, &mut noise, *training))
+        })
+    }
+}
+
+macro_rules! value_learner {
+    ($model:ty, $family:literal, $summary:literal, [$($slow:ident),*]) => {
+        impl Trainable for $model {
+            const FAMILY: &'static str = $family;
+            const SUMMARY: &'static str = $summary;
+            const PRESETS: &'static [Preset] = presets!($family);
+            type Config = GcrlConfig;
+            type Loss = ValueLoss;
+
+            fn check(config: &TrainConfig<Self>) -> Result<()> {
+                config.model.check()?;
+                config.loss.check()?;
+                frames(config.data.num_steps, config.model.history + 1)?;
+                let clip = clip(config.data.num_steps, config.data.frameskip);
+                goals(&config.loss.goals, GOAL, &config.model).check(&clip)?;
+                goals(&config.loss.policy_goals, POLICY_GOAL, &config.model).check(&clip)
+            }
+
+            fn picture(config: &GcrlConfig) -> Option<usize> {
+                Some(config.image)
+            }
+
+            fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
+                pixels::check(config.model.image, schema, "pixels")?;
+                Ok(LoaderConfig {
+                    clip: clip(config.data.num_steps, config.data.frameskip),
+                    goals: vec![
+                        goals(&config.loss.goals, GOAL, &config.model),
+                        goals(&config.loss.policy_goals, POLICY_GOAL, &config.model),
+                    ],
+                    ..LoaderConfig::default()
+                })
+            }
+
+            fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
+                Ok(Self::init(&config.model, config.data.frameskip * facts.action.dim(), key, device))
+            }
+
+            fn pretrained(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
+                self.encoder = see_with(self.encoder, &config.model.weights, cache)?;
+                Ok(self)
+            }
+
+            fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
+                let StepContext { config, facts, key, device, training } = context;
+                let steps = (config.data.num_steps, config.data.frameskip);
+                let read = Read::new(&config.model, facts, steps, batch, device)?;
+                shards::mean(batch.rows(), config.shards, |range| {
+                    let mut rng = key.with("dropout").at(range.start as u64).rng();
+                    let mut noise = Noise(training.then_some(&mut rng));
+                    let (clips, more) = (read.clips(range.clone())?, read.relabelled(range)?);
+                    Ok(self.losses(&clips, &more, &config.loss, &mut noise, *training))
+                })
+            }
+
+            fn after(mut self, context: &StepContext<'_, Self>, _: Named<Tensor<1>>) -> Self {
+                let keep = f64::from(context.config.loss.target);
+                $(self.$slow = self.$slow.follow(keep);)*
+                self
+            }
+
+            fn group(name: &str) -> Group {
+                group(name)
+            }
+        }
+    };
+}
+value_learner!(
+    Gcivl,
+    "gcivl",
+    "goal-conditioned implicit value learning: values by expectile regression, a policy weighted by what an action gains",
+    [value_predictor]
+);
+value_learner!(
+    Gciql,
+    "gciql",
+    "goal-conditioned implicit Q-learning: a critic beside the values, a policy weighted by an action's advantage",
+    [value_predictor, critic_predictor]
+);
+
+/// An encoder with the weights that `from` names, if it names any: those of an encoder, or of a model that has one.
+fn see_with(encoder: Backbone, from: &str, cache: &Path) -> Result<Backbone> {
+    if from.is_empty() {
+        return Ok(encoder);
+    }
+    let path = weights::locate(from, cache)?;
+    let mut found = weights::names::published(weights::read(&path)?, "");
+    if !parameters::shapes(&encoder).keys().all(|name| found.contains_key(name)) {
+        let inside = |(name, weight): (String, _)| Some((name.strip_prefix("encoder.")?.to_owned(), weight));
+        found = found.into_iter().filter_map(inside).collect();
+    }
+    weights::fill(encoder, &found, &path, "model.encoder")
+}
+
+/// Every network is clipped by itself, as it has an optimizer of its own in the published scripts.
+fn group(name: &str) -> Group {
+    let clip = match name.split('.').next() {
+        Some("action_predictor" | "log_stds") => 1,
+        Some("value_predictor") => 2,
+        Some("critic_predictor") => 3,
+        _ => 0,
+    };
+    Group { clip, ..Group::default() }
+}
+
+impl ValueLoss {
+    fn check(&self) -> Result<()> {
+        let shares =
+            [("loss.discount", self.discount), ("loss.expectile", self.expectile), ("loss.target", self.target)];
+        for (what, share) in shares {
+            if !(0.0..1.0).contains(&share) {
+                return Err(Error::config(what, share.to_string(), "give at least 0 and below 1"));
+            }
+        }
+        if !(self.temperature.is_finite() && self.temperature >= 0.0) {
+            let fix = "give at least 0 (which is behavioural cloning)";
+            return Err(Error::config("loss.temperature", self.temperature.to_string(), fix));
+        }
+        Ok(())
+    }
+}
+
+/// The frames of a clip are decided by the history.
+fn frames(given: usize, wanted: usize) -> Result<()> {
+    if given == wanted {
+        return Ok(());
+    }
+    Err(Error::config(
+        "data.num_steps",
+        format!("{given} frames in a clip"),
+        format!("say {wanted}, what model.history asks for, or change that"),
+    ))
+}
+
+fn clip(num_steps: usize, frameskip: usize) -> ClipSpec {
+    ClipSpec { num_steps, frameskip, columns: vec!["pixels".to_owned(), "action".to_owned()] }
+}
+
+/// Pictures of goals; now is the last frame of the history.
+fn goals(mixture: &GoalMixture, name: &str, model: &GcrlConfig) -> GoalSpec {
+    GoalSpec {
+        name: name.to_owned(),
+        columns: vec!["pixels".to_owned()],
+        anchor: Some(model.history.saturating_sub(1)),
+        mixture: *mixture,
+    }
+}
+
+/// A batch, read a range of clips at a time.
+struct Read<'a> {
+    config: &'a GcrlConfig,
+    device: &'a Device,
+    /// Frames of a clip.
+    steps: usize,
+    frames: &'a [u8],
+    batch: &'a Batch,
+    actions: Tensor<3>,
+}
+
+impl<'a> Read<'a> {
+    fn new(
+        config: &'a GcrlConfig,
+        facts: &Facts,
+        (steps, frameskip): (usize, usize),
+        batch: &'a Batch,
+        device: &'a Device,
+    ) -> Result<Self> {
+        let actions = facts.actions(batch, steps, frameskip, device)?;
+        Ok(Self { config, device, steps, frames: batch.get("pixels")?, batch, actions })
+    }
+
+    /// The pictures of some clips, of a column that holds `each` of them a clip.
+    fn part<'b>(&self, pictures: &'b [u8], each: usize, clips: &Range<usize>) -> &'b [u8] {
+        let bytes = each * self.config.image * self.config.image * 3;
+        &pictures[clips.start * bytes..clips.end * bytes]
+    }
+
+    fn patches(&self, pictures: &[u8]) -> Result<Tensor<3>> {
+        pixels::patches(&self.config.pixels(), self.config.encoder.patch(), pictures, self.device)
+    }
+
+    fn goals(&self, name: &str) -> Result<&[u8]> {
+        self.batch.get(&format!("{name}_pixels"))
+    }
+
+    fn clips(&self, clips: Range<usize>) -> Result<Clips> {
+        let [_, _, numbers] = self.actions.dims();
+        Ok(Clips {
+            frames: self.patches(self.part(self.frames, self.steps, &clips))?,
+            goal: self.patches(self.part(self.goals(GOAL)?, 1, &clips))?,
+            actions: self.actions.clone().slice([clips, 0..self.config.history, 0..numbers]),
+        })
+    }
+
+    fn relabelled(&self, clips: Range<usize>) -> Result<Relabelled> {
+        let bytes = self.config.image * self.config.image * 3;
+        let (frames, goals) = (self.part(self.frames, self.steps, &clips), self.part(self.goals(GOAL)?, 1, &clips));
+        // A goal is reached where its very picture is seen.
+        let reached: Vec<f32> = frames
+            .chunks_exact(self.steps * bytes)
+            .zip(goals.chunks_exact(bytes))
+            .flat_map(|(clip, goal)| {
+                let history = clip.chunks_exact(bytes).take(self.config.history);
+                history.map(move |frame| if frame == goal { 1.0 } else { 0.0 })
+            })
+            .collect();
+        let shape = [clips.len(), self.config.history, 1];
+        Ok(Relabelled {
+            policy_goal: self.patches(self.part(self.goals(POLICY_GOAL)?, 1, &clips))?,
+            reached: Tensor::from_data(TensorData::new(reached, shape), self.device),
+        })
+    }
+}

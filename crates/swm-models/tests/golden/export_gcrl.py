@@ -1,0 +1,149 @@
+"""Writes gcbc-small.safetensors, gcivl-small.safetensors and gciql-small.safetensors: numerics of goal-conditioned models at
+a very small size; and reference/gcivl, a checkpoint as the published training script leaves it.
+
+Run with an interpreter that has torch and the reference package (`pip install stable-worldmodel torch`):
+
+    python export_gcrl.py FOLDER
+
+Model, heads and expectile loss are the reference's (`wm/gcrl`). The package holds no training code, so the losses are
+transcribed here from the algorithms of the paper's appendix (GCBC, GCIVL and GCIQL training), with what the published
+training scripts add: an action's weight is at most 100, the policy is a normal distribution with one learnt spread a
+number, values are pooled by the mean. Values and policy are learnt at once: nothing of the policy's loss reaches
+encoder and values, so its gradients are those of the paper's two phases.
+"""
+
+import json
+import os
+import struct
+import sys
+
+import torch
+from export_lewm import Vit
+from stable_worldmodel.wm.gcrl.gcrl import GCRL
+from stable_worldmodel.wm.gcrl.module import ExpectileLoss, Predictor, QPredictor
+from torch import nn
+
+CONFIG = dict(
+    image=8, patch=4, dim=12, vit_layers=1, vit_heads=2, vit_mlp=16, history=3, depth=3, heads=2, dim_head=4, mlp=16,
+    action_dim=4, critic_hidden=16, discount=0.9, expectile=0.7, temperature=3.0,
+)  # fmt: skip
+
+
+class TeacherStudent(nn.Module):
+    """A network and its slow copy, under the names of the published training scripts."""
+
+    def __init__(self, make):
+        super().__init__()
+        self.student, self.teacher = make(), make()
+
+
+def flat(embedding):
+    """[rows, frames, patches, dim] to [rows, frames * patches, dim]."""
+    return embedding.flatten(1, 2)
+
+
+def save(model, folder):
+    """The state dict, beside the settings of the script that trained it."""
+    c = CONFIG
+    sizes = dict(depth=c["depth"], heads=c["heads"], mlp_dim=c["mlp"], dim_head=c["dim_head"], dropout=0.0)
+    settings = dict(
+        image_size=c["image"], patch_size=c["patch"], frameskip=2, dinowm=dict(history_size=c["history"], action_dim=2),
+        predictor=sizes, encoder=dict(num_attention_heads=c["vit_heads"]),
+    )  # fmt: skip
+    os.makedirs(folder, exist_ok=True)
+    torch.save(model.state_dict(), os.path.join(folder, "weights.pt"))
+    with open(os.path.join(folder, "config.json"), "w") as file:
+        json.dump(settings, file, indent=2)
+
+
+def main(family, path):
+    torch.manual_seed(["gcbc", "gcivl", "gciql"].index(family))
+    c = CONFIG
+    size = dict(
+        num_patches=(c["image"] // c["patch"]) ** 2, num_frames=c["history"], dim=c["dim"], depth=c["depth"],
+        heads=c["heads"], mlp_dim=c["mlp"], dim_head=c["dim_head"],
+    )  # fmt: skip
+    parts = {}
+    if family != "gcbc":
+        parts["value_predictor"] = TeacherStudent(lambda: Predictor(out_dim=1, pool_type="mean", **size))
+    if family == "gciql":
+        parts["critic_predictor"] = TeacherStudent(
+            lambda: QPredictor(
+                action_dim=c["action_dim"], q_hidden_dim=c["critic_hidden"], pool_type="mean", **size
+            )
+        )
+    model = GCRL(encoder=Vit(c), action_predictor=Predictor(out_dim=c["action_dim"], **size), **parts)
+    # Nothing may be left at a value that hides mistakes.
+    with torch.no_grad():
+        for value in model.state_dict().values():
+            if value.is_floating_point():
+                value.add_(0.1 * torch.randn_like(value))
+
+    clips, history = 3, c["history"]
+    steps = history if family == "gcbc" else history + 1
+    pixels = torch.randn(clips, steps, 3, c["image"], c["image"])
+    action = torch.randn(clips, steps, c["action_dim"])
+    goal = torch.randn(clips, 1, 3, c["image"], c["image"])
+    goal[0, 0] = pixels[0, history - 1]  # one clip is where it shall be
+    actor_goal = torch.randn_like(goal)
+    out = {"i.pixels": pixels, "i.action": action, "i.goal": goal}
+    out |= {f"w.{name}": value.clone() for name, value in model.state_dict().items()}
+    if family == "gcivl":
+        save(model, os.path.join(os.path.dirname(path), "reference", family))
+
+    encode = lambda x: model.encode({"pixels": x}, emb_keys=[])["embed"]
+    embed, goal_embed = encode(pixels), encode(goal)
+    taken = action[:, :history]
+    if family == "gcbc":
+        means, _ = model.predict_actions(embed, goal_embed)
+        loss = nn.functional.mse_loss(means, taken)
+        out["o.loss"] = loss[None]
+    else:
+        now, then, towards = flat(embed[:, :history]), flat(embed[:, 1:]), flat(goal_embed)
+        reached = (pixels[:, :history] == goal).all((2, 3, 4)).float().unsqueeze(-1)
+        open_ = 1 - reached
+        value = model.value_predictor.student(now, towards)
+        with torch.no_grad():
+            target = c["discount"] * open_ * model.value_predictor.teacher(then, towards) - open_
+        critic_loss = torch.zeros(())
+        if family == "gciql":
+            critic = model.critic_predictor.student(now, taken, towards)
+            critic_loss = (critic - target).square().mean()
+            with torch.no_grad():
+                target = model.critic_predictor.teacher(now, taken, towards)
+            out["o.critic_loss"] = critic_loss[None]
+        value_loss = ExpectileLoss(c["expectile"])(value, target)
+
+        with torch.no_grad():
+            actor_embed = encode(actor_goal)
+            towards = flat(actor_embed)
+            if family == "gciql":
+                after = model.critic_predictor.student(now, taken, towards)
+            else:
+                after = model.value_predictor.student(then, towards)
+            advantage = after - model.value_predictor.student(now, towards)
+            weight = (c["temperature"] * advantage).exp().clamp(max=100)
+        means, stds = model.predict_actions(embed[:, :history].detach(), actor_embed)
+        policy_loss = (weight * (stds.log() + (taken - means).square() / stds.square() / 2)).mean()
+        loss = value_loss + critic_loss + policy_loss
+        out |= {"i.actor_goal": actor_goal, "i.reached": reached, "o.value": value.mean()[None]}
+        out |= {"o.weight": weight.mean()[None], "o.value_loss": value_loss[None], "o.policy_loss": policy_loss[None]}
+        out["o.loss"] = loss[None]
+    loss.backward()
+    out |= {f"g.{name}": p.grad for name, p in model.named_parameters() if p.grad is not None}
+
+    header, data = {"__metadata__": {"config": json.dumps(c)}}, b""
+    for name, value in sorted(out.items()):
+        if not value.is_floating_point():
+            continue
+        raw = value.detach().contiguous().numpy().tobytes()
+        header[name] = {"dtype": "F32", "shape": list(value.shape), "data_offsets": [len(data), len(data) + len(raw)]}
+        data += raw
+    text = json.dumps(header).encode()
+    with open(path, "wb") as file:
+        file.write(struct.pack("<Q", len(text)) + text + data)
+
+
+if __name__ == "__main__":
+    for family in ("gcbc", "gcivl", "gciql"):
+        main(family, os.path.join(sys.argv[1], f"{family}-small.safetensors"))

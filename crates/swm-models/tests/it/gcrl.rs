@@ -1,0 +1,288 @@
+//! Goal-conditioned models learn on a dot that moves, act, and refuse what does not fit; probes read where the dot is.
+
+use crate::dots::{Dots, SIDE, draw};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Key, Policy as _, Result, Schema, Space, VariationSpace};
+use swm_models::feed_forward::FeedForwardPolicy;
+use swm_models::gcrl::{Actor, Gcbc, Gciql, Gcivl, GcrlConfig, GoalConditioned};
+use swm_models::nn::parameters;
+use swm_models::probe::{self, Encodes, PictureConfig, StateConfig};
+use swm_models::train::Facts;
+use swm_models::{Checkpoint, Device, TrainConfig, TrainOptions, TrainSummary, Trainable, train};
+use swm_plan::ActionScale;
+
+const SMALL: &[&str] = &[
+    "model.image=16",
+    "model.encoder.pyramid.stages=[{ patch = 4, channels = 16 }, { patch = 2, channels = 16 }]",
+    "model.encoder.pyramid.hidden=32",
+    "model.encoder.pyramid.dim=16",
+    "model.head.dim_head=8",
+    "model.head.mlp=32",
+    "data.frameskip=2",
+    "data.batch_size=32",
+    "schedule.steps=12",
+    "schedule.warmup=2",
+    "log_every=4",
+];
+
+fn config<M: GoalConditioned<Config = GcrlConfig>>(words: &[&str]) -> TrainConfig<M> {
+    let words: Vec<String> = SMALL.iter().chain(words).map(|&word| word.to_owned()).collect();
+    TrainConfig::load("tiny", &words).expect("a configuration")
+}
+
+fn run<M: Trainable>(config: &TrainConfig<M>, out: &Path, options: &TrainOptions) -> Result<TrainSummary> {
+    train(config, Arc::new(Dots::new(20, 0)), out, options, &mut (), &AtomicBool::new(false))
+}
+
+fn trained<M: Trainable>(config: &TrainConfig<M>, out: &Path) -> Checkpoint<M> {
+    run(config, out, &TrainOptions::default()).expect("trained");
+    Checkpoint::load(out, &Device::flex()).expect("a checkpoint")
+}
+
+/// A world of dots; nobody steps it.
+fn spec(action_space: Space) -> EnvSpec {
+    EnvSpec {
+        id: "test/Dots-v0".to_owned(),
+        action_space,
+        columns: vec![],
+        observation_space: vec![],
+        variation_space: VariationSpace::new(vec![], &[]),
+        max_episode_steps: 10,
+        cameras: vec![],
+    }
+}
+
+fn plane() -> Space {
+    Space::uniform_box([2], DType::Float32, -1.0, 1.0)
+}
+
+/// The dot of every environment at a place, and where it shall be.
+fn infos(places: &[([f32; 2], [f32; 2])]) -> Batch {
+    let schema = Schema::new([ColumnSpec::image("pixels", SIDE, SIDE), ColumnSpec::image("goal", SIDE, SIDE)]);
+    let mut infos = Batch::zeros(&schema.expect("columns"), places.len());
+    for (env, &(at, goal)) in places.iter().enumerate() {
+        let mut row = infos.row_mut(env);
+        draw(at, row.at::<u8>(0));
+        draw(goal, row.at::<u8>(1));
+    }
+    infos
+}
+
+fn actions(envs: usize) -> Batch {
+    Batch::zeros(&Schema::new([ColumnSpec::new("action", DType::Float32, [2])]).expect("a column"), envs)
+}
+
+#[test]
+fn presets_load_and_say_everything() {
+    fn check<M: GoalConditioned<Config = GcrlConfig>>() {
+        for preset in M::PRESETS {
+            let config = TrainConfig::<M>::load(preset.id, &[]).expect(preset.id);
+            let frames = config.data.num_steps - config.model.history;
+            assert_eq!(frames, usize::from(M::FAMILY != "gcbc"), "{} {}", M::FAMILY, preset.id);
+            assert_eq!(config.model.frozen, preset.id == "paper");
+        }
+    }
+    check::<Gcbc>();
+    check::<Gcivl>();
+    check::<Gciql>();
+}
+
+#[test]
+fn threads_do_not_change_a_byte() {
+    fn check<M: GoalConditioned<Config = GcrlConfig>>(words: &[&str]) {
+        let folder = tempfile::tempdir().expect("a folder");
+        let config = config::<M>(words);
+        let weights = [("one", 1), ("three", 3)].map(|(name, threads)| {
+            let out = folder.path().join(name);
+            run(&config, &out, &TrainOptions { threads, ..TrainOptions::default() }).expect("trained");
+            std::fs::read(out.join("checkpoint/weights.safetensors")).expect("weights")
+        });
+        assert_eq!(weights[0], weights[1], "{}", M::FAMILY);
+    }
+    check::<Gcbc>(&["model.history=2", "data.num_steps=2", "model.head.dropout=0.1"]);
+    check::<Gciql>(&["model.history=2", "data.num_steps=3", "model.head.dropout=0.1"]);
+}
+
+/// A number in the first and the last line of a run's log.
+fn first_and_last(run: &Path, name: &str) -> (f64, f64) {
+    let lines = std::fs::read_to_string(run.join("train.jsonl")).expect("lines");
+    let number =
+        |line: &str| serde_json::from_str::<serde_json::Value>(line).expect("JSON")[name].as_f64().expect("a number");
+    (number(lines.lines().next().expect("a line")), number(lines.lines().last().expect("a line")))
+}
+
+#[test]
+fn cloning_learns_what_leads_to_a_goal() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let words = ["schedule.steps=240", "log_every=40", "model.history=2", "data.num_steps=2"];
+    trained(&config::<Gcbc>(&words), folder.path());
+    let (first, last) = first_and_last(folder.path(), "loss");
+    assert!(last < 0.95 * first, "{first} to {last}");
+}
+
+#[test]
+fn values_learn_that_the_way_is_long() {
+    fn check<M: GoalConditioned<Config = GcrlConfig>>() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let words = ["schedule.steps=240", "log_every=20", "loss.target=0.9"];
+        trained(&config::<M>(&words), folder.path());
+        let (first, last) = first_and_last(folder.path(), "value");
+        // A goal is several steps away, each of which costs 1, and none is worth more than 0.
+        assert!(last < first - 0.3 && last > -20.0, "{}: {first} to {last}", M::FAMILY);
+    }
+    check::<Gcivl>();
+    check::<Gciql>();
+}
+
+#[test]
+fn targets_follow_and_frozen_encoders_stay() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let config = config::<Gcivl>(&["loss.target=0.5"]);
+    let facts = Facts { action: ActionScale::identity(2), columns: Default::default(), env: None };
+    let first = Gcivl::new(&config, &facts, Key::new(config.seed).with("init"), &Device::flex()).expect("a model");
+    let last = trained(&config, folder.path()).model;
+    let (first, last) = (parameters::values(&first), parameters::values(&last));
+    let name = "out_proj.weight";
+    let (student, teacher) =
+        (&last[&format!("value_predictor.student.{name}")], &last[&format!("value_predictor.teacher.{name}")]);
+    let begun = &first[&format!("value_predictor.student.{name}")];
+    let away = |a: &parameters::HostTensor, b: &parameters::HostTensor| {
+        a.values.iter().zip(&b.values).map(|(a, b)| (a - b).abs()).sum::<f32>()
+    };
+    assert!(away(student, teacher) > 0.0 && away(student, teacher) < away(student, begun), "it follows, behind");
+
+    // An encoder that was trained here, frozen.
+    let weights = folder.path().join("checkpoint/weights.safetensors");
+    let words = [format!("model.weights={}", weights.display()), "model.frozen=true".to_owned()];
+    let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    let again = trained(&self::config::<Gcbc>(&words), &folder.path().join("frozen")).model;
+    let again = parameters::values(&again);
+    let encoders: Vec<_> = again.iter().filter(|(name, _)| name.starts_with("encoder.")).collect();
+    assert!(!encoders.is_empty() && encoders.iter().all(|(name, tensor)| &last[*name] == *tensor));
+    let mut drawn = config.clone();
+    drawn.model.frozen = true;
+    let words = drawn.check().expect_err("frozen as it was drawn").to_string();
+    assert!(words.contains("model.weights"), "{words}");
+}
+
+#[test]
+fn a_policy_acts_by_itself_in_chunks_within_bounds() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let checkpoint = trained(&config::<Gcbc>(&["model.history=2", "data.num_steps=2"]), folder.path());
+    let policy = |slots: usize| -> FeedForwardPolicy<Actor> {
+        Gcbc::actor(&checkpoint).policy(&spec(plane()), slots).expect("a policy")
+    };
+    let scene = ([4.0, 5.0], [11.0, 9.0]);
+    // Five steps alone, and beside another that begins later; the dot is seen to move.
+    let seen = |step: usize| ([4.0 + step as f32, 5.0], scene.1);
+    let (mut alone, mut beside) = (policy(1), policy(2));
+    alone.begin(0, Key::new(0));
+    beside.begin(1, Key::new(0));
+    let mut taken: Vec<Vec<f32>> = vec![];
+    for step in 0..5 {
+        let (mut one, mut two) = (actions(1), actions(2));
+        alone.act(&infos(&[seen(step)]), &[true], &mut one).expect("acts");
+        beside.act(&infos(&[([9.0, 9.0], [2.0, 2.0]), seen(step)]), &[step > 1, true], &mut two).expect("acts");
+        let action = one.row(0).at::<f32>(0).to_vec();
+        assert_eq!(action, two.row(1).at::<f32>(0));
+        assert!(action.iter().all(|v| (-1.0..=1.0).contains(v)), "{action:?}");
+        taken.push(action);
+    }
+    // A frameskip of 2: a decision every other step.
+    assert_eq!(alone.take_latencies().len(), 3);
+    assert_ne!(taken[0], taken[2], "another picture, another action");
+}
+
+#[test]
+fn what_does_not_fit_is_refused_in_words() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let wrong = |words: &[&str]| {
+        let words: Vec<String> = SMALL.iter().chain(words).map(|&word| word.to_owned()).collect();
+        TrainConfig::<Gcivl>::load("tiny", &words).expect_err("wrong").to_string()
+    };
+    assert!(wrong(&["data.num_steps=1"]).contains("model.history"), "{}", wrong(&["data.num_steps=1"]));
+    assert!(wrong(&["model.head.depth=2"]).contains("looks at the goal"));
+    assert!(wrong(&["loss.expectile=1.5"]).contains("loss.expectile"));
+    assert!(wrong(&["loss.goals.random=0.9"]).contains("add up to 1"));
+    assert!(wrong(&["model.image=20"]).contains("patches"), "{}", wrong(&["model.image=20"]));
+
+    // Pictures of another size than the model sees.
+    let mut large = config::<Gcbc>(&[]);
+    large.model.image = 32;
+    let words = run(&large, &folder.path().join("large"), &TrainOptions::default()).expect_err("wrong").to_string();
+    assert!(words.contains("[16, 16, 3]") && words.contains("model.image"), "{words}");
+
+    let checkpoint = trained(&config::<Gcbc>(&[]), &folder.path().join("run"));
+    let discrete = Gcbc::actor(&checkpoint).policy(&spec(Space::Discrete { n: 3, start: 0 }), 1);
+    let words = discrete.err().expect("discrete actions").to_string();
+    assert!(words.contains("2 means"), "{words}");
+    let mut policy = Gcbc::actor(&checkpoint).policy(&spec(plane()), 1).expect("a policy");
+    policy.begin(0, Key::new(0));
+    let blind = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", SIDE, SIDE)]).expect("a column"), 1);
+    let words = policy.act(&blind, &[true], &mut actions(1)).expect_err("no goal").to_string();
+    assert!(words.contains("'goal'"), "{words}");
+    // A checkpoint of another family.
+    let words = Checkpoint::<Gciql>::load(&folder.path().join("run"), &Device::flex()).expect_err("gcbc").to_string();
+    assert!(words.contains("gcbc") && words.contains("gciql"), "{words}");
+}
+
+/// Sums of light along rows and columns: an encoder that knows where the dot is.
+struct Profiles;
+
+impl Encodes for Profiles {
+    fn image(&self) -> usize {
+        SIDE
+    }
+
+    fn latent(&self) -> usize {
+        2 * SIDE
+    }
+
+    fn encode(&self, rgb: &[u8]) -> Result<Vec<f32>> {
+        let one = |rgb: &[u8]| {
+            let mut sums = vec![0.0; 2 * SIDE];
+            for (i, pixel) in rgb.chunks(3).enumerate() {
+                sums[i % SIDE] += f32::from(pixel[0]);
+                sums[SIDE + i / SIDE] += f32::from(pixel[0]);
+            }
+            sums
+        };
+        Ok(rgb.chunks(SIDE * SIDE * 3).flat_map(one).collect())
+    }
+}
+
+#[test]
+fn probes_read_where_the_dot_is_and_draw_it_again() {
+    let data = Dots::new(40, 1);
+    let mut settings = StateConfig::new(vec!["place".to_owned()]);
+    settings.fit.steps = 300;
+    let report = probe::state(&Profiles, &data, &settings).expect("read");
+    assert_eq!((report.latent, report.linear.len(), report.network.len()), (2 * SIDE, 2, 2));
+    for score in report.linear.iter().chain(&report.network) {
+        let r2 = score.r2.expect("the dot moves");
+        assert!(r2 > 0.95, "{score:?}");
+        assert!((r2 - (1.0 - (score.rmse / score.spread).powi(2))).abs() < 1e-9);
+    }
+    assert_eq!(probe::state(&Profiles, &data, &settings).expect("read"), report, "the same again");
+    // An action cannot be read from a picture, and the last of an episode, which is missing, spoils nothing.
+    let actions = StateConfig { columns: vec!["action".to_owned()], ..settings };
+    let report = probe::state(&Profiles, &data, &actions).expect("read");
+    assert!(report.linear.iter().all(|score| score.r2.expect("it changes") < 0.1), "{report:?}");
+
+    let mut settings = PictureConfig { channels: vec![16, 8], shown: 6, ..PictureConfig::default() };
+    (settings.fit.steps, settings.fit.lr) = (1000, 5e-3);
+    let (report, sheet) = probe::picture(&Profiles, &data, &settings).expect("drawn");
+    assert!(report.explained > 0.2 && report.rmse < report.rmse_of_mean, "{report:?}");
+    let cell = SIDE * 8 + 2;
+    assert_eq!((sheet.width, sheet.height), (6 * cell + 2, 2 * cell + 2));
+
+    let words = |columns: &[&str]| {
+        let columns = columns.iter().map(|&name| name.to_owned()).collect();
+        probe::state(&Profiles, &data, &StateConfig::new(columns)).expect_err("wrong").to_string()
+    };
+    assert!(words(&["plaice"]).contains("did you mean place"), "{}", words(&["plaice"]));
+    assert!(words(&["pixels"]).contains("holds pictures"));
+    assert!(words(&[]).contains("columns"));
+}

@@ -1,0 +1,211 @@
+//! Goal-conditioned models: heads of the published package (`gcrl-*`), and losses with all gradients (`gcbc-*`, `gcivl-*`,
+//! `gciql-*`).
+
+use super::{Golden, TOLERANCE, check, error, files, values};
+use burn::module::Module;
+use burn::tensor::{Device, Tensor};
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use swm_core::Key;
+use swm_data::GoalMixture;
+use swm_models::gcrl::heads::{Critic, Head};
+use swm_models::gcrl::loss::{self, ValueLoss};
+use swm_models::gcrl::step::{Clips, Relabelled};
+use swm_models::gcrl::transformer::{Pool, Sight, TransformerConfig};
+use swm_models::gcrl::{Gcbc, Gciql, Gcivl, GcrlConfig, import};
+use swm_models::nn::{BackboneConfig, Init, Noise, VitConfig, parameters};
+use swm_models::train::{Facts, StepOutput};
+use swm_models::weights::{self, Naming};
+use swm_plan::ActionScale;
+
+impl Golden {
+    fn head(&self) -> TransformerConfig {
+        TransformerConfig {
+            depth: self.size("depth"),
+            heads: self.size("heads"),
+            dim_head: self.size("dim_head"),
+            mlp: self.config.get("mlp_dim").map_or_else(|| self.size("mlp"), |_| self.size("mlp_dim")),
+            dropout: 0.0,
+            emb_dropout: 0.0,
+        }
+    }
+
+    fn gcrl(&self) -> GcrlConfig {
+        GcrlConfig {
+            image: self.size("image"),
+            pixel_mean: [0.5; 3],
+            pixel_std: [0.5; 3],
+            history: self.size("history"),
+            frozen: false,
+            weights: String::new(),
+            encoder: BackboneConfig::Vit(VitConfig {
+                patch: self.size("patch"),
+                dim: self.size("dim"),
+                depth: self.size("vit_layers"),
+                heads: self.size("vit_heads"),
+                mlp: self.size("vit_mlp"),
+            }),
+            head: self.head(),
+            critic: self.size("critic_hidden"),
+        }
+    }
+
+    /// The published weights, all of which the module must have.
+    fn fill<M: Module>(&self, prefix: &str, module: M) -> M {
+        let weights = self.group(prefix);
+        let shapes = parameters::shapes(&module);
+        for (name, shape) in &shapes {
+            assert_eq!(weights.get(name).map(|weight| &weight.shape), Some(shape), "published weight {name}");
+        }
+        assert_eq!(shapes.len(), weights.len());
+        parameters::load(module, &weights)
+    }
+
+    fn clips(&self) -> Clips {
+        let actions: Tensor<3> = self.tensor("i.action");
+        let [clips, _, numbers] = actions.dims();
+        let actions = actions.slice([0..clips, 0..self.size("history"), 0..numbers]);
+        Clips { frames: self.patches("i.pixels"), goal: self.patches("i.goal"), actions }
+    }
+
+    fn relabelled(&self) -> Relabelled {
+        Relabelled { policy_goal: self.patches("i.actor_goal"), reached: self.tensor("i.reached") }
+    }
+
+    fn value_loss(&self) -> ValueLoss {
+        let number = |name: &str| self.config[name].as_f64().expect(name) as f32;
+        ValueLoss {
+            discount: number("discount"),
+            expectile: number("expectile"),
+            temperature: number("temperature"),
+            target: 0.995,
+            goals: GoalMixture::default(),
+            policy_goals: GoalMixture::FUTURE,
+        }
+    }
+
+    /// Compares the metrics that were recorded, and all gradients.
+    fn compare(&self, output: &StepOutput) {
+        for (name, ours) in &output.metrics {
+            if self.tensors.contains_key(&format!("o.{name}")) {
+                check(self, &format!("o.{name}"), &[*ours as f32]);
+            }
+        }
+        let mut worst = (0.0, String::new());
+        let theirs = self.group("g.");
+        let largest = theirs.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));
+        for (name, gradient) in &theirs {
+            let ours = values(output.gradients.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
+            // A shift that a softmax takes out again has no effect: its gradient is zero but for rounding, and is held
+            // against the others. So is what no head looks at, the class token behind the last layer.
+            let idle = name.ends_with(".key.bias");
+            let error = error(&ours, &gradient.values, if idle { largest } else { 1e-6 });
+            if error > worst.0 {
+                worst = (error, name.clone());
+            }
+        }
+        println!("worst gradient: {:.1e} ({})", worst.0, worst.1);
+        assert!(worst.0 < TOLERANCE, "gradient of {} differs by {:.1e}", worst.1, worst.0);
+        let more: Vec<_> = output.gradients.keys().filter(|name| !theirs.contains_key(*name)).collect();
+        assert!(more.is_empty(), "gradients that are not in the file: {more:?}");
+    }
+}
+
+#[test]
+fn golden_gcrl_heads() {
+    for file in files("gcrl") {
+        println!("{}", file.display());
+        let golden = Golden::read(&file);
+        let init = Init::new(Key::new(0), &Device::flex());
+        let sight =
+            Sight { frames: golden.size("num_frames"), patches: golden.size("num_patches"), dim: golden.size("dim") };
+        let (frames, goal) = (golden.tensor("i.x"), golden.tensor("i.goal"));
+        let policy = Head::new(&init, &golden.head(), sight, Pool::Attention, golden.size("out_dim"));
+        let means = golden.fill("w.policy.", policy).forward(&frames, &goal, &mut Noise::off());
+        check(&golden, "o.policy", &values(means));
+        let (actions, hidden) = (golden.size("action_dim"), golden.size("q_hidden_dim"));
+        let critic = Critic::new(&init, &golden.head(), sight, Pool::Attention, actions, hidden);
+        let critic = golden.fill("w.q.", critic);
+        let worth = critic.forward(&frames, golden.tensor("i.action"), &goal, &mut Noise::off());
+        check(&golden, "o.q", &values(worth));
+        for name in golden.tensors.keys().filter(|name| name.starts_with("o.expectile_")) {
+            let tau = name.trim_start_matches("o.expectile_").parse().expect("a number");
+            let loss = loss::expectile::<1>(golden.tensor("i.preds"), golden.tensor("i.targets"), tau);
+            check(&golden, name, &values(loss));
+        }
+    }
+}
+
+#[test]
+fn golden_gcbc() {
+    for file in files("gcbc") {
+        println!("{}", file.display());
+        let golden = Golden::read(&file);
+        let model = Gcbc::init(&golden.gcrl(), golden.size("action_dim"), Key::new(0), &Device::flex());
+        let model = golden.fill("w.", model);
+        golden.compare(&model.losses(&golden.clips(), &mut Noise::off(), true));
+    }
+}
+
+#[test]
+fn golden_gcivl() {
+    for file in files("gcivl") {
+        println!("{}", file.display());
+        let golden = Golden::read(&file);
+        let model = Gcivl::init(&golden.gcrl(), golden.size("action_dim"), Key::new(0), &Device::flex());
+        let model = golden.fill("w.", model);
+        let (clips, more, settings) = (golden.clips(), golden.relabelled(), golden.value_loss());
+        golden.compare(&model.losses(&clips, &more, &settings, &mut Noise::off(), true));
+    }
+}
+
+#[test]
+fn golden_gciql() {
+    for file in files("gciql") {
+        println!("{}", file.display());
+        let golden = Golden::read(&file);
+        let model = Gciql::init(&golden.gcrl(), golden.size("action_dim"), Key::new(0), &Device::flex());
+        let model = golden.fill("w.", model);
+        let (clips, more, settings) = (golden.clips(), golden.relabelled(), golden.value_loss());
+        golden.compare(&model.losses(&clips, &more, &settings, &mut Noise::off(), true));
+    }
+}
+
+#[test]
+fn golden_gcrl_checkpoints_of_the_reference_load_and_go_back() {
+    let here = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
+    let facts = Facts { action: ActionScale::identity(2), columns: Default::default(), env: None };
+    let checkpoint = import::import::<Gcivl>(&here.join("reference/gcivl"), facts.clone()).expect("imported");
+    let golden = Golden::read(&here.join("gcivl-small.safetensors"));
+    let sizes = &checkpoint.config.model;
+    assert_eq!((&sizes.head, &sizes.encoder), (&golden.head(), &golden.gcrl().encoder));
+    assert_eq!((sizes.image, sizes.history, checkpoint.config.data.frameskip), (8, 3, 2));
+    let ours = parameters::values(&checkpoint.model);
+    assert_eq!(ours, golden.group("w."));
+
+    // What goes back has the names and the shapes of the reference's class; values without their slow copy.
+    let folder = tempfile::tempdir().expect("a folder");
+    import::export(&checkpoint, folder.path(), Naming::Published).expect("exported");
+    let written = weights::read(&folder.path().join("weights.pt")).expect("weights");
+    let theirs = weights::read(&here.join("reference/gcivl/weights.pt")).expect("weights");
+    let theirs: BTreeMap<_, _> = theirs
+        .into_iter()
+        .filter(|(name, _)| !name.contains(".teacher."))
+        .map(|(name, weight)| (name.replace(".student.", "."), weight))
+        .collect();
+    assert_eq!(written, theirs);
+    let again = import::import::<Gcivl>(folder.path(), facts.clone()).expect("imported again");
+    let again = parameters::values(&again.model);
+    for (name, weight) in &again {
+        assert_eq!(weight, &ours[&name.replace(".teacher.", ".student.")], "{name}");
+    }
+
+    // A policy is part of it; a critic is not; nor do other actions fit.
+    let cloned = import::import::<Gcbc>(folder.path(), facts.clone()).expect("the policy alone");
+    assert_eq!(parameters::values(&cloned.model)["log_stds"], ours["log_stds"]);
+    let words = import::import::<Gciql>(folder.path(), facts).expect_err("no critic").to_string();
+    assert!(words.contains("critic_predictor"), "{words}");
+    let facts = Facts { action: ActionScale::identity(3), columns: Default::default(), env: None };
+    let words = import::import::<Gcivl>(folder.path(), facts).expect_err("other actions").to_string();
+    assert!(words.contains("a divisor of 4"), "{words}");
+}

@@ -1,17 +1,99 @@
-//! Published checkpoints: the reference's configuration, whose weights carry our names already.
+//! Published checkpoints, both ways: the reference's configuration; its weights carry our names already.
 
 use super::config::{Encoding, LossConfig, PIXELS, Tdmpc2Config};
 use super::model::Tdmpc2;
+use crate::Checkpoint;
 use crate::nn::parameters::{self, HostTensor};
 use crate::nn::{Bins, Named};
+use crate::train::{Facts, TrainConfig};
+use crate::weights::reference::{Reference, write};
 use burn::tensor::Device;
-use serde::de::{Deserialize, Deserializer, MapAccess, Visitor};
+use serde::de::{Deserializer, MapAccess, Visitor};
+use serde::{Deserialize, Serialize, Serializer};
+use serde_json::json;
 use std::collections::BTreeMap;
 use std::fmt;
-use swm_core::{Error, Key, Result};
+use std::path::Path;
+use swm_core::{Error, Key, Manifest, Result};
+
+const CLASS: &str = "stable_worldmodel.wm.tdmpc2.TDMPC2";
+
+/// A TD-MPC2 that the reference trained: a folder with `weights.pt` and `config.json`, or that file. What it does not store is
+/// how actions were brought between -1 and 1, so `facts` must be those of its world or its dataset.
+///
+/// # Errors
+/// When it is another model, or damaged, or has other actions than `facts`.
+pub fn import(from: &Path, facts: Facts) -> Result<Checkpoint<Tdmpc2>> {
+    let reference = Reference::open(from, "TDMPC2")?;
+    let folder = if from.is_dir() { from } else { from.parent().unwrap_or(Path::new("")) };
+    let path = folder.join("config.json");
+    let text = std::fs::read_to_string(&path).map_err(|error| Error::io(&path, "reading a checkpoint", error))?;
+    let published = serde_json::from_str::<Tree>(&text).map_err(|error| reference.wrong(error.to_string()))?.cfg;
+    if published.action_dim != facts.action.dim() {
+        return Err(Error::mismatch(
+            "importing a checkpoint",
+            format!("{} numbers an action in the dataset", facts.action.dim()),
+            format!("{}, as the model was trained", published.action_dim),
+        ));
+    }
+    let model = published.with(&reference.weights, &Device::flex())?;
+    let mut config = TrainConfig::<Tdmpc2>::load("paper", &[])?;
+    (config.model, config.loss) = (published.model(), published.loss());
+    config.data.num_steps = published.wm.horizon + 1;
+    config.check()?;
+    let manifest = Manifest::new("import", 0, json!({ "from": from.display().to_string() }));
+    Ok(Checkpoint { model, config, facts, manifest })
+}
+
+/// Writes `weights.pt` and `config.json` that the reference's `load_pretrained` reads.
+///
+/// # Errors
+/// When the model predicts terminations, which the reference does not, or the disk refuses.
+pub fn export(checkpoint: &Checkpoint<Tdmpc2>, folder: &Path) -> Result<()> {
+    let (model, loss) = (&checkpoint.config.model, &checkpoint.config.loss);
+    if model.termination {
+        let fix = "train with model.termination=false";
+        return Err(Error::config("exporting a model", "the reference does not predict terminations", fix));
+    }
+    let widths = checkpoint.model.extra_encoders.iter();
+    let widths = widths.map(|(column, encoder)| (column.to_owned(), encoder._0.weight.dims()[1]));
+    let cfg = Published {
+        action_dim: checkpoint.model.actions(),
+        extra_dims: widths.collect(),
+        image_size: model.image,
+        wm: World {
+            encoding: InOrder(model.encoding.iter().map(|part| (part.column.clone(), part.latent)).collect()),
+            enc_dim: model.encoder,
+            mlp_dim: model.hidden,
+            num_bins: model.bins.count,
+            vmin: model.bins.low,
+            vmax: model.bins.high,
+            num_q: model.critics,
+            simnorm_dim: model.simplex,
+            horizon: checkpoint.config.data.num_steps - 1,
+            tau: loss.tau,
+            rho: loss.rho,
+            discount: loss.discount,
+            uncertainty_penalty: loss.uncertainty,
+            entropy_coef: loss.entropy,
+            consistency_coef: loss.consistency,
+            reward_coef: loss.reward,
+            value_coef: loss.value,
+        },
+    };
+    write(folder, &Tree { class: CLASS.to_owned(), cfg }, &parameters::values(&checkpoint.model))
+}
+
+/// The class and what it is made with.
+#[derive(Serialize, Deserialize)]
+struct Tree {
+    #[serde(rename = "_target_")]
+    class: String,
+    cfg: Published,
+}
 
 /// A configuration as the reference writes it.
-#[derive(serde::Deserialize)]
+#[derive(Serialize, Deserialize)]
 pub struct Published {
     action_dim: usize,
     #[serde(default)]
@@ -21,8 +103,8 @@ pub struct Published {
     wm: World,
 }
 
-/// Defaults are the reference's.
-#[derive(serde::Deserialize)]
+/// Defaults are those of the publication.
+#[derive(Serialize, Deserialize)]
 #[serde(default)]
 struct World {
     encoding: InOrder,
@@ -33,6 +115,7 @@ struct World {
     vmax: f64,
     num_q: usize,
     simnorm_dim: usize,
+    horizon: usize,
     tau: f64,
     rho: f64,
     discount: f64,
@@ -54,6 +137,7 @@ impl Default for World {
             vmax: 10.0,
             num_q: 5,
             simnorm_dim: 8,
+            horizon: 3,
             tau: 0.01,
             rho: 0.5,
             discount: 0.99,
@@ -86,6 +170,12 @@ impl<'de> Deserialize<'de> for InOrder {
             }
         }
         deserializer.deserialize_map(Entries)
+    }
+}
+
+impl Serialize for InOrder {
+    fn serialize<S: Serializer>(&self, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+        serializer.collect_map(self.0.iter().map(|(column, latent)| (column, latent)))
     }
 }
 

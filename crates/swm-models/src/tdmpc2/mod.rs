@@ -13,7 +13,7 @@ mod train;
 
 pub use config::{Encoding, LossConfig, Tdmpc2Config};
 pub use cost::Tdmpc2Cost;
-pub use import::Published;
+pub use import::{Published, export, import};
 pub use model::{Gaussian, Observation, Tdmpc2};
 pub use planner::{PlannerConfig, Tdmpc2Policy};
 pub use rollouts::Rollouts;

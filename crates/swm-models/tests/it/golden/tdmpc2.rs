@@ -2,9 +2,12 @@
 
 use super::{Golden, TOLERANCE, check, error, files, values};
 use burn::tensor::{Device, Tensor};
-use swm_models::nn::{Ensemble, Noise, two_hot};
+use swm_models::Checkpoint;
+use swm_models::nn::{Ensemble, Named, Noise, parameters, two_hot};
 use swm_models::tdmpc2::step::{Draws, Step, TrainBatch, step};
-use swm_models::tdmpc2::{LossConfig, Observation, Published, Rollouts, Tdmpc2, Tdmpc2Config};
+use swm_models::tdmpc2::{LossConfig, Observation, Published, Rollouts, Tdmpc2, Tdmpc2Config, export, import};
+use swm_models::train::{Facts, TrainConfig};
+use swm_plan::ActionScale;
 
 impl Golden {
     fn wm(&self, name: &str) -> f64 {
@@ -57,6 +60,26 @@ fn golden_tdmpc2_forward() {
             );
         }
         check(&golden, "o.cost", &costs);
+    }
+}
+
+#[test]
+fn golden_tdmpc2_goes_to_the_reference_and_back() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for golden in forward_files() {
+        let (model, published) = golden.tdmpc2();
+        let mut config = TrainConfig::<Tdmpc2>::load("paper", &[]).expect("a configuration");
+        (config.model, config.loss) = (published.model(), published.loss());
+        let action = ActionScale::identity(model.actions());
+        let facts = Facts { action, columns: Named::new(), env: None };
+        let manifest = swm_core::Manifest::new("test", 0, serde_json::Value::Null);
+        let checkpoint = Checkpoint { model, config, facts: facts.clone(), manifest };
+        export(&checkpoint, folder.path()).expect("written");
+        let again = import(folder.path(), facts).expect("read");
+        assert_eq!(parameters::values(&again.model), parameters::values(&checkpoint.model));
+        assert_eq!((&again.config.model, &again.config.loss), (&checkpoint.config.model, &checkpoint.config.loss));
+        let other = Facts { action: ActionScale::identity(1), columns: Named::new(), env: None };
+        assert!(import(folder.path(), other).expect_err("other actions").to_string().contains("numbers an action"));
     }
 }
 

@@ -117,10 +117,8 @@ impl DinoWm {
     /// # Shapes
     /// `[clips, frames, patches, dim]` and `[clips, frames, numbers]` to the former.
     pub fn with_actions(&self, frames: Tensor<4>, actions: Tensor<3>) -> Tensor<4> {
-        let Some((_, encoder)) = self.extra_encoders.iter().find(|(name, _)| *name == ACTION) else { return frames };
-        let Some(span) = self.columns().into_iter().find_map(|(name, span)| (name == ACTION).then_some(span)) else {
-            return frames;
-        };
+        let mut columns = self.extra_encoders.iter().zip(self.columns());
+        let Some(((_, encoder), (_, span))) = columns.find(|((name, _), _)| *name == ACTION) else { return frames };
         let [clips, steps, patches, dim] = frames.dims();
         let part = |range: Range<usize>| frames.clone().slice([0..clips, 0..steps, 0..patches, range]);
         let mut parts = vec![part(0..span.start), tiled(encoder.forward(actions), patches)];

@@ -1,6 +1,7 @@
 //! [`LewmConfig`]: the size of a LeWM.
 
-use crate::nn::{PredictorConfig, PyramidConfig, VitConfig};
+pub use crate::nn::BackboneConfig as EncoderConfig;
+use crate::nn::PredictorConfig;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 
@@ -25,34 +26,6 @@ pub struct LewmConfig {
     pub encoder: EncoderConfig,
     /// The predictor.
     pub predictor: PredictorConfig,
-}
-
-/// The encoder of a LeWM.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum EncoderConfig {
-    /// A vision transformer, as published.
-    Vit(VitConfig),
-    /// Convolutions of disjoint patches: small and fast.
-    Pyramid(PyramidConfig),
-}
-
-impl EncoderConfig {
-    /// Side of the patches the picture is cut into.
-    pub fn patch(&self) -> usize {
-        match self {
-            Self::Vit(vit) => vit.patch,
-            Self::Pyramid(pyramid) => pyramid.stages.first().map_or(0, |stage| stage.patch),
-        }
-    }
-
-    /// Features the encoder returns.
-    pub fn dim(&self) -> usize {
-        match self {
-            Self::Vit(vit) => vit.dim,
-            Self::Pyramid(pyramid) => pyramid.dim,
-        }
-    }
 }
 
 impl LewmConfig {
@@ -89,32 +62,6 @@ impl LewmConfig {
         if self.pixel_std.iter().any(|std| *std <= 0.0) {
             return wrong("model.pixel_std", format!("{:?}", self.pixel_std), "give three positive numbers");
         }
-        let patches = match &self.encoder {
-            EncoderConfig::Vit(vit) => {
-                if vit.dim == 0 || vit.heads == 0 || vit.dim % vit.heads != 0 {
-                    let problem = format!("{} features do not split into {} heads", vit.dim, vit.heads);
-                    return wrong("model.encoder.vit.heads", problem, "choose a divisor of `dim`");
-                }
-                vec![vit.patch]
-            }
-            EncoderConfig::Pyramid(pyramid) => {
-                if pyramid.hidden == 0 || pyramid.dim == 0 || pyramid.stages.iter().any(|stage| stage.channels == 0) {
-                    return wrong("model.encoder.pyramid", "a size is 0".to_owned(), "give at least 1");
-                }
-                pyramid.stages.iter().map(|stage| stage.patch).collect()
-            }
-        };
-        let mut side = self.image;
-        for patch in &patches {
-            if *patch == 0 || !side.is_multiple_of(*patch) {
-                let problem = format!("a side of {side} does not split into patches of {patch}");
-                return wrong("model.encoder", problem, "choose patches whose product divides `model.image`");
-            }
-            side /= patch;
-        }
-        if patches.is_empty() {
-            return wrong("model.encoder.pyramid.stages", "none".to_owned(), "give at least one");
-        }
-        Ok(())
+        self.encoder.check("model.encoder", self.image)
     }
 }

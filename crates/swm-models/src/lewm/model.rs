@@ -1,31 +1,11 @@
 //! [`Lewm`]: encoder, action encoder, predictor and projections.
 
-use super::config::{EncoderConfig, LewmConfig};
-use crate::nn::{BatchStatistics, Embedder, Init, Noise, Predictor, Projector, Pyramid, Vit};
+use super::config::LewmConfig;
+pub use crate::nn::Backbone as Encoder;
+use crate::nn::{BatchStatistics, Embedder, Init, Noise, Predictor, Projector};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
-
-/// An encoder.
-#[derive(Module, Debug)]
-#[allow(clippy::large_enum_variant)]
-pub enum Encoder {
-    /// A vision transformer.
-    Vit(Vit),
-    /// Convolutions of disjoint patches.
-    Pyramid(Pyramid),
-}
-
-impl Encoder {
-    /// # Shapes
-    /// `[frames, patches, 3 * patch * patch]` to `[frames, features]`.
-    pub fn forward(&self, patches: Tensor<3>) -> Tensor<2> {
-        match self {
-            Self::Vit(vit) => vit.forward(patches),
-            Self::Pyramid(pyramid) => pyramid.forward(patches),
-        }
-    }
-}
 
 /// A LeWM: from pictures to latents, and from latents and actions to the next latents.
 #[derive(Module, Debug)]
@@ -48,13 +28,9 @@ impl Lewm {
         let init = Init::new(key, device);
         let features = config.encoder.dim();
         let project = |name| Projector::new(&init.of(name), features, config.projector, config.latent);
-        let part = init.of("encoder");
         let smoothed = if config.smoothed == 0 { actions } else { config.smoothed };
         Self {
-            encoder: match &config.encoder {
-                EncoderConfig::Vit(vit) => Encoder::Vit(vit.init(&part, config.image)),
-                EncoderConfig::Pyramid(pyramid) => Encoder::Pyramid(pyramid.init(&part, config.image)),
-            },
+            encoder: config.encoder.init(&init.of("encoder"), config.image),
             projector: project("projector"),
             action_encoder: Embedder::new(&init.of("action_encoder"), actions, smoothed, config.latent),
             predictor: config.predictor.init(&init.of("predictor"), config.latent),

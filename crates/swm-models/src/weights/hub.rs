@@ -76,7 +76,7 @@ impl Hub {
         let mut done = 0;
         while done < remote.len() {
             let end = (done + PIECE).min(remote.len());
-            for bytes in remote.read(&[done..end]).map_err(unreachable)? {
+            for bytes in remote.read(std::slice::from_ref(&(done..end))).map_err(unreachable)? {
                 out.write_all(&bytes).map_err(io(&part, "keeping a download"))?;
             }
             done = end;

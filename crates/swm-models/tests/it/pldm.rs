@@ -26,6 +26,7 @@ fn config(words: &[&str]) -> Result<TrainConfig<Pldm>> {
         "data.frameskip=2",
         "data.num_steps=4",
         "data.batch_size=16",
+        "loss.temp_align=0.2",
         "loss.temp_straight=0.1",
         "loss.idm_hidden=16",
         "schedule.steps=10",

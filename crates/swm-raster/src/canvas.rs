@@ -147,7 +147,7 @@ impl Canvas {
         };
         backdrop.paint(scene, assets, view, main, colours);
         painter.paint(main, &look, whole, |pixel, part, colour| {
-            colours[pixel] = add(colours[pixel], scale(colour.map(|x| x.min(1.0)), part));
+            colours[pixel] = add(colours[pixel], scale(colour, part));
         });
         veil(scene, view, main, colours);
         self.see_through(scene, assets, view);
@@ -219,7 +219,7 @@ impl Canvas {
             dimmed: geom.reflectance,
         };
         painter.paint(mirror, &look, seen, |pixel, part, colour| {
-            colours[pixel] = add(colours[pixel], scale(colour.map(|x| x.min(1.0)), part));
+            colours[pixel] = add(colours[pixel], scale(colour, part));
         });
         plain.truncate(all);
     }
@@ -242,7 +242,7 @@ impl Canvas {
         if clear.is_empty() {
             return;
         }
-        clear.sort_by(|a, b| a.0.total_cmp(&b.0));
+        clear.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         let all = plain.len();
         plain.extend(shadowed.iter().map(|(lamp, _)| *lamp));
         painter.start(scene.geoms.len());
@@ -270,8 +270,7 @@ impl Canvas {
                 _ => geom.rgba[3],
             };
             painter.paint(glass, &look, region, |pixel, part, colour| {
-                colours[pixel] =
-                    sky::over(colour.map(|x| x.min(1.0)), (part * opacity).clamp(0.0, 1.0), colours[pixel]);
+                colours[pixel] = sky::over(colour, (part * opacity).clamp(0.0, 1.0), colours[pixel]);
             });
         }
         plain.truncate(all);
@@ -333,7 +332,8 @@ fn veil(scene: &Scene, view: &View, main: &Layers, colours: &mut [V3]) {
 }
 
 vectorised! {
-    /// Colours to bytes, rounded.
+    /// Colours to bytes, rounded; what is no number is black.
+    #[allow(clippy::manual_clamp, reason = "`clamp` would keep what is no number")]
     fn to_bytes(colours: &[V3], bytes: &mut [[u8; 3]]) {
         for (bytes, colour) in bytes.iter_mut().zip(colours) {
             // Added to 2^23, a number is rounded to a whole one, which is in the lowest bits.

@@ -227,8 +227,7 @@ impl Layers {
         floor: Option<&[f32]>,
     ) {
         let area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
-        // Nothing faces the camera whose area is no number.
-        if area * front < 0.0 || !(area.abs() > 1e-12) {
+        if area * front < 0.0 || area.abs() <= 1e-12 || !area.is_finite() {
             return;
         }
         // Pixels of which a sample may be inside.
@@ -309,7 +308,7 @@ impl Layers {
                     let sum = sum0 + sum[0] * dx;
                     // Neighbours overlap by a hair, so that no sample falls between them.
                     let edge = -1e-5 * sum;
-                    if (p0 + p[0] * dx < edge) | (q0 + q[0] * dx < edge) | (r0 + r[0] * dx < edge) | !(sum > 0.0) {
+                    if (p0 + p[0] * dx < edge) | (q0 + q[0] * dx < edge) | (r0 + r[0] * dx < edge) | (sum <= 0.0) {
                         continue;
                     }
                     let far = (depth0 + depth[0] * dx) / sum;

@@ -168,7 +168,7 @@ impl Painter {
         mut show: impl FnMut(usize, f32, V3),
     ) {
         #[allow(clippy::cast_precision_loss)]
-        let share = 1.0 / layers.samples as f32;
+        let (share, all) = (1.0 / layers.samples as f32, u8::MAX >> (8 - layers.samples));
         let mut y = y0;
         while y < y1 {
             let next = (y + BAND).min(y1);
@@ -186,9 +186,13 @@ impl Painter {
                     self.batch.shade(&mut self.lattices, fragments, (number, geom, posed.as_ref()), layers, look);
                     #[allow(clippy::cast_precision_loss)]
                     for (i, fragment) in fragments.iter().enumerate() {
-                        let colour = [0, 1, 2].map(|k| self.batch.sum[k][i]);
+                        let [r, g, b] = &self.batch.sum;
                         let pixel = usize::from(fragment.y) * layers.width + usize::from(fragment.x);
-                        show(pixel, fragment.samples.count_ones() as f32 * share, colour);
+                        let part = match fragment.samples {
+                            samples if samples == all => 1.0,
+                            samples => samples.count_ones() as f32 * share,
+                        };
+                        show(pixel, part, [r[i], g[i], b[i]]);
                     }
                 }
                 begin = end;
@@ -208,7 +212,7 @@ impl Painter {
     }
 
     /// Gathers the fragments of a region, those of a geom together.
-    #[allow(clippy::cast_possible_truncation)]
+    #[allow(clippy::cast_possible_truncation, clippy::needless_range_loop)]
     fn gather(&mut self, layers: &Layers, [x0, y0, x1, y1]: Region) {
         self.fragments.clear();
         self.present.clear();
@@ -316,9 +320,7 @@ impl Batch {
             }
         }
         for (sum, tint) in self.sum.iter_mut().zip(&self.tint) {
-            for (sum, tint) in sum[..n].iter_mut().zip(&tint[..n]) {
-                *sum *= tint;
-            }
+            tinted(&mut sum[..n], &tint[..n]);
         }
     }
 
@@ -484,26 +486,26 @@ impl Batch {
         matter: &Matter,
         look: &Look<'_>,
     ) {
-        let mut last = (u32::MAX, [[0.0; 3]; 4]);
-        for i in 0..self.n {
-            if self.cell[i] != last.0 {
-                let grid = self.grid(geom, i);
-                let corners = [0, 1, grid.row, grid.row + 1].map(|step| {
-                    let corner = start + (grid.first + step) * passes + pass;
-                    if !lattices.known[corner] {
-                        lattices.known[corner] = true;
-                        lattices.colours[corner] = corner_light(grid.corner(geom, step), pass, matter, look);
-                    }
-                    lattices.colours[corner]
-                });
-                last = (self.cell[i], corners);
+        let mut begin = 0;
+        while begin < self.n {
+            // Neighbours are mostly in the same cell.
+            let cell = self.cell[begin];
+            let same = self.cell[begin..self.n].iter().take_while(|other| **other == cell).count();
+            let grid = self.grid(geom, begin);
+            let [a, b, c, d] = [0, 1, grid.row, grid.row + 1].map(|step| {
+                let corner = start + (grid.first + step) * passes + pass;
+                if !lattices.known[corner] {
+                    lattices.known[corner] = true;
+                    lattices.colours[corner] = corner_light(grid.corner(geom, step), pass, matter, look);
+                }
+                lattices.colours[corner]
+            });
+            let run = begin..begin + same;
+            let (u, v) = (&self.within[0][run.clone()], &self.within[1][run.clone()]);
+            for (k, lane) in self.pass.iter_mut().enumerate() {
+                interpolate([a[k], b[k], c[k], d[k]], u, v, &mut lane[run.clone()]);
             }
-            let [a, b, c, d] = last.1;
-            let [u, v] = [self.within[0][i], self.within[1][i]];
-            for k in 0..3 {
-                let (low, high) = (a[k] + u * (b[k] - a[k]), c[k] + u * (d[k] - c[k]));
-                self.pass[k][i] = low + v * (high - low);
-            }
+            begin += same;
         }
     }
 }
@@ -656,10 +658,26 @@ impl Lattices {
 }
 
 vectorised! {
+    /// Multiplies light with a texture; more than white is white.
+    fn tinted(sums: &mut [f32], tints: &[f32]) {
+        for (sum, tint) in sums.iter_mut().zip(tints) {
+            *sum = (*sum * tint).min(1.0);
+        }
+    }
+
     /// Adds light where there is some.
     fn add_lit(sums: &mut [f32], light: &[f32], lit: &[f32]) {
         for ((sum, light), lit) in sums.iter_mut().zip(light).zip(lit) {
             *sum += light * lit;
+        }
+    }
+
+    /// Between the values at four corners.
+    fn interpolate(corners: [f32; 4], u: &[f32], v: &[f32], values: &mut [f32]) {
+        let [a, b, c, d] = corners;
+        for ((value, u), v) in values.iter_mut().zip(u).zip(v) {
+            let (low, high) = (a + u * (b - a), c + u * (d - c));
+            *value = low + v * (high - low);
         }
     }
 

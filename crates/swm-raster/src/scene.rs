@@ -116,7 +116,7 @@ impl Axis {
         let inner = (from as i32).saturating_add(1).min(self.cells as i32 - 1).max(0);
         let cell = if from < 0.0 { 0 } else { inner };
         let (low, high) = (self.line(cell), self.line(cell + 1));
-        (cell, ((x - low) / (high - low).max(1e-12)).max(0.0).min(1.0))
+        (cell, ((x - low) / (high - low).max(1e-12)).clamp(0.0, 1.0))
     }
 }
 

@@ -62,7 +62,7 @@ impl Level {
         let right = fx * fy;
         let weights = [65536 - 256 * (fx + fy) + right, 256 * fx - right, 256 * fy - right, right];
         // Rounded so that they still sum to 256.
-        let [_, b, c, d] = weights.map(|weight| weight + 128 >> 8);
+        let [_, b, c, d] = weights.map(|weight| (weight + 128) >> 8);
         weighted(four, [256 - b - c - d, b, c, d])
     }
 }

@@ -6,13 +6,18 @@ use serde_json::{Value, json};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use swm_core::{CostModel, EnvSpec, Error, Manifest, Named, Policy, Registry, Result};
+use swm_core::{CostModel, EnvPool, EnvSpec, Error, Manifest, Named, Policy, Registry, Result};
 use swm_data::Reader;
 use swm_eval::Predictor;
 use swm_models::dino_wm::{DinoWm, DinoWmCost};
+use swm_models::gcrl::{Gcbc, Gciql, Gcivl, GoalConditioned as _};
 use swm_models::inverse::{self, InverseCheckpoint, InverseConfig, InversePolicy};
 use swm_models::lewm::{Lewm, LewmCost};
+use swm_models::online::{Agent, Live, OnlineSummary, train_online};
 use swm_models::pldm::{self, Pldm};
+use swm_models::probe::Encodes;
+use swm_models::sac::Sac;
+use swm_models::tdmpc2::{Tdmpc2, Tdmpc2Cost};
 use swm_models::train::{Facts, Preset};
 use swm_models::{Checkpoint, Device, Observer, TrainConfig, TrainOptions, TrainSummary, Trainable, checkpoint};
 
@@ -20,7 +25,17 @@ use swm_models::{Checkpoint, Device, Observer, TrainConfig, TrainOptions, TrainS
 pub static FAMILIES: Registry<Family> = Registry {
     kind: "model",
     hint: "`swm models` lists them",
-    rows: &[family::<Lewm>(), family::<Pldm>(), family::<DinoWm>(), INVERSE],
+    rows: &[
+        family::<Lewm>(),
+        family::<Pldm>(),
+        family::<DinoWm>(),
+        family::<Tdmpc2>(),
+        family::<Gcbc>(),
+        family::<Gcivl>(),
+        family::<Gciql>(),
+        family::<Sac>(),
+        INVERSE,
+    ],
 };
 
 /// A model family.
@@ -78,6 +93,9 @@ pub trait Loaded {
     /// The cost of a plan in it; none for a model that acts without planning.
     fn cost(&self) -> Option<Box<dyn CostModel>>;
 
+    /// Whether it knows by itself what to do, without one of the solvers.
+    fn acts(&self) -> bool;
+
     /// A policy that acts as it says, without planning, in `slots` environments; none for a model that only predicts.
     ///
     /// # Errors
@@ -86,6 +104,9 @@ pub trait Loaded {
 
     /// Its predictions, to be held against recordings; none for a model without a rollout of latents.
     fn predictor(&self) -> Option<Box<dyn Predictor>>;
+
+    /// Its encoder, to be probed; none for a model without eyes.
+    fn encoder(&self) -> Option<Box<dyn Encodes>>;
 }
 
 /// A configuration to train with.
@@ -101,6 +122,16 @@ pub trait Training {
 
     /// Steps to train.
     fn steps(&self) -> usize;
+
+    /// The side of the square pictures the model sees, if it sees any.
+    fn picture(&self) -> Option<usize>;
+
+    /// Trains by playing in the worlds that `worlds` makes, as many as it is asked for; none for a family that learns from
+    /// datasets only.
+    ///
+    /// # Errors
+    /// As [`swm_models::online::train_online`].
+    fn play(&self, on: PlayOn<'_>, observer: &mut dyn Observer, stop: &AtomicBool) -> Option<Result<OnlineSummary>>;
 
     /// Trains on `reader`; the checkpoint and the logs go to `out`. `encoder` is the checkpoint to see through, for
     /// families that do.
@@ -122,6 +153,16 @@ pub struct TrainOn<'a> {
     pub options: TrainOptions,
 }
 
+/// What a model learns by playing in.
+pub struct PlayOn<'a> {
+    /// Makes worlds.
+    pub worlds: &'a dyn Fn(usize) -> Result<EnvPool>,
+    /// Where the checkpoint and the logs go.
+    pub out: &'a Path,
+    /// What does not decide the numbers.
+    pub options: TrainOptions,
+}
+
 /// What a model of a family can be used for.
 trait Usable: Trainable {
     /// Frames it looks at to predict.
@@ -134,6 +175,9 @@ trait Usable: Trainable {
         None
     }
 
+    /// As [`Loaded::acts`].
+    const ACTS: bool = false;
+
     /// As [`Loaded::policy`].
     fn policy(_checkpoint: &Checkpoint<Self>, _spec: &EnvSpec, _slots: usize) -> Option<Result<Box<dyn Policy>>> {
         None
@@ -141,6 +185,21 @@ trait Usable: Trainable {
 
     /// As [`Loaded::predictor`].
     fn predictor(_checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Predictor>> {
+        None
+    }
+
+    /// As [`Loaded::encoder`].
+    fn encoder(_checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Encodes>> {
+        None
+    }
+
+    /// As [`Training::play`].
+    fn play(
+        _config: &TrainConfig<Self>,
+        _on: PlayOn<'_>,
+        _observer: &mut dyn Observer,
+        _stop: &AtomicBool,
+    ) -> Option<Result<OnlineSummary>> {
         None
     }
 }
@@ -155,8 +214,13 @@ impl Usable for Lewm {
     }
 
     fn predictor(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Predictor>> {
-        let frameskip = checkpoint.config.data.frameskip;
-        Some(Box::new(LewmPredictor::new(&checkpoint.model, &checkpoint.config.model, frameskip, &checkpoint.facts)))
+        let scale = checkpoint.facts.action.clone();
+        let (config, block) = (&checkpoint.config.model, checkpoint.config.data.frameskip);
+        Some(Box::new(LewmPredictor::new(&checkpoint.model, config, scale, block)))
+    }
+
+    fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Encodes>> {
+        Some(Box::new(checkpoint.clone()))
     }
 }
 
@@ -170,8 +234,13 @@ impl Usable for Pldm {
     }
 
     fn predictor(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Predictor>> {
-        let (model, frameskip) = (&checkpoint.model.model, checkpoint.config.data.frameskip);
-        Some(Box::new(LewmPredictor::new(model, &checkpoint.config.model, frameskip, &checkpoint.facts)))
+        let scale = checkpoint.facts.action.clone();
+        let (config, block) = (&checkpoint.config.model, checkpoint.config.data.frameskip);
+        Some(Box::new(LewmPredictor::new(&checkpoint.model.model, config, scale, block)))
+    }
+
+    fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Encodes>> {
+        Some(Box::new(checkpoint.clone()))
     }
 }
 
@@ -183,7 +252,77 @@ impl Usable for DinoWm {
     fn cost(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn CostModel>> {
         Some(Box::new(DinoWmCost::new(checkpoint)))
     }
+
+    fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Encodes>> {
+        Some(Box::new(checkpoint.clone()))
+    }
 }
+
+impl Usable for Tdmpc2 {
+    const ACTS: bool = true;
+
+    fn cost(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn CostModel>> {
+        Some(Box::new(Tdmpc2Cost::new(checkpoint)))
+    }
+
+    fn policy(checkpoint: &Checkpoint<Self>, spec: &EnvSpec, slots: usize) -> Option<Result<Box<dyn Policy>>> {
+        Some(agent(checkpoint, spec, slots))
+    }
+
+    fn play(
+        config: &TrainConfig<Self>,
+        on: PlayOn<'_>,
+        observer: &mut dyn Observer,
+        stop: &AtomicBool,
+    ) -> Option<Result<OnlineSummary>> {
+        Some(train_online(config, on.worlds, on.out, &on.options, observer, stop))
+    }
+}
+
+impl Usable for Sac {
+    const ACTS: bool = true;
+
+    fn policy(checkpoint: &Checkpoint<Self>, spec: &EnvSpec, slots: usize) -> Option<Result<Box<dyn Policy>>> {
+        Some(agent(checkpoint, spec, slots))
+    }
+
+    fn play(
+        config: &TrainConfig<Self>,
+        on: PlayOn<'_>,
+        observer: &mut dyn Observer,
+        stop: &AtomicBool,
+    ) -> Option<Result<OnlineSummary>> {
+        Some(train_online(config, on.worlds, on.out, &on.options, observer, stop))
+    }
+}
+
+/// The policy of a model that learnt by playing.
+fn agent<M: Agent>(checkpoint: &Checkpoint<M>, spec: &EnvSpec, slots: usize) -> Result<Box<dyn Policy>> {
+    M::policy(&checkpoint.config, &checkpoint.facts, Live::new(checkpoint.model.clone()), spec, slots, false)
+}
+
+/// Goal-conditioned models act without planning.
+macro_rules! acts {
+    ($($model:ty),*) => {
+        $(impl Usable for $model {
+            const ACTS: bool = true;
+
+            fn history(config: &TrainConfig<Self>) -> usize {
+                config.model.history
+            }
+
+            fn policy(checkpoint: &Checkpoint<Self>, spec: &EnvSpec, slots: usize) -> Option<Result<Box<dyn Policy>>> {
+                let policy = Self::actor(checkpoint).policy(spec, slots);
+                Some(policy.map(|policy| Box::new(policy) as Box<dyn Policy>))
+            }
+
+            fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Encodes>> {
+                Some(Box::new(Self::actor(checkpoint)))
+            }
+        })*
+    };
+}
+acts!(Gcbc, Gcivl, Gciql);
 
 /// The row of a family.
 const fn family<M: Usable>() -> Family {
@@ -210,6 +349,14 @@ impl<M: Usable> Training for TrainConfig<M> {
         self.schedule.steps
     }
 
+    fn picture(&self) -> Option<usize> {
+        M::picture(&self.model)
+    }
+
+    fn play(&self, on: PlayOn<'_>, observer: &mut dyn Observer, stop: &AtomicBool) -> Option<Result<OnlineSummary>> {
+        M::play(self, on, observer, stop)
+    }
+
     fn train(&self, on: TrainOn<'_>, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainSummary> {
         swm_models::train(self, on.reader, on.out, &on.options, observer, stop)
     }
@@ -234,12 +381,20 @@ impl<M: Usable> Loaded for Checkpoint<M> {
         M::cost(self)
     }
 
+    fn acts(&self) -> bool {
+        M::ACTS
+    }
+
     fn policy(&self, spec: &EnvSpec, slots: usize) -> Option<Result<Box<dyn Policy>>> {
         M::policy(self, spec, slots)
     }
 
     fn predictor(&self) -> Option<Box<dyn Predictor>> {
         M::predictor(self)
+    }
+
+    fn encoder(&self) -> Option<Box<dyn Encodes>> {
+        M::encoder(self)
     }
 }
 
@@ -251,7 +406,11 @@ pub fn load(run: &Path, device: &Device) -> Result<Box<dyn Loaded>> {
     let Some(family) = checkpoint::family(run) else {
         return Err(Error::corrupt(run, "there is no checkpoint", "give the folder that `swm train` wrote to"));
     };
-    (FAMILIES.get(&family)?.load)(run, device)
+    let Some(row) = FAMILIES.rows.iter().find(|row| row.id == family) else {
+        let problem = format!("it holds a model of the family '{family}', which this program does not know");
+        return Err(Error::corrupt(run, problem, "give another checkpoint; `swm models` lists the families"));
+    };
+    (row.load)(run, device)
 }
 
 /// Inverse dynamics, which is trained in a way of its own: on the latents of another checkpoint.
@@ -279,6 +438,14 @@ impl Training for InverseConfig {
 
     fn steps(&self) -> usize {
         self.schedule.steps
+    }
+
+    fn picture(&self) -> Option<usize> {
+        None
+    }
+
+    fn play(&self, _: PlayOn<'_>, _: &mut dyn Observer, _: &AtomicBool) -> Option<Result<OnlineSummary>> {
+        None
     }
 
     fn train(&self, on: TrainOn<'_>, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainSummary> {
@@ -320,11 +487,19 @@ impl Loaded for InverseCheckpoint {
         None
     }
 
+    fn acts(&self) -> bool {
+        true
+    }
+
     fn policy(&self, spec: &EnvSpec, slots: usize) -> Option<Result<Box<dyn Policy>>> {
         Some(InversePolicy::new(self.clone(), spec, slots).map(|policy| Box::new(policy) as Box<dyn Policy>))
     }
 
     fn predictor(&self) -> Option<Box<dyn Predictor>> {
         None
+    }
+
+    fn encoder(&self) -> Option<Box<dyn Encodes>> {
+        Some(Box::new(self.world.clone()))
     }
 }

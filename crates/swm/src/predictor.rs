@@ -1,27 +1,25 @@
-//! [`LewmPredictor`]: a LeWM's model, as a PLDM has one, too, whose predictions are compared with recorded trajectories.
+//! [`LewmPredictor`]: a LeWM whose predictions are compared with recorded trajectories.
 
 use rayon::prelude::*;
 use swm_core::{Batch, Error, Result};
 use swm_eval::Predictor;
 use swm_models::Device;
 use swm_models::lewm::{Lewm, LewmConfig, Rollout, pixels};
-use swm_models::train::Facts;
 use swm_plan::ActionScale;
 
 /// Rows encoded, and trajectories predicted, at once: each by itself, so that its latents do not depend on the others.
 pub struct LewmPredictor {
     model: Lewm,
     config: LewmConfig,
-    frameskip: usize,
-    scale: ActionScale,
     rollout: Rollout,
+    scale: ActionScale,
+    frameskip: usize,
 }
 
 impl LewmPredictor {
-    /// The predictor of a trained model.
-    pub fn new(model: &Lewm, config: &LewmConfig, frameskip: usize, facts: &Facts) -> Self {
-        let (model, config, scale) = (model.clone(), config.clone(), facts.action.clone());
-        Self { rollout: Rollout::new(&model), model, config, frameskip, scale }
+    /// The predictor of a trained model, whose model step is `frameskip` environment steps.
+    pub fn new(model: &Lewm, config: &LewmConfig, scale: ActionScale, frameskip: usize) -> Self {
+        Self { rollout: Rollout::new(model), model: model.clone(), config: config.clone(), scale, frameskip }
     }
 }
 

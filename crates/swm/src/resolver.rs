@@ -1,7 +1,7 @@
 //! [`Home`]: what the names in an evaluation's request stand for: environments, wrappers and solvers of this build,
 //! datasets and checkpoints at home.
 
-use crate::families::load;
+use crate::families::{Card, load};
 use crate::{ENVS, home};
 use std::cell::RefCell;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -100,13 +100,7 @@ impl Resolver for Home {
             Acts::Random => Ok(Actor::from(Box::new(RandomPolicy::new(spec, slots)) as Box<dyn Policy>)),
             Acts::Expert { id } => scripted(&env.entry, id, world).map(Actor::from),
             Acts::Direct { checkpoint: given, .. } => {
-                let loaded = load(&home::find_checkpoint(given)?, &Device::flex())?;
-                let card = loaded.card()?;
-                fits(card.facts.env.as_deref(), given, spec)?;
-                let policy = loaded.policy(spec, slots).ok_or_else(|| {
-                    let problem = format!("a {} predicts and does not act", card.family);
-                    Error::config(format!("checkpoint {given}"), problem, "plan in it (`swm eval` does)")
-                })??;
+                let (policy, card) = direct(given, spec, slots)?;
                 Ok(Actor {
                     weights: Some(card.weights),
                     libraries: card.manifest.libraries,
@@ -167,6 +161,32 @@ impl Resolver for Home {
         let Acts::Plan { model: Model::Checkpoint(given), .. } = &request.acts else { return Ok(None) };
         Ok(load(&home::find_checkpoint(given)?, &Device::flex())?.predictor())
     }
+}
+
+/// Who acts in a world, and the hash of the weights if a checkpoint does: as [`scripted`], or by the name or path of a
+/// checkpoint that acts by itself.
+///
+/// # Errors
+/// When there is neither such an expert nor such a checkpoint, or the checkpoint is of another world or only predicts.
+pub fn acting(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Policy>, Option<String>)> {
+    let known = ["random", "expert"].contains(&name) || entry.experts.iter().any(|expert| expert.id == name);
+    if known || !home::checkpoint(name).exists() {
+        return Ok((scripted(entry, name, world)?, None));
+    }
+    let (policy, card) = direct(name, world.spec(), world.pool().len())?;
+    Ok((policy, Some(card.weights)))
+}
+
+/// The policy of a checkpoint that acts by itself, and what the checkpoint holds.
+fn direct(given: &str, spec: &EnvSpec, slots: usize) -> Result<(Box<dyn Policy>, Card)> {
+    let loaded = load(&home::find_checkpoint(given)?, &Device::flex())?;
+    let card = loaded.card()?;
+    fits(card.facts.env.as_deref(), given, spec)?;
+    let policy = loaded.policy(spec, slots).ok_or_else(|| {
+        let problem = format!("a {} predicts and does not act", card.family);
+        Error::config(format!("checkpoint {given}"), problem, "plan in it (`swm eval` does)")
+    })??;
+    Ok((policy, card))
 }
 
 /// Who acts in a world without having been trained: `random`, `expert` (the environment's first), or an expert by name.

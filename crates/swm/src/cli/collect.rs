@@ -7,7 +7,7 @@ use clap::Args;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
-use swm::resolver::scripted;
+use swm::resolver::acting;
 use swm::{ENVS, home};
 use swm_core::{EnvChoice, Error, Manifest, Result, View};
 use swm_data::lance::{Shard, create_shard};
@@ -23,7 +23,7 @@ pub struct CollectArgs {
     /// The dataset to write: a path or a name
     #[arg(short, long, value_name = "DATASET")]
     output: String,
-    /// Who acts: random, expert, or one of the environment's experts by name
+    /// Who acts: random, expert, one of the environment's experts by name, or a checkpoint that acts by itself
     #[arg(long, default_value = "expert")]
     policy: String,
     /// Episodes the dataset shall have
@@ -150,10 +150,13 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     let Collection { env, location, config, .. } = collection;
     let (stack, goal) = collection.wrappers.stack()?;
     let mut world = World::of(|| Ok(stack.wrap(env.env()?, goal)), collection.world.clone())?;
-    let mut policy = scripted(&env.entry, collection.policy, &world)?;
+    let (mut policy, weights) = acting(&env.entry, collection.policy, &world)?;
     // A wrong factor is found before anything of an older dataset is replaced.
     world.spec().variation_space.resolve(&config.variation, swm_core::Key::new(config.seed))?;
     let mut manifest = world.collect_manifest(config);
+    if let Some(weights) = weights {
+        manifest.hashes.insert("policy".to_owned(), weights);
+    }
     manifest.config["codec"] = json!(collection.codec);
     if !collection.wrappers.wrappers.is_empty() {
         manifest.config["wrappers"] = json!(collection.wrappers.choices()?);

@@ -173,11 +173,14 @@ impl EvalArgs {
         let image = image.map(|side| [side, side]);
         let (model, block, history) = match kind {
             Kind::Acts(acts) => return Ok(vec![(PolicyRequest { name, acts }, image)]),
+            Kind::Plans { acts: Some(acts), .. } if self.planner.solvers.is_empty() => {
+                return Ok(vec![(PolicyRequest { name, acts }, image)]);
+            }
             Kind::Plans { model: None, .. } => {
                 parse_score(&self.planner.score)?;
                 (Model::Simulator { score: self.planner.score.clone() }, self.planner.action_block, 1)
             }
-            Kind::Plans { model: Some(given), block, history } => (Model::Checkpoint(given), block, history),
+            Kind::Plans { model: Some(given), block, history, .. } => (Model::Checkpoint(given), block, history),
         };
         let solvers = self.planner.solvers(env)?;
         // Several solvers are told apart by what was written, settings included.
@@ -204,8 +207,8 @@ struct Found {
 enum Kind {
     /// A policy that does not plan.
     Acts(Acts),
-    /// A model to plan in; the simulator for none.
-    Plans { model: Option<String>, block: usize, history: usize },
+    /// A model to plan in, the simulator for none; one that knows how to act does so unless a solver is named.
+    Plans { model: Option<String>, block: usize, history: usize, acts: Option<Acts> },
 }
 
 /// Finds out what a word stands for.
@@ -219,16 +222,22 @@ fn find(given: &str, env: Option<&str>) -> Result<Found> {
         return Ok(scripted(Acts::Expert { id: given.to_owned() }));
     }
     if given == "simulator" {
-        let kind = Kind::Plans { model: None, block: 1, history: 1 };
+        let kind = Kind::Plans { model: None, block: 1, history: 1, acts: None };
         return Ok(Found { name: given.to_owned(), kind, env: None, image: None });
     }
     let path = home::find_checkpoint(given)?;
     let name = Path::new(given).file_name().map_or(given.to_owned(), |name| name.to_string_lossy().into_owned());
     let found = families::load(&path, &Device::flex())?;
     let card = found.card()?;
+    let direct = Acts::Direct { checkpoint: given.to_owned(), settings: Value::Null };
     let kind = match found.cost() {
-        Some(_) => Kind::Plans { model: Some(given.to_owned()), block: card.action_block, history: card.history },
-        None => Kind::Acts(Acts::Direct { checkpoint: given.to_owned(), settings: Value::Null }),
+        Some(_) => Kind::Plans {
+            model: Some(given.to_owned()),
+            block: card.action_block,
+            history: card.history,
+            acts: found.acts().then_some(direct),
+        },
+        None => Kind::Acts(direct),
     };
     Ok(Found { name, kind, env: card.facts.env, image: card.image })
 }

@@ -14,6 +14,7 @@ mod eval;
 mod inspect;
 mod models;
 mod planner;
+mod probe;
 mod progress;
 mod report;
 mod solvers;
@@ -75,6 +76,8 @@ enum Command {
     Train(train::TrainArgs),
     /// List the checkpoints at home, or show one
     Checkpoints(checkpoints::CheckpointsArgs),
+    /// Read columns, or the pictures themselves, from a checkpoint's latents
+    Probe(probe::ProbeArgs),
     /// Evaluate a checkpoint, the expert or the random floor
     Eval(Box<eval::EvalArgs>),
     /// Run an evaluation again from its results and say what differs
@@ -144,6 +147,7 @@ impl Cli {
             Command::Doctor(args) => doctor::doctor(&args, &Context::new(json, self.threads)),
             Command::Collect(args) => collect::collect(&args, &Context::new(json, self.threads)),
             Command::Train(args) => train::train(&args, &Context::new(json, self.threads)),
+            Command::Probe(args) => probe::probe(&args, &Context::new(json, self.threads)),
             Command::Eval(args) => eval::eval(&args, &Context::new(json, self.threads)),
             Command::Reproduce(args) => eval::reproduce(&args, &Context::new(json, self.threads)),
             Command::Bench(args) => bench::bench(&args, &Context::new(json, self.threads)),

@@ -4,9 +4,9 @@ use super::{Context, Progress, emit, emit_json};
 use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use swm::families::{FAMILIES, TrainOn, Training};
-use swm::home;
-use swm_core::{Error, Result};
+use swm::families::{FAMILIES, PlayOn, TrainOn, Training};
+use swm::{ENVS, home};
+use swm_core::{EnvPool, Error, Result};
 use swm_data::Reader;
 use swm_models::{Observer, TrainOptions, TrainSummary, device};
 
@@ -21,6 +21,12 @@ pub struct TrainArgs {
     /// The size and schedule: a preset's name or a TOML file (default: the model's first preset)
     #[arg(long)]
     preset: Option<String>,
+    /// Learn by playing in this environment instead (tdmpc2, sac)
+    #[arg(long, value_name = "ENV", conflicts_with = "data")]
+    env: Option<String>,
+    /// Steps after which an episode is truncated, with --env (default: the environment's own)
+    #[arg(long, value_name = "STEPS", requires = "env")]
+    max_steps: Option<usize>,
     /// Where to write the checkpoint and the logs: a path or a name (default: the model's and dataset's names)
     #[arg(short, long, value_name = "CHECKPOINT")]
     output: Option<String>,
@@ -57,8 +63,6 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
         let problem = format!("{} trains an encoder of its own", family.id);
         anyhow::bail!(Error::config("--encoder", problem, "leave it out, or train inverse"));
     }
-    let encoder = args.encoder.as_deref().map(home::find_checkpoint).transpose()?;
-    let (reader, out) = args.places()?;
     let options = TrainOptions {
         resume: args.resume,
         device: device::parse(&args.device)?,
@@ -66,8 +70,57 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
         cache: home::weights(),
         ..TrainOptions::default()
     };
+    if let Some(env) = &args.env {
+        return play(args, env, &*config, options, context);
+    }
+    let encoder = args.encoder.as_deref().map(home::find_checkpoint).transpose()?;
+    let (reader, out) = args.places()?;
     let on = TrainOn { reader, encoder: encoder.as_deref(), out: &out, options };
     let summary = run(&*config, on, context)?;
+    if context.json {
+        return emit_json(&summary);
+    }
+    emit(&format!("{}\n", summary.checkpoint.display()));
+    Ok(())
+}
+
+/// Trains by playing.
+fn play(
+    args: &TrainArgs,
+    env: &str,
+    config: &dyn Training,
+    options: TrainOptions,
+    context: &Context,
+) -> anyhow::Result<()> {
+    let choice = ENVS.choose(env)?;
+    let threads = swm_core::pool::threads(context.threads)?;
+    let worlds = |count: usize| {
+        let envs = (0..count).map(|_| choice.env()).collect::<Result<Vec<_>>>()?;
+        EnvPool::new(envs, config.picture().map(|side| (side, side)), args.max_steps, Arc::clone(&threads))
+    };
+    let name = args.output.clone().unwrap_or_else(|| {
+        let world = env.rsplit('/').next().unwrap_or(env).split(',').next().unwrap_or(env);
+        format!("{}-{world}", args.model)
+    });
+    let out = home::checkpoint(&name);
+    let mut bar = Bar(Progress::new("train", config.steps()));
+    let Some(summary) = config.play(PlayOn { worlds: &worlds, out: &out, options }, &mut bar, &context.stop) else {
+        let problem = format!("{} learns from datasets only", args.model);
+        anyhow::bail!(Error::config("--env", problem, "give a dataset with --data, or train tdmpc2 or sac"));
+    };
+    let summary = summary?;
+    let evaluated = summary.evaluated.map_or(String::new(), |mean| format!(", mean return {mean:.1}"));
+    let best = summary.best.map_or(String::new(), |(step, mean)| format!(", best {mean:.1} after step {step}"));
+    bar.0.done(&format!(
+        "{} gradient steps and {} environment steps in {:.0} s{evaluated}{best}, {}",
+        summary.steps,
+        summary.env_steps,
+        summary.seconds,
+        out.display()
+    ));
+    if summary.interrupted {
+        anyhow::bail!(Error::Interrupted);
+    }
     if context.json {
         return emit_json(&summary);
     }
@@ -79,7 +132,9 @@ impl TrainArgs {
     /// The dataset, and where the checkpoint goes.
     fn places(&self) -> Result<(Arc<dyn Reader>, PathBuf)> {
         let Some(data) = &self.data else {
-            return Err(Error::config("--data", "no dataset is given", "name one (`swm datasets` lists them)"));
+            let fix =
+                "name one (`swm datasets` lists them), or an environment with --env for a model that learns by playing";
+            return Err(Error::config("--data", "no dataset is given", fix));
         };
         let name = self.output.clone().unwrap_or_else(|| {
             let stem = Path::new(data).file_stem().unwrap_or_default().to_string_lossy();

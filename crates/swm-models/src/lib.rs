@@ -27,9 +27,9 @@ pub mod nn;
 pub mod online;
 pub mod pixels;
 pub mod pldm;
+pub mod probe;
 pub mod sac;
 pub mod tdmpc2;
-pub mod probe;
 pub mod train;
 pub mod weights;
 

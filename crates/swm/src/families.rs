@@ -38,6 +38,9 @@ pub static FAMILIES: Registry<Family> = Registry {
     ],
 };
 
+/// From a preset and `key=value` words to what can be trained.
+pub type Configure = fn(&str, &[String]) -> Result<Box<dyn Training>>;
+
 /// A model family.
 pub struct Family {
     /// Its name.
@@ -49,7 +52,7 @@ pub struct Family {
     /// Whether it sees through the encoder of another checkpoint.
     pub borrows: bool,
     /// A complete configuration, from a preset and `key=value` words.
-    pub config: fn(&str, &[String]) -> Result<Box<dyn Training>>,
+    pub config: Configure,
     /// Loads a checkpoint.
     pub load: fn(&Path, &Device) -> Result<Box<dyn Loaded>>,
 }

@@ -205,7 +205,7 @@ impl Part {
 
     /// The rows of a step.
     fn at(&self, x: &Tensor<2>, step: usize) -> Tensor<2> {
-        x.clone().slice([step * self.clips..(step + 1) * self.clips])
+        x.clone().narrow(0, step * self.clips, self.clips)
     }
 
     /// The weight of every row: `ρ^t`, over the number of rows.

@@ -71,9 +71,9 @@ impl Trainable for Tdmpc2 {
         let (clips, horizon, width) = (batch.rows(), steps - 1, facts.action.dim());
         let flat = |name: &str| {
             let column = Tensor::<2>::from_data(TensorData::new(batch.to_f32(name)?, [clips, steps]), context.device);
-            Ok::<_, Error>(column.swap_dims(0, 1).slice([0..horizon]))
+            Ok::<_, Error>(column.swap_dims(0, 1).narrow(0, 0, horizon))
         };
-        let actions = facts.actions(batch, steps, 1, device)?.swap_dims(0, 1).slice([0..horizon]);
+        let actions = facts.actions(batch, steps, 1, device)?.swap_dims(0, 1).narrow(0, 0, horizon);
         let batch = TrainBatch {
             observations: observe(&config.model, batch, steps, device)?,
             actions,

@@ -53,6 +53,9 @@ struct Run<'a, M: Trainable> {
     log: log::Log,
 }
 
+/// Named numbers.
+type Metrics = Vec<(&'static str, f64)>;
+
 /// How far a run is: all that its future depends on, beside the tensors.
 #[derive(Clone, Debug, Default, serde::Serialize, serde::Deserialize)]
 pub(crate) struct Position {
@@ -258,7 +261,7 @@ impl<'a, M: Trainable> Run<'a, M> {
     }
 
     /// One step of the optimizer; returns the step's numbers, its learning rate and the gradient's norm.
-    fn learn(&mut self, learnt: Learnt) -> Result<(Vec<(&'static str, f64)>, f64, f64)> {
+    fn learn(&mut self, learnt: Learnt) -> Result<(Metrics, f64, f64)> {
         let StepOutput { metrics, gradients, buffers } = learnt.mean();
         let share = self.config.schedule.share(self.state.step);
         let (model, norm) = self.optimizer.step(self.model.clone(), share, gradients, M::group);

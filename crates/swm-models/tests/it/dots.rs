@@ -15,13 +15,12 @@ pub struct Dots {
 impl Dots {
     pub fn new(episodes: usize, seed: u64) -> Self {
         use rand::Rng as _;
-        let schema =
-            Schema::new([
-                ColumnSpec::image("pixels", SIDE, SIDE),
-                ColumnSpec::new("action", DType::Float32, [2]),
-                ColumnSpec::new("place", DType::Float32, [2]),
-            ])
-            .expect("three columns");
+        let schema = Schema::new([
+            ColumnSpec::image("pixels", SIDE, SIDE),
+            ColumnSpec::new("action", DType::Float32, [2]),
+            ColumnSpec::new("place", DType::Float32, [2]),
+        ])
+        .expect("three columns");
         let mut rows = Batch::zeros(&schema, episodes * LENGTH);
         for episode in 0..episodes {
             let mut rng = Key::new(seed).at(episode as u64).rng();

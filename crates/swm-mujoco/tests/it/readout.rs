@@ -77,7 +77,7 @@ fn a_read_out_learned_from_one_renderer_serves_the_other() {
             }
         }
     }
-    let held_out = |i: &usize| i / STEPS % HELD_OUT == 0;
+    let held_out = |i: &usize| (i / STEPS).is_multiple_of(HELD_OUT);
     let train: Vec<usize> = (0..poses.len()).filter(|i| !held_out(i)).collect();
     let test: Vec<usize> = (0..poses.len()).filter(held_out).collect();
     let error = |learned: &[Vec<f64>], shown: &[Vec<f64>]| -> f64 {

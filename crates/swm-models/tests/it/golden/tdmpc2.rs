@@ -139,14 +139,14 @@ impl Golden {
         };
         let [clips, steps, width] = self.tensor::<3>("i.action").dims();
         let horizon = steps - 1;
-        let flat = |name: &str| self.tensor::<2>(name).swap_dims(0, 1).slice([0..horizon]);
+        let flat = |name: &str| self.tensor::<2>(name).swap_dims(0, 1).narrow(0, 0, horizon);
         let ended = flat("i.terminated");
         let batch = TrainBatch {
             observations: Observation {
                 pixels: None,
                 numbers: config.numbers().map(|part| turned(&format!("i.{}", part.column))).collect(),
             },
-            actions: turned("i.action").slice([0..horizon * clips]).reshape([horizon, clips, width]),
+            actions: turned("i.action").narrow(0, 0, horizon * clips).reshape([horizon, clips, width]),
             rewards: flat("i.reward"),
             terminated: if terminations { ended } else { ended.zeros_like() },
         };

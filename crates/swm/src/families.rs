@@ -9,16 +9,17 @@ use std::sync::atomic::AtomicBool;
 use swm_core::{CostModel, EnvPool, EnvSpec, Error, Manifest, Named, Policy, Registry, Result};
 use swm_data::Reader;
 use swm_eval::Predictor;
-use swm_models::dino_wm::{DinoWm, DinoWmCost};
-use swm_models::gcrl::{Gcbc, Gciql, Gcivl, GoalConditioned as _};
+use swm_models::dino_wm::{self, DinoWm, DinoWmCost};
+use swm_models::gcrl::{self, Gcbc, Gciql, Gcivl, GoalConditioned as _};
 use swm_models::inverse::{self, InverseCheckpoint, InverseConfig, InversePolicy};
-use swm_models::lewm::{Lewm, LewmCost};
+use swm_models::lewm::{self, Lewm, LewmCost};
 use swm_models::online::{Agent, Live, OnlineSummary, train_online};
 use swm_models::pldm::{self, Pldm};
 use swm_models::probe::Encodes;
 use swm_models::sac::Sac;
-use swm_models::tdmpc2::{Tdmpc2, Tdmpc2Cost};
+use swm_models::tdmpc2::{self, Tdmpc2, Tdmpc2Cost};
 use swm_models::train::{Facts, Preset};
+use swm_models::weights::Naming;
 use swm_models::{Checkpoint, Device, Observer, TrainConfig, TrainOptions, TrainSummary, Trainable, checkpoint};
 
 /// The families, in the order in which they are listed.
@@ -55,6 +56,9 @@ pub struct Family {
     pub config: Configure,
     /// Loads a checkpoint.
     pub load: fn(&Path, &Device) -> Result<Box<dyn Loaded>>,
+    /// Makes a checkpoint, in the last folder, of what the reference trained (its `weights.pt` and `config.json` are in the first) on
+    /// a dataset; none where the reference has no such family.
+    pub import: fn(&Path, &dyn Reader, &Path) -> Option<Result<String>>,
 }
 
 impl Named for Family {
@@ -107,6 +111,12 @@ pub trait Loaded {
 
     /// Its predictions, to be held against recordings; none for a model without a rollout of latents.
     fn predictor(&self) -> Option<Box<dyn Predictor>>;
+
+    /// Writes what the reference's `load_pretrained` reads; none where the reference has no such family.
+    ///
+    /// # Errors
+    /// When the reference has no model of these sizes, or the disk refuses.
+    fn export(&self, folder: &Path) -> Option<Result<()>>;
 
     /// Its encoder, to be probed; none for a model without eyes.
     fn encoder(&self) -> Option<Box<dyn Encodes>>;
@@ -196,6 +206,16 @@ trait Usable: Trainable {
         None
     }
 
+    /// What the reference trained, as a checkpoint of this program.
+    fn import(_from: &Path, _facts: Facts) -> Option<Result<Checkpoint<Self>>> {
+        None
+    }
+
+    /// As [`Loaded::export`].
+    fn export(_checkpoint: &Checkpoint<Self>, _folder: &Path) -> Option<Result<()>> {
+        None
+    }
+
     /// As [`Training::play`].
     fn play(
         _config: &TrainConfig<Self>,
@@ -225,6 +245,14 @@ impl Usable for Lewm {
     fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Encodes>> {
         Some(Box::new(checkpoint.clone()))
     }
+
+    fn import(from: &Path, facts: Facts) -> Option<Result<Checkpoint<Self>>> {
+        Some(lewm::import::import(from, facts))
+    }
+
+    fn export(checkpoint: &Checkpoint<Self>, folder: &Path) -> Option<Result<()>> {
+        Some(lewm::import::export(checkpoint, folder, Naming::default()))
+    }
 }
 
 impl Usable for Pldm {
@@ -245,6 +273,14 @@ impl Usable for Pldm {
     fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Encodes>> {
         Some(Box::new(checkpoint.clone()))
     }
+
+    fn import(from: &Path, facts: Facts) -> Option<Result<Checkpoint<Self>>> {
+        Some(pldm::import::import(from, facts))
+    }
+
+    fn export(checkpoint: &Checkpoint<Self>, folder: &Path) -> Option<Result<()>> {
+        Some(pldm::import::export(checkpoint, folder, Naming::default()))
+    }
 }
 
 impl Usable for DinoWm {
@@ -258,6 +294,14 @@ impl Usable for DinoWm {
 
     fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Encodes>> {
         Some(Box::new(checkpoint.clone()))
+    }
+
+    fn import(from: &Path, facts: Facts) -> Option<Result<Checkpoint<Self>>> {
+        Some(dino_wm::import::import(from, facts))
+    }
+
+    fn export(checkpoint: &Checkpoint<Self>, folder: &Path) -> Option<Result<()>> {
+        Some(dino_wm::import::export(checkpoint, folder, Naming::default()))
     }
 }
 
@@ -279,6 +323,14 @@ impl Usable for Tdmpc2 {
         stop: &AtomicBool,
     ) -> Option<Result<OnlineSummary>> {
         Some(train_online(config, on.worlds, on.out, &on.options, observer, stop))
+    }
+
+    fn import(from: &Path, facts: Facts) -> Option<Result<Checkpoint<Self>>> {
+        Some(tdmpc2::import(from, facts))
+    }
+
+    fn export(checkpoint: &Checkpoint<Self>, folder: &Path) -> Option<Result<()>> {
+        Some(tdmpc2::export(checkpoint, folder))
     }
 }
 
@@ -322,6 +374,13 @@ macro_rules! acts {
             fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Encodes>> {
                 Some(Box::new(Self::actor(checkpoint)))
             }
+            fn import(from: &Path, facts: Facts) -> Option<Result<Checkpoint<Self>>> {
+                Some(gcrl::import::import(from, facts))
+            }
+
+            fn export(checkpoint: &Checkpoint<Self>, folder: &Path) -> Option<Result<()>> {
+                Some(gcrl::import::export(checkpoint, folder, Naming::default()))
+            }
         })*
     };
 }
@@ -336,6 +395,14 @@ const fn family<M: Usable>() -> Family {
         borrows: false,
         config: |preset, words| Ok(Box::new(TrainConfig::<M>::load(preset, words)?)),
         load: |run, device| Ok(Box::new(Checkpoint::<M>::load(run, device)?)),
+        import: |from, reader, out| {
+            let columns: Vec<String> = reader.schema().columns().iter().map(|column| column.name.clone()).collect();
+            let facts = match Facts::of(reader, &columns, M::BOUNDED) {
+                Ok(facts) => facts,
+                Err(error) => return Some(Err(error)),
+            };
+            Some(M::import(from, facts)?.and_then(|mut checkpoint| checkpoint.save_to(out)))
+        },
     }
 }
 
@@ -396,6 +463,10 @@ impl<M: Usable> Loaded for Checkpoint<M> {
         M::predictor(self)
     }
 
+    fn export(&self, folder: &Path) -> Option<Result<()>> {
+        M::export(self, folder)
+    }
+
     fn encoder(&self) -> Option<Box<dyn Encodes>> {
         M::encoder(self)
     }
@@ -428,6 +499,7 @@ const INVERSE: Family = Family {
     borrows: true,
     config: |_, words| Ok(Box::new(InverseConfig::load(words)?)),
     load: |run, device| Ok(Box::new(InverseCheckpoint::load(run, device)?)),
+    import: |_, _, _| None,
 };
 
 impl Training for InverseConfig {
@@ -499,6 +571,10 @@ impl Loaded for InverseCheckpoint {
     }
 
     fn predictor(&self) -> Option<Box<dyn Predictor>> {
+        None
+    }
+
+    fn export(&self, _: &Path) -> Option<Result<()>> {
         None
     }
 

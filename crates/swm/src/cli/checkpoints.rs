@@ -3,8 +3,8 @@
 use super::{emit, emit_json, table};
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
-use std::path::PathBuf;
-use swm::families::{self, Card};
+use std::path::{Path, PathBuf};
+use swm::families::{self, Card, FAMILIES};
 use swm::home::{self, names_in};
 use swm_core::{Error, Result};
 use swm_models::{Device, checkpoint};
@@ -33,6 +33,27 @@ enum What {
         /// Paths or names (default: all at home)
         checkpoints: Vec<String>,
     },
+    /// Make one of what the reference trained: a folder with weights.pt and config.json
+    Import {
+        /// The folder
+        folder: PathBuf,
+        /// The model: `swm models` lists them
+        #[arg(long)]
+        model: String,
+        /// The dataset it was trained on, which says how actions and columns were scaled
+        #[arg(long, value_name = "DATASET")]
+        data: String,
+        /// What to call it: a path or a name
+        #[arg(short, long, value_name = "CHECKPOINT")]
+        output: String,
+    },
+    /// Write what the reference's load_pretrained reads
+    Export {
+        /// A path or a name
+        checkpoint: String,
+        /// The folder to write weights.pt and config.json to
+        folder: PathBuf,
+    },
     /// Remove one with its logs
     Remove {
         /// A path or a name
@@ -46,6 +67,8 @@ pub fn checkpoints(args: &CheckpointsArgs, as_json: bool) -> anyhow::Result<()> 
         (Some(What::Show { checkpoint }), _) | (None, Some(checkpoint)) => show(checkpoint, as_json),
         (Some(What::List) | None, None | Some(_)) => list(as_json),
         (Some(What::Verify { checkpoints }), _) => verify(checkpoints, as_json),
+        (Some(What::Import { folder, model, data, output }), _) => import(folder, model, data, output, as_json),
+        (Some(What::Export { checkpoint, folder }), _) => export(checkpoint, folder, as_json),
         (Some(What::Remove { checkpoint }), _) => remove(checkpoint, as_json),
     }
 }
@@ -142,6 +165,39 @@ fn verify(given: &[String], as_json: bool) -> anyhow::Result<()> {
             "train them again, or `swm checkpoints remove` them"
         ));
     }
+    Ok(())
+}
+
+fn import(folder: &Path, model: &str, data: &str, output: &str, as_json: bool) -> anyhow::Result<()> {
+    let (family, out) = (FAMILIES.get(model)?, home::checkpoint(output));
+    if checkpoint::family(&out).is_some() {
+        let fix = "choose another --output, or `swm checkpoints remove` it";
+        anyhow::bail!(Error::config(out.display().to_string(), "holds a checkpoint already", fix));
+    }
+    let reader = home::open_dataset(data)?;
+    let Some(weights) = (family.import)(folder, &*reader, &out) else {
+        let fix = "import lewm, pldm, dino_wm, tdmpc2, gcbc, gcivl or gciql";
+        anyhow::bail!(Error::config("--model", format!("the reference has no {model}"), fix));
+    };
+    let weights = weights?;
+    if as_json {
+        return emit_json(&json!({"path": out, "weights": weights}));
+    }
+    emit(&format!("{}\n", out.display()));
+    Ok(())
+}
+
+fn export(given: &str, folder: &Path, as_json: bool) -> anyhow::Result<()> {
+    let loaded = families::load(&home::find_checkpoint(given)?, &Device::flex())?;
+    let Some(done) = loaded.export(folder) else {
+        let problem = format!("the reference has no {}", loaded.card()?.family);
+        anyhow::bail!(Error::config(format!("checkpoint {given}"), problem, "its weights are in weights.safetensors"));
+    };
+    done?;
+    if as_json {
+        return emit_json(&json!({"path": folder}));
+    }
+    emit(&format!("{}\n", folder.display()));
     Ok(())
 }
 

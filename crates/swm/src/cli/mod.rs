@@ -16,6 +16,7 @@ mod models;
 mod planner;
 mod probe;
 mod progress;
+mod pull;
 mod report;
 mod solvers;
 mod train;
@@ -74,7 +75,9 @@ enum Command {
     Models,
     /// Train a model on a dataset
     Train(train::TrainArgs),
-    /// List the checkpoints at home, or show one
+    /// Fetch weights of others from the Hugging Face hub, to begin a training with
+    Pull(pull::PullArgs),
+    /// List the checkpoints at home; show, verify, import, export or remove one
     Checkpoints(checkpoints::CheckpointsArgs),
     /// Read columns, or the pictures themselves, from a checkpoint's latents
     Probe(probe::ProbeArgs),
@@ -147,6 +150,7 @@ impl Cli {
             Command::Doctor(args) => doctor::doctor(&args, &Context::new(json, self.threads)),
             Command::Collect(args) => collect::collect(&args, &Context::new(json, self.threads)),
             Command::Train(args) => train::train(&args, &Context::new(json, self.threads)),
+            Command::Pull(args) => pull::pull(&args, json),
             Command::Probe(args) => probe::probe(&args, &Context::new(json, self.threads)),
             Command::Eval(args) => eval::eval(&args, &Context::new(json, self.threads)),
             Command::Reproduce(args) => eval::reproduce(&args, &Context::new(json, self.threads)),

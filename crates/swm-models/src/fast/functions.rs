@@ -19,6 +19,27 @@ pub fn gelu(x: &mut [f32]) {
     dispatch(Gelu(x));
 }
 
+/// The tangent of `x Φ(x)` at every number: replaces each by where the tangent is at 0, `-x² φ(x)`, and gives the slopes,
+/// `Φ(x) + x φ(x)`.
+pub fn gelu_tangent(x: &mut [f32], slopes: &mut [f32]) {
+    struct Tangent<'a>(&'a mut [f32], &'a mut [f32]);
+    impl Kernel for Tangent<'_> {
+        type Output = ();
+
+        #[inline(always)]
+        fn run<L: Level>(self) {
+            /// `1 / √(2π)`.
+            const HEIGHT: f32 = 0.398_942_3;
+            for (x, slope) in self.0.iter_mut().zip(self.1) {
+                let along = *x * HEIGHT * exp::<L>(-0.5 * *x * *x);
+                *slope = 0.5 + half_erf::<L>(*x) + along;
+                *x *= -along;
+            }
+        }
+    }
+    dispatch(Tangent(x, slopes));
+}
+
 /// `x / (1 + exp(-x))` of every number.
 pub fn silu(x: &mut [f32]) {
     struct Silu<'a>(&'a mut [f32]);
@@ -134,6 +155,42 @@ pub fn softmax(x: &mut [f32], width: usize) {
     dispatch(Softmax(x, width));
 }
 
+/// Takes the gradient of a [`softmax`] back: `shares` is what came out, `d` its gradient, replaced by that of what went in.
+pub fn softmax_backward(shares: &[f32], d: &mut [f32], width: usize) {
+    struct Backward<'a>(&'a [f32], &'a mut [f32], usize);
+    impl Kernel for Backward<'_> {
+        type Output = ();
+
+        #[inline(always)]
+        fn run<L: Level>(self) {
+            for (shares, d) in self.0.chunks_exact(self.2).zip(self.1.chunks_exact_mut(self.2)) {
+                let mean = dot::<L>(shares, d);
+                for (share, d) in shares.iter().zip(d) {
+                    *d = share * (*d - mean);
+                }
+            }
+        }
+    }
+    dispatch(Backward(shares, d, width));
+}
+
+/// `x * slope` in the place of `x`, number by number.
+pub fn multiply(x: &mut [f32], slopes: &[f32]) {
+    x.iter_mut().zip(slopes).for_each(|(x, slope)| *x *= slope);
+}
+
+/// `x * slope + offset` in the place of the offset, number by number.
+pub fn multiply_add(offsets: &mut [f32], x: &[f32], slopes: &[f32]) {
+    offsets.iter_mut().zip(x).zip(slopes).for_each(|((offset, x), slope)| *offset += x * slope);
+}
+
+/// Adds all rows of `x` to one.
+pub fn add_rows(sum: &mut [f32], x: &[f32]) {
+    for row in x.chunks_exact(sum.len()) {
+        sum.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
+    }
+}
+
 /// The largest number.
 #[inline(always)]
 fn most(x: &[f32]) -> f32 {
@@ -182,6 +239,10 @@ mod tests {
             let mut values = [x as f32];
             gelu(&mut values);
             assert!((f64::from(values[0]) - x * phi).abs() < 1e-6, "gelu({x}) = {}, not {}", values[0], x * phi);
+            let (mut offset, mut slope) = ([x as f32], [0.0]);
+            gelu_tangent(&mut offset, &mut slope);
+            assert!((f64::from(slope[0]) - phi - x * density(x)).abs() < 1e-6, "slope at {x}: {}", slope[0]);
+            assert!((f64::from(offset[0]) + x * x * density(x)).abs() < 1e-6, "offset at {x}: {}", offset[0]);
         }
         let mut rows: Vec<f32> = (0..38).map(|i| (i * 7 % 19) as f32 * 0.3 - 2.0).collect();
         let given = rows.clone();

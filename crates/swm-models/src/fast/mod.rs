@@ -1,8 +1,11 @@
-//! Inference on the CPU: what planning repeats thousands of times, as kernels on plain arrays.
+//! Planning and training on the CPU: what is repeated thousands of times, as kernels on plain arrays.
 //!
 //! Burn's tensors cost fresh memory and a pass over it for every operation. Here weights are laid out once
 //! ([`Panels`]), scratch is kept, and every row is computed on its own, so that neither threads nor neighbours change a
 //! byte. The numbers are those of the same layers in [`nn`](crate::nn), up to rounding.
+
+// Loops over constant numbers of lanes are what compilers turn into vectors.
+#![allow(clippy::needless_range_loop)]
 
 pub mod attention;
 pub mod dense;
@@ -12,6 +15,7 @@ pub mod product;
 mod scratch;
 mod simd;
 pub mod vit;
+pub mod vit_gradient;
 
 pub(crate) use attention::attend;
 pub use dense::dense;
@@ -19,6 +23,7 @@ pub use norm::{Modulation, Norm};
 pub use product::Panels;
 pub(crate) use scratch::{Pool, grown};
 pub use vit::FastVit;
+pub use vit_gradient::VitGradient;
 
 use crate::nn::parameters::IntoF32;
 use burn::tensor::Tensor;

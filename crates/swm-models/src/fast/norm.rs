@@ -98,6 +98,49 @@ fn centre<L: Level>(row: &mut [f32], epsilon: f32) -> f32 {
     1.0 / (dot::<L>(row, row) / n + epsilon).sqrt()
 }
 
+/// Takes the gradient of normalised rows back to the rows: adds it to `dx`, and to `weight` and `bias` what is theirs.
+///
+/// # Shapes
+/// `x`, `dy` and `dx` are `[rows, features]`, `weight` and `bias` `[features]`.
+pub fn backward(norm: &Norm, x: &[f32], dy: &[f32], dx: &mut [f32], [weight, bias]: [&mut [f32]; 2]) {
+    struct Backward<'a> {
+        norm: &'a Norm,
+        x: &'a [f32],
+        dy: &'a [f32],
+        dx: &'a mut [f32],
+        weight: &'a mut [f32],
+        bias: &'a mut [f32],
+        row: Vec<f32>,
+        pull: Vec<f32>,
+    }
+    impl Kernel for Backward<'_> {
+        type Output = ();
+
+        #[inline(always)]
+        #[allow(clippy::cast_precision_loss)]
+        fn run<L: Level>(mut self) {
+            let (features, n) = (self.norm.features(), self.norm.features() as f32);
+            let rows = self.x.chunks_exact(features).zip(self.dy.chunks_exact(features));
+            for ((x, dy), dx) in rows.zip(self.dx.chunks_exact_mut(features)) {
+                self.row.copy_from_slice(x);
+                let factor = centre::<L>(&mut self.row, self.norm.epsilon);
+                for i in 0..features {
+                    self.row[i] *= factor;
+                    self.weight[i] = L::fma(dy[i], self.row[i], self.weight[i]);
+                    self.bias[i] += dy[i];
+                    self.pull[i] = dy[i] * self.norm.weight[i];
+                }
+                let (mean, along) = (sum(&self.pull) / n, dot::<L>(&self.pull, &self.row) / n);
+                for i in 0..features {
+                    dx[i] = L::fma(factor, self.pull[i] - mean - along * self.row[i], dx[i]);
+                }
+            }
+        }
+    }
+    let scratch = || vec![0.0; norm.features()];
+    dispatch(Backward { norm, x, dy, dx, weight, bias, row: scratch(), pull: scratch() });
+}
+
 /// Adds `y` to `x`, number by number; rows of `y` are gated by part `gate` of their modulations where there are some.
 ///
 /// # Shapes

@@ -66,6 +66,24 @@ impl Panels {
         }
     }
 
+    /// As [`Panels::fill`], from rows as they lie in memory: given are the numbers from the first row on, and how many
+    /// there are from row to row.
+    pub fn fill_rows(&mut self, inputs: usize, (rows, stride): (&[f32], usize)) {
+        self.inputs = inputs;
+        self.numbers.clear();
+        self.numbers.resize(self.bias.len() * inputs, ZERO);
+        for (index, panel) in self.numbers.chunks_exact_mut(inputs.max(1)).enumerate() {
+            let first = index * WIDTH;
+            let width = WIDTH.min(self.outputs - first);
+            for (input, pair) in panel.iter_mut().enumerate() {
+                let row = &rows[input * stride + first..][..width];
+                for (lanes, row) in pair.iter_mut().zip(row.chunks(LANES)) {
+                    lanes.0[..row.len()].copy_from_slice(row);
+                }
+            }
+        }
+    }
+
     /// Rows of the matrix.
     pub fn inputs(&self) -> usize {
         self.inputs
@@ -88,12 +106,19 @@ impl Panels {
     /// many there are from row to row.
     pub fn apply_strided(&self, rows: usize, x: (&[f32], usize), y: (&mut [f32], usize)) {
         let mut tile = [Lanes([0.0; LANES]); TILE];
-        dispatch(Product { rows, x, y, weights: self, tile: &mut tile });
+        dispatch(Product::<false> { rows, x, y, weights: self, tile: &mut tile });
+    }
+
+    /// `y += xᵀ W + b`, where `x` is `[inputs, rows]`: how gradients of weights come about. Given as to
+    /// [`Panels::apply_strided`].
+    pub fn add_transposed(&self, rows: usize, x: (&[f32], usize), y: (&mut [f32], usize)) {
+        let mut tile = [Lanes([0.0; LANES]); TILE];
+        dispatch(Product::<true> { rows, x, y, weights: self, tile: &mut tile });
     }
 }
 
-/// A product to be computed.
-struct Product<'a> {
+/// A product to be computed; one of transposed rows is added.
+struct Product<'a, const TRANSPOSED: bool> {
     rows: usize,
     x: (&'a [f32], usize),
     y: (&'a mut [f32], usize),
@@ -102,7 +127,7 @@ struct Product<'a> {
     tile: &'a mut [Lanes; TILE],
 }
 
-impl Kernel for Product<'_> {
+impl<const TRANSPOSED: bool> Kernel for Product<'_, TRANSPOSED> {
     type Output = ();
 
     #[inline(always)]
@@ -145,12 +170,13 @@ struct Panel<'a> {
     bias: &'a Pair,
 }
 
-impl Product<'_> {
+impl<const TRANSPOSED: bool> Product<'_, TRANSPOSED> {
     /// `R` rows of a panel, `W` vectors at a time.
     #[inline(always)]
     fn tile<L: Level, const R: usize, const W: usize>(&mut self, row: usize, panel: Panel<'_>) {
         let ((x, x_stride), k) = (self.x, panel.numbers.len());
-        let x: [&[f32]; R] = std::array::from_fn(|r| &x[(row + r) * x_stride..][..k]);
+        let by_row: [&[f32]; R] =
+            std::array::from_fn(|r| if TRANSPOSED { &[][..] } else { &x[(row + r) * x_stride..][..k] });
         for half in (0..WIDTH / LANES).step_by(W) {
             let first = panel.first + half * LANES;
             if first >= self.weights.outputs {
@@ -159,8 +185,9 @@ impl Product<'_> {
             let mut sums: [[Lanes; W]; R] = [std::array::from_fn(|w| panel.bias[half + w]); R];
             for p in 0..k {
                 let weights: [Lanes; W] = std::array::from_fn(|w| panel.numbers[p][half + w]);
+                let column = if TRANSPOSED { &x[p * x_stride + row..][..R] } else { &[] };
                 for r in 0..R {
-                    let x = x[r][p];
+                    let x = if TRANSPOSED { column[r] } else { by_row[r][p] };
                     for w in 0..W {
                         for lane in 0..LANES {
                             sums[r][w].0[lane] = L::fma(x, weights[w].0[lane], sums[r][w].0[lane]);
@@ -174,7 +201,11 @@ impl Product<'_> {
             for (r, sums) in held.iter().enumerate() {
                 let to = &mut self.y.0[(row + r) * self.y.1 + first..][..width];
                 for (to, sums) in to.chunks_mut(LANES).zip(sums) {
-                    to.copy_from_slice(&sums.0[..to.len()]);
+                    if TRANSPOSED {
+                        to.iter_mut().zip(&sums.0).for_each(|(to, sum)| *to += sum);
+                    } else {
+                        to.copy_from_slice(&sums.0[..to.len()]);
+                    }
                 }
             }
         }
@@ -202,6 +233,17 @@ mod tests {
                     let wanted = f64::from(bias[output]) + terms.sum::<f64>();
                     assert!((f64::from(*y) - wanted).abs() < 1e-5, "{rows} {inputs} {outputs}: {y} for {wanted}");
                 }
+                // The same by columns, added to what is there.
+                let columns: Vec<f32> = (0..rows * inputs).map(|i| x[i % rows * inputs + i / rows]).collect();
+                let mut sum = y.clone();
+                panels.add_transposed(rows, (&columns, rows), (&mut sum, outputs));
+                assert!(sum.iter().zip(&y).all(|(sum, y)| *sum == 2.0 * y));
+                // Filled again from rows, it is the same matrix.
+                let matrix: Vec<f32> = (0..inputs * outputs).map(|i| weight(i / outputs, i % outputs)).collect();
+                let mut again = Panels::new(0, outputs, |_, _| 0.0).with_bias(&bias);
+                again.fill_rows(inputs, (&matrix, outputs));
+                again.apply(&x, &mut sum);
+                assert_eq!(sum, y);
                 // A row alone is the same bytes as among others, and as part of a longer one.
                 let mut alone = vec![f32::NAN; outputs + 2];
                 panels.apply_strided(1, (&x[(rows - 1) * inputs..], inputs), (&mut alone, outputs + 2));

@@ -6,6 +6,7 @@
 use super::dense::dense;
 use super::functions::{gelu, softmax};
 use super::norm::add;
+use super::vit_gradient::scale;
 use super::{Norm, Panels, Pool, grown, numbers};
 use crate::nn::positions::{Resampling, positions};
 use crate::nn::vit::Layer;
@@ -17,25 +18,25 @@ const BLOCK: usize = 36;
 
 /// The weights of a vision transformer.
 pub struct FastVit {
-    dim: usize,
-    heads: usize,
+    pub(super) dim: usize,
+    pub(super) heads: usize,
     /// From patches to tokens.
-    embed: Panels,
+    pub(super) embed: Panels,
     /// `[tokens, dim]`, that of the class token with the class token itself.
-    positions: Vec<f32>,
-    layers: Vec<FastLayer>,
-    norm: Norm,
+    pub(super) positions: Vec<f32>,
+    pub(super) layers: Vec<FastLayer>,
+    pub(super) norm: Norm,
     scratch: Pool<Scratch>,
     blocks: Pool<BlockScratch>,
 }
 
-struct FastLayer {
-    before: Norm,
+pub(super) struct FastLayer {
+    pub before: Norm,
     /// Queries (scaled), keys and values.
-    qkv: Panels,
-    out: Panels,
-    after: Norm,
-    mlp: [Panels; 2],
+    pub qkv: Panels,
+    pub out: Panels,
+    pub after: Norm,
+    pub mlp: [Panels; 2],
 }
 
 /// Memory of one picture.
@@ -115,7 +116,7 @@ impl FastVit {
                 if part < self.heads {
                     panels.fill(width, |i, token| from[token * 3 * dim + i]);
                 } else {
-                    panels.fill(tokens, |token, i| from[token * 3 * dim + i]);
+                    panels.fill_rows(tokens, (from, 3 * dim));
                 }
             });
             let asked = if index + 1 == self.layers.len() { 1 } else { tokens };
@@ -131,9 +132,8 @@ impl FastVit {
 }
 
 impl FastLayer {
-    #[allow(clippy::cast_precision_loss)]
     fn new(layer: &Layer, dim: usize, heads: usize) -> Self {
-        let scale = 1.0 / ((dim / heads) as f32).sqrt();
+        let scale = scale(dim, heads);
         let parts = &layer.attention.attention;
         let of = |linear: &Linear, scale: f32| {
             let scaled = |values: Vec<f32>| -> Vec<f32> { values.into_iter().map(|value| value * scale).collect() };
@@ -174,5 +174,30 @@ impl FastLayer {
         gelu(hidden);
         out.apply(hidden, narrow);
         add(x, narrow);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::{Init, VitConfig};
+    use burn::tensor::{Device, Tensor, TensorData};
+    use swm_core::Key;
+
+    #[test]
+    fn it_is_the_transformer_on_any_number_of_threads() {
+        let sizes = VitConfig { patch: 2, dim: 24, depth: 2, heads: 3, mlp: 40 };
+        // 50 tokens, in two blocks; more positions than were learnt, so that they are resampled.
+        let (patches, numbers) = (49, 12);
+        let vit = sizes.init(&Init::new(Key::new(1), &Device::flex()), 12);
+        let fast = FastVit::new(&vit, sizes.heads, patches);
+        let picture: Vec<f32> = (0..patches * numbers).map(|i| (i * 37 % 101) as f32 / 50.0 - 1.0).collect();
+        let on = |threads: usize| swm_core::pool::threads(threads).expect("threads").install(|| fast.encode(&picture));
+        let class = on(1);
+        assert_eq!(class, on(3));
+        let given = Tensor::from_data(TensorData::new(picture.clone(), [1, patches, numbers]), &Device::flex());
+        for (ours, wanted) in class.iter().zip(crate::fast::numbers(vit.forward(given))) {
+            assert!((ours - wanted).abs() < 1e-4, "{ours} for {wanted}");
+        }
     }
 }

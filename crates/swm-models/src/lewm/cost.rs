@@ -91,19 +91,23 @@ impl LewmCost {
         ))
     }
 
+    /// The latent of one picture, `[image, image, 3]` bytes.
+    ///
+    /// # Errors
+    /// When it is of another size.
+    pub fn latent_of(&self, rgb: &[u8]) -> Result<Vec<f32>> {
+        let patches = pixels::patches(&self.config, rgb, &self.model.device())?;
+        Ok(match self.host.as_ref().and_then(|host| host.encoder.as_ref()) {
+            Some(encoder) => encoder.encode(&patches.into_data().try_into_vec_as_f32()),
+            None => self.model.encode(patches).into_data().try_into_vec_as_f32(),
+        })
+    }
+
     /// Present and goal of one environment.
     fn look(&self, infos: &Batch, env: usize) -> Result<Scene> {
         let row = infos.row(env);
-        let device = self.model.device();
-        let encode = |rgb: &[u8]| {
-            let patches = pixels::patches(&self.config, rgb, &device)?;
-            Ok::<_, Error>(match self.host.as_ref().and_then(|host| host.encoder.as_ref()) {
-                Some(encoder) => encoder.encode(&patches.into_data().try_into_vec_as_f32()),
-                None => self.model.encode(patches).into_data().try_into_vec_as_f32(),
-            })
-        };
         // Each picture by itself: what a latent is must not depend on how many are encoded at once.
-        let mut start = vec![encode(row.get::<u8>("pixels")?)?];
+        let mut start = vec![self.latent_of(row.get::<u8>("pixels")?)?];
         let mut past = vec![];
         if infos.schema().find("history.length").is_some() {
             let length = usize::try_from(row.get::<i32>("history.length")?[0]).unwrap_or(0);
@@ -113,11 +117,11 @@ impl LewmCost {
             let frames = row.get::<u8>("history.pixels")?;
             let actions = row.get::<f32>("history.action")?;
             for frame in frames[frames.len() - length * bytes..].rchunks_exact(bytes) {
-                start.insert(0, encode(frame)?);
+                start.insert(0, self.latent_of(frame)?);
             }
             past = actions[actions.len() - length * self.actions..].to_vec();
         }
-        Ok(Scene { start: start.concat(), past, goal: encode(row.get::<u8>("goal")?)? })
+        Ok(Scene { start: start.concat(), past, goal: self.latent_of(row.get::<u8>("goal")?)? })
     }
 }
 
@@ -203,5 +207,47 @@ impl CostModel for LewmCost {
 
     fn latent(&mut self) -> Option<&mut dyn LatentDynamics> {
         Some(self)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::TrainConfig;
+    use crate::nn::parameters;
+    use swm_core::{ColumnSpec, Key};
+
+    #[test]
+    fn other_devices_come_to_the_same_costs() {
+        let config = TrainConfig::<Lewm>::load("tiny", &["model.predictor.history=3".to_owned()]).expect("a preset");
+        let (samples, horizon, dim) = (5, 5, 4);
+        let model = Lewm::init(&config.model, dim, Key::new(0), &Device::flex());
+        // Modulations are zero before training; without them actions have no effect.
+        let mut values = parameters::values(&model);
+        for (_, tensor) in values.iter_mut().filter(|(name, _)| name.contains("adaLN")) {
+            for (i, value) in tensor.values.iter_mut().enumerate() {
+                *value = ((i * 37 % 101) as f32 / 101.0 - 0.5) * 0.4;
+            }
+        }
+        let model = parameters::load(model, &values);
+        let side = config.model.image;
+        let columns = [ColumnSpec::image("pixels", side, side), ColumnSpec::image("goal", side, side)];
+        let mut infos = Batch::zeros(&Schema::new(columns).expect("columns"), 1);
+        infos.row_mut(0).at::<u8>(1).fill(200);
+        let actions: Vec<f32> = (0..samples * horizon * dim).map(|i| (i * 29 % 97) as f32 / 50.0 - 1.0).collect();
+        let costs = |on_host: bool| {
+            let mut cost = LewmCost::of(&model, &config.model, dim);
+            cost.host = cost.host.filter(|_| on_host);
+            cost.observe(&infos, &[0]).expect("observed");
+            let mut costs = vec![0.0; samples];
+            let candidates = Candidates { actions: &actions, envs: 1, samples, horizon, dim };
+            cost.cost(candidates, &mut costs).expect("costs");
+            costs
+        };
+        let (host, other) = (costs(true), costs(false));
+        assert!(host.windows(2).all(|pair| pair[0] != pair[1]), "actions have no effect: {host:?}");
+        for (host, other) in host.iter().zip(&other) {
+            assert!((host - other).abs() < 1e-4 * other.abs(), "{host} for {other}");
+        }
     }
 }

@@ -12,13 +12,13 @@ use super::model::Lewm;
 use super::rollout::Rollout;
 use crate::nn::parameters::IntoF32;
 use burn::module::Module;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Tensor, TensorData};
 use rayon::prelude::*;
 use swm_core::{Candidates, DifferentiableCost, Error, LatentDynamics, Result};
 
-/// Rows of numbers as a tensor.
-fn tensor<const D: usize>(numbers: Vec<f32>, shape: [usize; D]) -> Tensor<D> {
-    Tensor::from_data(TensorData::new(numbers, shape), &Device::flex())
+/// Rows of numbers as a tensor, where a model computes.
+fn tensor<const D: usize>(model: &Lewm, numbers: Vec<f32>, shape: [usize; D]) -> Tensor<D> {
+    Tensor::from_data(TensorData::new(numbers, shape), &model.device().inner())
 }
 
 /// The model, as differentiation wants it: its weights are constants.
@@ -37,15 +37,18 @@ fn cost_and_gradient(
 ) {
     let (latent, past) = (scene.goal.len(), scene.past.len() / dim);
     let seen = scene.start.len() / latent;
-    let start = tensor(scene.start.repeat(samples), [samples, seen, latent]).autodiff();
-    let free = tensor(actions.to_vec(), [samples, horizon, dim]).autodiff().require_grad();
+    let start = tensor(model, scene.start.repeat(samples), [samples, seen, latent]).autodiff();
+    let free = tensor(model, actions.to_vec(), [samples, horizon, dim]).autodiff().require_grad();
     let taken = match past {
         0 => free.clone(),
-        _ => Tensor::cat(vec![tensor(scene.past.repeat(samples), [samples, past, dim]).autodiff(), free.clone()], 1),
+        _ => Tensor::cat(
+            vec![tensor(model, scene.past.repeat(samples), [samples, past, dim]).autodiff(), free.clone()],
+            1,
+        ),
     };
     let last = seen + horizon - 1;
     let end = model.rollout(start, taken).slice([0..samples, last..last + 1, 0..latent]);
-    let goal = tensor(scene.goal.repeat(samples), [samples, 1, latent]).autodiff();
+    let goal = tensor(model, scene.goal.repeat(samples), [samples, 1, latent]).autodiff();
     let cost = (end - goal).square().sum_dim(2);
     costs.copy_from_slice(&cost.clone().inner().into_data().try_into_vec_as_f32());
     let all = cost.sum().backward();
@@ -133,8 +136,8 @@ impl LatentDynamics for LewmCost {
         let mut work: Vec<_> = parts.zip(chunks_mut(next, rows, latent)).collect();
         work.par_iter_mut().for_each(|((latents, actions), next)| {
             let (n, dim) = (latents.len() / latent, self.actions);
-            let window = tensor(latents.to_vec(), [n, 1, latent]);
-            let conditions = self.model.embed_actions(tensor(actions.to_vec(), [n, 1, dim]));
+            let window = tensor(&self.model, latents.to_vec(), [n, 1, latent]);
+            let conditions = self.model.embed_actions(tensor(&self.model, actions.to_vec(), [n, 1, dim]));
             next.copy_from_slice(&self.model.predict(window, conditions).into_data().try_into_vec_as_f32());
         });
         Ok(())
@@ -162,10 +165,10 @@ impl LatentDynamics for LewmCost {
         let mut work: Vec<_> = given.zip(asked).collect();
         work.par_iter_mut().for_each(|(((latents, actions), pull), (latent_gradient, action_gradient))| {
             let n = latents.len() / latent;
-            let from = tensor(latents.to_vec(), [n, 1, latent]).autodiff().require_grad();
-            let by = tensor(actions.to_vec(), [n, 1, dim]).autodiff().require_grad();
+            let from = tensor(&model, latents.to_vec(), [n, 1, latent]).autodiff().require_grad();
+            let by = tensor(&model, actions.to_vec(), [n, 1, dim]).autodiff().require_grad();
             let next = model.predict(from.clone(), model.embed_actions(by.clone()));
-            let all = (next * tensor(pull.to_vec(), [n, 1, latent]).autodiff()).sum().backward();
+            let all = (next * tensor(&model, pull.to_vec(), [n, 1, latent]).autodiff()).sum().backward();
             copy_gradient(from.grad(&all), latent_gradient);
             copy_gradient(by.grad(&all), action_gradient);
         });

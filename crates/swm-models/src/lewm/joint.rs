@@ -4,7 +4,8 @@
 //! The split is part of the configuration, never of the machine, and gradients are summed in the order of the
 //! shards, so the numbers do not depend on the number of threads.
 
-use super::model::{Encoder, Lewm};
+use super::model::Lewm;
+use super::shard::{Differentiation, Shard};
 use super::step::TrainBatch;
 use crate::nn::parameters::{self, Named};
 use crate::nn::{BatchStatistics, Noise};
@@ -39,23 +40,22 @@ pub(crate) fn step(
     let [clips, steps, _] = batch.actions.dims();
     let frames = clips * steps;
 
-    // Every shard differentiates its own copy of the encoder: their graphs share nothing.
     let size = frames.div_ceil(shards.max(1));
     let ranges: Vec<_> = (0..frames).step_by(size).map(|start| start..(start + size).min(frames)).collect();
-    let encoded: Vec<(Encoder, Tensor<2>)> = ranges
+    let [_, count, numbers] = batch.patches.dims();
+    let differentiation = Differentiation::of(&model.encoder, count, &model.device());
+    let encoded: Vec<Shard> = ranges
         .par_iter()
         .map(|range| {
-            let encoder = model.encoder.clone().train();
-            let [_, count, numbers] = batch.patches.dims();
-            let patches = batch.patches.clone().slice([range.clone(), 0..count, 0..numbers]).autodiff();
-            let features = encoder.forward(patches);
-            (encoder, features)
+            let patches = batch.patches.clone().slice([range.clone(), 0..count, 0..numbers]);
+            Shard::forward(&differentiation, patches)
         })
         .collect();
 
     // The rest of the model, from the features on.
     let head = model.clone().train();
-    let features = Tensor::cat(encoded.iter().map(|(_, f)| f.clone().inner()).collect(), 0).autodiff().require_grad();
+    let features = Tensor::cat(encoded.iter().map(|shard| shard.features.clone()).collect(), 0);
+    let features = features.autodiff().require_grad();
     let (latents, projector_statistics) = head.projector.forward_train(features.clone());
     let [_, latent] = latents.dims();
     let latents = latents.reshape([clips, steps, latent]);
@@ -85,10 +85,9 @@ pub(crate) fn step(
         let shards: Vec<Named<Tensor<1>>> = encoded
             .into_par_iter()
             .zip(&ranges)
-            .map(|((encoder, features), range)| {
-                let gradient = features_gradient.clone().slice([range.clone(), 0..width]).autodiff();
-                let all = (features * gradient).sum().backward();
-                parameters::gradients(&encoder, &all)
+            .map(|(shard, range)| {
+                let gradient = features_gradient.clone().slice([range.clone(), 0..width]);
+                shard.backward(&differentiation, gradient)
             })
             .collect();
         for shard in shards {

@@ -11,6 +11,7 @@ pub mod loss;
 pub mod model;
 pub mod pixels;
 pub mod rollout;
+mod shard;
 pub mod step;
 pub(crate) mod train;
 

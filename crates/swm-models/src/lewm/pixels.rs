@@ -21,6 +21,20 @@ pub fn check(config: &LewmConfig, schema: &Schema, column: &str) -> Result<()> {
 /// # Errors
 /// When the bytes are not whole pictures of the configured size.
 pub fn patches(config: &LewmConfig, rgb: &[u8], device: &Device) -> Result<Tensor<3>> {
-    let seen = Pixels { side: config.image, mean: config.pixel_mean, std: config.pixel_std };
-    pixels::patches(&seen, config.encoder.patch(), rgb, device)
+    pixels::patches(&seen(config), config.encoder.patch(), rgb, device)
+}
+
+/// Pictures as normalised planes.
+///
+/// # Shapes
+/// `[frames, image, image, 3]` bytes to `[frames, 3, image, image]`.
+///
+/// # Errors
+/// As [`patches`].
+pub fn planes(config: &LewmConfig, rgb: &[u8], device: &Device) -> Result<Tensor<4>> {
+    pixels::planes(&seen(config), rgb, device)
+}
+
+fn seen(config: &LewmConfig) -> Pixels {
+    Pixels { side: config.image, mean: config.pixel_mean, std: config.pixel_std }
 }

@@ -270,6 +270,11 @@ impl Attention {
         }
     }
 
+    /// How many heads there are.
+    pub(crate) fn heads(&self) -> usize {
+        self.heads
+    }
+
     /// What all tokens, or the first `asked`, attend to.
     #[allow(clippy::cast_precision_loss)]
     pub(super) fn forward(&self, x: Tensor<3>, asked: Option<usize>) -> Tensor<3> {

@@ -9,9 +9,10 @@ use swm_data::ClipSpec;
 
 const SCRIPT: &str = include_str!("reference.py");
 const PLAN_SCRIPT: &str = include_str!("reference_plan.py");
+const MODEL_SCRIPT: &str = include_str!("reference_model.py");
 const DATA_SCRIPT: &str = include_str!("reference_data.py");
 
-/// A Python process that holds one world, one solver, or the datasets of the reference.
+/// A Python process that holds one world, one solver, one model, or the datasets of the reference.
 pub(crate) struct Reference {
     process: Child,
     ask: ChildStdin,
@@ -47,6 +48,14 @@ impl Reference {
     /// As [`Reference::start`].
     pub fn start_solver(python: &Path, numbers: [usize; 6]) -> Result<Self> {
         Self::spawn(python, PLAN_SCRIPT, &numbers.map(|n| n.to_string()))
+    }
+
+    /// Starts it with a LeWM of some sizes; its weights and inputs are in a file.
+    ///
+    /// # Errors
+    /// As [`Reference::start`].
+    pub fn start_model(python: &Path, sizes: &serde_json::Value, weights: &Path) -> Result<Self> {
+        Self::spawn(python, MODEL_SCRIPT, &[sizes.to_string(), weights.display().to_string()])
     }
 
     /// Starts it to load and convert datasets.
@@ -96,6 +105,18 @@ impl Reference {
         self.rate(&format!("solve\t{seconds}"))
     }
 
+    /// Does a work of its model so often: times a second.
+    pub fn run(&mut self, work: &str, count: usize) -> Result<f64> {
+        self.rate(&format!("run\t{work}\t{count}"))
+    }
+
+    /// The numbers that a work of its model comes to.
+    pub fn numbers(&mut self, work: &str) -> Result<Vec<f32>> {
+        let words = self.ask(&format!("numbers\t{work}"))?;
+        let numbers = words.iter().map(|word| word.parse());
+        numbers.collect::<std::result::Result<_, _>>().map_err(|error| Error::external("reading the reference", error))
+    }
+
     /// Loads shuffled batches of clips with the columns `pixels` and `action` for about so long: clips a second.
     pub fn load(
         &mut self,
@@ -116,9 +137,7 @@ impl Reference {
     }
 
     fn rate(&mut self, request: &str) -> Result<f64> {
-        let lost = |error| Error::external("asking the reference", error);
-        writeln!(self.ask, "{request}").and_then(|()| self.ask.flush()).map_err(lost)?;
-        let words = self.answer()?;
+        let words = self.ask(request)?;
         if let Some(("error", why)) = words.split_first().map(|(first, why)| (first.as_str(), why)) {
             return Err(Error::external("the reference", why.join(" ")));
         }
@@ -127,6 +146,13 @@ impl Reference {
             [count, seconds] if seconds > 0.0 => Ok(count / seconds),
             _ => Err(Error::external("asking the reference", format!("it answered {words:?}"))),
         }
+    }
+
+    /// The words it answers to a request.
+    fn ask(&mut self, request: &str) -> Result<Vec<String>> {
+        let lost = |error| Error::external("asking the reference", error);
+        writeln!(self.ask, "{request}").and_then(|()| self.ask.flush()).map_err(lost)?;
+        self.answer()
     }
 
     /// The words of its next answer.

@@ -17,6 +17,7 @@ pub mod families;
 pub mod home;
 pub mod predictor;
 pub mod resolver;
+pub mod subject;
 
 use swm_core::EnvEntry;
 use swm_core::registry::{Registry, join};

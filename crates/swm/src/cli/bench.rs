@@ -3,12 +3,15 @@
 use super::{Context, complain, emit, emit_json, table};
 use clap::{Args, Subcommand};
 use swm::ENVS;
+use swm::subject::LewmSubject;
 use swm_core::EnvChoice;
 use swm_data::Location;
 use swm_eval::bench_render::Drawing;
 use swm_eval::{
-    BenchConfig, DataBenchConfig, PlanBenchConfig, RenderBenchConfig, bench_data, bench_envs, bench_plan, bench_render,
+    BenchConfig, DataBenchConfig, ModelBenchConfig, ModelBenchReport, PlanBenchConfig, RenderBenchConfig, Work, bench_data,
+    bench_envs, bench_model, bench_plan, bench_render,
 };
+use swm_models::device;
 use swm_mujoco::render::{Choice as Renderer, name, with};
 
 /// Arguments of `swm bench`.
@@ -23,9 +26,11 @@ enum What {
     /// Steps a second of worlds: stepping with rendering, and collecting into Lance. The reference runs in turn
     /// with ours where SWM_REFERENCE_PYTHON names a Python that has it
     Envs(EnvsArgs),
-    /// Iterations a second of CEM with a model that costs nothing, beside the reference's, and the planner's share of the
-    /// time beside a model that costs what a LeWM does
+    /// Planning: iterations a second of CEM with a model that costs nothing, and the planner's share of the time beside a
+    /// model; then a LeWM of the published size: a plan, the costs of one iteration, encoding a picture
     Plan(PlanArgs),
+    /// A training step of a LeWM of the published size
+    Train(TrainArgs),
     /// Clips a second from every format, and conversions; the use of memory over epochs
     Data(DataArgs),
     /// Pictures a second on one thread, by environment and size, drawn by each renderer there is
@@ -142,25 +147,83 @@ struct PlanArgs {
     /// Pairs of turns, ours and the reference's
     #[arg(long, default_value_t = 5)]
     pairs: usize,
-    /// Seconds of a turn
+    /// Seconds of a turn with a model that costs nothing
     #[arg(long, default_value_t = 1.0)]
     seconds: f64,
+    /// Iterations of a plan with a LeWM; 0 leaves the LeWM out
+    #[arg(long, default_value_t = 30)]
+    iterations: usize,
+    /// Where the LeWM computes: cpu, vulkan, cuda (:1 for the second such GPU) or auto
+    #[arg(long, default_value = "cpu")]
+    device: String,
 }
 
-/// Measures planners.
+/// Measures planners, and a model that is planned with.
 fn plan(args: &PlanArgs, context: &Context) -> anyhow::Result<()> {
-    let report = bench_plan(&PlanBenchConfig {
+    let planner = bench_plan(&PlanBenchConfig {
         envs: args.envs.clone(),
         pairs: args.pairs,
         seconds: args.seconds,
         threads: context.threads,
         ..PlanBenchConfig::default()
     })?;
+    if args.iterations > 0 {
+        let works = vec![(Work::Plan, 1), (Work::Cost, 2), (Work::Encode, 10)];
+        let model = lewm(works, args.iterations, 2, args.pairs, &args.device, context)?;
+        if context.json {
+            return emit_json(&serde_json::json!({ "planner": planner, "model": model }));
+        }
+        emit(&format!("{planner}{model}"));
+    } else if context.json {
+        return emit_json(&serde_json::json!({ "planner": planner }));
+    } else {
+        emit(&planner.to_string());
+    }
+    Ok(())
+}
+
+#[derive(Args)]
+struct TrainArgs {
+    /// Clips of a batch
+    #[arg(long, default_value_t = 8)]
+    clips: usize,
+    /// Pairs of turns, ours and the reference's
+    #[arg(long, default_value_t = 5)]
+    pairs: usize,
+    /// Where it computes: cpu, vulkan, cuda (:1 for the second such GPU) or auto
+    #[arg(long, default_value = "cpu")]
+    device: String,
+}
+
+/// Measures training.
+fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
+    let report = lewm(vec![(Work::Train, 1)], 1, args.clips, args.pairs, &args.device, context)?;
     if context.json {
         return emit_json(&report);
     }
-    emit(&report.to_string());
+    let rate = report.rows.first().map_or(0.0, |row| args.clips as f64 / row.seconds);
+    emit(&format!("{report}{} clips a step: {rate:.1} clips/s\n", args.clips));
     Ok(())
+}
+
+/// Measures a LeWM of the published size.
+fn lewm(
+    works: Vec<(Work, usize)>,
+    iterations: usize,
+    clips: usize,
+    pairs: usize,
+    name: &str,
+    context: &Context,
+) -> anyhow::Result<ModelBenchReport> {
+    let device = device::parse(name)?;
+    let weights = tempfile::NamedTempFile::new()?;
+    Ok(swm_core::pool::threads(context.threads)?.install(|| {
+        let mut subject = LewmSubject::new(iterations, clips, &device)?;
+        subject.write(weights.path())?;
+        let python = PlanBenchConfig::default().python;
+        let config = ModelBenchConfig { works, pairs, sizes: subject.sizes(), python };
+        bench_model(&config, weights.path(), &mut subject)
+    })?)
 }
 
 #[derive(Args)]
@@ -195,6 +258,7 @@ pub fn bench(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
     let args = match &args.what {
         What::Envs(args) => args,
         What::Plan(args) => return plan(args, context),
+        What::Train(args) => return train(args, context),
         What::Data(args) => return data(args, context),
         What::Render(args) => return render(args, context),
     };

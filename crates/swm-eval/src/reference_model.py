@@ -1,0 +1,166 @@
+"""Measures the reference's LeWM with given weights, on request, line by line: `run WORK COUNT`, `numbers WORK`.
+
+Arguments: the sizes as JSON, a file of weights and inputs. Works are `cost` (of the given candidates, the encodings of
+start and goal known), `plan` (both encoded, then CEM), `encode` (one picture) and `train` (one step, optimizer included).
+Answers are lines that begin with `SWM `; whatever else the reference prints is not ours.
+
+The reference's encoder comes from another package, so the vision transformer is spelled out here, with fused attention.
+"""
+
+import json
+import sys
+import time
+from importlib.metadata import version
+
+import gymnasium as gym
+import numpy as np
+import torch
+from stable_worldmodel.policy import PlanConfig
+from stable_worldmodel.solver import CEMSolver
+from stable_worldmodel.wm.lewm.lewm import LeWM
+from stable_worldmodel.wm.lewm.module import MLP, Embedder, Predictor
+from stable_worldmodel.wm.loss import SIGReg
+from torch import nn
+
+c = json.loads(sys.argv[1])
+given = torch.load(sys.argv[2], weights_only=True)
+device = torch.device(c["device"])
+
+
+def tree(**parts):
+    """A module that is nothing but its named parts."""
+    module = nn.Module()
+    for name, part in parts.items():
+        setattr(module, name, part)
+    return module
+
+
+class Vit(nn.Module):
+    def __init__(self):
+        super().__init__()
+        d, tokens = c["dim"], (c["image"] // c["patch"]) ** 2
+        self.heads = c["vit_heads"]
+        self.embeddings = tree(
+            cls_token=nn.Parameter(torch.zeros(1, 1, d)),
+            position_embeddings=nn.Parameter(torch.zeros(1, tokens + 1, d)),
+            patch_embeddings=tree(projection=nn.Conv2d(3, d, c["patch"], c["patch"])),
+        )
+        layers = [
+            tree(
+                layernorm_before=nn.LayerNorm(d, 1e-12),
+                attention=tree(
+                    attention=tree(query=nn.Linear(d, d), key=nn.Linear(d, d), value=nn.Linear(d, d)),
+                    output=tree(dense=nn.Linear(d, d)),
+                ),
+                layernorm_after=nn.LayerNorm(d, 1e-12),
+                intermediate=tree(dense=nn.Linear(d, c["vit_mlp"])),
+                output=tree(dense=nn.Linear(c["vit_mlp"], d)),
+            )
+            for _ in range(c["vit_layers"])
+        ]
+        self.encoder = tree(layer=nn.ModuleList(layers))
+        self.layernorm = nn.LayerNorm(d, 1e-12)
+
+    def forward(self, pixels, **_):
+        tokens = self.embeddings.patch_embeddings.projection(pixels).flatten(2).transpose(1, 2)
+        class_token = self.embeddings.cls_token.expand(len(pixels), -1, -1)
+        x = torch.cat([class_token, tokens], 1) + self.embeddings.position_embeddings
+        split = lambda t: t.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+        for layer in self.encoder.layer:
+            y, qkv = layer.layernorm_before(x), layer.attention.attention
+            q, k, v = split(qkv.query(y)), split(qkv.key(y)), split(qkv.value(y))
+            mixed = nn.functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
+            x = x + layer.attention.output.dense(mixed)
+            x = x + layer.output.dense(nn.functional.gelu(layer.intermediate.dense(layer.layernorm_after(x))))
+        return tree(last_hidden_state=self.layernorm(x))
+
+
+def lewm():
+    latent, norm = c["latent"], nn.BatchNorm1d
+    model = LeWM(
+        encoder=Vit(),
+        predictor=Predictor(
+            num_frames=c["history"], depth=c["depth"], heads=c["heads"], mlp_dim=c["mlp"], input_dim=latent,
+            hidden_dim=c["predictor_dim"], output_dim=latent, dim_head=c["dim_head"], dropout=c["dropout"],
+        ),  # fmt: skip
+        action_encoder=Embedder(c["actions"], c["actions"], latent),
+        projector=MLP(c["dim"], c["proj_hidden"], latent, norm),
+        pred_proj=MLP(latent, c["proj_hidden"], latent, norm),
+    )
+    weights = {name[2:]: value for name, value in given.items() if name.startswith("w.")}
+    missing, unknown = model.load_state_dict(weights, strict=False)
+    assert not unknown and all(name.endswith("num_batches_tracked") for name in missing), (missing, unknown)
+    return model.to(device)
+
+
+model = lewm().eval()
+pixels, goal, candidates = (given[f"i.{name}"].to(device) for name in ("pixels", "goal", "candidates"))
+samples, horizon, actions = candidates.shape
+solver = CEMSolver(
+    model, batch_size=1, num_samples=samples, n_steps=c["iterations"], topk=c["elites"], device=device
+)
+space = gym.spaces.Box(-1.0, 1.0, shape=(1, actions), dtype=np.float32)
+solver.configure(action_space=space, n_envs=1, config=PlanConfig(horizon=horizon, receding_horizon=horizon))
+scene = lambda: {"pixels": pixels[None, None], "goal": goal[None, None], "action": torch.zeros(1, 1, actions)}
+expand = lambda x: x.to(device)[:, None].expand(1, samples, *x.shape[1:])
+known = {name: expand(value) for name, value in scene().items()}
+
+
+@torch.inference_mode()
+def cost():
+    return model.get_cost(known, candidates[None])
+
+
+@torch.inference_mode()
+def encode():
+    return model.encode({"pixels": pixels[None, None]})["emb"]
+
+
+class Training:
+    """One step as published: prediction error and SIGReg, gradients clipped, AdamW."""
+
+    def __init__(self):
+        self.model = lewm().train()
+        self.optimizer = torch.optim.AdamW(self.model.parameters(), lr=5e-5, weight_decay=1e-3)
+        self.regulariser = SIGReg(c["knots"], c["directions"]).to(device)
+        clips, steps = c["batch"], c["history"] + 1
+        self.pixels = torch.randn(clips, steps, 3, c["image"], c["image"], device=device)
+        self.actions = torch.randn(clips, steps, actions, device=device)
+
+    def __call__(self):
+        info = self.model.encode({"pixels": self.pixels, "action": self.actions})
+        latents, conditions = info["emb"], info["act_emb"]
+        predicted = self.model.predict(latents[:, :-1], conditions[:, :-1])
+        loss = (predicted - latents[:, 1:]).square().mean() + 0.09 * self.regulariser(latents.transpose(0, 1))
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
+        self.optimizer.step()
+        self.optimizer.zero_grad()
+        return loss.item()
+
+
+works = {"cost": cost, "encode": encode, "plan": lambda: solver.solve(scene())}
+
+
+def run(work, count):
+    if work == "train" and work not in works:
+        works[work] = Training()
+    begun = time.perf_counter()
+    for _ in range(count):
+        works[work]()
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    return count, time.perf_counter() - begun
+
+
+def answer(*words):
+    print("SWM", *words, flush=True)
+
+
+answer("ready", version("stable-worldmodel"), "torch", torch.__version__)
+for line in sys.stdin:
+    command, *arguments = line.rstrip("\n").split("\t")
+    if command == "run":
+        answer(*run(arguments[0], int(arguments[1])))
+    else:
+        answer(*works[arguments[0]]().flatten().tolist())

@@ -1,0 +1,178 @@
+//! [`LewmSubject`]: the LeWM that `swm bench plan` and `swm bench train` measure, of the published size, with weights
+//! that were drawn, not trained: how fast it is does not depend on them.
+
+use rand::Rng as _;
+use std::path::Path;
+use swm_core::{
+    Batch, Candidates, ColumnSpec, CostModel as _, DType, Key, PlanProblem, PlanSpace, Result, Schema, Solver as _,
+};
+use swm_eval::{Subject, Work};
+use swm_models::lewm::{EncoderConfig, Lewm, LewmCost, pixels};
+use swm_models::nn::Named;
+use swm_models::nn::parameters::{self, HostTensor};
+use swm_models::train::{AdamW, Facts, StepContext};
+use swm_models::{Device, TrainConfig, Trainable as _, weights};
+use swm_plan::{ActionScale, Cem};
+
+/// Model steps of a plan.
+const HORIZON: usize = 5;
+/// Numbers of an environment's action.
+const NUMBERS: usize = 2;
+
+/// A LeWM, what it plans for, and what it is trained on.
+pub struct LewmSubject {
+    config: TrainConfig<Lewm>,
+    device: Device,
+    model: Lewm,
+    cost: LewmCost,
+    cem: Cem,
+    /// `pixels` and `goal` of one environment.
+    infos: Batch,
+    /// `[samples, HORIZON, numbers]`.
+    candidates: Vec<f32>,
+    training: Option<Training>,
+}
+
+/// What a training run holds.
+struct Training {
+    model: Lewm,
+    optimizer: AdamW,
+    facts: Facts,
+    batch: Batch,
+    steps: u64,
+}
+
+impl LewmSubject {
+    /// The published model with a CEM of so many iterations, and training batches of so many clips.
+    ///
+    /// # Errors
+    /// When the preset does not load.
+    pub fn new(iterations: usize, clips: usize, device: &Device) -> Result<Self> {
+        let words = [format!("data.batch_size={clips}"), format!("shards={}", rayon::current_num_threads())];
+        let config = TrainConfig::<Lewm>::load("paper", &words)?;
+        let actions = config.data.frameskip * NUMBERS;
+        let model = stirred(Lewm::init(&config.model, actions, Key::new(0), device));
+        let mut cost = LewmCost::of(&model, &config.model, actions);
+        let side = config.model.image;
+        let columns = [ColumnSpec::image("pixels", side, side), ColumnSpec::image("goal", side, side)];
+        let mut infos = Batch::zeros(&Schema::new(columns)?, 1);
+        let mut rng = Key::new(0).with("inputs").rng();
+        for column in 0..2 {
+            rng.fill(infos.row_mut(0).at::<u8>(column));
+        }
+        cost.observe(&infos, &[0])?;
+        let cem = Cem { iterations, ..Cem::default() };
+        let candidates = (0..cem.samples * HORIZON * actions).map(|_| rng.random_range(-1.0..1.0)).collect();
+        Ok(Self { config, device: device.clone(), model, cost, cem, infos, candidates, training: None })
+    }
+
+    /// The sizes as the reference's process reads them.
+    pub fn sizes(&self) -> serde_json::Value {
+        let (model, predictor) = (&self.config.model, &self.config.model.predictor);
+        let EncoderConfig::Vit(vit) = &model.encoder else { return serde_json::Value::Null };
+        serde_json::json!({
+            "device": if self.device == Device::flex() { "cpu" } else { "cuda" },
+            "image": model.image, "patch": vit.patch, "dim": vit.dim, "vit_layers": vit.depth, "vit_heads": vit.heads,
+            "vit_mlp": vit.mlp, "latent": model.latent, "proj_hidden": model.projector, "actions": self.actions(),
+            "history": predictor.history, "depth": predictor.depth, "heads": predictor.heads, "mlp": predictor.mlp,
+            "predictor_dim": predictor.dim, "dim_head": predictor.dim_head, "dropout": predictor.dropout,
+            "iterations": self.cem.iterations, "elites": self.cem.elites, "batch": self.config.data.batch_size,
+            "knots": self.config.loss.knots, "directions": self.config.loss.directions,
+        })
+    }
+
+    /// Writes weights and inputs for the reference's process: `w.NAME` and `i.NAME`, pictures normalised.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn write(&self, path: &Path) -> Result<()> {
+        let weights = parameters::values(&self.model).into_iter();
+        let mut tensors: Named<HostTensor> = weights.map(|(name, tensor)| (format!("w.{name}"), tensor)).collect();
+        let side = self.config.model.image;
+        for name in ["pixels", "goal"] {
+            let planes = pixels::planes(&self.config.model, self.infos.get::<u8>(name)?, &Device::flex())?;
+            let values = planes.into_data().iter::<f32>().collect();
+            tensors.insert(format!("i.{name}"), HostTensor { shape: vec![3, side, side], values });
+        }
+        let shape = vec![self.cem.samples, HORIZON, self.actions()];
+        tensors.insert("i.candidates".to_owned(), HostTensor { shape, values: self.candidates.clone() });
+        weights::torch::write(path, &tensors)
+    }
+
+    fn actions(&self) -> usize {
+        self.config.data.frameskip * NUMBERS
+    }
+
+    fn costs(&mut self) -> Result<Vec<f32>> {
+        let mut costs = vec![0.0; self.cem.samples];
+        let (samples, dim) = (self.cem.samples, self.actions());
+        let candidates = Candidates { actions: &self.candidates, envs: 1, samples, horizon: HORIZON, dim };
+        self.cost.cost(candidates, &mut costs)?;
+        Ok(costs)
+    }
+
+    fn plan(&mut self) -> Result<()> {
+        self.cost.observe(&self.infos, &[0])?;
+        let (low, high) = (vec![-1.0; self.actions()], vec![1.0; self.actions()]);
+        let space = PlanSpace::Continuous { low: &low, high: &high };
+        let problem = PlanProblem { horizon: HORIZON, space, keys: &[Key::new(0)], init: None, deadline: None };
+        self.cem.solve(&mut self.cost, problem).map(|_| ())
+    }
+
+    fn train(&mut self) -> Result<()> {
+        let (config, device) = (&self.config, &self.device);
+        let mut training = match self.training.take() {
+            Some(training) => training,
+            None => Training::new(config, &self.model)?,
+        };
+        let key = Key::new(0).at(training.steps);
+        let context = StepContext { config, facts: &training.facts, key, device, training: true };
+        let found = training.model.step(&context, &training.batch)?;
+        let (model, _) = training.optimizer.step(training.model, 1.0, found.gradients, Lewm::group);
+        training.model = model.after(&context, found.buffers);
+        training.steps += 1;
+        self.training = Some(training);
+        Ok(())
+    }
+}
+
+impl Training {
+    fn new(config: &TrainConfig<Lewm>, model: &Lewm) -> Result<Self> {
+        let (steps, side) = (config.data.num_steps, config.model.image);
+        let columns = [
+            ColumnSpec::new("pixels", DType::U8, [steps, side, side, 3]),
+            ColumnSpec::new("action", DType::Float32, [steps, config.data.frameskip * NUMBERS]),
+        ];
+        let mut batch = Batch::zeros(&Schema::new(columns)?, config.data.batch_size);
+        let mut rng = Key::new(0).with("batch").rng();
+        for row in 0..batch.rows() {
+            let mut row = batch.row_mut(row);
+            rng.fill(row.at::<u8>(0));
+            row.at::<f32>(1).iter_mut().for_each(|action| *action = rng.random_range(-1.0..1.0));
+        }
+        let facts = Facts { action: ActionScale::identity(NUMBERS), columns: Named::new(), env: None };
+        Ok(Self { model: model.clone(), optimizer: AdamW::new(config.optim.clone()), facts, batch, steps: 0 })
+    }
+}
+
+impl Subject for LewmSubject {
+    fn run(&mut self, work: Work) -> Result<Vec<f32>> {
+        match work {
+            Work::Cost => return self.costs(),
+            Work::Encode => return self.cost.latent_of(self.infos.get::<u8>("pixels")?),
+            Work::Plan => self.plan()?,
+            Work::Train => self.train()?,
+        }
+        Ok(vec![])
+    }
+}
+
+/// Modulations are zero before training; without them actions have no effect.
+fn stirred(model: Lewm) -> Lewm {
+    let mut values = parameters::values(&model);
+    let mut rng = Key::new(0).with("modulations").rng();
+    for (_, tensor) in values.iter_mut().filter(|(name, _)| name.contains("adaLN")) {
+        tensor.values.iter_mut().for_each(|value| *value = rng.random_range(-0.1..0.1));
+    }
+    parameters::load(model, &values)
+}

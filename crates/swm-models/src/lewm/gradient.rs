@@ -9,7 +9,6 @@
 
 use super::cost::{LewmCost, Scene};
 use super::model::Lewm;
-use super::rollout::Rollout;
 use crate::nn::parameters::IntoF32;
 use burn::module::Module;
 use burn::tensor::{Tensor, TensorData};
@@ -19,6 +18,12 @@ use swm_core::{Candidates, DifferentiableCost, Error, LatentDynamics, Result};
 /// Rows of numbers as a tensor, where a model computes.
 fn tensor<const D: usize>(model: &Lewm, numbers: Vec<f32>, shape: [usize; D]) -> Tensor<D> {
     Tensor::from_data(TensorData::new(numbers, shape), &model.device().inner())
+}
+
+/// How many of `rows` are differentiated at once: equal parts of at most 80. Burn's products depend on it, so it does not
+/// depend on the machine.
+fn part(rows: usize) -> usize {
+    rows.div_ceil(rows.div_ceil(80).max(1)).max(1)
 }
 
 /// The model, as differentiation wants it: its weights are constants.
@@ -72,7 +77,7 @@ impl DifferentiableCost for LewmCost {
             return Err(Error::mismatch("the gradient of a LeWM's cost, in numbers", given, expected));
         }
         let model = differentiable(&self.model);
-        let (numbers, part) = (horizon * dim, Rollout::part(samples));
+        let (numbers, part) = (horizon * dim, part(samples));
         let rows = costs.par_chunks_mut(samples).zip(gradient.par_chunks_mut(samples * numbers));
         rows.zip(actions.par_chunks(samples * numbers)).zip(&self.scenes).for_each(
             |(((costs, gradient), actions), scene)| {
@@ -178,12 +183,12 @@ impl LatentDynamics for LewmCost {
 
 /// Rows of `width` numbers in the parts they are computed in: each environment's `rows` by themselves.
 fn chunks(numbers: &[f32], rows: usize, width: usize) -> impl Iterator<Item = &[f32]> {
-    let part = Rollout::part(rows);
+    let part = part(rows);
     numbers.chunks(rows.max(1) * width).flat_map(move |env| env.chunks(part * width))
 }
 
 /// As [`chunks`], to be written.
 fn chunks_mut(numbers: &mut [f32], rows: usize, width: usize) -> impl Iterator<Item = &mut [f32]> {
-    let part = Rollout::part(rows);
+    let part = part(rows);
     numbers.chunks_mut(rows.max(1) * width).flat_map(move |env| env.chunks_mut(part * width))
 }

@@ -25,8 +25,9 @@ use crate::nn::Linear;
 use crate::nn::predictor::{Block, MODULATED_EPSILON};
 use burn::module::Param;
 
-/// Rows that go through a layer together: what they need in between stays in a core's cache.
-const BLOCK: usize = 48;
+/// Rows that go through a layer together: as many as leave what they need in between near a core; each block reads all
+/// weights once more.
+const BLOCK: usize = 80;
 /// Shift, scale and gate of the attention, then those of the feed-forward part.
 const PARTS: usize = 6;
 
@@ -152,10 +153,10 @@ impl Rollout {
         }
     }
 
-    /// How many of `samples` candidates to run at once: equal parts of at most 80, which keep the matrix products
-    /// efficient.
+    /// How many of `samples` candidates a thread runs at once: its share, within what keeps the matrix products efficient.
+    /// What a candidate comes to does not depend on it.
     pub fn part(samples: usize) -> usize {
-        samples.div_ceil(samples.div_ceil(80).max(1)).max(1)
+        samples.div_ceil(rayon::current_num_threads()).clamp(24, 160)
     }
 
     /// The latents of a rollout from one present: those given, then one predicted after each further action.

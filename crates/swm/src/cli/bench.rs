@@ -8,8 +8,8 @@ use swm_core::EnvChoice;
 use swm_data::Location;
 use swm_eval::bench_render::Drawing;
 use swm_eval::{
-    BenchConfig, DataBenchConfig, ModelBenchConfig, ModelBenchReport, PlanBenchConfig, RenderBenchConfig, Work, bench_data,
-    bench_envs, bench_model, bench_plan, bench_render,
+    BenchConfig, DataBenchConfig, ModelBenchConfig, ModelBenchReport, PlanBenchConfig, RenderBenchConfig, Work,
+    bench_data, bench_envs, bench_model, bench_plan, bench_render,
 };
 use swm_models::device;
 use swm_mujoco::render::{Choice as Renderer, name, with};

@@ -112,6 +112,10 @@ pub enum Error {
         /// The library's message.
         message: String,
     },
+    /// An error of the program that embeds the platform, raised in something it lent (a policy, a model, an
+    /// environment), and handed back to it as it was.
+    #[error("{0}")]
+    Foreign(Box<dyn std::error::Error + Send + Sync>),
 }
 
 impl Error {

@@ -152,7 +152,7 @@ impl EvalRequest {
                     }),
                 };
                 let progress: Box<dyn FnMut(Progress) + '_> = Box::new(|at| watch(Moment::Progress(at)));
-                let mut control = Control { stop: means.stop.clone(), progress: Some(progress) };
+                let mut control = Control { stop: means.stop.clone(), progress: Some(progress), ..Control::default() };
                 let mut run = world.evaluate(&mut *actor.policy, &starts, &config, &mut control)?;
                 drop(control);
                 if let Some((horizon, reader)) = request.prediction.zip(dataset.as_deref())

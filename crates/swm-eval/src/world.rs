@@ -47,15 +47,17 @@ pub struct Progress {
 pub struct Control<'a> {
     /// Set by somebody (Ctrl-C) to stop; looked at between steps.
     pub stop: Option<Arc<AtomicBool>>,
+    /// Asked between steps whether to go on, by embedders with signals of their own; its error ends the run.
+    pub poll: Option<Box<dyn FnMut() -> Result<()> + 'a>>,
     /// Told whenever an episode is done.
     pub progress: Option<Box<dyn FnMut(Progress) + 'a>>,
 }
 
 impl Control<'_> {
-    fn check(&self) -> Result<()> {
+    fn check(&mut self) -> Result<()> {
         match &self.stop {
             Some(stop) if stop.load(Ordering::Relaxed) => Err(Error::Interrupted),
-            _ => Ok(()),
+            _ => self.poll.as_mut().map_or(Ok(()), |poll| poll()),
         }
     }
 
@@ -145,13 +147,37 @@ impl World {
         self.pool.step(&self.actions, active)
     }
 
+    /// The action of every slot, for loops of one's own: filled before [`World::advance`].
+    pub fn actions_mut(&mut self) -> &mut Batch {
+        &mut self.actions
+    }
+
+    /// Steps the active slots with the actions in [`World::actions_mut`].
+    ///
+    /// # Errors
+    /// When an environment fails.
+    pub fn advance(&mut self, active: &[bool]) -> Result<()> {
+        self.pool.step(&self.actions, active)
+    }
+
+    /// Lets the policy fill the active slots of [`World::actions_mut`], without stepping.
+    ///
+    /// # Errors
+    /// When the policy fails.
+    pub fn ask(&mut self, policy: &mut dyn Policy, active: &[bool]) -> Result<()> {
+        self.act(policy, active)
+    }
+
     /// Starts some of these episodes in slots: `(slot, episode)`.
     pub(crate) fn start(&mut self, starts: &Starts, starting: &[(usize, usize)]) -> Result<()> {
         starts.start(&mut self.pool, starting)
     }
 
     /// Starts new episodes in some slots.
-    pub(crate) fn restart(&mut self, resets: &[Reset]) -> Result<()> {
+    ///
+    /// # Errors
+    /// When an environment refuses its options.
+    pub fn restart(&mut self, resets: &[Reset]) -> Result<()> {
         self.pool.reset(resets)
     }
 
@@ -247,13 +273,13 @@ pub(crate) trait Play {
 }
 
 /// The key of an episode: all its randomness, the policy's included.
-pub(crate) fn episode_key(seed: u64, episode: usize) -> Key {
+pub fn episode_key(seed: u64, episode: usize) -> Key {
     Key::new(seed).with("episode").at(episode as u64)
 }
 
 /// The seed an environment is reset with. The highest bit is left out so that signed integers hold it: it is
 /// written to results and datasets, and Gymnasium takes no negative seeds.
-pub(crate) fn reset_seed(key: Key) -> u64 {
+pub fn reset_seed(key: Key) -> u64 {
     key.seed() >> 1
 }
 

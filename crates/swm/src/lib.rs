@@ -4,6 +4,9 @@
 //! models, plan with them, and measure how they hold up when the world changes. The parts are crates of their
 //! own, re-exported here; this crate also builds the `swm` command.
 
+// The command line was written against the facade by its name.
+extern crate self as swm;
+
 pub use swm_core as core;
 pub use swm_data as data;
 pub use swm_envs as envs;
@@ -13,6 +16,7 @@ pub use swm_mujoco as mujoco;
 pub use swm_plan as plan;
 pub use swm_report as report;
 
+pub mod cli;
 pub mod families;
 pub mod home;
 pub mod predictor;

@@ -113,6 +113,7 @@ fn an_interruption_keeps_what_is_finished() {
             told = progress.episodes;
             stop.store(progress.episodes >= 6, Ordering::Relaxed);
         })),
+        ..Control::default()
     };
     let outcome = world.collect(&mut policy, part.writer(), &config(30), &mut control);
     drop(control);

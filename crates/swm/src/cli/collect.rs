@@ -218,6 +218,7 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     let mut control = Control {
         stop: Some(context.stop.clone()),
         progress: Some(Box::new(|at| progress.at(at.episodes, speed(at.steps)))),
+        ..Control::default()
     };
     let collected = world.collect(&mut *policy, writer, config, &mut control)?;
     drop(control);

@@ -181,6 +181,14 @@ impl World {
         self.pool.reset(resets)
     }
 
+    /// Changes environments in place, then shows them as after a reset.
+    ///
+    /// # Errors
+    /// What `change` returns.
+    pub fn change(&mut self, slots: &[usize], change: impl Fn(usize, &mut dyn Env) -> Result<()> + Sync) -> Result<()> {
+        self.pool.restart(slots, change)
+    }
+
     fn act(&mut self, policy: &mut dyn Policy, active: &[bool]) -> Result<()> {
         policy.see(&self.pool, active)?;
         let (infos, actions) = (self.pool.infos(), &mut self.actions);

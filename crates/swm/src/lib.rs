@@ -17,6 +17,8 @@ pub use swm_plan as plan;
 pub use swm_report as report;
 
 pub mod cli;
+pub mod collect;
+pub mod describe;
 pub mod families;
 pub mod home;
 pub mod predictor;

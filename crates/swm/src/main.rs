@@ -3,5 +3,5 @@
 use clap::Parser as _;
 
 fn main() -> std::process::ExitCode {
-    swm::cli::Cli::parse().run()
+    swm::cli::Cli::parse().run().into()
 }

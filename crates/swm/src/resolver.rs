@@ -178,7 +178,10 @@ pub fn acting(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Po
 }
 
 /// The policy of a checkpoint that acts by itself, and what the checkpoint holds.
-fn direct(given: &str, spec: &EnvSpec, slots: usize) -> Result<(Box<dyn Policy>, Card)> {
+///
+/// # Errors
+/// When there is no such checkpoint, it is of another world, or it only predicts.
+pub fn direct(given: &str, spec: &EnvSpec, slots: usize) -> Result<(Box<dyn Policy>, Card)> {
     let loaded = load(&home::find_checkpoint(given)?, &Device::flex())?;
     let card = loaded.card()?;
     fits(card.facts.env.as_deref(), given, spec)?;

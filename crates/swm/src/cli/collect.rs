@@ -9,10 +9,9 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm::resolver::acting;
 use swm::{ENVS, home};
-use swm_core::{EnvChoice, Error, Manifest, Result, View};
+use swm_core::{EnvChoice, Error, Result, View};
 use swm_data::lance::{Shard, create_shard};
 use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions};
-use swm_eval::collect::check_continues;
 use swm_eval::{CollectConfig, Collected, Control, World, WorldConfig};
 
 /// Arguments of `swm collect`.
@@ -162,37 +161,8 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
         manifest.config["wrappers"] = json!(collection.wrappers.choices()?);
         manifest.config["wrap_goal"] = json!(collection.wrappers.wrap_goal);
     }
-    let there = match location.path() {
-        Some(path) => path.exists(),
-        None => swm_data::open(*location).is_ok(),
-    };
-    if collection.shard.is_none() && there {
-        match collection.mode {
-            WriteMode::Overwrite => {}
-            WriteMode::Append => {
-                if let Some(stored) = swm_data::open(*location)?.manifest() {
-                    check_continues(&stored, &manifest)?;
-                    if !collection.mix_renderers {
-                        check_renderer(&stored, &manifest)?;
-                    }
-                    let (stored, wanted) = (&stored.config["codec"], &manifest.config["codec"]);
-                    if stored != wanted {
-                        return Err(Error::config(
-                            "--codec",
-                            format!("the dataset's pictures are {stored}, not {wanted}"),
-                            "ask for the same again, or collect into another dataset",
-                        ));
-                    }
-                }
-            }
-            WriteMode::Create => {
-                return Err(Error::config(
-                    format!("dataset {location}"),
-                    "there is one already",
-                    "continue it with --resume, replace it with --overwrite, or name another",
-                ));
-            }
-        }
+    if collection.shard.is_none() {
+        swm::collect::check(location, collection.mode, &manifest, collection.mix_renderers)?;
     }
     let schema = world.collect_schema(config.goal)?;
     let options = WriteOptions {
@@ -230,21 +200,6 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
         speed(collected.steps)
     ));
     Ok(collected)
-}
-
-/// Checks that the pictures of a dataset were drawn as those to come will be: by the same renderer, on whichever device.
-fn check_renderer(stored: &Manifest, wanted: &Manifest) -> Result<()> {
-    fn kind(manifest: &Manifest) -> Option<&str> {
-        manifest.libraries.get("renderer")?.split(' ').next()
-    }
-    match (kind(stored), kind(wanted)) {
-        (Some(stored), Some(wanted)) if stored != wanted => Err(Error::config(
-            format!("continuing a collection with the renderer {wanted}"),
-            format!("its pictures were drawn by {stored}"),
-            format!("--renderer {stored} draws like them; --mix-renderers adds pictures that look a little different"),
-        )),
-        _ => Ok(()),
-    }
 }
 
 /// What `--output` of a command becomes: the folder, made.

@@ -4,8 +4,8 @@ use super::{complain, emit, emit_json, table};
 use clap::Args;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeSet;
-use swm::ENVS;
-use swm_core::{EnvChoice, EnvEntry, EnvSpec, Space, VariationSpace};
+use swm::{ENVS, describe};
+use swm_core::EnvChoice;
 
 /// Arguments of `swm envs`.
 #[derive(Args)]
@@ -28,7 +28,7 @@ pub fn envs(args: &EnvsArgs, as_json: bool) -> anyhow::Result<()> {
     }
     if as_json {
         let all = ENVS.rows.iter().map(|row| match row.env() {
-            Ok(env) => (row.id.to_owned(), describe(row, env.spec())),
+            Ok(env) => (row.id.to_owned(), describe::env(row, env.spec())),
             Err(error) => (row.id.to_owned(), json!({"summary": row.summary, "missing": error.to_string()})),
         });
         return emit_json(&all.collect::<Map<String, Value>>());
@@ -67,7 +67,7 @@ fn show(choice: &EnvChoice, as_json: bool) -> anyhow::Result<()> {
     let (row, env) = (&choice.entry, choice.env()?);
     let spec = env.spec();
     if as_json {
-        return emit_json(&describe(row, spec));
+        return emit_json(&describe::env(row, spec));
     }
     let list = |words: Vec<String>| if words.is_empty() { "none".to_owned() } else { words.join(", ") };
     let columns =
@@ -98,8 +98,8 @@ pub fn fovs(args: &FovsArgs, as_json: bool) -> anyhow::Result<()> {
     let space = &env.spec().variation_space;
     if as_json {
         return emit_json(&json!({
-            "variation": variation(space),
-            "sampling_order": sampling_order(space),
+            "variation": describe::variation(space),
+            "sampling_order": describe::sampling_order(space),
             "default_variations": space.defaults(),
         }));
     }
@@ -113,98 +113,4 @@ pub fn fovs(args: &FovsArgs, as_json: bool) -> anyhow::Result<()> {
     });
     emit(&table(&["factor", "values", "default", "at reset"], rows));
     Ok(())
-}
-
-/// One environment, with the fields a Python user knows.
-fn describe(row: &EnvEntry, spec: &EnvSpec) -> Value {
-    let info: Map<String, Value> = spec
-        .columns
-        .iter()
-        .map(|column| {
-            let shape: Vec<String> = column.shape.iter().map(ToString::to_string).collect();
-            let shape = if shape.is_empty() { String::new() } else { format!("[{}]", shape.join(", ")) };
-            (column.name.clone(), json!(format!("{}{shape}", column.dtype.name())))
-        })
-        .collect();
-    json!({
-        "summary": row.summary,
-        "action_space": space(&spec.action_space),
-        "observation_space": observation(spec),
-        "info": info,
-        "variation": variation(&spec.variation_space),
-        "sampling_order": sampling_order(&spec.variation_space),
-        "default_variations": spec.variation_space.defaults(),
-        "max_episode_steps": spec.max_episode_steps,
-        "cameras": spec.cameras,
-        "options": row.options.iter().map(|o| json!({"key": o.key, "summary": o.summary, "values": o.values})).collect::<Vec<_>>(),
-        "experts": row.experts.iter().map(|e| json!({"id": e.id, "summary": e.summary})).collect::<Vec<_>>(),
-    })
-}
-
-/// What an agent observes: a space, or several by name.
-fn observation(spec: &EnvSpec) -> Value {
-    match &spec.observation_space[..] {
-        [(_, one)] => space(one),
-        several => {
-            let spaces: Map<String, Value> =
-                several.iter().map(|(name, one)| ((*name).to_owned(), space(one))).collect();
-            json!({"type": "Dict", "spaces": spaces})
-        }
-    }
-}
-
-/// Every factor by its key.
-fn variation(variation_space: &VariationSpace) -> Map<String, Value> {
-    let factors = variation_space.factors().iter();
-    factors
-        .map(|factor| {
-            let mut value = space(&factor.space);
-            value["init_value"] = shaped(&factor.space, &factor.init_value);
-            (factor.key.clone(), value)
-        })
-        .collect()
-}
-
-/// Groups and factors, in the order they are sampled.
-fn sampling_order(variation_space: &VariationSpace) -> Vec<String> {
-    let mut order: Vec<String> = vec![];
-    for factor in variation_space.factors() {
-        if let Some((group, _)) = factor.key.split_once('.')
-            && !order.iter().any(|known| known == group)
-        {
-            order.push(group.to_owned());
-        }
-        order.push(factor.key.clone());
-    }
-    order
-}
-
-/// A space with its bounds written out.
-fn space(space: &Space) -> Value {
-    let bounds = |pick: fn((f64, f64)) -> f64| {
-        let values: Vec<f64> = (0..space.len()).map(|i| pick(space.bounds(i))).collect();
-        shaped(space, &values)
-    };
-    match space {
-        Space::Discrete { n, start } => json!({"type": "Discrete", "n": n, "start": start}),
-        Space::MultiDiscrete { nvec, start } => json!({"type": "MultiDiscrete", "nvec": nvec, "start": start}),
-        Space::Box { .. } | Space::Rgb => json!({
-            "type": if matches!(space, Space::Rgb) { "RGBBox" } else { "Box" },
-            "shape": space.shape(),
-            "dtype": space.dtype().name(),
-            "low": bounds(|b| b.0),
-            "high": bounds(|b| b.1),
-        }),
-    }
-}
-
-/// A value as a scalar or as lists within lists, in whole numbers where its type is whole; null where there is no bound.
-#[allow(clippy::cast_possible_truncation)]
-fn shaped(space: &Space, value: &[f64]) -> Value {
-    let whole = matches!(space, Space::Discrete { .. } | Space::MultiDiscrete { .. } | Space::Rgb);
-    let mut values: Vec<Value> = value.iter().map(|&v| if whole { json!(v as i64) } else { json!(v) }).collect();
-    for &size in space.shape().iter().rev() {
-        values = values.chunks(size.max(1)).map(|row| Value::Array(row.to_vec())).collect();
-    }
-    values.pop().unwrap_or_default()
 }

@@ -24,7 +24,6 @@ mod wrappers;
 
 use clap::{Parser, Subcommand};
 use progress::Progress;
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -106,7 +105,7 @@ pub struct Context {
 impl Cli {
     /// Runs the command; the exit code is 0 when done, 1 when it failed, 2 for wrong usage, 130 when
     /// interrupted.
-    pub fn run(self) -> ExitCode {
+    pub fn run(self) -> u8 {
         tracing_subscriber::fmt()
             .with_writer(std::io::stderr)
             .with_env_filter(
@@ -116,15 +115,15 @@ impl Cli {
             .without_time()
             .init();
         match self.dispatch() {
-            Ok(()) => ExitCode::SUCCESS,
+            Ok(()) => 0,
             Err(error) => {
                 // Our own errors say everything in one line; others are told with their causes.
                 let ours = error.downcast_ref::<swm_core::Error>();
                 complain(&ours.map_or_else(|| format!("error: {error:#}\n"), |ours| format!("error: {ours}\n")));
                 match ours {
-                    Some(swm_core::Error::Interrupted) => ExitCode::from(130),
-                    Some(error) if error.is_usage() => ExitCode::from(2),
-                    _ => ExitCode::FAILURE,
+                    Some(swm_core::Error::Interrupted) => 130,
+                    Some(error) if error.is_usage() => 2,
+                    _ => 1,
                 }
             }
         }

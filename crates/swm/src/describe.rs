@@ -1,0 +1,110 @@
+//! What an environment is, as JSON with the fields a Python user knows.
+
+use serde_json::{Map, Value, json};
+use swm_core::{EnvEntry, EnvSpec, Named as _, Space, VariationSpace};
+
+/// A row of the registry of environments.
+pub fn env(row: &EnvEntry, made: &EnvSpec) -> Value {
+    let mut value = spec(made);
+    value["summary"] = json!(row.summary);
+    value["options"] =
+        row.options.iter().map(|o| json!({"key": o.key, "summary": o.summary, "values": o.values})).collect();
+    value["experts"] = row.experts.iter().map(|e| json!({"id": e.id(), "summary": e.summary})).collect();
+    value
+}
+
+/// What never changes about an environment.
+pub fn spec(spec: &EnvSpec) -> Value {
+    let info: Map<String, Value> = spec
+        .columns
+        .iter()
+        .map(|column| {
+            let shape: Vec<String> = column.shape.iter().map(ToString::to_string).collect();
+            let shape = if shape.is_empty() { String::new() } else { format!("[{}]", shape.join(", ")) };
+            (column.name.clone(), json!(format!("{}{shape}", column.dtype.name())))
+        })
+        .collect();
+    json!({
+        "id": spec.id,
+        "action_space": space(&spec.action_space),
+        "observation_space": observation(spec),
+        "observation_column": match &spec.observation_space[..] {
+            [(name, _)] => Some(*name),
+            _ => None,
+        },
+        "info": info,
+        "variation": variation(&spec.variation_space),
+        "sampling_order": sampling_order(&spec.variation_space),
+        "default_variations": spec.variation_space.defaults(),
+        "max_episode_steps": spec.max_episode_steps,
+        "cameras": spec.cameras,
+    })
+}
+
+/// What an agent observes: a space, or several by name.
+fn observation(spec: &EnvSpec) -> Value {
+    match &spec.observation_space[..] {
+        [(_, one)] => space(one),
+        several => {
+            let spaces: Map<String, Value> =
+                several.iter().map(|(name, one)| ((*name).to_owned(), space(one))).collect();
+            json!({"type": "Dict", "spaces": spaces})
+        }
+    }
+}
+
+/// Every factor by its key.
+pub fn variation(variation_space: &VariationSpace) -> Map<String, Value> {
+    let factors = variation_space.factors().iter();
+    factors
+        .map(|factor| {
+            let mut value = space(&factor.space);
+            value["init_value"] = shaped(&factor.space, &factor.init_value);
+            (factor.key.clone(), value)
+        })
+        .collect()
+}
+
+/// Groups and factors, in the order they are sampled.
+pub fn sampling_order(variation_space: &VariationSpace) -> Vec<String> {
+    let mut order: Vec<String> = vec![];
+    for factor in variation_space.factors() {
+        if let Some((group, _)) = factor.key.split_once('.')
+            && !order.iter().any(|known| known == group)
+        {
+            order.push(group.to_owned());
+        }
+        order.push(factor.key.clone());
+    }
+    order
+}
+
+/// A space with its bounds written out.
+fn space(space: &Space) -> Value {
+    let bounds = |pick: fn((f64, f64)) -> f64| {
+        let values: Vec<f64> = (0..space.len()).map(|i| pick(space.bounds(i))).collect();
+        shaped(space, &values)
+    };
+    match space {
+        Space::Discrete { n, start } => json!({"type": "Discrete", "n": n, "start": start}),
+        Space::MultiDiscrete { nvec, start } => json!({"type": "MultiDiscrete", "nvec": nvec, "start": start}),
+        Space::Box { .. } | Space::Rgb => json!({
+            "type": if matches!(space, Space::Rgb) { "RGBBox" } else { "Box" },
+            "shape": space.shape(),
+            "dtype": space.dtype().name(),
+            "low": bounds(|b| b.0),
+            "high": bounds(|b| b.1),
+        }),
+    }
+}
+
+/// A value as a scalar or as lists within lists, in whole numbers where its type is whole; null where there is no bound.
+#[allow(clippy::cast_possible_truncation)]
+fn shaped(space: &Space, value: &[f64]) -> Value {
+    let whole = matches!(space, Space::Discrete { .. } | Space::MultiDiscrete { .. } | Space::Rgb);
+    let mut values: Vec<Value> = value.iter().map(|&v| if whole { json!(v as i64) } else { json!(v) }).collect();
+    for &size in space.shape().iter().rev() {
+        values = values.chunks(size.max(1)).map(|row| Value::Array(row.to_vec())).collect();
+    }
+    values.pop().unwrap_or_default()
+}

@@ -1,0 +1,168 @@
+//! [`NativeEnv`]: one environment of ours, for Gymnasium.
+
+use crate::arrays;
+use crate::errors::raised;
+use crate::world::{factors, reset_options, stack};
+use numpy::PyReadonlyArray1;
+use pyo3::exceptions::PyTypeError;
+use pyo3::prelude::*;
+use pyo3::types::{PyBytes, PyDict};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use swm::core::{Action, Batch, DType, Env, Error, FrameMut, Key, Schema, Snapshot, View};
+
+/// One environment.
+#[pyclass(frozen, module = "stable_worldmodel._engine")]
+pub struct NativeEnv(Mutex<State>);
+
+struct State {
+    env: Box<dyn Env>,
+    /// What it shows, one row.
+    row: Batch,
+}
+
+impl NativeEnv {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    /// Its observation, as arrays of their own.
+    fn observe<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        self.env.observe(&mut self.row.row_mut(0));
+        let dict = PyDict::new(py);
+        for (i, column) in self.row.schema().columns().iter().enumerate() {
+            dict.set_item(&column.name, arrays::array(py, column.dtype, &column.shape, self.row.bytes(i))?)?;
+        }
+        Ok(dict)
+    }
+}
+
+#[pymethods]
+impl NativeEnv {
+    #[new]
+    fn new(py: Python<'_>, id: &str, wrappers: &str, wrap_goal: bool) -> PyResult<Self> {
+        let (stack, goal) = stack(wrappers, wrap_goal)?;
+        let made = py.detach(|| {
+            let env = stack.wrap(swm::ENVS.choose(id)?.env()?, goal);
+            let row = Batch::zeros(&Schema::new(env.spec().columns.clone())?, 1);
+            Ok(State { env, row })
+        });
+        made.map(|state| Self(Mutex::new(state))).map_err(raised)
+    }
+
+    /// What it is, as JSON.
+    fn spec(&self) -> String {
+        swm::describe::spec(self.lock().env.spec()).to_string()
+    }
+
+    /// Starts an episode; returns what it shows.
+    fn reset<'py>(&self, py: Python<'py>, seed: u64, options: &str) -> PyResult<Bound<'py, PyDict>> {
+        let options = reset_options(options)?;
+        let mut state = self.lock();
+        let state = &mut *state;
+        py.detach(|| state.env.reset(seed, &options)).map_err(raised)?;
+        state.observe(py)
+    }
+
+    /// Applies an action, a `float32` or `int64` array; returns what it shows, the reward, whether the episode is over because
+    /// of where the world is, and because of the clock, and whether the goal is reached.
+    #[allow(clippy::type_complexity)]
+    fn step<'py>(
+        &self,
+        py: Python<'py>,
+        action: &Bound<'py, PyAny>,
+    ) -> PyResult<(Bound<'py, PyDict>, f64, bool, bool, bool)> {
+        let mut state = self.lock();
+        let state = &mut *state;
+        let stepped = if let Ok(numbers) = action.extract::<PyReadonlyArray1<'_, f32>>() {
+            let numbers = numbers.as_slice()?;
+            py.detach(|| state.env.step(Action::Continuous(numbers)))
+        } else if let Ok(integers) = action.extract::<PyReadonlyArray1<'_, i64>>() {
+            let integers = integers.as_slice()?;
+            py.detach(|| state.env.step(Action::Discrete(integers)))
+        } else {
+            return Err(PyTypeError::new_err(format!("expected a float32 or int64 array as action, got {action:?}")));
+        };
+        let transition = stepped.map_err(raised)?;
+        let success = state.env.is_success();
+        Ok((state.observe(py)?, transition.reward, transition.terminated, transition.truncated, success))
+    }
+
+    /// Its picture, `[height, width, 3]`, or with `goal` that of its goal.
+    fn render<'py>(&self, py: Python<'py>, height: usize, width: usize, goal: bool) -> PyResult<Bound<'py, PyAny>> {
+        let mut state = self.lock();
+        let state = &mut *state;
+        let mut rgb = vec![0; height * width * 3];
+        let frame = FrameMut::new(width, height, &mut rgb);
+        let drawn = py.detach(|| if goal { state.env.render_goal(frame) } else { state.env.render(frame) });
+        drawn.map_err(raised)?;
+        arrays::array(py, DType::U8, &[height, width, 3], &rgb)
+    }
+
+    /// What a view of it shows, such as `wrist:depth`.
+    fn render_view<'py>(
+        &self,
+        py: Python<'py>,
+        view: &str,
+        height: usize,
+        width: usize,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        let view = View::parse(view).map_err(raised)?;
+        let column = view.column(height, width);
+        let mut bytes = vec![0; column.row_bytes()];
+        let mut state = self.lock();
+        let state = &mut *state;
+        py.detach(|| state.env.render_view(&view, height, width, &mut bytes)).map_err(raised)?;
+        arrays::array(py, column.dtype, &column.shape, &bytes)
+    }
+
+    /// The factors of the episode, by key.
+    fn factors<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        factors(py, &*self.lock().env)
+    }
+
+    /// How far the world is from its goal.
+    fn goal_distance(&self) -> f64 {
+        self.lock().env.goal_distance()
+    }
+
+    /// Whether the goal is reached now.
+    fn is_success(&self) -> bool {
+        self.lock().env.is_success()
+    }
+
+    /// Chooses a new reachable goal.
+    fn sample_goal(&self, seed: u64) -> PyResult<()> {
+        self.lock().env.sample_goal(Key::new(seed).with("goal")).map_err(raised)
+    }
+
+    /// The full state.
+    fn snapshot<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
+        PyBytes::new(py, &self.lock().env.snapshot().0)
+    }
+
+    /// Puts a state back; returns what it shows.
+    fn restore<'py>(&self, py: Python<'py>, state: Vec<u8>) -> PyResult<Bound<'py, PyDict>> {
+        let mut this = self.lock();
+        this.env.restore(&Snapshot(state)).map_err(raised)?;
+        this.observe(py)
+    }
+
+    /// Continues from a row of a dataset towards another one.
+    fn restore_from<'py>(
+        &self,
+        py: Python<'py>,
+        start: &Bound<'py, PyDict>,
+        goal: &Bound<'py, PyDict>,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let (start, goal) = (arrays::batch(start)?, arrays::batch(goal)?);
+        if start.rows() != 1 || goal.rows() != 1 {
+            let given = format!("{} rows of a start, {} of a goal", start.rows(), goal.rows());
+            return Err(raised(Error::mismatch("restoring from a dataset", given, "one of each")));
+        }
+        let mut this = self.lock();
+        this.env.restore_from(start.row(0), goal.row(0)).map_err(raised)?;
+        this.observe(py)
+    }
+}

@@ -1,0 +1,358 @@
+//! [`World`]: many environments of one kind, their infos as numpy arrays, collecting and evaluating.
+
+use crate::arrays;
+use crate::errors::{foreign, json, raised, signals};
+use crate::policy::Actor;
+use pyo3::exceptions::PyIndexError;
+use pyo3::prelude::*;
+use pyo3::types::{PyBytes, PyDict};
+use serde_json::{Map, Value};
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
+use std::time::{Duration, Instant};
+use swm::core::pool::Reset;
+use swm::core::results::Counting;
+use swm::core::{Env, Error, Key, ResetOptions, Snapshot, VariationRequest, View};
+use swm::data::{ImageCodec, WriteMode, WriteOptions};
+use swm::envs::wrappers::{GoalPicture, Stack, WRAPPERS};
+use swm::eval::world::{episode_key, reset_seed};
+use swm::eval::{CollectConfig, Control, EvalConfig, Progress, Starts, Videos, WorldConfig};
+
+/// Many environments of one kind.
+#[pyclass(frozen, module = "stable_worldmodel._engine")]
+pub struct World {
+    world: Mutex<swm::eval::World>,
+    envs: usize,
+}
+
+/// Visual wrappers by id and settings, one stack for all environments.
+pub fn stack(wrappers: &str, wrap_goal: bool) -> PyResult<(Arc<Stack>, GoalPicture)> {
+    let choices: Vec<(String, Map<String, Value>)> = json("wrappers", wrappers)?;
+    let made: swm::core::Result<_> =
+        choices.into_iter().map(|(id, settings)| WRAPPERS.get(&id)?.make(&settings.into_iter().collect())).collect();
+    let goal = if wrap_goal { GoalPicture::Wrapped } else { GoalPicture::Clean };
+    Ok((Arc::new(Stack::new(made.map_err(raised)?)), goal))
+}
+
+impl World {
+    /// The engine's world, for as long as nobody else plays in it.
+    pub fn lock(&self) -> PyResult<MutexGuard<'_, swm::eval::World>> {
+        match self.world.try_lock() {
+            Ok(world) => Ok(world),
+            // What a panic left is consistent enough to be reset.
+            Err(TryLockError::Poisoned(poisoned)) => Ok(poisoned.into_inner()),
+            Err(TryLockError::WouldBlock) => Err(raised(Error::config(
+                "world",
+                "it is being played in by somebody else",
+                "wait for them: a policy gets what it needs as its arguments",
+            ))),
+        }
+    }
+}
+
+#[pymethods]
+impl World {
+    #[new]
+    #[pyo3(signature = (env, envs, image, views, max_episode_steps, threads, wrappers, wrap_goal))]
+    #[allow(clippy::too_many_arguments)]
+    fn new(
+        py: Python<'_>,
+        env: String,
+        envs: usize,
+        image: Option<(usize, usize)>,
+        views: Vec<String>,
+        max_episode_steps: Option<usize>,
+        threads: usize,
+        wrappers: &str,
+        wrap_goal: bool,
+    ) -> PyResult<Self> {
+        let (stack, goal) = stack(wrappers, wrap_goal)?;
+        let views: swm::core::Result<Vec<View>> = views.iter().map(|text| View::parse(text)).collect();
+        let config = WorldConfig { envs, image, views: views.map_err(raised)?, max_episode_steps, threads };
+        let world = py.detach(|| {
+            let chosen = swm::ENVS.choose(&env)?;
+            swm::eval::World::of(|| Ok(stack.wrap(chosen.env()?, goal)), config)
+        });
+        Ok(Self { world: Mutex::new(world.map_err(raised)?), envs })
+    }
+
+    /// What the environments are, as JSON.
+    fn spec(&self) -> PyResult<String> {
+        Ok(swm::describe::spec(self.lock()?.spec()).to_string())
+    }
+
+    /// Steps after which episodes are truncated.
+    fn max_episode_steps(&self) -> PyResult<usize> {
+        Ok(self.lock()?.pool().max_episode_steps())
+    }
+
+    /// What the last reset or step produced: views, `[envs, 1, ..]`, that follow every later one.
+    pub fn infos<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyDict>> {
+        let infos = PyDict::new(slf.py());
+        let world = slf.get().lock()?;
+        let batch = world.pool().infos();
+        for (i, column) in batch.schema().columns().iter().enumerate() {
+            // SAFETY: the pool never resizes its infos, and lives as long as this object, which the array keeps alive.
+            #[allow(unsafe_code)]
+            infos.set_item(&column.name, unsafe { arrays::view(batch, i, true, slf.as_any()) }?)?;
+        }
+        Ok(infos)
+    }
+
+    /// The actions of the next [`World::advance`], one row an environment: to be written into.
+    fn actions<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        let mut world = slf.get().lock()?;
+        let batch = world.actions_mut();
+        // SAFETY: the world never resizes its actions, and lives as long as this object, which the array keeps alive.
+        #[allow(unsafe_code)]
+        unsafe {
+            arrays::view(batch, 0, false, slf.as_any())
+        }
+    }
+
+    /// Starts episodes: `(slot, seed)`. `options` is a JSON object of a variation request, a state and a goal state.
+    fn reset(&self, py: Python<'_>, starts: Vec<(usize, u64)>, options: &str) -> PyResult<()> {
+        let options = reset_options(options)?;
+        if let Some((slot, _)) = starts.iter().find(|(slot, _)| *slot >= self.envs) {
+            return Err(PyIndexError::new_err(format!("environment {slot} of {}", self.envs)));
+        }
+        let mut world = self.lock()?;
+        let world = &mut *world;
+        let resets: Vec<Reset> =
+            starts.iter().map(|&(slot, seed)| Reset { slot, seed, options: options.clone() }).collect();
+        py.detach(|| world.restart(&resets)).map_err(raised)
+    }
+
+    /// Tells a policy that a slot begins an episode of a seed.
+    fn begin(&self, actor: &Actor, slot: usize, seed: u64, episode: usize) -> PyResult<()> {
+        actor.lock()?.begin(slot, episode_key(seed, episode));
+        Ok(())
+    }
+
+    /// Lets a policy fill the actions of the active slots.
+    fn ask(&self, py: Python<'_>, actor: &Actor, active: Vec<bool>) -> PyResult<()> {
+        let (mut world, mut policy) = (self.lock()?, actor.lock()?);
+        let (world, policy) = (&mut *world, &mut **policy);
+        py.detach(|| world.ask(policy, &active)).map_err(raised)
+    }
+
+    /// Steps the active slots with the actions that were written.
+    fn advance(&self, py: Python<'_>, active: Vec<bool>) -> PyResult<()> {
+        let mut world = self.lock()?;
+        let world = &mut *world;
+        py.detach(|| world.advance(&active)).map_err(raised)
+    }
+
+    /// The factors of a slot's episode, by key.
+    fn factors<'py>(&self, py: Python<'py>, slot: usize) -> PyResult<Bound<'py, PyDict>> {
+        factors(py, self.lock()?.pool().env(slot))
+    }
+
+    /// The full state of a slot.
+    fn snapshot<'py>(&self, py: Python<'py>, slot: usize) -> PyResult<Bound<'py, PyBytes>> {
+        Ok(PyBytes::new(py, &self.lock()?.pool().env(slot).snapshot().0))
+    }
+
+    /// Puts the full state of a slot back.
+    fn restore(&self, py: Python<'_>, slot: usize, state: Vec<u8>) -> PyResult<()> {
+        let mut world = self.lock()?;
+        let world = &mut *world;
+        let snapshot = Snapshot(state);
+        py.detach(|| world.change(&[slot], |_, env| env.restore(&snapshot))).map_err(raised)
+    }
+
+    /// Plays episodes into a dataset; returns `(episodes, added, steps)`.
+    #[allow(clippy::too_many_arguments)]
+    fn collect(
+        &self,
+        py: Python<'_>,
+        actor: &Actor,
+        path: String,
+        format: Option<String>,
+        mode: &str,
+        codec: Option<&str>,
+        config: &str,
+        progress: Option<Py<PyAny>>,
+    ) -> PyResult<(usize, usize, usize)> {
+        let wanted: Collection = json("collection", config)?;
+        let mode = match mode {
+            "append" => WriteMode::Append,
+            "overwrite" => WriteMode::Overwrite,
+            _ => WriteMode::Create,
+        };
+        let codec: ImageCodec = codec.map_or(Ok(ImageCodec::default()), |text| json("codec", text))?;
+        let (mut world, mut policy) = (self.lock()?, actor.lock()?);
+        let (world, policy) = (&mut *world, &mut **policy);
+        let collected = py.detach(|| {
+            let config = CollectConfig {
+                episodes: wanted.episodes,
+                seed: wanted.seed,
+                variation: wanted.variation,
+                policy: wanted.policy,
+                goal: wanted.goal,
+                first: wanted.first,
+            };
+            let mut manifest = world.collect_manifest(&config);
+            if let Some(weights) = &actor.weights {
+                manifest.hashes.insert("policy".to_owned(), weights.clone());
+            }
+            manifest.config["codec"] = serde_json::json!(codec);
+            manifest.config["wrappers"] = wanted.wrappers;
+            let location = swm::home::target(&path, format.as_deref())?;
+            swm::collect::check(&location, mode, &manifest, false)?;
+            let schema = world.collect_schema(config.goal)?;
+            let options = WriteOptions { mode, codec, manifest: Some(manifest), ..WriteOptions::default() };
+            let writer = match &format {
+                Some(format) => (swm::data::FORMATS.get(format)?.create)(&location, &schema, options)?,
+                None => swm::data::create(location, &schema, options)?,
+            };
+            world.collect(policy, writer, &config, &mut control(progress))
+        });
+        let collected = collected.map_err(raised)?;
+        Ok((collected.episodes, collected.added, collected.steps))
+    }
+
+    /// Plays starts and judges them; returns the run as JSON.
+    fn evaluate(
+        &self,
+        py: Python<'_>,
+        actor: &Actor,
+        config: &str,
+        dataset: Option<String>,
+        progress: Option<Py<PyAny>>,
+    ) -> PyResult<String> {
+        let wanted: Evaluation = json("evaluation", config)?;
+        let (mut world, mut policy) = (self.lock()?, actor.lock()?);
+        let (world, policy) = (&mut *world, &mut **policy);
+        let run = py.detach(|| {
+            let starts = match dataset {
+                Some(dataset) => {
+                    let reader = swm::home::open_dataset(&dataset)?;
+                    let picks = match wanted.picks {
+                        Some(picks) => picks,
+                        None => Starts::choose(&*reader, wanted.episodes, wanted.goal_offset, wanted.seed)?,
+                    };
+                    let offset = wanted.goal_offset;
+                    Starts::from_dataset(&*reader, world.spec(), picks, offset, wanted.seed, wanted.variation)?
+                }
+                None if matches!(wanted.counting, Counting::Compat { .. }) => {
+                    Starts::sequential(wanted.episodes, wanted.seed, wanted.variation)?
+                }
+                None => Starts::episodic(wanted.episodes, wanted.seed, wanted.variation)?,
+            };
+            let videos = wanted.videos.map(|(root, prefix, count)| Videos { root, prefix, count, fps: 15 });
+            let config = EvalConfig {
+                policy: wanted.policy,
+                condition: wanted.condition,
+                budget: wanted.budget,
+                counting: wanted.counting,
+                videos,
+            };
+            world.evaluate(policy, &starts, &config, &mut control(progress))
+        });
+        serde_json::to_string(&run.map_err(raised)?).map_err(|error| raised(Error::external("writing a run", error)))
+    }
+
+    /// What decides the numbers and pictures, with versions, as JSON.
+    fn libraries(&self) -> PyResult<String> {
+        Ok(Value::from_iter(self.lock()?.libraries()).to_string())
+    }
+
+    /// How many episodes are stored at a place already; none where nothing is.
+    #[staticmethod]
+    fn stored(py: Python<'_>, path: &str, format: Option<&str>) -> PyResult<Option<usize>> {
+        let stored = py.detach(|| {
+            let location = swm::home::target(path, format)?;
+            if location.path().is_some_and(|path| !path.exists()) {
+                return Ok(None);
+            }
+            Ok(Some(swm::data::open(location)?.episodes().len()))
+        });
+        stored.map_err(raised)
+    }
+
+    /// The seed that the environment of an episode is reset with.
+    #[staticmethod]
+    fn episode_seed(seed: u64, episode: usize) -> u64 {
+        reset_seed(episode_key(seed, episode))
+    }
+}
+
+/// What to collect, apart from where to.
+#[derive(serde::Deserialize)]
+struct Collection {
+    episodes: usize,
+    seed: u64,
+    variation: VariationRequest,
+    policy: String,
+    goal: bool,
+    first: usize,
+    wrappers: Value,
+}
+
+/// What to evaluate.
+#[derive(serde::Deserialize)]
+struct Evaluation {
+    episodes: usize,
+    seed: u64,
+    variation: VariationRequest,
+    policy: String,
+    condition: String,
+    budget: Option<usize>,
+    counting: Counting,
+    picks: Option<Vec<[usize; 2]>>,
+    goal_offset: usize,
+    videos: Option<(PathBuf, String, usize)>,
+}
+
+/// Long runs let Python see its signals, and tell how far they are, ten times a second at most.
+fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
+    let failed = Arc::new(Mutex::new(None));
+    let told = Arc::clone(&failed);
+    let mut last: Option<Instant> = None;
+    let progress = progress.map(|call| -> Box<dyn FnMut(Progress) + 'a> {
+        Box::new(move |at| {
+            let done = at.episodes == at.total;
+            if !done && last.is_some_and(|last| last.elapsed() < Duration::from_millis(100)) {
+                return;
+            }
+            last = Some(Instant::now());
+            let outcome = Python::attach(|py| call.call1(py, (at.episodes, at.total, at.steps)).map(drop));
+            if let Err(error) = outcome {
+                told.lock().unwrap_or_else(std::sync::PoisonError::into_inner).get_or_insert(error);
+            }
+        })
+    });
+    let mut signals = signals();
+    let poll = move || match failed.lock().unwrap_or_else(std::sync::PoisonError::into_inner).take() {
+        Some(error) => Err(foreign(error)),
+        None => signals(),
+    };
+    Control { stop: None, poll: Some(Box::new(poll)), progress }
+}
+
+/// Options of a reset, from JSON.
+pub fn reset_options(text: &str) -> PyResult<ResetOptions> {
+    #[derive(serde::Deserialize)]
+    struct Given {
+        variation: VariationRequest,
+        state: Option<Vec<f64>>,
+        goal_state: Option<Vec<f64>>,
+    }
+    let Given { variation, state, goal_state } = json("options", text)?;
+    Ok(ResetOptions { variation, state, goal_state })
+}
+
+/// The factors of an episode, by key, each a list of numbers.
+pub fn factors<'py>(py: Python<'py>, env: &dyn Env) -> PyResult<Bound<'py, PyDict>> {
+    let dict = PyDict::new(py);
+    for (key, value) in env.factors().iter() {
+        dict.set_item(key, value.to_vec())?;
+    }
+    Ok(dict)
+}
+
+/// The key of plans that are made outside of episodes.
+pub fn plan_key(seed: u64) -> Key {
+    Key::new(seed).with("solve")
+}

@@ -1,0 +1,16 @@
+"""The command line: `swm`, and `python -m stable_worldmodel`."""
+
+from __future__ import annotations
+
+import sys
+
+
+def main() -> None:
+    """Runs the `swm` command with the words of the command line, and exits with its code."""
+    from . import _engine
+
+    sys.exit(_engine.command(["swm", *sys.argv[1:]]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,55 @@
+"""Options of a reset, as the engine takes them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+KNOWN = ("variation", "variation_values", "state", "goal_state")
+
+
+def variation(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """The variation request in `options`: what is sampled and what is pinned.
+
+    `spaces` are the environment's factors, by key. Colours may be given as 0..255, or as fractions of 1.
+    """
+    options = options or {}
+    unknown = [name for name in options if name not in KNOWN]
+    if unknown:
+        raise ValueError(f"options: unknown {unknown}; known are {list(KNOWN)}")
+    sampled = options.get("variation")
+    if isinstance(sampled, str):
+        sampled = [sampled]
+    if sampled is not None and not (
+        isinstance(sampled, (Sequence, set, frozenset)) and all(isinstance(key, str) for key in sampled)
+    ):
+        raise ValueError(f"options['variation']: expected names of factors, such as ['agent.color'], got {sampled!r}")
+    values = options.get("variation_values") or {}
+    if not isinstance(values, Mapping):
+        raise ValueError(f"options['variation_values']: expected a dict from factors to values, got {values!r}")
+    pinned = {key: _numbers(key, value, spaces.get(key)) for key, value in values.items()}
+    return {"variation": None if sampled is None else sorted(sampled), "variation_values": pinned}
+
+
+def reset(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[str, Any]]) -> str:
+    """All of `options`, as JSON."""
+    options = options or {}
+    given = {
+        name: None if options.get(name) is None else np.asarray(options[name], dtype=np.float64).ravel().tolist()
+        for name in ("state", "goal_state")
+    }
+    return json.dumps({"variation": variation(options, spaces), **given})
+
+
+def _numbers(key: str, value: Any, space: Mapping[str, Any] | None) -> list[float]:
+    try:
+        numbers = np.asarray(value, dtype=np.float64).ravel()
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"options['variation_values'][{key!r}]: expected numbers, got {value!r}") from error
+    fractions = np.any(numbers != np.round(numbers)) and np.all((numbers >= 0) & (numbers <= 1))
+    if space is not None and space["type"] == "RGBBox" and fractions:
+        numbers = np.round(255 * numbers)
+    return numbers.tolist()

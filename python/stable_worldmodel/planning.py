@@ -1,0 +1,419 @@
+"""What a model must offer to be planned in, and what makes such a model out of less.
+
+A model is anything with `get_cost(info_dict, action_candidates) -> (B, S)`: `Costable`. A model that can encode
+and predict (`Dynamics`) becomes one with `ShootingCostEvaluator`, which rolls candidates out and prices where they lead by
+objectives. The gradient solvers take gradients of `get_cost` through torch's autograd; GRASP asks for `Dynamics`.
+
+Shapes: B environments, S candidates each, H model steps, A numbers of one model step (action dimension times action block), D
+numbers of a latent.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import numpy as np
+
+if TYPE_CHECKING:
+    import torch
+
+__all__ = [
+    "Actionable",
+    "ActionPenalty",
+    "Costable",
+    "Dynamics",
+    "GoalDistance",
+    "Objective",
+    "ShootingCostEvaluator",
+    "Transformable",
+]
+
+
+@runtime_checkable
+class Costable(Protocol):
+    """A model to plan in."""
+
+    def get_cost(self, info_dict: dict[str, Any], action_candidates: Any) -> Any:
+        """What candidates `(B, S, H, A)` cost, `(B, S)`.
+
+        `info_dict` holds what the environments show, each `(B, S, T, ..)`, with T frames of history (1 unless the plan's
+        `history_len` says more): `pixels`, `goal` and every other column. What is written into it stays for the rest of the
+        search, so that an encoding need not be computed twice.
+        """
+        ...
+
+
+@runtime_checkable
+class Dynamics(Protocol):
+    """A model with a latent state, for GRASP and `ShootingCostEvaluator`."""
+
+    def encode(self, info_dict: dict[str, Any]) -> Any:
+        """The latents of the present, `(B, D)`, of infos `(B, T, ..)`."""
+        ...
+
+    def encode_goal(self, info_dict: dict[str, Any]) -> Any:
+        """The latents of the goal, `(B, D)`."""
+        ...
+
+    def predict(self, latents: Any, actions: Any) -> Any:
+        """The latents `(N, D)` one model step after `latents` `(N, D)`, by `actions` `(N, A)`."""
+        ...
+
+
+@runtime_checkable
+class Actionable(Protocol):
+    """A model that acts by itself."""
+
+    def get_action(self, info: dict[str, Any]) -> Any:
+        """The actions `(B, ..)` for what the environments show."""
+        ...
+
+
+@runtime_checkable
+class Transformable(Protocol):
+    """Something that scales numbers and back, such as `stable_worldmodel.data.ZScoreScaler`."""
+
+    def transform(self, x: Any) -> Any:
+        """To the model's units."""
+        ...
+
+    def inverse_transform(self, x: Any) -> Any:
+        """Back."""
+        ...
+
+
+class Objective(Protocol):
+    """A price of trajectories."""
+
+    def __call__(self, latents: Any, goal: Any, actions: Any) -> Any:
+        """The price `(N,)` of latents `(N, H + 1, D)`, the present first, with goal `(N, D)` and actions `(N, H, A)`."""
+        ...
+
+
+class GoalDistance:
+    """The squared distance of latents to the goal's: of the last one, or of all after the present with `running`."""
+
+    def __init__(self, weight: float = 1.0, running: bool = False) -> None:
+        self.weight, self.running = float(weight), bool(running)
+
+    def __call__(self, latents: Any, goal: Any, actions: Any) -> Any:
+        reached = latents[:, 1:] if self.running else latents[:, -1:]
+        return self.weight * ((reached - goal[:, None]) ** 2).sum((1, 2))
+
+
+class ActionPenalty:
+    """The squared size of the actions, in the model's units."""
+
+    def __init__(self, weight: float = 1.0) -> None:
+        self.weight = float(weight)
+
+    def __call__(self, latents: Any, goal: Any, actions: Any) -> Any:
+        return self.weight * (actions**2).sum((1, 2))
+
+
+class ShootingCostEvaluator:
+    """A `Dynamics` as a `Costable`: rolls every candidate out and adds up its objectives."""
+
+    def __init__(self, dynamics: Dynamics, objective: Objective | Sequence[Objective] | None = None) -> None:
+        if not isinstance(dynamics, Dynamics):
+            raise TypeError(f"{type(dynamics).__name__} has no encode, encode_goal and predict to roll out with")
+        self.dynamics = dynamics
+        objectives = [GoalDistance()] if objective is None else objective
+        self.objectives = list(objectives) if isinstance(objectives, Sequence) else [objectives]
+
+    def get_cost(self, info_dict: dict[str, Any], action_candidates: Any) -> Any:
+        """See `Costable`."""
+        envs, samples, horizon, dim = action_candidates.shape
+        known = info_dict.setdefault("_latents", {})
+        if not known:
+            present = {key: value[:, 0] for key, value in info_dict.items() if not key.startswith("_")}
+            known["start"], known["goal"] = self.dynamics.encode(present), self.dynamics.encode_goal(present)
+        latent = _repeat(known["start"], samples)
+        goal = _repeat(known["goal"], samples)
+        actions = action_candidates.reshape(envs * samples, horizon, dim)
+        latents = [latent]
+        for step in range(horizon):
+            latents.append(self.dynamics.predict(latents[-1], actions[:, step]))
+        stack = np.stack if isinstance(latent, np.ndarray) else _torch().stack
+        trajectory = stack(latents, 1)
+        price = sum(objective(trajectory, goal, actions) for objective in self.objectives)
+        return price.reshape(envs, samples)  # type: ignore[union-attr]
+
+
+def _repeat(rows: Any, times: int) -> Any:
+    return np.repeat(rows, times, 0) if isinstance(rows, np.ndarray) else rows.repeat_interleave(times, 0)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# Models of Python's, as the engine asks them.
+
+
+def _torch() -> Any:
+    import torch
+
+    return torch
+
+
+@lru_cache(maxsize=1)
+def has_torch() -> bool:
+    """Whether torch is installed."""
+    return importlib.util.find_spec("torch") is not None
+
+
+def prepared(info: Mapping[str, Any], process: Mapping[str, Any], transform: Mapping[str, Any]) -> dict[str, Any]:
+    """Infos `(B, T, ..)` with every column scaled by `process` and every picture passed through `transform`, as torch
+    tensors where torch is installed.
+
+    A transform gets pictures channels first, one by one, as torch tensors.
+    """
+    out: dict[str, Any] = {}
+    for key, value in info.items():
+        if key in process:
+            array = np.asarray(value)
+            flat = array.reshape(-1, *array.shape[2:]) if array.ndim > 2 else array
+            value = np.asarray(process[key].transform(flat)).reshape(array.shape)
+        if key in transform:
+            torch = _torch()
+            frames = torch.as_tensor(np.asarray(value))
+            shape = frames.shape[:2]
+            frames = frames.reshape(-1, *frames.shape[2:])
+            if frames.ndim == 4 and frames.shape[-1] == 3:
+                frames = frames.permute(0, 3, 1, 2)
+            frames = torch.stack([transform[key](frame) for frame in frames])
+            value = frames.reshape(*shape, *frames.shape[1:])
+        if has_torch() and isinstance(value, np.ndarray) and value.dtype.kind in "bifu":
+            value = _torch().from_numpy(np.ascontiguousarray(value))
+        out[key] = value
+    return out
+
+
+class Adapter:
+    """A model of Python's as the engine asks it: numpy arrays in and out.
+
+    Args:
+        model: A `Costable`, or a `Dynamics`.
+        device: Where torch's tensors go.
+        batch_size: Environments the model is asked about at once; all of them for `None`. What comes out does not depend
+            on it.
+        process, transform: As for `stable_worldmodel.policy.MPCPolicy`.
+        history: Frames the model sees.
+        dim: Numbers of one model step.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        device: Any = "cpu",
+        batch_size: int | None = None,
+        process: Mapping[str, Any] | None = None,
+        transform: Mapping[str, Any] | None = None,
+        history: int = 1,
+        dim: int = 0,
+    ) -> None:
+        if not hasattr(model, "get_cost") and isinstance(model, Dynamics):
+            model = ShootingCostEvaluator(model)
+        if not callable(getattr(model, "get_cost", None)):
+            raise TypeError(f"{type(model).__name__} has no get_cost(info_dict, action_candidates) to plan with")
+        if batch_size is not None and batch_size < 1:
+            raise ValueError(f"batch_size: {batch_size}; expected at least 1, or None for all environments at once")
+        self.model, self.device, self.batch_size = model, device, batch_size
+        self.process, self.transform = process or {}, transform or {}
+        self.history, self.dim = history, dim
+        self.torch = has_torch() and getattr(model, "backend", "torch") != "numpy"
+        if hasattr(model, "eval") and self.torch and isinstance(model, _torch().nn.Module):
+            model.eval()
+        self.dtype = self._dtype()
+        self._infos: dict[str, Any] = {}
+        self._envs = 0
+        self._kept: dict[Any, dict[str, Any]] = {}
+        self._constraints: dict[int, int] = {}
+
+    def _dtype(self) -> Any:
+        if not self.torch:
+            return None
+        try:
+            return next(self.model.parameters()).dtype
+        except (AttributeError, StopIteration, TypeError):
+            return _torch().float32
+
+    # What the engine asks before it plans.
+
+    @property
+    def has_gradient(self) -> bool:
+        """Whether gradients can be had."""
+        return self.torch
+
+    @property
+    def has_constraints(self) -> bool:
+        """Whether the model has `get_constraints`."""
+        return hasattr(self.model, "get_constraints")
+
+    @property
+    def dynamics(self) -> Any:
+        """The model as a `Dynamics`, if it is one."""
+        inner = getattr(self.model, "dynamics", self.model)
+        return inner if isinstance(inner, Dynamics) else None
+
+    @property
+    def latent_dim(self) -> int | None:
+        """Numbers of a latent; none where the model shows none."""
+        dynamics = self.dynamics
+        if dynamics is None or not self.torch:
+            return None
+        dim = getattr(dynamics, "latent_dim", None)
+        if dim is None:
+            raise AttributeError(f"{type(dynamics).__name__} encodes and predicts; give it latent_dim, too")
+        return int(dim)
+
+    # What the engine asks while it plans.
+
+    def observe(self, infos: Mapping[str, np.ndarray]) -> None:
+        """Takes note of infos `(B, ..)`."""
+        timed = {key: value[:, None] for key, value in infos.items() if not key.startswith("history.")}
+        if self.history > 1 and "history.pixels" in infos and "pixels" in timed:
+            past = infos["history.pixels"]
+            # What precedes an episode is its first picture again, as if the world had stood still.
+            real = infos["history.length"].reshape(-1)
+            steps = past.shape[1]
+            for row, length in enumerate(real):
+                missing = steps - min(int(length), steps)
+                if missing:
+                    past[row, :missing] = past[row, missing] if missing < steps else timed["pixels"][row, 0]
+            timed["pixels"] = np.concatenate([past, timed["pixels"]], 1)
+            timed["history_action"] = infos["history.action"]
+        self.see(timed)
+
+    def see(self, infos: Mapping[str, Any]) -> None:
+        """Takes note of infos `(B, T, ..)`, tensors or arrays."""
+        self._infos = prepared(infos, self.process, self.transform)
+        self._envs = len(next(iter(self._infos.values())))
+        self._kept.clear()
+
+    def cost(self, candidates: np.ndarray) -> np.ndarray:
+        """Costs `(B, S)`."""
+        if not self.torch:
+            costs = [self.model.get_cost(infos, part) for infos, part in self._parts(candidates, "cost")]
+            return np.ascontiguousarray(np.concatenate([np.asarray(c) for c in costs]), dtype=np.float32)
+        with _torch().inference_mode():
+            return self._numpy([self._asked(infos, part) for infos, part in self._parts(candidates, "cost")])
+
+    def cost_and_gradient(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Costs `(B, S)` and their gradients `(B, S, H, A)`."""
+        torch = _torch()
+        costs, slopes = [], []
+        with torch.enable_grad():
+            for infos, part in self._parts(candidates, "gradient"):
+                part = part.requires_grad_()
+                cost = self._asked(infos, part)
+                if not cost.requires_grad:
+                    name = type(self.model).__name__
+                    raise ValueError(f"{name}.get_cost is not differentiable: its result does not depend on its actions")
+                # The costs of candidates depend on their own actions only: the sum's gradient holds all of theirs. What
+                # the model kept in its infos may belong to an older graph, which is why it is kept.
+                (slope,) = torch.autograd.grad(cost.sum(), part, retain_graph=True)
+                costs.append(cost.detach())
+                slopes.append(slope)
+        return self._numpy(costs), self._numpy(slopes)
+
+    def encode(self) -> tuple[np.ndarray, np.ndarray]:
+        """Latents of the present and of the goal, `(B, D)` each."""
+        dynamics = self.dynamics
+        with _torch().inference_mode():
+            infos = {key: self._placed(value) for key, value in self._infos.items()}
+            return self._numpy([dynamics.encode(infos)]), self._numpy([dynamics.encode_goal(infos)])
+
+    def predict(self, latents: np.ndarray, actions: np.ndarray) -> np.ndarray:
+        """Latents `(N, D)` one step later."""
+        with _torch().inference_mode():
+            return self._numpy([self.dynamics.predict(self._tensor(latents), self._tensor(actions))])
+
+    def predict_vjp(self, latents: np.ndarray, actions: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The gradients of a prediction with respect to latents and actions, weighted by `slope`."""
+        torch = _torch()
+        with torch.enable_grad():
+            given = self._tensor(latents).requires_grad_(), self._tensor(actions).requires_grad_()
+            predicted = self.dynamics.predict(*given)
+            slopes = torch.autograd.grad(predicted, given, self._tensor(slope), allow_unused=True)
+        filled = [torch.zeros_like(x) if g is None else g for g, x in zip(slopes, given, strict=True)]
+        return self._numpy(filled[:1]), self._numpy(filled[1:])
+
+    def constraints(self, horizon: int) -> int:
+        """How many constraints a candidate has: as many as the model returns for one at rest."""
+        if horizon not in self._constraints:
+            resting = np.zeros((self._envs, 1, horizon, self.dim), dtype=np.float32)
+            self._constraints[horizon] = self.constrain(resting).shape[-1]
+        return self._constraints[horizon]
+
+    def constrain(self, candidates: np.ndarray) -> np.ndarray:
+        """Constraint values `(B, S, C)`, satisfied when at most 0."""
+        with _torch().inference_mode():
+            parts = self._parts(candidates, "constrain")
+            return self._numpy([self.model.get_constraints(infos, part) for infos, part in parts])
+
+    def constrain_vjp(self, candidates: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """The gradient of the constraints with respect to the candidates, weighted by `weights` `(B, S, C)`."""
+        torch = _torch()
+        slopes, at = [], 0
+        with torch.enable_grad():
+            for infos, part in self._parts(candidates, "constrain gradient"):
+                part = part.requires_grad_()
+                values = self.model.get_constraints(infos, part)
+                weight = self._tensor(weights[at : at + len(part)])
+                at += len(part)
+                (slope,) = torch.autograd.grad(values, part, weight, retain_graph=True, allow_unused=True)
+                slopes.append(torch.zeros_like(part) if slope is None else slope)
+        return self._numpy(slopes)
+
+    # Between numpy and torch.
+
+    def _asked(self, infos: dict[str, Any], candidates: Any) -> Any:
+        cost = self.model.get_cost(infos, candidates)
+        expected = tuple(candidates.shape[:2])
+        if tuple(getattr(cost, "shape", ())) != expected:
+            got = tuple(cost.shape) if hasattr(cost, "shape") else type(cost).__name__
+            name = type(self.model).__name__
+            raise ValueError(f"{name}.get_cost: expected costs of shape {expected} (environments, candidates), got {got}")
+        return cost if not isinstance(cost, np.ndarray) else _torch().from_numpy(cost)
+
+    def _parts(self, candidates: np.ndarray, what: str) -> Any:
+        """Infos, repeated for every candidate, and candidates, for as many environments at a time as fit."""
+        envs, samples = candidates.shape[:2]
+        size = self.batch_size or envs
+        for begin in range(0, envs, size):
+            key = (what, begin, samples)
+            rows = slice(begin, min(begin + size, envs))
+            part = candidates[rows]
+            if key not in self._kept:
+                self._kept[key] = self._expanded(rows, part)
+            yield self._kept[key], self._tensor(part) if self.torch else part
+
+    def _expanded(self, rows: slice, part: np.ndarray) -> dict[str, Any]:
+        samples, dim = part.shape[1], part.shape[3]
+        infos: dict[str, Any] = {}
+        for key, value in self._infos.items():
+            if isinstance(value, np.ndarray):
+                some = value[rows][:, None]
+                infos[key] = np.broadcast_to(some, (some.shape[0], samples, *some.shape[2:]))
+            elif hasattr(value, "expand"):
+                some = self._placed(value[rows]).unsqueeze(1)
+                infos[key] = some.expand(-1, samples, *some.shape[2:])
+            else:
+                infos[key] = value[rows] if isinstance(value, list) else value
+        if "action" not in infos and self.torch:
+            infos["action"] = self._tensor(np.zeros((part.shape[0], samples, 1, dim), dtype=np.float32))
+        return infos
+
+    def _placed(self, value: Any) -> Any:
+        if not hasattr(value, "is_floating_point"):
+            return value
+        return value.to(device=self.device, dtype=self.dtype if value.is_floating_point() else None)
+
+    def _tensor(self, array: np.ndarray) -> Any:
+        return _torch().from_numpy(array).to(device=self.device, dtype=self.dtype)
+
+    def _numpy(self, tensors: Sequence[Any]) -> np.ndarray:
+        joined = tensors[0] if len(tensors) == 1 else _torch().cat(list(tensors))
+        return np.ascontiguousarray(joined.detach().to("cpu", _torch().float32).numpy())

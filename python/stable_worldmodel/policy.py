@@ -1,0 +1,355 @@
+"""Policies: who acts.
+
+A policy of one's own is any object with `get_action(infos)` that returns one action an environment; `BasePolicy` gives it the rest.
+Policies of the engine (random, experts, checkpoints, planning) run inside it: what an episode brings depends on its
+seed alone, whichever environment plays it and whatever is played beside it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import _engine
+from .planning import Adapter, has_torch, prepared
+from .solver import EngineSolver, Solver, single
+
+if TYPE_CHECKING:
+    from .world import World
+
+__all__ = [
+    "AutoActionableModel",
+    "AutoCostModel",
+    "BasePolicy",
+    "ExpertPolicy",
+    "FeedForwardPolicy",
+    "MPCPolicy",
+    "PlanConfig",
+    "Policy",
+    "RandomPolicy",
+    "WorldModelPolicy",
+]
+
+
+@dataclass(frozen=True)
+class PlanConfig:
+    """How far to plan and how much of a plan to execute.
+
+    Attributes:
+        horizon: Model steps to plan.
+        receding_horizon: Model steps to execute before planning again; the whole horizon is open loop.
+        history_len: Frames the model sees, the present one included.
+        action_block: Environment steps in one model step (the frameskip the model was trained with).
+        warm_start: Whether a plan starts from what the last one left unexecuted.
+        latency_budget: Seconds after which a search stops with what it has; results then depend on the machine.
+    """
+
+    horizon: int = 5
+    receding_horizon: int = 5
+    history_len: int = 1
+    action_block: int = 1
+    warm_start: bool = True
+    latency_budget: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("horizon", "receding_horizon", "history_len", "action_block"):
+            if int(getattr(self, name)) < 1:
+                raise ValueError(f"PlanConfig.{name}: {getattr(self, name)}; expected at least 1")
+        if self.receding_horizon > self.horizon:
+            raise ValueError(f"PlanConfig: {self.receding_horizon} model steps to execute, {self.horizon} planned")
+
+    @property
+    def plan_len(self) -> int:
+        """Environment steps of a plan."""
+        return self.horizon * self.action_block
+
+
+class BasePolicy:
+    """What policies share."""
+
+    #: What kind it is, for manifests and results.
+    type = "policy"
+
+    def __init__(self, **kwargs: Any) -> None:
+        self.env: Any = None
+        for name, value in kwargs.items():
+            setattr(self, name, value)
+
+    def set_env(self, env: Any) -> None:
+        """Tells the policy which environments it acts in: `world.envs`."""
+        self.env = env
+
+    def get_action(self, obs: Any, **kwargs: Any) -> Any:
+        """The actions `(num_envs, ..)` for what the environments show."""
+        raise NotImplementedError(f"{type(self).__name__} has no get_action(infos)")
+
+    def _actor(self, world: World) -> Any:
+        """It as a policy of the engine, if it is one."""
+        return None
+
+
+Policy = BasePolicy
+
+
+class _EnginePolicy(BasePolicy):
+    """A policy that acts inside the engine."""
+
+    def get_action(self, obs: Any, **kwargs: Any) -> np.ndarray:
+        """The actions for what the world shows now, whatever `obs` is."""
+        if self.env is None:
+            raise RuntimeError(f"{type(self).__name__}: world.set_policy(policy) first")
+        return self.env._world._ask(self)
+
+
+class RandomPolicy(_EnginePolicy):
+    """Acts uniformly at random in the action space."""
+
+    type = "random"
+
+    def __init__(self, seed: int | None = None, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.seed = seed
+
+    def set_seed(self, seed: int) -> None:
+        """Decides what it draws, beside each episode's seed."""
+        self.seed = seed
+        if self.env is not None:
+            self.env._world._forget(self)
+
+    def _actor(self, world: World) -> Any:
+        return _engine.Actor.random(world._world, self.seed)
+
+
+class ExpertPolicy(_EnginePolicy):
+    """The environment's own demonstrator.
+
+    Args:
+        name: One of `swm.envs.experts(ID)`; the first for `"expert"`.
+        seed: What it draws beside each episode's seed.
+    """
+
+    type = "expert"
+
+    def __init__(self, name: str = "expert", seed: int | None = None, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.name, self.seed = name, seed
+        self.type = name
+
+    def _actor(self, world: World) -> Any:
+        return _engine.Actor.expert(world._world, self.name, self.seed)
+
+
+class FeedForwardPolicy(BasePolicy):
+    """Acts by one pass through a model: an `Actionable`, or the name of a checkpoint that acts.
+
+    Args:
+        model: Something with `get_action(info)`, or a checkpoint's name or path.
+        process: By column, what scales it; that of `action` scales actions back.
+        transform: By column, what pictures pass through, one by one, channels first.
+    """
+
+    type = "feed_forward"
+
+    def __init__(
+        self,
+        model: Any,
+        process: Mapping[str, Any] | None = None,
+        transform: Mapping[str, Callable[[Any], Any]] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(**kwargs)
+        self.model, self.process, self.transform = model, dict(process or {}), dict(transform or {})
+        if hasattr(model, "eval") and not isinstance(model, str):
+            model.eval()
+
+    def _actor(self, world: World) -> Any:
+        name = self.model if isinstance(self.model, str) else getattr(self.model, "_engine_policy", None)
+        return None if name is None else _engine.Actor.checkpoint(world._world, name)
+
+    def get_action(self, obs: Any, **kwargs: Any) -> Any:
+        if isinstance(self.model, str) or hasattr(self.model, "_engine_policy"):
+            if self.env is None:
+                raise RuntimeError("FeedForwardPolicy: world.set_policy(policy) first")
+            return self.env._world._ask(self)
+        infos = prepared({key: value for key, value in obs.items() if key[0] != "_"}, self.process, self.transform)
+        if "goal" in infos:
+            infos["goal_pixels"] = infos["goal"]
+        if has_torch():
+            import torch
+
+            try:
+                device = next(self.model.parameters()).device
+            except (AttributeError, StopIteration, TypeError):
+                device = torch.device("cpu")
+            infos = {key: value.to(device) if torch.is_tensor(value) else value for key, value in infos.items()}
+            with torch.inference_mode():
+                action = self.model.get_action(infos)
+            action = action.cpu().numpy() if torch.is_tensor(action) else np.asarray(action)
+        else:
+            action = np.asarray(self.model.get_action(infos))
+        return self.process["action"].inverse_transform(action) if "action" in self.process else action
+
+
+class MPCPolicy(BasePolicy):
+    """Plans with a solver, executes the first steps of the plan, plans again.
+
+    Args:
+        solver: One of `swm.solver`, or an object with `configure` and `solve`.
+        config: How far to plan; by default 5 model steps, all of them executed, of as many environment steps as the model's
+            `action_block` says (1 where it says nothing).
+        process: By column, what scales it before the model sees it (`transform`); that of `action` scales planned actions back
+            (`inverse_transform`).
+        transform: By picture column (`pixels`, `goal`), what pictures pass through, one by one, channels first.
+
+    The infos a model gets are those of the environments that replan, `(B, T, ..)`.
+    """
+
+    type = "world_model"
+
+    def __init__(
+        self,
+        solver: Any,
+        config: PlanConfig | None = None,
+        process: Mapping[str, Any] | None = None,
+        transform: Mapping[str, Callable[[Any], Any]] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(**kwargs)
+        if not isinstance(solver, Solver):
+            raise TypeError(f"{type(solver).__name__} is no solver: it needs configure(…) and solve(…)")
+        self.solver = solver
+        if config is None:
+            config = PlanConfig(action_block=int(getattr(getattr(solver, "model", None), "action_block", 1)))
+        self.cfg = self.config = config
+        self.process, self.transform = dict(process or {}), dict(transform or {})
+        #: How the searches went: a list of dicts, one a plan, after `evaluate` and `collect`.
+        self.plans: list[dict[str, Any]] = []
+        self._actions: list[list[np.ndarray]] = []
+        self._rest: dict[int, Any] = {}
+
+    def set_env(self, env: Any) -> None:
+        super().set_env(env)
+        self.solver.configure(action_space=env.action_space, n_envs=env.num_envs, config=self.cfg)
+        self._actions = [[] for _ in range(env.num_envs)]
+        self._rest = {}
+
+    def _actor(self, world: World) -> Any:
+        scale = _scale(self.process.get("action"))
+        if not isinstance(self.solver, EngineSolver) or (scale is None and "action" in self.process):
+            return None
+        model = self.solver.adapter(self.process, self.transform, self.cfg.history_len)
+        if not isinstance(model, Adapter) and (self.process or self.transform):
+            raise ValueError("MPCPolicy: models of swm.wm scale what they see by themselves; leave process and transform out")
+        cfg = asdict(self.cfg)
+        cfg["history"] = cfg.pop("history_len")
+        settings = json.dumps(self.solver.settings)
+        seed = self.solver.seed
+        return _engine.Actor.planning(world._world, self.solver.id, settings, json.dumps(cfg), scale, model, seed)
+
+    # In Python, for solvers of one's own.
+
+    def get_action(self, obs: Any, **kwargs: Any) -> np.ndarray:
+        """The actions for infos `(num_envs, T, ..)`."""
+        if self.env is None:
+            raise RuntimeError("MPCPolicy: world.set_policy(policy) first")
+        infos = dict(obs)
+        fresh, active = infos.pop("_needs_flush", None), infos.pop("_active", None)
+        envs = self.env.num_envs
+        for i in range(envs):
+            if fresh is not None and fresh[i]:
+                self._actions[i].clear()
+                self._rest.pop(i, None)
+        over = np.zeros(envs, bool) if active is None else ~np.asarray(active, bool)
+        due = [i for i in range(envs) if not self._actions[i] and not over[i]]
+        if due:
+            self._replan({key: np.asarray(value)[due] for key, value in infos.items()}, due)
+        space = single(self.env.action_space)
+        shape = space.shape
+        actions = np.full((envs, *shape), np.nan if space.dtype.kind == "f" else 0, dtype=space.dtype)
+        for i in range(envs):
+            if not over[i]:
+                actions[i] = self._actions[i].pop(0).reshape(shape)
+        return actions
+
+    def _replan(self, infos: dict[str, Any], due: list[int]) -> None:
+        known = [self._rest.get(i) for i in due]
+        init = None
+        if self.cfg.warm_start and any(rest is not None for rest in known):
+            some = next(rest for rest in known if rest is not None)
+            init = np.stack([np.zeros_like(some) if rest is None else rest for rest in known])
+            if has_torch():
+                import torch
+
+                init = torch.from_numpy(init)
+        outcome = self.solver.solve(prepared(infos, self.process, self.transform), init_action=init)
+        if not isinstance(outcome, Mapping) or "actions" not in outcome:
+            raise TypeError(f"{type(self.solver).__name__}.solve: expected a dict with 'actions', got {outcome!r:.200}")
+        plan = outcome["actions"]
+        plan = plan.detach().cpu().numpy() if hasattr(plan, "detach") else np.asarray(plan)
+        if plan.ndim != 3 or plan.shape[0] != len(due) or plan.shape[1] < self.cfg.receding_horizon:
+            raise ValueError(
+                f"{type(self.solver).__name__}.solve: got actions of shape {plan.shape}, expected "
+                f"({len(due)}, {self.cfg.horizon}, numbers of a model step)"
+            )
+        if not np.isfinite(plan).all():
+            raise ValueError(f"{type(self.solver).__name__}.solve: its plan holds numbers that are not finite")
+        space = single(self.env.action_space)
+        for row, i in enumerate(due):
+            self._rest[i] = plan[row, self.cfg.receding_horizon :]
+            if not len(self._rest[i]):
+                del self._rest[i]
+            steps = plan[row, : self.cfg.receding_horizon].reshape(self.cfg.receding_horizon * self.cfg.action_block, -1)
+            if "action" in self.process:
+                steps = np.asarray(self.process["action"].inverse_transform(steps))
+            self._actions[i] = [_executed(step, space) for step in steps]
+
+
+WorldModelPolicy = MPCPolicy
+
+
+def _executed(step: np.ndarray, space: Any) -> np.ndarray:
+    """A planned step as an action: clamped to a box; of one-hot vectors, the choices."""
+    if space.dtype.kind == "f":
+        return np.clip(step.reshape(space.shape), space.low, space.high).astype(space.dtype)
+    sizes = [int(n) for n in np.atleast_1d(getattr(space, "nvec", getattr(space, "n", 0)))]
+    if step.size == len(sizes):
+        return step.round().astype(space.dtype)
+    choices, at = [], 0
+    for size in sizes:
+        choices.append(int(step[at : at + size].argmax()))
+        at += size
+    return np.asarray(choices, dtype=space.dtype) + np.asarray(getattr(space, "start", 0))
+
+
+def _scale(scaler: Any) -> tuple[list[float], list[float]] | None:
+    """Mean and standard deviation of something that scales by them."""
+    if scaler is None:
+        return None
+    for mean, std in (("mean", "std"), ("mean_", "scale_")):
+        if hasattr(scaler, mean) and hasattr(scaler, std):
+            numbers = [getattr(scaler, name) for name in (mean, std)]
+            numbers = [n.detach().cpu().numpy() if hasattr(n, "detach") else n for n in numbers]
+            return tuple(np.asarray(n, dtype=np.float32).reshape(-1).tolist() for n in numbers)  # type: ignore[return-value]
+    return None
+
+
+def AutoCostModel(run_name: str, cache_dir: Any = None) -> Any:
+    """A checkpoint to plan in, by name or path: `swm.wm.load`."""
+    from . import wm
+
+    return wm.load(_named(run_name, cache_dir))
+
+
+def AutoActionableModel(run_name: str, cache_dir: Any = None) -> Any:
+    """A checkpoint that acts, by name or path: `swm.wm.load`."""
+    return AutoCostModel(run_name, cache_dir)
+
+
+def _named(name: str, folder: Any) -> str:
+    from pathlib import Path
+
+    return str(name) if folder is None else str(Path(folder) / name)

@@ -1,0 +1,363 @@
+"""Gymnasium's spaces with a value, a default and a condition: what factors of variation are made of.
+
+A factor is a space with an `init_value` (what it is where nobody varies it), a current `value`, and maybe a
+`constrain_fn` that samples must satisfy. A `Dict` of them, nested as deep as one likes, is a `variation_space`;
+its members are named by dots, such as `agent.color`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+__all__ = ["Box", "Dict", "Discrete", "MultiDiscrete", "RGBBox", "reset_variation_space"]
+
+#: How often a space is sampled before its condition is taken for impossible.
+TRIES = 1000
+
+
+class _Factor:
+    """What a space needs to be a factor: mixed into Gymnasium's spaces."""
+
+    constrain_fn: Callable[[Any], bool] | None
+    _init_value: Any
+    _value: Any
+
+    def _begin(self, init_value: Any, constrain_fn: Callable[[Any], bool] | None) -> None:
+        self.constrain_fn = constrain_fn
+        self._init_value = self._value = None if init_value is None else self._typed(init_value)
+        if init_value is not None and not self.contains(self._init_value):
+            raise ValueError(f"init_value {init_value!r} is not in {self}, or violates its constrain_fn")
+
+    def _typed(self, value: Any) -> Any:
+        """The value in the type of the space, where nothing is lost by it."""
+        typed = np.asarray(value, dtype=self.dtype)  # type: ignore[attr-defined]
+        return typed if np.array_equal(typed, np.asarray(value)) or typed.dtype.kind == "f" else np.asarray(value)
+
+    @property
+    def init_value(self) -> Any:
+        """The value where nobody varies it."""
+        return self._init_value
+
+    @property
+    def value(self) -> Any:
+        """The current value."""
+        return self._value
+
+    def reset(self) -> None:
+        """Takes the default."""
+        self._value = self._init_value
+
+    def contains(self, x: Any) -> bool:
+        """Whether a value is in the space and satisfies the condition."""
+        return bool(super().contains(x)) and (self.constrain_fn is None or bool(self.constrain_fn(x)))  # type: ignore[misc]
+
+    def check(self) -> bool:
+        """Whether the current value is allowed."""
+        return self.contains(self._value)
+
+    def sample(self, mask: Any = None, max_tries: int = TRIES, set_value: bool = True, **kwargs: Any) -> Any:
+        """Samples until the condition holds, at most `max_tries` times; the sample becomes the value."""
+        for _ in range(max_tries):
+            value = super().sample(mask=mask, **kwargs)  # type: ignore[misc]
+            if self.contains(value):
+                if set_value:
+                    self._value = value
+                return value
+        raise RuntimeError(
+            f"no sample of {self} satisfied its constrain_fn in {max_tries} tries; widen the space or the condition"
+        )
+
+    def _allowed(self, value: Any) -> Any:
+        typed = self._typed(value)
+        if not self.contains(typed):
+            raise ValueError(f"{value!r} is not in {self}, or violates its constrain_fn")
+        return typed
+
+    def set_init_value(self, value: Any) -> None:
+        """Changes the default."""
+        self._init_value = self._allowed(value)
+
+    def set_value(self, value: Any) -> None:
+        """Changes the current value."""
+        self._value = self._allowed(value)
+
+
+class Box(_Factor, spaces.Box):
+    """Numbers within bounds."""
+
+    def __init__(
+        self,
+        low: Any,
+        high: Any,
+        shape: Sequence[int] | None = None,
+        dtype: Any = np.float32,
+        init_value: Any = None,
+        constrain_fn: Callable[[Any], bool] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        spaces.Box.__init__(self, low, high, shape=shape, dtype=dtype, **kwargs)
+        self._begin(init_value, constrain_fn)
+
+
+class RGBBox(Box):
+    """A colour, or colours: whole numbers from 0 to 255, three of them along some axis."""
+
+    def __init__(self, shape: Sequence[int] = (3,), init_value: Any = None, **kwargs: Any) -> None:
+        if 3 not in tuple(shape):
+            raise ValueError(f"a colour has three numbers along some axis, shape {tuple(shape)} has not")
+        super().__init__(low=0, high=255, shape=shape, dtype=np.uint8, init_value=init_value, **kwargs)
+
+
+class Discrete(_Factor, spaces.Discrete):
+    """One of `n` whole numbers from `start`."""
+
+    def __init__(
+        self,
+        n: int,
+        init_value: Any = None,
+        constrain_fn: Callable[[Any], bool] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        spaces.Discrete.__init__(self, n, **kwargs)
+        self._begin(init_value, constrain_fn)
+
+    def _typed(self, value: Any) -> Any:
+        return int(value) if int(value) == value else value
+
+
+class MultiDiscrete(_Factor, spaces.MultiDiscrete):
+    """Several whole numbers, each one of its own `nvec` many."""
+
+    def __init__(
+        self,
+        nvec: Any,
+        init_value: Any = None,
+        constrain_fn: Callable[[Any], bool] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        spaces.MultiDiscrete.__init__(self, nvec, **kwargs)
+        self._begin(init_value, constrain_fn)
+
+
+class Dict(spaces.Dict):
+    """Factors by name, nested: a `variation_space`.
+
+    They are sampled in `sampling_order` (their own order by default), so that the condition of a later one may look at the
+    values of earlier ones. A condition on the whole samples all of them again until it holds.
+    """
+
+    def __init__(
+        self,
+        spaces_dict: Mapping[str, spaces.Space] | None = None,
+        constrain_fn: Callable[[dict], bool] | None = None,
+        sampling_order: Sequence[str] | None = None,
+        init_value: Mapping[str, Any] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        members = dict(spaces_dict or {})
+        super().__init__(members, **kwargs)
+        # Gymnasium sorts; what is written first is sampled first here.
+        self.spaces = {**members, **{key: space for key, space in self.spaces.items() if key not in members}}
+        self.constrain_fn = constrain_fn
+        named = list(sampling_order or [])
+        unknown = [key for key in named if key not in self.spaces]
+        if unknown:
+            raise ValueError(f"sampling_order names {unknown}, which are not among {list(self.spaces)}")
+        self._order = named + [key for key in self.spaces if key not in named]
+        if init_value is not None:
+            self.set_init_value(dict(self._flat(init_value)))
+            self.reset()
+
+    @property
+    def init_value(self) -> dict[str, Any]:
+        """The defaults, nested as the spaces are."""
+        return {key: space.init_value for key, space in self.spaces.items()}
+
+    @property
+    def value(self) -> dict[str, Any]:
+        """The current values, nested as the spaces are."""
+        return {key: space.value for key, space in self.spaces.items()}
+
+    @property
+    def sampling_order(self) -> list[str]:
+        """Every group and factor by its dot key, in the order in which they are sampled."""
+        order = []
+        for key in self._order:
+            order.append(key)
+            if isinstance(self.spaces[key], Dict):
+                order.extend(f"{key}.{inner}" for inner in self.spaces[key].sampling_order)
+        return order
+
+    def names(self) -> list[str]:
+        """The dot keys of all factors."""
+        return [key for key, _ in self.factors()]
+
+    def factors(self) -> Iterator[tuple[str, Any]]:
+        """Every factor with its dot key."""
+        for key, space in self.spaces.items():
+            if isinstance(space, Dict):
+                yield from ((f"{key}.{inner}", factor) for inner, factor in space.factors())
+            else:
+                yield key, space
+
+    def find(self, key: str) -> Any:
+        """The factor or group of a dot key."""
+        space: Any = self
+        for part in key.split("."):
+            if not isinstance(space, Dict) or part not in space.spaces:
+                raise ValueError(f"no factor is called {key!r}; there are {self.names()}")
+            space = space.spaces[part]
+        return space
+
+    def reset(self) -> None:
+        """Every factor takes its default."""
+        for space in self.spaces.values():
+            space.reset()
+
+    def contains(self, x: Any) -> bool:
+        """Whether these values are allowed, one by one and together."""
+        return (
+            isinstance(x, Mapping)
+            and all(key in x and space.contains(x[key]) for key, space in self.spaces.items())
+            and (self.constrain_fn is None or bool(self.constrain_fn(x)))
+        )
+
+    def check(self, debug: bool = False) -> bool:
+        """Whether the current values are allowed, one by one and together."""
+        wrong = [key for key, factor in self.factors() if not factor.check()]
+        if debug and wrong:
+            import warnings
+
+            warnings.warn(f"not allowed: {', '.join(wrong)}", stacklevel=2)
+        return not wrong and (self.constrain_fn is None or bool(self.constrain_fn(self.value)))
+
+    def sample(self, mask: Any = None, max_tries: int = TRIES, set_value: bool = True, **kwargs: Any) -> dict[str, Any]:
+        """Samples every factor, in order, until the condition on the whole holds."""
+        for _ in range(max_tries):
+            mask = mask or {}
+            value = {
+                key: self.spaces[key].sample(mask=mask.get(key), set_value=set_value, **kwargs) for key in self._order
+            }
+            if self.constrain_fn is None or self.constrain_fn(value):
+                return {key: value[key] for key in self.spaces}
+        raise RuntimeError(f"the factors' common constrain_fn did not hold in {max_tries} tries")
+
+    def update(self, keys: Iterable[str]) -> None:
+        """Samples these factors and groups, in order; `all` means every one."""
+        wanted = set(keys)
+        if "all" in wanted:
+            self.sample()
+            return
+        for key in wanted:
+            self.find(key)
+        for _ in range(TRIES):
+            for key in self.sampling_order:
+                inside = any(key.startswith(f"{group}.") for group in wanted)
+                if key in wanted or (inside and not isinstance(self.find(key), Dict)):
+                    self.find(key).sample()
+            if self.constrain_fn is None or self.constrain_fn(self.value):
+                return
+        raise RuntimeError(f"the factors' common constrain_fn did not hold in {TRIES} tries; vary fewer of them")
+
+    def set_init_value(self, values: Mapping[str, Any]) -> None:
+        """Changes defaults, by dot key."""
+        for key, value in self._flat(values):
+            self.find(key).set_init_value(value)
+
+    def set_value(self, values: Mapping[str, Any]) -> None:
+        """Changes current values, by dot key."""
+        for key, value in self._flat(values):
+            self.find(key).set_value(value)
+
+    def _flat(self, values: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+        for key, value in values.items():
+            name = f"{before}{key}"
+            if isinstance(value, Mapping):
+                yield from self._flat(value, f"{name}.")
+            else:
+                yield name, value
+
+    def to_str(self) -> str:
+        """The tree of factors, one a line."""
+        lines = []
+        for key, space in self.spaces.items():
+            if isinstance(space, Dict):
+                lines += [f"{key}:", *(f"    {line}" for line in space.to_str().splitlines())]
+            else:
+                lines.append(f"{key}: {space}")
+        return "\n".join(lines)
+
+
+def reset_variation_space(
+    variation_space: Dict,
+    seed: int | None = None,
+    options: Mapping[str, Any] | None = None,
+    default_variations: Iterable[str] = (),
+) -> None:
+    """What an environment does with its factors at a reset: all take their defaults, then those are sampled that
+    `options["variation"]` names (`default_variations` where it is not given), then those are pinned that
+    `options["variation_values"]` names.
+    """
+    options = options or {}
+    variation_space.seed(seed)
+    variation_space.reset()
+    names = options.get("variation")
+    names = default_variations if names is None else names
+    variation_space.update([names] if isinstance(names, str) else names)
+    variation_space.set_value(options.get("variation_values") or {})
+    if not variation_space.check():
+        raise ValueError(f"these factors are not allowed together: {variation_space.value}")
+
+
+def from_description(described: Mapping[str, Any]) -> spaces.Space:
+    """A space as the engine describes it."""
+    kind = described["type"]
+    if kind == "Dict":
+        return spaces.Dict({key: from_description(inner) for key, inner in described["spaces"].items()})
+    factor = "init_value" in described
+    more = {"init_value": described["init_value"]} if factor else {}
+    if kind == "Discrete":
+        return (Discrete if factor else spaces.Discrete)(described["n"], start=described["start"], **more)
+    if kind == "MultiDiscrete":
+        # Gymnasium's environments of one choice each know no start.
+        return (MultiDiscrete if factor else spaces.MultiDiscrete)(
+            np.asarray(described["nvec"]), start=np.asarray(described["start"]), **more
+        )
+    if kind == "RGBBox":
+        return RGBBox(shape=tuple(described["shape"]), **more)
+    dtype = np.dtype(described["dtype"])
+    low, high = (
+        np.array(_unbounded(described[side], bound), dtype=np.float64)
+        for side, bound in (("low", -np.inf), ("high", np.inf))
+    )
+    shape = tuple(described["shape"])
+    low, high = (np.broadcast_to(side, shape).astype(dtype) for side in (low, high))
+    return (Box if factor else spaces.Box)(low, high, shape=shape, dtype=dtype.type, **more)
+
+
+def _unbounded(numbers: Any, bound: float) -> Any:
+    """JSON knows no infinity and says null."""
+    if isinstance(numbers, list):
+        return [_unbounded(number, bound) for number in numbers]
+    return bound if numbers is None else numbers
+
+
+def variation_space(factors: Mapping[str, Mapping[str, Any]], order: Sequence[str]) -> Dict:
+    """The factors of an environment, described by dot key, as nested spaces in their sampling order."""
+    tree: dict[str, Any] = {}
+    for key in order:
+        if key in factors:
+            *groups, name = key.split(".")
+            node = tree
+            for group in groups:
+                node = node.setdefault(group, {})
+            node[name] = from_description(factors[key])
+
+    def nested(node: Mapping[str, Any]) -> Dict:
+        return Dict({key: nested(inner) if isinstance(inner, dict) else inner for key, inner in node.items()})
+
+    return nested(tree)

@@ -1,0 +1,652 @@
+"""`World`: many environments at once, who acts in them, and what is done with what they play."""
+
+from __future__ import annotations
+
+import json
+import math
+import secrets
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+
+from . import _engine, _options, _progress
+from . import spaces as swm_spaces
+from .wrapper.visual import engine_wrappers
+
+__all__ = ["EnvPool", "Metrics", "World"]
+
+#: Formats by the ending of a path; the first is what a path without one of these gets.
+_ENDINGS = {".lance": "lance", ".h5": "hdf5", ".hdf5": "hdf5", ".mp4": "video", ".lerobot": "lerobot"}
+
+
+class World:
+    """Many environments of one kind, stepped and drawn in parallel.
+
+    Args:
+        env_name: An environment's id, such as `swm/PushT-v1`, with options as `ID,option=value`; or any id that Gymnasium knows.
+        num_envs: Environments played side by side. What an episode brings does not depend on it.
+        image_shape: `(height, width)` of pictures.
+        max_episode_steps: Steps after which episodes are truncated; the environment's own number for `None`.
+        goal_conditioned: Whether `goal`, the picture of the goal, is among the infos.
+        extra_wrappers: What is put around every environment, in order: `functools.partial` of a class of
+            `swm.wrapper.visual`, or any factory of a `gymnasium.Wrapper`.
+        pre_wrappers: The same, before `extra_wrappers`.
+        add_pixels: Whether pictures are drawn.
+        views: What is drawn besides: cameras, `depth`, `segmentation`, or `CAMERA:MODALITY`.
+        wrap_goal: Whether visual wrappers change the picture of the goal, too.
+        threads: Worker threads; as many as there are cores for 0. What comes out does not depend on it.
+        **kwargs: Options of the environment.
+
+    Attributes:
+        infos: What the environments show, by name: arrays `[num_envs, 1, ..]` that every reset and step writes anew,
+            without a copy. Keep `infos[name].copy()` of what shall stay.
+    """
+
+    def __init__(
+        self,
+        env_name: str,
+        num_envs: int = 1,
+        image_shape: tuple[int, int] | None = (224, 224),
+        max_episode_steps: int | None = None,
+        goal_conditioned: bool = True,
+        pre_wrappers: Sequence[Callable[..., Any]] | None = None,
+        extra_wrappers: Sequence[Callable[..., Any]] | None = None,
+        image_transform: Any = None,
+        goal_transform: Any = None,
+        image_resample: Any = None,
+        add_pixels: bool = True,
+        *,
+        views: Sequence[str] = (),
+        wrap_goal: bool = False,
+        threads: int = 0,
+        **kwargs: Any,
+    ) -> None:
+        if image_transform is not None or goal_transform is not None:
+            raise TypeError("image_transform, goal_transform: give transforms to the policy that wants them (transform=…)")
+        if add_pixels and image_shape is None:
+            raise ValueError("image_shape: None; give (height, width), or add_pixels=False for no pictures")
+        if isinstance(num_envs, bool) or int(num_envs) < 1:
+            raise ValueError(f"num_envs: {num_envs}; expected at least 1")
+        kwargs.pop("render_mode", None)
+        self.env_name = ",".join([env_name, *(f"{key}={value}" for key, value in kwargs.items())])
+        self.num_envs = int(num_envs)
+        image = (int(image_shape[0]), int(image_shape[1])) if add_pixels and image_shape is not None else None
+        wrappers = [*(pre_wrappers or []), *(extra_wrappers or [])]
+        drawn = engine_wrappers(wrappers)
+        if drawn is None or not self._is_native(env_name):
+            from ._gym import open_world
+
+            self._world = open_world(self, env_name, kwargs, wrappers, image, max_episode_steps, image_resample, threads)
+            self._wrapping = []
+        else:
+            self._wrapping = drawn
+            self._world = _engine.World(
+                self.env_name,
+                self.num_envs,
+                image,
+                list(views),
+                max_episode_steps,
+                threads,
+                json.dumps(drawn),
+                wrap_goal,
+            )
+        self.infos: dict[str, np.ndarray] = self._world.infos()
+        if not goal_conditioned:
+            self.infos.pop("goal", None)
+        self._actions = self._world.actions()
+        self.infos["action"] = self._actions[:, None]
+        self.envs = EnvPool(self)
+        self.policy: Any = None
+        #: What decides the episodes that `step` plays.
+        self.seed: int | None = None
+        self._actors: dict[int, tuple[Any, Any]] = {}
+        self._episodes = [0] * self.num_envs
+        self._next_episode = 0
+        self._options: Mapping[str, Any] | None = None
+        self._fresh = np.ones(self.num_envs, bool)
+
+    @staticmethod
+    def _is_native(env_name: str) -> bool:
+        return env_name.split(",")[0] in _engine.envs()
+
+    # What there is.
+
+    @cached_property
+    def spec(self) -> dict[str, Any]:
+        """What the environments are, in words and numbers."""
+        return json.loads(self._world.spec())
+
+    @property
+    def rewards(self) -> np.ndarray:
+        """The rewards of the last step, `[num_envs]`."""
+        return self.infos["reward"][:, 0]
+
+    @property
+    def terminateds(self) -> np.ndarray:
+        """Whether the last step ended the episode because of where the world is, `[num_envs]`."""
+        return self.infos["terminated"][:, 0]
+
+    @property
+    def truncateds(self) -> np.ndarray:
+        """Whether the last step ended the episode because of the clock, `[num_envs]`."""
+        return self.infos["truncated"][:, 0]
+
+    @property
+    def single_action_space(self) -> spaces.Space:
+        """The action space of one environment."""
+        return self.envs.single_action_space
+
+    @property
+    def action_space(self) -> spaces.Space:
+        """The action space of all environments together."""
+        return self.envs.action_space
+
+    @property
+    def variation_space(self) -> swm_spaces.Dict:
+        """The factors of variation."""
+        return self.envs.variation_space
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Steps after which episodes are truncated."""
+        return self._world.max_episode_steps()
+
+    def factors(self, index: int = 0) -> dict[str, list[float]]:
+        """The factors of an environment's episode, by key."""
+        return self._world.factors(index)
+
+    def close(self) -> None:
+        """Lets go of the environments."""
+        self._actors.clear()
+        close = getattr(self._world, "close", None)
+        if close is not None:
+            close()
+
+    def __enter__(self) -> World:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    # Loops of one's own.
+
+    def set_policy(self, policy: Any) -> None:
+        """Says who acts: an object with `get_action(infos)`."""
+        if not (callable(getattr(policy, "get_action", None)) or callable(getattr(policy, "get_actions", None))):
+            raise TypeError(f"{type(policy).__name__} is no policy: it needs get_action(infos)")
+        if callable(getattr(policy, "set_env", None)):
+            policy.set_env(self.envs)
+        self.policy = policy
+        self._forget(policy)
+
+    def reset(self, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None) -> None:
+        """Starts an episode in every environment and refreshes `infos`.
+
+        Args:
+            seed: What decides the episodes: environment `i` plays episode `i` of this seed, the one that `collect` and
+                `evaluate` call so. A list is what the environments themselves are reset with. Drawn for `None`.
+            options: `variation`: factors to sample; `variation_values`: factors to pin; `state`, `goal_state`: start and goal.
+        """
+        text = _options.reset(options, self.spec["variation"])
+        self._options = options
+        self.seed = _drawn() if seed is None else seed if isinstance(seed, int) else 0
+        self._episodes = list(range(self.num_envs))
+        self._next_episode = self.num_envs
+        if seed is not None and not isinstance(seed, (int, np.integer)):
+            seeds = [int(one) for one in seed]
+            if len(seeds) != self.num_envs:
+                raise ValueError(f"seed: {len(seeds)} of them for {self.num_envs} environments")
+        else:
+            seeds = [_engine.World.episode_seed(self.seed, i) for i in range(self.num_envs)]
+        self._world.reset(list(enumerate(seeds)), text)
+        self._begin(range(self.num_envs))
+        self._actions[:] = np.nan if self._actions.dtype.kind == "f" else -1
+
+    def step(self) -> None:
+        """Lets the policy act once, and refreshes `infos`. Environments whose episode is over begin the next one instead."""
+        if self.policy is None:
+            raise RuntimeError("World.step: no policy; call set_policy first")
+        if self.seed is None:
+            self.reset()
+        over = self.terminateds | self.truncateds
+        active = ~over
+        if active.any():
+            self._act(self.policy, active)
+            self._world.advance(active.tolist())
+        if over.any():
+            slots = np.flatnonzero(over).tolist()
+            for slot in slots:
+                self._episodes[slot] = self._next_episode
+                self._next_episode += 1
+            starts = [(slot, _engine.World.episode_seed(self.seed, self._episodes[slot])) for slot in slots]
+            self._world.reset(starts, _options.reset(self._options, self.spec["variation"]))
+            self._begin(slots)
+
+    def snapshot(self, index: int = 0) -> bytes:
+        """The full state of an environment, randomness included."""
+        return self._world.snapshot(index)
+
+    def restore(self, state: bytes, index: int = 0) -> None:
+        """Puts a state back; what follows equals what followed the snapshot."""
+        self._world.restore(index, state)
+
+    def _begin(self, slots: Sequence[int]) -> None:
+        self._fresh[list(slots)] = True
+        for policy, actor in self._actors.values():
+            if policy is self.policy:
+                for slot in slots:
+                    self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
+
+    def _act(self, policy: Any, active: np.ndarray) -> None:
+        actor = self._actor(policy)
+        if actor is None:
+            infos = {**self.infos, "_needs_flush": self._fresh.copy(), "_active": active}
+            self._actions[:] = self._asked(policy, infos, active)
+        else:
+            self._world.ask(actor, active.tolist())
+        self._fresh[:] = False
+
+    def _ask(self, policy: Any) -> np.ndarray:
+        """What a policy of the engine does now."""
+        active = ~(self.terminateds | self.truncateds)
+        self._world.ask(self._actor(policy), active.tolist())
+        return self._actions.reshape(self.envs.action_space.shape).copy()
+
+    def _asked(self, policy: Any, infos: dict[str, Any], active: np.ndarray) -> np.ndarray:
+        """What a policy of Python's returns, as the engine's actions."""
+        ask = getattr(policy, "get_action", None) or policy.get_actions
+        given = ask(infos)
+        name = type(policy).__name__
+        if given is None:
+            raise TypeError(f"{name}.get_action returned None; expected actions of shape {self.envs.action_space.shape}")
+        given = given.detach().cpu().numpy() if hasattr(given, "detach") else np.asarray(given)
+        want = self._actions
+        if given.size != want.size or given.shape[:1] != want.shape[:1]:
+            expected = self.envs.action_space.shape
+            raise ValueError(f"{name}.get_action: got actions of shape {given.shape}, expected {expected}")
+        given = given.reshape(want.shape)
+        if given.dtype.kind == "f" and not np.isfinite(given[active]).all():
+            raise ValueError(f"{name}.get_action: returned actions that are not finite: {given[active]}")
+        if want.dtype.kind != "f":
+            given = np.nan_to_num(given, nan=0)
+        return np.ascontiguousarray(given, dtype=want.dtype)
+
+    def _actor(self, policy: Any) -> Any:
+        """A policy as one of the engine's; none for one of Python's."""
+        known = self._actors.get(id(policy))
+        if known is not None and known[0] is policy:
+            return known[1]
+        make = getattr(policy, "_actor", None)
+        actor = make(self) if make is not None else None
+        if actor is not None:
+            self._actors[id(policy)] = (policy, actor)
+            for slot in range(self.num_envs):
+                self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
+        return actor
+
+    def _forget(self, policy: Any) -> None:
+        self._actors.pop(id(policy), None)
+
+    def _playing(self, policy: Any) -> Any:
+        """A policy for a long run: one of the engine's, or one that calls Python."""
+        actor = self._actor(policy)
+        if actor is not None:
+            return actor
+
+        def call(infos: dict[str, Any], active: np.ndarray, fresh: np.ndarray) -> np.ndarray:
+            infos |= {"_needs_flush": fresh, "_active": active, "action": self.infos["action"]}
+            if "goal" not in self.infos:
+                infos.pop("goal", None)
+            return self._asked(policy, infos, active)
+
+        return _engine.Actor.calling(self._world, call)
+
+    # Long runs.
+
+    def collect(
+        self,
+        path: str | Path | None = None,
+        episodes: int = 0,
+        seed: int | None = None,
+        options: Mapping[str, Any] | None = None,
+        format: str | None = None,
+        writer: Any = None,
+        progress: bool = True,
+        *,
+        dataset_path: str | Path | None = None,
+        policy: Any = None,
+        mode: str = "error",
+        codec: str | None = None,
+        goal: bool = False,
+    ) -> dict[str, int]:
+        """Plays episodes with the policy and stores them.
+
+        Args:
+            path: Where to: a path, a URI of an object store, or a name under `$STABLEWM_HOME/datasets`. `dataset_path` is another name
+                for it.
+            episodes: How many.
+            seed: What decides them, together with their numbers; drawn for `None`.
+            options: Factors to sample (`variation`) and to pin (`variation_values`).
+            format: One of `swm.data.list_formats()`; what the path's ending says, or Lance, for `None`.
+            writer: Instead of a path: an object with `write_episode(dict of arrays)`, such as `swm.data.ReplayBuffer`.
+            progress: Whether to show how far it is.
+            policy: Who acts, instead of `set_policy`'s.
+            mode: If there is a dataset already: `"error"` refuses, `"overwrite"` replaces it, `"append"` adds `episodes`
+                more, `"resume"` plays on until it has `episodes`.
+            codec: How pictures are stored: `"qoi"` (lossless), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
+            goal: Whether to store the picture of the goal with every row.
+
+        Returns:
+            `episodes` in the dataset, `added` ones, environment `steps`. An interrupt or an error keeps what is finished.
+        """
+        path = dataset_path if path is None else path
+        if (path is None) == (writer is None):
+            raise ValueError("World.collect: give a path, or a writer")
+        if mode not in ("error", "overwrite", "append", "resume"):
+            raise ValueError(f"mode: {mode!r}; expected 'error', 'overwrite', 'append' or 'resume'")
+        if int(episodes) < 1:
+            raise ValueError(f"episodes: {episodes}; expected at least 1")
+        policy = self._chosen(policy)
+        if writer is None and format is None:
+            format = _ENDINGS.get(Path(str(path)).suffix)
+        if writer is None and format is not None and format not in _engine.formats():
+            from .data import get_format
+
+            writer = get_format(format).open_writer(path)
+        config = {
+            "episodes": int(episodes),
+            "seed": _drawn() if seed is None else int(seed),
+            "variation": _options.variation(_varied(options), self.spec["variation"]),
+            "policy": _name(policy),
+            "goal": bool(goal),
+            "first": 0,
+            "wrappers": [{"id": id, "settings": settings} for id, settings in self._wrapping],
+        }
+        if writer is not None:
+            return self._collect_into(writer, policy, config, progress)
+        if mode == "append":
+            config["episodes"] += _engine.World.stored(str(path), format) or 0
+        engine_mode = {"error": "create", "resume": "append"}.get(mode, mode)
+        return self._collect(policy, str(path), format, engine_mode, codec, config, progress)
+
+    def _collect(
+        self, policy: Any, path: str, format: str | None, mode: str, codec: str | None, config: dict, progress: bool
+    ) -> dict[str, int]:
+        with _progress.bar("collect", config["episodes"], progress) as bar:
+            outcome = self._world.collect(
+                self._playing(policy), path, format, mode, _codec(codec), json.dumps(config), bar
+            )
+        self._settle()
+        return dict(zip(("episodes", "added", "steps"), outcome, strict=True))
+
+    def _collect_into(self, writer: Any, policy: Any, config: dict, progress: bool) -> dict[str, int]:
+        """Collects into a folder of its own first, so that every writer gets the very episodes a dataset would hold."""
+        from .data import load_dataset
+
+        with tempfile.TemporaryDirectory(prefix="swm-collect-") as folder:
+            path = str(Path(folder) / "episodes.lance")
+            try:
+                outcome = self._collect(policy, path, None, "create", None, config, progress)
+            finally:
+                if Path(path).exists():
+                    stored = load_dataset(path, backend="numpy")
+                    with writer as opened:
+                        for episode in range(stored.num_episodes):
+                            opened.write_episode(stored.load_episode(episode))
+        return outcome
+
+    def evaluate(
+        self,
+        episodes: int | None = None,
+        seed: int | None = None,
+        options: Mapping[str, Any] | None = None,
+        video: str | Path | None = None,
+        reset_mode: str | None = None,
+        dataset: Any = None,
+        episodes_idx: Sequence[int] | None = None,
+        start_steps: Sequence[int] | None = None,
+        goal_offset: int | None = None,
+        eval_budget: int | None = None,
+        callables: Any = None,
+        *,
+        policy: Any = None,
+        protocol: str = "strict",
+        hold: int = 1,
+        floor: bool = True,
+        videos: int | None = None,
+        condition: str | None = None,
+        progress: bool = True,
+    ) -> Metrics:
+        """Says how often the policy reaches its goals, beside the random floor on the same starts.
+
+        Args:
+            episodes: How many (50, or as many as `episodes_idx` has).
+            seed: What decides starts, goals, factors and plans; drawn for `None`.
+            options: Factors to sample (`variation`) and to pin (`variation_values`).
+            video: A folder for videos of the first episodes.
+            dataset: Take starts and goals from a dataset: a `swm.data.Dataset`, its path, URI or name.
+            episodes_idx, start_steps: Which episodes and steps of it; chosen by the seed for `None`.
+            goal_offset: Steps from a start to its goal (25).
+            eval_budget: Steps an episode may take; the world's own, or 50 from a dataset.
+            callables: How the reference's environments are put into a state; ours know that by themselves.
+            policy: Who acts, instead of `set_policy`'s.
+            protocol: `"strict"`: starts that are solved already do not count, and success means that the goal is satisfied;
+                `"compat"`: counts as the Python package stable-worldmodel 0.1.1 does.
+            hold: Steps in a row that must satisfy the goal (strict).
+            floor: Whether to play the same starts at random, too.
+            videos: Episodes to film, where `video` is given (all).
+            condition: What was shifted, in words, for reports.
+        """
+        if reset_mode not in (None, "auto", "wait"):
+            raise ValueError(f"reset_mode: {reset_mode!r}; expected 'auto' or 'wait' (it decides nothing here)")
+        if protocol not in ("strict", "compat"):
+            raise ValueError(f"protocol: {protocol!r}; expected 'strict' or 'compat'")
+        policy = self._chosen(policy)
+        picks = None
+        if dataset is not None:
+            dataset = str(getattr(dataset, "path", dataset))
+            goal_offset = 25 if goal_offset is None else int(goal_offset)
+            eval_budget = 50 if eval_budget is None else int(eval_budget)
+            if (episodes_idx is None) != (start_steps is None):
+                raise ValueError("episodes_idx, start_steps: give both, or none of them")
+            if episodes_idx is not None and start_steps is not None:
+                picks = [[int(e), int(s)] for e, s in zip(episodes_idx, start_steps, strict=True)]
+                episodes = len(picks)
+        elif episodes_idx is not None or start_steps is not None or goal_offset is not None:
+            raise ValueError("episodes_idx, start_steps, goal_offset: they choose from a dataset; give dataset=…")
+        episodes = 50 if episodes is None else int(episodes)
+        variation = _options.variation(_varied(options), self.spec["variation"])
+        config = {
+            "episodes": episodes,
+            "seed": _drawn() if seed is None else int(seed),
+            "variation": variation,
+            "condition": condition or _describe(variation),
+            "budget": eval_budget,
+            "counting": {"strict": {"hold": int(hold)}} if protocol == "strict" else {"compat": {"envs": self.num_envs}},
+            "picks": picks,
+            "goal_offset": goal_offset or 0,
+        }
+        acting: list[tuple[str, Any]] = [(_name(policy), self._playing(policy))]
+        if floor and acting[0][0] != "random":
+            acting.append(("random", _engine.Actor.random(self._world, None)))
+        runs = []
+        for name, actor in acting:
+            filmed = None
+            if video is not None and not runs:
+                folder = Path(video)
+                folder.mkdir(parents=True, exist_ok=True)
+                filmed = [str(folder), "episode", episodes if videos is None else int(videos)]
+            given = json.dumps({**config, "policy": name, "videos": filmed})
+            with _progress.bar(f"evaluate {name}", episodes, progress) as bar:
+                runs.append(json.loads(self._world.evaluate(actor, given, dataset, bar)))
+        self._settle()
+        if hasattr(policy, "plans"):
+            policy.plans = json.loads(acting[0][1].take_plans())
+        return Metrics._of(self, config, runs, dataset)
+
+    def _chosen(self, policy: Any) -> Any:
+        if policy is not None and policy is not self.policy:
+            self.set_policy(policy)
+        if self.policy is None:
+            raise RuntimeError("World: no policy; call set_policy, or give policy=…")
+        return self.policy
+
+    def _settle(self) -> None:
+        """After a long run, loops of one's own begin anew."""
+        self.seed = None
+        self._actors.clear()
+
+
+class EnvPool:
+    """What a policy sees of a world: how many environments there are, and their spaces."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+
+    @property
+    def num_envs(self) -> int:
+        """How many environments."""
+        return self._world.num_envs
+
+    @cached_property
+    def single_action_space(self) -> spaces.Space:
+        """The action space of one environment."""
+        return swm_spaces.from_description(self._world.spec["action_space"])
+
+    @cached_property
+    def action_space(self) -> spaces.Space:
+        """The action space of all environments together."""
+        return batch_space(self.single_action_space, self.num_envs)
+
+    @cached_property
+    def single_observation_space(self) -> spaces.Space:
+        """The observation space of one environment."""
+        return swm_spaces.from_description(self._world.spec["observation_space"])
+
+    @cached_property
+    def observation_space(self) -> spaces.Space:
+        """The observation space of all environments together."""
+        return batch_space(self.single_observation_space, self.num_envs)
+
+    @cached_property
+    def variation_space(self) -> swm_spaces.Dict:
+        """The factors of variation."""
+        return swm_spaces.variation_space(self._world.spec["variation"], self._world.spec["sampling_order"])
+
+    @property
+    def single_variation_space(self) -> swm_spaces.Dict:
+        """The same."""
+        return self.variation_space
+
+    @property
+    def seeds(self) -> np.ndarray:
+        """What the environments were reset with last."""
+        seed, episodes = self._world.seed or 0, self._world._episodes
+        return np.array([_engine.World.episode_seed(seed, episode) for episode in episodes], dtype=np.int64)
+
+
+class Metrics(dict):
+    """What an evaluation found.
+
+    Keys: `success_rate` in percent; `interval`, its 95 % Wilson interval; `random_success_rate` and `random_interval`, the
+    floor's; `episode_successes`, `seeds` and `steps`, one an episode; `solved_at_start`, starts that needed no policy;
+    `time_to_goal`, steps among successes; `plan_seconds`, of policies that plan; `videos`.
+    """
+
+    results: dict[str, Any]
+
+    @classmethod
+    def _of(cls, world: World, config: dict[str, Any], runs: list[dict[str, Any]], dataset: str | None) -> Metrics:
+        run, *floors = runs
+        played = run["episodes"]
+        metrics = cls(
+            success_rate=_percent(run["success"]["rate"]),
+            interval=tuple(_percent(run["success"][side]) for side in ("low", "high")),
+            episode_successes=np.array([episode["success"] for episode in played], dtype=bool),
+            seeds=np.array([episode["seed"] for episode in played], dtype=np.int64),
+            steps=np.array([episode["steps"] for episode in played], dtype=np.int64),
+            solved_at_start=run["solved_at_start"],
+            time_to_goal=run["time_to_goal"],
+            plan_seconds=run["timing"]["plan_seconds"],
+            seed=config["seed"],
+            videos=run["videos"],
+        )
+        if floors:
+            floor = floors[0]["success"]
+            metrics["random_success_rate"] = _percent(floor["rate"])
+            metrics["random_interval"] = tuple(_percent(floor[side]) for side in ("low", "high"))
+        manifest = {
+            "kind": "evaluate",
+            "swm_version": _engine.__version__,
+            "libraries": json.loads(world._world.libraries()),
+            "seed": config["seed"],
+            "config": {**config, "env": world.env_name, "num_envs": world.num_envs, "dataset": dataset, "front": "python"},
+            "hashes": {},
+            "device": "cpu",
+        }
+        metrics.results = {
+            "manifest": manifest,
+            "env": world.env_name,
+            "protocol": "episodic" if dataset is None else "dataset",
+            "counting": config["counting"],
+            "runs": [*floors, run],
+            "comparisons": [],
+        }
+        return metrics
+
+    def save(self, path: str | Path = "results.json") -> Path:
+        """Writes `results.json`, which `swm report` makes a page of."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(self.results, indent=2))
+        return path
+
+    def __str__(self) -> str:
+        low, high = self["interval"]
+        words = f"{self['success_rate']:.1f} % [{low:.0f}, {high:.0f}] of {len(self['seeds'])} episodes"
+        if "random_success_rate" in self:
+            low, high = self["random_interval"]
+            words += f", at random {self['random_success_rate']:.1f} % [{low:.0f}, {high:.0f}]"
+        return words
+
+
+def _percent(rate: float | None) -> float:
+    return math.nan if rate is None else 100.0 * rate
+
+
+def _drawn() -> int:
+    """A seed nobody chose."""
+    return secrets.randbits(32)
+
+
+def _name(policy: Any) -> str:
+    return str(getattr(policy, "type", None) or type(policy).__name__)
+
+
+def _varied(options: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
+    fixed = [name for name in ("state", "goal_state") if (options or {}).get(name) is not None]
+    if fixed:
+        raise ValueError(f"options: {fixed} would be the same in every episode; give them to World.reset")
+    return options
+
+
+def _describe(variation: Mapping[str, Any]) -> str:
+    pinned = [f"{key} = {value}" for key, value in variation["variation_values"].items()]
+    return ", ".join([*(variation["variation"] or []), *pinned]) or "in distribution"
+
+
+def _codec(name: str | None) -> str | None:
+    if name is None:
+        return None
+    kind, _, quality = name.partition("-")
+    if kind == "jpeg":
+        return json.dumps({"jpeg": {"quality": int(quality or 95)}})
+    if kind not in ("qoi", "png") or quality:
+        raise ValueError(f"codec: {name!r}; expected 'qoi', 'png', 'jpeg' or 'jpeg-QUALITY'")
+    return json.dumps(kind)

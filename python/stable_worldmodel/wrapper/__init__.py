@@ -1,0 +1,41 @@
+"""Wrappers: what is put around environments. Those of `visual` change pictures."""
+
+from .visual import (
+    BlurWrapper,
+    ChromaKeyWrapper,
+    ColorJitterWrapper,
+    CutoutWrapper,
+    GrayscaleWrapper,
+    MovingPatchWrapper,
+    NoiseWrapper,
+    OcclusionWrapper,
+    RandomConvWrapper,
+    RandomShiftWrapper,
+    ResolutionWrapper,
+    VisualWrapper,
+    constant,
+    cosine,
+    exponential,
+    linear,
+    sinusoidal,
+)
+
+__all__ = [
+    "BlurWrapper",
+    "ChromaKeyWrapper",
+    "ColorJitterWrapper",
+    "CutoutWrapper",
+    "GrayscaleWrapper",
+    "MovingPatchWrapper",
+    "NoiseWrapper",
+    "OcclusionWrapper",
+    "RandomConvWrapper",
+    "RandomShiftWrapper",
+    "ResolutionWrapper",
+    "VisualWrapper",
+    "constant",
+    "cosine",
+    "exponential",
+    "linear",
+    "sinusoidal",
+]

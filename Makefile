@@ -8,16 +8,22 @@ CACHE := $(HOME)/.cache/swm
 VENV := $(CACHE)/venv-formats-1
 # What 3-D worlds need of others (`swm assets`), one copy for every checkout on the machine.
 export SWM_ASSETS ?= $(CACHE)/assets
+# What users of the Python package bring along: PyTorch, Gymnasium, Stable-Baselines3, the Arcade Learning Environment.
+PYTHON_VENV := $(CACHE)/venv-python-1
+WHEELS := $(CARGO_TARGET_DIR)/wheels
+# Worker processes of Gymnasium environments run in it.
+export SWM_PYTHON ?= $(PYTHON_VENV)/bin/python
 SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test check build gpu assets setup setup-python reference bench clean
+.PHONY: help demo test test-python check build wheel gpu assets setup setup-python reference bench clean
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
 	@echo 'make test       all checks and all tests'
 	@echo 'make build      the swm binary: $(SWM)'
+	@echo 'make wheel      the Python package: $(WHEELS)'
 	@echo 'make gpu        the same with models on a GPU through Vulkan: $(CARGO_TARGET_DIR)-gpu/release/swm'
 	@echo 'make assets     MuJoCo, its models and meshes, into $(SWM_ASSETS)'
 	@echo 'make bench      our benchmarks, against the reference where `make reference` installed it'
@@ -25,8 +31,16 @@ help:
 demo: build
 	$(SWM) demo
 
-test: check setup-python assets
+test: check setup-python assets test-python
 	SWM_LANCE_PYTHON=$(VENV)/bin/python $(CARGO) test --release --workspace
+
+# The wheel in an environment of its own with nothing but what it asks for, then its tests beside PyTorch and others.
+test-python: wheel assets
+	rm -rf $(CACHE)/venv-bare && python3 -m venv $(CACHE)/venv-bare
+	$(CACHE)/venv-bare/bin/python -m pip install --quiet $(WHEELS)/*.whl
+	$(CACHE)/venv-bare/bin/python python/tests/bare.py
+	$(PYTHON_VENV)/bin/python -m pip install --quiet --force-reinstall --no-deps $(WHEELS)/*.whl
+	cd python/tests && $(PYTHON_VENV)/bin/python -m pytest -q
 
 check: setup
 	$(CARGO) xtask check
@@ -34,6 +48,12 @@ check: setup
 # With the tests, whose needs switch on features of shared dependencies: so `make test` finds them compiled.
 build: setup
 	$(CARGO) build --release --workspace --bins --tests
+
+# After `build`, whose compiled libraries it uses again (python/Cargo.toml says how).
+wheel: build $(PYTHON_VENV)/ready
+	@rm -rf $(WHEELS)
+	$(PYTHON_VENV)/bin/maturin build --release --manifest-path python/Cargo.toml --out $(WHEELS) --compatibility linux \
+	  --auditwheel skip --interpreter $(PYTHON_VENV)/bin/python
 
 # The program with models on a GPU through Vulkan, in a folder of its own: other features compile other libraries.
 gpu: setup
@@ -59,6 +79,7 @@ setup:
 	done; \
 	[ -e /usr/include/google/protobuf/any.proto ] || missing="$$missing libprotobuf-dev"; \
 	python3 -m pip --version >/dev/null 2>&1 || missing="$$missing python3-pip"; \
+	python3 -c 'import ensurepip, venv' 2>/dev/null || missing="$$missing python3-venv"; \
 	for package in $(PACKAGES); do \
 	  dpkg-query -W -f='$${Status}' $$package 2>/dev/null | grep -q 'ok installed' || missing="$$missing $$package"; \
 	done; \
@@ -68,12 +89,16 @@ setup:
 	fi
 	@$(CARGO) fmt --version >/dev/null 2>&1 && $(CARGO) clippy --version >/dev/null 2>&1 || rustup component add rustfmt clippy
 
-setup-python: $(VENV)/ready
+setup-python: $(VENV)/ready $(PYTHON_VENV)/ready
 
-$(VENV)/ready:
+$(PYTHON_VENV)/ready: python/tests/requirements.txt | setup
 	@mkdir -p $(CACHE)
-	@python3 -c 'import ensurepip, venv' 2>/dev/null || { $(SUDO) apt-get update -qq; \
-	  DEBIAN_FRONTEND=noninteractive $(SUDO) apt-get install -y -qq --no-install-recommends python3-venv; }
+	python3 -m venv --clear $(PYTHON_VENV)
+	$(PYTHON_VENV)/bin/python -m pip install --quiet -r python/tests/requirements.txt
+	touch $@
+
+$(VENV)/ready: | setup
+	@mkdir -p $(CACHE)
 	python3 -m venv --clear $(VENV)
 	$(VENV)/bin/python -m pip install --quiet pylance==14.0.2 numpy h5py==3.16.0 hdf5plugin==7.1.0 pillow
 	touch $@

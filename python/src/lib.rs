@@ -5,12 +5,14 @@
 //! - [`arrays`]: batches as numpy arrays, and back.
 //! - [`world`], [`policy`]: many environments at once and who acts in them.
 //! - [`cost`], [`solver`], [`model`]: models of Python's to plan in, planning, models of our own.
+//! - [`gym`]: environments of others, in this interpreter.
 //! - [`env`](mod@env), [`pictures`]: one environment, and visual wrappers, for Gymnasium.
 
 mod arrays;
 mod cost;
 mod env;
 mod errors;
+mod gym;
 mod listing;
 mod model;
 mod pictures;
@@ -25,6 +27,8 @@ use pyo3::prelude::*;
 mod _engine {
     #[pymodule_export]
     use super::env::NativeEnv;
+    #[pymodule_export]
+    use super::gym::bridge;
     #[pymodule_export]
     use super::listing::{command, envs, formats, home, solvers, spec, wrappers};
     #[pymodule_export]

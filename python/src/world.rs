@@ -2,6 +2,7 @@
 
 use crate::arrays;
 use crate::errors::{foreign, json, raised, signals};
+use crate::gym::InProcess;
 use crate::policy::Actor;
 use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
@@ -16,6 +17,7 @@ use swm::core::{Env, Error, Key, ResetOptions, Snapshot, VariationRequest, View}
 use swm::data::{ImageCodec, WriteMode, WriteOptions};
 use swm::envs::wrappers::{GoalPicture, Stack, WRAPPERS};
 use swm::eval::world::{episode_key, reset_seed};
+use swm::gym::GymEnv;
 use swm::eval::{CollectConfig, Control, EvalConfig, Progress, Starts, Videos, WorldConfig};
 
 /// Many environments of one kind.
@@ -72,6 +74,32 @@ impl World {
         let world = py.detach(|| {
             let chosen = swm::ENVS.choose(&env)?;
             swm::eval::World::of(|| Ok(stack.wrap(chosen.env()?, goal)), config)
+        });
+        Ok(Self { world: Mutex::new(world.map_err(raised)?), envs })
+    }
+
+    /// Environments of this interpreter: `make` takes nothing and returns a `Bridge`.
+    #[staticmethod]
+    #[allow(clippy::too_many_arguments)]
+    fn foreign(
+        py: Python<'_>,
+        id: String,
+        make: Py<PyAny>,
+        envs: usize,
+        image: Option<(usize, usize)>,
+        max_episode_steps: Option<usize>,
+        threads: usize,
+        wrappers: &str,
+        wrap_goal: bool,
+    ) -> PyResult<Self> {
+        let (stack, goal) = stack(wrappers, wrap_goal)?;
+        let config = WorldConfig { envs, image, views: vec![], max_episode_steps, threads };
+        let world = py.detach(|| {
+            let made = || -> swm::core::Result<Box<dyn Env>> {
+                let make = Python::attach(|py| make.clone_ref(py));
+                Ok(stack.wrap(Box::new(GymEnv::new(&id, Box::new(InProcess::new(make)), 0)?), goal))
+            };
+            swm::eval::World::of(made, config)
         });
         Ok(Self { world: Mutex::new(world.map_err(raised)?), envs })
     }

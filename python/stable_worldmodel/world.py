@@ -41,6 +41,9 @@ class World:
         views: What is drawn besides: cameras, `depth`, `segmentation`, or `CAMERA:MODALITY`.
         wrap_goal: Whether visual wrappers change the picture of the goal, too.
         threads: Worker threads; as many as there are cores for 0. What comes out does not depend on it.
+        workers: Whether environments of others get a process each, instead of living in this interpreter: they then step in
+            parallel, are restarted when they crash, and must be importable there.
+        image_resample: How pictures of others' environments are resized: `"bilinear"`, or `"nearest"` for pixel art.
         **kwargs: Options of the environment.
 
     Attributes:
@@ -65,6 +68,7 @@ class World:
         views: Sequence[str] = (),
         wrap_goal: bool = False,
         threads: int = 0,
+        workers: bool = False,
         **kwargs: Any,
     ) -> None:
         if image_transform is not None or goal_transform is not None:
@@ -79,11 +83,18 @@ class World:
         image = (int(image_shape[0]), int(image_shape[1])) if add_pixels and image_shape is not None else None
         wrappers = [*(pre_wrappers or []), *(extra_wrappers or [])]
         drawn = engine_wrappers(wrappers)
-        if drawn is None or not self._is_native(env_name):
+        #: The Gymnasium environments behind it, where they live in this interpreter.
+        self.gym_envs: list[Any] = []
+        if drawn is None and workers:
+            raise ValueError("workers: wrappers of one's own cannot follow environments into other processes")
+        if drawn is None or not (workers or self._is_native(env_name)):
             from ._gym import open_world
 
-            self._world = open_world(self, env_name, kwargs, wrappers, image, max_episode_steps, image_resample, threads)
-            self._wrapping = []
+            name, *given = env_name.split(",")
+            settings = {**dict(word.split("=", 1) for word in given), **kwargs}
+            self._world, self.gym_envs, self._wrapping = open_world(
+                name, settings, self.num_envs, wrappers, image, max_episode_steps, image_resample, threads, wrap_goal
+            )
         else:
             self._wrapping = drawn
             self._world = _engine.World(

@@ -1,0 +1,65 @@
+import gymnasium
+import numpy as np
+import pytest
+
+from stable_worldmodel import spaces as swm_spaces
+
+
+def factors():
+    return swm_spaces.Dict(
+        {
+            "agent": swm_spaces.Dict(
+                {
+                    "color": swm_spaces.RGBBox(init_value=[255, 0, 0]),
+                    "x": swm_spaces.Box(0.0, 1.0, shape=(), init_value=0.25),
+                }
+            ),
+            "shape": swm_spaces.Discrete(4, init_value=1, constrain_fn=lambda shape: shape != 2),
+        }
+    )
+
+
+def test_a_space_has_a_default_a_value_and_a_condition():
+    space = factors()
+    assert space.names() == ["agent.color", "agent.x", "shape"]
+    assert space.sampling_order == ["agent", "agent.color", "agent.x", "shape"]
+    space.seed(0)
+    seen = set()
+    for _ in range(50):
+        space.update(["shape"])
+        seen.add(int(space.value["shape"]))
+    assert seen == {0, 1, 3}
+    assert space.value["agent"]["x"] == np.float32(0.25)
+    space.reset()
+    assert space.value["shape"] == 1
+
+
+def test_groups_are_sampled_whole_and_values_pinned():
+    space = factors()
+    space.seed(1)
+    swm_spaces.reset_variation_space(space, 3, {"variation": ["agent"], "variation_values": {"shape": 3}})
+    first = space.value
+    assert first["agent"]["x"] != np.float32(0.25) and first["shape"] == 3
+    swm_spaces.reset_variation_space(space, 3, {"variation": ["agent"]})
+    assert space.value["agent"]["x"] == first["agent"]["x"] and space.value["shape"] == 1
+    swm_spaces.reset_variation_space(space, 4, {"variation": "all"})
+    assert space.check() and isinstance(space, gymnasium.spaces.Dict)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda s: s.update(["agent.colour"]), "agent.colour"),
+        (lambda s: s.set_value({"agent.x": 2.0}), "2.0"),
+        (lambda s: s.set_value({"shape": 2}), "constrain_fn"),
+        (lambda s: s.set_init_value({"shape": 9}), "9"),
+    ],
+)
+def test_what_is_not_allowed_says_so(change, words):
+    with pytest.raises(ValueError, match=words):
+        change(factors())
+
+
+def test_an_impossible_condition_ends():
+    with pytest.raises(RuntimeError, match="1000 tries"):
+        swm_spaces.Box(0, 1, shape=(2,), constrain_fn=lambda x: False).sample()

@@ -1,0 +1,221 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+
+import stable_worldmodel as swm
+from stable_worldmodel.wrapper.visual import GrayscaleWrapper, NoiseWrapper, linear
+
+
+def rooms(**more):
+    return swm.World("swm/TwoRoom-v1", **{"num_envs": 3, "image_shape": (32, 32), **more})
+
+
+class Zero(swm.policy.BasePolicy):
+    """A policy of Python's."""
+
+    def __init__(self, value=0.0):
+        super().__init__()
+        self.value, self.fresh = value, 0
+
+    def get_action(self, infos, **kwargs):
+        self.fresh += int(infos.get("_needs_flush", np.zeros(1)).sum())
+        return np.full(self.env.action_space.shape, self.value, dtype=np.float32)
+
+
+def test_infos_are_views_that_every_step_writes():
+    world = rooms()
+    world.set_policy(swm.policy.RandomPolicy(seed=1))
+    world.reset(seed=0)
+    pixels, state = world.infos["pixels"], world.infos["state"]
+    assert pixels.shape == (3, 1, 32, 32, 3) and pixels.dtype == np.uint8
+    assert world.infos["goal"].any() and np.isnan(world.infos["action"]).all()
+    before, kept = state.copy(), world.infos["pixels"]
+    world.step()
+    assert world.infos["pixels"] is kept and not np.array_equal(state, before)
+    assert world.rewards.shape == world.terminateds.shape == world.truncateds.shape == (3,)
+    assert world.infos["step_idx"].ravel().tolist() == [1, 1, 1]
+
+
+def test_an_episode_is_the_same_wherever_it_is_played():
+    def played(envs, threads):
+        world = rooms(num_envs=envs, threads=threads)
+        world.set_policy(swm.policy.RandomPolicy(seed=5))
+        world.reset(seed=3)
+        rows = []
+        for _ in range(10):
+            world.step()
+            rows.append({key: value[0].copy() for key, value in world.infos.items()})
+        return rows
+
+    for one, other in zip(played(1, 1), played(4, 2), strict=True):
+        for key, value in one.items():
+            assert np.array_equal(value, other[key], equal_nan=value.dtype.kind == "f"), key
+
+
+def test_episodes_go_on_and_begin_anew():
+    world = rooms(max_episode_steps=4)
+    world.set_policy(Zero())
+    world.reset(seed=0)
+    first = world.envs.seeds.copy()
+    for _ in range(4):
+        world.step()
+    assert world.truncateds.all()
+    world.step()
+    assert not world.truncateds.any() and (world.infos["step_idx"] == 0).all()
+    assert not set(first) & set(world.envs.seeds)
+
+
+def test_factors_are_sampled_and_pinned():
+    world = rooms()
+    world.set_policy(Zero())
+    names = world.variation_space.names()
+    assert "agent.color" in names
+    world.reset(seed=0, options={"variation": ["agent.color"], "variation_values": {"background.color": [0.1, 0.2, 0.9]}})
+    colours = [tuple(world.factors(i)["agent.color"]) for i in range(3)]
+    assert len(set(colours)) > 1
+    # Fractions of a colour are meant as such.
+    assert world.factors(0)["background.color"] == [26.0, 51.0, 230.0]
+    with pytest.raises(ValueError, match="agent.color"):
+        world.reset(options={"variation": ["agent.colour"]})
+    with pytest.raises(ValueError, match="variations"):
+        world.reset(options={"variations": ["all"]})
+
+
+def test_policies_of_python_and_of_the_engine_collect(tmp_path):
+    world = rooms(max_episode_steps=6)
+    policy = Zero(0.5)
+    world.set_policy(policy)
+    outcome = world.collect(tmp_path / "a.lance", episodes=5, seed=1, progress=False)
+    assert outcome == {"episodes": 5, "added": 5, "steps": 30} and policy.fresh >= 5
+    data = swm.data.load_dataset(str(tmp_path / "a.lance"), backend="numpy")
+    actions = data.get_col_data("action")
+    rows = np.tile([True] * 6 + [False], 5)
+    assert (actions[rows] == 0.5).all() and np.isnan(actions[~rows]).all()
+    # There is one already.
+    with pytest.raises(ValueError, match="there is one already"):
+        world.collect(tmp_path / "a.lance", episodes=5, seed=1, progress=False)
+    more = world.collect(tmp_path / "a.lance", episodes=2, seed=1, mode="append", progress=False)
+    assert more == {"episodes": 7, "added": 2, "steps": 12}
+    again = world.collect(tmp_path / "b.h5", episodes=7, seed=1, progress=False)
+    assert again["episodes"] == 7
+    one, other = (swm.data.load_dataset(str(tmp_path / name), backend="numpy") for name in ("a.lance", "b.h5"))
+    assert np.array_equal(one.get_col_data("state"), other.get_col_data("state"))
+
+
+def test_evaluation_tells_intervals_and_the_floor(tmp_path):
+    world = rooms()
+    metrics = world.evaluate(
+        policy=swm.policy.ExpertPolicy(), episodes=12, seed=2, video=tmp_path / "videos", videos=2, progress=False
+    )
+    assert metrics["success_rate"] > metrics["random_success_rate"]
+    low, high = metrics["interval"]
+    assert low < metrics["success_rate"] <= high and len(metrics["episode_successes"]) == 12
+    assert len(list((tmp_path / "videos").glob("*.mp4"))) == 2
+    again = rooms(num_envs=5).evaluate(policy=swm.policy.ExpertPolicy(), episodes=12, seed=2, progress=False)
+    assert np.array_equal(metrics["steps"], again["steps"]) and np.array_equal(metrics["seeds"], again["seeds"])
+    saved = json.loads(metrics.save(tmp_path / "results.json").read_text())
+    assert [run["policy"] for run in saved["runs"]] == ["random", "expert"]
+
+
+def test_starts_and_goals_of_a_dataset(tmp_path):
+    world = rooms()
+    world.set_policy(swm.policy.ExpertPolicy())
+    world.collect(tmp_path / "d.lance", episodes=4, seed=0, progress=False)
+    dataset = swm.data.load_dataset(str(tmp_path / "d.lance"))
+    metrics = world.evaluate(
+        dataset=dataset, episodes_idx=[0, 1, 2], start_steps=[0, 2, 1], goal_offset=5, eval_budget=30, progress=False
+    )
+    assert len(metrics["seeds"]) == 3 and metrics.results["protocol"] == "dataset"
+    with pytest.raises(ValueError, match="rows"):
+        world.evaluate(dataset=dataset, episodes_idx=[0], start_steps=[9999], goal_offset=5, progress=False)
+
+
+def test_visual_wrappers_run_in_the_engine():
+    plain, noisy = (
+        rooms(extra_wrappers=wrappers)
+        for wrappers in ([], [partial(NoiseWrapper, std=linear(8, 30, 10)), GrayscaleWrapper])
+    )
+    for world in (plain, noisy):
+        world.reset(seed=0)
+    grey = noisy.infos["pixels"]
+    assert not np.array_equal(grey, plain.infos["pixels"])
+    assert np.array_equal(grey[..., 0], grey[..., 1]) and np.array_equal(noisy.infos["goal"], plain.infos["goal"])
+    with pytest.raises(ValueError, match="std"):
+        rooms(extra_wrappers=[partial(NoiseWrapper, std=-3)])
+    with pytest.raises(TypeError, match="function of one's own"):
+        rooms(extra_wrappers=[partial(NoiseWrapper, std=lambda step: 3.0)])
+
+
+def test_a_world_goes_back_to_what_it_was():
+    world = rooms(num_envs=1)
+    world.set_policy(Zero(0.7))
+    world.reset(seed=0)
+    state, before = world.snapshot(), world.infos["state"].copy()
+    world.step()
+    after = world.infos["state"].copy()
+    world.restore(state)
+    assert np.array_equal(world.infos["state"], before)
+    world.step()
+    assert np.array_equal(world.infos["state"], after)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "words"),
+    [
+        (lambda: swm.World("swm/PushTT-v1", image_shape=(8, 8)), ValueError, "swm/PushT-v1"),
+        (lambda: rooms(num_envs=0), ValueError, "num_envs"),
+        (lambda: rooms(image_shape=(0, 8)), ValueError, "at least one pixel"),
+        (lambda: rooms().step(), RuntimeError, "set_policy"),
+        (lambda: rooms().set_policy(3), TypeError, "get_action"),
+        (lambda: rooms().evaluate(policy=Zero(), episodes=0), ValueError, "at least 1"),
+        (lambda: rooms().evaluate(policy=Zero(), protocol="loose"), ValueError, "compat"),
+        (lambda: rooms().evaluate(policy=swm.policy.ExpertPolicy("weakk")), ValueError, "weak"),
+        (lambda: rooms().evaluate(policy=Zero(), dataset="nothing"), FileNotFoundError, "nothing"),
+        (lambda: rooms().evaluate(policy=Zero(np.nan), episodes=1), ValueError, "not finite"),
+    ],
+)
+def test_wrong_words_get_clear_errors(make, error, words):
+    with pytest.raises(error, match=words):
+        make()
+
+
+def test_what_a_policy_raises_comes_back_as_it_was(tmp_path):
+    class Failing(Zero):
+        def get_action(self, infos, **kwargs):
+            if infos["step_idx"].max() >= 3:
+                raise KeyError("mine")
+            return super().get_action(infos)
+
+    world = rooms(max_episode_steps=3)
+    world.set_policy(Failing())
+    assert world.collect(tmp_path / "fine.lance", episodes=3, seed=0, progress=False)["episodes"] == 3
+    world = rooms(max_episode_steps=9)
+    with pytest.raises(KeyError, match="mine"):
+        world.collect(tmp_path / "not.lance", episodes=3, seed=0, policy=Failing(), progress=False)
+
+
+def test_ctrl_c_keeps_finished_episodes(tmp_path):
+    program = f"""
+import stable_worldmodel as swm
+world = swm.World("swm/PushT-v1", num_envs=2, image_shape=(64, 64), max_episode_steps=50)
+world.set_policy(swm.policy.RandomPolicy())
+print("ready", flush=True)
+try:
+    world.collect({str(tmp_path / "long.lance")!r}, episodes=1_000_000, seed=0, progress=False)
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+"""
+    child = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert child.stdout.readline().strip() == "ready"
+    time.sleep(1.5)
+    os.kill(child.pid, signal.SIGINT)
+    assert child.communicate(timeout=60)[0].strip() == "interrupted" and child.returncode == 0
+    data = swm.data.load_dataset(str(tmp_path / "long.lance"), backend="numpy")
+    assert data.num_episodes > 0 and set(np.asarray(data.lengths).tolist()) == {51}

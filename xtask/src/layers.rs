@@ -28,9 +28,9 @@ pub enum Rule {
 /// The rules of this workspace.
 pub const RULES: &[Rule] = &[
     Rule::Never {
-        crates: &["swm-core", "swm-envs", "swm-plan", "swm-report", "swm-raster"],
+        crates: &["swm-core", "swm-envs", "swm-gym", "swm-plan", "swm-report", "swm-raster"],
         forbidden: |name| ["burn", "lance", "mujoco", "ffmpeg"].iter().any(|family| of_family(name, family)),
-        words: "core, envs, plan, report and raster know no deep learning, dataset engine, MuJoCo or FFmpeg",
+        words: "core, envs, gym, plan, report and raster know no deep learning, dataset engine, MuJoCo or FFmpeg",
     },
     Rule::Never {
         crates: &[],
@@ -45,13 +45,18 @@ pub const RULES: &[Rule] = &[
     },
     Rule::Never {
         crates: &["swm-eval"],
-        forbidden: |name| ["swm-models", "swm-envs", "swm-mujoco"].contains(&name),
+        forbidden: |name| ["swm-models", "swm-envs", "swm-mujoco", "swm-gym"].contains(&name),
         words: "evaluation knows models and environments by their contracts only",
     },
     Rule::Only {
         users: &["swm"],
         crates: &["swm-envs", "swm-mujoco", "swm-models"],
         words: "only the facade knows concrete families",
+    },
+    Rule::Only {
+        users: &["swm", "swm-python"],
+        crates: &["swm-gym"],
+        words: "only the facade and the Python extension know Gymnasium",
     },
 ];
 
@@ -99,6 +104,7 @@ mod tests {
             ("swm-core", vec!["serde"]),
             ("swm-envs", vec!["swm-core"]),
             ("swm-mujoco", vec!["swm-core", "mujoco-rs"]),
+            ("swm-gym", vec!["swm-core"]),
             ("swm-plan", vec!["swm-core"]),
             ("swm-report", vec!["swm-core"]),
             ("swm-data", vec!["swm-core", "lance-file"]),
@@ -141,6 +147,7 @@ mod tests {
             ("swm-models", "swm-envs", "swm-models → swm-envs (only the facade"),
             ("swm-report", "swm-mujoco", "swm-report → swm-mujoco (only the facade"),
             ("swm-report", "swm-models", "swm-report → swm-models (only the facade"),
+            ("swm-data", "swm-gym", "swm-data → swm-gym (only the facade and"),
             (
                 "lance-file",
                 "datafusion-physical-plan",

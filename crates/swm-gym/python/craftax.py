@@ -1,0 +1,82 @@
+"""Craftax as Gymnasium environments, under the ids, spaces and sizes that stable-worldmodel's Python package gives them.
+
+Craftax computes in JAX: a pure function from a key, a state and an action to the next state. An environment here holds
+key and state. Symbolic variants can be drawn as well, by the renderer that makes the observations of the pixel ones.
+"""
+
+import importlib
+
+import gymnasium
+import jax
+import numpy as np
+from craftax.craftax_env import make_craftax_env_from_name
+from gymnasium import spaces
+
+# Our id: Craftax's own, the shape of an observation (its `observation_space` swaps height and width), and the limit of
+# steps that its parameters name.
+VARIANTS = {
+    'swm/CraftaxPixels-v1': ('Craftax-Pixels-v1', (130, 110, 3), 100_000),
+    'swm/CraftaxSymbolic-v1': ('Craftax-Symbolic-v1', (8268,), 100_000),
+    'swm/CraftaxClassicPixels-v1': ('Craftax-Classic-Pixels-v1', (63, 63, 3), 10_000),
+    'swm/CraftaxClassicSymbolic-v1': ('Craftax-Classic-Symbolic-v1', (1345,), 10_000),
+}
+
+
+def register():
+    """Makes the ids known to Gymnasium."""
+    for id, (name, shape, steps) in VARIANTS.items():
+        if id not in gymnasium.registry:
+            gymnasium.register(
+                id, Craftax, max_episode_steps=steps, kwargs={'name': name, 'shape': shape}, order_enforce=False
+            )
+
+
+class Craftax(gymnasium.Env):
+    """One world of Craftax."""
+
+    metadata = {'render_modes': ['rgb_array'], 'render_fps': 30}
+    libraries = ('craftax', 'jax')
+    # Scaled to the size of a picture without blending neighbours.
+    pixel_art = True
+
+    def __init__(self, name, shape, render_mode=None):
+        self.render_mode = render_mode
+        # The pool starts the next episode, not the environment.
+        env = make_craftax_env_from_name(name, auto_reset=False)
+        params = env.default_params
+        self.observation_space = spaces.Box(0.0, 1.0, shape, np.float32)
+        self.action_space = spaces.Discrete(env.num_actions)
+        self.pixels = len(shape) == 3
+        package = 'craftax.craftax_classic' if 'Classic' in name else 'craftax.craftax'
+        constants = importlib.import_module(f'{package}.constants')
+        renderer = importlib.import_module(f'{package}.renderer')
+        self.draw = jax.jit(renderer.make_craftax_pixel_renderer(constants.BLOCK_PIXEL_SIZE_AGENT))
+
+        @jax.jit
+        def begin(key):
+            kept, used = jax.random.split(key)
+            return env.reset(used, params), kept
+
+        @jax.jit
+        def go(key, state, action):
+            kept, used = jax.random.split(key)
+            return env.step(used, state, action, params), kept
+
+        self.begin, self.go = begin, go
+        self.key = jax.random.PRNGKey(0)
+
+    def reset(self, *, seed=None, options=None):
+        if seed is not None:
+            self.key = jax.random.PRNGKey(seed)
+        (observation, self.state), self.key = self.begin(self.key)
+        self.observation = np.asarray(observation, np.float32)
+        return self.observation, {}
+
+    def step(self, action):
+        (observation, self.state, reward, done, info), self.key = self.go(self.key, self.state, int(action))
+        self.observation = np.asarray(observation, np.float32)
+        return self.observation, float(reward), bool(done), False, {key: np.asarray(v) for key, v in info.items()}
+
+    def render(self):
+        picture = self.observation * 255.0 if self.pixels else np.asarray(self.draw(self.state))
+        return np.rint(np.clip(picture, 0.0, 255.0)).astype(np.uint8)

@@ -1,0 +1,132 @@
+//! The Python packages that environments need, pinned, in a virtual environment of their own.
+//!
+//! They live beside the other assets: in `$SWM_ASSETS`, else `$STABLEWM_HOME/assets`, else
+//! `~/.stable_worldmodel/assets`, under `python-gym`.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use swm_core::{Error, Result};
+
+/// A package, and what comes with it.
+pub struct Package {
+    /// The name `swm assets install` takes.
+    pub name: &'static str,
+    /// Its version.
+    pub version: &'static str,
+    /// What it is for, in a few words.
+    pub summary: &'static str,
+    /// The distribution that tells whether it is there.
+    distribution: &'static str,
+    /// What pip is asked for besides Gymnasium.
+    requirements: &'static [&'static str],
+}
+
+/// What all of them need; pygame draws Gymnasium's own environments.
+const GYMNASIUM: &[&str] = &["gymnasium==1.4.0", "pygame==2.6.1"];
+
+/// Everything that can be installed.
+pub const PACKAGES: &[Package] = &[
+    Package {
+        name: "gymnasium",
+        version: "1.4.0",
+        summary: "Gymnasium and its classic control environments, in a Python environment of ours",
+        distribution: "gymnasium",
+        requirements: &[],
+    },
+    Package {
+        name: "ale",
+        version: "0.12.1",
+        summary: "the Arcade Learning Environment: ALE/*",
+        distribution: "ale_py",
+        requirements: &["ale-py==0.12.1"],
+    },
+    Package {
+        name: "craftax",
+        version: "1.6.1",
+        summary: "Craftax on JAX: swm/Craftax*",
+        distribution: "craftax",
+        requirements: &["craftax==1.6.1", "jax==0.10.2"],
+    },
+];
+
+impl Package {
+    /// Where it is or would be.
+    pub fn folder(&self) -> PathBuf {
+        environment()
+    }
+
+    /// Whether this version is there.
+    pub fn is_installed(&self) -> bool {
+        let name = format!("{}-{}.dist-info", self.distribution, self.version);
+        let Ok(entries) = std::fs::read_dir(environment().join("lib")) else { return false };
+        entries.flatten().any(|entry| entry.path().join("site-packages").join(&name).is_dir())
+    }
+}
+
+/// Where assets live; `swm-mujoco` keeps its own in the same place.
+pub(crate) fn folder() -> PathBuf {
+    let set = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    let home = || Path::new(&std::env::var_os("HOME").unwrap_or_default()).join(".stable_worldmodel");
+    set("SWM_ASSETS").unwrap_or_else(|| set("STABLEWM_HOME").unwrap_or_else(home).join("assets"))
+}
+
+/// The virtual environment.
+fn environment() -> PathBuf {
+    folder().join("python-gym")
+}
+
+/// Its interpreter, whether it is there or not.
+pub(crate) fn python() -> PathBuf {
+    environment().join("bin").join("python")
+}
+
+/// The package of that name, if it is one of ours.
+pub fn get(name: &str) -> Option<&'static Package> {
+    PACKAGES.iter().find(|package| package.name == name)
+}
+
+/// Installs a package with pip, after making the virtual environment where there is none. Where it is.
+///
+/// # Errors
+/// When Python or pip fails.
+pub fn install(package: &Package) -> Result<PathBuf> {
+    let place = environment();
+    if !python().is_file() {
+        let mut make = Command::new("python3");
+        run("making a Python environment with `python3 -m venv`", make.args(["-m", "venv"]).arg(&place))?;
+    }
+    let mut pip = Command::new(python());
+    pip.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check"]);
+    pip.args(GYMNASIUM).args(package.requirements);
+    run(&format!("installing {} {} with pip", package.name, package.version), &mut pip)?;
+    Ok(place)
+}
+
+/// Asks pip whether what is installed fits together.
+///
+/// # Errors
+/// When the package is not there, or lacks something.
+pub fn verify(package: &Package) -> Result<()> {
+    let fix = || format!("`swm assets install {}` brings it", package.name);
+    if !package.is_installed() {
+        let what = format!("asset {} {}", package.name, package.version);
+        return Err(Error::config(what, format!("it is not installed in {}", environment().display()), fix()));
+    }
+    let mut pip = Command::new(python());
+    run(
+        &format!("checking {} ({})", package.name, fix()),
+        pip.args(["-m", "pip", "check", "--disable-pip-version-check"]),
+    )
+}
+
+/// Runs a command to its end.
+fn run(what: &str, command: &mut Command) -> Result<()> {
+    let output = command.output().map_err(|error| {
+        Error::external(what, format!("{error}; Python 3 must be installed (Debian: apt install python3-venv)"))
+    })?;
+    if output.status.success() {
+        return Ok(());
+    }
+    let said = [output.stdout, output.stderr].concat();
+    Err(Error::external(what, String::from_utf8_lossy(&said).trim()))
+}

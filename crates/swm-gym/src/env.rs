@@ -1,0 +1,445 @@
+//! [`GymEnv`]: a Gymnasium environment as a world.
+//!
+//! An episode is its seed, its options and the actions so far. That is what a snapshot holds, and what brings a world
+//! back whose worker is gone: a new one plays the episode again. So an environment that is not deterministic cannot be
+//! restored exactly.
+
+use crate::describe::head;
+use crate::picture::Scaler;
+use crate::{Description, Failure, Form, Request, Transport};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use swm_core::{
+    Action, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, RowMut, RowRef, Snapshot, Space,
+    Transition, VariationRequest,
+};
+
+/// How many lines of a traceback an error shows: the end, which names what was raised.
+const LINES: usize = 12;
+
+/// A Gymnasium environment.
+pub struct GymEnv {
+    transport: Box<dyn Transport>,
+    form: Arc<Form>,
+    /// How often a lost worker is replaced within one request.
+    restarts: usize,
+    stage: Stage,
+    /// None before the first reset and after an error.
+    episode: Option<Episode>,
+    factors: FactorValues,
+    /// Whether the picture in the memory is of now.
+    drawn: bool,
+    /// Whether somebody looks: then a step brings its picture along.
+    looked_at: bool,
+    scaler: Scaler,
+}
+
+/// How far the environment behind the transport is.
+#[derive(Clone, Copy, PartialEq)]
+enum Stage {
+    /// It is being made.
+    Begun,
+    /// It answers.
+    Ready,
+    /// It must be made anew.
+    Broken,
+}
+
+/// What decides everything so far.
+struct Episode {
+    /// The arguments of its reset, as JSON.
+    reset: String,
+    /// The bytes of its actions, one after the other.
+    actions: Vec<u8>,
+}
+
+/// What is asked for: as [`Request`], but of the episode as it is.
+#[derive(Clone, Copy, PartialEq)]
+enum Ask {
+    Reset,
+    /// The last of the episode's actions.
+    Step,
+    Render,
+}
+
+impl GymEnv {
+    /// A world over a transport, once its environment says what it is. A worker that is lost is replaced so many times
+    /// within one request.
+    ///
+    /// # Errors
+    /// When the environment cannot be made, or has actions or observations that no column can hold.
+    pub fn new(id: &str, mut transport: Box<dyn Transport>, restarts: usize) -> Result<Self> {
+        let mut lost = 0;
+        let description = loop {
+            match transport.describe() {
+                Ok(description) => break description,
+                Err(Failure::Lost(how)) if lost < restarts => {
+                    lost += 1;
+                    tracing::warn!("{id}: {how}; starting another worker ({lost} of {restarts})");
+                    transport.restart().map_err(|failure| explain(id, "making it", 0, failure))?;
+                }
+                Err(failure) => return Err(explain(id, "making it", lost, failure)),
+            }
+        };
+        let mut env = Self::like(Arc::new(Form::new(id, description)?), transport, restarts)?;
+        env.stage = Stage::Ready;
+        Ok(env)
+    }
+
+    /// A world of which another one told what it is: does not wait for its environment.
+    ///
+    /// # Errors
+    /// When the defaults of its factors contradict each other.
+    pub fn like(form: Arc<Form>, transport: Box<dyn Transport>, restarts: usize) -> Result<Self> {
+        let nothing = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
+        Ok(Self {
+            factors: form.spec.variation_space.resolve(&nothing, Key::new(0))?,
+            scaler: Scaler::new(form.pixel_art()),
+            transport,
+            form,
+            restarts,
+            stage: Stage::Begun,
+            episode: None,
+            drawn: false,
+            looked_at: false,
+        })
+    }
+
+    /// What worlds of this id share.
+    pub fn form(&self) -> &Arc<Form> {
+        &self.form
+    }
+
+    /// Asks, in a new environment with the same past where the old one is lost.
+    fn ask(&mut self, ask: Ask) -> Result<()> {
+        let mut lost = 0;
+        loop {
+            let answer = match lost {
+                0 => self.ready().and_then(|()| self.pass_on(ask)),
+                _ => self.replay(ask).and_then(|()| self.pass_on(ask)),
+            };
+            match answer {
+                Ok(()) => return Ok(()),
+                Err(Failure::Lost(how)) if lost < self.restarts => {
+                    lost += 1;
+                    self.stage = Stage::Broken;
+                    let (id, restarts) = (&self.form.spec.id, self.restarts);
+                    tracing::warn!("{id}: {how}; its episode is played again in a new worker ({lost} of {restarts})");
+                }
+                Err(failure) => {
+                    self.stage = Stage::Broken;
+                    self.episode = None;
+                    let what = match ask {
+                        Ask::Reset => "its reset",
+                        Ask::Step => "its step",
+                        Ask::Render => "its render",
+                    };
+                    return Err(explain(&self.form.spec.id, what, lost, failure));
+                }
+            }
+        }
+    }
+
+    /// Waits until the environment is made, anew if need be.
+    fn ready(&mut self) -> Result<(), Failure> {
+        if self.stage == Stage::Broken {
+            self.transport.restart()?;
+            self.stage = Stage::Begun;
+        }
+        if self.stage == Stage::Begun {
+            let description = self.transport.describe()?;
+            self.agree(&description)?;
+            self.stage = Stage::Ready;
+        }
+        Ok(())
+    }
+
+    /// Environments of one id are alike.
+    fn agree(&self, description: &Description) -> Result<(), Failure> {
+        if *description == self.form.description {
+            return Ok(());
+        }
+        Err(Failure::Refused(Error::config(
+            &self.form.spec.id,
+            "two environments of this id have other columns, spaces or pictures",
+            "what an environment observes must not change from one to the next",
+        )))
+    }
+
+    /// Brings a new environment to where the old one was before it was asked.
+    fn replay(&mut self, ask: Ask) -> Result<(), Failure> {
+        self.ready()?;
+        if ask == Ask::Reset {
+            return Ok(());
+        }
+        let Some(episode) = &self.episode else { return Ok(()) };
+        self.transport.call(Request::Reset(&episode.reset))?;
+        let n = self.form.action.len();
+        let past = episode.actions.len() - if ask == Ask::Step { n } else { 0 };
+        for action in episode.actions[..past].chunks_exact(n) {
+            self.transport.memory_mut()[self.form.action.clone()].copy_from_slice(action);
+            self.transport.call(Request::Step)?;
+        }
+        Ok(())
+    }
+
+    fn pass_on(&mut self, ask: Ask) -> Result<(), Failure> {
+        let Some(episode) = &self.episode else { return Ok(()) };
+        let request = match ask {
+            Ask::Reset => Request::Reset(&episode.reset),
+            Ask::Render => Request::Render,
+            Ask::Step => {
+                let place = self.form.action.clone();
+                let last = episode.actions.len() - place.len();
+                self.transport.memory_mut()[place].copy_from_slice(&episode.actions[last..]);
+                if self.looked_at { Request::DrawnStep } else { Request::Step }
+            }
+        };
+        self.transport.call(request)?;
+        self.drawn = matches!(request, Request::Render | Request::DrawnStep);
+        Ok(())
+    }
+
+    /// Starts an episode and reads its factors.
+    fn begin(&mut self, reset: String) -> Result<()> {
+        let mut actions = self.episode.take().map(|episode| episode.actions).unwrap_or_default();
+        actions.clear();
+        self.episode = Some(Episode { reset, actions });
+        self.drawn = false;
+        self.ask(Ask::Reset)?;
+        let numbers = self.transport.memory()[self.form.factors()].chunks_exact(size_of::<f64>());
+        let values: Vec<f64> = numbers.map(bytemuck::pod_read_unaligned).collect();
+        let space = &self.form.spec.variation_space;
+        let mut rest = &values[..];
+        let pinned = space.factors().iter().map(|factor| {
+            let (value, more) = rest.split_at(factor.space.len());
+            rest = more;
+            (factor.key.clone(), value.to_vec())
+        });
+        let request = VariationRequest { variation: Some(vec![]), variation_values: pinned.collect() };
+        self.factors = space.resolve(&request, Key::new(0))?;
+        Ok(())
+    }
+
+    /// Takes the action that was just added to the episode.
+    fn advance(&mut self) -> Result<()> {
+        self.drawn = false;
+        self.ask(Ask::Step)
+    }
+
+    /// The arguments of a reset; what the environment would not understand is an error here.
+    fn arguments(&self, seed: u64, options: &ResetOptions) -> Result<String> {
+        let id = &self.form.spec.id;
+        if options.state.is_some() || options.goal_state.is_some() {
+            return Err(Error::config(
+                format!("{id}, the state of a reset"),
+                "a Gymnasium environment starts where its seed says",
+                "choose the start by seed, or by its factors of variation if it has any",
+            ));
+        }
+        let space = &self.form.spec.variation_space;
+        let VariationRequest { variation, variation_values } = &options.variation;
+        let mut arguments = serde_json::json!({"seed": small(seed)});
+        if let Some(keys) = variation {
+            for key in keys {
+                space.select(key)?;
+            }
+            let all = keys.iter().any(|key| key == "all");
+            arguments["variation"] = if all { serde_json::json!(["all"]) } else { serde_json::json!(keys) };
+        }
+        if !variation_values.is_empty() {
+            for (key, value) in variation_values {
+                let known = space.factors().iter().map(|factor| factor.key.as_str());
+                let Some(place) = space.find(key) else {
+                    return Err(Error::unknown("factor of variation", key, known, "`swm fovs ENV` lists them"));
+                };
+                space.factors()[place].space.check(key, value)?;
+            }
+            arguments["variation_values"] = serde_json::json!(variation_values);
+        }
+        Ok(arguments.to_string())
+    }
+
+    /// A number of the head of the buffer; 0 before there is one.
+    fn number(&self, at: usize) -> f64 {
+        let bytes = self.transport.memory().get(at..at + 8);
+        bytes.map_or(0.0, bytemuck::pod_read_unaligned)
+    }
+
+    fn flag(&self, at: usize) -> bool {
+        self.transport.memory().get(at).is_some_and(|&byte| byte != 0)
+    }
+}
+
+/// A seed as Gymnasium environments take it: libraries below them want 31 bits. Those that fit stay as they are.
+fn small(seed: u64) -> u64 {
+    const BITS: u64 = (1 << 31) - 1;
+    if seed <= BITS { seed } else { (seed ^ (seed >> 31) ^ (seed >> 62)) & BITS }
+}
+
+/// A failure as an error of the platform.
+fn explain(id: &str, what: &str, lost: usize, failure: Failure) -> Error {
+    match failure {
+        Failure::Refused(error) => error,
+        Failure::Raised(traceback) => {
+            let lines: Vec<&str> = traceback.trim_end().lines().collect();
+            let end = &lines[lines.len().saturating_sub(LINES)..];
+            Error::external(format!("{id}: {what} raised"), end.join("\n"))
+        }
+        Failure::Lost(how) if lost == 0 => Error::external(format!("{id}: {what}"), how),
+        Failure::Lost(how) => {
+            Error::external(format!("{id}: {what} failed in {} workers, one after the other", lost + 1), how)
+        }
+    }
+}
+
+impl Env for GymEnv {
+    fn spec(&self) -> &EnvSpec {
+        &self.form.spec
+    }
+
+    fn reset(&mut self, seed: u64, options: &ResetOptions) -> Result<()> {
+        let arguments = self.arguments(seed, options)?;
+        self.begin(arguments)
+    }
+
+    fn step(&mut self, action: Action<'_>) -> Result<Transition> {
+        let space = &self.form.spec.action_space;
+        let bytes: &[u8] = match space {
+            Space::Box { .. } => bytemuck::cast_slice(action.continuous(space.len())?),
+            _ => bytemuck::cast_slice(action.discrete(space)?),
+        };
+        let Some(episode) = &mut self.episode else {
+            return Err(Error::config(&self.form.spec.id, "stepped outside an episode", "reset it first"));
+        };
+        episode.actions.extend_from_slice(bytes);
+        self.advance()?;
+        Ok(Transition {
+            reward: self.number(head::REWARD),
+            terminated: self.flag(head::TERMINATED),
+            truncated: self.flag(head::TRUNCATED),
+        })
+    }
+
+    fn observe(&self, row: &mut RowMut<'_>) {
+        let memory = self.transport.memory();
+        for (i, place) in self.form.columns.iter().enumerate() {
+            match memory.get(place.clone()) {
+                Some(bytes) => row.bytes(i).copy_from_slice(bytes),
+                None => row.bytes(i).fill(0),
+            }
+        }
+    }
+
+    fn render(&mut self, frame: FrameMut<'_>) -> Result<()> {
+        let form = Arc::clone(&self.form);
+        let Some(picture) = form.picture() else {
+            return Err(Error::config(
+                format!("pictures of {}", form.spec.id),
+                form.no_picture(),
+                "ask for no pictures, or give it a render mode 'rgb_array'",
+            ));
+        };
+        self.looked_at = true;
+        if !self.drawn {
+            if self.episode.is_none() {
+                return Err(Error::config(&form.spec.id, "drawn outside an episode", "reset it first"));
+            }
+            self.ask(Ask::Render)?;
+        }
+        self.scaler.draw(picture.size, &self.transport.memory()[picture.range()], frame);
+        Ok(())
+    }
+
+    /// The picture that `info['goal']` held at the reset, black where there is none.
+    fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()> {
+        match (self.form.goal(), &self.episode) {
+            (Some(goal), Some(_)) => {
+                self.scaler.draw(goal.size, &self.transport.memory()[goal.range()], frame);
+            }
+            _ => frame.rgb.fill(0),
+        }
+        Ok(())
+    }
+
+    fn libraries(&self) -> BTreeMap<String, String> {
+        self.form.libraries().clone()
+    }
+
+    fn factors(&self) -> &FactorValues {
+        &self.factors
+    }
+
+    /// The episode so far: the arguments of its reset, and its actions.
+    fn snapshot(&self) -> Snapshot {
+        let mut bytes = format!("{}\n", self.form.spec.id).into_bytes();
+        if let Some(Episode { reset, actions }) = &self.episode {
+            bytes.extend(format!("{reset}\n").bytes());
+            bytes.extend(actions);
+        }
+        Snapshot(bytes)
+    }
+
+    /// Plays the episode again, from where this one parts from it.
+    fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
+        let id = &self.form.spec.id;
+        let line = |bytes: &[u8]| -> Option<(String, usize)> {
+            let end = bytes.iter().position(|&byte| byte == b'\n')?;
+            Some((String::from_utf8(bytes[..end].to_vec()).ok()?, end + 1))
+        };
+        let parsed = line(&snapshot.0).filter(|(of, _)| of == id).and_then(|(_, at)| {
+            let (reset, n) = line(&snapshot.0[at..])?;
+            let actions = &snapshot.0[at + n..];
+            actions.len().is_multiple_of(self.form.action.len()).then_some((reset, actions))
+        });
+        let Some((reset, actions)) = parsed else {
+            return Err(Error::mismatch(
+                format!("restoring {id}"),
+                "a snapshot of another environment, or of one before its first reset",
+                "one of an episode of this environment",
+            ));
+        };
+        let begun = self.episode.as_ref().filter(|now| now.reset == reset && actions.starts_with(&now.actions));
+        let mut at = match begun.map(|now| now.actions.len()) {
+            Some(at) => at,
+            None => {
+                self.begin(reset)?;
+                0
+            }
+        };
+        while at < actions.len() {
+            let next = at + self.form.action.len();
+            if let Some(episode) = &mut self.episode {
+                episode.actions.extend_from_slice(&actions[at..next]);
+            }
+            self.advance()?;
+            at = next;
+        }
+        Ok(())
+    }
+
+    fn restore_from(&mut self, _: RowRef<'_>, _: RowRef<'_>) -> Result<()> {
+        Err(Error::config(
+            format!("starting {} from a row of a dataset", self.form.spec.id),
+            "nothing says how a Gymnasium environment takes a state",
+            "evaluate it on episodes of its own; from Python, `World.evaluate(callables=…)` names the methods to call",
+        ))
+    }
+
+    fn sample_goal(&mut self, _: Key) -> Result<()> {
+        Err(Error::config(
+            format!("a new goal of {}", self.form.spec.id),
+            "a Gymnasium environment chooses its goal itself, at a reset",
+            "reset it with another seed",
+        ))
+    }
+
+    fn is_success(&self) -> bool {
+        self.flag(head::SUCCESS)
+    }
+
+    /// What `info['goal_distance']` says, infinite where it says nothing.
+    fn goal_distance(&self) -> f64 {
+        if self.episode.is_some() { self.number(head::DISTANCE) } else { f64::INFINITY }
+    }
+}

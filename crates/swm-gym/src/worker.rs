@@ -1,0 +1,349 @@
+//! [`WorkerTransport`]: an environment in a Python process of its own, over shared memory.
+//!
+//! The process gets three descriptors: a socket for requests and answers as its standard input, the shared memory as its
+//! standard output (an unnamed file that vanishes with its last holder), a pipe as its standard error, whose last lines
+//! are kept for error messages. It dies when it is dropped here, when its socket closes, and, on Linux, by the kernel's
+//! hand when this process ends in any way.
+
+use crate::config::{GymConfig, Python};
+use crate::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport, WORKER, assets};
+use memmap2::MmapMut;
+use std::collections::{BTreeMap, VecDeque};
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixStream;
+use std::os::unix::process::CommandExt;
+use std::path::Path;
+use std::process::{Child, ChildStderr, Command, Stdio};
+use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+use swm_core::Error;
+
+/// Lines of a worker's standard error that are kept.
+const LINES: usize = 20;
+/// How long a worker that has nothing more to do, or is dying, is waited for.
+const PATIENCE: Duration = Duration::from_millis(500);
+
+/// A Python process with one environment.
+pub struct WorkerTransport {
+    id: String,
+    options: BTreeMap<String, String>,
+    config: GymConfig,
+    process: Option<Process>,
+}
+
+struct Process {
+    child: Child,
+    line: UnixStream,
+    file: File,
+    memory: Option<MmapMut>,
+    tail: Tail,
+}
+
+impl WorkerTransport {
+    /// Starts a process that makes the environment; does not wait for it.
+    ///
+    /// # Errors
+    /// When Python cannot be started.
+    pub fn new(id: &str, options: BTreeMap<String, String>, config: GymConfig) -> swm_core::Result<Self> {
+        let mut made = Self { id: id.to_owned(), options, config, process: None };
+        match made.restart() {
+            Ok(()) => Ok(made),
+            Err(Failure::Refused(error)) => Err(error),
+            Err(Failure::Raised(text) | Failure::Lost(text)) => Err(Error::external("starting a worker", text)),
+        }
+    }
+
+    /// The process that runs the environment now.
+    pub fn process_id(&self) -> Option<u32> {
+        self.process.as_ref().map(|process| process.child.id())
+    }
+
+    /// Ends a process that does not keep to the exchange; how it ended, and its last words.
+    fn lose(&mut self, problem: &std::io::Error, limit: Duration) -> Failure {
+        use std::io::ErrorKind::{TimedOut, WouldBlock};
+        let Some(mut process) = self.process.take() else { return Failure::Lost("its worker process is gone".into()) };
+        let id = process.child.id();
+        let mut how = if matches!(problem.kind(), TimedOut | WouldBlock) {
+            format!("worker process {id} did not answer within {limit:?} and was stopped")
+        } else {
+            match process.end() {
+                Some(status) => format!("worker process {id} ended with {status}"),
+                None => format!("worker process {id} closed its connection ({problem}) and was stopped"),
+            }
+        };
+        process.kill();
+        let last = process.tail.lines();
+        if !last.is_empty() {
+            how.push_str("; its last lines:\n");
+            how.push_str(&last.join("\n"));
+        }
+        Failure::Lost(how)
+    }
+
+    /// Sends a request and reads the answer.
+    fn exchange(&mut self, op: u8, payload: &[u8], limit: Duration) -> Result<(u8, Vec<u8>), Failure> {
+        let Some(process) = &mut self.process else { return Err(Failure::Lost("its worker process is gone".into())) };
+        process.send(op, payload).and_then(|()| process.receive()).map_err(|problem| self.lose(&problem, limit))
+    }
+
+    /// What an answer that is no success means.
+    fn failure(&self, kind: u8, text: Vec<u8>) -> Failure {
+        let text = String::from_utf8_lossy(&text).into_owned();
+        let (id, python) = (&self.id, &self.config.python);
+        let refused = match kind {
+            b'x' => return Failure::Raised(text),
+            b'u' => {
+                let known: Vec<String> = serde_json::from_str(&text).unwrap_or_default();
+                let hint = format!("it is none of the {} that Gymnasium knows in {python}", known.len());
+                Error::unknown("environment", id, known.iter().map(String::as_str), hint)
+            }
+            b'm' => {
+                let missing: BTreeMap<String, String> = serde_json::from_str(&text).unwrap_or_default();
+                let of = |key: &str| missing.get(key).cloned().unwrap_or_default();
+                let fix = format!("`swm assets install {}`, or name a Python that has it in $SWM_PYTHON", of("asset"));
+                Error::config(id, format!("{} in {python}", of("message")), fix)
+            }
+            _ => Error::config(id, text, format!("install what it asks for in {python}, or choose another")),
+        };
+        Failure::Refused(refused)
+    }
+}
+
+impl Transport for WorkerTransport {
+    fn restart(&mut self) -> Result<(), Failure> {
+        self.process = None;
+        let modules = BTreeMap::from([("swm_bridge", BRIDGE), ("swm_craftax", CRAFTAX)]);
+        let wanted = serde_json::json!({"id": self.id, "options": self.options, "modules": modules});
+        let mut process = Process::start(&self.id, &self.config.python).map_err(Failure::Refused)?;
+        // A process that cannot even be told will be found dead by whoever waits for its description.
+        if let Err(problem) = process.send(b'm', wanted.to_string().as_bytes()) {
+            tracing::debug!("{}: its worker did not listen: {problem}", self.id);
+        }
+        self.process = Some(process);
+        Ok(())
+    }
+
+    fn describe(&mut self) -> Result<Description, Failure> {
+        let limit = self.config.start;
+        let Some(process) = &mut self.process else { return Err(Failure::Lost("its worker process is gone".into())) };
+        let answer = process.line.set_read_timeout(Some(limit)).and_then(|()| process.receive());
+        let (kind, text) = answer.map_err(|problem| match self.lose(&problem, limit) {
+            // Waiting as long again would bring nothing.
+            Failure::Lost(how) if problem.kind() == std::io::ErrorKind::WouldBlock => {
+                Failure::Refused(Error::external(format!("making {}", self.id), how))
+            }
+            failure => failure,
+        })?;
+        if kind != b'.' {
+            self.process = None;
+            return Err(self.failure(kind, text));
+        }
+        let description = Description::parse(&String::from_utf8_lossy(&text)).map_err(Failure::Refused)?;
+        if let Some(process) = &mut self.process {
+            let opened = process.open(description.size, self.config.answer);
+            opened.map_err(|error| Failure::Refused(Error::external("sharing memory with a worker", error)))?;
+        }
+        Ok(description)
+    }
+
+    fn call(&mut self, request: Request<'_>) -> Result<(), Failure> {
+        match self.exchange(request.op(), request.payload(), self.config.answer)? {
+            (b'.', _) => Ok(()),
+            (kind, text) => Err(self.failure(kind, text)),
+        }
+    }
+
+    fn memory(&self) -> &[u8] {
+        self.process.as_ref().and_then(|process| process.memory.as_deref()).unwrap_or_default()
+    }
+
+    fn memory_mut(&mut self) -> &mut [u8] {
+        self.process.as_mut().and_then(|process| process.memory.as_deref_mut()).unwrap_or_default()
+    }
+}
+
+impl Process {
+    fn start(id: &str, python: &Python) -> swm_core::Result<Self> {
+        let shared = if Path::new("/dev/shm").is_dir() { "/dev/shm".into() } else { std::env::temp_dir() };
+        let file = tempfile::tempfile_in(&shared).map_err(|error| Error::io(&shared, "making shared memory", error))?;
+        let io = |error| Error::external("starting a worker", error);
+        let (line, far) = UnixStream::pair().map_err(io)?;
+        let mut command = Command::new(&python.program);
+        command.args(["-c", WORKER, &std::process::id().to_string(), id]);
+        command.stdin(Stdio::from(OwnedFd::from(far)));
+        command.stdout(Stdio::from(file.try_clone().map_err(io)?)).stderr(Stdio::piped());
+        // Signals of a terminal are for us; who asked for the worker decides what becomes of it.
+        command.process_group(0);
+        // Each environment has a core at most: there are as many workers as environments. What somebody set, stays.
+        let cache = assets::folder().join("jax-cache");
+        let defaults = [
+            ("OMP_NUM_THREADS", "1".as_ref()),
+            ("OPENBLAS_NUM_THREADS", "1".as_ref()),
+            ("MKL_NUM_THREADS", "1".as_ref()),
+            ("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1".as_ref()),
+            ("JAX_PLATFORMS", "cpu".as_ref()),
+            ("JAX_COMPILATION_CACHE_DIR", cache.as_os_str()),
+            ("SDL_VIDEODRIVER", "dummy".as_ref()),
+            ("SDL_AUDIODRIVER", "dummy".as_ref()),
+            ("PYGAME_HIDE_SUPPORT_PROMPT", "1".as_ref()),
+        ];
+        for (name, value) in defaults {
+            if std::env::var_os(name).is_none() {
+                command.env(name, value);
+            }
+        }
+        let mut child = spawn(command).map_err(|error| {
+            let fix = "`swm assets install gymnasium`, or name a Python that has Gymnasium in $SWM_PYTHON";
+            Error::config("Python", format!("{python} cannot be started: {error}"), fix)
+        })?;
+        let tail = Tail::of(child.stderr.take(), id);
+        Ok(Self { child, line, file, memory: None, tail })
+    }
+
+    fn send(&mut self, op: u8, payload: &[u8]) -> std::io::Result<()> {
+        let n = u32::try_from(payload.len()).map_err(std::io::Error::other)?;
+        let mut head = [0; 5];
+        head[0] = op;
+        head[1..].copy_from_slice(&n.to_le_bytes());
+        self.line.write_all(&head)?;
+        if payload.is_empty() { Ok(()) } else { self.line.write_all(payload) }
+    }
+
+    fn receive(&mut self) -> std::io::Result<(u8, Vec<u8>)> {
+        let mut head = [0; 5];
+        self.line.read_exact(&mut head)?;
+        let [kind, n @ ..] = head;
+        // Most answers are empty: no allocation.
+        let mut text = vec![0; u32::from_le_bytes(n) as usize];
+        self.line.read_exact(&mut text)?;
+        Ok((kind, text))
+    }
+
+    /// Maps the memory that the worker has made room in.
+    fn open(&mut self, size: usize, answer: Duration) -> std::io::Result<()> {
+        self.line.set_read_timeout(Some(answer))?;
+        let room = self.file.metadata()?.len();
+        if room < size as u64 {
+            return Err(std::io::Error::other(format!("it has {room} bytes of {size}")));
+        }
+        self.memory = Some(map(&self.file)?);
+        Ok(())
+    }
+
+    /// How it ended, if it has or is about to.
+    fn end(&mut self) -> Option<std::process::ExitStatus> {
+        let turns = 100;
+        for _ in 0..turns {
+            if let Ok(Some(status)) = self.child.try_wait() {
+                return Some(status);
+            }
+            std::thread::sleep(PATIENCE / turns);
+        }
+        None
+    }
+
+    fn kill(&mut self) {
+        // It may have ended by itself.
+        if let Err(problem) = self.child.kill().and_then(|()| self.child.wait()) {
+            tracing::debug!("stopping a worker: {problem}");
+        }
+    }
+}
+
+impl Drop for Process {
+    /// Lets the worker close its environment, for a moment.
+    fn drop(&mut self) {
+        let closed = self.line.shutdown(std::net::Shutdown::Write);
+        if closed.and_then(|()| self.line.set_read_timeout(Some(PATIENCE))).is_ok() {
+            // Its end of the line closes when it ends.
+            let mut rest = [0; 64];
+            while matches!(self.line.read(&mut rest), Ok(1..)) {}
+        }
+        self.kill();
+    }
+}
+
+#[allow(unsafe_code)]
+fn map(file: &File) -> std::io::Result<MmapMut> {
+    // SAFETY: the file has no name; besides us only our worker holds it, which never changes its size. The worker writes
+    // to it only between a request and its answer, when nobody here holds a reference: `Transport::call` borrows the
+    // transport mutably. A worker that does not answer in time is killed before the memory is touched again.
+    unsafe { MmapMut::map_mut(file) }
+}
+
+/// The last lines of a worker's standard error.
+struct Tail {
+    lines: Arc<Mutex<VecDeque<String>>>,
+    /// Closed when the pipe is.
+    over: Receiver<()>,
+}
+
+impl Tail {
+    fn of(pipe: Option<ChildStderr>, id: &str) -> Self {
+        let lines = Arc::new(Mutex::new(VecDeque::new()));
+        let (kept, id) = (Arc::clone(&lines), id.to_owned());
+        let (tell, over) = channel();
+        let read = move || {
+            let _closed_at_the_end: Sender<()> = tell;
+            let mut pipe = pipe.map(BufReader::new);
+            let mut line = vec![];
+            while let Some(pipe) = &mut pipe
+                && let Ok(1..) = pipe.read_until(b'\n', &mut line)
+            {
+                let text = String::from_utf8_lossy(&line).trim_end().to_owned();
+                tracing::debug!("{id}: {text}");
+                let mut kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
+                if kept.len() == LINES {
+                    kept.pop_front();
+                }
+                kept.push_back(text);
+                line.clear();
+            }
+        };
+        // Without a thread nothing is kept, and the worker's words are lost: an error message less.
+        if let Err(problem) = std::thread::Builder::new().name("swm-gym-stderr".to_owned()).spawn(read) {
+            tracing::debug!("keeping the words of a worker: {problem}");
+        }
+        Self { lines, over }
+    }
+
+    /// What was said last, once the worker has ended.
+    fn lines(&self) -> Vec<String> {
+        // A child of the worker may hold the pipe on: do not wait for it.
+        let _closed_or_late = self.over.recv_timeout(PATIENCE);
+        self.lines.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
+    }
+}
+
+/// A command and where its child goes.
+type Job = (Command, SyncSender<std::io::Result<Child>>);
+
+/// Starts a process from a thread that lives as long as this process: the kernel's promise to end a child with its
+/// parent (`PR_SET_PDEATHSIG`) counts from the thread that started it.
+fn spawn(command: Command) -> std::io::Result<Child> {
+    static STARTER: Mutex<Option<(u32, Sender<Job>)>> = Mutex::new(None);
+    let (tell, child) = sync_channel(1);
+    let mut starter = STARTER.lock().unwrap_or_else(PoisonError::into_inner);
+    // A fork of this process has no such thread any more.
+    let here = std::process::id();
+    let jobs = match &*starter {
+        Some((process, jobs)) if *process == here => jobs.clone(),
+        _ => {
+            let (jobs, queue) = channel::<Job>();
+            std::thread::Builder::new().name("swm-gym-starter".to_owned()).spawn(move || {
+                for (mut command, tell) in queue {
+                    // Who asked may have given up.
+                    let _received = tell.send(command.spawn());
+                }
+            })?;
+            *starter = Some((here, jobs.clone()));
+            jobs
+        }
+    };
+    drop(starter);
+    jobs.send((command, tell)).map_err(std::io::Error::other)?;
+    child.recv().map_err(std::io::Error::other)?
+}

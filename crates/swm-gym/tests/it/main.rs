@@ -1,0 +1,43 @@
+//! Gymnasium environments in worker processes. They need a Python that has Gymnasium: the one that `$SWM_PYTHON` names.
+//! Where it names none, they are skipped, in words; where it names one without Gymnasium, they fail.
+
+mod atari;
+mod parents;
+mod play;
+mod robust;
+mod spaces;
+
+use std::path::PathBuf;
+use std::time::Duration;
+use swm_gym::{GymConfig, Python};
+
+/// The configuration of the tests, None to skip.
+fn config() -> Option<GymConfig> {
+    let program = std::env::var_os("SWM_PYTHON").filter(|value| !value.is_empty());
+    let Some(program) = program else {
+        skip("$SWM_PYTHON names no Python with Gymnasium");
+        return None;
+    };
+    Some(GymConfig {
+        python: Python { program: PathBuf::from(program), whence: "named by $SWM_PYTHON" },
+        start: Duration::from_secs(300),
+        answer: Duration::from_secs(60),
+        restarts: 2,
+    })
+}
+
+/// Whether the Python of the tests can import a module.
+fn has(config: &GymConfig, module: &str) -> bool {
+    let program = &config.python.program;
+    let status = std::process::Command::new(program).args(["-c", &format!("import {module}")]).output();
+    let there = status.expect("$SWM_PYTHON starts").status.success();
+    if !there {
+        skip(&format!("{} has no {module}", program.display()));
+    }
+    there
+}
+
+#[allow(clippy::print_stderr)]
+fn skip(why: &str) {
+    eprintln!("skipped: {why}");
+}

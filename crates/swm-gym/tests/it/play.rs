@@ -1,0 +1,250 @@
+//! What an environment produces depends on its seed and its actions, never on who else is played.
+
+use crate::config;
+use swm_core::batch::{Batch, DType, Schema};
+use swm_core::pool::{Reset, threads};
+use swm_core::{
+    Action, Env, EnvPool, Error, FrameMut, Key, Policy, RandomPolicy, ResetOptions, Space, VariationRequest,
+};
+use swm_gym::GymConfig;
+
+pub const ROOM: &str = "tests.it.worlds:Room-v0";
+
+pub fn make(text: &str, config: &GymConfig) -> Box<dyn Env> {
+    swm_gym::make(text, config.clone()).unwrap_or_else(|error| panic!("{text}: {error}"))
+}
+
+/// Everything that episodes in these slots produce under random actions, as bytes.
+pub fn play(text: &str, config: &GymConfig, episodes: &[u64], workers: usize, steps: usize) -> Vec<Vec<u8>> {
+    let envs = episodes.iter().map(|_| make(text, config)).collect();
+    let threads = threads(workers).expect("threads");
+    let mut pool = EnvPool::new(envs, Some((48, 64)), Some(steps), threads).expect("a pool");
+    let mut policy = RandomPolicy::new(pool.spec(), episodes.len());
+    let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), episodes.len());
+    let resets: Vec<Reset> = (0..)
+        .zip(episodes)
+        .map(|(slot, &episode)| {
+            policy.begin(slot, Key::new(episode));
+            Reset { slot, seed: Key::new(episode).seed(), options: ResetOptions::default() }
+        })
+        .collect();
+    pool.reset(&resets).expect("a reset");
+    let mut seen = vec![vec![]; episodes.len()];
+    let mut look = |pool: &EnvPool| {
+        for (slot, seen) in seen.iter_mut().enumerate() {
+            for (column, spec) in pool.infos().schema().columns().iter().enumerate() {
+                let n = spec.row_bytes();
+                seen.extend_from_slice(&pool.infos().bytes(column)[slot * n..(slot + 1) * n]);
+            }
+        }
+    };
+    look(&pool);
+    let active = vec![true; episodes.len()];
+    for _ in 0..steps {
+        policy.act(pool.infos(), &active, &mut actions).expect("random actions");
+        pool.step(&actions, &active).expect("a step");
+        look(&pool);
+    }
+    seen
+}
+
+/// An environment and a row to look at it.
+pub struct Seen {
+    pub env: Box<dyn Env>,
+    row: Batch,
+}
+
+impl Seen {
+    pub fn of(env: Box<dyn Env>) -> Self {
+        let schema = Schema::new(env.spec().columns.clone()).expect("columns have their own names");
+        Self { env, row: Batch::zeros(&schema, 1) }
+    }
+
+    pub fn column(&mut self, name: &str) -> Vec<f64> {
+        self.env.observe(&mut self.row.row_mut(0));
+        self.row.row(0).to_f64(name).expect("a column")
+    }
+
+    pub fn everything(&mut self) -> Vec<u8> {
+        self.env.observe(&mut self.row.row_mut(0));
+        let mut bytes: Vec<u8> =
+            (0..self.row.schema().columns().len()).flat_map(|column| self.row.bytes(column)).copied().collect();
+        bytes.extend(self.picture(9, 12));
+        bytes
+    }
+
+    pub fn picture(&mut self, height: usize, width: usize) -> Vec<u8> {
+        let mut rgb = vec![7; height * width * 3];
+        self.env.render(FrameMut::new(width, height, &mut rgb)).expect("a picture");
+        rgb
+    }
+}
+
+#[test]
+fn threads_and_neighbours_change_nothing() {
+    let Some(config) = config() else { return };
+    for text in ["CartPole-v1", ROOM] {
+        let one = play(text, &config, &[0, 1, 2, 3], 1, 6);
+        assert!(one == play(text, &config, &[0, 1, 2, 3], 4, 6), "{text}: four threads differ from one");
+        assert!(one[0] != one[1], "{text}: two seeds give two episodes");
+        assert!(one[..2] == play(text, &config, &[0, 1], 2, 6), "{text}: two environments differ from four");
+        assert!(one[3] == play(text, &config, &[3], 1, 6)[0], "{text}: one alone differs");
+    }
+}
+
+#[test]
+fn an_environment_says_what_it_is() {
+    let Some(config) = config() else { return };
+    let env = make("CartPole-v1", &config);
+    let spec = env.spec();
+    assert_eq!(spec.id, "CartPole-v1");
+    assert_eq!(spec.action_space, Space::Discrete { n: 2, start: 0 });
+    assert_eq!(spec.max_episode_steps, 500);
+    assert_eq!((spec.columns.len(), spec.columns[0].name.as_str()), (1, "observation"));
+    assert_eq!(spec.observation_space[0].1.bounds(1), (f64::NEG_INFINITY, f64::INFINITY));
+    assert!(env.libraries().contains_key("gymnasium"), "{:?}", env.libraries());
+
+    let room = make(ROOM, &config);
+    let spec = room.spec();
+    let mut columns: Vec<(&str, DType, &[usize])> =
+        spec.columns.iter().map(|column| (column.name.as_str(), column.dtype, &column.shape[..])).collect();
+    let mut wanted: [(&str, DType, &[usize]); 9] = [
+        ("position", DType::Float64, &[2]),
+        ("camera", DType::U8, &[6, 8, 3]),
+        ("door_open", DType::Int64, &[]),
+        ("door_flags", DType::Bool, &[2]),
+        ("obs_reward", DType::Int64, &[]),
+        ("goal_distance", DType::Float64, &[]),
+        ("moved", DType::Float32, &[]),
+        ("noise", DType::Float64, &[]),
+        ("steps", DType::Int64, &[]),
+    ];
+    // A dictionary's keys come in the order Gymnasium keeps them in.
+    columns.sort_by(|a, b| a.0.cmp(b.0));
+    wanted.sort_by(|a, b| a.0.cmp(b.0));
+    assert_eq!(columns, wanted);
+    assert_eq!(spec.max_episode_steps, 30);
+    assert_eq!(spec.action_space, Space::uniform_box([2], DType::Float32, f64::from(-0.4f32), f64::from(0.4f32)));
+}
+
+#[test]
+fn info_goals_and_pictures_reach_the_world() {
+    let Some(config) = config() else { return };
+    let mut room = Seen::of(make(ROOM, &config));
+    assert_eq!(room.env.goal_distance(), f64::INFINITY, "no episode, no distance");
+    room.env.reset(3, &ResetOptions::default()).expect("a reset");
+    assert_eq!((room.column("noise"), room.column("steps")), (vec![0.5], vec![0.0]));
+    let mut goal = vec![0; 5 * 7 * 3];
+    room.env.render_goal(FrameMut::new(7, 5, &mut goal)).expect("a goal");
+    assert_eq!((goal[0], goal[2]), (40, 40));
+    let (mut noises, mut steps) = (vec![], 0);
+    let terminated = loop {
+        // A bound in single precision is a bound in double.
+        let transition = room.env.step(Action::Continuous(&[0.4, -0.4])).expect("a step");
+        steps += 1;
+        assert_eq!(transition.reward, -1.5);
+        assert_eq!(room.env.is_success(), steps >= 6);
+        assert_eq!(room.column("steps"), [f64::from(steps)]);
+        assert!((room.env.goal_distance() - room.column("goal_distance")[0]).abs() < 1e-12);
+        noises.extend(room.column("noise"));
+        if transition.terminated {
+            break steps;
+        }
+    };
+    assert_eq!(terminated, 7);
+    assert_eq!(noises[0], noises[1], "what is missing keeps its value");
+    assert_ne!(noises[1], noises[2]);
+    // The blue third at the top, at its own size and at another.
+    let own = room.picture(12, 16);
+    assert_eq!((&own[..3], &own[own.len() - 3..]), (&[0, 0, 140][..], &[0, 0, 0][..]));
+    let half = room.picture(6, 8);
+    assert_eq!((half[2], half[half.len() - 1]), (140, 0));
+    // The next episode forgets.
+    room.env.reset(3, &ResetOptions::default()).expect("a reset");
+    assert_eq!((room.column("noise"), room.column("steps")), (vec![0.5], vec![0.0]));
+}
+
+#[test]
+fn factors_are_sampled_pinned_and_read_back() {
+    let Some(config) = config() else { return };
+    let mut room = make(ROOM, &config);
+    let keys: Vec<String> = room.spec().variation_space.factors().iter().map(|factor| factor.key.clone()).collect();
+    assert_eq!(keys, ["agent.color", "agent.size", "door.number"]);
+    let mut reset = |variation: Option<&[&str]>, pinned: &[(&str, &[f64])]| {
+        let request = VariationRequest {
+            variation: variation.map(|keys| keys.iter().map(|&key| key.to_owned()).collect()),
+            variation_values: pinned.iter().map(|(key, value)| ((*key).to_owned(), value.to_vec())).collect(),
+        };
+        room.reset(9, &ResetOptions { variation: request, ..ResetOptions::default() })?;
+        let factors = room.factors();
+        Ok::<_, Error>((factors.scalar("agent.size"), factors.rgb("agent.color"), factors.integer("door.number")))
+    };
+    let plain = reset(Some(&[]), &[]).expect("nothing varied");
+    assert_eq!(plain, (1.0, [255, 0, 10], 1));
+    let default = reset(None, &[]).expect("the environment's own choice");
+    assert!(default.0 != 1.0 && default.1 == plain.1, "{default:?}");
+    assert_ne!(reset(Some(&["agent"]), &[]).expect("a group").1, plain.1);
+    assert_ne!(reset(Some(&["all"]), &[]).expect("everything").1, plain.1);
+    let pinned: &[(&str, &[f64])] =
+        &[("door.number", &[3.0]), ("agent.color", &[1.0, 2.0, 3.0]), ("agent.size", &[0.75])];
+    assert_eq!(reset(Some(&["all"]), pinned).expect("everything pinned"), (0.75, [1, 2, 3], 3));
+    for (variation, pinned, words) in [
+        (Some(&["agent.colour"][..]), &[][..], "did you mean agent.color"),
+        (None, &[("agent.size", &[9.0][..])][..], "0.5 ..= 2"),
+        (None, &[("agent.sise", &[1.0][..])][..], "did you mean agent.size"),
+    ] {
+        let error = reset(variation, pinned).expect_err(words).to_string();
+        assert!(error.contains(words), "{error}");
+    }
+}
+
+#[test]
+fn what_follows_a_restore_followed_the_snapshot() {
+    let Some(config) = config() else { return };
+    let mut room = Seen::of(make(ROOM, &config));
+    room.env.reset(5, &ResetOptions::default()).expect("a reset");
+    let go = |room: &mut Seen, n: i16| {
+        let actions = (0..n).map(|i| [0.1 * f32::from(i % 3), -0.2]);
+        actions
+            .flat_map(|action| {
+                room.env.step(Action::Continuous(&action)).expect("a step");
+                room.everything()
+            })
+            .collect::<Vec<u8>>()
+    };
+    go(&mut room, 2);
+    let snapshot = room.env.snapshot();
+    let wanted = go(&mut room, 3);
+    room.env.restore(&snapshot).expect("back");
+    assert!(go(&mut room, 3) == wanted, "in the same environment");
+    let mut other = Seen::of(make(ROOM, &config));
+    other.env.restore(&snapshot).expect("in another one");
+    assert!(go(&mut other, 3) == wanted, "in another environment");
+    let strange = make("CartPole-v1", &config).restore(&snapshot).expect_err("another world's").to_string();
+    assert!(strange.contains("another environment"), "{strange}");
+}
+
+#[test]
+fn what_a_gymnasium_environment_cannot_do_is_said() {
+    let Some(config) = config() else { return };
+    let mut env = Seen::of(make("CartPole-v1", &config));
+    let early = env.env.step(Action::Discrete(&[0])).expect_err("before a reset").to_string();
+    assert!(early.contains("reset it first"), "{early}");
+    assert!(env.env.sample_goal(Key::new(0)).expect_err("no goals").to_string().contains("another seed"));
+    let state = ResetOptions { state: Some(vec![0.0; 4]), ..ResetOptions::default() };
+    assert!(env.env.reset(0, &state).expect_err("no states").to_string().contains("where its seed says"));
+    env.env.reset(0, &ResetOptions::default()).expect("a reset");
+    assert!(env.env.step(Action::Discrete(&[2])).is_err(), "there are two actions");
+    assert!(env.env.step(Action::Continuous(&[0.0])).is_err(), "an action of another kind");
+    env.env.step(Action::Discrete(&[1])).expect("wrong actions change nothing");
+
+    let unknown = swm_gym::make("CartPoel-v1", config.clone()).err().expect("unknown").to_string();
+    assert!(unknown.contains("did you mean CartPole-v1"), "{unknown}");
+    let wrong = swm_gym::make("CartPole-v1,sutton=1", config.clone()).err().expect("no such argument").to_string();
+    assert!(wrong.contains("sutton") && wrong.contains("CartPole-v1"), "{wrong}");
+    let module = swm_gym::make("no_such_module:Maze-v0", config.clone()).err().expect("no module").to_string();
+    assert!(module.contains("no_such_module"), "{module}");
+    let python = swm_gym::Python { program: "/no/such/python".into(), whence: "named by a test" };
+    let none = swm_gym::make("CartPole-v1", GymConfig { python, ..config }).err().expect("no Python").to_string();
+    assert!(none.contains("/no/such/python (named by a test)") && none.contains("SWM_PYTHON"), "{none}");
+}

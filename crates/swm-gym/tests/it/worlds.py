@@ -1,0 +1,169 @@
+"""Environments that the tests play in; Rust names them `tests.it.worlds:NAME`."""
+
+import os
+import signal
+import sys
+import time
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+
+class Factor(spaces.Box):
+    """A leaf of a variation space: a box with a value."""
+
+    def __init__(self, low, high, shape, init_value, dtype=np.float32):
+        super().__init__(low, high, shape, dtype)
+        self.init_value = self.value = np.asarray(init_value, dtype)
+
+    def draw(self):
+        self.value = self.sample()
+
+    def set_value(self, value):
+        assert self.contains(value), value
+        self.value = value
+
+
+class Number(spaces.Discrete):
+    """A leaf of a variation space: one of several integers."""
+
+    def __init__(self, n, init_value):
+        super().__init__(n)
+        self.init_value = self.value = init_value
+
+    def draw(self):
+        self.value = int(self.sample())
+
+    def set_value(self, value):
+        assert self.contains(value), value
+        self.value = value
+
+
+class Group(spaces.Dict):
+    """A group of factors, or all of them."""
+
+    def leaves(self, prefix=''):
+        for key, space in self.spaces.items():
+            if isinstance(space, Group):
+                yield from space.leaves(f'{prefix}{key}.')
+            else:
+                yield f'{prefix}{key}', space
+
+    def start(self, seed, options):
+        self.seed(seed)
+        leaves = dict(self.leaves())
+        wanted = options.get('variation', ['agent.size'])
+        for key, leaf in leaves.items():
+            leaf.value = leaf.init_value
+            if 'all' in wanted or key in wanted or key.split('.')[0] in wanted:
+                leaf.draw()
+        for key, value in options.get('variation_values', {}).items():
+            leaves[key].set_value(value)
+
+
+class Room(gymnasium.Env):
+    """A point in a room: everything a world may have. Prints, and reads what it should not."""
+
+    metadata = {'render_modes': ['rgb_array']}
+
+    def __init__(self, render_mode=None, die_at=None, marker=None, raise_at=None, hang_at=None, size=4):
+        self.render_mode = render_mode
+        self.troubles = die_at, marker, raise_at, hang_at
+        self.size = size
+        self.action_space = spaces.Box(-0.4, 0.4, (2,), np.float64)
+        self.observation_space = spaces.Dict({
+            'position': spaces.Box(-np.inf, np.inf, (2,), np.float64),
+            'camera': spaces.Box(0, 255, (6, 8, 3), np.uint8),
+            'door': spaces.Dict({'open': spaces.Discrete(3), 'flags': spaces.MultiBinary(2)}),
+            'reward': spaces.Discrete(5, start=2),
+            'word': spaces.Text(4),
+        })
+        self.variation_space = Group({
+            'agent': Group({
+                'size': Factor(0.5, 2.0, (1,), [1.0]),
+                'color': Factor(0, 255, (3,), [255, 0, 10], np.uint8),
+            }),
+            'door': Group({'number': Number(4, 1)}),
+        })
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.variation_space.start(seed, options or {})
+        print('a new episode')
+        sys.stdin.read()
+        self.t, self.position = 0, self.np_random.uniform(-1, 1, 2)
+        goal = np.full((5, 7, 3), 40, np.uint8)
+        goal[..., 1] = int(255 * self.np_random.uniform())
+        return self.observation(), {'goal': goal, 'noise': 0.5, 'env_name': 'room', '_private': 3.0}
+
+    def observation(self):
+        camera = np.zeros((6, 8, 3), np.uint8)
+        camera[..., 0] = self.t
+        camera[2, 3] = self.variation_space['agent']['color'].value
+        door = {'open': self.t % 3, 'flags': np.array([self.t % 2, 1], np.int8)}
+        return {'position': self.position, 'camera': camera, 'door': door, 'reward': 2 + self.t % 5, 'word': 'abc'}
+
+    def step(self, action):
+        assert self.action_space.contains(action), f'{action!r} is outside'
+        die_at, marker, raise_at, hang_at = self.troubles
+        self.t += 1
+        print('step', self.t)
+        if self.t == raise_at:
+            raise ValueError('the room is on fire')
+        if self.t == hang_at:
+            print('about to hang', file=sys.stderr, flush=True)
+            while True:
+                time.sleep(0.01)
+        if self.t == die_at and not (marker and os.path.exists(marker)):
+            if marker:
+                open(marker, 'w').close()
+            print('about to die', file=sys.stderr, flush=True)
+            os.kill(os.getpid(), signal.SIGKILL)
+        self.position = self.position + action * self.variation_space['agent']['size'].value
+        info = {'steps': self.t, 'moved': np.float32(np.abs(action).sum()), 'goal_distance': float(np.abs(self.position).sum())}
+        if self.t % 2:
+            info['noise'] = self.np_random.uniform()
+        info['success'] = self.t >= 6
+        return self.observation(), -1.5, self.t >= 7, False, info
+
+    def render(self):
+        picture = np.zeros((self.size * 3, self.size * 4, 3), np.uint8)
+        picture[: self.size, ..., 2] = 20 * self.t
+        return picture
+
+
+class Choices(gymnasium.Env):
+    """Observes nothing but what was chosen, and cannot be drawn."""
+
+    SPACES = {
+        'discrete': spaces.Discrete(3, start=-1),
+        'multi': spaces.MultiDiscrete([2, 3]),
+        'binary': spaces.MultiBinary(3),
+        'whole': spaces.Box(0, 2, (2, 2), np.int32),
+        'tuple': spaces.Tuple([spaces.Discrete(2), spaces.MultiDiscrete([3, 4])]),
+        'dict': spaces.Dict({'a': spaces.Box(-1, 1, (2,)), 'b': spaces.Box(0, np.inf, (1,))}),
+        'mixed': spaces.Dict({'a': spaces.Box(-1, 1, (2,)), 'b': spaces.Discrete(2)}),
+    }
+
+    def __init__(self, kind):
+        self.action_space = self.SPACES[kind]
+        n = spaces.flatdim(spaces.Dict({'all': self.action_space})) + 8
+        self.observation_space = spaces.Box(-np.inf, np.inf, (n,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(self.observation_space.shape, np.float32), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), f'{action!r} is outside {self.action_space}'
+        numbers = []
+        for part in action.values() if isinstance(action, dict) else action if isinstance(action, tuple) else [action]:
+            numbers.extend(np.asarray(part, np.float32).reshape(-1))
+        observation = np.zeros(self.observation_space.shape, np.float32)
+        observation[: len(numbers)] = numbers
+        return observation, 0.0, False, False, {}
+
+
+gymnasium.register('Room-v0', Room, max_episode_steps=30)
+gymnasium.register('Choices-v0', Choices)

@@ -444,12 +444,13 @@ def literal(text):
         return text
 
 
-def make(id, options):
-    """The environment of an id as a `Bridge`; `options` are what `gymnasium.make` is given, as text.
+def make(id, options, wrappers=()):
+    """The environment of an id as a `Bridge`; `options` are what `gymnasium.make` is given, as text or as they are, and
+    `wrappers` what is put around it, first to last.
 
     The clock belongs to the platform: an environment's own limit is declared, not enforced by Gymnasium.
     """
-    kwargs = {key: literal(text) for key, text in options.items()}
+    kwargs = {key: literal(text) if isinstance(text, str) else text for key, text in options.items()}
     try:
         if id.startswith('ALE/'):
             import ale_py
@@ -474,4 +475,6 @@ def make(id, options):
         if 'render_mode' not in str(error) or 'render_mode' in kwargs:
             raise
         env = gymnasium.make(spec, **settings)
+    for wrap in wrappers:
+        env = wrap(env)
     return Bridge(env, limit)

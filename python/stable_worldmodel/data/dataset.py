@@ -154,6 +154,8 @@ class StoredDataset(Dataset):
 
     #: The format of this class's datasets; any for `None`.
     format: str | None = None
+    #: Formats whose samples show one number a step as `(num_steps, 1)`, as Lance's lists of one number are read elsewhere.
+    _LISTS = ("lance", "lance-video")
 
     def __init__(
         self,
@@ -171,14 +173,16 @@ class StoredDataset(Dataset):
         from .utils import resolve
 
         self.path = resolve(path)
-        if format is not None:
-            self.format = format
+        self.format = format or self.format or _engine.detect(self.path)
         self.backend = _tensors.backend(backend)
         self._handle: Any = _engine.Dataset(self.path, self.format)
         lengths = self._handle.lengths()
         super().__init__(lengths, np.cumsum(lengths) - lengths, frameskip, num_steps, transform)
+        scalar = (1,) if self.format in self._LISTS else ()
+        #: The type and the shape of a row of every column.
         self.schema: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
-            name: (np.dtype(dtype), tuple(shape)) for name, dtype, shape in self._handle.schema()
+            name: (np.dtype(dtype), tuple(shape) or (() if name in NUMBERING else scalar))
+            for name, dtype, shape in self._handle.schema()
         }
         #: Whole columns that were made of others.
         self._merged: dict[str, Array] = {}
@@ -236,6 +240,7 @@ class StoredDataset(Dataset):
         """The rows of runs, one run after another, `(rows, ...)`: of actions all, of others every `skip`-th."""
         stored = [name for name in names if name not in self._merged]
         found = self.engine.read(stored, *(np.ascontiguousarray(part, np.int64) for part in (episodes, starts, lengths)), skip)
+        found = {name: array.reshape(len(array), *self.schema[name][1]) for name, array in found.items()}
         if self._merged:
             firsts = self.offsets[episodes] + starts
             for name in names:
@@ -275,7 +280,9 @@ class StoredDataset(Dataset):
         self, episodes_idx: Sequence[int] | Array, start: Sequence[int] | Array, end: Sequence[int] | Array
     ) -> list[dict[str, Any]]:
         starts, ends = np.asarray(start, dtype=np.int64), np.asarray(end, dtype=np.int64)
-        steps = (ends - starts) // self.frameskip
+        steps, rest = np.divmod(ends - starts, self.frameskip)
+        if "action" in self._keys and rest.any():
+            raise ValueError(f"load_chunk: {(ends - starts).tolist()} rows are no multiples of frameskip {self.frameskip}")
         samples = self._slices(np.asarray(episodes_idx), starts, ends)
         return [self._grouped(sample, int(count)) for sample, count in zip(samples, steps, strict=True)]
 

@@ -174,6 +174,11 @@ class Loader:
         self._loader = _engine.Loader(engine, json.dumps(wanted))
         #: The shape of a row of every column of a batch: what follows the batch and the steps.
         self._shapes = {name: tuple(shape[1:]) for name, _, shape in self._loader.schema()}
+        # What the dataset shows as lists of one number.
+        for name, (_, shape) in getattr(dataset, "schema", {}).items():
+            for column in (name, *(f"{goal.name}_{name}" for goal in given)):
+                if name != "action" and self._shapes.get(column) == () and shape == (1,):
+                    self._shapes[column] = shape
         self._action = stored.get("action")
         #: Where the next iteration begins, and where the latest one is: epoch and batch.
         self._next = (0, 0)
@@ -230,7 +235,10 @@ class Loader:
     def _shaped(self, found: dict[str, Array]) -> dict[str, Any]:
         batch: dict[str, Any] = {}
         for name, array in found.items():
-            value = _tensors.wrap(_tensors.channels_first(array, self._shapes[name]), self.backend)
+            shape = self._shapes[name]
+            if shape == (1,) and array.ndim == 2:
+                array = array[..., np.newaxis]
+            value = _tensors.wrap(_tensors.channels_first(array, shape), self.backend)
             batch[name] = value if self.device is None else value.to(self.device, non_blocking=True)
         if self.transform is None:
             return batch

@@ -17,7 +17,7 @@ use std::future::Future;
 use std::ops::Range;
 use std::panic::AssertUnwindSafe;
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, OnceLock, mpsc};
+use std::sync::{Arc, Mutex, PoisonError, mpsc};
 use std::time::Duration;
 use swm_core::{Error, Result};
 use tokio::runtime::Runtime;
@@ -39,13 +39,23 @@ fn patience() -> RetryConfig {
     RetryConfig { max_retries: 6, retry_timeout: Duration::from_secs(60), ..RetryConfig::default() }
 }
 
-/// Asynchronous code runs on two threads of its own, made at first use.
+/// Asynchronous code runs on two threads of its own, made at first use and never ended. A process that was forked, as
+/// Python's are, has none of the threads of the one it was forked from, and makes its own.
 fn runtime() -> Result<&'static Runtime> {
-    static RUNTIME: OnceLock<std::io::Result<Runtime>> = OnceLock::new();
-    let made = RUNTIME.get_or_init(|| {
-        tokio::runtime::Builder::new_multi_thread().worker_threads(2).thread_name("swm-io").enable_all().build()
-    });
-    made.as_ref().map_err(|e| Error::external("starting the threads that read datasets", e))
+    static RUNTIME: Mutex<Option<(u32, &'static Runtime)>> = Mutex::new(None);
+    let mut made = RUNTIME.lock().unwrap_or_else(PoisonError::into_inner);
+    let process = std::process::id();
+    if let Some((owner, runtime)) = *made
+        && owner == process
+    {
+        return Ok(runtime);
+    }
+    let runtime =
+        tokio::runtime::Builder::new_multi_thread().worker_threads(2).thread_name("swm-io").enable_all().build();
+    let runtime = runtime.map_err(|e| Error::external("starting the threads that read datasets", e))?;
+    let runtime = &*Box::leak(Box::new(runtime));
+    *made = Some((process, runtime));
+    Ok(runtime)
 }
 
 /// Runs asynchronous code to its end, from any thread, be it one of another runtime. `None` when it panics, which

@@ -6,6 +6,7 @@ use std::ops::{Deref, DerefMut, Range};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
+use std::time::Duration;
 use swm_core::{Batch, Error, Result, Schema};
 
 /// Makes numbered batches. Called by several threads at once.
@@ -213,6 +214,21 @@ impl Iterator for Epoch {
 }
 
 impl Epoch {
+    /// Waits until [`Iterator::next`] has an answer, at most for so long, and says whether it has. Who must look after
+    /// something else meanwhile, such as signals, asks again and again.
+    pub fn wait(&self, at_most: Duration) -> bool {
+        if self.left.is_empty() || self.workers.threads.is_empty() {
+            return true;
+        }
+        let shared = &self.workers.shared;
+        let waiting = |state: &mut State| {
+            let job = state.jobs.iter().find(|job| job.name == self.name);
+            job.is_some_and(|job| !matches!(job.made.front(), Some(Some(_))))
+        };
+        let waited = shared.changed.wait_timeout_while(shared.lock(), at_most, waiting);
+        !waited.unwrap_or_else(PoisonError::into_inner).1.timed_out()
+    }
+
     fn wait_for(&self, batch: usize) -> Result<Loaded> {
         let shared = &self.workers.shared;
         let mut state = shared.lock();

@@ -1,0 +1,148 @@
+//! Readers and writers that Python brings, as the engine's own.
+
+use super::{Column, described, schema};
+use crate::arrays;
+use crate::errors::foreign;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use swm::core::{Batch, Error, Manifest, Result, Schema};
+use swm::data::{Constants, Episode, Reader, StepRange, Writer, checksum};
+
+/// The columns that number episodes and steps.
+const NUMBERING: [&str; 2] = ["episode_idx", "step_idx"];
+
+/// A dataset that an object of Python's reads. The object has `schema()`, a list of `(name, type, shape)`; `lengths()`, the
+/// rows of every episode; and `rows(column, episode, start, length)`, an array `[length, ..]` of the column's type.
+pub struct ForeignReader {
+    object: Py<PyAny>,
+    schema: Schema,
+    episodes: Vec<Episode>,
+}
+
+impl ForeignReader {
+    #[allow(clippy::cast_possible_wrap)]
+    pub fn new(py: Python<'_>, object: Py<PyAny>) -> PyResult<Self> {
+        let given: Vec<Column> = object.call_method0(py, "schema")?.extract(py)?;
+        let numbers = NUMBERING.map(|name| (name.to_owned(), "int64".to_owned(), vec![]));
+        let data = given.into_iter().filter(|(name, ..)| !NUMBERING.contains(&name.as_str()));
+        let schema = schema(numbers.into_iter().chain(data).collect())?;
+        let lengths: Vec<usize> = object.call_method0(py, "lengths")?.extract(py)?;
+        let episodes = lengths.into_iter().enumerate().map(|(i, length)| Episode { index: i as i64, length }).collect();
+        Ok(Self { object, schema, episodes })
+    }
+
+    fn rows(&self, column: &str, range: &StepRange) -> Result<Batch> {
+        let read = || {
+            Python::attach(|py| {
+                let asked = (column, range.episode, range.start, range.length);
+                let rows = self.object.bind(py).call_method1("rows", asked)?;
+                let dict = PyDict::new(py);
+                dict.set_item(column, rows)?;
+                arrays::batch(&dict)
+            })
+        };
+        let rows: Batch = read().map_err(foreign)?;
+        let (given, expected) = (&rows.schema().columns()[0], self.schema.column(column)?);
+        if given == expected && rows.rows() == range.length {
+            return Ok(rows);
+        }
+        let form = |schema: &Schema| format!("{:?}", described(schema));
+        Err(Error::mismatch(
+            format!("reading {} rows of '{column}' from Python", range.length),
+            format!("{} rows of {}", rows.rows(), form(rows.schema())),
+            form(&Schema::new([expected.clone()])?),
+        ))
+    }
+}
+
+impl Reader for ForeignReader {
+    fn schema(&self) -> &Schema {
+        &self.schema
+    }
+
+    fn episodes(&self) -> &[Episode] {
+        &self.episodes
+    }
+
+    #[allow(clippy::cast_possible_wrap)]
+    fn read_column(&self, column: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        let n = self.schema.column(column)?.row_bytes();
+        let mut rest = out;
+        for range in ranges {
+            let end = range.start.checked_add(range.length);
+            if !self.episodes.get(range.episode).is_some_and(|e| end.is_some_and(|end| end <= e.length)) {
+                let given = format!("{} rows from row {} of episode {}", range.length, range.start, range.episode);
+                return Err(Error::mismatch("reading rows", given, "rows that there are"));
+            }
+            let Some((place, others)) = rest.split_at_mut_checked(range.length * n) else {
+                return Err(Error::mismatch("reading rows", "less room", "room for every row"));
+            };
+            rest = others;
+            if let Some(which) = NUMBERING.iter().position(|&name| name == column) {
+                for (row, place) in place.chunks_exact_mut(n).enumerate() {
+                    let number = if which == 0 { range.episode } else { range.start + row } as i64;
+                    place.copy_from_slice(&number.to_ne_bytes());
+                }
+            } else {
+                place.copy_from_slice(self.rows(column, range)?.bytes(0));
+            }
+        }
+        Ok(())
+    }
+
+    fn manifest(&self) -> Option<Manifest> {
+        None
+    }
+
+    /// Nobody but Python knows.
+    fn footprint(&self) -> Result<Vec<(String, u64)>> {
+        Ok(vec![])
+    }
+
+    fn content_hash(&self) -> Result<String> {
+        checksum(self)
+    }
+}
+
+/// Hands episodes to an object of Python's: `write_episode({column: array [rows, ..]})`. What is the same in all steps of an
+/// episode is not handed on.
+pub struct ForeignWriter {
+    object: Py<PyAny>,
+    episodes: usize,
+}
+
+impl ForeignWriter {
+    /// Hands on to `object`, whose dataset has so many episodes.
+    #[allow(dead_code)] // worlds collect into it
+    pub fn new(object: Py<PyAny>, episodes: usize) -> Self {
+        Self { object, episodes }
+    }
+}
+
+impl Writer for ForeignWriter {
+    fn write_episode_with(&mut self, episode: &Batch, _: &Constants) -> Result<()> {
+        let write = |py: Python<'_>| {
+            let dict = PyDict::new(py);
+            for (i, column) in episode.schema().columns().iter().enumerate() {
+                if !NUMBERING.contains(&column.name.as_str()) {
+                    let shape: Vec<usize> =
+                        std::iter::once(episode.rows()).chain(column.shape.iter().copied()).collect();
+                    dict.set_item(&column.name, arrays::array(py, column.dtype, &shape, episode.bytes(i))?)?;
+                }
+            }
+            self.object.call_method1(py, "write_episode", (dict,))
+        };
+        Python::attach(write).map_err(foreign)?;
+        self.episodes += 1;
+        Ok(())
+    }
+
+    fn episodes(&self) -> usize {
+        self.episodes
+    }
+
+    /// Whoever opened it closes it.
+    fn finish(self: Box<Self>) -> Result<()> {
+        Ok(())
+    }
+}

@@ -1,0 +1,92 @@
+"""Datasets: reading, loading, writing, converting and examining episodes.
+
+- `load_dataset` opens a dataset of any format for a torch `DataLoader`; `Loader` gives shuffled batches by itself.
+- `open_writer` stores episodes; `convert`, `doctor` and `inspect` do with whole datasets what their names say.
+- `register_format` adds a format of your own to all of it.
+- `MergeDataset`, `ConcatDataset`, `GoalDataset`, `ReplayBuffer`: datasets made of datasets, and of a running collection.
+"""
+
+from .buffer import ReplayBuffer, classic_filter
+from .dataset import ConcatDataset, Dataset, GoalDataset, MergeDataset, StoredDataset
+from .format import (
+    FORMATS,
+    WRITE_MODES,
+    Format,
+    Writer,
+    detect_format,
+    get_format,
+    list_formats,
+    open_writer,
+    register_format,
+    validate_write_mode,
+)
+from .formats import (
+    FolderDataset,
+    FolderWriter,
+    HDF5Dataset,
+    HDF5Writer,
+    ImageDataset,
+    LanceDataset,
+    LanceVideoDataset,
+    LanceWriter,
+    LeRobotAdapter,
+    VideoDataset,
+    VideoWriter,
+)
+from .loader import Goals, Loader
+from .normalization import (
+    ColumnTransform,
+    IdentityScaler,
+    PercentileScaler,
+    ZScoreScaler,
+    column_normalizer,
+    get_scaler,
+)
+from .utils import convert, doctor, ensure_dir_exists, get_cache_dir, inspect, load_dataset
+from .writer import EpisodeWriter
+
+__all__ = [
+    "FORMATS",
+    "WRITE_MODES",
+    "ColumnTransform",
+    "ConcatDataset",
+    "Dataset",
+    "EpisodeWriter",
+    "FolderDataset",
+    "FolderWriter",
+    "Format",
+    "GoalDataset",
+    "Goals",
+    "HDF5Dataset",
+    "HDF5Writer",
+    "IdentityScaler",
+    "ImageDataset",
+    "LanceDataset",
+    "LanceVideoDataset",
+    "LanceWriter",
+    "LeRobotAdapter",
+    "Loader",
+    "MergeDataset",
+    "PercentileScaler",
+    "ReplayBuffer",
+    "StoredDataset",
+    "VideoDataset",
+    "VideoWriter",
+    "Writer",
+    "ZScoreScaler",
+    "classic_filter",
+    "column_normalizer",
+    "convert",
+    "detect_format",
+    "doctor",
+    "ensure_dir_exists",
+    "get_cache_dir",
+    "get_format",
+    "get_scaler",
+    "inspect",
+    "list_formats",
+    "load_dataset",
+    "open_writer",
+    "register_format",
+    "validate_write_mode",
+]

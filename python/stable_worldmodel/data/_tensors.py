@@ -1,0 +1,140 @@
+"""Arrays and tensors: which of the two users get, and how episodes of any form become arrays of rows."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Mapping
+from typing import Any, Literal, cast
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[Any]
+Backend = Literal["torch", "numpy"]
+
+#: Columns that number episodes and steps. Readers compute them, writers ignore them.
+NUMBERING = ("episode_idx", "step_idx")
+
+#: What is stored in place of types that are not.
+_WIDER = {
+    "float16": "float32",
+    "int8": "int32",
+    "int16": "int32",
+    "uint16": "int32",
+    "uint32": "int64",
+    "uint64": "int64",
+}
+_STORED = ("bool", "uint8", "int32", "int64", "float32", "float64")
+
+
+def backend(given: str | None) -> Backend:
+    """What samples are made of: as asked, else torch where it is installed."""
+    if given is None:
+        return "torch" if importlib.util.find_spec("torch") is not None else "numpy"
+    if given not in ("torch", "numpy"):
+        raise ValueError(f"backend: expected 'torch' or 'numpy', got {given!r}")
+    return cast(Backend, given)
+
+
+def wrap(array: Array, kind: Backend) -> Any:
+    """The array as a tensor that looks at the same memory, or as it is."""
+    if kind == "numpy":
+        return array
+    import torch
+
+    return torch.from_numpy(array)
+
+
+def is_picture(shape: tuple[int, ...]) -> bool:
+    """Whether rows of this shape are pictures, `(height, width, 1 or 3)`."""
+    return len(shape) == 3 and shape[-1] in (1, 3)
+
+
+def channels_first(array: Array, shape: tuple[int, ...]) -> Array:
+    """Pictures `(..., height, width, channels)` as a view `(..., channels, height, width)`; others as they are.
+
+    `shape` is that of a row.
+    """
+    return np.moveaxis(array, -1, -3) if is_picture(shape) else array
+
+
+def to_numpy(value: Any) -> Array:
+    """Numbers of any kind (a tensor, a list of them, ...) as an array."""
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        if isinstance(value, torch.Tensor):
+            return _from_torch(value)
+        if isinstance(value, (list, tuple)) and value and isinstance(value[0], torch.Tensor):
+            return np.stack([_from_torch(item) for item in value])
+    return np.asarray(value)
+
+
+def _from_torch(tensor: Any) -> Array:
+    tensor = tensor.detach().cpu()
+    if str(tensor.dtype) == "torch.bfloat16":
+        tensor = tensor.float()
+    return cast(Array, tensor.numpy())
+
+
+def rows(episode: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, str | bytes]]:
+    """An episode, a column a list of steps or an array `(T, ...)`, as arrays of the types that are stored, and text.
+
+    Pictures `(T, channels, height, width)` become `(T, height, width, channels)`. Text is kept once an episode. Actions
+    may be one fewer than the other columns' rows: none is taken from the final observation.
+    """
+    arrays: dict[str, Array] = {}
+    constants: dict[str, str | bytes] = {}
+    for name, value in episode.items():
+        if name in NUMBERING:
+            continue
+        text = _text(name, value)
+        if text is not None:
+            constants[name] = text
+            continue
+        try:
+            array = to_numpy(value)
+        except ValueError as error:
+            raise ValueError(f"column {name!r}: its steps differ in shape: {error}") from error
+        if array.ndim == 0:
+            raise ValueError(f"column {name!r}: expected a value a step, got {value!r}")
+        dtype = _WIDER.get(array.dtype.name, array.dtype.name)
+        if dtype not in _STORED:
+            raise TypeError(f"column {name!r}: {array.dtype} cannot be stored; give numbers, or one text an episode")
+        first = array.ndim == 4 and array.shape[1] in (1, 3) and array.shape[-1] not in (1, 3)
+        if first and array.dtype == np.uint8:
+            array = np.moveaxis(array, 1, -1)
+        arrays[name] = np.ascontiguousarray(array, dtype=dtype)
+    _equal_lengths(arrays)
+    return arrays, constants
+
+
+def _text(name: str, value: Any) -> str | bytes | None:
+    """The text that a column is, the same in every step; `None` for numbers."""
+    if isinstance(value, (str, bytes)):
+        return value
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind not in "SUO":
+            return None
+        value = value.ravel().tolist()
+    if isinstance(value, (list, tuple)) and value and isinstance(value[0], (str, bytes)):
+        if any(step != value[0] for step in value):
+            raise TypeError(f"column {name!r}: text that changes within an episode cannot be stored")
+        return cast("str | bytes", value[0])
+    return None
+
+
+def _equal_lengths(arrays: dict[str, Array]) -> None:
+    longest = max((len(array) for array in arrays.values()), default=0)
+    action = arrays.get("action")
+    if action is not None and len(action) == longest - 1:
+        missing = np.full((1, *action.shape[1:]), _missing(action.dtype), dtype=action.dtype)
+        arrays["action"] = np.concatenate([action, missing])
+    lengths = {name: len(array) for name, array in arrays.items()}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(f"the columns of an episode must have the same number of steps, got {lengths}")
+
+
+def _missing(dtype: np.dtype[Any]) -> float:
+    """What stands for no action."""
+    return {"f": np.nan, "i": -1}.get(dtype.kind, 0)

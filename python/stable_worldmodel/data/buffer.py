@@ -1,0 +1,233 @@
+"""The latest episodes of a running collection, to train on while it goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from stable_worldmodel import _engine
+
+from . import _tensors
+from ._tensors import NUMBERING, Array
+from .dataset import Dataset, Rows, Transform
+from .format import open_writer
+
+__all__ = ["ReplayBuffer", "classic_filter"]
+
+#: `(step, buffer, batch_size, history_len) -> indices of clips`.
+Sampler = Callable[[int, "ReplayBuffer", int, int], Any]
+
+
+class ReplayBuffer(Dataset):
+    """The latest episodes, of at most `max_steps` rows: a writer to who collects, a dataset to who learns.
+
+        buffer = ReplayBuffer(max_steps=100_000, history_len=4)
+        world.collect(buffer, episodes=10)
+        batch = buffer.sample(256)  # arrays (256, 4, ...)
+
+    When an episode does not fit, the oldest ones leave as a whole. What is drawn is a function of the seed, the step and
+    of what the buffer holds.
+
+    Args:
+        max_steps: How many rows it holds. An episode of `n` steps has `n + 1`.
+        history_len: Steps of a clip.
+        frameskip: Rows from one step to the next.
+        sampler: Chooses clips: `(step, buffer, batch_size, history_len)` to indices below `num_valid_ends(history_len)`.
+            Without it all clips are equally likely.
+        transform: Called with the dict of every sample of `buffer[i]`; not with those of `sample`.
+        key_filter: Called with every episode that comes: the columns to keep.
+        seed: Decides what is drawn, together with the step.
+    """
+
+    def __init__(
+        self,
+        max_steps: int,
+        history_len: int = 1,
+        frameskip: int = 1,
+        sampler: Sampler | None = None,
+        transform: Transform | None = None,
+        key_filter: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+        seed: int = 0,
+    ) -> None:
+        for name, number in (("max_steps", max_steps), ("history_len", history_len), ("frameskip", frameskip)):
+            if number < 1:
+                raise ValueError(f"{name}: expected at least 1, got {number}")
+        super().__init__([], [], frameskip, history_len, transform)
+        self.max_steps = int(max_steps)
+        self.history_len = int(history_len)
+        self.sampler = sampler
+        self.key_filter = key_filter
+        self.seed = int(seed)
+        self._buffer: Any = None
+        self._columns: list[tuple[str, str, list[int]]] = []
+        #: What the buffer held when it was last asked, and the samplers of it.
+        self._snapshot: Any = None
+        self._samplers: dict[tuple[int, int], Any] = {}
+        self._step = 0
+
+    def __enter__(self) -> ReplayBuffer:
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        return None
+
+    def write_episode(self, ep_data: Mapping[str, Any]) -> None:
+        """Adds an episode: a list of steps a column, or an array `(T, ...)`, as :class:`EpisodeWriter` takes it."""
+        if self.key_filter is not None:
+            ep_data = self.key_filter(dict(ep_data))
+        arrays, constants = _tensors.rows(ep_data)
+        if not arrays:
+            return
+        if self._buffer is None:
+            self._columns = [(name, array.dtype.name, list(array.shape[1:])) for name, array in arrays.items()]
+            self._buffer = _engine.ReplayBuffer(self._columns, self.max_steps)
+        missing = [name for name, _, _ in self._columns if name not in arrays]
+        extra = [name for name in arrays if name not in {name for name, _, _ in self._columns}]
+        if missing or extra:
+            raise ValueError(f"an episode must have the buffer's columns: missing {missing}, unexpected {extra}")
+        self._buffer.add({name: arrays[name] for name, _, _ in self._columns}, constants)
+        self._refresh()
+
+    def write_episodes(self, episodes: Iterable[Mapping[str, Any]]) -> None:
+        """Adds episodes as they come."""
+        for episode in episodes:
+            self.write_episode(episode)
+
+    def clear(self) -> None:
+        """Drops all episodes."""
+        if self._buffer is not None:
+            self._buffer = _engine.ReplayBuffer(self._columns, self.max_steps)
+            self._samplers.clear()
+            self._refresh()
+
+    def _refresh(self) -> None:
+        """Looks at what the buffer holds now."""
+        self._snapshot = self._buffer.snapshot()
+        lengths = self._snapshot.lengths()
+        super().__init__(lengths, np.cumsum(lengths) - lengths, self.frameskip, self.num_steps, self.transform)
+
+    @property
+    def column_names(self) -> list[str]:
+        return [name for name, _, _ in self._columns]
+
+    @property
+    def engine(self) -> Any:
+        """The engine's dataset of what it holds now."""
+        if self._snapshot is None:
+            raise RuntimeError("the replay buffer is empty: write an episode first")
+        return self._snapshot
+
+    @property
+    def num_steps_stored(self) -> int:
+        """Rows it holds."""
+        return 0 if self._buffer is None else int(self._buffer.rows())
+
+    @property
+    def num_episodes_added(self) -> int:
+        """Episodes that ever came, those that left included."""
+        return 0 if self._buffer is None else int(self._buffer.added())
+
+    def num_valid_ends(self, history_len: int | None = None) -> int:
+        """How many clips of so many steps it holds."""
+        span = (self.history_len if history_len is None else history_len) * self.frameskip
+        return int(np.maximum(self.lengths - span + 1, 0).sum())
+
+    def sample(self, batch_size: int, history_len: int | None = None, step: int | None = None) -> dict[str, Array]:
+        """Draws a batch of clips.
+
+        Args:
+            batch_size: How many.
+            history_len: Steps of a clip; the buffer's without it.
+            step: The number of the draw; without it they are counted.
+
+        Returns:
+            Arrays `(batch_size, history_len, ...)`; `action` is `(batch_size, history_len, frameskip * numbers)`, pictures
+            `(batch_size, history_len, height, width, channels)`.
+        """
+        steps = self.history_len if history_len is None else int(history_len)
+        if batch_size < 1 or steps < 1:
+            raise ValueError(f"expected a batch_size and history_len of at least 1, got {batch_size} and {steps}")
+        if step is None:
+            step = self._step
+            self._step += 1
+        if self.num_valid_ends(steps) == 0:
+            raise RuntimeError(
+                f"the replay buffer has no clip of {steps} steps with frameskip {self.frameskip}: it holds "
+                f"{self.num_episodes} episodes of {self.num_steps_stored} rows"
+            )
+        if self.sampler is not None:
+            return self._chosen(np.asarray(self.sampler(step, self, batch_size, steps)), batch_size, steps)
+        key = (batch_size, steps)
+        if key not in self._samplers:
+            wanted = {
+                "num_steps": steps,
+                "frameskip": self.frameskip,
+                "columns": self.column_names,
+                "goals": [],
+                "batch_size": batch_size,
+                "recent": None,
+            }
+            self._samplers[key] = self._buffer.sampler(json.dumps(wanted), self.seed)
+        return dict(self._samplers[key].sample(step))
+
+    def _chosen(self, indices: Array, batch_size: int, steps: int) -> dict[str, Array]:
+        if indices.shape != (batch_size,):
+            raise ValueError(f"the sampler gave indices of shape {indices.shape}, expected ({batch_size},)")
+        view = Dataset(self.lengths, self.offsets, self.frameskip, steps)
+        episodes, starts = view._clips(indices.astype(np.int64))
+        found = self._read(episodes, starts, np.full(batch_size, view.span), self.frameskip)
+        shapes = {name: () if name == "action" else tuple(shape) for name, _, shape in self._columns}
+        return {
+            name: array.reshape(batch_size, steps, *(shapes[name] or ((-1,) if name == "action" else ())))
+            for name, array in found.items()
+        }
+
+    def _read(self, episodes: Array, starts: Array, lengths: Array, skip: int) -> dict[str, Array]:
+        run = (np.ascontiguousarray(part, dtype=np.int64) for part in (episodes, starts, lengths))
+        return dict(self.engine.read(self.column_names, *run, skip))
+
+    def _load_slice(self, ep_idx: int, start: int, end: int) -> dict[str, Any]:
+        if not 0 <= ep_idx < self.num_episodes or not 0 <= start <= end <= self.lengths[ep_idx]:
+            raise IndexError(f"rows {start} .. {end} of episode {ep_idx} of {self.num_episodes}")
+        sample: dict[str, Any] = self._read(*(np.asarray([n]) for n in (ep_idx, start, end - start)), self.frameskip)
+        return self.transform(sample) if self.transform else sample
+
+    def get_col_data(self, col: str) -> Array:
+        if col not in self.column_names:
+            raise KeyError(f"there is no column {col!r}; the columns are {', '.join(self.column_names)}")
+        everything = np.arange(self.num_episodes)
+        found = self.engine.read([col], everything, np.zeros_like(everything), self.lengths, 1)
+        return np.asarray(found[col])
+
+    def get_row_data(self, row_idx: Rows) -> dict[str, Array]:
+        rows = np.atleast_1d(np.asarray(row_idx, dtype=np.int64))
+        episodes = np.searchsorted(self.offsets, rows, side="right") - 1
+        found = self._read(episodes, rows - self.offsets[episodes], np.ones_like(rows), 1)
+        return {name: array[0] for name, array in found.items()} if np.ndim(row_idx) == 0 else found
+
+    def episodes(self) -> Iterator[dict[str, Array]]:
+        """The episodes it holds, oldest first, as arrays `(T, ...)`."""
+        snapshot, lengths = self._snapshot, self.lengths
+        for episode in range(len(lengths)):
+            run = (np.asarray([n], dtype=np.int64) for n in (episode, 0, lengths[episode]))
+            yield dict(snapshot.read(self.column_names, *run, 1))
+
+    def dump(self, path: str | os.PathLike[str], format: str | None = None, mode: str = "overwrite", **kwargs: Any) -> None:
+        """Writes what it holds to a dataset of any format."""
+        with open_writer(path, format=format, mode=mode, **kwargs) as writer:
+            writer.write_episodes(self.episodes())
+
+    def __repr__(self) -> str:
+        columns = ", ".join(self.column_names) or "none yet"
+        rows = f"{self.num_steps_stored} of {self.max_steps} rows"
+        return f"ReplayBuffer({self.num_episodes} episodes, {rows}, columns: {columns})"
+
+
+def classic_filter(ep_data: dict[str, Any]) -> dict[str, Any]:
+    """A `key_filter` that keeps `pixels`, `action`, `reward`, `terminated` and `truncated`."""
+    classic = ("pixels", "action", "reward", "terminated", "truncated")
+    return {name: value for name, value in ep_data.items() if name in classic and name not in NUMBERING}

@@ -1,0 +1,664 @@
+"""Datasets of episodes as sequences of clips, and datasets made of datasets."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from stable_worldmodel import _engine
+
+from . import _collate, _tensors
+from ._tensors import NUMBERING, Array
+
+Transform = Callable[[dict[str, Any]], dict[str, Any]]
+#: One row, or several.
+Rows = int | Sequence[int] | Array
+
+__all__ = ["ConcatDataset", "Dataset", "GoalDataset", "MergeDataset", "StoredDataset"]
+
+
+class Dataset:
+    """Episodes, seen as all clips of `num_steps` steps that lie within one of them.
+
+    A clip covers `num_steps * frameskip` rows. Its step `k` shows row `k * frameskip` and carries the `frameskip`
+    actions from there on: `action` has the shape `(num_steps, frameskip * numbers)`, every other column
+    `(num_steps, ...)`, pictures `(num_steps, channels, height, width)`.
+
+    Readers of formats of your own derive from it, and bring `column_names` and `_load_slice`.
+
+    Args:
+        lengths: Rows of every episode.
+        offsets: The first row of every episode in the whole dataset.
+        frameskip: Rows from one step to the next.
+        num_steps: Steps of a clip.
+        transform: Called with the dict of every sample; what it returns is the sample.
+    """
+
+    def __init__(
+        self,
+        lengths: Sequence[int] | Array,
+        offsets: Sequence[int] | Array,
+        frameskip: int = 1,
+        num_steps: int = 1,
+        transform: Transform | None = None,
+    ) -> None:
+        if frameskip < 1 or num_steps < 1:
+            raise ValueError(f"expected a frameskip and num_steps of at least 1, got {frameskip} and {num_steps}")
+        self.lengths = np.asarray(lengths, dtype=np.int64)
+        self.offsets = np.asarray(offsets, dtype=np.int64)
+        self.frameskip = int(frameskip)
+        self.num_steps = int(num_steps)
+        self.span = self.num_steps * self.frameskip
+        self.transform = transform
+        clips = np.maximum(self.lengths - self.span + 1, 0)
+        #: Clips before every episode, and all of them.
+        self._clips_before = np.concatenate([[0], np.cumsum(clips)]).astype(np.int64)
+
+    @property
+    def column_names(self) -> list[str]:
+        """The columns of a sample."""
+        raise NotImplementedError(f"{type(self).__name__}.column_names")
+
+    def _load_slice(self, ep_idx: int, start: int, end: int) -> dict[str, Any]:
+        """The rows `start .. end` of an episode: of actions all, of other columns every `frameskip`-th. With `transform`
+        applied."""
+        raise NotImplementedError(f"{type(self).__name__}._load_slice")
+
+    @property
+    def num_episodes(self) -> int:
+        """How many episodes there are."""
+        return len(self.lengths)
+
+    @property
+    def clip_indices(self) -> list[tuple[int, int]]:
+        """The episode and the first row of every clip. Long: one entry a sample."""
+        episodes, starts = self._clips(np.arange(len(self)))
+        return list(zip(episodes.tolist(), starts.tolist(), strict=True))
+
+    def _clips(self, indices: Array) -> tuple[Array, Array]:
+        """The episodes and first rows of clips."""
+        total = int(self._clips_before[-1])
+        wrong = (indices < -total) | (indices >= total)
+        if wrong.any():
+            raise IndexError(f"clip {int(indices[wrong][0])} of a dataset of {total}")
+        indices = np.where(indices < 0, indices + total, indices)
+        episodes = np.searchsorted(self._clips_before, indices, side="right") - 1
+        return episodes, indices - self._clips_before[episodes]
+
+    def __len__(self) -> int:
+        return int(self._clips_before[-1])
+
+    def __getitem__(self, idx: int) -> dict[str, Any]:
+        episodes, starts = self._clips(np.asarray([idx], dtype=np.int64))
+        start = int(starts[0])
+        return self._grouped(self._load_slice(int(episodes[0]), start, start + self.span), self.num_steps)
+
+    @staticmethod
+    def _grouped(sample: dict[str, Any], steps: int) -> dict[str, Any]:
+        """A sample with the actions of a step one after another."""
+        if "action" in sample:
+            sample["action"] = sample["action"].reshape(steps, -1)
+        return sample
+
+    def load_chunk(
+        self, episodes_idx: Sequence[int] | Array, start: Sequence[int] | Array, end: Sequence[int] | Array
+    ) -> list[dict[str, Any]]:
+        """The rows `start .. end` of some episodes, a dict each, in the form of clips."""
+        runs = zip(*(np.asarray(part).tolist() for part in (episodes_idx, start, end)), strict=True)
+        return [self._grouped(self._load_slice(e, s, t), (t - s) // self.frameskip) for e, s, t in runs]
+
+    def load_episode(self, episode_idx: int) -> dict[str, Any]:
+        """A whole episode: of actions all rows, of other columns every `frameskip`-th."""
+        return self._load_slice(episode_idx, 0, int(self.lengths[episode_idx]))
+
+    def get_col_data(self, col: str) -> Array:
+        """All rows of a column, `(rows, ...)`; pictures `(rows, height, width, channels)`."""
+        raise NotImplementedError(f"{type(self).__name__}.get_col_data")
+
+    def get_row_data(self, row_idx: Rows) -> dict[str, Array]:
+        """Rows of the whole dataset, counted through all episodes: `(...)` for one, `(rows, ...)` for several."""
+        raise NotImplementedError(f"{type(self).__name__}.get_row_data")
+
+    def get_dim(self, col: str) -> int:
+        """Numbers in a row of a column."""
+        data = self.get_col_data(col)
+        return int(np.prod(data.shape[1:]))
+
+    def merge_col(self, source: list[str] | str, target: str, dim: int = -1) -> None:
+        """Adds a column made of others, side by side along `dim`: names, or a pattern that they match."""
+        raise NotImplementedError(f"{type(self).__name__}.merge_col")
+
+
+class StoredDataset(Dataset):
+    """A dataset that the engine reads, of any of its formats.
+
+    Whole batches are read in one call: all their rows sorted, merged, decoded once, on all cores, without Python's lock.
+    It may be pickled (it is opened again where it arrives) and used after a fork.
+
+    Args:
+        path: A path, a URI (`s3://`, `gs://`, `az://`, `http(s)://`), or a name under `$STABLEWM_HOME/datasets`.
+        frameskip: Rows from one step to the next.
+        num_steps: Steps of a clip.
+        transform: Called with the dict of every sample.
+        keys_to_load: The columns of a sample; all without it.
+        keys_to_cache: Columns whose decoded rows stay in memory.
+        keys_to_merge: Columns to add: see :meth:`merge_col`.
+        format: The format, where the path does not say it.
+        backend: `"torch"` or `"numpy"`; torch where it is installed.
+    """
+
+    #: The format of this class's datasets; any for `None`.
+    format: str | None = None
+    #: Formats whose samples show one number a step as `(num_steps, 1)`, as Lance's lists of one number are read elsewhere.
+    _LISTS = ("lance", "lance-video")
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        frameskip: int = 1,
+        num_steps: int = 1,
+        transform: Transform | None = None,
+        keys_to_load: Sequence[str] | None = None,
+        keys_to_cache: Sequence[str] | None = None,
+        keys_to_merge: Mapping[str, list[str] | str] | None = None,
+        format: str | None = None,
+        backend: str | None = None,
+    ) -> None:
+        from .utils import resolve
+
+        self.path = resolve(path)
+        self.format = format or self.format or _engine.detect(self.path)
+        self.backend = _tensors.backend(backend)
+        self._handle: Any = _engine.Dataset(self.path, self.format)
+        lengths = self._handle.lengths()
+        super().__init__(lengths, np.cumsum(lengths) - lengths, frameskip, num_steps, transform)
+        scalar = (1,) if self.format in self._LISTS else ()
+        #: The type and the shape of a row of every column.
+        self.schema: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
+            name: (np.dtype(dtype), tuple(shape) or (() if name in NUMBERING else scalar))
+            for name, dtype, shape in self._handle.schema()
+        }
+        #: Whole columns that were made of others.
+        self._merged: dict[str, Array] = {}
+        self._keys = [name for name in self.schema if name not in NUMBERING] if keys_to_load is None else [*keys_to_load]
+        self._cached = [*(keys_to_cache or [])]
+        for target, source in (keys_to_merge or {}).items():
+            self.merge_col(source, target)
+        for name in (*self._keys, *self._cached):
+            self._check(name)
+        if self._cached:
+            self._handle = self._open()
+
+    def _open(self) -> Any:
+        handle = _engine.Dataset(self.path, self.format)
+        return handle.kept(self._cached, 1 << 62) if self._cached else handle
+
+    @property
+    def engine(self) -> Any:
+        """The engine's dataset."""
+        if self._handle is None:
+            self._handle = self._open()
+        return self._handle
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_handle": None}
+
+    def __repr__(self) -> str:
+        rows = int(self.lengths.sum())
+        clips = f"clips of {self.num_steps} steps, frameskip {self.frameskip}"
+        return f"{type(self).__name__}({self.path!r}, {self.num_episodes} episodes, {rows} rows, {len(self)} {clips})"
+
+    def _check(self, name: str) -> None:
+        if name not in self.schema and name not in self._merged:
+            known = ", ".join([*self.schema, *self._merged])
+            raise KeyError(f"there is no column {name!r} in {self.path}; the columns are {known}")
+
+    @property
+    def column_names(self) -> list[str]:
+        return list(self._keys)
+
+    @property
+    def manifest(self) -> dict[str, Any] | None:
+        """Where the data come from, where that was recorded."""
+        text = self.engine.manifest()
+        return None if text is None else dict(json.loads(text))
+
+    def constants(self, episode_idx: int) -> dict[str, bytes]:
+        """What is the same in every step of an episode and no number, such as the XML of its scene."""
+        return dict(self.engine.constants(int(episode_idx)))
+
+    def _row_shape(self, name: str) -> tuple[int, ...]:
+        return self._merged[name].shape[1:] if name in self._merged else self.schema[name][1]
+
+    def _read(self, names: Sequence[str], episodes: Array, starts: Array, lengths: Array, skip: int) -> dict[str, Array]:
+        """The rows of runs, one run after another, `(rows, ...)`: of actions all, of others every `skip`-th."""
+        stored = [name for name in names if name not in self._merged]
+        found = self.engine.read(stored, *(np.ascontiguousarray(part, np.int64) for part in (episodes, starts, lengths)), skip)
+        found = {name: array.reshape(len(array), *self.schema[name][1]) for name, array in found.items()}
+        if self._merged:
+            firsts = self.offsets[episodes] + starts
+            for name in names:
+                if name in self._merged:
+                    step = 1 if name == "action" else skip
+                    at = [np.arange(first, first + length, step) for first, length in zip(firsts, lengths, strict=True)]
+                    found[name] = self._merged[name][np.concatenate(at)] if at else self._merged[name][:0]
+        return {name: found[name] for name in names}
+
+    def _check_runs(self, episodes: Array, starts: Array, ends: Array) -> None:
+        for episode, start, end in zip(episodes, starts, ends, strict=True):
+            if not 0 <= episode < self.num_episodes:
+                raise IndexError(f"episode {episode} of a dataset of {self.num_episodes}")
+            if not 0 <= start <= end <= self.lengths[episode]:
+                raise IndexError(f"rows {start} .. {end} of episode {episode}, which has {self.lengths[episode]}")
+
+    def _slices(self, episodes: Array, starts: Array, ends: Array) -> list[dict[str, Any]]:
+        """A dict for every run, in one call of the engine."""
+        episodes, starts, ends = (np.asarray(part, dtype=np.int64) for part in (episodes, starts, ends))
+        episodes = np.where(episodes < 0, episodes + self.num_episodes, episodes)
+        self._check_runs(episodes, starts, ends)
+        found = self._read(self._keys, episodes, starts, ends - starts, self.frameskip)
+        counts = {False: -(-(ends - starts) // self.frameskip), True: ends - starts}
+        cuts = {action: np.cumsum(count)[:-1] for action, count in counts.items()}
+        parts: dict[str, list[Any]] = {}
+        for name, array in found.items():
+            array = _tensors.channels_first(array, self._row_shape(name))
+            pieces = np.split(array, cuts[name == "action"])
+            parts[name] = [_tensors.wrap(piece, self.backend) for piece in pieces]
+        samples = [{name: pieces[i] for name, pieces in parts.items()} for i in range(len(episodes))]
+        return [self.transform(sample) for sample in samples] if self.transform else samples
+
+    def _load_slice(self, ep_idx: int, start: int, end: int) -> dict[str, Any]:
+        return self._slices(np.asarray([ep_idx]), np.asarray([start]), np.asarray([end]))[0]
+
+    def load_chunk(
+        self, episodes_idx: Sequence[int] | Array, start: Sequence[int] | Array, end: Sequence[int] | Array
+    ) -> list[dict[str, Any]]:
+        starts, ends = np.asarray(start, dtype=np.int64), np.asarray(end, dtype=np.int64)
+        steps, rest = np.divmod(ends - starts, self.frameskip)
+        if "action" in self._keys and rest.any():
+            raise ValueError(f"load_chunk: {(ends - starts).tolist()} rows are no multiples of frameskip {self.frameskip}")
+        samples = self._slices(np.asarray(episodes_idx), starts, ends)
+        return [self._grouped(sample, int(count)) for sample, count in zip(samples, steps, strict=True)]
+
+    def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Any]]:
+        """The samples of a batch, read in one call."""
+        if len(indices) == 0:
+            return []
+        episodes, starts = self._clips(np.asarray(indices, dtype=np.int64))
+        size = len(episodes)
+        found = self._read(self._keys, episodes, starts, np.full(size, self.span), self.frameskip)
+        columns: dict[str, Any] = {}
+        for name, array in found.items():
+            array = array.reshape(size, -1, *self._row_shape(name))
+            columns[name] = _tensors.wrap(_tensors.channels_first(array, self._row_shape(name)), self.backend)
+        if self.transform is not None:
+            samples = [self.transform({name: column[i] for name, column in columns.items()}) for i in range(size)]
+            return [self._grouped(sample, self.num_steps) for sample in samples]
+        if "action" in columns:
+            columns["action"] = columns["action"].reshape(size, self.num_steps, -1)
+        _collate.install()
+        return _collate.Together(columns, size).samples()
+
+    def get_col_data(self, col: str) -> Array:
+        self._check(col)
+        if col in self._merged:
+            return self._merged[col]
+        everything = np.arange(self.num_episodes)
+        return self._read([col], everything, np.zeros_like(everything), self.lengths, 1)[col]
+
+    def get_row_data(self, row_idx: Rows) -> dict[str, Array]:
+        rows = np.atleast_1d(np.asarray(row_idx, dtype=np.int64))
+        total = int(self.lengths.sum())
+        if ((rows < -total) | (rows >= total)).any():
+            raise IndexError(f"rows {rows.tolist()} of a dataset of {total}")
+        rows = np.where(rows < 0, rows + total, rows)
+        episodes = np.searchsorted(self.offsets, rows, side="right") - 1
+        # Episodes without rows begin where the next one does.
+        found = self._read(self._keys, episodes, rows - self.offsets[episodes], np.ones_like(rows), 1)
+        return {name: array[0] for name, array in found.items()} if np.ndim(row_idx) == 0 else found
+
+    def get_dim(self, col: str) -> int:
+        self._check(col)
+        return int(np.prod(self._row_shape(col)))
+
+    def merge_col(self, source: list[str] | str, target: str, dim: int = -1) -> None:
+        if isinstance(source, str):
+            pattern = re.compile(source)
+            source = [name for name in self.schema if name not in NUMBERING and pattern.match(name)]
+        if not source:
+            raise KeyError(f"no column of {self.path} matches what {target!r} is made of")
+        self._merged[target] = np.concatenate([self.get_col_data(name) for name in source], axis=dim)
+        if target not in self._keys:
+            self._keys.append(target)
+
+
+class MergeDataset:
+    """Columns of several datasets with the same episodes, side by side.
+
+    Args:
+        datasets: The datasets.
+        keys_from_dataset: The columns that each contributes; without it, those that none before it has.
+    """
+
+    def __init__(self, datasets: Sequence[Any], keys_from_dataset: Sequence[Sequence[str]] | None = None) -> None:
+        if not datasets:
+            raise ValueError("MergeDataset: expected at least one dataset")
+        self.datasets = list(datasets)
+        lengths = [np.asarray(dataset.lengths).tolist() for dataset in self.datasets]
+        if any(other != lengths[0] for other in lengths):
+            raise ValueError("MergeDataset: the datasets must have the same episodes, but their lengths differ")
+        if any(len(dataset) != len(self.datasets[0]) for dataset in self.datasets):
+            raise ValueError("MergeDataset: the datasets must have the same num_steps and frameskip")
+        if keys_from_dataset is None:
+            seen: set[str] = set()
+            self.keys_map = []
+            for dataset in self.datasets:
+                self.keys_map.append([name for name in dataset.column_names if name not in seen])
+                seen.update(self.keys_map[-1])
+        else:
+            self.keys_map = [list(keys) for keys in keys_from_dataset]
+
+    @property
+    def column_names(self) -> list[str]:
+        """The columns of a sample."""
+        return [name for keys in self.keys_map for name in keys]
+
+    @property
+    def lengths(self) -> Array:
+        """Rows of every episode."""
+        return np.asarray(self.datasets[0].lengths)
+
+    @property
+    def engine(self) -> Any:
+        """The engine's dataset."""
+        from .foreign import engine_of
+
+        merged = engine_of(self.datasets[0])
+        for dataset, keys in zip(self.datasets[1:], self.keys_map[1:], strict=True):
+            merged = _engine.Dataset.merge(merged, engine_of(dataset), keys)
+        return merged
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("num_steps", "frameskip", "span", "offsets", "num_episodes", "clip_indices"):
+            return getattr(self.datasets[0], name)
+        raise AttributeError(f"'MergeDataset' has no attribute {name!r}")
+
+    def __len__(self) -> int:
+        return len(self.datasets[0])
+
+    def _picked(self, items: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+        pairs = zip(items, self.keys_map, strict=True)
+        return {name: item[name] for item, keys in pairs for name in keys if name in item}
+
+    def __getitem__(self, idx: int) -> dict[str, Any]:
+        return self._picked(dataset[idx] for dataset in self.datasets)
+
+    def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Any]]:
+        """The samples of a batch."""
+        parts = [_items(dataset, indices) for dataset in self.datasets]
+        return [self._picked(items) for items in zip(*parts, strict=True)]
+
+    def load_chunk(self, episodes_idx: Any, start: Any, end: Any) -> list[dict[str, Any]]:
+        """As :meth:`Dataset.load_chunk`."""
+        parts = [dataset.load_chunk(episodes_idx, start, end) for dataset in self.datasets]
+        return [self._picked(items) for items in zip(*parts, strict=True)]
+
+    def load_episode(self, episode_idx: int) -> dict[str, Any]:
+        """As :meth:`Dataset.load_episode`."""
+        return self._picked(dataset.load_episode(episode_idx) for dataset in self.datasets)
+
+    def get_col_data(self, col: str) -> Array:
+        """As :meth:`Dataset.get_col_data`."""
+        for dataset, keys in zip(self.datasets, self.keys_map, strict=True):
+            if col in keys:
+                return np.asarray(dataset.get_col_data(col))
+        raise KeyError(f"there is no column {col!r}; the columns are {', '.join(self.column_names)}")
+
+    def get_row_data(self, row_idx: Rows) -> dict[str, Any]:
+        """As :meth:`Dataset.get_row_data`."""
+        return self._picked(dataset.get_row_data(row_idx) for dataset in self.datasets)
+
+
+class ConcatDataset:
+    """The episodes of several datasets, one after another."""
+
+    def __init__(self, datasets: Sequence[Any]) -> None:
+        if not datasets:
+            raise ValueError("ConcatDataset: expected at least one dataset")
+        self.datasets = list(datasets)
+        self._clips_before = np.cumsum([0, *(len(dataset) for dataset in self.datasets)])
+        self._episodes_before = np.cumsum([0, *(len(dataset.lengths) for dataset in self.datasets)])
+        self._rows_before = np.cumsum([0, *(int(np.sum(dataset.lengths)) for dataset in self.datasets)])
+
+    @property
+    def column_names(self) -> list[str]:
+        """The columns of any of them."""
+        return list(dict.fromkeys(name for dataset in self.datasets for name in dataset.column_names))
+
+    @property
+    def lengths(self) -> Array:
+        """Rows of every episode."""
+        return np.concatenate([np.asarray(dataset.lengths) for dataset in self.datasets])
+
+    @property
+    def offsets(self) -> Array:
+        """The first row of every episode in the whole dataset."""
+        return np.cumsum(self.lengths) - self.lengths
+
+    @property
+    def num_episodes(self) -> int:
+        """How many episodes there are."""
+        return int(self._episodes_before[-1])
+
+    @property
+    def num_steps(self) -> int:
+        """Steps of a clip."""
+        return int(self.datasets[0].num_steps)
+
+    @property
+    def frameskip(self) -> int:
+        """Rows from one step to the next."""
+        return int(self.datasets[0].frameskip)
+
+    @property
+    def engine(self) -> Any:
+        """The engine's dataset."""
+        from .foreign import engine_of
+
+        return _engine.Dataset.concat([engine_of(dataset) for dataset in self.datasets])
+
+    def __len__(self) -> int:
+        return int(self._clips_before[-1])
+
+    def __getitem__(self, idx: int) -> dict[str, Any]:
+        return self.__getitems__([idx])[0]
+
+    @staticmethod
+    def _places(before: Array, indices: Any, what: str) -> tuple[Array, Array]:
+        """Which dataset has each index, and which one it is there."""
+        indices = np.asarray(indices, dtype=np.int64)
+        total = int(before[-1])
+        if ((indices < -total) | (indices >= total)).any():
+            raise IndexError(f"{what} {indices.tolist()} of {total}")
+        indices = np.where(indices < 0, indices + total, indices)
+        parts = np.searchsorted(before, indices, side="right") - 1
+        return parts, indices - before[parts]
+
+    def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Any]]:
+        """The samples of a batch."""
+        parts, places = self._places(self._clips_before, indices, "clips")
+        return self._gathered(parts, lambda part, mask: _items(self.datasets[part], places[mask].tolist()))
+
+    def load_chunk(self, episodes_idx: Any, start: Any, end: Any) -> list[dict[str, Any]]:
+        """As :meth:`Dataset.load_chunk`."""
+        parts, episodes = self._places(self._episodes_before, episodes_idx, "episodes")
+        starts, ends = np.asarray(start), np.asarray(end)
+        return self._gathered(
+            parts, lambda part, mask: self.datasets[part].load_chunk(episodes[mask], starts[mask], ends[mask])
+        )
+
+    @staticmethod
+    def _gathered(parts: Array, load: Callable[[int, Array], list[dict[str, Any]]]) -> list[dict[str, Any]]:
+        found: dict[int, dict[str, Any]] = {}
+        for part in np.unique(parts).tolist():
+            mask = np.flatnonzero(parts == part)
+            found.update(zip(mask.tolist(), load(part, mask), strict=True))
+        return [found[i] for i in range(len(parts))]
+
+    def load_episode(self, episode_idx: int) -> dict[str, Any]:
+        """As :meth:`Dataset.load_episode`."""
+        parts, episodes = self._places(self._episodes_before, [episode_idx], "episodes")
+        return dict(self.datasets[int(parts[0])].load_episode(int(episodes[0])))
+
+    def get_col_data(self, col: str) -> Array:
+        """As :meth:`Dataset.get_col_data`."""
+        having = [dataset for dataset in self.datasets if col in dataset.column_names]
+        if not having:
+            raise KeyError(f"there is no column {col!r}; the columns are {', '.join(self.column_names)}")
+        return np.concatenate([np.asarray(dataset.get_col_data(col)) for dataset in having])
+
+    def get_row_data(self, row_idx: Rows) -> dict[str, Any]:
+        """As :meth:`Dataset.get_row_data`."""
+        parts, rows = self._places(self._rows_before, np.atleast_1d(np.asarray(row_idx)), "rows")
+        found = [self.datasets[part].get_row_data(row) for part, row in zip(parts.tolist(), rows.tolist(), strict=True)]
+        if np.ndim(row_idx) == 0:
+            return dict(found[0])
+        return {name: np.stack([row[name] for row in found]) for name in found[0]}
+
+
+def _items(dataset: Any, indices: Sequence[int]) -> list[dict[str, Any]]:
+    if hasattr(dataset, "__getitems__"):
+        return list(dataset.__getitems__(indices))
+    return [dataset[i] for i in indices]
+
+
+class GoalDataset:
+    """A dataset whose samples come with a goal: a row that they shall lead to, `(1, ...)`.
+
+    The goal is a random row of the dataset, a later step of the episode (nearer ones more likely, or all equally
+    likely), or the current step. Clips without a later step are left out if one may be asked for.
+
+    Args:
+        dataset: The dataset.
+        goal_probabilities: The chances of a random row, a later step with geometric chances, a later step, the current
+            step.
+        gamma: The discount of the geometric law: the goal is `k` steps ahead with probability
+            `(1 - gamma) * gamma**(k - 1)`, and the last step at most.
+        current_goal_offset: Which step of the clip, counted from 1, is the current one; the last one without it.
+        goal_keys: What is loaded of goals, and the names it gets; `pixels` and `proprio` without it.
+        seed: Decides the goals, together with the epoch and the sample's index. Without it every draw is a fresh one.
+    """
+
+    def __init__(
+        self,
+        dataset: Any,
+        goal_probabilities: Sequence[float] = (0.3, 0.5, 0.0, 0.2),
+        gamma: float = 0.99,
+        current_goal_offset: int | None = None,
+        goal_keys: Mapping[str, str] | None = None,
+        seed: int | None = None,
+    ) -> None:
+        if len(goal_probabilities) != 4 or min(goal_probabilities) < 0 or not np.isclose(sum(goal_probabilities), 1.0):
+            raise ValueError(
+                "goal_probabilities: expected the chances (random, geometric future, uniform future, current), "
+                f"which add up to 1, got {tuple(goal_probabilities)}"
+            )
+        if not 0 <= gamma < 1:
+            raise ValueError(f"gamma: expected at least 0 and below 1, got {gamma}")
+        self.dataset = dataset
+        self.goal_probabilities = tuple(goal_probabilities)
+        self.gamma = gamma
+        self.current_goal_offset = dataset.num_steps if current_goal_offset is None else current_goal_offset
+        if goal_keys is None:
+            goal_keys = {name: f"goal_{name}" for name in ("pixels", "proprio") if name in dataset.column_names}
+        self.goal_keys = dict(goal_keys)
+        self.seed = seed
+        self.epoch = 0
+        self._fresh: tuple[int, np.random.Generator] | None = None
+        self._rows_before = np.cumsum([0, *np.asarray(dataset.lengths).tolist()])
+        self._now = (self.current_goal_offset - 1) * dataset.frameskip
+        clips = np.asarray(dataset.clip_indices, dtype=np.int64).reshape(-1, 2)
+        _, geometric, uniform, _ = self.goal_probabilities
+        if geometric > 0 or uniform > 0:
+            later = clips[:, 1] + self._now + dataset.frameskip < np.asarray(dataset.lengths)[clips[:, 0]]
+        else:
+            later = np.ones(len(clips), dtype=bool)
+        #: The dataset's clips that have a goal.
+        self._indices = np.flatnonzero(later)
+        self._clips = clips[later]
+
+    def set_epoch(self, epoch: int) -> None:
+        """Draws other goals: with a seed they are a function of it, the epoch, and the sample's index."""
+        self.epoch = int(epoch)
+
+    @property
+    def clip_indices(self) -> list[tuple[int, int]]:
+        """The episode and the first row of every clip."""
+        return [(int(episode), int(start)) for episode, start in self._clips]
+
+    @property
+    def column_names(self) -> list[str]:
+        """The columns of the dataset, without the goals'."""
+        return list(self.dataset.column_names)
+
+    @property
+    def lengths(self) -> Array:
+        """Rows of every episode."""
+        return np.asarray(self.dataset.lengths)
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def _random(self, idx: int) -> np.random.Generator:
+        if self.seed is not None:
+            return np.random.default_rng([self.seed, self.epoch, idx])
+        # Worker processes must not share what their parent would have drawn.
+        if self._fresh is None or self._fresh[0] != os.getpid():
+            self._fresh = (os.getpid(), np.random.default_rng())
+        return self._fresh[1]
+
+    def _draw(self, idx: int) -> tuple[int, int]:
+        """The episode and row of a goal."""
+        random = self._random(idx)
+        episode, start = (int(number) for number in self._clips[idx])
+        now, skip = start + self._now, self.dataset.frameskip
+        later = (int(self.dataset.lengths[episode]) - 1 - now) // skip
+        kind = random.choice(4, p=self.goal_probabilities)
+        if kind == 0:
+            row = int(random.integers(self._rows_before[-1]))
+            episode = int(np.searchsorted(self._rows_before, row, side="right")) - 1
+            return episode, row - int(self._rows_before[episode])
+        if kind == 1:
+            return episode, now + min(int(random.geometric(max(1 - self.gamma, 1e-6))), later) * skip
+        if kind == 2:
+            return episode, now + int(random.integers(1, later + 1)) * skip
+        return episode, now
+
+    def __getitem__(self, idx: int) -> dict[str, Any]:
+        return self.__getitems__([idx])[0]
+
+    def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Any]]:
+        """The samples of a batch."""
+        wrong = [i for i in indices if not -len(self) <= i < len(self)]
+        if wrong:
+            raise IndexError(f"clip {wrong[0]} of a dataset of {len(self)}")
+        indices = [i % len(self) for i in indices]
+        samples = [dict(sample) for sample in _items(self.dataset, self._indices[indices].tolist())]
+        if not self.goal_keys:
+            return samples
+        places = np.asarray([self._draw(i) for i in indices])
+        if isinstance(self.dataset, StoredDataset):
+            goals = self.dataset._slices(places[:, 0], places[:, 1], places[:, 1] + 1)
+        else:
+            goals = [self.dataset._load_slice(episode, row, row + 1) for episode, row in places.tolist()]
+        for sample, goal in zip(samples, goals, strict=True):
+            for name, goal_name in self.goal_keys.items():
+                if name in goal and name in sample:
+                    sample[goal_name] = goal[name]
+        return samples

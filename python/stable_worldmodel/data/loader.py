@@ -1,0 +1,255 @@
+"""Batches for training, loaded ahead by threads of the engine, without worker processes."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from stable_worldmodel import _engine
+
+from . import _tensors
+from ._tensors import NUMBERING, Array
+from .dataset import Transform
+from .foreign import engine_of
+from .utils import load_dataset
+
+__all__ = ["Goals", "Loader"]
+
+
+@dataclass(frozen=True)
+class Goals:
+    """A goal for every clip: a row that it shall lead to, as the columns `NAME_COLUMN`, `(batch, 1, ...)`, and the rows from
+    the anchor to it as `NAME_offset`, `(batch,)`, -1 where it does not follow.
+
+    Attributes:
+        columns: What is loaded of goals.
+        random: The chance of any row of any episode.
+        geometric: The chance of a later step, `k` steps ahead with probability `(1 - discount) * discount**(k - 1)`.
+        future: The chance of a later step, all equally likely.
+        last: The chance of the episode's last row.
+        current: The chance of the anchor itself.
+        discount: Of the geometric law.
+        anchor: The step of the clip that counts as now; the last one without it.
+        name: What the columns' names begin with.
+    """
+
+    columns: Sequence[str] = ("pixels",)
+    random: float = 0.3
+    geometric: float = 0.5
+    future: float = 0.0
+    last: float = 0.0
+    current: float = 0.2
+    discount: float = 0.99
+    anchor: int | None = None
+    name: str = "goal"
+
+    def spec(self) -> dict[str, Any]:
+        """As the engine takes it."""
+        chances = ("random", "geometric", "future", "last", "current", "discount")
+        mixture = {chance: float(getattr(self, chance)) for chance in chances}
+        return {"name": self.name, "columns": [*self.columns], "anchor": self.anchor, "mixture": mixture}
+
+
+def bytes_of(given: int | str) -> int:
+    """A number of bytes, given as one or as text such as `"512MB"` or `"2GiB"`."""
+    if not isinstance(given, str):
+        return int(given)
+    units = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
+    units |= {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
+    text = given.strip().upper()
+    number = text.rstrip("BKMGTI").strip()
+    unit = text[len(number) :].strip()
+    try:
+        return int(float(number) * units[unit])
+    except (KeyError, ValueError) as error:
+        raise ValueError(f"expected bytes, such as 536870912 or '512MB', got {given!r}") from error
+
+
+class Loader:
+    """Shuffled batches of clips, decoded ahead by threads of the engine.
+
+        loader = Loader("pusht.lance", batch_size=64, num_steps=4, frameskip=5, columns=["pixels", "action"])
+        for batch in loader:
+            batch["pixels"]  # (64, 4, 3, 224, 224), uint8
+            batch["action"]  # (64, 4, 10)
+
+    Every time it is iterated over it gives the next epoch, in an order that is a function of the seed and the epoch. The
+    tensors look at the engine's memory; it is used again when the last of them is gone. Pictures are stored row by row with
+    their channels side by side, which torch calls `channels_last`.
+
+    Args:
+        dataset: A path, a URI, a name, or a dataset that is open, of our or your own formats.
+        batch_size: Clips of a batch.
+        num_steps: Steps of a clip; the open dataset's without it, or 1.
+        frameskip: Rows from one step to the next; the open dataset's without it, or 1.
+        columns: The columns; those of the open dataset without it, or all.
+        shuffle: Whether clips come in random order, over the whole dataset.
+        seed: Decides the order and the goals, together with the epoch.
+        drop_last: Whether a last batch with fewer clips is left out.
+        episodes: Positions of the episodes to use; all without it.
+        goals: Goals to draw for every clip, several kinds if need be.
+        transform: Called with the dict of every batch, in which `action` is `(batch, num_steps * frameskip, numbers)`, as in
+            a dataset's `transform`.
+        device: Where tensors go.
+        threads: Threads that load ahead, which share the engine's to decode; 0 loads when asked.
+        prefetch: Batches loaded ahead, at most.
+        prefetch_bytes: Bytes of them, at most.
+        cache: Bytes of decoded rows to keep for later epochs, such as `"2GB"`; 0 keeps none.
+        cache_dir: A folder to keep them in, for several runs, in place of memory.
+        backend: `"torch"` or `"numpy"`; torch where it is installed.
+        format: The dataset's format, where it cannot be told from the path.
+    """
+
+    def __init__(
+        self,
+        dataset: Any,
+        batch_size: int = 64,
+        *,
+        num_steps: int | None = None,
+        frameskip: int | None = None,
+        columns: Sequence[str] | None = None,
+        shuffle: bool = True,
+        seed: int = 0,
+        drop_last: bool = False,
+        episodes: Sequence[int] | Array | None = None,
+        goals: Goals | Sequence[Goals] | None = None,
+        transform: Transform | None = None,
+        device: Any = None,
+        threads: int = 2,
+        prefetch: int = 4,
+        prefetch_bytes: int | str = "512MiB",
+        cache: int | str = 0,
+        cache_dir: str | os.PathLike[str] | None = None,
+        backend: str | None = None,
+        format: str | None = None,
+    ) -> None:
+        if isinstance(dataset, (str, os.PathLike)):
+            dataset = load_dataset(dataset, format=format)
+        elif format is not None:
+            raise TypeError("format: the dataset is open already")
+        self.dataset = dataset
+        self.backend = _tensors.backend(backend if backend is not None else getattr(dataset, "backend", None))
+        if device is not None and self.backend == "numpy":
+            raise ValueError("device: arrays of numpy stay on the CPU; use backend='torch'")
+        self.device = device
+        self.transform = transform if transform is not None else getattr(dataset, "transform", None)
+        self.batch_size = int(batch_size)
+        self.seed = int(seed)
+        engine = engine_of(dataset)
+        stored = {name: tuple(shape) for name, _, shape in engine.schema()}
+        if columns is None:
+            columns = list(getattr(dataset, "column_names", None) or [n for n in stored if n not in NUMBERING])
+        if isinstance(columns, str):
+            raise TypeError(f"columns: expected a list of names, such as [{columns!r}]")
+        unknown = [name for name in columns if name not in stored]
+        if unknown:
+            raise KeyError(f"there is no column {unknown[0]!r}; the columns are {', '.join(stored)}")
+        given = [goals] if isinstance(goals, Goals) else list(goals or [])
+        self.num_steps = int(num_steps if num_steps is not None else getattr(dataset, "num_steps", 1))
+        self.frameskip = int(frameskip if frameskip is not None else getattr(dataset, "frameskip", 1))
+        wanted = {
+            "num_steps": self.num_steps,
+            "frameskip": self.frameskip,
+            "columns": [*columns],
+            "goals": [goal.spec() for goal in given],
+            "batch_size": self.batch_size,
+            "shuffle": bool(shuffle),
+            "seed": self.seed,
+            "drop_last": bool(drop_last),
+            "threads": int(threads),
+            "prefetch": int(prefetch),
+            "prefetch_bytes": bytes_of(prefetch_bytes),
+            "episodes": None if episodes is None else np.asarray(episodes, dtype=np.int64).tolist(),
+            "cache": bytes_of(cache),
+            "cache_dir": None if cache_dir is None else os.fspath(cache_dir),
+        }
+        if any(isinstance(value, int) and value < 0 for value in wanted.values()):
+            negative = {name: value for name, value in wanted.items() if isinstance(value, int) and value < 0}
+            raise ValueError(f"expected no negative numbers, got {negative}")
+        self._loader = _engine.Loader(engine, json.dumps(wanted))
+        #: The shape of a row of every column of a batch: what follows the batch and the steps.
+        self._shapes = {name: tuple(shape[1:]) for name, _, shape in self._loader.schema()}
+        # What the dataset shows as lists of one number.
+        for name, (_, shape) in getattr(dataset, "schema", {}).items():
+            for column in (name, *(f"{goal.name}_{name}" for goal in given)):
+                if name != "action" and self._shapes.get(column) == () and shape == (1,):
+                    self._shapes[column] = shape
+        self._action = stored.get("action")
+        #: Where the next iteration begins, and where the latest one is: epoch and batch.
+        self._next = (0, 0)
+        self._at = (0, 0)
+
+    def __len__(self) -> int:
+        """Batches of an epoch."""
+        return int(self._loader.batches())
+
+    @property
+    def num_clips(self) -> int:
+        """Clips of an epoch."""
+        return int(self._loader.clips())
+
+    @property
+    def column_names(self) -> list[str]:
+        """The columns of a batch."""
+        return list(self._shapes)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Begins the next iteration with this epoch, unless it is the one that goes on there."""
+        if epoch != self._next[0]:
+            self._next = (int(epoch), 0)
+
+    def state_dict(self) -> dict[str, int]:
+        """Where the iteration is: what :meth:`load_state_dict` needs to go on with the next batch."""
+        epoch, batch = self._at
+        clips = self.num_clips
+        return {"epoch": epoch, "batch": batch, "seed": self.seed, "batch_size": self.batch_size, "clips": clips}
+
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """Begins the next iteration where another one was, with the same batches as it would have had."""
+        here = self.state_dict()
+        other = {name: (state[name], here[name]) for name in ("seed", "batch_size", "clips") if state[name] != here[name]}
+        if other:
+            told = ", ".join(f"{name} was {was} and is {now}" for name, (was, now) in other.items())
+            raise ValueError(f"the state is of another loader: {told}")
+        self._next = self._at = (int(state["epoch"]), int(state["batch"]))
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        """The batches of an epoch. Ended early, the next iteration begins the epoch after it."""
+        epoch, batch = self._next
+        self._next = (epoch + 1, 0)
+        self._at = (epoch, batch)
+        return self._batches(epoch, batch)
+
+    def _batches(self, epoch: int, batch: int) -> Iterator[dict[str, Any]]:
+        loading = self._loader.epoch(epoch, batch)
+        while (found := loading.next()) is not None:
+            batch += 1
+            self._at = (epoch, batch) if batch < len(self) else (epoch + 1, 0)
+            yield self._shaped(found)
+
+    def _shaped(self, found: dict[str, Array]) -> dict[str, Any]:
+        batch: dict[str, Any] = {}
+        for name, array in found.items():
+            shape = self._shapes[name]
+            if shape == (1,) and array.ndim == 2:
+                array = array[..., np.newaxis]
+            value = _tensors.wrap(_tensors.channels_first(array, shape), self.backend)
+            batch[name] = value if self.device is None else value.to(self.device, non_blocking=True)
+        if self.transform is None:
+            return batch
+        if "action" in batch and self._action is not None:
+            size = len(batch["action"])
+            batch["action"] = batch["action"].reshape(size, self.num_steps * self.frameskip, *self._action)
+        batch = self.transform(batch)
+        if "action" in batch:
+            batch["action"] = batch["action"].reshape(len(batch["action"]), self.num_steps, -1)
+        return batch
+
+    def __repr__(self) -> str:
+        clips = f"{self.num_clips} clips of {self.num_steps} steps, frameskip {self.frameskip}"
+        return f"Loader({len(self)} batches of {self.batch_size}: {clips})"

@@ -1,0 +1,180 @@
+"""Scaling columns to a common range. Scalers may be pickled, and take arrays and tensors alike."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any, TypeVar
+
+import numpy as np
+
+from . import _tensors
+from ._tensors import Array
+
+__all__ = ["ColumnTransform", "IdentityScaler", "PercentileScaler", "ZScoreScaler", "column_normalizer", "get_scaler"]
+
+X = TypeVar("X")
+
+
+def _is_tensor(value: Any) -> bool:
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(value, torch.Tensor)
+
+
+def _like(value: Any, *bounds: Array | None) -> list[Any]:
+    """Bounds as arrays or tensors, as `value` is one."""
+    if any(bound is None for bound in bounds):
+        raise ValueError("the scaler is not fitted: call fit first, or give it its bounds")
+    if not _is_tensor(value):
+        return list(bounds)
+    import torch
+
+    return [torch.as_tensor(bound, dtype=value.dtype, device=value.device) for bound in bounds]
+
+
+def _finite_rows(values: Any) -> Array:
+    """All rows `(n, d)` without a NaN, such as the missing action of an episode's last row."""
+    array = _tensors.to_numpy(values)
+    array = array.reshape(-1, array.shape[-1] if array.ndim > 1 else 1)
+    array = array[~np.isnan(array).any(axis=1)]
+    if len(array) == 0:
+        raise ValueError("a scaler cannot be fitted to no rows")
+    return array
+
+
+class IdentityScaler:
+    """Leaves values as they are."""
+
+    def fit(self, values: Any) -> IdentityScaler:
+        """Nothing to learn."""
+        return self
+
+    def transform(self, values: X) -> X:
+        """The values."""
+        return values
+
+    def inverse_transform(self, values: X) -> X:
+        """The values."""
+        return values
+
+    def fit_transform(self, values: X) -> X:
+        """The values."""
+        return values
+
+    def __call__(self, values: X) -> X:
+        return values
+
+
+class _Affine:
+    """Values moved and stretched, a dimension each: `(x - centre) / scale`."""
+
+    def _bounds(self) -> tuple[Array | None, Array | None]:
+        """The centre and the scale."""
+        raise NotImplementedError
+
+    def fit(self, values: Any) -> Any:
+        """Learns from values `(..., d)`; rows with a NaN do not count."""
+        raise NotImplementedError
+
+    def transform(self, values: Any) -> Any:
+        """The scaled values, `(..., d)`."""
+        centre, scale = _like(values, *self._bounds())
+        return (values - centre) / scale
+
+    def inverse_transform(self, values: Any) -> Any:
+        """The values that were scaled, `(..., d)`."""
+        centre, scale = _like(values, *self._bounds())
+        return values * scale + centre
+
+    def fit_transform(self, values: Any) -> Any:
+        """Learns from values, and scales them."""
+        return self.fit(values).transform(values)
+
+    def __call__(self, values: Any) -> Any:
+        scaled = self.transform(values)
+        return scaled.float() if _is_tensor(scaled) else scaled
+
+
+class ZScoreScaler(_Affine):
+    """Mean 0 and standard deviation 1 in every dimension; deviations below `eps` count as `eps`."""
+
+    def __init__(self, mean: Any = None, std: Any = None, eps: float = 1e-8) -> None:
+        self.mean = None if mean is None else np.asarray(mean)
+        self.std = None if std is None else np.asarray(std)
+        self.eps = eps
+
+    def fit(self, values: Any) -> ZScoreScaler:
+        """Learns from values `(..., d)`; rows with a NaN do not count."""
+        rows = _finite_rows(values)
+        self.mean, self.std = rows.mean(axis=0, keepdims=True), rows.std(axis=0, keepdims=True)
+        return self
+
+    def _bounds(self) -> tuple[Array | None, Array | None]:
+        return self.mean, None if self.std is None else np.maximum(self.std, self.eps)
+
+
+class PercentileScaler(_Affine):
+    """The range between two percentiles becomes -1 .. 1, and what is outside of it is clipped."""
+
+    def __init__(
+        self, low: float = 1.0, high: float = 99.0, q_low: Any = None, q_high: Any = None, eps: float = 1e-8
+    ) -> None:
+        if not 0 <= low < high <= 100:
+            raise ValueError(f"expected percentiles 0 <= low < high <= 100, got {low} and {high}")
+        self.low = low
+        self.high = high
+        self.q_low = None if q_low is None else np.asarray(q_low)
+        self.q_high = None if q_high is None else np.asarray(q_high)
+        self.eps = eps
+
+    def fit(self, values: Any) -> PercentileScaler:
+        """Learns from values `(..., d)`; rows with a NaN do not count."""
+        self.q_low, self.q_high = np.percentile(_finite_rows(values), [self.low, self.high], axis=0)
+        return self
+
+    def _bounds(self) -> tuple[Array | None, Array | None]:
+        if self.q_low is None or self.q_high is None:
+            return None, None
+        return (self.q_low + self.q_high) / 2, np.maximum(self.q_high - self.q_low, self.eps) / 2
+
+    def transform(self, values: Any) -> Any:
+        """The scaled values, `(..., d)`."""
+        scaled = super().transform(values)
+        return scaled.clamp(-1, 1) if _is_tensor(scaled) else np.clip(scaled, -1, 1)
+
+
+_SCALERS: dict[str, Any] = {"zscore": ZScoreScaler, "percentile": PercentileScaler, "none": IdentityScaler}
+
+
+def get_scaler(method: str = "zscore", **kwargs: Any) -> Any:
+    """A scaler that is not fitted yet: `"zscore"`, `"percentile"` or `"none"`."""
+    if method not in _SCALERS:
+        raise ValueError(f"unknown scaler {method!r}; there are {', '.join(_SCALERS)}")
+    return _SCALERS[method](**kwargs)
+
+
+class ColumnTransform:
+    """A transform of samples: `sample[target] = scaler(sample[source])`."""
+
+    def __init__(self, scaler: Any, source: str, target: str) -> None:
+        self.scaler = scaler
+        self.source = source
+        self.target = target
+
+    def __call__(self, sample: dict[str, Any]) -> dict[str, Any]:
+        sample[self.target] = self.scaler(sample[self.source])
+        return sample
+
+
+def column_normalizer(dataset: Any, source: str, target: str, method: str = "zscore") -> ColumnTransform:
+    """A transform that scales a column by what the dataset has of it.
+
+    Args:
+        dataset: Anything with `get_col_data`.
+        source: The column to read.
+        target: The column to write; may be the same.
+        method: `"zscore"`, `"percentile"` or `"none"`.
+    """
+    scaler = get_scaler(method)
+    if method != "none":
+        scaler.fit(dataset.get_col_data(source))
+    return ColumnTransform(scaler, source, target)

@@ -1,0 +1,263 @@
+"""Finding, opening, converting, examining and describing datasets."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stable_worldmodel import _engine
+
+from . import _tensors
+from .dataset import Transform
+from .format import FORMATS, detect_format, get_format, validate_write_mode
+from .foreign import engine_of
+from .writer import codec_json
+
+__all__ = ["convert", "doctor", "ensure_dir_exists", "get_cache_dir", "inspect", "load_dataset"]
+
+
+def get_cache_dir(override_root: str | Path | None = None, sub_folder: str | None = None) -> Path:
+    """The folder of everything without a path of its own (`$STABLEWM_HOME`), or one below it; made if need be."""
+    folder = Path(_engine.home() if override_root is None else override_root)
+    folder = folder if sub_folder is None else folder / sub_folder
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def ensure_dir_exists(path: str | Path) -> None:
+    """Makes a folder, if it is not there."""
+    Path(path).mkdir(parents=True, exist_ok=True)
+
+
+def resolve(given: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None = None) -> str:
+    """Where a dataset is that is there: a path, a URI, or a name below `datasets` of the home folder or `cache_dir`."""
+    text = os.fspath(given)
+    if "://" in text:
+        return text
+    datasets = Path(_engine.home() if cache_dir is None else cache_dir) / "datasets"
+    # A dataset of a hub lies under its name there.
+    places = [Path(text), datasets / text, datasets / text.replace("/", "--")]
+    if cache_dir is not None:
+        places = [*places[1:], *sorted(datasets.glob(f"{text}.*")), places[0]]
+    for place in places:
+        if place.exists():
+            return os.path.abspath(place)
+    return os.path.abspath(_engine.find_dataset(text))
+
+
+def load_dataset(
+    name: str | os.PathLike[str],
+    cache_dir: str | os.PathLike[str] | None = None,
+    format: str | None = None,
+    *,
+    num_steps: int = 1,
+    frameskip: int = 1,
+    keys_to_load: list[str] | None = None,
+    keys_to_cache: list[str] | None = None,
+    transform: Transform | None = None,
+    **kwargs: Any,
+) -> Any:
+    """Opens a dataset of any format, as clips for a torch `DataLoader`.
+
+        dataset = load_dataset("pusht.lance", num_steps=4, frameskip=5, keys_to_load=["pixels", "action"])
+        dataset[0]["pixels"].shape  # (4, 3, 224, 224), uint8
+        dataset[0]["action"].shape  # (4, 10): the five actions of every step
+
+    Args:
+        name: A path, a URI (`s3://`, `gs://`, `az://`, `http(s)://`), or a name under `$STABLEWM_HOME/datasets`.
+        cache_dir: A folder in place of `$STABLEWM_HOME`.
+        format: The format's name, where it cannot be told from the path.
+        num_steps: Steps of a clip.
+        frameskip: Rows from one step to the next.
+        keys_to_load: The columns of a sample; all without it.
+        keys_to_cache: Columns whose decoded rows stay in memory.
+        transform: Called with the dict of every sample.
+        **kwargs: What the format's reader takes besides; ours take `backend` (`"torch"` or `"numpy"`) and
+            `keys_to_merge`.
+
+    Returns:
+        A :class:`~stable_worldmodel.data.Dataset`.
+    """
+    path = resolve(name, cache_dir)
+    kind = get_format(format) if format is not None else detect_format(path)
+    given = {
+        "num_steps": num_steps,
+        "frameskip": frameskip,
+        "keys_to_load": keys_to_load,
+        "keys_to_cache": keys_to_cache,
+        "transform": transform,
+    }
+    if kind is None:
+        known = ", ".join(FORMATS)
+        raise ValueError(f"{path} is of no known format ({known}); name one with format=")
+    if not kind.native:
+        # Readers of others need not know all of it.
+        defaults = {"num_steps": 1, "frameskip": 1}
+        given = {name: value for name, value in given.items() if value != defaults.get(name)}
+    return kind.open_reader(path, **given, **kwargs)
+
+
+def _telling(progress: bool) -> Callable[[str, int, int], None] | None:
+    """Shows how far something is, with tqdm where it is installed."""
+    if not progress:
+        return None
+    try:
+        from tqdm.auto import tqdm
+    except ImportError:
+        return None
+    bar: Any = None
+
+    def tell(stage: str, done: int, total: int) -> None:
+        nonlocal bar
+        if bar is None or bar.desc != stage:
+            if bar is not None:
+                bar.close()
+            bar = tqdm(total=total, desc=stage, unit="episode")
+        bar.update(done - bar.n)
+        if done == total:
+            bar.close()
+
+    return tell
+
+
+def _options(
+    format: str | None, mode: str, codec: str | None, quality: int | None, verify: bool, least_psnr: float
+) -> str:
+    if mode not in ("resume", "append", "overwrite", "error"):
+        raise ValueError(f"mode: expected 'resume', 'append', 'overwrite' or 'error', got {mode!r}")
+    chosen = codec_json(codec, quality)
+    wanted = {
+        "format": format,
+        "mode": mode,
+        "codec": None if chosen is None else json.loads(chosen),
+        "verify": verify,
+        "least_psnr": least_psnr,
+    }
+    return json.dumps(wanted)
+
+
+def convert(
+    source: Any,
+    dest: str | os.PathLike[str],
+    *,
+    source_format: str | None = None,
+    dest_format: str | None = None,
+    format: str | None = None,
+    cache_dir: str | os.PathLike[str] | None = None,
+    progress: bool = True,
+    mode: str = "resume",
+    codec: str | None = None,
+    jpeg_quality: int | None = None,
+    verify: bool = True,
+    least_psnr: float = 25.0,
+    **kwargs: Any,
+) -> dict[str, Any]:
+    """Writes a dataset in another format or codec, and reads it again to compare what readers get.
+
+        convert("pusht.lance", "pusht.h5")
+        convert("pusht.lance", "pusht-video", dest_format="video")
+
+    Args:
+        source: A path, a URI, a name, or a dataset that is open.
+        dest: Where to; its name says the format, or `dest_format` does, or it is Lance.
+        source_format: The source's format, where it cannot be told from the path.
+        dest_format: The format to write.
+        format: The same.
+        cache_dir: A folder in place of `$STABLEWM_HOME` to find the source in.
+        progress: Whether to show a progress bar (with tqdm, if it is installed).
+        mode: What to do with a target that is there: `"resume"` goes on behind its last episode if what it has is the
+            beginning of the source, `"append"` adds to it, `"overwrite"` replaces it, `"error"` refuses.
+        codec: How pictures are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg:QUALITY"`.
+        jpeg_quality: Another way to say `codec="jpeg:QUALITY"`.
+        verify: Whether the target is read again and compared.
+        least_psnr: The least signal-to-noise ratio of lossy pictures, in dB; less is an error.
+        **kwargs: What the writer of a format of yours takes besides.
+
+    Returns:
+        What became of it: `episodes`, `kept` (those that were there), `rows`, `last_actions` (left out, as no observation
+        follows them), `checksum`, and how the `columns` compare. Of a format of yours, `episodes` and `rows`.
+    """
+    if isinstance(source, (str, os.PathLike)):
+        source = load_dataset(source, cache_dir, source_format)
+    format = dest_format if format is None else format
+    kind = get_format(format) if format is not None else detect_format(dest)
+    kind = FORMATS["lance"] if kind is None else kind
+    tell = _telling(progress)
+    if not kind.native:
+        return _hand_over(source, kind.open_writer(dest, mode=_plain(mode), **kwargs), tell)
+    if kwargs:
+        raise TypeError(f"convert: the format {kind.name} takes no {', '.join(kwargs)}")
+    options = _options(kind.name, mode, codec, jpeg_quality, verify, least_psnr)
+    return dict(json.loads(_engine.convert(engine_of(source), os.fspath(dest), options, tell)))
+
+
+def _plain(mode: str) -> str:
+    """A mode that every writer knows."""
+    return validate_write_mode("error" if mode == "resume" else mode)
+
+
+def _hand_over(source: Any, writer: Any, tell: Callable[[str, int, int], None] | None) -> dict[str, Any]:
+    """Writes all episodes of a dataset with a writer that Python brings."""
+    engine = engine_of(source)
+    lengths = engine.lengths()
+    names = [name for name, _, _ in engine.schema() if name not in _tensors.NUMBERING]
+    with writer:
+        for episode, length in enumerate(lengths):
+            run = (np.asarray([number], dtype=np.int64) for number in (episode, 0, length))
+            writer.write_episode(dict(engine.read(names, *run, 1)))
+            if tell is not None:
+                tell("convert", episode + 1, len(lengths))
+    return {"episodes": len(lengths), "rows": int(lengths.sum())}
+
+
+def doctor(
+    dataset: str | os.PathLike[str],
+    *,
+    repair: str | os.PathLike[str] | None = None,
+    format: str | None = None,
+    progress: bool = True,
+    codec: str | None = None,
+    jpeg_quality: int | None = None,
+) -> dict[str, Any]:
+    """Reads everything as training does, and says what is wrong and which models it can train.
+
+    Args:
+        dataset: A path, a URI or a name.
+        repair: Where to write the sound episodes to, if at all.
+        format: The format of what is written.
+        progress: Whether to show a progress bar.
+        codec: How pictures are stored there, as in :func:`convert`.
+        jpeg_quality: Another way to say `codec="jpeg:QUALITY"`.
+
+    Returns:
+        `episodes`, `rows`, `problems` (how many), `findings` (each with `severity`, `what`, `episodes`), `sound` (the
+        positions of sound episodes), `models`, and `repaired` (as :func:`convert` returns it, or `None`).
+    """
+    options = _options(format, "resume", codec, jpeg_quality, True, 25.0)
+    target = None if repair is None else os.fspath(repair)
+    return dict(json.loads(_engine.doctor(resolve(dataset), target, options, _telling(progress))))
+
+
+def inspect(dataset: Any, *, checksum: bool = False) -> dict[str, Any]:
+    """What is in a dataset.
+
+    Args:
+        dataset: A path, a URI, a name, or a dataset that is open.
+        checksum: Whether to read everything for the hash of what readers get, which does not depend on the format.
+
+    Returns:
+        `episodes`, `steps`, `lengths`, `columns` (each with `name`, `dtype`, `shape`), `bytes`, `footprint` (bytes by
+        part), `manifest`, `content_hash` and `checksum`.
+    """
+    if isinstance(dataset, (str, os.PathLike)):
+        dataset = load_dataset(dataset)
+    engine = engine_of(dataset)
+    found = dict(json.loads(_engine.inspect(engine, checksum)))
+    manifest = engine.manifest()
+    columns = [{"name": name, "dtype": dtype, "shape": list(shape)} for name, dtype, shape in engine.schema()]
+    return {**found, "columns": columns, "manifest": None if manifest is None else json.loads(manifest)}

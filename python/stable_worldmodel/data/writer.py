@@ -1,0 +1,164 @@
+"""Writing episodes into datasets of the engine's formats."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stable_worldmodel import _engine
+
+from . import _tensors
+from ._tensors import NUMBERING, Array
+from .format import validate_write_mode
+
+__all__ = ["EpisodeWriter"]
+
+
+def codec_json(codec: str | None, quality: int | None = None) -> str | None:
+    """How pictures are stored, as the engine takes it: `"qoi"` or `"png"` (lossless), `"jpeg"` or `"jpeg:QUALITY"`."""
+    if codec is None:
+        if quality is None:
+            return None
+        codec = "jpeg"
+    name, _, given = codec.lower().partition(":")
+    name = {"lossless": "qoi", "jpg": "jpeg"}.get(name, name)
+    if name == "jpeg" and (not given or given.isdigit()):
+        return json.dumps({"jpeg": {"quality": int(given or (95 if quality is None else quality))}})
+    if name not in ("qoi", "png") or given:
+        raise ValueError(f"codec: expected 'qoi' or 'png' (lossless), 'jpeg' or 'jpeg:QUALITY', got {codec!r}")
+    return json.dumps(name)
+
+
+class EpisodeWriter:
+    """Writes episodes into a dataset: a :class:`~stable_worldmodel.data.Writer`.
+
+    The first episode says which columns there are. Episodes survive a killed process once they are committed, which
+    happens at least every two seconds and when the writer is closed.
+
+    Args:
+        path: A path, a URI, or a name under `$STABLEWM_HOME/datasets`.
+        format: The format, where the path does not say it; Lance without either.
+        mode: `"append"` continues a dataset that is there, `"overwrite"` replaces it, `"error"` refuses.
+        codec: How pictures are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg:QUALITY"`.
+        jpeg_quality: Another way to say `codec="jpeg:QUALITY"`.
+        manifest: Where the data come from: what to store beside them, under the key `config`.
+    """
+
+    #: The format of this class's datasets; what the path says for `None`.
+    format: str | None = None
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        format: str | None = None,
+        mode: str = "append",
+        codec: str | None = None,
+        jpeg_quality: int | None = None,
+        manifest: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.mode = validate_write_mode(mode)
+        if format is not None:
+            self.format = format
+        self.path = _engine.target(os.fspath(path), self.format)
+        if self.format is None:
+            self.format = _engine.detect(self.path) or "lance"
+        self._codec = codec_json(codec, jpeg_quality)
+        self._manifest = None if manifest is None else self._provenance(manifest)
+        self._writer: Any = None
+        self._closed = False
+        #: The columns and their types, once they are known.
+        self._columns: dict[str, tuple[str, tuple[int, ...]]] = {}
+        place = Path(self.path)
+        there = "://" not in self.path and place.exists() and not (place.is_dir() and not any(place.iterdir()))
+        if there and mode == "error":
+            raise FileExistsError(
+                f"{self.path}: there is a dataset already; continue it (mode='append') or replace it (mode='overwrite')"
+            )
+        if there and mode == "append":
+            schema = _engine.Dataset(self.path, self.format).schema()
+            self._columns = {name: (dtype, tuple(shape)) for name, dtype, shape in schema if name not in NUMBERING}
+
+    @staticmethod
+    def _provenance(given: Mapping[str, Any]) -> str:
+        if "kind" in given and "config" in given:
+            return json.dumps(dict(given))
+        from stable_worldmodel._engine import __version__
+
+        empty: dict[str, str] = {}
+        made = {"kind": "write", "swm_version": __version__, "libraries": empty, "seed": 0, "hashes": empty}
+        return json.dumps({**made, "config": dict(given), "device": "cpu"})
+
+    @property
+    def num_episodes(self) -> int:
+        """Episodes in the dataset, those to be committed included; 0 before the first one is written."""
+        return 0 if self._writer is None else int(self._writer.episodes() or 0)
+
+    def write_episode(self, ep_data: Mapping[str, Any]) -> None:
+        """Adds an episode: a list of steps a column, or an array `(T, ...)`.
+
+        Row `t` holds the observation at `t` and the action taken from it; the last row's action is missing, NaN (or -1 of
+        integers), or left out.
+        """
+        if self._closed:
+            raise ValueError(f"{self.path}: the writer is closed; open another one with mode='append'")
+        arrays, constants = _tensors.rows(ep_data)
+        if not arrays:
+            raise ValueError("an episode needs a column of numbers at least")
+        if not self._columns:
+            self._columns = {name: (array.dtype.name, array.shape[1:]) for name, array in arrays.items()}
+        fitted = self._fitted(arrays)
+        if self._writer is None:
+            columns = [(name, dtype, list(shape)) for name, (dtype, shape) in self._columns.items()]
+            self._writer = _engine.Writer(
+                self.path, self.format, self.mode, self._codec, columns, self._manifest
+            )
+        self._writer.write(fitted, constants)
+
+    def _fitted(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
+        """The episode with the columns of the dataset, in their order and of their types."""
+        missing = [name for name in self._columns if name not in arrays]
+        extra = [name for name in arrays if name not in self._columns]
+        if missing or extra:
+            raise ValueError(
+                f"{self.path}: an episode must have the dataset's columns: missing {missing}, unexpected {extra}"
+            )
+        fitted = {}
+        for name, (dtype, shape) in self._columns.items():
+            array = arrays[name]
+            # Lists of one number a step are scalars to some, and lists of one to others.
+            if array.shape[1:] != shape and array[:1].size == int(np.prod(shape)) and max(array.ndim - 1, len(shape)) <= 1:
+                array = array.reshape(len(array), *shape)
+            if array.shape[1:] != shape:
+                raise ValueError(
+                    f"{self.path}: column {name!r} has steps of shape {array.shape[1:]}, the dataset's of {shape}"
+                )
+            if array.dtype.name != dtype and not np.can_cast(array.dtype, dtype, "same_kind"):
+                raise TypeError(f"{self.path}: column {name!r} is {array.dtype.name}, the dataset's {dtype}")
+            fitted[name] = np.ascontiguousarray(array, dtype=dtype)
+        return fitted
+
+    def write_episodes(self, episodes: Iterable[Mapping[str, Any]]) -> None:
+        """Adds episodes as they come."""
+        for episode in episodes:
+            self.write_episode(episode)
+
+    def close(self) -> None:
+        """Commits what was written."""
+        self._closed = True
+        if self._writer is not None:
+            self._writer.finish()
+
+    def __enter__(self) -> EpisodeWriter:
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.path!r}, format={self.format!r}, mode={self.mode!r})"

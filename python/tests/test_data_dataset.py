@@ -1,0 +1,241 @@
+"""Reading: what was written comes back, as clips, chunks, columns and rows."""
+
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from data_helpers import LENGTHS, clips, episode, same, write
+
+from stable_worldmodel import data
+
+FORMATS = {"lance": "a.lance", "hdf5": "a.h5"}
+
+
+@pytest.fixture(scope="module", params=FORMATS)
+def stored(request, tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / FORMATS[request.param]
+    return path, write(path), request.param == "lance"
+
+
+@pytest.mark.parametrize(("num_steps", "frameskip"), [(1, 1), (3, 1), (3, 2), (4, 5)])
+def test_clips_are_windows_of_episodes(stored, num_steps, frameskip):
+    path, written, lists = stored
+    dataset = data.load_dataset(path, num_steps=num_steps, frameskip=frameskip, backend="numpy")
+    expected = clips(written, num_steps, frameskip)
+    assert len(dataset) == len(dataset.clip_indices) == len(expected)
+    together = dataset.__getitems__(range(len(dataset)))
+    for i, clip in enumerate(expected):
+        same(together[i], clip, lists)
+    for i in (0, len(dataset) // 2, -1):
+        same(dataset[i], expected[i], lists)
+
+
+def test_what_a_dataset_says_of_itself(stored):
+    path, _, lists = stored
+    dataset = data.load_dataset(path, keys_to_load=["action", "reward"])
+    assert dataset.column_names == ["action", "reward"]
+    assert dataset.lengths.tolist() == list(LENGTHS)
+    assert dataset.offsets.tolist() == [0, 12, 32, 41]
+    assert dataset.num_episodes == 4
+    assert dataset.get_dim("action") == 2
+    assert dataset.get_dim("pixels") == 16 * 16 * 3
+    assert dataset.schema["reward"] == (np.dtype("float64"), (1,) if lists else ())
+    assert dataset.manifest is None
+    assert "4 episodes, 71 rows" in repr(dataset)
+
+
+def test_chunks_episodes_columns_rows(stored):
+    path, written, lists = stored
+    dataset = data.load_dataset(path, num_steps=2, frameskip=3, backend="numpy")
+    chunks = dataset.load_chunk(np.array([3, 0]), np.array([2, 0]), np.array([14, 6]))
+    for chunk, (number, start, end) in zip(chunks, [(3, 2, 14), (0, 0, 6)], strict=True):
+        expected = clips([{name: array[start:end] for name, array in written[number].items()}], (end - start) // 3, 3)
+        same(chunk, expected[0], lists)
+    whole = dataset.load_episode(2)
+    assert whole["action"].shape == (9, 2) and whole["state"].shape == (3, 4)
+    for name in ("pixels", "action", "state"):
+        np.testing.assert_array_equal(dataset.get_col_data(name), np.concatenate([e[name] for e in written]))
+    rows = dataset.get_row_data([70, 12, 12])
+    np.testing.assert_array_equal(rows["state"], [written[3]["state"][29], written[1]["state"][0], written[1]["state"][0]])
+    assert dataset.get_row_data(-1)["pixels"].shape == (16, 16, 3)
+    np.testing.assert_array_equal(dataset.get_col_data("episode_idx"), np.repeat(np.arange(4), LENGTHS))
+
+
+def test_columns_kept_and_merged(stored):
+    path, written, _ = stored
+    dataset = data.load_dataset(
+        path, num_steps=2, keys_to_load=["pixels"], keys_to_cache=["pixels"], backend="numpy",
+        keys_to_merge={"both": ["action", "state"], "actions": "act.*"},
+    )  # fmt: skip
+    expected = np.concatenate([written[0]["action"][:2], written[0]["state"][:2]], axis=1)
+    for _ in range(2):
+        sample = dataset[0]
+        np.testing.assert_array_equal(sample["both"], expected)
+        np.testing.assert_array_equal(sample["pixels"], written[0]["pixels"][:2].transpose(0, 3, 1, 2))
+    assert dataset.column_names == ["pixels", "both", "actions"]
+    assert dataset.get_dim("both") == 6
+
+
+def test_transforms_see_rows_before_actions_are_grouped(stored):
+    path, _, _ = stored
+    seen = []
+
+    def transform(sample):
+        seen.append(sample["action"].shape)
+        return {**sample, "action": 2 * sample["action"]}
+
+    plain = data.load_dataset(path, num_steps=3, frameskip=2, backend="numpy")
+    dataset = data.load_dataset(path, num_steps=3, frameskip=2, backend="numpy", transform=transform)
+    np.testing.assert_array_equal(dataset[4]["action"], 2 * plain[4]["action"])
+    np.testing.assert_array_equal(dataset.__getitems__([4])[0]["action"], 2 * plain[4]["action"])
+    assert seen == [(6, 2), (6, 2)]
+
+
+def test_it_may_be_pickled(stored):
+    path, written, lists = stored
+    dataset = pickle.loads(pickle.dumps(data.load_dataset(path, num_steps=3, keys_to_cache=["pixels"], backend="numpy")))
+    same(dataset[20], clips(written, 3, 1)[20], lists)
+
+
+def test_mistakes_are_named(stored, tmp_path, monkeypatch):
+    path, _, _ = stored
+    with pytest.raises(KeyError, match="no column 'pixel'.*the columns are .*pixels"):
+        data.load_dataset(path, keys_to_load=["pixel"])
+    dataset = data.load_dataset(path, num_steps=2)
+    with pytest.raises(IndexError, match="of a dataset of 67"):
+        dataset[67]
+    with pytest.raises(IndexError, match="rows 5 .. 13 of episode 0, which has 12"):
+        dataset.load_chunk([0], [5], [13])
+    with pytest.raises(IndexError, match="episode 4 of a dataset of 4"):
+        dataset.load_chunk([4], [0], [1])
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        data.load_dataset(path, frameskip=0)
+    with pytest.raises(ValueError, match="'torch' or 'numpy', got 'jax'"):
+        data.load_dataset(path, backend="jax")
+    with pytest.raises(ValueError, match="unknown format 'zarr'"):
+        data.load_dataset(path, format="zarr")
+    with pytest.raises(ValueError, match="no multiples of frameskip 2"):
+        data.load_dataset(path, frameskip=2).load_chunk([0], [0], [3])
+    monkeypatch.setenv("STABLEWM_HOME", str(tmp_path))
+    (tmp_path / "datasets").mkdir()
+    write(tmp_path / "datasets" / "rooms.lance", (5,))
+    with pytest.raises(FileNotFoundError, match="'roms'.*did you mean rooms"):
+        data.load_dataset("roms")
+    (tmp_path / "notes").mkdir()
+    with pytest.raises(ValueError, match="of no known format"):
+        data.load_dataset(tmp_path / "notes")
+
+
+def test_names_are_found_at_home(tmp_path, monkeypatch):
+    monkeypatch.setenv("STABLEWM_HOME", str(tmp_path))
+    write("rooms", (5,))
+    assert (tmp_path / "datasets" / "rooms.lance").exists()
+    monkeypatch.chdir(tmp_path)
+    for name in ("rooms", "rooms.lance"):
+        assert data.load_dataset(name).lengths.tolist() == [5]
+    monkeypatch.setenv("STABLEWM_HOME", str(tmp_path / "elsewhere"))
+    assert data.load_dataset("rooms", cache_dir=tmp_path).lengths.tolist() == [5]
+
+
+def test_numpy_needs_no_torch(stored):
+    path, _, _ = stored
+    program = (
+        "import sys; from stable_worldmodel import data\n"
+        f"dataset = data.load_dataset({str(path)!r}, backend='numpy')\n"
+        "batch = next(iter(data.Loader(dataset, 4)))\n"
+        "assert type(dataset[0]['pixels']).__name__ == 'ndarray' and batch['pixels'].shape[2] == 3\n"
+        "assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_concat_and_merge(tmp_path):
+    first, second = write(tmp_path / "a.lance", (8, 9)), write(tmp_path / "b.lance", (7,))
+    parts = [data.load_dataset(tmp_path / f"{name}.lance", num_steps=3, frameskip=2, backend="numpy") for name in "ab"]
+    both = data.ConcatDataset(parts)
+    expected = clips(first + second, 3, 2)
+    assert len(both) == len(expected)
+    for found, clip in zip(both.__getitems__(range(len(both))), expected, strict=True):
+        same(found, clip, True)
+    same(both[-1], expected[-1], True)
+    np.testing.assert_array_equal(both.get_row_data([17])["state"][0], second[0]["state"][0])
+    assert [len(chunk["state"]) for chunk in both.load_chunk([2, 0], [0, 0], [4, 8])] == [2, 4]
+    assert both.lengths.tolist() == [8, 9, 7] and both.get_col_data("reward").shape == (24, 1)
+
+    with data.open_writer(tmp_path / "c.lance") as writer:
+        writer.write_episodes({"feature": 10.0 + content["state"], "state": content["state"]} for content in first)
+    features = data.load_dataset(tmp_path / "c.lance", num_steps=3, frameskip=2, backend="numpy")
+    merged = data.MergeDataset([parts[0], features])
+    assert merged.column_names == [*parts[0].column_names, "feature"]
+    for sample in (merged[2], merged.__getitems__([2])[0]):
+        np.testing.assert_array_equal(sample["feature"], 10.0 + sample["state"])
+    with pytest.raises(ValueError, match="same episodes"):
+        data.MergeDataset([parts[0], parts[1]])
+    for dataset in (both, merged):
+        batches = list(data.Loader(dataset, 4, shuffle=False, columns=["state", "action"], backend="numpy"))
+        found = np.concatenate([batch["state"] for batch in batches])
+        np.testing.assert_array_equal(found, [dataset[i]["state"] for i in range(len(dataset))])
+
+
+def test_goals_follow_the_clip(tmp_path):
+    write(tmp_path / "a.lance")
+    dataset = data.load_dataset(tmp_path / "a.lance", num_steps=2, frameskip=2, backend="numpy")
+    keys = {"reward": "goal"}
+
+    def drawn(chances, **kwargs):
+        goals = data.GoalDataset(dataset, chances, goal_keys=keys, seed=3, **kwargs)
+        samples = goals.__getitems__(range(len(goals)))
+        # The reward counts rows: what is ahead of the last step of the clip, in rows.
+        return goals, np.array([sample["goal"][0, 0] - sample["reward"][-1, 0] for sample in samples])
+
+    goals, ahead = drawn((0, 0, 0, 1))
+    assert len(goals) == len(dataset) and (ahead == 0).all()
+    goals, ahead = drawn((0, 0.5, 0.5, 0), gamma=0.5)
+    assert len(goals) == sum(length - 2 - 2 for length in LENGTHS)
+    assert (ahead >= 2).all() and (ahead % 2 == 0).all() and (ahead > 2).any()
+    _, again = drawn((0, 0.5, 0.5, 0), gamma=0.5)
+    np.testing.assert_array_equal(ahead, again)
+    goals.set_epoch(1)
+    later = np.array([sample["goal"][0, 0] - sample["reward"][-1, 0] for sample in goals.__getitems__(range(len(goals)))])
+    assert (later != ahead).any()
+    _, ahead = drawn((1, 0, 0, 0))
+    assert (abs(ahead) > 30).any(), "of other episodes, too"
+    assert goals.clip_indices[0] == (0, 0)
+    with pytest.raises(ValueError, match="add up to 1"):
+        data.GoalDataset(dataset, (1, 1, 0, 0))
+
+
+def test_scalers(tmp_path):
+    write(tmp_path / "a.lance")
+    dataset = data.load_dataset(tmp_path / "a.lance", num_steps=3, frameskip=2, backend="numpy")
+    action = dataset.get_col_data("action")
+    transform = pickle.loads(pickle.dumps(data.column_normalizer(dataset, "action", "action")))
+    dataset.transform = transform
+    finite = action[~np.isnan(action).any(axis=1)]
+    expected = (action[:6] - finite.mean(axis=0)) / finite.std(axis=0)
+    np.testing.assert_allclose(dataset[0]["action"], expected.reshape(3, 4), rtol=1e-6)
+    batch = next(iter(data.Loader(dataset, 2, shuffle=False)))
+    np.testing.assert_allclose(batch["action"][0], expected.reshape(3, 4), rtol=1e-6)
+    for method in ("zscore", "percentile", "none"):
+        scaler = data.get_scaler(method).fit(action)
+        inner = np.median(finite, axis=0, keepdims=True)
+        np.testing.assert_allclose(scaler.inverse_transform(scaler.transform(inner)), inner, rtol=1e-5, atol=1e-6)
+    clipped = data.PercentileScaler(10, 90).fit_transform(finite)
+    assert clipped.min() == -1 and clipped.max() == 1
+    with pytest.raises(ValueError, match="not fitted"):
+        data.ZScoreScaler().transform(finite)
+    with pytest.raises(ValueError, match="unknown scaler 'minmax'"):
+        data.get_scaler("minmax")
+
+
+def test_constants_of_episodes(tmp_path):
+    content = {**episode(0, 4), "scene": "<mujoco/>", "words": ["go"] * 4}
+    with data.open_writer(tmp_path / "a.lance") as writer:
+        writer.write_episode(content)
+        with pytest.raises(TypeError, match="'words': text that changes"):
+            writer.write_episode({**content, "words": ["go", "go", "stop", "stop"]})
+    dataset = data.load_dataset(tmp_path / "a.lance")
+    assert dataset.constants(0) == {"scene": b"<mujoco/>", "words": b"go"}
+    assert "words" not in dataset.column_names

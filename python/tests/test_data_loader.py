@@ -1,0 +1,186 @@
+"""The loader: every clip once an epoch, the same order for the same seed, resumed, interrupted."""
+
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from data_helpers import LENGTHS, clips, same, write
+
+from stable_worldmodel import data
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "a.lance"
+    return path, write(path)
+
+
+def loader(path, **kwargs):
+    given = {"batch_size": 8, "num_steps": 3, "frameskip": 2, "backend": "numpy", **kwargs}
+    return data.Loader(path, **given)
+
+
+def identities(batches):
+    """What clips are in the batches: their first rewards, which are all different."""
+    return [batch["reward"][:, 0].ravel().tolist() for batch in batches]
+
+
+def test_batches_are_clips_in_order(stored):
+    path, written = stored
+    expected = clips(written, 3, 2)
+    at = 0
+    for batch in loader(path, shuffle=False):
+        for i in range(len(batch["action"])):
+            same({name: column[i] for name, column in batch.items()}, expected[at], True)
+            at += 1
+    assert at == len(expected)
+
+
+def test_an_epoch_has_every_clip_once_in_an_order_of_its_own(stored):
+    path, written = stored
+    expected = sorted(clip["reward"][0] for clip in clips(written, 3, 2))
+    first, second = (sum(identities(loader(path, seed=seed)), []) for seed in (1, 2))
+    assert sorted(first) == sorted(second) == expected
+    assert first != second != expected
+    same_seed = loader(path, seed=1, threads=0, cache="64MB", prefetch=1)
+    assert len(same_seed) == 7 and same_seed.num_clips == 51
+    epochs = [sum(identities(same_seed), []) for _ in range(2)]
+    assert epochs[0] == first != epochs[1] and sorted(epochs[1]) == expected
+    same_seed.set_epoch(0)
+    assert sum(identities(same_seed), []) == first
+    assert len(list(loader(path, drop_last=True))) == 6
+
+
+def test_it_goes_on_where_another_was(stored):
+    path, _ = stored
+    whole = loader(path, seed=5)
+    epochs = [identities(whole), identities(whole)]
+    for stop in (3, 7):
+        stopped = loader(path, seed=5)
+        batches = iter(stopped)
+        for _ in range(stop):
+            next(batches)
+        resumed = loader(path, seed=5)
+        resumed.load_state_dict(stopped.state_dict())
+        assert identities(resumed) == (epochs[0][stop:] if stop < 7 else epochs[1])
+        if stop < 7:
+            assert identities(resumed) == epochs[1]
+    # Who ends early gets the next epoch, not the same again.
+    next(iter(stopped := loader(path, seed=5)))
+    assert identities(stopped) == epochs[1]
+    with pytest.raises(ValueError, match="seed was 5 and is 6"):
+        loader(path, seed=6).load_state_dict(whole.state_dict())
+
+
+def test_goals(stored):
+    path, _ = stored
+    later = data.Goals(columns=["reward", "pixels"], random=0, current=0, geometric=1, discount=0.5)
+    end = data.Goals(columns=["reward"], random=0, current=0, geometric=0, last=1, name="end")
+    lasts = {100 * i + length - 1 for i, length in enumerate(LENGTHS)}
+    for batch in loader(path, goals=[later, end]):
+        assert batch["goal_pixels"].shape[1:] == (1, 3, 16, 16)
+        ahead = batch["goal_reward"][:, 0, 0] - batch["reward"][:, -1, 0]
+        np.testing.assert_array_equal(ahead, batch["goal_offset"])
+        assert (ahead >= 2).all()
+        assert set(batch["end_reward"].ravel()) <= lasts
+    with pytest.raises(ValueError, match="add up to 1"):
+        loader(path, goals=data.Goals(random=1.0))
+
+
+def test_transforms_see_rows(stored):
+    path, _ = stored
+    plain = next(iter(loader(path)))
+    transform = data.ColumnTransform(data.ZScoreScaler(mean=[0.0, 0.0], std=[2.0, 4.0]), "action", "action")
+    scaled = next(iter(loader(path, transform=transform)))
+    np.testing.assert_allclose(scaled["action"], plain["action"] / [2, 4, 2, 4])
+
+
+def test_what_a_dataset_chose_holds(stored):
+    path, _ = stored
+    dataset = data.load_dataset(path, num_steps=2, frameskip=3, keys_to_load=["state"], backend="numpy")
+    batch = next(iter(data.Loader(dataset, 5)))
+    assert {name: column.shape for name, column in batch.items()} == {"state": (5, 2, 4)}
+    only = data.Loader(dataset, 100, episodes=[2], columns=["reward"])
+    assert {int(r) // 100 for r in next(iter(only))["reward"].ravel()} == {2}
+
+
+def test_batches_outlive_the_loader(stored):
+    path, _ = stored
+    made = loader(path, shuffle=False, columns=["pixels"])
+    kept = [batch["pixels"] for batch in made]
+    copies = [array.copy() for array in kept]
+    for _ in made:
+        pass
+    del made
+    for array, copy in zip(kept, copies, strict=True):
+        np.testing.assert_array_equal(array, copy)
+
+
+def test_mistakes_are_named(stored, tmp_path):
+    path, _ = stored
+    with pytest.raises(KeyError, match="no column 'pixel'"):
+        loader(path, columns=["pixel"])
+    with pytest.raises(TypeError, match=r"such as \['pixels'\]"):
+        loader(path, columns="pixels")
+    with pytest.raises(ValueError, match="none of the 4 episodes is long enough"):
+        loader(path, num_steps=40)
+    with pytest.raises(ValueError, match="batch_size"):
+        loader(path, batch_size=0)
+    with pytest.raises(ValueError, match="no negative numbers, got {'threads': -1}"):
+        loader(path, threads=-1)
+    with pytest.raises(ValueError, match="'12XB'"):
+        loader(path, cache="12XB")
+    with pytest.raises(FileNotFoundError):
+        loader(tmp_path / "nothing.lance")
+    with pytest.raises(ValueError, match="stay on the CPU"):
+        loader(path, device="cuda")
+
+
+def test_an_error_of_a_reader_reaches_whoever_loads(stored):
+    class Broken(data.Dataset):
+        column_names = ["state"]
+
+        def _load_slice(self, episode, start, end):
+            if episode == 1:
+                raise RuntimeError("the disk is gone")
+            return {"state": np.zeros((end - start, 2))}
+
+    batches = iter(data.Loader(Broken([6, 6], [0, 6]), 4, shuffle=False, backend="numpy"))
+    assert next(batches)["state"].shape == (4, 1, 2)
+    with pytest.raises(RuntimeError, match="the disk is gone"):
+        list(batches)
+
+
+WAITING = """
+import threading
+import numpy as np
+from stable_worldmodel import data
+
+enough = threading.Event()
+
+class Slow(data.Dataset):
+    column_names = ["state"]
+
+    def _load_slice(self, episode, start, end):
+        if episode == 1 and not enough.is_set():
+            print("waiting", flush=True)
+            enough.wait()
+        return {"state": np.zeros((end - start, 2))}
+
+loader = data.Loader(Slow([6, 6], [0, 6]), 6, shuffle=False, backend="numpy", threads=1)
+try:
+    list(loader)
+except KeyboardInterrupt:
+    enough.set()
+    print("interrupted", flush=True)
+"""
+
+
+def test_ctrl_c_ends_the_wait_for_a_batch():
+    process = subprocess.Popen([sys.executable, "-c", WAITING], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "waiting\n"
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=60)
+    assert output.splitlines()[-1] == "interrupted" and process.returncode == 0

@@ -1,0 +1,67 @@
+"""The replay buffer: the latest episodes, drawn as seed and step say."""
+
+import numpy as np
+import pytest
+from data_helpers import episode, episodes
+
+from stable_worldmodel import data
+
+
+def test_old_episodes_leave_as_a_whole():
+    buffer = data.ReplayBuffer(max_steps=50, history_len=3, frameskip=2)
+    assert len(buffer) == 0 and buffer.num_steps_stored == 0
+    with buffer as writer:
+        writer.write_episodes(episodes())
+    assert buffer.lengths.tolist() == [9, 30] and buffer.offsets.tolist() == [0, 9]
+    assert (buffer.num_episodes, buffer.num_steps_stored, buffer.num_episodes_added) == (2, 39, 4)
+    assert len(buffer) == buffer.num_valid_ends() == (9 - 5) + (30 - 5)
+    clip = buffer[4]
+    assert clip["pixels"].shape == (3, 16, 16, 3) and clip["action"].shape == (3, 4)
+    np.testing.assert_array_equal(clip["reward"], [300, 302, 304])
+    assert buffer.get_col_data("reward").tolist() == [*range(200, 209), *range(300, 330)]
+    assert buffer.get_row_data(9)["reward"] == 300
+    assert [len(content["state"]) for content in buffer.episodes()] == [9, 30]
+    with pytest.raises(ValueError, match="51 rows.*at most 50"):
+        buffer.write_episode(episode(0, 51))
+    with pytest.raises(ValueError, match=r"missing \['state'\]"):
+        buffer.write_episode({name: array for name, array in episode(0, 5).items() if name != "state"})
+    buffer.clear()
+    assert len(buffer) == 0
+    buffer.write_episode(episode(1, 8))
+    assert buffer.lengths.tolist() == [8]
+
+
+def test_samples_are_a_function_of_seed_and_step():
+    buffers = [data.ReplayBuffer(100, history_len=2, seed=seed) for seed in (1, 1, 2)]
+    for buffer in buffers:
+        buffer.write_episodes(episodes())
+    first, again, other = ([buffer.sample(16)["reward"].tolist() for _ in range(2)] for buffer in buffers)
+    assert first == again != other and first[0] != first[1]
+    assert buffers[0].sample(16, step=0)["reward"].tolist() == first[0]
+    batch = buffers[0].sample(4, history_len=5)
+    assert batch["pixels"].shape == (4, 5, 16, 16, 3) and batch["action"].shape == (4, 5, 2)
+    assert (np.diff(batch["reward"], axis=1) == 1).all()
+
+
+def test_samplers_of_ones_own():
+    buffer = data.ReplayBuffer(100, history_len=2, sampler=lambda step, buffer, size, history: np.full(size, step))
+    with pytest.raises(RuntimeError, match="no clip of 2 steps"):
+        buffer.sample(4)
+    buffer.write_episodes(episodes())
+    batch = buffer.sample(3, step=11)
+    np.testing.assert_array_equal(batch["reward"], [[100, 101]] * 3)
+    assert batch["action"].shape == (3, 2, 2)
+    buffer.sampler = lambda *_: np.zeros(2)
+    with pytest.raises(ValueError, match=r"shape \(2,\), expected \(3,\)"):
+        buffer.sample(3)
+
+
+def test_filters_loaders_dumps(tmp_path):
+    buffer = data.ReplayBuffer(100, history_len=2, key_filter=data.classic_filter)
+    buffer.write_episodes(episodes())
+    assert buffer.column_names == ["pixels", "action", "reward", "terminated"]
+    batch = next(iter(data.Loader(buffer, 8, backend="numpy")))
+    assert batch["pixels"].shape == (8, 2, 3, 16, 16)
+    buffer.dump(tmp_path / "a.lance")
+    dataset = data.load_dataset(tmp_path / "a.lance")
+    np.testing.assert_array_equal(dataset.get_col_data("pixels"), buffer.get_col_data("pixels"))

@@ -1,0 +1,79 @@
+"""Datasets in torch's DataLoader: with and without workers, spawned and forked."""
+
+import numpy as np
+import pytest
+from data_helpers import clips, same, write
+
+from stable_worldmodel import data
+
+torch = pytest.importorskip("torch")
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "a.lance"
+    return path, write(path)
+
+
+@pytest.mark.parametrize(("workers", "context"), [(0, None), (2, "fork"), (2, "spawn")])
+def test_a_data_loader_gives_every_clip(stored, workers, context):
+    path, written = stored
+    dataset = data.load_dataset(path, num_steps=3, frameskip=2)
+    # The engine has threads here that a forked worker has not.
+    dataset.get_col_data("pixels")
+    loader = torch.utils.data.DataLoader(dataset, 8, num_workers=workers, multiprocessing_context=context)
+    expected = clips(written, 3, 2)
+    found = 0
+    for batch in loader:
+        assert batch["pixels"].shape[1:] == (3, 3, 16, 16) and batch["pixels"].dtype == torch.uint8
+        for i in range(len(batch["action"])):
+            same({name: column[i] for name, column in batch.items()}, expected[found], True)
+            found += 1
+    assert found == len(expected)
+
+
+def test_batches_are_collated_without_a_copy(stored):
+    path, _ = stored
+    dataset = data.load_dataset(path, num_steps=3)
+    samples = dataset.__getitems__([5, 1, 30])
+    batch = torch.utils.data.default_collate(samples)
+    assert batch["pixels"][1].data_ptr() == samples[1]["pixels"].data_ptr()
+    # Whoever changed a sample gets what they made of it.
+    samples[2]["reward"] = torch.full((3, 1), 7.0, dtype=torch.float64)
+    changed = torch.utils.data.default_collate(samples)
+    assert changed["reward"][2].eq(7).all() and changed["reward"][:2].equal(batch["reward"][:2])
+    assert torch.utils.data.default_collate(samples[:2])["pixels"].equal(batch["pixels"][:2])
+    assert set(torch.utils.data.default_collate([{**samples[0], "new": 1}])) == {*batch, "new"}
+
+
+def test_the_loader_gives_tensors_that_look_at_its_memory(stored):
+    path, written = stored
+    loader = data.Loader(path, 4, num_steps=2, shuffle=False, columns=["pixels", "action"])
+    batches = [batch["pixels"] for batch in loader]
+    del loader
+    expected = np.stack([clip["pixels"] for clip in clips(written, 2, 1)])
+    assert torch.cat(batches).numpy().tolist() == expected.tolist()
+    model = torch.nn.Conv2d(3, 2, 3)
+    assert model(batches[0].flatten(0, 1).float()).shape == (8, 2, 14, 14)
+
+
+def test_scalers_take_tensors():
+    scaler = data.ZScoreScaler(mean=[1.0, 2.0], std=[2.0, 0.0])
+    scaled = scaler(torch.tensor([[3.0, 2.0]], dtype=torch.float64))
+    assert scaled.dtype == torch.float32 and scaled.tolist() == [[1.0, 0.0]]
+    assert data.PercentileScaler(q_low=[0.0], q_high=[4.0])(torch.tensor([[9.0], [1.0]])).tolist() == [[1.0], [-0.5]]
+
+
+def test_episodes_of_tensors_are_written(tmp_path):
+    with data.open_writer(tmp_path / "a.lance") as writer:
+        writer.write_episode(
+            {
+                "pixels": torch.arange(4 * 3 * 6 * 5, dtype=torch.uint8).reshape(4, 3, 6, 5),
+                "action": [torch.tensor([0.5]), torch.tensor([1.0]), torch.tensor([2.0])],
+                "latent": torch.ones(4, 2, dtype=torch.bfloat16, requires_grad=True),
+            }
+        )
+    sample = data.load_dataset(tmp_path / "a.lance", num_steps=4)[0]
+    assert sample["pixels"].flatten()[:5].tolist() == [0, 1, 2, 3, 4]
+    assert sample["action"][:3].tolist() == [[0.5], [1.0], [2.0]] and sample["action"][3].isnan().all()
+    assert sample["latent"].dtype == torch.float32

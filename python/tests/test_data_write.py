@@ -1,0 +1,268 @@
+"""Writing, formats of our own and of users, converting, examining."""
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from data_helpers import episode, episodes, same, write
+
+from stable_worldmodel import data
+
+
+@pytest.mark.parametrize("name", ["a.lance", "a.h5"])
+def test_modes(tmp_path, name):
+    path = tmp_path / name
+    write(path, (5, 6))
+    write(path, (7,))
+    assert data.load_dataset(path).lengths.tolist() == [5, 6, 7]
+    with pytest.raises(FileExistsError, match="there is a dataset already"):
+        write(path, (5,), mode="error")
+    write(path, (4,), mode="overwrite")
+    assert data.load_dataset(path).lengths.tolist() == [4]
+    with pytest.raises(ValueError, match="mode: expected one of append, overwrite, error, got 'replace'"):
+        write(path, (5,), mode="replace")
+
+
+def test_episodes_of_lists_and_other_types(tmp_path):
+    path = tmp_path / "a.lance"
+    given = {
+        "pixels": [np.full((8, 8, 3), step, dtype=np.uint8) for step in range(4)],
+        "action": [[0.0, 1.0]] * 3,
+        "half": np.ones(4, dtype=np.float16),
+        "small": np.arange(4, dtype=np.int8),
+        "step_idx": [9, 9, 9, 9],
+    }
+    with data.open_writer(path) as writer:
+        writer.write_episode(given)
+        assert writer.num_episodes == 1
+    dataset = data.load_dataset(path, num_steps=4, backend="numpy")
+    sample = dataset[0]
+    assert np.isnan(sample["action"][3]).all() and (sample["action"][:3] == [0, 1]).all()
+    assert sample["half"].dtype == np.float32 and sample["small"].dtype == np.int32
+    assert dataset.get_col_data("step_idx").tolist() == [0, 1, 2, 3], "numbered by the writer"
+
+
+def test_discrete_actions_that_are_missing(tmp_path):
+    with data.open_writer(tmp_path / "a.lance") as writer:
+        writer.write_episode({"action": np.array([2, 0]), "state": np.zeros((3, 1))})
+    assert data.load_dataset(tmp_path / "a.lance").get_col_data("action").ravel().tolist() == [2, 0, -1]
+
+
+def test_broken_episodes_are_refused_and_finished_ones_kept(tmp_path):
+    path = tmp_path / "a.lance"
+    sound = episode(0, 5)
+    cases = [
+        ({**sound, "action": np.zeros((5, 2), np.float32)}, ValueError, "the last row is the final observation"),
+        ({**sound, "state": np.zeros((4, 4))}, ValueError, "same number of steps"),
+        ({name: array for name, array in sound.items() if name != "reward"}, ValueError, r"missing \['reward'\]"),
+        ({**sound, "extra": np.zeros(5)}, ValueError, r"unexpected \['extra'\]"),
+        ({**sound, "state": np.zeros((5, 3))}, ValueError, r"steps of shape \(3,\), the dataset's of \(4,\)"),
+        ({**sound, "terminated": np.zeros(5)}, TypeError, "'terminated' is float64, the dataset's bool"),
+        ({**sound, "state": np.zeros((5, 4), complex)}, TypeError, "complex128 cannot be stored"),
+        ({**sound, "state": [np.zeros(4), np.zeros(3)]}, ValueError, "'state': its steps differ in shape"),
+        ({}, ValueError, "a column of numbers"),
+    ]
+    with data.open_writer(path) as writer:
+        writer.write_episode(sound)
+        for broken, kind, message in cases:
+            with pytest.raises(kind, match=message):
+                writer.write_episode(broken)
+        writer.write_episode(sound)
+    with pytest.raises(ValueError, match="the writer is closed"):
+        writer.write_episode(sound)
+    assert data.load_dataset(path).lengths.tolist() == [5, 5]
+    with pytest.raises(RuntimeError, match="stop here"), data.open_writer(path) as writer:
+        writer.write_episode(sound)
+        raise RuntimeError("stop here")
+    assert data.load_dataset(path).num_episodes == 3
+    with pytest.raises(ValueError, match="unexpected"), data.open_writer(path) as writer:
+        writer.write_episode({**sound, "other": np.zeros(5)})
+
+
+def test_codecs(tmp_path):
+    sizes = {}
+    for codec in (None, "qoi", "png", "jpeg", "jpeg:20"):
+        path = tmp_path / f"{codec}.lance".replace(":", "")
+        written = write(path, (6,), codec=codec)
+        error = np.abs(data.load_dataset(path).get_col_data("pixels").astype(int) - written[0]["pixels"]).max()
+        assert (error == 0) == ("jpeg" not in str(codec))
+        sizes[codec] = data.inspect(path)["footprint"]["pixels"]
+    assert sizes["jpeg:20"] < sizes["jpeg"]
+    for wrong in ("webp", "png:3", "jpeg:high"):
+        with pytest.raises(ValueError, match="codec: expected"):
+            data.open_writer(tmp_path / "b.lance", codec=wrong)
+    assert data.LanceWriter(tmp_path / "c.lance", jpeg_quality=80).format == "lance"
+
+
+@pytest.fixture
+def numpy_format():
+    """A format that keeps a `.npz` file an episode."""
+
+    class Reader(data.Dataset):
+        def __init__(self, path, **kwargs):
+            self.files = sorted(Path(path).glob("*.npz"))
+            lengths = [len(np.load(file)["action"]) for file in self.files]
+            super().__init__(lengths, np.cumsum([0, *lengths[:-1]]), **kwargs)
+
+        @property
+        def column_names(self):
+            return list(np.load(self.files[0]))
+
+        def _load_slice(self, ep_idx, start, end):
+            sample = {}
+            for name, array in np.load(self.files[ep_idx]).items():
+                array = array[start:end] if name == "action" else array[start : end : self.frameskip]
+                sample[name] = array.transpose(0, 3, 1, 2) if array.ndim == 4 else array
+            return self.transform(sample) if self.transform else sample
+
+    class Writer:
+        def __init__(self, path, mode="append"):
+            self.path = Path(path)
+            if mode == "error" and self.path.exists():
+                raise FileExistsError(path)
+
+        def __enter__(self):
+            self.path.mkdir(parents=True, exist_ok=True)
+            return self
+
+        def __exit__(self, *exc):
+            pass
+
+        def write_episode(self, ep_data):
+            np.savez(self.path / f"{len(list(self.path.iterdir())):05}.npz", **ep_data)
+
+        def write_episodes(self, episodes):
+            for content in episodes:
+                self.write_episode(content)
+
+    @data.register_format
+    class Npz(data.Format):
+        name = "npz"
+
+        @classmethod
+        def detect(cls, path):
+            return str(path).endswith(".npzs")
+
+        @classmethod
+        def open_reader(cls, path, **kwargs):
+            return Reader(path, **kwargs)
+
+        @classmethod
+        def open_writer(cls, path, **kwargs):
+            return Writer(path, **kwargs)
+
+    yield Npz
+    del data.FORMATS["npz"]
+
+
+def test_a_format_of_ones_own(tmp_path, numpy_format):
+    assert data.get_format("npz") is numpy_format and "npz" in data.list_formats()
+    assert data.detect_format(tmp_path / "x.npzs") is numpy_format
+    written = write(tmp_path / "a.npzs")
+    dataset = data.load_dataset(tmp_path / "a.npzs", num_steps=3, frameskip=2)
+    assert dataset[0]["pixels"].shape == (3, 3, 16, 16) and dataset[0]["action"].shape == (3, 4)
+    # To ours and back.
+    report = data.convert(tmp_path / "a.npzs", tmp_path / "b.lance", progress=False)
+    assert report["episodes"] == 4 and all(column["exact"] for column in report["columns"])
+    report = data.convert(tmp_path / "b.lance", tmp_path / "c", dest_format="npz", progress=False)
+    assert report == {"episodes": 4, "rows": 71}
+    back = data.load_dataset(tmp_path / "c", format="npz")
+    for number, content in enumerate(written):
+        found = back.load_episode(number)
+        same({**found, "pixels": found["pixels"].transpose(0, 2, 3, 1)}, content)
+    with pytest.raises(FileExistsError):
+        data.convert(tmp_path / "b.lance", tmp_path / "c", dest_format="npz", progress=False)
+    # Our loader reads it, and what it gives is what ours gives.
+    theirs = data.Loader(dataset, 8, backend="numpy")
+    ours = data.Loader(tmp_path / "b.lance", 8, num_steps=3, frameskip=2, columns=dataset.column_names, backend="numpy")
+    for a, b in zip(theirs, ours, strict=True):
+        np.testing.assert_array_equal(a["pixels"], b["pixels"])
+        np.testing.assert_array_equal(a["action"], b["action"])
+    assert data.inspect(tmp_path / "a.npzs", checksum=True)["checksum"] == data.inspect(
+        data.load_dataset(tmp_path / "c", format="npz"), checksum=True
+    )["checksum"]
+
+
+def test_registering(numpy_format):
+    with pytest.raises(ValueError, match="registered already"):
+        data.register_format(type("Lance", (data.Format,), {"name": "lance"}))
+    with pytest.raises(ValueError, match="needs a `name`"):
+        data.register_format(type("Nameless", (data.Format,), {}))
+    assert data.register_format(numpy_format) is numpy_format, "again, as notebooks do"
+    reads = type("Reads", (data.Format,), {"name": "reads"})
+    with pytest.raises(NotImplementedError, match="'reads' cannot be written"):
+        reads.open_writer("x")
+    for name in ("lance", "hdf5", "video", "folder", "lerobot", "lance-video"):
+        assert data.get_format(name).native
+    assert isinstance(data.open_writer("never.lance"), data.Writer)
+
+
+def test_convert_between_our_formats(tmp_path):
+    write(tmp_path / "a.lance")
+    sums = set()
+    for target, kwargs in (("b.h5", {}), ("c", {"format": "folder", "codec": "png"}), ("d.lance", {"codec": "png"})):
+        report = data.convert(tmp_path / "a.lance", tmp_path / target, progress=False, least_psnr=5, **kwargs)
+        assert report["episodes"] == 4 and report["kept"] == 0
+        sums.add(report["checksum"])
+        again = data.convert(tmp_path / "a.lance", tmp_path / target, progress=False, least_psnr=5, **kwargs)
+        assert again["kept"] == 4 and again["rows"] == 0
+    assert len(sums) == 1
+    with pytest.raises(ValueError, match="not the beginning of the source"):
+        write(tmp_path / "e.lance", (3,))
+        data.convert(tmp_path / "a.lance", tmp_path / "e.lance", progress=False)
+    data.convert(tmp_path / "a.lance", tmp_path / "e.lance", mode="append", progress=False)
+    assert data.load_dataset(tmp_path / "e.lance").num_episodes == 5
+    with pytest.raises(TypeError, match="takes no colour"):
+        data.convert(tmp_path / "a.lance", tmp_path / "f.lance", colour="red", progress=False)
+
+
+def test_doctor_and_inspect(tmp_path):
+    write(tmp_path / "a.lance")
+    assert data.doctor(tmp_path / "a.lance", progress=False)["problems"] == 0
+    broken = episodes((6, 6))
+    broken[1]["state"][3] = np.inf
+    with data.open_writer(tmp_path / "b.lance", manifest={"why": "a test"}) as writer:
+        writer.write_episodes(broken)
+    found = data.doctor(tmp_path / "b.lance", repair=tmp_path / "c.lance", progress=False)
+    assert found["problems"] == 1 and found["sound"] == [0] and found["repaired"]["episodes"] == 1
+    assert data.load_dataset(tmp_path / "c.lance").lengths.tolist() == [6]
+    seen = data.inspect(tmp_path / "b.lance")
+    assert (seen["episodes"], seen["steps"], seen["lengths"]) == (2, 12, [6, 6])
+    assert seen["manifest"]["config"] == {"why": "a test"}
+    assert {"name": "state", "dtype": "float64", "shape": [4]} in seen["columns"]
+    json.dumps(seen)
+
+
+CONVERTING = """
+import sys
+from stable_worldmodel import data, _engine
+from stable_worldmodel.data import utils
+
+def tell(stage, done, total):
+    if done == 2:
+        print("converting", flush=True)
+        sys.stdin.readline()
+
+utils._telling = lambda progress: tell
+try:
+    data.convert(sys.argv[1], sys.argv[2])
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+"""
+
+
+def test_ctrl_c_keeps_what_was_converted(tmp_path):
+    write(tmp_path / "a.lance")
+    target = tmp_path / "b.lance"
+    command = [sys.executable, "-c", CONVERTING, str(tmp_path / "a.lance"), str(target)]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "converting\n"
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate("\n", timeout=60)
+    assert output == "interrupted\n" and process.returncode == 0
+    assert data.load_dataset(target).num_episodes == 2
+    assert data.convert(tmp_path / "a.lance", target, progress=False)["kept"] == 2

@@ -5,11 +5,13 @@
 //! - [`arrays`]: batches as numpy arrays, and back.
 //! - [`world`], [`policy`]: many environments at once and who acts in them.
 //! - [`cost`], [`solver`], [`model`]: models of Python's to plan in, planning, models of our own.
+//! - [`data`]: datasets, the loader, the replay buffer, conversion.
 //! - [`gym`]: environments of others, in this interpreter.
 //! - [`env`](mod@env), [`pictures`]: one environment, and visual wrappers, for Gymnasium.
 
 mod arrays;
 mod cost;
+mod data;
 mod env;
 mod errors;
 mod gym;
@@ -25,6 +27,16 @@ use pyo3::prelude::*;
 /// The engine.
 #[pymodule]
 mod _engine {
+    #[pymodule_export]
+    use super::data::dataset::Dataset;
+    #[pymodule_export]
+    use super::data::loader::{Epoch, Loader};
+    #[pymodule_export]
+    use super::data::replay::{ReplayBuffer, ReplaySampler};
+    #[pymodule_export]
+    use super::data::work::{convert, detect, doctor, find_dataset, inspect, target};
+    #[pymodule_export]
+    use super::data::writer::Writer;
     #[pymodule_export]
     use super::env::NativeEnv;
     #[pymodule_export]
@@ -46,6 +58,7 @@ mod _engine {
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        data::process::begin();
         module.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 }

@@ -124,7 +124,13 @@ class World:
 
     @staticmethod
     def _is_native(env_name: str) -> bool:
-        return env_name.split(",")[0] in _engine.envs()
+        name = env_name.split(",")[0]
+        if name in _engine.envs():
+            return True
+        import gymnasium
+
+        # The namespace is ours, and open to others: what nobody registered is a word of ours, misspelt.
+        return name.startswith("swm/") and not name.startswith("swm/Craftax") and name not in gymnasium.registry
 
     # What there is.
 

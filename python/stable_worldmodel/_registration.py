@@ -14,15 +14,21 @@ from typing import Any
 def install() -> None:
     """Registers, or arranges for it."""
     if "gymnasium" in sys.modules:
-        _register()
+        register()
     elif not any(isinstance(finder, _AfterGymnasium) for finder in sys.meta_path):
         sys.meta_path.insert(0, _AfterGymnasium())
 
 
-def _register() -> None:
-    from . import envs
+def register() -> None:
+    """Registers our environments with Gymnasium; again changes nothing."""
+    import gymnasium
 
-    envs.register()
+    from . import _engine
+
+    # Gymnasium imports the module only when it makes one: this may run in the midst of that module's own import.
+    for name in _engine.envs():
+        if name not in gymnasium.registry:
+            gymnasium.register(id=name, entry_point="stable_worldmodel.envs:NativeEnv", kwargs={"name": name})
 
 
 class _AfterGymnasium:
@@ -41,7 +47,7 @@ class _AfterGymnasium:
 
         def exec_module(module: ModuleType) -> None:
             execute(module)
-            _register()
+            register()
 
         spec.loader.exec_module = exec_module  # type: ignore[method-assign]
         return spec

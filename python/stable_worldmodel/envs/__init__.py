@@ -17,6 +17,7 @@ import numpy as np
 
 from .. import _engine, _options
 from .. import spaces as swm_spaces
+from .._registration import register
 
 __all__ = ["NativeEnv", "experts", "ids", "register"]
 
@@ -29,13 +30,6 @@ def ids() -> list[str]:
 def experts(env: str) -> list[str]:
     """Who can demonstrate an environment."""
     return list(_engine.Actor.experts(env))
-
-
-def register() -> None:
-    """Registers our environments with Gymnasium; again changes nothing."""
-    for name in ids():
-        if name not in gymnasium.registry:
-            gymnasium.register(id=name, entry_point="stable_worldmodel.envs:NativeEnv", kwargs={"name": name})
 
 
 class NativeEnv(gymnasium.Env):

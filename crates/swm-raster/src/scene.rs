@@ -109,14 +109,13 @@ impl Axis {
 
     /// The cell a place is in, and how far into it, from 0 to 1.
     #[inline(always)]
-    #[allow(clippy::cast_possible_truncation)]
+    #[allow(clippy::cast_possible_truncation, clippy::manual_clamp, reason = "`clamp` would keep what is no number")]
     pub(crate) fn cell(&self, x: f32) -> (i32, f32) {
-        let from = (x + self.half - self.pad) / self.step;
-        // Conversion saturates, and NaN becomes 0.
-        let inner = (from as i32).saturating_add(1).min(self.cells as i32 - 1).max(0);
-        let cell = if from < 0.0 { 0 } else { inner };
+        // Where it is among the inner lines; what is far outside, or no number, may be anywhere.
+        let from = ((x + self.half - self.pad) / self.step).max(-1.0).min(1e6);
+        let cell = ((from + 1.0) as i32).min(self.cells as i32 - 1);
         let (low, high) = (self.line(cell), self.line(cell + 1));
-        (cell, ((x - low) / (high - low).max(1e-12)).clamp(0.0, 1.0))
+        (cell, ((x - low) / (high - low).max(1e-12)).max(0.0).min(1.0))
     }
 }
 

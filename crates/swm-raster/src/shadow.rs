@@ -5,9 +5,9 @@
 
 use crate::layers::{Layers, NOTHING, pattern, touched};
 use crate::light::Lamp;
-use crate::paint::MANY;
 use crate::scene::{Assets, Light, Scene, Shape};
 use crate::simd::vectorised;
+use crate::texture::MANY;
 use crate::vector::{V3, across, cross, dot, unit};
 use crate::view::View;
 
@@ -118,7 +118,7 @@ impl Shadow {
     #[inline]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn darkens(&self, view: &View, geom: u32, [x, y, depth]: V3, facing: f32) -> bool {
-        let at = y as usize * view.width + x as usize;
+        let at = self.layers.span(y as usize, x as usize, x as usize).start;
         let id = self.layers.ids[at];
         if id == NOTHING {
             return false;

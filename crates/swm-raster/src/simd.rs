@@ -4,6 +4,17 @@
 //! neither fuses multiplications with additions, and division and square root are exact in both.
 #![allow(unsafe_code, reason = "AVX2 code is called where the processor has it")]
 
+/// Whether the processor has AVX2.
+#[cfg(target_arch = "x86_64")]
+#[inline]
+pub(crate) fn avx2() -> bool {
+    #[cfg(test)]
+    if tests::PLAIN.get() {
+        return false;
+    }
+    std::arch::is_x86_feature_detected!("avx2")
+}
+
 /// Defines such functions.
 macro_rules! vectorised {
     ($($(#[$meta:meta])* $vis:vis fn $name:ident($($arg:ident: $type:ty),* $(,)?) $(-> $out:ty)? $body:block)*) => { $(
@@ -18,7 +29,7 @@ macro_rules! vectorised {
                 fn avx2($($arg: $type),*) $(-> $out)? {
                     plain($($arg),*)
                 }
-                if std::arch::is_x86_feature_detected!("avx2") {
+                if $crate::simd::avx2() {
                     // SAFETY: the processor was just asked.
                     return unsafe { avx2($($arg),*) };
                 }
@@ -54,6 +65,27 @@ pub(crate) fn power(base: f32, exponent: f32) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Canvas;
+    use crate::scenes::{assets, drawn, scene};
+    use proptest::prelude::*;
+    use std::cell::Cell;
+
+    thread_local! {
+        /// As if the processor had no AVX2.
+        pub static PLAIN: Cell<bool> = const { Cell::new(false) };
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(1000))]
+        #[test]
+        fn pictures_are_the_same_on_any_processor(scene in scene()) {
+            let seen = drawn(&mut Canvas::new(), &scene, &assets());
+            PLAIN.set(true);
+            let plain = drawn(&mut Canvas::new(), &scene, &assets());
+            PLAIN.set(false);
+            prop_assert_eq!(seen, plain);
+        }
+    }
 
     #[test]
     fn power_is_close() {

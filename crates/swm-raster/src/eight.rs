@@ -16,6 +16,7 @@ pub(crate) trait Simd: Copy {
     fn load(self, from: &[f32; LANES]) -> Self::Numbers;
     fn splat(self, number: f32) -> Self::Numbers;
     fn add(self, a: Self::Numbers, b: Self::Numbers) -> Self::Numbers;
+    fn sub(self, a: Self::Numbers, b: Self::Numbers) -> Self::Numbers;
     fn mul(self, a: Self::Numbers, b: Self::Numbers) -> Self::Numbers;
     fn div(self, a: Self::Numbers, b: Self::Numbers) -> Self::Numbers;
     /// The smaller one, b where one is no number.
@@ -27,6 +28,7 @@ pub(crate) trait Simd: Copy {
     fn both(self, a: Self::Mask, b: Self::Mask) -> Self::Mask;
     fn either(self, a: Self::Mask, b: Self::Mask) -> Self::Mask;
     fn any(self, mask: Self::Mask) -> bool;
+    fn store(self, numbers: Self::Numbers, to: &mut [f32; LANES]);
     /// Stores numbers where the mask says so.
     fn put(self, mask: Self::Mask, numbers: Self::Numbers, to: &mut [f32; LANES]);
     /// Stores a word there.
@@ -74,6 +76,10 @@ impl Simd for Plain {
         each(|i| a[i] + b[i])
     }
     #[inline(always)]
+    fn sub(self, a: [f32; LANES], b: [f32; LANES]) -> [f32; LANES] {
+        each(|i| a[i] - b[i])
+    }
+    #[inline(always)]
     fn mul(self, a: [f32; LANES], b: [f32; LANES]) -> [f32; LANES] {
         each(|i| a[i] * b[i])
     }
@@ -106,6 +112,10 @@ impl Simd for Plain {
         mask.contains(&true)
     }
     #[inline(always)]
+    fn store(self, numbers: [f32; LANES], to: &mut [f32; LANES]) {
+        *to = numbers;
+    }
+    #[inline(always)]
     fn put(self, mask: [bool; LANES], numbers: [f32; LANES], to: &mut [f32; LANES]) {
         *to = each(|i| if mask[i] { numbers[i] } else { to[i] });
     }
@@ -122,7 +132,7 @@ mod avx2 {
         __m256, __m256i, _CMP_GE_OQ, _CMP_GT_OQ, _mm256_add_ps, _mm256_and_ps, _mm256_blendv_epi8, _mm256_blendv_ps,
         _mm256_castps_si256, _mm256_cmp_ps, _mm256_div_ps, _mm256_loadu_ps, _mm256_loadu_si256, _mm256_min_ps,
         _mm256_movemask_ps, _mm256_mul_ps, _mm256_or_ps, _mm256_set1_epi32, _mm256_set1_ps, _mm256_storeu_ps,
-        _mm256_storeu_si256,
+        _mm256_storeu_si256, _mm256_sub_ps,
     };
 
     /// Shows that the processor has AVX2.
@@ -163,6 +173,10 @@ mod avx2 {
             unsafe { _mm256_add_ps(a, b) }
         }
         #[inline(always)]
+        fn sub(self, a: __m256, b: __m256) -> __m256 {
+            unsafe { _mm256_sub_ps(a, b) }
+        }
+        #[inline(always)]
         fn mul(self, a: __m256, b: __m256) -> __m256 {
             unsafe { _mm256_mul_ps(a, b) }
         }
@@ -193,6 +207,10 @@ mod avx2 {
         #[inline(always)]
         fn any(self, mask: __m256) -> bool {
             unsafe { _mm256_movemask_ps(mask) != 0 }
+        }
+        #[inline(always)]
+        fn store(self, numbers: __m256, to: &mut [f32; LANES]) {
+            unsafe { _mm256_storeu_ps(to.as_mut_ptr(), numbers) }
         }
         #[inline(always)]
         fn put(self, mask: __m256, numbers: __m256, to: &mut [f32; LANES]) {

@@ -83,6 +83,8 @@ pub(crate) struct Layers {
     pub centres: [[f32; 2]; 16],
     /// By sample of a row: nothing is too near.
     free: Vec<f32>,
+    /// Scratch: how far to the left and right a shape reaches, by row.
+    outline: [Vec<f32>; 2],
     /// Scratch: vertices of a mesh in pixels, `w`, and depth.
     vertices: Vec<[f32; 4]>,
 }
@@ -201,6 +203,7 @@ impl Layers {
         Some(region)
     }
 
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     fn shape(
         &mut self,
         number: u32,
@@ -209,11 +212,15 @@ impl Layers {
         outline: &Outline,
         floor: Option<&[f32]>,
     ) {
-        for y in y0..y1 {
-            let (x0, x1) = outline.span(y, left, right);
-            if x0 >= x1 {
+        let [mut lows, mut highs] = std::mem::take(&mut self.outline);
+        outline.reach(y0..y1, &mut lows, &mut highs);
+        for (y, (&low, &high)) in (y0..y1).zip(lows.iter().zip(&highs)) {
+            // A hair wider than computed.
+            let (low, high) = ((low - 0.01).max(left as f32), (high + 0.01).min(right as f32));
+            if low >= high {
                 continue;
             }
+            let (x0, x1) = (low as usize, (high as usize + 1).min(right));
             let (span, columns) = (self.span(y, x0, x1), self.span(0, x0, x1));
             let samples = Samples {
                 at: self.at.each_ref().map(|at| &at[columns.clone()]),
@@ -223,6 +230,7 @@ impl Layers {
             };
             pose.enter(&pose.row(y), number, samples);
         }
+        self.outline = [lows, highs];
     }
 
     #[allow(clippy::cast_possible_truncation)]
@@ -459,25 +467,21 @@ impl Outline {
         Self { edges: Some(edges) }
     }
 
-    /// The pixels of a row from `left` to before `right` that it may touch.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-    fn span(&self, y: usize, left: usize, right: usize) -> (usize, usize) {
-        let Some(edges) = &self.edges else { return (left, right) };
-        let (top, bottom) = (y as f32, y as f32 + 1.0);
-        let (mut lows, mut highs) = ([f32::INFINITY; EDGES], [f32::NEG_INFINITY; EDGES]);
-        for i in 0..EDGES {
-            // The part of the edge within the row.
-            let at = |y: f32| (edges.x[i] + (y - edges.y[i]) * edges.slope[i]).max(edges.left[i]).min(edges.right[i]);
-            let (p, q) = (at(top), at(bottom));
-            let touched = (edges.top[i] <= bottom) & (edges.bottom[i] >= top);
-            lows[i] = if touched { p.min(q) } else { f32::INFINITY };
-            highs[i] = if touched { p.max(q) } else { f32::NEG_INFINITY };
+    /// How far to the left and right it reaches in rows.
+    fn reach(&self, rows: std::ops::Range<usize>, lows: &mut Vec<f32>, highs: &mut Vec<f32>) {
+        lows.clear();
+        highs.clear();
+        match &self.edges {
+            Some(edges) => {
+                lows.resize(rows.len(), f32::INFINITY);
+                highs.resize(rows.len(), f32::NEG_INFINITY);
+                widen(edges, rows.start, lows, highs);
+            }
+            None => {
+                lows.resize(rows.len(), f32::NEG_INFINITY);
+                highs.resize(rows.len(), f32::INFINITY);
+            }
         }
-        let low = lows.into_iter().fold(f32::INFINITY, f32::min);
-        let high = highs.into_iter().fold(f32::NEG_INFINITY, f32::max);
-        // A hair wider than computed.
-        let (low, high) = ((low - 0.01).max(left as f32), (high + 0.01).min(right as f32));
-        if low < high { (low as usize, (high as usize + 1).min(right)) } else { (left, left) }
     }
 }
 
@@ -536,6 +540,31 @@ impl Job for Faces<'_> {
 }
 
 vectorised! {
+    /// Widens what edges reach in rows, from `top` on.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+    fn widen(edges: &Edges, top: usize, lows: &mut [f32], highs: &mut [f32]) {
+        let n = lows.len();
+        let highs = &mut highs[..n];
+        for k in 0..EDGES {
+            let (x, y, slope) = (edges.x[k], edges.y[k], edges.slope[k]);
+            let (left, right, upper, lower) = (edges.left[k], edges.right[k], edges.top[k], edges.bottom[k]);
+            let at = |row: f32| {
+                let x = x + (row - y) * slope;
+                let x = if x > left { x } else { left };
+                if x < right { x } else { right }
+            };
+            for i in 0..n {
+                // The part of the edge within the row.
+                let above = top as f32 + i as u32 as i32 as f32;
+                let (p, q) = (at(above), at(above + 1.0));
+                let (low, high) = if p < q { (p, q) } else { (q, p) };
+                let touched = (upper <= above + 1.0) & (lower >= above);
+                lows[i] = if touched & (low < lows[i]) { low } else { lows[i] };
+                highs[i] = if touched & (high > highs[i]) { high } else { highs[i] };
+            }
+        }
+    }
+
     /// Vertices in pixels, `w` and depth.
     fn to_pixels(places: &[V3], axes: &[[f32; 4]; 3], origin: [f32; 4], vertices: &mut [[f32; 4]]) {
         for (place, vertex) in places.iter().zip(vertices) {

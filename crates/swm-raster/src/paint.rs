@@ -1,11 +1,12 @@
 //! From what is nearest to colours: the fragments of a picture, gathered by geom and lit many at once.
 
 use crate::cast::Posed;
+use crate::eight::{self, Job, LANES, Simd};
 use crate::layers::{Layers, NOTHING, Region, TRIANGLE};
 use crate::light::{Lamp, Matter};
 use crate::scene::{Assets, Axis, Geom, Mapping, Scene, Shape};
 use crate::shadow::Shadow;
-use crate::simd::vectorised;
+use crate::simd::{nearest, vectorised};
 use crate::texture::{MANY, Reader, Spots, Texture};
 use crate::vector::{V3, add, dot, rotate, scale, sub, unrotate};
 use crate::view::{Rays, View};
@@ -19,8 +20,8 @@ const QUADS: usize = 4;
 /// Light between corners that are at most so many pixels apart is as good as at each pixel.
 const COARSE: f32 = 6.0;
 
-/// One number for each of many fragments.
-type Lane = [f32; MANY];
+/// One number for each of many fragments, and room for those that are computed with the last ones.
+type Lane = [f32; MANY + LANES];
 
 /// Pixels of a row next to each other, and which of their samples show a geom: all, or of one pixel some.
 #[derive(Clone, Copy, Debug, Default)]
@@ -96,7 +97,7 @@ pub(crate) struct Painter {
 
 impl Default for Painter {
     fn default() -> Self {
-        const ZERO: Lane = [0.0; MANY];
+        const ZERO: Lane = [0.0; MANY + LANES];
         Self {
             runs: vec![],
             sorted: vec![],
@@ -533,24 +534,27 @@ impl Batch {
         matter: &Matter,
         look: &Look<'_>,
     ) {
+        let row = match geom.shape {
+            Shape::Plane(x, _) => x.cells + 1,
+            _ => QUADS + 1,
+        };
         let mut begin = 0;
         while begin < self.n {
             // Neighbours are mostly in the same cell.
             let cell = self.cell[begin];
             let same = self.cell[begin..self.n].iter().take_while(|other| **other == cell).count();
-            let grid = self.grid(geom, begin);
-            let [a, b, c, d] = [0, 1, grid.row, grid.row + 1].map(|step| {
-                let corner = start + (grid.first + step) * passes + pass;
+            let mut corners = [[0.0; 3]; 4];
+            for (colour, step) in corners.iter_mut().zip([0, 1, row, row + 1]) {
+                let corner = start + (cell as usize + step) * passes + pass;
                 if !lattices.known[corner] {
                     lattices.known[corner] = true;
-                    lattices.colours[corner] = corner_light(grid.corner(geom, step), pass, matter, look);
+                    let corner_there = self.grid(geom, begin).corner(geom, step);
+                    lattices.colours[corner] = corner_light(corner_there, pass, matter, look);
                 }
-                lattices.colours[corner]
-            });
-            let run = begin..begin + same;
-            let (u, v) = (&self.within[0][run.clone()], &self.within[1][run.clone()]);
-            let [red, green, blue] = self.pass.each_mut().map(|lane| &mut lane[run.clone()]);
-            interpolate(&[a, b, c, d], u, v, red, green, blue);
+                *colour = lattices.colours[corner];
+            }
+            let run = [begin, begin + same];
+            eight::run(Between { corners, run, within: &self.within, colours: &mut self.pass });
             begin += same;
         }
     }
@@ -565,11 +569,6 @@ fn side_axes(normal: V3) -> [usize; 2] {
     } else {
         [0, 1]
     }
-}
-
-/// A place in a list.
-fn at_least_0(i: i32) -> usize {
-    usize::try_from(i).unwrap_or(0)
 }
 
 /// The light of a pass at a corner of a grid.
@@ -638,7 +637,7 @@ impl LocalRays {
 struct Grid {
     axes: [Axis; 2],
     /// The cell, along both axes.
-    cell: [i32; 2],
+    cell: [f32; 2],
     /// Its first corner.
     first: usize,
     /// Corners of a row.
@@ -674,12 +673,20 @@ impl Grid {
         };
         let ((i, s), (j, t)) = (axes[0].cell(at[0]), axes[1].cell(at[1]));
         let row = axes[0].cells + 1;
-        Self { axes, cell: [i, j], first: begin + at_least_0(j) * row + at_least_0(i), row, within: [s, t], side }
+        Self {
+            axes,
+            cell: [i, j],
+            first: begin + nearest(j) as usize * row + nearest(i) as usize,
+            row,
+            within: [s, t],
+            side,
+        }
     }
 
     /// A corner of the cell in the world, and how the surface looks there.
     fn corner(&self, geom: &Geom, step: usize) -> (V3, V3) {
-        let (i, j) = (self.cell[0] + i32::from(step % self.row == 1), self.cell[1] + i32::from(step >= self.row));
+        let one = |yes: bool| if yes { 1.0 } else { 0.0 };
+        let (i, j) = (self.cell[0] + one(step % self.row == 1), self.cell[1] + one(step >= self.row));
         let (side, at) = self.side;
         let (mut place, mut normal) = ([0.0; 3], [0.0; 3]);
         place[side] = at;
@@ -707,6 +714,33 @@ impl Lattices {
     }
 }
 
+/// Colours between those at four corners, for fragments of a run; what follows may be overwritten.
+struct Between<'a> {
+    corners: [V3; 4],
+    run: [usize; 2],
+    within: &'a [Lane; 2],
+    colours: &'a mut [Lane; 3],
+}
+
+impl Job for Between<'_> {
+    #[inline(always)]
+    fn run(self, simd: impl Simd) {
+        let Self { corners: [a, b, c, d], run: [begin, end], within: [u, v], colours } = self;
+        for from in (begin..end).step_by(LANES) {
+            let (Some(u), Some(v)) = (u[from..].first_chunk(), v[from..].first_chunk()) else { return };
+            let (u, v) = (simd.load(u), simd.load(v));
+            for (k, lane) in colours.iter_mut().enumerate() {
+                let between = |a: f32, b: f32| simd.add(simd.splat(a), simd.mul(u, simd.splat(b - a)));
+                let (low, high) = (between(a[k], b[k]), between(c[k], d[k]));
+                let colour = simd.add(low, simd.mul(v, simd.sub(high, low)));
+                if let Some(to) = lane[from..].first_chunk_mut() {
+                    simd.store(colour, to);
+                }
+            }
+        }
+    }
+}
+
 vectorised! {
     /// Multiplies light with a texture; more than white is white.
     fn tinted(sums: &mut [f32], tints: &[f32]) {
@@ -722,20 +756,6 @@ vectorised! {
         }
     }
 
-    /// Between the colours at four corners.
-    fn interpolate(corners: &[V3; 4], u: &[f32], v: &[f32], r: &mut [f32], g: &mut [f32], b: &mut [f32]) {
-        let n = u.len();
-        let (v, r, g, b) = (&v[..n], &mut r[..n], &mut g[..n], &mut b[..n]);
-        let [p, q, s, t] = *corners;
-        for i in 0..n {
-            let at = |k: usize| {
-                let (low, high) = (p[k] + u[i] * (q[k] - p[k]), s[k] + u[i] * (t[k] - s[k]));
-                low + v[i] * (high - low)
-            };
-            (r[i], g[i], b[i]) = (at(0), at(1), at(2));
-        }
-    }
-
     /// The cells of places on a plane, and how far inside they are.
     #[allow(clippy::cast_possible_truncation)]
     fn plane_cells(
@@ -743,10 +763,10 @@ vectorised! {
     ) {
         let n = px.len();
         let (py, cells, u, v) = (&py[..n], &mut cells[..n], &mut u[..n], &mut v[..n]);
-        let row = x.cells as i32 + 1;
+        let row = x.cells as u32 + 1;
         for i in 0..n {
             let ((column, s), (line, t)) = (x.cell(px[i]), y.cell(py[i]));
-            cells[i] = (line * row + column) as u32;
+            cells[i] = nearest(line) * row + nearest(column);
             (u[i], v[i]) = (s, t);
         }
     }

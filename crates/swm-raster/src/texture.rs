@@ -3,7 +3,7 @@
 //! The choice between two versions is that of Mesa's software rasteriser, with which pictures are compared: the larger
 //! of the coordinates' derivatives counts, and versions blend only in the second half of the way from one to the next.
 
-use crate::simd::vectorised;
+use crate::simd::{nearest, rounded, vectorised};
 
 /// Places looked up at once.
 pub(crate) const MANY: usize = 128;
@@ -13,21 +13,13 @@ pub(crate) const MANY: usize = 128;
 pub struct Texture {
     width: u32,
     height: u32,
-    /// Versions of a face, from fine to coarse.
-    levels: Vec<Level>,
+    /// Versions of a face, from fine to coarse: where each begins, of the texels of the face. It is kept row after row, with a frame
+    /// of one texel around it that repeats the texture or continues its rim.
+    levels: Vec<usize>,
     /// Faces one after the other, each of so many texels.
     face: usize,
     /// RGBA texels in a word each.
     texels: Vec<u32>,
-}
-
-/// One version of a face: row after row, with a frame of one texel around it that repeats the texture or continues its rim.
-#[derive(Clone, Copy, Debug)]
-struct Level {
-    /// Where the first texel of the frame is, of those of the face.
-    begin: usize,
-    /// From a row to the next.
-    stride: usize,
 }
 
 /// A picture while its smaller versions are made.
@@ -132,7 +124,7 @@ impl Texture {
             levels.clear();
             let begin = texels.len();
             loop {
-                levels.push(Level { begin: texels.len() - begin, stride: sheet.width + 2 });
+                levels.push(texels.len() - begin);
                 texels.extend(sheet.framed(repeat));
                 if sheet.width == 1 && sheet.height == 1 {
                     break;
@@ -249,6 +241,7 @@ struct Seen {
     shares: [u32; MANY],
     /// The texel at the upper left, counted from that of the frame, and in 256ths how far the spot is from its middle.
     places: [u32; MANY],
+    strides: [u32; MANY],
     right: [u32; MANY],
     below: [u32; MANY],
     four: [[u32; MANY]; 4],
@@ -265,6 +258,7 @@ impl Default for Seen {
             levels: NONE,
             shares: NONE,
             places: NONE,
+            strides: NONE,
             right: NONE,
             below: NONE,
             four: [NONE; 4],
@@ -276,13 +270,13 @@ impl Default for Seen {
 impl Seen {
     /// Looks up the versions chosen.
     fn look(&mut self, texture: &Texture, n: usize) {
-        let Self { s, t, faces, levels, places, right, below, four, words, .. } = self;
-        find(texture.width, texture.height, &s[..n], &t[..n], &levels[..n], places, right, below);
+        let Self { s, t, faces, levels, places, strides, right, below, four, words, .. } = self;
+        find(texture.width, texture.height, &s[..n], &t[..n], &levels[..n], places, strides, right, below);
         let [a, b, c, d] = four;
         for i in 0..n {
-            let Some(level) = texture.levels.get(levels[i] as usize) else { continue };
-            let at = faces[i] as usize * texture.face + level.begin + places[i] as usize;
-            [a[i], b[i], c[i], d[i]] = texture.four(at, level.stride);
+            let Some(begin) = texture.levels.get(levels[i] as usize) else { continue };
+            let at = faces[i] as usize * texture.face + begin + places[i] as usize;
+            [a[i], b[i], c[i], d[i]] = texture.four(at, strides[i] as usize);
         }
         between(&right[..n], &below[..n], a, b, c, d, words);
     }
@@ -312,7 +306,7 @@ vectorised! {
         let Seen { s: inside_s, t: inside_t, levels, shares, .. } = seen;
         let last = texture.levels.len() as i32 - 1;
         let whole = |x: f32| {
-            let part = x - x as i32 as f32;
+            let part = x - rounded(x);
             let part = if part < 0.0 { part + 1.0 } else { part };
             // What is no number, or too large to have a fraction, is 0.
             if part <= 1.0 { part } else { 0.0 }
@@ -322,28 +316,28 @@ vectorised! {
             let scaled = if dense[i] > 1.0 { (dense[i] * 1.237_436_9).min(1e9) } else { 1.0 };
             let exponent = (scaled.to_bits() >> 23) as i32 - 127;
             let mantissa = f32::from_bits(scaled.to_bits() & 0x007f_ffff | 0x3f80_0000);
-            let between = ((2.0 * mantissa - 3.0) * 256.0) as i32;
-            let between = if exponent < last { between } else { 0 };
+            let between = if exponent < last { (2.0 * mantissa - 3.0) * 256.0 } else { 0.0 };
             // Less than a few steps of a byte apart, one of them will do.
-            levels[i] = (exponent.min(last) + i32::from(between > 240)) as u32;
-            shares[i] = if (between > 16) & (between <= 240) { between as u32 } else { 0 };
+            levels[i] = (exponent.min(last) + i32::from(between > 240.0)) as u32;
+            shares[i] = nearest(if (between > 16.0) & (between <= 240.0) { between } else { 0.0 });
             (inside_s[i], inside_t[i]) = (whole(s[i]), whole(t[i]));
         }
     }
 
-    /// Finds texels.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    /// Finds texels: where they are on a version, and from each row of it to the next.
+    #[allow(clippy::cast_precision_loss)]
     fn find(
-        width: u32, height: u32, s: &[f32], t: &[f32], levels: &[u32], places: &mut [u32; MANY], right: &mut [u32; MANY],
-        below: &mut [u32; MANY],
+        width: u32, height: u32, s: &[f32], t: &[f32], levels: &[u32], places: &mut [u32; MANY],
+        strides: &mut [u32; MANY], right: &mut [u32; MANY], below: &mut [u32; MANY],
     ) {
         let n = s.len().min(MANY);
         let (s, t, levels) = (&s[..n], &t[..n], &levels[..n]);
         for i in 0..n {
             let (w, h) = ((width >> levels[i]).max(1), (height >> levels[i]).max(1));
-            // From the middle of the first texel of the frame.
-            let x = (s[i] * (256 * w) as i32 as f32) as i32 as u32 + 128;
-            let y = (t[i] * (256 * h) as i32 as f32) as i32 as u32 + 128;
+            // In 256ths, from the middle of the first texel of the frame.
+            let x = nearest(s[i] * (256 * w) as i32 as f32) + 128;
+            let y = nearest(t[i] * (256 * h) as i32 as f32) + 128;
+            strides[i] = w + 2;
             places[i] = (y >> 8) * (w + 2) + (x >> 8);
             (right[i], below[i]) = (x & 255, y & 255);
         }

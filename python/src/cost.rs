@@ -24,7 +24,7 @@ pub struct Planned {
 /// What somebody gave as a model: one of ours, an adapted one of Python's, or nothing for the world itself.
 pub fn model(given: Option<&Bound<'_, PyAny>>, spec: &EnvSpec, action_block: usize) -> PyResult<Planned> {
     let Some(given) = given else {
-        let env = swm::ENVS.choose(&spec.id).map_err(raised)?;
+        let env = swm::env(&spec.id).map_err(raised)?;
         let scale = ActionScale::unscaled(spec);
         let cost = SimulatorCost::new(move || env.env(), scale.clone(), action_block, Score::default());
         return Ok(Planned { cost: Box::new(cost.map_err(raised)?), scale: Some(scale), weights: None, python: false });

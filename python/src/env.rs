@@ -44,7 +44,7 @@ impl NativeEnv {
     fn new(py: Python<'_>, id: &str, wrappers: &str, wrap_goal: bool) -> PyResult<Self> {
         let (stack, goal) = stack(wrappers, wrap_goal)?;
         let made = py.detach(|| {
-            let env = stack.wrap(swm::ENVS.choose(id)?.env()?, goal);
+            let env = stack.wrap(swm::env(id)?.env()?, goal);
             let row = Batch::zeros(&Schema::new(env.spec().columns.clone())?, 1);
             Ok(State { env, row })
         });

@@ -48,7 +48,7 @@ impl Actor {
     #[staticmethod]
     fn expert(world: &World, name: &str, seed: Option<u64>) -> PyResult<Self> {
         let world = world.lock()?;
-        let entry = swm::ENVS.choose(&world.spec().id).map_err(raised)?.entry;
+        let entry = swm::env(&world.spec().id).map_err(raised)?.entry;
         Ok(Self::new(swm::resolver::scripted(&entry, name, &world).map_err(raised)?, seed))
     }
 
@@ -110,7 +110,7 @@ impl Actor {
     /// Experts of an environment.
     #[staticmethod]
     fn experts(env: &str) -> PyResult<Vec<&'static str>> {
-        Ok(swm::ENVS.choose(env).map_err(raised)?.entry.experts.iter().map(|expert| expert.id()).collect())
+        Ok(swm::env(env).map_err(raised)?.entry.experts.iter().map(|expert| expert.id()).collect())
     }
 }
 

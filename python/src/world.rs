@@ -72,7 +72,7 @@ impl World {
         let views: swm::core::Result<Vec<View>> = views.iter().map(|text| View::parse(text)).collect();
         let config = WorldConfig { envs, image, views: views.map_err(raised)?, max_episode_steps, threads };
         let world = py.detach(|| {
-            let chosen = swm::ENVS.choose(&env)?;
+            let chosen = swm::env(&env)?;
             swm::eval::World::of(|| Ok(stack.wrap(chosen.env()?, goal)), config)
         });
         Ok(Self { world: Mutex::new(world.map_err(raised)?), envs })

@@ -1,8 +1,8 @@
 """One Gymnasium environment behind one flat buffer.
 
 A `Bridge` finds out what its environment is (`describe`: spaces, columns, pictures, factors of variation), and then
-writes whatever a reset, a step or a render brings into a single buffer, each thing at its own 64-byte aligned offset. It
-returns nothing: whoever holds the buffer reads it. The same class serves a worker process (`worker.py`, over shared
+writes whatever a reset, a step or a render brings into a single buffer, each thing at its own 64-byte aligned offset.
+It returns nothing: whoever holds the buffer reads it. The same class serves a worker process (`worker.py`, over shared
 memory) and an interpreter that lives in the caller's process.
 
 Columns come from two places:
@@ -31,7 +31,7 @@ ALIGN = 64
 HEAD = struct.Struct('<dd???')
 # Columns that the platform adds itself.
 TAKEN = frozenset(
-    'action reward terminated truncated success step_idx episode_idx ep_idx ep_len ep_offset pixels goal'.split()
+    'action reward terminated truncated success step_idx episode_idx episode_seed ep_len ep_offset pixels goal'.split()
 )
 # `info` entries that have another way to the platform.
 ELSEWHERE = frozenset(['success', 'is_success'])
@@ -114,11 +114,14 @@ class Actions:
         parts = [part for _, _, part in leaves(space, 'action')]
         if all(isinstance(part, spaces.Box) and part.dtype.kind == 'f' for part in parts):
             self.dtype = np.dtype(np.float32)
-            low, high = (np.concatenate([getattr(part, side).reshape(-1) for part in parts]) for side in ('low', 'high'))
+            with np.errstate(over='ignore'):
+                sides = ('low', 'high')
+                low, high = np.float32([np.concatenate([getattr(p, s).reshape(-1) for p in parts]) for s in sides])
             # Random actions need bounds: a side without one counts as 1. Actions are passed on as they come.
-            low, high = np.where(np.isfinite(low), low, -1.0), np.where(np.isfinite(high), high, 1.0)
+            low = np.where(np.isfinite(low), low, -1)
+            high = np.where(np.isfinite(high), high, 1)
             shape = parts[0].shape if len(parts) == 1 else low.shape
-            self.json = box(*np.float32([low, np.maximum(low, high)]), shape, np.float32)
+            self.json = box(low, np.maximum(low, high), shape, np.float32)
         else:
             self.dtype = np.dtype(np.int64)
             nvec, start = zip(*map(self.choices, parts))
@@ -182,7 +185,8 @@ def factor(key, space):
         start = int(getattr(space, 'start', 0))
         form, default = {'type': 'Discrete', 'n': int(space.n), 'start': start}, start
     elif hasattr(space, 'low'):
-        colour = space.dtype == np.uint8 and space.shape == (3,) and (space.low == 0).all() and (space.high == 255).all()
+        byte = space.dtype == np.uint8 and (space.low == 0).all() and (space.high == 255).all()
+        colour = byte and space.shape == (3,)
         form = {'type': 'RGBBox'} if colour else box(space.low, space.high, space.shape, space.dtype)
         default = space.low
     else:
@@ -370,9 +374,9 @@ class Bridge:
         for leaf, view in self.factor_views:
             value = getattr(leaf, 'value', None)
             view[...] = np.asarray(leaf.init_value if value is None else value, np.float64).reshape(-1)
-        if self.goal is not None and is_picture(info.get('goal')):
-            self.goal[...] = info['goal'][..., :3]
-        self.write(observation, 0.0, False, False, info, reset=True)
+        if self.goal is not None:
+            self.goal[...] = info['goal'][..., :3] if is_picture(info.get('goal')) else 0
+        self.write(observation, 0.0, False, False, info)
 
     def value(self, key, value):
         """A factor's numbers in the form its space holds."""
@@ -385,7 +389,7 @@ class Bridge:
         """Takes the action in the buffer."""
         self.write(*self.env.step(self.actions.read(self.action)))
 
-    def write(self, observation, reward, terminated, truncated, info, reset=False):
+    def write(self, observation, reward, terminated, truncated, info):
         for path, view in self.observed_views:
             value = observation
             for key in path:
@@ -397,10 +401,9 @@ class Bridge:
                 continue
             value = np.asarray(value)
             if value.shape != view.shape or (value.dtype.kind == 'f') > (view.dtype.kind == 'f'):
-                is_now = f'{value.dtype} {list(value.shape)}'
                 raise ValueError(
-                    f"info['{key}'] was {view.dtype} {list(view.shape)} when the environment was tried, and is {is_now} now:"
-                    ' give it one type and shape'
+                    f"info['{key}'] was {view.dtype} {list(view.shape)} when the environment was tried, and is"
+                    f' {value.dtype} {list(value.shape)} now: give it one type and shape'
                 )
             view[...] = value
         success = info.get('success', info.get('is_success'))
@@ -417,8 +420,8 @@ class Bridge:
         picture = self.env.render()
         if not is_picture(picture) or picture.shape[:2] != self.render_shape:
             raise ValueError(
-                f'render() gave {getattr(picture, "shape", type(picture).__name__)}, and {(*self.render_shape, 3)} when the'
-                ' environment was tried: pictures must keep their size'
+                f'render() gave {getattr(picture, "shape", type(picture).__name__)}, and {(*self.render_shape, 3)}'
+                ' when the environment was tried: pictures must keep their size'
             )
         self.picture[...] = picture[..., :3]
 

@@ -1,13 +1,16 @@
-"""Craftax as Gymnasium environments, under the ids, spaces and sizes that stable-worldmodel's Python package gives them.
+"""Craftax as Gymnasium environments, under the ids, spaces and sizes of stable-worldmodel's Python package.
 
 Craftax computes in JAX: a pure function from a key, a state and an action to the next state. An environment here holds
 key and state. Symbolic variants can be drawn as well, by the renderer that makes the observations of the pixel ones.
 """
 
 import importlib
+import os
+import pickle
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 from craftax.craftax_env import make_craftax_env_from_name
 from gymnasium import spaces
@@ -31,6 +34,17 @@ def register():
             )
 
 
+def textured(make, *arguments):
+    """What `make` makes with Craftax's textures, which Craftax keeps in a file: half of one if it was stopped then."""
+    try:
+        return make(*arguments)
+    except (EOFError, OSError, ValueError, pickle.UnpicklingError):
+        os.environ['CRAFTAX_RELOAD_TEXTURES'] = 'true'
+        return make(*arguments)
+    finally:
+        os.environ.pop('CRAFTAX_RELOAD_TEXTURES', None)
+
+
 class Craftax(gymnasium.Env):
     """One world of Craftax."""
 
@@ -42,7 +56,7 @@ class Craftax(gymnasium.Env):
     def __init__(self, name, shape, render_mode=None):
         self.render_mode = render_mode
         # The pool starts the next episode, not the environment.
-        env = make_craftax_env_from_name(name, auto_reset=False)
+        env = textured(make_craftax_env_from_name, name, False)
         params = env.default_params
         self.observation_space = spaces.Box(0.0, 1.0, shape, np.float32)
         self.action_space = spaces.Discrete(env.num_actions)
@@ -50,7 +64,7 @@ class Craftax(gymnasium.Env):
         package = 'craftax.craftax_classic' if 'Classic' in name else 'craftax.craftax'
         constants = importlib.import_module(f'{package}.constants')
         renderer = importlib.import_module(f'{package}.renderer')
-        self.draw = jax.jit(renderer.make_craftax_pixel_renderer(constants.BLOCK_PIXEL_SIZE_AGENT))
+        self.draw = jax.jit(textured(renderer.make_craftax_pixel_renderer, constants.BLOCK_PIXEL_SIZE_AGENT))
 
         @jax.jit
         def begin(key):
@@ -60,7 +74,11 @@ class Craftax(gymnasium.Env):
         @jax.jit
         def go(key, state, action):
             kept, used = jax.random.split(key)
-            return env.step(used, state, action, params), kept
+            observation, state, reward, done, info = env.step(used, state, action, params)
+            # One array comes over sooner than thirty.
+            self.names = list(info)
+            numbers = jnp.stack([jnp.float32(value) for value in (reward, done, *info.values())])
+            return observation, state, numbers, kept
 
         self.begin, self.go = begin, go
         self.key = jax.random.PRNGKey(0)
@@ -73,9 +91,10 @@ class Craftax(gymnasium.Env):
         return self.observation, {}
 
     def step(self, action):
-        (observation, self.state, reward, done, info), self.key = self.go(self.key, self.state, int(action))
+        observation, self.state, numbers, self.key = self.go(self.key, self.state, int(action))
         self.observation = np.asarray(observation, np.float32)
-        return self.observation, float(reward), bool(done), False, {key: np.asarray(v) for key, v in info.items()}
+        reward, done, *info = np.asarray(numbers)
+        return self.observation, float(reward), bool(done), False, dict(zip(self.names, info))
 
     def render(self):
         picture = self.observation * 255.0 if self.pixels else np.asarray(self.draw(self.state))

@@ -80,11 +80,6 @@ pub(crate) fn python() -> PathBuf {
     environment().join("bin").join("python")
 }
 
-/// The package of that name, if it is one of ours.
-pub fn get(name: &str) -> Option<&'static Package> {
-    PACKAGES.iter().find(|package| package.name == name)
-}
-
 /// Installs a package with pip, after making the virtual environment where there is none. Where it is.
 ///
 /// # Errors

@@ -103,8 +103,7 @@ impl WorkerTransport {
             b'm' => {
                 let missing: BTreeMap<String, String> = serde_json::from_str(&text).unwrap_or_default();
                 let of = |key: &str| missing.get(key).cloned().unwrap_or_default();
-                let fix = format!("`swm assets install {}`, or name a Python that has it in $SWM_PYTHON", of("asset"));
-                Error::config(id, format!("{} in {python}", of("message")), fix)
+                Error::config(id, format!("{} in {python}", of("message")), python.fix(&of("asset")))
             }
             _ => Error::config(id, text, format!("install what it asks for in {python}, or choose another")),
         };
@@ -196,8 +195,7 @@ impl Process {
             }
         }
         let mut child = spawn(command).map_err(|error| {
-            let fix = "`swm assets install gymnasium`, or name a Python that has Gymnasium in $SWM_PYTHON";
-            Error::config("Python", format!("{python} cannot be started: {error}"), fix)
+            Error::config("Python", format!("{python} cannot be started: {error}"), python.fix("gymnasium"))
         })?;
         let tail = Tail::of(child.stderr.take(), id);
         Ok(Self { child, line, file, memory: None, tail })

@@ -86,11 +86,13 @@ impl Canvas {
             }
             Target::Labels(labels) => {
                 self.visible(scene, assets, &view, pattern(1), |geom| scene.geoms[geom].label.is_some());
-                for (label, &id) in labels.iter_mut().zip(&self.main.ids) {
-                    *label = match id {
-                        NOTHING => -1,
-                        id => scene.geoms[self.main.geom(id) as usize].label.unwrap_or(-1),
-                    };
+                for (y, labels) in labels.chunks_exact_mut(width).take(height).enumerate() {
+                    for (label, &id) in labels.iter_mut().zip(&self.main.ids[self.main.span(y, 0, width)]) {
+                        *label = match id {
+                            NOTHING => -1,
+                            id => scene.geoms[self.main.geom(id) as usize].label.unwrap_or(-1),
+                        };
+                    }
                 }
             }
         }
@@ -119,10 +121,14 @@ impl Canvas {
     fn depths(&self, scene: &Scene, view: &View, metres: &mut [f32]) {
         let (rays, radius) = (view.rays(), sky::radius(scene));
         let [dx, dy] = self.main.pattern[0];
-        for (pixel, (metre, &depth)) in metres.iter_mut().zip(&self.main.depths).enumerate() {
-            let (x, y) = ((pixel % view.width) as f32 + dx, (pixel / view.width) as f32 + dy);
-            let direction = add(rays.direction, add(scale(rays.directions[0], x), scale(rays.directions[1], y)));
-            *metre = if scene.sky.is_some() { depth.min(sky::depth(radius, direction)) } else { depth };
+        for (y, metres) in metres.chunks_exact_mut(view.width).take(view.height).enumerate() {
+            let row = add(rays.direction, scale(rays.directions[1], y as f32 + dy));
+            for (x, (metre, &depth)) in
+                metres.iter_mut().zip(&self.main.depths[self.main.span(y, 0, view.width)]).enumerate()
+            {
+                let direction = add(row, scale(rays.directions[0], x as f32 + dx));
+                *metre = if scene.sky.is_some() { depth.min(sky::depth(radius, direction)) } else { depth };
+            }
         }
     }
 
@@ -258,12 +264,11 @@ impl Canvas {
             let geom = &scene.geoms[number];
             let Some(region) = touched(geom, assets, view) else { continue };
             let [x0, y0, x1, y1] = region;
-            for row in y0 * glass.samples..y1 * glass.samples {
-                let row = row * view.width + x0..row * view.width + x1;
+            for row in (y0..y1).map(|y| main.span(y, x0, x1)) {
                 glass.depths[row.clone()].copy_from_slice(&main.depths[row.clone()]);
                 glass.ids[row].fill(NOTHING);
             }
-            glass.triangles.clear();
+            glass.forget();
             glass.draw(u32::try_from(number).unwrap_or(NOTHING), geom, (assets, view), None, false);
             let opacity = match geom.shape {
                 Shape::Plane(..) if hind(scene, number, view) => BEHIND * geom.rgba[3],
@@ -324,7 +329,7 @@ fn veil(scene: &Scene, view: &View, main: &Layers, colours: &mut [V3]) {
         let row = add(rays.direction, scale(rays.directions[1], y as f32 + 0.5));
         for x in 0..view.width {
             let Some((opacity, depth)) = veil.at(add(row, scale(rays.directions[0], x as f32 + 0.5))) else { continue };
-            let open = (0..main.samples).filter(|&sample| main.depths[main.place(y, sample) + x] > depth).count();
+            let open = main.depths[main.span(y, x, x + 1)].iter().filter(|far| **far > depth).count();
             let pixel = &mut colours[y * view.width + x];
             *pixel = sky::over(veil.rgb, opacity * open as f32 * share, *pixel);
         }

@@ -42,15 +42,27 @@ pub(crate) struct Posed {
     pub directions: [V3; 2],
 }
 
-/// Rays of one row: number `i` is at `place + i * place_step` at the depth of [`Posed`].
+/// The rays through a row of pixels: at `x` pixels from the left and `y` from the upper edge of the row, they pass the depth of
+/// [`Posed`] at `place + x * places[0] + y * places[1]`, and so the direction.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Row {
+    base: f32,
     place: V3,
-    place_step: V3,
+    places: [V3; 2],
     direction: V3,
-    direction_step: V3,
+    directions: [V3; 2],
     depth: f32,
     near: f32,
+}
+
+/// Samples next to each other, and the nearest thing at each.
+pub(crate) struct Samples<'a> {
+    /// Where they are: from the left of the picture, and from the upper edge of the row.
+    pub at: [&'a [f32]; 2],
+    /// What is not farther than this does not count.
+    pub floor: &'a [f32],
+    pub depths: &'a mut [f32],
+    pub ids: &'a mut [u32],
 }
 
 impl Shape {
@@ -116,40 +128,47 @@ impl Posed {
         })
     }
 
-    /// The rays from pixel coordinates (x, y) to the right.
-    pub fn row(&self, x: f32, y: f32) -> Row {
-        let (x, y) = (x - self.base[0], y - self.base[1]);
-        let at = |from: V3, steps: [V3; 2]| add(from, add(scale(steps[0], x), scale(steps[1], y)));
+    /// The rays of row `y`.
+    #[allow(clippy::cast_precision_loss)]
+    pub fn row(&self, y: usize) -> Row {
+        let down = y as f32 - self.base[1];
         Row {
-            place: at(self.place, self.places),
-            place_step: self.places[0],
-            direction: at(self.direction, self.directions),
-            direction_step: self.directions[0],
+            base: self.base[0],
+            place: add(self.place, scale(self.places[1], down)),
+            places: self.places,
+            direction: add(self.direction, scale(self.directions[1], down)),
+            directions: self.directions,
             depth: self.depth,
             near: self.near,
         }
     }
 
-    /// Where rays enter: their depths, infinite for those that miss.
-    pub fn enter(&self, row: &Row, depths: &mut [f32]) {
+    /// Puts the shape, as `id`, where it is nearer than what is there.
+    pub fn enter(&self, row: &Row, id: u32, samples: Samples<'_>) {
+        let Samples { at: [x, y], floor, depths, ids } = samples;
         match self.unit {
-            Unit::Plane([x, y]) => enter_plane(row, x, y, depths),
-            Unit::Sphere => enter_sphere(row, depths),
-            Unit::Capsule(half) => enter_capsule(row, half, depths),
-            Unit::Cylinder => enter_cylinder(row, depths),
-            Unit::Cube => enter_cube(row, depths),
+            Unit::Plane(halves) => enter_plane(&self.rectangle(halves), row, id, x, y, floor, depths, ids),
+            Unit::Sphere => enter_sphere(row, id, x, y, floor, depths, ids),
+            Unit::Capsule(half) => enter_capsule(&Rod(half), row, id, x, y, floor, depths, ids),
+            Unit::Cylinder => enter_cylinder(row, id, x, y, floor, depths, ids),
+            Unit::Cube => enter_cube(row, id, x, y, floor, depths, ids),
         }
+    }
+
+    fn rectangle(&self, halves: [f32; 2]) -> Rectangle {
+        Rectangle(halves, self.near - self.depth)
     }
 
     /// What is seen through the middles of pixels: depth (added to that of the pose), unit coordinates, and the direction of the
     /// surface in unit coordinates, not of length 1. Rays that miss are led to the rim.
     pub fn surface(&self, x: &[f32], y: &[f32], depths: &mut [f32], places: [&mut [f32]; 3], normals: [&mut [f32]; 3]) {
-        let [px, py, pz] = places;
-        let [nx, ny, nz] = normals;
+        let ([px, py, pz], [nx, ny, nz]) = (places, normals);
         match self.unit {
-            Unit::Plane(_) => surface_plane(self, x, y, depths, px, py, pz, nx, ny, nz),
+            Unit::Plane(halves) => {
+                surface_plane(&self.rectangle(halves), self, x, y, depths, px, py, pz, nx, ny, nz);
+            }
             Unit::Sphere => surface_sphere(self, x, y, depths, px, py, pz, nx, ny, nz),
-            Unit::Capsule(half) => surface_capsule(self, half, x, y, depths, px, py, pz, nx, ny, nz),
+            Unit::Capsule(half) => surface_capsule(&Rod(half), self, x, y, depths, px, py, pz, nx, ny, nz),
             Unit::Cylinder => surface_cylinder(self, x, y, depths, px, py, pz, nx, ny, nz),
             Unit::Cube => surface_cube(self, x, y, depths, px, py, pz, nx, ny, nz),
         }
@@ -165,17 +184,10 @@ struct Ray {
 
 impl Row {
     #[inline(always)]
-    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation)]
-    fn ray(&self, i: usize) -> Ray {
-        let i = i as u32 as i32 as f32;
-        Ray { p: add(self.place, scale(self.place_step, i)), d: add(self.direction, scale(self.direction_step, i)) }
-    }
-
-    /// A depth, if the ray goes in there, in front of the camera.
-    #[inline(always)]
-    fn hit(&self, t: f32, hit: bool) -> f32 {
-        let depth = self.depth + t;
-        if hit & (depth > self.near) { depth } else { f32::INFINITY }
+    fn ray(&self, x: f32, y: f32) -> Ray {
+        let x = x - self.base;
+        let at = |from: V3, steps: &[V3; 2]| add(from, add(scale(steps[0], x), scale(steps[1], y)));
+        Ray { p: at(self.place, &self.places), d: at(self.direction, &self.directions) }
     }
 }
 
@@ -226,158 +238,238 @@ fn slab(p: f32, d: f32) -> (f32, f32) {
     (a.min(b), a.max(b))
 }
 
-/// The way to where a ray enters a capsule, and whether it does.
+/// A unit shape.
+trait Solid {
+    /// The way along a ray to where it enters, and whether it does.
+    fn enter(&self, ray: Ray) -> (f32, bool);
+
+    /// The way to where a ray enters, or comes close to the shape; the place, and the direction of the surface there.
+    fn surface(&self, ray: Ray) -> (f32, V3, V3);
+}
+
+/// A rectangle at z = 0: its halves, and the least way along a ray that is in front of the camera.
+struct Rectangle([f32; 2], f32);
+struct Sphere;
+/// A capsule: half the length of its cylinder.
+struct Rod(f32);
+struct Drum;
+struct Cube;
+
+impl Solid for Rectangle {
+    #[inline(always)]
+    fn enter(&self, Ray { p, d }: Ray) -> (f32, bool) {
+        let t = -p[2] / nonzero(d[2]);
+        (t, ((p[0] + t * d[0]).abs() <= self.0[0]) & ((p[1] + t * d[1]).abs() <= self.0[1]))
+    }
+
+    #[inline(always)]
+    fn surface(&self, Ray { p, d }: Ray) -> (f32, V3, V3) {
+        // A pixel whose middle is past the horizon or the rim takes what is there.
+        let way = -p[2] / nonzero(d[2]);
+        let way = if way > self.1 { way } else { 1e6 };
+        (way, [p[0] + way * d[0], p[1] + way * d[1], 0.0], [0.0, 0.0, 1.0])
+    }
+}
+
+impl Solid for Sphere {
+    #[inline(always)]
+    fn enter(&self, ray: Ray) -> (f32, bool) {
+        let (t, inside) = ball(ray, 0.0);
+        (t, inside >= 0.0)
+    }
+
+    #[inline(always)]
+    fn surface(&self, ray: Ray) -> (f32, V3, V3) {
+        let (way, _) = ball(ray, 0.0);
+        let at = add(ray.p, scale(ray.d, way));
+        (way, at, at)
+    }
+}
+
+impl Solid for Rod {
+    #[inline(always)]
+    fn enter(&self, ray: Ray) -> (f32, bool) {
+        let (body, _, inside) = tube(ray);
+        let on_body = (inside >= 0.0) & ((ray.p[2] + body * ray.d[2]).abs() <= self.0);
+        let (upper, in_upper) = ball(ray, self.0);
+        let (lower, in_lower) = ball(ray, -self.0);
+        let mut t = if on_body { body } else { f32::INFINITY };
+        t = if in_upper >= 0.0 { t.min(upper) } else { t };
+        t = if in_lower >= 0.0 { t.min(lower) } else { t };
+        (t, t < f32::INFINITY)
+    }
+
+    #[inline(always)]
+    fn surface(&self, ray: Ray) -> (f32, V3, V3) {
+        let (hit, is_hit) = self.enter(ray);
+        // Past the rim: where it passes the axis, or the nearer end.
+        let (body, _, _) = tube(ray);
+        let end = (ray.p[2] + body * ray.d[2]).clamp(-self.0, self.0);
+        let (rim, _) = ball(ray, end);
+        let way = if is_hit { hit } else { rim };
+        let at = add(ray.p, scale(ray.d, way));
+        (way, at, [at[0], at[1], at[2] - at[2].clamp(-self.0, self.0)])
+    }
+}
+
+impl Solid for Drum {
+    #[inline(always)]
+    fn enter(&self, ray: Ray) -> (f32, bool) {
+        let (enter, leave, inside) = tube(ray);
+        let (low, high) = slab(ray.p[2], ray.d[2]);
+        let t = enter.max(low);
+        (t, (inside >= 0.0) & (t <= leave.min(high)))
+    }
+
+    #[inline(always)]
+    fn surface(&self, ray: Ray) -> (f32, V3, V3) {
+        let (enter, _, _) = tube(ray);
+        let (low, _) = slab(ray.p[2], ray.d[2]);
+        let way = enter.max(low);
+        let at = add(ray.p, scale(ray.d, way));
+        let end = low > enter;
+        let up = if ray.d[2] > 0.0 { -1.0 } else { 1.0 };
+        (way, at, [if end { 0.0 } else { at[0] }, if end { 0.0 } else { at[1] }, if end { up } else { 0.0 }])
+    }
+}
+
+impl Solid for Cube {
+    #[inline(always)]
+    fn enter(&self, Ray { p, d }: Ray) -> (f32, bool) {
+        let ((ax, bx), (ay, by), (az, bz)) = (slab(p[0], d[0]), slab(p[1], d[1]), slab(p[2], d[2]));
+        let t = ax.max(ay).max(az);
+        (t, t <= bx.min(by).min(bz))
+    }
+
+    #[inline(always)]
+    fn surface(&self, Ray { p, d }: Ray) -> (f32, V3, V3) {
+        let ((a, _), (b, _), (c, _)) = (slab(p[0], d[0]), slab(p[1], d[1]), slab(p[2], d[2]));
+        let way = a.max(b).max(c);
+        let against = |d: f32| if d > 0.0 { -1.0 } else { 1.0 };
+        let (on_x, on_y) = ((a >= b) & (a >= c), b >= c);
+        let normal = [
+            if on_x { against(d[0]) } else { 0.0 },
+            if !on_x & on_y { against(d[1]) } else { 0.0 },
+            if on_x | on_y { 0.0 } else { against(d[2]) },
+        ];
+        (way, [p[0] + way * d[0], p[1] + way * d[1], p[2] + way * d[2]], normal)
+    }
+}
+
+/// Puts a solid where it is nearer than what is there.
 #[inline(always)]
-fn capsule(ray: Ray, half: f32) -> (f32, bool) {
-    let (body, _, inside) = tube(ray);
-    let on_body = (inside >= 0.0) & ((ray.p[2] + body * ray.d[2]).abs() <= half);
-    let (upper, in_upper) = ball(ray, half);
-    let (lower, in_lower) = ball(ray, -half);
-    let mut t = if on_body { body } else { f32::INFINITY };
-    t = if in_upper >= 0.0 { t.min(upper) } else { t };
-    t = if in_lower >= 0.0 { t.min(lower) } else { t };
-    (t, t < f32::INFINITY)
+#[allow(clippy::too_many_arguments, reason = "references to numbers of which the compiler knows that they are apart")]
+fn enter(
+    solid: &impl Solid,
+    row: &Row,
+    id: u32,
+    x: &[f32],
+    y: &[f32],
+    floor: &[f32],
+    depths: &mut [f32],
+    ids: &mut [u32],
+) {
+    let (row, n) = (*row, depths.len());
+    let (x, y, floor, depths, ids) = (&x[..n], &y[..n], &floor[..n], &mut depths[..n], &mut ids[..n]);
+    for i in 0..n {
+        let (way, hit) = solid.enter(row.ray(x[i], y[i]));
+        let depth = row.depth + way;
+        let closer = hit & (depth > row.near) & (depth <= depths[i]) & (depth > floor[i]);
+        depths[i] = if closer { depth } else { depths[i] };
+        ids[i] = if closer { id } else { ids[i] };
+    }
+}
+
+/// What is seen of a solid at many places.
+#[inline(always)]
+#[allow(clippy::too_many_arguments, reason = "as above")]
+fn surfaces(
+    solid: &impl Solid,
+    pose: &Posed,
+    x: &[f32],
+    y: &[f32],
+    t: &mut [f32],
+    px: &mut [f32],
+    py: &mut [f32],
+    pz: &mut [f32],
+    nx: &mut [f32],
+    ny: &mut [f32],
+    nz: &mut [f32],
+) {
+    let (pose, n) = (*pose, x.len());
+    let (y, t, px, py, pz) = (&y[..n], &mut t[..n], &mut px[..n], &mut py[..n], &mut pz[..n]);
+    let (nx, ny, nz) = (&mut nx[..n], &mut ny[..n], &mut nz[..n]);
+    for i in 0..n {
+        let (way, place, normal) = solid.surface(pose.ray(x[i], y[i]));
+        t[i] = way;
+        (px[i], py[i], pz[i]) = (place[0], place[1], place[2]);
+        (nx[i], ny[i], nz[i]) = (normal[0], normal[1], normal[2]);
+    }
 }
 
 vectorised! {
-    fn enter_plane(row: &Row, x: f32, y: f32, depths: &mut [f32]) {
-        for (i, depth) in depths.iter_mut().enumerate() {
-            let Ray { p, d } = row.ray(i);
-            let t = -p[2] / nonzero(d[2]);
-            let hit = ((p[0] + t * d[0]).abs() <= x) & ((p[1] + t * d[1]).abs() <= y);
-            *depth = row.hit(t, hit);
-        }
+    fn enter_plane(
+        solid: &Rectangle, row: &Row, id: u32, x: &[f32], y: &[f32], floor: &[f32], depths: &mut [f32], ids: &mut [u32],
+    ) {
+        enter(solid, row, id, x, y, floor, depths, ids);
     }
 
-    fn enter_sphere(row: &Row, depths: &mut [f32]) {
-        for (i, depth) in depths.iter_mut().enumerate() {
-            let (t, inside) = ball(row.ray(i), 0.0);
-            *depth = row.hit(t, inside >= 0.0);
-        }
+    fn enter_sphere(
+        row: &Row, id: u32, x: &[f32], y: &[f32], floor: &[f32], depths: &mut [f32], ids: &mut [u32],
+    ) {
+        enter(&Sphere, row, id, x, y, floor, depths, ids);
     }
 
-    fn enter_capsule(row: &Row, half: f32, depths: &mut [f32]) {
-        for (i, depth) in depths.iter_mut().enumerate() {
-            let (t, hit) = capsule(row.ray(i), half);
-            *depth = row.hit(t, hit);
-        }
+    fn enter_capsule(
+        solid: &Rod, row: &Row, id: u32, x: &[f32], y: &[f32], floor: &[f32], depths: &mut [f32], ids: &mut [u32],
+    ) {
+        enter(solid, row, id, x, y, floor, depths, ids);
     }
 
-    fn enter_cylinder(row: &Row, depths: &mut [f32]) {
-        for (i, depth) in depths.iter_mut().enumerate() {
-            let ray = row.ray(i);
-            let (enter, leave, inside) = tube(ray);
-            let (low, high) = slab(ray.p[2], ray.d[2]);
-            let t = enter.max(low);
-            *depth = row.hit(t, (inside >= 0.0) & (t <= leave.min(high)));
-        }
+    fn enter_cylinder(
+        row: &Row, id: u32, x: &[f32], y: &[f32], floor: &[f32], depths: &mut [f32], ids: &mut [u32],
+    ) {
+        enter(&Drum, row, id, x, y, floor, depths, ids);
     }
 
-    fn enter_cube(row: &Row, depths: &mut [f32]) {
-        for (i, depth) in depths.iter_mut().enumerate() {
-            let Ray { p, d } = row.ray(i);
-            let ((ax, bx), (ay, by), (az, bz)) = (slab(p[0], d[0]), slab(p[1], d[1]), slab(p[2], d[2]));
-            let t = ax.max(ay).max(az);
-            *depth = row.hit(t, t <= bx.min(by).min(bz));
-        }
+    fn enter_cube(
+        row: &Row, id: u32, x: &[f32], y: &[f32], floor: &[f32], depths: &mut [f32], ids: &mut [u32],
+    ) {
+        enter(&Cube, row, id, x, y, floor, depths, ids);
     }
 
     fn surface_plane(
-        pose: &Posed, x: &[f32], y: &[f32], t: &mut [f32],
+        solid: &Rectangle, pose: &Posed, x: &[f32], y: &[f32], t: &mut [f32],
         px: &mut [f32], py: &mut [f32], pz: &mut [f32], nx: &mut [f32], ny: &mut [f32], nz: &mut [f32],
     ) {
-        let n = x.len();
-        let (y, t, px, py, pz) = (&y[..n], &mut t[..n], &mut px[..n], &mut py[..n], &mut pz[..n]);
-        let (nx, ny, nz) = (&mut nx[..n], &mut ny[..n], &mut nz[..n]);
-        for i in 0..n {
-            let Ray { p, d } = pose.ray(x[i], y[i]);
-            // A pixel whose middle is past the horizon or the rim takes what is there.
-            let way = -p[2] / nonzero(d[2]);
-            let way = if pose.depth + way > pose.near { way } else { 1e6 };
-            t[i] = way;
-            (px[i], py[i], pz[i]) = (p[0] + way * d[0], p[1] + way * d[1], 0.0);
-            (nx[i], ny[i], nz[i]) = (0.0, 0.0, 1.0);
-        }
+        surfaces(solid, pose, x, y, t, px, py, pz, nx, ny, nz);
     }
 
     fn surface_sphere(
         pose: &Posed, x: &[f32], y: &[f32], t: &mut [f32],
         px: &mut [f32], py: &mut [f32], pz: &mut [f32], nx: &mut [f32], ny: &mut [f32], nz: &mut [f32],
     ) {
-        let n = x.len();
-        let (y, t, px, py, pz) = (&y[..n], &mut t[..n], &mut px[..n], &mut py[..n], &mut pz[..n]);
-        let (nx, ny, nz) = (&mut nx[..n], &mut ny[..n], &mut nz[..n]);
-        for i in 0..n {
-            let ray = pose.ray(x[i], y[i]);
-            let (way, _) = ball(ray, 0.0);
-            let at = add(ray.p, scale(ray.d, way));
-            t[i] = way;
-            (px[i], py[i], pz[i]) = (at[0], at[1], at[2]);
-            (nx[i], ny[i], nz[i]) = (at[0], at[1], at[2]);
-        }
+        surfaces(&Sphere, pose, x, y, t, px, py, pz, nx, ny, nz);
     }
 
     fn surface_capsule(
-        pose: &Posed, half: f32, x: &[f32], y: &[f32], t: &mut [f32],
+        solid: &Rod, pose: &Posed, x: &[f32], y: &[f32], t: &mut [f32],
         px: &mut [f32], py: &mut [f32], pz: &mut [f32], nx: &mut [f32], ny: &mut [f32], nz: &mut [f32],
     ) {
-        let n = x.len();
-        let (y, t, px, py, pz) = (&y[..n], &mut t[..n], &mut px[..n], &mut py[..n], &mut pz[..n]);
-        let (nx, ny, nz) = (&mut nx[..n], &mut ny[..n], &mut nz[..n]);
-        for i in 0..n {
-            let ray = pose.ray(x[i], y[i]);
-            let (hit, is_hit) = capsule(ray, half);
-            // Past the rim: where it passes the axis, or the nearer end.
-            let (body, _, _) = tube(ray);
-            let end = (ray.p[2] + body * ray.d[2]).clamp(-half, half);
-            let (rim, _) = ball(ray, end);
-            let way = if is_hit { hit } else { rim };
-            let at = add(ray.p, scale(ray.d, way));
-            t[i] = way;
-            (px[i], py[i], pz[i]) = (at[0], at[1], at[2]);
-            (nx[i], ny[i], nz[i]) = (at[0], at[1], at[2] - at[2].clamp(-half, half));
-        }
+        surfaces(solid, pose, x, y, t, px, py, pz, nx, ny, nz);
     }
 
     fn surface_cylinder(
         pose: &Posed, x: &[f32], y: &[f32], t: &mut [f32],
         px: &mut [f32], py: &mut [f32], pz: &mut [f32], nx: &mut [f32], ny: &mut [f32], nz: &mut [f32],
     ) {
-        let n = x.len();
-        let (y, t, px, py, pz) = (&y[..n], &mut t[..n], &mut px[..n], &mut py[..n], &mut pz[..n]);
-        let (nx, ny, nz) = (&mut nx[..n], &mut ny[..n], &mut nz[..n]);
-        for i in 0..n {
-            let ray = pose.ray(x[i], y[i]);
-            let (enter, _, _) = tube(ray);
-            let (low, _) = slab(ray.p[2], ray.d[2]);
-            let way = enter.max(low);
-            let at = add(ray.p, scale(ray.d, way));
-            let end = low > enter;
-            t[i] = way;
-            (px[i], py[i], pz[i]) = (at[0], at[1], at[2]);
-            (nx[i], ny[i]) = (if end { 0.0 } else { at[0] }, if end { 0.0 } else { at[1] });
-            nz[i] = if end { if ray.d[2] > 0.0 { -1.0 } else { 1.0 } } else { 0.0 };
-        }
+        surfaces(&Drum, pose, x, y, t, px, py, pz, nx, ny, nz);
     }
 
     fn surface_cube(
         pose: &Posed, x: &[f32], y: &[f32], t: &mut [f32],
         px: &mut [f32], py: &mut [f32], pz: &mut [f32], nx: &mut [f32], ny: &mut [f32], nz: &mut [f32],
     ) {
-        let n = x.len();
-        let (y, t, px, py, pz) = (&y[..n], &mut t[..n], &mut px[..n], &mut py[..n], &mut pz[..n]);
-        let (nx, ny, nz) = (&mut nx[..n], &mut ny[..n], &mut nz[..n]);
-        for i in 0..n {
-            let Ray { p, d } = pose.ray(x[i], y[i]);
-            let ((a, _), (b, _), (c, _)) = (slab(p[0], d[0]), slab(p[1], d[1]), slab(p[2], d[2]));
-            let way = a.max(b).max(c);
-            let against = |d: f32| if d > 0.0 { -1.0 } else { 1.0 };
-            let (on_x, on_y) = ((a >= b) & (a >= c), b >= c);
-            t[i] = way;
-            (px[i], py[i], pz[i]) = (p[0] + way * d[0], p[1] + way * d[1], p[2] + way * d[2]);
-            nx[i] = if on_x { against(d[0]) } else { 0.0 };
-            ny[i] = if !on_x & on_y { against(d[1]) } else { 0.0 };
-            nz[i] = if on_x | on_y { 0.0 } else { against(d[2]) };
-        }
+        surfaces(&Cube, pose, x, y, t, px, py, pz, nx, ny, nz);
     }
 }

@@ -1,6 +1,7 @@
 //! [`Layers`]: what is nearest at every sample of a picture, and how far it is.
 
-use crate::cast::Posed;
+use crate::cast::{Posed, Samples};
+use crate::eight::{self, Job, LANES, Plain, Simd};
 use crate::mesh::Level;
 use crate::scene::{Assets, Geom, Shape};
 use crate::simd::vectorised;
@@ -17,6 +18,9 @@ const INVISIBLE: f32 = 0.6;
 
 /// And so many texels large in maps of shadows.
 const COARSE: f32 = 2.0;
+
+/// By how much triangles are wider than they are, as a part of their size.
+const HAIR: f32 = 1e-5;
 
 /// Where the samples of a pixel are.
 pub(crate) fn pattern(samples: usize) -> &'static [[f32; 2]] {
@@ -37,12 +41,28 @@ pub(crate) fn pattern(samples: usize) -> &'static [[f32; 2]] {
     }
 }
 
-/// The nearest thing at every sample, samples of a row one after the other.
+/// The middle of samples, a bit each, which is inside a convex shape even at its rim; that of the pixel where it is covered.
+#[allow(clippy::cast_precision_loss)]
+fn centre_of(pattern: &[[f32; 2]], covered: usize) -> [f32; 2] {
+    let count = covered.count_ones() as usize;
+    if count == 0 || count >= pattern.len() {
+        return [0.5, 0.5];
+    }
+    let mut sum = [0.0; 2];
+    for (_, offset) in pattern.iter().enumerate().filter(|(sample, _)| covered >> sample & 1 == 1) {
+        sum = [sum[0] + offset[0], sum[1] + offset[1]];
+    }
+    sum.map(|sum| sum / count as f32)
+}
+
+/// The nearest thing at every sample. Samples of a pixel are neighbours, so that a small triangle meets many at once.
 #[derive(Default)]
 pub(crate) struct Layers {
     pub width: usize,
     pub height: usize,
     pub samples: usize,
+    /// From a row to the next: the samples of its pixels, and room for [`LANES`] that reach beyond them.
+    stride: usize,
     /// Where they are in a pixel.
     pub pattern: &'static [[f32; 2]],
     /// Their least and greatest coordinates.
@@ -53,8 +73,18 @@ pub(crate) struct Layers {
     pub ids: Vec<u32>,
     /// Triangles that were drawn since the start.
     pub triangles: Vec<Triangle>,
-    /// Scratch: depths of a row.
-    row: Vec<f32>,
+    /// Their geoms.
+    owners: Vec<u32>,
+    /// By sample of a row: where it is, from the left of the picture and the upper edge of the row.
+    at: [Vec<f32>; 2],
+    /// The same of the first ones.
+    lanes: [[f32; LANES]; 2],
+    /// By the samples that are covered, a bit each: their middle in the pixel.
+    pub centres: [[f32; 2]; 16],
+    /// By sample of a row: nothing is too near.
+    free: Vec<f32>,
+    /// Scratch: how far to the left and right a shape reaches, by row.
+    outline: [Vec<f32>; 2],
     /// Scratch: vertices of a mesh in pixels, `w`, and depth.
     vertices: Vec<[f32; 4]>,
 }
@@ -62,7 +92,6 @@ pub(crate) struct Layers {
 /// A triangle on the screen.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Triangle {
-    pub geom: u32,
     /// Its version of the mesh, and its place there.
     pub level: u32,
     pub face: u32,
@@ -93,15 +122,40 @@ pub(crate) type Region = [usize; 4];
 impl Layers {
     /// Forgets everything, for a picture of this size.
     pub fn start(&mut self, width: usize, height: usize, pattern: &'static [[f32; 2]]) {
-        (self.width, self.height, self.samples, self.pattern) = (width, height, pattern.len(), pattern);
+        let stride = width * pattern.len() + LANES;
+        if (stride, pattern) != (self.stride, self.pattern) {
+            self.place_samples(stride, pattern);
+        }
+        (self.width, self.height) = (width, height);
+        self.depths.resize(height * stride, 0.0);
+        self.ids.resize(height * stride, NOTHING);
+        self.forget();
+    }
+
+    /// Finds where the samples of a row are.
+    #[allow(clippy::cast_precision_loss)]
+    fn place_samples(&mut self, stride: usize, pattern: &'static [[f32; 2]]) {
+        (self.stride, self.samples, self.pattern) = (stride, pattern.len(), pattern);
         let reach = |with: fn(f32, f32) -> f32, from: f32| {
             pattern.iter().fold([from; 2], |a, b| [with(a[0], b[0]), with(a[1], b[1])])
         };
         self.reach = [reach(f32::min, 1.0), reach(f32::max, 0.0)];
-        let size = width * height * self.samples;
-        self.depths.resize(size, 0.0);
-        self.ids.resize(size, NOTHING);
+        for (axis, at) in self.at.iter_mut().enumerate() {
+            let pixel = |i: usize| if axis == 0 { (i / pattern.len()) as f32 } else { 0.0 };
+            at.clear();
+            at.extend((0..stride).map(|i| pixel(i) + pattern[i % pattern.len()][axis]));
+            self.lanes[axis].copy_from_slice(&at[..LANES]);
+        }
+        self.free.resize(stride, f32::NEG_INFINITY);
+        for (covered, centre) in self.centres.iter_mut().enumerate() {
+            *centre = centre_of(pattern, covered);
+        }
+    }
+
+    /// Forgets all triangles.
+    pub fn forget(&mut self) {
         self.triangles.clear();
+        self.owners.clear();
     }
 
     /// Empties it: one sees so far.
@@ -110,10 +164,11 @@ impl Layers {
         self.ids.fill(NOTHING);
     }
 
-    /// Where a row of samples is.
+    /// Where the samples of the pixels from `x0` to before `x1` of a row are.
     #[inline]
-    pub fn place(&self, y: usize, sample: usize) -> usize {
-        (y * self.samples + sample) * self.width
+    pub fn span(&self, y: usize, x0: usize, x1: usize) -> std::ops::Range<usize> {
+        let first = y * self.stride;
+        first + x0 * self.samples..first + x1 * self.samples
     }
 
     /// Draws a geom over what is there, where it is nearer, and farther than `floor` if there is one. What casts shadows does
@@ -148,7 +203,7 @@ impl Layers {
         Some(region)
     }
 
-    #[allow(clippy::cast_precision_loss)]
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     fn shape(
         &mut self,
         number: u32,
@@ -157,24 +212,25 @@ impl Layers {
         outline: &Outline,
         floor: Option<&[f32]>,
     ) {
-        self.row.resize(self.width, 0.0);
-        for y in y0..y1 {
-            let (x0, x1) = outline.span(y, left, right);
-            if x0 >= x1 {
+        let [mut lows, mut highs] = std::mem::take(&mut self.outline);
+        outline.reach(y0..y1, &mut lows, &mut highs);
+        for (y, (&low, &high)) in (y0..y1).zip(lows.iter().zip(&highs)) {
+            // A hair wider than computed.
+            let (low, high) = ((low - 0.01).max(left as f32), (high + 0.01).min(right as f32));
+            if low >= high {
                 continue;
             }
-            for (sample, offset) in self.pattern.iter().enumerate() {
-                let at = self.place(y, sample);
-                let row = pose.row(x0 as f32 + offset[0], y as f32 + offset[1]);
-                let found = &mut self.row[x0..x1];
-                pose.enter(&row, found);
-                let (depths, ids) = (&mut self.depths[at + x0..at + x1], &mut self.ids[at + x0..at + x1]);
-                match floor {
-                    None => nearer(found, depths, ids, number),
-                    Some(floor) => nearer_than(found, &floor[at + x0..at + x1], depths, ids, number),
-                }
-            }
+            let (x0, x1) = (low as usize, (high as usize + 1).min(right));
+            let (span, columns) = (self.span(y, x0, x1), self.span(0, x0, x1));
+            let samples = Samples {
+                at: self.at.each_ref().map(|at| &at[columns.clone()]),
+                floor: floor.map_or(&self.free[columns], |floor| &floor[span.clone()]),
+                depths: &mut self.depths[span.clone()],
+                ids: &mut self.ids[span],
+            };
+            pose.enter(&pose.row(y), number, samples);
         }
+        self.outline = [lows, highs];
     }
 
     #[allow(clippy::cast_possible_truncation)]
@@ -201,25 +257,18 @@ impl Layers {
         // Rows run downwards, so that what is counterclockwise to the eye is clockwise in pixels.
         let front = if view.mirrored { 1.0 } else { -1.0 };
         let front = if both_sides { 0.0 } else { front };
-        for (face, &[a, b, c]) in level.faces.iter().enumerate() {
-            let corners = [vertices[a as usize], vertices[b as usize], vertices[c as usize]];
-            let number = (number, place, face as u32);
-            let [p, q, r] = corners.map(|corner| corner[3] > view.near);
-            if p & q & r {
-                self.triangle(number, corners, front, view.near, floor);
-            } else if p | q | r {
-                self.crossing(number, corners, front, view.near, floor);
-            }
-        }
+        let near = view.near;
+        eight::run(Faces { layers: self, number: (number, place), level, vertices: &vertices, front, near, floor });
         self.vertices = vertices;
     }
 
     /// Draws a triangle in front of the camera, if it faces it (`front` times its area is positive), or from both sides where `front`
     /// is 0.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-    #[inline]
+    #[inline(always)]
     fn triangle(
         &mut self,
+        simd: impl Simd,
         number: (u32, u32, u32),
         [a, b, c]: [[f32; 4]; 3],
         front: f32,
@@ -248,7 +297,16 @@ impl Layers {
             [(q.1 - r.1) * p.2, (r.0 - q.0) * p.2, (q.0 * r.1 - q.1 * r.0) * p.2]
         };
         let shares = [share(a, b, c), share(b, c, a), share(c, a, b)];
-        self.fill(number, base, shares, depths, [x0 as usize, y0 as usize, x1 as usize, y1 as usize], near, floor);
+        self.fill(
+            simd,
+            number,
+            base,
+            shares,
+            depths,
+            [x0 as usize, y0 as usize, x1 as usize, y1 as usize],
+            near,
+            floor,
+        );
     }
 
     /// Draws a triangle of which a part is too near to be seen.
@@ -275,14 +333,15 @@ impl Layers {
         }
         let shares = [bc, ca, ab].map(|row| row.map(|x| (x / determinant) as f32));
         let whole = [0, 0, self.width, self.height];
-        self.fill(number, [0.0; 2], shares, corners.map(|corner| corner[3]), whole, near, floor);
+        self.fill(Plain, number, [0.0; 2], shares, corners.map(|corner| corner[3]), whole, near, floor);
     }
 
     /// Draws a triangle by the shares of its corners, divided by `w`, within a region.
     #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss, clippy::too_many_arguments)]
-    #[inline]
+    #[inline(always)]
     fn fill(
         &mut self,
+        simd: impl Simd,
         (geom, level, face): (u32, u32, u32),
         base: [f32; 2],
         shares: [[f32; 3]; 3],
@@ -294,34 +353,62 @@ impl Layers {
         let [p, q, r] = shares;
         let [u, v, w] = depths;
         let depth = [p[0] * u + q[0] * v + r[0] * w, p[1] * u + q[1] * v + r[1] * w, p[2] * u + q[2] * v + r[2] * w];
+        // Neighbours overlap by a hair, so that no sample falls between them.
         let sum = [p[0] + q[0] + r[0], p[1] + q[1] + r[1], p[2] + q[2] + r[2]];
-        let id = TRIANGLE | self.triangles.len() as u32;
-        let mut drawn = false;
-        for y in y0..y1 {
-            for (sample, offset) in self.pattern.iter().enumerate() {
-                let at = self.place(y, sample);
-                let dy = y as f32 - base[1] + offset[1];
-                let row = |line: [f32; 3]| line[1] * dy + line[2];
-                let (p0, q0, r0, sum0, depth0) = (row(p), row(q), row(r), row(sum), row(depth));
-                for x in x0..x1 {
-                    let dx = x as f32 - base[0] + offset[0];
-                    let sum = sum0 + sum[0] * dx;
-                    // Neighbours overlap by a hair, so that no sample falls between them.
-                    let edge = -1e-5 * sum;
-                    if (p0 + p[0] * dx < edge) | (q0 + q[0] * dx < edge) | (r0 + r[0] * dx < edge) | (sum <= 0.0) {
-                        continue;
-                    }
-                    let far = (depth0 + depth[0] * dx) / sum;
-                    if far <= self.depths[at + x] && far > near && floor.is_none_or(|floor| far > floor[at + x]) {
-                        self.depths[at + x] = far;
-                        self.ids[at + x] = id;
-                        drawn = true;
-                    }
-                }
+        let mut lines = [p, q, r, depth];
+        for line in &mut lines[..3] {
+            for (x, sum) in line.iter_mut().zip(sum) {
+                *x += HAIR * sum;
             }
         }
-        if drawn {
-            self.triangles.push(Triangle { geom, level, face, base, shares, depth });
+        for x in &mut lines[3] {
+            *x *= 1.0 + 3.0 * HAIR;
+        }
+        // Their values at the first samples of the region, and by how much they grow to the right.
+        let (dx, dy) = (x0 as f32 - base[0], y0 as f32 - base[1]);
+        let (across, down) = (simd.load(&self.lanes[0]), simd.load(&self.lanes[1]));
+        let (mut corner, mut slopes) = ([simd.splat(0.0); 4], [simd.splat(0.0); 4]);
+        for (k, [x, y, constant]) in lines.into_iter().enumerate() {
+            slopes[k] = simd.splat(x);
+            let lanes = simd.add(simd.mul(slopes[k], across), simd.mul(simd.splat(y), down));
+            corner[k] = simd.add(simd.splat(x * dx + y * dy + constant), lanes);
+        }
+        let (none, near, pixels) = (simd.splat(0.0), simd.splat(near), simd.splat((LANES / self.samples) as f32));
+        let id = TRIANGLE | self.triangles.len() as u32;
+        let wide = ((x1 - x0) * self.samples).next_multiple_of(LANES);
+        let mut drawn = simd.more(none, none);
+        for y in y0..y1 {
+            let begin = self.span(y, x0, x0).start;
+            let row = begin..begin + wide;
+            let floor = floor.map_or(&self.free[..wide], |floor| &floor[row.clone()]).as_chunks().0;
+            let depths = self.depths[row.clone()].as_chunks_mut().0;
+            let ids = self.ids[row].as_chunks_mut().0;
+            let rows = (y - y0) as f32;
+            let mut left = corner;
+            for (left, line) in left.iter_mut().zip(&lines) {
+                *left = simd.add(*left, simd.splat(line[1] * rows));
+            }
+            let mut column = none;
+            for ((depths, ids), floor) in depths.iter_mut().zip(ids).zip(floor) {
+                let mut at = left;
+                for (at, slope) in at.iter_mut().zip(slopes) {
+                    *at = simd.add(*at, simd.mul(slope, column));
+                }
+                let [p, q, r, depth] = at;
+                let inside = simd.at_least(simd.min(simd.min(p, q), r), none);
+                // Where all are 0, this is no number, and not near.
+                let far = simd.div(depth, simd.add(simd.add(p, q), r));
+                let nearer = simd.both(simd.at_least(simd.load(depths), far), simd.more(far, near));
+                let nearer = simd.both(inside, simd.both(nearer, simd.more(far, simd.load(floor))));
+                simd.put(nearer, far, depths);
+                simd.mark(nearer, id, ids);
+                drawn = simd.either(drawn, nearer);
+                column = simd.add(column, pixels);
+            }
+        }
+        if simd.any(drawn) {
+            self.triangles.push(Triangle { level, face, base, shares, depth });
+            self.owners.push(geom);
         }
     }
 
@@ -330,15 +417,31 @@ impl Layers {
     pub fn geom(&self, id: u32) -> u32 {
         match id & TRIANGLE {
             0 => id,
-            _ => self.triangles[(id & !TRIANGLE) as usize].geom,
+            _ => self.owners[(id & !TRIANGLE) as usize],
         }
     }
 }
 
+/// Edges of a box.
+const EDGES: usize = 12;
+
 /// The outline of a box around a geom: where it is in each row.
 struct Outline {
-    /// Its corners in pixels; `None` where one of them is behind the camera.
-    corners: Option<[[f32; 2]; 8]>,
+    /// Its edges; `None` where a corner is behind the camera.
+    edges: Option<Edges>,
+}
+
+/// Edges on the screen.
+#[derive(Default)]
+struct Edges {
+    left: [f32; EDGES],
+    right: [f32; EDGES],
+    top: [f32; EDGES],
+    bottom: [f32; EDGES],
+    /// A place on each, and how far to the right it goes in a row.
+    x: [f32; EDGES],
+    y: [f32; EDGES],
+    slope: [f32; EDGES],
 }
 
 impl Outline {
@@ -349,38 +452,36 @@ impl Outline {
             let local = std::array::from_fn(|k| if number >> k & 1 == 1 { halves[k] } else { -halves[k] });
             let ([x, y, w], depth) = view.project(add(geom.position, rotate(&geom.rotation, local)));
             if !(depth > view.near && x.is_finite() && y.is_finite()) {
-                return Self { corners: None };
+                return Self { edges: None };
             }
             *corner = [x / w, y / w];
         }
-        Self { corners: Some(corners) }
+        let mut edges = Edges::default();
+        let ends = (0..8).flat_map(|a| [a | 1, a | 2, a | 4].map(|b| (a, b))).filter(|(a, b)| a != b);
+        for (i, (a, b)) in ends.enumerate() {
+            let ([ax, ay], [bx, by]) = (corners[a], corners[b]);
+            (edges.left[i], edges.right[i], edges.x[i]) = (ax.min(bx), ax.max(bx), ax);
+            (edges.top[i], edges.bottom[i], edges.y[i]) = (ay.min(by), ay.max(by), ay);
+            edges.slope[i] = if by == ay { 1e30 } else { (bx - ax) / (by - ay) };
+        }
+        Self { edges: Some(edges) }
     }
 
-    /// The pixels of a row from `left` to before `right` that it may touch.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-    fn span(&self, y: usize, left: usize, right: usize) -> (usize, usize) {
-        let Some(corners) = &self.corners else { return (left, right) };
-        let (top, bottom) = (y as f32, y as f32 + 1.0);
-        let (mut low, mut high) = (f32::INFINITY, f32::NEG_INFINITY);
-        for a in 0..8 {
-            for b in [a | 1, a | 2, a | 4] {
-                let ([ax, ay], [bx, by]) = (corners[a], corners[b]);
-                if a == b || ay.min(by) > bottom || ay.max(by) < top {
-                    continue;
-                }
-                // The part of the edge within the row.
-                let slope = (bx - ax) / if by == ay { 1.0 } else { by - ay };
-                let at = |y: f32| {
-                    let x = ax + (y - ay) * slope;
-                    x.clamp(ax.min(bx), ax.max(bx))
-                };
-                let (p, q) = if by == ay { (ax, bx) } else { (at(top), at(bottom)) };
-                (low, high) = (low.min(p).min(q), high.max(p).max(q));
+    /// How far to the left and right it reaches in rows.
+    fn reach(&self, rows: std::ops::Range<usize>, lows: &mut Vec<f32>, highs: &mut Vec<f32>) {
+        lows.clear();
+        highs.clear();
+        match &self.edges {
+            Some(edges) => {
+                lows.resize(rows.len(), f32::INFINITY);
+                highs.resize(rows.len(), f32::NEG_INFINITY);
+                widen(edges, rows.start, lows, highs);
+            }
+            None => {
+                lows.resize(rows.len(), f32::NEG_INFINITY);
+                highs.resize(rows.len(), f32::INFINITY);
             }
         }
-        // A hair wider than computed.
-        let (low, high) = ((low - 0.01).max(left as f32), (high + 0.01).min(right as f32));
-        if low < high { (low as usize, (high as usize + 1).min(right)) } else { (left, left) }
     }
 }
 
@@ -408,26 +509,59 @@ pub(crate) fn touched(geom: &Geom, assets: &Assets, view: &View) -> Option<Regio
     view.touched(middle, sides)
 }
 
-vectorised! {
-    /// Takes over what is nearer.
-    fn nearer(found: &[f32], depths: &mut [f32], ids: &mut [u32], id: u32) {
-        let n = found.len();
-        let (depths, ids) = (&mut depths[..n], &mut ids[..n]);
-        for i in 0..n {
-            let closer = found[i] <= depths[i];
-            depths[i] = if closer { found[i] } else { depths[i] };
-            ids[i] = if closer { id } else { ids[i] };
+/// The triangles of a mesh, whose vertices are on the screen, to be drawn.
+struct Faces<'a> {
+    layers: &'a mut Layers,
+    /// The geom, and the version of its mesh.
+    number: (u32, u32),
+    level: &'a Level,
+    vertices: &'a [[f32; 4]],
+    front: f32,
+    near: f32,
+    floor: Option<&'a [f32]>,
+}
+
+impl Job for Faces<'_> {
+    #[allow(clippy::cast_possible_truncation)]
+    #[inline(always)]
+    fn run(self, simd: impl Simd) {
+        let Self { layers, number, level, vertices, front, near, floor } = self;
+        for (face, &[a, b, c]) in level.faces.iter().enumerate() {
+            let corners = [vertices[a as usize], vertices[b as usize], vertices[c as usize]];
+            let number = (number.0, number.1, face as u32);
+            let [p, q, r] = corners.map(|corner| corner[3] > near);
+            if p & q & r {
+                layers.triangle(simd, number, corners, front, near, floor);
+            } else if p | q | r {
+                layers.crossing(number, corners, front, near, floor);
+            }
         }
     }
+}
 
-    /// Takes over what is nearer, behind a floor.
-    fn nearer_than(found: &[f32], floor: &[f32], depths: &mut [f32], ids: &mut [u32], id: u32) {
-        let n = found.len();
-        let (floor, depths, ids) = (&floor[..n], &mut depths[..n], &mut ids[..n]);
-        for i in 0..n {
-            let closer = (found[i] <= depths[i]) & (found[i] > floor[i]);
-            depths[i] = if closer { found[i] } else { depths[i] };
-            ids[i] = if closer { id } else { ids[i] };
+vectorised! {
+    /// Widens what edges reach in rows, from `top` on.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+    fn widen(edges: &Edges, top: usize, lows: &mut [f32], highs: &mut [f32]) {
+        let n = lows.len();
+        let highs = &mut highs[..n];
+        for k in 0..EDGES {
+            let (x, y, slope) = (edges.x[k], edges.y[k], edges.slope[k]);
+            let (left, right, upper, lower) = (edges.left[k], edges.right[k], edges.top[k], edges.bottom[k]);
+            let at = |row: f32| {
+                let x = x + (row - y) * slope;
+                let x = if x > left { x } else { left };
+                if x < right { x } else { right }
+            };
+            for i in 0..n {
+                // The part of the edge within the row.
+                let above = top as f32 + i as u32 as i32 as f32;
+                let (p, q) = (at(above), at(above + 1.0));
+                let (low, high) = if p < q { (p, q) } else { (q, p) };
+                let touched = (upper <= above + 1.0) & (lower >= above);
+                lows[i] = if touched & (low < lows[i]) { low } else { lows[i] };
+                highs[i] = if touched & (high > highs[i]) { high } else { highs[i] };
+            }
         }
     }
 

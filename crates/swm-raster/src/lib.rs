@@ -42,8 +42,12 @@
 //!
 //! **Determinism.** A picture's bytes depend on the scene alone. Numbers are single precision without fused operations.
 
+#[cfg(test)]
+extern crate self as swm_raster;
+
 mod canvas;
 mod cast;
+mod eight;
 mod layers;
 mod light;
 mod mesh;
@@ -55,6 +59,10 @@ mod sky;
 mod texture;
 mod vector;
 mod view;
+
+#[cfg(test)]
+#[path = "../tests/it/scenes.rs"]
+mod scenes;
 
 pub use canvas::{Canvas, Target};
 pub use mesh::{Corner, Mesh};

@@ -12,12 +12,16 @@ const FINEST: f32 = 512.0;
 /// And of the coarsest.
 const COARSEST: f32 = 7.0;
 
+/// Edges of so many triangles may be those of holes in a mesh that counts as closed: parts of robots have holes where the next part
+/// begins.
+const OPEN: f32 = 0.1;
+
 /// A mesh, prepared once.
 #[derive(Clone, Debug)]
 pub struct Mesh {
     /// From fine to coarse.
     levels: Vec<Level>,
-    /// Whether it has an inside: every edge is one of two triangles.
+    /// Whether it has an inside: edges are those of two triangles.
     closed: bool,
     low: V3,
     high: V3,
@@ -98,7 +102,7 @@ impl Mesh {
         Self { levels, closed, low, high }
     }
 
-    /// Whether one never sees its triangles from behind, unless from inside.
+    /// Whether one does not see its triangles from behind, unless from inside or through small holes.
     pub(crate) fn is_closed(&self) -> bool {
         self.closed
     }
@@ -125,15 +129,17 @@ impl Mesh {
 }
 
 impl Level {
-    /// Whether every edge is passed once in either direction.
+    /// Whether all edges, but for a few, are passed once in either direction.
+    #[allow(clippy::cast_precision_loss)]
     fn is_closed(&self) -> bool {
         let mut passed = HashMap::new();
         for [a, b, c] in &self.faces {
             for (from, to) in [(a, b), (b, c), (c, a)] {
-                *passed.entry((from.min(to), from.max(to))).or_insert(0) += if from < to { 1 } else { -1 };
+                *passed.entry((from.min(to), from.max(to))).or_insert(0_i32) += if from < to { 1 } else { -1 };
             }
         }
-        passed.values().all(|sum| *sum == 0)
+        let open: u32 = passed.values().map(|sum| sum.unsigned_abs()).sum();
+        open as f32 <= OPEN * self.faces.len() as f32
     }
 
     /// The version whose vertices are those of cells of this size, each in the mean of its vertices. Directions are merged only

@@ -1,20 +1,18 @@
 //! From what is nearest to colours: the fragments of a picture, gathered by geom and lit many at once.
 
 use crate::cast::Posed;
+use crate::eight::{self, Job, LANES, Simd};
 use crate::layers::{Layers, NOTHING, Region, TRIANGLE};
 use crate::light::{Lamp, Matter};
 use crate::scene::{Assets, Axis, Geom, Mapping, Scene, Shape};
 use crate::shadow::Shadow;
-use crate::simd::vectorised;
-use crate::texture::Texture;
+use crate::simd::{nearest, vectorised};
+use crate::texture::{MANY, Reader, Spots, Texture};
 use crate::vector::{V3, add, dot, rotate, scale, sub, unrotate};
 use crate::view::{Rays, View};
 
-/// Fragments lit at once.
-pub(crate) const MANY: usize = 128;
-
-/// Rows whose fragments are gathered at once.
-const BAND: usize = 16;
+/// Rows that are gathered at once.
+const BAND: usize = 64;
 
 /// Quads along the side of a box, between whose corners light is interpolated.
 const QUADS: usize = 4;
@@ -22,36 +20,20 @@ const QUADS: usize = 4;
 /// Light between corners that are at most so many pixels apart is as good as at each pixel.
 const COARSE: f32 = 6.0;
 
-/// One number for each of many fragments.
-type Lane = [f32; MANY];
+/// One number for each of many fragments, and room for those that are computed with the last ones.
+type Lane = [f32; MANY + LANES];
 
-/// What a geom shows of a pixel.
+/// Pixels of a row next to each other, and which of their samples show a geom: all, or of one pixel some.
 #[derive(Clone, Copy, Debug, Default)]
-struct Fragment {
+struct Run {
     geom: u32,
+    /// What the first of the samples shows.
     id: u32,
     x: u16,
     y: u16,
-    /// Samples of the pixel, a bit each.
+    count: u16,
+    /// A bit each.
     samples: u8,
-}
-
-impl Fragment {
-    /// Where it is looked at: in the middle of its samples, which is inside a convex shape even at its rim.
-    #[inline]
-    #[allow(clippy::cast_precision_loss)]
-    fn place(&self, pattern: &[[f32; 2]]) -> [f32; 2] {
-        let (x, y) = (f32::from(self.x), f32::from(self.y));
-        if self.samples.count_ones() as usize == pattern.len() {
-            return [x + 0.5, y + 0.5];
-        }
-        let mut sum = [0.0; 2];
-        for (_, offset) in pattern.iter().enumerate().filter(|(sample, _)| self.samples >> sample & 1 == 1) {
-            sum = [sum[0] + offset[0], sum[1] + offset[1]];
-        }
-        let share = 1.0 / self.samples.count_ones() as f32;
-        [x + share * sum[0], y + share * sum[1]]
-    }
 }
 
 /// Fragments of one geom.
@@ -68,7 +50,12 @@ struct Batch {
     /// Of planes and boxes: the cell of the grid, and how far inside it.
     cell: [u32; MANY],
     within: [Lane; 2],
-    scratch: [Lane; 4],
+    /// Of textures: how many texels a pixel covers, and the face.
+    dense: Lane,
+    face: [u32; MANY],
+    reader: Reader,
+    /// What light reaches.
+    lit: Lane,
     tint: [Lane; 3],
     /// Light of one pass.
     pass: [Lane; 3],
@@ -96,11 +83,12 @@ pub(crate) struct Look<'a> {
 
 /// Scratch of painting.
 pub(crate) struct Painter {
-    fragments: Vec<Fragment>,
-    sorted: Vec<Fragment>,
-    /// By pixel of a row: whether all its samples are alike.
-    uniform: Vec<u32>,
-    /// By geom: fragments, and then where the next one goes.
+    runs: Vec<Run>,
+    /// The same, those of a geom together.
+    sorted: Vec<Run>,
+    /// What is being lit.
+    lit: Vec<Run>,
+    /// By geom: runs, and then where the next one goes.
     counts: Vec<usize>,
     present: Vec<u32>,
     batch: Box<Batch>,
@@ -109,11 +97,11 @@ pub(crate) struct Painter {
 
 impl Default for Painter {
     fn default() -> Self {
-        const ZERO: Lane = [0.0; MANY];
+        const ZERO: Lane = [0.0; MANY + LANES];
         Self {
-            fragments: vec![],
+            runs: vec![],
             sorted: vec![],
-            uniform: vec![],
+            lit: vec![],
             counts: vec![],
             present: vec![],
             batch: Box::new(Batch {
@@ -127,7 +115,10 @@ impl Default for Painter {
                 coordinates: [ZERO; 2],
                 cell: [0; MANY],
                 within: [ZERO; 2],
-                scratch: [ZERO; 4],
+                dense: ZERO,
+                face: [0; MANY],
+                reader: Reader::default(),
+                lit: ZERO,
                 tint: [ZERO; 3],
                 pass: [ZERO; 3],
                 sum: [ZERO; 3],
@@ -167,8 +158,6 @@ impl Painter {
         [x0, y0, x1, y1]: Region,
         mut show: impl FnMut(usize, f32, V3),
     ) {
-        #[allow(clippy::cast_precision_loss)]
-        let (share, all) = (1.0 / layers.samples as f32, u8::MAX >> (8 - layers.samples));
         let mut y = y0;
         while y < y1 {
             let next = (y + BAND).min(y1);
@@ -177,23 +166,15 @@ impl Painter {
             for k in 0..self.present.len() {
                 let number = self.present[k];
                 // After sorting, counts are where the runs end.
-                let end = self.counts[number as usize];
-                self.counts[number as usize] = 0;
+                let end = std::mem::take(&mut self.counts[number as usize]);
                 let geom = &look.scene.geoms[number as usize];
                 let posed = Posed::new(geom, look.view);
-                for from in (begin..end).step_by(MANY) {
-                    let fragments = &self.sorted[from..end.min(from + MANY)];
-                    self.batch.shade(&mut self.lattices, fragments, (number, geom, posed.as_ref()), layers, look);
-                    #[allow(clippy::cast_precision_loss)]
-                    for (i, fragment) in fragments.iter().enumerate() {
-                        let [r, g, b] = &self.batch.sum;
-                        let pixel = usize::from(fragment.y) * layers.width + usize::from(fragment.x);
-                        let part = match fragment.samples {
-                            samples if samples == all => 1.0,
-                            samples => samples.count_ones() as f32 * share,
-                        };
-                        show(pixel, part, [r[i], g[i], b[i]]);
-                    }
+                let mut runs = self.sorted[begin..end].iter().copied();
+                let mut rest = runs.next();
+                while rest.is_some() {
+                    rest = fill(&mut self.lit, rest, &mut runs);
+                    self.batch.shade(&mut self.lattices, &self.lit, (number, geom, posed.as_ref()), layers, look);
+                    self.batch.show(&self.lit, layers, &mut show);
                 }
                 begin = end;
             }
@@ -201,57 +182,35 @@ impl Painter {
         }
     }
 
+    /// Adds a run, to the last one if it goes on there.
     #[inline]
-    fn push(&mut self, fragment: Fragment) {
-        self.fragments.push(fragment);
-        let known = &mut self.counts[fragment.geom as usize];
+    fn push(&mut self, run: Run, all: u8) {
+        if run.samples == all
+            && let Some(last) = self.runs.last_mut()
+            && (last.geom, last.y, last.samples) == (run.geom, run.y, all)
+            && last.x + last.count == run.x
+        {
+            last.count += run.count;
+            return;
+        }
+        self.runs.push(run);
+        let known = &mut self.counts[run.geom as usize];
         if *known == 0 {
-            self.present.push(fragment.geom);
+            self.present.push(run.geom);
         }
         *known += 1;
     }
 
-    /// Gathers the fragments of a region, those of a geom together.
-    #[allow(clippy::cast_possible_truncation, clippy::needless_range_loop)]
+    /// Gathers the runs of a region, those of a geom together.
+    #[allow(clippy::cast_possible_truncation)]
     fn gather(&mut self, layers: &Layers, [x0, y0, x1, y1]: Region) {
-        self.fragments.clear();
+        self.runs.clear();
         self.present.clear();
-        self.uniform.resize(layers.width, 0);
         for y in y0..y1 {
-            let first = layers.place(y, 0);
-            let row = |sample: usize| &layers.ids[first + sample * layers.width..][..layers.width];
-            let front = row(0);
-            self.uniform.fill(u32::MAX);
-            for sample in 1..layers.samples {
-                keep_equal(front, row(sample), &mut self.uniform);
-            }
-            let all = u8::MAX >> (8 - layers.samples);
-            for x in x0..x1 {
-                if self.uniform[x] != 0 {
-                    let id = front[x];
-                    if id != NOTHING {
-                        let fragment = Fragment { geom: layers.geom(id), id, x: x as u16, y: y as u16, samples: all };
-                        self.push(fragment);
-                    }
-                    continue;
-                }
-                let mut count = 0;
-                for sample in 0..layers.samples {
-                    let id = row(sample)[x];
-                    if id == NOTHING {
-                        continue;
-                    }
-                    let geom = layers.geom(id);
-                    // A pixel shows a geom once, whatever triangles of it.
-                    let begin = self.fragments.len() - count;
-                    match self.fragments[begin..].iter_mut().find(|known| known.geom == geom) {
-                        Some(known) => known.samples |= 1 << sample,
-                        None => {
-                            count += 1;
-                            self.push(Fragment { geom, id, x: x as u16, y: y as u16, samples: 1 << sample });
-                        }
-                    }
-                }
+            match layers.samples {
+                1 => self.gather_row::<1>(layers, y, [x0, x1]),
+                2 => self.gather_row::<2>(layers, y, [x0, x1]),
+                _ => self.gather_row::<4>(layers, y, [x0, x1]),
             }
         }
         self.present.sort_unstable();
@@ -260,13 +219,60 @@ impl Painter {
             let count = &mut self.counts[geom as usize];
             (begin, *count) = (begin + *count, begin);
         }
-        self.sorted.resize(self.fragments.len(), Fragment::default());
-        for fragment in &self.fragments {
-            let place = &mut self.counts[fragment.geom as usize];
-            self.sorted[*place] = *fragment;
+        self.sorted.resize(self.runs.len(), Run::default());
+        for run in &self.runs {
+            let place = &mut self.counts[run.geom as usize];
+            self.sorted[*place] = *run;
             *place += 1;
         }
     }
+
+    /// The same of a row with so many samples a pixel.
+    #[allow(clippy::cast_possible_truncation)]
+    fn gather_row<const SAMPLES: usize>(&mut self, layers: &Layers, y: usize, [x0, x1]: [usize; 2]) {
+        let all = u8::MAX >> (8 - SAMPLES);
+        let (pixels, _) = layers.ids[layers.span(y, x0, x1)].as_chunks::<SAMPLES>();
+        let mut at = 0;
+        while let Some(pixel) = pixels.get(at) {
+            let id = pixel[0];
+            let x = (x0 + at) as u16;
+            if *pixel == [id; SAMPLES] {
+                let count = pixels[at..].iter().take_while(|pixel| **pixel == [id; SAMPLES]).count();
+                if id != NOTHING {
+                    let run = Run { geom: layers.geom(id), id, x, y: y as u16, count: count as u16, samples: all };
+                    self.push(run, all);
+                }
+                at += count;
+                continue;
+            }
+            // A pixel shows a geom once, whatever triangles of it.
+            let geoms = pixel.map(|id| if id == NOTHING { NOTHING } else { layers.geom(id) });
+            for (sample, (&geom, &id)) in geoms.iter().zip(pixel).enumerate() {
+                if geom == NOTHING || geoms[..sample].contains(&geom) {
+                    continue;
+                }
+                let same = (0..SAMPLES).filter(|&other| geoms[other] == geom);
+                let samples = same.fold(0, |samples, other| samples | 1 << other);
+                self.push(Run { geom, id, x, y: y as u16, count: 1, samples }, all);
+            }
+            at += 1;
+        }
+    }
+}
+
+/// Takes the next runs, up to [`MANY`] pixels; returns what is left of the last one.
+#[allow(clippy::cast_possible_truncation)]
+fn fill(lit: &mut Vec<Run>, first: Option<Run>, more: &mut impl Iterator<Item = Run>) -> Option<Run> {
+    lit.clear();
+    let (mut room, mut next) = (MANY as u16, first);
+    while let Some(run) = next.filter(|_| room > 0) {
+        let count = run.count.min(room);
+        room -= count;
+        lit.push(Run { count, ..run });
+        let rest = Run { x: run.x + count, count: run.count - count, ..run };
+        next = if rest.count > 0 { Some(rest) } else { more.next() };
+    }
+    next
 }
 
 impl Batch {
@@ -274,19 +280,16 @@ impl Batch {
     fn shade(
         &mut self,
         lattices: &mut Lattices,
-        fragments: &[Fragment],
+        runs: &[Run],
         (number, geom, posed): (u32, &Geom, Option<&Posed>),
         layers: &Layers,
         look: &Look<'_>,
     ) {
-        let n = fragments.len();
-        self.n = n;
-        for (i, fragment) in fragments.iter().enumerate() {
-            [self.x[i], self.y[i]] = fragment.place(layers.pattern);
-        }
+        self.place(runs, layers);
+        let n = self.n;
         match posed {
             Some(posed) => self.analytic(geom, posed),
-            None => self.triangles(geom, fragments, layers, look),
+            None => self.triangles(geom, runs, layers, look),
         }
         let rays = look.view.rays();
         self.tint(geom, look, &rays);
@@ -312,7 +315,7 @@ impl Batch {
                 let shadow = &look.lamps.shadows[*shadow];
                 let (places, normals) =
                     (self.place.each_ref().map(|l| &l[..n]), self.normal.each_ref().map(|l| &l[..n]));
-                let lit = &mut self.scratch[0][..n];
+                let lit = &mut self.lit[..n];
                 shadow.reaches(number, lamp, places, normals, lit);
                 for (sum, light) in self.sum.iter_mut().zip(&self.pass) {
                     add_lit(&mut sum[..n], &light[..n], lit);
@@ -321,6 +324,37 @@ impl Batch {
         }
         for (sum, tint) in self.sum.iter_mut().zip(&self.tint) {
             tinted(&mut sum[..n], &tint[..n]);
+        }
+    }
+
+    /// Where pixels are looked at.
+    fn place(&mut self, runs: &[Run], layers: &Layers) {
+        self.n = 0;
+        for run in runs {
+            let [dx, dy] = layers.centres[usize::from(run.samples)];
+            let fragments = self.n..self.n + usize::from(run.count);
+            for (x, i) in self.x[fragments.clone()].iter_mut().zip(0u16..) {
+                *x = f32::from(run.x + i) + dx;
+            }
+            self.y[fragments.clone()].fill(f32::from(run.y) + dy);
+            self.n = fragments.end;
+        }
+    }
+
+    /// Shows the colours of runs.
+    #[allow(clippy::cast_precision_loss)]
+    fn show(&self, runs: &[Run], layers: &Layers, show: &mut impl FnMut(usize, f32, V3)) {
+        let [r, g, b] = &self.sum;
+        let mut begin = 0;
+        for run in runs {
+            let pixel = usize::from(run.y) * layers.width + usize::from(run.x);
+            let part = run.samples.count_ones() as f32 / layers.samples as f32;
+            let count = usize::from(run.count);
+            let colours = r[begin..begin + count].iter().zip(&g[begin..]).zip(&b[begin..]);
+            for (i, ((r, g), b)) in colours.enumerate() {
+                show(pixel + i, part, [*r, *g, *b]);
+            }
+            begin += count;
         }
     }
 
@@ -341,11 +375,18 @@ impl Batch {
     }
 
     /// Places and directions on a mesh.
-    fn triangles(&mut self, geom: &Geom, fragments: &[Fragment], layers: &Layers, look: &Look<'_>) {
+    fn triangles(&mut self, geom: &Geom, runs: &[Run], layers: &Layers, look: &Look<'_>) {
         let Shape::Mesh(mesh) = geom.shape else { return };
         let mesh = &look.assets.meshes[mesh];
-        for (i, fragment) in fragments.iter().enumerate() {
-            let triangle = &layers.triangles[(fragment.id & !TRIANGLE) as usize];
+        // A covered pixel shows what its first sample does.
+        let ids = runs.iter().flat_map(|run| {
+            let (x, y, count) = (usize::from(run.x), usize::from(run.y), usize::from(run.count));
+            let covered = run.samples.count_ones() as usize == layers.samples;
+            let first = layers.span(y, x, x + count).step_by(layers.samples);
+            first.map(move |at| if covered { layers.ids[at] } else { run.id })
+        });
+        for (i, id) in ids.enumerate() {
+            let triangle = &layers.triangles[(id & !TRIANGLE) as usize];
             let level = mesh.level(triangle.level as usize);
             let (face, corners) = (level.faces[triangle.face as usize], level.corners[triangle.face as usize]);
             // The middle of the pixel may be outside the triangle: then a place on its rim is taken.
@@ -382,41 +423,48 @@ impl Batch {
         let rays = LocalRays::new(geom, look.view, rays);
         if let Mapping::Flat { scale, offset } = paint.mapping {
             let flat = FlatRays { rays, scale, offset };
-            let [s, t, ds, dt] = &mut self.scratch;
             let (places, normals) = (self.local.each_ref().map(|l| &l[..n]), self.normal.each_ref().map(|l| &l[..n]));
-            flat_coordinates(&flat, &self.x[..n], &self.y[..n], places, normals, s, t, ds, dt);
-            let coordinates = self.scratch.each_ref().map(|l| &l[..n]);
-            flat_colours(texture, coordinates, self.tint.each_mut().map(|l| &mut l[..n]));
-            return;
+            let [s, t] = self.coordinates.each_mut().map(|l| &mut l[..n]);
+            flat_coordinates(texture, &flat, &self.x[..n], &self.y[..n], places, normals, s, t, &mut self.dense[..n]);
+            self.face[..n].fill(0);
+        } else if let Mapping::Cube(by) = paint.mapping {
+            let (places, normals) = (self.local.each_ref().map(|l| &l[..n]), self.normal.each_ref().map(|l| &l[..n]));
+            let ([s, t], dense) = (self.coordinates.each_mut().map(|l| &mut l[..n]), &mut self.dense[..n]);
+            let faces = &mut self.face[..n];
+            cube_coordinates(texture, &rays, by, &self.x[..n], &self.y[..n], places, normals, s, t, dense, faces);
+        } else {
+            self.spots(geom, paint.mapping, texture, &rays);
         }
-        for i in 0..n {
-            let place = [0, 1, 2].map(|k| self.local[k][i]);
-            let normal = [0, 1, 2].map(|k| self.normal[k][i]);
+        let [s, t] = self.coordinates.each_ref().map(|l| &l[..n]);
+        let spots = Spots { s, t, dense: &self.dense[..n], faces: &self.face[..n] };
+        texture.colours(&spots, &mut self.reader, self.tint.each_mut().map(|l| &mut l[..n]));
+    }
+
+    /// Where on its texture a geom shows itself.
+    fn spots(&mut self, geom: &Geom, mapping: Mapping, texture: &Texture, rays: &LocalRays) {
+        for i in 0..self.n {
+            let (place, normal) = (self.local.each_ref().map(|l| l[i]), self.normal.each_ref().map(|l| l[i]));
+            self.face[i] = 0;
             let moved = rays.moved(self.x[i], self.y[i], place, normal);
-            let colour = match paint.mapping {
-                Mapping::Cube(by) => {
-                    let multiply = |a: V3| [a[0] * by[0], a[1] * by[1], a[2] * by[2]];
-                    texture.cube_at(multiply(place), multiply(moved[0]), multiply(moved[1]))
-                }
+            let (s, t);
+            match mapping {
                 Mapping::Sides(repeat) => {
                     // The axes that run to the right and up on this side.
                     let [u, v] = side_axes(unrotate(&geom.rotation, normal));
                     let (_, halves) = geom.shape.bounds();
                     let by = [0.5 * repeat[0] / halves[u].max(1e-6), 0.5 * repeat[1] / halves[v].max(1e-6)];
-                    texture.flat_at(
-                        by[0] * place[u] + 0.5 * repeat[0],
-                        0.5 * repeat[1] - by[1] * place[v],
-                        [(0, u), (1, v)].map(|(k, axis)| by[k] * moved[0][axis].abs().max(moved[1][axis].abs())),
-                    )
+                    let change =
+                        [(0, u), (1, v)].map(|(k, axis)| by[k] * moved[0][axis].abs().max(moved[1][axis].abs()));
+                    (s, t) = (by[0] * place[u] + 0.5 * repeat[0], 0.5 * repeat[1] - by[1] * place[v]);
+                    self.dense[i] = texture.dense(change);
                 }
                 // A mesh's coordinates are taken as they are: its triangles are small.
-                Mapping::Own | Mapping::Flat { .. } => {
-                    texture.flat_at(self.coordinates[0][i], self.coordinates[1][i], [0.0; 2])
+                Mapping::Own | Mapping::Flat { .. } | Mapping::Cube(_) => {
+                    [s, t] = self.coordinates.each_ref().map(|lane| lane[i]);
+                    self.dense[i] = 0.0;
                 }
-            };
-            for (lane, colour) in self.tint.iter_mut().zip(colour) {
-                lane[i] = colour;
             }
+            (self.coordinates[0][i], self.coordinates[1][i]) = (s, t);
         }
     }
 
@@ -486,25 +534,27 @@ impl Batch {
         matter: &Matter,
         look: &Look<'_>,
     ) {
+        let row = match geom.shape {
+            Shape::Plane(x, _) => x.cells + 1,
+            _ => QUADS + 1,
+        };
         let mut begin = 0;
         while begin < self.n {
             // Neighbours are mostly in the same cell.
             let cell = self.cell[begin];
             let same = self.cell[begin..self.n].iter().take_while(|other| **other == cell).count();
-            let grid = self.grid(geom, begin);
-            let [a, b, c, d] = [0, 1, grid.row, grid.row + 1].map(|step| {
-                let corner = start + (grid.first + step) * passes + pass;
+            let mut corners = [[0.0; 3]; 4];
+            for (colour, step) in corners.iter_mut().zip([0, 1, row, row + 1]) {
+                let corner = start + (cell as usize + step) * passes + pass;
                 if !lattices.known[corner] {
                     lattices.known[corner] = true;
-                    lattices.colours[corner] = corner_light(grid.corner(geom, step), pass, matter, look);
+                    let corner_there = self.grid(geom, begin).corner(geom, step);
+                    lattices.colours[corner] = corner_light(corner_there, pass, matter, look);
                 }
-                lattices.colours[corner]
-            });
-            let run = begin..begin + same;
-            let (u, v) = (&self.within[0][run.clone()], &self.within[1][run.clone()]);
-            for (k, lane) in self.pass.iter_mut().enumerate() {
-                interpolate([a[k], b[k], c[k], d[k]], u, v, &mut lane[run.clone()]);
+                *colour = lattices.colours[corner];
             }
+            let run = [begin, begin + same];
+            eight::run(Between { corners, run, within: &self.within, colours: &mut self.pass });
             begin += same;
         }
     }
@@ -519,11 +569,6 @@ fn side_axes(normal: V3) -> [usize; 2] {
     } else {
         [0, 1]
     }
-}
-
-/// A place in a list.
-fn at_least_0(i: i32) -> usize {
-    usize::try_from(i).unwrap_or(0)
 }
 
 /// The light of a pass at a corner of a grid.
@@ -577,10 +622,14 @@ impl LocalRays {
         let direction = add(self.direction, add(scale(self.directions[0], x), scale(self.directions[1], y)));
         let facing = dot(normal, direction);
         let facing = 1.0 / if facing.abs() > 1e-6 { facing } else { 1e-6 };
-        [0, 1].map(|k| {
-            let free = add(self.origins[k], scale(self.directions[k], depth));
-            sub(free, scale(direction, dot(normal, free) * facing))
-        })
+        [self.slid(0, depth, direction, normal, facing), self.slid(1, depth, direction, normal, facing)]
+    }
+
+    /// The same to one side.
+    #[inline(always)]
+    fn slid(&self, side: usize, depth: f32, direction: V3, normal: V3, facing: f32) -> V3 {
+        let free = add(self.origins[side], scale(self.directions[side], depth));
+        sub(free, scale(direction, dot(normal, free) * facing))
     }
 }
 
@@ -588,7 +637,7 @@ impl LocalRays {
 struct Grid {
     axes: [Axis; 2],
     /// The cell, along both axes.
-    cell: [i32; 2],
+    cell: [f32; 2],
     /// Its first corner.
     first: usize,
     /// Corners of a row.
@@ -624,12 +673,20 @@ impl Grid {
         };
         let ((i, s), (j, t)) = (axes[0].cell(at[0]), axes[1].cell(at[1]));
         let row = axes[0].cells + 1;
-        Self { axes, cell: [i, j], first: begin + at_least_0(j) * row + at_least_0(i), row, within: [s, t], side }
+        Self {
+            axes,
+            cell: [i, j],
+            first: begin + nearest(j) as usize * row + nearest(i) as usize,
+            row,
+            within: [s, t],
+            side,
+        }
     }
 
     /// A corner of the cell in the world, and how the surface looks there.
     fn corner(&self, geom: &Geom, step: usize) -> (V3, V3) {
-        let (i, j) = (self.cell[0] + i32::from(step % self.row == 1), self.cell[1] + i32::from(step >= self.row));
+        let one = |yes: bool| if yes { 1.0 } else { 0.0 };
+        let (i, j) = (self.cell[0] + one(step % self.row == 1), self.cell[1] + one(step >= self.row));
         let (side, at) = self.side;
         let (mut place, mut normal) = ([0.0; 3], [0.0; 3]);
         place[side] = at;
@@ -657,6 +714,33 @@ impl Lattices {
     }
 }
 
+/// Colours between those at four corners, for fragments of a run; what follows may be overwritten.
+struct Between<'a> {
+    corners: [V3; 4],
+    run: [usize; 2],
+    within: &'a [Lane; 2],
+    colours: &'a mut [Lane; 3],
+}
+
+impl Job for Between<'_> {
+    #[inline(always)]
+    fn run(self, simd: impl Simd) {
+        let Self { corners: [a, b, c, d], run: [begin, end], within: [u, v], colours } = self;
+        for from in (begin..end).step_by(LANES) {
+            let (Some(u), Some(v)) = (u[from..].first_chunk(), v[from..].first_chunk()) else { return };
+            let (u, v) = (simd.load(u), simd.load(v));
+            for (k, lane) in colours.iter_mut().enumerate() {
+                let between = |a: f32, b: f32| simd.add(simd.splat(a), simd.mul(u, simd.splat(b - a)));
+                let (low, high) = (between(a[k], b[k]), between(c[k], d[k]));
+                let colour = simd.add(low, simd.mul(v, simd.sub(high, low)));
+                if let Some(to) = lane[from..].first_chunk_mut() {
+                    simd.store(colour, to);
+                }
+            }
+        }
+    }
+}
+
 vectorised! {
     /// Multiplies light with a texture; more than white is white.
     fn tinted(sums: &mut [f32], tints: &[f32]) {
@@ -672,15 +756,6 @@ vectorised! {
         }
     }
 
-    /// Between the values at four corners.
-    fn interpolate(corners: [f32; 4], u: &[f32], v: &[f32], values: &mut [f32]) {
-        let [a, b, c, d] = corners;
-        for ((value, u), v) in values.iter_mut().zip(u).zip(v) {
-            let (low, high) = (a + u * (b - a), c + u * (d - c));
-            *value = low + v * (high - low);
-        }
-    }
-
     /// The cells of places on a plane, and how far inside they are.
     #[allow(clippy::cast_possible_truncation)]
     fn plane_cells(
@@ -691,42 +766,43 @@ vectorised! {
         let row = x.cells as u32 + 1;
         for i in 0..n {
             let ((column, s), (line, t)) = (x.cell(px[i]), y.cell(py[i]));
-            cells[i] = line as u32 * row + column as u32;
+            cells[i] = nearest(line) * row + nearest(column);
             (u[i], v[i]) = (s, t);
         }
     }
 
-    /// Clears what differs.
-    fn keep_equal(a: &[u32], b: &[u32], equal: &mut [u32]) {
-        for ((a, b), equal) in a.iter().zip(b).zip(equal) {
-            *equal &= if a == b { u32::MAX } else { 0 };
-        }
-    }
-
-    /// Coordinates on a flat texture, and how much they change from pixel to pixel, for surfaces of one geom.
+    /// Coordinates on a flat texture, and how many texels a pixel covers, for surfaces of one geom.
     fn flat_coordinates(
-        flat: &FlatRays, x: &[f32], y: &[f32], places: [&[f32]; 3], normals: [&[f32]; 3],
-        s: &mut [f32], t: &mut [f32], ds: &mut [f32], dt: &mut [f32],
+        texture: &Texture, flat: &FlatRays, x: &[f32], y: &[f32], places: [&[f32]; 3], normals: [&[f32]; 3],
+        s: &mut [f32], t: &mut [f32], dense: &mut [f32],
     ) {
         let n = x.len();
         let ([px, py, pz], [nx, ny, nz]) = (places.map(|lane| &lane[..n]), normals.map(|lane| &lane[..n]));
-        let (y, s, t, ds, dt) = (&y[..n], &mut s[..n], &mut t[..n], &mut ds[..n], &mut dt[..n]);
+        let (y, s, t, dense) = (&y[..n], &mut s[..n], &mut t[..n], &mut dense[..n]);
         for i in 0..n {
             let place = [px[i], py[i], pz[i]];
             let [right, down] = flat.rays.moved(x[i], y[i], place, [nx[i], ny[i], nz[i]]);
             s[i] = flat.scale[0] * place[0] + flat.offset[0];
             t[i] = flat.scale[1] * place[1] + flat.offset[1];
-            ds[i] = flat.scale[0].abs() * right[0].abs().max(down[0].abs());
-            dt[i] = flat.scale[1].abs() * right[1].abs().max(down[1].abs());
+            let change = |k: usize| flat.scale[k].abs() * right[k].abs().max(down[k].abs());
+            dense[i] = texture.dense([change(0), change(1)]);
         }
     }
 
-    /// The colours of a flat texture.
-    fn flat_colours(texture: &Texture, coordinates: [&[f32]; 4], colours: [&mut [f32]; 3]) {
-        let [s, t, ds, dt] = coordinates;
-        let [r, g, b] = colours;
-        for i in 0..s.len() {
-            [r[i], g[i], b[i]] = texture.flat_at(s[i], t[i], [ds[i], dt[i]]);
+    /// Faces of a cube texture, coordinates there, and how many texels a pixel covers.
+    fn cube_coordinates(
+        texture: &Texture, rays: &LocalRays, by: V3, x: &[f32], y: &[f32], places: [&[f32]; 3], normals: [&[f32]; 3],
+        s: &mut [f32], t: &mut [f32], dense: &mut [f32], faces: &mut [u32],
+    ) {
+        let n = x.len();
+        let ([px, py, pz], [nx, ny, nz]) = (places.map(|lane| &lane[..n]), normals.map(|lane| &lane[..n]));
+        let (y, s, t, dense, faces) = (&y[..n], &mut s[..n], &mut t[..n], &mut dense[..n], &mut faces[..n]);
+        let multiply = |a: V3| [a[0] * by[0], a[1] * by[1], a[2] * by[2]];
+        for i in 0..n {
+            let place = [px[i], py[i], pz[i]];
+            let [right, down] = rays.moved(x[i], y[i], place, [nx[i], ny[i], nz[i]]);
+            let (face, spot, texels) = texture.face_in(multiply(place), multiply(right), multiply(down));
+            (faces[i], s[i], t[i], dense[i]) = (face, spot[0], spot[1], texels);
         }
     }
 

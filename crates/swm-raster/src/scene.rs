@@ -2,6 +2,7 @@
 //! OpenGL's fixed pipeline and of MuJoCo, which draws with it.
 
 use crate::mesh::Mesh;
+use crate::simd::floor;
 use crate::texture::Texture;
 use crate::vector::V3;
 use std::sync::Arc;
@@ -98,25 +99,26 @@ impl Axis {
         Self { half, pad: step, step, cells: cells.max(1), infinite: false }
     }
 
-    /// Where the line before cell `i` is.
+    /// Where the line before cell `i`, a whole number, is.
     #[inline(always)]
     #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn line(&self, i: i32) -> f32 {
-        let inner = -self.half + self.pad + (i - 1) as f32 * self.step;
-        let inner = if i > 0 { inner } else { -self.half };
-        if i < self.cells as i32 { inner } else { self.half }
+    pub(crate) fn line(&self, i: f32) -> f32 {
+        let inner = -self.half + self.pad + (i - 1.0) * self.step;
+        let inner = if i > 0.0 { inner } else { -self.half };
+        if i < self.cells as f32 { inner } else { self.half }
     }
 
     /// The cell a place is in, and how far into it, from 0 to 1.
     #[inline(always)]
-    #[allow(clippy::cast_possible_truncation)]
-    pub(crate) fn cell(&self, x: f32) -> (i32, f32) {
-        let from = (x + self.half - self.pad) / self.step;
-        // Conversion saturates, and NaN becomes 0.
-        let inner = (from as i32).saturating_add(1).min(self.cells as i32 - 1).max(0);
-        let cell = if from < 0.0 { 0 } else { inner };
-        let (low, high) = (self.line(cell), self.line(cell + 1));
-        (cell, ((x - low) / (high - low).max(1e-12)).clamp(0.0, 1.0))
+    #[allow(clippy::cast_precision_loss, clippy::manual_clamp, reason = "`clamp` would keep what is no number")]
+    pub(crate) fn cell(&self, x: f32) -> (f32, f32) {
+        // Where it is among the inner lines; what is far outside, or no number, may be anywhere.
+        let from = ((x + self.half - self.pad) / self.step).max(-1.0).min(1e6);
+        let last = (self.cells - 1) as f32;
+        let cell = floor(from) + 1.0;
+        let cell = if cell < last { cell } else { last };
+        let (low, high) = (self.line(cell), self.line(cell + 1.0));
+        (cell, ((x - low) / (high - low).max(1e-12)).max(0.0).min(1.0))
     }
 }
 

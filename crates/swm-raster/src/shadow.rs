@@ -3,11 +3,12 @@
 //! The map covers what casts shadows and no more, so that it is sharp although it is small. A convex shape is never in its
 //! own shadow, but where it turns away from the lamp; only meshes need a margin against rounding.
 
+use crate::eight::LANES;
 use crate::layers::{Layers, NOTHING, pattern, touched};
 use crate::light::Lamp;
-use crate::paint::MANY;
 use crate::scene::{Assets, Light, Scene, Shape};
 use crate::simd::vectorised;
+use crate::texture::MANY;
 use crate::vector::{V3, across, cross, dot, unit};
 use crate::view::View;
 
@@ -104,12 +105,22 @@ impl Shadow {
         let mut texels = [[0.0; MANY]; 3];
         project(view, places, &mut texels);
         let [x, y, depths] = &texels;
-        for (i, lit) in lit.iter_mut().enumerate() {
-            let facing = *lit;
+        for (from, lit) in (0..).step_by(LANES).zip(lit.chunks_mut(LANES)) {
             // What turns away is in its own shadow; along an edge-on surface, ambient light passes.
-            *lit = if facing < -EDGE_ON { 0.0 } else { 1.0 };
-            if x[i] >= 0.0 && facing >= -EDGE_ON && self.darkens(view, geom, [x[i], y[i], depths[i]], facing) {
-                *lit = 0.0;
+            let (mut cosines, mut count) = ([0.0; LANES], 0);
+            for ((cosine, lit), x) in cosines.iter_mut().zip(lit.iter_mut()).zip(&x[from..]) {
+                *cosine = *lit;
+                *lit = if *cosine < -EDGE_ON { 0.0 } else { 1.0 };
+                count += u32::from((*x >= 0.0) & (*cosine >= -EDGE_ON));
+            }
+            if count == 0 {
+                continue;
+            }
+            for (i, (lit, facing)) in (from..).zip(lit.iter_mut().zip(cosines)) {
+                let inside = x[i] >= 0.0 && facing >= -EDGE_ON;
+                if inside && self.darkens(view, geom, [x[i], y[i], depths[i]], facing) {
+                    *lit = 0.0;
+                }
             }
         }
     }
@@ -118,7 +129,7 @@ impl Shadow {
     #[inline]
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn darkens(&self, view: &View, geom: u32, [x, y, depth]: V3, facing: f32) -> bool {
-        let at = y as usize * view.width + x as usize;
+        let at = self.layers.span(y as usize, x as usize, x as usize).start;
         let id = self.layers.ids[at];
         if id == NOTHING {
             return false;

@@ -4,6 +4,17 @@
 //! neither fuses multiplications with additions, and division and square root are exact in both.
 #![allow(unsafe_code, reason = "AVX2 code is called where the processor has it")]
 
+/// Whether the processor has AVX2.
+#[cfg(target_arch = "x86_64")]
+#[inline]
+pub(crate) fn avx2() -> bool {
+    #[cfg(test)]
+    if tests::PLAIN.get() {
+        return false;
+    }
+    std::arch::is_x86_feature_detected!("avx2")
+}
+
 /// Defines such functions.
 macro_rules! vectorised {
     ($($(#[$meta:meta])* $vis:vis fn $name:ident($($arg:ident: $type:ty),* $(,)?) $(-> $out:ty)? $body:block)*) => { $(
@@ -18,7 +29,7 @@ macro_rules! vectorised {
                 fn avx2($($arg: $type),*) $(-> $out)? {
                     plain($($arg),*)
                 }
-                if std::arch::is_x86_feature_detected!("avx2") {
+                if $crate::simd::avx2() {
                     // SAFETY: the processor was just asked.
                     return unsafe { avx2($($arg),*) };
                 }
@@ -28,6 +39,26 @@ macro_rules! vectorised {
     )* };
 }
 pub(crate) use vectorised;
+
+/// The whole number next to one from 0 to 2^22; any for others. Conversion by `as` is done one by one.
+#[inline(always)]
+pub(crate) fn nearest(x: f32) -> u32 {
+    // Added to 2^23, the whole number is in the lowest bits.
+    (x + 8_388_608.0).to_bits() & 0x007f_ffff
+}
+
+/// The same as a number, from -2^22 to 2^22; about the number itself beyond.
+#[inline(always)]
+pub(crate) fn rounded(x: f32) -> f32 {
+    (x + 12_582_912.0) - 12_582_912.0
+}
+
+/// The greatest whole number that is not greater, from -2^22 to 2^22.
+#[inline(always)]
+pub(crate) fn floor(x: f32) -> f32 {
+    let near = rounded(x);
+    if near > x { near - 1.0 } else { near }
+}
 
 /// `base` to the power of `exponent`, for bases from 0 to 1 and exponents from 0 up, to about 1e-5; 1 for exponent 0. Plain arithmetic:
 /// the same on every machine, and the compiler can do many at once.
@@ -43,17 +74,46 @@ pub(crate) fn power(base: f32, exponent: f32) -> f32 {
     let v = u * u;
     let log2 = whole + u * (2.885_39 + v * (0.961_796_7 + v * (0.577_078 + v * 0.412_198_6)));
     let x = (exponent * log2).clamp(-126.0, 0.0);
-    // Whole and fractional part; conversion rounds towards zero, so the fraction is in (-1, 0].
-    let floor = x as i32;
-    let f = (x - floor as f32) * std::f32::consts::LN_2;
+    // Whole part and fraction, from -1/2 to 1/2.
+    let whole = rounded(x);
+    let f = (x - whole) * std::f32::consts::LN_2;
     let exp =
         1.0 + f * (1.0 + f * (0.5 + f * (0.166_666_67 + f * (0.041_666_67 + f * (0.008_333_334 + f * 0.001_388_889)))));
-    exp * f32::from_bits(((floor + 127) << 23) as u32)
+    exp * f32::from_bits(nearest(whole + 127.0) << 23)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Canvas;
+    use crate::scenes::{assets, drawn, scene};
+    use proptest::prelude::*;
+    use std::cell::Cell;
+
+    thread_local! {
+        /// As if the processor had no AVX2.
+        pub static PLAIN: Cell<bool> = const { Cell::new(false) };
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(1000))]
+        #[test]
+        fn pictures_are_the_same_on_any_processor(scene in scene()) {
+            let seen = drawn(&mut Canvas::new(), &scene, &assets());
+            PLAIN.set(true);
+            let plain = drawn(&mut Canvas::new(), &scene, &assets());
+            PLAIN.set(false);
+            prop_assert_eq!(seen, plain);
+        }
+    }
+
+    #[test]
+    fn whole_numbers_are_near() {
+        for x in [0.0, 0.25, 0.75, 1.0, 2.5, 99.9, 4_000_000.0_f32] {
+            assert_eq!(f64::from(nearest(x)), f64::from(x.round_ties_even()));
+            assert_eq!((rounded(-x), floor(-x), floor(x)), (-x.round_ties_even(), (-x).floor(), x.floor()));
+        }
+    }
 
     #[test]
     fn power_is_close() {

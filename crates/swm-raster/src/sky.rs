@@ -3,7 +3,7 @@
 use crate::layers::{Layers, NOTHING};
 use crate::scene::{Assets, Geom, Haze, Scene, Shape};
 use crate::simd::vectorised;
-use crate::texture::Texture;
+use crate::texture::{Reader, Texture};
 use crate::vector::{V3, add, dot, scale, sub, unrotate};
 use crate::view::View;
 use std::sync::Arc;
@@ -25,10 +25,10 @@ pub(crate) fn depth(radius: f32, direction: V3) -> f32 {
 
 /// The sky's colour in a direction, which changes so much from pixel to pixel.
 #[inline]
-fn colour(texture: &Texture, direction: V3, right: V3, down: V3) -> V3 {
+fn colour(texture: &Texture, reader: &mut Reader, direction: V3, right: V3, down: V3) -> V3 {
     // The texture's y axis points upwards.
     let turn = |[x, y, z]: V3| [x, z, -y];
-    texture.cube_at(turn(direction), turn(right), turn(down))
+    texture.colour(reader, texture.face_in(turn(direction), turn(right), turn(down)))
 }
 
 /// The sky as it was seen last. It is so far away that it stays the same while a camera only moves: its pixels are
@@ -40,6 +40,7 @@ pub(crate) struct Backdrop {
     size: (usize, usize),
     /// Colours of pixels; negative where nobody has looked yet.
     colours: Vec<V3>,
+    reader: Reader,
     /// Scratch: how much of each pixel of a row is open.
     open: Vec<f32>,
 }
@@ -70,24 +71,25 @@ impl Backdrop {
         for y in 0..view.height {
             let row = add(rays.direction, scale(rays.directions[1], y as f32 + 0.5));
             let at = |x: usize| add(row, scale(rays.directions[0], x as f32 + 0.5));
-            self.open.fill(0.0);
-            for sample in 0..main.samples {
-                let first = main.place(y, sample);
-                if endless {
-                    // The sky is nearer than the far ends of endless planes.
-                    for x in 0..view.width {
-                        if main.depths[first + x] > depth(radius, at(x)) {
-                            main.ids[first + x] = NOTHING;
-                        }
+            let samples = main.span(y, 0, view.width);
+            if endless {
+                // The sky is nearer than the far ends of endless planes.
+                let pixels = main.depths[samples.clone()].chunks_exact(main.samples);
+                for (x, (depths, ids)) in
+                    pixels.zip(main.ids[samples.clone()].chunks_exact_mut(main.samples)).enumerate()
+                {
+                    let far = depth(radius, at(x));
+                    for (depth, id) in depths.iter().zip(ids) {
+                        *id = if *depth > far { NOTHING } else { *id };
                     }
                 }
-                count_open(&main.ids[first..first + view.width], share, &mut self.open);
             }
+            count_open(&main.ids[samples], main.samples, share, &mut self.open);
             let row = y * view.width..(y + 1) * view.width;
             let (seen, colours) = (&mut self.colours[row.clone()], &mut colours[row]);
             for (x, (seen, open)) in seen.iter_mut().zip(&self.open).enumerate() {
                 if *open > 0.0 && seen[0] < 0.0 {
-                    *seen = colour(texture, at(x), rays.directions[0], rays.directions[1]);
+                    *seen = colour(texture, &mut self.reader, at(x), rays.directions[0], rays.directions[1]);
                 }
             }
             shine_through(seen, &self.open, colours);
@@ -96,10 +98,18 @@ impl Backdrop {
 }
 
 vectorised! {
-    /// Adds a share for every pixel where nothing is.
-    fn count_open(ids: &[u32], share: f32, open: &mut [f32]) {
-        for (open, id) in open.iter_mut().zip(ids) {
-            *open += if *id == NOTHING { share } else { 0.0 };
+    /// Finds how much of every pixel shows nothing: a share for every sample.
+    fn count_open(ids: &[u32], samples: usize, share: f32, open: &mut [f32]) {
+        #[inline(always)]
+        fn count<const SAMPLES: usize>(ids: &[u32], share: f32, open: &mut [f32]) {
+            for (open, ids) in open.iter_mut().zip(ids.as_chunks::<SAMPLES>().0) {
+                *open = ids.iter().fold(0.0, |open, id| open + if *id == NOTHING { share } else { 0.0 });
+            }
+        }
+        match samples {
+            1 => count::<1>(ids, share, open),
+            2 => count::<2>(ids, share, open),
+            _ => count::<4>(ids, share, open),
         }
     }
 

@@ -3,18 +3,38 @@
 //! The choice between two versions is that of Mesa's software rasteriser, with which pictures are compared: the larger
 //! of the coordinates' derivatives counts, and versions blend only in the second half of the way from one to the next.
 
+use crate::simd::{nearest, rounded, vectorised};
+
+/// Places looked up at once.
+pub(crate) const MANY: usize = 128;
+
 /// A flat texture, or the six faces of a cube (+x, -x, +y, -y, +z, -z, as OpenGL orders and turns them).
 #[derive(Clone, Debug)]
 pub struct Texture {
-    faces: Vec<Vec<Level>>,
+    width: u32,
+    height: u32,
+    /// Versions of a face, from fine to coarse: where each begins, of the texels of the face. It is kept row after row, with a frame
+    /// of one texel around it that repeats the texture or continues its rim.
+    levels: Vec<usize>,
+    /// Faces one after the other, each of so many texels.
+    face: usize,
+    /// RGBA texels in a word each.
+    texels: Vec<u32>,
 }
 
-/// One version: RGBA texels in a word each, row after row.
-#[derive(Clone, Debug)]
-struct Level {
-    width: i32,
-    height: i32,
+/// A picture while its smaller versions are made.
+struct Sheet {
+    width: usize,
+    height: usize,
     texels: Vec<u32>,
+}
+
+/// What is looked up: coordinates from 0 to 1 on a face of a texture, and how many of its texels a pixel covers.
+pub(crate) struct Spots<'a> {
+    pub s: &'a [f32],
+    pub t: &'a [f32],
+    pub dense: &'a [f32],
+    pub faces: &'a [u32],
 }
 
 /// Every other byte of a word: two channels that can be multiplied by up to 256 at once.
@@ -31,11 +51,23 @@ fn weighted<const N: usize>(words: [u32; N], weights: [u32; N]) -> u32 {
     (even >> 8 & TWO) | (odd & !TWO)
 }
 
-impl Level {
+impl Sheet {
+    /// `channels` (3 or 4) bytes a texel; `None` where sizes do not fit.
+    fn new(width: usize, height: usize, channels: usize, bytes: &[u8]) -> Option<Self> {
+        let texels = width.checked_mul(height)?;
+        // Coordinates are counted in 256ths of texels.
+        let fits = (1..=1 << 14).contains(&width) && (1..=1 << 14).contains(&height) && (3..=4).contains(&channels);
+        if !fits || texels.checked_mul(channels)? != bytes.len() {
+            return None;
+        }
+        let word = |c: &[u8]| u32::from_le_bytes([c[0], c[1], c[2], c.get(3).copied().unwrap_or(255)]);
+        Some(Self { width, height, texels: bytes.chunks_exact(channels).map(word).collect() })
+    }
+
     /// Half the width and height, at least 1.
     fn halved(&self) -> Self {
         let (width, height) = ((self.width / 2).max(1), (self.height / 2).max(1));
-        let at = |x: i32, y: i32| self.texels[to_usize(y.min(self.height - 1) * self.width + x.min(self.width - 1))];
+        let at = |x: usize, y: usize| self.texels[y.min(self.height - 1) * self.width + x.min(self.width - 1)];
         let texels = (0..width * height).map(|place| {
             let (x, y) = (2 * (place % width), 2 * (place / width));
             weighted([at(x, y), at(x + 1, y), at(x, y + 1), at(x + 1, y + 1)], [64; 4])
@@ -43,153 +75,301 @@ impl Level {
         Self { width, height, texels: texels.collect() }
     }
 
-    /// The colour at coordinates from 0 to 1, between four texels, to a 256th of the way.
-    #[inline(always)]
-    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss, clippy::cast_sign_loss)]
-    fn look(&self, s: f32, t: f32, repeat: bool) -> u32 {
-        let (w, h) = (self.width, self.height);
-        let x = (s * (256 * w) as f32) as i32 - 128;
-        let y = (t * (256 * h) as f32) as i32 - 128;
-        let (fx, fy) = ((x & 255) as u32, (y & 255) as u32);
-        let (x, y) = (x >> 8, y >> 8);
-        // The ends of coordinates are half a texel beyond the texture; what is farther is no number, and black.
-        let first = |i: i32, n: i32| if i < 0 { if repeat { n - 1 } else { 0 } } else { i };
-        let second = |i: i32, n: i32| if i + 1 >= n { if repeat { 0 } else { n - 1 } } else { i + 1 };
-        let (xa, xb) = (first(x, w), second(x, w));
-        let (ya, yb) = (first(y, h).wrapping_mul(w), second(y, h).wrapping_mul(w));
-        let at = |x: i32, y: i32| self.texels.get(y.wrapping_add(x) as usize).copied().unwrap_or(0);
-        let four = [at(xa, ya), at(xb, ya), at(xa, yb), at(xb, yb)];
-        let right = fx * fy;
-        let weights = [65536 - 256 * (fx + fy) + right, 256 * fx - right, 256 * fy - right, right];
-        // Rounded so that they still sum to 256.
-        let [_, b, c, d] = weights.map(|weight| (weight + 128) >> 8);
-        weighted(four, [256 - b - c - d, b, c, d])
+    /// The texels with their frame.
+    fn framed(&self, repeat: bool) -> impl Iterator<Item = u32> + '_ {
+        let inside = move |i: usize, n: usize| match repeat {
+            true => (i + n - 1) % n,
+            false => i.saturating_sub(1).min(n - 1),
+        };
+        let row = move |y: usize| (0..self.width + 2).map(move |x| (x, y));
+        (0..self.height + 2)
+            .flat_map(row)
+            .map(move |(x, y)| self.texels[inside(y, self.height) * self.width + inside(x, self.width)])
     }
 }
-
-/// A place that is not negative.
-#[inline(always)]
-#[allow(clippy::cast_sign_loss)]
-fn to_usize(i: i32) -> usize {
-    i as usize
-}
-
-/// The faces of a cube, as OpenGL's table has them: which coordinate runs across, along and away, and whether backwards.
-const FACES: [[(usize, f32); 3]; 6] = [
-    [(2, -1.0), (1, -1.0), (0, 1.0)],
-    [(2, 1.0), (1, -1.0), (0, -1.0)],
-    [(0, 1.0), (2, 1.0), (1, 1.0)],
-    [(0, 1.0), (2, -1.0), (1, -1.0)],
-    [(0, 1.0), (1, -1.0), (2, 1.0)],
-    [(0, -1.0), (1, -1.0), (2, -1.0)],
-];
 
 impl Texture {
     /// A flat texture of `channels` (3 or 4) bytes a texel; `None` where the sizes do not fit.
     pub fn flat(width: usize, height: usize, channels: usize, bytes: &[u8]) -> Option<Self> {
-        Some(Self { faces: vec![pyramid(width, height, channels, bytes)?] })
+        Some(Self::new(vec![Sheet::new(width, height, channels, bytes)?], true))
     }
 
     /// A cube texture: six squares one after the other, or one for all sides; `None` where the sizes do not fit.
     pub fn cube(side: usize, channels: usize, bytes: &[u8]) -> Option<Self> {
         let face = side.checked_mul(side)?.checked_mul(channels)?;
-        let faces = match bytes.len() {
-            one if one == face && face > 0 => {
-                let face = pyramid(side, side, channels, bytes)?;
-                vec![face; 6]
-            }
+        let sheet = |bytes| Sheet::new(side, side, channels, bytes);
+        let sheets = match bytes.len() {
+            one if one == face && face > 0 => [bytes; 6].into_iter().map(sheet).collect::<Option<_>>()?,
             six if face.checked_mul(6) == Some(six) && face > 0 => {
-                bytes.chunks_exact(face).map(|bytes| pyramid(side, side, channels, bytes)).collect::<Option<_>>()?
+                bytes.chunks_exact(face).map(sheet).collect::<Option<_>>()?
             }
             _ => return None,
         };
-        Some(Self { faces })
+        Some(Self::new(sheets, false))
     }
 
     /// A white one, flat and a cube's.
     pub fn white() -> Self {
-        Self { faces: vec![vec![Level { width: 1, height: 1, texels: vec![u32::MAX] }]; 6] }
+        let white = || Sheet { width: 1, height: 1, texels: vec![u32::MAX] };
+        Self::new((0..6).map(|_| white()).collect(), false)
+    }
+
+    /// Faces of one size, and their smaller versions down to one texel.
+    #[allow(clippy::cast_possible_truncation)]
+    fn new(faces: Vec<Sheet>, repeat: bool) -> Self {
+        let (width, height) = faces.first().map_or((1, 1), |face| (face.width, face.height));
+        let (mut levels, mut texels) = (vec![], vec![]);
+        let count = faces.len().max(1);
+        for mut sheet in faces {
+            levels.clear();
+            let begin = texels.len();
+            loop {
+                levels.push(texels.len() - begin);
+                texels.extend(sheet.framed(repeat));
+                if sheet.width == 1 && sheet.height == 1 {
+                    break;
+                }
+                sheet = sheet.halved();
+            }
+        }
+        Self { width: width as u32, height: height as u32, levels, face: texels.len() / count, texels }
     }
 
     /// Whether it is a cube's.
     pub fn is_cube(&self) -> bool {
-        self.faces.len() == 6
+        self.texels.len() == 6 * self.face
     }
 
-    /// The colour (0 to 1) at coordinates that repeat from 1 on; `change` is how much they change from a pixel to the next, at
-    /// most, in either direction: `[s, t]`.
+    /// How many texels a pixel covers, where coordinates change so much from a pixel to the next.
+    #[inline(always)]
+    #[allow(clippy::cast_precision_loss)]
+    pub(crate) fn dense(&self, change: [f32; 2]) -> f32 {
+        (change[0] * self.width as f32).max(change[1] * self.height as f32)
+    }
+
+    /// The face in a direction, which changes so much from a pixel to the next, to the right and down; the place there, and how many
+    /// texels a pixel covers. The faces are those of OpenGL's table.
     #[inline(always)]
     #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation)]
-    pub(crate) fn flat_at(&self, s: f32, t: f32, change: [f32; 2]) -> [f32; 3] {
-        let levels = &self.faces[0];
-        let rho = (change[0] * levels[0].width as f32).max(change[1] * levels[0].height as f32);
-        let whole = |x: f32| {
-            let part = x - x as i32 as f32;
-            if part < 0.0 { part + 1.0 } else { part }
+    pub(crate) fn face_in(&self, d: [f32; 3], right: [f32; 3], down: [f32; 3]) -> (u32, [f32; 2], f32) {
+        let [x, y, z] = [d[0].abs(), d[1].abs(), d[2].abs()];
+        let on_x = (x >= y) & (x >= z);
+        let on_y = !on_x & (z <= y);
+        let main = if on_x {
+            d[0]
+        } else if on_y {
+            d[1]
+        } else {
+            d[2]
         };
-        Self::blend(levels, whole(s), whole(t), rho, true)
-    }
-
-    /// The colour (0 to 1) in a direction, which changes so much from a pixel to the next, to the right and down.
-    #[inline]
-    #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn cube_at(&self, d: [f32; 3], right: [f32; 3], down: [f32; 3]) -> [f32; 3] {
-        let size = d.map(f32::abs);
-        let axis = if size[0] >= size[1] && size[0] >= size[2] { 0 } else { 1 + usize::from(size[2] > size[1]) };
-        let face = 2 * axis + usize::from(d[axis] < 0.0);
-        let pick = |d: [f32; 3]| FACES[face].map(|(axis, sign)| sign * d[axis]);
-        let [across, along, major] = pick(d);
-        let major = 1.0 / major.max(1e-20);
-        let (s, t) = (across * major, along * major);
-        let levels = &self.faces[face.min(self.faces.len() - 1)];
-        let half = 0.5 * levels[0].width as f32;
-        let slope = |by: [f32; 3]| {
-            let [across, along, away] = pick(by);
-            (across - s * away).abs().max((along - t * away).abs())
-        };
-        let rho = slope(right).max(slope(down)) * major * half;
-        Self::blend(levels, 0.5 * s + 0.5, 0.5 * t + 0.5, rho, false)
-    }
-
-    /// The colour between versions, for coordinates from 0 to 1.
-    #[inline(always)]
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-    fn blend(levels: &[Level], s: f32, t: f32, rho: f32, repeat: bool) -> [f32; 3] {
-        let last = levels.len() - 1;
-        // 3.5 / sqrt(8): a texel a pixel is still the full version.
-        let scaled = if rho > 1.0 { (rho * 1.237_436_9).min(1e9) } else { 1.0 };
-        let exponent = (scaled.to_bits() >> 23) - 127;
-        let mantissa = f32::from_bits(scaled.to_bits() & 0x007f_ffff | 0x3f80_0000);
-        let level = (exponent as usize).min(last);
-        let between = if level < last { ((2.0 * mantissa - 3.0) * 256.0) as i32 } else { 0 };
-        let fine = levels[level].look(s, t, repeat);
-        let seen = match u32::try_from(between) {
-            // Less than a few steps of a byte apart, one of them will do.
-            Ok(between) if between > 240 => levels[level + 1].look(s, t, repeat),
-            Ok(between) if between > 16 => {
-                weighted([fine, levels[level + 1].look(s, t, repeat)], [256 - between, between])
+        let sign = if main < 0.0 { -1.0 } else { 1.0 };
+        let face = if on_x {
+            0
+        } else if on_y {
+            2
+        } else {
+            4
+        } + u32::from(main < 0.0);
+        // What runs across, along and away.
+        let across = |v: [f32; 3]| {
+            if on_x {
+                -sign * v[2]
+            } else if on_y {
+                v[0]
+            } else {
+                sign * v[0]
             }
-            _ => fine,
         };
-        [0, 8, 16].map(|shift| (seen >> shift & 255) as f32 * (1.0 / 255.0))
+        let along = |v: [f32; 3]| if on_y { sign * v[2] } else { -v[1] };
+        let away = |v: [f32; 3]| {
+            sign * if on_x {
+                v[0]
+            } else if on_y {
+                v[1]
+            } else {
+                v[2]
+            }
+        };
+        let major = 1.0 / main.abs().max(1e-20);
+        let (s, t) = (across(d) * major, along(d) * major);
+        let slope = |v: [f32; 3]| (across(v) - s * away(v)).abs().max((along(v) - t * away(v)).abs());
+        let dense = slope(right).max(slope(down)) * major * 0.5 * self.width as f32;
+        (if self.is_cube() { face } else { 0 }, [0.5 * s + 0.5, 0.5 * t + 0.5], dense)
+    }
+
+    /// The colours (0 to 1) at up to [`MANY`] spots.
+    pub(crate) fn colours(&self, spots: &Spots<'_>, reader: &mut Reader, [r, g, b]: [&mut [f32]; 3]) {
+        let (n, Reader { seen, next }) = (spots.s.len().min(MANY), reader);
+        choose(self, &spots.s[..n], &spots.t[..n], &spots.dense[..n], seen);
+        seen.faces[..n].copy_from_slice(&spots.faces[..n]);
+        seen.look(self, n);
+        seen.mix(next, self, n);
+        split(&seen.words[..n], r, g, b);
+    }
+
+    /// The colour at one spot: a place on a face, and how many texels a pixel covers.
+    pub(crate) fn colour(&self, reader: &mut Reader, (face, [s, t], dense): (u32, [f32; 2], f32)) -> [f32; 3] {
+        let (mut r, mut g, mut b) = ([0.0], [0.0], [0.0]);
+        let spots = Spots { s: &[s], t: &[t], dense: &[dense], faces: &[face] };
+        self.colours(&spots, reader, [&mut r, &mut g, &mut b]);
+        [r[0], g[0], b[0]]
+    }
+
+    /// Two texels next to each other in two rows.
+    #[inline(always)]
+    fn four(&self, at: usize, stride: usize) -> [u32; 4] {
+        let two = |at: usize| self.texels.get(at..at + 2).map_or([0; 2], |two| [two[0], two[1]]);
+        let ([a, b], [c, d]) = (two(at), two(at + stride));
+        [a, b, c, d]
     }
 }
 
-/// A picture and its smaller versions, down to one texel.
-fn pyramid(width: usize, height: usize, channels: usize, bytes: &[u8]) -> Option<Vec<Level>> {
-    let texels = width.checked_mul(height)?;
-    if texels == 0 || !(3..=4).contains(&channels) || texels.checked_mul(channels)? != bytes.len() {
-        return None;
+/// Scratch of looking things up.
+#[derive(Default)]
+pub(crate) struct Reader {
+    seen: Seen,
+    next: Seen,
+}
+
+/// What is found at spots.
+struct Seen {
+    s: [f32; MANY],
+    t: [f32; MANY],
+    faces: [u32; MANY],
+    /// The version, and in 256ths how much the next one adds.
+    levels: [u32; MANY],
+    shares: [u32; MANY],
+    /// The texel at the upper left, counted from that of the frame, and in 256ths how far the spot is from its middle.
+    places: [u32; MANY],
+    strides: [u32; MANY],
+    right: [u32; MANY],
+    below: [u32; MANY],
+    four: [[u32; MANY]; 4],
+    words: [u32; MANY],
+}
+
+impl Default for Seen {
+    fn default() -> Self {
+        const NONE: [u32; MANY] = [0; MANY];
+        Self {
+            s: [0.0; MANY],
+            t: [0.0; MANY],
+            faces: NONE,
+            levels: NONE,
+            shares: NONE,
+            places: NONE,
+            strides: NONE,
+            right: NONE,
+            below: NONE,
+            four: [NONE; 4],
+            words: NONE,
+        }
     }
-    // Coordinates are counted in 256ths of texels.
-    let side = |n: usize| i32::try_from(n).ok().filter(|n| *n <= 1 << 14);
-    let word = |c: &[u8]| u32::from_le_bytes([c[0], c[1], c[2], c.get(3).copied().unwrap_or(255)]);
-    let texels = bytes.chunks_exact(channels).map(word).collect();
-    let mut levels = vec![Level { width: side(width)?, height: side(height)?, texels }];
-    while let Some(level) = levels.last().filter(|level| level.width > 1 || level.height > 1) {
-        levels.push(level.halved());
+}
+
+impl Seen {
+    /// Looks up the versions chosen.
+    fn look(&mut self, texture: &Texture, n: usize) {
+        let Self { s, t, faces, levels, places, strides, right, below, four, words, .. } = self;
+        find(texture.width, texture.height, &s[..n], &t[..n], &levels[..n], places, strides, right, below);
+        let [a, b, c, d] = four;
+        for i in 0..n {
+            let Some(begin) = texture.levels.get(levels[i] as usize) else { continue };
+            let at = faces[i] as usize * texture.face + begin + places[i] as usize;
+            [a[i], b[i], c[i], d[i]] = texture.four(at, strides[i] as usize);
+        }
+        between(&right[..n], &below[..n], a, b, c, d, words);
     }
-    Some(levels)
+
+    /// Adds what the next versions show, where they do.
+    fn mix(&mut self, next: &mut Self, texture: &Texture, n: usize) {
+        let (mut count, mut from) = (0, [0; MANY]);
+        for i in 0..n {
+            // Written in any case, and kept if it is to be.
+            (next.s[count], next.t[count], next.faces[count]) = (self.s[i], self.t[i], self.faces[i]);
+            (next.levels[count], from[count]) = (self.levels[i] + 1, i);
+            count += usize::from(self.shares[i] > 0);
+        }
+        next.look(texture, count);
+        for (&i, &word) in from[..count].iter().zip(&next.words) {
+            self.words[i] = weighted([self.words[i], word], [256 - self.shares[i], self.shares[i]]);
+        }
+    }
+}
+
+vectorised! {
+    /// Chooses versions, and brings coordinates into the texture.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    fn choose(texture: &Texture, s: &[f32], t: &[f32], dense: &[f32], seen: &mut Seen) {
+        let n = s.len().min(MANY);
+        let (s, t, dense) = (&s[..n], &t[..n], &dense[..n]);
+        let Seen { s: inside_s, t: inside_t, levels, shares, .. } = seen;
+        let last = texture.levels.len() as i32 - 1;
+        let whole = |x: f32| {
+            let part = x - rounded(x);
+            let part = if part < 0.0 { part + 1.0 } else { part };
+            // What is no number, or too large to have a fraction, is 0.
+            if part <= 1.0 { part } else { 0.0 }
+        };
+        for i in 0..n {
+            // 3.5 / sqrt(8): a texel a pixel is still the full version.
+            let scaled = if dense[i] > 1.0 { (dense[i] * 1.237_436_9).min(1e9) } else { 1.0 };
+            let exponent = (scaled.to_bits() >> 23) as i32 - 127;
+            let mantissa = f32::from_bits(scaled.to_bits() & 0x007f_ffff | 0x3f80_0000);
+            let between = if exponent < last { (2.0 * mantissa - 3.0) * 256.0 } else { 0.0 };
+            // Less than a few steps of a byte apart, one of them will do.
+            levels[i] = (exponent.min(last) + i32::from(between > 240.0)) as u32;
+            shares[i] = nearest(if (between > 16.0) & (between <= 240.0) { between } else { 0.0 });
+            (inside_s[i], inside_t[i]) = (whole(s[i]), whole(t[i]));
+        }
+    }
+
+    /// Finds texels: where they are on a version, and from each row of it to the next.
+    #[allow(clippy::cast_precision_loss)]
+    fn find(
+        width: u32, height: u32, s: &[f32], t: &[f32], levels: &[u32], places: &mut [u32; MANY],
+        strides: &mut [u32; MANY], right: &mut [u32; MANY], below: &mut [u32; MANY],
+    ) {
+        let n = s.len().min(MANY);
+        let (s, t, levels) = (&s[..n], &t[..n], &levels[..n]);
+        for i in 0..n {
+            let (w, h) = ((width >> levels[i]).max(1), (height >> levels[i]).max(1));
+            // In 256ths, from the middle of the first texel of the frame.
+            let x = nearest(s[i] * (256 * w) as i32 as f32) + 128;
+            let y = nearest(t[i] * (256 * h) as i32 as f32) + 128;
+            strides[i] = w + 2;
+            places[i] = (y >> 8) * (w + 2) + (x >> 8);
+            (right[i], below[i]) = (x & 255, y & 255);
+        }
+    }
+
+    /// The words between four texels.
+    fn between(
+        right: &[u32], below: &[u32], a: &[u32; MANY], b: &[u32; MANY], c: &[u32; MANY], d: &[u32; MANY],
+        words: &mut [u32; MANY],
+    ) {
+        let n = right.len().min(MANY);
+        let (right, below) = (&right[..n], &below[..n]);
+        for i in 0..n {
+            let both = right[i] * below[i];
+            // Rounded so that they still sum to 256.
+            let q = (256 * right[i] - both + 128) >> 8;
+            let r = (256 * below[i] - both + 128) >> 8;
+            let s = (both + 128) >> 8;
+            words[i] = weighted([a[i], b[i], c[i], d[i]], [256 - q - r - s, q, r, s]);
+        }
+    }
+
+    /// The colours in words.
+    #[allow(clippy::cast_precision_loss)]
+    fn split(words: &[u32], r: &mut [f32], g: &mut [f32], b: &mut [f32]) {
+        let n = words.len();
+        let (r, g, b) = (&mut r[..n], &mut g[..n], &mut b[..n]);
+        for i in 0..n {
+            let channel = |shift: u32| (words[i] >> shift & 255) as i32 as f32 * (1.0 / 255.0);
+            (r[i], g[i], b[i]) = (channel(0), channel(8), channel(16));
+        }
+    }
 }
 
 #[cfg(test)]
@@ -199,10 +379,11 @@ mod tests {
     #[test]
     fn texels_stand_where_they_were_given() {
         let texture = Texture::flat(2, 1, 3, &[255, 0, 0, 0, 0, 255]).expect("a texture");
-        assert_eq!(texture.flat_at(0.25, 0.5, [0.0; 2]), [1.0, 0.0, 0.0]);
-        assert_eq!(texture.flat_at(1.75, 0.5, [0.0; 2]), [0.0, 0.0, 1.0]);
+        let mut reader = Reader::default();
+        assert_eq!(texture.colour(&mut reader, (0, [0.25, 0.5], 0.0)), [1.0, 0.0, 0.0]);
+        assert_eq!(texture.colour(&mut reader, (0, [1.75, 0.5], 0.0)), [0.0, 0.0, 1.0]);
         // A pixel that covers everything sees the mean.
-        let mean = texture.flat_at(0.25, 0.5, [4.0; 2]);
+        let mean = texture.colour(&mut reader, (0, [0.25, 0.5], 8.0));
         assert!((mean[0] - 0.5).abs() < 0.01 && (mean[2] - 0.5).abs() < 0.01, "{mean:?}");
     }
 
@@ -212,8 +393,9 @@ mod tests {
         let texture = Texture::cube(1, 3, &bytes).expect("a texture");
         let directions =
             [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]];
+        let mut reader = Reader::default();
         for (face, direction) in (0..6u8).zip(directions) {
-            let seen = texture.cube_at(direction, [0.0; 3], [0.0; 3]);
+            let seen = texture.colour(&mut reader, texture.face_in(direction, [0.0; 3], [0.0; 3]));
             assert!((seen[0] * 255.0 - f32::from(face * 40)).abs() < 0.01);
         }
     }

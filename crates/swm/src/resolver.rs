@@ -2,7 +2,7 @@
 //! datasets and checkpoints at home.
 
 use crate::families::{Card, load};
-use crate::{ENVS, home};
+use crate::home;
 use std::cell::RefCell;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::policy::ExpertPolicy;
@@ -85,7 +85,7 @@ impl Home {
 
 impl Resolver for Home {
     fn env(&self, request: &EvalRequest) -> Result<Box<dyn Env>> {
-        let (env, wrapping) = (ENVS.choose(&request.env)?.env()?, self.wrapping(request)?);
+        let (env, wrapping) = (crate::env(&request.env)?.env()?, self.wrapping(request)?);
         Ok(wrapping.stack.wrap(env, wrapping.goal))
     }
 
@@ -95,7 +95,7 @@ impl Resolver for Home {
 
     fn policy(&self, request: &PolicyRequest, world: &World) -> Result<Actor> {
         let (spec, slots) = (world.spec(), world.pool().len());
-        let env = ENVS.choose(&spec.id)?;
+        let env = crate::env(&spec.id)?;
         match &request.acts {
             Acts::Random => Ok(Actor::from(Box::new(RandomPolicy::new(spec, slots)) as Box<dyn Policy>)),
             Acts::Expert { id } => scripted(&env.entry, id, world).map(Actor::from),
@@ -203,6 +203,10 @@ pub fn scripted(entry: &EnvEntry, name: &str, world: &World) -> Result<Box<dyn P
     }
     let expert = match entry.experts {
         [first, ..] if name == "expert" => first,
+        [] => {
+            let hint = format!("{} has no experts: choose random or a checkpoint", entry.id);
+            return Err(Error::unknown("policy", name, ["random"], hint));
+        }
         experts => experts.iter().find(|expert| expert.id == name).ok_or_else(|| {
             let known = ["random", "expert"].into_iter().chain(experts.iter().map(|expert| expert.id()));
             Error::unknown("policy", name, known, format!("`swm envs` lists the experts of {}", entry.id))

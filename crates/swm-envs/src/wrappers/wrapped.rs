@@ -1,6 +1,7 @@
 //! [`Wrapped`]: an environment whose pictures pass through visual wrappers.
 
 use super::{View, VisualWrapper, parse};
+use std::collections::BTreeMap;
 use swm_core::{
     Action, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, RowMut, RowRef, Snapshot,
     Transition,
@@ -124,6 +125,14 @@ impl Env for Wrapped {
             self.apply(&mut frame, View::Goal);
         }
         Ok(())
+    }
+
+    fn libraries(&self) -> BTreeMap<String, String> {
+        self.env.libraries()
+    }
+
+    fn constants(&self) -> BTreeMap<String, Vec<u8>> {
+        self.env.constants()
     }
 
     fn factors(&self) -> &FactorValues {

@@ -23,7 +23,7 @@ fn pong_shows_its_frames() {
 }
 
 #[test]
-#[ignore = "JAX compiles for half a minute"]
+#[ignore = "JAX compiles for minutes"]
 fn craftax_is_played_and_drawn() {
     let Some(config) = config().filter(|config| has(config, "craftax")) else { return };
     for (id, shape, actions) in [

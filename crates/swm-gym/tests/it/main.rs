@@ -20,7 +20,7 @@ fn config() -> Option<GymConfig> {
     };
     Some(GymConfig {
         python: Python { program: PathBuf::from(program), whence: "named by $SWM_PYTHON" },
-        start: Duration::from_secs(300),
+        start: Duration::from_secs(1800),
         answer: Duration::from_secs(60),
         restarts: 2,
     })

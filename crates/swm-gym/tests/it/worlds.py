@@ -121,7 +121,8 @@ class Room(gymnasium.Env):
             print('about to die', file=sys.stderr, flush=True)
             os.kill(os.getpid(), signal.SIGKILL)
         self.position = self.position + action * self.variation_space['agent']['size'].value
-        info = {'steps': self.t, 'moved': np.float32(np.abs(action).sum()), 'goal_distance': float(np.abs(self.position).sum())}
+        distance = float(np.abs(self.position).sum())
+        info = {'steps': self.t, 'moved': np.float32(np.abs(action).sum()), 'goal_distance': distance}
         if self.t % 2:
             info['noise'] = self.np_random.uniform()
         info['success'] = self.t >= 6

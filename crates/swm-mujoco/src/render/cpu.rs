@@ -40,7 +40,7 @@ impl Renderer for Cpu {
         DESK.with_borrow_mut(|desk| {
             let Scene { abstracted, model, look } = scene;
             if desk.look.as_ref() != Some(look) {
-                desk.assets = assets::of(model, look);
+                assets::fill(&mut desk.assets, model, look);
                 desk.look = Some(look.clone());
             }
             convert::fill(&mut desk.scene, abstracted, model, (width, height));

@@ -6,6 +6,7 @@ mod golden;
 #[path = "../../src/render/likeness.rs"]
 mod likeness;
 mod link;
+mod no_gl;
 mod readout;
 mod recorded;
 mod views;

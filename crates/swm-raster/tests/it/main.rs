@@ -2,3 +2,4 @@
 
 mod odd;
 mod plain;
+mod scenes;

@@ -56,7 +56,7 @@ struct RenderArgs {
 fn render(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
     let envs: Vec<EnvChoice> = match &args.envs[..] {
         [] => swm_mujoco::ENVS.rows.iter().map(EnvChoice::from).collect(),
-        ids => ids.iter().map(|id| ENVS.choose(id)).collect::<swm_core::Result<_>>()?,
+        ids => ids.iter().map(|id| swm::env(id)).collect::<swm_core::Result<_>>()?,
     };
     let cpu = |work: &mut dyn FnMut() -> swm_core::Result<()>| with(Renderer::Cpu, work);
     let egl = |work: &mut dyn FnMut() -> swm_core::Result<()>| with(Renderer::Egl, work);
@@ -117,7 +117,7 @@ struct DataArgs {
 /// Measures loading and converting.
 fn data(args: &DataArgs, context: &Context) -> anyhow::Result<()> {
     let report = bench_data(
-        &ENVS.choose(&args.env)?,
+        &swm::env(&args.env)?,
         &DataBenchConfig {
             episodes: args.episodes,
             steps: args.steps,
@@ -264,7 +264,7 @@ pub fn bench(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
     };
     let entries: Vec<EnvChoice> = match &args.envs[..] {
         [] => ENVS.rows.iter().map(EnvChoice::from).collect(),
-        ids => ids.iter().map(|id| ENVS.choose(id)).collect::<swm_core::Result<_>>()?,
+        ids => ids.iter().map(|id| swm::env(id)).collect::<swm_core::Result<_>>()?,
     };
     let report = bench_envs(
         &entries,

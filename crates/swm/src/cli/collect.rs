@@ -7,8 +7,8 @@ use clap::Args;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use swm::home;
 use swm::resolver::acting;
-use swm::{ENVS, home};
 use swm_core::{EnvChoice, Error, Result, View};
 use swm_data::lance::{Shard, create_shard};
 use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions};
@@ -108,7 +108,7 @@ pub struct Collection<'a> {
 pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
     let location = home::target(&args.output, args.format.as_deref())?;
     let collection = Collection {
-        env: ENVS.choose(&args.env)?,
+        env: swm::env(&args.env)?,
         location: &location,
         format: args.format.as_deref(),
         shard: args.shard,

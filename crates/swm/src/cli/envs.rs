@@ -4,7 +4,7 @@ use super::{complain, emit, emit_json, table};
 use clap::Args;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeSet;
-use swm::{ENVS, describe};
+use swm::{ENVS, describe, gym};
 use swm_core::EnvChoice;
 
 /// Arguments of `swm envs`.
@@ -24,7 +24,7 @@ pub struct FovsArgs {
 /// Lists the environments.
 pub fn envs(args: &EnvsArgs, as_json: bool) -> anyhow::Result<()> {
     if let Some(id) = &args.env {
-        return show(&ENVS.choose(id)?, as_json);
+        return show(&swm::env(id)?, as_json);
     }
     if as_json {
         let all = ENVS.rows.iter().map(|row| match row.env() {
@@ -59,6 +59,11 @@ pub fn envs(args: &EnvsArgs, as_json: bool) -> anyhow::Result<()> {
         .collect();
     emit(&table(&["environment", "action", "factors", "experts", "task"], rows));
     missing.iter().for_each(|error| complain(&format!("missing: {error}\n")));
+    emit("\nand every environment of Gymnasium, such as\n");
+    emit(&table(
+        &["environment", "what it is"],
+        gym::EXAMPLES.iter().map(|(id, what)| vec![(*id).to_owned(), (*what).to_owned()]),
+    ));
     Ok(())
 }
 
@@ -94,7 +99,7 @@ fn show(choice: &EnvChoice, as_json: bool) -> anyhow::Result<()> {
 
 /// Lists the factors of variation of one environment.
 pub fn fovs(args: &FovsArgs, as_json: bool) -> anyhow::Result<()> {
-    let env = ENVS.choose(&args.env)?.env()?;
+    let env = swm::env(&args.env)?.env()?;
     let space = &env.spec().variation_space;
     if as_json {
         return emit_json(&json!({

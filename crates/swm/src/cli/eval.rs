@@ -9,7 +9,7 @@ use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use swm::resolver::{Home, parse_score};
-use swm::{ENVS, families, home};
+use swm::{families, home};
 use swm_core::results::{Counting, Proportion, Run};
 use swm_core::{EnvChoice, Error, Result, Results};
 use swm_data::{Part, Split};
@@ -119,7 +119,7 @@ impl EvalArgs {
         let Some(env) = self.env.clone().or(trained_on) else {
             return Err(Error::config("--env", "no environment is given", "name one (`swm envs` lists them)"));
         };
-        let chosen = ENVS.choose(&env)?;
+        let chosen = swm::env(&env)?;
         let mut policies = vec![];
         for found in found {
             policies.extend(self.acts(&chosen, found)?);
@@ -214,7 +214,7 @@ enum Kind {
 /// Finds out what a word stands for.
 fn find(given: &str, env: Option<&str>) -> Result<Found> {
     let scripted = |acts| Found { name: given.to_owned(), kind: Kind::Acts(acts), env: None, image: None };
-    let env = env.map(|id| ENVS.choose(id)).transpose()?;
+    let env = env.map(|id| swm::env(id)).transpose()?;
     if given == "random" {
         return Ok(scripted(Acts::Random));
     }

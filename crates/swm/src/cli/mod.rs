@@ -50,7 +50,7 @@ enum Command {
     Envs(envs::EnvsArgs),
     /// List an environment's factors of variation
     Fovs(envs::FovsArgs),
-    /// List, install and verify what 3-D worlds need: MuJoCo's library, models, meshes
+    /// List, install and verify what worlds need of others: MuJoCo and its models, Gymnasium, the Atari games, Craftax
     Assets(assets::AssetsArgs),
     /// List the visual wrappers and their settings
     Wrappers,

@@ -5,7 +5,7 @@ use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use swm::families::{FAMILIES, PlayOn, TrainOn, Training};
-use swm::{ENVS, home};
+use swm::home;
 use swm_core::{EnvPool, Error, Result};
 use swm_data::Reader;
 use swm_models::{Observer, TrainOptions, TrainSummary, device};
@@ -92,7 +92,7 @@ fn play(
     options: TrainOptions,
     context: &Context,
 ) -> anyhow::Result<()> {
-    let choice = ENVS.choose(env)?;
+    let choice = swm::env(env)?;
     let threads = swm_core::pool::threads(context.threads)?;
     let worlds = |count: usize| {
         let envs = (0..count).map(|_| choice.env()).collect::<Result<Vec<_>>>()?;

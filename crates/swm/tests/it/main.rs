@@ -3,6 +3,7 @@
 
 mod collecting;
 mod data;
+mod gym;
 mod listing;
 mod pipeline;
 mod python;

@@ -23,8 +23,8 @@ struct Group {
     textures: BTreeMap<(usize, u64), Arc<Texture>>,
 }
 
-/// The assets of a model that looks so.
-pub(super) fn of(model: &MjModel, look: &Look) -> Assets {
+/// Puts the assets of a model that looks so in the place of others.
+pub(super) fn fill(assets: &mut Assets, model: &MjModel, look: &Look) {
     static KNOWN: Mutex<Vec<(u64, Group)>> = Mutex::new(vec![]);
     let mut known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
     let (number, mut group) = match known.iter().position(|(number, _)| *number == look.group) {
@@ -43,12 +43,13 @@ pub(super) fn of(model: &MjModel, look: &Look) -> Assets {
         let made = group.textures.entry((place, content)).or_insert_with(|| Arc::new(texture(model, place)));
         Arc::clone(made)
     });
-    let assets = Assets { textures: textures.collect(), meshes: group.meshes.clone() };
+    assets.textures.clear();
+    assets.textures.extend(textures);
+    assets.meshes.clone_from(&group.meshes);
     if known.len() >= GROUPS {
         known.remove(0);
     }
     known.push((number, group));
-    assets
 }
 
 /// A number of MuJoCo's as a place; 0 for what is none.

@@ -57,14 +57,16 @@ pub struct Canvas {
 }
 
 impl Library {
-    /// Opens EGL. Its symbols become visible to all: MuJoCo looks for OpenGL's functions through them.
+    /// Opens EGL: the library that `SWM_EGL_LIBRARY` names, else the system's. Its symbols become visible to all: MuJoCo looks for
+    /// OpenGL's functions through them.
     ///
     /// # Errors
     /// When it is not installed.
     pub fn open() -> Result<Self> {
-        let failed = |error: libloading::Error| Error::external("opening libEGL.so.1", error);
+        let name = std::env::var("SWM_EGL_LIBRARY").unwrap_or_else(|_| "libEGL.so.1".to_owned());
+        let failed = |error: libloading::Error| Error::external(format!("opening {name}"), error);
         // SAFETY: opening EGL runs the initialisers of a system library.
-        let shared = unsafe { Shared::open(Some("libEGL.so.1"), RTLD_NOW | RTLD_GLOBAL) }.map_err(failed)?;
+        let shared = unsafe { Shared::open(Some(&name), RTLD_NOW | RTLD_GLOBAL) }.map_err(failed)?;
         // SAFETY: each is called as its specification declares it.
         unsafe {
             Ok(Self {

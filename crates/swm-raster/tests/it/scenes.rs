@@ -1,0 +1,152 @@
+//! Scenes of every kind, among them those nobody would draw: sizes of zero, places that are no numbers, cameras inside of bodies.
+#![allow(clippy::expect_used, reason = "for tests")]
+
+use proptest::prelude::*;
+use std::sync::Arc;
+use swm_raster::{
+    Assets, Axis, Camera, Canvas, Corner, Geom, Haze, IDENTITY, Light, Mapping, Mesh, Paint, Scene, Shape, Target,
+    Texture, V3,
+};
+
+/// Numbers, among them those that are trouble.
+fn number() -> impl Strategy<Value = f32> {
+    prop_oneof![
+        8 => -3.0..3.0f32,
+        1 => prop::sample::select(vec![
+            0.0, -0.0, 1.0, f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e30, -1e30, 1e-30, f32::MIN_POSITIVE, f32::MAX,
+        ]),
+    ]
+}
+
+fn vector() -> impl Strategy<Value = V3> {
+    prop::array::uniform3(number())
+}
+
+fn shape() -> impl Strategy<Value = Shape> {
+    let axis =
+        || {
+            (number(), number(), number(), 1..50usize, any::<bool>())
+                .prop_map(|(half, pad, step, cells, infinite)| Axis { half, pad, step, cells, infinite })
+        };
+    prop_oneof![
+        (axis(), axis()).prop_map(|(x, y)| Shape::Plane(x, y)),
+        vector().prop_map(Shape::Ellipsoid),
+        (number(), number()).prop_map(|(radius, half)| Shape::Capsule(radius, half)),
+        (number(), number()).prop_map(|(radius, half)| Shape::Cylinder(radius, half)),
+        vector().prop_map(Shape::Box),
+        (0..4usize).prop_map(Shape::Mesh),
+    ]
+}
+
+fn rotation() -> impl Strategy<Value = [f32; 9]> {
+    prop_oneof![3 => Just(IDENTITY), 1 => prop::array::uniform9(number())]
+}
+
+fn paint() -> impl Strategy<Value = Option<Paint>> {
+    let mapping = prop_oneof![
+        (prop::array::uniform2(number()), prop::array::uniform2(number()))
+            .prop_map(|(scale, offset)| Mapping::Flat { scale, offset }),
+        vector().prop_map(Mapping::Cube),
+        prop::array::uniform2(number()).prop_map(Mapping::Sides),
+        Just(Mapping::Own),
+    ];
+    prop::option::of((0..4usize, mapping).prop_map(|(texture, mapping)| Paint { texture, mapping }))
+}
+
+/// A thing.
+pub fn geom() -> impl Strategy<Value = Geom> {
+    let looks = (prop::array::uniform4(number()), number(), number(), number(), number(), paint());
+    (shape(), vector(), rotation(), looks, any::<bool>()).prop_map(|(shape, position, rotation, looks, casts)| {
+        let (rgba, emission, specular, shininess, reflectance, paint) = looks;
+        let label = Some(1);
+        Geom { shape, position, rotation, rgba, emission, specular, shininess, reflectance, paint, label, casts }
+    })
+}
+
+fn light() -> impl Strategy<Value = Light> {
+    let colours = (vector(), vector(), vector());
+    (vector(), vector(), any::<bool>(), vector(), (number(), number()), colours, any::<bool>()).prop_map(
+        |(position, direction, directional, attenuation, (cutoff, exponent), (ambient, diffuse, specular), shadows)| {
+            Light {
+                position,
+                direction,
+                directional,
+                attenuation,
+                cutoff: 60.0 * cutoff,
+                exponent,
+                ambient,
+                diffuse,
+                specular,
+                shadows,
+            }
+        },
+    )
+}
+
+fn camera() -> impl Strategy<Value = Camera> {
+    let usual = vector().prop_map(|position| Camera {
+        position,
+        forward: [0.0, 1.0, 0.0],
+        up: [0.0, 0.0, 1.0],
+        frustum: [-0.02, 0.02, -0.02, 0.02],
+        near: 0.02,
+        far: 100.0,
+        orthographic: false,
+    });
+    let odd = (vector(), vector(), vector(), prop::array::uniform4(number()), number(), number(), any::<bool>())
+        .prop_map(|(position, forward, up, frustum, near, far, orthographic)| Camera {
+            position,
+            forward,
+            up,
+            frustum,
+            near,
+            far,
+            orthographic,
+        });
+    prop_oneof![3 => usual, 1 => odd]
+}
+
+/// A scene.
+pub fn scene() -> impl Strategy<Value = Scene> {
+    let more = (prop::option::of(0..4usize), any::<bool>(), any::<bool>(), number(), number());
+    (camera(), prop::collection::vec(geom(), 0..12), prop::collection::vec(light(), 0..4), more).prop_map(
+        |(camera, geoms, lights, (sky, shadows, reflections, shadow_reach, shadow_angle))| Scene {
+            camera,
+            geoms,
+            lights,
+            sky,
+            haze: Some(Haze { rgb: [0.5; 3], depth: 0.3 }),
+            shadows,
+            reflections,
+            shadow_reach,
+            shadow_angle,
+        },
+    )
+}
+
+/// A tetrahedron, triangles without area and with numbers that are none, nothing; a flat and a cube texture.
+pub fn assets() -> Assets {
+    let corner = |place: V3| Corner { place, normal: place, coordinates: [0.5, 2.5] };
+    let [a, b, c, d] = [[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, -1.0, -1.0]].map(corner);
+    let solid = Mesh::new([[a, b, d], [a, d, c], [a, c, b], [b, c, d]]);
+    let broken = Mesh::new([[a, a, a], [a, b, corner([f32::NAN, 0.0, 0.0])], [a, b, corner([1e30; 3])]]);
+    let bytes: Vec<u8> = (0..72u8).map(|i| i.wrapping_mul(89)).collect();
+    let flat = Texture::flat(3, 2, 3, &bytes[..18]).expect("a texture");
+    let cube = Texture::cube(2, 3, &bytes).expect("a texture");
+    Assets {
+        textures: vec![Arc::new(flat), Arc::new(cube), Arc::new(Texture::white())],
+        meshes: vec![Arc::new(solid), Arc::new(broken), Arc::new(Mesh::new([]))],
+    }
+}
+
+const SIZE: (usize, usize) = (13, 9);
+
+/// Colours, depths and labels.
+pub fn drawn(canvas: &mut Canvas, scene: &Scene, assets: &Assets) -> (Vec<u8>, Vec<u32>, Vec<i32>) {
+    let n = SIZE.0 * SIZE.1;
+    let (mut rgb, mut depths, mut labels) = (vec![0; 3 * n], vec![0.0; n], vec![0; n]);
+    canvas.draw(scene, assets, SIZE, 4, Target::Rgb(&mut rgb));
+    canvas.draw(scene, assets, SIZE, 4, Target::Depth(&mut depths));
+    canvas.draw(scene, assets, SIZE, 4, Target::Labels(&mut labels));
+    (rgb, depths.into_iter().map(f32::to_bits).collect(), labels)
+}

@@ -1,0 +1,71 @@
+//! Gymnasium environments on the command line. They need a Python that has Gymnasium, which `$SWM_PYTHON` names.
+
+use crate::{Swm, text};
+
+/// Whether there is a Python for these tests, which may lack some packages.
+fn python(module: &str) -> bool {
+    let Some(program) = std::env::var_os("SWM_PYTHON").filter(|value| !value.is_empty()) else {
+        println!("SKIPPED: set SWM_PYTHON to a Python with Gymnasium, as `make test` does");
+        return false;
+    };
+    let command = format!("import {module}");
+    let output = std::process::Command::new(program).args(["-c", &command]).output().expect("$SWM_PYTHON starts");
+    // Gymnasium must be there; other packages may.
+    assert!(output.status.success() || module != "gymnasium", "{}", text(&output.stderr));
+    if !output.status.success() {
+        println!("SKIPPED: $SWM_PYTHON has no {module}");
+    }
+    output.status.success()
+}
+
+#[test]
+fn gymnasium_environments_are_collected_and_evaluated() {
+    if !python("gymnasium") {
+        return;
+    }
+    let swm = Swm::new();
+    let collect = ["collect", "CartPole-v1", "--policy", "random", "--episodes", "5", "--image", "32", "--seed", "4"];
+    let with = |more: &[&str]| {
+        let args: Vec<&str> = collect.iter().chain(more).copied().collect();
+        swm.json(&args);
+    };
+    with(&["-o", "one", "--envs", "1"]);
+    with(&["-o", "three", "--envs", "3", "--threads", "2"]);
+    with(&["-o", "noisy", "--envs", "2", "--wrapper", "noise"]);
+    let [one, three, noisy] = ["one", "three", "noisy"].map(|name| swm.json(&["inspect", name]));
+    assert_eq!(one["content_hash"], three["content_hash"], "environments and threads change nothing");
+    assert_ne!(one["content_hash"], noisy["content_hash"], "a wrapper changes pictures");
+    assert_eq!((&one["episodes"], &one["steps"]), (&noisy["episodes"], &noisy["steps"]));
+    assert!(one["manifest"]["libraries"]["gymnasium"].is_string(), "{}", one["manifest"]);
+    swm.json(&["eval", "random", "--env", "CartPole-v1", "--episodes", "3", "--image", "32", "-o", "floor"]);
+    assert_eq!(swm.json(&["fovs", "CartPole-v1"])["variation"], serde_json::json!({}));
+    swm.refuses(&["collect", "CartPoel-v1", "-o", "x", "--policy", "random"], 2, &["did you mean CartPole-v1"]);
+    swm.refuses(&["collect", "CartPole-v1", "-o", "x"], 2, &["CartPole-v1 has no experts"]);
+    let mut command = swm.command(&["envs", "CartPole-v1"]);
+    let output = command.env("SWM_PYTHON", "/no/such/python").output().expect("swm starts");
+    assert_eq!(output.status.code(), Some(2));
+    assert!(text(&output.stderr).contains("/no/such/python (named by $SWM_PYTHON)"), "{}", text(&output.stderr));
+}
+
+/// The robustness sweep of the paper's Atari listing: three wrappers.
+#[test]
+fn atari_games_pass_through_wrappers() {
+    if !python("ale_py") {
+        return;
+    }
+    let swm = Swm::new();
+    let sweep = [None, Some("noise"), Some("blur"), Some("color-jitter")];
+    let hashes = sweep.map(|wrapper| {
+        let name = wrapper.unwrap_or("plain");
+        let mut args = vec!["collect", "ALE/Pong-v5", "-o", name, "--policy", "random", "--episodes", "2"];
+        args.extend(["--max-steps", "5", "--image", "64", "--envs", "2"]);
+        args.extend(wrapper.into_iter().flat_map(|name| ["--wrapper", name]));
+        swm.json(&args);
+        let found = swm.json(&["inspect", name]);
+        assert!(found["manifest"]["libraries"]["ale-py"].is_string(), "{}", found["manifest"]);
+        found["content_hash"].as_str().expect("a hash").to_owned()
+    });
+    for (i, hash) in hashes.iter().enumerate() {
+        assert!(!hashes[..i].contains(hash), "{:?} shows", sweep[i]);
+    }
+}

@@ -29,9 +29,11 @@ def open_world(
     inside = [] if drawn is not None else list(wrappers)
     bridge = _engine.bridge()
     envs: list[Any] = []
+    # Ours draw in any size, which beats resizing.
+    sized = {"image_shape": image} if image is not None and env_name in _engine.envs() else {}
 
     def make() -> Any:
-        made = bridge.make(env_name, dict(options), inside)
+        made = bridge.make(env_name, {**options, **sized}, inside)
         if max_episode_steps is not None:
             made.max_episode_steps = max_episode_steps
         if resample is not None:

@@ -30,8 +30,10 @@ def variation(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[st
     values = options.get("variation_values") or {}
     if not isinstance(values, Mapping):
         raise ValueError(f"options['variation_values']: expected a dict from factors to values, got {values!r}")
+    values = {_known(key, spaces): value for key, value in values.items()}
     pinned = {key: _numbers(key, value, spaces.get(key)) for key, value in values.items()}
-    return {"variation": None if sampled is None else sorted(sampled), "variation_values": pinned}
+    sampled = None if sampled is None else sorted({_known(key, spaces) for key in sampled})
+    return {"variation": sampled, "variation_values": pinned}
 
 
 def reset(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[str, Any]]) -> str:
@@ -42,6 +44,13 @@ def reset(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[str, A
         for name in ("state", "goal_state")
     }
     return json.dumps({"variation": variation(options, spaces), **given})
+
+
+def _known(key: str, spaces: Mapping[str, Any]) -> str:
+    """The environment's name of a factor. The paper says `agent.size` where Push-T says `agent.scale`."""
+    group, _, name = key.rpartition(".")
+    scale = f"{group}.scale"
+    return scale if name == "size" and key not in spaces and scale in spaces else key
 
 
 def _numbers(key: str, value: Any, space: Mapping[str, Any] | None) -> list[float]:

@@ -1,6 +1,7 @@
 """The listings of the paper, as printed but for smaller numbers, and the extensions that it describes."""
 
 from functools import partial
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -186,7 +187,7 @@ def test_a_format_of_ones_own(tmp_path):
 
     class NpzDataset(swm.data.Dataset):
         def __init__(self, folder, **kwargs):
-            self.files = sorted(folder.glob("*.npz"))
+            self.files = sorted(Path(folder).glob("*.npz"))
             self.episodes = [dict(np.load(file)) for file in self.files]
             lengths = np.array([len(episode["action"]) for episode in self.episodes])
             super().__init__(lengths, np.concatenate([[0], lengths.cumsum()[:-1]]), **kwargs)
@@ -308,7 +309,7 @@ def test_an_environment_of_ones_own(tmp_path, corridor):
     assert np.array_equal(starts, places)
     metrics = world.evaluate(episodes=4, seed=0, options={"variation_values": {"start": 0}}, floor=False)
     assert metrics["success_rate"] == 100 and metrics["steps"].tolist() == [5] * 4
-    with pytest.raises(ValueError, match=r"agent\.speed"):
+    with pytest.raises(ValueError, match=r"agent\.velocity.*swm fovs"):
         world.reset(options={"variation": ["agent.velocity"]})
 
 
@@ -337,7 +338,7 @@ def test_a_wrapper_of_ones_own(corridor):
     )
     plain = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(32, 32))
     for one in (mixed, plain):
-        one.reset(seed=0)
+        one.reset(seed=[5, 6])
     assert np.array_equal(mixed.infos["state"], plain.infos["state"])
     difference = np.abs(255.0 - mixed.infos["pixels"] - plain.infos["pixels"])
     assert 1 < difference.mean() < 6

@@ -52,8 +52,9 @@ class NativeEnv(gymnasium.Env):
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode: expected 'rgb_array' or None, got {render_mode!r}")
-        full = ",".join([name, *(f"{key}={value}" for key, value in options.items())])
-        self._env = _engine.NativeEnv(full, "[]", False)
+        #: Its id with its options.
+        self.name = ",".join([name, *(f"{key}={value}" for key, value in options.items())])
+        self._env = _engine.NativeEnv(self.name, "[]", False)
         self._described: dict[str, Any] = json.loads(self._env.spec())
         self.render_mode = render_mode
         self.image_shape = (int(image_shape[0]), int(image_shape[1]))
@@ -66,7 +67,15 @@ class NativeEnv(gymnasium.Env):
             self.observation_space = gymnasium.spaces.Dict(
                 {"state": gymnasium.spaces.Box(-np.inf, np.inf, state.shape, state.dtype)}
             )
-        self._steps = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy needs to go on from here."""
+        return {**self.__dict__, "_env": self.snapshot()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._env = _engine.NativeEnv(self.name, "[]", False)
+        self._env.restore(state["_env"])
 
     @property
     def max_episode_steps(self) -> int:

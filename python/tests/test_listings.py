@@ -11,7 +11,7 @@ import stable_worldmodel as swm
 from stable_worldmodel.wrapper.visual import ColorJitterWrapper, NoiseWrapper, OcclusionWrapper
 
 torch = pytest.importorskip("torch")
-torch.set_num_threads(2)
+torch.set_num_threads(1)
 
 
 class MyWorldModel(torch.nn.Module):

@@ -100,7 +100,7 @@ def train(
         **overrides: What differs from it, with `__` for dots: `train__steps=1000`.
     """
     words = ["swm", "train", model]
-    for flag, value in (("--data", data), ("--env", env), ("--out", out), ("--preset", preset), ("--device", device)):
+    for flag, value in (("--data", data), ("--env", env), ("--output", out), ("--preset", preset), ("--device", device)):
         if value is not None:
             words += [flag, str(value)]
     words += [f"{key.replace('__', '.')}={value}" for key, value in overrides.items()]

@@ -127,8 +127,8 @@ vectorised! {
     /// The depths at which rays of a row, which begins so, meet the sky.
     #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
     fn depths(radius: f32, row: V3, right: V3, far: &mut [f32]) {
-        for i in 0..far.len() {
-            far[i] = depth(radius, add(row, scale(right, i as u32 as i32 as f32 + 0.5)));
+        for (i, far) in far.iter_mut().enumerate() {
+            *far = depth(radius, add(row, scale(right, i as u32 as i32 as f32 + 0.5)));
         }
     }
 

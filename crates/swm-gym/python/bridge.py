@@ -195,6 +195,16 @@ def factor(key, space):
     return {'key': key, 'space': form, 'init': np.asarray(value, np.float64).reshape(-1).tolist()}
 
 
+def variation_space(env):
+    """The factors of an environment: its own, or those of the outermost wrapper that has some."""
+    while env is not None:
+        space = getattr(env, 'variation_space', None)
+        if space is not None:
+            return space
+        env = getattr(env, 'env', None)
+    return None
+
+
 def factors(space, prefix=''):
     """All leaves of a nested `variation_space`: (JSON, leaf), in sampling order."""
     inside = getattr(space, 'spaces', None)
@@ -234,7 +244,7 @@ class Bridge:
         """Tries the environment (a reset, a step, a picture) to learn what it is."""
         self.env = env
         self.actions = Actions(env.action_space)
-        self.factors = list(factors(getattr(env.unwrapped, 'variation_space', None)))
+        self.factors = list(factors(variation_space(env)))
         limit = max_episode_steps or getattr(env.spec, 'max_episode_steps', None)
         self.max_episode_steps = limit or STEPS
 
@@ -273,12 +283,14 @@ class Bridge:
         if self.goal_shape:
             self.goal_at = self.place(math.prod(self.goal_shape) * 3)
 
-        top = type(env.unwrapped).__module__.partition('.')[0]
+        # Versions of the packages behind it: that of its class, that of its registration, and those it names itself.
+        modules = type(env.unwrapped).__module__, str(getattr(env.spec, 'entry_point', ''))
+        packages = (module.partition(':')[0].partition('.')[0] for module in modules)
         self.libraries = {}
-        for name in ('gymnasium', 'numpy', top, *getattr(env.unwrapped, 'libraries', ())):
+        for name in ('gymnasium', 'numpy', *packages, *getattr(env.unwrapped, 'swm_libraries', ())):
             try:
                 self.libraries[name.replace('_', '-')] = importlib.metadata.version(name)
-            except importlib.metadata.PackageNotFoundError:
+            except (importlib.metadata.PackageNotFoundError, ValueError):
                 pass
 
     def place(self, size):
@@ -299,7 +311,8 @@ class Bridge:
     def first_picture(self):
         """What `render` gives, or the observation that is a picture; None, and why, where there is neither."""
         try:
-            picture = self.env.render() if self.env.render_mode == 'rgb_array' else None
+            # Some environments draw without having been asked for a mode.
+            picture = self.env.render() if self.env.render_mode in ('rgb_array', None) else None
             if is_picture(picture):
                 return picture
             self.no_picture = f'render() gives {type(picture).__name__} in mode {self.env.render_mode!r}'
@@ -323,7 +336,7 @@ class Bridge:
             'picture': self.render_shape and {'size': self.render_shape, 'offset': self.picture_at},
             'goal': self.goal_shape and {'size': self.goal_shape, 'offset': self.goal_at},
             'no_picture': self.no_picture,
-            'pixel_art': bool(getattr(self.env.unwrapped, 'pixel_art', False)),
+            'pixel_art': bool(getattr(self.env.unwrapped, 'swm_pixel_art', False)),
             'max_episode_steps': self.max_episode_steps,
             'libraries': self.libraries,
             'size': self.size,

@@ -49,9 +49,9 @@ class Craftax(gymnasium.Env):
     """One world of Craftax."""
 
     metadata = {'render_modes': ['rgb_array'], 'render_fps': 30}
-    libraries = ('craftax', 'jax')
+    swm_libraries = ('craftax', 'jax')
     # Scaled to the size of a picture without blending neighbours.
-    pixel_art = True
+    swm_pixel_art = True
 
     def __init__(self, name, shape, render_mode=None):
         self.render_mode = render_mode

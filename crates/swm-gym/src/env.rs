@@ -239,6 +239,11 @@ impl GymEnv {
         }
         let space = &self.form.spec.variation_space;
         let VariationRequest { variation, variation_values } = &options.variation;
+        let asked = !variation_values.is_empty() || variation.as_ref().is_some_and(|keys| !keys.is_empty());
+        if asked && space.factors().is_empty() {
+            let problem = "it has none: neither the environment nor a wrapper of it has a `variation_space`";
+            return Err(Error::config(format!("factors of variation of {id}"), problem, "ask for none"));
+        }
         let mut arguments = serde_json::json!({"seed": small(seed)});
         if let Some(keys) = variation {
             for key in keys {

@@ -189,7 +189,9 @@ impl Process {
             ("SDL_AUDIODRIVER", "dummy".as_ref()),
             ("PYGAME_HIDE_SUPPORT_PROMPT", "1".as_ref()),
         ];
-        for (name, value) in defaults {
+        // Without a screen, MuJoCo's Python package draws through EGL only.
+        let headless = std::env::var_os("DISPLAY").is_none().then_some(("MUJOCO_GL", "egl".as_ref()));
+        for (name, value) in defaults.into_iter().chain(headless) {
             if std::env::var_os(name).is_none() {
                 command.env(name, value);
             }

@@ -5,10 +5,11 @@ use crate::light::Lamp;
 use crate::paint::{Lamps, Look, Painter};
 use crate::scene::{Assets, Scene, Shape};
 use crate::shadow::Shadow;
-use crate::simd::vectorised;
+use crate::simd::{nearest, vectorised};
 use crate::sky::{self, Backdrop, Veil};
-use crate::vector::{V3, add, dot, scale, sub};
+use crate::vector::{add, dot, scale, sub};
 use crate::view::View;
+use std::ops::Range;
 
 /// What to draw, and where: `height` rows of `width` pixels, the upper row first.
 pub enum Target<'a> {
@@ -31,7 +32,8 @@ pub struct Canvas {
     shadowed: Vec<(Lamp, usize)>,
     painter: Painter,
     backdrop: Backdrop,
-    colours: Vec<V3>,
+    /// Red, green and blue of all pixels.
+    colours: [Vec<f32>; 3],
     /// Places of geoms one sees through, from near to far, and how far they are.
     clear: Vec<(f32, usize)>,
 }
@@ -137,13 +139,15 @@ impl Canvas {
         self.visible(scene, assets, view, pattern(samples), |geom| !clear(scene, geom, view));
         self.lamps(scene, assets, view);
         self.painter.start(scene.geoms.len());
-        self.colours.clear();
-        self.colours.resize(view.width * view.height, [0.0; 3]);
+        for colours in &mut self.colours {
+            colours.resize(view.width * view.height, 0.0);
+        }
+        self.backdrop.paint(scene, assets, view, &mut self.main, &mut self.colours);
         if scene.reflections {
             self.reflect(scene, assets, view);
             self.painter.start(scene.geoms.len());
         }
-        let Self { main, shadows, plain, shadowed, painter, colours, backdrop, .. } = self;
+        let Self { main, shadows, plain, shadowed, painter, colours, .. } = self;
         let look = Look {
             scene,
             assets,
@@ -151,13 +155,11 @@ impl Canvas {
             lamps: Lamps { plain: plain.as_slice(), shadowed: shadowed.as_slice(), shadows: shadows.as_slice() },
             dimmed: 1.0,
         };
-        backdrop.paint(scene, assets, view, main, colours);
-        painter.paint(main, &look, whole, |pixel, part, colour| {
-            colours[pixel] = add(colours[pixel], scale(colour, part));
-        });
+        painter.paint(main, &look, whole, |pixels, part, seen| add_part(colours, pixels, part, seen));
         veil(scene, view, main, colours);
         self.see_through(scene, assets, view);
-        to_bytes(&self.colours, bytes.as_chunks_mut::<3>().0);
+        let [r, g, b] = &self.colours;
+        to_bytes(r, g, b, bytes.as_chunks_mut::<3>().0);
     }
 
     /// Prepares lights and their shadows.
@@ -224,9 +226,7 @@ impl Canvas {
             lamps: Lamps { plain: plain.as_slice(), shadowed: &[], shadows: shadows.as_slice() },
             dimmed: geom.reflectance,
         };
-        painter.paint(mirror, &look, seen, |pixel, part, colour| {
-            colours[pixel] = add(colours[pixel], scale(colour, part));
-        });
+        painter.paint(mirror, &look, seen, |pixels, part, seen| add_part(colours, pixels, part, seen));
         plain.truncate(all);
     }
 
@@ -274,11 +274,25 @@ impl Canvas {
                 Shape::Plane(..) if hind(scene, number, view) => BEHIND * geom.rgba[3],
                 _ => geom.rgba[3],
             };
-            painter.paint(glass, &look, region, |pixel, part, colour| {
-                colours[pixel] = sky::over(colour, (part * opacity).clamp(0.0, 1.0), colours[pixel]);
+            painter.paint(glass, &look, region, |pixels, part, seen| {
+                let opacity = (part * opacity).clamp(0.0, 1.0);
+                for (colours, seen) in colours.iter_mut().zip(seen) {
+                    for (colour, seen) in colours[pixels.clone()].iter_mut().zip(seen) {
+                        *colour = sky::over(*seen, opacity, *colour);
+                    }
+                }
             });
         }
         plain.truncate(all);
+    }
+}
+
+/// Adds parts of colours to those of pixels.
+fn add_part(colours: &mut [Vec<f32>; 3], pixels: Range<usize>, part: f32, seen: [&[f32]; 3]) {
+    for (colours, seen) in colours.iter_mut().zip(seen) {
+        for (colour, seen) in colours[pixels.clone()].iter_mut().zip(seen) {
+            *colour += part * seen;
+        }
     }
 }
 
@@ -318,7 +332,7 @@ fn clear(scene: &Scene, number: usize, view: &View) -> bool {
 
 /// Draws haze over the sky and the far ends of planes.
 #[allow(clippy::cast_precision_loss)]
-fn veil(scene: &Scene, view: &View, main: &Layers, colours: &mut [V3]) {
+fn veil(scene: &Scene, view: &View, main: &Layers, colours: &mut [Vec<f32>; 3]) {
     let Some(veil) = scene.haze.filter(|_| scene.sky.is_some()).and_then(|haze| Veil::new(scene, &haze, view.position))
     else {
         return;
@@ -330,8 +344,10 @@ fn veil(scene: &Scene, view: &View, main: &Layers, colours: &mut [V3]) {
         for x in 0..view.width {
             let Some((opacity, depth)) = veil.at(add(row, scale(rays.directions[0], x as f32 + 0.5))) else { continue };
             let open = main.depths[main.span(y, x, x + 1)].iter().filter(|far| **far > depth).count();
-            let pixel = &mut colours[y * view.width + x];
-            *pixel = sky::over(veil.rgb, opacity * open as f32 * share, *pixel);
+            for (colours, veil) in colours.iter_mut().zip(veil.rgb) {
+                let colour = &mut colours[y * view.width + x];
+                *colour = sky::over(veil, opacity * open as f32 * share, *colour);
+            }
         }
     }
 }
@@ -339,10 +355,12 @@ fn veil(scene: &Scene, view: &View, main: &Layers, colours: &mut [V3]) {
 vectorised! {
     /// Colours to bytes, rounded; what is no number is black.
     #[allow(clippy::manual_clamp, reason = "`clamp` would keep what is no number")]
-    fn to_bytes(colours: &[V3], bytes: &mut [[u8; 3]]) {
-        for (bytes, colour) in bytes.iter_mut().zip(colours) {
-            // Added to 2^23, a number is rounded to a whole one, which is in the lowest bits.
-            *bytes = colour.map(|x| ((x * 255.0).max(0.0).min(255.0) + 8_388_608.0).to_bits() as u8);
+    fn to_bytes(r: &[f32], g: &[f32], b: &[f32], bytes: &mut [[u8; 3]]) {
+        let n = bytes.len().min(r.len());
+        let (r, g, b, bytes) = (&r[..n], &g[..n], &b[..n], &mut bytes[..n]);
+        let byte = |x: f32| nearest((x * 255.0).max(0.0).min(255.0)) as u8;
+        for i in 0..n {
+            bytes[i] = [byte(r[i]), byte(g[i]), byte(b[i])];
         }
     }
 }

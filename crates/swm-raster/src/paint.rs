@@ -10,6 +10,7 @@ use crate::simd::{nearest, vectorised};
 use crate::texture::{MANY, Reader, Spots, Texture};
 use crate::vector::{V3, add, dot, rotate, scale, sub, unrotate};
 use crate::view::{Rays, View};
+use std::ops::Range;
 
 /// Rows that are gathered at once.
 const BAND: usize = 64;
@@ -149,14 +150,14 @@ impl Painter {
         self.counts.resize(geoms, 0);
     }
 
-    /// Paints what is in the layers, within a region. `show` is given each fragment's pixel, the part of it that is covered, and its
-    /// colour.
+    /// Paints what is in the layers, within a region. `show` is given pixels next to each other, the part of each that is covered, and
+    /// colours: red, green and blue.
     pub fn paint(
         &mut self,
         layers: &Layers,
         look: &Look<'_>,
         [x0, y0, x1, y1]: Region,
-        mut show: impl FnMut(usize, f32, V3),
+        mut show: impl FnMut(Range<usize>, f32, [&[f32]; 3]),
     ) {
         let mut y = y0;
         while y < y1 {
@@ -343,17 +344,12 @@ impl Batch {
 
     /// Shows the colours of runs.
     #[allow(clippy::cast_precision_loss)]
-    fn show(&self, runs: &[Run], layers: &Layers, show: &mut impl FnMut(usize, f32, V3)) {
-        let [r, g, b] = &self.sum;
+    fn show(&self, runs: &[Run], layers: &Layers, show: &mut impl FnMut(Range<usize>, f32, [&[f32]; 3])) {
         let mut begin = 0;
         for run in runs {
-            let pixel = usize::from(run.y) * layers.width + usize::from(run.x);
+            let (pixel, count) = (usize::from(run.y) * layers.width + usize::from(run.x), usize::from(run.count));
             let part = run.samples.count_ones() as f32 / layers.samples as f32;
-            let count = usize::from(run.count);
-            let colours = r[begin..begin + count].iter().zip(&g[begin..]).zip(&b[begin..]);
-            for (i, ((r, g), b)) in colours.enumerate() {
-                show(pixel + i, part, [*r, *g, *b]);
-            }
+            show(pixel..pixel + count, part, self.sum.each_ref().map(|lane| &lane[begin..begin + count]));
             begin += count;
         }
     }

@@ -3,7 +3,7 @@
 use crate::layers::{Layers, NOTHING};
 use crate::scene::{Assets, Geom, Haze, Scene, Shape};
 use crate::simd::vectorised;
-use crate::texture::{Reader, Texture};
+use crate::texture::{MANY, Reader, Spots, Texture};
 use crate::vector::{V3, add, dot, scale, sub, unrotate};
 use crate::view::View;
 use std::sync::Arc;
@@ -23,36 +23,36 @@ pub(crate) fn depth(radius: f32, direction: V3) -> f32 {
     radius / (x * x + y * y).sqrt().max(z.abs()).max(1e-12)
 }
 
-/// The sky's colour in a direction, which changes so much from pixel to pixel.
-#[inline]
-fn colour(texture: &Texture, reader: &mut Reader, direction: V3, right: V3, down: V3) -> V3 {
-    // The texture's y axis points upwards.
-    let turn = |[x, y, z]: V3| [x, z, -y];
-    texture.colour(reader, texture.face_in(turn(direction), turn(right), turn(down)))
-}
-
-/// The sky as it was seen last. It is so far away that it stays the same while a camera only moves: its pixels are
-/// looked up once.
+/// The sky as it was seen last. It is so far away that it stays the same while a camera only moves: its rows are looked up once.
 #[derive(Default)]
 pub(crate) struct Backdrop {
     /// The texture and the rays it was seen along.
     seen: Option<(Arc<Texture>, V3, [V3; 2])>,
     size: (usize, usize),
-    /// Colours of pixels; negative where nobody has looked yet.
-    colours: Vec<V3>,
+    /// Red, green and blue of pixels, and by row whether they were looked up.
+    colours: [Vec<f32>; 3],
+    known: Vec<bool>,
     reader: Reader,
-    /// Scratch: how much of each pixel of a row is open.
+    /// Scratch: how much of each pixel of a row is open, and how far the sky is there.
     open: Vec<f32>,
+    far: Vec<f32>,
 }
 
-/// Nobody has looked yet.
-const UNSEEN: V3 = [-1.0; 3];
-
 impl Backdrop {
-    /// Paints the sky where nothing is before it.
+    /// Paints the sky where nothing is before it, and black elsewhere.
     #[allow(clippy::cast_precision_loss)]
-    pub fn paint(&mut self, scene: &Scene, assets: &Assets, view: &View, main: &mut Layers, colours: &mut [V3]) {
-        let Some(texture) = scene.sky.and_then(|sky| assets.textures.get(sky)) else { return };
+    pub fn paint(
+        &mut self,
+        scene: &Scene,
+        assets: &Assets,
+        view: &View,
+        main: &mut Layers,
+        colours: &mut [Vec<f32>; 3],
+    ) {
+        let Some(texture) = scene.sky.and_then(|sky| assets.textures.get(sky)) else {
+            colours.iter_mut().for_each(|colours| colours.fill(0.0));
+            return;
+        };
         let rays = view.rays();
         let known = self.seen.as_ref().is_some_and(|(seen, direction, directions)| {
             Arc::ptr_eq(seen, texture) && *direction == rays.direction && *directions == rays.directions
@@ -60,44 +60,96 @@ impl Backdrop {
         if !known || self.size != (view.width, view.height) {
             self.seen = Some((Arc::clone(texture), rays.direction, rays.directions));
             self.size = (view.width, view.height);
-            self.colours.clear();
-            self.colours.resize(view.width * view.height, UNSEEN);
+            self.colours.iter_mut().for_each(|colours| colours.resize(view.width * view.height, 0.0));
+            self.known.clear();
+            self.known.resize(view.height, false);
         }
         let infinite = |geom: &Geom| matches!(geom.shape, Shape::Plane(x, y) if x.infinite || y.infinite);
         let endless = scene.geoms.iter().any(infinite);
         let radius = radius(scene);
         let share = 1.0 / main.samples as f32;
         self.open.resize(view.width, 0.0);
+        self.far.resize(view.width, 0.0);
         for y in 0..view.height {
             let row = add(rays.direction, scale(rays.directions[1], y as f32 + 0.5));
-            let at = |x: usize| add(row, scale(rays.directions[0], x as f32 + 0.5));
             let samples = main.span(y, 0, view.width);
             if endless {
                 // The sky is nearer than the far ends of endless planes.
-                let pixels = main.depths[samples.clone()].chunks_exact(main.samples);
-                for (x, (depths, ids)) in
-                    pixels.zip(main.ids[samples.clone()].chunks_exact_mut(main.samples)).enumerate()
-                {
-                    let far = depth(radius, at(x));
-                    for (depth, id) in depths.iter().zip(ids) {
-                        *id = if *depth > far { NOTHING } else { *id };
-                    }
-                }
+                depths(radius, row, rays.directions[0], &mut self.far);
+                hide(&self.far, main.samples, &main.depths[samples.clone()], &mut main.ids[samples.clone()]);
             }
             count_open(&main.ids[samples], main.samples, share, &mut self.open);
-            let row = y * view.width..(y + 1) * view.width;
-            let (seen, colours) = (&mut self.colours[row.clone()], &mut colours[row]);
-            for (x, (seen, open)) in seen.iter_mut().zip(&self.open).enumerate() {
-                if *open > 0.0 && seen[0] < 0.0 {
-                    *seen = colour(texture, &mut self.reader, at(x), rays.directions[0], rays.directions[1]);
-                }
+            let pixels = y * view.width..(y + 1) * view.width;
+            if self.open.iter().all(|open| *open == 0.0) {
+                colours.iter_mut().for_each(|colours| colours[pixels.clone()].fill(0.0));
+                continue;
             }
-            shine_through(seen, &self.open, colours);
+            if !std::mem::replace(&mut self.known[y], true) {
+                let [r, g, b] = self.colours.each_mut().map(|colours| &mut colours[pixels.clone()]);
+                look_up(texture, &mut self.reader, row, rays.directions, [r, g, b]);
+            }
+            for (colours, sky) in colours.iter_mut().zip(&self.colours) {
+                shine_through(&sky[pixels.clone()], &self.open, &mut colours[pixels.clone()]);
+            }
         }
     }
 }
 
+/// The sky's colours along the rays of a row, which begins so, and to the right and down.
+fn look_up(texture: &Texture, reader: &mut Reader, row: V3, [right, down]: [V3; 2], [r, g, b]: [&mut [f32]; 3]) {
+    // The texture's y axis points upwards.
+    let turn = |[x, y, z]: V3| [x, z, -y];
+    let (row, right, down) = (turn(row), turn(right), turn(down));
+    let ([mut s, mut t, mut dense], mut faces) = ([[0.0; MANY]; 3], [0; MANY]);
+    for from in (0..r.len()).step_by(MANY) {
+        let part = from..r.len().min(from + MANY);
+        let n = part.len();
+        find(texture, &row, &right, &down, from, &mut s, &mut t, &mut dense, &mut faces);
+        let spots = Spots { s: &s[..n], t: &t[..n], dense: &dense[..n], faces: &faces[..n] };
+        texture.colours(&spots, reader, [&mut r[part.clone()], &mut g[part.clone()], &mut b[part]]);
+    }
+}
+
 vectorised! {
+    /// Where on the sky rays of a row meet it, from pixel `from` on.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+    fn find(
+        texture: &Texture, row: &V3, right: &V3, down: &V3, from: usize, s: &mut [f32; MANY], t: &mut [f32; MANY],
+        dense: &mut [f32; MANY], faces: &mut [u32; MANY],
+    ) {
+        for i in 0..MANY {
+            let direction = add(*row, scale(*right, from as f32 + (i as u32 as i32 as f32 + 0.5)));
+            let (face, spot, texels) = texture.face_in(direction, *right, *down);
+            (faces[i], s[i], t[i], dense[i]) = (face, spot[0], spot[1], texels);
+        }
+    }
+
+    /// The depths at which rays of a row, which begins so, meet the sky.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+    fn depths(radius: f32, row: V3, right: V3, far: &mut [f32]) {
+        for (i, far) in far.iter_mut().enumerate() {
+            *far = depth(radius, add(row, scale(right, i as u32 as i32 as f32 + 0.5)));
+        }
+    }
+
+    /// Takes away what is farther than the sky.
+    fn hide(far: &[f32], samples: usize, depths: &[f32], ids: &mut [u32]) {
+        #[inline(always)]
+        fn hide<const SAMPLES: usize>(far: &[f32], depths: &[f32], ids: &mut [u32]) {
+            let (depths, ids) = (depths.as_chunks::<SAMPLES>().0, ids.as_chunks_mut::<SAMPLES>().0);
+            for ((far, depths), ids) in far.iter().zip(depths).zip(ids) {
+                for (depth, id) in depths.iter().zip(ids) {
+                    *id = if *depth > *far { NOTHING } else { *id };
+                }
+            }
+        }
+        match samples {
+            1 => hide::<1>(far, depths, ids),
+            2 => hide::<2>(far, depths, ids),
+            _ => hide::<4>(far, depths, ids),
+        }
+    }
+
     /// Finds how much of every pixel shows nothing: a share for every sample.
     fn count_open(ids: &[u32], samples: usize, share: f32, open: &mut [f32]) {
         #[inline(always)]
@@ -113,12 +165,10 @@ vectorised! {
         }
     }
 
-    /// Adds the sky as far as pixels are open.
-    fn shine_through(sky: &[V3], open: &[f32], colours: &mut [V3]) {
+    /// The sky as far as pixels are open.
+    fn shine_through(sky: &[f32], open: &[f32], colours: &mut [f32]) {
         for ((sky, open), colour) in sky.iter().zip(open).zip(colours) {
-            for k in 0..3 {
-                colour[k] += if *open > 0.0 { open * sky[k] } else { 0.0 };
-            }
+            *colour = sky * open;
         }
     }
 }
@@ -178,7 +228,6 @@ impl Veil {
 
 /// A colour behind another.
 #[inline]
-pub(crate) fn over(front: V3, opacity: f32, behind: V3) -> V3 {
-    let behind = scale(behind, 1.0 - opacity);
-    std::array::from_fn(|k| opacity * front[k] + behind[k])
+pub(crate) fn over(front: f32, opacity: f32, behind: f32) -> f32 {
+    opacity * front + (1.0 - opacity) * behind
 }

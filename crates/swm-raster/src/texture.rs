@@ -208,7 +208,8 @@ impl Texture {
     }
 
     /// The colour at one spot: a place on a face, and how many texels a pixel covers.
-    pub(crate) fn colour(&self, reader: &mut Reader, (face, [s, t], dense): (u32, [f32; 2], f32)) -> [f32; 3] {
+    #[cfg(test)]
+    fn colour(&self, reader: &mut Reader, (face, [s, t], dense): (u32, [f32; 2], f32)) -> [f32; 3] {
         let (mut r, mut g, mut b) = ([0.0], [0.0], [0.0]);
         let spots = Spots { s: &[s], t: &[t], dense: &[dense], faces: &[face] };
         self.colours(&spots, reader, [&mut r, &mut g, &mut b]);

@@ -199,6 +199,19 @@ fn factors_are_sampled_pinned_and_read_back() {
 }
 
 #[test]
+fn a_wrapper_may_have_the_factors_and_draw() {
+    let Some(config) = config() else { return };
+    let mut coated = Seen::of(make("tests.it.worlds:Coated-v0", &config));
+    coated.env.reset(1, &ResetOptions::default()).expect("a reset");
+    assert_eq!(coated.picture(2, 2), [9; 12]);
+    let pinned = [("coat".to_owned(), vec![1.0, 2.0, 3.0])].into();
+    let variation = VariationRequest { variation: None, variation_values: pinned };
+    coated.env.reset(1, &ResetOptions { variation, ..ResetOptions::default() }).expect("a reset");
+    assert_eq!(coated.env.factors().rgb("coat"), [1, 2, 3]);
+    assert_eq!(coated.picture(1, 1), [1, 2, 3]);
+}
+
+#[test]
 fn what_follows_a_restore_followed_the_snapshot() {
     let Some(config) = config() else { return };
     let mut room = Seen::of(make(ROOM, &config));
@@ -233,6 +246,9 @@ fn what_a_gymnasium_environment_cannot_do_is_said() {
     assert!(env.env.sample_goal(Key::new(0)).expect_err("no goals").to_string().contains("another seed"));
     let state = ResetOptions { state: Some(vec![0.0; 4]), ..ResetOptions::default() };
     assert!(env.env.reset(0, &state).expect_err("no states").to_string().contains("where its seed says"));
+    let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
+    let varied = ResetOptions { variation, ..ResetOptions::default() };
+    assert!(env.env.reset(0, &varied).expect_err("no factors").to_string().contains("variation_space"));
     env.env.reset(0, &ResetOptions::default()).expect("a reset");
     assert!(env.env.step(Action::Discrete(&[2])).is_err(), "there are two actions");
     assert!(env.env.step(Action::Continuous(&[0.0])).is_err(), "an action of another kind");

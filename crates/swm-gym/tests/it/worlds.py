@@ -166,5 +166,21 @@ class Choices(gymnasium.Env):
         return observation, 0.0, False, False, {}
 
 
+class Coated(gymnasium.Wrapper):
+    """A wrapper with factors around an environment without any; it draws without having been asked for a mode."""
+
+    def __init__(self):
+        super().__init__(Choices('discrete'))
+        self.variation_space = Group({'coat': Factor(0, 255, (3,), [9, 9, 9], np.uint8)})
+
+    def reset(self, *, seed=None, options=None):
+        self.variation_space.start(seed, options or {})
+        return self.env.reset(seed=seed)
+
+    def render(self):
+        return np.broadcast_to(self.variation_space['coat'].value, (2, 2, 3))
+
+
 gymnasium.register('Room-v0', Room, max_episode_steps=30)
+gymnasium.register('Coated-v0', Coated)
 gymnasium.register('Choices-v0', Choices)

@@ -9,6 +9,7 @@
 
 mod arrays;
 mod cost;
+mod data;
 mod env;
 mod errors;
 mod listing;
@@ -23,6 +24,16 @@ use pyo3::prelude::*;
 /// The engine.
 #[pymodule]
 mod _engine {
+    #[pymodule_export]
+    use super::data::dataset::Dataset;
+    #[pymodule_export]
+    use super::data::loader::{Epoch, Loader, end_loaders};
+    #[pymodule_export]
+    use super::data::replay::{ReplayBuffer, ReplaySampler};
+    #[pymodule_export]
+    use super::data::work::{convert, detect, doctor, find_dataset, inspect, target};
+    #[pymodule_export]
+    use super::data::writer::Writer;
     #[pymodule_export]
     use super::env::NativeEnv;
     #[pymodule_export]
@@ -42,6 +53,7 @@ mod _engine {
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        data::process::begin();
         module.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 }

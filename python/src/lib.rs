@@ -30,7 +30,7 @@ mod _engine {
     #[pymodule_export]
     use super::data::dataset::Dataset;
     #[pymodule_export]
-    use super::data::loader::{Epoch, Loader};
+    use super::data::loader::{Epoch, Loader, end_loaders};
     #[pymodule_export]
     use super::data::replay::{ReplayBuffer, ReplaySampler};
     #[pymodule_export]

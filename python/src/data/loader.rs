@@ -8,9 +8,9 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde::Deserialize;
 use std::path::PathBuf;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
 use std::time::Duration;
-use swm::core::Result;
+use swm::core::{Error, Result};
 use swm::data::{CacheConfig, ClipSpec, GoalSpec, LoaderConfig};
 
 /// What to load and how, from JSON.
@@ -60,47 +60,82 @@ impl Wanted {
 
 /// Something with threads. They end where it goes; but they may wait for Python's lock, and a process forked since has
 /// none of them.
-struct Threaded<T: Send> {
-    inner: Option<T>,
+struct Threaded<T: Send + 'static> {
+    inner: Arc<Mutex<Option<T>>>,
     process: u32,
 }
 
 impl<T: Send> Threaded<T> {
     fn new(inner: T) -> Self {
-        Self { inner: Some(inner), process: std::process::id() }
+        let inner = Arc::new(Mutex::new(Some(inner)));
+        let weak: Weak<Mutex<Option<T>>> = Arc::downgrade(&inner);
+        let mut live = lock(&LIVE);
+        live.retain(|other| other.strong_count() > 0);
+        live.push(weak);
+        Self { inner, process: std::process::id() }
     }
 
-    /// It, unless its threads are another process's.
-    fn here(&mut self) -> Result<&mut T> {
-        let here = self.process == std::process::id();
-        self.inner.as_mut().filter(|_| here).ok_or_else(|| {
-            swm::core::Error::config(
-                "loader",
-                "it was made in the process that this one was forked from",
-                "make it in the process that uses it",
-            )
-        })
+    /// Does something with it, if its threads are here.
+    fn with<R>(&self, work: impl FnOnce(&mut T) -> Result<R>) -> Result<R> {
+        if self.process != std::process::id() {
+            let problem = "it was made in the process that this one was forked from";
+            return Err(Error::config("loader", problem, "make it in the process that uses it"));
+        }
+        match &mut *lock(&self.inner) {
+            Some(inner) => work(inner),
+            None => Err(Error::config("loader", "it ended with the interpreter", "use it before")),
+        }
     }
 }
 
 impl<T: Send> Drop for Threaded<T> {
     fn drop(&mut self) {
-        let inner = self.inner.take();
         if self.process == std::process::id() {
-            Python::attach(|py| py.detach(|| drop(inner)));
+            Python::attach(|py| py.detach(|| self.inner.end()));
         } else {
-            std::mem::forget(inner);
+            std::mem::forget(Arc::clone(&self.inner));
         }
+    }
+}
+
+/// What has threads now.
+static LIVE: Mutex<Vec<Weak<dyn End>>> = Mutex::new(vec![]);
+
+/// Something whose threads can be ended.
+trait End: Send + Sync {
+    fn end(&self);
+}
+
+impl<T: Send> End for Mutex<Option<T>> {
+    fn end(&self) {
+        let inner = lock(self).take();
+        drop(inner);
+    }
+}
+
+fn lock<T: ?Sized>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Ends the threads of all loaders. To be called while the interpreter is sound: a thread that asks for its lock when it is
+/// not any more takes the process with it.
+#[pyfunction]
+pub fn end_loaders(py: Python<'_>) {
+    if !is_forked() {
+        py.detach(|| {
+            let live: Vec<_> = lock(&LIVE).drain(..).collect();
+            live.iter().filter_map(Weak::upgrade).for_each(|loader| loader.end());
+        });
     }
 }
 
 /// Batches of clips, epoch after epoch.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
-pub struct Loader(Mutex<Threaded<swm::data::Loader>>);
+pub struct Loader(Threaded<swm::data::Loader>);
 
 /// The batches of one epoch, from one on.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
-pub struct Epoch(Mutex<Threaded<swm::data::Epoch>>);
+pub struct Epoch(Threaded<swm::data::Epoch>);
 
 #[pymethods]
 impl Loader {
@@ -108,36 +143,28 @@ impl Loader {
     fn new(py: Python<'_>, dataset: &Dataset, config: &str) -> PyResult<Self> {
         let config = json::<Wanted>("loader", config)?.config();
         let made = work(py, || swm::data::Loader::new(dataset.reader()?, config));
-        made.map(|loader| Self(Mutex::new(Threaded::new(loader)))).map_err(raised)
+        made.map(|loader| Self(Threaded::new(loader))).map_err(raised)
     }
 
     /// The columns of a batch.
     fn schema(&self) -> PyResult<Vec<Column>> {
-        Ok(described(self.lock().here().map_err(raised)?.schema()))
+        self.0.with(|loader| Ok(described(loader.schema()))).map_err(raised)
     }
 
     /// Clips in an epoch.
     fn clips(&self) -> PyResult<usize> {
-        Ok(self.lock().here().map_err(raised)?.clips())
+        self.0.with(|loader| Ok(loader.clips())).map_err(raised)
     }
 
     /// Batches in an epoch.
     fn batches(&self) -> PyResult<usize> {
-        Ok(self.lock().here().map_err(raised)?.batches_per_epoch())
+        self.0.with(|loader| Ok(loader.batches_per_epoch())).map_err(raised)
     }
 
     /// The batches of an epoch, from `first` on.
     fn epoch(&self, py: Python<'_>, epoch: u64, first: usize) -> PyResult<Epoch> {
-        let mut loader = self.lock();
-        let loader = loader.here().map_err(raised)?;
-        let begun = py.detach(|| loader.epoch(epoch, first));
-        Ok(Epoch(Mutex::new(Threaded::new(begun))))
-    }
-}
-
-impl Loader {
-    fn lock(&self) -> std::sync::MutexGuard<'_, Threaded<swm::data::Loader>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        let begun = py.detach(|| self.0.with(|loader| Ok(loader.epoch(epoch, first))));
+        Ok(Epoch(Threaded::new(begun.map_err(raised)?)))
     }
 }
 
@@ -146,13 +173,13 @@ impl Epoch {
     /// The next batch, as arrays `[clips, ..]` that look at its memory; `None` where the epoch ends.
     fn next<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
         let next = work(py, || {
-            let mut epoch = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-            let epoch = epoch.here()?;
-            let mut signals = signals();
-            while !epoch.wait(Duration::from_millis(20)) {
-                signals()?;
-            }
-            epoch.next().transpose()
+            self.0.with(|epoch| {
+                let mut signals = signals();
+                while !epoch.wait(Duration::from_millis(20)) {
+                    signals()?;
+                }
+                epoch.next().transpose()
+            })
         });
         next.map_err(raised)?.map(|batch| columns(py, Kept::Lent(batch))).transpose()
     }

@@ -69,7 +69,7 @@ def engine_of(dataset: Any) -> Any:
     Readers of formats of your own need `lengths`, and `_load_slice(episode, start, end)` or `load_episode(episode)`.
     """
     own = getattr(dataset, "engine", None)
-    if own is not None:
+    if isinstance(own, _engine.Dataset):
         return own
     if not hasattr(dataset, "lengths") or not (hasattr(dataset, "_load_slice") or hasattr(dataset, "load_episode")):
         raise TypeError(

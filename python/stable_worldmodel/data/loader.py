@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,6 +20,8 @@ from .foreign import engine_of
 from .utils import load_dataset
 
 __all__ = ["Goals", "Loader"]
+
+atexit.register(_engine.end_loaders)
 
 
 @dataclass(frozen=True)

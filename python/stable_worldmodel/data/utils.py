@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -103,8 +104,9 @@ def load_dataset(
 
 
 def _telling(progress: bool) -> Callable[[str, int, int], None] | None:
-    """Shows how far something is, with tqdm where it is installed."""
-    if not progress:
+    """Shows how far something is, with tqdm where it is installed and somebody looks."""
+    notebook = "ipykernel" in sys.modules
+    if not progress or not (notebook or sys.stderr.isatty()):
         return None
     try:
         from tqdm.auto import tqdm

@@ -256,6 +256,11 @@ class MPCPolicy(BasePolicy):
         """The actions for infos `(num_envs, T, ..)`."""
         if self.env is None:
             raise RuntimeError("MPCPolicy: world.set_policy(policy) first")
+        if self.cfg.history_len > 1:
+            raise ValueError(
+                f"history_len: {self.cfg.history_len}; past frames are kept for the engine's solvers only, and where actions are "
+                "scaled by a mean and a standard deviation or not at all"
+            )
         infos = dict(obs)
         fresh, active = infos.pop("_needs_flush", None), infos.pop("_active", None)
         envs = self.env.num_envs
@@ -267,7 +272,7 @@ class MPCPolicy(BasePolicy):
         due = [i for i in range(envs) if not self._actions[i] and not over[i]]
         if due:
             self._replan({key: np.asarray(value)[due] for key, value in infos.items()}, due)
-        space = single(self.env.action_space)
+        space = single(self.env.action_space, self.env.num_envs)
         shape = space.shape
         actions = np.full((envs, *shape), np.nan if space.dtype.kind == "f" else 0, dtype=space.dtype)
         for i in range(envs):
@@ -297,7 +302,7 @@ class MPCPolicy(BasePolicy):
             )
         if not np.isfinite(plan).all():
             raise ValueError(f"{type(self.solver).__name__}.solve: its plan holds numbers that are not finite")
-        space = single(self.env.action_space)
+        space = single(self.env.action_space, self.env.num_envs)
         for row, i in enumerate(due):
             self._rest[i] = plan[row, self.cfg.receding_horizon :]
             if not len(self._rest[i]):

@@ -114,8 +114,8 @@ class EngineSolver:
     def solve(self, info_dict: dict[str, Any], init_action: Any = None) -> dict[str, Any]:
         """Plans for every row of `info_dict` `(B, T, ..)`.
 
-        Returns a dict with `actions` `(B, horizon, action_dim)`, `costs` (one an environment) and `trace` (how each
-        search went). Every call draws other random numbers; the same calls with the same seed draw the same.
+        Returns a dict with `actions` `(B, horizon, action_dim)`, `costs` (one an environment: of the cheapest candidate
+        of the last iteration) and `trace` (how each search went). Every call draws other random numbers; the same calls with the same seed draw the same.
         """
         config, space = self._configured(), self._space()
         block, horizon, dim = config.action_block, config.horizon, self.action_dim
@@ -161,7 +161,7 @@ class EngineSolver:
 
     def _space(self) -> spaces.Space:
         self._configured()
-        return single(self._action_space)
+        return single(self._action_space, self._n_envs)
 
 
 class _Seen:
@@ -177,12 +177,18 @@ class _Seen:
         return getattr(self._adapter, name)
 
 
-def single(space: Any) -> Any:
-    """The action space of one environment, of that of one or of all together."""
+def single(space: Any, envs: int) -> Any:
+    """The action space of one environment, of that of one or of all `envs` together.
+
+    Several choices, as many as there are environments and all of one kind, are taken for one an environment: that is what
+    Gymnasium makes of `Discrete`.
+    """
     if isinstance(space, spaces.Box) and len(space.shape) > 1:
         return spaces.Box(space.low[0], space.high[0], dtype=space.dtype.type)
     if isinstance(space, spaces.MultiDiscrete) and space.nvec.ndim > 1:
         return spaces.MultiDiscrete(space.nvec[0])
+    if isinstance(space, spaces.MultiDiscrete) and len(space.nvec) == envs and (space.nvec == space.nvec[0]).all():
+        return spaces.Discrete(space.nvec[0], start=space.start[0])
     return space
 
 

@@ -167,7 +167,7 @@ class Dict(spaces.Dict):
         unknown = [key for key in named if key not in self.spaces]
         if unknown:
             raise ValueError(f"sampling_order names {unknown}, which are not among {list(self.spaces)}")
-        self._order = named + [key for key in self.spaces if key not in named]
+        self._sampling_order = named + [key for key in self.spaces if key not in named]
         if init_value is not None:
             self.set_init_value(dict(self._flat(init_value)))
             self.reset()
@@ -186,7 +186,7 @@ class Dict(spaces.Dict):
     def sampling_order(self) -> list[str]:
         """Every group and factor by its dot key, in the order in which they are sampled."""
         order = []
-        for key in self._order:
+        for key in self._sampling_order:
             order.append(key)
             if isinstance(self.spaces[key], Dict):
                 order.extend(f"{key}.{inner}" for inner in self.spaces[key].sampling_order)
@@ -240,7 +240,7 @@ class Dict(spaces.Dict):
         for _ in range(max_tries):
             mask = mask or {}
             value = {
-                key: self.spaces[key].sample(mask=mask.get(key), set_value=set_value, **kwargs) for key in self._order
+                key: self.spaces[key].sample(mask=mask.get(key), set_value=set_value, **kwargs) for key in self._sampling_order
             }
             if self.constrain_fn is None or self.constrain_fn(value):
                 return {key: value[key] for key in self.spaces}

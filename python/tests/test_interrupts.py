@@ -1,0 +1,121 @@
+"""What fails in the middle of something: the error is the one that was raised, and what was finished stays."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import gymnasium
+import numpy as np
+import pytest
+
+import stable_worldmodel as swm
+
+
+class Broken(Exception):
+    pass
+
+
+class Fragile(gymnasium.Env):
+    """Counts; raises in the step that it is told."""
+
+    metadata = {"render_modes": ["rgb_array"]}
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+        self.observation_space = gymnasium.spaces.Box(0, 1000, (1,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+        self.episodes, self.breaks = 0, None
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count, self.episodes = 0, self.episodes + 1
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.count += 1
+        if self.breaks is not None and (self.episodes, self.count) >= self.breaks:
+            raise Broken(f"episode {self.episodes}, step {self.count}")
+        return np.full(1, self.count, np.float32), 1.0, False, self.count == 5, {}
+
+    def render(self):
+        return np.full((8, 8, 3), self.count, np.uint8)
+
+
+@pytest.fixture
+def world():
+    gymnasium.register("Fragile-v0", entry_point=Fragile, max_episode_steps=5)
+    world = swm.World("Fragile-v0", num_envs=2, image_shape=(8, 8))
+    world.set_policy(swm.policy.RandomPolicy(seed=0))
+    yield world
+    world.close()
+    gymnasium.registry.pop("Fragile-v0")
+
+
+def test_an_environment_that_raises_in_step(world):
+    world.reset(seed=0)
+    fragile = world.gym_envs[1].unwrapped
+    fragile.breaks = (fragile.episodes, 3)
+    with pytest.raises(Broken, match="step 3") as caught:
+        for _ in range(5):
+            world.step()
+    # Where it was raised is in the traceback.
+    assert any(entry.name == "step" and "test_interrupts" in str(entry.path) for entry in caught.traceback)
+    fragile.breaks = None
+    world.reset(seed=1)
+    assert (world.infos["observation"] == 0).all()
+    for _ in range(5):
+        world.step()
+    assert world.truncateds.all() and (world.infos["observation"] == 5).all()
+
+
+def test_finished_episodes_outlive_an_error(world, tmp_path):
+    fragile = world.gym_envs[0].unwrapped
+    fragile.breaks = (fragile.episodes + 4, 3)
+    with pytest.raises(Broken):
+        world.collect(tmp_path / "d.lance", episodes=50, seed=0, progress=False)
+    data = swm.data.load_dataset(str(tmp_path / "d.lance"), backend="numpy")
+    begun = data.num_episodes
+    assert begun >= 4 and set(np.asarray(data.lengths).tolist()) == {6}
+    # And collecting goes on from there.
+    fragile.breaks = None
+    outcome = world.collect(tmp_path / "d.lance", episodes=10, seed=0, mode="resume", progress=False)
+    assert outcome == {"episodes": 10, "added": 10 - begun, "steps": 5 * (10 - begun)}
+
+
+def test_an_evaluation_that_breaks_leaves_the_world_usable(world):
+    fragile = world.gym_envs[0].unwrapped
+    fragile.breaks = (fragile.episodes + 1, 2)
+    with pytest.raises(Broken):
+        world.evaluate(episodes=4, seed=0, progress=False)
+    fragile.breaks = None
+    assert world.evaluate(episodes=4, seed=0, progress=False)["steps"].tolist() == [5] * 4
+
+
+CTRL_C = """
+import sys
+import stable_worldmodel as swm
+world = swm.World("swm/PushT-v1", num_envs=2, image_shape=(32, 32), max_episode_steps=100)
+world.set_policy(swm.policy.ExpertPolicy() if sys.argv[1] == "engine" else type("Mine", (swm.policy.BasePolicy,), {
+    "get_action": lambda self, infos: self.env.action_space.sample()})())
+print("ready", flush=True)
+try:
+    world.evaluate(episodes=1_000_000, seed=0, progress=False)
+except KeyboardInterrupt:
+    world.reset(seed=0)
+    world.step()
+    print("interrupted", flush=True)
+"""
+
+
+@pytest.mark.parametrize("whose", ["engine", "python"])
+def test_ctrl_c_stops_an_evaluation(whose):
+    child = subprocess.Popen([sys.executable, "-c", CTRL_C, whose], stdout=subprocess.PIPE, text=True)
+    try:
+        assert child.stdout.readline().strip() == "ready"
+        time.sleep(0.5)
+        os.kill(child.pid, signal.SIGINT)
+        assert child.communicate(timeout=10)[0].strip() == "interrupted" and child.returncode == 0
+    finally:
+        child.kill()

@@ -84,7 +84,9 @@ pub fn bridge(py: Python<'_>) -> PyResult<Bound<'_, PyModule>> {
         if let Ok(known) = modules.get_item(name) {
             return Ok(known.cast_into()?);
         }
-        let text = |text: &str| std::ffi::CString::new(text).map_err(|e| pyo3::exceptions::PyValueError::new_err(e.to_string()));
+        let text = |text: &str| {
+            std::ffi::CString::new(text).map_err(|e| pyo3::exceptions::PyValueError::new_err(e.to_string()))
+        };
         let module = PyModule::from_code(py, &text(source)?, &text(&format!("<{name}>"))?, &text(name)?)?;
         modules.set_item(name, &module)?;
         Ok(module)

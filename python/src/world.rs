@@ -17,8 +17,8 @@ use swm::core::{Env, Error, Key, ResetOptions, Snapshot, VariationRequest, View}
 use swm::data::{ImageCodec, WriteMode, WriteOptions};
 use swm::envs::wrappers::{GoalPicture, Stack, WRAPPERS};
 use swm::eval::world::{episode_key, reset_seed};
-use swm::gym::GymEnv;
 use swm::eval::{CollectConfig, Control, EvalConfig, Progress, Starts, Videos, WorldConfig};
+use swm::gym::GymEnv;
 
 /// Many environments of one kind.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
@@ -169,6 +169,58 @@ impl World {
         let mut world = self.lock()?;
         let world = &mut *world;
         py.detach(|| world.advance(&active)).map_err(raised)
+    }
+
+    /// Lets a policy play `steps` steps. Slots whose episode is over begin the next one instead: of a seed, numbered from
+    /// `next`; returns `(slot, episode)` of those, and the next number.
+    #[allow(clippy::too_many_arguments)]
+    fn play(
+        &self,
+        py: Python<'_>,
+        actor: &Actor,
+        steps: usize,
+        seed: u64,
+        mut next: usize,
+        options: &str,
+    ) -> PyResult<(Vec<(usize, usize)>, usize)> {
+        let options = reset_options(options)?;
+        let (mut world, mut policy) = (self.lock()?, actor.lock()?);
+        let (world, policy) = (&mut *world, &mut **policy);
+        let mut begun = vec![];
+        let mut signals = signals();
+        py.detach(|| {
+            let schema = world.pool().infos().schema();
+            let flags = [schema.index("terminated")?, schema.index("truncated")?];
+            let mut active = vec![true; world.pool().len()];
+            for _ in 0..steps {
+                signals()?;
+                let infos = world.pool().infos();
+                for (slot, active) in active.iter_mut().enumerate() {
+                    *active = flags.iter().all(|&flag| infos.bytes(flag)[slot] == 0);
+                }
+                if active.contains(&true) {
+                    world.ask(policy, &active)?;
+                    world.advance(&active)?;
+                }
+                if active.contains(&false) {
+                    let over = (0..active.len()).filter(|&slot| !active[slot]);
+                    let starting: Vec<(usize, usize)> = over.zip(next..).collect();
+                    next += starting.len();
+                    let reset = |&(slot, episode)| {
+                        let seed = reset_seed(episode_key(seed, episode));
+                        Reset { slot, seed, options: options.clone() }
+                    };
+                    world.restart(&starting.iter().map(reset).collect::<Vec<_>>())?;
+                    for &(slot, episode) in &starting {
+                        policy.begin(slot, episode_key(seed, episode));
+                    }
+                    begun.extend(starting);
+                }
+            }
+            Ok(())
+        })
+        .map_err(raised)?;
+        Ok((begun, next))
     }
 
     /// The factors of a slot's episode, by key.

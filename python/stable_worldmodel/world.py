@@ -119,7 +119,7 @@ class World:
         self._actors: dict[int, tuple[Any, Any]] = {}
         self._episodes = [0] * self.num_envs
         self._next_episode = 0
-        self._options: Mapping[str, Any] | None = None
+        self._reset_text = _options.reset(None, {})
         self._fresh = np.ones(self.num_envs, bool)
 
     @staticmethod
@@ -210,8 +210,7 @@ class World:
                 `evaluate` call so. A list is what the environments themselves are reset with. Drawn for `None`.
             options: `variation`: factors to sample; `variation_values`: factors to pin; `state`, `goal_state`: start and goal.
         """
-        text = _options.reset(options, self.spec["variation"])
-        self._options = options
+        self._reset_text = text = _options.reset(options, self.spec["variation"])
         self.seed = _drawn() if seed is None else seed if isinstance(seed, int) else 0
         self._episodes = list(range(self.num_envs))
         self._next_episode = self.num_envs
@@ -225,25 +224,41 @@ class World:
         self._begin(range(self.num_envs))
         self._actions[:] = np.nan if self._actions.dtype.kind == "f" else -1
 
-    def step(self) -> None:
-        """Lets the policy act once, and refreshes `infos`. Environments whose episode is over begin the next one instead."""
+    def step(self, steps: int = 1) -> None:
+        """Lets the policy act, and refreshes `infos`. Environments whose episode is over begin the next one instead.
+
+        Args:
+            steps: How often; policies of the engine play them in one call, without Python between.
+        """
         if self.policy is None:
             raise RuntimeError("World.step: no policy; call set_policy first")
         if self.seed is None:
             self.reset()
-        over = self.terminateds | self.truncateds
-        active = ~over
-        if active.any():
-            self._act(self.policy, active)
-            self._world.advance(active.tolist())
-        if over.any():
-            slots = np.flatnonzero(over).tolist()
-            for slot in slots:
-                self._episodes[slot] = self._next_episode
-                self._next_episode += 1
-            starts = [(slot, _engine.World.episode_seed(self.seed, self._episodes[slot])) for slot in slots]
-            self._world.reset(starts, _options.reset(self._options, self.spec["variation"]))
-            self._begin(slots)
+        actor = self._actor(self.policy)
+        if actor is not None:
+            begun, self._next_episode = self._world.play(
+                actor, int(steps), self.seed, self._next_episode, self._reset_text
+            )
+            for slot, episode in begun:
+                self._episodes[slot] = episode
+            self._fresh[:] = False
+            return
+        for _ in range(steps):
+            over = self.terminateds | self.truncateds
+            active = ~over
+            if active.any():
+                infos = {**self.infos, "_needs_flush": self._fresh.copy(), "_active": active}
+                self._actions[:] = self._asked(self.policy, infos, active)
+                self._fresh[:] = False
+                self._world.advance(active.tolist())
+            if over.any():
+                slots = np.flatnonzero(over).tolist()
+                for slot in slots:
+                    self._episodes[slot] = self._next_episode
+                    self._next_episode += 1
+                starts = [(slot, _engine.World.episode_seed(self.seed, self._episodes[slot])) for slot in slots]
+                self._world.reset(starts, self._reset_text)
+                self._begin(slots)
 
     def snapshot(self, index: int = 0) -> bytes:
         """The full state of an environment, randomness included."""
@@ -259,15 +274,6 @@ class World:
             if policy is self.policy:
                 for slot in slots:
                     self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
-
-    def _act(self, policy: Any, active: np.ndarray) -> None:
-        actor = self._actor(policy)
-        if actor is None:
-            infos = {**self.infos, "_needs_flush": self._fresh.copy(), "_active": active}
-            self._actions[:] = self._asked(policy, infos, active)
-        else:
-            self._world.ask(actor, active.tolist())
-        self._fresh[:] = False
 
     def _ask(self, policy: Any) -> np.ndarray:
         """What a policy of the engine does now."""

@@ -1,0 +1,58 @@
+"""Steps a second of a World seen from Python, beside the same engine from the command line (`swm bench envs`).
+
+    python benches/bench_pool.py [--swm PATH] [--pairs 3]
+
+Both sides step with random actions, alternating; the ratio is the median of the pairs'.
+"""
+
+import argparse
+import json
+import statistics
+import subprocess
+import time
+
+import stable_worldmodel as swm
+
+CASES = [("swm/PushT-v1", 8, 224), ("swm/PushT-v1", 8, 64), ("swm/TwoRoom-v1", 8, 64), ("swm/PushT-v1", 8, None)]
+
+
+def python(env: str, envs: int, side: int | None, seconds: float, chunk: int) -> float:
+    shape = None if side is None else (side, side)
+    world = swm.World(env, num_envs=envs, image_shape=shape, add_pixels=side is not None)
+    world.set_policy(swm.policy.RandomPolicy())
+    world.reset(seed=0)
+    world.step(50)
+    begun, steps = time.perf_counter(), 0
+    while time.perf_counter() - begun < seconds:
+        world.step(chunk)
+        steps += chunk * envs
+    return steps / (time.perf_counter() - begun)
+
+
+def command(program: str, env: str, envs: int, side: int | None, steps: int) -> float:
+    words = [program, "--json", "bench", "envs", env, "--num-envs", str(envs), "--pairs", "1", "--episodes", "0"]
+    words += ["--episode-steps", str(steps), "--sizes", str(side or 64)]
+    report = json.loads(subprocess.run(words, check=True, capture_output=True, text=True).stdout)
+    what = "step" if side is None else "step + render"
+    return next(row["steps_per_second"] for row in report["rows"] if row["what"] == what)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--swm", default="swm")
+    parser.add_argument("--pairs", type=int, default=3)
+    parser.add_argument("--seconds", type=float, default=3.0)
+    parser.add_argument("--chunk", type=int, default=1, help="steps in one call")
+    given = parser.parse_args()
+    for env, envs, side in CASES:
+        ours, theirs = [], []
+        for _ in range(given.pairs):
+            ours.append(python(env, envs, side, given.seconds, given.chunk))
+            theirs.append(command(given.swm, env, envs, side, 500))
+        ratio = statistics.median(a / b for a, b in zip(ours, theirs, strict=True))
+        size = f"{side} px" if side else "no pictures"
+        print(f"{env}, {envs} environments, {size}: {statistics.median(ours):,.0f} steps/s, {ratio:.2f} x the command line's")
+
+
+if __name__ == "__main__":
+    main()

@@ -222,8 +222,12 @@ class MPCPolicy(BasePolicy):
         if not isinstance(solver, Solver):
             raise TypeError(f"{type(solver).__name__} is no solver: it needs configure(…) and solve(…)")
         self.solver = solver
+        model = getattr(solver, "model", None)
+        block = int(getattr(model, "action_block", 1))
         if config is None:
-            config = PlanConfig(action_block=int(getattr(getattr(solver, "model", None), "action_block", 1)))
+            config = PlanConfig(action_block=block)
+        elif hasattr(model, "_engine_model") and config.action_block != block:
+            raise ValueError(f"PlanConfig.action_block: {config.action_block}; {model} was trained with {block}")
         self.cfg = self.config = config
         self.process, self.transform = dict(process or {}), dict(transform or {})
         #: How the searches went: a list of dicts, one a plan, after `evaluate` and `collect`.

@@ -80,8 +80,8 @@ class EngineSolver:
         self._n_envs, self._config = 0, None
 
     def __repr__(self) -> str:
-        words = ", ".join(f"{name}={value!r}" for name, value in self.settings.items())
-        return f"{type(self).__name__}({type(self.model).__name__}, {words})"
+        words = [type(self.model).__name__, *(f"{name}={value!r}" for name, value in self.settings.items())]
+        return f"{type(self).__name__}({', '.join(words)})"
 
     def configure(self, *, action_space: spaces.Space, n_envs: int, config: Any) -> None:
         """See `Solver.configure`."""

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -48,19 +49,25 @@ class Model:
         return self.path
 
     def get_cost(self, info_dict: dict[str, Any], action_candidates: Any) -> Any:
-        """What candidates `(B, S, H, A)`, in the model's units, cost: `(B, S)`. torch in, torch out; numpy in, numpy out."""
+        """What candidates `(B, S, H, A)`, in the model's units, cost: `(B, S)`. torch in, torch out; numpy in, numpy out.
+
+        Infos are `(B, T, ..)`, or `(B, S, T, ..)`: the same for every candidate. Pictures, `(height, width, 3)` bytes, show
+        which.
+        """
         torch_in = hasattr(action_candidates, "detach")
         candidates = action_candidates.detach().cpu().numpy() if torch_in else np.asarray(action_candidates)
         candidates = np.ascontiguousarray(candidates, dtype=np.float32)
         if candidates.ndim != 4:
             raise ValueError(f"action_candidates: got shape {candidates.shape}, expected (B, S, H, A)")
-        infos = {}
-        for key, value in info_dict.items():
-            if isinstance(value, (list, str)) or key.startswith("_"):
-                continue
-            # Infos repeated for every candidate say nothing new.
-            repeated = value.ndim > 1 and value.shape[:2] == candidates.shape[:2] and candidates.shape[1] > 1
-            infos[key] = now(value[:, 0] if repeated else value)
+        given = {
+            key: value
+            for key, value in info_dict.items()
+            if not isinstance(value, (list, str, Mapping)) and not key.startswith("_")
+        }
+        pictures = [value.ndim for key, value in given.items() if key in ("pixels", "goal")]
+        # Infos repeated for every candidate say nothing new.
+        repeated = bool(pictures) and max(pictures) == 6
+        infos = {key: now(value[:, 0] if repeated else value) for key, value in given.items()}
         costs = self._engine_model.cost(infos, candidates)
         if torch_in and has_torch():
             import torch

@@ -287,3 +287,37 @@ def test_worlds_are_played_the_same(twins):
             actions.append(world.infos["action"].copy())
         played.append(np.array(actions))
     assert np.allclose(*played, atol=1e-4) and played[0].std() > 0.1
+
+
+def test_a_model_of_ours_answers_numpy_and_torch(twins, infos):
+    burn, _ = twins
+    candidates = np.random.default_rng(1).normal(size=(3, 1, 2, 10)).astype(np.float32)
+    expected = burn.get_cost(infos, candidates)
+    assert isinstance(expected, np.ndarray) and expected.shape == (3, 1)
+    asked = torch.from_numpy(candidates).double()
+    for samples in (1, 4):
+        repeated = {key: torch.from_numpy(value)[:, None].expand(-1, samples, *value.shape[1:]) for key, value in infos.items()}
+        cost = burn.get_cost(repeated, asked.expand(-1, samples, -1, -1))
+        assert torch.is_tensor(cost) and np.array_equal(cost.numpy(), np.repeat(expected, samples, 1))
+    # Several moments, of which the last one counts, as many as candidates.
+    moments = {key: np.concatenate([np.zeros_like(value), value], 1) for key, value in infos.items()}
+    assert np.array_equal(burn.get_cost(moments, np.repeat(candidates, 2, 1)), np.repeat(expected, 2, 1))
+
+
+def test_a_model_of_ours_says_what_does_not_fit(twins, infos):
+    burn, _ = twins
+    with pytest.raises(ValueError, match=r"\(B, S, H, A\)"):
+        burn.get_cost(infos, np.zeros((3, 4, 10), np.float32))
+    with pytest.raises(ValueError, match="10 numbers a model step"):
+        burn.get_cost(infos, np.zeros((3, 4, 2, 4), np.float32))
+    with pytest.raises(ValueError, match="goal"):
+        burn.get_cost({"pixels": infos["pixels"]}, np.zeros((3, 4, 2, 10), np.float32))
+    with pytest.raises(ValueError, match="trained with 5"):
+        swm.policy.MPCPolicy(swm.solver.CEMSolver(burn), config=swm.PlanConfig())
+    assert swm.policy.MPCPolicy(swm.solver.CEMSolver(burn)).config.action_block == 5
+    with pytest.raises(ValueError, match="64"):
+        rooms(image_shape=(32, 32)).evaluate(policy=swm.policy.MPCPolicy(swm.solver.CEMSolver(burn)), episodes=1)
+    with pytest.raises(ValueError, match="does not act"):
+        rooms().evaluate(policy=swm.policy.FeedForwardPolicy(burn), episodes=1)
+    with pytest.raises(FileNotFoundError, match="nothing"):
+        swm.wm.load("nothing")

@@ -64,8 +64,11 @@ class EngineSolver:
         batch_size: int | None = None,
         device: Any = "cpu",
         seed: int = 1234,
+        callbacks: Any = None,
         **settings: Any,
     ) -> None:
+        if callbacks:
+            raise TypeError("callbacks: the search runs outside of Python; solve(…)['trace'] and policy.plans tell how it went")
         self.model, self.batch_size, self.device, self.seed = model, batch_size, device, int(seed)
         known = json.loads(_engine.solvers())[self.id]
         self.settings: dict[str, Any] = {}

@@ -94,9 +94,9 @@ class Box(_Factor, spaces.Box):
         low: Any,
         high: Any,
         shape: Sequence[int] | None = None,
-        dtype: Any = np.float32,
         init_value: Any = None,
         constrain_fn: Callable[[Any], bool] | None = None,
+        dtype: Any = np.float32,
         **kwargs: Any,
     ) -> None:
         spaces.Box.__init__(self, low, high, shape=shape, dtype=dtype, **kwargs)
@@ -153,9 +153,9 @@ class Dict(spaces.Dict):
     def __init__(
         self,
         spaces_dict: Mapping[str, spaces.Space] | None = None,
+        init_value: Mapping[str, Any] | None = None,
         constrain_fn: Callable[[dict], bool] | None = None,
         sampling_order: Sequence[str] | None = None,
-        init_value: Mapping[str, Any] | None = None,
         **kwargs: Any,
     ) -> None:
         members = dict(spaces_dict or {})

@@ -309,6 +309,7 @@ def test_a_wrong_model_stops_an_evaluation(how, error, words):
         (lambda: plan(solvers.CEMSolver()), ValueError, "model"),
         (lambda: plan(solvers.CEMSolver(object())), TypeError, "get_cost"),
         (lambda: solvers.CEMSolver(Quadratic(), samples_n=3), TypeError, "num_samples"),
+        (lambda: solvers.CEMSolver(Quadratic(), callbacks=[print]), TypeError, "trace"),
         (lambda: solvers.CEMSolver(Quadratic()).solve(infos()), RuntimeError, "configure"),
         (lambda: plan(solvers.CEMSolver(Quadratic(), batch_size=0)), ValueError, "batch_size"),
         (lambda: plan(solvers.CEMSolver(Quadratic(), num_samples=0)), ValueError, "sample"),

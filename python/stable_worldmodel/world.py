@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import secrets
+import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -96,6 +98,8 @@ class World:
                 name, settings, self.num_envs, wrappers, image, max_episode_steps, image_resample, threads, wrap_goal
             )
         else:
+            # Workers run what this interpreter runs.
+            os.environ.setdefault("SWM_PYTHON", sys.executable)
             self._wrapping = drawn
             self._world = _engine.World(
                 self.env_name,

@@ -49,8 +49,7 @@ impl Transport for InProcess {
         Python::attach(|py| {
             let Some(bridge) = &self.bridge else { return Err(Failure::Lost("it was not made yet".to_owned())) };
             let payload = PyBytes::new(py, request.payload());
-            let op = PyBytes::new(py, &[request.op()]);
-            bridge.bind(py).call_method1("handle", (op, payload)).map(drop).map_err(refused)
+            bridge.bind(py).call_method1("handle", (request.op(), payload)).map(drop).map_err(refused)
         })
     }
 

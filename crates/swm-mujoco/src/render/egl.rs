@@ -25,9 +25,13 @@ const MOST_THREADS: usize = 8;
 /// As many suffice to keep a graphics card busy.
 const HARDWARE_THREADS: usize = 4;
 
-/// Whether there is a graphics card that can draw.
+/// Whether there is a graphics card that can draw. EGL is opened only where the system knows a card: without one it would
+/// load Mesa with its compiler, whose symbols collide with those that PyTorch's Triton brings into the same process.
 pub(crate) fn hardware() -> bool {
-    Library::open().and_then(|library| library.display()).is_ok_and(|display| display.hardware)
+    let is_card = |name: &str| name == "dri" || name == "dxg" || name.starts_with("nvidia");
+    let devices = std::fs::read_dir("/dev").into_iter().flatten().flatten();
+    let known = devices.filter_map(|device| device.file_name().into_string().ok()).any(|name| is_card(&name));
+    known && Library::open().and_then(|library| library.display()).is_ok_and(|display| display.hardware)
 }
 
 /// The renderer: a queue, and threads that draw from it.

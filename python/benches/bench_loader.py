@@ -79,6 +79,7 @@ def serve() -> None:
     """The reference's side: answers `write FORMAT SOURCE PATH` and `turn FORMAT PATH WORKERS SECONDS`, a JSON line each."""
     import numpy as np
     import torch
+
     from stable_worldmodel.data.format import get_format
 
     torch.set_num_threads(1)
@@ -135,6 +136,7 @@ class Reference:
 def collect(folder: Path, episodes: int, steps: int, size: int) -> Path:
     """Plays Push-T at random: the content of all datasets."""
     import numpy as np
+
     import stable_worldmodel as swm
 
     world = swm.World("swm/PushT-v1", num_envs=8, image_shape=(size, size), max_episode_steps=steps)
@@ -167,6 +169,7 @@ def main() -> None:
         return
 
     import torch
+
     from stable_worldmodel import data
 
     torch.set_num_threads(1)

@@ -182,9 +182,10 @@ def test_a_format_of_ones_own(tmp_path, numpy_format):
     for a, b in zip(theirs, ours, strict=True):
         np.testing.assert_array_equal(a["pixels"], b["pixels"])
         np.testing.assert_array_equal(a["action"], b["action"])
-    assert data.inspect(tmp_path / "a.npzs", checksum=True)["checksum"] == data.inspect(
-        data.load_dataset(tmp_path / "c", format="npz"), checksum=True
-    )["checksum"]
+    assert (
+        data.inspect(tmp_path / "a.npzs", checksum=True)["checksum"]
+        == data.inspect(data.load_dataset(tmp_path / "c", format="npz"), checksum=True)["checksum"]
+    )
 
 
 def test_registering(numpy_format):

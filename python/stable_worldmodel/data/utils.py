@@ -15,8 +15,8 @@ from stable_worldmodel import _engine
 
 from . import _tensors
 from .dataset import Transform
-from .format import FORMATS, detect_format, get_format, validate_write_mode
 from .foreign import engine_of
+from .format import FORMATS, detect_format, get_format, validate_write_mode
 from .writer import codec_json
 
 __all__ = ["convert", "doctor", "ensure_dir_exists", "get_cache_dir", "inspect", "load_dataset"]
@@ -127,9 +127,7 @@ def _telling(progress: bool) -> Callable[[str, int, int], None] | None:
     return tell
 
 
-def _options(
-    format: str | None, mode: str, codec: str | None, quality: int | None, verify: bool, least_psnr: float
-) -> str:
+def _options(format: str | None, mode: str, codec: str | None, quality: int | None, verify: bool, least_psnr: float) -> str:
     if mode not in ("resume", "append", "overwrite", "error"):
         raise ValueError(f"mode: expected 'resume', 'append', 'overwrite' or 'error', got {mode!r}")
     chosen = codec_json(codec, quality)

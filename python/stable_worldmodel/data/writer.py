@@ -115,9 +115,7 @@ class EpisodeWriter:
         fitted = self._fitted(arrays)
         if self._writer is None:
             columns = [(name, dtype, list(shape)) for name, (dtype, shape) in self._columns.items()]
-            self._writer = _engine.Writer(
-                self.path, self.format, self.mode, self._codec, columns, self._manifest
-            )
+            self._writer = _engine.Writer(self.path, self.format, self.mode, self._codec, columns, self._manifest)
         self._writer.write(fitted, constants)
 
     def _fitted(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
@@ -125,9 +123,7 @@ class EpisodeWriter:
         missing = [name for name in self._columns if name not in arrays]
         extra = [name for name in arrays if name not in self._columns]
         if missing or extra:
-            raise ValueError(
-                f"{self.path}: an episode must have the dataset's columns: missing {missing}, unexpected {extra}"
-            )
+            raise ValueError(f"{self.path}: an episode must have the dataset's columns: missing {missing}, unexpected {extra}")
         fitted = {}
         for name, (dtype, shape) in self._columns.items():
             array = arrays[name]
@@ -135,9 +131,7 @@ class EpisodeWriter:
             if array.shape[1:] != shape and array[:1].size == int(np.prod(shape)) and max(array.ndim - 1, len(shape)) <= 1:
                 array = array.reshape(len(array), *shape)
             if array.shape[1:] != shape:
-                raise ValueError(
-                    f"{self.path}: column {name!r} has steps of shape {array.shape[1:]}, the dataset's of {shape}"
-                )
+                raise ValueError(f"{self.path}: column {name!r} has steps of shape {array.shape[1:]}, the dataset's of {shape}")
             if array.dtype.name != dtype and not np.can_cast(array.dtype, dtype, "same_kind"):
                 raise TypeError(f"{self.path}: column {name!r} is {array.dtype.name}, the dataset's {dtype}")
             fitted[name] = np.ascontiguousarray(array, dtype=dtype)

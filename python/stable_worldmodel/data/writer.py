@@ -20,17 +20,17 @@ __all__ = ["EpisodeWriter"]
 
 
 def codec_json(codec: str | None, quality: int | None = None) -> str | None:
-    """How pictures are stored, as the engine takes it: `"qoi"` or `"png"` (lossless), `"jpeg"` or `"jpeg:QUALITY"`."""
+    """How pictures are stored, as the engine takes it: `"qoi"` or `"png"` (lossless), `"jpeg"` or `"jpeg-QUALITY"`."""
     if codec is None:
         if quality is None:
             return None
         codec = "jpeg"
-    name, _, given = codec.lower().partition(":")
+    name, _, given = codec.lower().replace(":", "-").partition("-")
     name = {"lossless": "qoi", "jpg": "jpeg"}.get(name, name)
     if name == "jpeg" and (not given or given.isdigit()):
         return json.dumps({"jpeg": {"quality": int(given or (95 if quality is None else quality))}})
     if name not in ("qoi", "png") or given:
-        raise ValueError(f"codec: expected 'qoi' or 'png' (lossless), 'jpeg' or 'jpeg:QUALITY', got {codec!r}")
+        raise ValueError(f"codec: expected 'qoi' or 'png' (lossless), 'jpeg' or 'jpeg-QUALITY', got {codec!r}")
     return json.dumps(name)
 
 
@@ -44,8 +44,8 @@ class EpisodeWriter:
         path: A path, a URI, or a name under `$STABLEWM_HOME/datasets`.
         format: The format, where the path does not say it; Lance without either.
         mode: `"append"` continues a dataset that is there, `"overwrite"` replaces it, `"error"` refuses.
-        codec: How pictures are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg:QUALITY"`.
-        jpeg_quality: Another way to say `codec="jpeg:QUALITY"`.
+        codec: How pictures are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
+        jpeg_quality: Another way to say `codec="jpeg-QUALITY"`.
         manifest: Where the data come from: what to store beside them, under the key `config`.
     """
 

@@ -3,10 +3,10 @@
     python benches/bench_loader.py --reference /path/to/python
 
 The loop is LeRobot's: shuffled batches of 64 clips of 4 frames, 5 rows apart, at 224 pixels, each of which goes through a
-trivial model, whose step all sides take. One collection is the content of all datasets; the reference's are written by its
-own writers. It runs in the Python that `--reference` (or `$SWM_REFERENCE_PYTHON`) names, in turns with ours: what counts
-is the median of the ratios of neighbouring turns. The reference is tried with every number of workers, and the fastest one
-is what ours is compared with.
+trivial model, whose step all sides take. Our loader runs twice: as it decodes every picture, and as it is by default, keeping
+some. One collection is the content of all datasets; the reference's are written by its own writers. It runs in the Python that
+`--reference` (or `$SWM_REFERENCE_PYTHON`) names, in turns with ours: what counts is the median of the ratios of neighbouring
+turns. The reference is tried with every number of workers, and the fastest one is what ours is compared with.
 """
 
 from __future__ import annotations
@@ -79,6 +79,7 @@ def serve() -> None:
     """The reference's side: answers `write FORMAT SOURCE PATH` and `turn FORMAT PATH WORKERS SECONDS`, a JSON line each."""
     import numpy as np
     import torch
+
     from stable_worldmodel.data.format import get_format
 
     torch.set_num_threads(1)
@@ -135,6 +136,7 @@ class Reference:
 def collect(folder: Path, episodes: int, steps: int, size: int) -> Path:
     """Plays Push-T at random: the content of all datasets."""
     import numpy as np
+
     import stable_worldmodel as swm
 
     world = swm.World("swm/PushT-v1", num_envs=8, image_shape=(size, size), max_episode_steps=steps)
@@ -159,6 +161,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=2.0, help="of a turn")
     parser.add_argument("--workers", type=int, nargs="*", default=[0, 2], help="worker processes of DataLoaders")
     parser.add_argument("--threads", type=int, default=2, help="threads of our loader that load ahead")
+    parser.add_argument("--cache", default="512MiB", help="what our loader keeps of decoded pictures, in one row")
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.serve:
@@ -166,6 +169,7 @@ def main() -> None:
         return
 
     import torch
+
     from stable_worldmodel import data
 
     torch.set_num_threads(1)
@@ -175,7 +179,7 @@ def main() -> None:
         folder = Path(name)
         source = collect(folder, given.episodes, given.steps, given.size)
         print(f"{given.episodes} episodes of {given.steps} steps at {given.size} px; load average {os.getloadavg()[0]:.1f}")
-        print(f"{'content':<17}{'how':<34}{'clips/s':>9}  {'x reference':>12}")
+        print(f"{'content':<17}{'how':<40}{'clips/s':>9}  {'x reference':>12}")
         for layout, place, writing, beside in LAYOUTS:
             data.convert(source, folder / place, progress=False, verify=False, **writing)
             ways: dict[str, Callable[[], float]] = {}
@@ -186,10 +190,10 @@ def main() -> None:
                 ways[f"reference, {workers} workers"] = lambda theirs=theirs, workers=workers, beside=beside: reference.ask(
                     "turn", beside, theirs, workers, given.seconds
                 )
-            batches = endless(
-                data.Loader(folder / place, BATCH, columns=COLUMNS, drop_last=True, threads=given.threads, **CLIP)
-            )
-            ways["Loader"] = lambda batches=batches: turn(batches, step, given.seconds)
+            settings = {"columns": COLUMNS, "drop_last": True, "threads": given.threads, **CLIP}
+            for how, cache in (("Loader, every picture decoded", 0), (f"Loader, {given.cache} of pictures kept", given.cache)):
+                batches = endless(data.Loader(folder / place, BATCH, cache=cache, **settings))
+                ways[how] = lambda batches=batches: turn(batches, step, given.seconds)
             for workers in given.workers:
                 dataset = data.load_dataset(folder / place, keys_to_load=COLUMNS, **CLIP)
                 mine = endless(torch_loader(dataset, workers))
@@ -203,7 +207,7 @@ def main() -> None:
             rivals = [how for how in ways if how.startswith("reference")]
             fastest = max(rivals, key=lambda how: statistics.median(rates[how]), default=None)
             for how, mine in rates.items():
-                line = f"{layout:<17}{how:<34}{statistics.median(mine):>9.0f}"
+                line = f"{layout:<17}{how:<40}{statistics.median(mine):>9.0f}"
                 if fastest is not None and how not in rivals:
                     ratio = statistics.median(a / b for a, b in zip(mine, rates[fastest], strict=True))
                     line += f"  {ratio:>11.1f}x"

@@ -85,14 +85,14 @@ def test_broken_episodes_are_refused_and_finished_ones_kept(tmp_path):
 
 def test_codecs(tmp_path):
     sizes = {}
-    for codec in (None, "qoi", "png", "jpeg", "jpeg:20"):
-        path = tmp_path / f"{codec}.lance".replace(":", "")
+    for codec in (None, "qoi", "png", "jpeg", "jpeg-20"):
+        path = tmp_path / f"{codec}.lance"
         written = write(path, (6,), codec=codec)
         error = np.abs(data.load_dataset(path).get_col_data("pixels").astype(int) - written[0]["pixels"]).max()
         assert (error == 0) == ("jpeg" not in str(codec))
         sizes[codec] = data.inspect(path)["footprint"]["pixels"]
-    assert sizes["jpeg:20"] < sizes["jpeg"]
-    for wrong in ("webp", "png:3", "jpeg:high"):
+    assert sizes["jpeg-20"] < sizes["jpeg"]
+    for wrong in ("webp", "png-3", "jpeg-high"):
         with pytest.raises(ValueError, match="codec: expected"):
             data.open_writer(tmp_path / "b.lance", codec=wrong)
     assert data.LanceWriter(tmp_path / "c.lance", jpeg_quality=80).format == "lance"
@@ -182,9 +182,10 @@ def test_a_format_of_ones_own(tmp_path, numpy_format):
     for a, b in zip(theirs, ours, strict=True):
         np.testing.assert_array_equal(a["pixels"], b["pixels"])
         np.testing.assert_array_equal(a["action"], b["action"])
-    assert data.inspect(tmp_path / "a.npzs", checksum=True)["checksum"] == data.inspect(
-        data.load_dataset(tmp_path / "c", format="npz"), checksum=True
-    )["checksum"]
+    assert (
+        data.inspect(tmp_path / "a.npzs", checksum=True)["checksum"]
+        == data.inspect(data.load_dataset(tmp_path / "c", format="npz"), checksum=True)["checksum"]
+    )
 
 
 def test_registering(numpy_format):

@@ -70,7 +70,8 @@ impl Reader for ForeignReader {
         let mut rest = out;
         for range in ranges {
             let end = range.start.checked_add(range.length);
-            if !self.episodes.get(range.episode).is_some_and(|e| end.is_some_and(|end| end <= e.length)) {
+            let known = |episode: &Episode| end.is_some_and(|end| end <= episode.length);
+            if !self.episodes.get(range.episode).is_some_and(known) {
                 let given = format!("{} rows from row {} of episode {}", range.length, range.start, range.episode);
                 return Err(Error::mismatch("reading rows", given, "rows that there are"));
             }

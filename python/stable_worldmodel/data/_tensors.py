@@ -120,7 +120,7 @@ def _text(name: str, value: Any) -> str | bytes | None:
     if isinstance(value, (list, tuple)) and value and isinstance(value[0], (str, bytes)):
         if any(step != value[0] for step in value):
             raise TypeError(f"column {name!r}: text that changes within an episode cannot be stored")
-        return cast("str | bytes", value[0])
+        return value[0]
     return None
 
 

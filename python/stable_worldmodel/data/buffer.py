@@ -193,7 +193,8 @@ class ReplayBuffer(Dataset):
     def _load_slice(self, ep_idx: int, start: int, end: int) -> dict[str, Any]:
         if not 0 <= ep_idx < self.num_episodes or not 0 <= start <= end <= self.lengths[ep_idx]:
             raise IndexError(f"rows {start} .. {end} of episode {ep_idx} of {self.num_episodes}")
-        sample: dict[str, Any] = self._read(*(np.asarray([n]) for n in (ep_idx, start, end - start)), self.frameskip)
+        episodes, starts, lengths = (np.asarray([number]) for number in (ep_idx, start, end - start))
+        sample: dict[str, Any] = self._read(episodes, starts, lengths, self.frameskip)
         return self.transform(sample) if self.transform else sample
 
     def get_col_data(self, col: str) -> Array:

@@ -72,7 +72,5 @@ def engine_of(dataset: Any) -> Any:
     if isinstance(own, _engine.Dataset):
         return own
     if not hasattr(dataset, "lengths") or not (hasattr(dataset, "_load_slice") or hasattr(dataset, "load_episode")):
-        raise TypeError(
-            f"expected a dataset, with `lengths` and `load_episode` or `_load_slice`, got {type(dataset).__name__}"
-        )
+        raise TypeError(f"expected a dataset, with `lengths` and `load_episode` or `_load_slice`, got {type(dataset).__name__}")
     return _engine.Dataset.foreign(_Rows(dataset))

@@ -124,9 +124,7 @@ def validate_write_mode(mode: str) -> str:
     return mode
 
 
-def open_writer(
-    path: str | os.PathLike[str], *, format: str | None = None, mode: str = "append", **kwargs: Any
-) -> Any:
+def open_writer(path: str | os.PathLike[str], *, format: str | None = None, mode: str = "append", **kwargs: Any) -> Any:
     """A writer into a dataset of any format: that of the name, else the one that the path says.
 
         with open_writer("mine.lance", mode="overwrite", codec="jpeg") as writer:

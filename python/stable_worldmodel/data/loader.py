@@ -15,7 +15,7 @@ from stable_worldmodel import _engine
 
 from . import _tensors
 from ._tensors import NUMBERING, Array
-from .dataset import Transform
+from .dataset import ConcatDataset, MergeDataset, StoredDataset, Transform
 from .foreign import engine_of
 from .utils import load_dataset
 
@@ -102,7 +102,8 @@ class Loader:
         threads: Threads that load ahead, which share the engine's to decode; 0 loads when asked.
         prefetch: Batches loaded ahead, at most.
         prefetch_bytes: Bytes of them, at most.
-        cache: Bytes of decoded rows to keep for later epochs, such as `"2GB"`; 0 keeps none.
+        cache: Bytes of decoded rows to keep for later epochs, such as `"8GB"`; 0 keeps none. Without it 512 MiB of datasets
+            that the engine reads.
         cache_dir: A folder to keep them in, for several runs, in place of memory.
         backend: `"torch"` or `"numpy"`; torch where it is installed.
         format: The dataset's format, where it cannot be told from the path.
@@ -126,7 +127,7 @@ class Loader:
         threads: int = 2,
         prefetch: int = 4,
         prefetch_bytes: int | str = "512MiB",
-        cache: int | str = 0,
+        cache: int | str | None = None,
         cache_dir: str | os.PathLike[str] | None = None,
         backend: str | None = None,
         format: str | None = None,
@@ -143,6 +144,8 @@ class Loader:
         self.transform = transform if transform is not None else getattr(dataset, "transform", None)
         self.batch_size = int(batch_size)
         self.seed = int(seed)
+        if cache is None:
+            cache = "512MiB" if isinstance(dataset, (StoredDataset, ConcatDataset, MergeDataset)) else 0
         engine = engine_of(dataset)
         stored = {name: tuple(shape) for name, _, shape in engine.schema()}
         if columns is None:

@@ -115,9 +115,7 @@ class ZScoreScaler(_Affine):
 class PercentileScaler(_Affine):
     """The range between two percentiles becomes -1 .. 1, and what is outside of it is clipped."""
 
-    def __init__(
-        self, low: float = 1.0, high: float = 99.0, q_low: Any = None, q_high: Any = None, eps: float = 1e-8
-    ) -> None:
+    def __init__(self, low: float = 1.0, high: float = 99.0, q_low: Any = None, q_high: Any = None, eps: float = 1e-8) -> None:
         if not 0 <= low < high <= 100:
             raise ValueError(f"expected percentiles 0 <= low < high <= 100, got {low} and {high}")
         self.low = low

@@ -15,8 +15,8 @@ from stable_worldmodel import _engine
 
 from . import _tensors
 from .dataset import Transform
-from .format import FORMATS, detect_format, get_format, validate_write_mode
 from .foreign import engine_of
+from .format import FORMATS, detect_format, get_format, validate_write_mode
 from .writer import codec_json
 
 __all__ = ["convert", "doctor", "ensure_dir_exists", "get_cache_dir", "inspect", "load_dataset"]
@@ -127,9 +127,7 @@ def _telling(progress: bool) -> Callable[[str, int, int], None] | None:
     return tell
 
 
-def _options(
-    format: str | None, mode: str, codec: str | None, quality: int | None, verify: bool, least_psnr: float
-) -> str:
+def _options(format: str | None, mode: str, codec: str | None, quality: int | None, verify: bool, least_psnr: float) -> str:
     if mode not in ("resume", "append", "overwrite", "error"):
         raise ValueError(f"mode: expected 'resume', 'append', 'overwrite' or 'error', got {mode!r}")
     chosen = codec_json(codec, quality)
@@ -174,8 +172,8 @@ def convert(
         progress: Whether to show a progress bar (with tqdm, if it is installed).
         mode: What to do with a target that is there: `"resume"` goes on behind its last episode if what it has is the
             beginning of the source, `"append"` adds to it, `"overwrite"` replaces it, `"error"` refuses.
-        codec: How pictures are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg:QUALITY"`.
-        jpeg_quality: Another way to say `codec="jpeg:QUALITY"`.
+        codec: How pictures are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
+        jpeg_quality: Another way to say `codec="jpeg-QUALITY"`.
         verify: Whether the target is read again and compared.
         least_psnr: The least signal-to-noise ratio of lossy pictures, in dB; less is an error.
         **kwargs: What the writer of a format of yours takes besides.
@@ -191,7 +189,7 @@ def convert(
     kind = FORMATS["lance"] if kind is None else kind
     tell = _telling(progress)
     if not kind.native:
-        return _hand_over(source, kind.open_writer(dest, mode=_plain(mode), **kwargs), tell)
+        return hand_over(source, kind.open_writer(dest, mode=_plain(mode), **kwargs), tell)
     if kwargs:
         raise TypeError(f"convert: the format {kind.name} takes no {', '.join(kwargs)}")
     options = _options(kind.name, mode, codec, jpeg_quality, verify, least_psnr)
@@ -203,7 +201,7 @@ def _plain(mode: str) -> str:
     return validate_write_mode("error" if mode == "resume" else mode)
 
 
-def _hand_over(source: Any, writer: Any, tell: Callable[[str, int, int], None] | None) -> dict[str, Any]:
+def hand_over(source: Any, writer: Any, tell: Callable[[str, int, int], None] | None) -> dict[str, Any]:
     """Writes all episodes of a dataset with a writer that Python brings."""
     engine = engine_of(source)
     lengths = engine.lengths()
@@ -234,7 +232,7 @@ def doctor(
         format: The format of what is written.
         progress: Whether to show a progress bar.
         codec: How pictures are stored there, as in :func:`convert`.
-        jpeg_quality: Another way to say `codec="jpeg:QUALITY"`.
+        jpeg_quality: Another way to say `codec="jpeg-QUALITY"`.
 
     Returns:
         `episodes`, `rows`, `problems` (how many), `findings` (each with `severity`, `what`, `episodes`), `sound` (the

@@ -20,17 +20,17 @@ __all__ = ["EpisodeWriter"]
 
 
 def codec_json(codec: str | None, quality: int | None = None) -> str | None:
-    """How pictures are stored, as the engine takes it: `"qoi"` or `"png"` (lossless), `"jpeg"` or `"jpeg:QUALITY"`."""
+    """How pictures are stored, as the engine takes it: `"qoi"` or `"png"` (lossless), `"jpeg"` or `"jpeg-QUALITY"`."""
     if codec is None:
         if quality is None:
             return None
         codec = "jpeg"
-    name, _, given = codec.lower().partition(":")
+    name, _, given = codec.lower().replace(":", "-").partition("-")
     name = {"lossless": "qoi", "jpg": "jpeg"}.get(name, name)
     if name == "jpeg" and (not given or given.isdigit()):
         return json.dumps({"jpeg": {"quality": int(given or (95 if quality is None else quality))}})
     if name not in ("qoi", "png") or given:
-        raise ValueError(f"codec: expected 'qoi' or 'png' (lossless), 'jpeg' or 'jpeg:QUALITY', got {codec!r}")
+        raise ValueError(f"codec: expected 'qoi' or 'png' (lossless), 'jpeg' or 'jpeg-QUALITY', got {codec!r}")
     return json.dumps(name)
 
 
@@ -44,8 +44,8 @@ class EpisodeWriter:
         path: A path, a URI, or a name under `$STABLEWM_HOME/datasets`.
         format: The format, where the path does not say it; Lance without either.
         mode: `"append"` continues a dataset that is there, `"overwrite"` replaces it, `"error"` refuses.
-        codec: How pictures are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg:QUALITY"`.
-        jpeg_quality: Another way to say `codec="jpeg:QUALITY"`.
+        codec: How pictures are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
+        jpeg_quality: Another way to say `codec="jpeg-QUALITY"`.
         manifest: Where the data come from: what to store beside them, under the key `config`.
     """
 
@@ -115,9 +115,7 @@ class EpisodeWriter:
         fitted = self._fitted(arrays)
         if self._writer is None:
             columns = [(name, dtype, list(shape)) for name, (dtype, shape) in self._columns.items()]
-            self._writer = _engine.Writer(
-                self.path, self.format, self.mode, self._codec, columns, self._manifest
-            )
+            self._writer = _engine.Writer(self.path, self.format, self.mode, self._codec, columns, self._manifest)
         self._writer.write(fitted, constants)
 
     def _fitted(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
@@ -125,9 +123,7 @@ class EpisodeWriter:
         missing = [name for name in self._columns if name not in arrays]
         extra = [name for name in arrays if name not in self._columns]
         if missing or extra:
-            raise ValueError(
-                f"{self.path}: an episode must have the dataset's columns: missing {missing}, unexpected {extra}"
-            )
+            raise ValueError(f"{self.path}: an episode must have the dataset's columns: missing {missing}, unexpected {extra}")
         fitted = {}
         for name, (dtype, shape) in self._columns.items():
             array = arrays[name]
@@ -135,9 +131,7 @@ class EpisodeWriter:
             if array.shape[1:] != shape and array[:1].size == int(np.prod(shape)) and max(array.ndim - 1, len(shape)) <= 1:
                 array = array.reshape(len(array), *shape)
             if array.shape[1:] != shape:
-                raise ValueError(
-                    f"{self.path}: column {name!r} has steps of shape {array.shape[1:]}, the dataset's of {shape}"
-                )
+                raise ValueError(f"{self.path}: column {name!r} has steps of shape {array.shape[1:]}, the dataset's of {shape}")
             if array.dtype.name != dtype and not np.can_cast(array.dtype, dtype, "same_kind"):
                 raise TypeError(f"{self.path}: column {name!r} is {array.dtype.name}, the dataset's {dtype}")
             fitted[name] = np.ascontiguousarray(array, dtype=dtype)

@@ -183,11 +183,19 @@ class World:
         return self._world.factors(index)
 
     def close(self) -> None:
-        """Lets go of the environments."""
+        """Ends the environments, and the processes that they live in. The world cannot be used afterwards."""
         self._actors.clear()
-        close = getattr(self._world, "close", None)
-        if close is not None:
-            close()
+        for env in self.gym_envs:
+            env.close()
+        self.gym_envs.clear()
+        # The arrays are the engine's: it ends with the last of them.
+        self.infos, self._actions = {}, np.empty(0)
+        self.__dict__.pop("_world", None)
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "_world":
+            raise RuntimeError("World: it was closed; make another one")
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def __enter__(self) -> World:
         return self

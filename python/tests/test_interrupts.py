@@ -119,3 +119,79 @@ def test_ctrl_c_stops_an_evaluation(whose):
         assert child.communicate(timeout=10)[0].strip() == "interrupted" and child.returncode == 0
     finally:
         child.kill()
+
+
+# Environments in processes of their own.
+
+
+def children(pid):
+    found = []
+    for task in os.listdir(f"/proc/{pid}/task"):
+        with open(f"/proc/{pid}/task/{task}/children") as listed:
+            found += [int(child) for child in listed.read().split()]
+    return found
+
+
+def gone(pids, seconds=10):
+    """Whether processes end in time."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        if not any(os.path.exists(f"/proc/{pid}") for pid in pids):
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.fixture
+def unrendered(monkeypatch):
+    pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+def carts(**more):
+    world = swm.World("CartPole-v1", num_envs=2, image_shape=(24, 24), **more)
+    world.set_policy(swm.policy.RandomPolicy(seed=0))
+    world.reset(seed=0)
+    return world
+
+
+def test_a_killed_worker_is_replaced_in_mid_episode(unrendered):
+    before = set(children(os.getpid()))
+    alone, apart = carts(), carts(workers=True)
+    workers = set(children(os.getpid())) - before
+    assert len(workers) == 2
+    for step in range(6):
+        if step == 3:
+            os.kill(min(workers), signal.SIGKILL)
+        for world in (alone, apart):
+            world.step()
+        assert np.array_equal(alone.infos["observation"], apart.infos["observation"])
+        assert np.array_equal(alone.infos["pixels"], apart.infos["pixels"])
+    workers = set(children(os.getpid())) - before
+    apart.close()
+    assert gone(workers)
+    with pytest.raises(RuntimeError, match="closed"):
+        apart.step()
+    apart.close()
+
+
+ABANDONED = """
+import time
+import stable_worldmodel as swm
+world = swm.World("CartPole-v1", num_envs=2, image_shape=(24, 24), workers=True)
+world.set_policy(swm.policy.RandomPolicy(seed=0))
+print("ready", flush=True)
+world.evaluate(episodes=1_000_000, progress=False)
+"""
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_no_worker_outlives_the_program(unrendered, end):
+    child = subprocess.Popen([sys.executable, "-c", ABANDONED], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    assert child.stdout.readline().strip() == "ready"
+    workers = children(child.pid)
+    assert len(workers) == 2
+    time.sleep(0.2)
+    os.kill(child.pid, end)
+    assert child.wait(timeout=10) == -end
+    assert gone(workers)

@@ -197,7 +197,8 @@ def test_a_format_of_ones_own(tmp_path):
             return list(self.episodes[0])
 
         def _load_slice(self, ep_idx, start, end):
-            return {key: torch.from_numpy(value[start:end]) for key, value in self.episodes[ep_idx].items()}
+            rows = {key: torch.from_numpy(value[start:end]) for key, value in self.episodes[ep_idx].items()}
+            return {**rows, "pixels": rows["pixels"].permute(0, 3, 1, 2)}
 
     @swm.data.register_format
     class NpzFormat(swm.data.Format):

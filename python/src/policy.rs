@@ -151,7 +151,7 @@ impl Policy for Here {
     }
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
-        self.0.act(infos, active, actions)
+        solver::here(|| self.0.act(infos, active, actions))
     }
 
     fn see(&mut self, worlds: &EnvPool, active: &[bool]) -> Result<()> {

@@ -7,9 +7,24 @@ use crate::model::Model;
 use crate::world::plan_key;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use rayon::{ThreadPool, ThreadPoolBuilder};
 use serde_json::Value;
 use swm::core::{Error, Key, PlanProblem, PlanSpace, Solver};
 use swm::plan::SOLVERS;
+
+/// Works with this very thread as one of a pool's. Solvers ask a model from whichever thread of the pool they work on, and
+/// Python hands its signals to the main thread only: so a model of Python's is asked where Ctrl-C arrives.
+pub fn here<T: Send>(work: impl FnOnce() -> T + Send) -> T {
+    thread_local! {
+        // A pool that this thread belongs to cannot end before it does.
+        static POOL: Option<&'static ThreadPool> =
+            ThreadPoolBuilder::new().use_current_thread().build().ok().map(|pool| &*Box::leak(Box::new(pool)));
+    }
+    match POOL.with(|pool| *pool) {
+        Some(pool) => pool.install(work),
+        None => work(),
+    }
+}
 
 /// A solver with these settings, JSON.
 pub fn made(solver: &str, settings: &str) -> PyResult<Box<dyn Solver>> {
@@ -58,7 +73,7 @@ pub fn solve<'py>(
         let mut cost = PythonCost::new(model)?;
         model.call_method1("observe", (infos,))?;
         cost.observed(envs);
-        py.detach(|| solver.solve(&mut cost, problem))
+        py.detach(|| here(|| solver.solve(&mut cost, problem)))
     };
     let plan = plan.map_err(raised)?;
     let trace = serde_json::to_string(&plan.trace).map_err(|e| raised(Error::external("writing a trace", e)))?;

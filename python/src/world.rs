@@ -1,6 +1,7 @@
 //! [`World`]: many environments of one kind, their infos as numpy arrays, collecting and evaluating.
 
 use crate::arrays;
+use crate::data::foreign::ForeignWriter;
 use crate::errors::{foreign, json, raised, signals};
 use crate::gym::InProcess;
 use crate::policy::Actor;
@@ -241,13 +242,15 @@ impl World {
         py.detach(|| world.change(&[slot], |_, env| env.restore(&snapshot))).map_err(raised)
     }
 
-    /// Plays episodes into a dataset; returns `(episodes, added, steps)`.
+    /// Plays episodes into a dataset at `path`, or into `writer`, an object with `write_episode`; returns `(episodes, added,
+    /// steps)`.
     #[allow(clippy::too_many_arguments)]
     fn collect(
         &self,
         py: Python<'_>,
         actor: &Actor,
-        path: String,
+        path: Option<String>,
+        writer: Option<Py<PyAny>>,
         format: Option<String>,
         mode: &str,
         codec: Option<&str>,
@@ -278,13 +281,18 @@ impl World {
             }
             manifest.config["codec"] = serde_json::json!(codec);
             manifest.config["wrappers"] = wanted.wrappers;
-            let location = swm::home::target(&path, format.as_deref())?;
-            swm::collect::check(&location, mode, &manifest, false)?;
-            let schema = world.collect_schema(config.goal)?;
-            let options = WriteOptions { mode, codec, manifest: Some(manifest), ..WriteOptions::default() };
-            let writer = match &format {
-                Some(format) => (swm::data::FORMATS.get(format)?.create)(&location, &schema, options)?,
-                None => swm::data::create(location, &schema, options)?,
+            let writer: Box<dyn swm::data::Writer> = match (writer, path) {
+                (Some(writer), _) => Box::new(ForeignWriter::new(writer, 0)),
+                (None, path) => {
+                    let location = swm::home::target(&path.unwrap_or_default(), format.as_deref())?;
+                    swm::collect::check(&location, mode, &manifest, false)?;
+                    let schema = world.collect_schema(config.goal)?;
+                    let options = WriteOptions { mode, codec, manifest: Some(manifest), ..WriteOptions::default() };
+                    match &format {
+                        Some(format) => (swm::data::FORMATS.get(format)?.create)(&location, &schema, options)?,
+                        None => swm::data::create(location, &schema, options)?,
+                    }
+                }
             };
             world.collect(policy, writer, &config, &mut control(progress))
         });

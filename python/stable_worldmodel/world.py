@@ -7,7 +7,6 @@ import math
 import os
 import secrets
 import sys
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -390,10 +389,10 @@ class World:
         policy = self._chosen(policy)
         if writer is None and format is None:
             format = _ENDINGS.get(Path(str(path)).suffix)
-        if writer is None and format is not None and format not in _engine.formats():
-            from .data import get_format
+        if writer is None and not (format or "lance") in _engine.formats():
+            from .data.format import foreign_writer
 
-            writer = get_format(format).open_writer(path)
+            writer = foreign_writer(path, format, "append" if mode == "resume" else mode)
         config = {
             "episodes": int(episodes),
             "seed": _drawn() if seed is None else int(seed),
@@ -404,37 +403,30 @@ class World:
             "wrappers": [{"id": id, "settings": settings} for id, settings in self._wrapping],
         }
         if writer is not None:
-            return self._collect_into(writer, policy, config, progress)
+            with writer as opened:
+                return self._collect(policy, None, opened, None, "create", None, config, progress)
         if mode == "append":
             config["episodes"] += _engine.World.stored(str(path), format) or 0
         engine_mode = {"error": "create", "resume": "append"}.get(mode, mode)
-        return self._collect(policy, str(path), format, engine_mode, codec, config, progress)
+        return self._collect(policy, str(path), None, format, engine_mode, codec, config, progress)
 
     def _collect(
-        self, policy: Any, path: str, format: str | None, mode: str, codec: str | None, config: dict, progress: bool
+        self,
+        policy: Any,
+        path: str | None,
+        writer: Any,
+        format: str | None,
+        mode: str,
+        codec: str | None,
+        config: dict[str, Any],
+        progress: bool,
     ) -> dict[str, int]:
         with _progress.bar("collect", config["episodes"], progress) as bar:
             outcome = self._world.collect(
-                self._playing(policy), path, format, mode, _codec(codec), json.dumps(config), bar
+                self._playing(policy), path, writer, format, mode, _codec(codec), json.dumps(config), bar
             )
         self._settle()
         return dict(zip(("episodes", "added", "steps"), outcome, strict=True))
-
-    def _collect_into(self, writer: Any, policy: Any, config: dict, progress: bool) -> dict[str, int]:
-        """Collects into a folder of its own first, so that every writer gets the very episodes a dataset would hold."""
-        from .data import load_dataset
-
-        with tempfile.TemporaryDirectory(prefix="swm-collect-") as folder:
-            path = str(Path(folder) / "episodes.lance")
-            try:
-                outcome = self._collect(policy, path, None, "create", None, config, progress)
-            finally:
-                if Path(path).exists():
-                    stored = load_dataset(path, backend="numpy")
-                    with writer as opened:
-                        for episode in range(stored.num_episodes):
-                            opened.write_episode(stored.load_episode(episode))
-        return outcome
 
     def evaluate(
         self,

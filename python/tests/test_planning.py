@@ -512,7 +512,6 @@ except KeyboardInterrupt:
 """
 
 
-@pytest.mark.xfail(strict=True, reason="searches ask models from a thread of the pool, which no signal reaches")
 @pytest.mark.parametrize("where", ["solve", "evaluate"])
 def test_ctrl_c_interrupts_a_slow_model_at_once(where):
     child = subprocess.Popen([sys.executable, "-c", SLOW, where], stdout=subprocess.PIPE, text=True)

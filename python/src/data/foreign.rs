@@ -114,7 +114,6 @@ pub struct ForeignWriter {
 
 impl ForeignWriter {
     /// Hands on to `object`, whose dataset has so many episodes.
-    #[allow(dead_code)] // worlds collect into it
     pub fn new(object: Py<PyAny>, episodes: usize) -> Self {
         Self { object, episodes }
     }

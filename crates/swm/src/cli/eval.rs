@@ -214,7 +214,7 @@ enum Kind {
 /// Finds out what a word stands for.
 fn find(given: &str, env: Option<&str>) -> Result<Found> {
     let scripted = |acts| Found { name: given.to_owned(), kind: Kind::Acts(acts), env: None, image: None };
-    let env = env.map(|id| swm::env(id)).transpose()?;
+    let env = env.map(swm::env).transpose()?;
     if given == "random" {
         return Ok(scripted(Acts::Random));
     }

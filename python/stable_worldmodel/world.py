@@ -76,6 +76,8 @@ class World:
             raise TypeError("image_transform, goal_transform: give transforms to the policy that wants them (transform=…)")
         if add_pixels and image_shape is None:
             raise ValueError("image_shape: None; give (height, width), or add_pixels=False for no pictures")
+        if add_pixels and not (isinstance(image_shape, Sequence) and len(image_shape) == 2):
+            raise TypeError(f"image_shape: {image_shape!r}; expected (height, width)")
         if isinstance(num_envs, bool) or int(num_envs) < 1:
             raise ValueError(f"num_envs: {num_envs}; expected at least 1")
         kwargs.pop("render_mode", None)
@@ -206,6 +208,8 @@ class World:
 
     def set_policy(self, policy: Any) -> None:
         """Says who acts: an object with `get_action(infos)`."""
+        if isinstance(policy, type):
+            raise TypeError(f"{policy.__name__} is a class of policies: make one of it")
         if not (callable(getattr(policy, "get_action", None)) or callable(getattr(policy, "get_actions", None))):
             raise TypeError(f"{type(policy).__name__} is no policy: it needs get_action(infos)")
         if callable(getattr(policy, "set_env", None)):
@@ -421,9 +425,11 @@ class World:
         config: dict[str, Any],
         progress: bool,
     ) -> dict[str, int]:
+        from .data.writer import codec_json
+
         with _progress.bar("collect", config["episodes"], progress) as bar:
             outcome = self._world.collect(
-                self._playing(policy), path, writer, format, mode, _codec(codec), json.dumps(config), bar
+                self._playing(policy), path, writer, format, mode, codec_json(codec), json.dumps(config), bar
             )
         self._settle()
         return dict(zip(("episodes", "added", "steps"), outcome, strict=True))
@@ -666,14 +672,3 @@ def _varied(options: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
 def _describe(variation: Mapping[str, Any]) -> str:
     pinned = [f"{key} = {value}" for key, value in variation["variation_values"].items()]
     return ", ".join([*(variation["variation"] or []), *pinned]) or "in distribution"
-
-
-def _codec(name: str | None) -> str | None:
-    if name is None:
-        return None
-    kind, _, quality = name.partition("-")
-    if kind == "jpeg":
-        return json.dumps({"jpeg": {"quality": int(quality or 95)}})
-    if kind not in ("qoi", "png") or quality:
-        raise ValueError(f"codec: {name!r}; expected 'qoi', 'png', 'jpeg' or 'jpeg-QUALITY'")
-    return json.dumps(kind)

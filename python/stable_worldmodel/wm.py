@@ -8,7 +8,11 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -111,9 +115,63 @@ def train(
         if value is not None:
             words += [flag, str(value)]
     words += [f"{key.replace('__', '.')}={value}" for key, value in overrides.items()]
-    code = _engine.command(words)
-    if code == 130:
-        raise KeyboardInterrupt
-    if code:
-        raise RuntimeError(f"swm train ended with code {code}; what it printed says why")
+    _command(words)
     return str(out)
+
+
+#: Runs the command line in a process of its own, which stops, as on Ctrl-C, when its standard input ends.
+_CHILD = """
+import os, signal, sys, threading
+
+sys.path.insert(0, sys.argv[1])
+from stable_worldmodel import _engine
+
+
+def follow():
+    os.read(0, 1)
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+threading.Thread(target=follow, daemon=True).start()
+sys.exit(_engine.command(sys.argv[2:]))
+"""
+
+
+def _command(words: list[str]) -> None:
+    """Runs the command line beside this interpreter, whose signals and logs stay its own.
+
+    It saves what it has and ends when it is interrupted, or when this interpreter ends in any way.
+    """
+    package = Path(__file__).resolve().parent.parent
+    # A terminal is shown progress by the command itself; notebooks are told what it says.
+    told = None if sys.stderr.isatty() else subprocess.PIPE
+    child = subprocess.Popen(
+        [sys.executable, "-c", _CHILD, str(package), *words],
+        stdin=subprocess.PIPE,
+        stdout=told,
+        stderr=None if told is None else subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        env=os.environ,
+        start_new_session=True,
+    )
+    said = ""
+    try:
+        for line in child.stdout or ():
+            sys.stderr.write(line)
+            said = line
+        child.wait()
+    except BaseException:
+        child.stdin.close()  # type: ignore[union-attr]
+        child.wait()
+        raise
+    finally:
+        for stream in (child.stdin, child.stdout):
+            if stream is not None:
+                stream.close()
+    why = said.removeprefix("error: ").strip() or "what it printed says why"
+    if child.returncode == 130:
+        raise KeyboardInterrupt
+    if child.returncode:
+        kind = ValueError if child.returncode == 2 else RuntimeError
+        raise kind(f"swm {words[1]} ended with code {child.returncode}: {why}")

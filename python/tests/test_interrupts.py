@@ -195,3 +195,41 @@ def test_no_worker_outlives_the_program(unrendered, end):
     os.kill(child.pid, end)
     assert child.wait(timeout=10) == -end
     assert gone(workers)
+
+
+# Training.
+
+TRAINING = """
+import sys
+import stable_worldmodel as swm
+world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(64, 64), max_episode_steps=30)
+world.set_policy(swm.policy.RandomPolicy(seed=0))
+world.collect("rooms", episodes=8, seed=0, progress=False)
+small = {"data": "rooms", "preset": "tiny", "data__batch_size": 8}
+swm.wm.train("lewm", out="short", schedule__steps=1, **small)
+print("ready", flush=True)
+try:
+    swm.wm.train("lewm", out="long", schedule__steps=1_000_000, **small)
+except KeyboardInterrupt:
+    print("interrupted", flush=True)
+"""
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
+def test_interrupted_training_saves_what_it_has(end, home):
+    child = subprocess.Popen([sys.executable, "-c", TRAINING], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    assert child.stdout.readline().strip() == "ready"
+    time.sleep(1.0)
+    workers = children(child.pid)
+    assert len(workers) == 1
+    os.kill(child.pid, end)
+    said = child.communicate(timeout=20)[0].strip()
+    assert said == ("interrupted" if end == signal.SIGINT else "") and gone(workers)
+    assert (home / "checkpoints/long/checkpoint/weights.safetensors").exists()
+
+
+def test_training_says_what_is_wrong():
+    with pytest.raises(ValueError, match="unknown dataset 'nothing'"):
+        swm.wm.train("lewm", data="nothing", out="mine")
+    with pytest.raises(ValueError, match="schedule.steps"):
+        swm.wm.train("lewm", data="nothing", out="mine", schedul__steps=3)

@@ -118,7 +118,8 @@ class EngineSolver:
         """Plans for every row of `info_dict` `(B, T, ..)`.
 
         Returns a dict with `actions` `(B, horizon, action_dim)`, `costs` (one an environment: of the cheapest candidate
-        of the last iteration) and `trace` (how each search went). Every call draws other random numbers; the same calls with the same seed draw the same.
+        of the last iteration) and `trace` (how each search went). Every call draws other random numbers; the same calls
+        with the same seed draw the same.
         """
         config, space = self._configured(), self._space()
         block, horizon, dim = config.action_block, config.horizon, self.action_dim

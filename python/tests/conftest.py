@@ -1,9 +1,16 @@
 """Every test has a home of its own, so that names of datasets and checkpoints meet nothing of yours."""
 
+import os
+from pathlib import Path
+
 import pytest
+
+#: Where what `swm assets` brought is: not in a test's home.
+ASSETS = Path(os.environ.get("STABLEWM_HOME") or Path.home() / ".stable_worldmodel") / "assets"
 
 
 @pytest.fixture(autouse=True)
 def home(tmp_path, monkeypatch):
+    monkeypatch.setenv("SWM_ASSETS", os.environ.get("SWM_ASSETS") or str(ASSETS))
     monkeypatch.setenv("STABLEWM_HOME", str(tmp_path / "home"))
     return tmp_path / "home"

@@ -114,16 +114,23 @@ def test_keyword_arguments_are_options_of_the_environment():
         swm.envs.NativeEnv("swm/PushT-v1", render_mode="human")
 
 
+def test_a_copy_has_the_options_of_the_environment():
+    env = make("swm/OGBCube-v0", env_type="double").unwrapped
+    env.reset(seed=0)
+    twin = copy.deepcopy(env)
+    assert twin.name == "swm/OGBCube-v0,env_type=double" and twin.observation_space == env.observation_space
+
+
 def test_a_limit_of_gymnasiums_truncates():
     env = gymnasium.make("swm/TwoRoom-v1", max_episode_steps=3)
     env.reset(seed=0)
     assert [env.step(np.zeros(2, np.float32))[3] for _ in range(3)] == [False, False, True]
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-@pytest.mark.parametrize("name", ["swm/PushT-v1", "swm/PendulumControl-v1"])
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
+@pytest.mark.parametrize("name", swm.envs.ids())
 def test_a_copy_goes_on_from_where_it_was(name, copied):
-    env = gymnasium.make(name, render_mode="rgb_array", image_shape=(24, 24)).unwrapped
+    env = make(name, render_mode="rgb_array", image_shape=(24, 24)).unwrapped
     env.reset(seed=3)
     env.step(env.action_space.sample())
     twin = copied(env)

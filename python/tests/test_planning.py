@@ -89,13 +89,14 @@ def plan(solver, rows=slice(None), space=BOX, **more):
     return configured(solver, space, **more).solve(infos(rows))["actions"].numpy()
 
 
+SGD = {"optimizer_cls": torch.optim.SGD, "optimizer_kwargs": {"lr": 0.2}}
 CONTINUOUS = [
     (solvers.PredictiveSamplingSolver, {"num_samples": 4000, "noise_scale": 0.7}, 0.35),
     (solvers.CEMSolver, {"num_samples": 200, "n_steps": 15, "topk": 20}, 0.02),
     (solvers.ICEMSolver, {"num_samples": 200, "n_steps": 15, "topk": 20}, 0.05),
     (solvers.MPPISolver, {"num_samples": 200, "n_steps": 20, "topk": 20, "temperature": 0.1, "var_scale": 0.3}, 0.1),
     (solvers.GradientSolver, {"num_samples": 4, "n_steps": 80}, 0.01),
-    (solvers.GradientSolver, {"num_samples": 2, "n_steps": 30, "optimizer_cls": torch.optim.SGD, "optimizer_kwargs": {"lr": 0.2}}, 0.01),
+    (solvers.GradientSolver, {"num_samples": 2, "n_steps": 30, **SGD}, 0.01),
 ]
 CONTINUOUS_IDS = ["predictive-sampling", "cem", "icem", "mppi", "adam", "sgd"]
 DISCRETE = [
@@ -478,7 +479,8 @@ def test_discrete_actions_are_planned_and_executed():
             return -action_candidates.unflatten(-1, (-1, 2))[..., 1].sum((2, 3))
 
     config = swm.PlanConfig(horizon=3, receding_horizon=2, action_block=2)
-    for solver in (solvers.CategoricalCEMSolver(Right(), num_samples=60, n_steps=4, topk=8), Followed(solvers.PGDSolver(Right()))):
+    engine = solvers.CategoricalCEMSolver(Right(), num_samples=60, n_steps=4, topk=8)
+    for solver in (engine, Followed(solvers.PGDSolver(Right()))):
         world = swm.World("swm/CartPoleControl-v1", num_envs=2, image_shape=(16, 16))
         world.set_policy(swm.policy.MPCPolicy(solver, config))
         world.reset(seed=0)
@@ -525,6 +527,7 @@ def test_ctrl_c_interrupts_a_slow_model_at_once(where):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
 def test_a_model_on_a_gpu_plans_as_on_the_cpu():
-    for solver, model in ((solvers.CEMSolver, Quadratic()), (solvers.GradientSolver, Quadratic()), (solvers.GRASPSolver, Linear())):
+    kinds = [(solvers.CEMSolver, Quadratic()), (solvers.GradientSolver, Quadratic()), (solvers.GRASPSolver, Linear())]
+    for solver, model in kinds:
         on = [plan(few(solver, model.to(device), device=device)) for device in ("cpu", "cuda")]
         assert np.allclose(*on, atol=1e-4)

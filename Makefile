@@ -36,6 +36,8 @@ test: check setup-python assets test-python
 
 # The wheel in an environment of its own with nothing but what it asks for, then its tests beside PyTorch and others.
 test-python: wheel assets
+	cd python && $(PYTHON_VENV)/bin/ruff format --check --quiet . && $(PYTHON_VENV)/bin/ruff check --quiet . && \
+	  $(PYTHON_VENV)/bin/mypy
 	rm -rf $(CACHE)/venv-bare && python3 -m venv $(CACHE)/venv-bare
 	$(CACHE)/venv-bare/bin/python -m pip install --quiet $(WHEELS)/*.whl
 	$(CACHE)/venv-bare/bin/python python/tests/bare.py

@@ -7,7 +7,7 @@ use pyo3::types::PyDict;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
-use swm::core::{Candidates, CostModel, Error};
+use swm::core::{Batch, Candidates, CostModel, Error, Key, Policy, Schema};
 use swm::families::{Card, load};
 use swm::models::Device;
 use swm::plan::ActionScale;
@@ -25,6 +25,10 @@ pub struct Model {
     card: String,
     /// The cost that answers [`Model::cost`], made when it is first asked.
     asked: Mutex<Option<Box<dyn CostModel>>>,
+    /// The policy that answers [`Model::act`], and for how many environments it was made.
+    acting: Mutex<Option<(Box<dyn Policy>, usize)>>,
+    /// The environment it was trained on.
+    env: Option<String>,
 }
 
 impl Model {
@@ -76,6 +80,8 @@ impl Model {
             weights: card.weights.clone(),
             card: described.to_string(),
             asked: Mutex::new(None),
+            acting: Mutex::new(None),
+            env: card.facts.env.clone(),
         })
     }
 
@@ -89,6 +95,34 @@ impl Model {
     #[getter]
     fn path(&self) -> String {
         self.path.display().to_string()
+    }
+
+    /// What a model that acts does: an action a row of infos, in the environment's units.
+    fn act<'py>(&self, py: Python<'py>, infos: &Bound<'py, PyDict>) -> PyResult<Bound<'py, PyAny>> {
+        let batch = arrays::batch(infos)?;
+        let rows = batch.rows();
+        let mut acting = self.acting.lock().unwrap_or_else(PoisonError::into_inner);
+        let acting = &mut *acting;
+        let actions = py.detach(|| {
+            let what = || format!("checkpoint {}", self.path.display());
+            let Some(id) = &self.env else {
+                return Err(Error::config(what(), "it does not say which environment it acts in", "train it again"));
+            };
+            let spec = swm::env(id)?.env()?.spec().clone();
+            if acting.as_ref().is_none_or(|(_, slots)| *slots != rows) {
+                let policy = load(&self.path, &self.device)?.policy(&spec, rows).ok_or_else(|| {
+                    Error::config(what(), "it predicts and does not act", "plan in it: get_cost, MPCPolicy")
+                })??;
+                *acting = Some((policy, rows));
+            }
+            let mut actions = Batch::zeros(&Schema::new([spec.action_column()])?, rows);
+            if let Some((policy, _)) = acting {
+                (0..rows).for_each(|slot| policy.begin(slot, Key::new(0).at(slot as u64)));
+                policy.act(&batch, &vec![true; rows], &mut actions)?;
+            }
+            Ok(actions)
+        });
+        arrays::copied(py, &actions.map_err(raised)?, 0, &(0..rows).collect::<Vec<_>>())
     }
 
     /// What plans cost: `[envs, samples]` for infos of `envs` rows and candidates `[envs, samples, horizon, dim]`.

@@ -1,7 +1,7 @@
 """Policies: who acts.
 
-A policy of one's own is any object with `get_action(infos)` that returns one action an environment; `BasePolicy` gives it the rest.
-Policies of the engine (random, experts, checkpoints, planning) run inside it: what an episode brings depends on its
+A policy of one's own is any object with `get_action(infos)` that returns one action an environment; `BasePolicy` gives it the
+rest. Policies of the engine (random, experts, checkpoints, planning) run inside it: what an episode brings depends on its
 seed alone, whichever environment plays it and whatever is played beside it.
 """
 
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from . import _engine
-from .planning import Adapter, has_torch, prepared
+from .planning import has_torch, prepared
 from .solver import EngineSolver, Solver, single
 
 if TYPE_CHECKING:
@@ -246,7 +246,7 @@ class MPCPolicy(BasePolicy):
         if not isinstance(self.solver, EngineSolver) or (scale is None and "action" in self.process):
             return None
         model = self.solver.adapter(self.process, self.transform, self.cfg.history_len)
-        if not isinstance(model, Adapter) and (self.process or self.transform):
+        if isinstance(model, _engine.Model) and (self.process or self.transform):
             raise ValueError("MPCPolicy: models of swm.wm scale what they see by themselves; leave process and transform out")
         cfg = asdict(self.cfg)
         cfg["history"] = cfg.pop("history_len")
@@ -262,8 +262,8 @@ class MPCPolicy(BasePolicy):
             raise RuntimeError("MPCPolicy: world.set_policy(policy) first")
         if self.cfg.history_len > 1:
             raise ValueError(
-                f"history_len: {self.cfg.history_len}; past frames are kept for the engine's solvers only, and where actions are "
-                "scaled by a mean and a standard deviation or not at all"
+                f"history_len: {self.cfg.history_len}; past frames are kept for the engine's solvers only, and where actions "
+                "are scaled by a mean and a standard deviation or not at all"
             )
         infos = dict(obs)
         fresh, active = infos.pop("_needs_flush", None), infos.pop("_active", None)

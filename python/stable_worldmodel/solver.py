@@ -3,7 +3,8 @@
     solver = swm.solver.CEMSolver(model, num_samples=300, n_steps=30, topk=30)
     policy = swm.policy.MPCPolicy(solver, config=swm.PlanConfig(horizon=5, receding_horizon=5))
 
-`model` is anything with `get_cost` (a PyTorch module, one of `swm.wm`, …). The search runs in the engine, for all
+`model` is anything with `get_cost` (a PyTorch module, one of `swm.wm`, …), or `"simulator"`: the world itself, the upper bound
+of any model. The search runs in the engine, for all
 environments together; what it returns depends on the seed and on each environment's own infos, never on how many are
 planned together. A solver of one's own is any object with `configure(action_space, n_envs, config)` and
 `solve(info_dict, init_action)`.
@@ -106,9 +107,13 @@ class EngineSolver:
         return _dim(self._space(), self._configured().action_block)
 
     def adapter(self, process: Any = None, transform: Any = None, history: int = 1) -> Any:
-        """The model as the engine asks it."""
+        """The model as the engine asks it; `None` for the world itself."""
         if self.model is None:
-            raise ValueError(f"{type(self).__name__} was made without a model to plan in: give it one")
+            raise ValueError(f"{type(self).__name__} was made without a model to plan in: give it one, or 'simulator'")
+        if isinstance(self.model, str):
+            if self.model != "simulator":
+                raise ValueError(f"model: {self.model!r}; load a checkpoint with swm.wm.load, or say 'simulator'")
+            return None
         engine = getattr(self.model, "_engine_model", None)
         if engine is not None:
             return engine
@@ -124,6 +129,8 @@ class EngineSolver:
         config, space = self._configured(), self._space()
         block, horizon, dim = config.action_block, config.horizon, self.action_dim
         model = self.adapter()
+        if model is None:
+            raise ValueError("the simulator is planned in by MPCPolicy, which sees the worlds themselves; solve sees infos")
         infos = {key: value for key, value in info_dict.items() if not isinstance(value, (list, str))}
         envs = len(next(iter(infos.values())))
         if isinstance(model, Adapter):

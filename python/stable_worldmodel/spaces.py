@@ -161,7 +161,7 @@ class Dict(spaces.Dict):
         members = dict(spaces_dict or {})
         super().__init__(members, **kwargs)
         # Gymnasium sorts; what is written first is sampled first here.
-        self.spaces = {**members, **{key: space for key, space in self.spaces.items() if key not in members}}
+        self.spaces: dict[str, Any] = dict(members)
         self.constrain_fn = constrain_fn
         named = list(sampling_order or [])
         unknown = [key for key in named if key not in self.spaces]
@@ -223,7 +223,7 @@ class Dict(spaces.Dict):
         return (
             isinstance(x, Mapping)
             and all(key in x and space.contains(x[key]) for key, space in self.spaces.items())
-            and (self.constrain_fn is None or bool(self.constrain_fn(x)))
+            and (self.constrain_fn is None or bool(self.constrain_fn(dict(x))))
         )
 
     def check(self, debug: bool = False) -> bool:
@@ -331,8 +331,7 @@ def from_description(described: Mapping[str, Any]) -> spaces.Space:
         return RGBBox(shape=tuple(described["shape"]), **more)
     dtype = np.dtype(described["dtype"])
     low, high = (
-        np.array(_unbounded(described[side], bound), dtype=np.float64)
-        for side, bound in (("low", -np.inf), ("high", np.inf))
+        np.array(_unbounded(described[side], bound), dtype=np.float64) for side, bound in (("low", -np.inf), ("high", np.inf))
     )
     shape = tuple(described["shape"])
     low, high = (np.broadcast_to(side, shape).astype(dtype) for side in (low, high))

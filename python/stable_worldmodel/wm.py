@@ -1,8 +1,8 @@
 """Our own models: checkpoints of LeWM, PLDM, DINO-WM, TD-MPC2, GCBC, GCIVL, GCIQL, SAC.
 
-    model = swm.wm.load("lewm-rooms")            # a name under $STABLEWM_HOME/checkpoints, or a path
-    solver = swm.solver.CEMSolver(model)         # planning runs in the engine, without Python
-    swm.wm.train("lewm", data="rooms", out="lewm-rooms", preset="tiny")
+model = swm.wm.load("lewm-rooms")            # a name under $STABLEWM_HOME/checkpoints, or a path
+solver = swm.solver.CEMSolver(model)         # planning runs in the engine, without Python
+swm.wm.train("lewm", data="rooms", out="lewm-rooms", preset="tiny")
 """
 
 from __future__ import annotations
@@ -78,6 +78,16 @@ class Model:
 
             return torch.from_numpy(costs).to(action_candidates.device)
         return costs
+
+    def get_action(self, info: dict[str, Any], **kwargs: Any) -> Any:
+        """What a model that acts does for infos `(B, T, ..)`: `(B, ..)`, in the environment's units. torch in, torch out."""
+        given = {key: value for key, value in info.items() if not isinstance(value, (list, str, Mapping)) and key[0] != "_"}
+        actions = self._engine_model.act({key: now(value) for key, value in given.items()})
+        if has_torch() and any(hasattr(value, "detach") for value in given.values()):
+            import torch
+
+            return torch.from_numpy(actions)
+        return actions
 
     def __repr__(self) -> str:
         return f"Model({self.card['family']}, {self.path!r})"

@@ -30,7 +30,7 @@ class World:
     """Many environments of one kind, stepped and drawn in parallel.
 
     Args:
-        env_name: An environment's id, such as `swm/PushT-v1`, with options as `ID,option=value`; or any id that Gymnasium knows.
+        env_name: An environment's id, such as `swm/PushT-v1`, with options as `ID,option=value`; or any that Gymnasium knows.
         num_envs: Environments played side by side. What an episode brings does not depend on it.
         image_shape: `(height, width)` of pictures.
         max_episode_steps: Steps after which episodes are truncated; the environment's own number for `None`.
@@ -226,11 +226,12 @@ class World:
             options: `variation`: factors to sample; `variation_values`: factors to pin; `state`, `goal_state`: start and goal.
         """
         self._reset_text = text = _options.reset(options, self.spec["variation"])
-        self.seed = _drawn() if seed is None else seed if isinstance(seed, int) else 0
+        one = seed is None or isinstance(seed, (int, np.integer))
+        self.seed = _seed(seed if one else None)  # type: ignore[arg-type]
         self._episodes = list(range(self.num_envs))
         self._next_episode = self.num_envs
-        if seed is not None and not isinstance(seed, (int, np.integer)):
-            seeds = [int(one) for one in seed]
+        if not one:
+            seeds = [_seed(given) for given in seed]  # type: ignore[union-attr]
             if len(seeds) != self.num_envs:
                 raise ValueError(f"seed: {len(seeds)} of them for {self.num_envs} environments")
         else:
@@ -251,9 +252,7 @@ class World:
             self.reset()
         actor = self._actor(self.policy)
         if actor is not None:
-            begun, self._next_episode = self._world.play(
-                actor, int(steps), self.seed, self._next_episode, self._reset_text
-            )
+            begun, self._next_episode = self._world.play(actor, int(steps), self.seed, self._next_episode, self._reset_text)
             for slot, episode in begun:
                 self._episodes[slot] = episode
             self._fresh[:] = False
@@ -271,7 +270,7 @@ class World:
                 for slot in slots:
                     self._episodes[slot] = self._next_episode
                     self._next_episode += 1
-                starts = [(slot, _engine.World.episode_seed(self.seed, self._episodes[slot])) for slot in slots]
+                starts = [(slot, _engine.World.episode_seed(self.seed or 0, self._episodes[slot])) for slot in slots]
                 self._world.reset(starts, self._reset_text)
                 self._begin(slots)
 
@@ -366,8 +365,8 @@ class World:
         """Plays episodes with the policy and stores them.
 
         Args:
-            path: Where to: a path, a URI of an object store, or a name under `$STABLEWM_HOME/datasets`. `dataset_path` is another name
-                for it.
+            path: Where to: a path, a URI of an object store, or a name under `$STABLEWM_HOME/datasets`. `dataset_path` is
+                another name for it.
             episodes: How many.
             seed: What decides them, together with their numbers; drawn for `None`.
             options: Factors to sample (`variation`) and to pin (`variation_values`).
@@ -393,13 +392,13 @@ class World:
         policy = self._chosen(policy)
         if writer is None and format is None:
             format = _ENDINGS.get(Path(str(path)).suffix)
-        if writer is None and not (format or "lance") in _engine.formats():
+        if path is not None and writer is None and format not in _engine.formats():
             from .data.format import foreign_writer
 
             writer = foreign_writer(path, format, "append" if mode == "resume" else mode)
-        config = {
+        config: dict[str, Any] = {
             "episodes": int(episodes),
-            "seed": _drawn() if seed is None else int(seed),
+            "seed": _seed(seed),
             "variation": _options.variation(_varied(options), self.spec["variation"]),
             "policy": _name(policy),
             "goal": bool(goal),
@@ -497,7 +496,7 @@ class World:
         variation = _options.variation(_varied(options), self.spec["variation"])
         config = {
             "episodes": episodes,
-            "seed": _drawn() if seed is None else int(seed),
+            "seed": _seed(seed),
             "variation": variation,
             "condition": condition or _describe(variation),
             "budget": eval_budget,
@@ -508,7 +507,7 @@ class World:
         acting: list[tuple[str, Any]] = [(_name(policy), self._playing(policy))]
         if floor and acting[0][0] != "random":
             acting.append(("random", _engine.Actor.random(self._world, None)))
-        runs = []
+        runs: list[dict[str, Any]] = []
         for name, actor in acting:
             filmed = None
             if video is not None and not runs:
@@ -656,6 +655,15 @@ def _percent(rate: float | None) -> float:
 def _drawn() -> int:
     """A seed nobody chose."""
     return secrets.randbits(32)
+
+
+def _seed(seed: int | None) -> int:
+    """A seed, drawn where nobody chose one."""
+    if seed is None:
+        return _drawn()
+    if int(seed) != seed or not 0 <= seed < 2**63:
+        raise ValueError(f"seed: {seed}; expected a whole number from 0 to 2^63 - 1")
+    return int(seed)
 
 
 def _name(policy: Any) -> str:

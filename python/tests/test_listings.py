@@ -53,9 +53,7 @@ def test_the_loop(tmp_path, monkeypatch):
     planner = swm.solver.CEMSolver(model, num_samples=16, n_steps=2, topk=4)
     wm_policy = swm.policy.MPCPolicy(planner)
     world.set_policy(wm_policy)
-    metrics = world.evaluate(
-        episodes=3, seed=0, video="videos/", options={"variation": ["agent.size", "background.color"]}
-    )
+    metrics = world.evaluate(episodes=3, seed=0, video="videos/", options={"variation": ["agent.size", "background.color"]})
     print(metrics["success_rate"])
     assert 0 <= metrics["success_rate"] <= 100 and len(metrics["episode_successes"]) == 3
     assert len(list((tmp_path / "videos").glob("*.mp4"))) == 3
@@ -84,7 +82,7 @@ def test_factors_of_variation(tmp_path):
         },
     )
     data = swm.data.load_dataset(str(tmp_path / "data/pusht_demo.h5"), backend="numpy")
-    first = {key: data.get_col_data(key)[:: 6] for key in data.column_names if key.startswith("variation.")}
+    first = {key: data.get_col_data(key)[::6] for key in data.column_names if key.startswith("variation.")}
     assert (first["variation.background.color"] == [26, 51, 230]).all()
     assert len(np.unique(first["variation.agent.color"], axis=0)) > 1
     assert len(np.unique(first["variation.block.scale"])) > 1

@@ -185,7 +185,9 @@ def few(solver, model, **more):
     return solver(model, **settings, **more)
 
 
-@pytest.mark.parametrize(("solver", "model", "space"), ALL, ids=[*CONTINUOUS_IDS, "lagrangian", "categorical-cem", "pgd", "grasp"])
+@pytest.mark.parametrize(
+    ("solver", "model", "space"), ALL, ids=[*CONTINUOUS_IDS, "lagrangian", "categorical-cem", "pgd", "grasp"]
+)
 def test_a_plan_depends_on_the_seed_and_on_its_own_infos_only(solver, model, space):
     together = plan(few(solver, model, seed=8), space=space)
     for size in (1, 2):

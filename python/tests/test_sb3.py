@@ -57,9 +57,8 @@ def test_dictionaries_of_observations(name):
 
 
 def test_sb3_finds_nothing_wrong():
-    from stable_baselines3.common.env_checker import check_env
-
     import gymnasium
+    from stable_baselines3.common.env_checker import check_env
 
     for name in ("swm/TwoRoom-v1", "swm/CartPoleControl-v1", "swm/PushT-v1"):
         check_env(gymnasium.make(name), warn=False)

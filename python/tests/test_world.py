@@ -139,8 +139,7 @@ def test_starts_and_goals_of_a_dataset(tmp_path):
 
 def test_visual_wrappers_run_in_the_engine():
     plain, noisy = (
-        rooms(extra_wrappers=wrappers)
-        for wrappers in ([], [partial(NoiseWrapper, std=linear(8, 30, 10)), GrayscaleWrapper])
+        rooms(extra_wrappers=wrappers) for wrappers in ([], [partial(NoiseWrapper, std=linear(8, 30, 10)), GrayscaleWrapper])
     )
     for world in (plain, noisy):
         world.reset(seed=0)
@@ -173,6 +172,8 @@ def test_a_world_goes_back_to_what_it_was():
         (lambda: rooms(num_envs=0), ValueError, "num_envs"),
         (lambda: rooms(image_shape=(0, 8)), ValueError, "at least one pixel"),
         (lambda: rooms().step(), RuntimeError, "set_policy"),
+        (lambda: rooms().reset(seed=-1), ValueError, "from 0"),
+        (lambda: rooms().reset(seed=[1, 2]), ValueError, "2 of them for 3"),
         (lambda: rooms(image_shape=64), TypeError, "height, width"),
         (lambda: rooms().set_policy(3), TypeError, "get_action"),
         (lambda: rooms().set_policy(Zero), TypeError, "class"),
@@ -202,6 +203,30 @@ def test_what_a_policy_raises_comes_back_as_it_was(tmp_path):
     world = rooms(max_episode_steps=9)
     with pytest.raises(KeyError, match="mine"):
         world.collect(tmp_path / "not.lance", episodes=3, seed=0, policy=Failing(), progress=False)
+
+
+def test_planning_in_the_world_itself():
+    world = rooms(num_envs=2, add_pixels=False)
+    solver = swm.solver.CEMSolver("simulator", num_samples=32, n_steps=4, topk=8)
+    policy = swm.policy.MPCPolicy(solver, swm.PlanConfig(horizon=10, receding_horizon=5))
+    metrics = world.evaluate(policy=policy, episodes=4, seed=0, progress=False)
+    assert metrics["success_rate"] > metrics["random_success_rate"] and policy.plans
+
+
+def test_a_model_that_acts(tmp_path):
+    """A GCBC of two steps knows nothing, and acts: by itself, and as a policy inside the engine."""
+    world = rooms(image_shape=(64, 64))
+    world.collect(tmp_path / "rooms.lance", episodes=12, seed=0, policy=swm.policy.ExpertPolicy(), progress=False)
+    out = tmp_path / "gcbc"
+    swm.wm.train("gcbc", data=str(tmp_path / "rooms.lance"), out=str(out), schedule__steps=2, data__batch_size=4)
+    model = swm.wm.load(str(out))
+    world.set_policy(swm.policy.FeedForwardPolicy(model))
+    world.reset(seed=4)
+    infos = {key: value.copy() for key, value in world.infos.items()}
+    world.step()
+    assert np.array_equal(world.infos["action"][:, 0], np.clip(model.get_action(infos), -1, 1))
+    with pytest.raises(ValueError, match="it acts and does not predict"):
+        model.get_cost(infos, np.zeros((3, 1, 1, 2), np.float32))
 
 
 def test_ctrl_c_keeps_finished_episodes(tmp_path):

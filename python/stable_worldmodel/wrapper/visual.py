@@ -5,8 +5,8 @@
         partial(ColorJitterWrapper, brightness=0.3, hue=0.1),
     ])
 
-In a `World` they run in the engine. Around a Gymnasium environment they change `render()` and the `pixels` of its infos. What is
-drawn at random follows from the episode's seed, so an episode looks the same whenever it is played. `swm wrappers`
+In a `World` they run in the engine. Around a Gymnasium environment they change `render()` and the `pixels` of its infos. What
+is drawn at random follows from the episode's seed, so an episode looks the same whenever it is played. `swm wrappers`
 lists their settings and what they may be.
 """
 
@@ -239,10 +239,11 @@ class GrayscaleWrapper(VisualWrapper):
     id = "grayscale"
 
     @classmethod
-    def engine_settings(cls, keep_channels: bool = True, **settings: Any) -> dict[str, Any]:
+    def engine_settings(cls, *values: Any, seed: int | None = None, **settings: Any) -> dict[str, Any]:
+        keep_channels = settings.pop("keep_channels", values[0] if values else True)
         if not keep_channels:
             raise ValueError("GrayscaleWrapper: pictures keep three channels here; take one of them")
-        return super().engine_settings(**settings)
+        return super().engine_settings(seed=seed, **settings)
 
 
 class ResolutionWrapper(VisualWrapper):

@@ -106,14 +106,15 @@ impl Cli {
     /// Runs the command; the exit code is 0 when done, 1 when it failed, 2 for wrong usage, 130 when
     /// interrupted.
     pub fn run(self) -> u8 {
-        tracing_subscriber::fmt()
+        // A program that embeds this one may be logging already.
+        let _ = tracing_subscriber::fmt()
             .with_writer(std::io::stderr)
             .with_env_filter(
                 tracing_subscriber::EnvFilter::try_from_env("SWM_LOG")
                     .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("warn")),
             )
             .without_time()
-            .init();
+            .try_init();
         match self.dispatch() {
             Ok(()) => 0,
             Err(error) => {

@@ -286,7 +286,7 @@ class MPCPolicy(BasePolicy):
 
     def _replan(self, infos: dict[str, Any], due: list[int]) -> None:
         known = [self._rest.get(i) for i in due]
-        init = None
+        init: Any = None
         if self.cfg.warm_start and any(rest is not None for rest in known):
             some = next(rest for rest in known if rest is not None)
             init = np.stack([np.zeros_like(some) if rest is None else rest for rest in known])

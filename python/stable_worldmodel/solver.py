@@ -155,11 +155,12 @@ class EngineSolver:
             self._solved,
         )
         self._solved += 1
+        found: Any = actions
         if has_torch():
             import torch
 
-            actions = torch.from_numpy(actions)
-        return {"actions": actions, "costs": costs.tolist(), "trace": json.loads(trace)}
+            found = torch.from_numpy(actions)
+        return {"actions": found, "costs": costs.tolist(), "trace": json.loads(trace)}
 
     def __call__(self, info_dict: dict[str, Any], init_action: Any = None) -> dict[str, Any]:
         """The same as `solve`."""
@@ -218,7 +219,7 @@ def _dim(space: spaces.Space, block: int) -> int:
         return int(space.n) * block
     if isinstance(space, spaces.MultiDiscrete):
         return int(space.nvec.sum()) * block
-    return int(np.prod(space.shape)) * block
+    return int(np.prod(space.shape or ())) * block
 
 
 def _bounds(space: Any, block: int, model: Any) -> tuple[list[float], list[float], list[int] | None]:

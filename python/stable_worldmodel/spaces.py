@@ -59,10 +59,12 @@ class _Factor:
         """Whether the current value is allowed."""
         return self.contains(self._value)
 
-    def sample(self, mask: Any = None, max_tries: int = TRIES, set_value: bool = True, **kwargs: Any) -> Any:
+    def sample(self, mask: Any = None, probability: Any = None, *, max_tries: int = TRIES, set_value: bool = True) -> Any:
         """Samples until the condition holds, at most `max_tries` times; the sample becomes the value."""
         for _ in range(max_tries):
-            value = super().sample(mask=mask, **kwargs)  # type: ignore[misc]
+            # What is not given is not named: Gymnasium knows probabilities since 1.1.
+            given = {} if probability is None else {"probability": probability}
+            value = super().sample(mask=mask, **given)  # type: ignore[misc]
             if self.contains(value):
                 if set_value:
                     self._value = value
@@ -235,12 +237,15 @@ class Dict(spaces.Dict):
             warnings.warn(f"not allowed: {', '.join(wrong)}", stacklevel=2)
         return not wrong and (self.constrain_fn is None or bool(self.constrain_fn(self.value)))
 
-    def sample(self, mask: Any = None, max_tries: int = TRIES, set_value: bool = True, **kwargs: Any) -> dict[str, Any]:
+    def sample(
+        self, mask: Any = None, probability: Any = None, *, max_tries: int = TRIES, set_value: bool = True
+    ) -> dict[str, Any]:
         """Samples every factor, in order, until the condition on the whole holds."""
         for _ in range(max_tries):
-            mask = mask or {}
+            masks, chances = mask or {}, probability or {}
             value = {
-                key: self.spaces[key].sample(mask=mask.get(key), set_value=set_value, **kwargs) for key in self._sampling_order
+                key: self.spaces[key].sample(masks.get(key), chances.get(key), set_value=set_value)
+                for key in self._sampling_order
             }
             if self.constrain_fn is None or self.constrain_fn(value):
                 return {key: value[key] for key in self.spaces}

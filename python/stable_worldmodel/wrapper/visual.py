@@ -132,7 +132,7 @@ class VisualWrapper(gymnasium.Wrapper):
 
     def render(self) -> Any:
         """The picture, changed."""
-        picture = self.env.render()
+        picture: Any = self.env.render()
         return picture if picture is None else self.apply(picture)
 
     def apply(self, picture: np.ndarray) -> np.ndarray:

@@ -75,9 +75,9 @@ impl Transport for InProcess {
     }
 }
 
-/// The module with the class `Bridge`, loaded once; `swm_craftax` becomes importable with it.
+/// The module with the class `Bridge`, loaded once. With `craftax`, `swm_craftax` becomes importable: it needs JAX.
 #[pyfunction]
-pub fn bridge(py: Python<'_>) -> PyResult<Bound<'_, PyModule>> {
+pub fn bridge(py: Python<'_>, craftax: bool) -> PyResult<Bound<'_, PyModule>> {
     let modules = py.import("sys")?.getattr("modules")?;
     let load = |source: &str, name: &str| -> PyResult<Bound<'_, PyModule>> {
         if let Ok(known) = modules.get_item(name) {
@@ -90,6 +90,8 @@ pub fn bridge(py: Python<'_>) -> PyResult<Bound<'_, PyModule>> {
         modules.set_item(name, &module)?;
         Ok(module)
     };
-    load(CRAFTAX, "swm_craftax")?;
+    if craftax {
+        load(CRAFTAX, "swm_craftax")?;
+    }
     load(BRIDGE, "swm_bridge")
 }

@@ -27,13 +27,19 @@ def open_world(
     """
     drawn = engine_wrappers(wrappers)
     inside = [] if drawn is not None else list(wrappers)
-    bridge = _engine.bridge()
+    try:
+        bridge = _engine.bridge(env_name.startswith("swm/Craftax"))
+    except ModuleNotFoundError as error:
+        raise _missing("craftax", error) from error
     envs: list[Any] = []
     # Ours draw in any size, which beats resizing.
     sized = {"image_shape": image} if image is not None and env_name in _engine.envs() else {}
 
     def make() -> Any:
-        made = bridge.make(env_name, {**options, **sized}, inside)
+        try:
+            made = bridge.make(env_name, {**options, **sized}, inside)
+        except bridge.Missing as error:
+            raise _missing(error.args[0], error) from error
         if max_episode_steps is not None:
             made.max_episode_steps = max_episode_steps
         if resample is not None:
@@ -46,3 +52,7 @@ def open_world(
         described, make, num_envs, image, max_episode_steps, threads, json.dumps(drawn or []), wrap_goal
     )
     return world, envs, drawn or []
+
+
+def _missing(package: str, error: Exception) -> ModuleNotFoundError:
+    return ModuleNotFoundError(f"{error.args[-1]}; install it with: pip install 'stable-worldmodel-rs[{package}]'")

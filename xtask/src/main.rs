@@ -80,7 +80,17 @@ fn verdict(what: &str, violations: &[String]) -> Result<()> {
 fn cargo(arguments: &[&str], fix: &str) -> Result<()> {
     let program = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let words = arguments.join(" ");
-    let status = Command::new(program)
+    let mut command = Command::new(program);
+    // What `cargo run` told this program about itself is not for others: build scripts that watch these variables (ring's)
+    // would run again, and everything above them be compiled again, at every change between check and build.
+    let own = std::env::vars_os().map(|(name, _)| name).filter(|name| {
+        let name = name.to_string_lossy();
+        name == "OUT_DIR" || name.starts_with("CARGO_PKG_") || name.starts_with("CARGO_MANIFEST_")
+    });
+    own.for_each(|name| {
+        command.env_remove(name);
+    });
+    let status = command
         .args(arguments)
         .current_dir(root())
         .status()

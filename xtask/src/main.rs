@@ -90,11 +90,8 @@ fn cargo(arguments: &[&str], fix: &str) -> Result<()> {
     own.for_each(|name| {
         command.env_remove(name);
     });
-    let status = command
-        .args(arguments)
-        .current_dir(root())
-        .status()
-        .with_context(|| format!("starting `cargo {words}`"))?;
+    let status =
+        command.args(arguments).current_dir(root()).status().with_context(|| format!("starting `cargo {words}`"))?;
     if !status.success() {
         bail!("`cargo {words}` failed ({status}); {fix}");
     }

@@ -30,7 +30,7 @@ pub fn check(location: &Location, mode: WriteMode, wanted: &Manifest, mix_render
                 return Ok(());
             }
             Err(Error::config(
-                "codec",
+                "codec (--codec)",
                 format!("the dataset's pictures are {stored}, not {wanted}"),
                 "ask for the same again, or collect into another dataset",
             ))

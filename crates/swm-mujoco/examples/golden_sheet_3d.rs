@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! SWM_GOLDEN_PICTURES=DIR cargo nextest run --release -p swm-mujoco golden follow
-//! cargo run --release -p swm-mujoco --example golden_sheet DIR
+//! cargo run --release -p swm-mujoco --example golden_sheet_3d DIR
 //! ```
 //! The golden tests leave triptychs in a folder: the recorded picture, that of our own renderer, and their difference.
 #![allow(clippy::print_stdout, reason = "a program")]

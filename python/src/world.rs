@@ -184,7 +184,6 @@ impl World {
         mut next: usize,
         options: &str,
     ) -> PyResult<(Vec<(usize, usize)>, usize)> {
-        let options = reset_options(options)?;
         let (mut world, mut policy) = (self.lock()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
         let mut begun = vec![];
@@ -207,6 +206,8 @@ impl World {
                     let over = (0..active.len()).filter(|&slot| !active[slot]);
                     let starting: Vec<(usize, usize)> = over.zip(next..).collect();
                     next += starting.len();
+                    // Read only now: most calls begin no episode.
+                    let options = reset_options(options).map_err(foreign)?;
                     let reset = |&(slot, episode)| {
                         let seed = reset_seed(episode_key(seed, episode));
                         Reset { slot, seed, options: options.clone() }

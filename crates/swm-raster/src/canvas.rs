@@ -301,9 +301,10 @@ fn around(a: Region, b: Region) -> Region {
     [a[0].min(b[0]), a[1].min(b[1]), a[2].max(b[2]), a[3].max(b[3])]
 }
 
-/// What is in both of two regions.
+/// What is in both of two regions; of regions that lie apart, one without pixels.
 fn within(a: Region, b: Region) -> Region {
-    [a[0].max(b[0]), a[1].max(b[1]), a[2].min(b[2]), a[3].min(b[3])]
+    let [x, y] = [a[0].max(b[0]), a[1].max(b[1])];
+    [x, y, a[2].min(b[2]).max(x), a[3].min(b[3]).max(y)]
 }
 
 /// Whether a camera's numbers make a picture.
@@ -362,5 +363,17 @@ vectorised! {
         for i in 0..n {
             bytes[i] = [byte(r[i]), byte(g[i]), byte(b[i])];
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn regions_that_lie_apart_share_no_pixels() {
+        assert_eq!(within([2, 3, 9, 8], [4, 1, 20, 6]), [4, 3, 9, 6]);
+        assert_eq!(within([0, 0, 3, 3], [5, 0, 9, 3]), [5, 0, 5, 3]);
+        assert_eq!(within([0, 6, 3, 9], [0, 0, 3, 4]), [0, 6, 3, 6]);
     }
 }

@@ -98,8 +98,10 @@ fn cargo(arguments: &[&str], fix: &str) -> Result<()> {
     Ok(())
 }
 
-/// The workspace's folder.
+/// The workspace's folder: the one that cargo runs this in, which need not be the one it was compiled in when two
+/// checkouts share a target folder.
 fn root() -> PathBuf {
-    let here = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
+    let here = std::env::var_os("CARGO_MANIFEST_DIR").unwrap_or_else(|| env!("CARGO_MANIFEST_DIR").into());
+    let here = PathBuf::from(here);
     here.parent().map(PathBuf::from).unwrap_or(here)
 }

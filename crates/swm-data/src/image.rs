@@ -119,7 +119,7 @@ fn recognise(bytes: &[u8]) -> Result<Stored> {
 pub fn size(bytes: &[u8]) -> Result<(usize, usize)> {
     match recognise(bytes)? {
         Stored::Jpeg => {
-            let mut decoder = jpeg(bytes);
+            let mut decoder = jpeg_reader(bytes);
             decoder.decode_headers().map_err(|e| Error::external("reading a JPEG header", e))?;
             let info = decoder.info().ok_or_else(|| Error::external("reading a JPEG header", "it has no size"))?;
             Ok((info.height.into(), info.width.into()))
@@ -137,8 +137,9 @@ pub fn size(bytes: &[u8]) -> Result<(usize, usize)> {
 /// # Errors
 /// When the bytes are neither JPEG, PNG nor QOI, are damaged, or show a picture of another size.
 pub fn decode(bytes: &[u8], height: usize, width: usize, out: &mut [u8]) -> Result<()> {
+    let length = out.len();
     let check = |given: (usize, usize)| {
-        if given == (height, width) && out.len() == height * width * 3 {
+        if given == (height, width) && length == height * width * 3 {
             return Ok(());
         }
         Err(Error::mismatch(
@@ -149,8 +150,12 @@ pub fn decode(bytes: &[u8], height: usize, width: usize, out: &mut [u8]) -> Resu
     };
     match recognise(bytes)? {
         Stored::Jpeg => {
+            if jpeg::decode(bytes, height, width, out) {
+                return Ok(());
+            }
+            // Of another kind or size, or damaged: the general decoder knows.
             let fail = |e| Error::external("decoding a JPEG picture", e);
-            let mut decoder = jpeg(bytes);
+            let mut decoder = jpeg_reader(bytes);
             decoder.decode_headers().map_err(fail)?;
             let info = decoder.info().ok_or_else(|| Error::external("decoding a JPEG picture", "it has no size"))?;
             check((info.height.into(), info.width.into()))?;
@@ -182,7 +187,7 @@ pub fn decode(bytes: &[u8], height: usize, width: usize, out: &mut [u8]) -> Resu
     }
 }
 
-fn jpeg(bytes: &[u8]) -> zune_jpeg::JpegDecoder<ZCursor<&[u8]>> {
+fn jpeg_reader(bytes: &[u8]) -> zune_jpeg::JpegDecoder<ZCursor<&[u8]>> {
     // Strict: a truncated picture is an error, not a grey area.
     let options = DecoderOptions::default().jpeg_set_out_colorspace(ColorSpace::RGB).set_strict_mode(true);
     zune_jpeg::JpegDecoder::new_with_options(ZCursor::new(bytes), options)

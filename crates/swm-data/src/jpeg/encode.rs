@@ -6,6 +6,8 @@
 //! baseline, JFIF, colour at half resolution (4:2:0), the example tables of Annex K scaled by quality as libjpeg
 //! does. Equal pictures give equal bytes on every machine: arithmetic is IEEE single precision in a fixed order.
 
+use super::ZIGZAG;
+
 /// Quantisation tables of Annex K (K.1, K.2), row by row.
 const LUMINANCE: [u8; 64] = [
     16, 11, 10, 16, 24, 40, 51, 61, 12, 12, 14, 19, 26, 58, 60, 55, 14, 13, 16, 24, 40, 57, 69, 56, 14, 17, 22, 29, 51,
@@ -17,13 +19,6 @@ const CHROMINANCE: [u8; 64] = [
     17, 18, 24, 47, 99, 99, 99, 99, 18, 21, 26, 66, 99, 99, 99, 99, 24, 26, 56, 99, 99, 99, 99, 99, 47, 66, 99, 99, 99,
     99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99, 99,
     99, 99, 99, 99, 99, 99,
-];
-
-/// The place (row by row) of the k-th coefficient in the order of a scan, figure A.6.
-const ZIGZAG: [u8; 64] = [
-    0, 1, 8, 16, 9, 2, 3, 10, 17, 24, 32, 25, 18, 11, 4, 5, 12, 19, 26, 33, 40, 48, 41, 34, 27, 20, 13, 6, 7, 14, 21,
-    28, 35, 42, 49, 56, 57, 50, 43, 36, 29, 22, 15, 23, 30, 37, 44, 51, 58, 59, 52, 45, 38, 31, 39, 46, 53, 60, 61, 54,
-    47, 55, 62, 63,
 ];
 
 /// A Huffman table of Annex K.3: how many codes of each length from 1 to 16, and the symbols in their order.

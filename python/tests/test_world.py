@@ -148,8 +148,25 @@ def test_visual_wrappers_run_in_the_engine():
     assert np.array_equal(grey[..., 0], grey[..., 1]) and np.array_equal(noisy.infos["goal"], plain.infos["goal"])
     with pytest.raises(ValueError, match="std"):
         rooms(extra_wrappers=[partial(NoiseWrapper, std=-3)])
-    with pytest.raises(TypeError, match="function of one's own"):
-        rooms(extra_wrappers=[partial(NoiseWrapper, std=lambda step: 3.0)])
+    with pytest.raises(TypeError, match="std is no function from a step"):
+        rooms(extra_wrappers=[partial(NoiseWrapper, std=lambda step: "loud")])
+
+
+def test_any_function_of_the_step_is_a_schedule():
+    ours, theirs = (
+        rooms(extra_wrappers=[partial(NoiseWrapper, std=schedule)])
+        for schedule in (linear(8, 28, 10), lambda step: 8 + 2 * min(step, 10))
+    )
+    for world in (ours, theirs):
+        world.set_policy(Zero(0.7))
+        world.reset(seed=0)
+    first = ours.infos["pixels"].copy()
+    for _ in range(12):
+        assert np.array_equal(ours.infos["pixels"], theirs.infos["pixels"])
+        ours.step(), theirs.step()
+    assert not np.array_equal(ours.infos["pixels"], first)
+    with pytest.raises(ValueError, match="std"):
+        rooms(extra_wrappers=[partial(NoiseWrapper, std=lambda step: 250.0 + step)])
 
 
 def test_a_world_goes_back_to_what_it_was():

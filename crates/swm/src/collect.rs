@@ -1,6 +1,7 @@
 //! What a collection may be added to.
 
 use swm_core::{Error, Manifest, Result};
+use swm_data::lance::shard_manifests;
 use swm_data::{Location, WriteMode};
 use swm_eval::collect::check_continues;
 
@@ -23,7 +24,7 @@ pub fn check(location: &Location, mode: WriteMode, wanted: &Manifest, mix_render
             let Some(stored) = swm_data::open(location.clone())?.manifest() else { return Ok(()) };
             check_continues(&stored, wanted)?;
             if !mix_renderers {
-                check_renderer(&stored, wanted)?;
+                check_renderer("continuing a collection", &stored, wanted)?;
             }
             let (stored, wanted) = (&stored.config["codec"], &wanted.config["codec"]);
             if stored == wanted {
@@ -43,15 +44,29 @@ pub fn check(location: &Location, mode: WriteMode, wanted: &Manifest, mix_render
     }
 }
 
-/// Checks that the pictures of a dataset were drawn as those to come will be: by the same renderer, on whichever device.
-fn check_renderer(stored: &Manifest, wanted: &Manifest) -> Result<()> {
+/// Checks that the parts of a dataset which several machines collected, and the episodes that are there already, have
+/// pictures of one renderer.
+///
+/// # Errors
+/// When they have not; says what to do.
+pub fn check_parts(location: &Location) -> Result<()> {
+    let stored = swm_data::open(location.clone()).ok().and_then(|reader| reader.manifest());
+    let parts = shard_manifests(location)?;
+    let mut all = stored.iter().chain(&parts);
+    let Some(first) = all.next() else { return Ok(()) };
+    all.try_for_each(|other| check_renderer("committing a part", first, other))
+}
+
+/// Checks that the pictures of a dataset were drawn as those to come were or will be: by the same renderer, on whichever
+/// device.
+fn check_renderer(doing: &str, stored: &Manifest, wanted: &Manifest) -> Result<()> {
     fn kind(manifest: &Manifest) -> Option<&str> {
         manifest.libraries.get("renderer")?.split(' ').next()
     }
     match (kind(stored), kind(wanted)) {
         (Some(stored), Some(wanted)) if stored != wanted => Err(Error::config(
-            format!("continuing a collection with the renderer {wanted}"),
-            format!("its pictures were drawn by {stored}"),
+            format!("{doing} with the renderer {wanted}"),
+            format!("the dataset's other pictures were drawn by {stored}"),
             format!("--renderer {stored} draws like them; --mix-renderers adds pictures that look a little different"),
         )),
         _ => Ok(()),

@@ -163,11 +163,23 @@ def _plain(cls: type, name: str, value: Any) -> Any:
         # Several colours are one list of their numbers.
         return [n for inner in plain for n in inner] if plain and isinstance(plain[0], list) else plain
     if callable(value):
-        raise TypeError(
-            f"{cls.__name__}: {name} is a function of one's own; the engine knows numbers, linear, cosine, exponential "
-            "and sinusoidal"
-        )
+        return _tabulated(cls, name, value)
     return value
+
+
+#: The steps of an episode for which a function of one's own is asked; its last number is held.
+_STEPS = 10_000
+
+
+def _tabulated(cls: type, name: str, schedule: Callable[[int], Any]) -> list[float]:
+    """The numbers that a function gives for the steps of an episode: the engine asks for no Python."""
+    try:
+        numbers = [float(schedule(step)) for step in range(_STEPS)]
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{cls.__name__}: {name} is no function from a step of the episode to a number: {error}") from error
+    while len(numbers) > 1 and numbers[-1] == numbers[-2]:
+        numbers.pop()
+    return numbers
 
 
 class ChromaKeyWrapper(VisualWrapper):

@@ -24,7 +24,7 @@ mod table;
 mod writer;
 
 pub use salvage::salvage;
-pub use shard::{Shard, commit_shards, create_shard};
+pub use shard::{Shard, commit_shards, create_shard, shard_manifests};
 
 use crate::format::Format;
 

@@ -250,6 +250,15 @@ fn parse<T: DeserializeOwned>(store: &Store, path: &object_store::path::Path) ->
     serde_json::from_slice(&store.read(path)?).map_err(|e| damaged(&store.label, format!("{path} is unreadable: {e}")))
 }
 
+/// The manifests of the parts that are there, in order, for those that have one.
+///
+/// # Errors
+/// When the log of a part is damaged, or the system refuses.
+pub fn shard_manifests(location: &Location) -> Result<Vec<Manifest>> {
+    let log = Log::of(&Store::new(location)?)?;
+    Ok(log.parts.into_values().filter_map(|part| part.begun?.manifest).collect())
+}
+
 /// Makes one version of what all parts wrote, in the order of the parts, after the episodes that are there. Gives the
 /// number of episodes that were added. What a killed commit left is taken up where it stopped.
 ///

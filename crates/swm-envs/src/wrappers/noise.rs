@@ -50,7 +50,7 @@ pub const ENTRY: WrapperEntry = WrapperEntry {
     },
 };
 
-#[derive(Clone, Copy, Deserialize)]
+#[derive(Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Settings {
     kind: Kind,

@@ -132,7 +132,8 @@ impl fmt::Display for Domain {
             Self::Schedule { low, high } => write!(
                 f,
                 "a number from {low} to {high}, or linear/START/END/STEPS, cosine/START/END/STEPS, \
-                 exponential/START/DECAY/FLOOR or sinusoidal/LOW/HIGH/PERIOD of them"
+                 exponential/START/DECAY/FLOOR or sinusoidal/LOW/HIGH/PERIOD of them, or one for every step, \
+                 FIRST/SECOND/…, the last one held"
             ),
             Self::Color => write!(f, "red/green/blue from 0 to 255, or one number for all three"),
             Self::Colors => write!(f, "red/green/blue from 0 to 255, again for every further colour"),
@@ -216,13 +217,15 @@ pub(super) fn complete(wrapper: &str, table: &'static [Parameter], given: &Setti
 }
 
 /// A number that follows the steps of the episode, counted from its first picture.
-#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(untagged)]
 pub enum Schedule {
     /// Always the same.
     Constant(f64),
     /// By a formula with three numbers.
     Formula(Formula, f64, f64, f64),
+    /// One number a step; the last is held.
+    Steps(Vec<f64>),
 }
 
 /// How a [`Schedule`] changes.
@@ -244,10 +247,12 @@ impl Schedule {
     #[allow(clippy::cast_precision_loss)]
     pub fn at(&self, step: u64) -> f64 {
         use std::f64::consts::{PI, TAU};
+        let index = usize::try_from(step).unwrap_or(usize::MAX);
         let step = step as f64;
         let part = |steps: f64| (step / steps.max(1.0)).min(1.0);
         match *self {
             Self::Constant(value) => value,
+            Self::Steps(ref values) => values.get(index).or(values.last()).copied().unwrap_or_default(),
             Self::Formula(Formula::Linear, start, end, steps) => start + (end - start) * part(steps),
             Self::Formula(Formula::Cosine, start, end, steps) => {
                 end + 0.5 * (start - end) * (1.0 + (PI * part(steps)).cos())
@@ -264,6 +269,7 @@ impl Schedule {
         let allowed = |value: f64| (low..=high).contains(&value);
         match *self {
             Self::Constant(value) => allowed(value),
+            Self::Steps(ref values) => !values.is_empty() && values.iter().all(|&value| allowed(value)),
             Self::Formula(Formula::Exponential, start, decay, floor) => {
                 allowed(start) && allowed(floor) && (0.0..=1.0).contains(&decay)
             }
@@ -331,5 +337,6 @@ mod tests {
         assert_eq!(at(r#"["cosine", 2, 12, 10]"#, [0, 2, 5, 99]), [2.0, 2.954915, 7.0, 12.0]);
         assert_eq!(at(r#"["exponential", 8, 0.5, 1]"#, [0, 1, 3, 9]), [8.0, 4.0, 1.0, 1.0]);
         assert_eq!(at(r#"["sinusoidal", 2, 12, 8]"#, [0, 1, 2, 6]), [7.0, 10.535534, 12.0, 2.0]);
+        assert_eq!(at("[3, 1, 4]", [0, 1, 2, 99]), [3.0, 1.0, 4.0, 4.0]);
     }
 }

@@ -42,13 +42,19 @@ enum DatasetsCommand {
     Commit {
         /// The dataset: a path, a URI or a name
         dataset: String,
+        /// Commit parts whose pictures different renderers drew
+        #[arg(long)]
+        mix_renderers: bool,
     },
 }
 
 /// Lists the datasets at home, or commits parts.
 pub fn datasets(args: &DatasetsArgs, as_json: bool) -> anyhow::Result<()> {
-    if let Some(DatasetsCommand::Commit { dataset }) = &args.command {
+    if let Some(DatasetsCommand::Commit { dataset, mix_renderers }) = &args.command {
         let location = home::location(dataset)?;
+        if !mix_renderers {
+            swm::collect::check_parts(&location)?;
+        }
         let added = commit_shards(&location)?;
         if as_json {
             return emit_json(&json!({"dataset": location.to_string(), "added": added}));

@@ -113,3 +113,39 @@ fn a_truncated_dataset_says_so() {
     std::fs::remove_file(&file).expect("removable");
     swm.refuses(&["inspect", "rooms"], 1, &["rooms.lance"]);
 }
+
+/// Parts of one dataset whose pictures two renderers drew. Only one renderer is sure to be there, so the second part's
+/// note is changed to tell of another.
+#[test]
+fn parts_of_two_renderers_are_committed_only_when_asked() {
+    let swm = Swm::new();
+    let part = |shard| {
+        [
+            "collect",
+            "swm/PendulumDMControl-v0",
+            "-o",
+            "swings",
+            "--image",
+            "16",
+            "--max-steps",
+            "3",
+            "--policy",
+            "random",
+            "--shard",
+            shard,
+        ]
+    };
+    for shard in ["0/2", "1/2"] {
+        swm.json(&with(&part(shard), &["--episodes", "2", "--renderer", "cpu"]));
+    }
+    let parts = swm.path("datasets/swings.lance/_shards");
+    let second =
+        std::fs::read_dir(parts).expect("parts").map(|entry| entry.expect("a part").path()).max().expect("two");
+    let note = second.join("begun.json");
+    let told = std::fs::read_to_string(&note).expect("a note").replace(r#""renderer":"cpu"#, r#""renderer":"egl"#);
+    std::fs::write(&note, told).expect("writes");
+    let refused = swm.run(&["datasets", "commit", "swings"]);
+    let told = text(&refused.stderr);
+    assert!(!refused.status.success() && told.contains("egl") && told.contains("--mix-renderers"), "{told}");
+    assert_eq!(swm.json(&["datasets", "commit", "swings", "--mix-renderers"])["added"], 2);
+}

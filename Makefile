@@ -17,13 +17,14 @@ SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test test-python check build wheel gpu assets setup setup-python reference bench clean
+.PHONY: help demo test test-python check build wheel wheel-portable gpu assets setup setup-python reference bench clean
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
 	@echo 'make test       all checks and all tests'
 	@echo 'make build      the swm binary: $(SWM)'
 	@echo 'make wheel      the Python package: $(WHEELS)'
+	@echo 'make wheel-portable   the same with the FFmpeg it uses inside, for other machines: $(WHEELS)/portable'
 	@echo 'make gpu        the same with models on a GPU through Vulkan: $(CARGO_TARGET_DIR)-gpu/release/swm'
 	@echo 'make assets     MuJoCo, its models and meshes, into $(SWM_ASSETS)'
 	@echo 'make bench      our benchmarks, against the reference where `make reference` installed it'
@@ -56,6 +57,11 @@ wheel: build $(PYTHON_VENV)/ready
 	@rm -rf $(WHEELS)
 	$(PYTHON_VENV)/bin/maturin build --release --manifest-path python/Cargo.toml --out $(WHEELS) --compatibility linux \
 	  --auditwheel skip --interpreter $(PYTHON_VENV)/bin/python
+
+# For machines without the FFmpeg of this one: its libraries go along (88 MB instead of 24). They include x264, which is
+# under the GPL: whoever gives the wheel to others gives it under those terms.
+wheel-portable: wheel
+	cd $(WHEELS) && PATH=$(PYTHON_VENV)/bin:$$PATH auditwheel repair --wheel-dir portable *.whl
 
 # The program with models on a GPU through Vulkan, in a folder of its own: other features compile other libraries.
 gpu: setup

@@ -46,12 +46,19 @@ def __getattr__(name: str) -> Any:
         from ._engine import __version__
 
         return __version__
-    if name in _HOMES:
-        value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-    elif name in __all__:
-        value = importlib.import_module(f"{__name__}.{name}")
-    else:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        home = importlib.import_module(f"{__name__}.{_HOMES.get(name, name)}")
+    except ImportError as error:
+        if "libav" in str(error) or "libsw" in str(error):
+            message = (
+                f"{error}\nThis wheel uses the FFmpeg libraries of the machine it was built on, and they are not here. "
+                "Install those, or a wheel that has them inside (make wheel-portable)."
+            )
+            raise ImportError(message) from error
+        raise
+    value = getattr(home, name) if name in _HOMES else home
     globals()[name] = value
     return value
 

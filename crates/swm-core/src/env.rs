@@ -150,6 +150,15 @@ impl<'a> FrameMut<'a> {
     }
 }
 
+/// What a world will be asked for next ([`Env::announce`]).
+#[derive(Clone, Copy, Debug)]
+pub enum Next<'a> {
+    /// [`Env::reset`].
+    Reset(u64, &'a ResetOptions),
+    /// [`Env::step`].
+    Step(Action<'a>),
+}
+
 /// The full state of an environment, randomness included: opaque bytes, valid for the same environment id.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Snapshot(pub Vec<u8>);
@@ -171,6 +180,13 @@ pub trait Env: Send {
     /// # Errors
     /// When the action is of the wrong kind, length or range, or not finite.
     fn step(&mut self, action: Action<'_>) -> Result<Transition>;
+
+    /// What comes next, so that a world which lives elsewhere can begin while others are told, too. The very call follows,
+    /// with nothing else in between; what is wrong about it is that call's error. Whether work began, for which the call
+    /// only has to wait.
+    fn announce(&mut self, _next: Next<'_>) -> bool {
+        false
+    }
 
     /// Writes the columns of [`EnvSpec::columns`] into the first places of a row.
     fn observe(&self, row: &mut RowMut<'_>);

@@ -26,7 +26,7 @@ pub mod variation;
 pub mod view;
 
 pub use batch::{Batch, ColumnSpec, DType, Element, RowMut, RowRef, Schema};
-pub use env::{Action, Env, EnvSpec, FrameMut, ResetOptions, Snapshot, Transition};
+pub use env::{Action, Env, EnvSpec, FrameMut, Next, ResetOptions, Snapshot, Transition};
 pub use error::{Error, Result};
 pub use key::{Key, Rng};
 pub use manifest::Manifest;

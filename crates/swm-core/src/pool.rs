@@ -7,7 +7,7 @@
 
 use crate::batch::{Batch, ColumnSpec, DType, RowMut, Schema};
 use crate::pace::Pace;
-use crate::{Action, Env, EnvSpec, Error, FrameMut, ResetOptions, Result, View};
+use crate::{Action, Env, EnvSpec, Error, FrameMut, Next, ResetOptions, Result, View};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -178,6 +178,11 @@ impl EnvPool {
         for reset in resets {
             wanted[reset.slot] = Some(reset);
         }
+        for (slot, reset) in self.slots.iter_mut().zip(&wanted) {
+            if let Some(reset) = reset {
+                slot.env.announce(Next::Reset(reset.seed, &reset.options));
+            }
+        }
         self.each(false, |i, slot, places, row| {
             let Some(reset) = wanted[i] else { return Ok(()) };
             slot.env.reset(reset.seed, &reset.options)?;
@@ -229,16 +234,21 @@ impl EnvPool {
         let limit = self.max_episode_steps;
         let begun = Instant::now();
         let stepping = active.iter().filter(|&&active| active).count();
-        let alone = self.pace.alone(stepping);
+        let action = |i| match dtype {
+            DType::Float32 => Action::Continuous(actions.row(i).at::<f32>(column)),
+            _ => Action::Discrete(actions.row(i).at::<i64>(column)),
+        };
+        let mut elsewhere = true;
+        for (i, slot) in self.slots.iter_mut().enumerate().filter(|(i, _)| active[*i]) {
+            elsewhere &= slot.env.announce(Next::Step(action(i)));
+        }
+        // To wait for what others do, one thread is enough; pictures are scaled and changed here.
+        let alone = self.pace.alone(stepping) || (elsewhere && self.places.pixels.is_none());
         let stepped = self.each(alone, |i, slot, places, row| {
             if !active[i] {
                 return Ok(());
             }
-            let action = match dtype {
-                DType::Float32 => Action::Continuous(actions.row(i).at::<f32>(column)),
-                _ => Action::Discrete(actions.row(i).at::<i64>(column)),
-            };
-            let mut transition = slot.env.step(action)?;
+            let mut transition = slot.env.step(action(i))?;
             slot.steps += 1;
             transition.truncated |= slot.steps >= limit && !transition.terminated;
             #[allow(clippy::cast_possible_truncation)]

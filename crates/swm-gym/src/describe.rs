@@ -3,7 +3,7 @@
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::ops::Range;
-use swm_core::{ColumnSpec, DType, EnvSpec, Error, Factor, Result, Schema, Space, VariationSpace};
+use swm_core::{Action, ColumnSpec, DType, EnvSpec, Error, Factor, Result, Schema, Space, VariationSpace};
 
 /// What an environment is, and where in the buffer everything lies: `Bridge.describe()`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -197,6 +197,15 @@ impl Form {
     /// The picture of the goal that its `info` holds.
     pub(crate) fn goal(&self) -> Option<&Place> {
         self.description.goal.as_ref()
+    }
+
+    /// The numbers of an action, as they lie in the memory.
+    pub(crate) fn bytes<'a>(&self, action: Action<'a>) -> Result<&'a [u8]> {
+        let space = &self.spec.action_space;
+        Ok(match space {
+            Space::Box { .. } => bytemuck::cast_slice(action.continuous(space.len())?),
+            _ => bytemuck::cast_slice(action.discrete(space)?),
+        })
     }
 
     /// Why there are no pictures.

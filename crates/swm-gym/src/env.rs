@@ -10,7 +10,7 @@ use crate::{Description, Failure, Form, Request, Transport};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use swm_core::{
-    Action, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, RowMut, RowRef, Snapshot, Space,
+    Action, Env, EnvSpec, Error, FactorValues, FrameMut, Key, Next, ResetOptions, Result, RowMut, RowRef, Snapshot,
     Transition, VariationRequest,
 };
 
@@ -26,6 +26,8 @@ pub struct GymEnv {
     stage: Stage,
     /// None before the first reset and after an error.
     episode: Option<Episode>,
+    /// What the environment does already, before it was asked for: the reset of the episode, or the last of its actions.
+    announced: Option<Ask>,
     factors: FactorValues,
     /// Whether the picture in the memory is of now.
     drawn: bool,
@@ -100,6 +102,7 @@ impl GymEnv {
             restarts,
             stage: Stage::Begun,
             episode: None,
+            announced: None,
             drawn: false,
             looked_at: false,
         })
@@ -189,23 +192,45 @@ impl GymEnv {
             Ask::Reset => Request::Reset(&episode.reset),
             Ask::Render => Request::Render,
             Ask::Step => {
-                let place = self.form.action.clone();
-                let last = episode.actions.len() - place.len();
-                self.transport.memory_mut()[place].copy_from_slice(&episode.actions[last..]);
-                if self.looked_at { Request::DrawnStep } else { Request::Step }
+                // Announced, it is there already, and the memory is the environment's.
+                if self.announced.is_none() {
+                    let place = self.form.action.clone();
+                    let last = episode.actions.len() - place.len();
+                    self.transport.memory_mut()[place].copy_from_slice(&episode.actions[last..]);
+                }
+                self.step_request()
             }
         };
+        self.announced = None;
         self.transport.call(request)?;
         self.drawn = matches!(request, Request::Render | Request::DrawnStep);
         Ok(())
     }
 
-    /// Starts an episode and reads its factors.
-    fn begin(&mut self, reset: String) -> Result<()> {
+    /// With a picture, if somebody looks.
+    fn step_request(&self) -> Request<'static> {
+        if self.looked_at { Request::DrawnStep } else { Request::Step }
+    }
+
+    /// Finishes what was announced, whether or not it was asked for.
+    fn settle(&mut self) -> Result<()> {
+        match self.announced {
+            None => Ok(()),
+            Some(Ask::Reset) => self.begin(),
+            Some(_) => self.advance(),
+        }
+    }
+
+    /// An episode without actions.
+    fn open(&mut self, reset: String) {
         let mut actions = self.episode.take().map(|episode| episode.actions).unwrap_or_default();
         actions.clear();
         self.episode = Some(Episode { reset, actions });
         self.drawn = false;
+    }
+
+    /// Starts the episode and reads its factors.
+    fn begin(&mut self) -> Result<()> {
         self.ask(Ask::Reset)?;
         let numbers = self.transport.memory()[self.form.factors()].chunks_exact(size_of::<f64>());
         let values: Vec<f64> = numbers.map(bytemuck::pod_read_unaligned).collect();
@@ -305,25 +330,57 @@ impl Env for GymEnv {
 
     fn reset(&mut self, seed: u64, options: &ResetOptions) -> Result<()> {
         let arguments = self.arguments(seed, options)?;
-        self.begin(arguments)
+        let announced = self.announced == Some(Ask::Reset);
+        if !announced || self.episode.as_ref().is_none_or(|episode| episode.reset != arguments) {
+            self.settle()?;
+            self.open(arguments);
+        }
+        self.begin()
     }
 
     fn step(&mut self, action: Action<'_>) -> Result<Transition> {
-        let space = &self.form.spec.action_space;
-        let bytes: &[u8] = match space {
-            Space::Box { .. } => bytemuck::cast_slice(action.continuous(space.len())?),
-            _ => bytemuck::cast_slice(action.discrete(space)?),
-        };
-        let Some(episode) = &mut self.episode else {
-            return Err(Error::config(&self.form.spec.id, "stepped outside an episode", "reset it first"));
-        };
-        episode.actions.extend_from_slice(bytes);
+        let bytes = self.form.bytes(action)?;
+        let announced = self.announced == Some(Ask::Step);
+        if !announced || self.episode.as_ref().is_none_or(|episode| !episode.actions.ends_with(bytes)) {
+            self.settle()?;
+            let Some(episode) = &mut self.episode else {
+                return Err(Error::config(&self.form.spec.id, "stepped outside an episode", "reset it first"));
+            };
+            episode.actions.extend_from_slice(bytes);
+        }
         self.advance()?;
         Ok(Transition {
             reward: self.number(head::REWARD),
             terminated: self.flag(head::TERMINATED),
             truncated: self.flag(head::TRUNCATED),
         })
+    }
+
+    fn announce(&mut self, next: Next<'_>) -> bool {
+        if self.stage != Stage::Ready || self.announced.is_some() {
+            return false;
+        }
+        match next {
+            Next::Reset(seed, options) => {
+                let Ok(arguments) = self.arguments(seed, options) else { return false };
+                if !self.transport.announce(Request::Reset(&arguments)) {
+                    return false;
+                }
+                self.open(arguments);
+                self.announced = Some(Ask::Reset);
+            }
+            Next::Step(action) => {
+                let request = self.step_request();
+                let (Some(episode), Ok(bytes)) = (&mut self.episode, self.form.bytes(action)) else { return false };
+                self.transport.memory_mut()[self.form.action.clone()].copy_from_slice(bytes);
+                if !self.transport.announce(request) {
+                    return false;
+                }
+                episode.actions.extend_from_slice(bytes);
+                self.announced = Some(Ask::Step);
+            }
+        }
+        true
     }
 
     fn observe(&self, row: &mut RowMut<'_>) {
@@ -345,6 +402,7 @@ impl Env for GymEnv {
                 "ask for no pictures, or give it a render mode 'rgb_array'",
             ));
         };
+        self.settle()?;
         self.looked_at = true;
         if !self.drawn {
             if self.episode.is_none() {
@@ -358,6 +416,7 @@ impl Env for GymEnv {
 
     /// The picture that `info['goal']` held at the reset, black where there is none.
     fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()> {
+        self.settle()?;
         match (self.form.goal(), &self.episode) {
             (Some(goal), Some(_)) => {
                 self.scaler.draw(goal.size, &self.transport.memory()[goal.range()], frame);
@@ -404,11 +463,13 @@ impl Env for GymEnv {
                 "one of an episode of this environment",
             ));
         };
+        self.settle()?;
         let begun = self.episode.as_ref().filter(|now| now.reset == reset && actions.starts_with(&now.actions));
         let mut at = match begun.map(|now| now.actions.len()) {
             Some(at) => at,
             None => {
-                self.begin(reset)?;
+                self.open(reset);
+                self.begin()?;
                 0
             }
         };

@@ -61,13 +61,20 @@ pub trait Transport: Send {
     /// When it cannot be made.
     fn describe(&mut self) -> Result<Description, Failure>;
 
-    /// Asks, and waits for the answer.
+    /// Asks without waiting, where an environment can work meanwhile; whether it does. [`Transport::call`] with the same request
+    /// follows and waits for the answer. Until then [`Transport::memory`] is empty.
+    fn announce(&mut self, _request: Request<'_>) -> bool {
+        false
+    }
+
+    /// Asks, unless that was announced, and waits for the answer.
     ///
     /// # Errors
     /// When the environment raises, or is gone.
     fn call(&mut self, request: Request<'_>) -> Result<(), Failure>;
 
-    /// The buffer of the bridge, [`Description::size`] bytes; empty before [`Transport::describe`] and after a loss.
+    /// The buffer of the bridge, [`Description::size`] bytes; empty before [`Transport::describe`], after a loss, and while the
+    /// environment works.
     fn memory(&self) -> &[u8];
 
     /// The same, to write actions into.

@@ -39,6 +39,8 @@ struct Process {
     line: UnixStream,
     file: File,
     memory: Option<MmapMut>,
+    /// Whether a request was sent of which the answer is not yet read: the memory is the worker's.
+    told: bool,
     tail: Tail,
 }
 
@@ -83,10 +85,11 @@ impl WorkerTransport {
         Failure::Lost(how)
     }
 
-    /// Sends a request and reads the answer.
+    /// Sends a request, if that is still to be done, and reads the answer.
     fn exchange(&mut self, op: u8, payload: &[u8], limit: Duration) -> Result<(u8, Vec<u8>), Failure> {
         let Some(process) = &mut self.process else { return Err(Failure::Lost("its worker process is gone".into())) };
-        process.send(op, payload).and_then(|()| process.receive()).map_err(|problem| self.lose(&problem, limit))
+        let sent = if std::mem::take(&mut process.told) { Ok(()) } else { process.send(op, payload) };
+        sent.and_then(|()| process.receive()).map_err(|problem| self.lose(&problem, limit))
     }
 
     /// What an answer that is no success means.
@@ -148,6 +151,13 @@ impl Transport for WorkerTransport {
         Ok(description)
     }
 
+    /// A worker that cannot be told is found dead by the call.
+    fn announce(&mut self, request: Request<'_>) -> bool {
+        let Some(process) = &mut self.process else { return false };
+        process.told = process.told || process.send(request.op(), request.payload()).is_ok();
+        process.told
+    }
+
     fn call(&mut self, request: Request<'_>) -> Result<(), Failure> {
         match self.exchange(request.op(), request.payload(), self.config.answer)? {
             (b'.', _) => Ok(()),
@@ -156,11 +166,13 @@ impl Transport for WorkerTransport {
     }
 
     fn memory(&self) -> &[u8] {
-        self.process.as_ref().and_then(|process| process.memory.as_deref()).unwrap_or_default()
+        let process = self.process.as_ref().filter(|process| !process.told);
+        process.and_then(|process| process.memory.as_deref()).unwrap_or_default()
     }
 
     fn memory_mut(&mut self) -> &mut [u8] {
-        self.process.as_mut().and_then(|process| process.memory.as_deref_mut()).unwrap_or_default()
+        let process = self.process.as_mut().filter(|process| !process.told);
+        process.and_then(|process| process.memory.as_deref_mut()).unwrap_or_default()
     }
 }
 
@@ -200,7 +212,7 @@ impl Process {
             Error::config("Python", format!("{python} cannot be started: {error}"), python.fix("gymnasium"))
         })?;
         let tail = Tail::of(child.stderr.take(), id);
-        Ok(Self { child, line, file, memory: None, tail })
+        Ok(Self { child, line, file, memory: None, told: false, tail })
     }
 
     fn send(&mut self, op: u8, payload: &[u8]) -> std::io::Result<()> {
@@ -269,8 +281,8 @@ impl Drop for Process {
 #[allow(unsafe_code)]
 fn map(file: &File) -> std::io::Result<MmapMut> {
     // SAFETY: the file has no name; besides us only our worker holds it, which never changes its size. The worker writes
-    // to it only between a request and its answer, when nobody here holds a reference: `Transport::call` borrows the
-    // transport mutably. A worker that does not answer in time is killed before the memory is touched again.
+    // to it only between a request and its answer, when nobody here holds a reference: `Transport::announce` and `call`
+    // borrow the transport mutably, and between the two it lends no memory. A worker that does not answer in time is killed before the memory is touched again.
     unsafe { MmapMut::map_mut(file) }
 }
 

@@ -3,7 +3,7 @@
 use super::{View, VisualWrapper, parse};
 use std::collections::BTreeMap;
 use swm_core::{
-    Action, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, RowMut, RowRef, Snapshot,
+    Action, Env, EnvSpec, Error, FactorValues, FrameMut, Key, Next, ResetOptions, Result, RowMut, RowRef, Snapshot,
     Transition,
 };
 
@@ -107,6 +107,10 @@ impl Env for Wrapped {
         let transition = self.env.step(action)?;
         self.step += 1;
         Ok(transition)
+    }
+
+    fn announce(&mut self, next: Next<'_>) -> bool {
+        self.env.announce(next)
     }
 
     fn observe(&self, row: &mut RowMut<'_>) {

@@ -4,7 +4,7 @@ use crate::config;
 use swm_core::batch::{Batch, DType, Schema};
 use swm_core::pool::{Reset, threads};
 use swm_core::{
-    Action, Env, EnvPool, Error, FrameMut, Key, Policy, RandomPolicy, ResetOptions, Space, VariationRequest,
+    Action, Env, EnvPool, Error, FrameMut, Key, Next, Policy, RandomPolicy, ResetOptions, Space, VariationRequest,
 };
 use swm_gym::GymConfig;
 
@@ -90,6 +90,62 @@ fn threads_and_neighbours_change_nothing() {
         assert!(one[..2] == play(text, &config, &[0, 1], 2, 6), "{text}: two environments differ from four");
         assert!(one[3] == play(text, &config, &[3], 1, 6)[0], "{text}: one alone differs");
     }
+}
+
+#[test]
+fn one_thread_lets_all_environments_work_at_once() {
+    let Some(config) = config() else { return };
+    let folder = tempfile::tempdir().expect("a folder");
+    // Each waits in its reset and in its step until the other is there, too; not in episodes of seed 0.
+    let text = format!("{ROOM},meet={}", folder.path().display());
+    let envs = (0..2).map(|_| make(&text, &config)).collect();
+    let mut pool = EnvPool::new(envs, None, None, threads(1).expect("threads")).expect("a pool");
+    let actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), 2);
+    for seeds in [[0, 0], [1, 2]] {
+        let reset = |(slot, seed)| Reset { slot, seed, options: ResetOptions::default() };
+        pool.reset(&(0..).zip(seeds).map(reset).collect::<Vec<_>>()).expect("a reset");
+        pool.step(&actions, &[true, true]).expect("a step");
+    }
+    assert_eq!(pool.infos().get::<i64>("steps").expect("a column"), [1, 1]);
+}
+
+#[test]
+fn what_was_announced_happens_once() {
+    let Some(config) = config() else { return };
+    let push = Action::Continuous(&[0.1, -0.2]);
+    let (start, none) = (ResetOptions::default(), Action::Continuous(&[0.0, 0.0]));
+    let mut plain = Seen::of(make(ROOM, &config));
+    let mut told = Seen::of(make(ROOM, &config));
+    for world in [&mut plain, &mut told] {
+        world.env.reset(1, &start).expect("a reset");
+    }
+    plain.env.reset(4, &start).expect("a reset");
+    assert!(told.env.announce(Next::Reset(4, &start)));
+    assert!(!told.env.announce(Next::Step(push)), "one thing at a time");
+    told.env.reset(4, &start).expect("the reset");
+    plain.env.step(push).expect("a step");
+    assert!(told.env.announce(Next::Step(push)));
+    told.env.step(push).expect("the step");
+    assert!(plain.everything() == told.everything());
+    // Whoever does something else finds the step taken.
+    plain.env.step(push).expect("a step");
+    assert!(told.env.announce(Next::Step(push)));
+    assert!(plain.env.snapshot() == told.env.snapshot());
+    assert!(plain.picture(9, 12) == told.picture(9, 12) && plain.everything() == told.everything());
+    plain.env.step(push).and_then(|_| plain.env.step(none)).expect("two steps");
+    assert!(told.env.announce(Next::Step(push)));
+    told.env.step(none).expect("another step");
+    assert!(plain.everything() == told.everything());
+    // And whoever begins anew finds a world that is ready for it.
+    assert!(told.env.announce(Next::Step(push)));
+    for world in [&mut plain, &mut told] {
+        world.env.reset(7, &start).expect("a reset");
+    }
+    assert!(plain.everything() == told.everything());
+    // What is wrong is said by the call, and changes nothing.
+    assert!(!told.env.announce(Next::Step(Action::Discrete(&[0]))));
+    assert!(told.env.step(Action::Discrete(&[0])).is_err());
+    assert!(plain.everything() == told.everything());
 }
 
 #[test]

@@ -14,7 +14,7 @@ use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
 use std::time::{Duration, Instant};
 use swm::core::pool::Reset;
 use swm::core::results::Counting;
-use swm::core::{Env, Error, Key, ResetOptions, Snapshot, VariationRequest, View};
+use swm::core::{Call, Env, Error, Key, ResetOptions, Snapshot, VariationRequest, View};
 use swm::data::{ImageCodec, WriteMode, WriteOptions};
 use swm::envs::wrappers::{GoalPicture, Stack, WRAPPERS};
 use swm::eval::world::{episode_key, reset_seed};
@@ -321,8 +321,9 @@ impl World {
                         Some(picks) => picks,
                         None => Starts::choose(&*reader, wanted.episodes, wanted.goal_offset, wanted.seed)?,
                     };
-                    let offset = wanted.goal_offset;
-                    Starts::from_dataset(&*reader, world.spec(), picks, offset, wanted.seed, wanted.variation)?
+                    let (env, offset) = (world.pool().env(0), wanted.goal_offset);
+                    let calls = &wanted.callables;
+                    Starts::from_dataset(&*reader, env, picks, offset, wanted.seed, wanted.variation, calls)?
                 }
                 None if matches!(wanted.counting, Counting::Compat { .. }) => {
                     Starts::sequential(wanted.episodes, wanted.seed, wanted.variation)?
@@ -391,6 +392,7 @@ struct Evaluation {
     counting: Counting,
     picks: Option<Vec<[usize; 2]>>,
     goal_offset: usize,
+    callables: Vec<Call>,
     videos: Option<(PathBuf, String, usize)>,
 }
 

@@ -46,6 +46,42 @@ def reset(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[str, A
     return json.dumps({"variation": variation(options, spaces), **given})
 
 
+def callables(given: Any) -> list[dict[str, Any]]:
+    """Methods to call with their arguments, as `World.evaluate` is given them, in JSON's words."""
+    calls = []
+    for call in given or ():
+        method, args = (call.get("method"), call.get("args") or {}) if isinstance(call, Mapping) else (None, {})
+        if not isinstance(method, str) or not isinstance(args, Mapping):
+            raise ValueError(f"callables: expected {{'method': NAME, 'args': {{KEYWORD: {{'value': COLUMN}}}}}}, got {call!r}")
+        words: dict[str, Any] = {}
+        for key, argument in args.items():
+            if not isinstance(argument, Mapping) or "value" not in argument:
+                raise ValueError(f"callables: {method}({key}=…) needs {{'value': COLUMN}}, got {argument!r}")
+            in_dataset, value = bool(argument.get("in_dataset", True)), argument["value"]
+            if in_dataset and not isinstance(value, str):
+                raise ValueError(
+                    f"callables: {method}({key}=…) names a column by {value!r}; give a name, or 'in_dataset': False for a value"
+                )
+            words[str(key)] = {"value": _plain(value, f"{method}({key}=…)"), "in_dataset": in_dataset}
+        calls.append({"method": method, "args": words})
+    return calls
+
+
+def _plain(value: Any, what: str) -> Any:
+    """A value that JSON can hold; arrays by their type, shape and bytes."""
+    if hasattr(value, "detach"):
+        value = value.detach().cpu().numpy()
+    if isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "biuf":
+        return {"dtype": value.dtype.name, "shape": list(value.shape), "data": value.tobytes().hex()}
+    try:
+        json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"callables: {what} is {value!r}; expected numbers, text, lists, dicts or an array of numbers"
+        ) from error
+    return value
+
+
 def _known(key: str, spaces: Mapping[str, Any]) -> str:
     """The environment's name of a factor. The paper says `agent.size` where Push-T says `agent.scale`."""
     group, _, name = key.rpartition(".")

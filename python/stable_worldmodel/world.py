@@ -7,6 +7,7 @@ import math
 import os
 import secrets
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -86,11 +87,12 @@ class World:
         image = (int(image_shape[0]), int(image_shape[1])) if add_pixels and image_shape is not None else None
         wrappers = [*(pre_wrappers or []), *(extra_wrappers or [])]
         drawn = engine_wrappers(wrappers)
+        self._native = drawn is not None and self._is_native(env_name)
         #: The Gymnasium environments behind it, where they live in this interpreter.
         self.gym_envs: list[Any] = []
         if drawn is None and workers:
             raise ValueError("workers: wrappers of one's own cannot follow environments into other processes")
-        if drawn is None or not (workers or self._is_native(env_name)):
+        if not (self._native or (drawn is not None and workers)):
             from ._gym import open_world
 
             name, *given = env_name.split(",")
@@ -101,7 +103,7 @@ class World:
         else:
             # Workers run what this interpreter runs.
             os.environ.setdefault("SWM_PYTHON", sys.executable)
-            self._wrapping = drawn
+            self._wrapping = drawn or []
             self._world = _engine.World(
                 self.env_name,
                 self.num_envs,
@@ -466,7 +468,11 @@ class World:
             episodes_idx, start_steps: Which episodes and steps of it; chosen by the seed for `None`.
             goal_offset: Steps from a start to its goal (25).
             eval_budget: Steps an episode may take; the world's own, or 50 from a dataset.
-            callables: How the reference's environments are put into a state; ours know that by themselves.
+            callables: The methods that put an environment into a recorded state, called in this order after its reset:
+                `{"method": NAME, "args": {KEYWORD: {"value": COLUMN}}}`, where `goal_` before a column's name takes it from
+                the goal's row, and `{"value": ANYTHING, "in_dataset": False}` is the value itself. Without any, it is
+                `set_state(state)` and `set_goal_state(goal_state)`, with or without `_` before. Environments of ours
+                know their states by themselves.
             policy: Who acts, instead of `set_policy`'s.
             protocol: `"strict"`: starts that are solved already do not count, and success means that the goal is satisfied;
                 `"compat"`: counts as the Python package stable-worldmodel 0.1.1 does.
@@ -503,6 +509,7 @@ class World:
             "counting": {"strict": {"hold": int(hold)}} if protocol == "strict" else {"compat": {"envs": self.num_envs}},
             "picks": picks,
             "goal_offset": goal_offset or 0,
+            "callables": self._callables(_options.callables(callables)) if dataset is not None else [],
         }
         acting: list[tuple[str, Any]] = [(_name(policy), self._playing(policy))]
         if floor and acting[0][0] != "random":
@@ -521,6 +528,16 @@ class World:
         if hasattr(policy, "plans"):
             policy.plans = json.loads(acting[0][1].take_plans())
         return Metrics._of(self, config, runs, dataset)
+
+    def _callables(self, callables: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Those that the engine is to call."""
+        if not self._native:
+            return callables
+        others = sorted({call["method"] for call in callables} - {"_set_state", "_set_goal_state", "set_state"})
+        if others:
+            name = self.env_name.partition(",")[0]
+            warnings.warn(f"callables: {name} starts at recorded states by itself; {others} are not called", stacklevel=3)
+        return []
 
     def _chosen(self, policy: Any) -> Any:
         if policy is not None and policy is not self.policy:

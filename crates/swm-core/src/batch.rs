@@ -439,6 +439,12 @@ impl<'a> RowRef<'a> {
         })
     }
 
+    /// The bytes of column `index`, whatever its type.
+    pub fn bytes(self, index: usize) -> &'a [u8] {
+        let n = self.batch.schema.columns()[index].row_bytes();
+        &self.batch.bytes(index)[self.row * n..][..n]
+    }
+
     /// The columns of the row.
     pub fn schema(self) -> &'a Schema {
         &self.batch.schema

@@ -5,7 +5,8 @@
 //! full state can be taken and put back ([`Env::snapshot`]), it can start from a row of a dataset
 //! ([`Env::restore_from`]), and it can always make a reachable goal ([`Env::sample_goal`]).
 
-use crate::batch::{ColumnSpec, RowMut, RowRef};
+use crate::batch::{ColumnSpec, RowMut, RowRef, Schema};
+use crate::recorded::{Call, Recorded};
 use crate::view::View;
 use crate::{Error, FactorValues, Key, Result, Space, VariationRequest, VariationSpace};
 use std::collections::BTreeMap;
@@ -244,6 +245,36 @@ pub trait Env: Send {
     /// # Errors
     /// When a row lacks what the environment needs.
     fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()>;
+
+    /// The columns that [`Env::reset_from`] makes use of, of those a dataset has; `calls` are as in [`Recorded`]. Here, all but
+    /// pictures.
+    ///
+    /// # Errors
+    /// When it lacks one that is needed: here, a `state` of the world's shape.
+    fn recorded_columns(&self, stored: &Schema, _calls: &[Call]) -> Result<Vec<String>> {
+        let (spec, state) = (self.spec(), stored.column("state")?);
+        if let Some(own) = spec.columns.iter().find(|column| column.name == "state")
+            && own.shape != state.shape
+        {
+            return Err(Error::mismatch(
+                format!("starting {} from a dataset", spec.id),
+                format!("states of shape {:?}", state.shape),
+                format!("{:?}; was the dataset collected in this environment?", own.shape),
+            ));
+        }
+        let kept = stored.columns().iter().filter(|column| !column.is_image());
+        Ok(kept.map(|column| column.name.clone()).collect())
+    }
+
+    /// Starts an episode at a row of a dataset, towards the state of another row: [`Env::reset`], which decides what the
+    /// rows do not (randomness, factors that are shifted or not recorded), then [`Env::restore_from`].
+    ///
+    /// # Errors
+    /// As both of them.
+    fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: Recorded<'_>) -> Result<()> {
+        self.reset(seed, options)?;
+        self.restore_from(from.start, from.goal)
+    }
 
     /// Chooses a new reachable goal that is not already reached, without moving the world.
     ///

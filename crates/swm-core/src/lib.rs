@@ -5,7 +5,7 @@
 //! 1. [`batch`]: the only thing that flows between its parts, named typed columns.
 //! 2. [`space`] and [`variation`]: what an action, an observation and a factor of variation may be.
 //! 3. [`key`]: where every random number comes from.
-//! 4. [`env`], [`view`], [`pool`], [`policy`]: worlds, many of them at once, and who acts in them.
+//! 4. [`env`], [`view`], [`recorded`], [`pool`], [`policy`]: worlds, many of them at once, and who acts in them.
 //! 5. [`plan`]: costs of candidate action sequences, and the solvers that minimise them.
 //! 6. [`registry`], [`manifest`], [`results`], [`error`]: names, provenance, findings, and what goes wrong.
 
@@ -19,6 +19,7 @@ mod pace;
 pub mod plan;
 pub mod policy;
 pub mod pool;
+pub mod recorded;
 pub mod registry;
 pub mod results;
 pub mod space;
@@ -36,6 +37,7 @@ pub use plan::{
 };
 pub use policy::{Policy, RandomPolicy};
 pub use pool::EnvPool;
+pub use recorded::{Argument, Call, Recorded};
 pub use registry::{EnvChoice, EnvEntry, EnvOption, ExpertEntry, Named, Registry};
 pub use results::Results;
 pub use space::Space;

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use swm_core::results::{Comparison, Counting, Run, Searches};
-use swm_core::{Env, EnvSpec, Error, Manifest, PlanTrace, Policy, RandomPolicy, Result, Results, VariationRequest};
+use swm_core::{Env, Error, Manifest, PlanTrace, Policy, RandomPolicy, Result, Results, VariationRequest};
 use swm_data::Reader;
 
 /// What the floor is called in results.
@@ -130,7 +130,7 @@ impl EvalRequest {
         }
         let (mut witness, mut runs) = (Witness::default(), vec![]);
         for condition in &request.conditions {
-            let starts = request.starts(dataset.as_deref(), world.spec(), condition.variation.clone())?;
+            let starts = request.starts(dataset.as_deref(), world.pool().env(0), condition.variation.clone())?;
             witness.note(&mut world, &starts)?;
             for policy in &request.policies {
                 let mut actor = match policy.acts {
@@ -206,7 +206,7 @@ impl EvalRequest {
     }
 
     /// From where to play under a condition.
-    fn starts(&self, dataset: Option<&dyn Reader>, spec: &EnvSpec, variation: VariationRequest) -> Result<Starts> {
+    fn starts(&self, dataset: Option<&dyn Reader>, env: &dyn Env, variation: VariationRequest) -> Result<Starts> {
         let Some((reader, StartsRequest::Dataset { goal_offset, held_out, .. })) = dataset.zip(Some(&self.starts))
         else {
             return match self.counting {
@@ -221,7 +221,7 @@ impl EvalRequest {
                 Starts::choose_among(reader, &split.episodes(reader, *part)?, n, *goal_offset, seed)?
             }
         };
-        Starts::from_dataset(reader, spec, picks, *goal_offset, seed, variation)
+        Starts::from_dataset(reader, env, picks, *goal_offset, seed, variation, &[])
     }
 
     fn manifest(&self) -> Result<Manifest> {

@@ -5,7 +5,10 @@ use crate::world::{episode_key, reset_seed};
 use rand::Rng as _;
 use std::collections::HashSet;
 use swm_core::pool::Reset;
-use swm_core::{Batch, ColumnSpec, EnvPool, EnvSpec, Error, Key, ResetOptions, Result, Schema, VariationRequest};
+use swm_core::recorded::flat;
+use swm_core::{
+    Batch, Call, ColumnSpec, Env, EnvPool, Error, Key, Recorded, ResetOptions, Result, Schema, VariationRequest,
+};
 use swm_data::{Reader, StepRange};
 
 /// Starts and goals, decided by what was asked and nothing else.
@@ -27,6 +30,8 @@ struct Rows {
     goal_offset: usize,
     /// The start and the goal of every pick, one after the other.
     rows: Batch,
+    /// How a world that does not know states by itself is put into them.
+    calls: Vec<Call>,
 }
 
 impl Starts {
@@ -55,19 +60,23 @@ impl Starts {
     /// Factors are those of the recorded episode, except the ones `variation` names: these are sampled or
     /// pinned as it says, which is how a shift is applied to recorded starts.
     ///
+    /// `env` is one of the environments to be played, and `calls` says how it is put into a state if it does not know that
+    /// by itself.
+    ///
     /// # Errors
-    /// When there is no pick, a pick or its goal lies outside its episode, the dataset has no `state` column of this
-    /// environment's shape, or `variation` names what is no factor.
+    /// When there is no pick, a pick or its goal lies outside its episode, the dataset lacks columns that the environment
+    /// needs ([`Env::recorded_columns`]), or `variation` names what is no factor.
     pub fn from_dataset(
         reader: &dyn Reader,
-        spec: &EnvSpec,
+        env: &dyn Env,
         picks: Vec<[usize; 2]>,
         goal_offset: usize,
         seed: u64,
         variation: VariationRequest,
+        calls: &[Call],
     ) -> Result<Self> {
         check_count(picks.len())?;
-        let columns = restored_columns(reader.schema(), spec, &variation)?;
+        let columns = unshifted(env.recorded_columns(reader.schema(), calls)?, env, &variation)?;
         let mut ranges = Vec::with_capacity(2 * picks.len());
         for &[episode, step] in &picks {
             let found = reader.episodes().get(episode).ok_or_else(|| no_episode(reader, episode))?;
@@ -88,7 +97,7 @@ impl Starts {
             n: picks.len(),
             sequential: false,
             variation,
-            dataset: Some(Rows { picks, goal_offset, rows }),
+            dataset: Some(Rows { picks, goal_offset, rows, calls: calls.to_vec() }),
         })
     }
 
@@ -203,10 +212,10 @@ impl Starts {
         let slots: Vec<usize> = starting.iter().map(|&(slot, _)| slot).collect();
         pool.restart(&slots, |slot, env| {
             let Some(i) = slots.iter().position(|&started| started == slot) else { return Ok(()) };
-            // The reset decides what the rows do not: randomness, and factors that are shifted or not recorded.
-            env.reset(resets[i].seed, &resets[i].options)?;
             let episode = starting[i].1;
-            env.restore_from(dataset.rows.row(2 * episode), dataset.rows.row(2 * episode + 1))
+            let [start, goal] = [2 * episode, 2 * episode + 1].map(|row| dataset.rows.row(row));
+            let from = Recorded { start, goal, calls: &dataset.calls };
+            env.reset_from(resets[i].seed, &resets[i].options, from)
         })
     }
 }
@@ -223,35 +232,19 @@ fn check_count(n: usize) -> Result<()> {
     Err(Error::config("number of evaluation episodes", "0", "ask for at least 1"))
 }
 
-/// The columns an environment is restored from: all but pictures, and but the factors that are to be shifted.
-fn restored_columns(stored: &Schema, spec: &EnvSpec, variation: &VariationRequest) -> Result<Vec<String>> {
-    let state = stored.column("state")?;
-    if let Some(own) = spec.columns.iter().find(|column| column.name == "state")
-        && own.shape != state.shape
-    {
-        return Err(Error::mismatch(
-            format!("starting {} from a dataset", spec.id),
-            format!("states of shape {:?}", state.shape),
-            format!("{:?}; was the dataset collected in this environment?", own.shape),
-        ));
-    }
-    let factors = spec.variation_space.factors();
+/// These columns without the factors that are to be shifted.
+fn unshifted(columns: Vec<String>, env: &dyn Env, variation: &VariationRequest) -> Result<Vec<String>> {
+    let space = &env.spec().variation_space;
     let mut shifted = HashSet::new();
     for name in variation.variation.iter().flatten().chain(variation.variation_values.keys()) {
-        for i in spec.variation_space.select(name)? {
-            shifted.insert(flat(&format!("variation.{}", factors[i].key)));
+        for i in space.select(name)? {
+            shifted.insert(flat(&format!("variation.{}", space.factors()[i].key)));
         }
     }
-    let kept = stored.columns().iter().filter(|column| !column.is_image() && !shifted.contains(&flat(&column.name)));
-    Ok(kept.map(|column| column.name.clone()).collect())
+    Ok(columns.into_iter().filter(|name| !shifted.contains(&flat(name))).collect())
 }
 
-/// A column's name as formats without dots store it, and as environments look for it.
-fn flat(name: &str) -> String {
-    name.replace('.', "_")
-}
-
-/// The same rows under flat names, so that environments find factors whatever format they come from.
+/// The same rows under flat names, so that environments find columns whatever format they come from.
 fn renamed(rows: Batch) -> Result<Batch> {
     let columns: Vec<ColumnSpec> =
         rows.schema().columns().iter().map(|c| ColumnSpec { name: flat(&c.name), ..c.clone() }).collect();

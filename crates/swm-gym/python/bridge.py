@@ -17,7 +17,9 @@ A name that the platform uses itself gets the prefix `obs_` or `info_`; entries 
 """
 
 import ast
+import difflib
 import importlib.metadata
+import inspect
 import json
 import math
 import struct
@@ -43,6 +45,13 @@ RESET, STEP, DRAWN_STEP, RENDER = b'rsdp'
 
 class Unsupported(Exception):
     """The environment has something that no column or action of the platform can hold."""
+
+
+class Wrong(ValueError):
+    """Something was asked for that the environment does not have: what is wrong, and what to do."""
+
+    def __str__(self):
+        return '; '.join(self.args)
 
 
 # ---- spaces ----
@@ -221,6 +230,51 @@ def factors(space, prefix=''):
                 yield form, leaf
 
 
+# ---- states ----
+
+
+# Methods that put an environment into a recorded state, by the names that say so, and the column each takes.
+SETTERS = [(('set_state', '_set_state'), 'state'), (('set_goal_state', '_set_goal_state'), 'goal_state')]
+
+
+def callables(env):
+    """How an environment takes a state: `swm_callables` if it says so itself, else its methods of one argument with a
+    name of `SETTERS`."""
+    own = getattr(env.unwrapped, 'swm_callables', None)
+    if own is not None:
+        return list(own)
+    found = []
+    for names, column in SETTERS:
+        for name in names:
+            key = only_argument(getattr(env.unwrapped, name, None))
+            if key is not None:
+                found.append({'method': name, 'args': {key: {'value': column, 'in_dataset': True}}})
+                break
+        if not found:
+            # A goal alone is no start.
+            return []
+    return found
+
+
+def only_argument(method):
+    """The name of the one argument that a method needs, None if it needs others."""
+    try:
+        parameters = inspect.signature(method).parameters.values()
+    except (TypeError, ValueError):
+        return None
+    free = [p for p in parameters if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    return free[0].name if len(free) == 1 and free[0].kind is not free[0].POSITIONAL_ONLY else None
+
+
+def argument(value):
+    """An argument as it came: an array by its type, shape and bytes, or anything of JSON's."""
+    if isinstance(value, dict) and value.keys() == {'dtype', 'shape', 'data'}:
+        array = np.frombuffer(bytes.fromhex(value['data']), value['dtype']).reshape(value['shape'])
+        # Its own, to be written into; numbers as numpy's numbers.
+        return array.copy()[()]
+    return value
+
+
 # ---- pictures ----
 
 
@@ -339,6 +393,7 @@ class Bridge:
             'pixel_art': bool(getattr(self.env.unwrapped, 'swm_pixel_art', False)),
             'max_episode_steps': self.max_episode_steps,
             'libraries': self.libraries,
+            'calls': callables(self.env),
             'size': self.size,
         })
 
@@ -359,6 +414,9 @@ class Bridge:
             self.factor_views.append((leaf, view(at, len(form['init']), np.float64)))
             at += 8 * len(form['init'])
         self.spaces = {form['key']: (form, leaf) for form, leaf in self.factors}
+        self.views = {c['name']: view(c['offset'], c['shape'], np.dtype(c['dtype'])) for c in self.columns}
+        # What the columns of a recorded goal hold throughout the episode.
+        self.held = []
 
     def handle(self, op, payload):
         """Does what a request asks: its kind, and for a reset its seed and options as JSON."""
@@ -374,8 +432,9 @@ class Bridge:
         else:
             raise ValueError(f'unknown request {op}')
 
-    def reset(self, seed, variation=None, variation_values=None):
-        """Starts an episode. `variation` and `variation_values` become the `options` of the environment's reset."""
+    def reset(self, seed, variation=None, variation_values=None, recorded=None):
+        """Starts an episode. `variation` and `variation_values` become the `options` of the environment's reset; `recorded`
+        is what `put` is given afterwards."""
         options = {}
         if variation is not None:
             options['variation'] = variation
@@ -389,7 +448,38 @@ class Bridge:
             view[...] = np.asarray(leaf.init_value if value is None else value, np.float64).reshape(-1)
         if self.goal is not None:
             self.goal[...] = info['goal'][..., :3] if is_picture(info.get('goal')) else 0
+        self.held = []
         self.write(observation, 0.0, False, False, info)
+        if recorded is not None:
+            self.put(**recorded)
+
+    def put(self, calls, shown, held):
+        """Puts the environment into a recorded state: calls methods of its own, (method, arguments) each, and shows in the
+        columns what the recorded rows hold, in those of the goal from now on."""
+        for call in calls:
+            self.method(call['method'])(**{key: argument(value) for key, value in call['args'].items()})
+        shown, self.held = ([(self.views[name], argument(value)) for name, value in part.items()] for part in (shown, held))
+        for view, value in [*shown, *self.held]:
+            view[...] = np.reshape(value, view.shape)
+        # What the reset said of the goal was said of another state.
+        HEAD.pack_into(self.buffer, 0, 0.0, math.inf, False, False, False)
+
+    def method(self, name):
+        """A method of the environment by its name; of its wrappers, from the outermost inwards, if it has none."""
+        env, layers = self.env, [self.env.unwrapped]
+        while env is not env.unwrapped:
+            layers.append(env)
+            env = env.env
+        for layer in layers:
+            found = getattr(layer, name, None)
+            if callable(found):
+                return found
+        own = type(self.env.unwrapped)
+        known = sorted(key for key in dir(own) if not hasattr(gymnasium.Env, key) and callable(getattr(own, key, None)))
+        near = difflib.get_close_matches(name, known, 1)
+        meant = f', did you mean {near[0]}' if near else ''
+        fix = f'it has {", ".join(known)}' if known else 'it has none but those of gymnasium.Env'
+        raise Wrong(f"{own.__name__} has no method '{name}'{meant}", fix)
 
     def value(self, key, value):
         """A factor's numbers in the form its space holds."""
@@ -419,6 +509,8 @@ class Bridge:
                     f' {value.dtype} {list(value.shape)} now: give it one type and shape'
                 )
             view[...] = value
+        for view, value in self.held:
+            view[...] = np.reshape(value, view.shape)
         success = info.get('success', info.get('is_success'))
         if success is None or success != success:
             success = terminated

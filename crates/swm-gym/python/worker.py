@@ -21,8 +21,8 @@ import sys
 import traceback
 
 FRAME = struct.Struct('<BI')
-# The kinds of answers: done; raised a Python error; no such id; a package is missing; refused in words.
-DONE, RAISED, UNKNOWN, MISSING, REFUSED = b'.xumf'
+# The kinds of answers: done; raised a Python error; no such id; a package is missing; refused in words, and with what to do.
+DONE, RAISED, UNKNOWN, MISSING, REFUSED, WRONG = b'.xumfw'
 PR_SET_PDEATHSIG = 1
 
 
@@ -105,10 +105,14 @@ def made(line, memory):
 
 def obey(line, bridge):
     """Does what is asked until the parent closes the line."""
+    from swm_bridge import Wrong
+
     while True:
         op, payload = line.request()
         try:
             bridge.handle(op, payload)
+        except Wrong as error:
+            line.answer(WRONG, json.dumps(error.args))
         except BaseException:  # Even `sys.exit()` is an answer.
             line.answer(RAISED, traceback.format_exc())
         else:
@@ -125,7 +129,8 @@ def serve():
     bridge = None
     try:
         bridge = made(line, memory)
-        obey(line, bridge)
+        if bridge is not None:
+            obey(line, bridge)
     except (EOFError, ConnectionError):
         if bridge is not None:
             bridge.close()

@@ -3,7 +3,7 @@
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::ops::Range;
-use swm_core::{Action, ColumnSpec, DType, EnvSpec, Error, Factor, Result, Schema, Space, VariationSpace};
+use swm_core::{Action, Call, ColumnSpec, DType, EnvSpec, Error, Factor, Result, Schema, Space, VariationSpace};
 
 /// What an environment is, and where in the buffer everything lies: `Bridge.describe()`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -20,6 +20,8 @@ pub struct Description {
     pixel_art: bool,
     max_episode_steps: usize,
     libraries: BTreeMap<String, String>,
+    /// How it takes a state, if its methods tell.
+    calls: Vec<Call>,
     /// Bytes of the buffer.
     pub size: usize,
 }
@@ -221,6 +223,11 @@ impl Form {
     /// What decides numbers and pictures, with versions.
     pub(crate) fn libraries(&self) -> &BTreeMap<String, String> {
         &self.description.libraries
+    }
+
+    /// The methods that put it into a state.
+    pub(crate) fn calls(&self) -> &[Call] {
+        &self.description.calls
     }
 
     /// Where the factors' values lie, as doubles in sampling order.

@@ -6,12 +6,13 @@
 
 use crate::describe::head;
 use crate::picture::Scaler;
+use crate::recorded::{self, Goal};
 use crate::{Description, Failure, Form, Request, Transport};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use swm_core::{
-    Action, Env, EnvSpec, Error, FactorValues, FrameMut, Key, Next, ResetOptions, Result, RowMut, RowRef, Snapshot,
-    Transition, VariationRequest,
+    Action, Call, Env, EnvSpec, Error, FactorValues, FrameMut, Key, Next, Recorded, ResetOptions, Result, RowMut,
+    RowRef, Schema, Snapshot, Transition, VariationRequest,
 };
 
 /// How many lines of a traceback an error shows: the end, which names what was raised.
@@ -51,6 +52,8 @@ enum Stage {
 struct Episode {
     /// The arguments of its reset, as JSON.
     reset: String,
+    /// The picture of its goal, where it starts from a dataset that has one.
+    goal: Option<Goal>,
     /// The bytes of its actions, one after the other.
     actions: Vec<u8>,
 }
@@ -222,10 +225,10 @@ impl GymEnv {
     }
 
     /// An episode without actions.
-    fn open(&mut self, reset: String) {
+    fn open(&mut self, reset: String, goal: Option<Goal>) {
         let mut actions = self.episode.take().map(|episode| episode.actions).unwrap_or_default();
         actions.clear();
-        self.episode = Some(Episode { reset, actions });
+        self.episode = Some(Episode { reset, goal, actions });
         self.drawn = false;
     }
 
@@ -253,7 +256,7 @@ impl GymEnv {
     }
 
     /// The arguments of a reset; what the environment would not understand is an error here.
-    fn arguments(&self, seed: u64, options: &ResetOptions) -> Result<String> {
+    fn arguments(&self, seed: u64, options: &ResetOptions) -> Result<serde_json::Value> {
         let id = &self.form.spec.id;
         if options.state.is_some() || options.goal_state.is_some() {
             return Err(Error::config(
@@ -287,7 +290,7 @@ impl GymEnv {
             }
             arguments["variation_values"] = serde_json::json!(variation_values);
         }
-        Ok(arguments.to_string())
+        Ok(arguments)
     }
 
     /// A number of the head of the buffer; 0 before there is one.
@@ -329,12 +332,27 @@ impl Env for GymEnv {
     }
 
     fn reset(&mut self, seed: u64, options: &ResetOptions) -> Result<()> {
-        let arguments = self.arguments(seed, options)?;
+        let arguments = self.arguments(seed, options)?.to_string();
         let announced = self.announced == Some(Ask::Reset);
         if !announced || self.episode.as_ref().is_none_or(|episode| episode.reset != arguments) {
             self.settle()?;
-            self.open(arguments);
+            self.open(arguments, None);
         }
+        self.begin()
+    }
+
+    fn recorded_columns(&self, stored: &Schema, calls: &[Call]) -> Result<Vec<String>> {
+        recorded::columns(&self.form, stored, calls)
+    }
+
+    /// The calls and what they are given belong to the arguments of the reset, so that whoever plays the episode again
+    /// starts where it started.
+    fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: Recorded<'_>) -> Result<()> {
+        self.settle()?;
+        let (seed, options) = recorded::reset(&self.form, seed, options, from.start)?;
+        let mut arguments = self.arguments(seed, &options)?;
+        arguments["recorded"] = recorded::json(&self.form, &from)?;
+        self.open(arguments.to_string(), Goal::of(&from));
         self.begin()
     }
 
@@ -363,10 +381,11 @@ impl Env for GymEnv {
         match next {
             Next::Reset(seed, options) => {
                 let Ok(arguments) = self.arguments(seed, options) else { return false };
+                let arguments = arguments.to_string();
                 if !self.transport.announce(Request::Reset(&arguments)) {
                     return false;
                 }
-                self.open(arguments);
+                self.open(arguments, None);
                 self.announced = Some(Ask::Reset);
             }
             Next::Step(action) => {
@@ -414,10 +433,12 @@ impl Env for GymEnv {
         Ok(())
     }
 
-    /// The picture that `info['goal']` held at the reset, black where there is none.
+    /// The picture in the goal's row of a dataset, or the one that `info['goal']` held at the reset, black where there is
+    /// none.
     fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.settle()?;
         match (self.form.goal(), &self.episode) {
+            (_, Some(Episode { goal: Some(goal), .. })) => self.scaler.draw(goal.size, &goal.rgb, frame),
             (Some(goal), Some(_)) => {
                 self.scaler.draw(goal.size, &self.transport.memory()[goal.range()], frame);
             }
@@ -434,11 +455,13 @@ impl Env for GymEnv {
         &self.factors
     }
 
-    /// The episode so far: the arguments of its reset, and its actions.
+    /// The episode so far: the arguments of its reset, the picture of its goal, its actions.
     fn snapshot(&self) -> Snapshot {
         let mut bytes = format!("{}\n", self.form.spec.id).into_bytes();
-        if let Some(Episode { reset, actions }) = &self.episode {
-            bytes.extend(format!("{reset}\n").bytes());
+        if let Some(Episode { reset, goal, actions }) = &self.episode {
+            let ([height, width], rgb) = goal.as_ref().map_or(([0, 0], &[][..]), |goal| (goal.size, &goal.rgb));
+            bytes.extend(format!("{reset}\n{height} {width}\n").bytes());
+            bytes.extend(rgb);
             bytes.extend(actions);
         }
         Snapshot(bytes)
@@ -453,10 +476,15 @@ impl Env for GymEnv {
         };
         let parsed = line(&snapshot.0).filter(|(of, _)| of == id).and_then(|(_, at)| {
             let (reset, n) = line(&snapshot.0[at..])?;
-            let actions = &snapshot.0[at + n..];
-            actions.len().is_multiple_of(self.form.action.len()).then_some((reset, actions))
+            let (size, m) = line(&snapshot.0[at + n..])?;
+            let (height, width) = size.split_once(' ')?;
+            let size: [usize; 2] = [height.parse().ok()?, width.parse().ok()?];
+            let (rgb, actions) =
+                snapshot.0[at + n + m..].split_at_checked(size[0].checked_mul(size[1])?.checked_mul(3)?)?;
+            let goal = (!rgb.is_empty()).then(|| Goal { size, rgb: rgb.to_vec() });
+            actions.len().is_multiple_of(self.form.action.len()).then_some((reset, goal, actions))
         });
-        let Some((reset, actions)) = parsed else {
+        let Some((reset, goal, actions)) = parsed else {
             return Err(Error::mismatch(
                 format!("restoring {id}"),
                 "a snapshot of another environment, or of one before its first reset",
@@ -464,11 +492,12 @@ impl Env for GymEnv {
             ));
         };
         self.settle()?;
-        let begun = self.episode.as_ref().filter(|now| now.reset == reset && actions.starts_with(&now.actions));
+        let same = |now: &&Episode| now.reset == reset && now.goal == goal && actions.starts_with(&now.actions);
+        let begun = self.episode.as_ref().filter(same);
         let mut at = match begun.map(|now| now.actions.len()) {
             Some(at) => at,
             None => {
-                self.open(reset);
+                self.open(reset, goal);
                 self.begin()?;
                 0
             }
@@ -487,8 +516,8 @@ impl Env for GymEnv {
     fn restore_from(&mut self, _: RowRef<'_>, _: RowRef<'_>) -> Result<()> {
         Err(Error::config(
             format!("starting {} from a row of a dataset", self.form.spec.id),
-            "nothing says how a Gymnasium environment takes a state",
-            "evaluate it on episodes of its own; from Python, `World.evaluate(callables=…)` names the methods to call",
+            "a Gymnasium environment is put into a state at a reset",
+            "start its episode there (`Env::reset_from`)",
         ))
     }
 

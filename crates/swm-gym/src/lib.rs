@@ -13,6 +13,7 @@ mod config;
 mod describe;
 mod env;
 mod picture;
+mod recorded;
 mod transport;
 mod worker;
 

@@ -108,6 +108,10 @@ impl WorkerTransport {
                 let of = |key: &str| missing.get(key).cloned().unwrap_or_default();
                 Error::config(id, format!("{} in {python}", of("message")), python.fix(&of("asset")))
             }
+            b'w' => {
+                let [problem, fix]: [String; 2] = serde_json::from_str(&text).unwrap_or_default();
+                Error::config(id, problem, fix)
+            }
             _ => Error::config(id, text, format!("install what it asks for in {python}, or choose another")),
         };
         Failure::Refused(refused)

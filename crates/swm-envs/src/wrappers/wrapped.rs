@@ -3,8 +3,8 @@
 use super::{View, VisualWrapper, parse};
 use std::collections::BTreeMap;
 use swm_core::{
-    Action, Env, EnvSpec, Error, FactorValues, FrameMut, Key, Next, ResetOptions, Result, RowMut, RowRef, Snapshot,
-    Transition,
+    Action, Call, Env, EnvSpec, Error, FactorValues, FrameMut, Key, Next, Recorded, ResetOptions, Result, RowMut,
+    RowRef, Schema, Snapshot, Transition,
 };
 
 /// What wrappers do to the picture of the goal.
@@ -170,6 +170,16 @@ impl Env for Wrapped {
     fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()> {
         self.env.restore_from(start, goal)?;
         self.step = 0;
+        Ok(())
+    }
+
+    fn recorded_columns(&self, stored: &Schema, calls: &[Call]) -> Result<Vec<String>> {
+        self.env.recorded_columns(stored, calls)
+    }
+
+    fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: Recorded<'_>) -> Result<()> {
+        self.env.reset_from(seed, options, from)?;
+        self.begin(seed, 0);
         Ok(())
     }
 

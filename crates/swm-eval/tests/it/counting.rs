@@ -49,7 +49,9 @@ fn compat_plays_and_counts_solved_starts_and_tells_the_strict_rate_too() {
     let reader = recorded(12);
     let spec = world(1, 1).spec().clone();
     let picks = Starts::choose(&reader, 40, 1, 3).expect("picks");
-    let starts = Starts::from_dataset(&reader, &spec, picks, 1, 3, VariationRequest::default()).expect("starts");
+    let starts =
+        Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks, 1, 3, VariationRequest::default(), &[])
+            .expect("starts");
     let mut random = RandomPolicy::new(&spec, 5);
     let strict = run_counted(&mut world(5, 1), &mut random, &starts, Counting::Strict { hold: 1 });
     let compat = run_counted(&mut world(5, 2), &mut random, &starts, Counting::Compat { envs: 40 });

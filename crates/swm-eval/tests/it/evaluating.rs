@@ -158,8 +158,9 @@ fn repeating_what_was_recorded_reaches_the_recorded_goal() {
     let picks = Starts::choose(&reader, 30, 4, 8).expect("picks");
     assert_eq!(picks, Starts::choose(&reader, 30, 4, 8).expect("picks"), "decided by the seed");
     assert_ne!(picks, Starts::choose(&reader, 30, 4, 9).expect("picks"));
-    let spec = world(1, 1).spec().clone();
-    let starts = Starts::from_dataset(&reader, &spec, picks, 4, 8, VariationRequest::default()).expect("starts");
+    let starts =
+        Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks, 4, 8, VariationRequest::default(), &[])
+            .expect("starts");
     let keys = (0..30).map(|i| (Key::new(8).with("episode").at(i as u64), i)).collect();
     let mut oracle = Oracle { reader: &reader, starts: &starts, keys, playing: vec![[0; 2]; 5] };
     let found = run(&mut world(5, 2), &mut oracle, &starts, Some(4));
@@ -201,10 +202,10 @@ impl Policy for Seeing {
 #[test]
 fn recorded_factors_hold_unless_they_are_shifted() {
     let reader = recorded(12);
-    let spec = world(1, 1).spec().clone();
     let picks = Starts::choose(&reader, 1, 6, 0).expect("picks");
     let color = |variation: VariationRequest| {
-        let starts = Starts::from_dataset(&reader, &spec, picks.clone(), 6, 0, variation).expect("starts");
+        let starts = Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks.clone(), 6, 0, variation, &[])
+            .expect("starts");
         let mut seeing = Seeing::default();
         run(&mut world(1, 1), &mut seeing, &starts, None);
         seeing.color
@@ -222,9 +223,10 @@ fn recorded_factors_hold_unless_they_are_shifted() {
 #[test]
 fn wrong_requests_say_so() {
     let reader = recorded(3);
-    let spec = world(1, 1).spec().clone();
     let starts = |picks, offset, variation| {
-        Starts::from_dataset(&reader, &spec, picks, offset, 0, variation).expect_err("wrong").to_string()
+        Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks, offset, 0, variation, &[])
+            .expect_err("wrong")
+            .to_string()
     };
     assert!(starts(vec![], 1, VariationRequest::default()).contains("at least 1"));
     assert!(starts(vec![[3, 0]], 1, VariationRequest::default()).contains("3 episodes, counted from 0"));

@@ -53,7 +53,8 @@ fn recorded_goals_are_within_the_experts_reach() {
     let mut world = world(5, 2);
     let spec = world.spec().clone();
     let evaluate = |world: &mut World, random: bool, variation: VariationRequest| {
-        let starts = Starts::from_dataset(&*reader, &spec, picks.clone(), 6, 0, variation).expect("starts");
+        let starts =
+            Starts::from_dataset(&*reader, world.pool().env(0), picks.clone(), 6, 0, variation, &[]).expect("starts");
         let config = EvalConfig { budget: Some(30), ..EvalConfig::default() };
         let control = &mut Control::default();
         if random {
@@ -83,8 +84,8 @@ fn a_dataset_of_another_world_is_refused() {
     let writer = writer.expect("a dataset");
     line.collect(&mut crate::line::Walker, writer, &config, &mut Control::default()).expect("collected");
     let reader = swm_data::open(&path).expect("a dataset");
-    let spec = world(1, 1).spec().clone();
-    let starts = Starts::from_dataset(&*reader, &spec, vec![[0, 0]], 1, 0, VariationRequest::default());
+    let starts =
+        Starts::from_dataset(&*reader, world(1, 1).pool().env(0), vec![[0, 0]], 1, 0, VariationRequest::default(), &[]);
     let error = starts.expect_err("another world");
     assert!(matches!(error, Error::Mismatch { .. }) && error.to_string().contains("swm/TwoRoom-v1"), "{error}");
 }

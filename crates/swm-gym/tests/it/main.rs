@@ -4,6 +4,7 @@
 mod atari;
 mod parents;
 mod play;
+mod recorded;
 mod robust;
 mod spaces;
 

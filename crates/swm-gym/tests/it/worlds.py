@@ -149,6 +149,55 @@ class Room(gymnasium.Env):
         return picture
 
 
+class Field(gymnasium.Env):
+    """A point that looks for another, in a wind that the seed decides; it can be put anywhere."""
+
+    metadata = {'render_modes': ['rgb_array']}
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+        self.action_space = spaces.Box(-1, 1, (2,), np.float32)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+        self.variation_space = Group({'agent': Group({'size': Factor(0.5, 2.0, (1,), [1.0])})})
+        self.t = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.variation_space.start(seed, options or {})
+        self.t = 0
+        self.wind = self.np_random.uniform(-0.1, 0.1, 2)
+        self.position, self.goal = self.np_random.uniform(-1, 1, (2, 2))
+        return self.position, self.info()
+
+    def info(self):
+        state = np.concatenate([self.position, [self.t]])
+        return {'state': state, 'goal_state': np.append(self.goal, 0.0), 'wind': self.wind, 'set': getattr(self, 'how', 0)}
+
+    def _set_state(self, state):
+        assert isinstance(state, np.ndarray) and state.dtype == np.float64, state
+        state += 0  # It is the environment's own.
+        self.position, self.t, self.how = state[:2].copy(), int(state[2]), 1
+
+    def _set_goal_state(self, goal_state):
+        self.goal = goal_state[:2]
+
+    def place(self, x, y=0.0, label=''):
+        self.position, self.how = np.array([x, y]), len(label)
+
+    def step(self, action):
+        self.t += 1
+        self.position = self.position + action * self.variation_space['agent']['size'].value + self.wind
+        info = self.info()
+        info.pop('goal_state')
+        return self.position, 0.0, bool(np.abs(self.position - self.goal).max() < 0.1), False, info
+
+    def render(self):
+        picture = np.zeros((16, 16, 3), np.uint8)
+        x, y = np.clip((self.position + 2) * 4, 0, 15).astype(int)
+        picture[y, x] = 255
+        return picture
+
+
 class Choices(gymnasium.Env):
     """Observes nothing but what was chosen, and cannot be drawn."""
 
@@ -198,4 +247,5 @@ class Coated(gymnasium.Wrapper):
 
 gymnasium.register('Room-v0', Room, max_episode_steps=30)
 gymnasium.register('Coated-v0', Coated)
+gymnasium.register('Field-v0', Field, max_episode_steps=20)
 gymnasium.register('Choices-v0', Choices)

@@ -1,0 +1,156 @@
+//! Episodes that start at a row of a dataset.
+
+use crate::config;
+use crate::play::{Seen, make};
+use crate::robust::kill_process;
+use swm_core::batch::{Batch, ColumnSpec, DType, Schema};
+use swm_core::{Action, Call, Env, FrameMut, Recorded, ResetOptions, VariationRequest};
+use swm_gym::{GymEnv, WorkerTransport};
+
+const FIELD: &str = "tests.it.worlds:Field-v0";
+const EAST: Action<'static> = Action::Continuous(&[0.5, 0.0]);
+
+/// A start and a goal.
+fn rows() -> Batch {
+    let schema = Schema::new([
+        ColumnSpec::new("state", DType::Float64, [3]),
+        ColumnSpec::new("observation", DType::Float64, [2]),
+        ColumnSpec::new("x", DType::Float32, []),
+        ColumnSpec::new("variation_agent_size", DType::Float32, [1]),
+        ColumnSpec::new("episode_seed", DType::Int32, [3]),
+        ColumnSpec::image("pixels", 2, 2),
+    ]);
+    let mut rows = Batch::zeros(&schema.expect("a schema"), 2);
+    for (row, x) in [(0, -0.3), (1, 1.2)] {
+        let mut row = rows.row_mut(row);
+        row.set(0, &[x, 0.25, 7.0]);
+        row.set(1, &[x, 0.25]);
+        row.set(2, &[x as f32]);
+        row.set(3, &[1.5f32]);
+        row.set(4, &[11, 0, 0]);
+        row.set(5, &[if x > 0.0 { 200u8 } else { 3 }; 12]);
+    }
+    rows
+}
+
+fn calls(json: &str) -> Vec<Call> {
+    serde_json::from_str(json).expect("calls")
+}
+
+fn start(env: &mut dyn Env, options: &ResetOptions, calls: &[Call]) -> swm_core::Result<()> {
+    let rows = rows();
+    env.recorded_columns(rows.schema(), calls)?;
+    env.reset_from(5, options, Recorded { start: rows.row(0), goal: rows.row(1), calls })
+}
+
+#[test]
+fn an_environment_with_setters_starts_where_it_was_recorded() {
+    let Some(config) = config() else { return };
+    let mut field = Seen::of(make(FIELD, &config));
+    start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start");
+    assert_eq!(field.column("state"), [-0.3, 0.25, 7.0]);
+    assert_eq!(field.column("observation"), [-0.3, 0.25]);
+    assert_eq!(field.column("goal_state"), [1.2, 0.25, 7.0]);
+    assert_eq!(field.env.factors().scalar("agent.size"), 1.5, "factors are the recorded ones");
+    assert!(!field.env.is_success() && field.env.goal_distance().is_infinite());
+    let wind = field.column("wind");
+    let own = field.picture(16, 16);
+    assert_eq!(own[3 * (9 * 16 + 6)], 255, "it stands there, too");
+    let mut goal = vec![0; 12];
+    field.env.render_goal(FrameMut::new(2, 2, &mut goal)).expect("a goal");
+    assert_eq!(goal, [200; 12]);
+    let transition = field.env.step(EAST).expect("a step");
+    let state = field.column("state");
+    assert!((state[0] - (-0.3 + 0.75 + wind[0])).abs() < 1e-12 && state[2] == 8.0, "{state:?}");
+    assert!(!transition.terminated);
+    assert_eq!(field.column("goal_state"), [1.2, 0.25, 7.0], "in every step");
+    // The seed of the recorded episode decides what its state does not hold.
+    let mut other = Seen::of(make(FIELD, &config));
+    other.env.reset(11, &ResetOptions::default()).expect("a reset");
+    assert_eq!(other.column("wind"), wind);
+    // A reset forgets.
+    field.env.reset(11, &ResetOptions::default()).expect("a reset");
+    assert_eq!(field.column("goal_state"), other.column("goal_state"));
+}
+
+#[test]
+fn shifted_factors_are_sampled_from_a_new_seed() {
+    let Some(config) = config() else { return };
+    let mut field = Seen::of(make(FIELD, &config));
+    let variation = VariationRequest { variation: Some(vec!["agent".to_owned()]), ..VariationRequest::default() };
+    start(&mut *field.env, &ResetOptions { variation, ..ResetOptions::default() }, &[]).expect("a start");
+    let wind = field.column("wind");
+    field.env.reset(5, &ResetOptions::default()).expect("a reset");
+    assert_eq!(field.column("wind"), wind);
+}
+
+#[test]
+fn methods_are_called_by_name() {
+    let Some(config) = config() else { return };
+    let mut field = Seen::of(make(FIELD, &config));
+    let place =
+        r#"[{"method": "place", "args": {"x": {"value": "goal_x"}, "label": {"value": "abc", "in_dataset": false}}}]"#;
+    start(&mut *field.env, &ResetOptions::default(), &calls(place)).expect("a start");
+    field.env.step(Action::Continuous(&[0.0, 0.0])).expect("a step");
+    let (position, wind) = (field.column("observation"), field.column("wind"));
+    assert!((position[0] - f64::from(1.2f32) - wind[0]).abs() < 1e-12 && position[1] == wind[1], "{position:?}");
+    assert_eq!(field.column("set"), [3.0]);
+
+    let mut wrong =
+        |json: &str| start(&mut *field.env, &ResetOptions::default(), &calls(json)).expect_err("wrong").to_string();
+    let error = wrong(r#"[{"method": "set_place"}]"#);
+    assert!(error.contains("Field has no method 'set_place'") && error.contains("place"), "{error}");
+    let error = wrong(r#"[{"method": "place", "args": {"x": {"value": "goal_y"}}}]"#);
+    assert!(error.contains("'goal_y'") && error.contains("state, observation, x"), "{error}");
+    let error = wrong(r#"[{"method": "place", "args": {"x": {"value": 3}}}]"#);
+    assert!(error.contains("a column's name"), "{error}");
+    let error = wrong(r#"[{"method": "place", "args": {"z": {"value": "x"}}}]"#);
+    assert!(error.contains("its reset raised") && error.contains("'z'"), "{error}");
+    start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start after errors");
+    let error =
+        start(&mut *make("CartPole-v1", &config), &ResetOptions::default(), &[]).expect_err("no way").to_string();
+    assert!(error.contains("CartPole-v1") && error.contains("set_state(state)"), "{error}");
+}
+
+#[test]
+fn a_killed_worker_is_replayed_from_the_recorded_state() {
+    let Some(config) = config() else { return };
+    let run = |kill: Option<usize>| {
+        let transport = WorkerTransport::new(FIELD, [].into(), config.clone()).expect("a worker");
+        let id = transport.process_id().expect("a process");
+        let mut field = Seen::of(Box::new(GymEnv::new(FIELD, Box::new(transport), 2).expect("a world")));
+        start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start");
+        let mut seen = vec![field.everything()];
+        for t in 0..4 {
+            if kill == Some(t) {
+                kill_process(id);
+            }
+            field.env.step(EAST).expect("a step");
+            seen.push(field.everything());
+        }
+        seen
+    };
+    let wanted = run(None);
+    assert!(run(Some(0)) == wanted && run(Some(2)) == wanted);
+}
+
+#[test]
+fn a_snapshot_knows_where_its_episode_started() {
+    let Some(config) = config() else { return };
+    let mut field = Seen::of(make(FIELD, &config));
+    start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start");
+    field.env.step(EAST).expect("a step");
+    let snapshot = field.env.snapshot();
+    let mut other = Seen::of(make(FIELD, &config));
+    other.env.restore(&snapshot).expect("restored");
+    for world in [&mut field, &mut other] {
+        world.env.step(EAST).expect("a step");
+    }
+    assert!(field.everything() == other.everything());
+    let goals = [&mut field, &mut other].map(|world| {
+        let mut goal = vec![0; 27];
+        world.env.render_goal(FrameMut::new(3, 3, &mut goal)).expect("a goal");
+        goal
+    });
+    assert_eq!(goals, [[200; 27], [200; 27]]);
+}

@@ -1,0 +1,239 @@
+"""Gymnasium environments that start at recorded states, in this interpreter and in processes of their own."""
+
+import os
+import signal
+import sys
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+from test_interrupts import children
+
+import stable_worldmodel as swm
+
+#: A module that worker processes import, too.
+MODULE = '''
+import os
+import signal
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+
+class Field(gymnasium.Env):
+    """A point that looks for another, in a wind that the seed decides."""
+
+    metadata = {"render_modes": ["rgb_array"]}
+
+    def __init__(self, render_mode=None, marker=None):
+        self.render_mode, self.marker = render_mode, marker
+        self.action_space = spaces.Box(-0.3, 0.3, (2,), np.float32)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.wind = self.np_random.uniform(-0.02, 0.02, 2)
+        self.position, self.goal = self.np_random.uniform(-1, 1, (2, 2))
+        self.put = False
+        return self.position, self.info()
+
+    def info(self):
+        return {"state": self.position, "goal_state": self.goal, "wind": self.wind, "put": self.put}
+
+    def _set_state(self, state):
+        self.position, self.put = np.array(state), True
+
+    def _set_goal_state(self, goal_state):
+        self.goal = np.array(goal_state)
+
+    def step(self, action):
+        if self.marker and self.put and not os.path.exists(self.marker):
+            open(self.marker, "w").close()
+            os.kill(os.getpid(), signal.SIGKILL)
+        self.position = self.position + action + self.wind
+        return self.position, 0.0, bool(np.abs(self.position - self.goal).max() < 0.03), False, self.info()
+
+    def render(self):
+        picture = np.zeros((32, 32, 3), np.uint8)
+        for place, channel in ((self.position, 0), (self.goal, 1)):
+            x, y = np.clip((place + 2) * 8, 0, 29).astype(int)
+            picture[y : y + 3, x : x + 3, channel] = 255
+        return picture
+
+
+class Quiet(Field):
+    """The same without names that say what they do."""
+
+    _set_state = _set_goal_state = None
+
+    def teleport(self, where, scale):
+        Field._set_state(self, where * scale)
+
+    def aim(self, at):
+        Field._set_goal_state(self, at)
+
+
+gymnasium.register("Field-v0", Field, max_episode_steps=40)
+gymnasium.register("Quiet-v0", Quiet, max_episode_steps=40)
+'''
+
+CALLABLES = [
+    {"method": "_set_state", "args": {"state": {"value": "state", "in_dataset": True}}},
+    {"method": "_set_goal_state", "args": {"goal_state": {"value": "goal_state"}}},
+]
+OWN = [
+    {"method": "teleport", "args": {"where": {"value": "state"}, "scale": {"value": np.float64(1), "in_dataset": False}}},
+    {"method": "aim", "args": {"at": {"value": "goal_state"}}},
+]
+
+
+class Seeking(swm.policy.BasePolicy):
+    """Goes to the goal that the infos show; notes what it saw."""
+
+    def __init__(self):
+        super().__init__()
+        self.first, self.goals = [], []
+
+    def get_action(self, infos, **kwargs):
+        for slot in np.flatnonzero(infos["_needs_flush"]):
+            self.first.append((infos["state"][slot, 0].copy(), infos["wind"][slot, 0].copy()))
+            self.goals.append(infos["goal"][slot, 0].copy())
+        way = infos["goal_state"][:, 0] - infos["state"][:, 0]
+        return np.clip(way, -0.3, 0.3).astype(np.float32)
+
+
+@pytest.fixture
+def fields(tmp_path, monkeypatch):
+    """The module, importable here and in workers; it gives the name of an environment in it."""
+    (tmp_path / "fields_of_mine.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv("SWM_PYTHON", sys.executable)
+    yield "fields_of_mine:{}-v0".format
+    sys.modules.pop("fields_of_mine", None)
+    for name in ("Field-v0", "Quiet-v0"):
+        gymnasium.registry.pop(name, None)
+
+
+@pytest.fixture
+def recorded(fields, tmp_path):
+    world = swm.World(fields("Field"), num_envs=2, image_shape=(32, 32))
+    world.set_policy(swm.policy.RandomPolicy(seed=2))
+    world.collect(tmp_path / "fields.lance", episodes=4, seed=7, progress=False)
+    return swm.data.load_dataset(str(tmp_path / "fields.lance"), backend="numpy")
+
+
+PICKS = {"episodes_idx": [0, 1, 2, 3, 0], "start_steps": [0, 3, 1, 8, 5], "goal_offset": 6, "eval_budget": 30}
+
+
+def evaluate(world, dataset, policy=None, **more):
+    return world.evaluate(dataset=dataset, **{**PICKS, "progress": False, "seed": 0, **more}, policy=policy or Seeking())
+
+
+@pytest.mark.parametrize(("name", "callables"), [("Field", CALLABLES), ("Field", None), ("Quiet", OWN)])
+def test_episodes_start_where_they_were_recorded(fields, recorded, name, callables):
+    found = []
+    for envs, workers in ((2, False), (3, True), (5, False)):
+        world, policy = swm.World(fields(name), num_envs=envs, image_shape=(32, 32), workers=workers), Seeking()
+        metrics = evaluate(world, recorded, policy, callables=callables)
+        assert metrics["success_rate"] == 100 and metrics["random_success_rate"] < 100
+        found.append((metrics["steps"].tolist(), metrics["episode_successes"].tolist()))
+        starts = {tuple(state) for state, _ in policy.first}
+        for episode, start in zip(PICKS["episodes_idx"], PICKS["start_steps"], strict=True):
+            rows = recorded.load_episode(episode)
+            assert tuple(rows["state"][start]) in starts
+            wind = next(wind for state, wind in policy.first if np.array_equal(state, rows["state"][start]))
+            assert np.array_equal(wind, rows["wind"][0]), "the seed is the recorded one"
+            goal = rows["pixels"][start + 6].transpose(1, 2, 0)
+            assert any(np.array_equal(goal, shown) for shown in policy.goals), "the goal's picture is the recorded one"
+        noted = metrics.results["manifest"]["config"]["callables"]
+        assert [call["method"] for call in noted] == [call["method"] for call in callables or []]
+        world.close()
+    assert found[0] == found[1] == found[2]
+
+
+def test_a_worker_that_dies_starts_there_again(fields, recorded, tmp_path):
+    wanted = evaluate(
+        swm.World(fields("Field"), num_envs=2, image_shape=None, add_pixels=False), recorded, floor=False, policy=Blind()
+    )
+    marker = tmp_path / "died"
+    world = swm.World(fields("Field"), num_envs=2, image_shape=None, add_pixels=False, workers=True, marker=str(marker))
+    metrics = evaluate(world, recorded, floor=False, policy=Blind())
+    assert marker.exists() and metrics["success_rate"] == 100
+    assert np.array_equal(metrics["steps"], wanted["steps"])
+
+
+class Blind(Seeking):
+    """Without pictures."""
+
+    def get_action(self, infos, **kwargs):
+        return super().get_action({**infos, "goal": infos["state"]})
+
+
+def test_a_worker_killed_between_steps_is_replaced(fields, recorded):
+    class Killing(Seeking):
+        killed = False
+
+        def get_action(self, infos, **kwargs):
+            if not Killing.killed and infos["step_idx"].max() == 2:
+                Killing.killed = True
+                os.kill(min(workers), signal.SIGKILL)
+            return super().get_action(infos)
+
+    wanted = evaluate(swm.World(fields("Field"), num_envs=2, image_shape=(32, 32)), recorded, floor=False)
+    before = set(children(os.getpid()))
+    world = swm.World(fields("Field"), num_envs=2, image_shape=(32, 32), workers=True)
+    workers = set(children(os.getpid())) - before
+    metrics = evaluate(world, recorded, Killing(), floor=False)
+    assert Killing.killed and np.array_equal(metrics["steps"], wanted["steps"])
+
+
+@pytest.mark.parametrize("workers", [False, True])
+def test_what_is_wrong_is_said(fields, recorded, workers):
+    def error(callables, name="Quiet", kind=ValueError):
+        world = swm.World(fields(name), num_envs=2, image_shape=(32, 32), workers=workers)
+        with pytest.raises(kind) as caught:
+            evaluate(world, recorded, callables=callables)
+        return str(caught.value)
+
+    def call(method, **args):
+        return [{"method": method, "args": args}]
+
+    unknown = error(call("teleprot"))
+    assert all(words in unknown for words in ("no method 'teleprot'", "did you mean teleport", "aim")), unknown
+    missing = error(call("teleport", where={"value": "place"}, scale={"value": 1, "in_dataset": False}))
+    assert "'place'" in missing and "state" in missing and "goal_" in missing
+    assert "set_state" in error(None) and "callables" in error(None)
+    assert "COLUMN" in error(call("teleport", where="state"))
+    assert "column" in error(call("teleport", where={"value": 3}))
+    assert "array of numbers" in error(call("aim", at={"value": object(), "in_dataset": False}), kind=TypeError)
+    raised = RuntimeError if workers else TypeError
+    assert "where" in error(call("teleport", scale={"value": 1, "in_dataset": False}), kind=raised)
+
+
+def test_worlds_of_ours_know_their_states(tmp_path):
+    world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(32, 32))
+    world.set_policy(swm.policy.ExpertPolicy())
+    world.collect(tmp_path / "rooms.lance", episodes=3, seed=1, progress=False)
+    picks = {"dataset": str(tmp_path / "rooms.lance"), "episodes_idx": [0, 1, 2], "start_steps": [0, 1, 2], "goal_offset": 4}
+    picks |= {"eval_budget": 20, "progress": False, "floor": False, "seed": 0}
+    plain = world.evaluate(**picks)
+    assert np.array_equal(world.evaluate(**picks, callables=CALLABLES)["steps"], plain["steps"])
+    with pytest.warns(UserWarning, match="set_colour.*not called"):
+        world.evaluate(**picks, callables=[{"method": "set_colour"}])
+
+    class Same(gymnasium.Wrapper):
+        """Nothing, around an environment of ours: it then lives in this interpreter."""
+
+    wrapped = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(32, 32), extra_wrappers=[partial(Same)])
+    for one in (world, wrapped):
+        one.set_policy(Still())
+    plain, wrapped = (one.evaluate(**picks) for one in (world, wrapped))
+    assert np.array_equal(plain["steps"], wrapped["steps"])
+
+
+class Still(swm.policy.BasePolicy):
+    def get_action(self, infos, **kwargs):
+        return np.zeros(self.env.action_space.shape, np.float32)

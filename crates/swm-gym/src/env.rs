@@ -375,7 +375,7 @@ impl Env for GymEnv {
     }
 
     fn announce(&mut self, next: Next<'_>) -> bool {
-        if self.stage != Stage::Ready || self.announced.is_some() {
+        if !self.transport.apart() || self.stage != Stage::Ready || self.announced.is_some() {
             return false;
         }
         match next {

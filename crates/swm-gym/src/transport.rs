@@ -61,7 +61,12 @@ pub trait Transport: Send {
     /// When it cannot be made.
     fn describe(&mut self) -> Result<Description, Failure>;
 
-    /// Asks without waiting, where an environment can work meanwhile; whether it does. [`Transport::call`] with the same request
+    /// Whether the environment works while nobody waits for it.
+    fn apart(&self) -> bool {
+        false
+    }
+
+    /// Asks without waiting, where the environment is apart; whether that went well. [`Transport::call`] with the same request
     /// follows and waits for the answer. Until then [`Transport::memory`] is empty.
     fn announce(&mut self, _request: Request<'_>) -> bool {
         false

@@ -155,6 +155,10 @@ impl Transport for WorkerTransport {
         Ok(description)
     }
 
+    fn apart(&self) -> bool {
+        true
+    }
+
     /// A worker that cannot be told is found dead by the call.
     fn announce(&mut self, request: Request<'_>) -> bool {
         let Some(process) = &mut self.process else { return false };

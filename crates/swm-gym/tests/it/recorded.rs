@@ -113,6 +113,19 @@ fn methods_are_called_by_name() {
 }
 
 #[test]
+fn an_environment_may_say_itself_what_to_call() {
+    let Some(config) = config() else { return };
+    let mut worded = Seen::of(make("tests.it.worlds:Worded-v0", &config));
+    start(&mut *worded.env, &ResetOptions::default(), &[]).expect("a start");
+    worded.env.step(EAST).expect("a step");
+    assert_eq!(worded.column("set"), [2.0]);
+    // A method of that name that wants something else is none of those meant.
+    let mut jointed = make("tests.it.worlds:Jointed-v0", &config);
+    let error = start(&mut *jointed, &ResetOptions::default(), &[]).expect_err("two arguments").to_string();
+    assert!(error.contains("nothing says how it takes a state"), "{error}");
+}
+
+#[test]
 fn a_killed_worker_is_replayed_from_the_recorded_state() {
     let Some(config) = config() else { return };
     let run = |kill: Option<usize>| {

@@ -198,6 +198,21 @@ class Field(gymnasium.Env):
         return picture
 
 
+class Jointed(Field):
+    """Takes its state in another form than a column has."""
+
+    _set_state = None
+
+    def set_state(self, qpos, qvel):
+        raise AssertionError('nobody knows what to give')
+
+
+class Worded(Jointed):
+    """Says itself how it takes one."""
+
+    swm_callables = [{'method': 'place', 'args': {'x': {'value': 'x'}, 'label': {'value': 'ab', 'in_dataset': False}}}]
+
+
 class Choices(gymnasium.Env):
     """Observes nothing but what was chosen, and cannot be drawn."""
 
@@ -249,3 +264,5 @@ gymnasium.register('Room-v0', Room, max_episode_steps=30)
 gymnasium.register('Coated-v0', Coated)
 gymnasium.register('Field-v0', Field, max_episode_steps=20)
 gymnasium.register('Choices-v0', Choices)
+gymnasium.register('Jointed-v0', Jointed)
+gymnasium.register('Worded-v0', Worded)

@@ -47,6 +47,56 @@ fn gymnasium_environments_are_collected_and_evaluated() {
     assert!(text(&output.stderr).contains("/no/such/python (named by $SWM_PYTHON)"), "{}", text(&output.stderr));
 }
 
+/// A train that goes its way, whatever is done, at a speed that the seed decides: what it passed it passes again.
+const TRAIN: &str = "
+import gymnasium, numpy as np
+from gymnasium import spaces
+
+class Train(gymnasium.Env):
+    action_space = spaces.Discrete(2)
+    observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.speed = self.np_random.uniform(1, 2)
+        self.set_state(np.zeros(1))
+        self.set_goal_state(np.full(1, 1e9))
+        return self.at, {'state': self.at}
+
+    def set_state(self, state):
+        self.at = state
+
+    def set_goal_state(self, goal_state):
+        self.goal = goal_state
+
+    def step(self, action):
+        self.at = self.at + self.speed
+        return self.at, 0.0, bool(self.at >= self.goal - 1e-9), False, {'state': self.at}
+
+gymnasium.register('Train-v0', Train, max_episode_steps=20)
+";
+
+#[test]
+fn an_environment_with_setters_is_evaluated_from_a_dataset() {
+    if !python("gymnasium") {
+        return;
+    }
+    let swm = Swm::new();
+    std::fs::write(swm.path("trains.py"), TRAIN).expect("a module");
+    let train = "trains:Train-v0";
+    swm.json(&["collect", train, "-o", "trains", "--policy", "random", "--episodes", "3", "--no-pixels"]);
+    let eval = ["eval", "random", "--env", train, "--dataset", "trains", "--goal-offset", "4", "--episodes", "6"];
+    let with = |more: &[&str]| swm.json(&eval.iter().chain(more).copied().collect::<Vec<_>>());
+    let results = with(&["--no-pixels", "--envs", "2", "-o", "two"]);
+    let episodes = results["runs"][0]["episodes"].as_array().expect("episodes");
+    assert_eq!(episodes.len(), 6);
+    assert!(episodes.iter().all(|episode| episode["success"] == true && episode["steps"] == 4), "{episodes:?}");
+    swm.json(&["collect", "CartPole-v1", "-o", "carts", "--policy", "random", "--episodes", "2", "--no-pixels"]);
+    let cart =
+        ["eval", "random", "--env", "CartPole-v1", "--dataset", "carts", "--goal-offset", "2", "--episodes", "2"];
+    swm.refuses(&cart, 2, &["starting CartPole-v1 from a row of a dataset", "set_state(state)"]);
+}
+
 /// The robustness sweep of the paper's Atari listing: three wrappers.
 #[test]
 fn atari_games_pass_through_wrappers() {

@@ -199,7 +199,7 @@ def test_a_world_goes_back_to_what_it_was():
         (lambda: rooms().evaluate(policy=Zero(), protocol="loose"), ValueError, "compat"),
         (lambda: rooms().evaluate(policy=swm.policy.ExpertPolicy("weakk")), ValueError, "weak"),
         (lambda: rooms().evaluate(policy=Zero(), dataset="nothing"), FileNotFoundError, "nothing"),
-        (lambda: rooms().evaluate(policy=Zero(np.nan), episodes=1), ValueError, "not finite"),
+        (lambda: rooms().evaluate(policy=Zero(np.nan), episodes=1, seed=0), ValueError, "not finite"),
     ],
 )
 def test_wrong_words_get_clear_errors(make, error, words):

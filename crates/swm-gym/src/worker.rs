@@ -290,7 +290,8 @@ impl Drop for Process {
 fn map(file: &File) -> std::io::Result<MmapMut> {
     // SAFETY: the file has no name; besides us only our worker holds it, which never changes its size. The worker writes
     // to it only between a request and its answer, when nobody here holds a reference: `Transport::announce` and `call`
-    // borrow the transport mutably, and between the two it lends no memory. A worker that does not answer in time is killed before the memory is touched again.
+    // borrow the transport mutably, and between the two it lends no memory. A worker that does not answer in time is
+    // killed before the memory is touched again.
     unsafe { MmapMut::map_mut(file) }
 }
 

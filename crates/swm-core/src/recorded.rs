@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
 
-/// A start and a goal out of a dataset: two rows, their columns under [flat](flat) names.
+/// A start and a goal out of a dataset: two rows, their columns under [`flat`] names.
 #[derive(Clone, Copy)]
 pub struct Recorded<'a> {
     /// Where the episode starts.

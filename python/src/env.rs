@@ -8,7 +8,7 @@ use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use swm::core::{Action, Batch, DType, Env, Error, FrameMut, Key, Schema, Snapshot, View};
+use swm::core::{Action, Batch, DType, Env, Error, FrameMut, Key, Schema, Snapshot, View, share};
 
 /// One environment.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
@@ -95,7 +95,8 @@ impl NativeEnv {
         let state = &mut *state;
         let mut rgb = vec![0; height * width * 3];
         let frame = FrameMut::new(width, height, &mut rgb);
-        let drawn = py.detach(|| if goal { state.env.render_goal(frame) } else { state.env.render(frame) });
+        let drawn =
+            py.detach(|| share::all(|| if goal { state.env.render_goal(frame) } else { state.env.render(frame) }));
         drawn.map_err(raised)?;
         arrays::array(py, DType::U8, &[height, width, 3], &rgb)
     }
@@ -113,7 +114,7 @@ impl NativeEnv {
         let mut bytes = vec![0; column.row_bytes()];
         let mut state = self.lock();
         let state = &mut *state;
-        py.detach(|| state.env.render_view(&view, height, width, &mut bytes)).map_err(raised)?;
+        py.detach(|| share::all(|| state.env.render_view(&view, height, width, &mut bytes))).map_err(raised)?;
         arrays::array(py, column.dtype, &column.shape, &bytes)
     }
 

@@ -5,7 +5,7 @@
 //! 1. [`batch`]: the only thing that flows between its parts, named typed columns.
 //! 2. [`space`] and [`variation`]: what an action, an observation and a factor of variation may be.
 //! 3. [`key`]: where every random number comes from.
-//! 4. [`env`], [`view`], [`recorded`], [`pool`], [`policy`]: worlds, many of them at once, and who acts in them.
+//! 4. [`env`], [`view`], [`recorded`], [`pool`], [`share`], [`policy`]: worlds, many of them at once, and who acts in them.
 //! 5. [`plan`]: costs of candidate action sequences, and the solvers that minimise them.
 //! 6. [`registry`], [`manifest`], [`results`], [`error`]: names, provenance, findings, and what goes wrong.
 
@@ -22,6 +22,7 @@ pub mod pool;
 pub mod recorded;
 pub mod registry;
 pub mod results;
+pub mod share;
 pub mod space;
 pub mod variation;
 pub mod view;

@@ -7,6 +7,7 @@
 
 use crate::batch::{Batch, ColumnSpec, DType, RowMut, Schema};
 use crate::pace::Pace;
+use crate::share;
 use crate::{Action, Env, EnvSpec, Error, FrameMut, Next, ResetOptions, Result, View};
 use std::sync::Arc;
 use std::time::Instant;
@@ -183,7 +184,7 @@ impl EnvPool {
                 slot.env.announce(Next::Reset(reset.seed, &reset.options));
             }
         }
-        self.each(false, |i, slot, places, row| {
+        self.each(Some(resets.len()), |i, slot, places, row| {
             let Some(reset) = wanted[i] else { return Ok(()) };
             slot.env.reset(reset.seed, &reset.options)?;
             slot.start(places, row)
@@ -199,7 +200,7 @@ impl EnvPool {
         slots: &[usize],
         change: impl Fn(usize, &mut dyn Env) -> Result<()> + Sync,
     ) -> Result<()> {
-        self.each(false, |i, slot, places, row| {
+        self.each(Some(slots.len()), |i, slot, places, row| {
             if !slots.contains(&i) {
                 return Ok(());
             }
@@ -244,7 +245,7 @@ impl EnvPool {
         }
         // To wait for what others do, one thread is enough; pictures are scaled and changed here.
         let alone = self.pace.alone(stepping) || (elsewhere && self.places.pixels.is_none());
-        let stepped = self.each(alone, |i, slot, places, row| {
+        let stepped = self.each((!alone).then_some(stepping), |i, slot, places, row| {
             if !active[i] {
                 return Ok(());
             }
@@ -261,24 +262,28 @@ impl EnvPool {
         stepped
     }
 
-    /// Runs `work` on every slot, in parallel or `alone` on this thread; the first slot's error wins, whatever finished
-    /// first.
+    /// Runs `work` on every slot; the first slot's error wins, whatever finished first. In parallel where it is said how many of them
+    /// have something to do, which share the threads; on this thread otherwise.
     fn each(
         &mut self,
-        alone: bool,
+        busy: Option<usize>,
         work: impl Fn(usize, &mut Slot, &Places, &mut RowMut<'_>) -> Result<()> + Sync,
     ) -> Result<()> {
         let (places, slots, infos) = (&self.places, &mut self.slots, &mut self.infos);
-        if alone {
-            for (i, slot) in slots.iter_mut().enumerate() {
-                slot.failed = work(i, slot, places, &mut infos.row_mut(i)).err();
+        match busy {
+            None => {
+                for (i, slot) in slots.iter_mut().enumerate() {
+                    slot.failed = work(i, slot, places, &mut infos.row_mut(i)).err();
+                }
             }
-        } else {
-            self.threads.install(|| {
-                infos.par_zip_mut(slots, |i, mut row, slot| {
-                    slot.failed = work(i, slot, places, &mut row).err();
+            Some(busy) => {
+                let threads = self.threads.current_num_threads().div_ceil(busy.max(1));
+                self.threads.install(|| {
+                    infos.par_zip_mut(slots, |i, mut row, slot| {
+                        slot.failed = share::with(threads, || work(i, slot, places, &mut row)).err();
+                    });
                 });
-            });
+            }
         }
         match self.slots.iter_mut().find_map(|slot| slot.failed.take()) {
             None => Ok(()),

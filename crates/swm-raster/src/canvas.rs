@@ -1,13 +1,12 @@
 //! [`Canvas`]: draws scenes, and keeps the memory it needs for that.
 
-use crate::layers::{Layers, NOTHING, Region, pattern, touched};
+use crate::layers::pattern;
 use crate::light::Lamp;
-use crate::paint::{Lamps, Look, Painter};
-use crate::scene::{Assets, Scene, Shape};
+use crate::paint::Lit;
+use crate::scene::{Assets, Light, Scene};
 use crate::shadow::Shadow;
-use crate::simd::{nearest, vectorised};
-use crate::sky::{self, Backdrop, Veil};
-use crate::vector::{add, dot, scale, sub};
+use crate::split::Split;
+use crate::strip::{Picture, Strip, clear};
 use crate::view::View;
 use std::ops::Range;
 
@@ -24,30 +23,23 @@ pub enum Target<'a> {
 /// Draws scenes. One canvas serves any scenes and sizes; after the first pictures of a kind, it allocates nothing.
 #[derive(Default)]
 pub struct Canvas {
-    main: Layers,
-    mirror: Layers,
-    glass: Layers,
+    threads: usize,
+    split: Split,
+    strips: Vec<Strip>,
+    lamps: Lamps,
     shadows: Vec<Shadow>,
-    plain: Vec<Lamp>,
-    shadowed: Vec<(Lamp, usize)>,
-    painter: Painter,
-    backdrop: Backdrop,
-    /// Red, green and blue of all pixels.
-    colours: [Vec<f32>; 3],
-    /// Places of geoms one sees through, from near to far, and how far they are.
-    clear: Vec<(f32, usize)>,
 }
 
-/// Less opaque geoms let something through.
-const OPAQUE: f32 = 0.995;
-
-/// How much of a plane is left of its opacity, seen from behind.
-const BEHIND: f32 = 0.3;
-
 impl Canvas {
-    /// An empty one.
+    /// An empty one, which draws on the thread that asks.
     pub fn new() -> Self {
         Self::default()
+    }
+
+    /// Draws the next pictures on at most so many threads: that which asks, and others of the pool of `rayon` that it belongs to. A
+    /// picture is cut where it has enough work for that; its bytes stay the same.
+    pub fn spread(&mut self, threads: usize) {
+        self.threads = threads;
     }
 
     /// Draws a scene at `width` times `height` pixels, colours with so many samples a pixel (1, 2 or 4). Labels are taken in the middle
@@ -80,231 +72,126 @@ impl Canvas {
             }
             return;
         }
+        let pattern = match target {
+            Target::Rgb(_) => pattern(samples),
+            Target::Depth(_) => &pattern(samples)[..1],
+            Target::Labels(_) => pattern(1),
+        };
+        let picture = Picture { scene, assets, view: &view, pattern };
+        self.split.cut(&picture, self.threads);
+        self.paint(&picture, target);
+    }
+
+    /// Draws a picture in the strips it was cut into.
+    fn paint(&mut self, picture: &Picture<'_>, target: Target<'_>) {
+        let &Picture { scene, assets, view, .. } = picture;
+        let opaque = |geom: usize| !clear(scene, geom, view);
+        let Split { ends, pays, .. } = &self.split;
+        if self.strips.len() < ends.len() {
+            self.strips.resize_with(ends.len(), Strip::default);
+        }
+        let strips = &mut self.strips[..ends.len()];
         match target {
-            Target::Rgb(bytes) => self.colours(scene, assets, &view, samples, bytes),
-            Target::Depth(metres) => {
-                self.visible(scene, assets, &view, &pattern(samples)[..1], |geom| !clear(scene, geom, &view));
-                self.depths(scene, &view, metres);
-            }
-            Target::Labels(labels) => {
-                self.visible(scene, assets, &view, pattern(1), |geom| scene.geoms[geom].label.is_some());
-                for (y, labels) in labels.chunks_exact_mut(width).take(height).enumerate() {
-                    for (label, &id) in labels.iter_mut().zip(&self.main.ids[self.main.span(y, 0, width)]) {
-                        *label = match id {
-                            NOTHING => -1,
-                            id => scene.geoms[self.main.geom(id) as usize].label.unwrap_or(-1),
-                        };
-                    }
+            Target::Rgb(bytes) => {
+                self.lamps.fill(scene);
+                let Lamps { plain, shadowed, casting, all } = &self.lamps;
+                if self.shadows.len() < casting.len() {
+                    self.shadows.resize_with(casting.len(), Shadow::default);
                 }
+                let shadows = &mut self.shadows[..casting.len()];
+                // Texels are to be smaller than pixels.
+                let side = (2 * view.width.max(view.height)).clamp(192, 1024);
+                both(
+                    *pays,
+                    || {
+                        each(strips, ends, 0, (&mut [], 0), &|strip, rows, _: &mut [u8]| {
+                            strip.find(picture, rows, opaque)
+                        })
+                    },
+                    || cast(shadows, casting, *pays, &|shadow, light| shadow.cast(scene, assets, light, side)),
+                );
+                let lamps = Lit { plain, shadowed, shadows };
+                let unshaded = Lit { plain: all, shadowed: &[], shadows: &[] };
+                each(strips, ends, 0, (bytes, 3 * view.width), &|strip, _, bytes| {
+                    strip.colours(picture, lamps, unshaded, bytes);
+                });
             }
+            Target::Depth(metres) => each(strips, ends, 0, (metres, view.width), &|strip, rows, metres| {
+                strip.find(picture, rows, opaque);
+                strip.depths(picture, metres);
+            }),
+            Target::Labels(labels) => each(strips, ends, 0, (labels, view.width), &|strip, rows, labels| {
+                strip.find(picture, rows, |geom| scene.geoms[geom].label.is_some());
+                strip.labels(picture, labels);
+            }),
         }
     }
+}
 
-    /// Finds what is nearest at every sample, of the geoms that count.
-    fn visible(
-        &mut self,
-        scene: &Scene,
-        assets: &Assets,
-        view: &View,
-        at: &'static [[f32; 2]],
-        counts: impl Fn(usize) -> bool,
-    ) {
-        self.main.start(view.width, view.height, at);
-        self.main.clear(scene.camera.far);
-        for (number, geom) in (0u32..).zip(&scene.geoms) {
-            if counts(number as usize) {
-                self.main.draw(number, geom, (assets, view), None, false);
-            }
-        }
-    }
+/// The lamps of a scene.
+#[derive(Default)]
+struct Lamps {
+    /// Those without shadows, and those with, by the places of these.
+    plain: Vec<Lamp>,
+    shadowed: Vec<Lamp>,
+    /// The lights that cast them.
+    casting: Vec<Light>,
+    /// All, those without shadows first.
+    all: Vec<Lamp>,
+}
 
-    /// Writes depths; where nothing is, that of the sky, or how far one sees.
-    #[allow(clippy::cast_precision_loss)]
-    fn depths(&self, scene: &Scene, view: &View, metres: &mut [f32]) {
-        let (rays, radius) = (view.rays(), sky::radius(scene));
-        let [dx, dy] = self.main.pattern[0];
-        for (y, metres) in metres.chunks_exact_mut(view.width).take(view.height).enumerate() {
-            let row = add(rays.direction, scale(rays.directions[1], y as f32 + dy));
-            for (x, (metre, &depth)) in
-                metres.iter_mut().zip(&self.main.depths[self.main.span(y, 0, view.width)]).enumerate()
-            {
-                let direction = add(row, scale(rays.directions[0], x as f32 + dx));
-                *metre = if scene.sky.is_some() { depth.min(sky::depth(radius, direction)) } else { depth };
-            }
-        }
-    }
-
-    fn colours(&mut self, scene: &Scene, assets: &Assets, view: &View, samples: usize, bytes: &mut [u8]) {
-        let whole = [0, 0, view.width, view.height];
-        self.visible(scene, assets, view, pattern(samples), |geom| !clear(scene, geom, view));
-        self.lamps(scene, assets, view);
-        self.painter.start(scene.geoms.len());
-        for colours in &mut self.colours {
-            colours.resize(view.width * view.height, 0.0);
-        }
-        self.backdrop.paint(scene, assets, view, &mut self.main, &mut self.colours);
-        if scene.reflections {
-            self.reflect(scene, assets, view);
-            self.painter.start(scene.geoms.len());
-        }
-        let Self { main, shadows, plain, shadowed, painter, colours, .. } = self;
-        let look = Look {
-            scene,
-            assets,
-            view,
-            lamps: Lamps { plain: plain.as_slice(), shadowed: shadowed.as_slice(), shadows: shadows.as_slice() },
-            dimmed: 1.0,
-        };
-        painter.paint(main, &look, whole, |pixels, part, seen| add_part(colours, pixels, part, seen));
-        veil(scene, view, main, colours);
-        self.see_through(scene, assets, view);
-        let [r, g, b] = &self.colours;
-        to_bytes(r, g, b, bytes.as_chunks_mut::<3>().0);
-    }
-
-    /// Prepares lights and their shadows.
-    fn lamps(&mut self, scene: &Scene, assets: &Assets, view: &View) {
-        self.plain.clear();
+impl Lamps {
+    fn fill(&mut self, scene: &Scene) {
+        let casts = |light: &&Light| scene.shadows && light.shadows;
+        self.casting.clear();
+        self.casting.extend(scene.lights.iter().filter(casts));
         self.shadowed.clear();
-        // Texels are to be smaller than pixels.
-        let side = (2 * view.width.max(view.height)).clamp(192, 1024);
-        for light in &scene.lights {
-            if scene.shadows && light.shadows {
-                let number = self.shadowed.len();
-                if self.shadows.len() == number {
-                    self.shadows.push(Shadow::default());
-                }
-                self.shadows[number].cast(scene, assets, light, side);
-                self.shadowed.push((Lamp::new(light), number));
-            } else {
-                self.plain.push(Lamp::new(light));
-            }
-        }
-    }
-
-    /// Draws the mirror image in the first geom that reflects. It is lit without shadows.
-    fn reflect(&mut self, scene: &Scene, assets: &Assets, view: &View) {
-        let reflecting = |number: &usize| {
-            let geom = &scene.geoms[*number];
-            let shape = matches!(geom.shape, Shape::Plane(..) | Shape::Box(_));
-            shape && geom.reflectance > 0.0 && !clear(scene, *number, view)
-        };
-        let Some(number) = (0..scene.geoms.len()).find(reflecting) else { return };
-        let geom = &scene.geoms[number];
-        let normal = [geom.rotation[2], geom.rotation[5], geom.rotation[8]];
-        // Of a box, the upper side reflects.
-        let height = if let Shape::Box(halves) = geom.shape { halves[2] } else { 0.0 };
-        let point = add(geom.position, scale(normal, height));
-        let Some(region) = touched(geom, assets, view) else { return };
-        if dot(sub(view.position, point), normal) < 0.0 {
-            return;
-        }
-        let mirrored = view.mirrored(point, normal);
-        let Self { main, mirror, shadows, plain, shadowed, painter, colours, .. } = self;
-        mirror.start(view.width, view.height, main.pattern);
-        mirror.ids.fill(NOTHING);
-        // One sees only where the mirror is, and what is in front of it.
-        let own = u32::try_from(number).unwrap_or(NOTHING);
-        for (depth, &id) in mirror.depths.iter_mut().zip(&main.ids) {
-            *depth = if id == own { scene.camera.far } else { f32::NEG_INFINITY };
-        }
-        let mut seen = [usize::MAX, usize::MAX, 0, 0];
-        for (other, geom) in (0u32..).zip(&scene.geoms) {
-            if other != own && !clear(scene, other as usize, view) {
-                let touched = mirror.draw(other, geom, (assets, &mirrored), Some(&main.depths), false);
-                seen = touched.map_or(seen, |touched| around(seen, touched));
-            }
-        }
-        let seen = within(seen, region);
-        // Mirrored lamps shine on mirrored things: the same light as on the things themselves. Nothing is in a shadow.
-        let all = plain.len();
-        plain.extend(shadowed.iter().map(|(lamp, _)| *lamp));
-        let look = Look {
-            scene,
-            assets,
-            view: &mirrored,
-            lamps: Lamps { plain: plain.as_slice(), shadowed: &[], shadows: shadows.as_slice() },
-            dimmed: geom.reflectance,
-        };
-        painter.paint(mirror, &look, seen, |pixels, part, seen| add_part(colours, pixels, part, seen));
-        plain.truncate(all);
-    }
-
-    /// Draws what one sees through: from near to far, and again from far to near. Nothing shades it.
-    fn see_through(&mut self, scene: &Scene, assets: &Assets, view: &View) {
-        let Self { main, glass, shadows, plain, shadowed, painter, colours, clear, .. } = self;
-        clear.clear();
-        for (number, geom) in scene.geoms.iter().enumerate().filter(|(number, _)| self::clear(scene, *number, view)) {
-            let distance = match geom.shape {
-                Shape::Plane(..) => 1e10,
-                shape => {
-                    let (_, halves) = shape.bounds();
-                    let way = sub(geom.position, view.position);
-                    dot(way, way).sqrt() - dot(halves, halves).sqrt()
-                }
-            };
-            clear.push((distance, number));
-        }
-        if clear.is_empty() {
-            return;
-        }
-        clear.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        let all = plain.len();
-        plain.extend(shadowed.iter().map(|(lamp, _)| *lamp));
-        painter.start(scene.geoms.len());
-        let look = Look {
-            scene,
-            assets,
-            view,
-            lamps: Lamps { plain: plain.as_slice(), shadowed: &[], shadows: shadows.as_slice() },
-            dimmed: 1.0,
-        };
-        glass.start(view.width, view.height, main.pattern);
-        for &(_, number) in clear.iter().chain(clear.iter().rev()) {
-            let geom = &scene.geoms[number];
-            let Some(region) = touched(geom, assets, view) else { continue };
-            let [x0, y0, x1, y1] = region;
-            for row in (y0..y1).map(|y| main.span(y, x0, x1)) {
-                glass.depths[row.clone()].copy_from_slice(&main.depths[row.clone()]);
-                glass.ids[row].fill(NOTHING);
-            }
-            glass.forget();
-            glass.draw(u32::try_from(number).unwrap_or(NOTHING), geom, (assets, view), None, false);
-            let opacity = match geom.shape {
-                Shape::Plane(..) if hind(scene, number, view) => BEHIND * geom.rgba[3],
-                _ => geom.rgba[3],
-            };
-            painter.paint(glass, &look, region, |pixels, part, seen| {
-                let opacity = (part * opacity).clamp(0.0, 1.0);
-                for (colours, seen) in colours.iter_mut().zip(seen) {
-                    for (colour, seen) in colours[pixels.clone()].iter_mut().zip(seen) {
-                        *colour = sky::over(*seen, opacity, *colour);
-                    }
-                }
-            });
-        }
-        plain.truncate(all);
+        self.shadowed.extend(self.casting.iter().map(Lamp::new));
+        self.plain.clear();
+        self.plain.extend(scene.lights.iter().filter(|light| !casts(light)).map(Lamp::new));
+        self.all.clear();
+        self.all.extend(self.plain.iter().chain(&self.shadowed));
     }
 }
 
-/// Adds parts of colours to those of pixels.
-fn add_part(colours: &mut [Vec<f32>; 3], pixels: Range<usize>, part: f32, seen: [&[f32]; 3]) {
-    for (colours, seen) in colours.iter_mut().zip(seen) {
-        for (colour, seen) in colours[pixels.clone()].iter_mut().zip(seen) {
-            *colour += part * seen;
+/// Does two things, on two threads where that pays.
+fn both(pays: bool, a: impl FnOnce() + Send, b: impl FnOnce() + Send) {
+    if pays {
+        rayon::join(a, b);
+    } else {
+        a();
+        b();
+    }
+}
+
+/// Works on every strip, the first of which begins at row `top`, and on its rows of the target, so many numbers each; on a thread each.
+fn each<T: Send>(
+    strips: &mut [Strip],
+    ends: &[usize],
+    top: usize,
+    (target, row): (&mut [T], usize),
+    work: &(impl Fn(&mut Strip, Range<usize>, &mut [T]) + Sync),
+) {
+    match (strips, ends) {
+        ([strip], [end]) => work(strip, top..*end, target),
+        (strips, ends) => {
+            let (upper, lower) = strips.split_at_mut(strips.len() / 2);
+            let (first, last) = ends.split_at(upper.len());
+            let middle = first.last().copied().unwrap_or(top);
+            let (above, below) = target.split_at_mut((middle - top) * row);
+            rayon::join(
+                || each(upper, first, top, (above, row), work),
+                || each(lower, last, middle, (below, row), work),
+            );
         }
     }
 }
 
-/// The smallest region around two.
-fn around(a: Region, b: Region) -> Region {
-    [a[0].min(b[0]), a[1].min(b[1]), a[2].max(b[2]), a[3].max(b[3])]
-}
-
-/// What is in both of two regions; of regions that lie apart, one without pixels.
-fn within(a: Region, b: Region) -> Region {
-    let [x, y] = [a[0].max(b[0]), a[1].max(b[1])];
-    [x, y, a[2].min(b[2]).max(x), a[3].min(b[3]).max(y)]
+/// Casts the shadows of lights, on a thread each where that pays.
+fn cast(shadows: &mut [Shadow], lights: &[Light], pays: bool, work: &(impl Fn(&mut Shadow, &Light) + Sync)) {
+    if let ([shadow, shadows @ ..], [light, lights @ ..]) = (shadows, lights) {
+        both(pays && !lights.is_empty(), || work(shadow, light), || cast(shadows, lights, pays, work));
+    }
 }
 
 /// Whether a camera's numbers make a picture.
@@ -319,61 +206,39 @@ fn seeing(view: &View) -> bool {
         && view.near > 0.0
 }
 
-/// Whether one sees the back of a plane.
-fn hind(scene: &Scene, number: usize, view: &View) -> bool {
-    let geom = &scene.geoms[number];
-    let normal = [geom.rotation[2], geom.rotation[5], geom.rotation[8]];
-    matches!(geom.shape, Shape::Plane(..)) && dot(sub(view.position, geom.position), normal) < 0.0
-}
-
-/// Whether one sees through a geom.
-fn clear(scene: &Scene, number: usize, view: &View) -> bool {
-    scene.geoms[number].rgba[3] < OPAQUE || hind(scene, number, view)
-}
-
-/// Draws haze over the sky and the far ends of planes.
-#[allow(clippy::cast_precision_loss)]
-fn veil(scene: &Scene, view: &View, main: &Layers, colours: &mut [Vec<f32>; 3]) {
-    let Some(veil) = scene.haze.filter(|_| scene.sky.is_some()).and_then(|haze| Veil::new(scene, &haze, view.position))
-    else {
-        return;
-    };
-    let rays = view.rays();
-    let share = 1.0 / main.samples as f32;
-    for y in 0..view.height {
-        let row = add(rays.direction, scale(rays.directions[1], y as f32 + 0.5));
-        for x in 0..view.width {
-            let Some((opacity, depth)) = veil.at(add(row, scale(rays.directions[0], x as f32 + 0.5))) else { continue };
-            let open = main.depths[main.span(y, x, x + 1)].iter().filter(|far| **far > depth).count();
-            for (colours, veil) in colours.iter_mut().zip(veil.rgb) {
-                let colour = &mut colours[y * view.width + x];
-                *colour = sky::over(veil, opacity * open as f32 * share, *colour);
-            }
-        }
-    }
-}
-
-vectorised! {
-    /// Colours to bytes, rounded; what is no number is black.
-    #[allow(clippy::manual_clamp, reason = "`clamp` would keep what is no number")]
-    fn to_bytes(r: &[f32], g: &[f32], b: &[f32], bytes: &mut [[u8; 3]]) {
-        let n = bytes.len().min(r.len());
-        let (r, g, b, bytes) = (&r[..n], &g[..n], &b[..n], &mut bytes[..n]);
-        let byte = |x: f32| nearest((x * 255.0).max(0.0).min(255.0)) as u8;
-        for i in 0..n {
-            bytes[i] = [byte(r[i]), byte(g[i]), byte(b[i])];
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scenes::{assets, scene};
+    use proptest::prelude::*;
 
-    #[test]
-    fn regions_that_lie_apart_share_no_pixels() {
-        assert_eq!(within([2, 3, 9, 8], [4, 1, 20, 6]), [4, 3, 9, 6]);
-        assert_eq!(within([0, 0, 3, 3], [5, 0, 9, 3]), [5, 0, 5, 3]);
-        assert_eq!(within([0, 6, 3, 9], [0, 0, 3, 4]), [0, 6, 3, 6]);
+    const SIZE: (usize, usize) = (11, 150);
+
+    /// Colours, depths and labels, drawn in strips that end so.
+    fn cut(canvas: &mut Canvas, scene: &Scene, ends: &[usize]) -> (Vec<u8>, Vec<u32>, Vec<i32>) {
+        let (assets, view, n) = (assets(), View::of(&scene.camera, SIZE.0, SIZE.1), SIZE.0 * SIZE.1);
+        let (mut rgb, mut depths, mut labels) = (vec![0; 3 * n], vec![0.0; n], vec![0; n]);
+        if seeing(&view) {
+            (canvas.split.ends, canvas.split.pays) = (ends.to_vec(), ends.len() > 1);
+            let mut draw = |samples, target| {
+                canvas.paint(&Picture { scene, assets: &assets, view: &view, pattern: pattern(samples) }, target);
+            };
+            draw(4, Target::Rgb(&mut rgb));
+            draw(1, Target::Depth(&mut depths));
+            draw(1, Target::Labels(&mut labels));
+        }
+        (rgb, depths.into_iter().map(f32::to_bits).collect(), labels)
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(300))]
+        #[test]
+        fn strips_show_what_the_whole_shows(scene in scene()) {
+            let mut canvas = Canvas::new();
+            let whole = cut(&mut canvas, &scene, &[150]);
+            for ends in [&[64, 150][..], &[32, 96, 150], &[32, 64, 96, 128, 150], &[150]] {
+                prop_assert_eq!(&cut(&mut canvas, &scene, ends), &whole, "{:?}", ends);
+            }
+        }
     }
 }

@@ -2,11 +2,12 @@
 
 use crate::cast::{Posed, Samples};
 use crate::eight::{self, Job, LANES, Plain, Simd};
-use crate::mesh::Level;
+use crate::mesh::{Level, Mesh};
 use crate::scene::{Assets, Geom, Shape};
 use crate::simd::vectorised;
 use crate::vector::{V3, add, dot, length, rotate, scale};
 use crate::view::View;
+use std::ops::Range;
 
 /// Nothing is there.
 pub(crate) const NOTHING: u32 = u32::MAX >> 1;
@@ -55,11 +56,13 @@ fn centre_of(pattern: &[[f32; 2]], covered: usize) -> [f32; 2] {
     sum.map(|sum| sum / count as f32)
 }
 
-/// The nearest thing at every sample. Samples of a pixel are neighbours, so that a small triangle meets many at once.
+/// The nearest thing at every sample of some rows of a picture. Samples of a pixel are neighbours, so that a small triangle meets
+/// many at once. What is at a sample does not depend on which rows are drawn together.
 #[derive(Default)]
 pub(crate) struct Layers {
     pub width: usize,
-    pub height: usize,
+    /// The rows of the picture.
+    pub rows: Range<usize>,
     pub samples: usize,
     /// From a row to the next: the samples of its pixels, and room for [`LANES`] that reach beyond them.
     stride: usize,
@@ -120,15 +123,15 @@ impl Triangle {
 pub(crate) type Region = [usize; 4];
 
 impl Layers {
-    /// Forgets everything, for a picture of this size.
-    pub fn start(&mut self, width: usize, height: usize, pattern: &'static [[f32; 2]]) {
+    /// Forgets everything, for these rows of a picture so wide.
+    pub fn start(&mut self, width: usize, rows: Range<usize>, pattern: &'static [[f32; 2]]) {
         let stride = width * pattern.len() + LANES;
         if (stride, pattern) != (self.stride, self.pattern) {
             self.place_samples(stride, pattern);
         }
-        (self.width, self.height) = (width, height);
-        self.depths.resize(height * stride, 0.0);
-        self.ids.resize(height * stride, NOTHING);
+        self.depths.resize(rows.len() * stride, 0.0);
+        self.ids.resize(rows.len() * stride, NOTHING);
+        (self.width, self.rows) = (width, rows);
         self.forget();
     }
 
@@ -166,13 +169,19 @@ impl Layers {
 
     /// Where the samples of the pixels from `x0` to before `x1` of a row are.
     #[inline]
-    pub fn span(&self, y: usize, x0: usize, x1: usize) -> std::ops::Range<usize> {
-        let first = y * self.stride;
+    pub fn span(&self, y: usize, x0: usize, x1: usize) -> Range<usize> {
+        let first = (y - self.rows.start) * self.stride;
         first + x0 * self.samples..first + x1 * self.samples
     }
 
+    /// The part of a region that is in its rows; without pixels where there is none.
+    pub fn part(&self, [x0, y0, x1, y1]: Region) -> Region {
+        let y0 = y0.clamp(self.rows.start, self.rows.end);
+        [x0, y0, x1, y1.clamp(y0, self.rows.end)]
+    }
+
     /// Draws a geom over what is there, where it is nearer, and farther than `floor` if there is one. What casts shadows does
-    /// so coarsely, and with both sides of meshes that are open. Returns where it may be seen.
+    /// so coarsely, and with both sides of meshes that are open. Returns where in the picture it may be seen.
     pub fn draw(
         &mut self,
         number: u32,
@@ -182,22 +191,23 @@ impl Layers {
         caster: bool,
     ) -> Option<Region> {
         let region = touched(geom, assets, view)?;
+        let part = self.part(region);
+        if part[1] == part[3] {
+            return Some(region);
+        }
         match geom.shape {
             Shape::Mesh(mesh) => {
                 let mesh = assets.meshes.get(mesh)?;
-                let (low, high) = mesh.bounds();
-                let reach = 0.5 * length([high[0] - low[0], high[1] - low[1], high[2] - low[2]]);
-                let middle = add(geom.position, rotate(&geom.rotation, scale(add(low, high), 0.5)));
-                let nearest = view.project(middle).1 - reach;
-                let number_of_level = mesh.level_for(if caster { COARSE } else { INVISIBLE } / view.pixels_at(nearest));
+                let number_of_level = mesh.level_for(cell(mesh, geom, view, caster));
                 let level = mesh.level(number_of_level);
                 let place = u32::try_from(number_of_level).unwrap_or(0);
-                self.mesh((number, place), geom, level, view, floor, caster && !mesh.is_closed());
+                let both_sides = caster && !mesh.is_closed();
+                self.mesh((number, place), geom, level, (view, part[1]..part[3]), floor, both_sides);
             }
             shape => {
                 let (_, halves) = shape.bounds();
                 let outline = Outline::new(geom, halves, view);
-                self.shape(number, &Posed::new(geom, view)?, region, &outline, floor);
+                self.shape(number, &Posed::new(geom, view)?, part, &outline, floor);
             }
         }
         Some(region)
@@ -221,7 +231,7 @@ impl Layers {
                 continue;
             }
             let (x0, x1) = (low as usize, (high as usize + 1).min(right));
-            let (span, columns) = (self.span(y, x0, x1), self.span(0, x0, x1));
+            let (span, columns) = (self.span(y, x0, x1), x0 * self.samples..x1 * self.samples);
             let samples = Samples {
                 at: self.at.each_ref().map(|at| &at[columns.clone()]),
                 floor: floor.map_or(&self.free[columns], |floor| &floor[span.clone()]),
@@ -239,7 +249,7 @@ impl Layers {
         (number, place): (u32, u32),
         geom: &Geom,
         level: &Level,
-        view: &View,
+        (view, rows): (&View, Range<usize>),
         floor: Option<&[f32]>,
         both_sides: bool,
     ) {
@@ -257,26 +267,17 @@ impl Layers {
         // Rows run downwards, so that what is counterclockwise to the eye is clockwise in pixels.
         let front = if view.mirrored { 1.0 } else { -1.0 };
         let front = if both_sides { 0.0 } else { front };
-        let near = view.near;
-        eight::run(Faces { layers: self, number: (number, place), level, vertices: &vertices, front, near, floor });
+        let way = Way { front, near: view.near, floor, rows };
+        eight::run(Faces { layers: self, number: (number, place), level, vertices: &vertices, way });
         self.vertices = vertices;
     }
 
-    /// Draws a triangle in front of the camera, if it faces it (`front` times its area is positive), or from both sides where `front`
-    /// is 0.
+    /// Draws a triangle in front of the camera, if it faces it (`front` times its area is positive, or 0).
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     #[inline(always)]
-    fn triangle(
-        &mut self,
-        simd: impl Simd,
-        number: (u32, u32, u32),
-        [a, b, c]: [[f32; 4]; 3],
-        front: f32,
-        near: f32,
-        floor: Option<&[f32]>,
-    ) {
+    fn triangle(&mut self, simd: impl Simd, number: (u32, u32, u32), [a, b, c]: [[f32; 4]; 3], way: &Way<'_>) {
         let area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
-        if area * front < 0.0 || area.abs() <= 1e-12 || !area.is_finite() {
+        if area * way.front < 0.0 || area.abs() <= 1e-12 || !area.is_finite() {
             return;
         }
         // Pixels of which a sample may be inside.
@@ -284,10 +285,12 @@ impl Layers {
         let low = |k: usize| (a[k].min(b[k]).min(c[k]) - last[k] + 1.0) as i32;
         let high = |k: usize| (a[k].max(b[k]).max(c[k]) - first[k] + 1.0) as i32;
         let (x0, y0) = (low(0).max(0), low(1).max(0));
-        let (x1, y1) = (high(0).min(self.width as i32), high(1).min(self.height as i32));
-        if x0 >= x1 || y0 >= y1 {
+        let x1 = high(0).min(self.width as i32);
+        let (first, last) = (y0.max(way.rows.start as i32), high(1).min(way.rows.end as i32));
+        if x0 >= x1 || first >= last {
             return;
         }
+        // Of the picture, not of the rows: rounding is to be the same wherever rows begin.
         let base = [x0 as f32, y0 as f32];
         let by = 1.0 / area;
         let corner = |p: [f32; 4]| (p[0] - base[0], p[1] - base[1], by / p[2]);
@@ -297,29 +300,14 @@ impl Layers {
             [(q.1 - r.1) * p.2, (r.0 - q.0) * p.2, (q.0 * r.1 - q.1 * r.0) * p.2]
         };
         let shares = [share(a, b, c), share(b, c, a), share(c, a, b)];
-        self.fill(
-            simd,
-            number,
-            base,
-            shares,
-            depths,
-            [x0 as usize, y0 as usize, x1 as usize, y1 as usize],
-            near,
-            floor,
-        );
+        let region = [x0 as usize, first as usize, x1 as usize, last as usize];
+        self.fill(simd, number, base, shares, depths, region, way);
     }
 
     /// Draws a triangle of which a part is too near to be seen.
     #[allow(clippy::cast_possible_truncation)]
     #[cold]
-    fn crossing(
-        &mut self,
-        number: (u32, u32, u32),
-        corners: [[f32; 4]; 3],
-        front: f32,
-        near: f32,
-        floor: Option<&[f32]>,
-    ) {
+    fn crossing(&mut self, number: (u32, u32, u32), corners: [[f32; 4]; 3], way: &Way<'_>) {
         // A share divided by w is linear on the screen: the inverse of the matrix of the corners.
         let [a, b, c] =
             corners.map(|[x, y, w, _]| [f64::from(x) * f64::from(w), f64::from(y) * f64::from(w), f64::from(w)]);
@@ -328,15 +316,15 @@ impl Layers {
         };
         let (bc, ca, ab) = (wedge(b, c), wedge(c, a), wedge(a, b));
         let determinant = a[0] * bc[0] + a[1] * bc[1] + a[2] * bc[2];
-        if determinant * f64::from(front) < 0.0 || determinant == 0.0 || !determinant.is_finite() {
+        if determinant * f64::from(way.front) < 0.0 || determinant == 0.0 || !determinant.is_finite() {
             return;
         }
         let shares = [bc, ca, ab].map(|row| row.map(|x| (x / determinant) as f32));
-        let whole = [0, 0, self.width, self.height];
-        self.fill(Plain, number, [0.0; 2], shares, corners.map(|corner| corner[3]), whole, near, floor);
+        let region = [0, way.rows.start, self.width, way.rows.end];
+        self.fill(Plain, number, [0.0; 2], shares, corners.map(|corner| corner[3]), region, way);
     }
 
-    /// Draws a triangle by the shares of its corners, divided by `w`, within a region.
+    /// Draws a triangle by the shares of its corners, divided by `w`, within a region, whose left edge is that of the base.
     #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss, clippy::too_many_arguments)]
     #[inline(always)]
     fn fill(
@@ -347,8 +335,7 @@ impl Layers {
         shares: [[f32; 3]; 3],
         depths: [f32; 3],
         [x0, y0, x1, y1]: Region,
-        near: f32,
-        floor: Option<&[f32]>,
+        way: &Way<'_>,
     ) {
         let [p, q, r] = shares;
         let [u, v, w] = depths;
@@ -364,26 +351,25 @@ impl Layers {
         for x in &mut lines[3] {
             *x *= 1.0 + 3.0 * HAIR;
         }
-        // Their values at the first samples of the region, and by how much they grow to the right.
-        let (dx, dy) = (x0 as f32 - base[0], y0 as f32 - base[1]);
+        // Their values at the first samples right of and below the base, and by how much they grow to the right.
         let (across, down) = (simd.load(&self.lanes[0]), simd.load(&self.lanes[1]));
         let (mut corner, mut slopes) = ([simd.splat(0.0); 4], [simd.splat(0.0); 4]);
         for (k, [x, y, constant]) in lines.into_iter().enumerate() {
             slopes[k] = simd.splat(x);
             let lanes = simd.add(simd.mul(slopes[k], across), simd.mul(simd.splat(y), down));
-            corner[k] = simd.add(simd.splat(x * dx + y * dy + constant), lanes);
+            corner[k] = simd.add(simd.splat(constant), lanes);
         }
-        let (none, near, pixels) = (simd.splat(0.0), simd.splat(near), simd.splat((LANES / self.samples) as f32));
+        let (none, near, pixels) = (simd.splat(0.0), simd.splat(way.near), simd.splat((LANES / self.samples) as f32));
         let id = TRIANGLE | self.triangles.len() as u32;
         let wide = ((x1 - x0) * self.samples).next_multiple_of(LANES);
         let mut drawn = simd.more(none, none);
         for y in y0..y1 {
             let begin = self.span(y, x0, x0).start;
             let row = begin..begin + wide;
-            let floor = floor.map_or(&self.free[..wide], |floor| &floor[row.clone()]).as_chunks().0;
+            let floor = way.floor.map_or(&self.free[..wide], |floor| &floor[row.clone()]).as_chunks().0;
             let depths = self.depths[row.clone()].as_chunks_mut().0;
             let ids = self.ids[row].as_chunks_mut().0;
-            let rows = (y - y0) as f32;
+            let rows = y as f32 - base[1];
             let mut left = corner;
             for (left, line) in left.iter_mut().zip(&lines) {
                 *left = simd.add(*left, simd.splat(line[1] * rows));
@@ -468,7 +454,7 @@ impl Outline {
     }
 
     /// How far to the left and right it reaches in rows.
-    fn reach(&self, rows: std::ops::Range<usize>, lows: &mut Vec<f32>, highs: &mut Vec<f32>) {
+    fn reach(&self, rows: Range<usize>, lows: &mut Vec<f32>, highs: &mut Vec<f32>) {
         lows.clear();
         highs.clear();
         match &self.edges {
@@ -483,6 +469,15 @@ impl Outline {
             }
         }
     }
+}
+
+/// How large cells of a mesh's version may be so that one does not see them.
+pub(crate) fn cell(mesh: &Mesh, geom: &Geom, view: &View, caster: bool) -> f32 {
+    let (low, high) = mesh.bounds();
+    let reach = 0.5 * length([high[0] - low[0], high[1] - low[1], high[2] - low[2]]);
+    let middle = add(geom.position, rotate(&geom.rotation, scale(add(low, high), 0.5)));
+    let nearest = view.project(middle).1 - reach;
+    (if caster { COARSE } else { INVISIBLE }) / view.pixels_at(nearest)
 }
 
 /// The part of a picture a geom can be seen in.
@@ -516,24 +511,33 @@ struct Faces<'a> {
     number: (u32, u32),
     level: &'a Level,
     vertices: &'a [[f32; 4]],
+    way: Way<'a>,
+}
+
+/// How triangles are drawn.
+struct Way<'a> {
+    /// The sign of the areas of those that are; 0 for all.
     front: f32,
+    /// What is not farther than this is not seen, nor what is not farther than the floor.
     near: f32,
     floor: Option<&'a [f32]>,
+    /// In these rows.
+    rows: Range<usize>,
 }
 
 impl Job for Faces<'_> {
     #[allow(clippy::cast_possible_truncation)]
     #[inline(always)]
     fn run(self, simd: impl Simd) {
-        let Self { layers, number, level, vertices, front, near, floor } = self;
+        let Self { layers, number, level, vertices, way } = self;
         for (face, &[a, b, c]) in level.faces.iter().enumerate() {
             let corners = [vertices[a as usize], vertices[b as usize], vertices[c as usize]];
             let number = (number.0, number.1, face as u32);
-            let [p, q, r] = corners.map(|corner| corner[3] > near);
+            let [p, q, r] = corners.map(|corner| corner[3] > way.near);
             if p & q & r {
-                layers.triangle(simd, number, corners, front, near, floor);
+                layers.triangle(simd, number, corners, &way);
             } else if p | q | r {
-                layers.crossing(number, corners, front, near, floor);
+                layers.crossing(number, corners, &way);
             }
         }
     }

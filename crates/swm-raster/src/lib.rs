@@ -40,7 +40,9 @@
 //! **The model** is the fixed pipeline of OpenGL as MuJoCo uses it, down to where light is interpolated (planes and boxes)
 //! and how textures are filtered, so that pictures are those that MuJoCo's renderer draws, but for some rims.
 //!
-//! **Determinism.** A picture's bytes depend on the scene alone. Numbers are single precision without fused operations.
+//! **Threads.** A large picture is cut into strips of rows (`split`), each drawn by a thread (`strip`), while others cast shadows.
+//!
+//! **Determinism.** A picture's bytes depend on the scene alone, not on how it was cut. Numbers are single precision without fused operations.
 
 #[cfg(test)]
 extern crate self as swm_raster;
@@ -56,6 +58,8 @@ mod scene;
 mod shadow;
 mod simd;
 mod sky;
+mod split;
+mod strip;
 mod texture;
 mod vector;
 mod view;

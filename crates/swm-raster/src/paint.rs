@@ -12,8 +12,9 @@ use crate::vector::{V3, add, dot, rotate, scale, sub, unrotate};
 use crate::view::{Rays, View};
 use std::ops::Range;
 
-/// Rows that are gathered at once.
-const BAND: usize = 64;
+/// Rows that are gathered at once, counted from the top of the picture. How they are lit may depend on what is gathered with them, so
+/// that rows drawn by one thread begin with a band.
+pub(crate) const BAND: usize = 32;
 
 /// Quads along the side of a box, between whose corners light is interpolated.
 const QUADS: usize = 4;
@@ -63,12 +64,13 @@ struct Batch {
     sum: [Lane; 3],
 }
 
-/// How many lamps there are, and what each pass of lighting is: all lamps without shadows, and then one with shadows each.
-pub(crate) struct Lamps<'a> {
+/// What lights a picture, and what each pass of lighting is: all lamps without shadows, and then one with its shadow each.
+#[derive(Clone, Copy)]
+pub(crate) struct Lit<'a> {
     /// Lamps without shadows.
     pub plain: &'a [Lamp],
     /// Lamps with shadows, and these.
-    pub shadowed: &'a [(Lamp, usize)],
+    pub shadowed: &'a [Lamp],
     pub shadows: &'a [Shadow],
 }
 
@@ -77,7 +79,7 @@ pub(crate) struct Look<'a> {
     pub scene: &'a Scene,
     pub assets: &'a Assets,
     pub view: &'a View,
-    pub lamps: Lamps<'a>,
+    pub lamps: Lit<'a>,
     /// What colours are multiplied with.
     pub dimmed: f32,
 }
@@ -150,18 +152,18 @@ impl Painter {
         self.counts.resize(geoms, 0);
     }
 
-    /// Paints what is in the layers, within a region. `show` is given pixels next to each other, the part of each that is covered, and
-    /// colours: red, green and blue.
+    /// Paints what is in the layers, within a region. `show` is given pixels next to each other, counted from the first row of the layers,
+    /// the part of each that is covered, and colours: red, green and blue.
     pub fn paint(
         &mut self,
         layers: &Layers,
         look: &Look<'_>,
-        [x0, y0, x1, y1]: Region,
+        region: Region,
         mut show: impl FnMut(Range<usize>, f32, [&[f32]; 3]),
     ) {
-        let mut y = y0;
+        let [x0, mut y, x1, y1] = layers.part(region);
         while y < y1 {
-            let next = (y + BAND).min(y1);
+            let next = (y / BAND * BAND + BAND).min(y1);
             self.gather(layers, [x0, y, x1, next]);
             let mut begin = 0;
             for k in 0..self.present.len() {
@@ -312,8 +314,7 @@ impl Batch {
                     sum[..n].copy_from_slice(&light[..n]);
                 }
             } else {
-                let (lamp, shadow) = &look.lamps.shadowed[pass - 1];
-                let shadow = &look.lamps.shadows[*shadow];
+                let (lamp, shadow) = (&look.lamps.shadowed[pass - 1], &look.lamps.shadows[pass - 1]);
                 let (places, normals) =
                     (self.place.each_ref().map(|l| &l[..n]), self.normal.each_ref().map(|l| &l[..n]));
                 let lit = &mut self.lit[..n];
@@ -347,7 +348,8 @@ impl Batch {
     fn show(&self, runs: &[Run], layers: &Layers, show: &mut impl FnMut(Range<usize>, f32, [&[f32]; 3])) {
         let mut begin = 0;
         for run in runs {
-            let (pixel, count) = (usize::from(run.y) * layers.width + usize::from(run.x), usize::from(run.count));
+            let row = usize::from(run.y) - layers.rows.start;
+            let (pixel, count) = (row * layers.width + usize::from(run.x), usize::from(run.count));
             let part = run.samples.count_ones() as f32 / layers.samples as f32;
             show(pixel..pixel + count, part, self.sum.each_ref().map(|lane| &lane[begin..begin + count]));
             begin += count;
@@ -481,7 +483,7 @@ impl Batch {
             }
             pass => {
                 let sums = self.pass.each_mut().map(|l| &mut l[..n]);
-                look.lamps.shadowed[pass - 1].0.add(matter, look.view.position, places, normals, sums);
+                look.lamps.shadowed[pass - 1].add(matter, look.view.position, places, normals, sums);
             }
         }
         for lane in &mut self.pass {
@@ -574,7 +576,7 @@ fn corner_light((place, normal): (V3, V3), pass: usize, matter: &Matter, look: &
             0 => look.lamps.plain.iter().fold(matter.dark(look.scene), |sum, lamp| {
                 add(sum, lamp.at(matter, look.view.position, place, normal))
             }),
-            pass => look.lamps.shadowed[pass - 1].0.at(matter, look.view.position, place, normal),
+            pass => look.lamps.shadowed[pass - 1].at(matter, look.view.position, place, normal),
         };
     light.map(|x| x.min(1.0))
 }

@@ -83,7 +83,7 @@ impl Shadow {
             height,
             ..whole
         };
-        self.layers.start(width, height, pattern(1));
+        self.layers.start(width, 0..height, pattern(1));
         self.layers.clear(scene.camera.far);
         self.hollow.clear();
         self.hollow.extend(scene.geoms.iter().map(|geom| matches!(geom.shape, Shape::Mesh(_))));

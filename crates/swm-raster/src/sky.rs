@@ -6,6 +6,7 @@ use crate::simd::vectorised;
 use crate::texture::{MANY, Reader, Spots, Texture};
 use crate::vector::{V3, add, dot, scale, sub, unrotate};
 use crate::view::View;
+use std::ops::Range;
 use std::sync::Arc;
 
 /// How far the sky is: just so near that no part of its cylinder is cut off, as a part of the depth one sees.
@@ -28,7 +29,8 @@ pub(crate) fn depth(radius: f32, direction: V3) -> f32 {
 pub(crate) struct Backdrop {
     /// The texture and the rays it was seen along.
     seen: Option<(Arc<Texture>, V3, [V3; 2])>,
-    size: (usize, usize),
+    width: usize,
+    rows: Range<usize>,
     /// Red, green and blue of pixels, and by row whether they were looked up.
     colours: [Vec<f32>; 3],
     known: Vec<bool>,
@@ -39,7 +41,7 @@ pub(crate) struct Backdrop {
 }
 
 impl Backdrop {
-    /// Paints the sky where nothing is before it, and black elsewhere.
+    /// Paints the sky where nothing is before it, and black elsewhere, in the rows of the layers.
     #[allow(clippy::cast_precision_loss)]
     pub fn paint(
         &mut self,
@@ -57,12 +59,12 @@ impl Backdrop {
         let known = self.seen.as_ref().is_some_and(|(seen, direction, directions)| {
             Arc::ptr_eq(seen, texture) && *direction == rays.direction && *directions == rays.directions
         });
-        if !known || self.size != (view.width, view.height) {
+        if !known || (self.width, &self.rows) != (view.width, &main.rows) {
             self.seen = Some((Arc::clone(texture), rays.direction, rays.directions));
-            self.size = (view.width, view.height);
-            self.colours.iter_mut().for_each(|colours| colours.resize(view.width * view.height, 0.0));
+            (self.width, self.rows) = (view.width, main.rows.clone());
+            self.colours.iter_mut().for_each(|colours| colours.resize(view.width * main.rows.len(), 0.0));
             self.known.clear();
-            self.known.resize(view.height, false);
+            self.known.resize(main.rows.len(), false);
         }
         let infinite = |geom: &Geom| matches!(geom.shape, Shape::Plane(x, y) if x.infinite || y.infinite);
         let endless = scene.geoms.iter().any(infinite);
@@ -70,7 +72,7 @@ impl Backdrop {
         let share = 1.0 / main.samples as f32;
         self.open.resize(view.width, 0.0);
         self.far.resize(view.width, 0.0);
-        for y in 0..view.height {
+        for (line, y) in main.rows.clone().enumerate() {
             let row = add(rays.direction, scale(rays.directions[1], y as f32 + 0.5));
             let samples = main.span(y, 0, view.width);
             if endless {
@@ -79,12 +81,12 @@ impl Backdrop {
                 hide(&self.far, main.samples, &main.depths[samples.clone()], &mut main.ids[samples.clone()]);
             }
             count_open(&main.ids[samples], main.samples, share, &mut self.open);
-            let pixels = y * view.width..(y + 1) * view.width;
+            let pixels = line * view.width..(line + 1) * view.width;
             if self.open.iter().all(|open| *open == 0.0) {
                 colours.iter_mut().for_each(|colours| colours[pixels.clone()].fill(0.0));
                 continue;
             }
-            if !std::mem::replace(&mut self.known[y], true) {
+            if !std::mem::replace(&mut self.known[line], true) {
                 let [r, g, b] = self.colours.each_mut().map(|colours| &mut colours[pixels.clone()]);
                 look_up(texture, &mut self.reader, row, rays.directions, [r, g, b]);
             }

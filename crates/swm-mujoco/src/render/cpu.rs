@@ -1,4 +1,5 @@
-//! The renderer of our own: MuJoCo's abstract scene, drawn by `swm-raster` on the thread that asks.
+//! The renderer of our own: MuJoCo's abstract scene, drawn by `swm-raster` on the thread that asks, and on others that
+//! have nothing else to do ([`share`]).
 //!
 //! It needs no graphics library, and gives the same bytes on every machine. What MuJoCo derives when it makes a context for a
 //! model (the grids of planes, corners of meshes, smaller textures) is derived here once for all models of a group, and kept.
@@ -8,13 +9,13 @@ mod convert;
 
 use super::{Look, Picture, Renderer, Scene};
 use std::cell::RefCell;
-use swm_core::{Error, Result};
+use swm_core::{Error, Result, share};
 use swm_raster::{Assets, Canvas, Target};
 
-/// The renderer: all it keeps is kept by threads.
+/// The renderer: all it keeps is kept by threads ([`DESKS`]).
 pub(crate) struct Cpu;
 
-/// What a thread keeps from picture to picture.
+/// What drawing needs, and keeps from picture to picture.
 #[derive(Default)]
 struct Desk {
     canvas: Canvas,
@@ -30,28 +31,39 @@ impl Renderer for Cpu {
     }
 
     fn draw(&self, scene: Scene<'_>, width: usize, height: usize, picture: Picture<'_>) -> Result<()> {
-        thread_local! {
-            static DESK: RefCell<Desk> = RefCell::default();
-        }
         if width.max(height) > 16384 {
             let size = format!("{width} x {height} pixels");
             return Err(Error::config("size of a picture", size, "at most 16384 a side can be drawn"));
         }
-        DESK.with_borrow_mut(|desk| {
-            let Scene { abstracted, model, look } = scene;
-            if desk.look.as_ref() != Some(look) {
-                assets::fill(&mut desk.assets, model, look);
-                desk.look = Some(look.clone());
-            }
-            convert::fill(&mut desk.scene, abstracted, model, (width, height));
-            let samples = usize::try_from(model.vis().quality.offsamples).unwrap_or(0).max(1);
-            let target = match picture {
-                Picture::Rgb(bytes) => Target::Rgb(bytes),
-                Picture::Depth(metres) => Target::Depth(metres),
-                Picture::Segmentation(geoms) => Target::Labels(geoms),
-            };
-            desk.canvas.draw(&desk.scene, &desk.assets, (width, height), samples, target);
-            Ok(())
-        })
+        let mut desk = DESKS.with_borrow_mut(Vec::pop).unwrap_or_default();
+        desk.draw(&scene, (width, height), picture);
+        DESKS.with_borrow_mut(|desks| desks.push(desk));
+        Ok(())
+    }
+}
+
+thread_local! {
+    /// One for each picture that the thread draws at a time: while it waits for others to draw their part of one, it may begin the
+    /// next.
+    static DESKS: RefCell<Vec<Desk>> = RefCell::default();
+}
+
+impl Desk {
+    /// Draws a scene.
+    fn draw(&mut self, scene: &Scene<'_>, size: (usize, usize), picture: Picture<'_>) {
+        let Scene { abstracted, model, look } = scene;
+        if self.look.as_ref() != Some(look) {
+            assets::fill(&mut self.assets, model, look);
+            self.look = Some((*look).clone());
+        }
+        convert::fill(&mut self.scene, abstracted, model, size);
+        let samples = usize::try_from(model.vis().quality.offsamples).unwrap_or(0).max(1);
+        let target = match picture {
+            Picture::Rgb(bytes) => Target::Rgb(bytes),
+            Picture::Depth(metres) => Target::Depth(metres),
+            Picture::Segmentation(geoms) => Target::Labels(geoms),
+        };
+        self.canvas.spread(share::threads());
+        self.canvas.draw(&self.scene, &self.assets, size, samples, target);
     }
 }

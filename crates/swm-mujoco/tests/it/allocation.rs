@@ -2,7 +2,7 @@
 //! driver of OpenGL does, is not counted.
 
 use swm_conformance::allocation::{self, Counting};
-use swm_core::{FrameMut, ResetOptions, VariationRequest};
+use swm_core::{Env, FrameMut, ResetOptions, VariationRequest, share};
 use swm_mujoco::ENVS;
 use swm_mujoco::render::{self, Choice};
 
@@ -19,11 +19,11 @@ fn steps_allocate_nothing() {
     allocation::steps_and_frames_allocate_nothing(ENVS.rows, &[]);
 }
 
-#[test]
-fn a_thread_that_draws_worlds_in_turn_allocates_nothing() {
+/// Worlds with default factors, and with all varied.
+fn worlds() -> Vec<Box<dyn Env>> {
     let names = ["swm/CheetahDMControl-v0", "swm/HumanoidDMControl-v0", "swm/OGBCube-v0", "swm/FetchReach-v3"];
     let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
-    let mut worlds: Vec<_> = names
+    names
         .iter()
         .flat_map(|name| [VariationRequest::default(), variation.clone()].map(|variation| (name, variation)))
         .map(|(name, variation)| {
@@ -31,15 +31,32 @@ fn a_thread_that_draws_worlds_in_turn_allocates_nothing() {
             world.reset(0, &ResetOptions { variation, ..ResetOptions::default() }).expect("a reset");
             world
         })
-        .collect();
-    let mut rgb = vec![0; 64 * 64 * 3];
+        .collect()
+}
+
+/// Draws all worlds, again and again: what is allocated after the first time.
+fn drawn(side: usize, worlds: &mut [Box<dyn Env>]) -> usize {
+    let mut rgb = vec![0; side * side * 3];
     let mut draw = || {
-        for world in &mut worlds {
-            world.render(FrameMut::new(64, 64, &mut rgb)).expect("a picture");
+        for world in &mut *worlds {
+            world.render(FrameMut::new(side, side, &mut rgb)).expect("a picture");
         }
     };
     render::with(Choice::Cpu, || {
         draw();
-        assert_eq!(allocation::allocations(&mut draw), 0);
-    });
+        allocation::allocations(&mut draw)
+    })
+}
+
+#[test]
+fn a_thread_that_draws_worlds_in_turn_allocates_nothing() {
+    assert_eq!(drawn(64, &mut worlds()), 0);
+}
+
+#[test]
+fn a_picture_that_threads_share_allocates_nothing() {
+    // Counted on the thread that asks, which is one of the pool's.
+    let pool = swm_core::pool::threads(3).expect("threads");
+    let mut worlds = worlds();
+    pool.install(|| share::all(|| assert_eq!(drawn(160, &mut worlds), 0)));
 }

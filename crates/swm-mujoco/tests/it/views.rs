@@ -1,6 +1,6 @@
 //! Every camera of every world, in colours, distances and geoms; and what draws them.
 
-use swm_core::{Batch, Env, FrameMut, Modality, ResetOptions, Result, Schema, View};
+use swm_core::{Batch, Env, FrameMut, Modality, ResetOptions, Result, Schema, VariationRequest, View, share};
 use swm_mujoco::ENVS;
 use swm_mujoco::render::{self, Choice};
 
@@ -46,6 +46,25 @@ fn views_of_all(renderer: &str) {
         assert_eq!(libraries.get("mujoco").map(String::as_str), Some(swm_mujoco::link::VERSION));
         assert!(libraries["renderer"].starts_with(renderer), "{libraries:?}");
     }
+}
+
+#[test]
+fn threads_that_share_a_picture_draw_what_one_draws() {
+    let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
+    let pools = [2, 3, 7].map(|threads| swm_core::pool::threads(threads).expect("threads"));
+    let (mut one, mut many) = (vec![0; 200 * 144 * 3], vec![0; 200 * 144 * 3]);
+    render::with(Choice::Cpu, || {
+        for entry in ENVS.rows {
+            let mut env = entry.env().unwrap_or_else(|error| panic!("{}: {error}", entry.id));
+            env.reset(3, &ResetOptions { variation: variation.clone(), ..ResetOptions::default() }).expect("a reset");
+            env.render(FrameMut::new(144, 200, &mut one)).expect("a picture");
+            for pool in &pools {
+                let draw = || render::with(Choice::Cpu, || env.render(FrameMut::new(144, 200, &mut many)));
+                pool.install(|| share::all(draw)).expect("a picture");
+                assert!(one == many, "{}: {} threads", entry.id, pool.current_num_threads());
+            }
+        }
+    });
 }
 
 /// The side of pictures in which both renderers are compared.

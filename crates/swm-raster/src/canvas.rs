@@ -21,6 +21,9 @@ pub enum Target<'a> {
 }
 
 /// Draws scenes. One canvas serves any scenes and sizes; after the first pictures of a kind, it allocates nothing.
+///
+/// A sample takes 8 bytes for each layer it needs (what is seen, what is mirrored, what is behind glass), and as much again for each
+/// of at most 4 views of which it keeps what stands still; a texel of a map of shadows, likewise.
 #[derive(Default)]
 pub struct Canvas {
     threads: usize,

@@ -92,6 +92,15 @@ pub(crate) struct Layers {
     vertices: Vec<[f32; 4]>,
 }
 
+/// What layers hold.
+#[derive(Default)]
+pub(crate) struct Record {
+    depths: Vec<f32>,
+    ids: Vec<u32>,
+    triangles: Vec<Triangle>,
+    owners: Vec<u32>,
+}
+
 /// A triangle on the screen.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Triangle {
@@ -159,6 +168,22 @@ impl Layers {
     pub fn forget(&mut self) {
         self.triangles.clear();
         self.owners.clear();
+    }
+
+    /// Copies what is there.
+    pub fn record(&self, into: &mut Record) {
+        into.depths.clone_from(&self.depths);
+        into.ids.clone_from(&self.ids);
+        into.triangles.clone_from(&self.triangles);
+        into.owners.clone_from(&self.owners);
+    }
+
+    /// Puts back what was there, in layers of the same rows and samples.
+    pub fn recall(&mut self, from: &Record) {
+        self.depths.clone_from(&from.depths);
+        self.ids.clone_from(&from.ids);
+        self.triangles.clone_from(&from.triangles);
+        self.owners.clone_from(&from.owners);
     }
 
     /// Empties it: one sees so far.

@@ -42,7 +42,11 @@
 //!
 //! **Threads.** A large picture is cut into strips of rows (`split`), each drawn by a thread (`strip`), while others cast shadows.
 //!
-//! **Determinism.** A picture's bytes depend on the scene alone, not on how it was cut. Numbers are single precision without fused operations.
+//! **What is kept.** What stands still is drawn once: the next picture from the same place begins with a copy of it (`still`). So does
+//! the map of a light. The sky is looked up once for each direction one looks in (`sky`).
+//!
+//! **Determinism.** A picture's bytes depend on the scene alone, not on how it was cut, nor on what
+//! was drawn before. Numbers are single precision without fused operations.
 
 #[cfg(test)]
 extern crate self as swm_raster;
@@ -59,6 +63,7 @@ mod shadow;
 mod simd;
 mod sky;
 mod split;
+mod still;
 mod strip;
 mod texture;
 mod vector;

@@ -6,8 +6,9 @@
 use crate::eight::LANES;
 use crate::layers::{Layers, NOTHING, pattern, touched};
 use crate::light::Lamp;
-use crate::scene::{Assets, Light, Scene, Shape};
+use crate::scene::{Assets, Geom, Light, Scene, Shape};
 use crate::simd::vectorised;
+use crate::still::{Setting, Still};
 use crate::texture::MANY;
 use crate::vector::{V3, across, cross, dot, unit};
 use crate::view::View;
@@ -22,6 +23,7 @@ const EDGE_ON: f32 = 0.01;
 #[derive(Default)]
 pub(crate) struct Shadow {
     layers: Layers,
+    still: Still,
     view: Option<View>,
     /// By geom: whether it may be in its own shadow.
     hollow: Vec<bool>,
@@ -59,9 +61,10 @@ impl Shadow {
             height: FINEST,
             mirrored: false,
         };
-        let casters = || scene.geoms.iter().filter(|geom| geom.casts && !matches!(geom.shape, Shape::Plane(..)));
+        let casts = |geom: &Geom| geom.casts && !matches!(geom.shape, Shape::Plane(..));
+        let casters = || (0u32..).zip(&scene.geoms).filter(|(_, geom)| casts(geom));
         let mut region = [usize::MAX, usize::MAX, 0, 0];
-        for [x0, y0, x1, y1] in casters().filter_map(|geom| touched(geom, assets, &whole)) {
+        for [x0, y0, x1, y1] in casters().filter_map(|(_, geom)| touched(geom, assets, &whole)) {
             region = [region[0].min(x0), region[1].min(y0), region[2].max(x1), region[3].max(y1)];
         }
         let [x0, y0, x1, y1] = region;
@@ -84,14 +87,10 @@ impl Shadow {
             ..whole
         };
         self.layers.start(width, 0..height, pattern(1));
-        self.layers.clear(scene.camera.far);
         self.hollow.clear();
         self.hollow.extend(scene.geoms.iter().map(|geom| matches!(geom.shape, Shape::Mesh(_))));
-        for (number, geom) in (0u32..).zip(&scene.geoms) {
-            if geom.casts && !matches!(geom.shape, Shape::Plane(..)) {
-                self.layers.draw(number, geom, (assets, &view), None, true);
-            }
-        }
+        let setting = Setting { assets, view: &view, far: scene.camera.far, casting: true };
+        self.still.draw(&mut self.layers, setting, casters());
         self.view = Some(view);
     }
 

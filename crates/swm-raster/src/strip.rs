@@ -5,6 +5,7 @@ use crate::paint::{Lit, Look, Painter};
 use crate::scene::{Assets, Scene, Shape};
 use crate::simd::{nearest, vectorised};
 use crate::sky::{self, Backdrop, Veil};
+use crate::still::{Setting, Still};
 use crate::vector::{add, dot, scale, sub};
 use crate::view::View;
 use std::ops::Range;
@@ -13,6 +14,7 @@ use std::ops::Range;
 #[derive(Default)]
 pub(crate) struct Strip {
     pub main: Layers,
+    still: Still,
     mirror: Layers,
     glass: Layers,
     painter: Painter,
@@ -44,12 +46,9 @@ impl Strip {
     pub fn find(&mut self, picture: &Picture<'_>, rows: Range<usize>, counts: impl Fn(usize) -> bool) {
         let Picture { scene, assets, view, pattern } = *picture;
         self.main.start(view.width, rows, pattern);
-        self.main.clear(scene.camera.far);
-        for (number, geom) in (0u32..).zip(&scene.geoms) {
-            if counts(number as usize) {
-                self.main.draw(number, geom, (assets, view), None, false);
-            }
-        }
+        let geoms = (0u32..).zip(&scene.geoms).filter(|(number, _)| counts(*number as usize));
+        let setting = Setting { assets, view, far: scene.camera.far, casting: false };
+        self.still.draw(&mut self.main, setting, geoms);
     }
 
     /// Writes depths; where nothing is, that of the sky, or how far one sees.

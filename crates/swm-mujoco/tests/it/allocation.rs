@@ -2,7 +2,7 @@
 //! driver of OpenGL does, is not counted.
 
 use swm_conformance::allocation::{self, Counting};
-use swm_core::{Env, FrameMut, ResetOptions, VariationRequest, share};
+use swm_core::{Action, Env, FrameMut, Key, ResetOptions, VariationRequest, share};
 use swm_mujoco::ENVS;
 use swm_mujoco::render::{self, Choice};
 
@@ -34,7 +34,7 @@ fn worlds() -> Vec<Box<dyn Env>> {
         .collect()
 }
 
-/// Draws all worlds, again and again: what is allocated after the first time.
+/// Draws all worlds, again and again: what is allocated once all have been in each place where something is kept of a few.
 fn drawn(side: usize, worlds: &mut [Box<dyn Env>]) -> usize {
     let mut rgb = vec![0; side * side * 3];
     let mut draw = || {
@@ -43,7 +43,7 @@ fn drawn(side: usize, worlds: &mut [Box<dyn Env>]) -> usize {
         }
     };
     render::with(Choice::Cpu, || {
-        draw();
+        (0..8).for_each(|_| draw());
         allocation::allocations(&mut draw)
     })
 }
@@ -51,6 +51,23 @@ fn drawn(side: usize, worlds: &mut [Box<dyn Env>]) -> usize {
 #[test]
 fn a_thread_that_draws_worlds_in_turn_allocates_nothing() {
     assert_eq!(drawn(64, &mut worlds()), 0);
+}
+
+#[test]
+#[allow(clippy::cast_possible_truncation, reason = "actions are single precision")]
+fn pictures_of_moving_worlds_allocate_nothing_once_warm() {
+    let mut rgb = vec![0; 64 * 64 * 3];
+    for mut world in worlds() {
+        let space = world.spec().action_space.clone();
+        let mut allocated = vec![];
+        for step in 0..120 {
+            let action: Vec<f32> = space.sample(&mut Key::new(7).at(step).rng()).iter().map(|&x| x as f32).collect();
+            world.step(Action::Continuous(&action)).expect("a step");
+            let mut draw = || world.render(FrameMut::new(64, 64, &mut rgb)).expect("a picture");
+            allocated.push(allocation::allocations(|| render::with(Choice::Cpu, &mut draw)));
+        }
+        assert!(allocated[60..].iter().all(|&count| count == 0), "{}: {allocated:?}", world.spec().id);
+    }
 }
 
 #[test]

@@ -1,6 +1,8 @@
 //! Every camera of every world, in colours, distances and geoms; and what draws them.
 
-use swm_core::{Batch, Env, FrameMut, Modality, ResetOptions, Result, Schema, VariationRequest, View, share};
+use swm_core::{
+    Action, Batch, Env, FrameMut, Key, Modality, ResetOptions, Result, Schema, VariationRequest, View, share,
+};
 use swm_mujoco::ENVS;
 use swm_mujoco::render::{self, Choice};
 
@@ -65,6 +67,44 @@ fn threads_that_share_a_picture_draw_what_one_draws() {
             }
         }
     });
+}
+
+/// Draws on a thread that has drawn nothing before, and so keeps nothing.
+fn afresh(env: &mut dyn Env, (width, height): (usize, usize)) -> Vec<u8> {
+    let mut rgb = vec![0; width * height * 3];
+    let draw = || render::with(Choice::Cpu, || env.render(FrameMut::new(width, height, &mut rgb)));
+    std::thread::scope(|scope| scope.spawn(draw).join()).expect("a thread").expect("a picture");
+    rgb
+}
+
+#[test]
+#[allow(clippy::cast_possible_truncation, reason = "actions are single precision")]
+fn what_is_kept_between_pictures_does_not_show() {
+    let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
+    for entry in ENVS.rows {
+        let mut env = entry.env().unwrap_or_else(|error| panic!("{}: {error}", entry.id));
+        let space = env.spec().action_space.clone();
+        for step in 0..18 {
+            let size = if step < 12 { (64, 48) } else { (40, 56) };
+            match step {
+                // Episodes begin, the second and third with other colours, lights, cameras and sizes.
+                0 => env.reset(0, &ResetOptions::default()).expect("a reset"),
+                6 | 9 => env
+                    .reset(step, &ResetOptions { variation: variation.clone(), ..ResetOptions::default() })
+                    .expect("a reset"),
+                // Some pictures show the same twice.
+                3 | 7 | 14 => {}
+                _ => {
+                    let action = space.sample(&mut Key::new(5).at(step).rng());
+                    let action: Vec<f32> = action.iter().map(|&x| x as f32).collect();
+                    env.step(Action::Continuous(&action)).expect("a step");
+                }
+            }
+            let mut rgb = vec![0; size.0 * size.1 * 3];
+            render::with(Choice::Cpu, || env.render(FrameMut::new(size.0, size.1, &mut rgb))).expect("a picture");
+            assert!(rgb == afresh(&mut *env, size), "{}, step {step}", entry.id);
+        }
+    }
 }
 
 /// The side of pictures in which both renderers are compared.

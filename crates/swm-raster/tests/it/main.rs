@@ -1,5 +1,6 @@
 //! What holds of every scene, however odd, and what simple scenes look like.
 
+mod moving;
 mod odd;
 mod plain;
 mod scenes;

@@ -1,6 +1,7 @@
 //! [`NativeEnv`]: one environment of ours, for Gymnasium.
 
 use crate::arrays;
+use crate::data::process;
 use crate::errors::raised;
 use crate::world::{factors, reset_options, stack};
 use numpy::PyReadonlyArray1;
@@ -95,9 +96,8 @@ impl NativeEnv {
         let state = &mut *state;
         let mut rgb = vec![0; height * width * 3];
         let frame = FrameMut::new(width, height, &mut rgb);
-        let drawn =
-            py.detach(|| share::all(|| if goal { state.env.render_goal(frame) } else { state.env.render(frame) }));
-        drawn.map_err(raised)?;
+        let draw = || if goal { state.env.render_goal(frame) } else { state.env.render(frame) };
+        process::work(py, || share::all(draw)).map_err(raised)?;
         arrays::array(py, DType::U8, &[height, width, 3], &rgb)
     }
 
@@ -114,7 +114,7 @@ impl NativeEnv {
         let mut bytes = vec![0; column.row_bytes()];
         let mut state = self.lock();
         let state = &mut *state;
-        py.detach(|| share::all(|| state.env.render_view(&view, height, width, &mut bytes))).map_err(raised)?;
+        process::work(py, || share::all(|| state.env.render_view(&view, height, width, &mut bytes))).map_err(raised)?;
         arrays::array(py, column.dtype, &column.shape, &bytes)
     }
 

@@ -1,13 +1,14 @@
 //! How many pictures a second worlds draw, by environment, size and renderer.
 //!
-//! One environment on one thread: what a core draws. Renderers take turns within one run, so that all meet the same machine, and
+//! One environment, on one thread unless more are asked for: what a core draws, or what one gets where there is but one environment.
+//! Renderers take turns within one run, so that all meet the same machine, and
 //! the median of the turns counts. The world takes a step between two pictures, whose time is not counted.
 
 use crate::world::episode_key;
 use serde::Serialize;
 use std::time::{Duration, Instant};
 use swm_core::results::Summary;
-use swm_core::{Action, EnvChoice, FrameMut, Key, ResetOptions, Result, Space};
+use swm_core::{Action, Env, EnvChoice, FrameMut, Key, ResetOptions, Result, Space, share};
 
 /// What to measure.
 #[derive(Clone, Debug)]
@@ -18,11 +19,13 @@ pub struct RenderBenchConfig {
     pub turns: usize,
     /// Seconds of a turn.
     pub seconds: f64,
+    /// Threads that a picture may be drawn on.
+    pub threads: usize,
 }
 
 impl Default for RenderBenchConfig {
     fn default() -> Self {
-        Self { sizes: vec![64, 224], turns: 5, seconds: 0.5 }
+        Self { sizes: vec![64, 224], turns: 5, seconds: 0.5, threads: 1 }
     }
 }
 
@@ -38,7 +41,9 @@ pub struct RenderRow {
     pub size: usize,
     /// What drew them.
     pub renderer: String,
-    /// On one thread, the median of the turns.
+    /// On so many threads.
+    pub threads: usize,
+    /// The median of the turns.
     pub pictures_per_second: f64,
 }
 
@@ -64,13 +69,17 @@ pub fn bench_render(
                     env.reset(seed, &ResetOptions::default())?;
                     let (mut spent, mut pictures, mut step) = (Duration::ZERO, 0u32, 0);
                     // The first picture prepares what is kept.
-                    draw(&mut || env.render(FrameMut::new(size, size, &mut rgb)))?;
+                    let mut picture = |env: &mut dyn Env| {
+                        let mut drawn = || env.render(FrameMut::new(size, size, &mut rgb));
+                        share::with(config.threads, || draw(&mut drawn))
+                    };
+                    picture(&mut *env)?;
                     let begun = Instant::now();
                     while begun.elapsed().as_secs_f64() < config.seconds {
                         act(&mut *env, &space, step)?;
                         step += 1;
                         let before = Instant::now();
-                        draw(&mut || env.render(FrameMut::new(size, size, &mut rgb)))?;
+                        picture(&mut *env)?;
                         spent += before.elapsed();
                         pictures += 1;
                     }
@@ -83,6 +92,7 @@ pub fn bench_render(
                     env: choice.id(),
                     size,
                     renderer: renderer.clone(),
+                    threads: config.threads,
                     pictures_per_second: median,
                 });
             }
@@ -93,7 +103,7 @@ pub fn bench_render(
 
 /// Takes a random step; begins again where an episode ends.
 #[allow(clippy::cast_possible_truncation)]
-fn act(env: &mut dyn swm_core::Env, space: &Space, step: u64) -> Result<()> {
+fn act(env: &mut dyn Env, space: &Space, step: u64) -> Result<()> {
     let drawn = space.sample(&mut Key::new(1).at(step).rng());
     let numbers: Vec<f32> = drawn.iter().map(|&x| x as f32).collect();
     let choices: Vec<i64> = drawn.iter().map(|&x| x as i64).collect();

@@ -239,7 +239,7 @@ mod tests {
         fn strips_show_what_the_whole_shows(scene in scene()) {
             let mut canvas = Canvas::new();
             let whole = cut(&mut canvas, &scene, &[150]);
-            for ends in [&[64, 150][..], &[32, 96, 150], &[32, 64, 96, 128, 150], &[150]] {
+            for ends in [&[64, 150][..], &[128, 150], &[64, 128, 150], &[150]] {
                 prop_assert_eq!(&cut(&mut canvas, &scene, ends), &whole, "{:?}", ends);
             }
         }

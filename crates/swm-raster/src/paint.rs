@@ -14,7 +14,7 @@ use std::ops::Range;
 
 /// Rows that are gathered at once, counted from the top of the picture. How they are lit may depend on what is gathered with them, so
 /// that rows drawn by one thread begin with a band.
-pub(crate) const BAND: usize = 32;
+pub(crate) const BAND: usize = 64;
 
 /// Quads along the side of a box, between whose corners light is interpolated.
 const QUADS: usize = 4;

@@ -110,7 +110,7 @@ mod tests {
         assert_eq!(ends(&scene, 256, 1), [256], "nobody to share it with");
         assert_eq!(ends(&scene, 256, 2), [128, 256]);
         assert_eq!(ends(&scene, 256, 4), [64, 128, 192, 256]);
-        assert_eq!(ends(&scene, 1024, 100).len(), 32, "no strip is less than a band");
+        assert_eq!(ends(&scene, 1024, 100).len(), 16, "no strip is less than a band");
         // Much to do below: upper strips are wider.
         let ball = Geom {
             shape: Shape::Ellipsoid([1.0; 3]),

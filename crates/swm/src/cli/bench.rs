@@ -33,7 +33,7 @@ enum What {
     Train(TrainArgs),
     /// Clips a second from every format, and conversions; the use of memory over epochs
     Data(DataArgs),
-    /// Pictures a second on one thread, by environment and size, drawn by each renderer there is
+    /// Pictures a second, by environment and size, drawn by each renderer there is: on one thread, or on so many as --threads says
     Render(RenderArgs),
 }
 
@@ -65,7 +65,8 @@ fn render(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
         Ok(name) => renderers.push((name, &egl)),
         Err(problem) => complain(&format!("{problem}\n")),
     }
-    let config = RenderBenchConfig { sizes: args.sizes.clone(), turns: args.turns, seconds: args.seconds };
+    let threads = context.threads.max(1);
+    let config = RenderBenchConfig { sizes: args.sizes.clone(), turns: args.turns, seconds: args.seconds, threads };
     let rows = bench_render(&envs, &renderers, &config)?;
     if context.json {
         return emit_json(&rows);
@@ -75,7 +76,8 @@ fn render(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
         vec![row.env.clone(), format!("{} px", row.size), row.renderer.clone(), speed]
     });
     emit(&table(&["environment", "pictures", "renderer", "pictures/s"], rows));
-    emit(&format!("one thread, medians of {} turns\n", args.turns));
+    let on = if threads == 1 { "one thread".to_owned() } else { format!("up to {threads} threads a picture") };
+    emit(&format!("{on}, medians of {} turns\n", args.turns));
     Ok(())
 }
 

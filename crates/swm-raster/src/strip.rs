@@ -124,9 +124,7 @@ impl Strip {
         mirror.ids.fill(NOTHING);
         // One sees only where the mirror is, and what is in front of it.
         let own = u32::try_from(number).unwrap_or(NOTHING);
-        for (depth, &id) in mirror.depths.iter_mut().zip(&main.ids) {
-            *depth = if id == own { scene.camera.far } else { f32::NEG_INFINITY };
-        }
+        open(own, scene.camera.far, &main.ids, &mut mirror.depths);
         let mut seen = [usize::MAX, usize::MAX, 0, 0];
         for (other, geom) in (0u32..).zip(&scene.geoms) {
             if other != own && !clear(scene, other as usize, view) {
@@ -243,6 +241,13 @@ fn veil(scene: &Scene, view: &View, main: &Layers, colours: &mut [Vec<f32>; 3]) 
 }
 
 vectorised! {
+    /// One sees so far where a geom is, and nothing elsewhere.
+    fn open(own: u32, far: f32, ids: &[u32], depths: &mut [f32]) {
+        for (depth, id) in depths.iter_mut().zip(ids) {
+            *depth = if *id == own { far } else { f32::NEG_INFINITY };
+        }
+    }
+
     /// Colours to bytes, rounded; what is no number is black.
     #[allow(clippy::manual_clamp, reason = "`clamp` would keep what is no number")]
     fn to_bytes(r: &[f32], g: &[f32], b: &[f32], bytes: &mut [[u8; 3]]) {

@@ -13,7 +13,7 @@ const PER_SAMPLE: f32 = 0.6;
 const PER_TRIANGLE: f32 = 35.0;
 
 /// Less work than this is not handed to another thread: waking it takes a part of it.
-const WORTH: f32 = 150_000.0;
+const WORTH: f32 = 250_000.0;
 
 /// Where strips end, and scratch.
 #[derive(Default)]

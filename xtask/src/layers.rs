@@ -45,8 +45,13 @@ pub const RULES: &[Rule] = &[
     },
     Rule::Never {
         crates: &["swm-eval"],
+        forbidden: |name| ["swm-plan", "swm-models", "swm-envs", "swm-mujoco", "swm-gym"].contains(&name),
+        words: "evaluation knows planners, models and environments by their contracts only",
+    },
+    Rule::Never {
+        crates: &["swm-bench"],
         forbidden: |name| ["swm-models", "swm-envs", "swm-mujoco", "swm-gym"].contains(&name),
-        words: "evaluation knows models and environments by their contracts only",
+        words: "benchmarks know models and environments by their contracts only",
     },
     Rule::Only {
         users: &["swm"],
@@ -110,6 +115,7 @@ mod tests {
             ("swm-data", vec!["swm-core", "lance-file"]),
             ("swm-models", vec!["swm-core", "swm-data", "swm-plan", "burn"]),
             ("swm-eval", vec!["swm-core", "swm-data"]),
+            ("swm-bench", vec!["swm-core", "swm-data", "swm-plan", "swm-eval"]),
             ("swm", vec!["swm-core", "swm-envs", "swm-mujoco", "swm-models", "swm-eval", "swm-report"]),
             ("serde", vec![]),
             ("burn", vec!["burn-core"]),
@@ -142,7 +148,9 @@ mod tests {
             ("swm-plan", "ffmpeg-next", "swm-plan → ffmpeg-next ("),
             ("serde", "burn-core", "swm-core → serde → burn-core ("),
             ("swm-plan", "swm-models", "swm-plan → swm-models (solvers"),
+            ("swm-eval", "swm-plan", "swm-eval → swm-plan (evaluation"),
             ("swm-eval", "swm-models", "swm-eval → swm-models (evaluation"),
+            ("swm-bench", "swm-mujoco", "swm-bench → swm-mujoco (benchmarks"),
             ("swm-data", "swm-envs", "swm-eval → swm-data → swm-envs (evaluation"),
             ("swm-models", "swm-envs", "swm-models → swm-envs (only the facade"),
             ("swm-report", "swm-mujoco", "swm-report → swm-mujoco (only the facade"),

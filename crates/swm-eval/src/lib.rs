@@ -6,23 +6,15 @@
 //! - [`request`], [`runner`] and [`reproduce`]: all that decides an evaluation as one value, running it for several
 //!   policies on the same starts, and running it again.
 //! - [`prediction`]: how well a model predicts what was recorded, beside whether its plans succeeded.
-//! - [`bench`](mod@bench), [`bench_data`](mod@bench_data), [`bench_plan`](mod@bench_plan), [`bench_model`](mod@bench_model)
-//!   and [`bench_render`](mod@bench_render): how fast all that is, beside the reference where it is installed.
 //!
 //! An episode is decided by its own key. Neither the number of environments, nor that of threads, nor what
 //! was played before in the same slot changes a byte of it.
 
-pub mod bench;
-pub mod bench_data;
-pub mod bench_model;
-pub mod bench_plan;
-pub mod bench_render;
 pub mod collect;
 pub mod evaluate;
 mod filming;
 mod judge;
 pub mod prediction;
-mod reference;
 pub mod reproduce;
 pub mod request;
 pub mod runner;
@@ -30,11 +22,6 @@ pub mod starts;
 mod witness;
 pub mod world;
 
-pub use bench::{BenchConfig, BenchReport, bench_envs};
-pub use bench_data::{DataBenchConfig, DataBenchReport, bench_data};
-pub use bench_model::{ModelBenchConfig, ModelBenchReport, Subject, Work, bench_model};
-pub use bench_plan::{PlanBenchConfig, PlanBenchReport, bench_plan, planner_overhead};
-pub use bench_render::{RenderBenchConfig, RenderRow, bench_render};
 pub use collect::{CollectConfig, Collected};
 pub use evaluate::EvalConfig;
 pub use filming::Videos;

@@ -3,10 +3,10 @@
 
 use rand::Rng as _;
 use std::path::Path;
+use swm_bench::{Subject, Work};
 use swm_core::{
     Batch, Candidates, ColumnSpec, CostModel as _, DType, Key, PlanProblem, PlanSpace, Result, Schema, Solver as _,
 };
-use swm_eval::{Subject, Work};
 use swm_models::lewm::{EncoderConfig, Lewm, LewmCost, pixels};
 use swm_models::nn::Named;
 use swm_models::nn::parameters::{self, HostTensor};

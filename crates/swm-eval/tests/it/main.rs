@@ -1,6 +1,5 @@
 //! Worlds of a tiny environment, so that what is tested is the world and nothing else.
 
-mod benching;
 mod collecting;
 mod counting;
 mod evaluating;

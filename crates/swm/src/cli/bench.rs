@@ -6,9 +6,8 @@ use swm::ENVS;
 use swm::subject::LewmSubject;
 use swm_core::EnvChoice;
 use swm_data::Location;
-use swm_eval::bench_render::Drawing;
-use swm_eval::{
-    BenchConfig, DataBenchConfig, ModelBenchConfig, ModelBenchReport, PlanBenchConfig, RenderBenchConfig, Work,
+use swm_bench::{
+    BenchConfig, DataBenchConfig, Drawing, ModelBenchConfig, ModelBenchReport, PlanBenchConfig, RenderBenchConfig, Work,
     bench_data, bench_envs, bench_model, bench_plan, bench_render,
 };
 use swm_models::device;

@@ -1,12 +1,11 @@
 //! How fast planning is: the sampling and update step of CEM beside the reference's where it is installed, and what a
 //! planner takes beside its model.
 //!
-//! As in [`bench`](mod@crate::bench), turns of ours and of the reference's alternate, and the figure that counts is the
+//! As in [`bench`](mod@crate::envs), turns of ours and of the reference's alternate, and the figure that counts is the
 //! median of the ratios of neighbouring turns. The model of both is free: it answers with costs that were drawn before,
 //! so that nothing but the planner is measured.
 
-use crate::bench::REFERENCE_PYTHON;
-use crate::reference::Reference;
+use crate::reference::{Reference, not_compared, reference_python};
 use rand::Rng as _;
 use serde::Serialize;
 use std::fmt;
@@ -54,7 +53,7 @@ impl Default for PlanBenchConfig {
             threads: 0,
             pairs: 5,
             seconds: 1.0,
-            python: std::env::var_os(REFERENCE_PYTHON).filter(|path| !path.is_empty()).map(PathBuf::from),
+            python: reference_python(),
         }
     }
 }
@@ -121,7 +120,7 @@ pub fn bench_plan(config: &PlanBenchConfig) -> Result<PlanBenchReport> {
         horizon,
         dim,
         threads: workers.current_num_threads(),
-        reference: format!("not compared: set {REFERENCE_PYTHON} to a Python that has stable-worldmodel"),
+        reference: not_compared(),
         rows: vec![],
     };
     for &envs in &config.envs {
@@ -158,48 +157,6 @@ pub fn bench_plan(config: &PlanBenchConfig) -> Result<PlanBenchReport> {
         });
     }
     Ok(report)
-}
-
-/// What a solver takes beside a model: the time of the whole solve that is not spent in [`CostModel::cost`], as a share of
-/// the time that is; the median of `turns`. The model has observed what the problem plans for.
-///
-/// # Errors
-/// When there is no turn, or the solver or the model fails.
-pub fn planner_overhead(
-    solver: &mut dyn Solver,
-    model: &mut dyn CostModel,
-    problem: PlanProblem<'_>,
-    turns: usize,
-) -> Result<f64> {
-    let mut shares = Vec::with_capacity(turns);
-    for _ in 0..turns {
-        let mut timed = Timed { model: &mut *model, seconds: 0.0 };
-        let begun = Instant::now();
-        solver.solve(&mut timed, problem)?;
-        let all = begun.elapsed().as_secs_f64();
-        shares.push((all - timed.seconds) / timed.seconds.max(f64::MIN_POSITIVE));
-    }
-    let none = || Error::config("turns of a benchmark", "0", "ask for at least 1");
-    Summary::of(&shares).map(|shares| shares.median).ok_or_else(none)
-}
-
-/// A model and the time it takes. Its gradient and latent state are hidden: what is measured is planning by cost alone.
-struct Timed<'m> {
-    model: &'m mut dyn CostModel,
-    seconds: f64,
-}
-
-impl CostModel for Timed<'_> {
-    fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()> {
-        self.model.observe(infos, envs)
-    }
-
-    fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
-        let begun = Instant::now();
-        let answer = self.model.cost(candidates, costs);
-        self.seconds += begun.elapsed().as_secs_f64();
-        answer
-    }
 }
 
 /// CEM and a free model.
@@ -287,6 +244,7 @@ impl fmt::Display for PlanBenchReport {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::REFERENCE_PYTHON;
 
     fn config() -> PlanBenchConfig {
         PlanBenchConfig {
@@ -339,17 +297,5 @@ mod tests {
         assert!(bench_plan(&PlanBenchConfig { seconds: f64::NAN, ..config() }).is_err());
         assert!(bench_plan(&PlanBenchConfig { model_seconds: 0.0, ..config() }).is_err());
         assert!(bench_plan(&PlanBenchConfig { envs: vec![0], ..config() }).is_err());
-    }
-
-    #[test]
-    fn the_overhead_is_measured_on_whole_plans() {
-        let config = config();
-        let mut planning = Planning::new(&config, 1);
-        let space = PlanSpace::Continuous { low: &planning.low, high: &planning.high };
-        let problem = PlanProblem { horizon: 2, space, keys: &planning.keys, init: None, deadline: None };
-        let share = planner_overhead(&mut planning.cem, &mut planning.model, problem, 3).expect("a share");
-        assert!(share > 0.0 && share.is_finite());
-        assert_eq!(planning.model.asked, 3 * config.cem.iterations);
-        assert!(planner_overhead(&mut planning.cem, &mut planning.model, problem, 0).is_err());
     }
 }

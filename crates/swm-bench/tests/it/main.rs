@@ -1,9 +1,13 @@
 //! That what is measured is reported, with and without a reference. Times themselves are not tested.
 
-use crate::line::ENTRY;
 use std::io::Write as _;
 use swm_core::EnvChoice;
-use swm_eval::{BenchConfig, bench_envs};
+use swm_bench::{BenchConfig, bench_envs};
+
+/// The cheapest of the native environments.
+fn env() -> EnvChoice {
+    EnvChoice::from(swm_envs::ENVS.get("swm/TwoRoom-v1").expect("an environment"))
+}
 
 fn config() -> BenchConfig {
     let (sizes, python) = (vec![8], None);
@@ -22,7 +26,7 @@ fn config() -> BenchConfig {
 
 #[test]
 fn without_the_reference_it_says_so() {
-    let report = bench_envs(&[EnvChoice::from(&ENTRY)], &config()).expect("a report");
+    let report = bench_envs(&[env()], &config()).expect("a report");
     assert!(report.reference.contains("SWM_REFERENCE_PYTHON"));
     let what: Vec<_> = report.rows.iter().map(|row| (row.what, row.size)).collect();
     assert_eq!(what, [("step", None), ("step, one thread", None), ("step + render", Some(8))]);
@@ -31,7 +35,7 @@ fn without_the_reference_it_says_so() {
         assert!(row.steps_per_second > 0.0);
     }
     let missing = BenchConfig { python: Some("/no/such/python".into()), ..config() };
-    let report = bench_envs(&[EnvChoice::from(&ENTRY)], &missing).expect("a report");
+    let report = bench_envs(&[env()], &missing).expect("a report");
     assert!(report.reference.contains("/no/such/python"), "{}", report.reference);
 }
 
@@ -48,7 +52,7 @@ fn ratios_are_those_of_neighbouring_turns() {
     file.set_permissions(std::fs::Permissions::from_mode(0o755)).expect("executable");
     drop(file);
     let report =
-        bench_envs(&[EnvChoice::from(&ENTRY)], &BenchConfig { python: Some(python), ..config() }).expect("a report");
+        bench_envs(&[env()], &BenchConfig { python: Some(python), ..config() }).expect("a report");
     assert_eq!(report.reference, "1.2.3");
     for row in &report.rows {
         assert_eq!(row.reference, [5.0; 3]);
@@ -59,6 +63,6 @@ fn ratios_are_those_of_neighbouring_turns() {
 
 #[test]
 fn a_benchmark_of_nothing_is_refused() {
-    assert!(bench_envs(&[EnvChoice::from(&ENTRY)], &BenchConfig { pairs: 0, ..config() }).is_err());
-    assert!(bench_envs(&[EnvChoice::from(&ENTRY)], &BenchConfig { seconds: f64::NAN, ..config() }).is_err());
+    assert!(bench_envs(&[env()], &BenchConfig { pairs: 0, ..config() }).is_err());
+    assert!(bench_envs(&[env()], &BenchConfig { seconds: f64::NAN, ..config() }).is_err());
 }

@@ -1,12 +1,10 @@
 //! How fast clips are loaded and datasets converted, beside the reference where it is installed.
 //!
 //! One collection of a world is the content of every dataset: ours are written by our writers, the reference's by its
-//! own. As in [`bench`](mod@crate::bench), turns alternate and the median of the ratios of neighbouring turns counts. The
+//! own. As in [`bench`](mod@crate::envs), turns alternate and the median of the ratios of neighbouring turns counts. The
 //! reference loads in its own process or with worker processes, whichever a first turn of each finds to be faster.
 
-use crate::bench::REFERENCE_PYTHON;
-use crate::reference::Reference;
-use crate::{CollectConfig, Control, World, WorldConfig};
+use crate::reference::{Reference, not_compared, reference_python};
 use serde::Serialize;
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -18,6 +16,7 @@ use swm_data::{
     CacheConfig, ClipSpec, ConvertMode, ConvertOptions, FORMATS, ImageCodec, Loader, LoaderConfig, Location, Reader,
     WriteOptions, convert, create, open,
 };
+use swm_eval::{CollectConfig, Control, World, WorldConfig};
 
 /// What to measure.
 #[derive(Clone, Debug)]
@@ -70,7 +69,7 @@ impl Default for DataBenchConfig {
             convert: true,
             epochs: 10,
             remote: None,
-            python: std::env::var_os(REFERENCE_PYTHON).filter(|path| !path.is_empty()).map(PathBuf::from),
+            python: reference_python(),
         }
     }
 }
@@ -174,7 +173,7 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
         rows,
         clip: [config.clip.num_steps, config.clip.frameskip, config.batch_size],
         threads: config.threads,
-        reference: format!("not compared: set {REFERENCE_PYTHON} to a Python that has stable-worldmodel"),
+        reference: not_compared(),
         rates: vec![],
         resident: vec![],
     };

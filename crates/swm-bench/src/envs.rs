@@ -4,9 +4,7 @@
 //! reported is the median of the ratios of neighbouring turns. Absolute figures mean little on a shared machine;
 //! ratios hold.
 
-use crate::reference::{Reference, Size};
-use crate::world::{Places, episode_key, reset};
-use crate::{CollectConfig, Control, World, WorldConfig};
+use crate::reference::{REFERENCE_PYTHON, Reference, Size, not_compared, reference_python};
 use serde::Serialize;
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -15,9 +13,8 @@ use swm_core::pool::Reset;
 use swm_core::results::Summary;
 use swm_core::{Action, EnvChoice, Error, Key, RandomPolicy, ResetOptions, Result, Space, VariationRequest};
 use swm_data::{ImageCodec, WriteOptions, create};
-
-/// The environment variable that names a Python with the reference.
-pub const REFERENCE_PYTHON: &str = "SWM_REFERENCE_PYTHON";
+use swm_eval::world::{episode_key, reset_seed};
+use swm_eval::{CollectConfig, Control, World, WorldConfig};
 
 /// What to measure.
 #[derive(Clone, Debug)]
@@ -59,7 +56,7 @@ impl Default for BenchConfig {
             seconds: 1.0,
             episode_steps: 50,
             episodes: 8,
-            python: std::env::var_os(REFERENCE_PYTHON).filter(|path| !path.is_empty()).map(PathBuf::from),
+            python: reference_python(),
         }
     }
 }
@@ -111,7 +108,7 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
     let mut report = BenchReport {
         envs: config.envs,
         threads: swm_core::pool::threads(config.threads)?.current_num_threads(),
-        reference: format!("not compared: set {REFERENCE_PYTHON} to a Python that has stable-worldmodel"),
+        reference: not_compared(),
         rows: vec![],
     };
     for env in choices {
@@ -216,7 +213,8 @@ impl Ours {
 
     /// Steps with random actions for about so long: environment steps a second.
     fn step(&mut self, seconds: f64) -> Result<f64> {
-        let places = Places::of(self.world.pool().infos().schema())?;
+        let schema = self.world.pool().infos().schema();
+        let ended = [schema.index("terminated")?, schema.index("truncated")?];
         let begun = Instant::now();
         let mut steps = 0;
         let elapsed = loop {
@@ -225,8 +223,9 @@ impl Ours {
             self.done.clear();
             for slot in 0..self.active.len() {
                 let row = self.world.pool().infos().row(slot);
-                if row.at::<u8>(places.terminated)[0] + row.at::<u8>(places.truncated)[0] > 0 {
-                    self.done.push(reset(slot, episode_key(0, self.episodes), &VariationRequest::default()));
+                if ended.iter().any(|&column| row.at::<u8>(column)[0] > 0) {
+                    let seed = reset_seed(episode_key(0, self.episodes));
+                    self.done.push(Reset { slot, seed, options: ResetOptions::default() });
                     self.episodes += 1;
                 }
             }

@@ -1,12 +1,11 @@
 //! How fast a LeWM is, beside the reference's with the same weights: a plan, the costs of one iteration, encoding a picture,
 //! a training step.
 //!
-//! As in [`bench`](mod@crate::bench), turns of ours and of the reference's alternate, and the figure that counts is the
+//! As in [`bench`](mod@crate::envs), turns of ours and of the reference's alternate, and the figure that counts is the
 //! median of the ratios of neighbouring turns; here it is the share of the reference's time that ours takes. Where both
 //! come to numbers, those are compared.
 
-use crate::bench::REFERENCE_PYTHON;
-use crate::reference::Reference;
+use crate::reference::{Reference, not_compared};
 use serde::Serialize;
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -103,7 +102,7 @@ pub fn bench_model(config: &ModelBenchConfig, weights: &Path, subject: &mut dyn 
         return Err(Error::config("turns of a benchmark", "0", "ask for at least 1"));
     }
     let mut report = ModelBenchReport {
-        reference: format!("not compared: set {REFERENCE_PYTHON} to a Python that has stable-worldmodel"),
+        reference: not_compared(),
         rows: vec![],
     };
     let mut reference = None;
@@ -184,6 +183,7 @@ impl fmt::Display for ModelBenchReport {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::REFERENCE_PYTHON;
 
     /// Comes to 1 and 2.
     struct Constant;

@@ -2,15 +2,28 @@
 
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _, Seek as _, Write as _};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
 use swm_core::{Error, Result};
 use swm_data::ClipSpec;
 
-const SCRIPT: &str = include_str!("reference.py");
-const PLAN_SCRIPT: &str = include_str!("reference_plan.py");
-const MODEL_SCRIPT: &str = include_str!("reference_model.py");
-const DATA_SCRIPT: &str = include_str!("reference_data.py");
+const SCRIPT: &str = include_str!("envs.py");
+const PLAN_SCRIPT: &str = include_str!("plan.py");
+const MODEL_SCRIPT: &str = include_str!("model.py");
+const DATA_SCRIPT: &str = include_str!("data.py");
+
+/// The environment variable that names a Python with the reference implementation.
+pub const REFERENCE_PYTHON: &str = "SWM_REFERENCE_PYTHON";
+
+/// The Python that [`REFERENCE_PYTHON`] names, if any.
+pub(crate) fn reference_python() -> Option<PathBuf> {
+    std::env::var_os(REFERENCE_PYTHON).filter(|path| !path.is_empty()).map(PathBuf::from)
+}
+
+/// What a report says in place of the reference's version where no Python is given.
+pub(crate) fn not_compared() -> String {
+    format!("not compared: set {REFERENCE_PYTHON} to a Python that has stable-worldmodel")
+}
 
 /// A Python process that holds one world, one solver, one model, or the datasets of the reference.
 pub(crate) struct Reference {

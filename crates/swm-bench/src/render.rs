@@ -4,11 +4,11 @@
 //! Renderers take turns within one run, so that all meet the same machine, and
 //! the median of the turns counts. The world takes a step between two pictures, whose time is not counted.
 
-use crate::world::episode_key;
 use serde::Serialize;
 use std::time::{Duration, Instant};
 use swm_core::results::Summary;
 use swm_core::{Action, Env, EnvChoice, FrameMut, Key, ResetOptions, Result, Space, share};
+use swm_eval::world::episode_key;
 
 /// What to measure.
 #[derive(Clone, Debug)]

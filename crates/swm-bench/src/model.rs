@@ -101,10 +101,7 @@ pub fn bench_model(config: &ModelBenchConfig, weights: &Path, subject: &mut dyn 
     if config.pairs == 0 || config.works.iter().any(|(_, count)| *count == 0) {
         return Err(Error::config("turns of a benchmark", "0", "ask for at least 1"));
     }
-    let mut report = ModelBenchReport {
-        reference: not_compared(),
-        rows: vec![],
-    };
+    let mut report = ModelBenchReport { reference: not_compared(), rows: vec![] };
     let mut reference = None;
     if let Some(python) = &config.python {
         match Reference::start_model(python, &config.sizes, weights) {

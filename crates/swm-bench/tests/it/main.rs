@@ -1,8 +1,8 @@
 //! That what is measured is reported, with and without a reference. Times themselves are not tested.
 
 use std::io::Write as _;
-use swm_core::EnvChoice;
 use swm_bench::{BenchConfig, bench_envs};
+use swm_core::EnvChoice;
 
 /// The cheapest of the native environments.
 fn env() -> EnvChoice {
@@ -51,8 +51,7 @@ fn ratios_are_those_of_neighbouring_turns() {
     file.write_all(script.as_bytes()).expect("written");
     file.set_permissions(std::fs::Permissions::from_mode(0o755)).expect("executable");
     drop(file);
-    let report =
-        bench_envs(&[env()], &BenchConfig { python: Some(python), ..config() }).expect("a report");
+    let report = bench_envs(&[env()], &BenchConfig { python: Some(python), ..config() }).expect("a report");
     assert_eq!(report.reference, "1.2.3");
     for row in &report.rows {
         assert_eq!(row.reference, [5.0; 3]);

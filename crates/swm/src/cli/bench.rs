@@ -4,12 +4,12 @@ use super::{Context, complain, emit, emit_json, table};
 use clap::{Args, Subcommand};
 use swm::ENVS;
 use swm::subject::LewmSubject;
+use swm_bench::{
+    BenchConfig, DataBenchConfig, Drawing, ModelBenchConfig, ModelBenchReport, PlanBenchConfig, RenderBenchConfig,
+    Work, bench_data, bench_envs, bench_model, bench_plan, bench_render,
+};
 use swm_core::EnvChoice;
 use swm_data::Location;
-use swm_bench::{
-    BenchConfig, DataBenchConfig, Drawing, ModelBenchConfig, ModelBenchReport, PlanBenchConfig, RenderBenchConfig, Work,
-    bench_data, bench_envs, bench_model, bench_plan, bench_render,
-};
 use swm_models::device;
 use swm_mujoco::render::{Choice as Renderer, name, with};
 

@@ -28,9 +28,9 @@ pub enum Rule {
 /// The rules of this workspace.
 pub const RULES: &[Rule] = &[
     Rule::Never {
-        crates: &["swm-core", "swm-envs", "swm-gym", "swm-plan", "swm-report", "swm-raster"],
+        crates: &["swm-core", "swm-envs", "swm-gym", "swm-plan", "swm-report", "swm-raster", "swm-image"],
         forbidden: |name| ["burn", "lance", "mujoco", "ffmpeg"].iter().any(|family| of_family(name, family)),
-        words: "core, envs, gym, plan, report and raster know no deep learning, dataset engine, MuJoCo or FFmpeg",
+        words: "core, envs, gym, plan, report, raster and image know no deep learning, dataset engine, MuJoCo or FFmpeg",
     },
     Rule::Never {
         crates: &[],
@@ -57,6 +57,11 @@ pub const RULES: &[Rule] = &[
         users: &["swm"],
         crates: &["swm-envs", "swm-mujoco", "swm-models"],
         words: "only the facade knows concrete families",
+    },
+    Rule::Only {
+        users: &["swm-data"],
+        crates: &["swm-video"],
+        words: "only the dataset crate knows FFmpeg",
     },
     Rule::Only {
         users: &["swm", "swm-python"],
@@ -107,6 +112,8 @@ mod tests {
     fn with(more: &[(&str, &'static str)]) -> Vec<String> {
         let mut packages: Vec<(&str, Vec<&str>)> = vec![
             ("swm-core", vec!["serde"]),
+            ("swm-image", vec!["swm-core"]),
+            ("swm-video", vec!["swm-core", "swm-image", "ffmpeg-next"]),
             ("swm-envs", vec!["swm-core"]),
             ("swm-mujoco", vec!["swm-core", "mujoco-rs"]),
             ("swm-gym", vec!["swm-core"]),
@@ -155,6 +162,8 @@ mod tests {
             ("swm-models", "swm-envs", "swm-models → swm-envs (only the facade"),
             ("swm-report", "swm-mujoco", "swm-report → swm-mujoco (only the facade"),
             ("swm-report", "swm-models", "swm-report → swm-models (only the facade"),
+            ("swm-image", "ffmpeg-next", "swm-image → ffmpeg-next ("),
+            ("swm-eval", "swm-video", "swm-eval → swm-video (only the dataset crate"),
             ("swm-data", "swm-gym", "swm-data → swm-gym (only the facade and"),
             (
                 "lance-file",

@@ -7,7 +7,7 @@
 //! - [`convert`](mod@convert): from any format to any other, resumed and verified.
 //! - [`doctor`]: what is wrong with a dataset, and which models it can train.
 //! - [`views`]: datasets made of datasets; [`replay`]: the latest episodes of a running collection.
-//! - [`image`]: how pictures are stored.
+//! - [`image`]: the codecs of stored frames.
 //! - [`preview`](mod@preview): frames as pictures and videos for people.
 //! - [`stats`]: column statistics.
 //! - [`Split`]: which episodes are held out.
@@ -24,8 +24,6 @@ pub mod format;
 pub mod goals;
 #[cfg(feature = "hdf5")]
 pub mod hdf5;
-pub mod image;
-mod jpeg;
 pub mod lance;
 mod lance_video;
 mod lerobot;
@@ -34,7 +32,6 @@ mod location;
 mod numbers;
 pub mod objects;
 pub mod preview;
-mod qoi;
 pub mod replay;
 mod split;
 pub mod stats;
@@ -49,12 +46,10 @@ pub use format::{
     Writer, create, open,
 };
 pub use goals::{GoalMixture, GoalSpec};
-pub use image::ImageCodec;
 pub use loader::{Epoch, Loaded, Loader, LoaderConfig};
 pub use location::Location;
-pub use preview::{
-    Picture, PreviewOptions, contact_sheet, integer_scale, preview, write_mp4, write_mp4_scaled, write_png,
-};
+pub use preview::{PreviewOptions, contact_sheet, integer_scale, preview, write_mp4, write_mp4_scaled};
 pub use replay::{ReplayBuffer, ReplayConfig, ReplayLoader};
 pub use split::{Part, Split};
 pub use stats::{ColumnStats, column_quantiles, column_stats, split};
+pub use swm_image::{self as image, ImageCodec, RgbImage, write_png};

@@ -125,7 +125,7 @@ fn foreign_pictures(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
             let path = picture(folder, &name, first, 0, SUFFIXES[0]);
             Error::corrupt(path, problem, "restore it from a copy, or rebuild the dataset")
         };
-        let (height, width) = image::size(&bytes).map_err(|problem| damaged(problem.to_string()))?;
+        let (height, width) = image::image_size(&bytes).map_err(|problem| damaged(problem.to_string()))?;
         let column = ColumnSpec::image(&name, height, width);
         if column.is_empty() || column.row_bytes() / MOST_PER_BYTE > bytes.len() {
             return Err(damaged(format!("{} bytes are no picture of {height} x {width}", bytes.len())));

@@ -218,7 +218,7 @@ pub fn columns_to_read(
                 None => {
                     let Some(bytes) = first_picture(name)? else { continue };
                     // Binary columns of foreign tables need not be pictures.
-                    let Ok((height, width)) = image::size(&bytes) else { continue };
+                    let Ok((height, width)) = image::image_size(&bytes) else { continue };
                     (ColumnSpec::image(name, height, width), Kind::Image)
                 }
             },

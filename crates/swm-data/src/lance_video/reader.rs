@@ -2,7 +2,7 @@
 
 use super::{SCHEMA, VIDEO, table};
 use crate::episodes::Rows;
-use crate::ffmpeg::{Library, Source};
+use crate::ffmpeg::{VideoCache, Source};
 use crate::format::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::lance;
 use crate::location::Location;
@@ -24,7 +24,7 @@ pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
     };
     let mut rows = Rows::default();
     numbers.episodes().iter().for_each(|episode| rows.push(episode.length));
-    Ok(Arc::new(LanceVideoReader { label: location.label(), numbers, schema, rows, library: Library::default() }))
+    Ok(Arc::new(LanceVideoReader { label: location.label(), numbers, schema, rows, library: VideoCache::default() }))
 }
 
 fn damaged(location: &Location, problem: &str) -> Error {
@@ -50,7 +50,7 @@ struct LanceVideoReader {
     schema: Schema,
     rows: Rows,
     /// By column and episode.
-    library: Library<(usize, usize)>,
+    library: VideoCache<(usize, usize)>,
 }
 
 impl LanceVideoReader {

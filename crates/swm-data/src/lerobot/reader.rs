@@ -4,7 +4,7 @@ use super::info::{Column, Info, Kind, damaged};
 use super::{CONSTANTS, TASK, numbers, table};
 use crate::clip::ACTION;
 use crate::episodes::{Rows, content_hash, numbering};
-use crate::ffmpeg::{Library, Source, Video};
+use crate::ffmpeg::{VideoCache, Source, Video};
 use crate::format::{Constants, Episode, Reader, StepRange};
 use crate::image;
 use crate::location::Location;
@@ -56,7 +56,7 @@ pub(super) struct LerobotReader {
     data: Vec<OnceLock<Vec<u8>>>,
     /// When each row is, where that is stored.
     timestamps: OnceLock<Option<Vec<f32>>>,
-    library: Library<PathBuf>,
+    library: VideoCache<PathBuf>,
 }
 
 impl LerobotReader {
@@ -92,11 +92,11 @@ impl LerobotReader {
         let specs: Vec<ColumnSpec> =
             numbering(recorded).into_iter().chain(columns.iter().map(|column| column.spec.clone())).collect();
         // Room is made for pictures of the promised size.
-        let library = Library::default();
+        let library = VideoCache::default();
         for column in &columns {
             if let (Kind::Video(feature), Some(place)) = (column.kind, places.iter().find(|place| place.length > 0)) {
                 let path = &place.videos[feature].0;
-                let size = library.size(path, || Ok(Source::File(path.clone())))?;
+                let size = library.frame_size(path, || Ok(Source::File(path.clone())))?;
                 if [size.0, size.1] != column.spec.shape[..2] {
                     let problem =
                         format!("camera '{}' has pictures of {size:?}, not {:?}", column.native, column.spec.shape);

@@ -12,7 +12,7 @@ use super::{CONSTANTS, NO_TASK, TASK, numbers};
 use crate::clip::ACTION;
 use crate::column_files::{lock, replace};
 use crate::episodes::{self, EPISODE, STEP};
-use crate::ffmpeg::{Encoding, Film};
+use crate::ffmpeg::{Encoder, Encoding};
 use crate::format::{Constants, Reader as _, WriteMode, WriteOptions, Writer};
 use crate::location::Location;
 use arrow_array::builder::{ListBuilder, StringBuilder};
@@ -61,7 +61,7 @@ struct Group {
     /// The bytes of each stored column of numbers.
     numbers: Vec<Vec<u8>>,
     /// The video of each stored column of pictures.
-    films: Vec<Option<Film>>,
+    films: Vec<Option<Encoder>>,
     rows: usize,
     bytes: usize,
 }
@@ -198,10 +198,10 @@ impl LerobotWriter {
             }
             let film = match film {
                 Some(film) => film,
-                none => none.insert(Film::begin(column.shape[1], column.shape[0], FPS, encoding)?),
+                none => none.insert(Encoder::new(column.shape[1], column.shape[0], FPS, encoding)?),
             };
             for (number, frame) in (frames..).zip(bytes.chunks_exact(column.row_bytes())) {
-                film.add(frame, number)?;
+                film.add_frame(frame, number)?;
             }
             stats.add(bytes.iter().map(|&v| f64::from(v)), rows);
             Ok(())

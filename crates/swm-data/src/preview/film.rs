@@ -51,7 +51,7 @@ pub(crate) struct Film {
     frames: i64,
     /// The enlarged frame, of even sides.
     large: Vec<u8>,
-    inner: ffmpeg::Film,
+    inner: ffmpeg::Encoder,
 }
 
 impl Film {
@@ -93,7 +93,7 @@ impl Film {
                 to.as_chunks_mut::<3>().0.fill(*pixel);
             }
         }
-        self.inner.add(&self.large, self.frames)?;
+        self.inner.add_frame(&self.large, self.frames)?;
         self.frames += 1;
         Ok(())
     }
@@ -129,19 +129,19 @@ fn even(width: usize, height: usize, scale: usize) -> (usize, usize) {
 }
 
 #[cfg(feature = "ffmpeg")]
-fn begin(width: usize, height: usize, fps: u32) -> Result<ffmpeg::Film> {
-    ffmpeg::Film::begin(width, height, fps, ffmpeg::Encoding::viewing())
+fn begin(width: usize, height: usize, fps: u32) -> Result<ffmpeg::Encoder> {
+    ffmpeg::Encoder::new(width, height, fps, ffmpeg::Encoding::viewing())
 }
 
 #[cfg(not(feature = "ffmpeg"))]
-fn begin(_: usize, _: usize, _: u32) -> Result<ffmpeg::Film> {
+fn begin(_: usize, _: usize, _: u32) -> Result<ffmpeg::Encoder> {
     Err(ffmpeg::absent("videos", "ffmpeg"))
 }
 
 #[cfg(all(test, feature = "ffmpeg"))]
 mod tests {
     use super::*;
-    use crate::ffmpeg::{Decoders, Source, Video, Wanted};
+    use crate::ffmpeg::{DecoderPool, FrameRequest, Source, Video};
 
     fn frames(width: usize, height: usize, n: usize) -> Vec<Vec<u8>> {
         (0..n).map(|t| (0..width * height * 3).map(|i| ((i / 9 + t * 11) % 256) as u8).collect()).collect()
@@ -173,7 +173,7 @@ mod tests {
         let video = open(&b);
         assert_eq!((video.size(), video.frames()), ((72, 124), 12));
         let mut out = vec![0; 72 * 124 * 3];
-        Decoders::default().read(vec![Wanted { video: &video, frame: 5, out: &mut out }]).expect("decodes");
+        DecoderPool::default().read(vec![FrameRequest { video: &video, frame: 5, out: &mut out }]).expect("decodes");
         let off: f64 = (0..72 * 124)
             .map(|i| f64::from(out[i * 3].abs_diff(frames[5][(i / 124 / 4 * 31 + i % 124 / 4) * 3])))
             .sum();

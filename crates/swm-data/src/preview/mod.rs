@@ -7,11 +7,12 @@ mod sheet;
 
 pub(crate) use film::Film;
 pub use film::{integer_scale, write_mp4, write_mp4_scaled};
-pub use sheet::{Picture, contact_sheet, write_png};
+pub use sheet::contact_sheet;
 
 use crate::format::{Reader, StepRange};
 use std::path::{Path, PathBuf};
 use swm_core::{Batch, ColumnSpec, Error, Result};
+use swm_image::write_png;
 
 /// What to show of a dataset.
 #[derive(Clone, Debug)]

@@ -1,24 +1,12 @@
-//! Still pictures of what a dataset or a world looks like: frames side by side, written as PNG.
+//! Contact sheets: frames of a dataset side by side in one image.
 
-use std::io::BufWriter;
-use std::path::Path;
 use swm_core::{Error, Result};
+use swm_image::RgbImage;
 
 /// Pixels between the frames of a contact sheet and around them.
 const GAP: usize = 2;
 /// The grey between the frames: neither the white nor the black that worlds are drawn on.
 const BACKGROUND: u8 = 128;
-
-/// An RGB picture.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Picture {
-    /// Pixels in a row.
-    pub width: usize,
-    /// Rows.
-    pub height: usize,
-    /// `height * width * 3` bytes, row after row.
-    pub rgb: Vec<u8>,
-}
 
 /// Lays out `frames` (each `height * width * 3` bytes, RGB) in a grid of `columns`, in reading order, every
 /// pixel drawn as a square of `scale` by `scale`.
@@ -31,7 +19,7 @@ pub fn contact_sheet<F: AsRef<[u8]>>(
     frames: &[F],
     columns: usize,
     scale: usize,
-) -> Result<Picture> {
+) -> Result<RgbImage> {
     if frames.is_empty() || columns == 0 || scale == 0 || width == 0 || height == 0 {
         return Err(Error::config(
             "contact sheet",
@@ -64,42 +52,7 @@ pub fn contact_sheet<F: AsRef<[u8]>>(
             }
         }
     }
-    Ok(Picture { width: sheet_width, height: sheet_height, rgb })
-}
-
-/// Writes an RGB picture (`height * width * 3` bytes) as PNG.
-///
-/// # Errors
-/// When the bytes are not that many, or the file cannot be written.
-pub fn write_png(path: &Path, width: usize, height: usize, rgb: &[u8]) -> Result<()> {
-    if width == 0 || height == 0 || rgb.len() != width * height * 3 {
-        return Err(Error::mismatch(
-            format!("writing {}", path.display()),
-            format!("{} bytes", rgb.len()),
-            format!("{}, for {width} x {height} RGB pixels", width * height * 3),
-        ));
-    }
-    let side = |pixels: usize| {
-        u32::try_from(pixels).map_err(|_| {
-            Error::config(
-                format!("picture {}", path.display()),
-                format!("{pixels} pixels wide or high"),
-                "make it smaller",
-            )
-        })
-    };
-    let (wide, high) = (side(width)?, side(height)?);
-    let file = std::fs::File::create(path).map_err(|source| Error::io(path, "creating a picture", source))?;
-    let mut encoder = png::Encoder::new(BufWriter::new(file), wide, high);
-    encoder.set_color(png::ColorType::Rgb);
-    encoder.set_depth(png::BitDepth::Eight);
-    let failed = |error: png::EncodingError| match error {
-        png::EncodingError::IoError(source) => Error::io(path, "writing a picture", source),
-        other => Error::external(format!("encoding {}", path.display()), other),
-    };
-    let mut writer = encoder.write_header().map_err(failed)?;
-    writer.write_image_data(rgb).map_err(failed)?;
-    writer.finish().map_err(failed)
+    Ok(RgbImage { width: sheet_width, height: sheet_height, rgb })
 }
 
 #[cfg(test)]
@@ -119,21 +72,5 @@ mod tests {
         let wrong = contact_sheet(2, 2, &frames, 2, 1).expect_err("too small").to_string();
         assert!(wrong.contains("frame 0") && wrong.contains("12"), "{wrong}");
         assert!(contact_sheet::<Vec<u8>>(2, 2, &[], 2, 1).is_err());
-    }
-
-    #[test]
-    fn pictures_read_back() {
-        let folder = tempfile::tempdir().expect("folder");
-        let path = folder.path().join("a.png");
-        let rgb: Vec<u8> = (0..5 * 4 * 3).collect();
-        write_png(&path, 5, 4, &rgb).expect("written");
-        let file = std::io::BufReader::new(std::fs::File::open(&path).expect("open"));
-        let mut reader = png::Decoder::new(file).read_info().expect("header");
-        let mut read = vec![0; rgb.len()];
-        let info = reader.next_frame(&mut read).expect("frame");
-        assert_eq!((info.width, info.height, read), (5, 4, rgb.clone()));
-        assert!(write_png(&path, 4, 4, &rgb).is_err());
-        let missing = write_png(&folder.path().join("missing/a.png"), 5, 4, &rgb).expect_err("no folder").to_string();
-        assert!(missing.contains("creating a picture"), "{missing}");
     }
 }

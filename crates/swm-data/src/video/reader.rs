@@ -3,7 +3,7 @@
 use super::file;
 use crate::column_files::{ColumnFiles, is_there};
 use crate::episodes::content_hash;
-use crate::ffmpeg::{Library, Source};
+use crate::ffmpeg::{VideoCache, Source};
 use crate::format::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::location::Location;
 use std::path::Path;
@@ -19,7 +19,7 @@ pub(super) struct VideoReader {
     files: ColumnFiles,
     schema: Schema,
     /// By column and episode.
-    library: Library<(usize, usize)>,
+    library: VideoCache<(usize, usize)>,
 }
 
 impl VideoReader {
@@ -34,7 +34,7 @@ impl VideoReader {
             None => foreign_pictures(&files)?,
         };
         let schema = files.schema(pictures)?;
-        Ok(Self { files, schema, library: Library::default() })
+        Ok(Self { files, schema, library: VideoCache::default() })
     }
 
     fn source(&self, &(column, episode): &(usize, usize)) -> Result<Source> {
@@ -120,7 +120,7 @@ fn foreign_pictures(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
         let Ok(name) = entry.file_name().into_string() else { continue };
         if entry.path().is_dir() {
             let source = Source::File(file(folder, &name, first));
-            let (height, width) = Library::default().size(&(), || Ok(source))?;
+            let (height, width) = VideoCache::default().frame_size(&(), || Ok(source))?;
             columns.push(ColumnSpec::image(name, height, width));
         }
     }

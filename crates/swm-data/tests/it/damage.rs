@@ -57,7 +57,7 @@ fn damaged_pictures(cases: u64) {
         let mut bytes = vec![];
         codec.encode(&picture(), 30, 40, &mut bytes).expect("encodes");
         let report = fuzz::bytes(name, &bytes, cases, |bytes| {
-            image::size(bytes)?;
+            image::image_size(bytes)?;
             let mut out = vec![0; 30 * 40 * 3];
             image::decode(bytes, 30, 40, &mut out).map(|()| out)
         });

@@ -11,7 +11,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Key, Result};
-use swm_data::{Part, Picture, Reader, contact_sheet};
+use swm_data::{Part, Reader, RgbImage, contact_sheet};
 
 /// How a decoder is fitted.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -130,7 +130,7 @@ impl Decoder {
 /// # Errors
 /// When the pictures are of another size than the encoder sees, or of one that blocks do not fill, no episode is held out, or
 /// a setting makes no sense.
-pub fn picture(encoder: &dyn Encodes, reader: &dyn Reader, config: &PictureConfig) -> Result<(PictureReport, Picture)> {
+pub fn picture(encoder: &dyn Encodes, reader: &dyn Reader, config: &PictureConfig) -> Result<(PictureReport, RgbImage)> {
     at_least(&[
         ("frames", config.frames, 2),
         ("held_out", config.held_out, 2),
@@ -222,7 +222,7 @@ fn root_mean_square(drawn: impl Iterator<Item = f32>, pictures: &[u8]) -> f64 {
 
 /// Rows of pictures, each above a row of how they were drawn again.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-fn sheet(pictures: &[u8], drawn: &[f32], image: usize, shown: usize) -> Result<Picture> {
+fn sheet(pictures: &[u8], drawn: &[f32], image: usize, shown: usize) -> Result<RgbImage> {
     const COLUMNS: usize = 8;
     let bytes = image * image * 3;
     let count = pictures.len() / bytes;

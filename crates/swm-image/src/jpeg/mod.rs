@@ -3,10 +3,12 @@
 mod colour;
 mod decode;
 mod encode;
+mod general;
 mod transform;
 
 pub use decode::decode;
 pub use encode::encode;
+pub use general::Decoder;
 
 /// The place (row by row) of the k-th coefficient in the order of a scan, ITU-T T.81 figure A.6.
 const ZIGZAG: [u8; 64] = [

@@ -1,5 +1,5 @@
 """Writes `odd-NAME.mp4`, videos that are harder to read than most, and the frames that FFmpeg's own library gives for
-them, one below the other, as `odd-NAME.png`: what `ffmpeg/decode.rs` compares.
+them, one below the other, as `odd-NAME.png`: what `swm-video/src/decode.rs` compares.
 
 python odd_videos_export.py    (av 15)
 """

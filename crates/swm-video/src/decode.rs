@@ -1,8 +1,8 @@
 //! Frames by number: all frames of a batch are asked for together, each run from a key frame is decoded once, runs are
 //! decoded in parallel.
 
-use super::colour;
-use super::mp4::{self, Codec, Index};
+use crate::colour;
+use crate::mp4::{self, Codec, Index};
 use ffmpeg_next::codec::{self, Compliance, Flags, threading};
 use ffmpeg_next::decoder::{self, Check};
 use ffmpeg_next::format::Pixel;
@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
 
-/// Decoders that wait for the next run. Each holds a few decoded pictures.
+/// DecoderPool that wait for the next run. Each holds a few decoded pictures.
 const IDLE_DECODERS: usize = 32;
 
 /// Where a video's bytes are.
@@ -149,9 +149,10 @@ fn damaged(path: &Path, problem: &str) -> Error {
 }
 
 /// A frame that is wanted, and where to.
-pub struct Wanted<'a> {
+pub struct FrameRequest<'a> {
+    /// The video.
     pub video: &'a Video,
-    /// Its number, in the order of presentation.
+    /// Index of the frame in presentation order.
     pub frame: usize,
     /// `[height, width, 3]` bytes.
     pub out: &'a mut [u8],
@@ -166,21 +167,21 @@ struct Job<'a> {
     out: &'a mut [u8],
 }
 
-/// Decoders that are kept between reads. Files of one dataset have the same parameters, so one decoder serves many.
+/// DecoderPool that are kept between reads. Files of one dataset have the same parameters, so one decoder serves many.
 #[derive(Default)]
-pub struct Decoders {
+pub struct DecoderPool {
     /// Last used last.
     idle: Mutex<Vec<Decoder>>,
 }
 
-impl Decoders {
+impl DecoderPool {
     /// Decodes frames of any videos, on the threads of the current rayon pool.
     ///
     /// # Errors
     /// When a frame does not exist or its `out` has another size, or a video is damaged.
-    pub fn read(&self, wanted: Vec<Wanted<'_>>) -> Result<()> {
+    pub fn read(&self, wanted: Vec<FrameRequest<'_>>) -> Result<()> {
         let mut jobs = Vec::with_capacity(wanted.len());
-        for Wanted { video, frame, out } in wanted {
+        for FrameRequest { video, frame, out } in wanted {
             let index = &video.index;
             let Some(&sample) = index.frames.get(frame) else {
                 return Err(video.lacks(frame));
@@ -262,7 +263,7 @@ struct Decoder {
 impl Decoder {
     fn new(video: &Video) -> Result<Self> {
         let index = &video.index;
-        super::prepare();
+        crate::prepare();
         let id = match index.codec {
             Codec::H264 => codec::Id::H264,
             Codec::Hevc => codec::Id::HEVC,
@@ -332,7 +333,6 @@ impl Decoder {
                 let wanted = jobs.binary_search_by_key(&at, |job| job.sample).is_ok();
                 self.inner.skip_frame(if wanted { Discard::Default } else { Discard::NonReference });
                 let mut packet = Packet::copy(bytes);
-                #[allow(clippy::cast_possible_wrap)]
                 packet.set_pts(Some(at as i64));
                 self.inner.send_packet(&packet).map_err(|e| format!("cannot be decoded in coded picture {at}: {e}"))?;
                 self.receive(video, jobs, &mut missing, &mut reducer)?;
@@ -457,16 +457,13 @@ mod tests {
     /// The frames of `tests/interop/odd-NAME.mp4`, as another program decoded them, and the video.
     fn odd(name: &str) -> (Vec<u8>, Video) {
         let place = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop").join(format!("odd-{name}"));
-        let file = std::io::BufReader::new(File::open(place.with_extension("png")).expect("opens"));
-        let mut png = png::Decoder::new(file).read_info().expect("a PNG");
-        let mut expected = vec![0; png.output_buffer_size().expect("a size")];
-        png.next_frame(&mut expected).expect("a picture");
+        let expected = swm_image::read_png(&place.with_extension("png")).expect("a PNG").rgb;
         (expected, Video::open(Source::File(place.with_extension("mp4"))).expect("opens"))
     }
 
     #[test]
     fn any_frame_of_any_video_is_found() {
-        let decoders = Decoders::default();
+        let decoders = DecoderPool::default();
         // Ten bits: the other program blurs the colours of neighbours, so only the mean is alike.
         for (name, tolerance) in [("times", 0), ("hevc", 0), ("deep", 4)] {
             let (expected, video) = odd(name);
@@ -480,7 +477,7 @@ mod tests {
                 let mut out = vec![7; order.len() * size];
                 let video = if i == 1 { &same } else { &video };
                 let frames = order.iter().zip(out.chunks_exact_mut(size));
-                let wanted: Vec<Wanted<'_>> = frames.map(|(&frame, out)| Wanted { video, frame, out }).collect();
+                let wanted: Vec<FrameRequest<'_>> = frames.map(|(&frame, out)| FrameRequest { video, frame, out }).collect();
                 if i == 0 {
                     wanted.into_iter().for_each(|wanted| decoders.read(vec![wanted]).expect("decodes"));
                 } else {
@@ -513,8 +510,8 @@ mod tests {
         let (_, video) = odd("times");
         let mut out = vec![0; 32 * 48 * 3];
         let error = |frame, out: &mut [u8]| {
-            let wanted = vec![Wanted { video: &video, frame, out }];
-            Decoders::default().read(wanted).expect_err("fails").to_string()
+            let wanted = vec![FrameRequest { video: &video, frame, out }];
+            DecoderPool::default().read(wanted).expect_err("fails").to_string()
         };
         assert!(error(14, &mut out).contains("14 frames"));
         assert!(error(0, &mut out[1..]).contains("48 x 32"));

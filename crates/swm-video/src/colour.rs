@@ -40,7 +40,6 @@ fn shares(space: Space) -> (f64, f64) {
 }
 
 impl Matrix {
-    #[allow(clippy::cast_possible_truncation)]
     fn new(space: Space, full_range: bool) -> Self {
         let (red, blue) = shares(space);
         let green = 1.0 - red - blue;
@@ -213,14 +212,12 @@ fn grey_row(matrix: &Matrix, y: &[u8], out: &mut [u8]) {
 
 /// The upper half of a product.
 #[inline(always)]
-#[allow(clippy::cast_possible_truncation)]
 fn times(a: i16, b: i16) -> i16 {
     ((i32::from(a) * i32::from(b)) >> 16) as i16
 }
 
 /// A sum of products as a byte, rounded where it has a fraction.
 #[inline(always)]
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn clamp(value: i16, fraction: u32) -> u8 {
     let half = if fraction > 0 { 1 << (fraction - 1) } else { 0 };
     ((value + half) >> fraction).clamp(0, 255) as u8
@@ -228,7 +225,6 @@ fn clamp(value: i16, fraction: u32) -> u8 {
 
 /// Fills a frame of [`Pixel::YUV420P`] (BT.601, 16 to 235) or [`Pixel::YUV444P`] with RGB pixels, or one of
 /// [`Pixel::RGB24`] as it is. Shared colour differences are the mean of their pixels.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn from_rgb(rgb: &[u8], frame: &mut frame::Video) {
     let (width, height) = (frame.width() as usize, frame.height() as usize);
     let rows = rgb.chunks_exact(width * 3);

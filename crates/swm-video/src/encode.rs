@@ -1,8 +1,8 @@
 //! Frames in, an MP4 file of H.264 out.
 
-use super::colour;
-use super::mp4;
-use crate::image::ImageCodec;
+use crate::colour;
+use crate::mp4;
+use swm_image::ImageCodec;
 use ffmpeg_next::codec::{self, Flags, threading};
 use ffmpeg_next::color::{Range, Space};
 use ffmpeg_next::format::{self, Pixel};
@@ -14,6 +14,7 @@ use swm_core::{Error, Result};
 /// How frames become a video.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Encoding {
+    /// What is lost.
     pub quality: Quality,
     /// Frames from one key frame to the next. A random frame costs half of them to decode.
     pub gop: u32,
@@ -97,7 +98,7 @@ where
         let problem = format!("{width} x {height} pixels at {fps} frames a second, a key frame every {}", encoding.gop);
         return Err(Error::config("video", problem, "give each of them at least 1"));
     }
-    let mut film = Film::begin(width, height, fps, encoding)?;
+    let mut encoder = Encoder::new(width, height, fps, encoding)?;
     let mut count = 0;
     for rgb in frames {
         let rgb = rgb.as_ref();
@@ -105,13 +106,13 @@ where
             let expected = format!("{}, for {width} x {height} RGB pixels", width * height * 3);
             return Err(Error::mismatch(format!("frame {count} of a video"), format!("{} bytes", rgb.len()), expected));
         }
-        film.add(rgb, count)?;
+        encoder.add_frame(rgb, count)?;
         count += 1;
     }
     if count == 0 {
         return Err(Error::config("video", "there is no frame to write", "record at least one step"));
     }
-    film.finish()
+    encoder.finish()
 }
 
 fn failed(error: ffmpeg_next::Error) -> Error {
@@ -119,7 +120,7 @@ fn failed(error: ffmpeg_next::Error) -> Error {
 }
 
 /// A video that is being written.
-pub struct Film {
+pub struct Encoder {
     encoder: encoder::video::Encoder,
     output: format::context::Output,
     file: Memory,
@@ -129,10 +130,10 @@ pub struct Film {
     units: [Rational; 2],
 }
 
-impl Film {
+impl Encoder {
     /// A video of frames of `width` by `height` pixels.
-    pub fn begin(width: usize, height: usize, fps: u32, encoding: Encoding) -> Result<Self> {
-        super::prepare();
+    pub fn new(width: usize, height: usize, fps: u32, encoding: Encoding) -> Result<Self> {
+        crate::prepare();
         let even = width.is_multiple_of(2) && height.is_multiple_of(2);
         let (name, pixels, settings) = encoding.settings(even);
         let Some(codec) = encoder::find_by_name(name) else {
@@ -177,12 +178,12 @@ impl Film {
         Ok(Self { encoder, output, file, frame, packet: Packet::empty(), units: [rate.invert(), unit] })
     }
 
-    /// Adds frame `number`, the next one.
-    pub fn add(&mut self, rgb: &[u8], number: i64) -> Result<()> {
+    /// Adds the next frame, `[height, width, 3]` bytes. `index` counts frames from 0.
+    pub fn add_frame(&mut self, rgb: &[u8], index: i64) -> Result<()> {
         // The encoder may still hold the last frame's memory.
         let mut frame = frame::Video::new(self.frame.format(), self.frame.width(), self.frame.height());
         colour::from_rgb(rgb, &mut frame);
-        frame.set_pts(Some(number));
+        frame.set_pts(Some(index));
         self.frame = frame;
         self.encoder.send_frame(&self.frame).map_err(failed)?;
         self.receive()

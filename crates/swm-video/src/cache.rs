@@ -1,6 +1,6 @@
 //! The videos of a dataset: their tables are read once and kept, and so are decoders.
 
-use super::decode::{Decoders, Source, Video, Wanted};
+use crate::decode::{DecoderPool, Source, Video, FrameRequest};
 use rayon::prelude::*;
 use std::collections::{HashMap, VecDeque};
 use std::hash::Hash;
@@ -11,8 +11,8 @@ use swm_core::Result;
 const KEPT_BYTES: usize = 256 << 20;
 
 /// Videos by their key.
-pub struct Library<K> {
-    decoders: Decoders,
+pub struct VideoCache<K> {
+    decoders: DecoderPool,
     shelf: Mutex<Shelf<K>>,
 }
 
@@ -23,14 +23,14 @@ struct Shelf<K> {
     bytes: usize,
 }
 
-impl<K> Default for Library<K> {
+impl<K> Default for VideoCache<K> {
     fn default() -> Self {
         let shelf = Shelf { videos: HashMap::new(), order: VecDeque::new(), bytes: 0 };
-        Self { decoders: Decoders::default(), shelf: Mutex::new(shelf) }
+        Self { decoders: DecoderPool::default(), shelf: Mutex::new(shelf) }
     }
 }
 
-impl<K: Clone + Eq + Hash + Send + Sync> Library<K> {
+impl<K: Clone + Eq + Hash + Send + Sync> VideoCache<K> {
     /// A video, opened unless it is known.
     ///
     /// # Errors
@@ -58,7 +58,7 @@ impl<K: Clone + Eq + Hash + Send + Sync> Library<K> {
     ///
     /// # Errors
     /// When it has not, or the video cannot be opened.
-    pub fn size(&self, key: &K, source: impl FnOnce() -> Result<Source>) -> Result<(usize, usize)> {
+    pub fn frame_size(&self, key: &K, source: impl FnOnce() -> Result<Source>) -> Result<(usize, usize)> {
         let video = self.get(key, source)?;
         self.decoders.check_size(&video)?;
         Ok(video.size())
@@ -107,7 +107,7 @@ impl<K: Clone + Eq + Hash + Send + Sync> Library<K> {
                     None => break,
                 },
             };
-            frames.push(Wanted { video, frame: frame(video, &which)?, out });
+            frames.push(FrameRequest { video, frame: frame(video, &which)?, out });
             last = Some((key, video));
         }
         self.decoders.read(frames)

@@ -646,7 +646,7 @@ mod tests {
                 assert!(out == expected, "{name} without AVX2");
             }
             // The general decoder takes the others, and rounds elsewhere.
-            crate::image::decode(&bytes, height, width, &mut out).expect("a picture");
+            crate::decode(&bytes, height, width, &mut out).expect("a picture");
             let off: u32 = out.iter().zip(&expected).map(|(a, b)| u32::from(a.abs_diff(*b))).sum();
             assert!(f64::from(off) / (expected.len() as f64) < 3.0, "{name}: {off}");
             assert!(!decode(&bytes, width, height, &mut out), "{name} has another size");

@@ -172,14 +172,12 @@ impl Index {
     }
 
     /// When a frame is shown, in seconds.
-    #[allow(clippy::cast_precision_loss)]
     pub fn seconds(&self, frame: usize) -> f64 {
         self.times[frame] as f64 / f64::from(self.timescale)
     }
 
     /// The frame that is shown nearest to a time in seconds.
     pub fn frame_at(&self, seconds: f64) -> Option<usize> {
-        #[allow(clippy::cast_precision_loss)]
         let after = self.times.partition_point(|&time| time as f64 / f64::from(self.timescale) < seconds);
         let candidates = [after.checked_sub(1), (after < self.times.len()).then_some(after)];
         let distance = |frame: &usize| (self.seconds(*frame) - seconds).abs();

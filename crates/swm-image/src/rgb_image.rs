@@ -1,0 +1,12 @@
+//! The owned RGB image that readers of files and contact sheets return.
+
+/// An RGB image in memory.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RgbImage {
+    /// Pixels in a row.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// The pixels, `[height, width, 3]` bytes.
+    pub rgb: Vec<u8>,
+}

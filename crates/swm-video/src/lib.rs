@@ -1,0 +1,28 @@
+//! MP4 videos with FFmpeg's libraries, in process: frames by index out of files, and files out of frames.
+//!
+//! - [`Video`], [`DecoderPool`]: reads frames by index; each run from a key frame is decoded once, by pooled decoders.
+//! - [`VideoCache`]: the opened videos of a dataset.
+//! - [`encode`], [`Encoder`]: writes videos for training (a key frame every few frames) or for people.
+//!
+//! Safe code of this crate reads the tables of MP4 files, because files may be damaged; FFmpeg only decodes and encodes
+//! single frames. Frames are `[height, width, 3]` RGB bytes, row-major. Only `swm-data` depends on this crate.
+
+mod cache;
+mod colour;
+mod decode;
+mod encode;
+mod mp4;
+
+pub use cache::VideoCache;
+pub use decode::{DecoderPool, FrameRequest, Source, Video};
+pub use encode::{Encoder, Encoding, Quality, encode};
+
+/// Initialises FFmpeg's libraries once. FFmpeg logs nothing to standard error, because failures become errors.
+fn prepare() {
+    static ONCE: std::sync::Once = std::sync::Once::new();
+    ONCE.call_once(|| {
+        // Initialisation only registers error messages and cannot fail.
+        let _ = ffmpeg_next::init();
+        ffmpeg_next::log::set_level(ffmpeg_next::log::Level::Quiet);
+    });
+}

@@ -58,11 +58,7 @@ pub const RULES: &[Rule] = &[
         crates: &["swm-envs", "swm-mujoco", "swm-models"],
         words: "only the facade knows concrete families",
     },
-    Rule::Only {
-        users: &["swm-data"],
-        crates: &["swm-video"],
-        words: "only the dataset crate knows FFmpeg",
-    },
+    Rule::Only { users: &["swm-data"], crates: &["swm-video"], words: "only the dataset crate knows FFmpeg" },
     Rule::Only {
         users: &["swm", "swm-python"],
         crates: &["swm-gym"],

@@ -1,6 +1,6 @@
 //! The videos of a dataset: their tables are read once and kept, and so are decoders.
 
-use crate::decode::{DecoderPool, Source, Video, FrameRequest};
+use crate::decode::{DecoderPool, FrameRequest, Source, Video};
 use rayon::prelude::*;
 use std::collections::{HashMap, VecDeque};
 use std::hash::Hash;

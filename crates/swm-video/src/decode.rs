@@ -477,7 +477,8 @@ mod tests {
                 let mut out = vec![7; order.len() * size];
                 let video = if i == 1 { &same } else { &video };
                 let frames = order.iter().zip(out.chunks_exact_mut(size));
-                let wanted: Vec<FrameRequest<'_>> = frames.map(|(&frame, out)| FrameRequest { video, frame, out }).collect();
+                let wanted: Vec<FrameRequest<'_>> =
+                    frames.map(|(&frame, out)| FrameRequest { video, frame, out }).collect();
                 if i == 0 {
                     wanted.into_iter().for_each(|wanted| decoders.read(vec![wanted]).expect("decodes"));
                 } else {

@@ -2,7 +2,6 @@
 
 use crate::colour;
 use crate::mp4;
-use swm_image::ImageCodec;
 use ffmpeg_next::codec::{self, Flags, threading};
 use ffmpeg_next::color::{Range, Space};
 use ffmpeg_next::format::{self, Pixel};
@@ -10,6 +9,7 @@ use ffmpeg_next::{Dictionary, Packet, Rational, encoder, frame};
 use std::io::{Cursor, Seek, SeekFrom, Write};
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
+use swm_image::ImageCodec;
 
 /// How frames become a video.
 #[derive(Clone, Copy, Debug, PartialEq)]

@@ -2,7 +2,7 @@
 
 use super::{SCHEMA, VIDEO, table};
 use crate::episodes::Rows;
-use crate::ffmpeg::{VideoCache, Source};
+use crate::ffmpeg::{Source, VideoCache};
 use crate::format::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::lance;
 use crate::location::Location;

@@ -4,7 +4,7 @@ use super::info::{Column, Info, Kind, damaged};
 use super::{CONSTANTS, TASK, numbers, table};
 use crate::clip::ACTION;
 use crate::episodes::{Rows, content_hash, numbering};
-use crate::ffmpeg::{VideoCache, Source, Video};
+use crate::ffmpeg::{Source, Video, VideoCache};
 use crate::format::{Constants, Episode, Reader, StepRange};
 use crate::image;
 use crate::location::Location;

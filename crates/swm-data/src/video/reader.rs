@@ -3,7 +3,7 @@
 use super::file;
 use crate::column_files::{ColumnFiles, is_there};
 use crate::episodes::content_hash;
-use crate::ffmpeg::{VideoCache, Source};
+use crate::ffmpeg::{Source, VideoCache};
 use crate::format::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::location::Location;
 use std::path::Path;

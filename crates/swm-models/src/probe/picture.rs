@@ -130,7 +130,11 @@ impl Decoder {
 /// # Errors
 /// When the pictures are of another size than the encoder sees, or of one that blocks do not fill, no episode is held out, or
 /// a setting makes no sense.
-pub fn picture(encoder: &dyn Encodes, reader: &dyn Reader, config: &PictureConfig) -> Result<(PictureReport, RgbImage)> {
+pub fn picture(
+    encoder: &dyn Encodes,
+    reader: &dyn Reader,
+    config: &PictureConfig,
+) -> Result<(PictureReport, RgbImage)> {
     at_least(&[
         ("frames", config.frames, 2),
         ("held_out", config.held_out, 2),

@@ -60,28 +60,28 @@ impl Model {
                 Ok((path, card))
             })
             .map_err(raised)?;
-        let Card { family, weights, config, facts, image, action_block, history, .. } = &card;
+        let Card { family, weights, config, dataset_info, image, action_block, history, .. } = &card;
         let described = json!({
             "family": family,
             "weights": weights,
             "config": config,
-            "env": facts.env,
+            "env": dataset_info.env,
             "image": image,
             "action_block": action_block,
             "history": history,
-            "action_mean": facts.action.mean,
-            "action_std": facts.action.std,
+            "action_mean": dataset_info.action.mean,
+            "action_std": dataset_info.action.std,
         });
         Ok(Self {
             path,
             device,
             objective,
-            scale: card.facts.action.clone(),
+            scale: card.dataset_info.action.clone(),
             weights: card.weights.clone(),
             card: described.to_string(),
             asked: Mutex::new(None),
             acting: Mutex::new(None),
-            env: card.facts.env.clone(),
+            env: card.dataset_info.env.clone(),
         })
     }
 

@@ -2,7 +2,7 @@
 //!
 //! | file | what |
 //! | --- | --- |
-//! | `config.json` | family, configuration, facts of the data |
+//! | `config.json` | family, configuration, dataset info |
 //! | `weights.safetensors` | weights under their published names |
 //! | `optimizer.safetensors`, `state.json` | what training needs to continue exactly |
 //! | `raw.safetensors` | the weights that are trained, where those to use are their average |
@@ -12,8 +12,8 @@
 //! of the two.
 
 use crate::nn::parameters::{self, HostTensor, Named};
-use crate::train::run::Position;
-use crate::train::{Facts, TrainConfig, Trainable};
+use crate::train::run::RunState;
+use crate::train::{DatasetInfo, TrainConfig, Trainable};
 use burn::tensor::Device;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -28,7 +28,7 @@ pub struct Checkpoint<M: Trainable> {
     /// How it was trained.
     pub config: TrainConfig<M>,
     /// What it knows of the data it was trained on.
-    pub facts: Facts,
+    pub dataset_info: DatasetInfo,
     /// Where it came from; `hashes["weights"]` names the checkpoint.
     pub manifest: Manifest,
 }
@@ -36,7 +36,7 @@ pub struct Checkpoint<M: Trainable> {
 /// What training needs to continue exactly.
 pub(crate) struct TrainState<M> {
     /// How far it is.
-    pub position: Position,
+    pub position: RunState,
     /// The state of the optimizer.
     pub moments: Named<HostTensor>,
     /// The weights that are trained, where those of the checkpoint are their average.
@@ -51,7 +51,8 @@ struct Card {
     /// The side of the pictures it sees.
     image: Option<usize>,
     action_block: usize,
-    facts: Facts,
+    #[serde(rename = "facts")]
+    dataset_info: DatasetInfo,
     config: serde_json::Value,
 }
 
@@ -76,7 +77,7 @@ impl<M: Trainable> Checkpoint<M> {
 
     /// Numbers of one model step's actions: those of an environment's action, times the frameskip.
     pub fn actions(&self) -> usize {
-        self.config.data.frameskip * self.facts.action.dim()
+        self.config.data.frameskip * self.dataset_info.action.dim()
     }
 
     /// Saves it into the run folder `run`, which keeps the last checkpoint only. Returns the hash of the weights.
@@ -92,10 +93,10 @@ impl<M: Trainable> Checkpoint<M> {
     pub(crate) fn save(&mut self, run: &Path, state: Option<&TrainState<M>>) -> Result<String> {
         let card = Card {
             family: M::FAMILY.to_owned(),
-            env: self.facts.env.clone(),
-            image: M::picture(&self.config.model),
+            env: self.dataset_info.env.clone(),
+            image: M::image_size(&self.config.model),
             action_block: self.config.data.frameskip,
-            facts: self.facts.clone(),
+            dataset_info: self.dataset_info.clone(),
             config: json(&self.config)?,
         };
         let mut more = vec![];
@@ -127,9 +128,9 @@ impl<M: Trainable> Checkpoint<M> {
         config.check()?;
         let card: Card =
             serde_json::from_value(card).map_err(|error| broken(&folder.join(CONFIG), error.to_string()))?;
-        let model = M::new(&config, &card.facts, Key::new(0), device)?;
+        let model = M::new(&config, &card.dataset_info, Key::new(0), device)?;
         let model = fill(model, &folder.join(WEIGHTS), manifest.hashes.get("weights"))?;
-        Ok((Self { model, config, facts: card.facts, manifest }, folder))
+        Ok((Self { model, config, dataset_info: card.dataset_info, manifest }, folder))
     }
 
     /// Loads the checkpoint and what training needs to continue.

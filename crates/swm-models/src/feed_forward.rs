@@ -6,9 +6,9 @@ use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result, RowRef, Schema};
 use swm_plan::ActionScale;
 
 /// A network that says what to do.
-pub trait Decide: Send + Sync {
+pub trait ActionNetwork: Send + Sync {
     /// What it remembers of an episode.
-    type Memory: Default + Send;
+    type EpisodeState: Default + Send;
 
     /// Between environment actions and its own.
     fn scale(&self) -> &ActionScale;
@@ -23,16 +23,16 @@ pub trait Decide: Send + Sync {
     ///
     /// # Errors
     /// When what the row holds cannot be read.
-    fn decide(&self, memory: &mut Self::Memory, row: RowRef<'_>) -> Result<Vec<f32>>;
+    fn next_actions(&self, memory: &mut Self::EpisodeState, row: RowRef<'_>) -> Result<Vec<f32>>;
 }
 
 /// Does what a network says, a model step at a time. Every environment is decided for by itself, so what it does is the
 /// same bytes whoever plays beside it and however many threads there are.
-pub struct FeedForwardPolicy<N: Decide> {
+pub struct FeedForwardPolicy<N: ActionNetwork> {
     network: N,
     /// Bounds of an environment action.
     bounds: Vec<(f32, f32)>,
-    slots: Vec<Slot<N::Memory>>,
+    slots: Vec<Slot<N::EpisodeState>>,
     latencies: Vec<f64>,
 }
 
@@ -46,7 +46,7 @@ struct Slot<M> {
     failed: Option<Error>,
 }
 
-impl<N: Decide> FeedForwardPolicy<N> {
+impl<N: ActionNetwork> FeedForwardPolicy<N> {
     /// A policy for `slots` environments of `spec`.
     ///
     /// # Errors
@@ -65,8 +65,13 @@ impl<N: Decide> FeedForwardPolicy<N> {
 }
 
 /// Asks for a slot's next actions, within `bounds`.
-fn ask<N: Decide>(network: &N, bounds: &[(f32, f32)], slot: &mut Slot<N::Memory>, row: RowRef<'_>) -> Result<()> {
-    let said = network.decide(&mut slot.memory, row)?;
+fn ask<N: ActionNetwork>(
+    network: &N,
+    bounds: &[(f32, f32)],
+    slot: &mut Slot<N::EpisodeState>,
+    row: RowRef<'_>,
+) -> Result<()> {
+    let said = network.next_actions(&mut slot.memory, row)?;
     let dim = bounds.len();
     slot.actions.resize(said.len(), 0.0);
     slot.done = 0;
@@ -79,7 +84,7 @@ fn ask<N: Decide>(network: &N, bounds: &[(f32, f32)], slot: &mut Slot<N::Memory>
     Ok(())
 }
 
-impl<N: Decide> Policy for FeedForwardPolicy<N> {
+impl<N: ActionNetwork> Policy for FeedForwardPolicy<N> {
     fn begin(&mut self, slot: usize, _: Key) {
         self.slots[slot] = Slot::default();
     }

@@ -6,7 +6,7 @@ use swm_core::{DType, Error, Result, Schema};
 
 /// How pictures become numbers.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Pixels {
+pub struct ImageNormalization {
     /// The side of the square pictures.
     pub side: usize,
     /// Mean by colour, of 0 ..= 1.
@@ -15,7 +15,7 @@ pub struct Pixels {
     pub std: [f32; 3],
 }
 
-impl Pixels {
+impl ImageNormalization {
     /// The mean and spread of ImageNet, which published encoders were trained with.
     pub const IMAGENET: ([f32; 3], [f32; 3]) = ([0.485, 0.456, 0.406], [0.229, 0.224, 0.225]);
 
@@ -70,7 +70,7 @@ pub fn check(side: usize, schema: &Schema, column: &str) -> Result<()> {
 ///
 /// # Errors
 /// When the bytes are not whole pictures of that side.
-pub fn patches(pixels: &Pixels, patch: usize, rgb: &[u8], device: &Device) -> Result<Tensor<3>> {
+pub fn patches(pixels: &ImageNormalization, patch: usize, rgb: &[u8], device: &Device) -> Result<Tensor<3>> {
     let side = pixels.side;
     let (frames, grid) = (pixels.count(rgb)?, side / patch);
     let (bytes, numbers) = (side * side * 3, 3 * patch * patch);
@@ -99,7 +99,7 @@ pub fn patches(pixels: &Pixels, patch: usize, rgb: &[u8], device: &Device) -> Re
 ///
 /// # Errors
 /// When the bytes are not whole pictures of that side.
-pub fn planes(pixels: &Pixels, rgb: &[u8], device: &Device) -> Result<Tensor<4>> {
+pub fn planes(pixels: &ImageNormalization, rgb: &[u8], device: &Device) -> Result<Tensor<4>> {
     let (side, frames) = (pixels.side, pixels.count(rgb)?);
     // A picture is one patch as large as itself.
     Ok(patches(pixels, side, rgb, device)?.reshape([frames, 3, side, side]))

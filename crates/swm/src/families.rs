@@ -13,12 +13,12 @@ use swm_models::dino_wm::{self, DinoWm, DinoWmCost};
 use swm_models::gcrl::{self, Gcbc, Gciql, Gcivl, GoalConditioned as _};
 use swm_models::inverse::{self, InverseCheckpoint, InverseConfig, InversePolicy};
 use swm_models::lewm::{self, Lewm, LewmCost};
-use swm_models::online::{Agent, Live, OnlineSummary, train_online};
+use swm_models::online::{Agent, OnlineSummary, SharedModel, train_online};
 use swm_models::pldm::{self, Pldm};
-use swm_models::probe::Encodes;
+use swm_models::probe::ImageEncoder;
 use swm_models::sac::Sac;
 use swm_models::tdmpc2::{self, Tdmpc2, Tdmpc2Cost};
-use swm_models::train::{Facts, Preset};
+use swm_models::train::{DatasetInfo, Preset};
 use swm_models::weights::Naming;
 use swm_models::{Checkpoint, Device, Observer, TrainConfig, TrainOptions, TrainSummary, Trainable, checkpoint};
 
@@ -78,7 +78,7 @@ pub struct Card {
     /// The same, as TOML.
     pub toml: String,
     /// What it knows of its data.
-    pub facts: Facts,
+    pub dataset_info: DatasetInfo,
     /// The side of the pictures it sees, if it sees any.
     pub image: Option<usize>,
     /// Environment steps in a model step.
@@ -119,7 +119,7 @@ pub trait Loaded {
     fn export(&self, folder: &Path) -> Option<Result<()>>;
 
     /// Its encoder, to be probed; none for a model without eyes.
-    fn encoder(&self) -> Option<Box<dyn Encodes>>;
+    fn encoder(&self) -> Option<Box<dyn ImageEncoder>>;
 }
 
 /// A configuration to train with.
@@ -137,7 +137,7 @@ pub trait Training {
     fn steps(&self) -> usize;
 
     /// The side of the square pictures the model sees, if it sees any.
-    fn picture(&self) -> Option<usize>;
+    fn image_size(&self) -> Option<usize>;
 
     /// Trains by playing in the worlds that `worlds` makes, as many as it is asked for; none for a family that learns from
     /// datasets only.
@@ -202,12 +202,12 @@ trait Usable: Trainable {
     }
 
     /// As [`Loaded::encoder`].
-    fn encoder(_checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Encodes>> {
+    fn encoder(_checkpoint: &Checkpoint<Self>) -> Option<Box<dyn ImageEncoder>> {
         None
     }
 
     /// What the reference trained, as a checkpoint of this program.
-    fn import(_from: &Path, _facts: Facts) -> Option<Result<Checkpoint<Self>>> {
+    fn import(_from: &Path, _facts: DatasetInfo) -> Option<Result<Checkpoint<Self>>> {
         None
     }
 
@@ -237,17 +237,17 @@ impl Usable for Lewm {
     }
 
     fn predictor(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Predictor>> {
-        let scale = checkpoint.facts.action.clone();
+        let scale = checkpoint.dataset_info.action.clone();
         let (config, block) = (&checkpoint.config.model, checkpoint.config.data.frameskip);
         Some(Box::new(LewmPredictor::new(&checkpoint.model, config, scale, block)))
     }
 
-    fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Encodes>> {
+    fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn ImageEncoder>> {
         Some(Box::new(checkpoint.clone()))
     }
 
-    fn import(from: &Path, facts: Facts) -> Option<Result<Checkpoint<Self>>> {
-        Some(lewm::import::import(from, facts))
+    fn import(from: &Path, dataset_info: DatasetInfo) -> Option<Result<Checkpoint<Self>>> {
+        Some(lewm::import::import(from, dataset_info))
     }
 
     fn export(checkpoint: &Checkpoint<Self>, folder: &Path) -> Option<Result<()>> {
@@ -265,17 +265,17 @@ impl Usable for Pldm {
     }
 
     fn predictor(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Predictor>> {
-        let scale = checkpoint.facts.action.clone();
+        let scale = checkpoint.dataset_info.action.clone();
         let (config, block) = (&checkpoint.config.model, checkpoint.config.data.frameskip);
         Some(Box::new(LewmPredictor::new(&checkpoint.model.model, config, scale, block)))
     }
 
-    fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Encodes>> {
+    fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn ImageEncoder>> {
         Some(Box::new(checkpoint.clone()))
     }
 
-    fn import(from: &Path, facts: Facts) -> Option<Result<Checkpoint<Self>>> {
-        Some(pldm::import::import(from, facts))
+    fn import(from: &Path, dataset_info: DatasetInfo) -> Option<Result<Checkpoint<Self>>> {
+        Some(pldm::import::import(from, dataset_info))
     }
 
     fn export(checkpoint: &Checkpoint<Self>, folder: &Path) -> Option<Result<()>> {
@@ -292,12 +292,12 @@ impl Usable for DinoWm {
         Some(Box::new(DinoWmCost::new(checkpoint)))
     }
 
-    fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Encodes>> {
+    fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn ImageEncoder>> {
         Some(Box::new(checkpoint.clone()))
     }
 
-    fn import(from: &Path, facts: Facts) -> Option<Result<Checkpoint<Self>>> {
-        Some(dino_wm::import::import(from, facts))
+    fn import(from: &Path, dataset_info: DatasetInfo) -> Option<Result<Checkpoint<Self>>> {
+        Some(dino_wm::import::import(from, dataset_info))
     }
 
     fn export(checkpoint: &Checkpoint<Self>, folder: &Path) -> Option<Result<()>> {
@@ -325,8 +325,8 @@ impl Usable for Tdmpc2 {
         Some(train_online(config, on.worlds, on.out, &on.options, observer, stop))
     }
 
-    fn import(from: &Path, facts: Facts) -> Option<Result<Checkpoint<Self>>> {
-        Some(tdmpc2::import(from, facts))
+    fn import(from: &Path, dataset_info: DatasetInfo) -> Option<Result<Checkpoint<Self>>> {
+        Some(tdmpc2::import(from, dataset_info))
     }
 
     fn export(checkpoint: &Checkpoint<Self>, folder: &Path) -> Option<Result<()>> {
@@ -353,7 +353,14 @@ impl Usable for Sac {
 
 /// The policy of a model that learnt by playing.
 fn agent<M: Agent>(checkpoint: &Checkpoint<M>, spec: &EnvSpec, slots: usize) -> Result<Box<dyn Policy>> {
-    M::policy(&checkpoint.config, &checkpoint.facts, Live::new(checkpoint.model.clone()), spec, slots, false)
+    M::policy(
+        &checkpoint.config,
+        &checkpoint.dataset_info,
+        SharedModel::new(checkpoint.model.clone()),
+        spec,
+        slots,
+        false,
+    )
 }
 
 /// Goal-conditioned models act without planning.
@@ -371,11 +378,11 @@ macro_rules! acts {
                 Some(policy.map(|policy| Box::new(policy) as Box<dyn Policy>))
             }
 
-            fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn Encodes>> {
+            fn encoder(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn ImageEncoder>> {
                 Some(Box::new(Self::actor(checkpoint)))
             }
-            fn import(from: &Path, facts: Facts) -> Option<Result<Checkpoint<Self>>> {
-                Some(gcrl::import::import(from, facts))
+            fn import(from: &Path, dataset_info: DatasetInfo) -> Option<Result<Checkpoint<Self>>> {
+                Some(gcrl::import::import(from, dataset_info))
             }
 
             fn export(checkpoint: &Checkpoint<Self>, folder: &Path) -> Option<Result<()>> {
@@ -397,11 +404,11 @@ const fn family<M: Usable>() -> Family {
         load: |run, device| Ok(Box::new(Checkpoint::<M>::load(run, device)?)),
         import: |from, reader, out| {
             let columns: Vec<String> = reader.schema().columns().iter().map(|column| column.name.clone()).collect();
-            let facts = match Facts::of(reader, &columns, M::BOUNDED) {
-                Ok(facts) => facts,
+            let dataset_info = match DatasetInfo::from_reader(reader, &columns, M::BOUNDED_ACTIONS) {
+                Ok(dataset_info) => dataset_info,
                 Err(error) => return Some(Err(error)),
             };
-            Some(M::import(from, facts)?.and_then(|mut checkpoint| checkpoint.save_to(out)))
+            Some(M::import(from, dataset_info)?.and_then(|mut checkpoint| checkpoint.save_to(out)))
         },
     }
 }
@@ -419,8 +426,8 @@ impl<M: Usable> Training for TrainConfig<M> {
         self.schedule.steps
     }
 
-    fn picture(&self) -> Option<usize> {
-        M::picture(&self.model)
+    fn image_size(&self) -> Option<usize> {
+        M::image_size(&self.model)
     }
 
     fn play(&self, on: PlayOn<'_>, observer: &mut dyn Observer, stop: &AtomicBool) -> Option<Result<OnlineSummary>> {
@@ -439,8 +446,8 @@ impl<M: Usable> Loaded for Checkpoint<M> {
             weights: self.hash().to_owned(),
             config: json!(self.config),
             toml: self.config.to_toml()?,
-            facts: self.facts.clone(),
-            image: M::picture(&self.config.model),
+            dataset_info: self.dataset_info.clone(),
+            image: M::image_size(&self.config.model),
             action_block: self.config.data.frameskip,
             history: M::history(&self.config),
             manifest: self.manifest.clone(),
@@ -467,7 +474,7 @@ impl<M: Usable> Loaded for Checkpoint<M> {
         M::export(self, folder)
     }
 
-    fn encoder(&self) -> Option<Box<dyn Encodes>> {
+    fn encoder(&self) -> Option<Box<dyn ImageEncoder>> {
         M::encoder(self)
     }
 }
@@ -515,7 +522,7 @@ impl Training for InverseConfig {
         self.schedule.steps
     }
 
-    fn picture(&self) -> Option<usize> {
+    fn image_size(&self) -> Option<usize> {
         None
     }
 
@@ -550,8 +557,8 @@ impl Loaded for InverseCheckpoint {
             weights: self.hash().to_owned(),
             config: json!(self.config),
             toml: self.config.to_toml()?,
-            facts: self.world.facts.clone(),
-            image: Lewm::picture(&self.world.config.model),
+            dataset_info: self.world.dataset_info.clone(),
+            image: Lewm::image_size(&self.world.config.model),
             action_block: self.world.config.data.frameskip,
             history: 1,
             manifest: self.manifest.clone(),
@@ -578,7 +585,7 @@ impl Loaded for InverseCheckpoint {
         None
     }
 
-    fn encoder(&self) -> Option<Box<dyn Encodes>> {
+    fn encoder(&self) -> Option<Box<dyn ImageEncoder>> {
         Some(Box::new(self.world.clone()))
     }
 }

@@ -137,12 +137,12 @@ impl Resolver for Home {
                     Model::Checkpoint(given) => {
                         let loaded = load(&home::find_checkpoint(given)?, &Device::flex())?;
                         let card = loaded.card()?;
-                        fits(card.facts.env.as_deref(), given, spec)?;
+                        fits(card.dataset_info.env.as_deref(), given, spec)?;
                         let cost = loaded.cost().ok_or_else(|| {
                             let problem = format!("a {} acts and does not predict", card.family);
                             Error::config(format!("checkpoint {given}"), problem, "let it act (`swm eval` does)")
                         })?;
-                        let (mut cost, scale) = (objective.apply(cost)?, card.facts.action);
+                        let (mut cost, scale) = (objective.apply(cost)?, card.dataset_info.action);
                         pairing(id, &mut *cost, actions)?;
                         let policy = MpcPolicy::new(solver, cost, mpc, scale, spec, slots)?;
                         Ok(Actor {
@@ -184,7 +184,7 @@ pub fn acting(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Po
 pub fn direct(given: &str, spec: &EnvSpec, slots: usize) -> Result<(Box<dyn Policy>, Card)> {
     let loaded = load(&home::find_checkpoint(given)?, &Device::flex())?;
     let card = loaded.card()?;
-    fits(card.facts.env.as_deref(), given, spec)?;
+    fits(card.dataset_info.env.as_deref(), given, spec)?;
     let policy = loaded.policy(spec, slots).ok_or_else(|| {
         let problem = format!("a {} predicts and does not act", card.family);
         Error::config(format!("checkpoint {given}"), problem, "plan in it (`swm eval` does)")

@@ -10,7 +10,7 @@ use swm_core::{
 use swm_models::lewm::{EncoderConfig, Lewm, LewmCost, pixels};
 use swm_models::nn::Named;
 use swm_models::nn::parameters::{self, HostTensor};
-use swm_models::train::{AdamW, Facts, StepContext};
+use swm_models::train::{AdamW, DatasetInfo, StepContext};
 use swm_models::{Device, TrainConfig, Trainable as _, weights};
 use swm_plan::{ActionScale, Cem};
 
@@ -37,7 +37,7 @@ pub struct LewmSubject {
 struct Training {
     model: Lewm,
     optimizer: AdamW,
-    facts: Facts,
+    dataset_info: DatasetInfo,
     batch: Batch,
     steps: u64,
 }
@@ -126,10 +126,10 @@ impl LewmSubject {
             None => Training::new(config, &self.model)?,
         };
         let key = Key::new(0).at(training.steps);
-        let context = StepContext { config, facts: &training.facts, key, device, training: true };
+        let context = StepContext { config, dataset_info: &training.dataset_info, key, device, training: true };
         let found = training.model.step(&context, &training.batch)?;
-        let (model, _) = training.optimizer.step(training.model, 1.0, found.gradients, Lewm::group);
-        training.model = model.after(&context, found.buffers);
+        let (model, _) = training.optimizer.step(training.model, 1.0, found.gradients, Lewm::parameter_group);
+        training.model = model.after_step(&context, found.buffers);
         training.steps += 1;
         self.training = Some(training);
         Ok(())
@@ -150,8 +150,8 @@ impl Training {
             rng.fill(row.at::<u8>(0));
             row.at::<f32>(1).iter_mut().for_each(|action| *action = rng.random_range(-1.0..1.0));
         }
-        let facts = Facts { action: ActionScale::identity(NUMBERS), columns: Named::new(), env: None };
-        Ok(Self { model: model.clone(), optimizer: AdamW::new(config.optim.clone()), facts, batch, steps: 0 })
+        let dataset_info = DatasetInfo { action: ActionScale::identity(NUMBERS), columns: Named::new(), env: None };
+        Ok(Self { model: model.clone(), optimizer: AdamW::new(config.optim.clone()), dataset_info, batch, steps: 0 })
     }
 }
 

@@ -11,7 +11,7 @@ use super::train::normalised;
 use crate::checkpoint::Checkpoint;
 use crate::nn::parameters::IntoF32;
 use crate::pixels;
-use crate::train::Facts;
+use crate::train::DatasetInfo;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
@@ -21,7 +21,7 @@ use swm_core::{Batch, Candidates, CostModel, DifferentiableCost, Error, Result, 
 pub struct DinoWmCost {
     model: DinoWm,
     config: DinoWmConfig,
-    facts: Facts,
+    dataset_info: DatasetInfo,
     actions: usize,
     scenes: Vec<Scene>,
 }
@@ -47,7 +47,7 @@ impl DinoWmCost {
         Self {
             model: checkpoint.model.clone(),
             config: checkpoint.config.model.clone(),
-            facts: checkpoint.facts.clone(),
+            dataset_info: checkpoint.dataset_info.clone(),
             actions: checkpoint.actions(),
             scenes: vec![],
         }
@@ -59,7 +59,7 @@ impl DinoWmCost {
         pixels::check(side, schema, "pixels")?;
         pixels::check(side, schema, "goal")?;
         for column in self.config.columns.iter().filter(|column| column.name != ACTION) {
-            let (given, wanted) = (&schema.column(&column.name)?.shape, &self.facts.column(&column.name)?.shape);
+            let (given, wanted) = (&schema.column(&column.name)?.shape, &self.dataset_info.column(&column.name)?.shape);
             if given != wanted {
                 return Err(Error::mismatch(
                     format!("reading '{}'", column.name),
@@ -104,7 +104,7 @@ impl DinoWmCost {
         let (row, device) = (infos.row(env), Device::flex());
         // Each picture by itself: what a frame is must not depend on how many are encoded at once.
         let encode = |rgb: &[u8]| Ok::<_, Error>(self.model.backbone.patches(self.config.cut(rgb, &device)?));
-        let column = |name: &str, values: &[f32]| normalised(&self.facts, name, values, [1, 1], &device);
+        let column = |name: &str, values: &[f32]| normalised(&self.dataset_info, name, values, [1, 1], &device);
         // Columns are not among the past that a policy keeps, so with any the present alone is seen.
         let others: Vec<&str> =
             self.config.columns.iter().map(|column| column.name.as_str()).filter(|name| *name != ACTION).collect();
@@ -190,7 +190,7 @@ impl CostModel for DinoWmCost {
             costs.par_chunks_mut(PART).zip(actions.par_chunks(PART * per)).for_each(|(costs, actions)| {
                 let data = TensorData::new(actions.to_vec(), [costs.len(), horizon, dim]);
                 let found = scene.cost(model, Tensor::from_data(data, &Device::flex()));
-                costs.copy_from_slice(&found.into_data().try_into_vec_as_f32());
+                costs.copy_from_slice(&found.into_data().into_f32_vec());
             });
         });
         Ok(())
@@ -222,9 +222,9 @@ impl DifferentiableCost for DinoWmCost {
                     let data = TensorData::new(actions.to_vec(), [costs.len(), horizon, dim]);
                     let free = Tensor::<3>::from_data(data, &Device::flex()).autodiff().require_grad();
                     let found = scene.cost(&model, free.clone());
-                    costs.copy_from_slice(&found.clone().inner().into_data().try_into_vec_as_f32());
+                    costs.copy_from_slice(&found.clone().inner().into_data().into_f32_vec());
                     match free.grad(&found.sum().backward()) {
-                        Some(found) => gradient.copy_from_slice(&found.into_data().try_into_vec_as_f32()),
+                        Some(found) => gradient.copy_from_slice(&found.into_data().into_f32_vec()),
                         None => gradient.fill(0.0),
                     }
                 });

@@ -6,8 +6,8 @@ use super::predictor::FramePredictorConfig;
 use crate::checkpoint::Checkpoint;
 use crate::nn::BackboneConfig;
 use crate::nn::parameters::{self, HostTensor, Named};
-use crate::pixels::Pixels;
-use crate::train::{Facts, TrainConfig};
+use crate::pixels::ImageNormalization;
+use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::keys::InOrder;
 use crate::weights::reference::{Reference, write};
 use crate::weights::{self, Naming, names};
@@ -21,11 +21,11 @@ const MODULES: &str = "stable_worldmodel.wm.prejepa.module";
 const CLASS: &str = "stable_worldmodel.wm.PreJEPA";
 
 /// A DINO-WM that the reference trained: a folder with `weights.pt` and `config.json`, or that file. What it does not
-/// store is how columns were normalised, so `facts` must be those of its dataset.
+/// store is how columns were normalised, so `dataset_info` must be those of its dataset.
 ///
 /// # Errors
-/// When it is another model, its encoder is no DINOv2, it is damaged, or its columns are not those in `facts`.
-pub fn import(from: &Path, facts: Facts) -> Result<Checkpoint<DinoWm>> {
+/// When it is another model, its encoder is no DINOv2, it is damaged, or its columns are not those in `dataset_info`.
+pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<DinoWm>> {
     let mut reference = Reference::open(from, "PreJEPA")?;
     // A wrapper that keeps the encoder from training adds its name.
     let weights = std::mem::take(&mut reference.weights);
@@ -46,7 +46,7 @@ pub fn import(from: &Path, facts: Facts) -> Result<Checkpoint<DinoWm>> {
         let [dim, given, _] = *weight else {
             return Err(reference.wrong(format!("the encoder of '{name}' is no convolution over time")));
         };
-        let wanted = if name == ACTION { facts.action.dim() } else { facts.column(&name)?.dim() };
+        let wanted = if name == ACTION { dataset_info.action.dim() } else { dataset_info.column(&name)?.dim() };
         let whole = if name == ACTION { given.is_multiple_of(wanted.max(1)) } else { given == wanted };
         if !whole {
             return Err(Error::mismatch(
@@ -61,7 +61,7 @@ pub fn import(from: &Path, facts: Facts) -> Result<Checkpoint<DinoWm>> {
         columns.push(ColumnConfig { name, dim });
         numbers.push(given);
     }
-    let (mean, std) = Pixels::IMAGENET;
+    let (mean, std) = ImageNormalization::IMAGENET;
     let sizes = DinoWmConfig {
         image: size("predictor.num_patches")?.isqrt() * dino.patch,
         pixel_mean: mean,
@@ -88,7 +88,7 @@ pub fn import(from: &Path, facts: Facts) -> Result<Checkpoint<DinoWm>> {
     config.model = sizes;
     config.check()?;
     let manifest = Manifest::new("import", 0, json!({ "from": from.display().to_string() }));
-    Ok(Checkpoint { model, config, facts, manifest })
+    Ok(Checkpoint { model, config, dataset_info, manifest })
 }
 
 /// Writes `weights.pt` and `config.json` that the reference's `load_pretrained` reads.
@@ -160,7 +160,7 @@ pub fn state(model: &DinoWm, naming: Naming) -> Named<HostTensor> {
         let mask = HostTensor { shape: vec![1, 1, tokens, tokens], values: values.clone() };
         weights.insert(format!("predictor.transformer.layers.{layer}.0.bias"), mask);
     }
-    names::named(weights, "backbone.", naming)
+    names::to_naming(weights, "backbone.", naming)
 }
 
 fn is_mask(name: &str, shape: &[usize]) -> bool {

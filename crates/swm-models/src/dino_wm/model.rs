@@ -2,8 +2,8 @@
 
 use super::config::{ACTION, DinoWmConfig};
 use super::predictor::FramePredictor;
-use crate::nn::mlp::Tap;
-use crate::nn::{Activation, Backbone, ByName, Init, Linear, Noise};
+use crate::nn::mlp::PointwiseConv;
+use crate::nn::{Activation, Backbone, DropoutRng, Init, Linear, ModuleDict};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use std::ops::Range;
@@ -17,7 +17,7 @@ pub struct DinoWm {
     /// From a window of frames to the next.
     pub predictor: FramePredictor,
     /// From columns to what stands beside the features of every patch.
-    pub extra_encoders: ByName<ColumnEncoder>,
+    pub extra_encoders: ModuleDict<ColumnEncoder>,
     /// From features of patches to their pixels.
     pub decoder: Option<PatchDecoder>,
 }
@@ -26,7 +26,7 @@ pub struct DinoWm {
 #[derive(Module, Debug)]
 pub struct ColumnEncoder {
     /// `[dim, numbers, 1]`.
-    pub patch_embed: Tap,
+    pub patch_embed: PointwiseConv,
 }
 
 /// From the features of a patch to its pixels: linear, GELU, and a transposed convolution whose stride is its kernel,
@@ -44,7 +44,7 @@ impl ColumnEncoder {
     fn new(init: &Init, numbers: usize, dim: usize) -> Self {
         let bound = 1.0 / (numbers as f32).sqrt();
         let weight = init.uniform("weight", [dim, numbers, 1], bound);
-        Self { patch_embed: Tap { weight, bias: init.uniform("bias", [dim], bound) } }
+        Self { patch_embed: PointwiseConv { weight, bias: init.uniform("bias", [dim], bound) } }
     }
 
     /// # Shapes
@@ -79,7 +79,7 @@ impl DinoWm {
         Self {
             backbone: config.encoder.init(&init.of("backbone"), config.image).no_grad(),
             predictor: config.predictor.init(&init.of("predictor"), config.patches(), config.dim()),
-            extra_encoders: ByName(columns.collect()),
+            extra_encoders: ModuleDict(columns.collect()),
             decoder: (config.decoder > 0).then(|| PatchDecoder {
                 hidden: Linear::new(&decoder.of("hidden"), config.encoder.dim(), config.decoder),
                 pixels: Linear::new(&decoder.of("pixels"), config.decoder, pixels),
@@ -132,7 +132,7 @@ impl DinoWm {
     ///
     /// # Shapes
     /// `[clips, frames, patches, dim]`, `frames` at most the history, to the same.
-    pub fn predict(&self, frames: Tensor<4>, noise: &mut Noise<'_>) -> Tensor<4> {
+    pub fn predict(&self, frames: Tensor<4>, noise: &mut DropoutRng<'_>) -> Tensor<4> {
         let [clips, steps, patches, dim] = frames.dims();
         self.predictor
             .forward(frames.reshape([clips, steps * patches, dim]), noise)
@@ -151,7 +151,7 @@ impl DinoWm {
         let mut all = self.with_actions(given, taken(0..seen));
         for end in seen..=steps {
             let window = all.clone().slice([0..clips, end.saturating_sub(history)..end, 0..patches, 0..dim]);
-            let next = self.predict(window, &mut Noise::off());
+            let next = self.predict(window, &mut DropoutRng::disabled());
             let [_, count, _, _] = next.dims();
             let mut next = next.slice([0..clips, count - 1..count, 0..patches, 0..dim]);
             if end < steps {

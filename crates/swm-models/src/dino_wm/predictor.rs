@@ -1,7 +1,7 @@
 //! The predictor: a transformer over the patches of a window of frames, in which a patch sees all patches of its own
 //! frame and of those before it.
 
-use crate::nn::{Activation, Init, LayerNorm, Linear, Noise};
+use crate::nn::{Activation, DropoutRng, Init, LayerNorm, Linear};
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor, TensorData, activation};
 use serde::{Deserialize, Serialize};
@@ -142,7 +142,7 @@ impl FramePredictor {
 
     /// # Shapes
     /// `[windows, frames * patches, dim]`, `frames` at most the history, to the same.
-    pub fn forward(&self, x: Tensor<3>, noise: &mut Noise<'_>) -> Tensor<3> {
+    pub fn forward(&self, x: Tensor<3>, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let [_, tokens, dim] = x.dims();
         let x = x + self.pos_embedding.val().slice([0..1, 0..tokens, 0..dim]);
         let mut x = noise.dropout(x, self.config.emb_dropout);
@@ -169,7 +169,7 @@ impl Attention {
         x: Tensor<3>,
         mask: Option<Tensor<4>>,
         config: &FramePredictorConfig,
-        noise: &mut Noise<'_>,
+        noise: &mut DropoutRng<'_>,
     ) -> Tensor<3> {
         let [windows, tokens, _] = x.dims();
         let (heads, width) = (config.heads, config.dim_head);
@@ -193,7 +193,7 @@ impl Attention {
 }
 
 impl FeedForward {
-    fn forward(&self, x: Tensor<3>, config: &FramePredictorConfig, noise: &mut Noise<'_>) -> Tensor<3> {
+    fn forward(&self, x: Tensor<3>, config: &FramePredictorConfig, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let hidden = Activation::Gelu.forward(self.net._1.forward(self.net._0.forward(x)));
         let hidden = noise.dropout(hidden, config.dropout);
         noise.dropout(self.net._4.forward(hidden), config.dropout)

@@ -4,7 +4,7 @@
 
 use super::config::ACTION;
 use super::model::DinoWm;
-use crate::nn::Noise;
+use crate::nn::DropoutRng;
 use crate::nn::parameters::{self, Named};
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -45,7 +45,7 @@ pub fn step(model: &DinoWm, batch: &TrainBatch, noise: Option<&mut Rng>) -> Foun
         let part = |s: usize| x.clone().slice([0..clips, s + offset..s + offset + history, 0..patches, 0..dim]);
         Tensor::cat((0..steps - history).map(part).collect(), 0)
     };
-    let predicted = learner.predict(windows(&frames, 0), &mut Noise(noise));
+    let predicted = learner.predict(windows(&frames, 0), &mut DropoutRng(noise));
     let error = (predicted - windows(&targets, 1).autodiff()).square();
     let [windows, _, _, _] = error.dims();
     let errors = |range: std::ops::Range<usize>| error.clone().slice([0..windows, 0..history, 0..patches, range]);

@@ -4,8 +4,8 @@ use super::config::{ACTION, DinoWmConfig};
 use super::model::DinoWm;
 use super::step::{Found, TrainBatch, step};
 use crate::nn::{Backbone, Named};
-use crate::pixels::{self, Pixels};
-use crate::train::{Facts, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least, shards};
+use crate::pixels::{self, ImageNormalization};
+use crate::train::{DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least, shards};
 use crate::weights;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
@@ -50,11 +50,11 @@ impl Trainable for DinoWm {
         Ok(())
     }
 
-    fn picture(config: &DinoWmConfig) -> Option<usize> {
+    fn image_size(config: &DinoWmConfig) -> Option<usize> {
         Some(config.image)
     }
 
-    fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
+    fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
         pixels::check(config.model.image, schema, "pixels")?;
         let mut columns = vec!["pixels".to_owned()];
         for column in &config.model.columns {
@@ -72,45 +72,45 @@ impl Trainable for DinoWm {
         Ok(LoaderConfig { clip, ..LoaderConfig::default() })
     }
 
-    fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
+    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
         let numbers: Result<Vec<usize>> = config
             .model
             .columns
             .iter()
             .map(|column| match column.name.as_str() {
-                ACTION => Ok(config.data.frameskip * facts.action.dim()),
-                name => Ok(facts.column(name)?.dim()),
+                ACTION => Ok(config.data.frameskip * dataset_info.action.dim()),
+                name => Ok(dataset_info.column(name)?.dim()),
             })
             .collect();
         Ok(Self::init(&config.model, &numbers?, key, device))
     }
 
-    fn pretrained(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
+    fn with_pretrained_weights(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
         let from = &config.model.weights;
         if from.is_empty() {
             return Ok(self);
         }
         let path = weights::locate(from, cache)?;
-        let found = weights::names::published(weights::read(&path)?, "");
+        let found = weights::names::to_published(weights::read(&path)?, "");
         let what = "model.encoder";
         self.backbone = match self.backbone {
             Backbone::Vit(vit) => Backbone::Vit(weights::fill(vit, &found, &path, what)?),
             Backbone::Dinov2(dino) => Backbone::Dinov2(weights::fill(dino, &found, &path, what)?),
-            Backbone::Pyramid(pyramid) => Backbone::Pyramid(weights::fill(pyramid, &found, &path, what)?),
+            Backbone::PatchCnn(pyramid) => Backbone::PatchCnn(weights::fill(pyramid, &found, &path, what)?),
         };
         Ok(self)
     }
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
-        let StepContext { config, facts, key, device, training } = context;
+        let StepContext { config, dataset_info, key, device, training } = context;
         let (model, data) = (&config.model, &config.data);
         let rgb = batch.get::<u8>("pixels")?;
         let columns: Result<Vec<Tensor<3>>> = model
             .columns
             .iter()
             .map(|column| match column.name.as_str() {
-                ACTION => facts.actions(batch, data.num_steps, data.frameskip, device),
-                name => normalised(facts, name, batch.get::<f32>(name)?, [batch.rows(), data.num_steps], device),
+                ACTION => dataset_info.actions(batch, data.num_steps, data.frameskip, device),
+                name => normalised(dataset_info, name, batch.get::<f32>(name)?, [batch.rows(), data.num_steps], device),
             })
             .collect();
         let columns = columns?;
@@ -139,7 +139,7 @@ impl DinoWmConfig {
     /// # Shapes
     /// `[frames, image, image, 3]` bytes to `[frames, patches, 3 * patch * patch]`.
     pub(super) fn cut(&self, rgb: &[u8], device: &Device) -> Result<Tensor<3>> {
-        let seen = Pixels { side: self.image, mean: self.pixel_mean, std: self.pixel_std };
+        let seen = ImageNormalization { side: self.image, mean: self.pixel_mean, std: self.pixel_std };
         pixels::patches(&seen, self.encoder.patch(), rgb, device)
     }
 }
@@ -149,13 +149,13 @@ impl DinoWmConfig {
 /// # Shapes
 /// `[clips, steps, numbers]`.
 pub(super) fn normalised(
-    facts: &Facts,
+    dataset_info: &DatasetInfo,
     name: &str,
     values: &[f32],
     [clips, steps]: [usize; 2],
     device: &Device,
 ) -> Result<Tensor<3>> {
-    let column = facts.column(name)?;
+    let column = dataset_info.column(name)?;
     let (mean, spread) = (&column.mean, column.spread());
     #[allow(clippy::cast_possible_truncation)]
     let scaled = |(index, value): (usize, &f32)| {

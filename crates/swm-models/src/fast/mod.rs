@@ -30,5 +30,5 @@ use burn::tensor::Tensor;
 
 /// The numbers of a tensor, row by row.
 pub(crate) fn numbers<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().try_into_vec_as_f32()
+    tensor.into_data().into_f32_vec()
 }

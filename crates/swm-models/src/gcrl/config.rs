@@ -2,7 +2,7 @@
 
 use super::transformer::{Sight, TransformerConfig};
 use crate::nn::BackboneConfig;
-use crate::pixels::Pixels;
+use crate::pixels::ImageNormalization;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 
@@ -38,8 +38,8 @@ fn critic() -> usize {
 
 impl GcrlConfig {
     /// How pictures become numbers.
-    pub fn pixels(&self) -> Pixels {
-        Pixels { side: self.image, mean: self.pixel_mean, std: self.pixel_std }
+    pub fn pixels(&self) -> ImageNormalization {
+        ImageNormalization { side: self.image, mean: self.pixel_mean, std: self.pixel_std }
     }
 
     /// What the heads look at. An encoder without patches gives one for the whole picture.

@@ -2,7 +2,7 @@
 //! ([`Head`]), what a state is worth ([`Head`] of one number), what an action is worth ([`Critic`]).
 
 use super::transformer::{Pool, Sight, Transformer, TransformerConfig};
-use crate::nn::{Activation, Init, Linear, Noise};
+use crate::nn::{Activation, DropoutRng, Init, Linear};
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 
@@ -61,7 +61,7 @@ impl Head {
     /// # Shapes
     /// Frames `[rows, frames * patches, dim]`, at most as many as the head was made for, and a goal
     /// `[rows, patches, dim]` to `[rows, frames, outputs]`.
-    pub fn forward(&self, frames: &Tensor<3>, goal: &Tensor<3>, noise: &mut Noise<'_>) -> Tensor<3> {
+    pub fn forward(&self, frames: &Tensor<3>, goal: &Tensor<3>, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let (frames, goal) = place([&self.pos_embedding, &self.pos_embedding_goal], frames, goal);
         let frames = noise.dropout(frames, self.emb_dropout);
         self.out_proj.forward(self.transformer.forward(frames, &goal, noise))
@@ -92,7 +92,7 @@ impl Critic {
         frames: &Tensor<3>,
         actions: Tensor<3>,
         goal: &Tensor<3>,
-        noise: &mut Noise<'_>,
+        noise: &mut DropoutRng<'_>,
     ) -> Tensor<3> {
         let (frames, goal) = place([&self.pos_embedding, &self.pos_embedding_goal], frames, goal);
         let frames = noise.dropout(frames, self.emb_dropout);

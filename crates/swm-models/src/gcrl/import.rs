@@ -11,8 +11,8 @@ use super::transformer::TransformerConfig;
 use crate::checkpoint::Checkpoint;
 use crate::nn::parameters::{self, HostTensor, Named};
 use crate::nn::{BackboneConfig, DinoConfig, VitConfig};
-use crate::pixels::Pixels;
-use crate::train::{Facts, TrainConfig};
+use crate::pixels::ImageNormalization;
+use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::reference::write;
 use crate::weights::{self, Naming, names};
 use burn::tensor::Device;
@@ -24,14 +24,14 @@ const CLASS: &str = "stable_worldmodel.wm.gcrl.GCRL";
 const MODULE: &str = "stable_worldmodel.wm.gcrl.module";
 
 /// A model that the reference trained: a folder with `weights.pt` and `config.json`, or a file of weights beside such a
-/// file. What it does not store is how actions were normalised, so `facts` must be those of its dataset.
+/// file. What it does not store is how actions were normalised, so `dataset_info` must be those of its dataset.
 ///
 /// A policy's checkpoint holds the values without their slow copy, which then begins as they are.
 ///
 /// # Errors
 /// When a part of the family is missing (the critic is not stored with the policies of GCIQL: import those as `gcivl`), it
-/// sees more than pictures, it is damaged, or its actions are not those in `facts`.
-pub fn import<M>(from: &Path, facts: Facts) -> Result<Checkpoint<M>>
+/// sees more than pictures, it is damaged, or its actions are not those in `dataset_info`.
+pub fn import<M>(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<M>>
 where
     M: GoalConditioned<Config = GcrlConfig>,
 {
@@ -45,10 +45,10 @@ where
     }
     let sizes = found.sizes(&settings)?;
     // What belongs to a larger family is left where it is.
-    let model = |config: &TrainConfig<M>| M::new(config, &facts, Key::new(0), &Device::flex());
+    let model = |config: &TrainConfig<M>| M::new(config, &dataset_info, Key::new(0), &Device::flex());
     let actions = found.shape("log_stds")?[0];
     let mut config = TrainConfig::<M>::load("paper", &[])?;
-    let dim = facts.action.dim();
+    let dim = dataset_info.action.dim();
     if dim == 0 || !actions.is_multiple_of(dim) {
         return Err(Error::mismatch(
             "importing a policy",
@@ -65,7 +65,7 @@ where
     found.weights.retain(|name, _| wanted.contains_key(name) || !extra(name));
     let model = weights::fill(drawn, &found.weights, &path, &format!("a {}", M::FAMILY))?;
     let manifest = Manifest::new("import", 0, json!({ "from": from.display().to_string() }));
-    Ok(Checkpoint { model, config, facts, manifest })
+    Ok(Checkpoint { model, config, dataset_info, manifest })
 }
 
 /// Whether a weight is of a part that only some families have.
@@ -94,7 +94,7 @@ fn plain(weights: Named<HostTensor>) -> Named<HostTensor> {
             }
         }
     }
-    names::published(plain, "encoder.")
+    names::to_published(plain, "encoder.")
 }
 
 /// Weights and where they were.
@@ -158,7 +158,7 @@ impl Found<'_> {
         if heads == 0 || !inner.is_multiple_of(heads) {
             return Err(self.wrong(format!("{inner} features do not split into {heads} attention heads")));
         }
-        let (pixel_mean, pixel_std) = Pixels::IMAGENET;
+        let (pixel_mean, pixel_std) = ImageNormalization::IMAGENET;
         let critic = self.side("critic_predictor.student.q_head.0.bias", 0).unwrap_or(256);
         Ok(GcrlConfig {
             image: patches.isqrt() * patch,
@@ -286,5 +286,5 @@ fn state<M: GoalConditioned>(model: &M, sizes: &GcrlConfig, naming: Naming) -> N
         }
         weights.insert(name, weight);
     }
-    names::named(weights, "encoder.", naming)
+    names::to_naming(weights, "encoder.", naming)
 }

@@ -3,11 +3,11 @@
 use super::config::GcrlConfig;
 use super::heads::Head;
 use super::transformer::Sight;
-use crate::feed_forward::{Decide, FeedForwardPolicy};
+use crate::feed_forward::{ActionNetwork, FeedForwardPolicy};
 use crate::nn::parameters::IntoF32;
-use crate::nn::{Backbone, Noise};
+use crate::nn::{Backbone, DropoutRng};
 use crate::pixels;
-use crate::probe::Encodes;
+use crate::probe::ImageEncoder;
 use burn::tensor::{Device, Tensor};
 use std::collections::VecDeque;
 use swm_core::{EnvSpec, Result, RowRef, Schema};
@@ -48,23 +48,23 @@ impl Actor {
     }
 }
 
-impl Encodes for Actor {
-    fn image(&self) -> usize {
+impl ImageEncoder for Actor {
+    fn image_size(&self) -> usize {
         self.config.image
     }
 
-    fn latent(&self) -> usize {
+    fn latent_dim(&self) -> usize {
         let Sight { patches, dim, .. } = self.config.sight();
         patches * dim
     }
 
     fn encode(&self, rgb: &[u8]) -> Result<Vec<f32>> {
-        Ok(self.patches(rgb)?.into_data().try_into_vec_as_f32())
+        Ok(self.patches(rgb)?.into_data().into_f32_vec())
     }
 }
 
-impl Decide for Actor {
-    type Memory = Seen;
+impl ActionNetwork for Actor {
+    type EpisodeState = Seen;
 
     fn scale(&self) -> &ActionScale {
         &self.scale
@@ -74,7 +74,7 @@ impl Decide for Actor {
         ["pixels", "goal"].into_iter().try_for_each(|name| pixels::check(self.config.image, infos, name))
     }
 
-    fn decide(&self, seen: &mut Seen, row: RowRef<'_>) -> Result<Vec<f32>> {
+    fn next_actions(&self, seen: &mut Seen, row: RowRef<'_>) -> Result<Vec<f32>> {
         if seen.frames.len() == self.config.history {
             seen.frames.pop_front();
         }
@@ -84,8 +84,8 @@ impl Decide for Actor {
             none => none.insert(self.patches(row.get("goal")?)?),
         };
         let frames = Tensor::cat(seen.frames.iter().cloned().collect(), 1);
-        let means = self.head.forward(&frames, goal, &mut Noise::off());
+        let means = self.head.forward(&frames, goal, &mut DropoutRng::disabled());
         let [_, steps, numbers] = means.dims();
-        Ok(means.slice([0..1, steps - 1..steps, 0..numbers]).into_data().try_into_vec_as_f32())
+        Ok(means.slice([0..1, steps - 1..steps, 0..numbers]).into_data().into_f32_vec())
     }
 }

@@ -6,7 +6,7 @@
 use super::heads::{Critic, Head};
 use super::loss::{self, ValueLoss};
 use super::model::{Gcbc, Gciql, Gcivl};
-use crate::nn::{Backbone, Noise, parameters};
+use crate::nn::{Backbone, DropoutRng, parameters};
 use crate::train::StepOutput;
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -44,7 +44,7 @@ struct Views {
 
 impl Gcbc {
     /// The mean squared error of actions.
-    pub fn losses(&self, clips: &Clips, noise: &mut Noise<'_>, training: bool) -> StepOutput {
+    pub fn losses(&self, clips: &Clips, noise: &mut DropoutRng<'_>, training: bool) -> StepOutput {
         let model = self.clone().train();
         let [count, _, _] = clips.actions.dims();
         let see = |pictures: &Tensor<3>| {
@@ -67,7 +67,7 @@ impl Gcivl {
         clips: &Clips,
         more: &Relabelled,
         settings: &ValueLoss,
-        noise: &mut Noise<'_>,
+        noise: &mut DropoutRng<'_>,
         training: bool,
     ) -> StepOutput {
         let model = self.clone().train();
@@ -77,7 +77,8 @@ impl Gcivl {
         let value = model.value_predictor.student.forward(now, goal, noise);
         let value_loss = loss::expectile(value.clone(), target.autodiff(), settings.expectile);
 
-        let worth = |frames: &Tensor<3>| self.value_predictor.student.forward(frames, policy_goal, &mut Noise::off());
+        let worth =
+            |frames: &Tensor<3>| self.value_predictor.student.forward(frames, policy_goal, &mut DropoutRng::disabled());
         let advantage = worth(then) - worth(&now.clone().inner());
         let Policy { loss: policy_loss, weights } =
             policy(&model.action_predictor, model.log_stds.val(), &views, clips, advantage, settings, noise);
@@ -102,14 +103,16 @@ impl Gciql {
         clips: &Clips,
         more: &Relabelled,
         settings: &ValueLoss,
-        noise: &mut Noise<'_>,
+        noise: &mut DropoutRng<'_>,
         training: bool,
     ) -> StepOutput {
         let model = self.clone().train();
         let views = views(&self.encoder, &model.encoder, self.config.frozen, clips, more);
         let Views { now, goal, policy_goal, .. } = &views;
         let (actions, seen) = (clips.actions.clone(), now.clone().inner());
-        let judge = |critic: &Critic, goal: &Tensor<3>| critic.forward(&seen, actions.clone(), goal, &mut Noise::off());
+        let judge = |critic: &Critic, goal: &Tensor<3>| {
+            critic.forward(&seen, actions.clone(), goal, &mut DropoutRng::disabled())
+        };
 
         let target = bootstrap(&self.value_predictor.teacher, &views, more, settings);
         let critic = model.critic_predictor.student.forward(now, actions.clone().autodiff(), goal, noise);
@@ -119,7 +122,7 @@ impl Gciql {
         let value = model.value_predictor.student.forward(now, goal, noise);
         let value_loss = loss::expectile(value.clone(), target.autodiff(), settings.expectile);
 
-        let worth = self.value_predictor.student.forward(&seen, policy_goal, &mut Noise::off());
+        let worth = self.value_predictor.student.forward(&seen, policy_goal, &mut DropoutRng::disabled());
         let advantage = judge(&self.critic_predictor.student, policy_goal) - worth;
         let Policy { loss: policy_loss, weights } =
             policy(&model.action_predictor, model.log_stds.val(), &views, clips, advantage, settings, noise);
@@ -171,7 +174,7 @@ fn views(plain: &Backbone, trained: &Backbone, frozen: bool, clips: &Clips, more
 
 /// `r + γ m V(s', g)`: a step costs 1 until the goal is reached, where nothing follows.
 fn bootstrap(teacher: &Head, views: &Views, more: &Relabelled, settings: &ValueLoss) -> Tensor<3> {
-    let next = teacher.forward(&views.then, &views.goal.clone().inner(), &mut Noise::off());
+    let next = teacher.forward(&views.then, &views.goal.clone().inner(), &mut DropoutRng::disabled());
     let under_way = -more.reached.clone() + 1.0;
     (next * settings.discount - 1.0) * under_way
 }
@@ -190,7 +193,7 @@ fn policy(
     clips: &Clips,
     advantage: Tensor<3>,
     settings: &ValueLoss,
-    noise: &mut Noise<'_>,
+    noise: &mut DropoutRng<'_>,
 ) -> Policy {
     let weights = loss::weights(advantage, settings.temperature);
     let means = head.forward(&views.now.clone().inner().autodiff(), &views.policy_goal.clone().autodiff(), noise);

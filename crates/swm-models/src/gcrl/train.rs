@@ -6,8 +6,8 @@ use super::model::{Gcbc, Gciql, Gcivl};
 use super::policy::Actor;
 use super::step::{Clips, Relabelled};
 use crate::checkpoint::Checkpoint;
-use crate::nn::{Backbone, Named, Noise, parameters};
-use crate::train::{Facts, Group, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards};
+use crate::nn::{Backbone, DropoutRng, Named, parameters};
+use crate::train::{DatasetInfo, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards};
 use crate::{pixels, weights};
 use burn::tensor::{Device, Tensor, TensorData};
 use std::ops::Range;
@@ -50,7 +50,7 @@ macro_rules! acts {
                     encoder: model.encoder.clone(),
                     head: model.action_predictor.clone(),
                     config: model.config.clone(),
-                    scale: checkpoint.facts.action.clone(),
+                    scale: checkpoint.dataset_info.action.clone(),
                 }
             }
         })*
@@ -71,11 +71,11 @@ impl Trainable for Gcbc {
         goals(&config.loss.goals, GOAL, &config.model).check(&clip(config.data.num_steps, config.data.frameskip))
     }
 
-    fn picture(config: &GcrlConfig) -> Option<usize> {
+    fn image_size(config: &GcrlConfig) -> Option<usize> {
         Some(config.image)
     }
 
-    fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
+    fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
         pixels::check(config.model.image, schema, "pixels")?;
         Ok(LoaderConfig {
             clip: clip(config.data.num_steps, config.data.frameskip),
@@ -84,21 +84,22 @@ impl Trainable for Gcbc {
         })
     }
 
-    fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
-        Ok(Self::init(&config.model, config.data.frameskip * facts.action.dim(), key, device))
+    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
+        Ok(Self::init(&config.model, config.data.frameskip * dataset_info.action.dim(), key, device))
     }
 
-    fn pretrained(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
+    fn with_pretrained_weights(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
         self.encoder = see_with(self.encoder, &config.model.weights, cache)?;
         Ok(self)
     }
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
-        let StepContext { config, facts, key, device, training } = context;
-        let read = Read::new(&config.model, facts, (config.data.num_steps, config.data.frameskip), batch, device)?;
+        let StepContext { config, dataset_info, key, device, training } = context;
+        let read =
+            Read::new(&config.model, dataset_info, (config.data.num_steps, config.data.frameskip), batch, device)?;
         shards::mean(batch.rows(), config.shards, |range| {
             let mut rng = key.with("dropout").at(range.start as u64).rng();
-            let mut noise = Noise(training.then_some(&mut rng));
+            let mut noise = DropoutRng(training.then_some(&mut rng));
             Ok(self.losses(&read.clips(range)?, &mut noise, *training))
         })
     }
@@ -122,11 +123,11 @@ macro_rules! value_learner {
                 goals(&config.loss.policy_goals, POLICY_GOAL, &config.model).check(&clip)
             }
 
-            fn picture(config: &GcrlConfig) -> Option<usize> {
+            fn image_size(config: &GcrlConfig) -> Option<usize> {
                 Some(config.image)
             }
 
-            fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
+            fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
                 pixels::check(config.model.image, schema, "pixels")?;
                 Ok(LoaderConfig {
                     clip: clip(config.data.num_steps, config.data.frameskip),
@@ -138,35 +139,35 @@ macro_rules! value_learner {
                 })
             }
 
-            fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
-                Ok(Self::init(&config.model, config.data.frameskip * facts.action.dim(), key, device))
+            fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
+                Ok(Self::init(&config.model, config.data.frameskip * dataset_info.action.dim(), key, device))
             }
 
-            fn pretrained(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
+            fn with_pretrained_weights(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
                 self.encoder = see_with(self.encoder, &config.model.weights, cache)?;
                 Ok(self)
             }
 
             fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
-                let StepContext { config, facts, key, device, training } = context;
+                let StepContext { config, dataset_info, key, device, training } = context;
                 let steps = (config.data.num_steps, config.data.frameskip);
-                let read = Read::new(&config.model, facts, steps, batch, device)?;
+                let read = Read::new(&config.model, dataset_info, steps, batch, device)?;
                 shards::mean(batch.rows(), config.shards, |range| {
                     let mut rng = key.with("dropout").at(range.start as u64).rng();
-                    let mut noise = Noise(training.then_some(&mut rng));
+                    let mut noise = DropoutRng(training.then_some(&mut rng));
                     let (clips, more) = (read.clips(range.clone())?, read.relabelled(range)?);
                     Ok(self.losses(&clips, &more, &config.loss, &mut noise, *training))
                 })
             }
 
-            fn after(mut self, context: &StepContext<'_, Self>, _: Named<Tensor<1>>) -> Self {
+            fn after_step(mut self, context: &StepContext<'_, Self>, _: Named<Tensor<1>>) -> Self {
                 let keep = f64::from(context.config.loss.target);
                 $(self.$slow = self.$slow.follow(keep);)*
                 self
             }
 
-            fn group(name: &str) -> Group {
-                group(name)
+            fn parameter_group(name: &str) -> ParameterGroup {
+                parameter_group(name)
             }
         }
     };
@@ -190,7 +191,7 @@ fn see_with(encoder: Backbone, from: &str, cache: &Path) -> Result<Backbone> {
         return Ok(encoder);
     }
     let path = weights::locate(from, cache)?;
-    let mut found = weights::names::published(weights::read(&path)?, "");
+    let mut found = weights::names::to_published(weights::read(&path)?, "");
     if !parameters::shapes(&encoder).keys().all(|name| found.contains_key(name)) {
         let inside = |(name, weight): (String, _)| Some((name.strip_prefix("encoder.")?.to_owned(), weight));
         found = found.into_iter().filter_map(inside).collect();
@@ -199,14 +200,14 @@ fn see_with(encoder: Backbone, from: &str, cache: &Path) -> Result<Backbone> {
 }
 
 /// Every network is clipped by itself, as it has an optimizer of its own in the published scripts.
-fn group(name: &str) -> Group {
+fn parameter_group(name: &str) -> ParameterGroup {
     let clip = match name.split('.').next() {
         Some("action_predictor" | "log_stds") => 1,
         Some("value_predictor") => 2,
         Some("critic_predictor") => 3,
         _ => 0,
     };
-    Group { clip, ..Group::default() }
+    ParameterGroup { clip, ..ParameterGroup::default() }
 }
 
 impl ValueLoss {
@@ -266,12 +267,12 @@ struct Read<'a> {
 impl<'a> Read<'a> {
     fn new(
         config: &'a GcrlConfig,
-        facts: &Facts,
+        dataset_info: &DatasetInfo,
         (steps, frameskip): (usize, usize),
         batch: &'a Batch,
         device: &'a Device,
     ) -> Result<Self> {
-        let actions = facts.actions(batch, steps, frameskip, device)?;
+        let actions = dataset_info.actions(batch, steps, frameskip, device)?;
         Ok(Self { config, device, steps, frames: batch.get("pixels")?, batch, actions })
     }
 

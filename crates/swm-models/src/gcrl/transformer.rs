@@ -4,7 +4,7 @@
 //! frame amounts to is gathered at the end, by a last layer in which one learnt token a frame attends to the patches up to
 //! that frame, or by the mean of its patches.
 
-use crate::nn::{Activation, Init, LayerNorm, Linear, Noise};
+use crate::nn::{Activation, DropoutRng, Init, LayerNorm, Linear};
 use burn::module::{Module, Param};
 use burn::tensor::{Tensor, TensorData, activation};
 use serde::{Deserialize, Serialize};
@@ -183,7 +183,7 @@ impl TransformerConfig {
 impl Transformer {
     /// # Shapes
     /// Frames `[rows, frames * patches, dim]` and a goal `[rows, patches, dim]` to `[rows, frames, dim]`.
-    pub fn forward(&self, frames: Tensor<3>, goal: &Tensor<3>, noise: &mut Noise<'_>) -> Tensor<3> {
+    pub fn forward(&self, frames: Tensor<3>, goal: &Tensor<3>, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let mut x = frames;
         for layer in &self.layers {
             let mixed = layer._0.forward(x.clone(), goal, noise);
@@ -206,7 +206,7 @@ impl Transformer {
 
 impl Attention {
     #[allow(clippy::cast_precision_loss)]
-    fn forward(&self, x: Tensor<3>, goal: &Tensor<3>, noise: &mut Noise<'_>) -> Tensor<3> {
+    fn forward(&self, x: Tensor<3>, goal: &Tensor<3>, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let [rows, tokens, dim] = x.dims();
         let x = self.norm.forward(x);
         let (asking, asked) = match (&self.frame_tokens, &self.norm_c) {
@@ -254,7 +254,7 @@ impl Attention {
 }
 
 impl FeedForward {
-    fn forward(&self, x: Tensor<3>, noise: &mut Noise<'_>) -> Tensor<3> {
+    fn forward(&self, x: Tensor<3>, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let hidden = Activation::Gelu.forward(self.net._1.forward(self.net._0.forward(x)));
         let hidden = noise.dropout(hidden, self.dropout);
         noise.dropout(self.net._4.forward(hidden), self.dropout)

@@ -38,7 +38,7 @@ impl InverseCheckpoint {
     /// When the disk refuses.
     pub fn save(&mut self, run: &Path) -> Result<String> {
         self.world.save_to(&run.join(WORLD))?;
-        let card = serde_json::json!({"family": FAMILY, "env": self.world.facts.env, "config": self.config});
+        let card = serde_json::json!({"family": FAMILY, "env": self.world.dataset_info.env, "config": self.config});
         checkpoint::install(run, &card, &mut self.manifest, &parameters::values(&self.model), &[])
     }
 

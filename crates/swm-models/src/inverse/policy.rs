@@ -1,7 +1,7 @@
 //! Acting with an inverse-dynamics network.
 
 use super::InverseCheckpoint;
-use crate::feed_forward::{Decide, FeedForwardPolicy};
+use crate::feed_forward::{ActionNetwork, FeedForwardPolicy};
 use crate::lewm::pixels;
 use crate::nn::parameters::IntoF32;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -11,23 +11,23 @@ use swm_plan::ActionScale;
 /// Does what the network says leads from the picture to the goal's picture, a model step at a time.
 pub type InversePolicy = FeedForwardPolicy<InverseCheckpoint>;
 
-impl Decide for InverseCheckpoint {
+impl ActionNetwork for InverseCheckpoint {
     /// The latent of the goal, once it was seen.
-    type Memory = Option<Vec<f32>>;
+    type EpisodeState = Option<Vec<f32>>;
 
     fn scale(&self) -> &ActionScale {
-        &self.world.facts.action
+        &self.world.dataset_info.action
     }
 
     fn check(&self, infos: &Schema) -> Result<()> {
         ["pixels", "goal"].into_iter().try_for_each(|name| pixels::check(&self.world.config.model, infos, name))
     }
 
-    fn decide(&self, goal: &mut Option<Vec<f32>>, row: RowRef<'_>) -> Result<Vec<f32>> {
+    fn next_actions(&self, goal: &mut Option<Vec<f32>>, row: RowRef<'_>) -> Result<Vec<f32>> {
         let device = Device::flex();
         let encode = |column: &str| {
             let patches = pixels::patches(&self.world.config.model, row.get::<u8>(column)?, &device)?;
-            Ok::<_, Error>(self.world.model.encode(patches).into_data().try_into_vec_as_f32())
+            Ok::<_, Error>(self.world.model.encode(patches).into_data().into_f32_vec())
         };
         let mut pair = encode("pixels")?;
         match goal {
@@ -36,6 +36,6 @@ impl Decide for InverseCheckpoint {
         }
         let width = pair.len();
         let said = self.model.forward(Tensor::from_data(TensorData::new(pair, [1, width]), &device));
-        Ok(said.into_data().try_into_vec_as_f32())
+        Ok(said.into_data().into_f32_vec())
     }
 }

@@ -6,7 +6,7 @@ use crate::checkpoint::Checkpoint;
 use crate::lewm::{Lewm, pixels};
 use crate::nn::parameters::{self, IntoF32};
 use crate::nn::{Init, Mlp};
-use crate::train::{AdamW, Group, Observer, OptimConfig, Progress, ScheduleConfig, TrainSummary, config, log};
+use crate::train::{AdamW, Observer, OptimConfig, ParameterGroup, Progress, ScheduleConfig, TrainSummary, config, log};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::Rng as _;
@@ -110,7 +110,8 @@ fn run(
 ) -> Result<TrainSummary> {
     let begun = Instant::now();
     let key = Key::new(config.seed).with(FAMILY);
-    let (block, dim, latent) = (world.config.data.frameskip, world.facts.action.dim(), world.config.model.latent);
+    let (block, dim, latent) =
+        (world.config.data.frameskip, world.dataset_info.action.dim(), world.config.model.latent);
     let mut manifest = Manifest::new("train", config.seed, serde_json::to_value(config).unwrap_or_default());
     manifest.libraries = world.manifest.libraries.clone();
     manifest.device = world.manifest.device.clone();
@@ -210,7 +211,7 @@ const FRAMES: usize = 64;
 impl Pairs {
     /// One pair for every frame of every clip but its last: the goal is one of the later frames, at random.
     fn draw(world: &Checkpoint<Lewm>, offset: usize, batch: &swm_core::Batch, key: Key) -> Result<Self> {
-        let (config, dim) = (&world.config.model, world.facts.action.dim());
+        let (config, dim) = (&world.config.model, world.dataset_info.action.dim());
         let (latent, actions) = (config.latent, world.config.data.frameskip * dim);
         let frame = config.image * config.image * 3;
         let encoded: Result<Vec<Vec<f32>>> = batch
@@ -218,7 +219,7 @@ impl Pairs {
             .par_chunks(FRAMES * frame)
             .map(|frames| {
                 let patches = pixels::patches(config, frames, &Device::flex())?;
-                Ok(world.model.encode(patches).into_data().try_into_vec_as_f32())
+                Ok(world.model.encode(patches).into_data().into_f32_vec())
             })
             .collect();
         let encoded = encoded?.concat();
@@ -236,7 +237,7 @@ impl Pairs {
                 let from = &taken[(clip * (offset + 1) + present) * actions..][..actions];
                 let to = &mut pairs.actions[(clip * offset + present) * actions..][..actions];
                 for (to, from) in to.chunks_exact_mut(dim).zip(from.chunks_exact(dim)) {
-                    world.facts.action.to_model(from, to);
+                    world.dataset_info.action.to_model(from, to);
                 }
             }
         }
@@ -262,6 +263,6 @@ fn learn(model: Mlp, optimizer: &mut AdamW, share: f64, pairs: Pairs) -> Result<
         });
     }
     let gradients = parameters::gradients(&trained, &loss.backward());
-    let (model, norm) = optimizer.step(model, share, gradients, |_| Group::default());
+    let (model, norm) = optimizer.step(model, share, gradients, |_| ParameterGroup::default());
     Ok((model, value, norm))
 }

@@ -98,8 +98,8 @@ impl LewmCost {
     pub fn latent_of(&self, rgb: &[u8]) -> Result<Vec<f32>> {
         let patches = pixels::patches(&self.config, rgb, &self.model.device())?;
         Ok(match self.host.as_ref().and_then(|host| host.encoder.as_ref()) {
-            Some(encoder) => encoder.encode(&patches.into_data().try_into_vec_as_f32()),
-            None => self.model.encode(patches).into_data().try_into_vec_as_f32(),
+            Some(encoder) => encoder.encode(&patches.into_data().into_f32_vec()),
+            None => self.model.encode(patches).into_data().into_f32_vec(),
         })
     }
 
@@ -161,7 +161,7 @@ impl Predicts<'_> {
                 let start = Tensor::<3>::from_data(TensorData::new(start.to_vec(), [1, seen, latent]), &device);
                 let actions = Tensor::from_data(TensorData::new(actions, [samples, steps, numbers]), &device);
                 let all = model.rollout(start.expand([samples, seen, latent]), actions);
-                all.slice([0..samples, steps..steps + 1, 0..latent]).into_data().try_into_vec_as_f32()
+                all.slice([0..samples, steps..steps + 1, 0..latent]).into_data().into_f32_vec()
             }
         }
     }

@@ -55,7 +55,7 @@ fn cost_and_gradient(
     let end = model.rollout(start, taken).slice([0..samples, last..last + 1, 0..latent]);
     let goal = tensor(model, scene.goal.repeat(samples), [samples, 1, latent]).autodiff();
     let cost = (end - goal).square().sum_dim(2);
-    costs.copy_from_slice(&cost.clone().inner().into_data().try_into_vec_as_f32());
+    costs.copy_from_slice(&cost.clone().inner().into_data().into_f32_vec());
     let all = cost.sum().backward();
     copy_gradient(free.grad(&all), gradient);
 }
@@ -63,7 +63,7 @@ fn cost_and_gradient(
 /// The gradient of a leaf; none where nothing depends on it.
 fn copy_gradient<const D: usize>(found: Option<Tensor<D>>, to: &mut [f32]) {
     match found {
-        Some(found) => to.copy_from_slice(&found.into_data().try_into_vec_as_f32()),
+        Some(found) => to.copy_from_slice(&found.into_data().into_f32_vec()),
         None => to.fill(0.0),
     }
 }
@@ -143,7 +143,7 @@ impl LatentDynamics for LewmCost {
             let (n, dim) = (latents.len() / latent, self.actions);
             let window = tensor(&self.model, latents.to_vec(), [n, 1, latent]);
             let conditions = self.model.embed_actions(tensor(&self.model, actions.to_vec(), [n, 1, dim]));
-            next.copy_from_slice(&self.model.predict(window, conditions).into_data().try_into_vec_as_f32());
+            next.copy_from_slice(&self.model.predict(window, conditions).into_data().into_f32_vec());
         });
         Ok(())
     }

@@ -5,8 +5,8 @@ use super::model::Lewm;
 use crate::checkpoint::Checkpoint;
 use crate::nn::parameters::{self, HostTensor, Named};
 use crate::nn::{PredictorConfig, VitConfig};
-use crate::pixels::Pixels;
-use crate::train::{Facts, TrainConfig};
+use crate::pixels::ImageNormalization;
+use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::reference::{Reference, write};
 use crate::weights::{self, BATCHES_TRACKED, Naming, names};
 use burn::tensor::Device;
@@ -19,20 +19,20 @@ const MODULES: &str = "stable_worldmodel.wm.lewm.module";
 const CLASS: &str = "stable_worldmodel.wm.lewm.LeWM";
 
 /// A LeWM that the reference trained: a folder with `weights.pt` and `config.json`, or that file. What it does not
-/// store is how actions were normalised, so `facts` must be those of its dataset.
+/// store is how actions were normalised, so `dataset_info` must be those of its dataset.
 ///
 /// # Errors
 /// When it is another model, of a kind that is not known here, or damaged, or its actions are not a whole number of
-/// those in `facts`.
-pub fn import(from: &Path, facts: Facts) -> Result<Checkpoint<Lewm>> {
-    let (model, sizes, frameskip) = world(Reference::open(from, "LeWM")?, &facts)?;
+/// those in `dataset_info`.
+pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Lewm>> {
+    let (model, sizes, frameskip) = world(Reference::open(from, "LeWM")?, &dataset_info)?;
     let mut config = TrainConfig::<Lewm>::load("paper", &[])?;
     config.data.num_steps = sizes.predictor.history + 1;
     config.data.frameskip = frameskip;
     config.model = sizes;
     config.check()?;
     let manifest = Manifest::new("import", 0, json!({ "from": from.display().to_string() }));
-    Ok(Checkpoint { model, config, facts, manifest })
+    Ok(Checkpoint { model, config, dataset_info, manifest })
 }
 
 /// Writes `weights.pt` and `config.json` that the reference's `load_pretrained` reads.
@@ -46,7 +46,7 @@ pub fn export(checkpoint: &Checkpoint<Lewm>, folder: &Path, naming: Naming) -> R
 }
 
 /// The world model of a checkpoint, its size, and environment steps in a model step.
-pub(crate) fn world(mut reference: Reference, facts: &Facts) -> Result<(Lewm, LewmConfig, usize)> {
+pub(crate) fn world(mut reference: Reference, dataset_info: &DatasetInfo) -> Result<(Lewm, LewmConfig, usize)> {
     let (vit, image) = reference.vit("encoder")?;
     for part in ["projector", "pred_proj"] {
         let norm = reference.class(&format!("{part}.norm_fn"));
@@ -56,7 +56,7 @@ pub(crate) fn world(mut reference: Reference, facts: &Facts) -> Result<(Lewm, Le
     }
     let size = |at: &str| reference.size(at);
     let latent = size("projector.output_dim")?;
-    let (mean, std) = Pixels::IMAGENET;
+    let (mean, std) = ImageNormalization::IMAGENET;
     let predictor = PredictorConfig {
         history: size("predictor.num_frames")?,
         dim: size("predictor.hidden_dim")?,
@@ -78,7 +78,7 @@ pub(crate) fn world(mut reference: Reference, facts: &Facts) -> Result<(Lewm, Le
         predictor,
     };
     let actions = size("action_encoder.input_dim")?;
-    let dim = facts.action.dim();
+    let dim = dataset_info.action.dim();
     if dim == 0 || !actions.is_multiple_of(dim) {
         return Err(Error::mismatch(
             "importing a checkpoint",
@@ -93,7 +93,7 @@ pub(crate) fn world(mut reference: Reference, facts: &Facts) -> Result<(Lewm, Le
 
 /// The state dict of a world model, as the reference's class has it.
 pub(crate) fn state(model: &Lewm, naming: Naming) -> Named<HostTensor> {
-    let mut weights = names::named(parameters::values(model), "encoder.", naming);
+    let mut weights = names::to_naming(parameters::values(model), "encoder.", naming);
     for part in ["projector", "pred_proj"] {
         let counter = HostTensor { shape: vec![], values: vec![0.0] };
         weights.insert(format!("{part}.net.1.{BATCHES_TRACKED}"), counter);

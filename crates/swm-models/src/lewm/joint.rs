@@ -8,7 +8,7 @@ use super::model::Lewm;
 use super::shard::{Differentiation, Shard};
 use super::step::TrainBatch;
 use crate::nn::parameters::{self, Named};
-use crate::nn::{BatchStatistics, Noise};
+use crate::nn::{BatchStatistics, DropoutRng};
 use burn::module::Module;
 use burn::tensor::{Gradients, Tensor};
 use rayon::prelude::*;
@@ -72,7 +72,8 @@ pub(crate) fn step(
         )
     };
     let conditions = head.embed_actions(windows(&batch.actions, 0).autodiff());
-    let (predicted, pred_proj_statistics) = head.predict_train(windows(&latents, 0), conditions, &mut Noise(noise));
+    let (predicted, pred_proj_statistics) =
+        head.predict_train(windows(&latents, 0), conditions, &mut DropoutRng(noise));
     let prediction = (predicted - windows(&latents, 1)).square().mean();
     let prediction_value: f32 = prediction.clone().inner().into_scalar();
 

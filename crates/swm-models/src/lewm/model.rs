@@ -2,7 +2,7 @@
 
 use super::config::LewmConfig;
 pub use crate::nn::Backbone as Encoder;
-use crate::nn::{BatchStatistics, Embedder, Init, Noise, Predictor, Projector};
+use crate::nn::{BatchStatistics, DropoutRng, Embedder, Init, Predictor, Projector};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
@@ -73,7 +73,7 @@ impl Lewm {
     /// # Shapes
     /// `[windows, steps, latent]`, twice, to the same.
     pub fn predict(&self, latents: Tensor<3>, conditions: Tensor<3>) -> Tensor<3> {
-        let features = self.predictor.forward(latents, conditions, &mut Noise::off());
+        let features = self.predictor.forward(latents, conditions, &mut DropoutRng::disabled());
         let [windows, steps, latent] = features.dims();
         self.pred_proj.forward(features.reshape([windows * steps, latent])).reshape([windows, steps, latent])
     }
@@ -83,7 +83,7 @@ impl Lewm {
         &self,
         latents: Tensor<3>,
         conditions: Tensor<3>,
-        noise: &mut Noise<'_>,
+        noise: &mut DropoutRng<'_>,
     ) -> (Tensor<3>, BatchStatistics) {
         let features = self.predictor.forward(latents, conditions, noise);
         let [windows, steps, latent] = features.dims();

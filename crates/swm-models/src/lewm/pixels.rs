@@ -1,7 +1,7 @@
 //! Pictures as a LeWM sees them.
 
 use super::config::LewmConfig;
-use crate::pixels::{self, Pixels};
+use crate::pixels::{self, ImageNormalization};
 use burn::tensor::{Device, Tensor};
 use swm_core::{Result, Schema};
 
@@ -35,6 +35,6 @@ pub fn planes(config: &LewmConfig, rgb: &[u8], device: &Device) -> Result<Tensor
     pixels::planes(&seen(config), rgb, device)
 }
 
-fn seen(config: &LewmConfig) -> Pixels {
-    Pixels { side: config.image, mean: config.pixel_mean, std: config.pixel_std }
+fn seen(config: &LewmConfig) -> ImageNormalization {
+    ImageNormalization { side: config.image, mean: config.pixel_mean, std: config.pixel_std }
 }

@@ -41,7 +41,7 @@ enum Way {
 }
 
 impl Shard {
-    /// Encodes `[pictures, patches, numbers]`.
+    /// ImageEncoder `[pictures, patches, numbers]`.
     pub fn forward(differentiation: &Differentiation<'_>, patches: Tensor<3>) -> Self {
         let ([pictures, count, width], device) = (patches.dims(), patches.device());
         match differentiation {

@@ -66,7 +66,7 @@ pub fn step(
     let (mut host, mut sigreg) = (vec![], 0.0);
     let found = joint::step(model, batch, shards, noise, |latents| {
         let shape = latents.dims();
-        host = latents.clone().inner().into_data().try_into_vec_as_f32();
+        host = latents.clone().inner().into_data().into_f32_vec();
         let (value, gradient) = loss::sigreg(&host, shape[1], shape[2], directions, config.knots);
         sigreg = value;
         let gradient = Tensor::<3>::from_data(TensorData::new(gradient, shape), &latents.device()).autodiff();

@@ -3,7 +3,7 @@
 use super::step::{self, SigregConfig, StepOutput as Found, TrainBatch};
 use super::{Lewm, LewmConfig, loss, pixels};
 use crate::nn::{BatchStatistics, Named};
-use crate::train::{DataConfig, Facts, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
+use crate::train::{DataConfig, DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
 use burn::tensor::{Device, Tensor};
 use swm_core::{Batch, Error, Key, Result, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
@@ -32,22 +32,22 @@ impl Trainable for Lewm {
         at_least(&[("loss.directions", config.loss.directions, 1), ("loss.knots", config.loss.knots, 2)])
     }
 
-    fn picture(config: &LewmConfig) -> Option<usize> {
+    fn image_size(config: &LewmConfig) -> Option<usize> {
         Some(config.image)
     }
 
-    fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
-        loading(&config.model, &config.data, schema)
+    fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
+        loader_config(&config.model, &config.data, schema)
     }
 
-    fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
-        Ok(Self::init(&config.model, config.data.frameskip * facts.action.dim(), key, device))
+    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
+        Ok(Self::init(&config.model, config.data.frameskip * dataset_info.action.dim(), key, device))
     }
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
-        let StepContext { config, facts, key, device, training } = context;
+        let StepContext { config, dataset_info, key, device, training } = context;
         let directions = loss::directions(key.with("sigreg"), config.model.latent, config.loss.directions);
-        let batch = prepare(&config.model, &config.data, facts, batch, device)?;
+        let batch = prepare(&config.model, &config.data, dataset_info, batch, device)?;
         let mut noise = key.with("dropout").rng();
         let noise = training.then_some(&mut noise);
         let Found { losses, gradients, statistics, .. } =
@@ -57,7 +57,7 @@ impl Trainable for Lewm {
         Ok(StepOutput { metrics, gradients, buffers })
     }
 
-    fn after(mut self, _: &StepContext<'_, Self>, buffers: Named<Tensor<1>>) -> Self {
+    fn after_step(mut self, _: &StepContext<'_, Self>, buffers: Named<Tensor<1>>) -> Self {
         self.track(buffers);
         self
     }
@@ -79,7 +79,7 @@ pub(crate) fn check(model: &LewmConfig, data: &DataConfig) -> Result<()> {
 }
 
 /// Clips of pictures and actions.
-pub(crate) fn loading(model: &LewmConfig, data: &DataConfig, schema: &Schema) -> Result<LoaderConfig> {
+pub(crate) fn loader_config(model: &LewmConfig, data: &DataConfig, schema: &Schema) -> Result<LoaderConfig> {
     pixels::check(model, schema, "pixels")?;
     let columns = vec!["pixels".to_owned(), "action".to_owned()];
     let clip = ClipSpec { num_steps: data.num_steps, frameskip: data.frameskip, columns };
@@ -90,13 +90,13 @@ pub(crate) fn loading(model: &LewmConfig, data: &DataConfig, schema: &Schema) ->
 pub(crate) fn prepare(
     model: &LewmConfig,
     data: &DataConfig,
-    facts: &Facts,
+    dataset_info: &DatasetInfo,
     batch: &Batch,
     device: &Device,
 ) -> Result<TrainBatch> {
     Ok(TrainBatch {
         patches: pixels::patches(model, batch.get::<u8>("pixels")?, device)?,
-        actions: facts.actions(batch, data.num_steps, data.frameskip, device)?,
+        actions: dataset_info.actions(batch, data.num_steps, data.frameskip, device)?,
     })
 }
 

@@ -51,12 +51,12 @@ fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
 }
 
 /// Dropout noise of one training pass; none when evaluating.
-pub struct Noise<'a>(pub Option<&'a mut Rng>);
+pub struct DropoutRng<'a>(pub Option<&'a mut Rng>);
 
-impl Noise<'_> {
+impl DropoutRng<'_> {
     /// No noise: evaluation.
-    pub fn off() -> Self {
-        Noise(None)
+    pub fn disabled() -> Self {
+        DropoutRng(None)
     }
 
     /// Sets numbers to zero with probability `rate` and scales the others by `1 / (1 - rate)`.

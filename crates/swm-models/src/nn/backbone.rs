@@ -1,6 +1,6 @@
 //! [`Backbone`]: any of the picture encoders, behind one door.
 
-use super::{Dino, DinoConfig, Init, Pyramid, PyramidConfig, Vit, VitConfig};
+use super::{Dino, DinoConfig, Init, PatchCnn, PatchCnnConfig, Vit, VitConfig};
 use burn::module::Module;
 use burn::tensor::Tensor;
 use serde::{Deserialize, Serialize};
@@ -15,7 +15,8 @@ pub enum BackboneConfig {
     /// DINOv2.
     Dinov2(DinoConfig),
     /// Convolutions of disjoint patches: small and fast.
-    Pyramid(PyramidConfig),
+    #[serde(rename = "pyramid")]
+    PatchCnn(PatchCnnConfig),
 }
 
 /// A picture encoder.
@@ -27,7 +28,7 @@ pub enum Backbone {
     /// DINOv2.
     Dinov2(Dino),
     /// Convolutions of disjoint patches.
-    Pyramid(Pyramid),
+    PatchCnn(PatchCnn),
 }
 
 impl BackboneConfig {
@@ -36,7 +37,7 @@ impl BackboneConfig {
         match self {
             Self::Vit(vit) => vit.patch,
             Self::Dinov2(dino) => dino.patch,
-            Self::Pyramid(pyramid) => pyramid.stages.first().map_or(0, |stage| stage.patch),
+            Self::PatchCnn(pyramid) => pyramid.stages.first().map_or(0, |stage| stage.patch),
         }
     }
 
@@ -45,7 +46,7 @@ impl BackboneConfig {
         match self {
             Self::Vit(vit) => vit.dim,
             Self::Dinov2(dino) => dino.dim,
-            Self::Pyramid(pyramid) => pyramid.dim,
+            Self::PatchCnn(pyramid) => pyramid.dim,
         }
     }
 
@@ -53,7 +54,7 @@ impl BackboneConfig {
     pub fn patches(&self, image: usize) -> usize {
         match self {
             Self::Vit(_) | Self::Dinov2(_) => (image / self.patch().max(1)).pow(2),
-            Self::Pyramid(_) => 1,
+            Self::PatchCnn(_) => 1,
         }
     }
 
@@ -87,7 +88,7 @@ impl BackboneConfig {
                 }
                 vec![*patch]
             }
-            Self::Pyramid(pyramid) => {
+            Self::PatchCnn(pyramid) => {
                 if pyramid.hidden == 0 || pyramid.dim == 0 || pyramid.stages.iter().any(|stage| stage.channels == 0) {
                     return wrong("pyramid", "a size is 0".to_owned(), "give at least 1");
                 }
@@ -113,7 +114,7 @@ impl BackboneConfig {
         match self {
             Self::Vit(vit) => Backbone::Vit(vit.init(init, image)),
             Self::Dinov2(dino) => Backbone::Dinov2(dino.init(init)),
-            Self::Pyramid(pyramid) => Backbone::Pyramid(pyramid.init(init, image)),
+            Self::PatchCnn(pyramid) => Backbone::PatchCnn(pyramid.init(init, image)),
         }
     }
 }
@@ -127,7 +128,7 @@ impl Backbone {
         match self {
             Self::Vit(vit) => vit.forward(patches),
             Self::Dinov2(dino) => dino.forward(patches),
-            Self::Pyramid(pyramid) => pyramid.forward(patches),
+            Self::PatchCnn(pyramid) => pyramid.forward(patches),
         }
     }
 
@@ -144,7 +145,7 @@ impl Backbone {
                 tokens.slice([0..frames, all - count..all, 0..dim])
             }
             Self::Dinov2(dino) => dino.patches(patches),
-            Self::Pyramid(pyramid) => pyramid.forward(patches).unsqueeze_dim(1),
+            Self::PatchCnn(pyramid) => pyramid.forward(patches).unsqueeze_dim(1),
         }
     }
 }

@@ -58,14 +58,14 @@ impl Projector {
 #[derive(Module, Debug)]
 pub struct Embedder {
     /// The convolution.
-    pub patch_embed: Tap,
+    pub patch_embed: PointwiseConv,
     /// The network.
     pub embed: EmbedderNet,
 }
 
 /// A convolution with one tap.
 #[derive(Module, Debug)]
-pub struct Tap {
+pub struct PointwiseConv {
     /// `[outputs, inputs, 1]`.
     pub weight: burn::module::Param<Tensor<3>>,
     /// `[outputs]`.
@@ -87,7 +87,7 @@ impl Embedder {
     pub fn new(init: &Init, inputs: usize, smoothed: usize, outputs: usize) -> Self {
         let (tap, bound) = (init.of("patch_embed"), 1.0 / (inputs as f32).sqrt());
         Self {
-            patch_embed: Tap {
+            patch_embed: PointwiseConv {
                 weight: tap.uniform("weight", [smoothed, inputs, 1], bound),
                 bias: tap.uniform("bias", [smoothed], bound),
             },

@@ -4,32 +4,32 @@
 
 pub mod activation;
 pub mod backbone;
-pub mod by_name;
+mod custom_derivative;
 pub mod dino;
-mod given;
 pub mod linear;
 pub mod mlp;
+pub mod module_dict;
 pub mod norm;
-pub mod normed;
+pub mod normalized_mlp;
 pub mod parameters;
+pub mod patch_cnn;
 pub mod positions;
 pub mod predictor;
-pub mod pyramid;
 pub mod two_hot;
 pub mod vit;
 
-pub use activation::{Activation, Noise};
+pub use activation::{Activation, DropoutRng};
 pub use backbone::{Backbone, BackboneConfig};
-pub use by_name::ByName;
+pub use custom_derivative::with_derivative;
 pub use dino::{Dino, DinoConfig};
-pub use given::given;
 pub use linear::Linear;
 pub use mlp::{Embedder, Mlp, Projector};
+pub use module_dict::ModuleDict;
 pub use norm::{BatchNorm, BatchStatistics, LayerNorm};
-pub use normed::{Dynamics, Ensemble, Head, NormedLinear};
+pub use normalized_mlp::{Dynamics, Ensemble, Head, NormalizedLinear};
 pub use parameters::Named;
+pub use patch_cnn::{PatchCnn, PatchCnnConfig, Stage};
 pub use predictor::{Predictor, PredictorConfig};
-pub use pyramid::{Pyramid, PyramidConfig, Stage};
 pub use two_hot::Bins;
 pub use vit::{Vit, VitConfig};
 

@@ -52,7 +52,7 @@ pub fn values<M: Module>(module: &M) -> Named<HostTensor> {
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
             let tensor = param.val().inner();
             let shape = tensor.dims().to_vec();
-            let values = tensor.into_data().try_into_vec_as_f32();
+            let values = tensor.into_data().into_f32_vec();
             self.1.insert(self.0.name(), HostTensor { shape, values });
         }
     }
@@ -148,7 +148,7 @@ pub fn blend<M: Module>(average: M, module: &M, keep: f64) -> M {
 }
 
 /// How many numbers of a module are trained: those of parameters that need a gradient.
-pub fn trained<M: Module>(module: &M) -> usize {
+pub fn trained_count<M: Module>(module: &M) -> usize {
     struct Visitor(usize);
     impl ModuleVisitor for Visitor {
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
@@ -167,11 +167,11 @@ pub fn trained<M: Module>(module: &M) -> usize {
 /// Reads numbers that are known to be single precision.
 pub(crate) trait IntoF32 {
     /// The numbers.
-    fn try_into_vec_as_f32(self) -> Vec<f32>;
+    fn into_f32_vec(self) -> Vec<f32>;
 }
 
 impl IntoF32 for TensorData {
-    fn try_into_vec_as_f32(self) -> Vec<f32> {
+    fn into_f32_vec(self) -> Vec<f32> {
         self.iter::<f32>().collect()
     }
 }

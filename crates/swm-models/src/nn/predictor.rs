@@ -4,7 +4,7 @@
 #![allow(non_snake_case)] // published parameter names
 
 use super::norm::standardize;
-use super::{Activation, Init, LayerNorm, Linear, Noise};
+use super::{Activation, DropoutRng, Init, LayerNorm, Linear};
 use burn::module::{Module, Param};
 use burn::tensor::{Tensor, TensorData, activation};
 use serde::{Deserialize, Serialize};
@@ -165,7 +165,7 @@ impl Predictor {
     /// # Shapes
     /// Latents `[windows, steps, latent]` and embedded actions of the same shape, `steps` at most the history, to
     /// predictions of the same shape.
-    pub fn forward(&self, latents: Tensor<3>, actions: Tensor<3>, noise: &mut Noise<'_>) -> Tensor<3> {
+    pub fn forward(&self, latents: Tensor<3>, actions: Tensor<3>, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let [_, steps, latent] = latents.dims();
         let x = latents + self.pos_embedding.val().slice([0..1, 0..steps, 0..latent]);
         let mut x = noise.dropout(x, self.config.emb_dropout);
@@ -189,7 +189,7 @@ impl Block {
         x: Tensor<3>,
         condition: Tensor<3>,
         config: &PredictorConfig,
-        noise: &mut Noise<'_>,
+        noise: &mut DropoutRng<'_>,
     ) -> Tensor<3> {
         let modulation = self.adaLN_modulation._1.forward(condition).chunk(6, 2);
         let [shift_attn, scale_attn, gate_attn, shift_mlp, scale_mlp, gate_mlp] =
@@ -206,7 +206,7 @@ impl Block {
 
 impl Attention {
     #[allow(clippy::cast_precision_loss)]
-    fn forward(&self, x: Tensor<3>, config: &PredictorConfig, noise: &mut Noise<'_>) -> Tensor<3> {
+    fn forward(&self, x: Tensor<3>, config: &PredictorConfig, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let [windows, steps, _] = x.dims();
         let (heads, width) = (config.heads, config.dim_head);
         let inner = heads * width;
@@ -232,7 +232,7 @@ impl Attention {
 }
 
 impl FeedForward {
-    fn forward(&self, x: Tensor<3>, config: &PredictorConfig, noise: &mut Noise<'_>) -> Tensor<3> {
+    fn forward(&self, x: Tensor<3>, config: &PredictorConfig, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let hidden = Activation::Gelu.forward(self.net._1.forward(self.net._0.forward(x)));
         let hidden = noise.dropout(hidden, config.dropout);
         noise.dropout(self.net._4.forward(hidden), config.dropout)

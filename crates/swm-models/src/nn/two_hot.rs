@@ -1,7 +1,7 @@
 //! Numbers as distributions over bins (Bellemare et al. 2017; Hafner et al. 2023, "two-hot"): a number lies between two bins,
 //! each of which gets a share, on an axis on which large numbers are nearer to each other.
 
-use super::given;
+use super::with_derivative;
 use burn::tensor::{Device, Tensor, TensorData, activation};
 use serde::{Deserialize, Serialize};
 
@@ -42,7 +42,7 @@ impl Bins {
 
     /// Shares of the bins: `[rows]` to `[rows, bins]`. The share of a bin falls linearly to 0 at its neighbours.
     #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation)]
-    pub fn shares(&self, x: Tensor<1>) -> Tensor<2> {
+    pub fn two_hot(&self, x: Tensor<1>) -> Tensor<2> {
         let position = (symlog(x).clamp(self.low, self.high) - self.low) / self.width();
         let numbers: Vec<f32> = (0..self.count).map(|i| i as f32).collect();
         let numbers = Tensor::<1>::from_data(TensorData::new(numbers, [self.count]), &position.device());
@@ -51,7 +51,7 @@ impl Bins {
     }
 
     /// The numbers that distributions stand for: logits `[rows, bins]` to `[rows]`.
-    pub fn numbers(&self, logits: Tensor<2>) -> Tensor<1> {
+    pub fn expectation(&self, logits: Tensor<2>) -> Tensor<1> {
         let places = if logits.is_autodiff() {
             self.places(&logits.clone().inner().device()).autodiff()
         } else {
@@ -72,6 +72,6 @@ pub fn cross_entropy(logits: Tensor<2>, shares: Tensor<2>) -> Tensor<1> {
         return value;
     }
     let slope = log.exp() - shares;
-    let sum = given(logits, Tensor::zeros(slope.dims(), &slope.device()), slope).sum_dim(1).reshape([rows]);
+    let sum = with_derivative(logits, Tensor::zeros(slope.dims(), &slope.device()), slope).sum_dim(1).reshape([rows]);
     sum + value.autodiff()
 }

@@ -1,8 +1,8 @@
 //! [`Learner`]: a model, its optimizer, and how far they are.
 
 use crate::checkpoint::{Checkpoint, TrainState};
-use crate::train::run::Position;
-use crate::train::{AdamW, Facts, StepContext, StepOutput, TrainConfig, Trainable, failure};
+use crate::train::run::RunState;
+use crate::train::{AdamW, DatasetInfo, StepContext, StepOutput, TrainConfig, Trainable, failure};
 use burn::tensor::Device;
 use std::path::Path;
 use swm_core::{Batch, Error, Key, Manifest, Result};
@@ -11,11 +11,11 @@ use swm_core::{Batch, Error, Key, Manifest, Result};
 pub(super) struct Learner<'a, M: Trainable> {
     pub config: &'a TrainConfig<M>,
     pub model: M,
-    pub facts: Facts,
+    pub dataset_info: DatasetInfo,
     pub manifest: Manifest,
     device: &'a Device,
     optimizer: AdamW,
-    pub state: Position,
+    pub state: RunState,
 }
 
 /// What a gradient step found: numbers of the model, and the norm of its gradient.
@@ -26,10 +26,15 @@ pub(super) struct Learnt {
 
 impl<'a, M: Trainable> Learner<'a, M> {
     /// One that has learnt nothing.
-    pub fn new(config: &'a TrainConfig<M>, facts: Facts, manifest: Manifest, device: &'a Device) -> Result<Self> {
-        let model = M::new(config, &facts, Key::new(config.seed).with("init"), device)?;
+    pub fn new(
+        config: &'a TrainConfig<M>,
+        dataset_info: DatasetInfo,
+        manifest: Manifest,
+        device: &'a Device,
+    ) -> Result<Self> {
+        let model = M::new(config, &dataset_info, Key::new(config.seed).with("init"), device)?;
         let optimizer = AdamW::new(config.optim.clone());
-        Ok(Self { config, model, facts, manifest, device, optimizer, state: Position::default() })
+        Ok(Self { config, model, dataset_info, manifest, device, optimizer, state: RunState::default() })
     }
 
     /// Goes on where a checkpoint is.
@@ -45,7 +50,7 @@ impl<'a, M: Trainable> Learner<'a, M> {
         let StepOutput { metrics, gradients, buffers } = output;
         let loss = metrics.first().map_or(f64::NAN, |&(_, loss)| loss);
         let share = self.config.schedule.share(self.state.step);
-        let (model, gradient_norm) = self.optimizer.step(self.model.clone(), share, gradients, M::group);
+        let (model, gradient_norm) = self.optimizer.step(self.model.clone(), share, gradients, M::parameter_group);
         if !(loss.is_finite() && gradient_norm.is_finite()) {
             let numbers: Vec<String> = metrics.iter().map(|(name, value)| format!("{name} {value}")).collect();
             let kept = match failure::save(out, batch) {
@@ -58,13 +63,13 @@ impl<'a, M: Trainable> Learner<'a, M> {
                 fix: "lower optim.lr; the last checkpoint, if any, is kept".to_owned(),
             });
         }
-        self.model = model.after(&self.context(key), buffers);
+        self.model = model.after_step(&self.context(key), buffers);
         self.state.step += 1;
         Ok(Learnt { metrics, gradient_norm })
     }
 
     fn context(&self, key: Key) -> StepContext<'_, M> {
-        StepContext { config: self.config, facts: &self.facts, key, device: self.device, training: true }
+        StepContext { config: self.config, dataset_info: &self.dataset_info, key, device: self.device, training: true }
     }
 
     /// The model as others use it.
@@ -72,7 +77,7 @@ impl<'a, M: Trainable> Learner<'a, M> {
         Checkpoint {
             model: self.model.clone(),
             config: self.config.clone(),
-            facts: self.facts.clone(),
+            dataset_info: self.dataset_info.clone(),
             manifest: self.manifest.clone(),
         }
     }

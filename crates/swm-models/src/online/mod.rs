@@ -7,21 +7,21 @@
 //! What an episode's clock cut short is not its end: only `terminated` stops a value from looking further.
 
 mod collector;
+mod config;
 mod evaluation;
 mod learner;
-mod live;
-mod reflex;
 mod run;
-mod settings;
+mod shared_model;
+mod stochastic_policy;
 mod world;
 
-pub use live::Live;
-pub use reflex::{Reflex, ReflexPolicy};
+pub use config::OnlineConfig;
 pub use run::{OnlineSummary, train_online};
-pub use settings::OnlineSettings;
-pub use world::facts;
+pub use shared_model::SharedModel;
+pub use stochastic_policy::{StochasticActor, StochasticPolicy};
+pub use world::dataset_info;
 
-use crate::train::{Facts, TrainConfig, Trainable};
+use crate::train::{DatasetInfo, TrainConfig, Trainable};
 use swm_core::{EnvSpec, Error, Policy, Result, Schema};
 
 /// A model that learns by playing.
@@ -33,8 +33,8 @@ pub trait Agent: Trainable {
     /// When the model does not fit the world.
     fn policy(
         config: &TrainConfig<Self>,
-        facts: &Facts,
-        live: Live<Self>,
+        dataset_info: &DatasetInfo,
+        live: SharedModel<Self>,
         spec: &EnvSpec,
         slots: usize,
         explore: bool,

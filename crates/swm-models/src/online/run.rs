@@ -2,7 +2,7 @@
 
 use super::collector::{Collector, Place};
 use super::learner::Learner;
-use super::{Agent, Live, OnlineSettings, evaluation, world};
+use super::{Agent, OnlineConfig, SharedModel, evaluation, world};
 use crate::checkpoint::Checkpoint;
 use crate::nn::parameters;
 use crate::train::run::{BEST, Window, due, same_run};
@@ -74,10 +74,10 @@ pub fn train_online<M: Agent>(
 
 /// A run in progress.
 struct Run<'a, M: Agent> {
-    settings: &'a OnlineSettings,
+    settings: &'a OnlineConfig,
     out: &'a Path,
     learner: Learner<'a, M>,
-    live: Live<M>,
+    live: SharedModel<M>,
     collector: Collector,
     replay: ReplayBuffer,
     loader: ReplayLoader,
@@ -96,7 +96,7 @@ const PLACE: &str = "place.json";
 impl<'a, M: Agent> Run<'a, M> {
     fn new(
         config: &'a TrainConfig<M>,
-        settings: &'a OnlineSettings,
+        settings: &'a OnlineConfig,
         pool: EnvPool,
         judge: EnvPool,
         out: &'a Path,
@@ -107,8 +107,8 @@ impl<'a, M: Agent> Run<'a, M> {
         let shown: Vec<ColumnSpec> =
             pool.infos().schema().columns().iter().cloned().chain([spec.action_column()]).collect();
         let shown = Schema::new(shown)?;
-        let LoaderConfig { clip, goals, .. } = M::loading(config, &shown)?;
-        let facts = world::facts(&spec, &clip.columns)?;
+        let LoaderConfig { clip, goals, .. } = M::loader_config(config, &shown)?;
+        let dataset_info = world::dataset_info(&spec, &clip.columns)?;
         let columns: Result<Vec<ColumnSpec>> = clip.columns.iter().map(|name| shown.column(name).cloned()).collect();
         let schema = Schema::new(columns?)?;
 
@@ -119,7 +119,7 @@ impl<'a, M: Agent> Run<'a, M> {
         manifest.device = crate::device::name(&options.device);
 
         let key = Key::new(config.seed).with("online");
-        let mut learner = Learner::new(config, facts, manifest, &options.device)?;
+        let mut learner = Learner::new(config, dataset_info, manifest, &options.device)?;
         let mut replay = ReplayBuffer::new(&schema, settings.capacity)?;
         let mut place = None;
         if Checkpoint::<M>::exists(out) {
@@ -152,8 +152,8 @@ impl<'a, M: Agent> Run<'a, M> {
             threads: 0,
             ..ReplayConfig::default()
         })?;
-        let live = Live::new(learner.model.clone());
-        let policy = |slots, explore| M::policy(config, &learner.facts, live.clone(), &spec, slots, explore);
+        let live = SharedModel::new(learner.model.clone());
+        let policy = |slots, explore| M::policy(config, &learner.dataset_info, live.clone(), &spec, slots, explore);
         Ok(Self {
             settings,
             out,
@@ -253,7 +253,7 @@ impl<'a, M: Agent> Run<'a, M> {
             interrupted,
             evaluated,
             best: self.learner.state.best.map(|(step, loss)| (step, -loss)),
-            parameters: parameters::trained(&self.learner.model),
+            parameters: parameters::trained_count(&self.learner.model),
             seconds,
             playing: if seconds > 0.0 { playing / seconds } else { 0.0 },
         })

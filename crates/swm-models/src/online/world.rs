@@ -1,16 +1,16 @@
 //! What a model is told of a world before it has data of it.
 
 use crate::nn::Named;
-use crate::train::{ColumnFacts, Facts};
+use crate::train::{ColumnInfo, DatasetInfo};
 use swm_core::{EnvSpec, Error, Result, Space};
 use swm_plan::ActionScale;
 
-/// The facts of a world: the shapes of `columns`, and actions whose bounds are -1 and 1 in model units. Of the numbers in the
+/// The dataset info of a world: the shapes of `columns`, and actions whose bounds are -1 and 1 in model units. Of the numbers in the
 /// columns nothing is known yet: they keep their scale.
 ///
 /// # Errors
 /// When actions are not numbers between finite bounds, or the world does not observe a column.
-pub fn facts(spec: &EnvSpec, columns: &[String]) -> Result<Facts> {
+pub fn dataset_info(spec: &EnvSpec, columns: &[String]) -> Result<DatasetInfo> {
     let action = bounded(spec)?;
     let known = |name: &String| {
         let column = spec.columns.iter().find(|column| column.name == *name).ok_or_else(|| {
@@ -18,20 +18,15 @@ pub fn facts(spec: &EnvSpec, columns: &[String]) -> Result<Facts> {
             Error::unknown("column of the world", name, known, format!("{} observes these", spec.id))
         })?;
         let same = |value: f64| vec![value; column.len()];
-        let facts = ColumnFacts {
-            shape: column.shape.clone(),
-            mean: same(0.0),
-            std: same(1.0),
-            min: same(0.0),
-            max: same(0.0),
-        };
-        Ok((name.clone(), facts))
+        let dataset_info =
+            ColumnInfo { shape: column.shape.clone(), mean: same(0.0), std: same(1.0), min: same(0.0), max: same(0.0) };
+        Ok((name.clone(), dataset_info))
     };
     // What the model is trained with but does not see is not the world's to show.
     let others = ["pixels", "action", "reward", "terminated"];
     let columns =
         columns.iter().filter(|name| !others.contains(&name.as_str())).map(known).collect::<Result<Named<_>>>()?;
-    Ok(Facts { action, columns, env: Some(spec.id.clone()) })
+    Ok(DatasetInfo { action, columns, env: Some(spec.id.clone()) })
 }
 
 #[allow(clippy::cast_possible_truncation)]

@@ -5,7 +5,7 @@ use super::model::{Idm, Pldm};
 use crate::checkpoint::Checkpoint;
 use crate::lewm::import::{state, tree, world};
 use crate::nn::Init;
-use crate::train::{Facts, TrainConfig};
+use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::Naming;
 use crate::weights::reference::{Reference, write};
 use burn::tensor::Device;
@@ -21,17 +21,17 @@ const CLASS: &str = "stable_worldmodel.wm.pldm.pldm.PLDM";
 ///
 /// # Errors
 /// As that does.
-pub fn import(from: &Path, facts: Facts) -> Result<Checkpoint<Pldm>> {
-    let (model, sizes, frameskip) = world(Reference::open(from, "PLDM")?, &facts)?;
+pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Pldm>> {
+    let (model, sizes, frameskip) = world(Reference::open(from, "PLDM")?, &dataset_info)?;
     let mut config = TrainConfig::<Pldm>::load("paper", &[])?;
     config.data.num_steps = sizes.predictor.history + 1;
     config.data.frameskip = frameskip;
     let init = Init::new(Key::new(config.seed), &Device::flex()).of("idm");
-    let idm = Idm::new(&init, sizes.latent, config.loss.idm_hidden, frameskip * facts.action.dim());
+    let idm = Idm::new(&init, sizes.latent, config.loss.idm_hidden, frameskip * dataset_info.action.dim());
     config.model = sizes;
     config.check()?;
     let manifest = Manifest::new("import", 0, json!({ "from": from.display().to_string() }));
-    Ok(Checkpoint { model: Pldm { model, idm }, config, facts, manifest })
+    Ok(Checkpoint { model: Pldm { model, idm }, config, dataset_info, manifest })
 }
 
 /// As [`crate::lewm::import::export`], of a PLDM.

@@ -36,7 +36,7 @@ pub fn step(
     let (mut terms, mut host, mut pull) = (vec![], vec![], 0.0);
     let value = |term: &Tensor<1>| f64::from(term.clone().inner().into_scalar::<f32>());
     let found = joint::step(&model.model, batch, shards, noise, |latents| {
-        host = latents.clone().inner().into_data().try_into_vec_as_f32();
+        host = latents.clone().inner().into_data().into_f32_vec();
         let of = Terms::of(latents.clone());
         let [clips, steps, actions] = batch.actions.dims();
         let taken = batch.actions.clone().slice([0..clips, 0..steps - 1, 0..actions]).autodiff();

@@ -6,7 +6,7 @@ use super::step::{StepOutput as Found, step};
 use crate::checkpoint::Checkpoint;
 use crate::lewm::{LewmConfig, LewmCost, train as lewm};
 use crate::nn::Named;
-use crate::train::{Facts, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
+use crate::train::{DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
 use burn::tensor::{Device, Tensor};
 use swm_core::{Batch, Error, Key, Result, Schema};
 use swm_data::LoaderConfig;
@@ -43,29 +43,29 @@ impl Trainable for Pldm {
         Ok(())
     }
 
-    fn picture(config: &LewmConfig) -> Option<usize> {
+    fn image_size(config: &LewmConfig) -> Option<usize> {
         Some(config.image)
     }
 
-    fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
-        lewm::loading(&config.model, &config.data, schema)
+    fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
+        lewm::loader_config(&config.model, &config.data, schema)
     }
 
-    fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
-        let actions = config.data.frameskip * facts.action.dim();
+    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
+        let actions = config.data.frameskip * dataset_info.action.dim();
         Ok(Self::init(&config.model, actions, config.loss.idm_hidden, key, device))
     }
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
-        let StepContext { config, facts, key, device, training } = context;
-        let batch = lewm::prepare(&config.model, &config.data, facts, batch, device)?;
+        let StepContext { config, dataset_info, key, device, training } = context;
+        let batch = lewm::prepare(&config.model, &config.data, dataset_info, batch, device)?;
         let mut noise = key.with("dropout").rng();
         let noise = training.then_some(&mut noise);
         let Found { losses, gradients, statistics, .. } = step(self, &batch, &config.loss, config.shards, noise);
         Ok(StepOutput { metrics: losses, gradients, buffers: lewm::stored(statistics) })
     }
 
-    fn after(mut self, _: &StepContext<'_, Self>, buffers: Named<Tensor<1>>) -> Self {
+    fn after_step(mut self, _: &StepContext<'_, Self>, buffers: Named<Tensor<1>>) -> Self {
         self.model.track(buffers);
         self
     }

@@ -1,6 +1,6 @@
 //! Fitting a small network: AdamW, warm-up and cosine, batches drawn by key.
 
-use crate::train::{AdamW, Group, OptimConfig, ScheduleConfig, StepOutput};
+use crate::train::{AdamW, OptimConfig, ParameterGroup, ScheduleConfig, StepOutput};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::Rng as _;
@@ -51,7 +51,7 @@ pub(super) fn fit<M: Module>(
                 fix: "lower its learning rate, or check the checkpoint and the dataset".to_owned(),
             });
         }
-        (model, _) = optimizer.step(model, schedule.share(number), output.gradients, |_| Group::default());
+        (model, _) = optimizer.step(model, schedule.share(number), output.gradients, |_| ParameterGroup::default());
     }
     Ok((model, loss))
 }

@@ -2,31 +2,31 @@
 //!
 //! - [`state`](mod@state): read-outs of the columns of a dataset from latents, [linear](ridge) and by a small network, judged
 //!   on episodes that they were not fitted on.
-//! - [`picture`](mod@picture): the pictures themselves, drawn again from latents.
+//! - [`reconstruction`]: the pictures themselves, drawn again from latents.
 //!
 //! A latent that knows where things are lets a linear map say so; one that a network alone can read holds it folded; what
 //! neither reads is lost, and no planner can use it.
 
 mod encoders;
 mod fit;
-pub mod picture;
+pub mod reconstruction;
 pub mod ridge;
 mod samples;
 mod scale;
 pub mod state;
 
-pub use picture::{PictureConfig, PictureReport, picture};
-pub use state::{Score, StateConfig, StateReport, state};
+pub use reconstruction::{ReconstructionConfig, ReconstructionReport, reconstruct_images};
+pub use state::{Score, StateConfig, StateReport, read_state};
 
 use swm_core::Result;
 
 /// An encoder from pictures to latents.
-pub trait Encodes: Send + Sync {
+pub trait ImageEncoder: Send + Sync {
     /// The side of the square pictures it sees, in pixels.
-    fn image(&self) -> usize;
+    fn image_size(&self) -> usize;
 
     /// Numbers in a latent: all patches, where it has patches.
-    fn latent(&self) -> usize;
+    fn latent_dim(&self) -> usize;
 
     /// The latents of pictures.
     ///

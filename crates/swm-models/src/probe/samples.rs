@@ -1,6 +1,6 @@
 //! Frames drawn from a dataset, their latents, and columns beside them.
 
-use super::Encodes;
+use super::ImageEncoder;
 use crate::pixels;
 use rand::Rng as _;
 use rayon::prelude::*;
@@ -28,20 +28,20 @@ const NUMBERS: usize = 1 << 27;
 /// Draws up to `count` frames of a part of a dataset (fewer where latents are very large), without repetition, in stored
 /// order. Frames at which a column holds something that is not finite are left out.
 pub(super) fn draw(
-    encoder: &dyn Encodes,
+    encoder: &dyn ImageEncoder,
     reader: &dyn Reader,
     part: Part,
     columns: &[String],
     keep_pictures: bool,
     (count, key): (usize, Key),
 ) -> Result<Samples> {
-    pixels::check(encoder.image(), reader.schema(), "pixels")?;
+    pixels::check(encoder.image_size(), reader.schema(), "pixels")?;
     let rows: Vec<StepRange> = Split::default()
         .episodes(reader, part)?
         .into_iter()
         .flat_map(|episode| (0..reader.episodes()[episode].length).map(move |row| StepRange::new(episode, row, 1)))
         .collect();
-    let rows = choose(rows, count.min(NUMBERS / encoder.latent()), key.with(&part.to_string()));
+    let rows = choose(rows, count.min(NUMBERS / encoder.latent_dim()), key.with(&part.to_string()));
     let names: Vec<&str> = std::iter::once("pixels").chain(columns.iter().map(String::as_str)).collect();
     let mut samples = Samples { count: 0, latents: vec![], pictures: vec![], targets: vec![] };
     // A few blocks at a time, each encoded by itself.
@@ -70,7 +70,7 @@ pub(super) fn draw(
 impl Samples {
     fn add(
         &mut self,
-        encoder: &dyn Encodes,
+        encoder: &dyn ImageEncoder,
         columns: &[String],
         keep_pictures: bool,
         latents: &[f32],
@@ -88,7 +88,7 @@ impl Samples {
                 continue;
             }
             self.targets.extend(numbers);
-            self.latents.extend_from_slice(&latents[row * encoder.latent()..][..encoder.latent()]);
+            self.latents.extend_from_slice(&latents[row * encoder.latent_dim()..][..encoder.latent_dim()]);
             if keep_pictures {
                 let bytes = pictures.len() / rows;
                 self.pictures.extend_from_slice(&pictures[row * bytes..][..bytes]);

@@ -3,7 +3,7 @@
 use super::fit::{FitConfig, fit, rows};
 use super::ridge::{Ridge, moments};
 use super::scale::Scale;
-use super::{Encodes, samples};
+use super::{ImageEncoder, samples};
 use crate::nn::parameters::{self, IntoF32};
 use crate::nn::{Init, Mlp};
 use crate::train::{StepOutput, at_least};
@@ -80,7 +80,7 @@ pub struct StateReport {
 /// # Errors
 /// When a column is missing or holds pictures, the pictures have another size than the encoder sees, no episode is held
 /// out, or a setting makes no sense.
-pub fn state(encoder: &dyn Encodes, reader: &dyn Reader, config: &StateConfig) -> Result<StateReport> {
+pub fn read_state(encoder: &dyn ImageEncoder, reader: &dyn Reader, config: &StateConfig) -> Result<StateReport> {
     at_least(&[
         ("columns", config.columns.len(), 1),
         ("frames", config.frames, 2),
@@ -107,7 +107,7 @@ pub fn state(encoder: &dyn Encodes, reader: &dyn Reader, config: &StateConfig) -
     let network = Network::fit(&train, config, key)?;
     let judge = |said: &[f32]| scores(&names, said, &held_out.targets);
     Ok(StateReport {
-        latent: encoder.latent(),
+        latent: encoder.latent_dim(),
         frames: train.count,
         held_out: held_out.count,
         linear: judge(&ridge.predict(&held_out.latents)),
@@ -147,7 +147,7 @@ impl Network {
             .par_chunks(256 * width)
             .map(|x| {
                 let x = TensorData::new(x.to_vec(), [x.len() / width, width]);
-                self.model.forward(Tensor::from_data(x, &Device::flex())).into_data().try_into_vec_as_f32()
+                self.model.forward(Tensor::from_data(x, &Device::flex())).into_data().into_f32_vec()
             })
             .collect();
         let mut said = parts.concat();

@@ -10,4 +10,4 @@ pub use config::{SacConfig, SacLoss};
 pub use model::{Actor, Critic, Critics, Drawn, Hidden, Sac};
 
 /// Acts as a trained SAC does: the mean of its policy, squashed.
-pub type SacPolicy = crate::online::ReflexPolicy<Sac>;
+pub type SacPolicy = crate::online::StochasticPolicy<Sac>;

@@ -5,8 +5,8 @@ use super::model::Sac;
 use super::step::{Transitions, step};
 use crate::nn::parameters::{self, IntoF32 as _};
 use crate::nn::{Named, normal};
-use crate::online::{Agent, Live, Reflex, ReflexPolicy};
-use crate::train::{Facts, Group, Preset, StepContext, StepOutput, TrainConfig, Trainable};
+use crate::online::{Agent, SharedModel, StochasticActor, StochasticPolicy};
+use crate::train::{DatasetInfo, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable};
 use burn::tensor::{Device, Tensor, TensorData};
 use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result, RowRef, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
@@ -27,7 +27,7 @@ impl Trainable for Sac {
             toml: include_str!("../../presets/sac/paper.toml"),
         },
     ];
-    const BOUNDED: bool = true;
+    const BOUNDED_ACTIONS: bool = true;
     type Config = SacConfig;
     type Loss = SacLoss;
 
@@ -49,11 +49,11 @@ impl Trainable for Sac {
         Ok(())
     }
 
-    fn picture(_: &SacConfig) -> Option<usize> {
+    fn image_size(_: &SacConfig) -> Option<usize> {
         None
     }
 
-    fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
+    fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
         crate::online::has_rewards(schema)?;
         let columns = config.model.columns.iter().map(String::as_str).chain(["action", "reward", "terminated"]);
         let clip = ClipSpec { num_steps: 2, frameskip: 1, columns: columns.map(str::to_owned).collect() };
@@ -61,15 +61,15 @@ impl Trainable for Sac {
         Ok(LoaderConfig { clip, ..LoaderConfig::default() })
     }
 
-    fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
+    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
         let widths: Result<Vec<usize>> =
-            config.model.columns.iter().map(|column| Ok(facts.column(column)?.dim())).collect();
-        Ok(Self::init(&config.model, &config.loss, widths?.iter().sum(), facts.action.dim(), key, device))
+            config.model.columns.iter().map(|column| Ok(dataset_info.column(column)?.dim())).collect();
+        Ok(Self::init(&config.model, &config.loss, widths?.iter().sum(), dataset_info.action.dim(), key, device))
     }
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
         let (config, device) = (context.config, context.device);
-        let (rows, width, inputs) = (batch.rows(), context.facts.action.dim(), self.inputs());
+        let (rows, width, inputs) = (batch.rows(), context.dataset_info.action.dim(), self.inputs());
         let columns = config.model.columns.iter().map(|column| {
             let numbers = batch.to_f32(column)?;
             let width = numbers.len() / (2 * rows).max(1);
@@ -85,7 +85,7 @@ impl Trainable for Sac {
             let numbers = normal(&[context.key.with(purpose)], rows * width);
             Tensor::from_data(TensorData::new(numbers, [rows, width]), device)
         };
-        let actions = context.facts.actions(batch, 2, 1, device)?.slice([0..rows, 0..1]).reshape([rows, width]);
+        let actions = context.dataset_info.actions(batch, 2, 1, device)?.slice([0..rows, 0..1]).reshape([rows, width]);
         let batch = Transitions {
             observations: frame(0),
             actions,
@@ -106,19 +106,19 @@ impl Trainable for Sac {
         Ok(StepOutput { metrics, gradients: found.gradients, buffers: Named::new() })
     }
 
-    fn after(mut self, context: &StepContext<'_, Self>, _: Named<Tensor<1>>) -> Self {
+    fn after_step(mut self, context: &StepContext<'_, Self>, _: Named<Tensor<1>>) -> Self {
         self.critic_target = parameters::blend(self.critic_target, &self.critic, 1.0 - context.config.loss.tau);
         self
     }
 
     /// Gradients of Q functions, policy and temperature are clipped apart.
-    fn group(name: &str) -> Group {
+    fn parameter_group(name: &str) -> ParameterGroup {
         let clip = ["critic.", "actor."].iter().position(|part| name.starts_with(part)).unwrap_or(2);
-        Group { clip, ..Group::default() }
+        ParameterGroup { clip, ..ParameterGroup::default() }
     }
 }
 
-impl Reflex for Sac {
+impl StochasticActor for Sac {
     fn act(&self, config: &TrainConfig<Self>, row: RowRef<'_>, key: Option<Key>) -> Result<Vec<f32>> {
         let device = self.log_ent_coef.val().device();
         let mut seen = vec![];
@@ -140,19 +140,19 @@ impl Reflex for Sac {
                 mean + log_std.exp() * noise
             }
         };
-        Ok(raw.tanh().into_data().try_into_vec_as_f32())
+        Ok(raw.tanh().into_data().into_f32_vec())
     }
 }
 
 impl Agent for Sac {
     fn policy(
         config: &TrainConfig<Self>,
-        facts: &Facts,
-        live: Live<Self>,
+        dataset_info: &DatasetInfo,
+        live: SharedModel<Self>,
         spec: &EnvSpec,
         slots: usize,
         explore: bool,
     ) -> Result<Box<dyn Policy>> {
-        Ok(Box::new(ReflexPolicy::new(config, facts, live, spec, slots, explore)?))
+        Ok(Box::new(StochasticPolicy::new(config, dataset_info, live, spec, slots, explore)?))
     }
 }

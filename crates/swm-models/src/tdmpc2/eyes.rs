@@ -1,6 +1,6 @@
 //! The encoder of pictures: four convolutions and a linear map.
 
-use crate::nn::{Init, Linear, normed::mish};
+use crate::nn::{Init, Linear, normalized_mlp::mish};
 use burn::module::{Module, Param};
 use burn::tensor::{Tensor, module, ops::ConvOptions};
 use swm_core::{Error, Result};

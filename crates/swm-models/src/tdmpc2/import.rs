@@ -5,7 +5,7 @@ use super::model::Tdmpc2;
 use crate::Checkpoint;
 use crate::nn::parameters::{self, HostTensor};
 use crate::nn::{Bins, Named};
-use crate::train::{Facts, TrainConfig};
+use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::reference::{Reference, write};
 use burn::tensor::Device;
 use serde::de::{Deserializer, MapAccess, Visitor};
@@ -19,20 +19,20 @@ use swm_core::{Error, Key, Manifest, Result};
 const CLASS: &str = "stable_worldmodel.wm.tdmpc2.TDMPC2";
 
 /// A TD-MPC2 that the reference trained: a folder with `weights.pt` and `config.json`, or that file. What it does not store is
-/// how actions were brought between -1 and 1, so `facts` must be those of its world or its dataset.
+/// how actions were brought between -1 and 1, so `dataset_info` must be those of its world or its dataset.
 ///
 /// # Errors
-/// When it is another model, or damaged, or has other actions than `facts`.
-pub fn import(from: &Path, facts: Facts) -> Result<Checkpoint<Tdmpc2>> {
+/// When it is another model, or damaged, or has other actions than `dataset_info`.
+pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Tdmpc2>> {
     let reference = Reference::open(from, "TDMPC2")?;
     let folder = if from.is_dir() { from } else { from.parent().unwrap_or(Path::new("")) };
     let path = folder.join("config.json");
     let text = std::fs::read_to_string(&path).map_err(|error| Error::io(&path, "reading a checkpoint", error))?;
     let published = serde_json::from_str::<Tree>(&text).map_err(|error| reference.wrong(error.to_string()))?.cfg;
-    if published.action_dim != facts.action.dim() {
+    if published.action_dim != dataset_info.action.dim() {
         return Err(Error::mismatch(
             "importing a checkpoint",
-            format!("{} numbers an action in the dataset", facts.action.dim()),
+            format!("{} numbers an action in the dataset", dataset_info.action.dim()),
             format!("{}, as the model was trained", published.action_dim),
         ));
     }
@@ -42,7 +42,7 @@ pub fn import(from: &Path, facts: Facts) -> Result<Checkpoint<Tdmpc2>> {
     config.data.num_steps = published.wm.horizon + 1;
     config.check()?;
     let manifest = Manifest::new("import", 0, json!({ "from": from.display().to_string() }));
-    Ok(Checkpoint { model, config, facts, manifest })
+    Ok(Checkpoint { model, config, dataset_info, manifest })
 }
 
 /// Writes `weights.pt` and `config.json` that the reference's `load_pretrained` reads.

@@ -2,7 +2,7 @@
 
 use super::config::Tdmpc2Config;
 use super::eyes::{self, Eyes};
-use crate::nn::{ByName, Dynamics, Head, Init, LayerNorm, Linear, NormedLinear, normed};
+use crate::nn::{Dynamics, Head, Init, LayerNorm, Linear, ModuleDict, NormalizedLinear, normalized_mlp};
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
@@ -17,7 +17,7 @@ pub struct Tdmpc2 {
     /// From there to a latent.
     pub pixel_encoder: Option<Linear>,
     /// What columns of numbers go through.
-    pub extra_encoders: ByName<NumberEncoder>,
+    pub extra_encoders: ModuleDict<NumberEncoder>,
     /// From a latent and an action to the next latent.
     pub dynamics: Dynamics,
     /// The reward of an action, as logits of bins.
@@ -45,7 +45,7 @@ pub struct RunningScale {
 #[derive(Module, Debug)]
 pub struct NumberEncoder {
     /// Into hidden features.
-    pub _0: NormedLinear,
+    pub _0: NormalizedLinear,
     /// Out of them.
     pub _1: Linear,
     /// The normalisation.
@@ -122,26 +122,26 @@ impl Tdmpc2 {
         let encoder = |(part, &width): (&super::Encoding, &usize)| {
             let init = init.of("extra_encoders").of(&part.column);
             let encoder = NumberEncoder {
-                _0: NormedLinear::new(&init.of("0"), width, config.encoder),
+                _0: NormalizedLinear::new(&init.of("0"), width, config.encoder),
                 _1: Linear::normal(&init.of("1"), config.encoder, part.latent, 0.02),
                 _2: LayerNorm::new(&init.of("2"), part.latent, 1e-5),
             };
             (part.column.clone(), encoder)
         };
-        let critic = |i| Head::silent(&init.of("qs").at(i), latent + actions, hidden, bins);
+        let critic = |i| Head::zero_initialized(&init.of("qs").at(i), latent + actions, hidden, bins);
         let qs: Vec<Head> = (0..config.critics).map(critic).collect();
         let pictures = config.pictures();
         Self {
             scale: RunningScale { value: init.buffer([1], 10.0) },
             cnn: pictures.map(|_| Eyes::new(&init.of("cnn"))),
             pixel_encoder: pictures.map(|part| eyes::projection(&init.of("pixel_encoder"), config.image, part.latent)),
-            extra_encoders: ByName(config.numbers().zip(widths).map(encoder).collect()),
+            extra_encoders: ModuleDict(config.numbers().zip(widths).map(encoder).collect()),
             dynamics: Dynamics::new(&init.of("dynamics"), latent + actions, hidden, latent),
-            reward: Head::silent(&init.of("reward"), latent + actions, hidden, bins),
+            reward: Head::zero_initialized(&init.of("reward"), latent + actions, hidden, bins),
             pi: Head::new(&init.of("pi"), latent, hidden, 2 * actions),
             target_qs: qs.clone().into_iter().map(Module::no_grad).collect(),
             qs,
-            termination: config.termination.then(|| Head::silent(&init.of("termination"), latent, hidden, 1)),
+            termination: config.termination.then(|| Head::zero_initialized(&init.of("termination"), latent, hidden, 1)),
             config: config.clone(),
         }
     }
@@ -167,7 +167,7 @@ impl Tdmpc2 {
         let seen = self.cnn.as_ref().zip(self.pixel_encoder.as_ref()).zip(pixels);
         let seen = seen.map(|((cnn, encoder), pixels)| encoder.forward(cnn.forward(pixels)));
         let read = self.extra_encoders.iter().zip(numbers).map(|((_, encoder), numbers)| encoder.forward(numbers));
-        normed::simplices(Tensor::cat(seen.into_iter().chain(read).collect(), 1), self.config.simplex)
+        normalized_mlp::sim_norm(Tensor::cat(seen.into_iter().chain(read).collect(), 1), self.config.simplex)
     }
 
     /// The latents that follow `[rows, latent + actions]`.
@@ -183,6 +183,6 @@ impl Tdmpc2 {
 
 impl NumberEncoder {
     fn forward(&self, x: Tensor<2>) -> Tensor<2> {
-        self._2.forward(self._1.forward(normed::mish(self._0.forward(x))))
+        self._2.forward(self._1.forward(normalized_mlp::mish(self._0.forward(x))))
     }
 }

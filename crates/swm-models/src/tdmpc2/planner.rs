@@ -13,9 +13,9 @@ use super::train::glance;
 use crate::Checkpoint;
 use crate::nn::normal;
 use crate::nn::parameters::IntoF32 as _;
-use crate::online::Live;
+use crate::online::SharedModel;
 use crate::train::config::at_least;
-use crate::train::{Facts, TrainConfig};
+use crate::train::{DatasetInfo, TrainConfig};
 use rand::Rng as _;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -147,7 +147,7 @@ pub struct Tdmpc2Policy {
     discount: f64,
     uncertainty: f64,
     scale: ActionScale,
-    live: Live<Tdmpc2>,
+    live: SharedModel<Tdmpc2>,
     explore: bool,
     slots: Vec<Slot>,
     latencies: Vec<f64>,
@@ -170,14 +170,14 @@ impl Tdmpc2Policy {
     pub fn new(
         planner: &PlannerConfig,
         config: &TrainConfig<Tdmpc2>,
-        facts: &Facts,
-        live: Live<Tdmpc2>,
+        dataset_info: &DatasetInfo,
+        live: SharedModel<Tdmpc2>,
         spec: &EnvSpec,
         slots: usize,
         explore: bool,
     ) -> Result<Self> {
         planner.check()?;
-        facts.action.check(spec)?;
+        dataset_info.action.check(spec)?;
         let dim = spec.action_dim();
         let slot =
             || Slot { key: Key::new(0), mean: vec![0.0; planner.horizon * dim], action: vec![0.0; dim], failed: None };
@@ -186,7 +186,7 @@ impl Tdmpc2Policy {
             model: config.model.clone(),
             discount: config.loss.discount,
             uncertainty: config.loss.uncertainty,
-            scale: facts.action.clone(),
+            scale: dataset_info.action.clone(),
             live,
             explore,
             slots: (0..slots).map(|_| slot()).collect(),
@@ -199,8 +199,8 @@ impl Tdmpc2Policy {
     /// # Errors
     /// As [`Tdmpc2Policy::new`].
     pub fn of(checkpoint: &Checkpoint<Tdmpc2>, planner: &PlannerConfig, spec: &EnvSpec, slots: usize) -> Result<Self> {
-        let live = Live::new(checkpoint.model.clone());
-        Self::new(planner, &checkpoint.config, &checkpoint.facts, live, spec, slots, false)
+        let live = SharedModel::new(checkpoint.model.clone());
+        Self::new(planner, &checkpoint.config, &checkpoint.dataset_info, live, spec, slots, false)
     }
 }
 
@@ -275,5 +275,5 @@ impl Policy for Tdmpc2Policy {
 /// The latent of what a row of the infos shows.
 pub(super) fn latent(config: &Tdmpc2Config, model: &Tdmpc2, infos: &Batch, row: usize) -> Result<Vec<f32>> {
     let observation = glance(config, model, infos.row(row))?;
-    Ok(model.encode(observation).into_data().try_into_vec_as_f32())
+    Ok(model.encode(observation).into_data().into_f32_vec())
 }

@@ -3,7 +3,7 @@
 use super::model::Tdmpc2;
 use super::step::numbers;
 use crate::nn::parameters::IntoF32;
-use crate::nn::{Ensemble, Noise, normal};
+use crate::nn::{DropoutRng, Ensemble, normal};
 use burn::tensor::{Tensor, TensorData};
 use rayon::prelude::*;
 use swm_core::Key;
@@ -63,17 +63,20 @@ impl Rollouts {
                 alive = alive * logits.lower_elem(0.0).float();
             }
         }
-        let rewards = bins.numbers(model.reward.forward(Tensor::cat(inputs, 0))) * Tensor::cat(weights, 0);
+        let rewards = bins.expectation(model.reward.forward(Tensor::cat(inputs, 0))) * Tensor::cat(weights, 0);
         let gained: Tensor<1> = rewards.reshape([horizon, samples]).sum_dim(0).squeeze_dim(0);
 
         let policy = model.policy(latents.clone()).mean.tanh();
-        let q = numbers(bins, self.critics.forward(Tensor::cat(vec![latents, policy], 1), 0.0, &mut Noise::off()));
+        let q = numbers(
+            bins,
+            self.critics.forward(Tensor::cat(vec![latents, policy], 1), 0.0, &mut DropoutRng::disabled()),
+        );
         let [count, _] = q.dims();
         let mean = q.clone().mean_dim(0);
         let unbiased = (count as f64 - 1.0).max(1.0);
         let std = ((q - mean.clone()).square().sum_dim(0) / unbiased).sqrt();
         let value: Tensor<1> = (mean.clone() - mean.abs() * std * self.uncertainty).squeeze_dim(0);
-        (gained + value * alive * self.discount.powi(horizon as i32)).neg().into_data().try_into_vec_as_f32()
+        (gained + value * alive * self.discount.powi(horizon as i32)).neg().into_data().into_f32_vec()
     }
 
     /// The policy's action at latents `[rows, latent]`: its mean, or drawn by the key of every row.
@@ -105,7 +108,7 @@ impl Rollouts {
                     self.act(latents.clone(), Some(&keys))
                 }
             };
-            let numbers = actions.to_data().try_into_vec_as_f32();
+            let numbers = actions.to_data().into_f32_vec();
             for (proposal, action) in proposals.chunks_exact_mut(horizon * width).zip(numbers.chunks_exact(width)) {
                 proposal[step * width..(step + 1) * width].copy_from_slice(action);
             }

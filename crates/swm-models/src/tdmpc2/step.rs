@@ -10,7 +10,7 @@
 use super::config::LossConfig;
 use super::model::{Observation, Tdmpc2};
 use crate::nn::parameters::{self, IntoF32, Named};
-use crate::nn::{Bins, Ensemble, Head, Noise, two_hot};
+use crate::nn::{Bins, DropoutRng, Ensemble, Head, two_hot};
 use burn::module::Module;
 use burn::tensor::{Tensor, TensorData, activation};
 use rand::Rng as _;
@@ -229,7 +229,7 @@ struct World {
 fn world(model: &Tdmpc2, part: &Part, config: &LossConfig, draws: &Draws) -> World {
     let bins = model.config().bins;
     let ahead = model.encode(part.future.clone());
-    let goals = bins.shares(targets(model, part, &ahead, config, draws));
+    let goals = bins.two_hot(targets(model, part, &ahead, config, draws));
 
     let live = model.clone().train();
     let weights = part.weights(config.rho);
@@ -247,10 +247,10 @@ fn world(model: &Tdmpc2, part: &Part, config: &LossConfig, draws: &Draws) -> Wor
     let weighed = |loss: Tensor<1>| (loss * weights.clone().autodiff()).sum();
     let consistency = weighed((predicted.clone() - ahead.autodiff()).square().mean_dim(1).squeeze_dim(1));
     let reward =
-        weighed(two_hot::cross_entropy(live.reward.forward(inputs.clone()), bins.shares(part.rewards.clone())));
+        weighed(two_hot::cross_entropy(live.reward.forward(inputs.clone()), bins.two_hot(part.rewards.clone())));
     let mut rng = draws.dropout.map(|key| key.at(part.index as u64).rng());
     let critics = Ensemble::of(&live.qs.iter().collect::<Vec<_>>());
-    let logits = critics.forward(inputs.clone(), model.config().dropout, &mut Noise(rng.as_mut()));
+    let logits = critics.forward(inputs.clone(), model.config().dropout, &mut DropoutRng(rng.as_mut()));
     let [count, rows, width] = logits.dims();
     let goals = goals.unsqueeze_dim::<3>(0).expand([count, rows, width]).reshape([count * rows, width]);
     let value: Tensor<2> =
@@ -279,8 +279,10 @@ fn targets(model: &Tdmpc2, part: &Part, ahead: &Tensor<2>, config: &LossConfig, 
     let input = Tensor::cat(vec![ahead.clone(), next], 1);
     let least = (0..part.horizon).map(|step| {
         let chosen = chosen(&model.target_qs, draws.target_critics[step]);
-        let q =
-            numbers(model.config().bins, Ensemble::of(&chosen).forward(part.at(&input, step), 0.0, &mut Noise::off()));
+        let q = numbers(
+            model.config().bins,
+            Ensemble::of(&chosen).forward(part.at(&input, step), 0.0, &mut DropoutRng::disabled()),
+        );
         q.min_dim(0).squeeze_dim(0)
     });
     let q: Tensor<1> = Tensor::cat(least.collect(), 0);
@@ -310,7 +312,7 @@ fn judge(model: &Tdmpc2, part: &Part, latents: &Tensor<2>, draws: &Draws) -> Jud
     let input = Tensor::cat(vec![latents, actions], 1);
     let means = (0..part.horizon).map(|step| {
         let critics = Ensemble::of(&chosen(&model.qs, draws.policy_critics[step])).frozen();
-        let logits = critics.forward(part.at(&input, step), 0.0, &mut Noise::off());
+        let logits = critics.forward(part.at(&input, step), 0.0, &mut DropoutRng::disabled());
         numbers(model.config().bins, logits).mean_dim(0).squeeze_dim(0)
     });
     Judged { policy, q: Tensor::cat(means.collect(), 0), entropy }
@@ -348,7 +350,7 @@ fn chosen(heads: &[Head], pair: [usize; 2]) -> [&Head; 2] {
 /// Logits `[heads, rows, bins]` to numbers `[heads, rows]`.
 pub(super) fn numbers(bins: Bins, logits: Tensor<3>) -> Tensor<2> {
     let [heads, rows, width] = logits.dims();
-    bins.numbers(logits.reshape([heads * rows, width])).reshape([heads, rows])
+    bins.expectation(logits.reshape([heads * rows, width])).reshape([heads, rows])
 }
 
 /// From the 5th to the 95th percentile, at least 1e-4; between two numbers it lies on the line.
@@ -365,7 +367,7 @@ fn spread(mut values: Vec<f32>) -> f32 {
 }
 
 fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.inner().into_data().try_into_vec_as_f32()
+    tensor.inner().into_data().into_f32_vec()
 }
 
 fn value_of(tensor: &Tensor<1>) -> f64 {

@@ -6,9 +6,9 @@ use super::planner::Tdmpc2Policy;
 use super::step::{Draws, TrainBatch, step};
 use crate::nn::parameters::{self, IntoF32 as _};
 use crate::nn::{Named, normal};
-use crate::online::{Agent, Live, Reflex, ReflexPolicy};
-use crate::pixels::{self, Pixels};
-use crate::train::{Facts, Group, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
+use crate::online::{Agent, SharedModel, StochasticActor, StochasticPolicy};
+use crate::pixels::{self, ImageNormalization};
+use crate::train::{DatasetInfo, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
 use burn::module::Param;
 use burn::tensor::{Device, Tensor, TensorData};
 use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result, RowRef, Schema};
@@ -30,7 +30,7 @@ impl Trainable for Tdmpc2 {
             toml: include_str!("../../presets/tdmpc2/paper.toml"),
         },
     ];
-    const BOUNDED: bool = true;
+    const BOUNDED_ACTIONS: bool = true;
     type Config = Tdmpc2Config;
     type Loss = LossConfig;
 
@@ -45,11 +45,11 @@ impl Trainable for Tdmpc2 {
         Ok(())
     }
 
-    fn picture(config: &Tdmpc2Config) -> Option<usize> {
+    fn image_size(config: &Tdmpc2Config) -> Option<usize> {
         config.pictures().map(|_| config.image)
     }
 
-    fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
+    fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
         if config.model.pictures().is_some() {
             pixels::check(config.model.image, schema, PIXELS)?;
         }
@@ -60,20 +60,20 @@ impl Trainable for Tdmpc2 {
         Ok(LoaderConfig { clip, ..LoaderConfig::default() })
     }
 
-    fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self> {
-        let widths = config.model.numbers().map(|part| Ok(facts.column(&part.column)?.dim()));
-        Ok(Self::init(&config.model, &widths.collect::<Result<Vec<_>>>()?, facts.action.dim(), key, device))
+    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
+        let widths = config.model.numbers().map(|part| Ok(dataset_info.column(&part.column)?.dim()));
+        Ok(Self::init(&config.model, &widths.collect::<Result<Vec<_>>>()?, dataset_info.action.dim(), key, device))
     }
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
-        let StepContext { config, facts, key, device, training } = context;
+        let StepContext { config, dataset_info, key, device, training } = context;
         let steps = config.data.num_steps;
-        let (clips, horizon, width) = (batch.rows(), steps - 1, facts.action.dim());
+        let (clips, horizon, width) = (batch.rows(), steps - 1, dataset_info.action.dim());
         let flat = |name: &str| {
             let column = Tensor::<2>::from_data(TensorData::new(batch.to_f32(name)?, [clips, steps]), context.device);
             Ok::<_, Error>(column.swap_dims(0, 1).narrow(0, 0, horizon))
         };
-        let actions = facts.actions(batch, steps, 1, device)?.swap_dims(0, 1).narrow(0, 0, horizon);
+        let actions = dataset_info.actions(batch, steps, 1, device)?.swap_dims(0, 1).narrow(0, 0, horizon);
         let batch = TrainBatch {
             observations: observe(&config.model, batch, steps, device)?,
             actions,
@@ -100,7 +100,7 @@ impl Trainable for Tdmpc2 {
     }
 
     /// The running spread is replaced; target networks move towards those that were trained.
-    fn after(mut self, context: &StepContext<'_, Self>, mut buffers: Named<Tensor<1>>) -> Self {
+    fn after_step(mut self, context: &StepContext<'_, Self>, mut buffers: Named<Tensor<1>>) -> Self {
         self.target_qs = parameters::blend(self.target_qs, &self.qs, 1.0 - context.config.loss.tau);
         if let Some(scale) = buffers.remove(SCALE) {
             self.scale.value = Param::from_tensor(scale).set_require_grad(false);
@@ -109,9 +109,9 @@ impl Trainable for Tdmpc2 {
     }
 
     /// Gradients of world and policy are clipped apart; the encoders learn more slowly, as published.
-    fn group(name: &str) -> Group {
+    fn parameter_group(name: &str) -> ParameterGroup {
         let encoder = ["cnn.", "pixel_encoder.", "extra_encoders."].iter().any(|part| name.starts_with(part));
-        Group { clip: usize::from(name.starts_with("pi.")), lr: if encoder { ENCODER_LR } else { 1.0 } }
+        ParameterGroup { clip: usize::from(name.starts_with("pi.")), lr: if encoder { ENCODER_LR } else { 1.0 } }
     }
 }
 
@@ -139,8 +139,8 @@ fn observe(config: &Tdmpc2Config, batch: &Batch, steps: usize, device: &Device) 
 }
 
 /// Pictures as numbers from -0.5 to 0.5, as published.
-fn eyes(config: &Tdmpc2Config) -> Pixels {
-    Pixels { side: config.image, mean: [0.5; 3], std: [1.0; 3] }
+fn eyes(config: &Tdmpc2Config) -> ImageNormalization {
+    ImageNormalization { side: config.image, mean: [0.5; 3], std: [1.0; 3] }
 }
 
 /// What one row shows.
@@ -167,7 +167,7 @@ pub(super) fn glance(config: &Tdmpc2Config, model: &Tdmpc2, row: RowRef<'_>) -> 
     Ok(Observation { pixels: pictures.transpose()?, numbers })
 }
 
-impl Reflex for Tdmpc2 {
+impl StochasticActor for Tdmpc2 {
     fn act(&self, config: &TrainConfig<Self>, row: RowRef<'_>, key: Option<Key>) -> Result<Vec<f32>> {
         let gaussian = self.policy(self.encode(glance(&config.model, self, row)?));
         let action = match key {
@@ -178,22 +178,22 @@ impl Reflex for Tdmpc2 {
                 gaussian.sample(Tensor::from_data(noise, &self.device()))
             }
         };
-        Ok(action.into_data().try_into_vec_as_f32())
+        Ok(action.into_data().into_f32_vec())
     }
 }
 
 impl Agent for Tdmpc2 {
     fn policy(
         config: &TrainConfig<Self>,
-        facts: &Facts,
-        live: Live<Self>,
+        dataset_info: &DatasetInfo,
+        live: SharedModel<Self>,
         spec: &EnvSpec,
         slots: usize,
         explore: bool,
     ) -> Result<Box<dyn Policy>> {
         Ok(match config.online.as_ref().and_then(|online| online.planner.as_ref()) {
-            Some(planner) => Box::new(Tdmpc2Policy::new(planner, config, facts, live, spec, slots, explore)?),
-            None => Box::new(ReflexPolicy::new(config, facts, live, spec, slots, explore)?),
+            Some(planner) => Box::new(Tdmpc2Policy::new(planner, config, dataset_info, live, spec, slots, explore)?),
+            None => Box::new(StochasticPolicy::new(config, dataset_info, live, spec, slots, explore)?),
         })
     }
 }

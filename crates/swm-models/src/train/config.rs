@@ -3,7 +3,7 @@
 use super::optim::OptimConfig;
 use super::schedule::ScheduleConfig;
 use super::trainable::Trainable;
-use crate::online::OnlineSettings;
+use crate::online::OnlineConfig;
 use figment::Figment;
 use figment::providers::{Format as _, Serialized, Toml};
 use serde::{Deserialize, Serialize};
@@ -31,7 +31,7 @@ pub struct TrainConfig<M: Trainable> {
     pub validation: ValidationConfig,
     /// How playing and learning take turns, for a model that can learn by playing.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub online: Option<OnlineSettings>,
+    pub online: Option<OnlineConfig>,
     /// Parts a batch is cut into, which can run in parallel. Changes the last bits of the numbers.
     pub shards: usize,
     /// Steps between two lines of the log.

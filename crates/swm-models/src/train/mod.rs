@@ -4,7 +4,7 @@
 //! random numbers they use, so a run that was interrupted continues as if it had not been.
 
 pub mod config;
-mod facts;
+mod dataset_info;
 pub(crate) mod failure;
 pub mod log;
 pub mod optim;
@@ -14,11 +14,11 @@ pub mod shards;
 mod trainable;
 
 pub use config::{DataConfig, Preset, TrainConfig, ValidationConfig, at_least};
-pub use facts::{ColumnFacts, Facts};
+pub use dataset_info::{ColumnInfo, DatasetInfo};
 pub use optim::{AdamW, OptimConfig};
 pub use run::train;
 pub use schedule::ScheduleConfig;
-pub use trainable::{Group, StepContext, StepOutput, Trainable};
+pub use trainable::{ParameterGroup, StepContext, StepOutput, Trainable};
 
 use burn::tensor::Device;
 use serde::Serialize;

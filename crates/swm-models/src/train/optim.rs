@@ -4,7 +4,7 @@
 //! one clips the whole gradient and keys its state by parameter name, so that it can be stored beside the
 //! weights.
 
-use super::trainable::Group;
+use super::trainable::ParameterGroup;
 use crate::nn::parameters::{self, HostTensor, IntoF32, Named};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -61,7 +61,7 @@ impl AdamW {
     /// The state: `first.NAME` and `second.NAME`.
     pub fn state(&self) -> Named<HostTensor> {
         let host = |tensor: &Tensor<1>| {
-            let values = tensor.to_data().try_into_vec_as_f32();
+            let values = tensor.to_data().into_f32_vec();
             HostTensor { shape: vec![values.len()], values }
         };
         let both = |(name, moments): (&String, &Moments)| {
@@ -93,7 +93,7 @@ impl AdamW {
         module: M,
         share: f64,
         mut gradients: Named<Tensor<1>>,
-        group: fn(&str) -> Group,
+        group: fn(&str) -> ParameterGroup,
     ) -> (M, f64) {
         // The square of each group's norm, in the order of names.
         let mut squares: BTreeMap<usize, f64> = BTreeMap::new();

@@ -2,7 +2,7 @@
 
 use super::config::TrainConfig;
 use super::trainable::{StepContext, StepOutput, Trainable};
-use super::{AdamW, Facts, Observer, Progress, TrainOptions, TrainSummary, episodes, failure, log};
+use super::{AdamW, DatasetInfo, Observer, Progress, TrainOptions, TrainSummary, episodes, failure, log};
 use crate::checkpoint::{Checkpoint, TrainState};
 use crate::nn::parameters::{self, Named};
 use burn::tensor::Tensor;
@@ -46,10 +46,10 @@ struct Run<'a, M: Trainable> {
     model: M,
     /// Their running average, where one is kept.
     average: Option<M>,
-    facts: Facts,
+    dataset_info: DatasetInfo,
     manifest: Manifest,
     optimizer: AdamW,
-    state: Position,
+    state: RunState,
     log: log::Log,
 }
 
@@ -58,7 +58,7 @@ type Metrics = Vec<(&'static str, f64)>;
 
 /// How far a run is: all that its future depends on, beside the tensors.
 #[derive(Clone, Debug, Default, serde::Serialize, serde::Deserialize)]
-pub(crate) struct Position {
+pub(crate) struct RunState {
     /// Steps done.
     pub step: usize,
     /// The step and the loss of the best look at held-out episodes.
@@ -78,17 +78,17 @@ impl<'a, M: Trainable> Run<'a, M> {
     ) -> Result<Self> {
         config.check()?;
         let device = &options.device;
-        let wanted = M::loading(config, reader.schema())?;
+        let wanted = M::loader_config(config, reader.schema())?;
         let columns: Vec<String> =
             wanted.clip.columns.iter().chain(wanted.goals.iter().flat_map(|goal| &goal.columns)).cloned().collect();
-        let facts = Facts::of(&*reader, &columns, M::BOUNDED)?;
+        let dataset_info = DatasetInfo::from_reader(&*reader, &columns, M::BOUNDED_ACTIONS)?;
         let mut manifest = Manifest::new("train", config.seed, serde_json::to_value(config).unwrap_or_default());
         manifest.libraries.insert("burn".to_owned(), "0.22.1".to_owned());
         manifest.hashes.insert("dataset".to_owned(), reader.content_hash()?);
         manifest.device = crate::device::name(device);
 
         let mut optimizer = AdamW::new(config.optim.clone());
-        let mut state = Position::default();
+        let mut state = RunState::default();
         let (model, average);
         if Checkpoint::<M>::exists(out) {
             if !options.resume {
@@ -108,8 +108,8 @@ impl<'a, M: Trainable> Run<'a, M> {
             }
         } else {
             std::fs::create_dir_all(out).map_err(|error| Error::io(out, "creating a folder", error))?;
-            let fresh = M::new(config, &facts, Key::new(config.seed).with("init"), device)?;
-            model = fresh.pretrained(config, &options.cache)?;
+            let fresh = M::new(config, &dataset_info, Key::new(config.seed).with("init"), device)?;
+            model = fresh.with_pretrained_weights(config, &options.cache)?;
             average = (config.optim.ema > 0.0).then(|| model.clone());
         }
 
@@ -133,7 +133,20 @@ impl<'a, M: Trainable> Run<'a, M> {
         };
         let loader = loader(wanted, Part::Train, true)?;
         let log = log::Log::new(out, state.step > 0)?;
-        Ok(Self { config, out, options, loader, validation, model, average, facts, manifest, optimizer, state, log })
+        Ok(Self {
+            config,
+            out,
+            options,
+            loader,
+            validation,
+            model,
+            average,
+            dataset_info,
+            manifest,
+            optimizer,
+            state,
+            log,
+        })
     }
 
     #[allow(clippy::cast_precision_loss)]
@@ -221,7 +234,7 @@ impl<'a, M: Trainable> Run<'a, M> {
             stopped_early,
             best: self.state.best,
             metrics: last.into_iter().map(|(name, value)| (name.to_owned(), value)).collect(),
-            parameters: parameters::trained(&self.model),
+            parameters: parameters::trained_count(&self.model),
             clips_per_second,
             data_wait: if seconds > 0.0 { waited / seconds } else { 0.0 },
             seconds,
@@ -257,16 +270,22 @@ impl<'a, M: Trainable> Run<'a, M> {
     }
 
     fn context(&self, key: Key, training: bool) -> StepContext<'_, M> {
-        StepContext { config: self.config, facts: &self.facts, key, device: &self.options.device, training }
+        StepContext {
+            config: self.config,
+            dataset_info: &self.dataset_info,
+            key,
+            device: &self.options.device,
+            training,
+        }
     }
 
     /// One step of the optimizer; returns the step's numbers, its learning rate and the gradient's norm.
     fn learn(&mut self, learnt: Learnt) -> Result<(Metrics, f64, f64)> {
         let StepOutput { metrics, gradients, buffers } = learnt.mean();
         let share = self.config.schedule.share(self.state.step);
-        let (model, norm) = self.optimizer.step(self.model.clone(), share, gradients, M::group);
+        let (model, norm) = self.optimizer.step(self.model.clone(), share, gradients, M::parameter_group);
         let key = Key::new(self.config.seed).with("after").at(self.state.step as u64);
-        let model = model.after(&self.context(key, true), buffers);
+        let model = model.after_step(&self.context(key, true), buffers);
         if let Some(average) = self.average.take() {
             self.average = Some(parameters::blend(average, &model, self.config.optim.ema));
         }
@@ -315,7 +334,7 @@ impl<'a, M: Trainable> Run<'a, M> {
         Checkpoint {
             model: self.average.as_ref().unwrap_or(&self.model).clone(),
             config: self.config.clone(),
-            facts: self.facts.clone(),
+            dataset_info: self.dataset_info.clone(),
             manifest: self.manifest.clone(),
         }
     }

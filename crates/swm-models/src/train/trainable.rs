@@ -1,7 +1,7 @@
 //! [`Trainable`]: what a model tells the training loop.
 
 use super::config::{Preset, TrainConfig};
-use super::facts::Facts;
+use super::dataset_info::DatasetInfo;
 use crate::nn::parameters::Named;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -24,7 +24,7 @@ pub trait Trainable: Module + Sync + 'static {
     const PRESETS: &'static [Preset];
     /// Whether actions lie between -1 and 1 in its units, which stand for the smallest and the largest of the data, instead of
     /// having mean 0 and spread 1.
-    const BOUNDED: bool = false;
+    const BOUNDED_ACTIONS: bool = false;
     /// Its sizes: the table `model` of a configuration.
     type Config: Serialize + DeserializeOwned + Clone + Debug + PartialEq + Send + Sync;
     /// Weights and settings of its loss: the table `loss`.
@@ -37,26 +37,26 @@ pub trait Trainable: Module + Sync + 'static {
     fn check(config: &TrainConfig<Self>) -> Result<()>;
 
     /// The side of the square pictures it sees; none for a model without eyes.
-    fn picture(config: &Self::Config) -> Option<usize>;
+    fn image_size(config: &Self::Config) -> Option<usize>;
 
     /// What a batch holds: clip, columns and goals. The loop decides batch size, order, threads and episodes.
     ///
     /// # Errors
     /// When the dataset lacks a column, or it is of another shape.
-    fn loading(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig>;
+    fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig>;
 
     /// A model with initial values decided by `key`.
     ///
     /// # Errors
     /// When the data do not fit the configuration.
-    fn new(config: &TrainConfig<Self>, facts: &Facts, key: Key, device: &Device) -> Result<Self>;
+    fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self>;
 
     /// Puts weights of others in place, such as a pretrained encoder's; called once, on a model that begins its
     /// training. `cache` is where downloads are kept.
     ///
     /// # Errors
     /// When they cannot be had or do not fit.
-    fn pretrained(self, _config: &TrainConfig<Self>, _cache: &Path) -> Result<Self> {
+    fn with_pretrained_weights(self, _config: &TrainConfig<Self>, _cache: &Path) -> Result<Self> {
         Ok(self)
     }
 
@@ -68,26 +68,26 @@ pub trait Trainable: Module + Sync + 'static {
 
     /// The model after the optimizer's step: running statistics follow, target networks move.
     #[must_use]
-    fn after(self, _context: &StepContext<'_, Self>, _buffers: Named<Tensor<1>>) -> Self {
+    fn after_step(self, _context: &StepContext<'_, Self>, _buffers: Named<Tensor<1>>) -> Self {
         self
     }
 
     /// How the optimizer treats the parameter of a name.
-    fn group(_name: &str) -> Group {
-        Group::default()
+    fn parameter_group(_name: &str) -> ParameterGroup {
+        ParameterGroup::default()
     }
 }
 
 /// How the optimizer treats a parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Group {
+pub struct ParameterGroup {
     /// Parameters of equal number share one gradient norm, which is clipped.
     pub clip: usize,
     /// A factor of the learning rate.
     pub lr: f64,
 }
 
-impl Default for Group {
+impl Default for ParameterGroup {
     fn default() -> Self {
         Self { clip: 0, lr: 1.0 }
     }
@@ -98,7 +98,7 @@ pub struct StepContext<'a, M: Trainable> {
     /// The run's configuration.
     pub config: &'a TrainConfig<M>,
     /// What is known of the data.
-    pub facts: &'a Facts,
+    pub dataset_info: &'a DatasetInfo,
     /// Decides the random numbers of this step.
     pub key: Key,
     /// Where tensors live.

@@ -41,7 +41,7 @@ fn table<T>(weights: &Named<T>, prefix: &str) -> &'static [(&'static str, &'stat
 }
 
 /// Gives the weights of the transformer below `prefix` (such as `encoder.`) their published names, whichever they have.
-pub fn published<T>(weights: Named<T>, prefix: &str) -> Named<T> {
+pub fn to_published<T>(weights: Named<T>, prefix: &str) -> Named<T> {
     let table = table(&weights, prefix);
     let is_newer = |name: &String| name.starts_with(prefix) && name.contains(".attention.q_proj.");
     if !weights.keys().any(is_newer) {
@@ -51,7 +51,7 @@ pub fn published<T>(weights: Named<T>, prefix: &str) -> Named<T> {
 }
 
 /// Gives the weights of the transformer below `prefix`, which have their published names, those of `naming`.
-pub fn named<T>(weights: Named<T>, prefix: &str, naming: Naming) -> Named<T> {
+pub fn to_naming<T>(weights: Named<T>, prefix: &str, naming: Naming) -> Named<T> {
     let table = table(&weights, prefix);
     match naming {
         Naming::Published => weights,
@@ -105,9 +105,9 @@ mod tests {
             // What lies outside the transformer keeps its name.
             let old = set(&[&a[..], &b[..], &["predictor.mlp.fc1.weight"]].concat());
             let new = set(&[&c[..], &d[..], &["predictor.mlp.fc1.weight"]].concat());
-            assert_eq!(named(old.clone(), "e.", Naming::Transformers5), new);
-            assert_eq!(published(new, "e."), old);
-            assert_eq!(published(old.clone(), "e."), old);
+            assert_eq!(to_naming(old.clone(), "e.", Naming::Transformers5), new);
+            assert_eq!(to_published(new, "e."), old);
+            assert_eq!(to_published(old.clone(), "e."), old);
         }
     }
 }

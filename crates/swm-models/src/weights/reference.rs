@@ -124,7 +124,7 @@ impl Reference {
         };
         let prefix = format!("{at}.");
         let weights = std::mem::take(&mut self.weights);
-        self.weights = names::published(weights, &prefix);
+        self.weights = names::to_published(weights, &prefix);
         // Of use while masked pictures are learnt from, and not there otherwise.
         self.weights.remove(&format!("{prefix}embeddings.mask_token"));
         Ok((config, image))
@@ -133,7 +133,7 @@ impl Reference {
     /// The size of the DINOv2 whose weights begin with `prefix`, which get their published names.
     pub fn dinov2(&mut self, prefix: &str) -> Result<DinoConfig> {
         let weights = std::mem::take(&mut self.weights);
-        self.weights = names::published(weights, prefix);
+        self.weights = names::to_published(weights, prefix);
         let of = |name: &str| self.shape(&format!("{prefix}{name}"));
         let projection = of("embeddings.patch_embeddings.projection.weight")?;
         let [dim, _, patch, _] = *projection else {

@@ -22,7 +22,7 @@ fn damage_and_mismatches_are_named() {
 
     run(&config(&["schedule.steps=1"]), &trained, &TrainOptions::default(), 0).expect("trained");
     let checkpoint = load(&trained).expect("whole");
-    assert_eq!(checkpoint.facts.env.as_deref(), Some("test/Dots-v0"));
+    assert_eq!(checkpoint.dataset_info.env.as_deref(), Some("test/Dots-v0"));
     assert_eq!(checkpoint.hash().len(), 64);
 
     let inner = trained.join("checkpoint");

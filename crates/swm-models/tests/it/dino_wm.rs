@@ -8,7 +8,7 @@ use std::sync::atomic::AtomicBool;
 use swm_core::{Batch, Candidates, ColumnSpec, CostModel, DType, Key, Manifest, Result, Schema};
 use swm_models::dino_wm::{DinoWm, DinoWmCost};
 use swm_models::nn::parameters;
-use swm_models::train::Facts;
+use swm_models::train::DatasetInfo;
 use swm_models::{Checkpoint, TrainConfig, TrainOptions, TrainSummary, Trainable, train};
 
 const ENVS: usize = 3;
@@ -49,9 +49,9 @@ fn run(config: &TrainConfig<DinoWm>, out: &Path, threads: usize) -> Result<Train
     train(config, Arc::new(Dots::new(6, 0)), out, &options, &mut (), &AtomicBool::new(false))
 }
 
-fn facts(config: &TrainConfig<DinoWm>) -> Facts {
+fn dataset_info(config: &TrainConfig<DinoWm>) -> DatasetInfo {
     let columns: Vec<String> = config.model.columns.iter().map(|column| column.name.clone()).collect();
-    Facts::of(&Dots::new(2, 0), &columns, false).expect("facts")
+    DatasetInfo::from_reader(&Dots::new(2, 0), &columns, false).expect("facts")
 }
 
 #[test]
@@ -63,7 +63,7 @@ fn threads_do_not_change_a_byte_and_the_encoder_is_frozen() {
     assert_eq!(one.weights, two.weights);
     let loaded = Checkpoint::<DinoWm>::load(&folder.path().join("1"), &Device::flex()).expect("it loads");
     let key = Key::new(config.seed).with("init");
-    let fresh = DinoWm::new(&config, &loaded.facts, key, &Device::flex()).expect("a model");
+    let fresh = DinoWm::new(&config, &loaded.dataset_info, key, &Device::flex()).expect("a model");
     let (before, after) = (parameters::values(&fresh), parameters::values(&loaded.model));
     for (name, value) in &before {
         assert_eq!(name.starts_with("backbone."), after[name] == *value, "{name}");
@@ -112,9 +112,9 @@ fn what_does_not_fit_is_told() {
 
 fn checkpoint(words: &[&str]) -> Checkpoint<DinoWm> {
     let config = config(words).expect("a configuration");
-    let facts = facts(&config);
-    let model = DinoWm::new(&config, &facts, Key::new(3), &Device::flex()).expect("a model");
-    Checkpoint { model, config, facts, manifest: Manifest::new("train", 0, serde_json::Value::Null) }
+    let dataset_info = dataset_info(&config);
+    let model = DinoWm::new(&config, &dataset_info, Key::new(3), &Device::flex()).expect("a model");
+    Checkpoint { model, config, dataset_info, manifest: Manifest::new("train", 0, serde_json::Value::Null) }
 }
 
 fn infos(more: &[&str]) -> Batch {

@@ -8,8 +8,8 @@ use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Key, Policy as _, Result, Sche
 use swm_models::feed_forward::FeedForwardPolicy;
 use swm_models::gcrl::{Actor, Gcbc, Gciql, Gcivl, GcrlConfig, GoalConditioned};
 use swm_models::nn::parameters;
-use swm_models::probe::{self, Encodes, PictureConfig, StateConfig};
-use swm_models::train::Facts;
+use swm_models::probe::{self, ImageEncoder, ReconstructionConfig, StateConfig};
+use swm_models::train::DatasetInfo;
 use swm_models::{Checkpoint, Device, TrainConfig, TrainOptions, TrainSummary, Trainable, train};
 use swm_plan::ActionScale;
 
@@ -140,8 +140,9 @@ fn values_learn_that_the_way_is_long() {
 fn targets_follow_and_frozen_encoders_stay() {
     let folder = tempfile::tempdir().expect("a folder");
     let config = config::<Gcivl>(&["loss.target=0.5"]);
-    let facts = Facts { action: ActionScale::identity(2), columns: Default::default(), env: None };
-    let first = Gcivl::new(&config, &facts, Key::new(config.seed).with("init"), &Device::flex()).expect("a model");
+    let dataset_info = DatasetInfo { action: ActionScale::identity(2), columns: Default::default(), env: None };
+    let first =
+        Gcivl::new(&config, &dataset_info, Key::new(config.seed).with("init"), &Device::flex()).expect("a model");
     let last = trained(&config, folder.path()).model;
     let (first, last) = (parameters::values(&first), parameters::values(&last));
     let name = "out_proj.weight";
@@ -231,12 +232,12 @@ fn what_does_not_fit_is_refused_in_words() {
 /// Sums of light along rows and columns: an encoder that knows where the dot is.
 struct Profiles;
 
-impl Encodes for Profiles {
-    fn image(&self) -> usize {
+impl ImageEncoder for Profiles {
+    fn image_size(&self) -> usize {
         SIDE
     }
 
-    fn latent(&self) -> usize {
+    fn latent_dim(&self) -> usize {
         2 * SIDE
     }
 
@@ -258,29 +259,29 @@ fn probes_read_where_the_dot_is_and_draw_it_again() {
     let data = Dots::new(40, 1);
     let mut settings = StateConfig::new(vec!["place".to_owned()]);
     settings.fit.steps = 300;
-    let report = probe::state(&Profiles, &data, &settings).expect("read");
+    let report = probe::read_state(&Profiles, &data, &settings).expect("read");
     assert_eq!((report.latent, report.linear.len(), report.network.len()), (2 * SIDE, 2, 2));
     for score in report.linear.iter().chain(&report.network) {
         let r2 = score.r2.expect("the dot moves");
         assert!(r2 > 0.95, "{score:?}");
         assert!((r2 - (1.0 - (score.rmse / score.spread).powi(2))).abs() < 1e-9);
     }
-    assert_eq!(probe::state(&Profiles, &data, &settings).expect("read"), report, "the same again");
+    assert_eq!(probe::read_state(&Profiles, &data, &settings).expect("read"), report, "the same again");
     // An action cannot be read from a picture, and the last of an episode, which is missing, spoils nothing.
     let actions = StateConfig { columns: vec!["action".to_owned()], ..settings };
-    let report = probe::state(&Profiles, &data, &actions).expect("read");
+    let report = probe::read_state(&Profiles, &data, &actions).expect("read");
     assert!(report.linear.iter().all(|score| score.r2.expect("it changes") < 0.1), "{report:?}");
 
-    let mut settings = PictureConfig { channels: vec![16, 8], shown: 6, ..PictureConfig::default() };
+    let mut settings = ReconstructionConfig { channels: vec![16, 8], shown: 6, ..ReconstructionConfig::default() };
     (settings.fit.steps, settings.fit.lr) = (1000, 5e-3);
-    let (report, sheet) = probe::picture(&Profiles, &data, &settings).expect("drawn");
+    let (report, sheet) = probe::image_size(&Profiles, &data, &settings).expect("drawn");
     assert!(report.explained > 0.2 && report.rmse < report.rmse_of_mean, "{report:?}");
     let cell = SIDE * 8 + 2;
     assert_eq!((sheet.width, sheet.height), (6 * cell + 2, 2 * cell + 2));
 
     let words = |columns: &[&str]| {
         let columns = columns.iter().map(|&name| name.to_owned()).collect();
-        probe::state(&Profiles, &data, &StateConfig::new(columns)).expect_err("wrong").to_string()
+        probe::read_state(&Profiles, &data, &StateConfig::new(columns)).expect_err("wrong").to_string()
     };
     assert!(words(&["plaice"]).contains("did you mean place"), "{}", words(&["plaice"]));
     assert!(words(&["pixels"]).contains("holds pictures"));

@@ -6,7 +6,7 @@ use burn::tensor::Device;
 use swm_core::{Batch, Candidates, ColumnSpec, CostModel, DType, Key, Manifest, Schema};
 use swm_models::Checkpoint;
 use swm_models::lewm::{Lewm, LewmCost};
-use swm_models::train::Facts;
+use swm_models::train::DatasetInfo;
 use swm_plan::ActionScale;
 
 const ENVS: usize = 3;
@@ -27,9 +27,9 @@ fn checkpoint() -> Checkpoint<Lewm> {
         }
     }
     let model = swm_models::nn::parameters::load(model, &values);
-    let facts = Facts { action: ActionScale::identity(2), columns: Default::default(), env: None };
+    let dataset_info = DatasetInfo { action: ActionScale::identity(2), columns: Default::default(), env: None };
     let manifest = Manifest::new("train", 0, serde_json::Value::Null);
-    Checkpoint { model, config, facts, manifest }
+    Checkpoint { model, config, dataset_info, manifest }
 }
 
 fn infos(history: bool) -> Batch {

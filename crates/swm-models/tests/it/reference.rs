@@ -6,10 +6,10 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use swm_models::dino_wm::{self, DinoWm};
 use swm_models::lewm::{self, Lewm};
-use swm_models::nn::Noise;
+use swm_models::nn::DropoutRng;
 use swm_models::nn::parameters;
 use swm_models::pldm;
-use swm_models::train::{ColumnFacts, Facts};
+use swm_models::train::{ColumnInfo, DatasetInfo};
 use swm_models::weights::{self, Naming};
 use swm_plan::ActionScale;
 
@@ -17,11 +17,11 @@ fn folder(family: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/reference").join(family)
 }
 
-fn facts(action: usize) -> Facts {
+fn dataset_info(action: usize) -> DatasetInfo {
     let numbers = |value: f64| vec![value; 3];
     let proprio =
-        ColumnFacts { shape: vec![3], mean: numbers(0.0), std: numbers(1.0), min: numbers(-1.0), max: numbers(1.0) };
-    Facts {
+        ColumnInfo { shape: vec![3], mean: numbers(0.0), std: numbers(1.0), min: numbers(-1.0), max: numbers(1.0) };
+    DatasetInfo {
         action: ActionScale::identity(action),
         columns: BTreeMap::from([("proprio".to_owned(), proprio)]),
         env: None,
@@ -44,7 +44,7 @@ fn world(golden: &Golden, model: &Lewm) {
 
 #[test]
 fn lewm_checkpoints_load() {
-    let checkpoint = lewm::import::import(&folder("lewm"), facts(2)).expect("it loads");
+    let checkpoint = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("it loads");
     assert_eq!((checkpoint.config.data.frameskip, checkpoint.config.model.image), (2, 8));
     world(&recorded("lewm"), &checkpoint.model);
 }
@@ -52,13 +52,13 @@ fn lewm_checkpoints_load() {
 #[test]
 fn pldm_checkpoints_load() {
     // The file itself may be named, too.
-    let checkpoint = pldm::import::import(&folder("pldm").join("weights.pt"), facts(4)).expect("it loads");
+    let checkpoint = pldm::import::import(&folder("pldm").join("weights.pt"), dataset_info(4)).expect("it loads");
     assert_eq!((checkpoint.config.data.frameskip, checkpoint.config.model.predictor.history), (1, 3));
     world(&recorded("pldm"), &checkpoint.model.model);
 }
 
 fn dino_wm_checkpoint() -> swm_models::Checkpoint<DinoWm> {
-    dino_wm::import::import(&folder("prejepa"), facts(2)).expect("it loads")
+    dino_wm::import::import(&folder("prejepa"), dataset_info(2)).expect("it loads")
 }
 
 #[test]
@@ -72,7 +72,7 @@ fn dino_wm_checkpoints_load() {
     let ([clips, steps, _], [_, patches, width]) = (columns[0].dims(), features.dims());
     let frames = model.embed(features.reshape([clips, steps, patches, width]), &columns);
     check(&golden, "o.emb", &values(frames.clone()));
-    check(&golden, "o.pred", &values(model.predict(frames, &mut Noise::off())));
+    check(&golden, "o.pred", &values(model.predict(frames, &mut DropoutRng::disabled())));
 }
 
 #[test]
@@ -80,16 +80,16 @@ fn exported_checkpoints_load_again() {
     let out = tempfile::tempdir().expect("a folder");
     for naming in [Naming::Published, Naming::Transformers5] {
         let there = out.path().join(format!("lewm-{naming:?}"));
-        let lewm = lewm::import::import(&folder("lewm"), facts(2)).expect("it loads");
+        let lewm = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("it loads");
         lewm::import::export(&lewm, &there, naming).expect("it is written");
-        let again = lewm::import::import(&there, facts(2)).expect("it loads");
+        let again = lewm::import::import(&there, dataset_info(2)).expect("it loads");
         assert_eq!(again.config.model, lewm.config.model);
         assert_eq!(parameters::values(&again.model), parameters::values(&lewm.model));
 
         let there = out.path().join(format!("pldm-{naming:?}"));
-        let pldm = pldm::import::import(&folder("pldm"), facts(2)).expect("it loads");
+        let pldm = pldm::import::import(&folder("pldm"), dataset_info(2)).expect("it loads");
         pldm::import::export(&pldm, &there, naming).expect("it is written");
-        let again = pldm::import::import(&there, facts(2)).expect("it loads");
+        let again = pldm::import::import(&there, dataset_info(2)).expect("it loads");
         assert_eq!(parameters::values(&again.model), parameters::values(&pldm.model));
     }
     // What was published under old names comes back as it was, but for counters.
@@ -117,18 +117,18 @@ fn exported_checkpoints_load_again() {
 #[test]
 fn what_does_not_fit_is_told() {
     let message = |found: swm_core::Result<swm_models::Checkpoint<Lewm>>| found.expect_err("wrong").to_string();
-    let other = message(lewm::import::import(&folder("pldm"), facts(2)));
+    let other = message(lewm::import::import(&folder("pldm"), dataset_info(2)));
     assert!(other.contains("PLDM") && other.contains("class LeWM"), "{other}");
-    let actions = message(lewm::import::import(&folder("lewm"), facts(3)));
+    let actions = message(lewm::import::import(&folder("lewm"), dataset_info(3)));
     assert!(actions.contains("3 numbers an action") && actions.contains("divisor of 4"), "{actions}");
-    let none = message(lewm::import::import(Path::new("nowhere"), facts(2)));
+    let none = message(lewm::import::import(Path::new("nowhere"), dataset_info(2)));
     assert!(none.contains("nowhere"), "{none}");
     // Weights of another size than config.json says.
     let out = tempfile::tempdir().expect("a folder");
     let text = std::fs::read_to_string(folder("lewm").join("config.json")).expect("there");
     std::fs::write(out.path().join("config.json"), text.replace("\"depth\": 2", "\"depth\": 1")).expect("written");
     std::fs::copy(folder("lewm").join("weights.pt"), out.path().join("weights.pt")).expect("copied");
-    let mismatch = message(lewm::import::import(out.path(), facts(2)));
+    let mismatch = message(lewm::import::import(out.path(), dataset_info(2)));
     assert!(mismatch.contains("layers.1") && mismatch.contains("config.json"), "{mismatch}");
 }
 
@@ -147,10 +147,10 @@ fn exported_checkpoints_load_in_the_reference() {
             .status();
         assert!(status.expect("it runs").success(), "{family}");
     };
-    let lewm = lewm::import::import(&folder("lewm"), facts(2)).expect("it loads");
+    let lewm = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("it loads");
     lewm::import::export(&lewm, &out.path().join("lewm"), Naming::Transformers5).expect("it is written");
     load("lewm");
-    let pldm = pldm::import::import(&folder("pldm"), facts(2)).expect("it loads");
+    let pldm = pldm::import::import(&folder("pldm"), dataset_info(2)).expect("it loads");
     pldm::import::export(&pldm, &out.path().join("pldm"), Naming::Transformers5).expect("it is written");
     load("pldm");
 }

@@ -87,14 +87,14 @@ fn show(given: &str, as_json: bool) -> anyhow::Result<()> {
             "path": path,
             "family": card.family,
             "weights": card.weights,
-            "env": card.facts.env,
+            "env": card.dataset_info.env,
             "config": card.config,
-            "facts": card.facts,
+            "facts": card.dataset_info,
             "manifest": card.manifest,
         }));
     }
     emit(&format!("{}\n{}, weights {}\n", path.display(), card.family, card.weights));
-    emit(&format!("trained on {}\n", card.facts.env.as_deref().unwrap_or("an unknown environment")));
+    emit(&format!("trained on {}\n", card.dataset_info.env.as_deref().unwrap_or("an unknown environment")));
     emit(&card.toml);
     Ok(())
 }
@@ -107,7 +107,7 @@ fn list(as_json: bool) -> anyhow::Result<()> {
             Ok((_, card)) => json!({
                 "name": name,
                 "family": card.family,
-                "env": card.facts.env,
+                "env": card.dataset_info.env,
                 "weights": card.weights,
                 "image": card.image,
             }),

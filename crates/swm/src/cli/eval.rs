@@ -239,7 +239,7 @@ fn find(given: &str, env: Option<&str>) -> Result<Found> {
         },
         None => Kind::Acts(direct),
     };
-    Ok(Found { name, kind, env: card.facts.env, image: card.image })
+    Ok(Found { name, kind, env: card.dataset_info.env, image: card.image })
 }
 
 /// Evaluates with a progress bar and writes `results.json`; `films` is where to, and how many episodes of each run.

@@ -8,7 +8,7 @@ use swm::{families, home};
 use swm_core::Error;
 use swm_data::write_png;
 use swm_models::Device;
-use swm_models::probe::{self, PictureConfig, Score, StateConfig};
+use swm_models::probe::{self, ReconstructionConfig, Score, StateConfig};
 
 /// Arguments of `swm probe`. Read-outs are fitted on episodes that models are trained on, and judged on those held out for
 /// validation.
@@ -56,15 +56,15 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
         let mut config = StateConfig { seed: args.seed, ..StateConfig::new(args.columns.clone()) };
         config.frames = args.frames.unwrap_or(config.frames);
         config.fit.steps = args.steps.unwrap_or(config.fit.steps);
-        Some(threads.install(|| probe::state(&*encoder, &*reader, &config))?)
+        Some(threads.install(|| probe::read_state(&*encoder, &*reader, &config))?)
     };
     let picture = match &args.pictures {
         None => None,
         Some(file) => {
-            let mut config = PictureConfig { seed: args.seed, ..PictureConfig::default() };
+            let mut config = ReconstructionConfig { seed: args.seed, ..ReconstructionConfig::default() };
             config.frames = args.frames.unwrap_or(config.frames);
             config.fit.steps = args.steps.unwrap_or(config.fit.steps);
-            let (report, sheet) = threads.install(|| probe::picture(&*encoder, &*reader, &config))?;
+            let (report, sheet) = threads.install(|| probe::image_size(&*encoder, &*reader, &config))?;
             write_png(file, sheet.width, sheet.height, &sheet.rgb)?;
             Some(report)
         }

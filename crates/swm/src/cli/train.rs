@@ -96,7 +96,7 @@ fn play(
     let threads = swm_core::pool::threads(context.threads)?;
     let worlds = |count: usize| {
         let envs = (0..count).map(|_| choice.env()).collect::<Result<Vec<_>>>()?;
-        EnvPool::new(envs, config.picture().map(|side| (side, side)), args.max_steps, Arc::clone(&threads))
+        EnvPool::new(envs, config.image_size().map(|side| (side, side)), args.max_steps, Arc::clone(&threads))
     };
     let name = args.output.clone().unwrap_or_else(|| {
         let world = env.rsplit('/').next().unwrap_or(env).split(',').next().unwrap_or(env);

@@ -6,7 +6,7 @@ use swm_core::Key;
 use swm_models::dino_wm::step::{TrainBatch, step};
 use swm_models::dino_wm::{ColumnConfig, DinoWm, DinoWmConfig, FramePredictor, FramePredictorConfig};
 use swm_models::nn::parameters::{self, HostTensor, Named};
-use swm_models::nn::{BackboneConfig, DinoConfig, Init, Noise};
+use swm_models::nn::{BackboneConfig, DinoConfig, DropoutRng, Init};
 
 /// Published weights without the masks of the attention, which are computed here.
 fn without_masks(weights: Named<HostTensor>) -> Named<HostTensor> {
@@ -36,10 +36,10 @@ fn golden_predictor() {
         assert_eq!(parameters::shapes(&predictor), published, "names and shapes of the published weights");
         let predictor = parameters::load(predictor, &weights);
         let x = golden.tensor::<3>("i.x");
-        check(&golden, "o.y", &values(predictor.forward(x.clone(), &mut Noise::off())));
+        check(&golden, "o.y", &values(predictor.forward(x.clone(), &mut DropoutRng::disabled())));
         let [windows, tokens, dim] = x.dims();
         let two = x.slice([0..windows, 0..tokens - size("num_patches"), 0..dim]);
-        check(&golden, "o.y_two_frames", &values(predictor.forward(two, &mut Noise::off())));
+        check(&golden, "o.y_two_frames", &values(predictor.forward(two, &mut DropoutRng::disabled())));
     }
 }
 
@@ -108,7 +108,7 @@ fn golden_model() {
         check(&golden, "o.emb", &values(frames.clone()));
         let [_, _, patches, dim] = frames.dims();
         let window = frames.clone().slice([0..clips, 0..golden.size("history"), 0..patches, 0..dim]);
-        check(&golden, "o.pred", &values(model.predict(window, &mut Noise::off())));
+        check(&golden, "o.pred", &values(model.predict(window, &mut DropoutRng::disabled())));
 
         let batch = TrainBatch { patches: golden.patches("i.pixels"), columns };
         let found = step(&model, &batch, None);

@@ -13,8 +13,8 @@ use swm_models::gcrl::loss::{self, ValueLoss};
 use swm_models::gcrl::step::{Clips, Relabelled};
 use swm_models::gcrl::transformer::{Pool, Sight, TransformerConfig};
 use swm_models::gcrl::{Gcbc, Gciql, Gcivl, GcrlConfig, import};
-use swm_models::nn::{BackboneConfig, Init, Noise, VitConfig, parameters};
-use swm_models::train::{Facts, StepOutput};
+use swm_models::nn::{BackboneConfig, DropoutRng, Init, VitConfig, parameters};
+use swm_models::train::{DatasetInfo, StepOutput};
 use swm_models::weights::{self, Naming};
 use swm_plan::ActionScale;
 
@@ -121,12 +121,12 @@ fn golden_gcrl_heads() {
             Sight { frames: golden.size("num_frames"), patches: golden.size("num_patches"), dim: golden.size("dim") };
         let (frames, goal) = (golden.tensor("i.x"), golden.tensor("i.goal"));
         let policy = Head::new(&init, &golden.head(), sight, Pool::Attention, golden.size("out_dim"));
-        let means = golden.fill("w.policy.", policy).forward(&frames, &goal, &mut Noise::off());
+        let means = golden.fill("w.policy.", policy).forward(&frames, &goal, &mut DropoutRng::disabled());
         check(&golden, "o.policy", &values(means));
         let (actions, hidden) = (golden.size("action_dim"), golden.size("q_hidden_dim"));
         let critic = Critic::new(&init, &golden.head(), sight, Pool::Attention, actions, hidden);
         let critic = golden.fill("w.q.", critic);
-        let worth = critic.forward(&frames, golden.tensor("i.action"), &goal, &mut Noise::off());
+        let worth = critic.forward(&frames, golden.tensor("i.action"), &goal, &mut DropoutRng::disabled());
         check(&golden, "o.q", &values(worth));
         for name in golden.tensors.keys().filter(|name| name.starts_with("o.expectile_")) {
             let tau = name.trim_start_matches("o.expectile_").parse().expect("a number");
@@ -143,7 +143,7 @@ fn golden_gcbc() {
         let golden = Golden::read(&file);
         let model = Gcbc::init(&golden.gcrl(), golden.size("action_dim"), Key::new(0), &Device::flex());
         let model = golden.fill("w.", model);
-        golden.compare(&model.losses(&golden.clips(), &mut Noise::off(), true));
+        golden.compare(&model.losses(&golden.clips(), &mut DropoutRng::disabled(), true));
     }
 }
 
@@ -155,7 +155,7 @@ fn golden_gcivl() {
         let model = Gcivl::init(&golden.gcrl(), golden.size("action_dim"), Key::new(0), &Device::flex());
         let model = golden.fill("w.", model);
         let (clips, more, settings) = (golden.clips(), golden.relabelled(), golden.value_loss());
-        golden.compare(&model.losses(&clips, &more, &settings, &mut Noise::off(), true));
+        golden.compare(&model.losses(&clips, &more, &settings, &mut DropoutRng::disabled(), true));
     }
 }
 
@@ -167,15 +167,15 @@ fn golden_gciql() {
         let model = Gciql::init(&golden.gcrl(), golden.size("action_dim"), Key::new(0), &Device::flex());
         let model = golden.fill("w.", model);
         let (clips, more, settings) = (golden.clips(), golden.relabelled(), golden.value_loss());
-        golden.compare(&model.losses(&clips, &more, &settings, &mut Noise::off(), true));
+        golden.compare(&model.losses(&clips, &more, &settings, &mut DropoutRng::disabled(), true));
     }
 }
 
 #[test]
 fn golden_gcrl_checkpoints_of_the_reference_load_and_go_back() {
     let here = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
-    let facts = Facts { action: ActionScale::identity(2), columns: Default::default(), env: None };
-    let checkpoint = import::import::<Gcivl>(&here.join("reference/gcivl"), facts.clone()).expect("imported");
+    let dataset_info = DatasetInfo { action: ActionScale::identity(2), columns: Default::default(), env: None };
+    let checkpoint = import::import::<Gcivl>(&here.join("reference/gcivl"), dataset_info.clone()).expect("imported");
     let golden = Golden::read(&here.join("gcivl-small.safetensors"));
     let sizes = &checkpoint.config.model;
     assert_eq!((&sizes.head, &sizes.encoder), (&golden.head(), &golden.gcrl().encoder));
@@ -194,18 +194,18 @@ fn golden_gcrl_checkpoints_of_the_reference_load_and_go_back() {
         .map(|(name, weight)| (name.replace(".student.", "."), weight))
         .collect();
     assert_eq!(written, theirs);
-    let again = import::import::<Gcivl>(folder.path(), facts.clone()).expect("imported again");
+    let again = import::import::<Gcivl>(folder.path(), dataset_info.clone()).expect("imported again");
     let again = parameters::values(&again.model);
     for (name, weight) in &again {
         assert_eq!(weight, &ours[&name.replace(".teacher.", ".student.")], "{name}");
     }
 
     // A policy is part of it; a critic is not; nor do other actions fit.
-    let cloned = import::import::<Gcbc>(folder.path(), facts.clone()).expect("the policy alone");
+    let cloned = import::import::<Gcbc>(folder.path(), dataset_info.clone()).expect("the policy alone");
     assert_eq!(parameters::values(&cloned.model)["log_stds"], ours["log_stds"]);
-    let words = import::import::<Gciql>(folder.path(), facts).expect_err("no critic").to_string();
+    let words = import::import::<Gciql>(folder.path(), dataset_info).expect_err("no critic").to_string();
     assert!(words.contains("critic_predictor"), "{words}");
-    let facts = Facts { action: ActionScale::identity(3), columns: Default::default(), env: None };
-    let words = import::import::<Gcivl>(folder.path(), facts).expect_err("other actions").to_string();
+    let dataset_info = DatasetInfo { action: ActionScale::identity(3), columns: Default::default(), env: None };
+    let words = import::import::<Gcivl>(folder.path(), dataset_info).expect_err("other actions").to_string();
     assert!(words.contains("a divisor of 4"), "{words}");
 }

@@ -3,10 +3,10 @@
 use super::{Golden, TOLERANCE, check, error, files, values};
 use burn::tensor::{Device, Tensor};
 use swm_models::Checkpoint;
-use swm_models::nn::{Ensemble, Named, Noise, parameters, two_hot};
+use swm_models::nn::{DropoutRng, Ensemble, Named, parameters, two_hot};
 use swm_models::tdmpc2::step::{Draws, Step, TrainBatch, step};
 use swm_models::tdmpc2::{LossConfig, Observation, Published, Rollouts, Tdmpc2, Tdmpc2Config, export, import};
-use swm_models::train::{Facts, TrainConfig};
+use swm_models::train::{DatasetInfo, TrainConfig};
 use swm_plan::ActionScale;
 
 impl Golden {
@@ -37,15 +37,15 @@ fn golden_tdmpc2_forward() {
         check(&golden, "o.next_z", &values(model.next(input.clone())));
         let logits = model.reward.forward(input.clone());
         check(&golden, "o.reward_logits", &values(logits.clone()));
-        check(&golden, "o.reward", &values(config.bins.numbers(logits)));
+        check(&golden, "o.reward", &values(config.bins.expectation(logits)));
         check(&golden, "o.pi", &values(model.pi.forward(z.clone())));
         let critics = Ensemble::of(&model.qs.iter().collect::<Vec<_>>());
-        check(&golden, "o.q_logits", &values(critics.forward(input, 0.0, &mut Noise::off())));
+        check(&golden, "o.q_logits", &values(critics.forward(input, 0.0, &mut DropoutRng::disabled())));
 
         let numbers = golden.tensor::<1>("i.values");
         check(&golden, "o.symlog", &values(two_hot::symlog(numbers.clone())));
         check(&golden, "o.symexp", &values(two_hot::symexp(numbers.clone() * 0.2)));
-        check(&golden, "o.two_hot", &values(config.bins.shares(numbers)));
+        check(&golden, "o.two_hot", &values(config.bins.two_hot(numbers)));
 
         let rollouts = Rollouts::new(&model, golden.wm("discount"), golden.wm("uncertainty_penalty"));
         let (latents, actions) = (values(z), values(golden.tensor::<4>("i.candidates")));
@@ -71,14 +71,14 @@ fn golden_tdmpc2_goes_to_the_reference_and_back() {
         let mut config = TrainConfig::<Tdmpc2>::load("paper", &[]).expect("a configuration");
         (config.model, config.loss) = (published.model(), published.loss());
         let action = ActionScale::identity(model.actions());
-        let facts = Facts { action, columns: Named::new(), env: None };
+        let dataset_info = DatasetInfo { action, columns: Named::new(), env: None };
         let manifest = swm_core::Manifest::new("test", 0, serde_json::Value::Null);
-        let checkpoint = Checkpoint { model, config, facts: facts.clone(), manifest };
+        let checkpoint = Checkpoint { model, config, dataset_info: dataset_info.clone(), manifest };
         export(&checkpoint, folder.path()).expect("written");
-        let again = import(folder.path(), facts).expect("read");
+        let again = import(folder.path(), dataset_info).expect("read");
         assert_eq!(parameters::values(&again.model), parameters::values(&checkpoint.model));
         assert_eq!((&again.config.model, &again.config.loss), (&checkpoint.config.model, &checkpoint.config.loss));
-        let other = Facts { action: ActionScale::identity(1), columns: Named::new(), env: None };
+        let other = DatasetInfo { action: ActionScale::identity(1), columns: Named::new(), env: None };
         assert!(import(folder.path(), other).expect_err("other actions").to_string().contains("numbers an action"));
     }
 }

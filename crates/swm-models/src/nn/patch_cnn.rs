@@ -7,10 +7,10 @@ use burn::module::Module;
 use burn::tensor::Tensor;
 use serde::{Deserialize, Serialize};
 
-/// The size of a [`Pyramid`].
+/// The size of a [`PatchCnn`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct PyramidConfig {
+pub struct PatchCnnConfig {
     /// The convolutions, from pixels up.
     pub stages: Vec<Stage>,
     /// Hidden features after the last convolution.
@@ -21,7 +21,7 @@ pub struct PyramidConfig {
     pub activation: Activation,
 }
 
-/// One convolution of a [`Pyramid`].
+/// One convolution of a [`PatchCnn`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Stage {
@@ -33,7 +33,7 @@ pub struct Stage {
 
 /// Convolutions of disjoint patches, then two linear layers.
 #[derive(Module, Debug)]
-pub struct Pyramid {
+pub struct PatchCnn {
     /// From pixels.
     pub stem: Projection,
     /// The later convolutions.
@@ -43,10 +43,10 @@ pub struct Pyramid {
     /// Out of them.
     pub out: Linear,
     #[module(skip)]
-    config: PyramidConfig,
+    config: PatchCnnConfig,
 }
 
-impl PyramidConfig {
+impl PatchCnnConfig {
     /// Side of the feature map after the last convolution, for pictures of `image` pixels.
     fn side(&self, image: usize) -> usize {
         self.stages.iter().fold(image, |side, stage| side / stage.patch)
@@ -54,7 +54,7 @@ impl PyramidConfig {
 
     /// An encoder for square pictures of `image` pixels.
     #[allow(clippy::cast_precision_loss)]
-    pub fn init(&self, init: &Init, image: usize) -> Pyramid {
+    pub fn init(&self, init: &Init, image: usize) -> PatchCnn {
         let first = self.stages[0];
         let stages = self.stages.windows(2).enumerate().map(|(index, pair)| {
             let inputs = pair[1].patch.pow(2) * pair[0].channels;
@@ -62,7 +62,7 @@ impl PyramidConfig {
         });
         let features = self.side(image).pow(2) * self.stages[self.stages.len() - 1].channels;
         let spread = (2.0 / (3 * first.patch.pow(2)) as f32).sqrt();
-        Pyramid {
+        PatchCnn {
             stem: Projection::new(&init.of("stem"), 3, first.patch, first.channels, spread),
             stages: stages.collect(),
             hidden: Linear::normal(&init.of("hidden"), features, self.hidden, (2.0 / features as f32).sqrt()),
@@ -72,7 +72,7 @@ impl PyramidConfig {
     }
 }
 
-impl Pyramid {
+impl PatchCnn {
     /// # Shapes
     /// `[frames, patches, 3 * patch * patch]`, patches in rows, to `[frames, dim]`.
     pub fn forward(&self, patches: Tensor<3>) -> Tensor<2> {

@@ -1,4 +1,4 @@
-//! [`Facts`]: what a model knows of the data it was trained on.
+//! [`DatasetInfo`]: what a model knows of the data it was trained on.
 
 use crate::nn::parameters::Named;
 use burn::tensor::{Device, Tensor, TensorData};
@@ -9,18 +9,18 @@ use swm_plan::ActionScale;
 
 /// What a model knows of the data it was trained on; stored in its checkpoint.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Facts {
+pub struct DatasetInfo {
     /// Between environment actions and the model's.
     pub action: ActionScale,
     /// The other columns of numbers that it sees.
-    pub columns: Named<ColumnFacts>,
+    pub columns: Named<ColumnInfo>,
     /// The environment the data came from, where the dataset says so.
     pub env: Option<String>,
 }
 
 /// What is known of a column, number by number.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct ColumnFacts {
+pub struct ColumnInfo {
     /// The shape of a row.
     pub shape: Vec<usize>,
     /// The mean.
@@ -33,7 +33,7 @@ pub struct ColumnFacts {
     pub max: Vec<f64>,
 }
 
-impl ColumnFacts {
+impl ColumnInfo {
     /// Numbers in a row.
     pub fn dim(&self) -> usize {
         self.mean.len()
@@ -45,17 +45,17 @@ impl ColumnFacts {
     }
 }
 
-impl Facts {
-    /// The facts of a dataset; `columns` are those a model sees. Pictures among them are left out. Actions are scaled to
+impl DatasetInfo {
+    /// The dataset info of a dataset; `columns` are those a model sees. Pictures among them are left out. Actions are scaled to
     /// mean 0 and spread 1, or, if `bounded`, to lie between -1 and 1.
     ///
     /// # Errors
     /// When there is no column of continuous actions, a column is missing, or the data are damaged.
-    pub fn of(reader: &dyn Reader, columns: &[String], bounded: bool) -> Result<Self> {
+    pub fn from_reader(reader: &dyn Reader, columns: &[String], bounded: bool) -> Result<Self> {
         let schema = reader.schema();
-        let facts = |spec: &ColumnSpec| {
+        let dataset_info = |spec: &ColumnSpec| {
             let stats = column_stats(reader, &spec.name, None)?;
-            Ok::<_, Error>(ColumnFacts {
+            Ok::<_, Error>(ColumnInfo {
                 shape: spec.shape.clone(),
                 mean: stats.mean,
                 std: stats.std,
@@ -71,14 +71,14 @@ impl Facts {
                 "float32 actions of a continuous action space",
             ));
         }
-        let action = facts(action)?;
+        let action = dataset_info(action)?;
         #[allow(clippy::cast_possible_truncation)]
         let single = |values: &[f64]| values.iter().map(|&value| value as f32).collect();
         let mut seen = Named::new();
         for name in columns.iter().filter(|name| *name != "action") {
             let spec = schema.column(name)?;
             if spec.dtype != DType::U8 {
-                seen.insert(name.clone(), facts(spec)?);
+                seen.insert(name.clone(), dataset_info(spec)?);
             }
         }
         let env = reader.manifest().and_then(|manifest| Some(manifest.config.get("env")?.as_str()?.to_owned()));
@@ -94,11 +94,11 @@ impl Facts {
         Ok(Self { action, columns: seen, env })
     }
 
-    /// The facts of a column.
+    /// The dataset info of a column.
     ///
     /// # Errors
     /// When the model was trained without it.
-    pub fn column(&self, name: &str) -> Result<&ColumnFacts> {
+    pub fn column(&self, name: &str) -> Result<&ColumnInfo> {
         self.columns.get(name).ok_or_else(|| {
             Error::unknown(
                 "column of the model",

@@ -1,4 +1,4 @@
-//! [`OnlineSettings`]: how playing and learning take turns.
+//! [`OnlineConfig`]: how playing and learning take turns.
 
 use crate::tdmpc2::PlannerConfig;
 use crate::train::config::at_least;
@@ -9,7 +9,7 @@ use swm_core::Result;
 /// steps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct OnlineSettings {
+pub struct OnlineConfig {
     /// Worlds that are played side by side. A round is one step of each.
     pub envs: usize,
     /// Gradient steps after a round.
@@ -30,7 +30,7 @@ pub struct OnlineSettings {
     pub planner: Option<PlannerConfig>,
 }
 
-impl OnlineSettings {
+impl OnlineConfig {
     /// Checks that the settings make sense.
     ///
     /// # Errors

@@ -2,7 +2,7 @@
 
 use super::fit::{FitConfig, fit, rows};
 use super::scale::Scale;
-use super::{Encodes, samples};
+use super::{ImageEncoder, samples};
 use crate::nn::parameters::{self, IntoF32};
 use crate::nn::{Activation, Init, Linear};
 use crate::train::{StepOutput, at_least, shards};
@@ -16,7 +16,7 @@ use swm_data::{Part, Reader, RgbImage, contact_sheet};
 /// How a decoder is fitted.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct PictureConfig {
+pub struct ReconstructionConfig {
     /// Decides which frames are drawn, initial weights and batches.
     pub seed: u64,
     /// Frames to fit on, at most; from episodes that models are trained on.
@@ -35,7 +35,7 @@ pub struct PictureConfig {
     pub fit: FitConfig,
 }
 
-impl Default for PictureConfig {
+impl Default for ReconstructionConfig {
     fn default() -> Self {
         let fit = FitConfig { steps: 1500, batch_size: 64, lr: 2e-3 };
         let channels = vec![64, 32, 16];
@@ -45,7 +45,7 @@ impl Default for PictureConfig {
 
 /// What a decoder can draw.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct PictureReport {
+pub struct ReconstructionReport {
     /// Numbers in a latent.
     pub latent: usize,
     /// Frames fitted on.
@@ -60,7 +60,7 @@ pub struct PictureReport {
     pub explained: f64,
 }
 
-/// Pixels of the blocks that the finest feature map draws.
+/// ImageNormalization of the blocks that the finest feature map draws.
 const BLOCK: usize = 4;
 
 /// From latents to pictures: a feature map drawn by a small network, then transposed convolutions whose strides are their
@@ -76,7 +76,7 @@ struct Decoder {
 }
 
 impl Decoder {
-    fn new(init: &Init, latent: usize, image: usize, config: &PictureConfig) -> Result<Self> {
+    fn new(init: &Init, latent: usize, image: usize, config: &ReconstructionConfig) -> Result<Self> {
         let coarsest = BLOCK << (config.channels.len() - 1);
         if !image.is_multiple_of(coarsest) || image == 0 {
             return Err(Error::config(
@@ -130,11 +130,11 @@ impl Decoder {
 /// # Errors
 /// When the pictures are of another size than the encoder sees, or of one that blocks do not fill, no episode is held out, or
 /// a setting makes no sense.
-pub fn picture(
-    encoder: &dyn Encodes,
+pub fn reconstruct_images(
+    encoder: &dyn ImageEncoder,
     reader: &dyn Reader,
-    config: &PictureConfig,
-) -> Result<(PictureReport, RgbImage)> {
+    config: &ReconstructionConfig,
+) -> Result<(ReconstructionReport, RgbImage)> {
     at_least(&[
         ("frames", config.frames, 2),
         ("held_out", config.held_out, 2),
@@ -150,7 +150,7 @@ pub fn picture(
     let draw = |part, count| samples::draw(encoder, reader, part, &[], true, (count, key.with("frames")));
     let train = draw(Part::Train, config.frames)?;
     let held_out = draw(Part::Validation, config.held_out)?;
-    let (latent, image) = (encoder.latent(), encoder.image());
+    let (latent, image) = (encoder.latent_dim(), encoder.image_size());
     let bytes = image * image * 3;
     let mean = mean_picture(&train.pictures, bytes);
     let scale = Scale::of(&train.latents, train.count);
@@ -178,7 +178,7 @@ pub fn picture(
     let drawn = redraw(&decoder, &scale.apply(&held_out.latents), latent, &mean);
     let rmse = root_mean_square(drawn.iter().copied(), &held_out.pictures);
     let rmse_of_mean = root_mean_square(mean.iter().copied().cycle(), &held_out.pictures);
-    let report = PictureReport {
+    let report = ReconstructionReport {
         latent,
         frames: train.count,
         held_out: held_out.count,
@@ -206,7 +206,7 @@ fn redraw(decoder: &Decoder, latents: &[f32], latent: usize, mean: &[f32]) -> Ve
         .par_chunks(64 * latent)
         .map(|latents| {
             let x = TensorData::new(latents.to_vec(), [latents.len() / latent, latent]);
-            let mut drawn = decoder.forward(Tensor::from_data(x, &Device::flex())).into_data().try_into_vec_as_f32();
+            let mut drawn = decoder.forward(Tensor::from_data(x, &Device::flex())).into_data().into_f32_vec();
             drawn
                 .iter_mut()
                 .zip(mean.iter().cycle())
@@ -255,7 +255,7 @@ mod tests {
     #[test]
     fn cells_are_drawn_where_they_are() {
         // One channel, weights that copy: every cell of a 2 x 2 map becomes a 4 x 4 square of its value after two doublings.
-        let config = PictureConfig { hidden: 4, channels: vec![1, 1], ..PictureConfig::default() };
+        let config = ReconstructionConfig { hidden: 4, channels: vec![1, 1], ..ReconstructionConfig::default() };
         let init = Init::new(Key::new(0), &Device::flex());
         let mut decoder = Decoder::new(&init, 4, 16, &config).expect("a decoder");
         let eye: Vec<f32> = (0..16).map(|i| if i % 5 == 0 { 1.0 } else { 0.0 }).collect();
@@ -270,7 +270,7 @@ mod tests {
         decoder.finer = vec![layer(vec![1.0; 4], [4, 1])];
         decoder.blocks = layer(vec![1.0; BLOCK * BLOCK * 3], [BLOCK * BLOCK * 3, 1]);
         let latent = Tensor::<2>::from_floats([[1.0, 2.0, 3.0, 4.0]], &Device::flex());
-        let drawn: Vec<f32> = decoder.forward(latent).into_data().try_into_vec_as_f32();
+        let drawn: Vec<f32> = decoder.forward(latent).into_data().into_f32_vec();
         assert_eq!(drawn.len(), 16 * 16 * 3);
         for (i, value) in drawn.iter().enumerate() {
             let (y, x) = (i / 48, i / 3 % 16);
@@ -282,7 +282,7 @@ mod tests {
     #[test]
     fn odd_sizes_are_refused() {
         let init = Init::new(Key::new(0), &Device::flex());
-        let wrong = Decoder::new(&init, 3, 65, &PictureConfig::default()).expect_err("65 pixels").to_string();
+        let wrong = Decoder::new(&init, 3, 65, &ReconstructionConfig::default()).expect_err("65 pixels").to_string();
         assert!(wrong.contains("multiple of 16"), "{wrong}");
     }
 }

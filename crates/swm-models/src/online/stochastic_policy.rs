@@ -1,14 +1,14 @@
-//! [`ReflexPolicy`]: acting by a network alone.
+//! [`StochasticPolicy`]: acting by a network alone.
 
-use super::Live;
+use super::SharedModel;
 use crate::Checkpoint;
-use crate::train::{Facts, TrainConfig, Trainable};
+use crate::train::{DatasetInfo, TrainConfig, Trainable};
 use std::time::Instant;
 use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result, RowRef};
 use swm_plan::ActionScale;
 
 /// A model that knows what to do at a glance.
-pub trait Reflex: Trainable {
+pub trait StochasticActor: Trainable {
     /// The action for what a row shows, in model units from -1 to 1: the one it thinks best, or one drawn by `key`.
     ///
     /// # Errors
@@ -17,17 +17,17 @@ pub trait Reflex: Trainable {
 }
 
 /// Does what a network says. Every slot is a call of its own, so what is done in one does not depend on the others.
-pub struct ReflexPolicy<M: Reflex> {
+pub struct StochasticPolicy<M: StochasticActor> {
     config: TrainConfig<M>,
     scale: ActionScale,
     bounds: Vec<(f32, f32)>,
-    live: Live<M>,
+    live: SharedModel<M>,
     explore: bool,
     slots: Vec<Key>,
     latencies: Vec<f64>,
 }
 
-impl<M: Reflex> ReflexPolicy<M> {
+impl<M: StochasticActor> StochasticPolicy<M> {
     /// A policy for `slots` worlds of `spec`; `explore` draws actions instead of taking the best.
     ///
     /// # Errors
@@ -35,17 +35,17 @@ impl<M: Reflex> ReflexPolicy<M> {
     #[allow(clippy::cast_possible_truncation)]
     pub fn new(
         config: &TrainConfig<M>,
-        facts: &Facts,
-        live: Live<M>,
+        dataset_info: &DatasetInfo,
+        live: SharedModel<M>,
         spec: &EnvSpec,
         slots: usize,
         explore: bool,
     ) -> Result<Self> {
-        facts.action.check(spec)?;
+        dataset_info.action.check(spec)?;
         let bounds = (0..spec.action_dim()).map(|i| spec.action_space.bounds(i));
         Ok(Self {
             config: config.clone(),
-            scale: facts.action.clone(),
+            scale: dataset_info.action.clone(),
             bounds: bounds.map(|(low, high)| (low as f32, high as f32)).collect(),
             live,
             explore,
@@ -57,14 +57,14 @@ impl<M: Reflex> ReflexPolicy<M> {
     /// The policy of a checkpoint.
     ///
     /// # Errors
-    /// As [`ReflexPolicy::new`].
+    /// As [`StochasticPolicy::new`].
     pub fn of(checkpoint: &Checkpoint<M>, spec: &EnvSpec, slots: usize) -> Result<Self> {
-        let live = Live::new(checkpoint.model.clone());
-        Self::new(&checkpoint.config, &checkpoint.facts, live, spec, slots, false)
+        let live = SharedModel::new(checkpoint.model.clone());
+        Self::new(&checkpoint.config, &checkpoint.dataset_info, live, spec, slots, false)
     }
 }
 
-impl<M: Reflex> Policy for ReflexPolicy<M> {
+impl<M: StochasticActor> Policy for StochasticPolicy<M> {
     fn begin(&mut self, slot: usize, key: Key) {
         self.slots[slot] = key.with("reflex");
     }

@@ -1,4 +1,4 @@
-//! [`given`]: a function whose derivative is written down.
+//! [`with_derivative`]: a function whose derivative is written down.
 
 use burn::tensor::Tensor;
 
@@ -6,7 +6,7 @@ use burn::tensor::Tensor;
 ///
 /// What is added to the value is 0, exactly; its gradient is the slope times the gradient that comes. A graph holds one
 /// product then, whatever the function.
-pub fn given<const D: usize>(x: Tensor<D>, value: Tensor<D>, slope: Tensor<D>) -> Tensor<D> {
+pub fn with_derivative<const D: usize>(x: Tensor<D>, value: Tensor<D>, slope: Tensor<D>) -> Tensor<D> {
     let away = x.clone() - x.inner().autodiff();
     away * slope.autodiff() + value.autodiff()
 }

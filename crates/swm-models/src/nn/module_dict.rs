@@ -1,4 +1,4 @@
-//! [`ByName`]: modules under names that are data, such as a column's.
+//! [`ModuleDict`]: modules under names that are data, such as a column's.
 
 use burn::module::{Content, Devices, Module, ModuleDisplay, ModuleDisplayDefault, ModuleMapper, ModuleVisitor};
 use burn::tensor::Device;
@@ -7,9 +7,9 @@ use std::fmt::Debug;
 /// Modules under names that are only known when the model is made, in a fixed order. A parameter's path goes through the
 /// name, as in a `ModuleDict` of PyTorch.
 #[derive(Clone, Debug)]
-pub struct ByName<M>(pub Vec<(String, M)>);
+pub struct ModuleDict<M>(pub Vec<(String, M)>);
 
-impl<M> ByName<M> {
+impl<M> ModuleDict<M> {
     /// Names and modules.
     pub fn iter(&self) -> impl Iterator<Item = (&str, &M)> {
         self.0.iter().map(|(name, module)| (name.as_str(), module))
@@ -20,9 +20,9 @@ impl<M> ByName<M> {
     }
 }
 
-const CONTAINER: &str = "ByName";
+const CONTAINER: &str = "ModuleDict";
 
-impl<M: Module> Module for ByName<M> {
+impl<M: Module> Module for ModuleDict<M> {
     fn collect_devices(&self, devices: Devices) -> Devices {
         self.0.iter().fold(devices, |devices, (_, module)| module.collect_devices(devices))
     }
@@ -70,10 +70,10 @@ impl<M: Module> Module for ByName<M> {
     }
 }
 
-impl<M: Module + ModuleDisplay> ModuleDisplayDefault for ByName<M> {
+impl<M: Module + ModuleDisplay> ModuleDisplayDefault for ModuleDict<M> {
     fn content(&self, content: Content) -> Option<Content> {
         self.0.iter().fold(content, |content, (name, module)| content.add(name, module)).optional()
     }
 }
 
-impl<M: Module + ModuleDisplay> ModuleDisplay for ByName<M> {}
+impl<M: Module + ModuleDisplay> ModuleDisplay for ModuleDict<M> {}

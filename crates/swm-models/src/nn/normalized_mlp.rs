@@ -2,7 +2,7 @@
 //! through Mish; latents are simplices.
 
 use super::norm::standardize;
-use super::{Init, LayerNorm, Linear, Noise, given};
+use super::{DropoutRng, Init, LayerNorm, Linear, with_derivative};
 use burn::module::{Module, Param};
 use burn::tensor::{Tensor, activation};
 
@@ -13,7 +13,7 @@ const STD: f32 = 0.02;
 
 /// A linear layer and the normalisation behind it.
 #[derive(Module, Debug)]
-pub struct NormedLinear {
+pub struct NormalizedLinear {
     /// `[outputs, inputs]`.
     pub weight: Param<Tensor<2>>,
     /// `[outputs]`.
@@ -22,7 +22,7 @@ pub struct NormedLinear {
     pub ln: LayerNorm,
 }
 
-impl NormedLinear {
+impl NormalizedLinear {
     /// A layer.
     pub fn new(init: &Init, inputs: usize, outputs: usize) -> Self {
         Self {
@@ -42,9 +42,9 @@ impl NormedLinear {
 #[derive(Module, Debug)]
 pub struct Head {
     /// Into hidden features.
-    pub _0: NormedLinear,
+    pub _0: NormalizedLinear,
     /// From hidden features to hidden features.
-    pub _1: NormedLinear,
+    pub _1: NormalizedLinear,
     /// Out of them.
     pub _2: Linear,
 }
@@ -53,14 +53,14 @@ impl Head {
     /// A head.
     pub fn new(init: &Init, inputs: usize, hidden: usize, outputs: usize) -> Self {
         Self {
-            _0: NormedLinear::new(&init.of("0"), inputs, hidden),
-            _1: NormedLinear::new(&init.of("1"), hidden, hidden),
+            _0: NormalizedLinear::new(&init.of("0"), inputs, hidden),
+            _1: NormalizedLinear::new(&init.of("1"), hidden, hidden),
             _2: Linear::normal(&init.of("2"), hidden, outputs, STD),
         }
     }
 
     /// A head whose read-out is 0 until trained.
-    pub fn silent(init: &Init, inputs: usize, hidden: usize, outputs: usize) -> Self {
+    pub fn zero_initialized(init: &Init, inputs: usize, hidden: usize, outputs: usize) -> Self {
         let mut head = Self::new(init, inputs, hidden, outputs);
         head._2 = Linear::zeros(init, hidden, outputs);
         head
@@ -76,27 +76,27 @@ impl Head {
 #[derive(Module, Debug)]
 pub struct Dynamics {
     /// Into hidden features.
-    pub _0: NormedLinear,
+    pub _0: NormalizedLinear,
     /// From hidden features to hidden features.
-    pub _1: NormedLinear,
+    pub _1: NormalizedLinear,
     /// To what becomes a latent.
-    pub _2: NormedLinear,
+    pub _2: NormalizedLinear,
 }
 
 impl Dynamics {
     /// Dynamics.
     pub fn new(init: &Init, inputs: usize, hidden: usize, latent: usize) -> Self {
         Self {
-            _0: NormedLinear::new(&init.of("0"), inputs, hidden),
-            _1: NormedLinear::new(&init.of("1"), hidden, hidden),
-            _2: NormedLinear::new(&init.of("2"), hidden, latent),
+            _0: NormalizedLinear::new(&init.of("0"), inputs, hidden),
+            _1: NormalizedLinear::new(&init.of("1"), hidden, hidden),
+            _2: NormalizedLinear::new(&init.of("2"), hidden, latent),
         }
     }
 
     /// `[rows, inputs]` to `[rows, latent]`; `simplex` numbers of a latent add up to 1.
     pub fn forward(&self, x: Tensor<2>, simplex: usize) -> Tensor<2> {
         let hidden = mish(self._1.forward(mish(self._0.forward(x))));
-        simplices(self._2.forward(hidden), simplex)
+        sim_norm(self._2.forward(hidden), simplex)
     }
 }
 
@@ -115,7 +115,7 @@ struct Layer {
 impl Ensemble {
     /// These heads; gradients flow back to them.
     pub fn of(heads: &[&Head]) -> Self {
-        let hidden = |get: fn(&Head) -> &NormedLinear| Layer {
+        let hidden = |get: fn(&Head) -> &NormalizedLinear| Layer {
             weight: matrices(heads.iter().map(|head| &get(head).weight)),
             bias: rows(heads.iter().map(|head| Some(&get(head).bias))),
             norm: rows(heads.iter().map(|head| Some(&get(head).ln.weight)))
@@ -142,7 +142,7 @@ impl Ensemble {
     }
 
     /// `[rows, inputs]` to `[heads, rows, outputs]`; `dropout` is the rate behind the first product.
-    pub fn forward(&self, x: Tensor<2>, dropout: f32, noise: &mut Noise<'_>) -> Tensor<3> {
+    pub fn forward(&self, x: Tensor<2>, dropout: f32, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let [first, second, last] = &self.layers;
         let [heads, _, _] = first.weight.dims();
         let [rows, inputs] = x.dims();
@@ -196,11 +196,11 @@ pub fn mish<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     }
     let sigmoid = exponential.clone() / (exponential + 1.0);
     let slope = tanh.clone() + inner * sigmoid * (tanh.square().neg() + 1.0);
-    given(x, value, slope)
+    with_derivative(x, value, slope)
 }
 
 /// Every `simplex` numbers of a row become weights that add up to 1 (SimNorm).
-pub fn simplices(x: Tensor<2>, simplex: usize) -> Tensor<2> {
+pub fn sim_norm(x: Tensor<2>, simplex: usize) -> Tensor<2> {
     let [rows, width] = x.dims();
     activation::softmax(x.reshape([rows, width / simplex, simplex]), 2).reshape([rows, width])
 }

@@ -1,18 +1,18 @@
-//! [`Live`]: weights that are trained while somebody acts with them.
+//! [`SharedModel`]: weights that are trained while somebody acts with them.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// A model that changes. Cheap to clone; all clones show the same model.
 #[derive(Debug)]
-pub struct Live<M>(Arc<Mutex<M>>);
+pub struct SharedModel<M>(Arc<Mutex<M>>);
 
-impl<M> Clone for Live<M> {
+impl<M> Clone for SharedModel<M> {
     fn clone(&self) -> Self {
         Self(Arc::clone(&self.0))
     }
 }
 
-impl<M: Clone> Live<M> {
+impl<M: Clone> SharedModel<M> {
     /// A model that may change.
     pub fn new(model: M) -> Self {
         Self(Arc::new(Mutex::new(model)))

@@ -274,7 +274,7 @@ fn probes_read_where_the_dot_is_and_draw_it_again() {
 
     let mut settings = ReconstructionConfig { channels: vec![16, 8], shown: 6, ..ReconstructionConfig::default() };
     (settings.fit.steps, settings.fit.lr) = (1000, 5e-3);
-    let (report, sheet) = probe::image_size(&Profiles, &data, &settings).expect("drawn");
+    let (report, sheet) = probe::reconstruct_images(&Profiles, &data, &settings).expect("drawn");
     assert!(report.explained > 0.2 && report.rmse < report.rmse_of_mean, "{report:?}");
     let cell = SIDE * 8 + 2;
     assert_eq!((sheet.width, sheet.height), (6 * cell + 2, 2 * cell + 2));

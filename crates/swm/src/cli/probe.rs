@@ -64,7 +64,7 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
             let mut config = ReconstructionConfig { seed: args.seed, ..ReconstructionConfig::default() };
             config.frames = args.frames.unwrap_or(config.frames);
             config.fit.steps = args.steps.unwrap_or(config.fit.steps);
-            let (report, sheet) = threads.install(|| probe::image_size(&*encoder, &*reader, &config))?;
+            let (report, sheet) = threads.install(|| probe::reconstruct_images(&*encoder, &*reader, &config))?;
             write_png(file, sheet.width, sheet.height, &sheet.rgb)?;
             Some(report)
         }

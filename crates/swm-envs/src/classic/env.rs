@@ -2,7 +2,7 @@
 
 use super::picture::Picture;
 use super::{World, factors};
-use crate::factors as values;
+use swm_core::factors as values;
 use rand::Rng as _;
 use rand::seq::IndexedRandom as _;
 use swm_core::{

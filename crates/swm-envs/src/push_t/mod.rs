@@ -9,7 +9,7 @@ mod physics;
 mod render;
 mod shapes;
 
-use crate::factors;
+use swm_core::factors;
 use physics::{AGENT, BLOCK, Body, Shape, Vec2, WALLS, World, put, take_array};
 use render::{Renderer, Scene};
 use shapes::Design;

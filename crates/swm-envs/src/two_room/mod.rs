@@ -5,14 +5,12 @@ mod paths;
 mod physics;
 mod render;
 
-use crate::draw::{SoftDisc, Rgb};
+use crate::draw::{Rgb, SoftDisc};
 use crate::point_agent::room::{self, GOAL_RADIUS, SIZE, choice, color, position_factor, scalar};
 use crate::point_agent::{PointAgentEnv, PointTask, Position, distance64, farthest_goal, position, widen};
 use physics::{Layout, MAX_DOORS, WALL_CENTER};
 use render::{RoomAppearance, RoomRenderer};
-use swm_core::{
-    DType, EnvEntry, EnvSpec, Factor, FactorValues, FrameMut, Rng, RowMut, Space, VariationSpace,
-};
+use swm_core::{DType, EnvEntry, EnvSpec, Factor, FactorValues, FrameMut, Rng, RowMut, Space, VariationSpace};
 
 /// The registry row.
 pub const ENTRY: EnvEntry = EnvEntry {

@@ -6,7 +6,7 @@
 //! rounding of it.
 
 use super::physics::WALL_CENTER;
-use crate::draw::{BySize, Brush, Rgb, SoftDisc};
+use crate::draw::{Brush, BySize, Rgb, SoftDisc};
 use crate::point_agent::room::{BORDER, LINE, SIZE};
 use swm_core::FrameMut;
 

@@ -4,25 +4,26 @@
 # One cache of compiled crates for every checkout on the machine.
 export CARGO_TARGET_DIR ?= $(HOME)/.cache/swm/target
 CACHE := $(HOME)/.cache/swm
-# A small Python environment with the `lance` and `h5py` packages: tests open our datasets with it.
+# A Python environment with the `lance` and `h5py` packages: tests open our datasets with them.
 VENV := $(CACHE)/venv-formats-1
-# What 3-D worlds need of others (`swm assets`), one copy for every checkout on the machine.
+# MuJoCo, its models and meshes (`swm assets`): one copy for every checkout on the machine.
 export SWM_ASSETS ?= $(CACHE)/assets
 # What users of the Python package bring along: PyTorch, Gymnasium, Stable-Baselines3, the Arcade Learning Environment.
-PYTHON_VENV := $(CACHE)/venv-python-1
+PYTHON_VENV := $(CACHE)/venv-python-2
 WHEELS := $(CARGO_TARGET_DIR)/wheels
 # Worker processes of Gymnasium environments run in it.
 export SWM_PYTHON ?= $(PYTHON_VENV)/bin/python
+export SWM_TYPOS ?= $(PYTHON_VENV)/bin/typos
 SWM := $(CARGO_TARGET_DIR)/release/swm
 SUDO := $(shell [ "$$(id -u)" = 0 ] || command -v sudo)
 CARGO := cargo
 
-.PHONY: help demo test test-python check build wheel wheel-portable gpu assets setup setup-python reference bench clean
+.PHONY: help demo test test-python check build tests wheel wheel-portable gpu assets setup setup-python reference bench clean
 
 help:
 	@echo 'make demo       collect, train, plan, evaluate and report on a laptop CPU'
 	@echo 'make test       all checks and all tests'
-	@echo 'make build      the swm binary: $(SWM)'
+	@echo 'make build      the swm program: $(SWM)'
 	@echo 'make wheel      the Python package: $(WHEELS)'
 	@echo 'make wheel-portable   the same with the FFmpeg it uses inside, for other machines: $(WHEELS)/portable'
 	@echo 'make gpu        the same with models on a GPU through Vulkan: $(CARGO_TARGET_DIR)-gpu/release/swm'
@@ -32,10 +33,10 @@ help:
 demo: build
 	$(SWM) demo
 
-test: check setup-python assets test-python
+test: check test-python
 	SWM_LANCE_PYTHON=$(VENV)/bin/python $(CARGO) test --release --workspace
 
-# The wheel in an environment of its own with nothing but what it asks for, then its tests beside PyTorch and others.
+# The wheel in an environment of its own with nothing but its requirements, then its tests with PyTorch and the rest.
 test-python: wheel assets
 	cd python && $(PYTHON_VENV)/bin/ruff format --check --quiet . && $(PYTHON_VENV)/bin/ruff check --quiet . && \
 	  $(PYTHON_VENV)/bin/mypy
@@ -45,21 +46,24 @@ test-python: wheel assets
 	$(PYTHON_VENV)/bin/python -m pip install --quiet --force-reinstall --no-deps $(WHEELS)/*.whl
 	cd python/tests && $(PYTHON_VENV)/bin/python -m pytest -q
 
-check: setup
-	$(CARGO) xtask check
+# After `tests`, which compiles xtask with the libraries of everything else.
+check: tests setup-python
+	$(CARGO_TARGET_DIR)/release/xtask check
 
-# With the tests, whose needs switch on features of shared dependencies: so `make test` finds them compiled.
+# The program alone.
 build: setup
+	$(CARGO) build --release -p swm --bins
+
+tests: setup
 	$(CARGO) build --release --workspace --bins --tests
 
-# After `build`, whose compiled libraries it uses again (python/Cargo.toml says how).
-wheel: build $(PYTHON_VENV)/ready
+wheel: setup $(PYTHON_VENV)/ready
 	@rm -rf $(WHEELS)
 	$(PYTHON_VENV)/bin/maturin build --release --manifest-path python/Cargo.toml --out $(WHEELS) --compatibility linux \
 	  --auditwheel skip --interpreter $(PYTHON_VENV)/bin/python
 
-# For machines without the FFmpeg of this one: its libraries go along (88 MB instead of 24). They include x264, which is
-# under the GPL: whoever gives the wheel to others gives it under those terms.
+# For machines without the FFmpeg of this one: its libraries are included (88 MB instead of 24). They include x264, which
+# is under the GPL, and so is a wheel that includes it.
 wheel-portable: wheel
 	cd $(WHEELS) && PATH=$(PYTHON_VENV)/bin:$$PATH auditwheel repair --wheel-dir portable *.whl
 
@@ -71,12 +75,12 @@ bench: assets
 	SWM_REFERENCE_PYTHON=$(CACHE)/reference/bin/python $(SWM) bench envs
 	SWM_REFERENCE_PYTHON=$(CACHE)/reference/bin/python $(SWM) bench data
 
-# Fetched once; every file is compared with its checksum at every call.
+# Downloaded once; every call compares the files with their checksums.
 assets: build
 	@$(SWM) assets verify mujoco dm_control ogbench gymnasium-robotics >/dev/null 2>&1 || $(SWM) assets install
 
 # What the build and the tests need: protoc for Lance, a C compiler for zstd, FFmpeg's libraries (and libclang, to read
-# their headers) for videos, Mesa for pictures of 3-D worlds where there is no GPU.
+# their headers) for videos, Mesa for OpenGL frames of 3-D environments where there is no GPU.
 PACKAGES := libavcodec-dev libavformat-dev libavutil-dev libswscale-dev libclang-dev pkg-config \
 	libegl1 libegl-mesa0 libgl1-mesa-dri
 setup:

@@ -1,38 +1,60 @@
-//! Checks and chores of the workspace.
+//! Checks of the workspace.
 //!
 //! `cargo xtask check` runs everything a change must pass apart from the tests, cheapest first, and stops at the
-//! first failure. `cargo xtask layers` and `cargo xtask table` run one check each.
+//! first failure. Every check is a command of its own as well.
 
-// A program that talks to people; the lint guards the libraries.
-#![allow(clippy::print_stdout, clippy::print_stderr)]
+// A command-line program; the lints guard the libraries.
+#![allow(clippy::print_stdout, clippy::print_stderr, reason = "a command-line program prints")]
 
+mod columns;
+mod cycles;
+mod features;
 mod graph;
 mod layers;
+mod registries;
+mod sizes;
+mod source;
 mod table;
+mod words;
 
 use anyhow::{Context as _, Result, bail};
 use graph::Graph;
 use std::path::PathBuf;
 use std::process::{Command, ExitCode};
 
-const USAGE: &str = "usage: cargo xtask COMMAND
+/// A check: its name, what it proves, and what it runs.
+type Check = (&'static str, &'static str, fn() -> Result<()>);
 
-  check    everything below and more, cheapest first: fmt, layers, table, clippy
-  layers   no crate reaches what its layer must not know
-  table    the crate table of ARCHITECTURE.md is true";
+/// The checks, cheapest first.
+const CHECKS: &[Check] = &[
+    ("fmt", "the code is formatted", fmt),
+    ("words", "no word that has a better one (words.toml)", || verdict("words", &word_list()?.violations(&prose()?))),
+    ("typos", "no misspelt word (the program `typos`)", typos),
+    ("sizes", "no file of more than 500 lines", || verdict("sizes", &sizes::violations(&sources()?))),
+    ("cycles", "no import cycle of more than four files", || verdict("cycles", &cycles::violations(&sources()?))),
+    ("columns", "only swm-core spells the standard columns", || verdict("columns", &columns::violations(&sources()?))),
+    ("registries", "every ENTRY is in a list", || verdict("registries", &registries::violations(&sources()?))),
+    ("layers", "no crate reaches what its layer excludes", || verdict("layers", &layers::violations(&graph()?, layers::RULES))),
+    ("table", "the crate table of ARCHITECTURE.md is true", table),
+    ("features", "every build compiles a library with the same features", || {
+        verdict("features", &features::violations(&root())?)
+    }),
+    ("clippy", "no warning", clippy),
+];
 
 fn main() -> ExitCode {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let outcome = match words.iter().map(String::as_str).collect::<Vec<_>>()[..] {
-        ["check"] => check(),
-        ["layers"] => Graph::load(&root()).and_then(|graph| layers(&graph)),
-        ["table"] => Graph::load(&root()).and_then(|graph| table(&graph)),
+        ["check"] => CHECKS.iter().try_for_each(|(_, _, run)| run()),
         ["help" | "--help" | "-h"] => {
-            println!("{USAGE}");
+            println!("{}", usage());
             Ok(())
         }
+        [name] if CHECKS.iter().any(|(check, ..)| *check == name) => {
+            CHECKS.iter().filter(|(check, ..)| *check == name).try_for_each(|(_, _, run)| run())
+        }
         _ => {
-            eprintln!("{USAGE}");
+            eprintln!("{}", usage());
             return ExitCode::from(2);
         }
     };
@@ -45,28 +67,63 @@ fn main() -> ExitCode {
     }
 }
 
-fn check() -> Result<()> {
+fn usage() -> String {
+    let rows: Vec<String> = CHECKS.iter().map(|(name, proves, _)| format!("  {name:<11}{proves}")).collect();
+    format!("usage: cargo xtask COMMAND\n\n  check      all of the following, cheapest first\n{}", rows.join("\n"))
+}
+
+fn fmt() -> Result<()> {
     cargo(&["fmt", "--all", "--", "--check"], "run `cargo fmt --all`")?;
-    println!("fmt: fine");
-    let graph = Graph::load(&root())?;
-    layers(&graph)?;
-    table(&graph)?;
+    verdict("fmt", &[])
+}
+
+fn clippy() -> Result<()> {
     cargo(
         &["clippy", "--release", "--workspace", "--all-targets", "--", "-D", "warnings"],
-        "mend what clippy names above",
+        "fix what clippy names above",
     )?;
-    println!("clippy: fine");
-    Ok(())
+    verdict("clippy", &[])
 }
 
-fn layers(graph: &Graph) -> Result<()> {
-    verdict("layers", &layers::violations(graph, layers::RULES))
+fn typos() -> Result<()> {
+    let program = std::env::var_os("SWM_TYPOS").unwrap_or_else(|| "typos".into());
+    let status = Command::new(&program).args(["--config", "xtask/typos.toml"]).current_dir(root()).status();
+    let status = status.with_context(|| {
+        format!("starting {}: install it with `pip install typos`, or name it in SWM_TYPOS", program.display())
+    })?;
+    if !status.success() {
+        bail!("typos: correct the words above, or add names to xtask/typos.toml");
+    }
+    verdict("typos", &[])
 }
 
-fn table(graph: &Graph) -> Result<()> {
+fn table() -> Result<()> {
     let path = root().join("ARCHITECTURE.md");
     let text = std::fs::read_to_string(&path).with_context(|| format!("reading {}", path.display()))?;
-    verdict("table", &table::violations(graph, &table::parse(&text)?))
+    verdict("table", &table::violations(&graph()?, &table::parse(&text)?))
+}
+
+fn graph() -> Result<Graph> {
+    Graph::load(&root())
+}
+
+/// Rust sources of libraries and programs, integration tests left out.
+fn sources() -> Result<Vec<source::File>> {
+    let mut files = source::files(&root(), &[".rs"])?;
+    files.retain(|file| file.path.contains("/src/"));
+    Ok(files)
+}
+
+/// Everything people read: code, documents, Python, presets. The list of words itself is left out.
+fn prose() -> Result<Vec<source::File>> {
+    let mut files = source::files(&root(), &[".rs", ".md", ".py", ".toml", "Makefile"])?;
+    files.retain(|file| !file.path.starts_with("xtask/"));
+    Ok(files)
+}
+
+fn word_list() -> Result<words::Words> {
+    let path = root().join("xtask/words.toml");
+    words::Words::parse(&std::fs::read_to_string(&path).with_context(|| format!("reading {}", path.display()))?)
 }
 
 fn verdict(what: &str, violations: &[String]) -> Result<()> {
@@ -81,8 +138,8 @@ fn cargo(arguments: &[&str], fix: &str) -> Result<()> {
     let program = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let words = arguments.join(" ");
     let mut command = Command::new(program);
-    // What `cargo run` told this program about itself is not for others: build scripts that watch these variables (ring's)
-    // would run again, and everything above them be compiled again, at every change between check and build.
+    // `cargo run` sets variables about this package. Build scripts that watch them (ring's) would run again in the inner
+    // cargo, and everything above them would be compiled again, so they are removed.
     let own = std::env::vars_os().map(|(name, _)| name).filter(|name| {
         let name = name.to_string_lossy();
         name == "OUT_DIR" || name.starts_with("CARGO_PKG_") || name.starts_with("CARGO_MANIFEST_")

@@ -99,6 +99,8 @@ fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
         let fix = "the environment says how it is reached, such as AWS_ENDPOINT_URL, AWS_REGION and AWS_ACCESS_KEY_ID";
         Error::config("dataset", format!("{url}: {e}"), fix)
     };
+    #[cfg(feature = "tls")]
+    provide_tls();
     match url.scheme() {
         #[cfg(feature = "s3")]
         "s3" => {
@@ -130,6 +132,13 @@ fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
             Err(Error::config("dataset", problem, fix))
         }
     }
+}
+
+/// Makes ring the process's provider of cryptography, unless the process already has one.
+#[cfg(feature = "tls")]
+fn provide_tls() {
+    // An error means that a provider is installed, which serves as well.
+    let _ = rustls::crypto::ring::default_provider().install_default();
 }
 
 /// An error of a store in our words.

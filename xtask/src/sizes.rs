@@ -1,0 +1,24 @@
+//! The size of source files. (The length of functions is Clippy's `too_many_lines`.)
+
+use crate::source::File;
+
+/// The most lines a file may have, its unit tests included.
+const MOST: usize = 500;
+
+/// Every file that is too long, a sentence each.
+pub fn violations(files: &[File]) -> Vec<String> {
+    let long = files.iter().map(|file| (file, file.text.lines().count())).filter(|(_, lines)| *lines > MOST);
+    long.map(|(file, lines)| format!("{}: {lines} lines (at most {MOST}): split it by concept", file.path)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_long_file_is_named() {
+        let file = |lines: usize| File { path: "a.rs".to_owned(), text: "x\n".repeat(lines) };
+        assert_eq!(violations(&[file(MOST)]), Vec::<String>::new());
+        assert!(violations(&[file(MOST + 1)])[0].contains("501 lines"));
+    }
+}

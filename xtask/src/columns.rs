@@ -6,7 +6,8 @@ use crate::source::File;
 const HOME: &str = "crates/swm-core/src/columns";
 
 /// Names that mean nothing but a column. (`action`, `goal` and the like are words of settings and JSON, too.)
-const NAMES: &[&str] = &["\"pixels\"", "\"terminated\"", "\"truncated\"", "\"episode_idx\"", "\"step_idx\"", "\"variation."];
+const NAMES: &[&str] =
+    &["\"pixels\"", "\"terminated\"", "\"truncated\"", "\"episode_idx\"", "\"step_idx\"", "\"variation."];
 
 /// Every spelling outside the file that defines it, a sentence each. Unit tests, at the end of a file, may spell names.
 pub fn violations(files: &[File]) -> Vec<String> {

@@ -44,7 +44,8 @@ struct Imports<'a> {
 
 impl<'a> Imports<'a> {
     fn of(root: &str, files: &[&'a File]) -> Self {
-        let modules: Vec<ModulePath> = files.iter().map(|file| module(&file.path[root.len() + "/src/".len()..])).collect();
+        let modules: Vec<ModulePath> =
+            files.iter().map(|file| module(&file.path[root.len() + "/src/".len()..])).collect();
         let index: HashMap<&[String], usize> = modules.iter().enumerate().map(|(i, m)| (m.as_slice(), i)).collect();
         let sources: Vec<String> = files.iter().map(|file| source::without_tests(&source::code(&file.text))).collect();
         let mut exports: HashMap<ModulePath, ModulePath> = HashMap::new();
@@ -137,7 +138,8 @@ fn imports(code: &str, module: &[String], index: &HashMap<&[String], usize>) -> 
     let mut found = vec![];
     for statement in code.split_inclusive(';') {
         // The last `use` before the semicolon begins the statement.
-        let Some(at) = statement.rfind("use ").filter(|&at| !statement[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_'))
+        let Some(at) =
+            statement.rfind("use ").filter(|&at| !statement[..at].ends_with(|c: char| c.is_alphanumeric() || c == '_'))
         else {
             continue;
         };
@@ -151,8 +153,10 @@ fn imports(code: &str, module: &[String], index: &HashMap<&[String], usize>) -> 
     // Paths in expressions and signatures.
     for start in ["crate::", "super::"] {
         for (at, _) in code.match_indices(start) {
-            let end = code[at..].find(|c: char| !c.is_alphanumeric() && c != '_' && c != ':').map_or(code.len(), |n| at + n);
-            let path: ModulePath = code[at..end].split("::").filter(|part| !part.is_empty()).map(str::to_owned).collect();
+            let end =
+                code[at..].find(|c: char| !c.is_alphanumeric() && c != '_' && c != ':').map_or(code.len(), |n| at + n);
+            let path: ModulePath =
+                code[at..end].split("::").filter(|part| !part.is_empty()).map(str::to_owned).collect();
             if let Some(path) = absolute(&path, module, index).filter(|path| path.len() > 1) {
                 // A path of a `use` statement is found above, with its braces.
                 let line = code[..at].rfind(['\n', ';', '{', '}']).map_or(0, |n| n + 1);
@@ -235,7 +239,11 @@ mod tests {
         let files: Vec<File> = files.iter().map(|(path, text)| file(&format!("c/src/{path}"), text)).collect();
         let files: Vec<&File> = files.iter().collect();
         let imports = Imports::of("c", &files);
-        imports.cycles().iter().map(|cycle| cycle.iter().map(|name| name["c/src/".len()..].to_owned()).collect()).collect()
+        imports
+            .cycles()
+            .iter()
+            .map(|cycle| cycle.iter().map(|name| name["c/src/".len()..].to_owned()).collect())
+            .collect()
     }
 
     #[test]
@@ -247,7 +255,9 @@ mod tests {
 
     #[test]
     fn paths_of_every_form_count() {
-        for import in ["use super::b::B;", "use crate::b::{self, x::{y, z}};", "fn f() { crate::b::g() }", "use crate::{q, b};"] {
+        for import in
+            ["use super::b::B;", "use crate::b::{self, x::{y, z}};", "fn f() { crate::b::g() }", "use crate::{q, b};"]
+        {
             let found = cycles(&[("lib.rs", ""), ("a.rs", import), ("b.rs", "use crate::a;")]);
             assert_eq!(found, [["a.rs", "b.rs"]], "{import}");
         }

@@ -22,13 +22,16 @@ type Features = BTreeMap<String, BTreeSet<String>>;
 
 /// Every library that two builds would compile with different features, a sentence each.
 pub fn violations(root: &Path) -> Result<Vec<String>> {
-    let resolved: Vec<(&str, Features)> =
-        BUILDS.iter().map(|(name, select, tests)| Ok((*name, features(root, select, *tests)?))).collect::<Result<_>>()?;
+    let resolved: Vec<(&str, Features)> = BUILDS
+        .iter()
+        .map(|(name, select, tests)| Ok((*name, features(root, select, *tests)?)))
+        .collect::<Result<_>>()?;
     let (whole, all) = &resolved[0];
     let mut found = vec![];
     for (name, features) in &resolved[1..] {
         for (library, sets) in features {
-            let missing: Vec<&String> = sets.iter().filter(|set| all.get(library).is_none_or(|sets| !sets.contains(*set))).collect();
+            let missing: Vec<&String> =
+                sets.iter().filter(|set| all.get(library).is_none_or(|sets| !sets.contains(*set))).collect();
             if let [set, ..] = missing[..] {
                 let sets: Vec<&str> = all.get(library).into_iter().flatten().map(String::as_str).collect();
                 found.push(format!(
@@ -75,7 +78,9 @@ mod tests {
 
     #[test]
     fn members_and_macros_are_left_out() {
-        let features = parse("swm v0.1.0 (/w/swm)\t\nserde v1.0.1\tderive,std\nserde v1.0.1\tderive,std (*)\nm v1 (proc-macro)\tx\n");
+        let features = parse(
+            "swm v0.1.0 (/w/swm)\t\nserde v1.0.1\tderive,std\nserde v1.0.1\tderive,std (*)\nm v1 (proc-macro)\tx\n",
+        );
         assert_eq!(features.len(), 1);
         assert_eq!(features["serde v1.0.1"].iter().collect::<Vec<_>>(), ["derive,std"]);
     }

@@ -34,7 +34,9 @@ const CHECKS: &[Check] = &[
     ("cycles", "no import cycle of more than four files", || verdict("cycles", &cycles::violations(&sources()?))),
     ("columns", "only swm-core spells the standard columns", || verdict("columns", &columns::violations(&sources()?))),
     ("registries", "every ENTRY is in a list", || verdict("registries", &registries::violations(&sources()?))),
-    ("layers", "no crate reaches what its layer excludes", || verdict("layers", &layers::violations(&graph()?, layers::RULES))),
+    ("layers", "no crate reaches what its layer excludes", || {
+        verdict("layers", &layers::violations(&graph()?, layers::RULES))
+    }),
     ("table", "the crate table of ARCHITECTURE.md is true", table),
     ("features", "every build compiles a library with the same features", || {
         verdict("features", &features::violations(&root())?)

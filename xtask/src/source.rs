@@ -146,7 +146,8 @@ mod tests {
 
     #[test]
     fn test_modules_are_removed() {
-        let text = "fn a() { b() }\n#[cfg(test)]\nmod tests { fn c() { d() } }\nfn e() {}\n#[cfg(test)]\nmod far;\nfn g() {}";
+        let text =
+            "fn a() { b() }\n#[cfg(test)]\nmod tests { fn c() { d() } }\nfn e() {}\n#[cfg(test)]\nmod far;\nfn g() {}";
         let rest = without_tests(text);
         assert!(rest.contains("fn a") && rest.contains("fn e") && rest.contains("fn g"));
         assert!(!rest.contains("fn c") && !rest.contains("far"));

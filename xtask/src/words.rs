@@ -99,7 +99,10 @@ impl Words {
             }
         }
         for (row, _) in self.allowed.iter().zip(&used).filter(|(_, used)| !**used) {
-            found.push(format!("words.toml allows `{}` in {}, where no refused word stands: delete the row", row.line, row.path));
+            found.push(format!(
+                "words.toml allows `{}` in {}, where no refused word stands: delete the row",
+                row.line, row.path
+            ));
         }
         found
     }
@@ -114,7 +117,8 @@ impl Words {
         }
         for reserved in self.types.iter().filter(|reserved| !reserved.only_in.iter().any(|file| file == path)) {
             let tokens: Vec<&str> = line.split(|c: char| !c.is_alphanumeric() && c != '_').collect();
-            let defines = |pair: &[&str]| ["struct", "enum", "trait", "type"].contains(&pair[0]) && pair[1] == reserved.name;
+            let defines =
+                |pair: &[&str]| ["struct", "enum", "trait", "type"].contains(&pair[0]) && pair[1] == reserved.name;
             if path.ends_with(".rs") && tokens.windows(2).any(defines) {
                 found.push(format!("a type named `{}`: {}", reserved.name, reserved.say));
             }

@@ -29,7 +29,6 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let entry = ENVS.get(id)?;
         let mut env = entry.env()?;
         let space = env.spec().action_space.clone();
-        #[allow(clippy::cast_possible_truncation)]
         let actions: Vec<Vec<f32>> = (0..steps)
             .map(|t| space.sample(&mut Key::new(1).at(t.into()).rng()).iter().map(|&v| v as f32).collect())
             .collect();

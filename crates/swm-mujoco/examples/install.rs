@@ -1,5 +1,5 @@
 //! Installs every asset that is not there: what `swm assets install` does.
-#![allow(clippy::print_stdout)]
+#![allow(clippy::print_stdout, reason = "a command-line program")]
 
 use swm_mujoco::assets::{self, Status};
 

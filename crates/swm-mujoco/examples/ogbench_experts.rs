@@ -1,6 +1,6 @@
 //! How often the experts of OGBench's worlds reach their goals: `ogbench_experts [ID …]`, 200 seeds with the default factors and 200
 //! with all varied, towards the goals of resets and towards sampled ones.
-#![allow(clippy::print_stdout)]
+#![allow(clippy::print_stdout, reason = "a command-line program")]
 
 use swm_core::{Action, Batch, Key, ResetOptions, Result, Schema, VariationRequest};
 use swm_mujoco::ENVS;
@@ -33,7 +33,6 @@ fn trial(id: &str, varied: bool, sampled: bool, seeds: u64) -> Result<Vec<usize>
         for step in 1..=env.spec().max_episode_steps {
             env.observe(&mut row.row_mut(0));
             expert.act(row.row(0), &mut action)?;
-            #[allow(clippy::cast_possible_truncation)]
             let numbers: Vec<f32> = action.iter().map(|&number| number as f32).collect();
             env.step(Action::Continuous(&numbers))?;
             if env.is_success() {

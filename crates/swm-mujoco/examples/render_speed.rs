@@ -13,7 +13,7 @@ fn busy() -> Duration {
     Duration::from_nanos(text.split(' ').next().and_then(|first| first.parse().ok()).unwrap_or(0))
 }
 
-#[allow(clippy::print_stdout, clippy::cast_precision_loss, reason = "what it is for")]
+#[allow(clippy::print_stdout, reason = "what it is for")]
 fn main() -> swm_core::Result<()> {
     let words: Vec<String> = std::env::args().skip(1).collect();
     let [renderer, size, seconds, envs @ ..] = &words[..] else {

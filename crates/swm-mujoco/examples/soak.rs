@@ -1,6 +1,6 @@
 //! Steps every world with all factors varied, reset after reset, and watches memory: `soak [STEPS]` (a million by default),
 //! a share for each world in parallel pools.
-#![allow(clippy::print_stdout)]
+#![allow(clippy::print_stdout, reason = "a command-line program")]
 
 use swm_core::policy::{Policy as _, RandomPolicy};
 use swm_core::pool::{Reset, threads};

@@ -28,7 +28,6 @@ fn main() -> Result<()> {
     let steps: u64 = std::env::args().nth(2).and_then(|text| text.parse().ok()).unwrap_or(200);
     let mut env = ENVS.choose(&id)?.env()?;
     let space = env.spec().action_space.clone();
-    #[allow(clippy::cast_possible_truncation)]
     let draw = |t| space.sample(&mut Key::new(1).at(t).rng()).iter().map(|&v| v as f32).collect();
     let actions: Vec<Vec<f32>> = (0..steps).map(draw).collect();
     let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone())?, 1);

@@ -1,10 +1,12 @@
-//! What the worlds need and we do not ship: MuJoCo's library, and the models and meshes of three packages.
+//! Third-party assets that the environments need and this project does not ship: MuJoCo's library, and the models and meshes
+//! of three Python packages.
 //!
-//! Each asset is a Python wheel of one version and one SHA-256. [`install`] fetches it with `pip download`, checks it,
-//! and unpacks the part that is needed to `NAME-VERSION/` in [`folder`], at once or not at all. Beside it lies the list
-//! of its files with their hashes, which [`verify`] holds against the disk.
+//! Each asset is a Python wheel of a pinned version and SHA-256. [`install`] downloads it with `pip download`, checks it, and
+//! unpacks the required files to `NAME-VERSION/` in [`folder`]; an interrupted installation leaves nothing behind. A list of
+//! the files with their hashes is stored with them, and [`verify`] compares it with the disk.
 //!
-//! They live in `$SWM_ASSETS` if that is set, else in `$STABLEWM_HOME/assets` (default `~/.stable_worldmodel/assets`).
+//! Assets are stored in `$SWM_ASSETS` if that is set, otherwise in `$STABLEWM_HOME/assets` (default
+//! `~/.stable_worldmodel/assets`).
 
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -14,26 +16,26 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use swm_core::{Error, Result};
 
-/// A pinned wheel, and what of it is needed.
+/// A pinned wheel, and the files of it that are required.
 pub struct Asset {
-    /// The package, such as `mujoco`.
+    /// The name of the Python package, such as `mujoco`.
     pub name: &'static str,
     /// Its version.
     pub version: &'static str,
-    /// What it is for, in a few words.
+    /// What the asset contains, in a few words.
     pub summary: &'static str,
-    /// The SHA-256 of its wheel by processor; `any` suits all.
+    /// The SHA-256 of the wheel by processor architecture; `any` fits all.
     wheels: &'static [(&'static str, &'static str)],
-    /// The files and folders (ending in `/`) to unpack; licences always come along.
+    /// The files and folders (ending in `/`) to unpack; licence files are always unpacked.
     parts: &'static [&'static str],
 }
 
-/// Everything that can be installed.
+/// Every asset that can be installed.
 pub const ASSETS: &[Asset] = &[
     Asset {
         name: "mujoco",
         version: crate::link::VERSION,
-        summary: "MuJoCo's library: the physics of every 3-D world",
+        summary: "MuJoCo's library: the physics of every 3-D environment",
         wheels: &[
             ("x86_64", "d66928d86a2d1b601bbaa4dc11db50214d17d5301bb8afd84721313b67ff0874"),
             ("aarch64", "91a70ed9979c383ff1f5c03f25cc2e1280a8254c1a8e558d5dd7f4184f01efc9"),
@@ -81,62 +83,62 @@ pub const ASSETS: &[Asset] = &[
     },
 ];
 
-/// How an asset stands on this machine.
+/// Whether an asset is installed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Status {
-    /// It is there, as far as its list of files tells ([`verify`] reads them all).
+    /// The list of its files is there; [`verify`] reads the files themselves.
     Installed,
-    /// It is not there.
+    /// The asset is not installed.
     Absent,
 }
 
-/// The list of files beside an installed asset.
-const LIST: &str = "files.json";
+/// The name of the list of files stored with an installed asset.
+const FILE_LIST: &str = "files.json";
 
-/// What [`LIST`] holds.
+/// The content of [`FILE_LIST`].
 #[derive(Serialize, Deserialize)]
 struct Files {
-    /// The wheel they came from.
+    /// The SHA-256 of the wheel that the files were unpacked from.
     wheel_sha256: String,
-    /// SHA-256 by path.
+    /// The SHA-256 of each file, by path.
     files: BTreeMap<String, String>,
 }
 
 impl Asset {
-    /// Where it is or would be.
+    /// The folder where the asset is or would be installed.
     pub fn folder(&self) -> PathBuf {
         folder().join(format!("{}-{}", self.name, self.version))
     }
 
-    /// How it stands.
+    /// Whether the asset is installed.
     pub fn status(&self) -> Status {
-        if self.folder().join(LIST).is_file() { Status::Installed } else { Status::Absent }
+        if self.folder().join(FILE_LIST).is_file() { Status::Installed } else { Status::Absent }
     }
 
-    /// Processor and SHA-256 of the wheel for this machine.
+    /// Architecture and SHA-256 of the wheel for this machine.
     fn wheel(&self) -> Result<(&'static str, &'static str)> {
         let here = std::env::consts::ARCH;
         let fits = |(arch, _): &&(&str, &str)| *arch == "any" || (*arch == here && cfg!(target_os = "linux"));
         self.wheels.iter().find(fits).copied().ok_or_else(|| {
-            let platform = format!("there is none for {} on {here}", std::env::consts::OS);
+            let platform = format!("there is no wheel for {} on {here}", std::env::consts::OS);
             Error::config(format!("asset {}", self.name), platform, "use Linux on x86_64 or aarch64")
         })
     }
 
-    /// Whether a file of the wheel is needed.
+    /// Whether a file of the wheel is required.
     fn needs(&self, file: &str) -> bool {
         let licence = file.contains(".dist-info/") && file.to_ascii_uppercase().contains("LICENSE");
         licence
             || self.parts.iter().any(|part| if part.ends_with('/') { file.starts_with(part) } else { file == *part })
     }
 
-    /// An error that names the command that mends it.
+    /// An error that names the command to repair the asset.
     fn damaged(&self, path: impl Into<PathBuf>, problem: impl Into<String>) -> Error {
-        Error::corrupt(path, problem, format!("`swm assets install {}` brings it anew", self.name))
+        Error::corrupt(path, problem, format!("run `swm assets install {}` to reinstall it", self.name))
     }
 }
 
-/// Where assets live: `$SWM_ASSETS`, else `$STABLEWM_HOME/assets`, else `~/.stable_worldmodel/assets`.
+/// The folder of all assets: `$SWM_ASSETS`, else `$STABLEWM_HOME/assets`, else `~/.stable_worldmodel/assets`.
 pub fn folder() -> PathBuf {
     let set = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     let home = || Path::new(&std::env::var_os("HOME").unwrap_or_default()).join(".stable_worldmodel");
@@ -146,7 +148,7 @@ pub fn folder() -> PathBuf {
 /// The asset of that name.
 ///
 /// # Errors
-/// When there is none.
+/// When there is no asset of that name.
 pub fn get(name: &str) -> Result<&'static Asset> {
     let names = ASSETS.iter().map(|asset| asset.name);
     ASSETS
@@ -155,31 +157,32 @@ pub fn get(name: &str) -> Result<&'static Asset> {
         .ok_or_else(|| Error::unknown("asset", name, names, "`swm assets list` lists them"))
 }
 
-/// The folder of an installed asset; paths in it are those of the wheel.
+/// The folder of an installed asset; the paths in it are those of the wheel.
 ///
 /// # Errors
-/// When it is not installed, naming the command that brings it.
+/// When it is not installed; the error names the command to install it.
 pub fn path(name: &str) -> Result<PathBuf> {
     let asset = get(name)?;
     match asset.status() {
         Status::Installed => Ok(asset.folder()),
         Status::Absent => Err(Error::config(
             format!("asset {name} {}", asset.version),
-            format!("it is not installed in {}", folder().display()),
-            format!("`swm assets install {name}` brings it"),
+            format!("not installed in {}", folder().display()),
+            format!("run `swm assets install {name}`"),
         )),
     }
 }
 
-/// Every asset and how it stands.
+/// Every asset with its status.
 pub fn status() -> impl Iterator<Item = (&'static Asset, Status)> {
     ASSETS.iter().map(|asset| (asset, asset.status()))
 }
 
-/// Fetches, checks and unpacks an asset, in place of what may be there.
+/// Downloads, checks and unpacks an asset, replacing an installed one.
 ///
 /// # Errors
-/// When there is none of that name or for this machine, `pip` fails, the wheel is another one, or the disk refuses.
+/// When there is no asset of that name, or no wheel for this machine; when `pip` or the file system fails; or when the wheel has
+/// another hash.
 pub fn install(name: &str) -> Result<PathBuf> {
     let asset = get(name)?;
     let (arch, sha256) = asset.wheel()?;
@@ -188,34 +191,36 @@ pub fn install(name: &str) -> Result<PathBuf> {
         let (path, action) = (path.to_owned(), action.to_owned());
         move |source| Error::io(path, action, source)
     };
-    // Made here and moved in place when complete, so that a killed installation leaves nothing that looks whole.
-    let workshop = root.join(format!(".{name}-{}", std::process::id()));
-    std::fs::create_dir_all(&workshop).map_err(io(&workshop, "making a folder"))?;
-    let made = fetch(asset, arch, &workshop).and_then(|wheel| unpack(asset, &wheel, sha256, &workshop.join("whole")));
-    let placed = made.and_then(|()| {
-        let (whole, place, old) = (workshop.join("whole"), asset.folder(), workshop.join("old"));
-        if place.exists() {
-            std::fs::rename(&place, &old).map_err(io(&place, "moving the old asset away"))?;
+    // The asset is unpacked to a temporary folder and renamed when complete, so that an interrupted installation is not
+    // mistaken for a complete one.
+    let temporary = root.join(format!(".{name}-{}", std::process::id()));
+    std::fs::create_dir_all(&temporary).map_err(io(&temporary, "creating a folder"))?;
+    let unpacked =
+        download(asset, arch, &temporary).and_then(|wheel| unpack(asset, &wheel, sha256, &temporary.join("complete")));
+    let installed = unpacked.and_then(|()| {
+        let (complete, target, old) = (temporary.join("complete"), asset.folder(), temporary.join("old"));
+        if target.exists() {
+            std::fs::rename(&target, &old).map_err(io(&target, "moving the old asset away"))?;
         }
-        std::fs::rename(&whole, &place).map_err(io(&place, "moving the asset in place"))?;
-        Ok(place)
+        std::fs::rename(&complete, &target).map_err(io(&target, "moving the asset to its folder"))?;
+        Ok(target)
     });
-    std::fs::remove_dir_all(&workshop).map_err(io(&workshop, "removing a folder"))?;
-    placed
+    std::fs::remove_dir_all(&temporary).map_err(io(&temporary, "removing a folder"))?;
+    installed
 }
 
-/// Fetches the wheel of an asset into a folder.
-fn fetch(asset: &Asset, arch: &str, into: &Path) -> Result<PathBuf> {
+/// Downloads the wheel of an asset to a folder.
+fn download(asset: &Asset, arch: &str, into: &Path) -> Result<PathBuf> {
     let mut pip = Command::new("python3");
     pip.args(["-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:", "--disable-pip-version-check"]);
     if arch != "any" {
-        // One wheel, whatever Python this machine has.
+        // The same wheel for every Python version of the machine.
         pip.args(["--python-version", "3.11", "--implementation", "cp", "--abi", "cp311"]);
         pip.args(["--platform", &format!("manylinux_2_28_{arch}")]);
     }
-    let wanted = format!("{}=={}", asset.name, asset.version);
-    let context = || format!("fetching {wanted} with `python3 -m pip download`");
-    let output = pip.arg("--dest").arg(into).arg(&wanted).output().map_err(|error| {
+    let requirement = format!("{}=={}", asset.name, asset.version);
+    let context = || format!("downloading {requirement} with `python3 -m pip download`");
+    let output = pip.arg("--dest").arg(into).arg(&requirement).output().map_err(|error| {
         Error::external(
             context(),
             format!("{error}; Python 3 with pip must be installed (Debian: apt install python3-pip)"),
@@ -228,16 +233,16 @@ fn fetch(asset: &Asset, arch: &str, into: &Path) -> Result<PathBuf> {
         .map_err(|error| Error::io(into, "reading a folder", error))?
         .filter_map(|entry| Some(entry.ok()?.path()))
         .find(|path| path.extension().is_some_and(|extension| extension == "whl"));
-    wheel.ok_or_else(|| Error::external(context(), "it succeeded, but left no wheel"))
+    wheel.ok_or_else(|| Error::external(context(), "`pip` succeeded, but there is no wheel"))
 }
 
-/// Checks a wheel and unpacks what is needed of it, with the list of files.
+/// Checks the hash of a wheel, unpacks the required files, and writes the list of files.
 fn unpack(asset: &Asset, wheel: &Path, sha256: &str, into: &Path) -> Result<()> {
     let bytes = std::fs::read(wheel).map_err(|error| Error::io(wheel, "reading a wheel", error))?;
     let found = hash(&bytes);
     if found != sha256 {
         let problem = format!("its SHA-256 is {found}, expected {sha256}");
-        return Err(Error::corrupt(wheel, problem, "check where `pip` takes its packages from"));
+        return Err(Error::corrupt(wheel, problem, "check the package index that `pip` uses"));
     }
     let broken = |error: zip::result::ZipError| Error::external(format!("unpacking {}", wheel.display()), error);
     let mut archive = zip::ZipArchive::new(std::io::Cursor::new(bytes)).map_err(broken)?;
@@ -248,42 +253,42 @@ fn unpack(asset: &Asset, wheel: &Path, sha256: &str, into: &Path) -> Result<()> 
         let Some(inside) = entry.enclosed_name().filter(|_| entry.is_file() && asset.needs(&name)) else { continue };
         let mut content = Vec::new();
         entry.read_to_end(&mut content).map_err(|error| Error::io(wheel, format!("unpacking {name}"), error))?;
-        let place = into.join(inside);
-        let parent = place.parent().unwrap_or(into);
-        std::fs::create_dir_all(parent).map_err(|error| Error::io(parent, "making a folder", error))?;
-        std::fs::write(&place, &content).map_err(|error| Error::io(&place, "unpacking", error))?;
+        let target = into.join(inside);
+        let parent = target.parent().unwrap_or(into);
+        std::fs::create_dir_all(parent).map_err(|error| Error::io(parent, "creating a folder", error))?;
+        std::fs::write(&target, &content).map_err(|error| Error::io(&target, "unpacking", error))?;
         files.insert(name, hash(&content));
     }
-    let list = into.join(LIST);
+    let list = into.join(FILE_LIST);
     let text = serde_json::to_vec_pretty(&Files { wheel_sha256: found, files })
         .map_err(|error| Error::external("writing the list of files", error))?;
     std::fs::write(&list, text).map_err(|error| Error::io(&list, "writing", error))
 }
 
-/// Reads every file of an installed asset and compares it with the list.
+/// Reads every file of an installed asset and compares its hash with the list.
 ///
 /// # Errors
-/// When the asset is not installed, came from another wheel, or a file is missing or differs.
+/// When the asset is not installed, was unpacked from another wheel, or a file is missing or differs.
 pub fn verify(name: &str) -> Result<()> {
     let asset = get(name)?;
     let folder = path(name)?;
-    let list = folder.join(LIST);
+    let list = folder.join(FILE_LIST);
     let text = std::fs::read(&list).map_err(|error| Error::io(&list, "reading", error))?;
     let list: Files = serde_json::from_slice(&text).map_err(|error| asset.damaged(list, error.to_string()))?;
     if list.wheel_sha256 != asset.wheel()?.1 {
-        return Err(asset.damaged(folder, "it came from another wheel"));
+        return Err(asset.damaged(folder, "it was unpacked from another wheel"));
     }
     for (file, expected) in &list.files {
-        let place = folder.join(file);
-        let content = std::fs::read(&place).map_err(|_| asset.damaged(&place, "it is missing or cannot be read"))?;
+        let path = folder.join(file);
+        let content = std::fs::read(&path).map_err(|_| asset.damaged(&path, "it is missing or cannot be read"))?;
         if hash(&content) != *expected {
-            return Err(asset.damaged(place, "it differs from what was installed"));
+            return Err(asset.damaged(path, "it differs from the installed file"));
         }
     }
     Ok(())
 }
 
-/// The SHA-256 of some bytes, in hexadecimal.
+/// The SHA-256 of bytes, in hexadecimal.
 fn hash(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }

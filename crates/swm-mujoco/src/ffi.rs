@@ -1,6 +1,9 @@
-//! The functions of MuJoCo that may end in an error while a world runs, declared so that [`crate::link::guard`] can catch it.
+//! Declarations of the MuJoCo functions that may fail while an environment runs, so that [`crate::link::guard`] can catch the
+//! error.
 //!
-//! `mujoco-rs` declares them `extern "C"`, through which nothing may unwind.
+//! MuJoCo calls the log handler on an error; ours unwinds from it. `mujoco-rs` declares the same functions `extern "C"`, through
+//! which unwinding aborts the process. Names, arguments and requirements are those of MuJoCo's API reference: model and data
+//! must be valid and belong together.
 #![allow(unsafe_code, reason = "declarations of foreign functions")]
 
 use mujoco_rs::mujoco_c::{

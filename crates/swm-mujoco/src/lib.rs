@@ -1,10 +1,11 @@
-//! 3-D worlds on MuJoCo: DeepMind Control, OGBench, Fetch.
+//! 3-D environments on MuJoCo: DeepMind Control, OGBench and Fetch.
 //!
-//! MuJoCo's library and the models of the worlds are no part of the program: [`assets`] fetches them, [`link`] loads the
-//! library when a world first needs it. Tests and programs share one copy of the assets through `SWM_ASSETS`
-//! (`SWM_ASSETS=~/.cache/swm/assets` on a developer's machine).
+//! MuJoCo's library and the models of the environments are not part of the program: [`assets`] installs them, and [`link`]
+//! loads the library when the first environment needs it. The environment variable `SWM_ASSETS` names the folder of the
+//! assets, for example `SWM_ASSETS=~/.cache/swm/assets`.
 //!
-//! Read [`physics`] (a model and its state), [`render`] (its picture), [`env`] (what all worlds share), and then a family.
+//! Read [`physics`] (a model and its state), [`render`] (rendering), `env` (the environment shared by all families) and
+//! `task` (what a family implements), and then a family.
 
 pub mod assets;
 pub mod dmc;
@@ -15,18 +16,19 @@ pub mod link;
 pub mod ogbench;
 pub mod physics;
 pub mod render;
+mod task;
 
 pub use physics::Physics;
 
 use swm_core::registry::join;
 use swm_core::{EnvEntry, Registry};
 
-const TWO: usize = dmc::ENTRIES.len() + fetch::ENTRIES.len();
-const THREE: usize = TWO + ogbench::ENTRIES.len();
+const DMC_AND_FETCH: usize = dmc::ENTRIES.len() + fetch::ENTRIES.len();
+const ALL: usize = DMC_AND_FETCH + ogbench::ENTRIES.len();
 
 /// Every environment of this crate.
 pub static ENVS: Registry<EnvEntry> = Registry {
     kind: "environment",
     hint: "`swm envs` lists them",
-    rows: &join::<_, THREE>(&join::<_, TWO>(&dmc::ENTRIES, &fetch::ENTRIES), &ogbench::ENTRIES),
+    rows: &join::<_, ALL>(&join::<_, DMC_AND_FETCH>(&dmc::ENTRIES, &fetch::ENTRIES), &ogbench::ENTRIES),
 };

@@ -110,7 +110,7 @@ mod tests {
 
     #[test]
     fn models_of_other_parts_are_refused() {
-        let compile = |xml: &str| crate::physics::compile("a test", xml, &[]).expect("a model");
+        let compile = |xml: &str| crate::physics::compile_xml("a test", xml, &[]).expect("a model");
         let mut one = compile("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>");
         let two = compile("<mujoco><worldbody><geom size='1'/><geom size='1'/></worldbody></mujoco>");
         assert!(adopt(&mut one, &two).is_err());

@@ -85,13 +85,11 @@ fn missing(what: &str, name: &str) -> Error {
 }
 
 /// A colour as MuJoCo keeps it.
-#[allow(clippy::cast_possible_truncation)]
 fn rgba(color: &[f64], alpha: f32) -> [f32; 4] {
     [color[0] as f32, color[1] as f32, color[2] as f32, alpha]
 }
 
 /// A number on its way through single precision.
-#[allow(clippy::cast_possible_truncation)]
 fn single(number: f64) -> f64 {
     f64::from(number as f32)
 }
@@ -108,7 +106,6 @@ impl Edit<'_> {
     }
 
     /// What all worlds have: the colours of floor and agent, and a lamp.
-    #[allow(clippy::cast_possible_truncation)]
     pub fn scene(&mut self, lamp: &str) -> Result<()> {
         let floor = self.factors.get("floor.color");
         let grid = self.spec.texture_mut("grid").ok_or_else(|| missing("texture", "grid"))?;

@@ -5,9 +5,10 @@ use super::adopt::adopt;
 use super::blueprint::Blueprint;
 use super::goal::Coordinates;
 use crate::Physics;
-use crate::env::{FIRST, Step, Task, World};
-use crate::physics::shared;
+use crate::env::MujocoEnv;
+use crate::physics::shared_model;
 use crate::render::Camera;
+use crate::task::{FIRST_TASK_COLUMN, StepOutcome, Task};
 use mujoco_rs::wrappers::MjModel;
 use rand::Rng as _;
 use std::borrow::Borrow;
@@ -28,13 +29,13 @@ const START_TRIES: u64 = 10;
 const GOAL_TRIES: u64 = 32;
 const GOAL_STEPS: RangeInclusive<usize> = 5..=25;
 
-/// Places of columns, from [`FIRST`] on.
-const GOAL_STATE: usize = FIRST;
-const OBSERVATION: usize = FIRST + 1;
-const QPOS: usize = FIRST + 2;
-const QVEL: usize = FIRST + 3;
-const SCORE: usize = FIRST + 4;
-const INFO: usize = FIRST + 5;
+/// Places of columns, from [`FIRST_TASK_COLUMN`] on.
+const GOAL_STATE: usize = FIRST_TASK_COLUMN;
+const OBSERVATION: usize = FIRST_TASK_COLUMN + 1;
+const QPOS: usize = FIRST_TASK_COLUMN + 2;
+const QVEL: usize = FIRST_TASK_COLUMN + 3;
+const SCORE: usize = FIRST_TASK_COLUMN + 4;
+const INFO: usize = FIRST_TASK_COLUMN + 5;
 
 /// An observation while it is written.
 pub struct Seen<'a> {
@@ -44,7 +45,6 @@ pub struct Seen<'a> {
 
 impl Seen<'_> {
     /// Appends a number.
-    #[allow(clippy::cast_possible_truncation)]
     pub fn push(&mut self, number: f64) {
         self.row[self.written] = number as f32;
         self.written += 1;
@@ -78,7 +78,7 @@ pub struct Control<D: Domain> {
 /// When MuJoCo or the models of the suite are not installed.
 pub fn make<D: Domain>(choice: &EnvChoice) -> Result<Box<dyn Env>> {
     let (spec, model, control) = parts::<D>(choice)?;
-    Ok(Box::new(World::new(spec, model, control)?))
+    Ok(Box::new(MujocoEnv::new(spec, model, control)?))
 }
 
 /// What a world of the suite is made of.
@@ -89,7 +89,8 @@ pub(super) fn parts<D: Domain>(choice: &EnvChoice) -> Result<(EnvSpec, Arc<MjMod
     let variation_space = VariationSpace::new(D::factors(), &[]);
     let none = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
     let defaults = variation_space.resolve(&none, Key::new(0))?;
-    let model = shared(&format!("{},{name}", D::ID), || blueprint.compile(&defaults, |edit| D::edit(edit, task)))?;
+    let model =
+        shared_model(&format!("{},{name}", D::ID), || blueprint.compile(&defaults, |edit| D::edit(edit, task)))?;
 
     let domain = D::new(&model, task)?;
     let mut physics = Physics::new(Arc::clone(&model))?;
@@ -142,7 +143,7 @@ impl<D: Domain> Control<D> {
     }
 
     /// Holds an action, in double precision.
-    pub(super) fn hold(&mut self, physics: &mut Physics, action: impl Iterator<Item = f64>) -> Step {
+    pub(super) fn hold(&mut self, physics: &mut Physics, action: impl Iterator<Item = f64>) -> StepOutcome {
         for ((control, &[low, high]), action) in physics.data_mut().ctrl_mut().iter_mut().zip(&self.ranges).zip(action)
         {
             *control = low + (high - low) / 2.0 * (action + 1.0);
@@ -157,7 +158,7 @@ impl<D: Domain> Control<D> {
             }
         }
         self.score += reward;
-        Step { reward, terminated }
+        StepOutcome { reward, terminated }
     }
 
     /// Where random actions lead: `qpos` and `qvel`, as soon as that is somewhere new where the world can stay, after as many
@@ -207,20 +208,20 @@ impl<D: Domain> Control<D> {
 }
 
 impl<D: Domain> Task for Control<D> {
-    fn arrange(&mut self, physics: &mut Physics, factors: &FactorValues) -> Result<()> {
+    fn apply_factors(&mut self, physics: &mut Physics, factors: &FactorValues) -> Result<()> {
         if factors.iter().zip(factors.factors()).all(|((_, value), factor)| *value == factor.init_value) {
             physics.restore_model();
         } else {
             adopt(physics.model_mut(), &self.compile(factors, false)?)?;
         }
-        physics.repaint();
+        physics.mark_textures_edited();
         self.domain.adapt(physics);
         // A target stays where it is, whatever the model was compiled with.
         self.domain.place(physics, &self.target);
         Ok(())
     }
 
-    fn overwrites(&self) -> bool {
+    fn overwrites_edits(&self) -> bool {
         true
     }
 
@@ -256,7 +257,7 @@ impl<D: Domain> Task for Control<D> {
         physics.load(&here)
     }
 
-    fn step(&mut self, physics: &mut Physics, action: &[f32]) -> Step {
+    fn step(&mut self, physics: &mut Physics, action: &[f32]) -> StepOutcome {
         self.hold(physics, action.iter().map(|&number| f64::from(number)))
     }
 
@@ -271,16 +272,16 @@ impl<D: Domain> Task for Control<D> {
         }
     }
 
-    fn memory_len(&self, _model: &MjModel) -> usize {
+    fn task_state_len(&self, _model: &MjModel) -> usize {
         1 + D::TARGET
     }
 
-    fn remember(&self, into: &mut [f64]) {
+    fn save_task_state(&self, into: &mut [f64]) {
         into[0] = self.score;
         into[1..].copy_from_slice(&self.target);
     }
 
-    fn recall(&mut self, physics: &mut Physics, memory: &[f64]) {
+    fn load_task_state(&mut self, physics: &mut Physics, memory: &[f64]) {
         self.score = memory[0];
         self.target.copy_from_slice(&memory[1..]);
         self.domain.place(physics, &self.target);
@@ -290,15 +291,15 @@ impl<D: Domain> Task for Control<D> {
         self.goal.len()
     }
 
-    fn remember_goal(&self, into: &mut [f64]) {
+    fn save_goal(&self, into: &mut [f64]) {
         into.copy_from_slice(&self.goal);
     }
 
-    fn recall_goal(&mut self, goal: &[f64]) {
+    fn load_goal(&mut self, goal: &[f64]) {
         self.goal.copy_from_slice(goal);
     }
 
-    fn aim(&mut self, _physics: &mut Physics, state: &[f64], _memory: &[f64]) -> Result<()> {
+    fn set_goal_state(&mut self, _physics: &mut Physics, state: &[f64], _memory: &[f64]) -> Result<()> {
         // Behind the time stand `qpos` and `qvel`.
         let n = self.goal.len();
         self.goal.copy_from_slice(&state[1..=n]);
@@ -309,7 +310,7 @@ impl<D: Domain> Task for Control<D> {
         self.seek(physics, key)
     }
 
-    fn show_goal(&mut self, physics: &mut Physics) {
+    fn move_to_goal(&mut self, physics: &mut Physics) {
         let nq = physics.data().qpos().len();
         physics.data_mut().qpos_mut().copy_from_slice(&self.goal[..nq]);
         physics.forward();

@@ -25,7 +25,6 @@ pub struct Coordinates {
 impl Coordinates {
     /// Those of every joint that is not idle. Of a free body these are its height and its orientation: where it is on the
     /// floor is neither observed nor asked for.
-    #[allow(clippy::cast_sign_loss)]
     pub fn new(model: &MjModel, idle: &[&str]) -> Self {
         let (mut asked, mut limits) = (vec![], vec![]);
         for joint in 0..model.jnt_type().len() {

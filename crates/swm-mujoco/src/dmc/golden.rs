@@ -9,9 +9,9 @@ mod recorded;
 use super::env::{Control, parts};
 use super::{Domain, ENTRIES};
 use crate::Physics;
-use crate::env::Task as _;
-use crate::render::likeness::Likeness;
-use crate::render::{self, Choice, Picture};
+use crate::render::similarity::ImageSimilarity;
+use crate::render::{self, Choice, FrameBuffer};
+use crate::task::Task as _;
 use recorded::Golden;
 use std::path::Path;
 use std::sync::Arc;
@@ -59,7 +59,7 @@ fn apart(a: &[f64], b: &[f64]) -> f64 {
 struct Follower<D: Domain> {
     physics: Physics,
     control: Control<D>,
-    stage: Option<Box<render::Stage>>,
+    stage: Option<Box<render::AbstractScene>>,
     row: Batch,
 }
 
@@ -78,14 +78,17 @@ impl<D: Domain> Follower<D> {
         let mut rgb = vec![0; wanted.len()];
         let camera = self.control.camera();
         let mut draw = |choice| {
-            let picture = Picture::Rgb(&mut rgb);
+            let picture = FrameBuffer::Rgb(&mut rgb);
             render::with(choice, || render::draw(&mut self.stage, &mut self.physics, camera, (width, height), picture))
                 .expect("a picture");
             rgb.clone()
         };
         let (cpu, egl) = (draw(Choice::Cpu), draw(Choice::Egl));
         let name = format!("{}-{name}", file.file_stem().unwrap_or_default().to_string_lossy());
-        (Likeness::of(&egl, &wanted, width).difference, Likeness::note(&name, &cpu, &wanted, width).suffices())
+        (
+            ImageSimilarity::of(&egl, &wanted, width).difference,
+            ImageSimilarity::report(&name, &cpu, &wanted, width).is_close(),
+        )
     }
 }
 
@@ -107,7 +110,7 @@ fn follow_one<D: Domain>(file: &Path) -> Worst {
     let (spec, model, mut control) = parts::<D>(&choice).expect("a world");
     let factors = spec.variation_space.resolve(&golden.variation(), Key::new(0)).expect("possible values");
     let mut physics = Physics::new(Arc::clone(&model)).expect("a state");
-    control.arrange(&mut physics, &factors).expect("a model");
+    control.apply_factors(&mut physics, &factors).expect("a model");
     control.start(&mut physics, &factors, Key::new(0)).expect("a start");
 
     // The recorded start.
@@ -119,10 +122,10 @@ fn follow_one<D: Domain>(file: &Path) -> Worst {
             state.extend(golden.numbers(&name));
         }
     }
-    let mut memory = vec![0.0; control.memory_len(&model)];
-    control.remember(&mut memory);
+    let mut memory = vec![0.0; control.task_state_len(&model)];
+    control.save_task_state(&mut memory);
     memory[1..=D::TARGET].copy_from_slice(&target::<D>(&mut golden));
-    control.recall(&mut physics, &memory);
+    control.load_task_state(&mut physics, &memory);
     physics.set_state(&state).expect("a state");
     physics.forward_passive();
 

@@ -39,19 +39,16 @@ impl Names<'_> {
     }
 
     /// Where a joint's coordinates begin in `qpos`.
-    #[allow(clippy::cast_sign_loss)]
     pub fn position(&self, joint: &str) -> Result<usize> {
         Ok(self.0.jnt_qposadr()[self.joint(joint)?] as usize)
     }
 
     /// Where a joint's velocities begin in `qvel`.
-    #[allow(clippy::cast_sign_loss)]
     pub fn velocity(&self, joint: &str) -> Result<usize> {
         Ok(self.0.jnt_dofadr()[self.joint(joint)?] as usize)
     }
 
     /// Where a sensor's numbers begin in `sensordata`.
-    #[allow(clippy::cast_sign_loss)]
     pub fn sensor(&self, name: &str) -> Result<usize> {
         Ok(self.0.sensor_adr()[self.id(MjtObjBase::mjOBJ_SENSOR, "sensor", name)?] as usize)
     }

@@ -131,7 +131,6 @@ impl Domain for Quadruped {
         edit.density("foot_back_left", "agent.foot_back_left_density")
     }
 
-    #[allow(clippy::cast_sign_loss)]
     fn new(model: &MjModel, task: Task) -> Result<Self> {
         let names = Names(model);
         let joints = (0..model.jnt_type().len()).filter(|&joint| model.jnt_type()[joint] == mjtJoint::mjJNT_HINGE);

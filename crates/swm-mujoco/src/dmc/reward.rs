@@ -75,7 +75,6 @@ impl Tolerance {
 }
 
 /// The mean reward of some numbers.
-#[allow(clippy::cast_precision_loss)]
 pub fn mean(tolerance: Tolerance, numbers: &[f64]) -> f64 {
     numbers.iter().map(|&x| tolerance.of(x)).sum::<f64>() / numbers.len() as f64
 }

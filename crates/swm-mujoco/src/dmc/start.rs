@@ -14,7 +14,6 @@ const TRIES: usize = 1000;
 ///
 /// A free body's quaternion has no negative numbers, which are not all turns there are: the suite's own slip, kept for the
 /// sake of comparison.
-#[allow(clippy::cast_sign_loss)]
 pub fn random_joints(physics: &mut Physics, rng: &mut Rng) {
     for joint in 0..physics.model().jnt_type().len() {
         let model = physics.model();
@@ -36,7 +35,6 @@ pub fn random_joints(physics: &mut Physics, rng: &mut Rng) {
 }
 
 /// Turns the joints that have limits within them.
-#[allow(clippy::cast_sign_loss)]
 pub fn limited_joints(physics: &mut Physics, rng: &mut Rng) {
     for joint in 0..physics.model().jnt_type().len() {
         let model = physics.model();

@@ -1,7 +1,6 @@
-//! Who can demonstrate the tasks: controllers that read where gripper, object and goal are (`proprio` and `desired_goal`), and
-//! remember nothing.
+//! Scripted experts for the four tasks: memoryless controllers on the columns `proprio` and `desired_goal`.
 
-use super::task::known_len;
+use super::task::proprio_len;
 use swm_core::policy::Expert;
 use swm_core::{Error, ExpertEntry, Key, Result, RowRef};
 
@@ -11,146 +10,155 @@ macro_rules! expert {
     };
 }
 
-pub const REACHERS: &[ExpertEntry] = expert!(reach, "leads the gripper straight to the goal");
-pub const PUSHERS: &[ExpertEntry] = expert!(push, "goes behind the block and pushes it to the goal");
-pub const SLIDERS: &[ExpertEntry] =
-    expert!(slide, "goes behind the puck and pushes it to the speed that ends at the goal");
-pub const PICKERS: &[ExpertEntry] = expert!(pick, "grasps the block from above and carries it to the goal");
+pub const REACH_EXPERTS: &[ExpertEntry] = expert!(reach, "moves the gripper straight to the goal");
+pub const PUSH_EXPERTS: &[ExpertEntry] = expert!(push, "moves behind the block and pushes it to the goal");
+pub const SLIDE_EXPERTS: &[ExpertEntry] =
+    expert!(slide, "moves behind the puck and accelerates it to the speed at which it stops at the goal");
+pub const PICK_EXPERTS: &[ExpertEntry] = expert!(pick, "grasps the block from above and carries it to the goal");
 
-type Place = [f64; 3];
+type Vec3 = [f64; 3];
 
-/// What an expert sees.
-struct Sight {
-    gripper: Place,
-    /// The object's middle, and its velocity in metres per action.
-    object: Place,
-    velocity: Place,
-    /// How wide the fingers are apart, in metres.
+/// The quantities that the controllers read.
+struct Inputs {
+    /// Position of the gripper, in metres.
+    gripper: Vec3,
+    /// Position of the object's centre, in metres.
+    object: Vec3,
+    /// Velocity of the object, in metres per action.
+    velocity: Vec3,
+    /// Distance between the fingers, in metres.
     gap: f64,
-    goal: Place,
+    /// The goal, in metres.
+    goal: Vec3,
 }
 
-/// An expert: a function of what it sees.
-struct Controller(fn(&Sight) -> [f64; 4]);
+/// An expert: a function from inputs to an action.
+struct Controller(fn(&Inputs) -> [f64; 4]);
 
 impl Expert for Controller {
     fn begin(&mut self, _key: Key) {}
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
-        let (known, goal) = (row.get::<f64>("proprio")?, row.get::<f64>("desired_goal")?);
-        let at = |place: usize| [known[place], known[place + 1], known[place + 2]];
-        let sight = match known.len() {
-            n if n == known_len(false) => {
-                Sight { gripper: at(0), object: at(0), velocity: [0.0; 3], gap: 0.0, goal: [goal[0], goal[1], goal[2]] }
+        let (proprio, goal) = (row.get::<f64>("proprio")?, row.get::<f64>("desired_goal")?);
+        let at = |index: usize| [proprio[index], proprio[index + 1], proprio[index + 2]];
+        let goal = [goal[0], goal[1], goal[2]];
+        let inputs = match proprio.len() {
+            n if n == proprio_len(false) => {
+                Inputs { gripper: at(0), object: at(0), velocity: [0.0; 3], gap: 0.0, goal }
             }
-            n if n == known_len(true) => {
+            n if n == proprio_len(true) => {
                 let (relative, gripper) = (at(14), at(20));
-                Sight {
+                Inputs {
                     gripper: at(0),
                     object: at(3),
                     velocity: std::array::from_fn(|i| relative[i] + gripper[i]),
-                    gap: known[9] + known[10],
-                    goal: [goal[0], goal[1], goal[2]],
+                    gap: proprio[9] + proprio[10],
+                    goal,
                 }
             }
-            n => return Err(Error::mismatch("acting as Fetch's expert", format!("{n} numbers"), "what Fetch knows")),
+            n => return Err(Error::mismatch("acting as Fetch's expert", format!("{n} values"), "a `proprio` column")),
         };
-        action.copy_from_slice(&(self.0)(&sight).map(|part| part.clamp(-1.0, 1.0)));
+        action.copy_from_slice(&(self.0)(&inputs).map(|part| part.clamp(-1.0, 1.0)));
         Ok(())
     }
 }
 
-/// Metres an action of 1 leads.
+/// Displacement of the gripper for an action of 1, in metres.
 const STEP: f64 = 0.05;
 
-/// The action that leads to a place, and what the fingers do.
-fn lead(sight: &Sight, to: Place, fingers: f64) -> [f64; 4] {
-    let part = |i: usize| (to[i] - sight.gripper[i]) / STEP;
+/// The action that moves the gripper towards a point, with a command for the fingers.
+fn move_to(inputs: &Inputs, target: Vec3, fingers: f64) -> [f64; 4] {
+    let part = |i: usize| (target[i] - inputs.gripper[i]) / STEP;
     [part(0), part(1), part(2), fingers]
 }
 
-fn reach(sight: &Sight) -> [f64; 4] {
-    lead(sight, sight.goal, 0.0)
+fn reach(inputs: &Inputs) -> [f64; 4] {
+    move_to(inputs, inputs.goal, 0.0)
 }
 
-/// The direction and the distance from one place to another, on the table.
-fn way(from: Place, to: Place) -> ([f64; 2], f64) {
+/// The horizontal direction (unit vector) and distance (m) from one point to another.
+fn direction_and_distance(from: Vec3, to: Vec3) -> ([f64; 2], f64) {
     let (x, y) = (to[0] - from[0], to[1] - from[1]);
     let length = x.hypot(y);
     if length < 1e-9 { ([1.0, 0.0], 0.0) } else { ([x / length, y / length], length) }
 }
 
-/// Where the gripper is, seen from the object along a direction: how far ahead, and how far to its left.
-fn seen([x, y]: [f64; 2], sight: &Sight) -> (f64, f64) {
-    let away = [sight.gripper[0] - sight.object[0], sight.gripper[1] - sight.object[1]];
-    (away[0] * x + away[1] * y, away[1] * x - away[0] * y)
+/// The gripper's offset from the object along a horizontal direction and to the left of it, in metres.
+fn gripper_offset([x, y]: [f64; 2], inputs: &Inputs) -> (f64, f64) {
+    let offset = [inputs.gripper[0] - inputs.object[0], inputs.gripper[1] - inputs.object[1]];
+    (offset[0] * x + offset[1] * y, offset[1] * x - offset[0] * y)
 }
 
-/// Goes behind the object, `back` metres from its middle, over it where it is in the way; `None` where it is there.
-fn behind(sight: &Sight, direction: [f64; 2], back: f64, height: f64) -> Option<[f64; 4]> {
-    let (ahead, left) = seen(direction, sight);
-    let [x, y] = [0, 1].map(|i| sight.object[i] - back * direction[i]);
-    if ahead < -0.03 && ahead > -back - 0.03 && left.abs() < 0.015 && sight.gripper[2] < height + 0.02 {
+/// Moves the gripper behind the object, `back` metres from its centre, and over the object where that is in the way. `None`
+/// when the gripper is there.
+fn move_behind(inputs: &Inputs, direction: [f64; 2], back: f64, height: f64) -> Option<[f64; 4]> {
+    let (ahead, left) = gripper_offset(direction, inputs);
+    let [x, y] = [0, 1].map(|i| inputs.object[i] - back * direction[i]);
+    if ahead < -0.03 && ahead > -back - 0.03 && left.abs() < 0.015 && inputs.gripper[2] < height + 0.02 {
         return None;
     }
     let above = height + 0.08;
-    let near = (x - sight.gripper[0]).hypot(y - sight.gripper[1]) < 0.02;
+    let near = (x - inputs.gripper[0]).hypot(y - inputs.gripper[1]) < 0.02;
     Some(if near {
-        lead(sight, [x, y, height], 0.0)
-    } else if sight.gripper[2] < above - 0.02 {
-        lead(sight, [sight.gripper[0], sight.gripper[1], above + 0.02], 0.0)
+        move_to(inputs, [x, y, height], 0.0)
+    } else if inputs.gripper[2] < above - 0.02 {
+        move_to(inputs, [inputs.gripper[0], inputs.gripper[1], above + 0.02], 0.0)
     } else {
-        lead(sight, [x, y, above], 0.0)
+        move_to(inputs, [x, y, above], 0.0)
     })
 }
 
-fn push(sight: &Sight) -> [f64; 4] {
-    let (direction, left) = way(sight.object, sight.goal);
-    if left < 0.01 {
+fn push(inputs: &Inputs) -> [f64; 4] {
+    let (direction, remaining) = direction_and_distance(inputs.object, inputs.goal);
+    if remaining < 0.01 {
         return [0.0; 4];
     }
-    if let Some(action) = behind(sight, direction, 0.07, 0.425) {
+    if let Some(action) = move_behind(inputs, direction, 0.07, 0.425) {
         return action;
     }
-    let (_, aside) = seen(direction, sight);
-    let speed = (left / STEP).min(1.0);
-    let to = [0, 1].map(|i| direction[i] * speed - [-direction[1], direction[0]][i] * 2.0 * aside / STEP);
-    [to[0], to[1], (0.425 - sight.gripper[2]) / STEP, 0.0]
+    let (_, left) = gripper_offset(direction, inputs);
+    let speed = (remaining / STEP).min(1.0);
+    let to = [0, 1].map(|i| direction[i] * speed - [-direction[1], direction[0]][i] * 2.0 * left / STEP);
+    [to[0], to[1], (0.425 - inputs.gripper[2]) / STEP, 0.0]
 }
 
-fn slide(sight: &Sight) -> [f64; 4] {
-    let (direction, left) = way(sight.object, sight.goal);
-    let speed = sight.velocity[0].hypot(sight.velocity[1]);
-    // Metres per action from which friction stops it there: v² = 2 μ g d, in steps of 0.04 s.
-    let wanted = (2.0 * 0.1 * 9.81 * left).sqrt() * 0.04;
-    if speed >= wanted || left < 0.02 {
-        let (ahead, _) = seen(direction, sight);
+fn slide(inputs: &Inputs) -> [f64; 4] {
+    let (direction, remaining) = direction_and_distance(inputs.object, inputs.goal);
+    let speed = inputs.velocity[0].hypot(inputs.velocity[1]);
+    // The speed, in metres per action of 0.04 s, from which friction stops the puck at the goal: v² = 2 μ g d.
+    let wanted = (2.0 * 0.1 * 9.81 * remaining).sqrt() * 0.04;
+    if speed >= wanted || remaining < 0.02 {
+        let (ahead, _) = gripper_offset(direction, inputs);
         return if ahead > -0.15 { [-direction[0], -direction[1], 0.0, 0.0] } else { [0.0; 4] };
     }
     if speed < 1e-3
-        && let Some(action) = behind(sight, direction, 0.07, 0.415)
+        && let Some(action) = move_behind(inputs, direction, 0.07, 0.415)
     {
         return action;
     }
-    let (_, aside) = seen(direction, sight);
-    let pace = wanted / STEP;
-    let to = [0, 1].map(|i| direction[i] * pace - [-direction[1], direction[0]][i] * 2.0 * aside / STEP);
-    [to[0], to[1], (0.415 - sight.gripper[2]) / STEP, 0.0]
+    let (_, left) = gripper_offset(direction, inputs);
+    let command = wanted / STEP;
+    let to = [0, 1].map(|i| direction[i] * command - [-direction[1], direction[0]][i] * 2.0 * left / STEP);
+    [to[0], to[1], (0.415 - inputs.gripper[2]) / STEP, 0.0]
 }
 
-fn pick(sight: &Sight) -> [f64; 4] {
-    let away: Place = std::array::from_fn(|i| sight.object[i] - sight.gripper[i]);
-    let aside = away[0].hypot(away[1]);
+fn pick(inputs: &Inputs) -> [f64; 4] {
+    let offset: Vec3 = std::array::from_fn(|i| inputs.object[i] - inputs.gripper[i]);
+    let horizontal = offset[0].hypot(offset[1]);
     let (open, shut) = (1.0, -1.0);
-    if aside < 0.02 && away[2].abs() < 0.015 {
-        // Between the fingers: grasped once these no longer close.
-        return if sight.gap > 0.06 { lead(sight, sight.object, shut) } else { lead(sight, sight.goal, shut) };
+    if horizontal < 0.02 && offset[2].abs() < 0.015 {
+        // The object is between the fingers, and grasped once the gap stops shrinking.
+        return if inputs.gap > 0.06 {
+            move_to(inputs, inputs.object, shut)
+        } else {
+            move_to(inputs, inputs.goal, shut)
+        };
     }
-    if aside < 0.015 {
-        return lead(sight, sight.object, open);
+    if horizontal < 0.015 {
+        return move_to(inputs, inputs.object, open);
     }
-    let above = [sight.object[0], sight.object[1], sight.object[2] + 0.08];
-    lead(sight, above, open)
+    let above = [inputs.object[0], inputs.object[1], inputs.object[2] + 0.08];
+    move_to(inputs, above, open)
 }
 
 #[cfg(test)]
@@ -158,7 +166,7 @@ mod tests {
     use super::super::ENTRIES;
     use swm_core::{Action, Batch, EnvEntry, Key, ResetOptions, Schema, VariationRequest};
 
-    /// How many of so many seeds the expert solves: those where the goal is reached at the end of the episode.
+    /// Counts the seeds in `0..seeds` for which the goal is reached at the end of the episode.
     fn solved(entry: &EnvEntry, seeds: u64, all: bool) -> u32 {
         let vary = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
         let variation = if all { vary } else { VariationRequest::default() };
@@ -181,11 +189,11 @@ mod tests {
         count
     }
 
-    /// `SEEDS=200 cargo nextest run --release -p swm-mujoco experts --no-capture` makes the table of the README.
+    /// `SEEDS=200 cargo nextest run --release -p swm-mujoco experts --no-capture` prints the table of the README.
     #[test]
-    fn experts_solve_their_tasks() {
+    fn experts_reach_expected_success_rates() {
         let seeds: u64 = std::env::var("SEEDS").ok().and_then(|text| text.parse().ok()).unwrap_or(10);
-        // Of 100 seeds, with default factors and with all varied; a strike of the puck is a matter of luck, too.
+        // Minimum success in percent, with default factors and with all varied. Sliding the puck succeeds rarely.
         let least = [("Reach", 95, 95), ("Push", 90, 80), ("Slide", 15, 0), ("PickAndPlace", 90, 80)];
         for (entry, (name, usual, all)) in ENTRIES.iter().step_by(3).zip(least) {
             assert!(entry.id.contains(name));

@@ -1,13 +1,13 @@
-//! The factors of variation, and what they do to the model. Names, bounds and defaults are the reference's.
+//! The factors of variation and their edits of the model. Names, bounds and defaults are those of the reference.
 
-use crate::physics::{Physics, place};
+use crate::physics::{Physics, index_of};
 use mujoco_rs::mujoco_c::mjtTexture;
 use mujoco_rs::wrappers::MjModel;
 use mujoco_rs::wrappers::mj_model::MjtObjBase;
 use std::f64::consts::PI;
 use swm_core::{DType, Factor, FactorValues, Result, Space, VariationSpace};
 
-/// The factors. Those of a block are there where there is one.
+/// The factors of a task; those of the block only where there is one.
 pub fn variation_space(block: bool) -> VariationSpace {
     let within = |shape: &[usize], low: &[f64], high: &[f64]| Space::Box {
         shape: shape.to_vec(),
@@ -26,6 +26,7 @@ pub fn variation_space(block: bool) -> VariationSpace {
         all.push(number("block.mass", 0.01, 50.0, 2.0));
         all.push(Factor::new("block.start_position", within(&[2], &[1.15, 0.6], &[1.45, 0.9]), [1.3, 0.74]));
     }
+    // Goals on the table: the height is that of a block's centre.
     let goal = within(&[3], &[1.15, 0.6, 0.4247], &[1.45, 0.9, 0.4247]);
     all.extend([
         Factor::new("camera.angle_delta", within(&[1, 2], &[-10.0; 2], &[10.0; 2]), [0.0; 2]),
@@ -35,12 +36,13 @@ pub fn variation_space(block: bool) -> VariationSpace {
         Factor::new("rendering.transparent_arm", Space::Discrete { n: 2, start: 0 }, [0.0]),
         color("table.color", [0.3; 3]),
     ]);
-    let looks = ["table.color", "object.color", "light.intensity", "background.color", "camera.angle_delta"];
-    VariationSpace::new(all, &looks)
+    let sampled_by_default =
+        ["table.color", "object.color", "light.intensity", "background.color", "camera.angle_delta"];
+    VariationSpace::new(all, &sampled_by_default)
 }
 
-/// What of the model the factors change.
-pub struct Handles {
+/// The elements of the model that factors edit, by index.
+pub struct FactorTargets {
     tables: Vec<usize>,
     floors: Vec<usize>,
     objects: Vec<usize>,
@@ -50,14 +52,14 @@ pub struct Handles {
     skybox: Option<usize>,
 }
 
-impl Handles {
-    /// Finds them.
+impl FactorTargets {
+    /// Finds the elements in a model.
     ///
     /// # Errors
-    /// When the model is not one of Fetch's.
+    /// When the model is not a model of Fetch.
     pub fn new(model: &MjModel, block: bool) -> Result<Self> {
         let of_material = |name: &str| -> Result<Vec<usize>> {
-            let material = i32::try_from(place(model, MjtObjBase::mjOBJ_MATERIAL, name)?).unwrap_or(-1);
+            let material = i32::try_from(index_of(model, MjtObjBase::mjOBJ_MATERIAL, name)?).unwrap_or(-1);
             Ok((0..model.geom_matid().len()).filter(|&geom| model.geom_matid()[geom] == material).collect())
         };
         let is_arm =
@@ -71,16 +73,15 @@ impl Handles {
             floors: of_material("floor_mat")?,
             objects,
             arm: (0..model.geom_matid().len()).filter(is_arm).collect(),
-            block: if block { Some(place(model, MjtObjBase::mjOBJ_BODY, "object0")?) } else { None },
-            light: place(model, MjtObjBase::mjOBJ_LIGHT, "light0")?,
+            block: if block { Some(index_of(model, MjtObjBase::mjOBJ_BODY, "object0")?) } else { None },
+            light: index_of(model, MjtObjBase::mjOBJ_LIGHT, "light0")?,
             skybox: model.tex_type().iter().position(|kind| *kind == mjtTexture::mjTEXTURE_SKYBOX),
         })
     }
 
-    /// Makes the model that of these factors. It comes as it was compiled, and what is at its default stays as it is there:
-    /// the reference's defaults are not the colours of the models.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    pub fn apply(&self, world: &mut Physics, factors: &FactorValues) {
+    /// Applies factors to the compiled model. A factor at its default leaves the model unchanged: the reference's default
+    /// colours are not those of the models.
+    pub fn apply(&self, physics: &mut Physics, factors: &FactorValues) {
         let changed = |key: &str| {
             let factor = factors.factors().iter().find(|factor| factor.key == key);
             Some(factors.get(key)).filter(|value| factor.is_some_and(|factor| factor.init_value != *value))
@@ -90,11 +91,11 @@ impl Handles {
             [("table.color", &self.tables), ("background.color", &self.floors), ("object.color", &self.objects)]
         {
             if let Some(color) = changed(key) {
-                geoms.iter().for_each(|&geom| world.paint(geom, single(color)));
+                geoms.iter().for_each(|&geom| physics.set_geom_color(geom, single(color)));
             }
         }
         if let (Some(color), Some(skybox)) = (changed("background.color"), self.skybox) {
-            let model = world.model_mut();
+            let model = physics.model_mut();
             let begin = usize::try_from(model.tex_adr()[skybox]).unwrap_or(0);
             let pixels = model.tex_width()[skybox] * model.tex_height()[skybox];
             let channels = usize::try_from(model.tex_nchannel()[skybox]).unwrap_or(3);
@@ -102,28 +103,28 @@ impl Handles {
             for pixel in model.tex_data_mut()[bytes].chunks_exact_mut(channels) {
                 pixel.iter_mut().zip(color).for_each(|(byte, part)| *byte = (part * 255.0) as u8);
             }
-            world.repaint();
+            physics.mark_textures_edited();
         }
         if let Some(intensity) = changed("light.intensity") {
-            world.model_mut().light_diffuse_mut()[self.light] = [intensity[0] as f32; 3];
+            physics.model_mut().light_diffuse_mut()[self.light] = [intensity[0] as f32; 3];
         }
         if factors.integer("rendering.transparent_arm") == 1 {
-            let colors = world.model_mut().geom_rgba_mut();
+            let colors = physics.model_mut().geom_rgba_mut();
             self.arm.iter().for_each(|&geom| colors[geom][3] = 0.3);
         }
         if let Some(&[azimuth, elevation]) = changed("camera.angle_delta") {
-            for position in world.model_mut().cam_pos_mut() {
-                *position = swung(*position, azimuth.to_radians(), elevation.to_radians());
+            for position in physics.model_mut().cam_pos_mut() {
+                *position = rotate_camera(*position, azimuth.to_radians(), elevation.to_radians());
             }
         }
         if let Some(block) = self.block {
-            world.model_mut().body_mass_mut()[block] = factors.scalar("block.mass");
+            physics.model_mut().body_mass_mut()[block] = factors.scalar("block.mass");
         }
     }
 }
 
-/// A camera's place, swung around the vertical axis and lifted, as the reference does it.
-fn swung([x, y, z]: [f64; 3], azimuth: f64, elevation: f64) -> [f64; 3] {
+/// Rotates the position of a camera around the vertical axis and raises it, with the reference's formula. Angles are in radians.
+fn rotate_camera([x, y, z]: [f64; 3], azimuth: f64, elevation: f64) -> [f64; 3] {
     let (x, y) = (x * azimuth.cos() - y * azimuth.sin(), x * azimuth.sin() + y * azimuth.cos());
     [x, y, z * elevation.cos() + x.hypot(y) * elevation.sin()]
 }

@@ -1,7 +1,7 @@
-//! Every function of MuJoCo's C interface that `mujoco-rs` declares, by name.
+//! The names of all functions of MuJoCo's C API that `mujoco-rs` declares.
 //!
-//! Taken from `mujoco-rs` 7.0.0+mj-3.17.0: `grep -oP 'pub fn \Kmj\w+(?=\()' src/mujoco_c.rs | sort -u`. A name that is missing
-//! here is an undefined symbol when the program is linked; one that MuJoCo does not export is an error when it is loaded.
+//! Extracted from `mujoco-rs` 7.0.0+mj-3.17.0 with `grep -oP 'pub fn \Kmj\w+(?=\()' src/mujoco_c.rs | sort -u`. A missing name is
+//! an undefined symbol at link time; a name that MuJoCo does not export is an error at load time.
 
 /// Calls `$then! { names … }`.
 macro_rules! each_symbol {

@@ -9,7 +9,6 @@ use swm_core::Result;
 pub const COLORS: [[f64; 3]; 2] = [[0.08, 0.11, 0.16], [0.15, 0.18, 0.25]];
 
 /// A colour in a texture, as MuJoCo makes it.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn bytes(color: &[f64]) -> [u8; 3] {
     [color[0], color[1], color[2]].map(|share| (255.0 * share) as u8)
 }
@@ -31,12 +30,11 @@ pub fn paint(physics: &mut Physics, colors: &[f64]) -> Result<()> {
     for (now, old) in now.iter_mut().zip(old) {
         *now = swaps.iter().find(|(known, _)| known == old).map_or(*old, |(_, color)| *color);
     }
-    physics.repaint();
+    physics.mark_textures_edited();
     Ok(())
 }
 
 /// Paints the floor so that its colour says where one is: red grows with the rows, green with the columns.
-#[allow(clippy::cast_possible_truncation)]
 pub fn encode(physics: &mut Physics, texture: usize) {
     const BRIGHTEST: usize = 192;
     let model = physics.model_mut();
@@ -46,5 +44,5 @@ pub fn encode(physics: &mut Physics, texture: usize) {
     for (place, texel) in texels.iter_mut().enumerate() {
         *texel = [(place / width * BRIGHTEST / height) as u8, (place % width * BRIGHTEST / width) as u8, 128];
     }
-    physics.repaint();
+    physics.mark_textures_edited();
 }

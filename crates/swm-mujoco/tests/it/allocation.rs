@@ -54,7 +54,6 @@ fn a_thread_that_draws_worlds_in_turn_allocates_nothing() {
 }
 
 #[test]
-#[allow(clippy::cast_possible_truncation, reason = "actions are single precision")]
 fn pictures_of_moving_worlds_allocate_nothing_once_warm() {
     let mut rgb = vec![0; 64 * 64 * 3];
     for mut world in worlds() {

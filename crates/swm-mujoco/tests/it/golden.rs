@@ -1,8 +1,8 @@
 //! Every recorded rollout of a MuJoCo world, step by step: states, observations, rewards, infos, and the first and last
 //! picture. Reads `SWM_GOLDEN` and the folder beside this test.
 
-use crate::likeness::Likeness;
 use crate::recorded::{self, Golden};
+use crate::similarity::ImageSimilarity;
 use std::collections::BTreeMap;
 use std::path::Path;
 use swm_core::{Action, Batch, Env, FrameMut, ResetOptions, Schema, VariationRequest};
@@ -365,7 +365,7 @@ impl<'a> Comparison<'a> {
             let frame = FrameMut::new(width, height, &mut rgb);
             render::with(Choice::Cpu, || self.env.render(frame)).unwrap_or_else(|error| panic!("{error}"));
             let name = format!("{}-{array}", self.name);
-            if !Likeness::note(&name, &rgb, &wanted, width).suffices() {
+            if !ImageSimilarity::report(&name, &rgb, &wanted, width).is_close() {
                 self.apart_at(&format!("{array} (cpu)"), 0, f64::INFINITY);
             }
             let frame = FrameMut::new(width, height, &mut rgb);

@@ -3,10 +3,10 @@
 mod allocation;
 mod conformance;
 mod golden;
-#[path = "../../src/render/likeness.rs"]
-mod likeness;
 mod link;
 mod no_gl;
 mod readout;
 mod recorded;
+#[path = "../../src/render/similarity.rs"]
+mod similarity;
 mod views;

@@ -63,7 +63,6 @@ impl Golden {
                 array.into_vec::<bool>().map(|all| all.into_iter().map(|b| f64::from(u8::from(b))).collect())
             }
             (TypeChar::Int, 4) => array.into_vec::<i32>().map(|all| all.into_iter().map(f64::from).collect()),
-            #[allow(clippy::cast_precision_loss)]
             (TypeChar::Int, 8) => array.into_vec::<i64>().map(|all| all.into_iter().map(|n| n as f64).collect()),
             other => panic!("{name} holds {other:?}"),
         };

@@ -78,7 +78,6 @@ fn afresh(env: &mut dyn Env, (width, height): (usize, usize)) -> Vec<u8> {
 }
 
 #[test]
-#[allow(clippy::cast_possible_truncation, reason = "actions are single precision")]
 fn what_is_kept_between_pictures_does_not_show() {
     let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
     for entry in ENVS.rows {
@@ -111,7 +110,7 @@ fn what_is_kept_between_pictures_does_not_show() {
 const SIDE: usize = 96;
 
 #[test]
-#[allow(clippy::print_stderr, clippy::cast_precision_loss, reason = "the table for whoever runs it with --no-capture")]
+#[allow(clippy::print_stderr, reason = "the table for whoever runs it with --no-capture")]
 fn both_renderers_see_the_same_geoms_at_the_same_distances() {
     let mut problems = vec![];
     for entry in ENVS.rows.iter().filter(|entry| !entry.id.contains("Dense") && !entry.id.contains("Dict")) {

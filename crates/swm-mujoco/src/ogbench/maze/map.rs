@@ -92,7 +92,6 @@ pub static MAPS: [Map; 5] = [
 ];
 
 /// The middle of a cell.
-#[allow(clippy::cast_precision_loss)]
 pub fn middle((row, column): Cell) -> Xy {
     [column as f64 * UNIT - OFFSET, row as f64 * UNIT - OFFSET]
 }
@@ -119,7 +118,6 @@ impl Map {
     }
 
     /// The cell of a place, the nearest one for places outside.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn cell(&self, [x, y]: Xy) -> Cell {
         let (rows, columns) = self.size();
         let at = |v: f64, n: usize| (((v + OFFSET) / UNIT + 0.5).max(0.0) as usize).min(n - 1);

@@ -8,8 +8,9 @@ pub use expert::EXPERTS;
 
 use super::arm::find;
 use super::floor;
-use crate::env::{FIRST, Step, Task, World};
+use crate::env::MujocoEnv;
 use crate::render::Camera;
+use crate::task::{FIRST_TASK_COLUMN, StepOutcome, Task};
 use crate::{Physics, physics};
 use map::{MAPS, Map, UNIT, Ways, Xy, middle};
 use mujoco_rs::mujoco_c::_mjtObjBase::{mjOBJ_GEOM, mjOBJ_LIGHT, mjOBJ_MATERIAL, mjOBJ_TEXTURE};
@@ -144,12 +145,12 @@ pub fn make(choice: &EnvChoice) -> Result<Box<dyn Env>> {
         previous: vec![0.0; nq + nv],
         luck: 0,
     };
-    Ok(Box::new(World::new(spec, model, maze)?))
+    Ok(Box::new(MujocoEnv::new(spec, model, maze)?))
 }
 
 /// The model of a maze, compiled once.
 fn shared(agent: Agent, map: &Map, seen: bool) -> Result<Arc<MjModel>> {
-    physics::shared(&format!("swm/OGBMaze-v0 {agent:?} {} {seen}", map.name), || model::compile(agent, map, seen))
+    physics::shared_model(&format!("swm/OGBMaze-v0 {agent:?} {} {seen}", map.name), || model::compile(agent, map, seen))
 }
 
 /// The models of all mazes as they are compiled, by name.
@@ -280,12 +281,11 @@ impl Maze {
 const MEMORY: usize = 1;
 
 impl Task for Maze {
-    fn overwrites(&self) -> bool {
+    fn overwrites_edits(&self) -> bool {
         true
     }
 
-    #[allow(clippy::cast_possible_truncation)]
-    fn arrange(&mut self, physics: &mut Physics, factors: &FactorValues) -> Result<()> {
+    fn apply_factors(&mut self, physics: &mut Physics, factors: &FactorValues) -> Result<()> {
         for (material, factor) in [("self", "agent.color"), ("wall", "wall.color")] {
             let material = find(physics.model(), mjOBJ_MATERIAL, material)?;
             let color = factors.get(factor);
@@ -329,23 +329,23 @@ impl Task for Maze {
         Ok(())
     }
 
-    fn step(&mut self, physics: &mut Physics, action: &[f32]) -> Step {
+    fn step(&mut self, physics: &mut Physics, action: &[f32]) -> StepOutcome {
         self.advance(physics, action);
         let success = self.is_success(physics);
         self.teleport(physics);
         let reward = f64::from(success) - if self.only.is_some() { 1.0 } else { 0.0 };
-        Step { reward, terminated: success && self.terminate }
+        StepOutcome { reward, terminated: success && self.terminate }
     }
 
     fn observe(&self, physics: &Physics, row: &mut RowMut<'_>) {
         let (qpos, qvel) = (physics.data().qpos(), physics.data().qvel());
-        let observation = row.at::<f64>(FIRST);
+        let observation = row.at::<f64>(FIRST_TASK_COLUMN);
         observation[..qpos.len()].copy_from_slice(qpos);
         if self.agent == Agent::Ant {
             observation[qpos.len()..].copy_from_slice(qvel);
         }
         let (previous_qpos, previous_qvel) = self.previous.split_at(qpos.len());
-        let (state, memory) = row.at::<f64>(FIRST + 1).split_at_mut(physics.state_len());
+        let (state, memory) = row.at::<f64>(FIRST_TASK_COLUMN + 1).split_at_mut(physics.state_len());
         physics.state(state);
         state[1..=self.goal_pose.len()].copy_from_slice(&self.goal_pose);
         memory[0] = f64::from(self.luck);
@@ -353,21 +353,20 @@ impl Task for Maze {
         let columns =
             [&xy(physics)[..], previous_qpos, previous_qvel, qpos, qvel, &self.goal, &self.ways.next(xy(physics))];
         for (i, numbers) in columns.into_iter().enumerate() {
-            row.set(FIRST + 2 + i, numbers);
+            row.set(FIRST_TASK_COLUMN + 2 + i, numbers);
         }
     }
 
-    fn memory_len(&self, model: &MjModel) -> usize {
+    fn task_state_len(&self, model: &MjModel) -> usize {
         MEMORY + model.qpos0().len() + model.dof_damping().len()
     }
 
-    fn remember(&self, into: &mut [f64]) {
+    fn save_task_state(&self, into: &mut [f64]) {
         into[0] = f64::from(self.luck);
         into[MEMORY..].copy_from_slice(&self.previous);
     }
 
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    fn recall(&mut self, _: &mut Physics, memory: &[f64]) {
+    fn load_task_state(&mut self, _: &mut Physics, memory: &[f64]) {
         self.luck = memory[0] as u32;
         self.previous.copy_from_slice(&memory[MEMORY..]);
     }
@@ -376,19 +375,19 @@ impl Task for Maze {
         2 + self.goal_pose.len()
     }
 
-    fn remember_goal(&self, into: &mut [f64]) {
+    fn save_goal(&self, into: &mut [f64]) {
         into[..2].copy_from_slice(&self.goal);
         into[2..].copy_from_slice(&self.goal_pose);
     }
 
-    fn recall_goal(&mut self, goal: &[f64]) {
+    fn load_goal(&mut self, goal: &[f64]) {
         self.goal_pose.copy_from_slice(&goal[2..]);
         if self.goal != goal[..2] {
             self.aim_at([goal[0], goal[1]]);
         }
     }
 
-    fn aim(&mut self, _: &mut Physics, state: &[f64], _: &[f64]) -> Result<()> {
+    fn set_goal_state(&mut self, _: &mut Physics, state: &[f64], _: &[f64]) -> Result<()> {
         let pose = &state[1..=self.goal_pose.len()];
         self.goal_pose.copy_from_slice(pose);
         self.aim_at([state[1], state[2]]);
@@ -415,14 +414,14 @@ impl Task for Maze {
         })
     }
 
-    fn show_goal(&mut self, physics: &mut Physics) {
+    fn move_to_goal(&mut self, physics: &mut Physics) {
         let (qpos, qvel) = self.goal_pose.split_at(physics.data().qpos().len());
         physics.data_mut().qpos_mut().copy_from_slice(qpos);
         physics.data_mut().qvel_mut().copy_from_slice(qvel);
         physics.forward();
     }
 
-    fn mark_goal(&mut self, physics: &mut Physics, _: &[f64]) {
+    fn update_markers(&mut self, physics: &mut Physics, _: &[f64]) {
         self.mark(physics);
     }
 

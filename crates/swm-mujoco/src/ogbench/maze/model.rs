@@ -72,7 +72,6 @@ pub fn center(map: &Map) -> [f64; 2] {
 }
 
 /// Columns and rows.
-#[allow(clippy::cast_precision_loss)]
 pub fn extent(map: &Map) -> [f64; 2] {
     let (rows, columns) = map.size();
     [columns as f64, rows as f64]

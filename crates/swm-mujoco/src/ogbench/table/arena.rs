@@ -144,7 +144,6 @@ fn settle_options(arena: &mut MjSpec) {
 }
 
 /// Gives the cube of `cube.xml` its number and its place among `cubes`.
-#[allow(clippy::cast_precision_loss)]
 fn number_cube(spec: &mut MjSpec, cube: usize, cubes: usize) -> Result<()> {
     let aside = 2.0 * SPACING * cube as f64 - SPACING * (cubes as f64 - 1.0);
     let named = |stem: &str| format!("{stem}_{cube}");

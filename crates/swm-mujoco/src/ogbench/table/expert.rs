@@ -104,7 +104,6 @@ impl View {
             let name = format!("privileged/block_{i}");
             Ok((vector(&format!("{name}_pos"))?, number(&format!("{name}_yaw"))?))
         };
-        #[allow(clippy::cast_possible_truncation)]
         let subject = Subject::from_number(number("goal/subject")? as i64);
         Ok(Self {
             hand: vector("proprio/effector_pos")?,
@@ -237,7 +236,6 @@ impl Fixtures {
             Ok([value[0], value[1], value[2]])
         };
         let number = |name: &str| -> Result<f64> { Ok(row.to_f64(name)?[0]) };
-        #[allow(clippy::cast_possible_truncation)]
         let pair = |name: &str| -> Result<[i64; 2]> {
             let value = row.to_f64(name)?;
             Ok([value[0] as i64, value[1] as i64])

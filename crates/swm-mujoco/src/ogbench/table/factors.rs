@@ -63,7 +63,6 @@ pub fn lock_colors(factors: &FactorValues) -> [[f32; 3]; 2] {
     [color(&value[..3]), color(&value[3..])]
 }
 
-#[allow(clippy::cast_possible_truncation)]
 fn color(value: &[f64]) -> [f32; 3] {
     [value[0] as f32, value[1] as f32, value[2] as f32]
 }
@@ -79,7 +78,6 @@ pub fn apply(physics: &mut Physics, setup: &Setup, parts: &Parts, factors: &Fact
         physics.model_mut().mat_rgba_mut()[material][..3].copy_from_slice(&color(factors.get("agent.color")));
     }
     let light = find(physics, mjOBJ_LIGHT, "global")?;
-    #[allow(clippy::cast_possible_truncation)]
     let intensity = factors.scalar("light.intensity") as f32;
     physics.model_mut().light_diffuse_mut()[light] = [intensity; 3];
     let turns = factors.get("camera.angle_delta");
@@ -106,7 +104,6 @@ pub fn apply(physics: &mut Physics, setup: &Setup, parts: &Parts, factors: &Fact
 }
 
 /// The means that the compiler computes once: MuJoCo's solver stops at a share of the mean inertia.
-#[allow(clippy::cast_precision_loss)]
 fn set_means(physics: &mut Physics) {
     let mean = |numbers: &[f64]| numbers.iter().sum::<f64>() / numbers.len() as f64;
     let (inertia, mass) = (mean(physics.model().dof_m0()), mean(&physics.model().body_mass()[1..]));

@@ -26,7 +26,6 @@ pub enum Subject {
 
 impl Subject {
     /// Numbers for [`Subject::from_number`], which the memory of a task holds.
-    #[allow(clippy::cast_possible_wrap)]
     pub fn number(self) -> i64 {
         match self {
             Self::All => -1,
@@ -38,7 +37,6 @@ impl Subject {
     }
 
     /// The subject of a number; what is none is everything.
-    #[allow(clippy::cast_sign_loss)]
     pub fn from_number(number: i64) -> Self {
         match number {
             i @ 0..100 => Self::Cube(i as usize),

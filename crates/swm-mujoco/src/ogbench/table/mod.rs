@@ -14,8 +14,9 @@ pub use expert::EXPERTS;
 
 use super::arm::pose::{Pose, Quat, Vec3};
 use super::arm::{ACTION, Arm, find};
-use crate::env::{Step, Task, World};
+use crate::env::MujocoEnv;
 use crate::render::Camera;
+use crate::task::{StepOutcome, Task};
 use crate::{Physics, physics};
 use arena::Look;
 use goal::{Sight, Subject};
@@ -93,7 +94,7 @@ pub fn make_scene(choice: &EnvChoice) -> Result<Box<dyn Env>> {
 
 /// The model of a table, compiled once.
 fn model(setup: &Setup, look: Look) -> Result<Arc<MjModel>> {
-    physics::shared(&format!("{} {} {look:?}", setup.id, setup.name), || arena::compile(setup, look))
+    physics::shared_model(&format!("{} {} {look:?}", setup.id, setup.name), || arena::compile(setup, look))
 }
 
 fn make(setup: &'static Setup, choice: &EnvChoice) -> Result<Box<dyn Env>> {
@@ -119,7 +120,7 @@ fn make(setup: &'static Setup, choice: &EnvChoice) -> Result<Box<dyn Env>> {
         max_episode_steps: setup.limit,
         cameras: vec![],
     };
-    Ok(Box::new(World::new(spec, model, table)?))
+    Ok(Box::new(MujocoEnv::new(spec, model, table)?))
 }
 
 /// How episodes begin and what they are for.
@@ -288,7 +289,7 @@ impl Table {
             return;
         }
         let (buttons, contact) = (self.buttons, self.contact);
-        self.show_goal(physics);
+        self.move_to_goal(physics);
         (self.buttons, self.contact) = (self.goal.fixed.buttons, self.goal.contact);
         let mut target = std::mem::take(&mut self.goal.target);
         self.observation(physics, &mut target);
@@ -312,11 +313,11 @@ fn locks(numbers: &[f64]) -> [u8; 2] {
 }
 
 impl Task for Table {
-    fn overwrites(&self) -> bool {
+    fn overwrites_edits(&self) -> bool {
         true
     }
 
-    fn arrange(&mut self, physics: &mut Physics, factors: &FactorValues) -> Result<()> {
+    fn apply_factors(&mut self, physics: &mut Physics, factors: &FactorValues) -> Result<()> {
         if self.setup.fixtures {
             self.lock_colors = factors::lock_colors(factors);
         }
@@ -330,32 +331,32 @@ impl Task for Table {
         Ok(())
     }
 
-    fn step(&mut self, physics: &mut Physics, action: &[f32]) -> Step {
+    fn step(&mut self, physics: &mut Physics, action: &[f32]) -> StepOutcome {
         self.advance(physics, action);
         let success = self.is_success(physics);
         let reward = match self.mode {
             Mode::One(_) => -self.sight(physics).gaps(self.goal.subject).map(|gap| f64::from(!gap.closed)).sum::<f64>(),
             _ => f64::from(success),
         };
-        Step { reward, terminated: success && self.terminate }
+        StepOutcome { reward, terminated: success && self.terminate }
     }
 
     fn observe(&self, physics: &Physics, row: &mut RowMut<'_>) {
         self.write(physics, row);
     }
 
-    fn memory_len(&self, model: &MjModel) -> usize {
+    fn task_state_len(&self, model: &MjModel) -> usize {
         MEMORY + model.qpos0().len() + model.dof_damping().len()
     }
 
-    fn remember(&self, into: &mut [f64]) {
+    fn save_task_state(&self, into: &mut [f64]) {
         let ([a, b], [c, d]) = (numbers(self.buttons), numbers(self.previous_buttons));
         let (head, previous) = into.split_at_mut(MEMORY);
         head.copy_from_slice(&[self.contact, a, b, c, d]);
         previous.copy_from_slice(&self.previous);
     }
 
-    fn recall(&mut self, _: &mut Physics, memory: &[f64]) {
+    fn load_task_state(&mut self, _: &mut Physics, memory: &[f64]) {
         let (head, previous) = memory.split_at(MEMORY);
         self.contact = head[0];
         (self.buttons, self.previous_buttons) = (locks(&head[1..]), locks(&head[3..]));
@@ -366,10 +367,9 @@ impl Task for Table {
         GOAL + 7 * self.setup.cubes + self.goal.pose.len()
     }
 
-    fn remember_goal(&self, into: &mut [f64]) {
+    fn save_goal(&self, into: &mut [f64]) {
         let (Fixed { buttons, drawer, window }, contact) = (self.goal.fixed, self.goal.contact);
         let [a, b] = numbers(buttons);
-        #[allow(clippy::cast_precision_loss)]
         let subject = self.goal.subject.number() as f64;
         let (head, rest) = into.split_at_mut(GOAL);
         head.copy_from_slice(&[subject, a, b, drawer, window, contact]);
@@ -381,8 +381,7 @@ impl Task for Table {
         pose.copy_from_slice(&self.goal.pose);
     }
 
-    #[allow(clippy::cast_possible_truncation)]
-    fn recall_goal(&mut self, goal: &[f64]) {
+    fn load_goal(&mut self, goal: &[f64]) {
         let (head, rest) = goal.split_at(GOAL);
         let (cubes, pose) = rest.split_at(7 * self.setup.cubes);
         self.goal.subject = Subject::from_number(head[0] as i64);
@@ -399,7 +398,7 @@ impl Task for Table {
         }
     }
 
-    fn aim(&mut self, physics: &mut Physics, state: &[f64], memory: &[f64]) -> Result<()> {
+    fn set_goal_state(&mut self, physics: &mut Physics, state: &[f64], memory: &[f64]) -> Result<()> {
         let pose = &state[1..=self.goal.pose.len()];
         self.goal.pose.copy_from_slice(pose);
         (self.goal.subject, self.goal.contact) = (Subject::All, memory[0]);
@@ -417,7 +416,7 @@ impl Task for Table {
         self.choose_goal(physics, key)
     }
 
-    fn mark_goal(&mut self, physics: &mut Physics, state: &[f64]) {
+    fn update_markers(&mut self, physics: &mut Physics, state: &[f64]) {
         if !self.goal.seen {
             self.look_at_goal(physics);
         }
@@ -432,7 +431,7 @@ impl Task for Table {
         }
     }
 
-    fn show_goal(&mut self, physics: &mut Physics) {
+    fn move_to_goal(&mut self, physics: &mut Physics) {
         let (qpos, qvel) = self.goal.pose.split_at(physics.data().qpos().len());
         physics.data_mut().qpos_mut().copy_from_slice(qpos);
         physics.data_mut().qvel_mut().copy_from_slice(qvel);

@@ -3,11 +3,11 @@
 
 use super::{MEMORY, Table};
 use crate::Physics;
-use crate::env::{FIRST, Task as _};
 use crate::ogbench::arm::CONTROLS;
 use crate::ogbench::arm::ik::JOINTS;
 use crate::ogbench::arm::pose::{Vec3, yaw, yaw_of_matrix};
 use crate::physics::state_len;
+use crate::task::{FIRST_TASK_COLUMN, Task as _};
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{ColumnSpec, DType, RowMut};
 
@@ -45,7 +45,7 @@ impl Pen<'_> {
     }
 }
 
-/// Fills columns one after the other, from [`FIRST`] on.
+/// Fills columns one after the other, from [`FIRST_TASK_COLUMN`] on.
 struct Columns<'a, 'b> {
     row: &'a mut RowMut<'b>,
     next: usize,
@@ -66,7 +66,7 @@ impl Columns<'_, '_> {
 impl Table {
     /// The columns of this table on this model.
     pub(super) fn columns(&self, model: &MjModel) -> Vec<ColumnSpec> {
-        let state = state_len(model) + self.memory_len(model);
+        let state = state_len(model) + self.task_state_len(model);
         let (nq, nv) = (model.qpos0().len(), model.dof_damping().len());
         let observation = observation_len(self.setup.cubes, self.setup.fixtures);
         let mut columns = vec![];
@@ -161,9 +161,9 @@ impl Table {
     pub(super) fn write(&self, physics: &Physics, row: &mut RowMut<'_>) {
         let (data, feel) = (physics.data(), self.arm.feel(physics, self.contact));
         let (qpos, qvel) = (data.qpos(), data.qvel());
-        self.observation(physics, row.at::<f64>(FIRST));
-        self.write_goal(physics, row.at::<f64>(FIRST + 1));
-        let mut columns = Columns { row, next: FIRST + 2 };
+        self.observation(physics, row.at::<f64>(FIRST_TASK_COLUMN));
+        self.write_goal(physics, row.at::<f64>(FIRST_TASK_COLUMN + 1));
+        let mut columns = Columns { row, next: FIRST_TASK_COLUMN + 2 };
         columns.set(&qpos[..JOINTS]);
         columns.set(&qvel[..JOINTS]);
         columns.set(&feel.place);

@@ -1,105 +1,105 @@
-//! What models of a group share: meshes and textures, prepared by the first who draws one.
+//! The meshes and textures of a model group, converted for `swm-raster` at its first rendering.
 
-use crate::render::Look;
+use crate::physics::Appearance;
 use mujoco_rs::mujoco_c::mjtTexture;
 use mujoco_rs::wrappers::MjModel;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_raster::{Assets, Corner, Mesh, Texture, V3};
 
-/// Groups that are kept; the one unused for longest makes room.
-const GROUPS: usize = 16;
+/// Model groups that are cached; the least recently used one is dropped first.
+const MAX_GROUPS: usize = 16;
 
-/// Versions of a group's textures that are kept.
-const REPAINTED: usize = 64;
+/// Textures that are cached per group before edited ones are dropped.
+const MAX_TEXTURES: usize = 64;
 
-/// Below this cosine, MuJoCo lights a corner of a mesh by the direction of its face instead of its own.
-const SMOOTH: f32 = 0.8;
+/// Below this cosine between vertex and face normal, MuJoCo shades a mesh vertex with the face normal.
+const SMOOTH_COSINE: f32 = 0.8;
 
-/// The assets of a group.
+/// The converted assets of a model group.
 struct Group {
     meshes: Vec<Arc<Mesh>>,
-    /// By place and content.
+    /// By texture index and content hash.
     textures: BTreeMap<(usize, u64), Arc<Texture>>,
 }
 
-/// Puts the assets of a model that looks so in the place of others.
-pub(super) fn fill(assets: &mut Assets, model: &MjModel, look: &Look) {
-    static KNOWN: Mutex<Vec<(u64, Group)>> = Mutex::new(vec![]);
-    let mut known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
-    let (number, mut group) = match known.iter().position(|(number, _)| *number == look.group) {
-        Some(place) => known.remove(place),
+/// Sets `assets` to the meshes and textures of a model.
+pub(super) fn fill(assets: &mut Assets, model: &MjModel, appearance: &Appearance) {
+    static CACHE: Mutex<Vec<(u64, Group)>> = Mutex::new(vec![]);
+    let mut cache = CACHE.lock().unwrap_or_else(PoisonError::into_inner);
+    let (number, mut group) = match cache.iter().position(|(number, _)| *number == appearance.group) {
+        Some(index) => cache.remove(index),
         None => {
             let meshes = (0..model.mesh_vertadr().len()).map(|i| Arc::new(mesh(model, i)));
             let mut meshes: Vec<_> = meshes.collect();
             meshes.extend((0..model.hfield_adr().len()).map(|i| Arc::new(height_field(model, i))));
-            (look.group, Group { meshes, textures: BTreeMap::new() })
+            (appearance.group, Group { meshes, textures: BTreeMap::new() })
         }
     };
-    if group.textures.len() > REPAINTED {
+    if group.textures.len() > MAX_TEXTURES {
+        // Hash 0 is the texture of the compiled model.
         group.textures.retain(|(_, content), _| *content == 0);
     }
-    let textures = look.textures.iter().enumerate().map(|(place, &content)| {
-        let made = group.textures.entry((place, content)).or_insert_with(|| Arc::new(texture(model, place)));
-        Arc::clone(made)
+    let textures = appearance.textures.iter().enumerate().map(|(index, &content)| {
+        let texture = group.textures.entry((index, content)).or_insert_with(|| Arc::new(texture(model, index)));
+        Arc::clone(texture)
     });
     assets.textures.clear();
     assets.textures.extend(textures);
     assets.meshes.clone_from(&group.meshes);
-    if known.len() >= GROUPS {
-        known.remove(0);
+    if cache.len() >= MAX_GROUPS {
+        cache.remove(0);
     }
-    known.push((number, group));
+    cache.push((number, group));
 }
 
-/// A number of MuJoCo's as a place; 0 for what is none.
-fn place(number: impl TryInto<usize>) -> usize {
+/// A count or address of MuJoCo as an index; 0 for negative values.
+fn index(number: impl TryInto<usize>) -> usize {
     number.try_into().unwrap_or(0)
 }
 
-/// A mesh of the model, its corners as MuJoCo lights them.
+/// Converts a mesh, with the vertex normals that MuJoCo shades with.
 fn mesh(model: &MjModel, number: usize) -> Mesh {
-    let first = |starts: &[i32]| place(starts[number]);
+    let first = |starts: &[i32]| index(starts[number]);
     let (vertices, normals) = (first(model.mesh_vertadr()), first(model.mesh_normaladr()));
     let coordinates = usize::try_from(model.mesh_texcoordadr()[number]).ok();
-    let faces = first(model.mesh_faceadr())..first(model.mesh_faceadr()) + place(model.mesh_facenum()[number]);
+    let faces = first(model.mesh_faceadr())..first(model.mesh_faceadr()) + index(model.mesh_facenum()[number]);
     Mesh::new(faces.map(|face| {
-        let places = model.mesh_face()[face].map(|i| model.mesh_vert()[vertices + place(i)]);
-        let flat = normal(places);
+        let positions = model.mesh_face()[face].map(|i| model.mesh_vert()[vertices + index(i)]);
+        let flat = face_normal(positions);
         std::array::from_fn(|k| {
-            let own = model.mesh_normal()[normals + place(model.mesh_facenormal()[face][k])];
-            let smooth = own.iter().zip(flat).map(|(a, b)| a * b).sum::<f32>() >= SMOOTH;
+            let own = model.mesh_normal()[normals + index(model.mesh_facenormal()[face][k])];
+            let smooth = own.iter().zip(flat).map(|(a, b)| a * b).sum::<f32>() >= SMOOTH_COSINE;
             Corner {
-                place: places[k],
+                place: positions[k],
                 normal: if coordinates.is_some() || smooth { own } else { flat },
                 coordinates: coordinates
-                    .map_or([0.0; 2], |first| model.mesh_texcoord()[first + place(model.mesh_facetexcoord()[face][k])]),
+                    .map_or([0.0; 2], |first| model.mesh_texcoord()[first + index(model.mesh_facetexcoord()[face][k])]),
             }
         })
     }))
 }
 
-/// The direction a triangle faces.
-fn normal([a, b, c]: [V3; 3]) -> V3 {
+/// The unit normal of a triangle; +z for a degenerate one.
+fn face_normal([a, b, c]: [V3; 3]) -> V3 {
     let (u, v): (V3, V3) = (std::array::from_fn(|k| b[k] - a[k]), std::array::from_fn(|k| c[k] - a[k]));
     let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
     let length = n.iter().map(|x| x * x).sum::<f32>().sqrt();
     if length > 0.0 { n.map(|x| x / length) } else { [0.0, 0.0, 1.0] }
 }
 
-/// A height field: its surface, four sides, and the bottom.
-#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation)]
+/// Converts a height field: surface, four side walls and bottom.
 fn height_field(model: &MjModel, number: usize) -> Mesh {
-    let (rows, columns) = (place(model.hfield_nrow()[number]), place(model.hfield_ncol()[number]));
+    let (rows, columns) = (index(model.hfield_nrow()[number]), index(model.hfield_ncol()[number]));
     let [x, y, above, below] = model.hfield_size()[number].map(|size| size as f32);
-    let heights = &model.hfield_data()[place(model.hfield_adr()[number])..];
+    let heights = &model.hfield_data()[index(model.hfield_adr()[number])..];
     let along = |i: usize, n: usize, half: f32| half * (2.0 * i as f32 / (n.max(2) - 1) as f32 - 1.0);
     let at = |r: usize, c: usize| [along(c, columns, x), along(r, rows, y), above * heights[r * columns + c]];
     let foot = |r: usize, c: usize| [along(c, columns, x), along(r, rows, y), -below];
     let mut triangles = vec![];
-    let mut triangle = |places: [V3; 3]| {
-        let normal = normal(places);
-        triangles.push(places.map(|place| Corner { place, normal, coordinates: [0.0; 2] }));
+    let mut triangle = |positions: [V3; 3]| {
+        let normal = face_normal(positions);
+        triangles.push(positions.map(|place| Corner { place, normal, coordinates: [0.0; 2] }));
     };
     for r in 1..rows {
         for c in 1..columns {
@@ -125,16 +125,16 @@ fn height_field(model: &MjModel, number: usize) -> Mesh {
     Mesh::new(triangles)
 }
 
-/// A texture of the model; white where it is of a kind that is not drawn.
+/// Converts a texture; white if its type is not rendered.
 fn texture(model: &MjModel, number: usize) -> Texture {
-    let (width, height) = (place(model.tex_width()[number]), place(model.tex_height()[number]));
-    let channels = place(model.tex_nchannel()[number]);
-    let first = place(model.tex_adr()[number]);
+    let (width, height) = (index(model.tex_width()[number]), index(model.tex_height()[number]));
+    let channels = index(model.tex_nchannel()[number]);
+    let first = index(model.tex_adr()[number]);
     let bytes = model.tex_data().get(first..first + width * height * channels).unwrap_or_default();
-    let made = match model.tex_type()[number] {
+    let texture = match model.tex_type()[number] {
         mjtTexture::mjTEXTURE_2D => Texture::flat(width, height, channels, bytes),
-        // Six squares, one below the other, or one for all sides.
+        // Six square faces stacked vertically, or one face for all sides.
         _ => Texture::cube(width, channels, bytes),
     };
-    made.unwrap_or_else(Texture::white)
+    texture.unwrap_or_else(Texture::white)
 }

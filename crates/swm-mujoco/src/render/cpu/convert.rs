@@ -1,7 +1,7 @@
-//! From MuJoCo's abstract scene to one of `swm-raster`.
+//! Converts MuJoCo's abstract scene to a scene of `swm-raster`.
 //!
-//! Constants and mappings are facts of MuJoCo's renderer: how planes are divided into quads, how textures lie on shapes.
-#![allow(unsafe_code, reason = "the geoms of a scene are an array that MuJoCo keeps")]
+//! Constants and mappings reproduce MuJoCo's OpenGL renderer: how planes are tessellated, how textures map onto shapes.
+#![allow(unsafe_code, reason = "MuJoCo stores the geoms of a scene in an array of its own")]
 
 use mujoco_rs::mujoco_c::{
     mjtCatBit, mjtGeom, mjtLightType, mjtObj, mjtRndFlag, mjtTexture, mjtTextureRole, mjvGLCamera, mjvGeom, mjvLight,
@@ -10,14 +10,13 @@ use mujoco_rs::mujoco_c::{
 use mujoco_rs::wrappers::MjModel;
 use swm_raster::{Axis, Camera, Geom, Haze, Light, Mapping, Paint, Scene, Shape, V3};
 
-/// Cells along each axis of a large plane.
-const MOST_CELLS: usize = 200;
+/// The most cells along each axis of a model's plane.
+const MAX_CELLS: usize = 200;
 
-/// Cells of a plane that is none of the model's.
-const CELLS: usize = 4;
+/// Cells along each axis of a plane that is not a geom of the model.
+const DECOR_CELLS: usize = 4;
 
-/// Fills a scene with what MuJoCo put into its own.
-#[allow(clippy::cast_possible_truncation)]
+/// Fills a scene from MuJoCo's.
 pub(super) fn fill(scene: &mut Scene, from: &mjvScene, model: &MjModel, (width, height): (usize, usize)) {
     let flag = |flag: mjtRndFlag| from.flags[flag as usize] != 0;
     let (vis, extent) = (model.vis(), model.stat().extent as f32);
@@ -35,13 +34,12 @@ pub(super) fn fill(scene: &mut Scene, from: &mjvScene, model: &MjModel, (width, 
     scene.lights.extend(from.lights.iter().take(lights).filter_map(light));
     scene.geoms.clear();
     let count = usize::try_from(from.ngeom).unwrap_or(0);
-    // SAFETY: a scene holds as many geoms as it says.
+    // SAFETY: `geoms` points to `ngeom` geoms.
     let geoms = if count == 0 { &[] } else { unsafe { std::slice::from_raw_parts(from.geoms, count) } };
     scene.geoms.extend(geoms.iter().filter_map(|from| geom(from, model)));
 }
 
-/// The camera in the middle of two eyes, as wide as the picture asks for.
-#[allow(clippy::cast_precision_loss)]
+/// The camera midway between MuJoCo's two eyes, with the aspect ratio of the frame.
 fn camera(eyes: &[mjvGLCamera; 2], width: usize, height: usize) -> Camera {
     let mean = |of: fn(&mjvGLCamera) -> V3| -> V3 {
         let [a, b] = [of(&eyes[0]), of(&eyes[1])];
@@ -53,7 +51,7 @@ fn camera(eyes: &[mjvGLCamera; 2], width: usize, height: usize) -> Camera {
         a.map(|x| x / length)
     };
     let forward = unit(mean(|eye| eye.forward));
-    // What is above is at right angles to where one looks.
+    // Makes `up` orthogonal to the viewing direction.
     let up = mean(|eye| eye.up);
     let along: f32 = up.iter().zip(forward).map(|(a, b)| a * b).sum();
     let up = unit(std::array::from_fn(|k| up[k] - along * forward[k]));
@@ -71,7 +69,7 @@ fn camera(eyes: &[mjvGLCamera; 2], width: usize, height: usize) -> Camera {
     }
 }
 
-/// A light; MuJoCo's renderer knows two types.
+/// Converts a light; MuJoCo's renderer supports directional lights and spotlights only.
 fn light(from: &mjvLight) -> Option<Light> {
     let directional = from.type_ == mjtLightType::mjLIGHT_DIRECTIONAL as i32;
     (directional || from.type_ == mjtLightType::mjLIGHT_SPOT as i32).then_some(Light {
@@ -88,7 +86,7 @@ fn light(from: &mjvLight) -> Option<Light> {
     })
 }
 
-/// A geom; `None` of lines, labels and what only shows forces and frames, which no world here asks for.
+/// Converts a geom; `None` for lines, labels and visualisations of forces and frames, which no environment enables.
 fn geom(from: &mjvGeom, model: &MjModel) -> Option<Geom> {
     let of_model = from.objtype == mjtObj::mjOBJ_GEOM as i32;
     Some(Geom {
@@ -117,7 +115,7 @@ fn shape(from: &mjvGeom, model: &MjModel, of_model: bool) -> Option<Shape> {
                 let repeat = material.map_or([0.0; 2], |material| model.mat_texrepeat()[material]);
                 Shape::Plane(axis(size[0], size[2], repeat[0], model), axis(size[1], size[2], repeat[1], model))
             }
-            None => Shape::Plane(Axis::even(x, CELLS), Axis::even(y, CELLS)),
+            None => Shape::Plane(Axis::even(x, DECOR_CELLS), Axis::even(y, DECOR_CELLS)),
         }
     } else if is(mjtGeom::mjGEOM_SPHERE) || is(mjtGeom::mjGEOM_ELLIPSOID) {
         Shape::Ellipsoid([x, y, z])
@@ -128,24 +126,24 @@ fn shape(from: &mjvGeom, model: &MjModel, of_model: bool) -> Option<Shape> {
     } else if is(mjtGeom::mjGEOM_BOX) {
         Shape::Box([x, y, z])
     } else if is(mjtGeom::mjGEOM_MESH) || is(mjtGeom::mjGEOM_SDF) {
-        // Two drawings a mesh: itself and its hull.
+        // MuJoCo has two display lists per mesh: the mesh and its convex hull.
         Shape::Mesh(usize::try_from(from.dataid).ok()? / 2)
     } else if is(mjtGeom::mjGEOM_HFIELD) {
-        // They stand behind the meshes.
+        // Height fields follow the meshes in the assets.
         Shape::Mesh(model.mesh_vertadr().len() + usize::try_from(from.dataid).ok()?)
     } else {
         return None;
     })
 }
 
-/// How MuJoCo divides a plane along an axis: `size` is half its extent (0: endless), `spacing` half the distance of grid lines.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+/// How MuJoCo tessellates a plane along an axis. `size` is half the extent in metres (0: infinite), `spacing` half the distance
+/// between grid lines in metres.
 fn axis(size: f64, spacing: f64, repeat: f32, model: &MjModel) -> Axis {
     if size > 0.0 {
-        let spacing = spacing.max(size / (MOST_CELLS - 2) as f64);
+        let spacing = spacing.max(size / (MAX_CELLS - 2) as f64);
         let lines = (size / spacing).floor() as usize & !1;
         let pad = size - lines as f64 * spacing;
-        // Lines are counted over half the plane, and are twice as far apart.
+        // Lines are counted over half the plane and are two spacings apart.
         return Axis {
             half: size as f32,
             pad: pad as f32,
@@ -155,19 +153,19 @@ fn axis(size: f64, spacing: f64, repeat: f32, model: &MjModel) -> Axis {
         };
     }
     let far = f64::from(model.vis().map.zfar) * model.stat().extent;
-    let cell = if repeat > 0.0 { 2.0 / f64::from(repeat) } else { 2.1 * far / (MOST_CELLS - 2) as f64 };
-    let step = (2.1 * far + 2.0 * cell) / MOST_CELLS as f64;
+    let cell = if repeat > 0.0 { 2.0 / f64::from(repeat) } else { 2.1 * far / (MAX_CELLS - 2) as f64 };
+    let step = (2.1 * far + 2.0 * cell) / MAX_CELLS as f64;
     Axis {
-        half: (step * (MOST_CELLS / 2) as f64) as f32,
+        half: (step * (MAX_CELLS / 2) as f64) as f32,
         pad: step as f32,
         step: step as f32,
-        cells: MOST_CELLS,
+        cells: MAX_CELLS,
         infinite: true,
     }
 }
 
-/// The texture of a geom. Most shapes are drawn from unit ones, whose coordinates OpenGL takes; planes and meshes of the model have
-/// coordinates in metres.
+/// The texture of a geom. OpenGL generates texture coordinates from unit shapes, except for planes and meshes of the model, whose
+/// vertices are in metres.
 fn paint(from: &mjvGeom, model: &MjModel) -> Option<Paint> {
     let material = usize::try_from(from.matid).ok()?;
     let (texture, uniform, repeat) = match usize::try_from(from.texid) {
@@ -182,7 +180,7 @@ fn paint(from: &mjvGeom, model: &MjModel) -> Option<Paint> {
     let mapping = if from.texcoord != 0 {
         Mapping::Own
     } else if flat {
-        // Textures begin at the upper left corner of a finite shape, and repeat in units of its size, or in space.
+        // The texture starts at the upper left corner of a finite shape and repeats per shape, or per metre if uniform.
         let repeat = [0, 1].map(|k| repeat[k] * if uniform && from.size[k] > 0.0 { from.size[k] } else { 1.0 });
         if from.type_ == mjtGeom::mjGEOM_BOX as i32 {
             return Some(Paint { texture, mapping: Mapping::Sides(repeat) });

@@ -1,7 +1,8 @@
-//! EGL, opened when the first picture is asked for: devices, and contexts without a window.
+//! EGL, loaded at the first rendering: devices, and OpenGL contexts without a window.
+//!
 //! Constants and signatures are those of the EGL 1.5 specification and its device and platform extensions.
 
-use libloading::os::unix::{Library as Shared, RTLD_GLOBAL, RTLD_NOW};
+use libloading::os::unix::{Library as SharedObject, RTLD_GLOBAL, RTLD_NOW};
 use std::ffi::{CStr, c_char, c_int, c_void};
 use swm_core::{Error, Result};
 
@@ -14,13 +15,13 @@ const EXTENSIONS: c_int = 0x3055;
 const OPENGL_API: u32 = 0x30A2;
 const PLATFORM_DEVICE: u32 = 0x313F;
 const PLATFORM_SURFACELESS: u32 = 0x31DD;
-/// Eight bits a colour and of opacity, depth, stencil, a buffer beside the screen, OpenGL.
+/// 8 bits per colour channel and alpha, 24 bits of depth, 8 bits of stencil, pbuffer surfaces, OpenGL.
 const CONFIG: [c_int; 17] =
     [0x3024, 8, 0x3023, 8, 0x3022, 8, 0x3021, 8, 0x3025, 24, 0x3026, 8, 0x3033, 0x0001, 0x3040, 0x0008, NONE];
 const PBUFFER: [c_int; 5] = [0x3057, 1, 0x3056, 1, NONE];
 const GL_RENDERER: u32 = 0x1F01;
 
-/// The functions needed of EGL.
+/// The functions of EGL that this crate uses.
 pub struct Library {
     get_proc_address: unsafe extern "C" fn(*const c_char) -> Pointer,
     get_display: unsafe extern "C" fn(Pointer) -> Pointer,
@@ -33,41 +34,41 @@ pub struct Library {
     destroy_surface: unsafe extern "C" fn(Pointer, Pointer) -> Bool,
     destroy_context: unsafe extern "C" fn(Pointer, Pointer) -> Bool,
     get_error: unsafe extern "C" fn() -> c_int,
-    /// Keeps the functions where they are.
-    _shared: Shared,
+    /// Keeps the library loaded while its functions are used.
+    _shared: SharedObject,
 }
 
-/// A device that was opened.
+/// An EGL display.
 #[derive(Clone, Copy)]
 pub struct Display {
     pointer: Pointer,
-    /// Whether a graphics card is behind it, as far as it says.
+    /// Whether EGL reports the device as a graphics card.
     pub hardware: bool,
 }
 
 // SAFETY: EGL allows a display to be used from any thread.
 unsafe impl Send for Display {}
 
-/// An OpenGL context, with the state that is OpenGL's own: lights, textures, the shadow map. Used by one thread.
-pub struct Canvas {
+/// An OpenGL context with its state (lights, textures, shadow map). Belongs to one thread.
+pub struct GlContext {
     display: Pointer,
     context: Pointer,
-    /// What older drivers want to be there; null for others.
+    /// A surface for older drivers, which require one; null otherwise.
     surface: Pointer,
 }
 
 impl Library {
-    /// Opens EGL: the library that `SWM_EGL_LIBRARY` names, else the system's. Its symbols become visible to all: MuJoCo looks for
-    /// OpenGL's functions through them.
+    /// Loads EGL: the library that `SWM_EGL_LIBRARY` names, otherwise the system's. Its symbols become globally visible,
+    /// because MuJoCo looks up OpenGL's functions through them.
     ///
     /// # Errors
-    /// When it is not installed.
+    /// When the library is not installed.
     pub fn open() -> Result<Self> {
         let name = std::env::var("SWM_EGL_LIBRARY").unwrap_or_else(|_| "libEGL.so.1".to_owned());
         let failed = |error: libloading::Error| Error::external(format!("opening {name}"), error);
-        // SAFETY: opening EGL runs the initialisers of a system library.
-        let shared = unsafe { Shared::open(Some(&name), RTLD_NOW | RTLD_GLOBAL) }.map_err(failed)?;
-        // SAFETY: each is called as its specification declares it.
+        // SAFETY: loading EGL runs the initialisers of a system library.
+        let shared = unsafe { SharedObject::open(Some(&name), RTLD_NOW | RTLD_GLOBAL) }.map_err(failed)?;
+        // SAFETY: the field types are the signatures of the EGL specification.
         unsafe {
             Ok(Self {
                 get_proc_address: *shared.get("eglGetProcAddress").map_err(failed)?,
@@ -86,52 +87,52 @@ impl Library {
         }
     }
 
-    /// A function that is no part of EGL itself.
+    /// Looks up an extension function.
     ///
     /// # Safety
-    /// `F` must be a pointer to functions of its signature.
+    /// `F` must be a function pointer of the function's signature.
     unsafe fn extension<F: Copy>(&self, name: &CStr) -> Option<F> {
-        // SAFETY: EGL answers for any name.
+        // SAFETY: `eglGetProcAddress` accepts any name.
         let address = unsafe { (self.get_proc_address)(name.as_ptr()) };
-        // SAFETY: a function's address, not null, has the size of any function pointer; the caller knows the signature.
+        // SAFETY: the address is not null and has the size of a function pointer; the caller guarantees the signature.
         (!address.is_null()).then(|| unsafe { std::mem::transmute_copy(&address) })
     }
 
-    /// Opens the device that `MUJOCO_EGL_DEVICE_ID` names, else the first one that can draw, graphics cards first.
+    /// Opens the device that `MUJOCO_EGL_DEVICE_ID` selects, otherwise the first usable one, graphics cards first.
     ///
     /// # Errors
-    /// When none can.
+    /// When no device is usable.
     pub fn display(&self) -> Result<Display> {
         let mut devices = self.devices();
         match std::env::var("MUJOCO_EGL_DEVICE_ID").ok().filter(|text| !text.is_empty()) {
             Some(text) => {
-                let chosen = text.parse().ok().and_then(|place: usize| devices.get(place).copied());
+                let chosen = text.parse().ok().and_then(|index: usize| devices.get(index).copied());
                 devices = vec![chosen.ok_or_else(|| {
-                    let problem = format!("'{text}' is no device: there are {}", devices.len());
-                    Error::config("MUJOCO_EGL_DEVICE_ID", problem, "give a number from 0 on, or leave it unset")
+                    let problem = format!("'{text}' is not the index of a device: there are {}", devices.len());
+                    Error::config("MUJOCO_EGL_DEVICE_ID", problem, "give an index from 0 on, or leave it unset")
                 })?];
             }
             None => devices.sort_by_key(|display| !display.hardware),
         }
         let opened = devices.into_iter().find(|display| {
-            // SAFETY: the display is one that EGL returned; EGL allows nulls where no version is wanted.
+            // SAFETY: the display was returned by EGL; null pointers are allowed where no version is requested.
             let open =
                 unsafe { (self.initialize)(display.pointer, std::ptr::null_mut(), std::ptr::null_mut()) } == TRUE;
             open && self.config(*display).is_some()
         });
         opened.ok_or_else(|| {
-            Error::external("EGL", "no device can draw: neither a graphics card's driver nor Mesa is there")
+            Error::external("EGL", "no device can render: neither a graphics driver nor Mesa is installed")
         })
     }
 
-    /// The displays of all devices, and Mesa's without any.
+    /// The displays of all devices, and Mesa's display without a device.
     fn devices(&self) -> Vec<Display> {
         type QueryDevices = unsafe extern "C" fn(c_int, *mut Pointer, *mut c_int) -> Bool;
         type QueryString = unsafe extern "C" fn(Pointer, c_int) -> *const c_char;
         type PlatformDisplay = unsafe extern "C" fn(u32, Pointer, *const c_int) -> Pointer;
         let mut found = vec![];
-        // SAFETY: signatures are those of EGL_EXT_device_enumeration, EGL_EXT_device_query and EGL_EXT_platform_base; each
-        // is called with the devices EGL itself returned, and with room for as many as is said.
+        // SAFETY: the signatures are those of EGL_EXT_device_enumeration, EGL_EXT_device_query and EGL_EXT_platform_base; the
+        // functions receive devices that EGL returned, and buffers of the stated length.
         unsafe {
             let query: Option<QueryDevices> = self.extension(c"eglQueryDevicesEXT");
             let describe: Option<QueryString> = self.extension(c"eglQueryDeviceStringEXT");
@@ -160,70 +161,70 @@ impl Library {
         found
     }
 
-    /// A configuration of the display that OpenGL can draw with.
+    /// A frame buffer configuration of the display for OpenGL.
     fn config(&self, display: Display) -> Option<Pointer> {
         let (mut config, mut count) = (std::ptr::null_mut(), 0);
-        // SAFETY: there is room for the one configuration that is asked for.
+        // SAFETY: there is room for the one configuration that is requested.
         let chosen =
             unsafe { (self.choose_config)(display.pointer, CONFIG.as_ptr(), &raw mut config, 1, &raw mut count) };
         (chosen == TRUE && count > 0).then_some(config)
     }
 
-    /// The error of what EGL refused on this thread.
-    fn refused(&self, what: &str) -> Error {
-        // SAFETY: asks for the error of this thread.
+    /// The error that EGL recorded on this thread.
+    fn last_error(&self, what: &str) -> Error {
+        // SAFETY: the function takes no arguments.
         let code = unsafe { (self.get_error)() };
         Error::external("EGL", format!("{what} failed with {code:#x}"))
     }
 
-    /// Makes an OpenGL context and binds it to this thread.
+    /// Creates an OpenGL context and binds it to this thread.
     ///
     /// # Errors
-    /// When EGL refuses.
-    pub fn canvas(&self, display: Display) -> Result<Canvas> {
+    /// When EGL fails.
+    pub fn create_context(&self, display: Display) -> Result<GlContext> {
         let null = std::ptr::null_mut();
-        let config = self.config(display).ok_or_else(|| self.refused("choosing a configuration"))?;
+        let config = self.config(display).ok_or_else(|| self.last_error("choosing a configuration"))?;
         let display = display.pointer;
-        // SAFETY: display and configuration are EGL's own; lists end in NONE.
+        // SAFETY: display and configuration were returned by EGL; attribute lists end in NONE.
         unsafe {
             if (self.bind_api)(OPENGL_API) != TRUE {
-                return Err(self.refused("choosing OpenGL"));
+                return Err(self.last_error("choosing OpenGL"));
             }
             let context = (self.create_context)(display, config, null, std::ptr::null());
             if context.is_null() {
-                return Err(self.refused("making a context"));
+                return Err(self.last_error("creating a context"));
             }
-            let mut canvas = Canvas { display, context, surface: null };
-            if self.bind(&canvas).is_err() {
-                // Older drivers want a surface, though nothing is drawn to it.
-                canvas.surface = (self.create_pbuffer)(display, config, PBUFFER.as_ptr());
-                if let Err(error) = self.bind(&canvas) {
-                    self.discard(&canvas);
+            let mut gl = GlContext { display, context, surface: null };
+            if self.bind(&gl).is_err() {
+                // Older drivers require a surface, though nothing is drawn to it.
+                gl.surface = (self.create_pbuffer)(display, config, PBUFFER.as_ptr());
+                if let Err(error) = self.bind(&gl) {
+                    self.destroy_context(&gl);
                     return Err(error);
                 }
             }
-            Ok(canvas)
+            Ok(gl)
         }
     }
 
-    /// What OpenGL calls go to on this thread from now on.
+    /// Makes a context current on this thread.
     ///
     /// # Errors
-    /// When EGL refuses.
-    pub fn bind(&self, canvas: &Canvas) -> Result<()> {
-        let Canvas { display, context, surface } = *canvas;
-        // SAFETY: all three are EGL's own, and used by this thread alone.
+    /// When EGL fails.
+    pub fn bind(&self, gl: &GlContext) -> Result<()> {
+        let GlContext { display, context, surface } = *gl;
+        // SAFETY: all three were returned by EGL and are used by this thread only.
         match unsafe { (self.make_current)(display, surface, surface, context) } {
             TRUE => Ok(()),
-            _ => Err(self.refused("making a context current")),
+            _ => Err(self.last_error("making a context current")),
         }
     }
 
-    /// Gives a context back; nothing is bound to this thread afterwards.
-    pub fn discard(&self, canvas: &Canvas) {
-        let Canvas { display, context, surface } = *canvas;
+    /// Destroys a context; no context is current on this thread afterwards.
+    pub fn destroy_context(&self, gl: &GlContext) {
+        let GlContext { display, context, surface } = *gl;
         let null = std::ptr::null_mut();
-        // SAFETY: as in `bind`; neither is used again.
+        // SAFETY: as in `bind`; none of them is used again.
         unsafe {
             (self.make_current)(display, null, null, null);
             if !surface.is_null() {
@@ -233,9 +234,9 @@ impl Library {
         }
     }
 
-    /// What draws, in OpenGL's words; a canvas is bound.
-    pub fn device(&self) -> String {
-        // SAFETY: the signature is OpenGL's; it answers with text that stays.
+    /// OpenGL's name of the device of the current context.
+    pub fn device_name(&self) -> String {
+        // SAFETY: the signature is OpenGL's; the returned text is static.
         unsafe {
             let get_string: Option<unsafe extern "C" fn(u32) -> *const c_char> = self.extension(c"glGetString");
             let name = get_string.map_or(std::ptr::null(), |get_string| get_string(GL_RENDERER));

@@ -1,12 +1,12 @@
-//! MuJoCo's library, loaded when the first world needs it.
+//! MuJoCo's library, loaded when the first environment needs it.
 //!
-//! `mujoco-rs` declares MuJoCo's functions as symbols that somebody links with. Here they are trampolines: one jump each,
-//! through a table that [`load`] fills from `libmujoco` of the installed assets. So one program starts, and everything
-//! else works, where MuJoCo is absent. A jump before loading ends in [`absent`], which says so.
+//! `mujoco-rs` declares MuJoCo's functions as symbols for the linker. This module defines them as trampolines: one jump each,
+//! through a table that [`load`] fills from `libmujoco` of the installed assets. The same program therefore starts, and works
+//! apart from these environments, where MuJoCo is not installed. A call before loading ends in [`not_loaded`].
 //!
-//! It also decides what MuJoCo does with its errors. By itself it writes them to `MUJOCO_LOG.TXT` of the working
-//! directory and exits the process. Here warnings go to the log of the program, and an error inside [`guard`] unwinds
-//! to it and becomes an [`Error`].
+//! The module also replaces MuJoCo's error handling. By default MuJoCo writes errors to `MUJOCO_LOG.TXT` in the working
+//! directory and exits the process. Here, messages go to the program's log, and an error inside [`guard`] unwinds to it and is
+//! returned as an [`Error`].
 #![allow(unsafe_code, reason = "foreign symbols, a table of addresses, and a handler that MuJoCo calls")]
 
 mod symbols;
@@ -20,20 +20,20 @@ use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::OnceLock;
 use swm_core::{Error, Result};
 
-/// The version of MuJoCo that is loaded, no other: `mujoco-rs` describes the structures of this one.
+/// The version of MuJoCo that is loaded. No other version works: `mujoco-rs` declares the structures of this one.
 pub const VERSION: &str = "3.17.0";
 
 macro_rules! trampolines {
     ($($name:ident)*) => {
-        /// The names, in the order of the table.
+        /// The names of the functions, in the order of the table.
         const NAMES: &[&CStr] = &[$(
             match CStr::from_bytes_with_nul(concat!(stringify!($name), "\0").as_bytes()) {
                 Ok(name) => name,
-                Err(_) => panic!("a name holds no zero"),
+                Err(_) => panic!("a name contains a zero byte"),
             }
         ),*];
 
-        // Each function jumps to the address in its place of the table; places follow one another as the names do.
+        // Each function jumps to the address in its entry of the table; entries are in the order of the names.
         std::arch::global_asm!(
             ".pushsection .data.swm_mujoco_table,\"aw\",%progbits",
             ".balign 8",
@@ -44,7 +44,7 @@ macro_rules! trampolines {
             $(
                 ".pushsection .data.swm_mujoco_table,\"aw\",%progbits",
                 "22:",
-                ".quad {absent}",
+                ".quad {not_loaded}",
                 ".popsection",
                 ".pushsection .text.swm_mujoco,\"ax\",%progbits",
                 concat!(".hidden ", stringify!($name)),
@@ -54,7 +54,7 @@ macro_rules! trampolines {
                 jump!(),
                 ".popsection",
             )*
-            absent = sym absent,
+            not_loaded = sym not_loaded,
         );
     };
 }
@@ -80,24 +80,24 @@ unsafe extern "C" {
     static mut swm_mujoco_table: [*const (); NAMES.len()];
 }
 
-/// Where a trampoline leads before [`load`]: a defect of this crate, which must load before it calls.
-extern "C" fn absent() -> ! {
+/// The target of every trampoline before [`load`]. Reaching it is a bug of this crate, which must load the library first.
+extern "C" fn not_loaded() -> ! {
     tracing::error!("a MuJoCo function was called before MuJoCo was loaded");
     std::process::abort();
 }
 
-/// Loads MuJoCo, once; afterwards its functions may be called.
+/// Loads MuJoCo if it is not loaded. Its functions may be called afterwards.
 ///
 /// # Errors
-/// When it is not installed (naming the command that brings it), or cannot be loaded.
+/// When it is not installed (the error names the command to install it), or cannot be loaded.
 pub fn load() -> Result<()> {
     static LOADED: OnceLock<()> = OnceLock::new();
     if LOADED.get().is_some() {
         return Ok(());
     }
-    // Whoever comes second waits for the first, and a failure may be mended and tried again.
-    static TURN: std::sync::Mutex<()> = std::sync::Mutex::new(());
-    let _turn = TURN.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    // Concurrent callers wait for the first; after a failure, the next call tries again.
+    static LOADING: std::sync::Mutex<()> = std::sync::Mutex::new(());
+    let _lock = LOADING.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
     if LOADED.get().is_none() {
         open()?;
         LOADED.get_or_init(|| ());
@@ -105,20 +105,20 @@ pub fn load() -> Result<()> {
     Ok(())
 }
 
-/// Opens the library, fills the table, and takes over MuJoCo's messages.
+/// Opens the library, fills the table, and installs the log handler.
 fn open() -> Result<()> {
     let path = assets::path("mujoco")?.join(format!("mujoco/libmujoco.so.{VERSION}"));
     let failed = |error: libloading::Error| Error::external(format!("loading {}", path.display()), error);
-    // SAFETY: MuJoCo's library runs no code of consequence when it is opened; its SHA-256 was checked when it was installed.
+    // SAFETY: MuJoCo's library has no initialisers with side effects; its SHA-256 was checked at installation.
     let library = unsafe { Library::open(Some(&path), RTLD_NOW | RTLD_LOCAL) }.map_err(failed)?;
     let mut table = [std::ptr::null(); NAMES.len()];
-    for (place, name) in table.iter_mut().zip(NAMES) {
-        // SAFETY: only the address is taken; `mujoco-rs` declares the signature it is called with.
-        *place = *unsafe { library.get::<*const ()>(name.to_bytes_with_nul()) }.map_err(failed)?;
+    for (entry, name) in table.iter_mut().zip(NAMES) {
+        // SAFETY: only the address is taken; `mujoco-rs` declares the signature of the function.
+        *entry = *unsafe { library.get::<*const ()>(name.to_bytes_with_nul()) }.map_err(failed)?;
     }
-    // The addresses stay valid until the process ends.
+    // Unloading would invalidate the addresses in the table.
     std::mem::forget(library);
-    // SAFETY: `load` lets one thread in, and lets none call a function before it is done.
+    // SAFETY: `load` calls this function under a lock, and no function of the table is called before it returns.
     unsafe {
         (&raw mut swm_mujoco_table).write(table);
         mju_setLogHandler(Some(on_message));
@@ -131,27 +131,27 @@ thread_local! {
     static GUARDED: Cell<bool> = const { Cell::new(false) };
 }
 
-/// What unwinds from MuJoCo's error to [`guard`].
+/// The payload that unwinds from MuJoCo's log handler to [`guard`].
 struct Fault(String);
 
-/// Calls into MuJoCo. What MuJoCo calls an error, and would end the process with, is returned.
+/// Calls MuJoCo and returns its errors, which would otherwise end the process.
 ///
-/// Only functions declared `extern "C-unwind"` may be called inside (`crate::ffi`), and whatever they worked on is in
-/// an undefined state after an error: a world resets it.
+/// `call` may only use functions declared `extern "C-unwind"` (`crate::ffi`). After an error, the objects it worked on are in an
+/// undefined state; the environment resets them.
 ///
 /// # Errors
-/// MuJoCo's own, in its words.
+/// MuJoCo's error message.
 pub(crate) fn guard<T>(doing: &str, call: impl FnOnce() -> T) -> Result<T> {
-    let before = GUARDED.replace(true);
+    let nested = GUARDED.replace(true);
     let outcome = catch_unwind(AssertUnwindSafe(call));
-    GUARDED.set(before);
+    GUARDED.set(nested);
     outcome.map_err(|payload| match payload.downcast::<Fault>() {
         Ok(fault) => Error::external(format!("MuJoCo, {doing}"), fault.0),
         Err(other) => resume_unwind(other),
     })
 }
 
-/// The head of MuJoCo's `mjLogMessage`.
+/// The first fields of MuJoCo's `mjLogMessage`.
 #[repr(C)]
 struct Message {
     level: c_int,
@@ -163,15 +163,15 @@ struct Message {
 type Handler = unsafe extern "C-unwind" fn(*const Message);
 
 unsafe extern "C" {
-    /// As `mujoco-rs` declares it, but for a handler that may unwind.
+    /// As declared by `mujoco-rs`, but for a handler that may unwind.
     fn mju_setLogHandler(handler: Option<Handler>) -> Option<Handler>;
 }
 
-/// Receives every message of MuJoCo.
+/// The log handler: receives every message of MuJoCo.
 unsafe extern "C-unwind" fn on_message(message: *const Message) {
-    // SAFETY: MuJoCo passes a valid message for the time of the call.
+    // SAFETY: MuJoCo passes a message that is valid during the call.
     let message = unsafe { &*message };
-    // SAFETY: the subject is a buffer that ends in zero; the body is null or ends in zero.
+    // SAFETY: the subject is a zero-terminated buffer; the body is null or zero-terminated.
     let text = unsafe {
         let subject = CStr::from_ptr(message.subject.as_ptr()).to_string_lossy();
         match message.body.is_null() {
@@ -181,7 +181,7 @@ unsafe extern "C-unwind" fn on_message(message: *const Message) {
     };
     if message.level == mjtLogLevel::mjLOG_ERROR as i32 {
         if GUARDED.get() {
-            // Not a panic: no hook prints it, and `guard` waits for it.
+            // Not a panic, so no panic hook prints it; `guard` catches it.
             resume_unwind(Box::new(Fault(text)));
         }
         tracing::error!("MuJoCo: {text}");

@@ -1,73 +1,79 @@
-//! The dynamics of MuJoCo 3.3.2, with which the reference's Fetch worlds were recorded, on the MuJoCo of today.
+//! Compatibility mode with MuJoCo 3.3.2, with which the reference's Fetch rollouts were recorded.
 //!
-//! Four things changed in between that show in these worlds within a few steps, and are changed back here between the
-//! stages of a time step:
+//! Four later changes of MuJoCo become visible in these environments within a few steps. [`Compat332`] reverts them between the
+//! stages of each time step:
 //!
-//! 1. The reference acceleration of a weld now knows that its Jacobian turns. The gripper hangs on a weld.
-//! 2. A mesh lying on a plane now touches it with four vertices, no longer three. The robot's base does.
-//! 3. Boxes touch otherwise: see [`super::boxes`].
-//! 4. Margins of two geoms are now added; the greater one counted.
+//! 1. The reference acceleration of a weld now includes the change of its Jacobian. The gripper is attached by a weld.
+//! 2. A mesh on a plane now has four contact points instead of three. This concerns the base of the robot.
+//! 3. Contacts of two boxes are computed differently: see [`box_contacts`].
+//! 4. The margin of a pair of geoms is now the sum of both margins; it was the larger one.
 
-use super::boxes::{Solid, touch};
-use crate::physics::{Poses, Row, Stages, place};
+mod box_contacts;
+
+use crate::physics::{EqualityRow, GeomPoses, StepHooks, index_of};
+use box_contacts::{OrientedBox, box_contacts};
 use mujoco_rs::mujoco_c::mjContact;
 use mujoco_rs::wrappers::MjModel;
 use mujoco_rs::wrappers::mj_model::{MjtGeomBase, MjtObjBase};
 use swm_core::Result;
 
 /// The vertices of the base's mesh that touched the floor.
-const FEET: [usize; 3] = [1751, 1782, 1806];
+const BASE_VERTICES: [usize; 3] = [1751, 1782, 1806];
 
-/// What is changed back.
-pub struct Era {
+/// Step hooks that reproduce the dynamics of MuJoCo 3.3.2 for a model of Fetch.
+pub struct Compat332 {
     floor: usize,
     base: usize,
-    feet: [[f64; 3]; 3],
-    /// Every two boxes that can touch: their contact, but for where it is.
-    boxes: Vec<mjContact>,
+    /// Positions of [`BASE_VERTICES`] in the frame of the base, in metres.
+    base_vertices: [[f64; 3]; 3],
+    /// A template contact for every pair of boxes that can collide; point, distance and frame are filled in per step.
+    box_pairs: Vec<mjContact>,
 }
 
-impl Era {
-    /// For a model of Fetch.
+impl Compat332 {
+    /// Creates the hooks for a model of Fetch.
     ///
     /// # Errors
-    /// When the model is another one.
+    /// When the model is not a model of Fetch.
     pub fn new(model: &MjModel) -> Result<Self> {
-        let base = place(model, MjtObjBase::mjOBJ_GEOM, "robot0:base_link")?;
-        let first = whole(model.mesh_vertadr()[whole(model.geom_dataid()[base])]);
-        let boxes =
+        let base = index_of(model, MjtObjBase::mjOBJ_GEOM, "robot0:base_link")?;
+        let first = to_index(model.mesh_vertadr()[to_index(model.geom_dataid()[base])]);
+        let is_box =
             |geom: &usize| model.geom_type()[*geom] == MjtGeomBase::mjGEOM_BOX && model.geom_contype()[*geom] > 0;
-        let boxes: Vec<usize> = (0..model.geom_type().len()).filter(boxes).collect();
+        let boxes: Vec<usize> = (0..model.geom_type().len()).filter(is_box).collect();
         let pairs =
             boxes.iter().enumerate().flat_map(|(i, &first)| boxes[i + 1..].iter().map(move |&second| [first, second]));
         Ok(Self {
-            floor: place(model, MjtObjBase::mjOBJ_GEOM, "floor0")?,
+            floor: index_of(model, MjtObjBase::mjOBJ_GEOM, "floor0")?,
             base,
-            feet: FEET.map(|foot| model.mesh_vert()[first + foot].map(f64::from)),
-            boxes: pairs.filter(|&pair| meet(model, pair)).map(|pair| meeting(model, pair)).collect(),
+            base_vertices: BASE_VERTICES.map(|vertex| model.mesh_vert()[first + vertex].map(f64::from)),
+            box_pairs: pairs
+                .filter(|&pair| can_collide(model, pair))
+                .map(|pair| contact_template(model, pair))
+                .collect(),
         })
     }
 }
 
-fn whole(number: i32) -> usize {
+fn to_index(number: i32) -> usize {
     usize::try_from(number).unwrap_or(0)
 }
 
-/// Whether the model lets two geoms touch, in so far as it excludes pairs of bodies.
-fn meet(model: &MjModel, pair: [usize; 2]) -> bool {
+/// Whether two geoms belong to different bodies that the model does not exclude from colliding.
+fn can_collide(model: &MjModel, pair: [usize; 2]) -> bool {
     let [first, second] = pair.map(|geom| model.geom_bodyid()[geom]);
     first != second && !model.exclude_signature().contains(&((first << 16) + second))
 }
 
-/// From how far on two geoms touch.
+/// The distance below which two geoms are in contact, in metres: the larger margin.
 fn margin(model: &MjModel, pair: [usize; 2]) -> f64 {
     let [first, second] = pair.map(|geom| model.geom_margin()[geom]);
     first.max(second)
 }
 
-/// The contact of two geoms, but for where it is: the greater friction, and the mean of what the solver is told. The models give
-/// all geoms the same priority and weight.
-fn meeting(model: &MjModel, pair: [usize; 2]) -> mjContact {
+/// A contact of two geoms without point, distance and frame: the larger friction, and the mean of the solver parameters. All
+/// geoms of the models have the same priority and mixing weight.
+fn contact_template(model: &MjModel, pair: [usize; 2]) -> mjContact {
     let [first, second] = pair;
     let mean = |a: f64, b: f64| 0.5 * (a + b);
     let friction = model.geom_friction();
@@ -98,22 +104,23 @@ fn meeting(model: &MjModel, pair: [usize; 2]) -> mjContact {
     }
 }
 
-impl Stages for Era {
-    fn collided(
+impl StepHooks for Compat332 {
+    fn replace_contacts(
         &self,
         model: &MjModel,
-        (places, turns): Poses<'_>,
+        (positions, rotations): GeomPoses<'_>,
         found: &[mjContact],
         contacts: &mut Vec<mjContact>,
     ) {
         for pair in found.chunk_by(|a, b| a.geom == b.geom) {
-            let geoms = pair[0].geom.map(whole);
+            let geoms = pair[0].geom.map(to_index);
             let margin = margin(model, geoms);
             if geoms == [self.floor, self.base] {
-                let (at, turn) = (places[self.base], turns[self.base]);
-                for foot in self.feet {
-                    let [x, y, z] =
-                        std::array::from_fn(|r| at[r] + (0..3).map(|c| turn[3 * r + c] * foot[c]).sum::<f64>());
+                let (center, rotation) = (positions[self.base], rotations[self.base]);
+                for vertex in self.base_vertices {
+                    let [x, y, z] = std::array::from_fn(|r| {
+                        center[r] + (0..3).map(|c| rotation[3 * r + c] * vertex[c]).sum::<f64>()
+                    });
                     if z < margin {
                         contacts.push(mjContact { pos: [x, y, 0.5 * z], dist: z, ..pair[0].clone() });
                     }
@@ -123,26 +130,30 @@ impl Stages for Era {
                 contacts.extend(near.map(|contact| mjContact { includemargin: margin, ..contact.clone() }));
             }
         }
-        // Boxes are looked at whether they were found to touch or not.
-        let solid = |geom: usize| Solid { at: places[geom], turn: turns[geom], half: model.geom_size()[geom] };
-        for like in &self.boxes {
-            let [first, second] = like.geom.map(|geom| solid(whole(geom)));
-            if let Some(touch) = touch(&first, &second, like.includemargin) {
-                let frame = frame(touch.normal);
-                let new = touch.places().iter().map(|&(pos, dist)| mjContact { pos, dist, frame, ..like.clone() });
+        // Pairs of boxes are tested independently of the contacts that were found.
+        let oriented = |geom: usize| OrientedBox {
+            center: positions[geom],
+            rotation: rotations[geom],
+            half: model.geom_size()[geom],
+        };
+        for template in &self.box_pairs {
+            let [first, second] = template.geom.map(|geom| oriented(to_index(geom)));
+            if let Some(found) = box_contacts(&first, &second, template.includemargin) {
+                let frame = contact_frame(found.normal);
+                let new = found.points().iter().map(|&(pos, dist)| mjContact { pos, dist, frame, ..template.clone() });
                 contacts.extend(new);
             }
         }
     }
 
-    fn referred(&self, row: &Row) -> f64 {
+    fn reference_acceleration(&self, row: &EqualityRow) -> f64 {
         let [stiffness, damping, impedance, _] = row.kbip;
         -damping * row.velocity - stiffness * impedance * (row.position - row.margin)
     }
 }
 
-/// Axes of a contact: the normal, and two across it, chosen as MuJoCo does.
-fn frame(x: [f64; 3]) -> [f64; 9] {
+/// The axes of a contact as rows: the normal, and two tangents chosen as MuJoCo does.
+fn contact_frame(x: [f64; 3]) -> [f64; 9] {
     let y = if x[1].abs() < 0.5 { [0.0, 1.0, 0.0] } else { [0.0, 0.0, 1.0] };
     let along: f64 = (0..3).map(|i| x[i] * y[i]).sum();
     let y: [f64; 3] = std::array::from_fn(|i| y[i] - along * x[i]);
@@ -154,20 +165,20 @@ fn frame(x: [f64; 3]) -> [f64; 9] {
 
 #[cfg(test)]
 mod tests {
-    use super::super::kind::PUSH;
+    use super::super::config::PUSH;
     use super::*;
     use crate::Physics;
 
     #[test]
-    fn contacts_of_boxes_are_those_of_mujoco_but_for_their_places() {
+    fn box_contacts_equal_those_of_mujoco_apart_from_their_points() {
         let setup = PUSH.setup().expect("the models");
         let mut physics = Physics::new(setup.model.clone()).expect("a state");
         physics.data_mut().qpos_mut().copy_from_slice(&setup.qpos);
         physics.forward();
-        let era = Era::new(&setup.model).expect("Fetch");
+        let compat = Compat332::new(&setup.model).expect("a model of Fetch");
         let found = physics.data().contact();
         let mut compared = 0;
-        for ours in &era.boxes {
+        for ours in &compat.box_pairs {
             for theirs in found.iter().filter(|contact| contact.geom == ours.geom) {
                 let (dist, pos, frame) = (theirs.dist, theirs.pos, theirs.frame);
                 let (mu, efc_address) = (theirs.mu, theirs.efc_address);
@@ -176,6 +187,6 @@ mod tests {
                 compared += 1;
             }
         }
-        assert!(compared >= 4, "the block stands on the table: {compared}");
+        assert!(compared >= 4, "the block on the table has four contacts: {compared}");
     }
 }

@@ -1,7 +1,7 @@
-//! [`Stage`]: a world as MuJoCo's abstract scene.
+//! [`AbstractScene`]: the state of an environment as MuJoCo's abstract scene, which renderers draw.
 #![allow(unsafe_code, reason = "a scene that MuJoCo allocates, fills and frees")]
 
-use super::Camera;
+use super::renderer::Camera;
 use crate::{Physics, ffi, link};
 use mujoco_rs::mujoco_c::{
     mjtCamera, mjtCatBit, mjtRndFlag, mjv_defaultCamera, mjv_defaultFreeCamera, mjv_defaultOption, mjv_defaultPerturb,
@@ -11,29 +11,29 @@ use mujoco_rs::wrappers::MjModel;
 use std::mem::MaybeUninit;
 use swm_core::Result;
 
-/// Geoms a scene has room for, beside the model's own.
-const MORE_GEOMS: usize = 1000;
+/// Geoms that a scene has room for in addition to those of the model.
+const EXTRA_GEOMS: usize = 1000;
 
-/// A scene, reused from picture to picture.
-pub(crate) struct Stage {
+/// A scene with camera and options, reused from frame to frame.
+pub(crate) struct AbstractScene {
     scene: Box<mjvScene>,
     option: mjvOption,
     perturb: mjvPerturb,
     camera: mjvCamera,
 }
 
-// SAFETY: a scene is memory that belongs to it alone.
-unsafe impl Send for Stage {}
+// SAFETY: the pointers in a scene refer to memory that this scene owns exclusively.
+unsafe impl Send for AbstractScene {}
 
-impl Stage {
-    /// An empty scene for models of these sizes, with the visual options MuJoCo begins with.
+impl AbstractScene {
+    /// An empty scene for models of these sizes, with MuJoCo's default visual options.
     pub fn new(model: &MjModel) -> Self {
         let geoms = model.ffi().ngeom + model.ffi().nsite;
-        let room = usize::try_from(geoms).unwrap_or(0) + MORE_GEOMS;
+        let room = usize::try_from(geoms).unwrap_or(0) + EXTRA_GEOMS;
         let mut scene = Box::new_uninit();
         let (mut option, mut perturb, mut camera) =
             (MaybeUninit::uninit(), MaybeUninit::uninit(), MaybeUninit::uninit());
-        // SAFETY: each function fills what it is given; the scene is emptied before it is made.
+        // SAFETY: each function initialises its argument; the scene is set to defaults before it is allocated.
         unsafe {
             mjv_defaultScene(scene.as_mut_ptr());
             mjv_makeScene(model.ffi(), scene.as_mut_ptr(), i32::try_from(room).unwrap_or(i32::MAX));
@@ -49,15 +49,18 @@ impl Stage {
         }
     }
 
-    /// Fills the scene: the world as it is now, seen through a camera, in its colours or coloured by geom.
-    pub fn set(&mut self, physics: &mut Physics, camera: Camera, by_geom: bool) -> Result<()> {
+    /// Fills the scene from the present state, for a camera. `by_geom` colours each geom by its index.
+    ///
+    /// # Errors
+    /// When MuJoCo fails.
+    pub fn update(&mut self, physics: &mut Physics, camera: Camera, by_geom: bool) -> Result<()> {
         match camera {
-            Camera::Fixed(place) => {
+            Camera::Fixed(index) => {
                 self.camera.type_ = mjtCamera::mjCAMERA_FIXED as i32;
-                self.camera.fixedcamid = i32::try_from(place).unwrap_or(-1);
+                self.camera.fixedcamid = i32::try_from(index).unwrap_or(-1);
             }
             Camera::Free => {
-                // SAFETY: both are valid.
+                // SAFETY: model and camera are valid.
                 unsafe { mjv_defaultFreeCamera(physics.model().ffi(), &raw mut self.camera) };
                 self.camera.type_ = mjtCamera::mjCAMERA_FREE as i32;
                 self.camera.fixedcamid = -1;
@@ -69,8 +72,8 @@ impl Stage {
                 (self.camera.distance, self.camera.azimuth, self.camera.elevation) = (distance, azimuth, elevation);
             }
         }
-        let (model, data) = physics.raw();
-        // SAFETY: model and data belong to each other; the scene was made for models of these sizes.
+        let (model, data) = physics.pointers();
+        // SAFETY: model and data belong together; the scene was allocated for models of these sizes.
         link::guard("filling a scene", || unsafe {
             ffi::mjv_updateScene(
                 model,
@@ -88,15 +91,15 @@ impl Stage {
         Ok(())
     }
 
-    /// The scene as it was filled last.
+    /// The scene of the last [`AbstractScene::update`].
     pub fn scene(&mut self) -> &mut mjvScene {
         &mut self.scene
     }
 }
 
-impl Drop for Stage {
+impl Drop for AbstractScene {
     fn drop(&mut self) {
-        // SAFETY: `new` made it, and nobody else knows it.
+        // SAFETY: `new` allocated the scene, and no other owner exists.
         unsafe { mjv_freeScene(&raw mut *self.scene) };
     }
 }

@@ -1,0 +1,70 @@
+//! Compiling models, sharing them between environments, and finding their named elements.
+#![allow(unsafe_code, reason = "mutable access to a model's equality constraints")]
+
+use crate::link;
+use mujoco_rs::mujoco_c::{mjNEQDATA, mjtEq};
+use mujoco_rs::wrappers::MjModel;
+use mujoco_rs::wrappers::mj_auxiliary::MjVfs;
+use mujoco_rs::wrappers::mj_model::MjtObjBase;
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
+use swm_core::{Error, Result};
+
+/// Compiles a model from an MJCF file.
+///
+/// # Errors
+/// When MuJoCo is not installed, or rejects the model (the error contains its message).
+pub fn compile_file(path: &Path) -> Result<MjModel> {
+    link::load()?;
+    MjModel::from_xml(path).map_err(|error| Error::external(format!("compiling {}", path.display()), error))
+}
+
+/// Compiles a model from MJCF text. `files` are the files that the text includes, by name; `label` names the model in errors.
+///
+/// # Errors
+/// When MuJoCo is not installed, or rejects the model (the error contains its message).
+pub fn compile_xml(label: &str, xml: &str, files: &[(&str, &[u8])]) -> Result<MjModel> {
+    link::load()?;
+    let failed = |error: &dyn std::fmt::Display| Error::external(format!("compiling {label}"), error);
+    let mut vfs = MjVfs::new();
+    for (name, content) in files {
+        vfs.add_from_buffer(name, content).map_err(|error| failed(&error))?;
+    }
+    vfs.add_from_buffer("model.xml", xml.as_bytes()).map_err(|error| failed(&error))?;
+    MjModel::from_xml_vfs("model.xml", &vfs).map_err(|error| failed(&error))
+}
+
+/// Returns the model of that name, compiling it on the first call in this process.
+///
+/// # Errors
+/// Those of `compile`.
+pub fn shared_model(name: &str, compile: impl FnOnce() -> Result<MjModel>) -> Result<Arc<MjModel>> {
+    static MODELS: Mutex<BTreeMap<String, Arc<MjModel>>> = Mutex::new(BTreeMap::new());
+    let mut models = MODELS.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(model) = models.get(name) {
+        return Ok(Arc::clone(model));
+    }
+    let model = Arc::new(compile()?);
+    models.insert(name.to_owned(), Arc::clone(&model));
+    Ok(model)
+}
+
+/// Edits the data of every weld constraint: anchor (m), relative position (m), relative quaternion, torque scale.
+pub(crate) fn edit_welds(model: &mut MjModel, edit: impl Fn(&mut [f64; mjNEQDATA as usize])) {
+    let is_weld: Vec<bool> = model.eq_type().iter().map(|kind| *kind == mjtEq::mjEQ_WELD).collect();
+    // SAFETY: the data of a weld contains no indices into other arrays, so any finite values are valid.
+    let data = unsafe { model.eq_data_mut() };
+    data.iter_mut().zip(is_weld).filter(|(_, weld)| *weld).for_each(|(data, _)| edit(data));
+}
+
+/// The index of a named element of a model.
+///
+/// # Errors
+/// When the model has no element of that kind and name.
+pub fn index_of(model: &MjModel, kind: MjtObjBase, name: &str) -> Result<usize> {
+    model.name_to_id(kind, name).ok_or_else(|| {
+        let known = (0..).map_while(|i| model.id_to_name(kind, i));
+        Error::unknown("element of a MuJoCo model", name, known, "`swm assets verify` checks the installed model files")
+    })
+}

@@ -28,9 +28,18 @@ pub enum Rule {
 /// The rules of this workspace.
 pub const RULES: &[Rule] = &[
     Rule::Never {
-        crates: &["swm-core", "swm-envs", "swm-gym", "swm-plan", "swm-report", "swm-raster", "swm-image"],
+        crates: &[
+            "swm-core",
+            "swm-envs",
+            "swm-gym",
+            "swm-plan",
+            "swm-report",
+            "swm-raster",
+            "swm-image",
+            "swm-kernels",
+        ],
         forbidden: |name| ["burn", "lance", "mujoco", "ffmpeg"].iter().any(|family| of_family(name, family)),
-        words: "core, envs, gym, plan, report, raster and image know no deep learning, dataset engine, MuJoCo or FFmpeg",
+        words: "core, envs, gym, plan, report, raster, image and kernels reach no deep learning, dataset engine, MuJoCo or FFmpeg",
     },
     Rule::Never {
         crates: &[],

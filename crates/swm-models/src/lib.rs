@@ -9,7 +9,6 @@
 //! - [`dino_wm`]: the DINO-WM family: a frozen encoder of patches, a predictor of the patches of the next frame.
 //! - [`gcrl`]: goal-conditioned cloning, values and Q-learning; [`feed_forward`]: acting without planning.
 //! - [`inverse`]: an inverse-dynamics policy on a frozen encoder, the baseline without planning.
-//! - [`fast`]: inference on the CPU, as kernels on plain arrays.
 //! - [`weights`]: weights of others, from files and the Hugging Face hub, and for PyTorch.
 //! - [`probe`]: what latents say about the world.
 //! - [`checkpoint`]: trained models on disk.
@@ -18,7 +17,6 @@
 pub mod checkpoint;
 pub mod device;
 pub mod dino_wm;
-pub mod fast;
 pub mod feed_forward;
 pub mod gcrl;
 pub mod inverse;

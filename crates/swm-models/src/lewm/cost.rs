@@ -6,7 +6,7 @@
 //! however many threads there are.
 
 use super::config::LewmConfig;
-use super::encode::FastEncoder;
+use super::encode::HostEncoder;
 use super::model::Lewm;
 use super::pixels;
 use super::rollout::Rollout;
@@ -28,7 +28,7 @@ pub struct LewmCost {
 /// The model laid out for the CPU; on other devices, it computes as it is.
 struct Host {
     rollout: Rollout,
-    encoder: Option<FastEncoder>,
+    encoder: Option<HostEncoder>,
 }
 
 /// Present and goal of one environment.
@@ -51,7 +51,7 @@ impl LewmCost {
     /// The cost of a model of these sizes, whose actions are `actions` numbers.
     pub fn of(model: &Lewm, config: &LewmConfig, actions: usize) -> Self {
         let on_host = model.device() == Device::flex();
-        let host = on_host.then(|| Host { rollout: Rollout::new(model), encoder: FastEncoder::new(model, config) });
+        let host = on_host.then(|| Host { rollout: Rollout::new(model), encoder: HostEncoder::new(model, config) });
         Self { model: model.clone(), host, config: config.clone(), actions, scenes: vec![] }
     }
 

@@ -1,27 +1,29 @@
-//! [`FastEncoder`]: from a picture to its latent, as fast as a CPU does it.
+//! [`HostEncoder`]: encodes images on the CPU with the kernels of `swm-kernels`.
 
 use super::config::{EncoderConfig, LewmConfig};
 use super::model::{Encoder, Lewm};
-use crate::fast::dense::folded;
-use crate::fast::functions::gelu;
-use crate::fast::{FastVit, Panels};
+use crate::nn::kernels::{projector_panels, vit_encoder};
+use swm_kernels::functions::gelu;
+use swm_kernels::{Panels, VitEncoder};
 
-/// A vision transformer and the projection behind it.
-pub struct FastEncoder {
-    vit: FastVit,
+/// A vision transformer and the projector after it, laid out for the CPU.
+pub struct HostEncoder {
+    vit: VitEncoder,
     project: [Panels; 2],
 }
 
-impl FastEncoder {
-    /// The weights of a model; none for an encoder that is no transformer.
+impl HostEncoder {
+    /// Lays out the encoder of a model; returns `None` if it is not a vision transformer.
     pub fn new(model: &Lewm, config: &LewmConfig) -> Option<Self> {
         let (Encoder::Vit(vit), EncoderConfig::Vit(sizes)) = (&model.encoder, &config.encoder) else { return None };
         let patches = (config.image / sizes.patch).pow(2);
-        Some(Self { vit: FastVit::new(vit, sizes.heads, patches), project: folded(&model.projector) })
+        Some(Self { vit: vit_encoder(vit, patches)?, project: projector_panels(&model.projector) })
     }
 
+    /// Returns the latent of one image from its normalised patches.
+    ///
     /// # Shapes
-    /// The normalised patches of one picture, `[patches, 3 * patch * patch]`, to `[latent]`.
+    /// `patches` is `[patches, 3 * patch * patch]`; returns `[latent]`.
     pub fn encode(&self, patches: &[f32]) -> Vec<f32> {
         let [into, out] = &self.project;
         let mut hidden = vec![0.0; into.outputs()];

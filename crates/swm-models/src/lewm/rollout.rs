@@ -17,13 +17,12 @@
 //! not depend on what else is planned.
 
 use super::model::Lewm;
-use crate::fast::dense::{dense, folded, part};
-use crate::fast::functions::{gelu, silu};
-use crate::fast::norm::{Modulation, Norm, add_gated};
-use crate::fast::{Panels, Pool, attend, grown, numbers};
 use crate::nn::Linear;
+use crate::nn::kernels::{host, norm, output_panels, panels, projector_panels};
 use crate::nn::predictor::{Block, MODULATED_EPSILON};
 use burn::module::Param;
+use swm_kernels::functions::{gelu, silu};
+use swm_kernels::{Modulation, Norm, Panels, ScratchPool, add_gated, causal_attention, grown};
 
 /// Rows that go through a layer together: as many as leave what they need in between near a core; each block reads all
 /// weights once more.
@@ -44,7 +43,7 @@ pub struct Rollout {
     layers: Vec<Layer>,
     norm: Norm,
     project: [Panels; 2],
-    scratch: Pool<Scratch>,
+    scratch: ScratchPool<Scratch>,
 }
 
 struct Layer {
@@ -91,15 +90,15 @@ impl Layer {
     #[allow(clippy::cast_precision_loss)]
     fn new(block: &Block, dim: usize, heads: usize, width: usize) -> Self {
         let inner = heads * width;
-        let weights = numbers(block.attn.to_qkv.weight.val());
+        let weights = host(block.attn.to_qkv.weight.val());
         let (key, value) = (&weights[inner * dim..2 * inner * dim], &weights[2 * inner * dim..]);
         let scale = 1.0 / (width as f32).sqrt();
         // The matrix of the values, `[dim, inner]`, is what a token that sees itself alone goes through.
         let values: Vec<f32> = (0..dim * inner).map(|i| value[i % inner * dim + i / inner]).collect();
         let (alone, out) = match &block.attn.to_out {
             Some(out) => {
-                let weight = numbers(out._0.weight.val());
-                let bias = out._0.bias.as_ref().map_or_else(Vec::new, |bias| numbers(bias.val()));
+                let weight = host(out._0.weight.val());
+                let bias = out._0.bias.as_ref().map_or_else(Vec::new, |bias| host(bias.val()));
                 let plain = Panels::new(inner, dim, |i, o| weight[o * inner + i]);
                 let mut product = vec![0.0; dim * dim];
                 plain.apply(&values, &mut product);
@@ -108,17 +107,17 @@ impl Layer {
             None => (Panels::new(dim, dim, |i, o| values[i * dim + o]), None),
         };
         Self {
-            modulation: dense(&block.adaLN_modulation._1),
-            norm: Norm::new(&block.attn.norm),
+            modulation: panels(&block.adaLN_modulation._1),
+            norm: norm(&block.attn.norm),
             alone,
-            query: part(&block.attn.to_qkv, 0..inner),
+            query: output_panels(&block.attn.to_qkv, 0..inner),
             key: (0..heads)
                 .map(|head| Panels::new(width, dim, |i, o| key[(head * width + i) * dim + o] * scale))
                 .collect(),
             value: (0..heads).map(|head| Panels::new(dim, width, |i, o| value[(head * width + o) * dim + i])).collect(),
             out,
-            mlp_norm: Norm::new(&block.mlp.net._0),
-            mlp: [dense(&block.mlp.net._1), dense(&block.mlp.net._4)],
+            mlp_norm: norm(&block.mlp.net._0),
+            mlp: [panels(&block.mlp.net._1), panels(&block.mlp.net._4)],
         }
     }
 }
@@ -139,17 +138,17 @@ impl Rollout {
             history: config.history,
             latent,
             dim: config.dim,
-            action: [dense(&tap), dense(&actions.embed._0), dense(&actions.embed._2)],
-            positions: numbers(predictor.pos_embedding.val()),
-            input: transformer.input_proj.as_ref().map(dense),
-            condition: transformer.cond_proj.as_ref().map(dense),
-            output: transformer.output_proj.as_ref().map(dense),
+            action: [panels(&tap), panels(&actions.embed._0), panels(&actions.embed._2)],
+            positions: host(predictor.pos_embedding.val()),
+            input: transformer.input_proj.as_ref().map(panels),
+            condition: transformer.cond_proj.as_ref().map(panels),
+            output: transformer.output_proj.as_ref().map(panels),
             layers: (transformer.layers.iter())
                 .map(|block| Layer::new(block, config.dim, config.heads, config.dim_head))
                 .collect(),
-            norm: Norm::new(&transformer.norm),
-            project: folded(&model.pred_proj),
-            scratch: Pool::default(),
+            norm: norm(&transformer.norm),
+            project: projector_panels(&model.pred_proj),
+            scratch: ScratchPool::default(),
         }
     }
 
@@ -338,7 +337,7 @@ impl Layer {
             let (from, to) = (&inner[head * width..], &mut wide[head * dim..]);
             key.apply_strided(count, (from, heads * width), (to, heads * dim));
         }
-        attend(wide, seen, rows.start, [samples, dim, heads], scores);
+        causal_attention(wide, seen, rows.start, [samples, dim, heads], scores);
         for (head, value) in self.value.iter().enumerate() {
             let (from, to) = (&wide[head * dim..], &mut inner[head * width..]);
             value.apply_strided(count, (from, heads * dim), (to, heads * width));
@@ -352,8 +351,8 @@ impl Layer {
 
 /// Shift and scale from part `shift` on.
 #[allow(clippy::cast_possible_truncation)]
-fn shifted(numbers: &[f32], shift: usize) -> Modulation<'_> {
-    Modulation { numbers, parts: PARTS, shift, epsilon: MODULATED_EPSILON as f32 }
+fn shifted(values: &[f32], shift: usize) -> Modulation<'_> {
+    Modulation { values, parts: PARTS, shift, epsilon: MODULATED_EPSILON as f32 }
 }
 
 /// Rows through a layer, if there is one; `spare` is memory to use.

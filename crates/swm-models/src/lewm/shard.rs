@@ -3,11 +3,11 @@
 //! On the CPU a vision transformer is differentiated by hand ([`VitGradient`]); everything else by Burn.
 
 use super::model::Encoder;
-use crate::fast::numbers;
-use crate::fast::vit_gradient::{Tape, VitGradient};
+use crate::nn::kernels::{host, named_vit_gradients, vit_gradient};
 use crate::nn::parameters::{self, Named};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
+use swm_kernels::{Tape, VitGradient};
 
 /// How an encoder is differentiated.
 pub(crate) enum Differentiation<'a> {
@@ -21,7 +21,7 @@ impl<'a> Differentiation<'a> {
     /// The fastest way on a device.
     pub fn of(encoder: &'a Encoder, patches: usize, device: &Device) -> Self {
         let by_hand = match encoder {
-            Encoder::Vit(vit) if *device == Device::flex() => VitGradient::new(vit, patches),
+            Encoder::Vit(vit) if *device == Device::flex() => vit_gradient(vit, patches),
             _ => None,
         };
         by_hand.map_or(Self::Burn(encoder), |by_hand| Self::Host(Box::new(by_hand)))
@@ -51,7 +51,7 @@ impl Shard {
                 Self { features: features.clone().inner(), way: Way::Burn(Box::new((encoder, features))) }
             }
             Differentiation::Host(vit) => {
-                let (patches, mut scratch) = (numbers(patches), vit.scratch());
+                let (patches, mut scratch) = (host(patches), vit.scratch());
                 let (features, tapes): (Vec<_>, Vec<_>) =
                     patches.chunks_exact(count * width).map(|picture| vit.forward(picture, &mut scratch)).unzip();
                 let features = TensorData::new(features.concat(), [pictures, vit.dim()]);
@@ -66,7 +66,7 @@ impl Shard {
         match (self.way, differentiation) {
             (Way::Host { patches, tapes }, Differentiation::Host(vit)) => {
                 let (mut sums, mut scratch) = (vit.sums(), vit.scratch());
-                let gradient = numbers(gradient);
+                let gradient = host(gradient);
                 let pictures = patches.chunks_exact(patches.len() / tapes.len().max(1)).zip(&tapes);
                 for ((picture, tape), gradient) in pictures.zip(gradient.chunks_exact(vit.dim())) {
                     vit.backward(picture, tape, gradient, &mut sums, &mut scratch);
@@ -75,7 +75,10 @@ impl Shard {
                     let shape = [values.len()];
                     Tensor::from_data(TensorData::new(values, shape), &device)
                 };
-                vit.named(sums).into_iter().map(|(name, values)| (name, tensor(values))).collect()
+                named_vit_gradients(vit.gradients(sums))
+                    .into_iter()
+                    .map(|(name, values)| (name, tensor(values)))
+                    .collect()
             }
             (Way::Burn(way), _) => {
                 let (encoder, features) = *way;

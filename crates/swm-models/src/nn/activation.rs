@@ -1,10 +1,11 @@
 //! Activations and dropout.
 
-use crate::fast::{functions, numbers};
+use super::kernels::host;
 use burn::tensor::{DType, Device, Tensor, TensorData, activation};
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 use swm_core::Rng;
+use swm_kernels::functions;
 
 /// A nonlinearity.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -39,12 +40,12 @@ fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     let shape = x.dims();
     let tensor = |values: Vec<f32>| Tensor::<D>::from_data(TensorData::new(values, shape), &device);
     if !device.is_autodiff() {
-        let mut values = numbers(x);
+        let mut values = host(x);
         functions::gelu(&mut values);
         return tensor(values);
     }
     // A line through every number that has the value and the slope of the curve there: that is all backward asks for.
-    let mut offsets = numbers(x.clone().inner());
+    let mut offsets = host(x.clone().inner());
     let mut slopes = vec![0.0; offsets.len()];
     functions::gelu_tangent(&mut offsets, &mut slopes);
     x * tensor(slopes) + tensor(offsets)

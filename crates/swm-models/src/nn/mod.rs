@@ -6,6 +6,7 @@ pub mod activation;
 pub mod backbone;
 mod custom_derivative;
 pub mod dino;
+pub(crate) mod kernels;
 pub mod linear;
 pub mod mlp;
 pub mod module_dict;

@@ -3,7 +3,7 @@
 use super::{Golden, TOLERANCE, check, error, files, values};
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
-use swm_models::lewm::encode::FastEncoder;
+use swm_models::lewm::encode::HostEncoder;
 use swm_models::lewm::step::{SigregConfig, TrainBatch, step};
 use swm_models::lewm::{EncoderConfig, Lewm, LewmConfig, Rollout};
 use swm_models::nn::parameters;
@@ -60,7 +60,7 @@ fn golden_evaluation() {
         let latents = model.encode(golden.patches("i.pixels")).reshape([clips, steps, dim]);
         check(&golden, "o.eval.emb", &values(latents.clone()));
         // The fast encoder, a picture at a time.
-        let fast = FastEncoder::new(&model, &golden.config()).expect("a transformer");
+        let fast = HostEncoder::new(&model, &golden.config()).expect("a transformer");
         let pictures = golden.patches("i.pixels");
         let size = pictures.dims()[1] * pictures.dims()[2];
         let fast: Vec<f32> = values(pictures).chunks(size).flat_map(|patches| fast.encode(patches)).collect();

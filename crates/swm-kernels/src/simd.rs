@@ -1,33 +1,34 @@
-//! The instruction set of the machine, chosen when the program runs.
+//! The choice of the instruction set at run time.
 //!
-//! Kernels are plain loops over arrays of sixteen numbers. [`dispatch`] compiles each for every [`Level`] and runs it at the
-//! best the machine has; the compiler turns the loops into vectors. Where multiplication and addition are fused, every
-//! level computes the same bytes: all of them add in the same order.
+//! Kernels are plain loops over arrays of sixteen elements. [`dispatch`] compiles each kernel for every [`Level`] and
+//! runs the best one that the machine supports; the compiler vectorises the loops. All levels add in the same order, so
+//! the levels that fuse multiplication and addition compute the same bytes.
 
-/// What a kernel may count on.
-pub(super) trait Level {
-    /// Rows of a product that registers hold at once.
+/// Properties of an instruction set.
+pub(crate) trait Level {
+    /// Rows of a matrix product that fit into the registers at once.
     const ROWS: usize;
     /// Whether multiplication and addition are one instruction.
     const FUSED: bool;
 
-    /// `a * b + c`.
+    /// Returns `a * b + c`.
     #[inline(always)]
     fn fma(a: f32, b: f32, c: f32) -> f32 {
         if Self::FUSED { a.mul_add(b, c) } else { a * b + c }
     }
 }
 
-/// What runs at any level. Everything it calls is `#[inline(always)]`, so that it is compiled for the level, too.
-pub(super) trait Kernel {
-    /// What it returns.
+/// A computation that is compiled for every level. Every function it calls is `#[inline(always)]`, so that it is compiled
+/// for the level, too.
+pub(crate) trait Kernel {
+    /// The result.
     type Output;
 
-    /// Runs it.
+    /// Runs the computation.
     fn run<L: Level>(self) -> Self::Output;
 }
 
-/// What every machine of an architecture has.
+/// Instructions that every machine of the architecture supports.
 struct Baseline;
 
 impl Level for Baseline {
@@ -35,21 +36,21 @@ impl Level for Baseline {
     const FUSED: bool = cfg!(target_arch = "aarch64");
 }
 
-/// Runs a kernel at the best level of the machine.
+/// Runs a kernel at the best level that the machine supports.
 #[cfg(not(target_arch = "x86_64"))]
 #[inline(always)]
-pub(super) fn dispatch<K: Kernel>(kernel: K) -> K::Output {
+pub(crate) fn dispatch<K: Kernel>(kernel: K) -> K::Output {
     kernel.run::<Baseline>()
 }
 
 #[cfg(target_arch = "x86_64")]
-pub(super) use x86::dispatch;
+pub(crate) use x86::dispatch;
 
 #[cfg(target_arch = "x86_64")]
 mod x86 {
     use super::{Baseline, Kernel, Level};
 
-    /// 32 registers of 16 numbers.
+    /// 32 registers of 16 elements.
     struct Avx512;
 
     impl Level for Avx512 {
@@ -57,7 +58,7 @@ mod x86 {
         const FUSED: bool = true;
     }
 
-    /// 16 registers of 8 numbers.
+    /// 16 registers of 8 elements.
     struct Avx2;
 
     impl Level for Avx2 {
@@ -75,10 +76,10 @@ mod x86 {
         kernel.run::<Avx2>()
     }
 
-    /// Runs a kernel at the best level of the machine.
-    #[allow(unsafe_code)]
+    /// Runs a kernel at the best level that the machine supports.
+    #[allow(unsafe_code, reason = "functions compiled for detected features can only be called unsafely")]
     pub fn dispatch<K: Kernel>(kernel: K) -> K::Output {
-        // The answers are cached by the standard library: asking costs a load each.
+        // The standard library caches the detected features: each check is one load.
         let has_avx2 = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
         if has_avx2
             && is_x86_feature_detected!("avx512f")
@@ -86,10 +87,10 @@ mod x86 {
             && is_x86_feature_detected!("avx512dq")
             && is_x86_feature_detected!("avx512vl")
         {
-            // SAFETY: the machine has every feature the function is compiled for.
+            // SAFETY: the machine supports every feature that the function is compiled for.
             unsafe { avx512(kernel) }
         } else if has_avx2 {
-            // SAFETY: as above.
+            // SAFETY: the machine supports AVX2 and FMA, which the function is compiled for.
             unsafe { avx2(kernel) }
         } else {
             kernel.run::<Baseline>()

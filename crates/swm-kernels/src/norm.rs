@@ -1,11 +1,10 @@
-//! Layer normalisation of rows, plain and modulated.
+//! Layer normalisation of rows, plain and modulated (AdaLN, Peebles and Xie 2023).
 
-use super::functions::{dot, sum};
-use super::numbers;
-use super::simd::{Kernel, Level, dispatch};
-use crate::nn::LayerNorm;
+use crate::Affine;
+use crate::functions::{dot, sum};
+use crate::simd::{Kernel, Level, dispatch};
 
-/// The weights of a layer normalisation.
+/// A layer normalisation: scale and shift per feature, and the number added to the variance.
 #[derive(Clone, Debug)]
 pub struct Norm {
     weight: Vec<f32>,
@@ -14,13 +13,12 @@ pub struct Norm {
 }
 
 impl Norm {
-    /// Those of a layer.
-    #[allow(clippy::cast_possible_truncation)]
-    pub fn new(layer: &LayerNorm) -> Self {
-        Self { weight: numbers(layer.weight.val()), bias: numbers(layer.bias.val()), epsilon: layer.epsilon() as f32 }
+    /// A normalisation with these parameters, which adds `epsilon` to the variance.
+    pub fn new(parameters: Affine, epsilon: f32) -> Self {
+        Self { weight: parameters.weight, bias: parameters.bias, epsilon }
     }
 
-    /// Normalised rows.
+    /// Writes the normalised rows of `x` to `y`.
     ///
     /// # Shapes
     /// `x` and `y` are `[rows, features]`.
@@ -28,7 +26,7 @@ impl Norm {
         dispatch(Normalise { norm: self, modulation: None, x, y });
     }
 
-    /// Rows standardised, modulated, and normalised.
+    /// Standardises the rows of `x`, modulates them, and writes them normalised to `y`.
     ///
     /// # Shapes
     /// As [`Norm::apply`].
@@ -41,16 +39,16 @@ impl Norm {
     }
 }
 
-/// Shift and scale of every row.
+/// Shift and scale of every row, as parts of a larger array of modulations.
 #[derive(Clone, Copy)]
 pub struct Modulation<'a> {
     /// `[rows, parts * features]`.
-    pub numbers: &'a [f32],
-    /// How many parts there are.
+    pub values: &'a [f32],
+    /// Number of parts.
     pub parts: usize,
-    /// Which part the shift is; the scale follows it.
+    /// Index of the part that holds the shift; the scale is the next part.
     pub shift: usize,
-    /// What the standardisation before the modulation adds to the variance.
+    /// Number that the standardisation before the modulation adds to the variance.
     pub epsilon: f32,
 }
 
@@ -70,15 +68,15 @@ impl Kernel for Normalise<'_> {
         let rows = self.x.chunks_exact(features).zip(self.y.chunks_exact_mut(features));
         for (index, (x, y)) in rows.enumerate() {
             y.copy_from_slice(x);
-            if let Some(Modulation { numbers, parts, shift, epsilon }) = self.modulation {
-                let modulation = &numbers[(index * parts + shift) * features..][..2 * features];
+            if let Some(Modulation { values, parts, shift, epsilon }) = self.modulation {
+                let modulation = &values[(index * parts + shift) * features..][..2 * features];
                 let (shift, scale) = modulation.split_at(features);
-                let factor = centre::<L>(y, epsilon);
+                let factor = center::<L>(y, epsilon);
                 for ((y, shift), scale) in y.iter_mut().zip(shift).zip(scale) {
                     *y = L::fma(*y * factor, 1.0 + scale, *shift);
                 }
             }
-            let factor = centre::<L>(y, *epsilon);
+            let factor = center::<L>(y, *epsilon);
             for ((y, weight), bias) in y.iter_mut().zip(weight).zip(bias) {
                 *y = L::fma(*y * factor, *weight, *bias);
             }
@@ -86,10 +84,9 @@ impl Kernel for Normalise<'_> {
     }
 }
 
-/// Takes the mean away; returns what makes the variance 1, up to `epsilon`.
+/// Subtracts the mean and returns the factor `1 / sqrt(variance + epsilon)`.
 #[inline(always)]
-#[allow(clippy::cast_precision_loss)]
-fn centre<L: Level>(row: &mut [f32], epsilon: f32) -> f32 {
+fn center<L: Level>(row: &mut [f32], epsilon: f32) -> f32 {
     let n = row.len() as f32;
     let mean = sum(row) / n;
     for x in row.iter_mut() {
@@ -98,11 +95,11 @@ fn centre<L: Level>(row: &mut [f32], epsilon: f32) -> f32 {
     1.0 / (dot::<L>(row, row) / n + epsilon).sqrt()
 }
 
-/// Takes the gradient of normalised rows back to the rows: adds it to `dx`, and to `weight` and `bias` what is theirs.
+/// Adds the gradients of a normalisation, whose output has the gradient `dy`, to `dx`, `weight` and `bias`.
 ///
 /// # Shapes
 /// `x`, `dy` and `dx` are `[rows, features]`, `weight` and `bias` `[features]`.
-pub fn backward(norm: &Norm, x: &[f32], dy: &[f32], dx: &mut [f32], [weight, bias]: [&mut [f32]; 2]) {
+pub(crate) fn backward(norm: &Norm, x: &[f32], dy: &[f32], dx: &mut [f32], [weight, bias]: [&mut [f32]; 2]) {
     struct Backward<'a> {
         norm: &'a Norm,
         x: &'a [f32],
@@ -111,40 +108,39 @@ pub fn backward(norm: &Norm, x: &[f32], dy: &[f32], dx: &mut [f32], [weight, bia
         weight: &'a mut [f32],
         bias: &'a mut [f32],
         row: Vec<f32>,
-        pull: Vec<f32>,
+        scaled: Vec<f32>,
     }
     impl Kernel for Backward<'_> {
         type Output = ();
 
         #[inline(always)]
-        #[allow(clippy::cast_precision_loss)]
         fn run<L: Level>(mut self) {
             let (features, n) = (self.norm.features(), self.norm.features() as f32);
             let rows = self.x.chunks_exact(features).zip(self.dy.chunks_exact(features));
             for ((x, dy), dx) in rows.zip(self.dx.chunks_exact_mut(features)) {
                 self.row.copy_from_slice(x);
-                let factor = centre::<L>(&mut self.row, self.norm.epsilon);
+                let factor = center::<L>(&mut self.row, self.norm.epsilon);
                 for i in 0..features {
                     self.row[i] *= factor;
                     self.weight[i] = L::fma(dy[i], self.row[i], self.weight[i]);
                     self.bias[i] += dy[i];
-                    self.pull[i] = dy[i] * self.norm.weight[i];
+                    self.scaled[i] = dy[i] * self.norm.weight[i];
                 }
-                let (mean, along) = (sum(&self.pull) / n, dot::<L>(&self.pull, &self.row) / n);
+                let (mean, along) = (sum(&self.scaled) / n, dot::<L>(&self.scaled, &self.row) / n);
                 for i in 0..features {
-                    dx[i] = L::fma(factor, self.pull[i] - mean - along * self.row[i], dx[i]);
+                    dx[i] = L::fma(factor, self.scaled[i] - mean - along * self.row[i], dx[i]);
                 }
             }
         }
     }
     let scratch = || vec![0.0; norm.features()];
-    dispatch(Backward { norm, x, dy, dx, weight, bias, row: scratch(), pull: scratch() });
+    dispatch(Backward { norm, x, dy, dx, weight, bias, row: scratch(), scaled: scratch() });
 }
 
-/// Adds `y` to `x`, number by number; rows of `y` are gated by part `gate` of their modulations where there are some.
+/// Adds the rows of `y`, each multiplied element by element by part `gate` of its modulation, to `x`.
 ///
 /// # Shapes
-/// `x` and `y` are `[rows, features]`, modulations `[rows, parts * features]`.
+/// `x` and `y` are `[rows, features]`, `modulation` is `[rows, parts * features]`.
 pub fn add_gated(x: &mut [f32], y: &[f32], modulation: &[f32], [features, parts, gate]: [usize; 3]) {
     struct Add<'a> {
         x: &'a mut [f32],
@@ -168,11 +164,4 @@ pub fn add_gated(x: &mut [f32], y: &[f32], modulation: &[f32], [features, parts,
         }
     }
     dispatch(Add { x, y, modulation, sizes: [features, parts, gate] });
-}
-
-/// Adds `y` to `x`.
-pub fn add(x: &mut [f32], y: &[f32]) {
-    for (x, y) in x.iter_mut().zip(y) {
-        *x += y;
-    }
 }

@@ -1,25 +1,26 @@
-//! [`Panels`]: products of rows with a matrix that is used again and again, at the speed of the processor.
+//! [`Panels`]: products of rows with a matrix that is laid out once and used often.
 //!
-//! The matrix is laid out once in panels of 32 columns, so that a product reads it in order. A tile of the result, some rows
-//! of a panel, stays in registers while all its terms are added one after the other: what a row comes to does not depend
-//! on how many others there are.
+//! The matrix is cut into panels of 32 columns, so that a product reads it in order. A tile of the result, some rows of a
+//! panel, stays in registers while its terms are added one after the other: a row's result does not depend on the other
+//! rows.
 
-use super::simd::{Kernel, Level, dispatch};
+use crate::Affine;
+use crate::simd::{Kernel, Level, dispatch};
 
-/// Numbers of a vector.
-pub(super) const LANES: usize = 16;
+/// Elements of a vector.
+pub(crate) const LANES: usize = 16;
 /// Columns of a panel.
 const WIDTH: usize = 2 * LANES;
 
 /// Vectors of the largest tile.
 const TILE: usize = 24;
 
-/// Numbers that are computed at once.
+/// Elements that are computed at once.
 #[derive(Clone, Copy, Debug)]
 #[repr(C, align(64))]
 struct Lanes([f32; LANES]);
 
-/// The numbers of a panel in one row of the matrix.
+/// The elements of a panel in one row of the matrix.
 type Pair = [Lanes; WIDTH / LANES];
 const ZERO: Pair = [Lanes([0.0; LANES]); WIDTH / LANES];
 
@@ -28,18 +29,25 @@ const ZERO: Pair = [Lanes([0.0; LANES]); WIDTH / LANES];
 pub struct Panels {
     inputs: usize,
     outputs: usize,
-    /// For each panel, its numbers in all rows; columns that are not there are 0.
-    numbers: Vec<Pair>,
-    /// For each panel, what is added to every row.
+    /// For each panel, its elements in all rows; columns beyond the matrix are 0.
+    elements: Vec<Pair>,
+    /// For each panel, the bias of its columns.
     bias: Vec<Pair>,
 }
 
 impl Panels {
-    /// A matrix without bias; `at` tells the number at an input and an output.
+    /// A matrix without bias whose elements are `at(input, output)`.
     pub fn new(inputs: usize, outputs: usize, at: impl Fn(usize, usize) -> f32) -> Self {
-        let mut made = Self { inputs, outputs, numbers: vec![], bias: vec![ZERO; outputs.div_ceil(WIDTH)] };
-        made.fill(inputs, at);
-        made
+        let mut panels = Self { inputs, outputs, elements: vec![], bias: vec![ZERO; outputs.div_ceil(WIDTH)] };
+        panels.fill(inputs, at);
+        panels
+    }
+
+    /// A linear layer: `parameters.weight` is `[outputs, inputs]`.
+    pub fn linear(parameters: &Affine) -> Self {
+        let outputs = parameters.bias.len();
+        let inputs = parameters.weight.len() / outputs;
+        Self::new(inputs, outputs, |i, o| parameters.weight[o * inputs + i]).with_bias(&parameters.bias)
     }
 
     /// The same matrix with a bias, `[outputs]`.
@@ -51,12 +59,12 @@ impl Panels {
         self
     }
 
-    /// Another matrix of as many outputs in the same memory.
+    /// Replaces the matrix by one with the same outputs and elements `at(input, output)`, in the same memory.
     pub fn fill(&mut self, inputs: usize, at: impl Fn(usize, usize) -> f32) {
         self.inputs = inputs;
-        self.numbers.clear();
-        self.numbers.resize(self.bias.len() * inputs, ZERO);
-        for (index, panel) in self.numbers.chunks_exact_mut(inputs.max(1)).enumerate() {
+        self.elements.clear();
+        self.elements.resize(self.bias.len() * inputs, ZERO);
+        for (index, panel) in self.elements.chunks_exact_mut(inputs.max(1)).enumerate() {
             let first = index * WIDTH;
             for (input, pair) in panel.iter_mut().enumerate() {
                 for column in 0..WIDTH.min(self.outputs - first) {
@@ -66,13 +74,15 @@ impl Panels {
         }
     }
 
-    /// As [`Panels::fill`], from rows as they lie in memory: given are the numbers from the first row on, and how many
-    /// there are from row to row.
+    /// Replaces the matrix by `inputs` rows in memory, given as a slice and the distance from row to row in elements.
+    ///
+    /// # Shapes
+    /// `rows` is `[inputs, outputs]` with the given stride.
     pub fn fill_rows(&mut self, inputs: usize, (rows, stride): (&[f32], usize)) {
         self.inputs = inputs;
-        self.numbers.clear();
-        self.numbers.resize(self.bias.len() * inputs, ZERO);
-        for (index, panel) in self.numbers.chunks_exact_mut(inputs.max(1)).enumerate() {
+        self.elements.clear();
+        self.elements.resize(self.bias.len() * inputs, ZERO);
+        for (index, panel) in self.elements.chunks_exact_mut(inputs.max(1)).enumerate() {
             let first = index * WIDTH;
             let width = WIDTH.min(self.outputs - first);
             for (input, pair) in panel.iter_mut().enumerate() {
@@ -84,17 +94,17 @@ impl Panels {
         }
     }
 
-    /// Rows of the matrix.
+    /// Returns the number of rows of the matrix.
     pub fn inputs(&self) -> usize {
         self.inputs
     }
 
-    /// Columns of the matrix.
+    /// Returns the number of columns of the matrix.
     pub fn outputs(&self) -> usize {
         self.outputs
     }
 
-    /// `y = x W + b`.
+    /// Computes `y = x W + b`.
     ///
     /// # Shapes
     /// `x` is `[rows, inputs]`, `y` is `[rows, outputs]`.
@@ -102,28 +112,32 @@ impl Panels {
         self.apply_strided(y.len() / self.outputs, (x, self.inputs), (y, self.outputs));
     }
 
-    /// As [`Panels::apply`], for `rows` that are parts of longer ones: given are the numbers from the first one on, and how
-    /// many there are from row to row.
+    /// Computes `y = x W + b` for rows with strides: each array is a slice and the distance from row to row in elements.
+    ///
+    /// # Shapes
+    /// `x` is `[rows, inputs]`, `y` is `[rows, outputs]`.
     pub fn apply_strided(&self, rows: usize, x: (&[f32], usize), y: (&mut [f32], usize)) {
         let mut tile = [Lanes([0.0; LANES]); TILE];
         dispatch(Product::<false> { rows, x, y, weights: self, tile: &mut tile });
     }
 
-    /// `y += xᵀ W + b`, where `x` is `[inputs, rows]`: how gradients of weights come about. Given as to
-    /// [`Panels::apply_strided`].
+    /// Computes `y += xᵀ W + b`, the product that gradients of weights need. Strides as in [`Panels::apply_strided`].
+    ///
+    /// # Shapes
+    /// `x` is `[inputs, rows]`, `y` is `[rows, outputs]`.
     pub fn add_transposed(&self, rows: usize, x: (&[f32], usize), y: (&mut [f32], usize)) {
         let mut tile = [Lanes([0.0; LANES]); TILE];
         dispatch(Product::<true> { rows, x, y, weights: self, tile: &mut tile });
     }
 }
 
-/// A product to be computed; one of transposed rows is added.
+/// A product to compute; with transposed rows, its result is added.
 struct Product<'a, const TRANSPOSED: bool> {
     rows: usize,
     x: (&'a [f32], usize),
     y: (&'a mut [f32], usize),
     weights: &'a Panels,
-    /// The last tile. It lies outside of the kernel, as what is indexed in memory is not kept in registers.
+    /// The last tile, in memory outside the kernel: arrays that are indexed at run time do not stay in registers.
     tile: &'a mut [Lanes; TILE],
 }
 
@@ -135,8 +149,8 @@ impl<const TRANSPOSED: bool> Kernel for Product<'_, TRANSPOSED> {
         let (rows, inputs) = (self.rows, self.weights.inputs);
         for (index, bias) in self.weights.bias.iter().enumerate() {
             let panel =
-                Panel { first: index * WIDTH, numbers: &self.weights.numbers[index * inputs..][..inputs], bias };
-            // As many rows at once as registers hold, then fewer.
+                Panel { first: index * WIDTH, elements: &self.weights.elements[index * inputs..][..inputs], bias };
+            // Tiles of as many rows as registers hold, then smaller ones.
             let mut row = 0;
             if L::ROWS >= 12 {
                 while rows - row >= 12 {
@@ -166,15 +180,15 @@ impl<const TRANSPOSED: bool> Kernel for Product<'_, TRANSPOSED> {
 struct Panel<'a> {
     /// The first of its columns.
     first: usize,
-    numbers: &'a [Pair],
+    elements: &'a [Pair],
     bias: &'a Pair,
 }
 
 impl<const TRANSPOSED: bool> Product<'_, TRANSPOSED> {
-    /// `R` rows of a panel, `W` vectors at a time.
+    /// Computes `R` rows of a panel, `W` vectors at a time.
     #[inline(always)]
     fn tile<L: Level, const R: usize, const W: usize>(&mut self, row: usize, panel: Panel<'_>) {
-        let ((x, x_stride), k) = (self.x, panel.numbers.len());
+        let ((x, x_stride), k) = (self.x, panel.elements.len());
         let by_row: [&[f32]; R] =
             std::array::from_fn(|r| if TRANSPOSED { &[][..] } else { &x[(row + r) * x_stride..][..k] });
         for half in (0..WIDTH / LANES).step_by(W) {
@@ -184,7 +198,7 @@ impl<const TRANSPOSED: bool> Product<'_, TRANSPOSED> {
             }
             let mut sums: [[Lanes; W]; R] = [std::array::from_fn(|w| panel.bias[half + w]); R];
             for p in 0..k {
-                let weights: [Lanes; W] = std::array::from_fn(|w| panel.numbers[p][half + w]);
+                let weights: [Lanes; W] = std::array::from_fn(|w| panel.elements[p][half + w]);
                 let column = if TRANSPOSED { &x[p * x_stride + row..][..R] } else { &[] };
                 for r in 0..R {
                     let x = if TRANSPOSED { column[r] } else { by_row[r][p] };
@@ -217,38 +231,38 @@ mod tests {
     use super::*;
 
     #[test]
-    fn products_are_those_of_the_definition_whatever_the_sizes() {
-        let number = |i: usize| (i * 37 % 101) as f32 / 101.0 - 0.5;
+    fn products_match_the_definition_for_all_sizes() {
+        let value = |i: usize| (i * 37 % 101) as f32 / 101.0 - 0.5;
         for rows in [1, 2, 5, 12, 31] {
             for (inputs, outputs) in [(1, 1), (3, 5), (17, 16), (40, 33), (64, 80)] {
-                let x: Vec<f32> = (0..rows * inputs).map(number).collect();
-                let bias: Vec<f32> = (0..outputs).map(|i| number(i + 7)).collect();
-                let weight = |i, o| number(i * outputs + o + 3);
+                let x: Vec<f32> = (0..rows * inputs).map(value).collect();
+                let bias: Vec<f32> = (0..outputs).map(|i| value(i + 7)).collect();
+                let weight = |i, o| value(i * outputs + o + 3);
                 let panels = Panels::new(inputs, outputs, weight).with_bias(&bias);
                 let mut y = vec![f32::NAN; rows * outputs];
                 panels.apply(&x, &mut y);
-                for (place, y) in y.iter().enumerate() {
-                    let (row, output) = (place / outputs, place % outputs);
+                for (index, y) in y.iter().enumerate() {
+                    let (row, output) = (index / outputs, index % outputs);
                     let terms = (0..inputs).map(|i| f64::from(x[row * inputs + i]) * f64::from(weight(i, output)));
-                    let wanted = f64::from(bias[output]) + terms.sum::<f64>();
-                    assert!((f64::from(*y) - wanted).abs() < 1e-5, "{rows} {inputs} {outputs}: {y} for {wanted}");
+                    let expected = f64::from(bias[output]) + terms.sum::<f64>();
+                    assert!((f64::from(*y) - expected).abs() < 1e-5, "{rows} {inputs} {outputs}: {y} for {expected}");
                 }
-                // The same by columns, added to what is there.
+                // The same product from columns, added to the previous result.
                 let columns: Vec<f32> = (0..rows * inputs).map(|i| x[i % rows * inputs + i / rows]).collect();
                 let mut sum = y.clone();
                 panels.add_transposed(rows, (&columns, rows), (&mut sum, outputs));
                 assert!(sum.iter().zip(&y).all(|(sum, y)| *sum == 2.0 * y));
-                // Filled again from rows, it is the same matrix.
+                // Filling from rows gives the same matrix.
                 let matrix: Vec<f32> = (0..inputs * outputs).map(|i| weight(i / outputs, i % outputs)).collect();
                 let mut again = Panels::new(0, outputs, |_, _| 0.0).with_bias(&bias);
                 again.fill_rows(inputs, (&matrix, outputs));
                 again.apply(&x, &mut sum);
                 assert_eq!(sum, y);
-                // A row alone is the same bytes as among others, and as part of a longer one.
+                // A row on its own has the same bytes as among other rows, and with a stride.
                 let mut alone = vec![f32::NAN; outputs + 2];
                 panels.apply_strided(1, (&x[(rows - 1) * inputs..], inputs), (&mut alone, outputs + 2));
                 assert_eq!(alone[..outputs], y[(rows - 1) * outputs..]);
-                assert!(alone[outputs..].iter().all(|number| number.is_nan()));
+                assert!(alone[outputs..].iter().all(|value| value.is_nan()));
             }
         }
     }

@@ -1,9 +1,11 @@
-//! Functions of many numbers, written so that compilers turn them into vectors: no branches, no calls.
+//! Element-wise functions, softmax and reductions, written without branches and calls so that compilers vectorise them.
 
-use super::product::LANES;
-use super::simd::{Kernel, Level, dispatch};
+use crate::panels::LANES;
+use crate::simd::{Kernel, Level, dispatch};
 
-/// `x Φ(x)` of every number, to 1e-6.
+/// Replaces every element by `x Φ(x)`, with an error below 1e-6.
+///
+/// GELU (Hendrycks and Gimpel 2016) with the error function, not its approximation by `tanh`.
 pub fn gelu(x: &mut [f32]) {
     struct Gelu<'a>(&'a mut [f32]);
     impl Kernel for Gelu<'_> {
@@ -19,8 +21,11 @@ pub fn gelu(x: &mut [f32]) {
     dispatch(Gelu(x));
 }
 
-/// The tangent of `x Φ(x)` at every number: replaces each by where the tangent is at 0, `-x² φ(x)`, and gives the slopes,
-/// `Φ(x) + x φ(x)`.
+/// Computes the tangent of [`gelu`] at every element: replaces `x` by the tangent's value at 0, `-x² φ(x)`, and writes
+/// its slope, `Φ(x) + x φ(x)`, to `slopes`.
+///
+/// # Shapes
+/// `x` and `slopes` have the same length.
 pub fn gelu_tangent(x: &mut [f32], slopes: &mut [f32]) {
     struct Tangent<'a>(&'a mut [f32], &'a mut [f32]);
     impl Kernel for Tangent<'_> {
@@ -40,7 +45,7 @@ pub fn gelu_tangent(x: &mut [f32], slopes: &mut [f32]) {
     dispatch(Tangent(x, slopes));
 }
 
-/// `x / (1 + exp(-x))` of every number.
+/// Replaces every element by `x / (1 + exp(-x))` (SiLU).
 pub fn silu(x: &mut [f32]) {
     struct Silu<'a>(&'a mut [f32]);
     impl Kernel for Silu<'_> {
@@ -57,7 +62,7 @@ pub fn silu(x: &mut [f32]) {
     dispatch(Silu(x));
 }
 
-/// `Φ(x) - 1/2`, half the error function of `x / √2`: a rational function of our own fit, off by 2e-7 at most.
+/// Returns `Φ(x) - 1/2`, half the error function of `x / √2`, by a fitted rational function with an error of at most 2e-7.
 #[inline(always)]
 fn half_erf<L: Level>(x: f32) -> f32 {
     let x = x.clamp(-5.6, 5.6);
@@ -70,9 +75,9 @@ fn half_erf<L: Level>(x: f32) -> f32 {
     (x * numerator / denominator).clamp(-0.5, 0.5)
 }
 
-/// The exponential of a number that is not positive: a power of two and a polynomial.
+/// Returns the exponential of `x <= 0` as a power of two times a polynomial.
 #[inline(always)]
-pub(super) fn exp<L: Level>(x: f32) -> f32 {
+pub(crate) fn exp<L: Level>(x: f32) -> f32 {
     /// 1.5 times 2²³: adding it leaves the nearest integer in the low bits.
     const ROUND: f32 = 12_582_912.0;
     let x = x.max(-87.0);
@@ -85,9 +90,9 @@ pub(super) fn exp<L: Level>(x: f32) -> f32 {
     series * scale
 }
 
-/// The sum, in lanes.
+/// Returns the sum of the elements, added lane by lane.
 #[inline(always)]
-pub(super) fn sum(x: &[f32]) -> f32 {
+pub(crate) fn sum(x: &[f32]) -> f32 {
     let mut lanes = [0.0f32; LANES];
     let (chunks, rest) = x.as_chunks::<LANES>();
     for chunk in chunks {
@@ -98,9 +103,9 @@ pub(super) fn sum(x: &[f32]) -> f32 {
     fold(lanes) + rest.iter().sum::<f32>()
 }
 
-/// The scalar product, in lanes.
+/// Returns the scalar product, added lane by lane.
 #[inline(always)]
-pub(super) fn dot<L: Level>(a: &[f32], b: &[f32]) -> f32 {
+pub(crate) fn dot<L: Level>(a: &[f32], b: &[f32]) -> f32 {
     let mut lanes = [0.0f32; LANES];
     let ((a, a_rest), (b, b_rest)) = (a.as_chunks::<LANES>(), b.as_chunks::<LANES>());
     for (a, b) in a.iter().zip(b) {
@@ -111,7 +116,7 @@ pub(super) fn dot<L: Level>(a: &[f32], b: &[f32]) -> f32 {
     fold(lanes) + a_rest.iter().zip(b_rest).map(|(a, b)| a * b).sum::<f32>()
 }
 
-/// The sum of all lanes, by halves.
+/// Returns the sum of all lanes, halving their number at each step.
 #[inline(always)]
 fn fold(mut lanes: [f32; LANES]) -> f32 {
     let mut width = LANES / 2;
@@ -124,15 +129,18 @@ fn fold(mut lanes: [f32; LANES]) -> f32 {
     lanes[0]
 }
 
-/// `to += factor * x`.
+/// Computes `to += factor * x`.
 #[inline(always)]
-pub(super) fn add_scaled<L: Level>(to: &mut [f32], factor: f32, x: &[f32]) {
+pub(crate) fn add_scaled<L: Level>(to: &mut [f32], factor: f32, x: &[f32]) {
     for (to, x) in to.iter_mut().zip(x) {
         *to = L::fma(factor, *x, *to);
     }
 }
 
-/// The softmax of every row of `width` numbers.
+/// Replaces every row by its softmax.
+///
+/// # Shapes
+/// `x` is `[rows, width]`.
 pub fn softmax(x: &mut [f32], width: usize) {
     struct Softmax<'a>(&'a mut [f32], usize);
     impl Kernel for Softmax<'_> {
@@ -141,13 +149,13 @@ pub fn softmax(x: &mut [f32], width: usize) {
         #[inline(always)]
         fn run<L: Level>(self) {
             for row in self.0.chunks_exact_mut(self.1) {
-                let most = most(row);
+                let max = max(row);
                 for x in row.iter_mut() {
-                    *x = exp::<L>(*x - most);
+                    *x = exp::<L>(*x - max);
                 }
-                let share = 1.0 / sum(row);
+                let factor = 1.0 / sum(row);
                 for x in row {
-                    *x *= share;
+                    *x *= factor;
                 }
             }
         }
@@ -155,53 +163,66 @@ pub fn softmax(x: &mut [f32], width: usize) {
     dispatch(Softmax(x, width));
 }
 
-/// Takes the gradient of a [`softmax`] back: `shares` is what came out, `d` its gradient, replaced by that of what went in.
-pub fn softmax_backward(shares: &[f32], d: &mut [f32], width: usize) {
+/// Replaces the gradient `d` of a [`softmax`]'s output by that of its input.
+///
+/// # Shapes
+/// `weights`, the output of the softmax, and `d` are `[rows, width]`.
+pub fn softmax_backward(weights: &[f32], d: &mut [f32], width: usize) {
     struct Backward<'a>(&'a [f32], &'a mut [f32], usize);
     impl Kernel for Backward<'_> {
         type Output = ();
 
         #[inline(always)]
         fn run<L: Level>(self) {
-            for (shares, d) in self.0.chunks_exact(self.2).zip(self.1.chunks_exact_mut(self.2)) {
-                let mean = dot::<L>(shares, d);
-                for (share, d) in shares.iter().zip(d) {
-                    *d = share * (*d - mean);
+            for (weights, d) in self.0.chunks_exact(self.2).zip(self.1.chunks_exact_mut(self.2)) {
+                let mean = dot::<L>(weights, d);
+                for (weight, d) in weights.iter().zip(d) {
+                    *d = weight * (*d - mean);
                 }
             }
         }
     }
-    dispatch(Backward(shares, d, width));
+    dispatch(Backward(weights, d, width));
 }
 
-/// `x * slope` in the place of `x`, number by number.
+/// Computes `x *= slope` element by element.
 pub fn multiply(x: &mut [f32], slopes: &[f32]) {
     x.iter_mut().zip(slopes).for_each(|(x, slope)| *x *= slope);
 }
 
-/// `x * slope + offset` in the place of the offset, number by number.
+/// Computes `offset += x * slope` element by element.
 pub fn multiply_add(offsets: &mut [f32], x: &[f32], slopes: &[f32]) {
     offsets.iter_mut().zip(x).zip(slopes).for_each(|((offset, x), slope)| *offset += x * slope);
 }
 
-/// Adds all rows of `x` to one.
+/// Adds all rows of `x` to `sum`.
+///
+/// # Shapes
+/// `x` is `[rows, features]`, `sum` is `[features]`.
 pub fn add_rows(sum: &mut [f32], x: &[f32]) {
     for row in x.chunks_exact(sum.len()) {
         sum.iter_mut().zip(row).for_each(|(sum, x)| *sum += x);
     }
 }
 
-/// The largest number.
+/// Adds `y` to `x` element by element.
+pub fn add(x: &mut [f32], y: &[f32]) {
+    for (x, y) in x.iter_mut().zip(y) {
+        *x += y;
+    }
+}
+
+/// Returns the largest element.
 #[inline(always)]
-fn most(x: &[f32]) -> f32 {
-    let mut most = [f32::NEG_INFINITY; LANES];
+fn max(x: &[f32]) -> f32 {
+    let mut max = [f32::NEG_INFINITY; LANES];
     let (chunks, rest) = x.as_chunks::<LANES>();
     for chunk in chunks {
         for lane in 0..LANES {
-            most[lane] = most[lane].max(chunk[lane]);
+            max[lane] = max[lane].max(chunk[lane]);
         }
     }
-    most.iter().chain(rest).copied().fold(f32::NEG_INFINITY, f32::max)
+    max.iter().chain(rest).copied().fold(f32::NEG_INFINITY, f32::max)
 }
 
 #[cfg(test)]
@@ -209,7 +230,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_functions_are_close() {
+    fn functions_match_references_within_tolerance() {
         struct Exp(f32);
         impl Kernel for Exp {
             type Output = f32;
@@ -229,7 +250,7 @@ mod tests {
             silu(&mut values);
             assert!((values[0] - x / (1.0 + (-x).exp())).abs() < 2e-6, "silu({x})");
         }
-        // Φ by Simpson's rule from 0: the density is smooth enough for 2,000 steps.
+        // Φ by Simpson's rule from 0: the density is smooth enough for 2,000 intervals.
         let density = |x: f64| (-x * x / 2.0).exp() / std::f64::consts::TAU.sqrt();
         for i in -600..=600 {
             let x = f64::from(i) / 50.0;
@@ -245,13 +266,13 @@ mod tests {
             assert!((f64::from(offset[0]) + x * x * density(x)).abs() < 1e-6, "offset at {x}: {}", offset[0]);
         }
         let mut rows: Vec<f32> = (0..38).map(|i| (i * 7 % 19) as f32 * 0.3 - 2.0).collect();
-        let given = rows.clone();
+        let inputs = rows.clone();
         softmax(&mut rows, 19);
-        for (row, given) in rows.chunks(19).zip(given.chunks(19)) {
-            let all: f32 = given.iter().map(|x| x.exp()).sum();
-            assert!(row.iter().zip(given).all(|(share, x)| (share - x.exp() / all).abs() < 1e-7), "{row:?}");
+        for (row, inputs) in rows.chunks(19).zip(inputs.chunks(19)) {
+            let sum: f32 = inputs.iter().map(|x| x.exp()).sum();
+            assert!(row.iter().zip(inputs).all(|(weight, x)| (weight - x.exp() / sum).abs() < 1e-7), "{row:?}");
         }
-        let numbers: Vec<f32> = (0..37).map(|i| i as f32).collect();
-        assert_eq!(sum(&numbers), 666.0);
+        let values: Vec<f32> = (0..37).map(|i| i as f32).collect();
+        assert_eq!(sum(&values), 666.0);
     }
 }

@@ -1,0 +1,27 @@
+//! CPU kernels of planning and of training vision transformers, on plain row-major `f32` slices.
+//!
+//! A tensor library allocates and reads memory once per operation. Here weights are laid out once ([`Panels`]), scratch
+//! memory is reused ([`ScratchPool`]), and every row is computed on its own, so that no byte of a result depends on the
+//! number of threads or on the other rows. The crate knows neither tensors nor model families: `swm-models` converts
+//! its layers to [`Affine`], [`Norm`], [`Panels`] and [`VitParameters`].
+
+// Loops over constant numbers of lanes are what compilers turn into vectors.
+#![allow(clippy::needless_range_loop, reason = "indexed loops over constant lane counts are vectorised")]
+
+mod affine;
+mod attention;
+pub mod functions;
+mod norm;
+mod panels;
+mod scratch;
+mod simd;
+mod vit;
+mod vit_gradient;
+
+pub use affine::Affine;
+pub use attention::causal_attention;
+pub use norm::{Modulation, Norm, add_gated};
+pub use panels::Panels;
+pub use scratch::{ScratchPool, grown};
+pub use vit::{VitEncoder, VitLayerParameters, VitParameters};
+pub use vit_gradient::{Tape, VitGradient, VitGradientScratch, VitGradientSums};

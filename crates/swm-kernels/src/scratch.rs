@@ -1,0 +1,26 @@
+//! Memory that is reused between calls.
+
+use std::sync::{Mutex, PoisonError};
+
+/// A pool of scratch values: as many as threads have ever used it at the same time.
+#[derive(Debug, Default)]
+pub struct ScratchPool<T>(Mutex<Vec<T>>);
+
+impl<T: Default> ScratchPool<T> {
+    /// Calls `work` with a scratch value that no other thread uses meanwhile. It holds what its last user left in it.
+    pub fn with<R>(&self, work: impl FnOnce(&mut T) -> R) -> R {
+        let free = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut scratch = free().pop().unwrap_or_default();
+        let result = work(&mut scratch);
+        free().push(scratch);
+        result
+    }
+}
+
+/// Returns the first `length` elements of a buffer, which grows if it is shorter.
+pub fn grown(buffer: &mut Vec<f32>, length: usize) -> &mut [f32] {
+    if buffer.len() < length {
+        buffer.resize(length, 0.0);
+    }
+    &mut buffer[..length]
+}

@@ -1,0 +1,156 @@
+//! Layers in the form that the CPU kernels of `swm-kernels` read.
+
+use super::norm::BatchNorm;
+use super::parameters::{IntoF32, Named};
+use super::positions::{Resampling, positions};
+use super::vit::{Layer, Projection};
+use super::{LayerNorm, Linear, Projector, Vit};
+use burn::tensor::Tensor;
+use swm_kernels::{Affine, Norm, Panels, VitEncoder, VitGradient, VitLayerParameters, VitParameters};
+
+/// Copies the elements of a tensor to the host, row-major.
+pub(crate) fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
+    tensor.into_data().into_f32_vec()
+}
+
+/// Lays out a linear layer.
+pub(crate) fn panels(layer: &Linear) -> Panels {
+    let [outputs, _] = layer.weight.dims();
+    output_panels(layer, 0..outputs)
+}
+
+/// Lays out a range of the outputs of a linear layer.
+pub(crate) fn output_panels(layer: &Linear, range: std::ops::Range<usize>) -> Panels {
+    let ([_, inputs], weight) = (layer.weight.dims(), host(layer.weight.val()));
+    let panels = Panels::new(inputs, range.len(), |i, o| weight[(range.start + o) * inputs + i]);
+    match &layer.bias {
+        Some(bias) => panels.with_bias(&host(bias.val())[range]),
+        None => panels,
+    }
+}
+
+/// Lays out the two layers of a projector, with the batch normalisation between them folded into the first.
+pub(crate) fn projector_panels(projector: &Projector) -> [Panels; 2] {
+    let (first, norm) = (&projector.net._0, &projector.net._1);
+    let scale = host(norm.weight.val() / (norm.running_var.val() + BatchNorm::EPSILON).sqrt());
+    let shift = match &first.bias {
+        Some(bias) => bias.val() - norm.running_mean.val(),
+        None => -norm.running_mean.val(),
+    };
+    let bias: Vec<f32> = (host(shift).iter().zip(&scale).zip(host(norm.bias.val())))
+        .map(|((shift, scale), bias)| shift * scale + bias)
+        .collect();
+    let ([outputs, inputs], weight) = (first.weight.dims(), host(first.weight.val()));
+    [Panels::new(inputs, outputs, |i, o| weight[o * inputs + i] * scale[o]).with_bias(&bias), panels(&projector.net._3)]
+}
+
+/// Copies a layer normalisation.
+pub(crate) fn norm(layer: &LayerNorm) -> Norm {
+    Norm::new(norm_parameters(layer), layer.epsilon() as f32)
+}
+
+/// Lays out a vision transformer for images of `patches` patches.
+pub(crate) fn vit_encoder(vit: &Vit, patches: usize) -> Option<VitEncoder> {
+    let heads = vit.encoder.layer.first()?.attention.heads();
+    Some(VitEncoder::new(&vit_parameters(vit, patches), heads, vit.layernorm.epsilon() as f32))
+}
+
+/// Lays out a vision transformer for training on images of `patches` patches; returns `None` if its learnt positions
+/// are for another number of patches.
+pub(crate) fn vit_gradient(vit: &Vit, patches: usize) -> Option<VitGradient> {
+    let [_, learnt, _] = vit.embeddings.position_embeddings.dims();
+    let heads = vit.encoder.layer.first()?.attention.heads();
+    (learnt == 1 + patches)
+        .then(|| VitGradient::new(&vit_parameters(vit, patches), heads, vit.layernorm.epsilon() as f32))
+}
+
+/// Names the gradients of a vision transformer as [`Vit`] names its parameters.
+pub(crate) fn named_vit_gradients(gradients: VitParameters) -> Named<Vec<f32>> {
+    let dim = gradients.norm.bias.len();
+    let mut named = Named::new();
+    named.insert("embeddings.cls_token".to_owned(), gradients.positions[..dim].to_vec());
+    named.insert("embeddings.position_embeddings".to_owned(), gradients.positions);
+    let mut insert = |name: &str, affine: Affine| {
+        named.insert(format!("{name}.weight"), affine.weight);
+        named.insert(format!("{name}.bias"), affine.bias);
+    };
+    insert("embeddings.patch_embeddings.projection", gradients.patches);
+    insert("layernorm", gradients.norm);
+    for (index, layer) in gradients.layers.into_iter().enumerate() {
+        for (part, affine) in [
+            ("layernorm_before", layer.norm_before),
+            ("attention.attention.query", layer.query),
+            ("attention.attention.key", layer.key),
+            ("attention.attention.value", layer.value),
+            ("attention.output.dense", layer.attention_output),
+            ("layernorm_after", layer.norm_after),
+            ("intermediate.dense", layer.intermediate),
+            ("output.dense", layer.output),
+        ] {
+            insert(&format!("encoder.layer.{index}.{part}"), affine);
+        }
+    }
+    named
+}
+
+fn vit_parameters(vit: &Vit, patches: usize) -> VitParameters {
+    let embeddings = &vit.embeddings;
+    let Projection { weight, bias } = &embeddings.patch_embeddings.projection;
+    let mut learnt = host(positions(embeddings.position_embeddings.val(), patches, Resampling::Bicubic));
+    swm_kernels::functions::add(&mut learnt, &host(embeddings.cls_token.val()));
+    VitParameters {
+        patches: Affine { weight: host(weight.val()), bias: host(bias.val()) },
+        positions: learnt,
+        layers: vit.encoder.layer.iter().map(layer_parameters).collect(),
+        norm: norm_parameters(&vit.layernorm),
+    }
+}
+
+fn layer_parameters(layer: &Layer) -> VitLayerParameters {
+    let parts = &layer.attention.attention;
+    VitLayerParameters {
+        norm_before: norm_parameters(&layer.layernorm_before),
+        query: linear_parameters(&parts.query),
+        key: linear_parameters(&parts.key),
+        value: linear_parameters(&parts.value),
+        attention_output: linear_parameters(&layer.attention.output.dense),
+        norm_after: norm_parameters(&layer.layernorm_after),
+        intermediate: linear_parameters(&layer.intermediate.dense),
+        output: linear_parameters(&layer.output.dense),
+    }
+}
+
+fn norm_parameters(layer: &LayerNorm) -> Affine {
+    Affine { weight: host(layer.weight.val()), bias: host(layer.bias.val()) }
+}
+
+fn linear_parameters(layer: &Linear) -> Affine {
+    let [outputs, _] = layer.weight.dims();
+    let bias = layer.bias.as_ref().map_or_else(|| vec![0.0; outputs], |bias| host(bias.val()));
+    Affine { weight: host(layer.weight.val()), bias }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::nn::{Init, VitConfig};
+    use burn::tensor::{Device, TensorData};
+    use swm_core::Key;
+
+    #[test]
+    fn vit_encoder_matches_module_on_any_number_of_threads() {
+        let sizes = VitConfig { patch: 2, dim: 24, depth: 2, heads: 3, mlp: 40 };
+        // 50 tokens, in two blocks; more positions than were learnt, so that they are resampled.
+        let (patches, elements) = (49, 12);
+        let vit = sizes.init(&Init::new(Key::new(1), &Device::flex()), 12);
+        let encoder = vit_encoder(&vit, patches).expect("a transformer with layers");
+        let image: Vec<f32> = (0..patches * elements).map(|i| (i * 37 % 101) as f32 / 50.0 - 1.0).collect();
+        let on = |threads: usize| swm_core::pool::threads(threads).expect("threads").install(|| encoder.encode(&image));
+        let class = on(1);
+        assert_eq!(class, on(3));
+        let input = Tensor::from_data(TensorData::new(image.clone(), [1, patches, elements]), &Device::flex());
+        for (actual, expected) in class.iter().zip(host(vit.forward(input))) {
+            assert!((actual - expected).abs() < 1e-4, "{actual} for {expected}");
+        }
+    }
+}

@@ -1,6 +1,6 @@
 //! [`GcrlConfig`]: the size of a goal-conditioned model.
 
-use super::transformer::{Sight, TransformerConfig};
+use super::transformer::{PatchGrid, TransformerConfig};
 use crate::nn::BackboneConfig;
 use crate::pixels::ImageNormalization;
 use serde::{Deserialize, Serialize};
@@ -43,9 +43,9 @@ impl GcrlConfig {
     }
 
     /// What the heads look at. An encoder without patches gives one for the whole picture.
-    pub(super) fn sight(&self) -> Sight {
+    pub(super) fn patch_grid(&self) -> PatchGrid {
         let patches = self.encoder.patches(self.image);
-        Sight { frames: self.history, patches, dim: self.encoder.dim() }
+        PatchGrid { frames: self.history, patches, dim: self.encoder.dim() }
     }
 
     /// Checks that the sizes fit each other.

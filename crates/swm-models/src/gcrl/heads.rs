@@ -1,7 +1,7 @@
 //! The heads of goal-conditioned models, on the patches that an encoder made of frames and goal: what to do
 //! ([`Head`]), what a state is worth ([`Head`] of one number), what an action is worth ([`Critic`]).
 
-use super::transformer::{Pool, Sight, Transformer, TransformerConfig};
+use super::transformer::{PatchGrid, Pool, Transformer, TransformerConfig};
 use crate::nn::{Activation, DropoutRng, Init, Linear};
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
@@ -47,13 +47,13 @@ pub struct CriticHead {
 
 impl Head {
     /// A head of `outputs` numbers.
-    pub fn new(init: &Init, size: &TransformerConfig, sight: Sight, pool: Pool, outputs: usize) -> Self {
-        let [pos_embedding, pos_embedding_goal] = positions(init, sight);
+    pub fn new(init: &Init, size: &TransformerConfig, grid: PatchGrid, pool: Pool, outputs: usize) -> Self {
+        let [pos_embedding, pos_embedding_goal] = positions(init, grid);
         Self {
             pos_embedding,
             pos_embedding_goal,
-            transformer: size.init(&init.of("transformer"), sight, pool),
-            out_proj: Linear::new(&init.of("out_proj"), sight.dim, outputs),
+            transformer: size.init(&init.of("transformer"), grid, pool),
+            out_proj: Linear::new(&init.of("out_proj"), grid.dim, outputs),
             emb_dropout: size.emb_dropout,
         }
     }
@@ -62,7 +62,7 @@ impl Head {
     /// Frames `[rows, frames * patches, dim]`, at most as many as the head was made for, and a goal
     /// `[rows, patches, dim]` to `[rows, frames, outputs]`.
     pub fn forward(&self, frames: &Tensor<3>, goal: &Tensor<3>, noise: &mut DropoutRng<'_>) -> Tensor<3> {
-        let (frames, goal) = place([&self.pos_embedding, &self.pos_embedding_goal], frames, goal);
+        let (frames, goal) = add_positions([&self.pos_embedding, &self.pos_embedding_goal], frames, goal);
         let frames = noise.dropout(frames, self.emb_dropout);
         self.out_proj.forward(self.transformer.forward(frames, &goal, noise))
     }
@@ -70,14 +70,21 @@ impl Head {
 
 impl Critic {
     /// A critic of `actions` numbers an action, with `hidden` features behind the transformer.
-    pub fn new(init: &Init, size: &TransformerConfig, sight: Sight, pool: Pool, actions: usize, hidden: usize) -> Self {
-        let [pos_embedding, pos_embedding_goal] = positions(init, sight);
+    pub fn new(
+        init: &Init,
+        size: &TransformerConfig,
+        grid: PatchGrid,
+        pool: Pool,
+        actions: usize,
+        hidden: usize,
+    ) -> Self {
+        let [pos_embedding, pos_embedding_goal] = positions(init, grid);
         Self {
             pos_embedding,
             pos_embedding_goal,
-            transformer: size.init(&init.of("transformer"), sight, pool),
+            transformer: size.init(&init.of("transformer"), grid, pool),
             q_head: CriticHead {
-                _0: Linear::new(&init.of("0"), sight.dim + actions, hidden),
+                _0: Linear::new(&init.of("0"), grid.dim + actions, hidden),
                 _2: Linear::new(&init.of("2"), hidden, hidden),
                 _4: Linear::new(&init.of("4"), hidden, 1),
             },
@@ -94,7 +101,7 @@ impl Critic {
         goal: &Tensor<3>,
         noise: &mut DropoutRng<'_>,
     ) -> Tensor<3> {
-        let (frames, goal) = place([&self.pos_embedding, &self.pos_embedding_goal], frames, goal);
+        let (frames, goal) = add_positions([&self.pos_embedding, &self.pos_embedding_goal], frames, goal);
         let frames = noise.dropout(frames, self.emb_dropout);
         let seen = self.transformer.forward(frames, &goal, noise);
         let head = &self.q_head;
@@ -108,15 +115,15 @@ impl Critic {
 const POSITION_STD: f32 = 0.02;
 
 /// Positions of frames and goal.
-fn positions(init: &Init, Sight { frames, patches, dim }: Sight) -> [Param<Tensor<3>>; 2] {
+fn positions(init: &Init, PatchGrid { frames, patches, dim }: PatchGrid) -> [Param<Tensor<3>>; 2] {
     [
         init.normal("pos_embedding", [1, frames * patches, dim], POSITION_STD),
         init.normal("pos_embedding_goal", [1, patches, dim], POSITION_STD),
     ]
 }
 
-/// Frames and goal with their positions.
-fn place(positions: [&Param<Tensor<3>>; 2], frames: &Tensor<3>, goal: &Tensor<3>) -> (Tensor<3>, Tensor<3>) {
+/// Adds the position embeddings to frames and goal.
+fn add_positions(positions: [&Param<Tensor<3>>; 2], frames: &Tensor<3>, goal: &Tensor<3>) -> (Tensor<3>, Tensor<3>) {
     let placed = |position: &Param<Tensor<3>>, x: &Tensor<3>| {
         let [_, tokens, dim] = x.dims();
         x.clone() + position.val().slice([0..1, 0..tokens, 0..dim])

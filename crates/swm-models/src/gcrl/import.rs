@@ -232,11 +232,11 @@ where
             ));
         }
     };
-    let (sight, head) = (sizes.sight(), &sizes.head);
+    let (grid, head) = (sizes.patch_grid(), &sizes.head);
     let class = |class: &str, pool: &str| {
         json!({
             "_target_": format!("{MODULE}.{class}"),
-            "num_patches": sight.patches, "num_frames": sight.frames, "dim": sight.dim, "pool_type": pool,
+            "num_patches": grid.patches, "num_frames": grid.frames, "dim": grid.dim, "pool_type": pool,
             "depth": head.depth, "heads": head.heads, "dim_head": head.dim_head, "mlp_dim": head.mlp,
             "dropout": head.dropout, "emb_dropout": head.emb_dropout,
         })
@@ -261,11 +261,11 @@ where
 
 /// The state dict of a model, as the reference's class has it: with the masks of the attention, without slow copies.
 fn state<M: GoalConditioned>(model: &M, sizes: &GcrlConfig, naming: Naming) -> Named<HostTensor> {
-    let sight = sizes.sight();
-    let keys = sight.frames * sight.patches;
+    let grid = sizes.patch_grid();
+    let keys = grid.frames * grid.patches;
     let mask = |queries: usize| {
-        let frame = |query: usize| query * sight.frames / queries;
-        let seen = |place: usize| place % keys / sight.patches <= frame(place / keys);
+        let frame = |query: usize| query * grid.frames / queries;
+        let seen = |place: usize| place % keys / grid.patches <= frame(place / keys);
         let values = (0..queries * keys).map(|place| if seen(place) { 1.0 } else { 0.0 }).collect();
         HostTensor { shape: vec![1, 1, queries, keys], values }
     };
@@ -281,7 +281,7 @@ fn state<M: GoalConditioned>(model: &M, sizes: &GcrlConfig, naming: Naming) -> N
         {
             let gathers = layer.starts_with("action_predictor.") && index + 1 == sizes.head.depth;
             if gathers || index.is_multiple_of(2) {
-                weights.insert(format!("{layer}.0.causal_mask"), mask(if gathers { sight.frames } else { keys }));
+                weights.insert(format!("{layer}.0.causal_mask"), mask(if gathers { grid.frames } else { keys }));
             }
         }
         weights.insert(name, weight);

@@ -93,7 +93,7 @@ impl<'a> Parts<'a> {
 
     fn policy(&self) -> Head {
         let init = self.init.of("action_predictor");
-        Head::new(&init, &self.config.head, self.config.sight(), Pool::Attention, self.actions)
+        Head::new(&init, &self.config.head, self.config.patch_grid(), Pool::Attention, self.actions)
     }
 
     fn log_stds(&self) -> Param<Tensor<1>> {
@@ -102,13 +102,13 @@ impl<'a> Parts<'a> {
 
     fn value(&self) -> Slow<Head> {
         let init = self.init.of("value_predictor");
-        Slow::new(Head::new(&init, &self.config.head, self.config.sight(), Pool::Mean, 1))
+        Slow::new(Head::new(&init, &self.config.head, self.config.patch_grid(), Pool::Mean, 1))
     }
 
     fn critic(&self) -> Slow<Critic> {
         let GcrlConfig { head, critic, .. } = self.config;
         let init = self.init.of("critic_predictor");
-        Slow::new(Critic::new(&init, head, self.config.sight(), Pool::Mean, self.actions, *critic))
+        Slow::new(Critic::new(&init, head, self.config.patch_grid(), Pool::Mean, self.actions, *critic))
     }
 }
 

@@ -2,7 +2,7 @@
 
 use super::config::GcrlConfig;
 use super::heads::Head;
-use super::transformer::Sight;
+use super::transformer::PatchGrid;
 use crate::feed_forward::{ActionNetwork, FeedForwardPolicy};
 use crate::nn::parameters::IntoF32;
 use crate::nn::{Backbone, DropoutRng};
@@ -54,7 +54,7 @@ impl ImageEncoder for Actor {
     }
 
     fn latent_dim(&self) -> usize {
-        let Sight { patches, dim, .. } = self.config.sight();
+        let PatchGrid { patches, dim, .. } = self.config.patch_grid();
         patches * dim
     }
 

@@ -1,45 +1,46 @@
-//! A transformer over the patches of a few frames that looks at the patches of a goal, and says one thing a frame.
+//! [`Transformer`]: a transformer over the patches of a few frames and of a goal image, with one output per frame.
 //!
-//! Layers take turns: patches attend to the patches of their own and earlier frames, then to those of the goal. What a
-//! frame amounts to is gathered at the end, by a last layer in which one learnt token a frame attends to the patches up to
-//! that frame, or by the mean of its patches.
+//! Layers alternate between causal attention among the patches of the frames and attention to the patches of the goal.
+//! The output of a frame is pooled at the end: by a last layer in which one learnt token per frame attends to the patches
+//! up to that frame, or as the mean of the frame's patches.
 
-use crate::nn::{Activation, DropoutRng, Init, LayerNorm, Linear};
+use crate::nn::attention::{AttentionOutput, attend, causal_mask};
+use crate::nn::{DropoutRng, FeedForward, Init, LayerNorm, Linear};
 use burn::module::{Module, Param};
-use burn::tensor::{Tensor, TensorData, activation};
+use burn::tensor::Tensor;
 use serde::{Deserialize, Serialize};
 
-/// The size of a transformer, and so of a head that stands on one.
+/// The configuration of a transformer, and of a head on top of one.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TransformerConfig {
-    /// Layers.
+    /// Number of layers.
     pub depth: usize,
-    /// Attention heads.
+    /// Number of attention heads.
     pub heads: usize,
     /// Features of an attention head.
     pub dim_head: usize,
-    /// Hidden features of the feed-forward part.
+    /// Hidden features of the feed-forward blocks.
     pub mlp: usize,
     /// Dropout inside the layers.
     pub dropout: f32,
-    /// Dropout of the patches that go in.
+    /// Dropout of the input patches.
     pub emb_dropout: f32,
 }
 
-/// How the patches of a frame become one.
+/// How the patches of a frame are pooled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pool {
-    /// The last layer's tokens attend to them: as published for policies.
+    /// A learnt token per frame attends to them in the last layer, as published for policies.
     Attention,
-    /// Their mean: as published for values.
+    /// Their mean, as published for values.
     Mean,
 }
 
-/// What one transformer looks at.
+/// The sizes of a transformer's input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Sight {
-    /// Frames, at most.
+pub struct PatchGrid {
+    /// The most frames.
     pub frames: usize,
     /// Patches of a frame.
     pub patches: usize,
@@ -47,12 +48,12 @@ pub struct Sight {
     pub dim: usize,
 }
 
-/// The layers.
+/// The transformer.
 #[derive(Module, Debug)]
 pub struct Transformer {
-    /// The last normalisation.
+    /// The normalisation after the last layer.
     pub norm: LayerNorm,
-    /// In order.
+    /// The layers, first to last.
     pub layers: Vec<Layer>,
     #[module(skip)]
     pool: Pool,
@@ -60,139 +61,108 @@ pub struct Transformer {
     patches: usize,
 }
 
-/// Attention, then feed-forward. A field `_0` is number 0 of a sequence.
+/// Attention, then a feed-forward block. A field `_0` is number 0 of a sequence.
 #[derive(Module, Debug)]
 pub struct Layer {
     /// The attention.
     pub _0: Attention,
-    /// The feed-forward part.
+    /// The feed-forward block.
     pub _1: FeedForward,
 }
 
-/// What the queries and the keys of an [`Attention`] are.
+/// The queries and keys of an [`Attention`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Role {
-    /// Patches look at patches of their own and earlier frames.
-    Past,
-    /// Patches look at the goal.
+    /// Patches attend to the patches of their own frame and of earlier frames.
+    Frames,
+    /// Patches attend to the patches of the goal.
     Goal,
-    /// A token a frame looks at patches of that and earlier frames.
-    Gather,
+    /// A learnt token per frame attends to the patches of that frame and of earlier frames.
+    Pool,
 }
 
-/// Attention with its normalisations in front.
+/// Attention with normalised inputs.
 #[derive(Module, Debug)]
 pub struct Attention {
-    /// Of the patches.
+    /// The normalisation of the patches.
     pub norm: LayerNorm,
-    /// Of the goal's patches, where they are looked at.
+    /// The normalisation of the goal's patches, in a layer that attends to them.
     pub norm_c: Option<LayerNorm>,
     /// Queries.
     pub to_q: Linear,
     /// Keys, then values, in one layer.
     pub to_kv: Linear,
-    /// What comes out; absent for a single head of the patches' size.
-    pub to_out: Option<AttentionOut>,
-    /// `[1, frames, dim]`, the queries of a layer that gathers.
+    /// The output projection; absent for a single head of the patches' size.
+    pub to_out: Option<AttentionOutput>,
+    /// `[1, frames, dim]`, the learnt tokens of a pooling layer.
     pub frame_tokens: Option<Param<Tensor<3>>>,
     #[module(skip)]
     role: Role,
     #[module(skip)]
     patches: usize,
     #[module(skip)]
-    size: TransformerConfig,
+    config: TransformerConfig,
 }
 
-/// What comes out of an [`Attention`].
-#[derive(Module, Debug)]
-pub struct AttentionOut {
-    /// The layer.
-    pub _0: Linear,
-}
-
-/// Normalisation, linear, GELU, linear.
-#[derive(Module, Debug)]
-pub struct FeedForward {
-    /// The sequence.
-    pub net: FeedForwardNet,
-    dropout: f32,
-}
-
-/// The sequence of a [`FeedForward`].
-#[derive(Module, Debug)]
-pub struct FeedForwardNet {
-    /// Normalises.
-    pub _0: LayerNorm,
-    /// Into the hidden features.
-    pub _1: Linear,
-    /// Out of them.
-    pub _4: Linear,
-}
-
-/// What the normalisations add to the variance.
+/// Number added to the variance by the normalisations.
 const EPSILON: f64 = 1e-5;
-/// The spread of the tokens that gather.
+/// The standard deviation of the learnt tokens' initial values.
 const TOKEN_STD: f32 = 0.02;
 
 impl TransformerConfig {
-    /// A transformer.
-    pub fn init(&self, init: &Init, sight: Sight, pool: Pool) -> Transformer {
+    /// A transformer for inputs of the given sizes.
+    pub fn init(&self, init: &Init, grid: PatchGrid, pool: Pool) -> Transformer {
         let layer = |index| {
             let init = init.of("layer").at(index);
             let role = match pool {
-                Pool::Attention if index + 1 == self.depth => Role::Gather,
-                _ if index % 2 == 0 => Role::Past,
+                Pool::Attention if index + 1 == self.depth => Role::Pool,
+                _ if index % 2 == 0 => Role::Frames,
                 _ => Role::Goal,
             };
-            Layer { _0: self.attention(&init, sight, role), _1: self.feed_forward(&init, sight.dim) }
+            Layer {
+                _0: self.attention(&init, grid, role),
+                _1: FeedForward::new(&init, grid.dim, self.mlp, self.dropout),
+            }
         };
         Transformer {
-            norm: LayerNorm::new(init, sight.dim, EPSILON),
+            norm: LayerNorm::new(init, grid.dim, EPSILON),
             layers: (0..self.depth).map(layer).collect(),
             pool,
-            patches: sight.patches,
+            patches: grid.patches,
         }
     }
 
-    fn attention(&self, init: &Init, sight: Sight, role: Role) -> Attention {
-        let (Sight { frames, patches, dim }, inner) = (sight, self.heads * self.dim_head);
+    fn attention(&self, init: &Init, grid: PatchGrid, role: Role) -> Attention {
+        let (PatchGrid { frames, patches, dim }, inner) = (grid, self.heads * self.dim_head);
         Attention {
             norm: LayerNorm::new(init, dim, EPSILON),
             norm_c: (role == Role::Goal).then(|| LayerNorm::new(init, dim, EPSILON)),
             to_q: Linear::without_bias(&init.of("to_q"), dim, inner),
             to_kv: Linear::without_bias(&init.of("to_kv"), dim, 2 * inner),
-            to_out: (self.heads != 1 || self.dim_head != dim)
-                .then(|| AttentionOut { _0: Linear::new(&init.of("to_out"), inner, dim) }),
-            frame_tokens: (role == Role::Gather).then(|| init.normal("frame_tokens", [1, frames, dim], TOKEN_STD)),
+            to_out: AttentionOutput::new(init, [self.heads, self.dim_head], dim),
+            frame_tokens: (role == Role::Pool).then(|| init.normal("frame_tokens", [1, frames, dim], TOKEN_STD)),
             role,
             patches,
-            size: self.clone(),
+            config: self.clone(),
         }
-    }
-
-    fn feed_forward(&self, init: &Init, dim: usize) -> FeedForward {
-        let net = FeedForwardNet {
-            _0: LayerNorm::new(init, dim, EPSILON),
-            _1: Linear::new(&init.of("mlp.1"), dim, self.mlp),
-            _4: Linear::new(&init.of("mlp.4"), self.mlp, dim),
-        };
-        FeedForward { net, dropout: self.dropout }
     }
 }
 
 impl Transformer {
+    /// Computes one output per frame.
+    ///
     /// # Shapes
-    /// Frames `[rows, frames * patches, dim]` and a goal `[rows, patches, dim]` to `[rows, frames, dim]`.
-    pub fn forward(&self, frames: Tensor<3>, goal: &Tensor<3>, noise: &mut DropoutRng<'_>) -> Tensor<3> {
+    /// `frames` is `[rows, frames * patches, dim]`, `goal` is `[rows, patches, dim]`; returns `[rows, frames, dim]`.
+    pub fn forward(&self, frames: Tensor<3>, goal: &Tensor<3>, rng: &mut DropoutRng<'_>) -> Tensor<3> {
         let mut x = frames;
         for layer in &self.layers {
-            let mixed = layer._0.forward(x.clone(), goal, noise);
-            // What is gathered has another shape than what it was gathered from.
-            if layer._0.role == Role::Gather {
-                x = layer._1.forward(mixed, noise);
+            let mixed = layer._0.forward(x.clone(), goal, rng);
+            // A pooling layer has no residual connection: its output has another shape than its input.
+            if layer._0.role == Role::Pool {
+                x = layer._1.forward(mixed, rng);
             } else {
                 x = mixed + x;
-                x = layer._1.forward(x.clone(), noise) + x;
+                x = layer._1.forward(x.clone(), rng) + x;
             }
         }
         if self.pool == Pool::Mean {
@@ -205,11 +175,13 @@ impl Transformer {
 }
 
 impl Attention {
-    #[allow(clippy::cast_precision_loss)]
-    fn forward(&self, x: Tensor<3>, goal: &Tensor<3>, noise: &mut DropoutRng<'_>) -> Tensor<3> {
+    /// # Shapes
+    /// `x` is `[rows, frames * patches, dim]`, `goal` is `[rows, patches, dim]`; returns the shape of `x`, or
+    /// `[rows, frames, dim]` from a pooling layer.
+    fn forward(&self, x: Tensor<3>, goal: &Tensor<3>, rng: &mut DropoutRng<'_>) -> Tensor<3> {
         let [rows, tokens, dim] = x.dims();
         let x = self.norm.forward(x);
-        let (asking, asked) = match (&self.frame_tokens, &self.norm_c) {
+        let (queries, context) = match (&self.frame_tokens, &self.norm_c) {
             (Some(token), _) => {
                 let frames = tokens / self.patches;
                 (token.val().slice([0..1, 0..frames, 0..dim]).expand([rows, frames, dim]), x)
@@ -217,46 +189,20 @@ impl Attention {
             (None, Some(norm)) => (x, norm.forward(goal.clone())),
             (None, None) => (x.clone(), x),
         };
-        let ([_, queries, _], [_, keys, _]) = (asking.dims(), asked.dims());
-        let TransformerConfig { heads, dim_head, dropout, .. } = self.size;
+        let ([_, count, _], [_, keys, _]) = (queries.dims(), context.dims());
+        let TransformerConfig { heads, dim_head, dropout, .. } = self.config;
         let inner = heads * dim_head;
-        let both = self.to_kv.forward(asked);
-        let part = |i: usize| both.clone().slice([0..rows, 0..keys, i * inner..(i + 1) * inner]);
+        let key_value = self.to_kv.forward(context);
+        let part = |i: usize| key_value.clone().slice([0..rows, 0..keys, i * inner..(i + 1) * inner]);
         let mixed = if keys == 1 {
-            // All attention goes to what alone is there.
-            part(1).expand([rows, queries, inner])
+            // All attention goes to the only key.
+            part(1).expand([rows, count, inner])
         } else {
-            let split = |x: Tensor<3>, count| x.reshape([rows, count, heads, dim_head]).swap_dims(1, 2);
-            let query = split(self.to_q.forward(asking), queries);
-            let mut scores = query.matmul(split(part(0), keys).transpose()) / (dim_head as f64).sqrt();
-            if self.role != Role::Goal && keys > self.patches {
-                scores = scores.clone() + self.future(queries, keys, &scores);
-            }
-            let weights = noise.dropout(activation::softmax(scores, 3), dropout);
-            weights.matmul(split(part(1), keys)).swap_dims(1, 2).reshape([rows, queries, inner])
+            let query = self.to_q.forward(queries);
+            let mask = (self.role != Role::Goal && keys > self.patches)
+                .then(|| causal_mask([count, keys], keys / self.patches, &query.device()));
+            attend([query, part(0), part(1)], heads, mask, dropout, rng)
         };
-        match &self.to_out {
-            Some(out) => noise.dropout(out._0.forward(mixed), dropout),
-            None => mixed,
-        }
-    }
-
-    /// Minus infinity where a query would look at a later frame, `[1, 1, queries, keys]`.
-    fn future(&self, queries: usize, keys: usize, like: &Tensor<4>) -> Tensor<4> {
-        // Queries are as many a frame as patches, or one a frame.
-        let frames = keys / self.patches;
-        let frame = |query: usize| query * frames / queries;
-        let mask: Vec<f32> = (0..queries * keys)
-            .map(|i| if i % keys / self.patches > frame(i / keys) { f32::NEG_INFINITY } else { 0.0 })
-            .collect();
-        Tensor::from_data(TensorData::new(mask, [1, 1, queries, keys]), &like.device())
-    }
-}
-
-impl FeedForward {
-    fn forward(&self, x: Tensor<3>, noise: &mut DropoutRng<'_>) -> Tensor<3> {
-        let hidden = Activation::Gelu.forward(self.net._1.forward(self.net._0.forward(x)));
-        let hidden = noise.dropout(hidden, self.dropout);
-        noise.dropout(self.net._4.forward(hidden), self.dropout)
+        AttentionOutput::apply(self.to_out.as_ref(), mixed, dropout, rng)
     }
 }

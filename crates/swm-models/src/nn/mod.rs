@@ -3,6 +3,7 @@
 //! generator.
 
 pub mod activation;
+pub mod attention;
 pub mod backbone;
 mod custom_derivative;
 pub mod dino;
@@ -20,6 +21,7 @@ pub mod two_hot;
 pub mod vit;
 
 pub use activation::{Activation, DropoutRng};
+pub use attention::{FeedForward, SelfAttention};
 pub use backbone::{Backbone, BackboneConfig};
 pub use custom_derivative::with_derivative;
 pub use dino::{Dino, DinoConfig};

@@ -3,10 +3,11 @@
 
 #![allow(non_snake_case)] // published parameter names
 
+use super::attention::{FeedForward, SelfAttention, causal_mask};
 use super::norm::standardize;
 use super::{Activation, DropoutRng, Init, LayerNorm, Linear};
 use burn::module::{Module, Param};
-use burn::tensor::{Tensor, TensorData, activation};
+use burn::tensor::Tensor;
 use serde::{Deserialize, Serialize};
 
 /// The size of a [`Predictor`].
@@ -61,7 +62,7 @@ pub struct Transformer {
 #[derive(Module, Debug)]
 pub struct Block {
     /// Self-attention.
-    pub attn: Attention,
+    pub attn: SelfAttention,
     /// The feed-forward part.
     pub mlp: FeedForward,
     /// From the condition to shifts, scales and gates.
@@ -76,42 +77,6 @@ pub struct Modulation {
     pub _1: Linear,
 }
 
-/// Causal self-attention.
-#[derive(Module, Debug)]
-pub struct Attention {
-    /// On what comes in.
-    pub norm: LayerNorm,
-    /// Queries, keys and values in one layer.
-    pub to_qkv: Linear,
-    /// What comes out; absent for a single head of the tokens' size.
-    pub to_out: Option<AttentionOut>,
-}
-
-/// What comes out of an [`Attention`].
-#[derive(Module, Debug)]
-pub struct AttentionOut {
-    /// The layer.
-    pub _0: Linear,
-}
-
-/// Normalisation, linear, GELU, linear.
-#[derive(Module, Debug)]
-pub struct FeedForward {
-    /// The sequence.
-    pub net: FeedForwardNet,
-}
-
-/// The sequence of a [`FeedForward`].
-#[derive(Module, Debug)]
-pub struct FeedForwardNet {
-    /// Normalises.
-    pub _0: LayerNorm,
-    /// Into the hidden features.
-    pub _1: Linear,
-    /// Out of them.
-    pub _4: Linear,
-}
-
 /// What the normalisations before a modulation add to the variance.
 pub(crate) const MODULATED_EPSILON: f64 = 1e-6;
 /// What the other normalisations add.
@@ -120,25 +85,14 @@ const EPSILON: f64 = 1e-5;
 impl PredictorConfig {
     /// A predictor of `latent` numbers.
     pub fn init(&self, init: &Init, latent: usize) -> Predictor {
-        let (dim, inner) = (self.dim, self.heads * self.dim_head);
+        let dim = self.dim;
         let bridge =
             |name: &str, inputs, outputs| (inputs != outputs).then(|| Linear::new(&init.of(name), inputs, outputs));
         let layer = |index| {
             let init = init.of("layer").at(index);
             Block {
-                attn: Attention {
-                    norm: LayerNorm::new(&init, dim, EPSILON),
-                    to_qkv: Linear::without_bias(&init.of("to_qkv"), dim, 3 * inner),
-                    to_out: (self.heads != 1 || self.dim_head != dim)
-                        .then(|| AttentionOut { _0: Linear::new(&init.of("to_out"), inner, dim) }),
-                },
-                mlp: FeedForward {
-                    net: FeedForwardNet {
-                        _0: LayerNorm::new(&init, dim, EPSILON),
-                        _1: Linear::new(&init.of("mlp.1"), dim, self.mlp),
-                        _4: Linear::new(&init.of("mlp.4"), self.mlp, dim),
-                    },
-                },
+                attn: SelfAttention::new(&init, dim, [self.heads, self.dim_head], self.dropout),
+                mlp: FeedForward::new(&init, dim, self.mlp, self.dropout),
                 adaLN_modulation: Modulation { _1: Linear::zeros(&init, dim, 6 * dim) },
             }
         };
@@ -176,8 +130,9 @@ impl Predictor {
         };
         x = through(&parts.input_proj, x);
         let condition = Activation::Silu.forward(through(&parts.cond_proj, actions));
+        let mask = (steps > 1).then(|| causal_mask([steps, steps], steps, &x.device()));
         for layer in &parts.layers {
-            x = layer.forward(x, condition.clone(), &self.config, noise);
+            x = layer.forward(x, condition.clone(), mask.clone(), noise);
         }
         through(&parts.output_proj, parts.norm.forward(x))
     }
@@ -188,7 +143,7 @@ impl Block {
         &self,
         x: Tensor<3>,
         condition: Tensor<3>,
-        config: &PredictorConfig,
+        mask: Option<Tensor<4>>,
         noise: &mut DropoutRng<'_>,
     ) -> Tensor<3> {
         let modulation = self.adaLN_modulation._1.forward(condition).chunk(6, 2);
@@ -197,44 +152,13 @@ impl Block {
         let modulate = |x: Tensor<3>, shift: Tensor<3>, scale: Tensor<3>| {
             standardize(x, MODULATED_EPSILON) * (scale + 1.0) + shift
         };
-        let mixed = self.attn.forward(modulate(x.clone(), shift_attn, scale_attn), config, noise);
-        let x = x + gate_attn * mixed;
-        let fed = self.mlp.forward(modulate(x.clone(), shift_mlp, scale_mlp), config, noise);
-        x + gate_mlp * fed
-    }
-}
-
-impl Attention {
-    #[allow(clippy::cast_precision_loss)]
-    fn forward(&self, x: Tensor<3>, config: &PredictorConfig, noise: &mut DropoutRng<'_>) -> Tensor<3> {
-        let [windows, steps, _] = x.dims();
-        let (heads, width) = (config.heads, config.dim_head);
-        let inner = heads * width;
-        let qkv = self.to_qkv.forward(self.norm.forward(x));
-        let part = |i: usize| qkv.clone().slice([0..windows, 0..steps, i * inner..(i + 1) * inner]);
-        // A single token attends to itself alone.
-        let mixed = if steps == 1 {
-            part(2)
-        } else {
-            let split = |i| part(i).reshape([windows, steps, heads, width]).swap_dims(1, 2);
-            let scores = split(0).matmul(split(1).transpose()) / (width as f64).sqrt();
-            let future: Vec<f32> =
-                (0..steps * steps).map(|i| if i % steps > i / steps { f32::NEG_INFINITY } else { 0.0 }).collect();
-            let future = Tensor::from_data(TensorData::new(future, [1, 1, steps, steps]), &scores.device());
-            let weights = noise.dropout(activation::softmax(scores + future, 3), config.dropout);
-            weights.matmul(split(2)).swap_dims(1, 2).reshape([windows, steps, inner])
+        let modulated = modulate(x.clone(), shift_attn, scale_attn);
+        let mixed = match mask {
+            Some(mask) => self.attn.forward(modulated, Some(mask), noise),
+            None => self.attn.forward_single(modulated, noise),
         };
-        match &self.to_out {
-            Some(out) => noise.dropout(out._0.forward(mixed), config.dropout),
-            None => mixed,
-        }
-    }
-}
-
-impl FeedForward {
-    fn forward(&self, x: Tensor<3>, config: &PredictorConfig, noise: &mut DropoutRng<'_>) -> Tensor<3> {
-        let hidden = Activation::Gelu.forward(self.net._1.forward(self.net._0.forward(x)));
-        let hidden = noise.dropout(hidden, config.dropout);
-        noise.dropout(self.net._4.forward(hidden), config.dropout)
+        let x = x + gate_attn * mixed;
+        let fed = self.mlp.forward(modulate(x.clone(), shift_mlp, scale_mlp), noise);
+        x + gate_mlp * fed
     }
 }

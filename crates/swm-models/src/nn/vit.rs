@@ -1,10 +1,11 @@
 //! A vision transformer (Dosovitskiy et al. 2021, pre-norm, class token, learned positions), named as the
 //! published checkpoints name it. Pictures of other sizes than it was made for get interpolated positions.
 
+use super::attention::attend;
 use super::positions::{Resampling, positions};
-use super::{Activation, Init, LayerNorm, Linear};
+use super::{Activation, DropoutRng, Init, LayerNorm, Linear};
 use burn::module::{Module, Param};
-use burn::tensor::{Tensor, activation};
+use burn::tensor::Tensor;
 use serde::{Deserialize, Serialize};
 
 /// The size of a [`Vit`].
@@ -276,19 +277,11 @@ impl Attention {
     }
 
     /// What all tokens, or the first `asked`, attend to.
-    #[allow(clippy::cast_precision_loss)]
     pub(super) fn forward(&self, x: Tensor<3>, asked: Option<usize>) -> Tensor<3> {
-        let [frames, tokens, dim] = x.dims();
-        let (asked, width) = (asked.unwrap_or(tokens), dim / self.heads);
-        let split = |layer: &Linear, x: Tensor<3>| {
-            let [_, count, _] = x.dims();
-            layer.forward(x).reshape([frames, count, self.heads, width]).swap_dims(1, 2)
-        };
+        let [_, tokens, _] = x.dims();
         let parts = &self.attention;
-        let query = split(&parts.query, leading(x.clone(), asked));
-        let (key, value) = (split(&parts.key, x.clone()), split(&parts.value, x));
-        let scores = query.matmul(key.transpose()) / (width as f64).sqrt();
-        let mixed = activation::softmax(scores, 3).matmul(value);
-        self.output.dense.forward(mixed.swap_dims(1, 2).reshape([frames, asked, dim]))
+        let query = parts.query.forward(leading(x.clone(), asked.unwrap_or(tokens)));
+        let (key, value) = (parts.key.forward(x.clone()), parts.value.forward(x));
+        self.output.dense.forward(attend([query, key, value], self.heads, None, 0.0, &mut DropoutRng::disabled()))
     }
 }

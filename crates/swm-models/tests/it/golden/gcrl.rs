@@ -11,7 +11,7 @@ use swm_data::GoalMixture;
 use swm_models::gcrl::heads::{Critic, Head};
 use swm_models::gcrl::loss::{self, ValueLoss};
 use swm_models::gcrl::step::{Clips, Relabelled};
-use swm_models::gcrl::transformer::{Pool, Sight, TransformerConfig};
+use swm_models::gcrl::transformer::{PatchGrid, Pool, TransformerConfig};
 use swm_models::gcrl::{Gcbc, Gciql, Gcivl, GcrlConfig, import};
 use swm_models::nn::{BackboneConfig, DropoutRng, Init, VitConfig, parameters};
 use swm_models::train::{DatasetInfo, StepOutput};
@@ -117,8 +117,11 @@ fn golden_gcrl_heads() {
         println!("{}", file.display());
         let golden = Golden::read(&file);
         let init = Init::new(Key::new(0), &Device::flex());
-        let sight =
-            Sight { frames: golden.size("num_frames"), patches: golden.size("num_patches"), dim: golden.size("dim") };
+        let sight = PatchGrid {
+            frames: golden.size("num_frames"),
+            patches: golden.size("num_patches"),
+            dim: golden.size("dim"),
+        };
         let (frames, goal) = (golden.tensor("i.x"), golden.tensor("i.goal"));
         let policy = Head::new(&init, &golden.head(), sight, Pool::Attention, golden.size("out_dim"));
         let means = golden.fill("w.policy.", policy).forward(&frames, &goal, &mut DropoutRng::disabled());

@@ -9,7 +9,7 @@ use pyo3::exceptions::PyTypeError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 use std::sync::{Mutex, MutexGuard, PoisonError};
-use swm::core::{Action, Batch, DType, Env, Error, FrameMut, Key, Schema, Snapshot, View, share};
+use swm::core::{Action, Batch, CameraView, DType, Env, Error, FrameMut, Key, Schema, Snapshot, thread_budget};
 
 /// One environment.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
@@ -97,7 +97,7 @@ impl NativeEnv {
         let mut rgb = vec![0; height * width * 3];
         let frame = FrameMut::new(width, height, &mut rgb);
         let draw = || if goal { state.env.render_goal(frame) } else { state.env.render(frame) };
-        process::work(py, || share::all(draw)).map_err(raised)?;
+        process::work(py, || thread_budget::all(draw)).map_err(raised)?;
         arrays::array(py, DType::U8, &[height, width, 3], &rgb)
     }
 
@@ -109,12 +109,13 @@ impl NativeEnv {
         height: usize,
         width: usize,
     ) -> PyResult<Bound<'py, PyAny>> {
-        let view = View::parse(view).map_err(raised)?;
+        let view = CameraView::parse(view).map_err(raised)?;
         let column = view.column(height, width);
         let mut bytes = vec![0; column.row_bytes()];
         let mut state = self.lock();
         let state = &mut *state;
-        process::work(py, || share::all(|| state.env.render_view(&view, height, width, &mut bytes))).map_err(raised)?;
+        process::work(py, || thread_budget::all(|| state.env.render_view(&view, height, width, &mut bytes)))
+            .map_err(raised)?;
         arrays::array(py, column.dtype, &column.shape, &bytes)
     }
 

@@ -129,8 +129,8 @@ impl Policy for Seeded {
         self.policy.act(infos, active, actions)
     }
 
-    fn see(&mut self, worlds: &EnvPool, active: &[bool]) -> Result<()> {
-        self.policy.see(worlds, active)
+    fn observe_envs(&mut self, envs: &EnvPool, active: &[bool]) -> Result<()> {
+        self.policy.observe_envs(envs, active)
     }
 
     fn uses_threads(&self) -> bool {
@@ -154,8 +154,8 @@ impl Policy for Here {
         solver::here(|| self.0.act(infos, active, actions))
     }
 
-    fn see(&mut self, worlds: &EnvPool, active: &[bool]) -> Result<()> {
-        self.0.see(worlds, active)
+    fn observe_envs(&mut self, envs: &EnvPool, active: &[bool]) -> Result<()> {
+        self.0.observe_envs(envs, active)
     }
 
     fn uses_threads(&self) -> bool {

@@ -14,11 +14,12 @@ use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
 use std::time::{Duration, Instant};
 use swm::core::pool::Reset;
 use swm::core::results::Counting;
-use swm::core::{Call, Env, Error, Key, ResetOptions, Snapshot, VariationRequest, View};
+use swm::core::run::{Control, Event};
+use swm::core::{Callable, CameraView, Env, Error, Key, ResetOptions, Snapshot, VariationRequest};
 use swm::data::{ImageCodec, WriteMode, WriteOptions};
 use swm::envs::wrappers::{GoalPicture, Stack, WRAPPERS};
 use swm::eval::world::{episode_key, reset_seed};
-use swm::eval::{CollectConfig, Control, EvalConfig, Progress, Starts, Videos, WorldConfig};
+use swm::eval::{CollectConfig, EvalConfig, Starts, Videos, WorldConfig};
 use swm::gym::GymEnv;
 
 /// Many environments of one kind.
@@ -70,7 +71,7 @@ impl World {
         wrap_goal: bool,
     ) -> PyResult<Self> {
         let (stack, goal) = stack(wrappers, wrap_goal)?;
-        let views: swm::core::Result<Vec<View>> = views.iter().map(|text| View::parse(text)).collect();
+        let views: swm::core::Result<Vec<CameraView>> = views.iter().map(|text| CameraView::parse(text)).collect();
         let config = WorldConfig { envs, image, views: views.map_err(raised)?, max_episode_steps, threads };
         let world = py.detach(|| {
             let chosen = swm::env(&env)?;
@@ -392,7 +393,7 @@ struct Evaluation {
     counting: Counting,
     picks: Option<Vec<[usize; 2]>>,
     goal_offset: usize,
-    callables: Vec<Call>,
+    callables: Vec<Callable>,
     videos: Option<(PathBuf, String, usize)>,
 }
 
@@ -400,26 +401,27 @@ struct Evaluation {
 fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
     let failed = Arc::new(Mutex::new(None));
     let told = Arc::clone(&failed);
-    let mut last: Option<Instant> = None;
-    let progress = progress.map(|call| -> Box<dyn FnMut(Progress) + 'a> {
-        Box::new(move |at| {
-            let done = at.episodes == at.total;
-            if !done && last.is_some_and(|last| last.elapsed() < Duration::from_millis(100)) {
-                return;
-            }
-            last = Some(Instant::now());
-            let outcome = Python::attach(|py| call.call1(py, (at.episodes, at.total, at.steps)).map(drop));
-            if let Err(error) = outcome {
-                told.lock().unwrap_or_else(std::sync::PoisonError::into_inner).get_or_insert(error);
-            }
-        })
-    });
     let mut signals = signals();
-    let poll = move || match failed.lock().unwrap_or_else(std::sync::PoisonError::into_inner).take() {
-        Some(error) => Err(foreign(error)),
-        None => signals(),
-    };
-    Control { stop: None, poll: Some(Box::new(poll)), progress }
+    let control = Control::new().with_poll(move || {
+        match failed.lock().unwrap_or_else(std::sync::PoisonError::into_inner).take() {
+            Some(error) => Err(foreign(error)),
+            None => signals(),
+        }
+    });
+    let Some(call) = progress else { return control };
+    let mut last: Option<Instant> = None;
+    control.with_events(move |event| {
+        let Event::Progress(at) = event else { return };
+        if !at.is_done() && last.is_some_and(|last| last.elapsed() < Duration::from_millis(100)) {
+            return;
+        }
+        last = Some(Instant::now());
+        let steps = at.metric("steps").unwrap_or_default() as usize;
+        let outcome = Python::attach(|py| call.call1(py, (at.done, at.total, steps)).map(drop));
+        if let Err(error) = outcome {
+            told.lock().unwrap_or_else(std::sync::PoisonError::into_inner).get_or_insert(error);
+        }
+    })
 }
 
 /// Options of a reset, from JSON.

@@ -11,12 +11,13 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 use swm_core::results::Summary;
+use swm_core::run::Control;
 use swm_core::{EnvChoice, Error, Named as _, RandomPolicy, Result};
 use swm_data::{
     CacheConfig, ClipSpec, ConvertMode, ConvertOptions, FORMATS, ImageCodec, Loader, LoaderConfig, Location, Reader,
     WriteOptions, convert, create, open,
 };
-use swm_eval::{CollectConfig, Control, World, WorldConfig};
+use swm_eval::{CollectConfig, World, WorldConfig};
 
 /// What to measure.
 #[derive(Clone, Debug)]

@@ -11,10 +11,13 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm_core::pool::Reset;
 use swm_core::results::Summary;
-use swm_core::{Action, EnvChoice, Error, Key, RandomPolicy, ResetOptions, Result, Space, VariationRequest};
+use swm_core::run::Control;
+use swm_core::{
+    Action, ColumnIndices, EnvChoice, Error, Key, RandomPolicy, ResetOptions, Result, Space, VariationRequest,
+};
 use swm_data::{ImageCodec, WriteOptions, create};
 use swm_eval::world::{episode_key, reset_seed};
-use swm_eval::{CollectConfig, Control, World, WorldConfig};
+use swm_eval::{CollectConfig, World, WorldConfig};
 
 /// What to measure.
 #[derive(Clone, Debug)]
@@ -213,8 +216,8 @@ impl Ours {
 
     /// Steps with random actions for about so long: environment steps a second.
     fn step(&mut self, seconds: f64) -> Result<f64> {
-        let schema = self.world.pool().infos().schema();
-        let ended = [schema.index("terminated")?, schema.index("truncated")?];
+        let columns = ColumnIndices::of(self.world.pool().infos().schema())?;
+        let ended = [columns.terminated, columns.truncated];
         let begun = Instant::now();
         let mut steps = 0;
         let elapsed = loop {

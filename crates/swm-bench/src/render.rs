@@ -7,7 +7,7 @@
 use serde::Serialize;
 use std::time::{Duration, Instant};
 use swm_core::results::Summary;
-use swm_core::{Action, Env, EnvChoice, FrameMut, Key, ResetOptions, Result, Space, share};
+use swm_core::{Action, Env, EnvChoice, FrameMut, Key, ResetOptions, Result, Space, thread_budget};
 use swm_eval::world::episode_key;
 
 /// What to measure.
@@ -71,7 +71,7 @@ pub fn bench_render(
                     // The first picture prepares what is kept.
                     let mut picture = |env: &mut dyn Env| {
                         let mut drawn = || env.render(FrameMut::new(size, size, &mut rgb));
-                        share::with(config.threads, || draw(&mut drawn))
+                        thread_budget::with(config.threads, || draw(&mut drawn))
                     };
                     picture(&mut *env)?;
                     let begun = Instant::now();

@@ -2,6 +2,7 @@
 
 use crate::Worlds;
 use swm_core::batch::{Batch, ColumnSpec, DType, Schema};
+use swm_core::columns::flat_factor;
 use swm_core::policy::{ExpertPolicy, Policy, RandomPolicy};
 use swm_core::pool::{Reset, threads};
 use swm_core::{
@@ -368,9 +369,7 @@ pub fn sampled_goals_are_new_and_count_when_reached(worlds: &Worlds) {
 #[allow(clippy::cast_possible_truncation)]
 fn dataset_row(probe: &mut Probe, dtype: DType) -> Batch {
     let mut values = vec![("state".to_owned(), probe.column("state"))];
-    values.extend(
-        probe.env.factors().iter().map(|(key, value)| (format!("variation_{}", key.replace('.', "_")), value.to_vec())),
-    );
+    values.extend(probe.env.factors().iter().map(|(key, value)| (flat_factor(key), value.to_vec())));
     let columns: Vec<ColumnSpec> =
         values.iter().map(|(name, value)| ColumnSpec::new(name.clone(), dtype, [value.len()])).collect();
     let mut row = Batch::zeros(&Schema::new(columns).expect("a schema"), 1);

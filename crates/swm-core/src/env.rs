@@ -5,9 +5,11 @@
 //! full state can be taken and put back ([`Env::snapshot`]), it can start from a row of a dataset
 //! ([`Env::restore_from`]), and it can always make a reachable goal ([`Env::sample_goal`]).
 
-use crate::batch::{ColumnSpec, RowMut, RowRef, Schema};
-use crate::recorded::{Call, Recorded};
-use crate::view::View;
+use crate::batch::{ColumnSpec, RowMut, RowRef};
+use crate::camera_view::CameraView;
+use crate::columns::ACTION;
+use crate::dataset_start::DatasetStartEnv;
+use crate::dispatch::DispatchEnv;
 use crate::{Error, FactorValues, Key, Result, Space, VariationRequest, VariationSpace};
 use std::collections::BTreeMap;
 
@@ -44,7 +46,7 @@ impl EnvSpec {
             Space::Discrete { .. } => vec![1],
             other => other.shape(),
         };
-        ColumnSpec::new("action", self.action_space.dtype(), shape)
+        ColumnSpec::new(ACTION, self.action_space.dtype(), shape)
     }
 }
 
@@ -151,15 +153,6 @@ impl<'a> FrameMut<'a> {
     }
 }
 
-/// What a world will be asked for next ([`Env::announce`]).
-#[derive(Clone, Copy, Debug)]
-pub enum Next<'a> {
-    /// [`Env::reset`].
-    Reset(u64, &'a ResetOptions),
-    /// [`Env::step`].
-    Step(Action<'a>),
-}
-
 /// The full state of an environment, randomness included: opaque bytes, valid for the same environment id.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Snapshot(pub Vec<u8>);
@@ -182,11 +175,9 @@ pub trait Env: Send {
     /// When the action is of the wrong kind, length or range, or not finite.
     fn step(&mut self, action: Action<'_>) -> Result<Transition>;
 
-    /// What comes next, so that a world which lives elsewhere can begin while others are told, too. The very call follows,
-    /// with nothing else in between; what is wrong about it is that call's error. Whether work began, for which the call
-    /// only has to wait.
-    fn announce(&mut self, _next: Next<'_>) -> bool {
-        false
+    /// The environment as one whose calls can be dispatched early, if it runs in another process.
+    fn as_dispatch(&mut self) -> Option<&mut dyn DispatchEnv> {
+        None
     }
 
     /// Writes the columns of [`EnvSpec::columns`] into the first places of a row.
@@ -204,13 +195,13 @@ pub trait Env: Send {
     /// As [`Env::render`].
     fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()>;
 
-    /// Writes what a view of the world shows, in the form of its [`View::column`]. Worlds with one camera know no view
+    /// Writes what a view of the world shows, in the form of its [`CameraView::column`]. Worlds with one camera know no view
     /// but that of [`Env::render`].
     ///
     /// # Errors
     /// When there is no such camera, or no such modality; and as [`Env::render`].
-    fn render_view(&mut self, view: &View, height: usize, width: usize, out: &mut [u8]) -> Result<()> {
-        if *view == View::default() {
+    fn render_view(&mut self, view: &CameraView, height: usize, width: usize, out: &mut [u8]) -> Result<()> {
+        if *view == CameraView::default() {
             return self.render(FrameMut::new(width, height, out));
         }
         Err(view.unknown(self.spec()))
@@ -246,34 +237,15 @@ pub trait Env: Send {
     /// When a row lacks what the environment needs.
     fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()>;
 
-    /// The columns that [`Env::reset_from`] makes use of, of those a dataset has; `calls` are as in [`Recorded`]. Here, all but
-    /// pictures.
-    ///
-    /// # Errors
-    /// When it lacks one that is needed: here, a `state` of the world's shape.
-    fn recorded_columns(&self, stored: &Schema, _calls: &[Call]) -> Result<Vec<String>> {
-        let (spec, state) = (self.spec(), stored.column("state")?);
-        if let Some(own) = spec.columns.iter().find(|column| column.name == "state")
-            && own.shape != state.shape
-        {
-            return Err(Error::mismatch(
-                format!("starting {} from a dataset", spec.id),
-                format!("states of shape {:?}", state.shape),
-                format!("{:?}; was the dataset collected in this environment?", own.shape),
-            ));
-        }
-        let kept = stored.columns().iter().filter(|column| !column.is_image());
-        Ok(kept.map(|column| column.name.clone()).collect())
+    /// The environment's own way to start at rows of a dataset, where it cannot restore its state from a row.
+    /// [`crate::dataset_start`] holds the functions that callers use.
+    fn dataset_start(&self) -> Option<&dyn DatasetStartEnv> {
+        None
     }
 
-    /// Starts an episode at a row of a dataset, towards the state of another row: [`Env::reset`], which decides what the
-    /// rows do not (randomness, factors that are shifted or not recorded), then [`Env::restore_from`].
-    ///
-    /// # Errors
-    /// As both of them.
-    fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: Recorded<'_>) -> Result<()> {
-        self.reset(seed, options)?;
-        self.restore_from(from.start, from.goal)
+    /// As [`Env::dataset_start`], to start an episode.
+    fn dataset_start_mut(&mut self) -> Option<&mut dyn DatasetStartEnv> {
+        None
     }
 
     /// Chooses a new reachable goal that is not already reached, without moving the world.

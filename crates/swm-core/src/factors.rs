@@ -1,12 +1,7 @@
 //! Factor values as bytes, and out of dataset rows: what every environment's `snapshot`, `restore` and
 //! `restore_from` need.
 
-use crate::{Error, FactorValues, Key, Result, RowRef, Snapshot, VariationRequest, VariationSpace};
-
-/// The column that holds a factor in a dataset: `variation_agent_color` for `agent.color`.
-pub fn column(key: &str) -> String {
-    format!("variation_{}", key.replace('.', "_"))
-}
+use crate::{Error, FactorValues, Key, Result, RowRef, Snapshot, VariationRequest, VariationSpace, columns};
 
 /// A request that resolves to exactly these values.
 ///
@@ -27,7 +22,7 @@ pub fn pin(values: &FactorValues) -> VariationRequest {
 pub fn from_row(space: &VariationSpace, current: &FactorValues, row: RowRef<'_>) -> Result<FactorValues> {
     let mut request = pin(current);
     for factor in space.factors() {
-        let name = column(&factor.key);
+        let name = columns::flat_factor(&factor.key);
         if row.schema().find(&name).is_some() {
             let value: Vec<f64> =
                 row.to_f64(&name)?.iter().enumerate().map(|(i, &v)| snapped(v, factor.space.bounds(i))).collect();

@@ -42,12 +42,12 @@ pub trait CostModel: Send {
     /// When the candidates do not fit the model.
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()>;
 
-    /// Shows the world of `slot` itself, before [`CostModel::observe`] names that slot. Only a model with privileged
-    /// information, such as a simulator, looks.
+    /// Reads the environment of `slot` itself, before [`CostModel::observe`] names that slot. Only a model with privileged
+    /// information, such as a simulator, does.
     ///
     /// # Errors
-    /// When the world is not one the model knows.
-    fn see(&mut self, _slot: usize, _env: &dyn Env) -> Result<()> {
+    /// When the model does not support the environment.
+    fn observe_env(&mut self, _slot: usize, _env: &dyn Env) -> Result<()> {
         Ok(())
     }
 

@@ -4,8 +4,8 @@
 //! played the same way wherever it runs.
 
 use crate::batch::{Batch, DType, RowMut, RowRef};
-use crate::pace::Pace;
-use crate::{EnvPool, EnvSpec, Error, Key, Result, Rng};
+use crate::parallelism::Parallelism;
+use crate::{EnvPool, EnvSpec, Error, Key, Result, Rng, columns};
 use std::time::Instant;
 
 /// Who acts.
@@ -19,12 +19,12 @@ pub trait Policy: Send {
     /// When the infos lack what the policy needs, or its model fails.
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()>;
 
-    /// Shows the worlds themselves, before [`Policy::act`]. Only a policy with privileged information, such as one that
-    /// plans in a simulator, looks.
+    /// Reads the environments themselves, before [`Policy::act`]. Only a policy with privileged information, such as one that
+    /// plans in a simulator, does.
     ///
     /// # Errors
-    /// When a world is not one the policy knows.
-    fn see(&mut self, _worlds: &EnvPool, _active: &[bool]) -> Result<()> {
+    /// When the policy does not support an environment.
+    fn observe_envs(&mut self, _envs: &EnvPool, _active: &[bool]) -> Result<()> {
         Ok(())
     }
 
@@ -58,7 +58,7 @@ impl Policy for RandomPolicy {
     }
 
     fn act(&mut self, _infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
-        let column = actions.schema().index("action")?;
+        let column = actions.schema().index(columns::ACTION)?;
         for slot in (0..active.len()).filter(|&slot| active[slot]) {
             let action = self.spec.action_space.sample(&mut self.rngs[slot]);
             write_action(&mut actions.row_mut(slot), column, &action);
@@ -85,11 +85,11 @@ pub trait Expert: Send {
 
 /// One [`Expert`] a slot.
 pub struct ExpertPolicy {
-    seats: Vec<Seat>,
-    pace: Pace,
+    slots: Vec<ExpertSlot>,
+    parallelism: Parallelism,
 }
 
-struct Seat {
+struct ExpertSlot {
     expert: Box<dyn Expert>,
     action: Vec<f64>,
     failed: Option<Error>,
@@ -98,40 +98,40 @@ struct Seat {
 impl ExpertPolicy {
     /// A policy of these experts, one a slot.
     pub fn new(spec: &EnvSpec, experts: Vec<Box<dyn Expert>>) -> Self {
-        let seat = |expert| Seat { expert, action: vec![0.0; spec.action_dim()], failed: None };
-        Self { seats: experts.into_iter().map(seat).collect(), pace: Pace::default() }
+        let slot_expert = |expert| ExpertSlot { expert, action: vec![0.0; spec.action_dim()], failed: None };
+        Self { slots: experts.into_iter().map(slot_expert).collect(), parallelism: Parallelism::default() }
     }
 }
 
 impl Policy for ExpertPolicy {
     fn begin(&mut self, slot: usize, key: Key) {
-        self.seats[slot].expert.begin(key.with("expert"));
+        self.slots[slot].expert.begin(key.with("expert"));
     }
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
-        let column = actions.schema().index("action")?;
-        let work = |slot: usize, mut row: RowMut<'_>, seat: &mut Seat| {
+        let column = actions.schema().index(columns::ACTION)?;
+        let work = |slot: usize, mut row: RowMut<'_>, slot_expert: &mut ExpertSlot| {
             if active[slot] {
-                seat.failed = seat.expert.act(infos.row(slot), &mut seat.action).err();
-                write_action(&mut row, column, &seat.action);
+                slot_expert.failed = slot_expert.expert.act(infos.row(slot), &mut slot_expert.action).err();
+                write_action(&mut row, column, &slot_expert.action);
             }
         };
         let begun = Instant::now();
         let alone = !self.uses_threads();
         if alone {
-            for (slot, seat) in self.seats.iter_mut().enumerate() {
-                work(slot, actions.row_mut(slot), seat);
+            for (slot, slot_expert) in self.slots.iter_mut().enumerate() {
+                work(slot, actions.row_mut(slot), slot_expert);
             }
         } else {
-            actions.par_zip_mut(&mut self.seats, work);
+            actions.par_zip_mut(&mut self.slots, work);
         }
         let workers = if alone { 1 } else { rayon::current_num_threads() };
-        self.pace.note(begun, workers, self.seats.len());
-        self.seats.iter_mut().find_map(|seat| seat.failed.take()).map_or(Ok(()), Err)
+        self.parallelism.record(begun, workers, self.slots.len());
+        self.slots.iter_mut().find_map(|slot_expert| slot_expert.failed.take()).map_or(Ok(()), Err)
     }
 
     fn uses_threads(&self) -> bool {
-        !self.pace.alone(self.seats.len())
+        !self.parallelism.is_serial(self.slots.len())
     }
 }
 

@@ -6,9 +6,10 @@
 //! number of threads or of neighbours.
 
 use crate::batch::{Batch, ColumnSpec, DType, RowMut, Schema};
-use crate::pace::Pace;
-use crate::share;
-use crate::{Action, Env, EnvSpec, Error, FrameMut, Next, ResetOptions, Result, View};
+use crate::columns::{self, ColumnIndices};
+use crate::parallelism::Parallelism;
+use crate::thread_budget;
+use crate::{Action, CameraView, Env, EnvSpec, Error, FrameMut, PendingCall, ResetOptions, Result};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -23,26 +24,70 @@ pub struct Reset {
     pub options: ResetOptions,
 }
 
-/// Columns the pool adds behind the environment's own.
-struct Places {
-    reward: usize,
-    terminated: usize,
-    truncated: usize,
-    success: usize,
-    step: usize,
-    pixels: Option<(usize, usize, usize)>,
-    /// The views behind `pixels` and `goal`.
-    views: Vec<View>,
+/// The columns that the pool adds after the environment's own.
+struct PoolColumns {
+    at: ColumnIndices,
+    step_idx: usize,
+    frames: Option<FrameColumns>,
+    /// The views that are rendered besides `pixels` and `goal`.
+    views: Vec<CameraView>,
+}
+
+/// Indices of the columns that hold frames, and the size of a frame in pixels.
+#[derive(Clone, Copy)]
+struct FrameColumns {
+    pixels: usize,
+    goal: usize,
+    /// The first view; one column for each view follows.
+    first_view: usize,
+    height: usize,
+    width: usize,
+}
+
+impl PoolColumns {
+    /// Appends the pool's columns to those of an environment.
+    fn add(
+        mut columns: Vec<ColumnSpec>,
+        image: Option<(usize, usize)>,
+        views: Vec<CameraView>,
+    ) -> Result<(Schema, Self)> {
+        columns.push(ColumnSpec::new(columns::REWARD, DType::Float32, []));
+        columns.push(ColumnSpec::new(columns::TERMINATED, DType::Bool, []));
+        columns.push(ColumnSpec::new(columns::TRUNCATED, DType::Bool, []));
+        columns.push(ColumnSpec::new(columns::SUCCESS, DType::Bool, []));
+        columns.push(ColumnSpec::new(columns::STEP_IDX, DType::Int32, []));
+        if let Some((height, width)) = image {
+            columns.push(ColumnSpec::image(columns::PIXELS, height, width));
+            columns.push(ColumnSpec::image(columns::GOAL, height, width));
+        }
+        let first_view = columns.len();
+        if let Some((height, width)) = image {
+            columns.extend(views.iter().map(|view| view.column(height, width)));
+        }
+        let schema = Schema::new(columns)?;
+        let frames = match image {
+            None => None,
+            Some((height, width)) => Some(FrameColumns {
+                pixels: schema.index(columns::PIXELS)?,
+                goal: schema.index(columns::GOAL)?,
+                first_view,
+                height,
+                width,
+            }),
+        };
+        let (at, step_idx) = (ColumnIndices::of(&schema)?, schema.index(columns::STEP_IDX)?);
+        Ok((schema, Self { at, step_idx, frames, views }))
+    }
 }
 
 /// Many environments of one kind.
 pub struct EnvPool {
     slots: Vec<Slot>,
     infos: Batch,
-    places: Places,
+    columns: PoolColumns,
     threads: Arc<rayon::ThreadPool>,
     max_episode_steps: usize,
-    pace: Pace,
+    parallelism: Parallelism,
 }
 
 struct Slot {
@@ -74,14 +119,14 @@ impl EnvPool {
         Self::with_views(envs, image, vec![], max_episode_steps, threads)
     }
 
-    /// As [`EnvPool::new`], with further views of the worlds, each in its own [`View::column`] behind `goal`.
+    /// As [`EnvPool::new`], with further views of the worlds, each in its own [`CameraView::column`] behind `goal`.
     ///
     /// # Errors
     /// As [`EnvPool::new`], and when views are asked for without a picture's size, or one of them twice.
     pub fn with_views(
         envs: Vec<Box<dyn Env>>,
         image: Option<(usize, usize)>,
-        views: Vec<View>,
+        views: Vec<CameraView>,
         max_episode_steps: Option<usize>,
         threads: Arc<rayon::ThreadPool>,
     ) -> Result<Self> {
@@ -92,36 +137,15 @@ impl EnvPool {
             return Err(Error::config("number of environments", "0", "ask for at least 1"));
         };
         let spec = first.spec();
-        let mut columns = spec.columns.clone();
-        let reward = columns.len();
-        columns.push(ColumnSpec::new("reward", DType::Float32, []));
-        columns.push(ColumnSpec::new("terminated", DType::Bool, []));
-        columns.push(ColumnSpec::new("truncated", DType::Bool, []));
-        columns.push(ColumnSpec::new("success", DType::Bool, []));
-        columns.push(ColumnSpec::new("step_idx", DType::Int32, []));
-        if let Some((height, width)) = image {
-            columns.push(ColumnSpec::image("pixels", height, width));
-            columns.push(ColumnSpec::image("goal", height, width));
-            columns.extend(views.iter().map(|view| view.column(height, width)));
-        }
-        let places = Places {
-            reward,
-            terminated: reward + 1,
-            truncated: reward + 2,
-            success: reward + 3,
-            step: reward + 4,
-            pixels: image.map(|(height, width)| (reward + 5, height, width)),
-            views,
-        };
+        let (schema, columns) = PoolColumns::add(spec.columns.clone(), image, views)?;
         let max_episode_steps = max_episode_steps.unwrap_or(spec.max_episode_steps);
-        let schema = Schema::new(columns)?;
         Ok(Self {
             infos: Batch::zeros(&schema, envs.len()),
             slots: envs.into_iter().map(|env| Slot { env, steps: 0, failed: None }).collect(),
-            places,
+            columns,
             threads,
             max_episode_steps,
-            pace: Pace::default(),
+            parallelism: Parallelism::default(),
         })
     }
 
@@ -147,12 +171,12 @@ impl EnvPool {
 
     /// The `(height, width)` of the pictures, if there are any.
     pub fn image(&self) -> Option<(usize, usize)> {
-        self.places.pixels.map(|(_, height, width)| (height, width))
+        self.columns.frames.map(|frames| (frames.height, frames.width))
     }
 
     /// What is drawn besides `pixels` and `goal`.
-    pub fn views(&self) -> &[View] {
-        &self.places.views
+    pub fn views(&self) -> &[CameraView] {
+        &self.columns.views
     }
 
     /// The worker threads.
@@ -181,13 +205,13 @@ impl EnvPool {
         }
         for (slot, reset) in self.slots.iter_mut().zip(&wanted) {
             if let Some(reset) = reset {
-                slot.env.announce(Next::Reset(reset.seed, &reset.options));
+                slot.dispatch(PendingCall::Reset(reset.seed, &reset.options));
             }
         }
-        self.each(Some(resets.len()), |i, slot, places, row| {
+        self.each(Some(resets.len()), |i, slot, columns, row| {
             let Some(reset) = wanted[i] else { return Ok(()) };
             slot.env.reset(reset.seed, &reset.options)?;
-            slot.start(places, row)
+            slot.start(columns, row)
         })
     }
 
@@ -200,12 +224,12 @@ impl EnvPool {
         slots: &[usize],
         change: impl Fn(usize, &mut dyn Env) -> Result<()> + Sync,
     ) -> Result<()> {
-        self.each(Some(slots.len()), |i, slot, places, row| {
+        self.each(Some(slots.len()), |i, slot, columns, row| {
             if !slots.contains(&i) {
                 return Ok(());
             }
             change(i, &mut *slot.env)?;
-            slot.start(places, row)
+            slot.start(columns, row)
         })
     }
 
@@ -222,7 +246,7 @@ impl EnvPool {
                 format!("{} of each", self.len()),
             ));
         }
-        let column = actions.schema().index("action")?;
+        let column = actions.schema().index(columns::ACTION)?;
         let dtype = actions.schema().columns()[column].dtype;
         let wanted = self.spec().action_column();
         if actions.schema().columns()[column] != wanted {
@@ -239,13 +263,13 @@ impl EnvPool {
             DType::Float32 => Action::Continuous(actions.row(i).at::<f32>(column)),
             _ => Action::Discrete(actions.row(i).at::<i64>(column)),
         };
-        let mut elsewhere = true;
+        let mut dispatched = true;
         for (i, slot) in self.slots.iter_mut().enumerate().filter(|(i, _)| active[*i]) {
-            elsewhere &= slot.env.announce(Next::Step(action(i)));
+            dispatched &= slot.dispatch(PendingCall::Step(action(i)));
         }
-        // To wait for what others do, one thread is enough; pictures are scaled and changed here.
-        let alone = self.pace.alone(stepping) || (elsewhere && self.places.pixels.is_none());
-        let stepped = self.each((!alone).then_some(stepping), |i, slot, places, row| {
+        // One thread is enough to wait for other processes; frames are resized and changed in this one.
+        let serial = self.parallelism.is_serial(stepping) || (dispatched && self.columns.frames.is_none());
+        let stepped = self.each((!serial).then_some(stepping), |i, slot, columns, row| {
             if !active[i] {
                 return Ok(());
             }
@@ -253,12 +277,12 @@ impl EnvPool {
             slot.steps += 1;
             transition.truncated |= slot.steps >= limit && !transition.terminated;
             #[allow(clippy::cast_possible_truncation)]
-            row.set(places.reward, &[transition.reward as f32]);
-            row.set(places.terminated, &[u8::from(transition.terminated)]);
-            row.set(places.truncated, &[u8::from(transition.truncated)]);
-            slot.look(places, row)
+            row.set(columns.at.reward, &[transition.reward as f32]);
+            row.set(columns.at.terminated, &[u8::from(transition.terminated)]);
+            row.set(columns.at.truncated, &[u8::from(transition.truncated)]);
+            slot.observe(columns, row)
         });
-        self.pace.note(begun, if alone { 1 } else { self.threads.current_num_threads() }, stepping);
+        self.parallelism.record(begun, if serial { 1 } else { self.threads.current_num_threads() }, stepping);
         stepped
     }
 
@@ -267,20 +291,20 @@ impl EnvPool {
     fn each(
         &mut self,
         busy: Option<usize>,
-        work: impl Fn(usize, &mut Slot, &Places, &mut RowMut<'_>) -> Result<()> + Sync,
+        work: impl Fn(usize, &mut Slot, &PoolColumns, &mut RowMut<'_>) -> Result<()> + Sync,
     ) -> Result<()> {
-        let (places, slots, infos) = (&self.places, &mut self.slots, &mut self.infos);
+        let (columns, slots, infos) = (&self.columns, &mut self.slots, &mut self.infos);
         match busy {
             None => {
                 for (i, slot) in slots.iter_mut().enumerate() {
-                    slot.failed = work(i, slot, places, &mut infos.row_mut(i)).err();
+                    slot.failed = work(i, slot, columns, &mut infos.row_mut(i)).err();
                 }
             }
             Some(busy) => {
                 let threads = self.threads.current_num_threads().div_ceil(busy.max(1));
                 self.threads.install(|| {
                     infos.par_zip_mut(slots, |i, mut row, slot| {
-                        slot.failed = share::with(threads, || work(i, slot, places, &mut row)).err();
+                        slot.failed = thread_budget::with(threads, || work(i, slot, columns, &mut row)).err();
                     });
                 });
             }
@@ -296,31 +320,36 @@ impl EnvPool {
 }
 
 impl Slot {
+    /// Dispatches a call to the environment's process, if it has one, and returns whether the work started.
+    fn dispatch(&mut self, call: PendingCall<'_>) -> bool {
+        self.env.as_dispatch().is_some_and(|env| env.dispatch(call))
+    }
+
     /// Fills a row after a reset.
-    fn start(&mut self, places: &Places, row: &mut RowMut<'_>) -> Result<()> {
+    fn start(&mut self, columns: &PoolColumns, row: &mut RowMut<'_>) -> Result<()> {
         self.steps = 0;
-        row.set(places.reward, &[0.0f32]);
-        row.set(places.terminated, &[0u8]);
-        row.set(places.truncated, &[0u8]);
-        self.look(places, row)?;
-        match places.pixels {
-            Some((pixels, height, width)) => {
-                self.env.render_goal(FrameMut::new(width, height, row.at::<u8>(pixels + 1)))
+        row.set(columns.at.reward, &[0.0f32]);
+        row.set(columns.at.terminated, &[0u8]);
+        row.set(columns.at.truncated, &[0u8]);
+        self.observe(columns, row)?;
+        match columns.frames {
+            Some(FrameColumns { goal, height, width, .. }) => {
+                self.env.render_goal(FrameMut::new(width, height, row.at::<u8>(goal)))
             }
             None => Ok(()),
         }
     }
 
     /// Fills the parts of a row that follow the world.
-    fn look(&mut self, places: &Places, row: &mut RowMut<'_>) -> Result<()> {
+    fn observe(&mut self, columns: &PoolColumns, row: &mut RowMut<'_>) -> Result<()> {
         self.env.observe(row);
-        row.set(places.success, &[u8::from(self.env.is_success())]);
+        row.set(columns.at.success, &[u8::from(self.env.is_success())]);
         #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
-        row.set(places.step, &[self.steps as i32]);
-        if let Some((pixels, height, width)) = places.pixels {
+        row.set(columns.step_idx, &[self.steps as i32]);
+        if let Some(FrameColumns { pixels, first_view, height, width, .. }) = columns.frames {
             self.env.render(FrameMut::new(width, height, row.at::<u8>(pixels)))?;
-            for (i, view) in places.views.iter().enumerate() {
-                self.env.render_view(view, height, width, row.bytes(pixels + 2 + i))?;
+            for (i, view) in columns.views.iter().enumerate() {
+                self.env.render_view(view, height, width, row.bytes(first_view + i))?;
             }
         }
         Ok(())

@@ -21,13 +21,15 @@
 //! The seed is split because datasets store numbers as `float32`, which holds whole numbers up to 2^24; and it is
 //! not called `seed` because the reference resets environments with a column of that name.
 
-use crate::world::{Control, Places, Play, Progress, World, episode_key, reset, reset_seed};
+use crate::world::{Play, World, episode_key, reset, reset_seed};
 use serde::Serialize;
 use serde_json::json;
 use std::collections::VecDeque;
 use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
 use std::thread::{ScopedJoinHandle, scope};
+use swm_core::columns::{self, ColumnIndices};
 use swm_core::pool::Reset;
+use swm_core::run::{Control, Progress};
 use swm_core::{
     Batch, ColumnSpec, DType, EnvPool, EnvSpec, Error, Key, Manifest, Policy, Result, Schema, VariationRequest,
 };
@@ -180,11 +182,14 @@ struct Layout {
     schema: Schema,
     /// `(place in the infos, place in the episode)` of what is copied.
     observed: Vec<(usize, usize)>,
+    /// The standard columns of the episode.
+    columns: ColumnIndices,
     action: usize,
-    reward: usize,
     /// The first factor column; one for each factor follows.
     factors: usize,
-    places: Places,
+    episode_seed: usize,
+    /// The standard columns of the infos.
+    infos: ColumnIndices,
 }
 
 impl Layout {
@@ -192,27 +197,28 @@ impl Layout {
         let mut columns: Vec<ColumnSpec> = vec![];
         let mut observed = vec![];
         let copied = |name: &str| match name {
-            "reward" | "terminated" | "truncated" | "step_idx" => false,
-            "goal" => goal,
+            columns::REWARD | columns::TERMINATED | columns::TRUNCATED | columns::STEP_IDX => false,
+            columns::GOAL => goal,
             _ => true,
         };
         for (from, column) in infos.columns().iter().enumerate().filter(|(_, column)| copied(&column.name)) {
             observed.push((from, columns.len()));
-            columns.push(ColumnSpec { name: column.name.replace('/', "."), ..column.clone() });
+            columns.push(ColumnSpec { name: columns::collected(&column.name), ..column.clone() });
         }
         let action = columns.len();
         columns.push(spec.action_column());
-        let reward = columns.len();
-        columns.push(ColumnSpec::new("reward", DType::Float32, []));
-        columns.push(ColumnSpec::new("terminated", DType::Bool, []));
-        columns.push(ColumnSpec::new("truncated", DType::Bool, []));
+        columns.push(ColumnSpec::new(columns::REWARD, DType::Float32, []));
+        columns.push(ColumnSpec::new(columns::TERMINATED, DType::Bool, []));
+        columns.push(ColumnSpec::new(columns::TRUNCATED, DType::Bool, []));
         let factors = columns.len();
         for factor in spec.variation_space.factors() {
-            let name = format!("variation.{}", factor.key);
-            columns.push(ColumnSpec::new(name, factor.space.dtype(), factor.space.shape()));
+            columns.push(ColumnSpec::new(columns::factor(&factor.key), factor.space.dtype(), factor.space.shape()));
         }
-        columns.push(ColumnSpec::new("episode_seed", DType::Int32, [3]));
-        Ok(Self { schema: Schema::new(columns)?, observed, action, reward, factors, places: Places::of(infos)? })
+        let episode_seed = columns.len();
+        columns.push(ColumnSpec::new(columns::EPISODE_SEED, DType::Int32, [3]));
+        let schema = Schema::new(columns)?;
+        let (columns, infos) = (ColumnIndices::of(&schema)?, ColumnIndices::of(infos)?);
+        Ok(Self { schema, observed, columns, action, factors, episode_seed, infos })
     }
 
     /// Writes what a slot shows into a row, the first one behind those there are at most.
@@ -232,18 +238,11 @@ impl Layout {
         for (i, (_, value)) in factors.iter().enumerate() {
             fill(episode, self.factors + i, value);
         }
-        let seed_column = self.factors + factors.factors().len();
-        let digits = seed_digits(seed);
+        let elements = columns::split_seed(seed);
         for row in 0..episode.rows() {
-            episode.row_mut(row).set(seed_column, &digits);
+            episode.row_mut(row).set(self.episode_seed, &elements);
         }
     }
-}
-
-/// A seed of 63 bits as three numbers of 21 bits, the lowest first.
-#[allow(clippy::cast_possible_truncation)]
-fn seed_digits(seed: u64) -> [i32; 3] {
-    [0, 21, 42].map(|shift| (seed >> shift & 0x1f_ffff) as i32)
 }
 
 /// Writes a value into all rows of a column, in the column's type.
@@ -325,7 +324,13 @@ impl Collecting<'_> {
     fn note_stored(&mut self, rows: Batch, control: &mut Control<'_>) {
         self.spare.push(rows);
         self.stored += 1;
-        control.report(Progress { episodes: self.stored, total: self.config.episodes, steps: self.steps });
+        control.progress(Progress {
+            stage: "collect",
+            done: self.stored,
+            total: self.config.episodes,
+            unit: "episodes",
+            metrics: &[("steps", self.steps as f64)],
+        });
     }
 
     /// Waits for the writer. Its error, if it has one, is the cause of every other.
@@ -389,13 +394,13 @@ impl Play for Collecting<'_> {
             self.note_stored(rows, control);
         }
         let Some(mut recording) = self.recordings[slot].take() else { return Ok(false) };
-        let (layout, places, infos) = (&self.layout, self.layout.places, pool.infos());
+        let (layout, seen, infos) = (&self.layout, self.layout.infos, pool.infos());
         let last = infos.row(slot);
-        let (terminated, truncated) = (last.at::<u8>(places.terminated)[0], last.at::<u8>(places.truncated)[0]);
+        let (terminated, truncated) = (last.at::<u8>(seen.terminated)[0], last.at::<u8>(seen.truncated)[0]);
         let mut row = recording.rows.row_mut(recording.length - 1);
-        row.set(layout.reward, last.at::<f32>(places.reward));
-        row.set(layout.reward + 1, &[terminated]);
-        row.set(layout.reward + 2, &[truncated]);
+        row.set(layout.columns.reward, last.at::<f32>(seen.reward));
+        row.set(layout.columns.terminated, &[terminated]);
+        row.set(layout.columns.truncated, &[truncated]);
         self.steps += 1;
         if terminated + truncated == 0 {
             self.recordings[slot] = Some(recording);
@@ -408,9 +413,9 @@ impl Play for Collecting<'_> {
             DType::Float32 => row.at::<f32>(layout.action).fill(f32::NAN),
             _ => row.at::<i64>(layout.action).fill(-1),
         }
-        row.set(layout.reward, &[0.0f32]);
-        row.set(layout.reward + 1, &[0u8]);
-        row.set(layout.reward + 2, &[0u8]);
+        row.set(layout.columns.reward, &[0.0f32]);
+        row.set(layout.columns.terminated, &[0u8]);
+        row.set(layout.columns.truncated, &[0u8]);
         let seed = reset_seed(self.key(recording.number));
         recording.rows.resize(recording.length);
         layout.fill_constants(&mut recording.rows, pool, slot, seed);

@@ -9,11 +9,12 @@
 use crate::Starts;
 use crate::filming::{Filming, Videos};
 use crate::judge::{Judge, Seen};
-use crate::world::{Control, Places, Play, Progress, World};
+use crate::world::{Play, World};
 use serde::Serialize;
 use std::time::Instant;
 use swm_core::results::{Counting, EpisodeResult, Proportion, Run, Summary, Timing};
-use swm_core::{Batch, EnvPool, Error, Key, Policy, Result};
+use swm_core::run::{Control, Progress};
+use swm_core::{Batch, ColumnIndices, EnvPool, Error, Key, Policy, Result};
 
 /// How to evaluate.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -64,7 +65,7 @@ impl World {
         let mut judging = Judging {
             starts,
             first_to_finish: episodic && matches!(config.counting, Counting::Compat { .. }),
-            places: Places::of(self.pool().infos().schema())?,
+            columns: ColumnIndices::of(self.pool().infos().schema())?,
             slots: vec![(0, Judge::new(config.counting, budget)); self.pool().len()],
             episodes: vec![],
             finished: vec![],
@@ -110,7 +111,7 @@ struct Judging<'a> {
     starts: &'a Starts,
     /// Whether episodes begin until enough have finished, instead of one a start.
     first_to_finish: bool,
-    places: Places,
+    columns: ColumnIndices,
     /// The episode each slot plays, and its judge.
     slots: Vec<(usize, Judge)>,
     /// Every episode begun.
@@ -128,7 +129,13 @@ impl Judging<'_> {
         let (episode, judge) = self.slots[slot];
         self.finished.push(episode);
         self.satisfied += usize::from(judge.satisfied() && !self.episodes[episode].solved_at_start);
-        control.report(Progress { episodes: self.finished.len(), total: self.starts.len(), steps: self.steps });
+        control.progress(Progress {
+            stage: "evaluate",
+            done: self.finished.len(),
+            total: self.starts.len(),
+            unit: "episodes",
+            metrics: &[("steps", self.steps as f64)],
+        });
     }
 
     fn film(&mut self, slot: usize, pool: &EnvPool) {
@@ -172,7 +179,7 @@ impl Play for Judging<'_> {
 
     fn started(&mut self, slot: usize, pool: &EnvPool, control: &mut Control<'_>) -> Result<bool> {
         self.film(slot, pool);
-        let solved = pool.infos().row(slot).at::<u8>(self.places.success)[0] != 0;
+        let solved = pool.infos().row(slot).at::<u8>(self.columns.success)[0] != 0;
         let (episode, judge) = self.slots[slot];
         self.episodes[episode].solved_at_start = solved;
         let plays = judge.plays(solved);
@@ -194,10 +201,10 @@ impl Play for Judging<'_> {
         let row = pool.infos().row(slot);
         let flag = |place| row.at::<u8>(place)[0] != 0;
         let seen = Seen {
-            reward: row.at::<f32>(self.places.reward)[0],
-            success: flag(self.places.success),
-            terminated: flag(self.places.terminated),
-            truncated: flag(self.places.truncated),
+            reward: row.at::<f32>(self.columns.reward)[0],
+            success: flag(self.columns.success),
+            terminated: flag(self.columns.terminated),
+            truncated: flag(self.columns.truncated),
         };
         let (episode, judge) = &mut self.slots[slot];
         let goes_on = judge.step(&mut self.episodes[*episode], seen);

@@ -30,4 +30,4 @@ pub use reproduce::{Difference, Reproduction, reproduce};
 pub use request::{Acts, Choice, Condition, EvalRequest, HeldOut, Model, PolicyRequest, StartsRequest};
 pub use runner::{Actor, Means, Moment, Resolver};
 pub use starts::Starts;
-pub use world::{Control, Progress, World, WorldConfig};
+pub use world::{World, WorldConfig};

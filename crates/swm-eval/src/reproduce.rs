@@ -69,7 +69,7 @@ pub fn reproduce(
     old: &Results,
     resolver: &dyn Resolver,
     means: &Means,
-    watch: &mut dyn FnMut(Moment<'_>),
+    watch: &mut (dyn FnMut(Moment<'_>) + Send),
 ) -> Result<Reproduction> {
     let request = EvalRequest::of(&old.manifest)?;
     let results = request.run(&Checked { resolver, manifest: &old.manifest }, means, watch)?;

@@ -3,12 +3,13 @@
 use crate::prediction::{Predictor, predict_run};
 use crate::request::{Acts, EvalRequest, HeldOut, PolicyRequest, StartsRequest};
 use crate::witness::Witness;
-use crate::{Control, EvalConfig, Progress, Starts, Videos, World, WorldConfig};
+use crate::{EvalConfig, Starts, Videos, World, WorldConfig};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use swm_core::results::{Comparison, Counting, Run, Searches};
+use swm_core::run::{Control, Event, Progress};
 use swm_core::{Env, Error, Manifest, PlanTrace, Policy, RandomPolicy, Result, Results, VariationRequest};
 use swm_data::Reader;
 
@@ -89,7 +90,7 @@ pub enum Moment<'a> {
         condition: &'a str,
     },
     /// Another episode is done.
-    Progress(Progress),
+    Progress(Progress<'a>),
     /// All are.
     Ends(&'a Run),
 }
@@ -101,7 +102,12 @@ impl EvalRequest {
     /// # Errors
     /// When the request contradicts itself or names what is not there, a policy or an environment fails, or the run is
     /// stopped.
-    pub fn run(&self, resolver: &dyn Resolver, means: &Means, watch: &mut dyn FnMut(Moment<'_>)) -> Result<Results> {
+    pub fn run(
+        &self,
+        resolver: &dyn Resolver,
+        means: &Means,
+        watch: &mut (dyn FnMut(Moment<'_>) + Send),
+    ) -> Result<Results> {
         self.check()?;
         let request = self.with_floor()?;
         let mut world = World::of(
@@ -151,8 +157,14 @@ impl EvalRequest {
                         fps: 15,
                     }),
                 };
-                let progress: Box<dyn FnMut(Progress) + '_> = Box::new(|at| watch(Moment::Progress(at)));
-                let mut control = Control { stop: means.stop.clone(), progress: Some(progress), ..Control::default() };
+                let mut control = Control::new().with_events(|event| {
+                    if let Event::Progress(at) = event {
+                        watch(Moment::Progress(at));
+                    }
+                });
+                if let Some(stop) = &means.stop {
+                    control = control.with_interrupt(Arc::clone(stop));
+                }
                 let mut run = world.evaluate(&mut *actor.policy, &starts, &config, &mut control)?;
                 drop(control);
                 if let Some((horizon, reader)) = request.prediction.zip(dataset.as_deref())

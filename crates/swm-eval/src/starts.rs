@@ -4,10 +4,11 @@
 use crate::world::{episode_key, reset_seed};
 use rand::Rng as _;
 use std::collections::HashSet;
+use swm_core::columns::{flat, flat_factor};
 use swm_core::pool::Reset;
-use swm_core::recorded::flat;
 use swm_core::{
-    Batch, Call, ColumnSpec, Env, EnvPool, Error, Key, Recorded, ResetOptions, Result, Schema, VariationRequest,
+    Batch, Callable, ColumnSpec, DatasetStart, Env, EnvPool, Error, Key, ResetOptions, Result, Schema,
+    VariationRequest, dataset_start,
 };
 use swm_data::{Reader, StepRange};
 
@@ -31,7 +32,7 @@ struct Rows {
     /// The start and the goal of every pick, one after the other.
     rows: Batch,
     /// How a world that does not know states by itself is put into them.
-    calls: Vec<Call>,
+    calls: Vec<Callable>,
 }
 
 impl Starts {
@@ -65,7 +66,7 @@ impl Starts {
     ///
     /// # Errors
     /// When there is no pick, a pick or its goal lies outside its episode, the dataset lacks columns that the environment
-    /// needs ([`Env::recorded_columns`]), or `variation` names what is no factor.
+    /// needs ([`dataset_start::required_columns`]), or `variation` names what is no factor.
     pub fn from_dataset(
         reader: &dyn Reader,
         env: &dyn Env,
@@ -73,10 +74,10 @@ impl Starts {
         goal_offset: usize,
         seed: u64,
         variation: VariationRequest,
-        calls: &[Call],
+        calls: &[Callable],
     ) -> Result<Self> {
         check_count(picks.len())?;
-        let columns = unshifted(env.recorded_columns(reader.schema(), calls)?, env, &variation)?;
+        let columns = unshifted(dataset_start::required_columns(env, reader.schema(), calls)?, env, &variation)?;
         let mut ranges = Vec::with_capacity(2 * picks.len());
         for &[episode, step] in &picks {
             let found = reader.episodes().get(episode).ok_or_else(|| no_episode(reader, episode))?;
@@ -214,8 +215,8 @@ impl Starts {
             let Some(i) = slots.iter().position(|&started| started == slot) else { return Ok(()) };
             let episode = starting[i].1;
             let [start, goal] = [2 * episode, 2 * episode + 1].map(|row| dataset.rows.row(row));
-            let from = Recorded { start, goal, calls: &dataset.calls };
-            env.reset_from(resets[i].seed, &resets[i].options, from)
+            let from = DatasetStart { start, goal, callables: &dataset.calls };
+            dataset_start::reset(env, resets[i].seed, &resets[i].options, from)
         })
     }
 }
@@ -238,7 +239,7 @@ fn unshifted(columns: Vec<String>, env: &dyn Env, variation: &VariationRequest) 
     let mut shifted = HashSet::new();
     for name in variation.variation.iter().flatten().chain(variation.variation_values.keys()) {
         for i in space.select(name)? {
-            shifted.insert(flat(&format!("variation.{}", space.factors()[i].key)));
+            shifted.insert(flat_factor(&space.factors()[i].key));
         }
     }
     Ok(columns.into_iter().filter(|name| !shifted.contains(&flat(name))).collect())

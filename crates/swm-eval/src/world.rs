@@ -2,11 +2,11 @@
 
 use crate::Starts;
 use std::collections::BTreeMap;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use swm_core::pool::{Reset, threads};
+use swm_core::run::Control;
 use swm_core::{
-    Batch, Env, EnvChoice, EnvPool, EnvSpec, Error, Key, Policy, ResetOptions, Result, Schema, VariationRequest, View,
+    Batch, CameraView, Env, EnvChoice, EnvPool, EnvSpec, Error, Key, Policy, ResetOptions, Result, Schema,
+    VariationRequest,
 };
 
 /// How big a world is and what it draws.
@@ -17,7 +17,7 @@ pub struct WorldConfig {
     /// The `(height, width)` of pictures, if any are drawn.
     pub image: Option<(usize, usize)>,
     /// What is drawn besides the default camera's colours, at the same size.
-    pub views: Vec<View>,
+    pub views: Vec<CameraView>,
     /// Steps after which an episode is truncated; the environment's own number for `None`.
     pub max_episode_steps: Option<usize>,
     /// Worker threads; as many as the machine offers for 0.
@@ -28,43 +28,6 @@ impl Default for WorldConfig {
     /// Eight environments at the paper's picture size, on all cores.
     fn default() -> Self {
         Self { envs: 8, image: Some((224, 224)), views: vec![], max_episode_steps: None, threads: 0 }
-    }
-}
-
-/// How far a long run is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Progress {
-    /// Episodes done: stored, or judged.
-    pub episodes: usize,
-    /// Episodes wanted.
-    pub total: usize,
-    /// Environment steps played in this run.
-    pub steps: usize,
-}
-
-/// How a long run is watched and stopped from outside.
-#[derive(Default)]
-pub struct Control<'a> {
-    /// Set by somebody (Ctrl-C) to stop; looked at between steps.
-    pub stop: Option<Arc<AtomicBool>>,
-    /// Asked between steps whether to go on, by embedders with signals of their own; its error ends the run.
-    pub poll: Option<Box<dyn FnMut() -> Result<()> + 'a>>,
-    /// Told whenever an episode is done.
-    pub progress: Option<Box<dyn FnMut(Progress) + 'a>>,
-}
-
-impl Control<'_> {
-    fn check(&mut self) -> Result<()> {
-        match &self.stop {
-            Some(stop) if stop.load(Ordering::Relaxed) => Err(Error::Interrupted),
-            _ => self.poll.as_mut().map_or(Ok(()), |poll| poll()),
-        }
-    }
-
-    pub(crate) fn report(&mut self, progress: Progress) {
-        if let Some(tell) = &mut self.progress {
-            tell(progress);
-        }
     }
 }
 
@@ -190,7 +153,7 @@ impl World {
     }
 
     fn act(&mut self, policy: &mut dyn Policy, active: &[bool]) -> Result<()> {
-        policy.see(&self.pool, active)?;
+        policy.observe_envs(&self.pool, active)?;
         let (infos, actions) = (self.pool.infos(), &mut self.actions);
         if policy.uses_threads() {
             self.pool.threads().install(|| policy.act(infos, active, actions))
@@ -295,24 +258,4 @@ pub fn reset_seed(key: Key) -> u64 {
 pub(crate) fn reset(slot: usize, key: Key, variation: &VariationRequest) -> Reset {
     let options = ResetOptions { variation: variation.clone(), ..ResetOptions::default() };
     Reset { slot, seed: reset_seed(key), options }
-}
-
-/// Places in the infos of a pool, looked up once.
-#[derive(Clone, Copy)]
-pub(crate) struct Places {
-    pub reward: usize,
-    pub terminated: usize,
-    pub truncated: usize,
-    pub success: usize,
-}
-
-impl Places {
-    pub fn of(infos: &Schema) -> Result<Self> {
-        Ok(Self {
-            reward: infos.index("reward")?,
-            terminated: infos.index("terminated")?,
-            truncated: infos.index("truncated")?,
-            success: infos.index("success")?,
-        })
-    }
 }

@@ -3,7 +3,7 @@
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::ops::Range;
-use swm_core::{Action, Call, ColumnSpec, DType, EnvSpec, Error, Factor, Result, Schema, Space, VariationSpace};
+use swm_core::{Action, Callable, ColumnSpec, DType, EnvSpec, Error, Factor, Result, Schema, Space, VariationSpace};
 
 /// What an environment is, and where in the buffer everything lies: `Bridge.describe()`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -21,7 +21,7 @@ pub struct Description {
     max_episode_steps: usize,
     libraries: BTreeMap<String, String>,
     /// How it takes a state, if its methods tell.
-    calls: Vec<Call>,
+    calls: Vec<Callable>,
     /// Bytes of the buffer.
     pub size: usize,
 }
@@ -226,7 +226,7 @@ impl Form {
     }
 
     /// The methods that put it into a state.
-    pub(crate) fn calls(&self) -> &[Call] {
+    pub(crate) fn calls(&self) -> &[Callable] {
         &self.description.calls
     }
 

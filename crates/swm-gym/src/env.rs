@@ -11,8 +11,8 @@ use crate::{Description, Failure, Form, Request, Transport};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use swm_core::{
-    Action, Call, Env, EnvSpec, Error, FactorValues, FrameMut, Key, Next, Recorded, ResetOptions, Result, RowMut,
-    RowRef, Schema, Snapshot, Transition, VariationRequest,
+    Action, Callable, DatasetStart, DatasetStartEnv, DispatchEnv, Env, EnvSpec, Error, FactorValues, FrameMut, Key,
+    PendingCall, ResetOptions, Result, RowMut, RowRef, Schema, Snapshot, Transition, VariationRequest,
 };
 
 /// How many lines of a traceback an error shows: the end, which names what was raised.
@@ -326,6 +326,53 @@ fn explain(id: &str, what: &str, lost: usize, failure: Failure) -> Error {
     }
 }
 
+impl DispatchEnv for GymEnv {
+    fn dispatch(&mut self, call: PendingCall<'_>) -> bool {
+        if !self.transport.apart() || self.stage != Stage::Ready || self.announced.is_some() {
+            return false;
+        }
+        match call {
+            PendingCall::Reset(seed, options) => {
+                let Ok(arguments) = self.arguments(seed, options) else { return false };
+                let arguments = arguments.to_string();
+                if !self.transport.announce(Request::Reset(&arguments)) {
+                    return false;
+                }
+                self.open(arguments, None);
+                self.announced = Some(Ask::Reset);
+            }
+            PendingCall::Step(action) => {
+                let request = self.step_request();
+                let (Some(episode), Ok(bytes)) = (&mut self.episode, self.form.bytes(action)) else { return false };
+                self.transport.memory_mut()[self.form.action.clone()].copy_from_slice(bytes);
+                if !self.transport.announce(request) {
+                    return false;
+                }
+                episode.actions.extend_from_slice(bytes);
+                self.announced = Some(Ask::Step);
+            }
+        }
+        true
+    }
+}
+
+impl DatasetStartEnv for GymEnv {
+    fn required_columns(&self, stored: &Schema, callables: &[Callable]) -> Result<Vec<String>> {
+        recorded::columns(&self.form, stored, callables)
+    }
+
+    /// The callables and their arguments belong to the arguments of the reset, so that a replay of the episode starts at the
+    /// same state.
+    fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: DatasetStart<'_>) -> Result<()> {
+        self.settle()?;
+        let (seed, options) = recorded::reset(&self.form, seed, options, from.start)?;
+        let mut arguments = self.arguments(seed, &options)?;
+        arguments["recorded"] = recorded::json(&self.form, &from)?;
+        self.open(arguments.to_string(), Goal::of(&from));
+        self.begin()
+    }
+}
+
 impl Env for GymEnv {
     fn spec(&self) -> &EnvSpec {
         &self.form.spec
@@ -341,19 +388,16 @@ impl Env for GymEnv {
         self.begin()
     }
 
-    fn recorded_columns(&self, stored: &Schema, calls: &[Call]) -> Result<Vec<String>> {
-        recorded::columns(&self.form, stored, calls)
+    fn as_dispatch(&mut self) -> Option<&mut dyn DispatchEnv> {
+        Some(self)
     }
 
-    /// The calls and what they are given belong to the arguments of the reset, so that whoever plays the episode again
-    /// starts where it started.
-    fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: Recorded<'_>) -> Result<()> {
-        self.settle()?;
-        let (seed, options) = recorded::reset(&self.form, seed, options, from.start)?;
-        let mut arguments = self.arguments(seed, &options)?;
-        arguments["recorded"] = recorded::json(&self.form, &from)?;
-        self.open(arguments.to_string(), Goal::of(&from));
-        self.begin()
+    fn dataset_start(&self) -> Option<&dyn DatasetStartEnv> {
+        Some(self)
+    }
+
+    fn dataset_start_mut(&mut self) -> Option<&mut dyn DatasetStartEnv> {
+        Some(self)
     }
 
     fn step(&mut self, action: Action<'_>) -> Result<Transition> {
@@ -372,34 +416,6 @@ impl Env for GymEnv {
             terminated: self.flag(head::TERMINATED),
             truncated: self.flag(head::TRUNCATED),
         })
-    }
-
-    fn announce(&mut self, next: Next<'_>) -> bool {
-        if !self.transport.apart() || self.stage != Stage::Ready || self.announced.is_some() {
-            return false;
-        }
-        match next {
-            Next::Reset(seed, options) => {
-                let Ok(arguments) = self.arguments(seed, options) else { return false };
-                let arguments = arguments.to_string();
-                if !self.transport.announce(Request::Reset(&arguments)) {
-                    return false;
-                }
-                self.open(arguments, None);
-                self.announced = Some(Ask::Reset);
-            }
-            Next::Step(action) => {
-                let request = self.step_request();
-                let (Some(episode), Ok(bytes)) = (&mut self.episode, self.form.bytes(action)) else { return false };
-                self.transport.memory_mut()[self.form.action.clone()].copy_from_slice(bytes);
-                if !self.transport.announce(request) {
-                    return false;
-                }
-                episode.actions.extend_from_slice(bytes);
-                self.announced = Some(Ask::Step);
-            }
-        }
-        true
     }
 
     fn observe(&self, row: &mut RowMut<'_>) {
@@ -517,7 +533,7 @@ impl Env for GymEnv {
         Err(Error::config(
             format!("starting {} from a row of a dataset", self.form.spec.id),
             "a Gymnasium environment is put into a state at a reset",
-            "start its episode there (`Env::reset_from`)",
+            "start its episode there (`swm_core::dataset_start::reset`)",
         ))
     }
 

@@ -6,11 +6,11 @@
 
 use crate::Form;
 use serde_json::{Value, json};
-use swm_core::recorded::flat;
-use swm_core::{Argument, Call, DType, Error, Recorded, ResetOptions, Result, RowRef, Schema};
+use swm_core::columns::{EPISODE_SEED, PIXELS, SEED, flat, flat_factor, goal_source, is_flat_factor, join_seed};
+use swm_core::{Callable, CallableArgument, DType, DatasetStart, Error, ResetOptions, Result, RowRef, Schema};
 
 /// The methods to call: those that somebody named, or else those that the environment is known by.
-pub fn calls<'a>(form: &'a Form, named: &'a [Call]) -> Result<&'a [Call]> {
+pub fn calls<'a>(form: &'a Form, named: &'a [Callable]) -> Result<&'a [Callable]> {
     let calls = if named.is_empty() { form.calls() } else { named };
     if !calls.is_empty() {
         return Ok(calls);
@@ -24,7 +24,7 @@ pub fn calls<'a>(form: &'a Form, named: &'a [Call]) -> Result<&'a [Call]> {
 }
 
 /// The columns that decide a start, of those a dataset has; an error for an argument that it lacks.
-pub fn columns(form: &Form, stored: &Schema, named: &[Call]) -> Result<Vec<String>> {
+pub fn columns(form: &Form, stored: &Schema, named: &[Callable]) -> Result<Vec<String>> {
     let find = |name: &str| stored.columns().iter().position(|column| flat(&column.name) == name);
     // Pictures are large: none but that of the goal and those that somebody wants.
     let mut wanted: Vec<bool> = stored.columns().iter().map(|column| kept(&flat(&column.name))).collect();
@@ -58,7 +58,7 @@ pub fn columns(form: &Form, stored: &Schema, named: &[Call]) -> Result<Vec<Strin
 
 /// Whether a column is read whatever the environment shows: its factors, its seed, the picture of the goal.
 fn kept(name: &str) -> bool {
-    name.starts_with("variation_") || ["seed", "episode_seed", "pixels"].contains(&name)
+    is_flat_factor(name) || [SEED, EPISODE_SEED, PIXELS].contains(&name)
 }
 
 /// Of which row a column is.
@@ -70,15 +70,11 @@ enum Whose {
 
 /// Of which row a column is, and its name there.
 fn source(name: &str) -> (Whose, &str) {
-    match name.strip_prefix("goal_") {
-        Some(rest) => (Whose::Goal, rest),
-        None if name == "goal" => (Whose::Goal, "pixels"),
-        None => (Whose::Start, name),
-    }
+    goal_source(name).map_or((Whose::Start, name), |name| (Whose::Goal, name))
 }
 
 /// The column that an argument names, under its flat name.
-fn argument_column(argument: &Argument) -> Result<Option<String>> {
+fn argument_column(argument: &CallableArgument) -> Result<Option<String>> {
     match (&argument.value, argument.in_dataset) {
         (_, false) => Ok(None),
         (Value::String(name), true) => Ok(Some(flat(name))),
@@ -96,7 +92,7 @@ pub fn reset(form: &Form, seed: u64, options: &ResetOptions, start: RowRef<'_>) 
     let samples = options.variation.variation.as_ref().is_some_and(|keys| !keys.is_empty());
     let seed = if samples { seed } else { recorded_seed(start)?.unwrap_or(seed) };
     for factor in form.spec.variation_space.factors() {
-        let name = flat(&format!("variation.{}", factor.key));
+        let name = flat_factor(&factor.key);
         if let Some(place) = start.schema().find(&name)
             && start.schema().columns()[place].len() == factor.space.len()
         {
@@ -110,24 +106,24 @@ pub fn reset(form: &Form, seed: u64, options: &ResetOptions, start: RowRef<'_>) 
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn recorded_seed(start: RowRef<'_>) -> Result<Option<u64>> {
     let numbers = |name| start.schema().find(name).map(|_| start.to_f64(name)).transpose();
-    if let Some(&[seed]) = numbers("seed")?.as_deref()
+    if let Some(&[seed]) = numbers(SEED)?.as_deref()
         && seed >= 0.0
     {
         return Ok(Some(seed as u64));
     }
-    let digits = numbers("episode_seed")?.filter(|digits| digits.len() == 3);
-    Ok(digits.map(|digits| digits.iter().rev().fold(0, |seed, &digit| seed << 21 | digit as u64)))
+    let elements = numbers(EPISODE_SEED)?.and_then(|elements| <[f64; 3]>::try_from(elements).ok());
+    Ok(elements.map(join_seed))
 }
 
 /// The methods with their arguments, and what the columns show then.
-pub fn json(form: &Form, from: &Recorded<'_>) -> Result<Value> {
+pub fn json(form: &Form, from: &DatasetStart<'_>) -> Result<Value> {
     let value = |name: &str| {
         let (whose, name) = source(name);
         let row = if whose == Whose::Goal { from.goal } else { from.start };
         row.schema().find(name).map(|place| array(row, place))
     };
     let mut made = vec![];
-    for call in calls(form, from.calls)? {
+    for call in calls(form, from.callables)? {
         let mut arguments = serde_json::Map::new();
         for (key, argument) in &call.args {
             let given = match argument_column(argument)? {
@@ -172,8 +168,8 @@ pub struct Goal {
 
 impl Goal {
     /// The picture in the goal's row.
-    pub fn of(from: &Recorded<'_>) -> Option<Self> {
-        let place = from.goal.schema().find("pixels")?;
+    pub fn of(from: &DatasetStart<'_>) -> Option<Self> {
+        let place = from.goal.schema().find(PIXELS)?;
         let column = &from.goal.schema().columns()[place];
         match column.shape[..] {
             [height, width, 3] if column.dtype == DType::U8 => {

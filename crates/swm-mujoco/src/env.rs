@@ -15,8 +15,8 @@ use mujoco_rs::wrappers::mj_model::MjtObjBase;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use swm_core::{
-    Action, ColumnSpec, DType, Env, EnvSpec, Error, FactorValues, FrameMut, Key, Modality, ResetOptions, Result,
-    RowMut, RowRef, Snapshot, Transition, VariationRequest, View, factors,
+    Action, CameraView, ColumnSpec, DType, Env, EnvSpec, Error, FactorValues, FrameMut, Key, Modality, ResetOptions,
+    Result, RowMut, RowRef, Snapshot, Transition, VariationRequest, factors,
 };
 
 /// An environment that runs a [`Task`] in MuJoCo.
@@ -206,7 +206,7 @@ impl<T: Task> Env for MujocoEnv<T> {
         })?
     }
 
-    fn render_view(&mut self, view: &View, height: usize, width: usize, out: &mut [u8]) -> Result<()> {
+    fn render_view(&mut self, view: &CameraView, height: usize, width: usize, out: &mut [u8]) -> Result<()> {
         let camera = match &view.camera {
             None => self.task.camera(),
             Some(name) => {

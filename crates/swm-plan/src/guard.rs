@@ -54,8 +54,8 @@ impl CostModel for Guard<'_> {
         self.ask("scoring candidates", |model| model.cost(candidates, costs))
     }
 
-    fn see(&mut self, slot: usize, env: &dyn Env) -> Result<()> {
-        self.ask("looking at the world", |model| model.see(slot, env))
+    fn observe_env(&mut self, slot: usize, env: &dyn Env) -> Result<()> {
+        self.ask("looking at the world", |model| model.observe_env(slot, env))
     }
 
     fn differentiable(&mut self) -> Option<&mut dyn DifferentiableCost> {

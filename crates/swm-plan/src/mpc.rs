@@ -9,7 +9,7 @@
 //! one-hot vector an integer. The `action_block` actions of a model step lie one after another.
 //!
 //! # What a model sees
-//! [`CostModel::see`] gets the worlds that are about to be planned for, [`CostModel::observe`] the infos. With `history`
+//! [`CostModel::observe_env`] gets the worlds that are about to be planned for, [`CostModel::observe`] the infos. With `history`
 //! above 1 the infos have these columns too, oldest step first and the latest at the end:
 //!
 //! | column | shape | |
@@ -290,11 +290,11 @@ impl Policy for MpcPolicy {
         }
     }
 
-    fn see(&mut self, worlds: &EnvPool, active: &[bool]) -> Result<()> {
-        self.check_slots(&[worlds.len(), active.len()])?;
+    fn observe_envs(&mut self, envs: &EnvPool, active: &[bool]) -> Result<()> {
+        self.check_slots(&[envs.len(), active.len()])?;
         let mut model = Guard::new(&mut *self.cost);
         let mut due = (0..active.len()).filter(|&slot| active[slot] && self.slots[slot].is_due());
-        due.try_for_each(|slot| model.see(slot, worlds.env(slot)))
+        due.try_for_each(|slot| model.observe_env(slot, envs.env(slot)))
     }
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {

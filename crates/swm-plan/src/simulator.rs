@@ -1,7 +1,7 @@
 //! [`SimulatorCost`]: the true simulator as the model, so that any solver can be run with perfect dynamics.
 //!
 //! It is an upper bound, and a test of solvers without a model's errors: what fails here is the search, its settings or
-//! the cost. The model looks at the world itself ([`CostModel::see`]), so only a [`crate::MpcPolicy`] that is shown the
+//! the cost. The model looks at the world itself ([`CostModel::observe_env`]), so only a [`crate::MpcPolicy`] that is shown the
 //! worlds can use it.
 //!
 //! Every candidate is played from a snapshot of the world in a simulator of the model's own, with the actions that the
@@ -108,7 +108,7 @@ impl SimulatorCost {
 }
 
 impl CostModel for SimulatorCost {
-    fn see(&mut self, slot: usize, env: &dyn Env) -> Result<()> {
+    fn observe_env(&mut self, slot: usize, env: &dyn Env) -> Result<()> {
         if env.spec().id != self.id {
             return Err(Error::mismatch("showing a world to a simulator", &env.spec().id, &self.id));
         }
@@ -127,7 +127,7 @@ impl CostModel for SimulatorCost {
                 return Err(Error::config(
                     format!("planning in slot {slot} with a simulator"),
                     "the world was not shown",
-                    "call Policy::see with the worlds before Policy::act",
+                    "call Policy::observe_envs with the worlds before Policy::act",
                 ));
             };
             self.present.push(world);

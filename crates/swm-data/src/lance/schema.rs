@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
-use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema};
+use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema, columns};
 
 /// The columns that number episodes and steps; the writer fills them.
 pub const EPISODE: &str = "episode_idx";
@@ -68,11 +68,6 @@ impl Precision {
     }
 }
 
-/// The name of a column in the table: Lance reads `.` as a path into a structure.
-fn stored_name(name: &str) -> String {
-    name.replace('.', "_")
-}
-
 /// The stored form of the columns an episode has; `episode_idx` and `step_idx` are left out.
 ///
 /// # Errors
@@ -80,7 +75,8 @@ fn stored_name(name: &str) -> String {
 pub fn columns_to_write(schema: &Schema) -> Result<Vec<StoredColumn>> {
     let mut columns: Vec<StoredColumn> = vec![];
     for spec in schema.columns() {
-        let name = stored_name(&spec.name);
+        // Lance reads a dot as a path into a structure.
+        let name = columns::flat(&spec.name);
         if name == EPISODE || name == STEP {
             continue;
         }
@@ -207,7 +203,7 @@ pub fn columns_to_read(
         }
         let known = recorded
             .as_ref()
-            .and_then(|recorded| recorded.columns.columns().iter().find(|spec| stored_name(&spec.name) == *name));
+            .and_then(|recorded| recorded.columns.columns().iter().find(|spec| columns::flat(&spec.name) == *name));
         let contradiction = |held: &str| {
             super::store::damaged(folder, format!("column '{name}' holds {held}, unlike its recorded schema says"))
         };

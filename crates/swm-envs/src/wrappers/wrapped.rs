@@ -3,8 +3,8 @@
 use super::{View, VisualWrapper, parse};
 use std::collections::BTreeMap;
 use swm_core::{
-    Action, Call, Env, EnvSpec, Error, FactorValues, FrameMut, Key, Next, Recorded, ResetOptions, Result, RowMut,
-    RowRef, Schema, Snapshot, Transition,
+    Action, Callable, DatasetStart, DatasetStartEnv, DispatchEnv, Env, EnvSpec, Error, FactorValues, FrameMut, Key,
+    ResetOptions, Result, RowMut, RowRef, Schema, Snapshot, Transition, dataset_start,
 };
 
 /// What wrappers do to the picture of the goal.
@@ -92,6 +92,18 @@ impl Wrapped {
     }
 }
 
+impl DatasetStartEnv for Wrapped {
+    fn required_columns(&self, stored: &Schema, callables: &[Callable]) -> Result<Vec<String>> {
+        dataset_start::required_columns(&*self.env, stored, callables)
+    }
+
+    fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: DatasetStart<'_>) -> Result<()> {
+        dataset_start::reset(&mut *self.env, seed, options, from)?;
+        self.begin(seed, 0);
+        Ok(())
+    }
+}
+
 impl Env for Wrapped {
     fn spec(&self) -> &EnvSpec {
         self.env.spec()
@@ -109,8 +121,16 @@ impl Env for Wrapped {
         Ok(transition)
     }
 
-    fn announce(&mut self, next: Next<'_>) -> bool {
-        self.env.announce(next)
+    fn as_dispatch(&mut self) -> Option<&mut dyn DispatchEnv> {
+        self.env.as_dispatch()
+    }
+
+    fn dataset_start(&self) -> Option<&dyn DatasetStartEnv> {
+        Some(self)
+    }
+
+    fn dataset_start_mut(&mut self) -> Option<&mut dyn DatasetStartEnv> {
+        Some(self)
     }
 
     fn observe(&self, row: &mut RowMut<'_>) {
@@ -170,16 +190,6 @@ impl Env for Wrapped {
     fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()> {
         self.env.restore_from(start, goal)?;
         self.step = 0;
-        Ok(())
-    }
-
-    fn recorded_columns(&self, stored: &Schema, calls: &[Call]) -> Result<Vec<String>> {
-        self.env.recorded_columns(stored, calls)
-    }
-
-    fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: Recorded<'_>) -> Result<()> {
-        self.env.reset_from(seed, options, from)?;
-        self.begin(seed, 0);
         Ok(())
     }
 

@@ -4,9 +4,10 @@ use crate::line::{ENTRY, Walker};
 use crate::memory::Memory;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use swm_core::run::{Control, Event};
 use swm_core::{Batch, DType, Error, Key, Policy, RandomPolicy, Result, VariationRequest};
 use swm_eval::collect::check_continues;
-use swm_eval::{CollectConfig, Collected, Control, World, WorldConfig};
+use swm_eval::{CollectConfig, Collected, World, WorldConfig};
 
 fn world(envs: usize, threads: usize) -> World {
     let config = WorldConfig { envs, image: Some((2, 3)), views: vec![], max_episode_steps: None, threads };
@@ -107,14 +108,12 @@ fn an_interruption_keeps_what_is_finished() {
     let mut world = world(4, 1);
     let mut policy = RandomPolicy::new(world.spec(), 4);
     let mut told = 0;
-    let mut control = Control {
-        stop: Some(Arc::clone(&stop)),
-        progress: Some(Box::new(|progress| {
-            told = progress.episodes;
-            stop.store(progress.episodes >= 6, Ordering::Relaxed);
-        })),
-        ..Control::default()
-    };
+    let mut control = Control::new().with_interrupt(Arc::clone(&stop)).with_events(|event| {
+        if let Event::Progress(progress) = event {
+            told = progress.done;
+            stop.store(progress.done >= 6, Ordering::Relaxed);
+        }
+    });
     let outcome = world.collect(&mut policy, part.writer(), &config(30), &mut control);
     drop(control);
     assert!(matches!(outcome, Err(Error::Interrupted)), "{outcome:?}");

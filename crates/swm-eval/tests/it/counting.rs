@@ -4,8 +4,9 @@ use crate::evaluating::{pinned, recorded, run_counted, world};
 use crate::line::Walker;
 use swm_core::policy::write_action;
 use swm_core::results::{Counting, Run};
+use swm_core::run::Control;
 use swm_core::{Batch, Key, Policy, RandomPolicy, Result, VariationRequest};
-use swm_eval::{Control, EvalConfig, Starts};
+use swm_eval::{EvalConfig, Starts};
 
 /// Always pushes to the right, through the goal and past it.
 struct Passing;

@@ -3,9 +3,10 @@
 use crate::line::{ENTRY, Walker};
 use crate::memory::{Memory, MemoryReader};
 use swm_core::results::{Counting, Run};
+use swm_core::run::Control;
 use swm_core::{Batch, Candidates, CostModel, Error, Key, Policy, RandomPolicy, Result, VariationRequest};
 use swm_data::Reader as _;
-use swm_eval::{CollectConfig, Control, EvalConfig, Starts, Videos, World, WorldConfig};
+use swm_eval::{CollectConfig, EvalConfig, Starts, Videos, World, WorldConfig};
 use swm_plan::{ActionScale, Cem, MpcConfig, MpcPolicy};
 
 pub fn world(envs: usize, threads: usize) -> World {

@@ -2,10 +2,11 @@
 
 use std::path::Path;
 use swm_core::policy::ExpertPolicy;
+use swm_core::run::Control;
 use swm_core::{Error, RandomPolicy, VariationRequest};
 use swm_data::{WriteMode, WriteOptions};
 use swm_envs::two_room::ENTRY;
-use swm_eval::{CollectConfig, Collected, Control, EvalConfig, Starts, World, WorldConfig};
+use swm_eval::{CollectConfig, Collected, EvalConfig, Starts, World, WorldConfig};
 
 fn world(envs: usize, threads: usize) -> World {
     World::new(&ENTRY, WorldConfig { envs, image: Some((28, 28)), views: vec![], max_episode_steps: Some(60), threads })

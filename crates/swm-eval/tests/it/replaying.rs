@@ -3,9 +3,10 @@
 use crate::line::ENTRY;
 use crate::memory::Memory;
 use std::thread::scope;
+use swm_core::run::Control;
 use swm_core::{RandomPolicy, VariationRequest};
 use swm_data::{ClipSpec, ReplayBuffer, ReplayConfig};
-use swm_eval::{CollectConfig, Control, World, WorldConfig};
+use swm_eval::{CollectConfig, World, WorldConfig};
 
 fn world() -> World {
     let config = WorldConfig { envs: 3, image: Some((2, 3)), threads: 1, ..WorldConfig::default() };

@@ -4,7 +4,8 @@ use crate::config;
 use swm_core::batch::{Batch, DType, Schema};
 use swm_core::pool::{Reset, threads};
 use swm_core::{
-    Action, Env, EnvPool, Error, FrameMut, Key, Next, Policy, RandomPolicy, ResetOptions, Space, VariationRequest,
+    Action, Env, EnvPool, Error, FrameMut, Key, PendingCall, Policy, RandomPolicy, ResetOptions, Space,
+    VariationRequest,
 };
 use swm_gym::GymConfig;
 
@@ -58,6 +59,10 @@ impl Seen {
     pub fn of(env: Box<dyn Env>) -> Self {
         let schema = Schema::new(env.spec().columns.clone()).expect("columns have their own names");
         Self { env, row: Batch::zeros(&schema, 1) }
+    }
+
+    pub fn dispatch(&mut self, call: PendingCall<'_>) -> bool {
+        self.env.as_dispatch().is_some_and(|env| env.dispatch(call))
     }
 
     pub fn column(&mut self, name: &str) -> Vec<f64> {
@@ -120,30 +125,30 @@ fn what_was_announced_happens_once() {
         world.env.reset(1, &start).expect("a reset");
     }
     plain.env.reset(4, &start).expect("a reset");
-    assert!(told.env.announce(Next::Reset(4, &start)));
-    assert!(!told.env.announce(Next::Step(push)), "one thing at a time");
+    assert!(told.dispatch(PendingCall::Reset(4, &start)));
+    assert!(!told.dispatch(PendingCall::Step(push)), "one thing at a time");
     told.env.reset(4, &start).expect("the reset");
     plain.env.step(push).expect("a step");
-    assert!(told.env.announce(Next::Step(push)));
+    assert!(told.dispatch(PendingCall::Step(push)));
     told.env.step(push).expect("the step");
     assert!(plain.everything() == told.everything());
     // Whoever does something else finds the step taken.
     plain.env.step(push).expect("a step");
-    assert!(told.env.announce(Next::Step(push)));
+    assert!(told.dispatch(PendingCall::Step(push)));
     assert!(plain.env.snapshot() == told.env.snapshot());
     assert!(plain.picture(9, 12) == told.picture(9, 12) && plain.everything() == told.everything());
     plain.env.step(push).and_then(|_| plain.env.step(none)).expect("two steps");
-    assert!(told.env.announce(Next::Step(push)));
+    assert!(told.dispatch(PendingCall::Step(push)));
     told.env.step(none).expect("another step");
     assert!(plain.everything() == told.everything());
     // And whoever begins anew finds a world that is ready for it.
-    assert!(told.env.announce(Next::Step(push)));
+    assert!(told.dispatch(PendingCall::Step(push)));
     for world in [&mut plain, &mut told] {
         world.env.reset(7, &start).expect("a reset");
     }
     assert!(plain.everything() == told.everything());
     // What is wrong is said by the call, and changes nothing.
-    assert!(!told.env.announce(Next::Step(Action::Discrete(&[0]))));
+    assert!(!told.dispatch(PendingCall::Step(Action::Discrete(&[0]))));
     assert!(told.env.step(Action::Discrete(&[0])).is_err());
     assert!(plain.everything() == told.everything());
 }

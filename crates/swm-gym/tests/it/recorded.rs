@@ -4,7 +4,7 @@ use crate::config;
 use crate::play::{Seen, make};
 use crate::robust::kill_process;
 use swm_core::batch::{Batch, ColumnSpec, DType, Schema};
-use swm_core::{Action, Call, Env, FrameMut, Recorded, ResetOptions, VariationRequest};
+use swm_core::{Action, Callable, DatasetStart, Env, FrameMut, ResetOptions, VariationRequest, dataset_start};
 use swm_gym::{GymEnv, WorkerTransport};
 
 const FIELD: &str = "tests.it.worlds:Field-v0";
@@ -33,14 +33,15 @@ fn rows() -> Batch {
     rows
 }
 
-fn calls(json: &str) -> Vec<Call> {
+fn calls(json: &str) -> Vec<Callable> {
     serde_json::from_str(json).expect("calls")
 }
 
-fn start(env: &mut dyn Env, options: &ResetOptions, calls: &[Call]) -> swm_core::Result<()> {
+fn start(env: &mut dyn Env, options: &ResetOptions, callables: &[Callable]) -> swm_core::Result<()> {
     let rows = rows();
-    env.recorded_columns(rows.schema(), calls)?;
-    env.reset_from(5, options, Recorded { start: rows.row(0), goal: rows.row(1), calls })
+    dataset_start::required_columns(env, rows.schema(), callables)?;
+    let from = DatasetStart { start: rows.row(0), goal: rows.row(1), callables };
+    dataset_start::reset(env, 5, options, from)
 }
 
 #[test]

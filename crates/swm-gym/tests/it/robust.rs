@@ -3,7 +3,7 @@
 use crate::config;
 use crate::play::{ROOM, Seen, make, play};
 use std::time::Duration;
-use swm_core::{Action, Next, ResetOptions};
+use swm_core::{Action, PendingCall, ResetOptions};
 use swm_gym::{GymConfig, GymEnv, WorkerTransport};
 
 const PUSH: Action<'static> = Action::Continuous(&[0.1, -0.2]);
@@ -49,20 +49,20 @@ fn what_a_killed_worker_was_told_is_told_again() {
         let transport = WorkerTransport::new("CartPole-v1", [].into(), config.clone()).expect("a worker");
         let id = transport.process_id().expect("a process");
         let mut env = Seen::of(Box::new(GymEnv::new("CartPole-v1", Box::new(transport), 2).expect("a world")));
-        let tell = |env: &mut Seen, what: &str, next: Next<'_>| {
+        let tell = |env: &mut Seen, what: &str, next: PendingCall<'_>| {
             if kill == Some((what, false)) {
                 kill_process(id);
             }
-            env.env.announce(next);
+            env.dispatch(next);
             if kill == Some((what, true)) {
                 kill_process(id);
             }
         };
-        tell(&mut env, "reset", Next::Reset(4, &options));
+        tell(&mut env, "reset", PendingCall::Reset(4, &options));
         env.env.reset(4, &options).expect("a reset");
         let mut seen = env.everything();
         for what in ["first", "second"] {
-            tell(&mut env, what, Next::Step(Action::Discrete(&[1])));
+            tell(&mut env, what, PendingCall::Step(Action::Discrete(&[1])));
             env.env.step(Action::Discrete(&[1])).expect("a step");
             seen.extend(env.everything());
         }

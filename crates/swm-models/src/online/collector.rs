@@ -98,7 +98,7 @@ impl Collector {
 
     /// One step of every world.
     pub fn play(&mut self, policy: &mut dyn Policy) -> Result<()> {
-        policy.see(&self.pool, &self.active)?;
+        policy.observe_envs(&self.pool, &self.active)?;
         policy.act(self.pool.infos(), &self.active, &mut self.actions)?;
         let ended = self.advance(true)?;
         self.begin(&ended)?;

@@ -30,7 +30,7 @@ pub(super) fn returns(pool: &mut EnvPool, policy: &mut dyn Policy, episodes: usi
         if active.iter().all(|&active| !active) {
             return Ok(returns);
         }
-        policy.see(pool, &active)?;
+        policy.observe_envs(pool, &active)?;
         policy.act(pool.infos(), &active, &mut actions)?;
         pool.step(&actions, &active)?;
         let infos = pool.infos();

@@ -2,7 +2,7 @@
 //! driver of OpenGL does, is not counted.
 
 use swm_conformance::allocation::{self, Counting};
-use swm_core::{Action, Env, FrameMut, Key, ResetOptions, VariationRequest, share};
+use swm_core::{Action, Env, FrameMut, Key, ResetOptions, VariationRequest, thread_budget};
 use swm_mujoco::ENVS;
 use swm_mujoco::render::{self, Choice};
 
@@ -74,5 +74,5 @@ fn a_picture_that_threads_share_allocates_nothing() {
     // Counted on the thread that asks, which is one of the pool's.
     let pool = swm_core::pool::threads(3).expect("threads");
     let mut worlds = worlds();
-    pool.install(|| share::all(|| assert_eq!(drawn(160, &mut worlds), 0)));
+    pool.install(|| thread_budget::all(|| assert_eq!(drawn(160, &mut worlds), 0)));
 }

@@ -1,7 +1,8 @@
 //! Every camera of every world, in colours, distances and geoms; and what draws them.
 
 use swm_core::{
-    Action, Batch, Env, FrameMut, Key, Modality, ResetOptions, Result, Schema, VariationRequest, View, share,
+    Action, Batch, CameraView, Env, FrameMut, Key, Modality, ResetOptions, Result, Schema, VariationRequest,
+    thread_budget,
 };
 use swm_mujoco::ENVS;
 use swm_mujoco::render::{self, Choice};
@@ -9,7 +10,7 @@ use swm_mujoco::render::{self, Choice};
 const HEIGHT: usize = 24;
 const WIDTH: usize = 32;
 
-fn see(env: &mut dyn Env, view: &View) -> Result<Vec<f64>> {
+fn see(env: &mut dyn Env, view: &CameraView) -> Result<Vec<f64>> {
     let mut row = Batch::zeros(&Schema::new([view.column(HEIGHT, WIDTH)])?, 1);
     env.render_view(view, HEIGHT, WIDTH, row.row_mut(0).bytes(0))?;
     row.row(0).to_f64(&view.to_string())
@@ -29,7 +30,7 @@ fn views_of_all(renderer: &str) {
         let cameras = env.spec().cameras.clone();
         for (i, camera) in cameras.into_iter().enumerate() {
             for modality in [Modality::Rgb, Modality::Depth, Modality::Segmentation] {
-                let view = View { camera: Some(camera.clone()), modality };
+                let view = CameraView { camera: Some(camera.clone()), modality };
                 let seen = see(&mut *env, &view).unwrap_or_else(|error| panic!("{}: {error}", entry.id));
                 let fine = match modality {
                     // The first camera is the default one.
@@ -40,9 +41,9 @@ fn views_of_all(renderer: &str) {
                 assert!(fine, "{}: {view}: {seen:?}", entry.id);
             }
         }
-        let geoms = see(&mut *env, &View { camera: None, modality: Modality::Segmentation }).expect("geoms");
+        let geoms = see(&mut *env, &CameraView { camera: None, modality: Modality::Segmentation }).expect("geoms");
         assert!(geoms.iter().any(|&geom| geom >= 0.0), "{}: something is to be seen", entry.id);
-        let unknown = View { camera: Some("nowhere".to_owned()), modality: Modality::Rgb };
+        let unknown = CameraView { camera: Some("nowhere".to_owned()), modality: Modality::Rgb };
         assert!(see(&mut *env, &unknown).is_err(), "{}", entry.id);
         let libraries = env.libraries();
         assert_eq!(libraries.get("mujoco").map(String::as_str), Some(swm_mujoco::link::VERSION));
@@ -62,7 +63,7 @@ fn threads_that_share_a_picture_draw_what_one_draws() {
             env.render(FrameMut::new(144, 200, &mut one)).expect("a picture");
             for pool in &pools {
                 let draw = || render::with(Choice::Cpu, || env.render(FrameMut::new(144, 200, &mut many)));
-                pool.install(|| share::all(draw)).expect("a picture");
+                pool.install(|| thread_budget::all(draw)).expect("a picture");
                 assert!(one == many, "{}: {} threads", entry.id, pool.current_num_threads());
             }
         }
@@ -117,7 +118,7 @@ fn both_renderers_see_the_same_geoms_at_the_same_distances() {
         let mut env = entry.env().unwrap_or_else(|error| panic!("{}: {error}", entry.id));
         env.reset(1, &ResetOptions::default()).expect("a reset");
         let mut see = |choice, modality| {
-            let view = View { camera: None, modality };
+            let view = CameraView { camera: None, modality };
             let mut row = Batch::zeros(&Schema::new([view.column(SIDE, SIDE)]).expect("a schema"), 1);
             render::with(choice, || env.render_view(&view, SIDE, SIDE, row.row_mut(0).bytes(0)))
                 .unwrap_or_else(|error| panic!("{}: {error}", entry.id));

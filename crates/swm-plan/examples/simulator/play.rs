@@ -121,7 +121,7 @@ pub fn play(entry: &EnvEntry, starts: &[Start], planner: &Planner, budget: usize
             if !active.contains(&true) {
                 break;
             }
-            policy.see(&pool, &active)?;
+            policy.observe_envs(&pool, &active)?;
             let infos = pool.infos();
             pool.threads().install(|| policy.act(infos, &active, &mut actions))?;
             pool.step(&actions, &active)?;

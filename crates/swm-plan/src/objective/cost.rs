@@ -90,8 +90,8 @@ impl CostModel for ObjectiveCost {
         dynamics(&mut *self.model)?.encode(&mut self.start, &mut self.goals)
     }
 
-    fn see(&mut self, slot: usize, env: &dyn Env) -> Result<()> {
-        self.model.see(slot, env)
+    fn observe_env(&mut self, slot: usize, env: &dyn Env) -> Result<()> {
+        self.model.observe_env(slot, env)
     }
 
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {

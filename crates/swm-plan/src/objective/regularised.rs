@@ -52,8 +52,8 @@ impl CostModel for Regularised {
         self.model.observe(infos, envs)
     }
 
-    fn see(&mut self, slot: usize, env: &dyn Env) -> Result<()> {
-        self.model.see(slot, env)
+    fn observe_env(&mut self, slot: usize, env: &dyn Env) -> Result<()> {
+        self.model.observe_env(slot, env)
     }
 
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {

@@ -29,7 +29,7 @@ fn simulator(entry: &EnvEntry, pool: &EnvPool, slots: &[usize], score: Score) ->
         score,
     )
     .expect("a simulator");
-    slots.iter().for_each(|&slot| simulator.see(slot, pool.env(slot)).expect("its own world"));
+    slots.iter().for_each(|&slot| simulator.observe_env(slot, pool.env(slot)).expect("its own world"));
     simulator.observe(pool.infos(), slots).expect("worlds that were shown");
     simulator
 }
@@ -125,7 +125,7 @@ fn costs_depend_on_their_own_world_alone() {
 fn a_simulator_refuses_worlds_it_does_not_know() {
     let (room, table) = (pool(&two_room::ENTRY, 1), pool(&push_t::ENTRY, 1));
     let mut simulator = simulator(&two_room::ENTRY, &room, &[0], Score::Terminal);
-    let foreign = simulator.see(0, table.env(0)).expect_err("another world").to_string();
+    let foreign = simulator.observe_env(0, table.env(0)).expect_err("another world").to_string();
     assert!(foreign.contains(push_t::ENTRY.id) && foreign.contains(two_room::ENTRY.id), "{foreign}");
     let again = simulator.observe(room.infos(), &[0]).expect_err("shown once, observed twice").to_string();
     assert!(again.contains("was not shown"), "{again}");

@@ -9,10 +9,11 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 use swm::home;
 use swm::resolver::acting;
-use swm_core::{EnvChoice, Error, Result, View};
+use swm_core::run::{Control, Event};
+use swm_core::{CameraView, EnvChoice, Error, Result};
 use swm_data::lance::{Shard, create_shard};
 use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions};
-use swm_eval::{CollectConfig, Collected, Control, World, WorldConfig};
+use swm_eval::{CollectConfig, Collected, World, WorldConfig};
 
 /// Arguments of `swm collect`.
 #[derive(Args)]
@@ -116,7 +117,7 @@ pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
         world: WorldConfig {
             envs: args.envs,
             image: (!args.no_pixels).then_some(args.image),
-            views: args.views.iter().map(|view| View::parse(view)).collect::<Result<_>>()?,
+            views: args.views.iter().map(|view| CameraView::parse(view)).collect::<Result<_>>()?,
             max_episode_steps: args.max_steps,
             threads: context.threads,
         },
@@ -181,23 +182,24 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
         (None, None) => swm_data::create(*location, &schema, options)?,
     };
     let config = &CollectConfig { episodes: part.len(), first: part.start, ..config.clone() };
-    let progress = Progress::new("collect", config.episodes);
+    let mut progress = Progress::new("collect", config.episodes);
     let begun = Instant::now();
-    #[allow(clippy::cast_precision_loss)]
-    let speed = |steps: usize| format!("{:.0} steps/s", steps as f64 / begun.elapsed().as_secs_f64().max(1e-9));
-    let mut control = Control {
-        stop: Some(context.stop.clone()),
-        progress: Some(Box::new(|at| progress.at(at.episodes, speed(at.steps)))),
-        ..Control::default()
+    let speed = |steps: f64| format!("{:.0} steps/s", steps / begun.elapsed().as_secs_f64().max(1e-9));
+    let collected = {
+        let progress = &mut progress;
+        let mut control = Control::new().with_interrupt(context.stop.clone()).with_events(move |event| {
+            if let Event::Progress(at) = event {
+                progress.at(at.done, speed(at.metric("steps").unwrap_or_default()));
+            }
+        });
+        world.collect(&mut *policy, writer, config, &mut control)?
     };
-    let collected = world.collect(&mut *policy, writer, config, &mut control)?;
-    drop(control);
     progress.done(&format!(
         "{} episodes in {location} ({} new, {} steps, {})",
         collected.episodes,
         collected.added,
         collected.steps,
-        speed(collected.steps)
+        speed(collected.steps as f64)
     ));
     Ok(collected)
 }

@@ -302,7 +302,7 @@ impl Bar {
             }
             Moment::Progress(at) => {
                 if let Some(progress) = &self.progress {
-                    progress.at(at.episodes, self.doing.clone());
+                    progress.at(at.done, self.doing.clone());
                 }
             }
             Moment::Ends(run) => {

@@ -6,6 +6,7 @@ use clap::Args;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use swm::home::open_dataset;
+use swm_core::columns::is_stored_as;
 use swm_core::results::Summary;
 use swm_core::{Manifest, Result};
 use swm_data::{Reader, checksum};
@@ -42,8 +43,7 @@ pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
     ));
     emit(&histogram(&lengths));
     let footprint = reader.footprint()?;
-    // Lance knows no dots in names.
-    let stored = |part: &str, name: &str| part == name || part == name.replace('.', "_");
+    let stored = |part: &str, name: &str| is_stored_as(name, part);
     let on_disk = |name: &str| footprint.iter().find(|(part, _)| stored(part, name)).map(|(_, size)| *size);
     let columns = reader.schema().columns().iter().map(|column| {
         let size = on_disk(&column.name);

@@ -9,7 +9,7 @@ mod convert;
 use super::renderer::{FrameBuffer, ModelScene, Renderer};
 use crate::physics::Appearance;
 use std::cell::RefCell;
-use swm_core::{Error, Result, share};
+use swm_core::{Error, Result, thread_budget};
 use swm_raster::{Assets, Canvas, Target};
 
 /// The CPU renderer. Its buffers are thread-local ([`WORKSPACES`]).
@@ -62,7 +62,7 @@ impl Workspace {
             FrameBuffer::Depth(metres) => Target::Depth(metres),
             FrameBuffer::Segmentation(geoms) => Target::Labels(geoms),
         };
-        self.canvas.spread(share::threads());
+        self.canvas.spread(thread_budget::threads());
         self.canvas.draw(&self.scene, &self.assets, size, samples, target);
     }
 }

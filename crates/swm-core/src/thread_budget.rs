@@ -1,7 +1,8 @@
-//! How many threads one environment may use: more than one where there are fewer environments than threads.
+//! The thread budget: how many threads one environment may use, which is more than one where there are fewer environments
+//! than threads.
 //!
-//! Work goes to environments first ([`crate::EnvPool`]). What is left over may draw parts of one picture; whoever can use it asks
-//! for [`threads`], and does its parts by `rayon`, in the pool it runs in. What comes out must not depend on the answer.
+//! The pool distributes environments over threads first ([`crate::EnvPool`]). A renderer reads [`threads`] and may draw
+//! parts of one frame on as many threads of the current rayon pool. Its output must not depend on the budget.
 
 use std::cell::Cell;
 
@@ -9,25 +10,25 @@ thread_local! {
     static THREADS: Cell<usize> = const { Cell::new(1) };
 }
 
-/// How many threads the present work may use, with that which asks: 1 unless somebody said otherwise.
+/// How many threads the present work may use, its own included; 1 unless a caller set a budget.
 pub fn threads() -> usize {
     THREADS.get()
 }
 
-/// Does work that may use so many threads.
+/// Runs `work` with a budget of `threads` threads.
 pub fn with<T>(threads: usize, work: impl FnOnce() -> T) -> T {
-    /// Puts back what was, also when the work panics.
-    struct Back(usize);
-    impl Drop for Back {
+    /// Restores the previous budget, also when the work panics.
+    struct Restore(usize);
+    impl Drop for Restore {
         fn drop(&mut self) {
             THREADS.set(self.0);
         }
     }
-    let _back = Back(THREADS.replace(threads));
+    let _restore = Restore(THREADS.replace(threads));
     work()
 }
 
-/// Does work that may use all threads of the pool it runs in; outside of any, those of the machine.
+/// Runs `work` with all threads of the current rayon pool as its budget.
 pub fn all<T>(work: impl FnOnce() -> T) -> T {
     with(rayon::current_num_threads(), work)
 }
@@ -37,7 +38,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_share_ends_with_its_work() {
+    fn budget_ends_with_its_work() {
         let seen = with(3, || (threads(), with(2, threads), threads()));
         assert_eq!((seen, threads()), ((3, 2, 3), 1));
         assert!(std::panic::catch_unwind(|| with(5, || panic!("as a test"))).is_err());
@@ -45,7 +46,7 @@ mod tests {
     }
 
     #[test]
-    fn all_are_those_of_the_pool() {
+    fn all_threads_are_those_of_the_pool() {
         let pool = crate::pool::threads(3).expect("threads");
         assert_eq!(pool.install(|| all(threads)), 3);
     }

@@ -1,6 +1,6 @@
-//! [`View`]: which camera looks at a world, and what it sees: colours, distances, or which thing is where.
+//! [`CameraView`]: which camera looks at a world, and what it sees: colours, distances, or which thing is where.
 
-use crate::{ColumnSpec, DType, EnvSpec, Error, Result};
+use crate::{ColumnSpec, DType, EnvSpec, Error, Result, columns};
 use std::fmt;
 
 /// What a camera sees.
@@ -17,7 +17,7 @@ pub enum Modality {
 
 impl Modality {
     const ALL: [(Self, &'static str); 3] =
-        [(Self::Rgb, "pixels"), (Self::Depth, "depth"), (Self::Segmentation, "segmentation")];
+        [(Self::Rgb, columns::PIXELS), (Self::Depth, columns::DEPTH), (Self::Segmentation, columns::SEGMENTATION)];
 
     /// What columns of it are called.
     pub fn name(self) -> &'static str {
@@ -27,14 +27,14 @@ impl Modality {
 
 /// A camera and what it sees; by default the colours that the world's default camera sees.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
-pub struct View {
+pub struct CameraView {
     /// The camera's name, one of [`EnvSpec::cameras`]; the default one for `None`.
     pub camera: Option<String>,
     /// What it sees.
     pub modality: Modality,
 }
 
-impl View {
+impl CameraView {
     /// Reads `MODALITY`, `CAMERA` or `CAMERA:MODALITY`, where a modality is `pixels`, `depth` or `segmentation`.
     ///
     /// # Errors
@@ -83,12 +83,9 @@ impl View {
     }
 }
 
-impl fmt::Display for View {
+impl fmt::Display for CameraView {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match &self.camera {
-            None => write!(f, "{}", self.modality.name()),
-            Some(camera) => write!(f, "{}.{camera}", self.modality.name()),
-        }
+        f.write_str(&columns::of_camera(self.modality.name(), self.camera.as_deref()))
     }
 }
 
@@ -98,13 +95,16 @@ mod tests {
 
     #[test]
     fn a_view_is_a_camera_a_modality_or_both() -> Result<()> {
-        assert_eq!(View::parse("pixels")?, View::default());
-        assert_eq!(View::parse("depth")?, View { camera: None, modality: Modality::Depth });
-        assert_eq!(View::parse("wrist")?, View { camera: Some("wrist".to_owned()), modality: Modality::Rgb });
-        let both = View::parse("top:segmentation")?;
+        assert_eq!(CameraView::parse("pixels")?, CameraView::default());
+        assert_eq!(CameraView::parse("depth")?, CameraView { camera: None, modality: Modality::Depth });
+        assert_eq!(
+            CameraView::parse("wrist")?,
+            CameraView { camera: Some("wrist".to_owned()), modality: Modality::Rgb }
+        );
+        let both = CameraView::parse("top:segmentation")?;
         assert_eq!((both.to_string().as_str(), both.modality), ("segmentation.top", Modality::Segmentation));
         assert_eq!(both.column(4, 6), ColumnSpec::new("segmentation.top", DType::Int32, [4, 6]));
-        let error = View::parse("top:dept").expect_err("no modality").to_string();
+        let error = CameraView::parse("top:dept").expect_err("no modality").to_string();
         assert!(error.contains("depth"), "{error}");
         Ok(())
     }

@@ -1,0 +1,102 @@
+//! Starting an episode at a recorded row of a dataset, towards the state of another row.
+//!
+//! [`required_columns`] and [`reset`] do it for any environment: by [`Env::reset`] and [`Env::restore_from`], or by the
+//! environment's own [`DatasetStartEnv`] where it cannot restore its state from a row.
+
+use crate::batch::{RowRef, Schema};
+use crate::{Env, Error, ResetOptions, Result, columns};
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use std::collections::BTreeMap;
+
+/// A start and a goal from a dataset: two rows, their columns under [`columns::flat`] names.
+#[derive(Clone, Copy)]
+pub struct DatasetStart<'a> {
+    /// The row at which the episode starts.
+    pub start: RowRef<'a>,
+    /// The row whose state is the goal.
+    pub goal: RowRef<'a>,
+    /// Methods that put a third-party environment into a state; native environments need none.
+    pub callables: &'a [Callable],
+}
+
+/// A method of a third-party environment, called by name after a reset.
+///
+/// The layout is that of the argument `callables` of `World.evaluate` in the Python package `stable-worldmodel` 0.1.1.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Callable {
+    /// The method's name.
+    pub method: String,
+    /// Its keyword arguments.
+    #[serde(default)]
+    pub args: BTreeMap<String, CallableArgument>,
+}
+
+/// An argument of a [`Callable`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CallableArgument {
+    /// The value itself, or the name of a column: a plain name reads the start row, a name of [`columns::of_goal`] reads
+    /// the goal row.
+    #[serde(default)]
+    pub value: Value,
+    /// Whether `value` is the name of a column.
+    #[serde(default = "yes")]
+    pub in_dataset: bool,
+}
+
+fn yes() -> bool {
+    true
+}
+
+/// An environment that starts episodes at dataset rows by rules of its own, instead of [`Env::restore_from`].
+pub trait DatasetStartEnv {
+    /// The columns of a dataset that [`DatasetStartEnv::reset_from`] reads.
+    ///
+    /// # Errors
+    /// When the dataset lacks a required column.
+    fn required_columns(&self, stored: &Schema, callables: &[Callable]) -> Result<Vec<String>>;
+
+    /// Starts an episode at a row of a dataset. `seed` and `options` decide what the rows do not: randomness, and factors
+    /// that are shifted or not recorded.
+    ///
+    /// # Errors
+    /// As [`Env::reset`], and when a row lacks a required column.
+    fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: DatasetStart<'_>) -> Result<()>;
+}
+
+/// The columns of a dataset that [`reset`] reads: those of the environment's own rule, or all but images.
+///
+/// # Errors
+/// When the dataset lacks a required column: by default, a `state` of the environment's shape.
+pub fn required_columns(env: &dyn Env, stored: &Schema, callables: &[Callable]) -> Result<Vec<String>> {
+    if let Some(env) = env.dataset_start() {
+        return env.required_columns(stored, callables);
+    }
+    let (spec, state) = (env.spec(), stored.column(columns::STATE)?);
+    if let Some(own) = spec.columns.iter().find(|column| column.name == columns::STATE)
+        && own.shape != state.shape
+    {
+        return Err(Error::mismatch(
+            format!("starting {} from a dataset", spec.id),
+            format!("states of shape {:?}", state.shape),
+            format!("{:?}; was the dataset collected in this environment?", own.shape),
+        ));
+    }
+    let read = stored.columns().iter().filter(|column| !column.is_image());
+    Ok(read.map(|column| column.name.clone()).collect())
+}
+
+/// Starts an episode at a row of a dataset: by the environment's own rule, or by [`Env::reset`], which decides what the
+/// rows do not, followed by [`Env::restore_from`].
+///
+/// # Errors
+/// As these methods.
+pub fn reset(env: &mut dyn Env, seed: u64, options: &ResetOptions, from: DatasetStart<'_>) -> Result<()> {
+    if let Some(env) = env.dataset_start_mut() {
+        return env.reset_from(seed, options, from);
+    }
+    env.reset(seed, options)?;
+    env.restore_from(from.start, from.goal)
+}

@@ -1,0 +1,192 @@
+//! The run protocol: how a caller watches and stops a long command.
+//!
+//! Collecting, training, converting, examining, evaluating, reproducing and the demo all take a [`Control`]. They call
+//! [`Control::check`] between steps and [`Control::emit`] with an [`Event`] whenever there is progress to report.
+
+use crate::{Error, Result};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Something a run reports to its caller.
+///
+/// A run is a sequence of stages: [`Event::Started`], any number of the other events, [`Event::Finished`]. A stage that
+/// fails or is interrupted does not finish.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[non_exhaustive]
+pub enum Event<'a> {
+    /// A stage starts.
+    Started(Stage<'a>),
+    /// Part of the present stage is done.
+    Progress(Progress<'a>),
+    /// A message for people, one line.
+    Log(&'a str),
+    /// A file or folder was written: a dataset, a checkpoint, a video.
+    Saved(&'a Path),
+    /// The present stage is done; values that summarise it, by name, such as `success_rate`.
+    Finished {
+        /// The stage's [`Stage::name`].
+        stage: &'static str,
+        /// Values by name.
+        metrics: &'a [(&'static str, f64)],
+    },
+}
+
+/// A stage of a run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stage<'a> {
+    /// What is done, as an imperative verb: `collect`, `train`, `compare`, `convert`, `verify`, `examine`, `evaluate`.
+    pub name: &'static str,
+    /// What it is done to, such as the policy and the condition of an evaluation; empty where there is one subject only.
+    pub subject: &'a [&'a str],
+    /// How many units of work there are.
+    pub total: usize,
+    /// The unit of work: `episodes`, `steps`, `columns`.
+    pub unit: &'static str,
+}
+
+/// How far a stage is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Progress<'a> {
+    /// The stage's [`Stage::name`].
+    pub stage: &'static str,
+    /// Units of work done.
+    pub done: usize,
+    /// Units of work in all.
+    pub total: usize,
+    /// The unit of work: `episodes`, `steps`, `columns`.
+    pub unit: &'static str,
+    /// Present values by name, such as `loss` or `steps`; those worth showing first.
+    pub metrics: &'a [(&'static str, f64)],
+}
+
+impl Progress<'_> {
+    /// The present value of that name, if the run reports one.
+    pub fn metric(&self, name: &str) -> Option<f64> {
+        self.metrics.iter().find(|(known, _)| *known == name).map(|(_, value)| *value)
+    }
+
+    /// Whether all units of work are done.
+    pub fn is_done(&self) -> bool {
+        self.done >= self.total
+    }
+}
+
+/// A caller's poll, see [`Control::with_poll`].
+type Poll<'a> = Box<dyn FnMut() -> Result<()> + Send + 'a>;
+/// A caller's event sink, see [`Control::with_events`].
+type Sink<'a> = Box<dyn FnMut(Event<'_>) + Send + 'a>;
+
+/// A caller's hold on a run: an interrupt flag, a poll, and an event sink, each optional.
+#[derive(Default)]
+pub struct Control<'a> {
+    interrupt: Option<Arc<AtomicBool>>,
+    poll: Option<Poll<'a>>,
+    events: Option<Sink<'a>>,
+}
+
+impl<'a> Control<'a> {
+    /// A control that never stops the run and drops its events.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Stops the run with [`Error::Interrupted`] once `flag` is set, as by a signal handler.
+    #[must_use]
+    pub fn with_interrupt(self, flag: Arc<AtomicBool>) -> Self {
+        Self { interrupt: Some(flag), ..self }
+    }
+
+    /// Calls `poll` at every check and stops the run with its error: for callers with signals of their own, such as Python.
+    /// It is called between steps, so a slow poll limits its own rate.
+    #[must_use]
+    pub fn with_poll(self, poll: impl FnMut() -> Result<()> + Send + 'a) -> Self {
+        Self { poll: Some(Box::new(poll)), ..self }
+    }
+
+    /// Sends events to `sink`, which also limits its own rate.
+    #[must_use]
+    pub fn with_events(self, sink: impl FnMut(Event<'_>) + Send + 'a) -> Self {
+        Self { events: Some(Box::new(sink)), ..self }
+    }
+
+    /// Returns an error if the run is to stop. Costs one atomic load when no poll is set.
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`] when the interrupt flag is set, else the poll's error.
+    pub fn check(&mut self) -> Result<()> {
+        if self.interrupt.as_ref().is_some_and(|flag| flag.load(Ordering::Relaxed)) {
+            return Err(Error::Interrupted);
+        }
+        self.poll.as_mut().map_or(Ok(()), |poll| poll())
+    }
+
+    /// Sends an event to the sink, if there is one.
+    pub fn emit(&mut self, event: Event<'_>) {
+        if let Some(sink) = &mut self.events {
+            sink(event);
+        }
+    }
+
+    /// Emits [`Event::Progress`].
+    pub fn progress(&mut self, progress: Progress<'_>) {
+        self.emit(Event::Progress(progress));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PROGRESS: Progress<'_> =
+        Progress { stage: "train", done: 3, total: 5, unit: "steps", metrics: &[("loss", 0.5), ("lr", 1e-3)] };
+
+    #[test]
+    fn default_control_never_stops() {
+        let mut control = Control::new();
+        control.emit(Event::Log("dropped"));
+        assert!(control.check().is_ok());
+    }
+
+    #[test]
+    fn interrupt_flag_comes_before_the_poll() {
+        let flag = Arc::new(AtomicBool::new(false));
+        let mut polls = 0;
+        let mut control = Control::new().with_interrupt(Arc::clone(&flag)).with_poll(|| {
+            polls += 1;
+            if polls < 2 { Ok(()) } else { Err(Error::external("polling", "a signal")) }
+        });
+        assert!(control.check().is_ok());
+        assert!(matches!(control.check(), Err(Error::External { .. })));
+        flag.store(true, Ordering::Relaxed);
+        assert!(matches!(control.check(), Err(Error::Interrupted)));
+        drop(control);
+        assert_eq!(polls, 2, "an interrupted run does not poll");
+    }
+
+    #[test]
+    fn events_reach_the_sink_in_order() {
+        let mut seen = vec![];
+        let mut control = Control::new().with_events(|event| {
+            seen.push(match event {
+                Event::Started(stage) => format!("{} {:?}", stage.name, stage.subject),
+                Event::Progress(at) => format!("{}/{} {}", at.done, at.total, at.unit),
+                Event::Saved(path) => path.display().to_string(),
+                Event::Finished { metrics, .. } => format!("{metrics:?}"),
+                Event::Log(line) => line.to_owned(),
+            });
+        });
+        control.emit(Event::Started(Stage { name: "train", subject: &["lewm"], total: 5, unit: "steps" }));
+        control.progress(PROGRESS);
+        control.emit(Event::Saved(Path::new("out")));
+        control.emit(Event::Finished { stage: "train", metrics: &[("loss", 0.25)] });
+        drop(control);
+        assert_eq!(seen, ["train [\"lewm\"]", "3/5 steps", "out", "[(\"loss\", 0.25)]"]);
+    }
+
+    #[test]
+    fn metrics_are_found_by_name() {
+        assert_eq!((PROGRESS.metric("lr"), PROGRESS.metric("norm")), (Some(1e-3), None));
+        assert!(!PROGRESS.is_done() && Progress { done: 5, ..PROGRESS }.is_done());
+    }
+}

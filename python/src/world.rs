@@ -291,7 +291,7 @@ impl World {
                     let schema = world.collect_schema(config.goal)?;
                     let options = WriteOptions { mode, codec, manifest: Some(manifest), ..WriteOptions::default() };
                     match &format {
-                        Some(format) => (swm::data::FORMATS.get(format)?.create)(&location, &schema, options)?,
+                        Some(format) => swm::data::FORMATS.get(format)?.create(&location, &schema, options)?,
                         None => swm::data::create(location, &schema, options)?,
                     }
                 }

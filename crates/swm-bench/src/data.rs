@@ -189,7 +189,7 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
         }
     }
     let wanted = |layout: &&Layout| {
-        let known = FORMATS.rows.iter().any(|format| format.id() == layout.format);
+        let known = FORMATS.rows.iter().any(|format| format.id() == layout.format && format.is_available());
         known && (config.formats.is_empty() || config.formats.iter().any(|name| name == layout.format))
     };
     for layout in LAYOUTS.iter().filter(wanted) {

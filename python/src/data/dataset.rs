@@ -10,7 +10,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 use std::sync::{Arc, Mutex, PoisonError};
 use swm::core::{Batch, ColumnSpec, Error, Result, Schema};
-use swm::data::clip::ACTION;
+use swm::data::dataset::clips::ACTION;
 use swm::data::{CacheConfig, FORMATS, Reader, StepRange, views};
 use swm::home;
 
@@ -74,7 +74,7 @@ impl Dataset {
         let open = move || {
             let location = home::find_dataset(&path)?;
             match &format {
-                Some(format) => (FORMATS.get(format)?.open)(&location),
+                Some(format) => FORMATS.get(format)?.open(&location),
                 None => swm::data::open(location),
             }
         };

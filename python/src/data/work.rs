@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use swm::core::{Error, Named as _};
 use swm::data::convert::Stage;
 use swm::data::doctor::{examine, open_what_is_left, repair};
-use swm::data::{ConvertMode, ConvertOptions, Converted, FORMATS, Location, Reader, checksum};
+use swm::data::{ConvertMode, ConvertOptions, Converted, Location, Reader, checksum, formats};
 use swm::home;
 
 /// How to convert, from JSON.
@@ -169,7 +169,7 @@ pub fn inspect(py: Python<'_>, dataset: &Dataset, summed: bool) -> PyResult<Stri
 #[pyfunction]
 pub fn detect(path: &str) -> PyResult<Option<&'static str>> {
     let location = Location::parse(path).map_err(raised)?;
-    Ok(FORMATS.rows.iter().find(|format| (format.detect)(&location)).map(|format| format.id()))
+    Ok(formats::detect(&location).map(|format| format.id()))
 }
 
 /// Where a dataset is that is there, given by path, URI or name.

@@ -33,7 +33,7 @@ impl Writer {
         let made = py.detach(|| {
             let location = home::target(path, format)?;
             match format {
-                Some(format) => (FORMATS.get(format)?.create)(&location, &schema, options),
+                Some(format) => FORMATS.get(format)?.create(&location, &schema, options),
                 None => swm::data::create(location, &schema, options),
             }
         });

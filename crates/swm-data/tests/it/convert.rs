@@ -45,13 +45,13 @@ fn every_format_gives_back_what_it_got() {
     let path = source(folder.path());
     let from = open(&path).expect("opens");
     let sum = checksum(&*from).expect("a checksum");
-    for format in FORMATS.rows {
+    for format in FORMATS.rows.iter().filter(|format| format.is_available()) {
         let target = place(folder.path(), format.id);
         let wanted = ConvertOptions { format: Some(format.id.to_owned()), ..lossless(ConvertMode::Create) };
         let report = run(&path, &target, &wanted).unwrap_or_else(|error| panic!("{}: {error}", format.id));
         assert_eq!((report.episodes, report.kept, report.last_actions), (9, 0, 0), "{}", format.id);
         assert_eq!(report.checksum.as_deref(), Some(&sum[..]), "{}", format.id);
-        let to = (format.open)(&Location::from(&target)).expect("opens");
+        let to = format.open(&Location::from(&target)).expect("opens");
         check(&*to, 0);
         assert_eq!(to.manifest().map(|manifest| manifest.seed), from.manifest().map(|manifest| manifest.seed));
         for column in &report.columns {

@@ -178,7 +178,7 @@ pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> 
     });
     let writer = match (collection.shard, collection.format) {
         (Some(shard), _) => create_shard(location, &schema, options, shard)?,
-        (None, Some(format)) => (FORMATS.get(format)?.create)(location, &schema, options)?,
+        (None, Some(format)) => FORMATS.get(format)?.create(location, &schema, options)?,
         (None, None) => swm_data::create(*location, &schema, options)?,
     };
     let config = &CollectConfig { episodes: part.len(), first: part.start, ..config.clone() };

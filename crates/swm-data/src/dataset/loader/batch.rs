@@ -1,0 +1,116 @@
+//! From clips to a batch: which rows of which column, in one plan for the whole batch.
+
+use crate::dataset::clips::{ACTION, ClipSpec};
+use crate::dataset::goals::{GoalSpec, Goals};
+use crate::dataset::reader::{Reader, StepRange};
+use swm_core::{Batch, ColumnSpec, DType, Key, Result, Schema};
+
+/// Clips of a batch and the rows they need, kept to be made again.
+#[derive(Default)]
+pub(crate) struct Anchors {
+    /// All rows of every clip.
+    clips: Vec<StepRange>,
+    /// The rows shown: one for every step.
+    frames: Vec<StepRange>,
+    /// The rows that one kind of goal shows.
+    goals: Vec<StepRange>,
+}
+
+impl Anchors {
+    pub fn clear(&mut self) {
+        self.clips.clear();
+    }
+
+    pub fn extend(&mut self, clips: impl Iterator<Item = StepRange>) {
+        self.clips.extend(clips);
+    }
+}
+
+/// Fills batches with clips and their goals.
+pub(crate) struct Filler {
+    clip: ClipSpec,
+    goals: Vec<GoalSpec>,
+    schema: Schema,
+}
+
+impl Filler {
+    pub fn new(dataset: &Schema, clip: ClipSpec, goals: Vec<GoalSpec>) -> Result<Self> {
+        let mut columns = clip.schema(dataset)?.columns().to_vec();
+        for goal in &goals {
+            goal.check(&clip)?;
+            for name in &goal.columns {
+                let column = dataset.column(name)?;
+                let shape: Vec<usize> = std::iter::once(1).chain(column.shape.iter().copied()).collect();
+                columns.push(ColumnSpec::new(format!("{}_{name}", goal.name), column.dtype, shape));
+            }
+            columns.push(ColumnSpec::new(format!("{}_offset", goal.name), DType::Int64, []));
+        }
+        Ok(Self { clip, goals, schema: Schema::new(columns)? })
+    }
+
+    pub fn clip(&self) -> &ClipSpec {
+        &self.clip
+    }
+
+    /// The columns of a batch.
+    pub fn schema(&self) -> &Schema {
+        &self.schema
+    }
+
+    /// The columns of the dataset that are read.
+    pub fn columns(&self) -> Vec<&str> {
+        let mut names: Vec<&str> = vec![];
+        for name in self.clip.columns.iter().chain(self.goals.iter().flat_map(|goal| &goal.columns)) {
+            if !names.contains(&name.as_str()) {
+                names.push(name);
+            }
+        }
+        names
+    }
+
+    /// Rows an episode must have from a clip's first on.
+    pub fn reach(&self) -> usize {
+        self.goals.iter().map(|goal| goal.reach(&self.clip)).fold(self.clip.span(), usize::max)
+    }
+
+    /// Reads the clips. The goals of the clip in place `i` are drawn from `key(i)`.
+    pub fn fill(
+        &self,
+        reader: &dyn Reader,
+        anchors: &mut Anchors,
+        episodes: &Goals,
+        key: impl Fn(usize) -> Key,
+        out: &mut Batch,
+    ) -> Result<()> {
+        let Anchors { clips, frames, goals } = anchors;
+        let (steps, skip) = (self.clip.num_steps, self.clip.frameskip);
+        frames.clear();
+        frames.extend(
+            clips.iter().flat_map(|clip| (0..steps).map(|k| StepRange::new(clip.episode, clip.start + k * skip, 1))),
+        );
+        if out.rows() != clips.len() {
+            out.resize(clips.len());
+        }
+        let mut column = 0;
+        for name in &self.clip.columns {
+            let ranges = if name == ACTION || skip == 1 { &*clips } else { &*frames };
+            reader.read_column(name, ranges, out.bytes_mut(column))?;
+            column += 1;
+        }
+        for goal in &self.goals {
+            goals.clear();
+            let offsets = column + goal.columns.len();
+            for (i, clip) in clips.iter().enumerate() {
+                let drawn = goal.draw(&self.clip, clip, episodes, key(i).with(&goal.name));
+                goals.push(StepRange::new(drawn.episode, drawn.row, 1));
+                out.row_mut(i).set(offsets, &[drawn.offset]);
+            }
+            for name in &goal.columns {
+                reader.read_column(name, goals, out.bytes_mut(column))?;
+                column += 1;
+            }
+            column += 1;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,30 @@
+//! Datasets of episodes, independent of their format on disk.
+//!
+//! The contracts are [`Reader`] and [`Writer`]. Everything else builds on them: clips and goals, the loader and its
+//! cache, the replay buffer, splits, statistics and views. No file in this folder knows a format.
+
+pub mod cache;
+pub mod clips;
+pub(crate) mod episodes;
+pub mod goals;
+pub mod loader;
+mod location;
+pub mod objects;
+mod reader;
+pub mod replay;
+mod split;
+pub mod stats;
+mod sync;
+pub mod views;
+mod writer;
+
+pub use cache::CacheConfig;
+pub use clips::{ClipSpec, Clips};
+pub use goals::{GoalMixture, GoalSpec};
+pub use loader::{Epoch, Loaded, Loader, LoaderConfig};
+pub use location::Location;
+pub use reader::{Constants, Episode, Irregularity, Reader, StepRange};
+pub use replay::{ReplayBuffer, ReplayConfig, ReplayLoader};
+pub use split::{Part, Split};
+pub use stats::{ColumnStats, column_quantiles, column_stats};
+pub use writer::{CommitPolicy, WriteMode, WriteOptions, Writer};

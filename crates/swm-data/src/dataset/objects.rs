@@ -1,0 +1,286 @@
+//! Object stores: `s3://`, `gs://`, `az://`, `http(s)://`, and this machine's files in the same terms.
+//!
+//! Credentials and endpoints come from the environment, under the names that each provider's own tools use:
+//! `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, `AWS_SESSION_TOKEN`, `AWS_REGION`, `AWS_ENDPOINT_URL`,
+//! `AWS_SKIP_SIGNATURE=true` for public buckets; `GOOGLE_APPLICATION_CREDENTIALS`; `AZURE_STORAGE_ACCOUNT_NAME`,
+//! `AZURE_STORAGE_ACCOUNT_KEY`. Each kind of store is a feature of this crate.
+
+mod blocks;
+
+pub(crate) use blocks::{Blocks, Pieces};
+
+use crate::dataset::location::Location;
+use futures::FutureExt as _;
+use object_store::path::Path as StorePath;
+use object_store::{ObjectStore, ObjectStoreExt as _, RetryConfig};
+use std::future::Future;
+use std::ops::Range;
+use std::panic::AssertUnwindSafe;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError, mpsc};
+use std::time::Duration;
+use swm_core::{Error, Result};
+use tokio::runtime::Runtime;
+use url::Url;
+
+/// Bytes of an object.
+pub use bytes::Bytes;
+
+/// Ranges nearer than this are fetched with what is between them: at 100 MB/s it costs a millisecond, and a request
+/// several.
+const GAP: u64 = 128 << 10;
+
+/// Requests in flight for one read.
+const REQUESTS: usize = 32;
+
+/// How long a store that does not answer is asked again: about six seconds in all.
+#[cfg_attr(not(any(feature = "s3", feature = "gs", feature = "az", feature = "http")), allow(unused))]
+fn patience() -> RetryConfig {
+    RetryConfig { max_retries: 6, retry_timeout: Duration::from_secs(60), ..RetryConfig::default() }
+}
+
+/// Asynchronous code runs on two threads of its own, made at first use and never ended. A process that was forked, as
+/// Python's are, has none of the threads of the one it was forked from, and makes its own.
+fn runtime() -> Result<&'static Runtime> {
+    static RUNTIME: Mutex<Option<(u32, &'static Runtime)>> = Mutex::new(None);
+    let mut made = RUNTIME.lock().unwrap_or_else(PoisonError::into_inner);
+    let process = std::process::id();
+    if let Some((owner, runtime)) = *made
+        && owner == process
+    {
+        return Ok(runtime);
+    }
+    let runtime =
+        tokio::runtime::Builder::new_multi_thread().worker_threads(2).thread_name("swm-io").enable_all().build();
+    let runtime = runtime.map_err(|e| Error::external("starting the threads that read datasets", e))?;
+    let runtime = &*Box::leak(Box::new(runtime));
+    *made = Some((process, runtime));
+    Ok(runtime)
+}
+
+/// Runs asynchronous code to its end, from any thread, be it one of another runtime. `None` when it panics, which
+/// damaged files can provoke in the libraries that read them.
+///
+/// # Errors
+/// When the system has no threads left.
+pub(crate) fn wait<T: Send + 'static>(future: impl Future<Output = T> + Send + 'static) -> Result<Option<T>> {
+    let (sender, receiver) = mpsc::sync_channel(1);
+    runtime()?.spawn(async move {
+        // The receiver waits below, so sending cannot fail.
+        let _ = sender.send(AssertUnwindSafe(future).catch_unwind().await);
+    });
+    Ok(receiver.recv().ok().and_then(std::result::Result::ok))
+}
+
+/// The store that a location is in, and its path there.
+///
+/// # Errors
+/// When the location names no bucket, this build lacks the feature for it, or the environment's settings for it make
+/// no sense.
+pub fn store(location: &Location) -> Result<(Arc<dyn ObjectStore>, StorePath)> {
+    match location {
+        Location::Path(path) => {
+            let path = std::path::absolute(path).map_err(|e| Error::io(path, "finding the file", e))?;
+            let inside = StorePath::from_absolute_path(&path)
+                .map_err(|e| Error::config("dataset path", e.to_string(), "use another path"))?;
+            Ok((Arc::new(object_store::local::LocalFileSystem::new()), inside))
+        }
+        Location::Uri(url) => {
+            let inside = StorePath::from_url_path(url.path())
+                .map_err(|e| Error::config("dataset", format!("{url}: {e}"), "check its spelling"))?;
+            Ok((remote(url)?, inside))
+        }
+    }
+}
+
+#[cfg_attr(not(any(feature = "s3", feature = "gs", feature = "az", feature = "http")), allow(unused))]
+fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
+    let wrong = |e: object_store::Error| {
+        let fix = "the environment says how it is reached, such as AWS_ENDPOINT_URL, AWS_REGION and AWS_ACCESS_KEY_ID";
+        Error::config("dataset", format!("{url}: {e}"), fix)
+    };
+    #[cfg(feature = "tls")]
+    provide_tls();
+    match url.scheme() {
+        #[cfg(feature = "s3")]
+        "s3" => {
+            // An endpoint that says http:// means it.
+            let builder = object_store::aws::AmazonS3Builder::from_env().with_url(url.as_str()).with_allow_http(true);
+            Ok(Arc::new(builder.with_retry(patience()).build().map_err(wrong)?))
+        }
+        #[cfg(feature = "gs")]
+        "gs" => {
+            let builder = object_store::gcp::GoogleCloudStorageBuilder::from_env().with_url(url.as_str());
+            Ok(Arc::new(builder.with_retry(patience()).build().map_err(wrong)?))
+        }
+        #[cfg(feature = "az")]
+        "az" => {
+            let builder = object_store::azure::MicrosoftAzureBuilder::from_env().with_url(url.as_str());
+            Ok(Arc::new(builder.with_allow_http(true).with_retry(patience()).build().map_err(wrong)?))
+        }
+        #[cfg(feature = "http")]
+        "http" | "https" => {
+            let options = object_store::ClientOptions::new().with_allow_http(true);
+            let server = &url[..url::Position::BeforePath];
+            let builder = object_store::http::HttpBuilder::new().with_url(server).with_client_options(options);
+            Ok(Arc::new(builder.with_retry(patience()).build().map_err(wrong)?))
+        }
+        scheme => {
+            let feature = if scheme == "https" { "http" } else { scheme };
+            let problem = format!("this build does not reach {scheme}:// (it lacks the feature `{feature}`)");
+            let fix = format!("build it with --features {feature}, or copy the dataset to this machine");
+            Err(Error::config("dataset", problem, fix))
+        }
+    }
+}
+
+/// Makes ring the process's provider of cryptography, unless the process already has one.
+#[cfg(feature = "tls")]
+fn provide_tls() {
+    // An error means that a provider is installed, which serves as well.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+}
+
+/// An error of a store in our words.
+pub(crate) fn explain(label: &Path, action: &str, error: &object_store::Error) -> Error {
+    match error {
+        object_store::Error::NotFound { .. } => Error::corrupt(
+            label,
+            format!("{action}: there is no such object"),
+            "check the name; the store tells apart upper and lower case",
+        ),
+        other => Error::external(format!("{}: {action}", label.display()), other),
+    }
+}
+
+/// A file, wherever it is, read by ranges of bytes. Safe to share between threads.
+pub struct ObjectFile {
+    store: Arc<dyn ObjectStore>,
+    path: StorePath,
+    label: PathBuf,
+    len: u64,
+}
+
+impl ObjectFile {
+    /// Opens a file.
+    ///
+    /// # Errors
+    /// When there is none, or the store does not answer.
+    pub fn open(location: &Location) -> Result<Self> {
+        let (store, path) = store(location)?;
+        let label = location.label();
+        let (asked, place) = (Arc::clone(&store), path.clone());
+        let meta = Self::finish(&label, "opening it", wait(async move { asked.head(&place).await })?)?;
+        Ok(Self { store, path, label, len: meta.size })
+    }
+
+    /// How many bytes it has.
+    pub fn len(&self) -> u64 {
+        self.len
+    }
+
+    /// Whether it has none.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// The bytes of all ranges, in the given order. Ranges that lie near each other are fetched in one request, and
+    /// all requests at once.
+    ///
+    /// # Errors
+    /// When a range is not within the file, or the store does not answer.
+    pub fn read(&self, ranges: &[Range<u64>]) -> Result<Vec<Bytes>> {
+        if let Some(range) = ranges.iter().find(|range| range.start > range.end || range.end > self.len) {
+            let given = format!("bytes {}..{} of {}", range.start, range.end, self.label.display());
+            return Err(Error::mismatch("reading a file", given, format!("bytes below {}", self.len)));
+        }
+        let (store, path) = (Arc::clone(&self.store), self.path.clone());
+        let ranges = ranges.to_vec();
+        let action = "reading it";
+        let result = wait(async move { fetch(&*store, &path, &ranges).await })?;
+        Self::finish(&self.label, action, result)
+    }
+
+    fn finish<T>(label: &Path, action: &str, result: Option<object_store::Result<T>>) -> Result<T> {
+        match result {
+            Some(result) => result.map_err(|e| explain(label, action, &e)),
+            None => Err(Error::external(format!("{}: {action}", label.display()), "the store's client panicked")),
+        }
+    }
+}
+
+/// The bytes of some ranges of an object.
+pub(crate) async fn fetch(
+    store: &dyn ObjectStore,
+    path: &StorePath,
+    ranges: &[Range<u64>],
+) -> object_store::Result<Vec<Bytes>> {
+    use futures::{StreamExt as _, TryStreamExt as _};
+    let joined = join(ranges);
+    let parts: Vec<Bytes> = futures::stream::iter(joined.clone())
+        .map(|range| store.get_range(path, range))
+        .buffered(REQUESTS)
+        .try_collect()
+        .await?;
+    ranges
+        .iter()
+        .map(|range| {
+            if range.is_empty() {
+                return Ok(Bytes::new());
+            }
+            let at = joined.partition_point(|part| part.start <= range.start) - 1;
+            let start = (range.start - joined[at].start) as usize;
+            let end = (range.end - joined[at].start) as usize;
+            if end > parts[at].len() {
+                // The object shrank since its size was asked for.
+                return Err(object_store::Error::Generic { store: "object", source: "it ends too early".into() });
+            }
+            Ok(parts[at].slice(start..end))
+        })
+        .collect()
+}
+
+/// The requests that cover all ranges: sorted, and those near each other joined.
+fn join(ranges: &[Range<u64>]) -> Vec<Range<u64>> {
+    let mut sorted: Vec<Range<u64>> = ranges.iter().filter(|range| !range.is_empty()).cloned().collect();
+    sorted.sort_unstable_by_key(|range| (range.start, range.end));
+    let mut joined: Vec<Range<u64>> = vec![];
+    for range in sorted {
+        match joined.last_mut() {
+            Some(last) if range.start <= last.end.saturating_add(GAP) => last.end = last.end.max(range.end),
+            _ => joined.push(range),
+        }
+    }
+    joined
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ranges_come_back_in_the_order_asked_however_they_are_joined() -> Result<()> {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("file");
+        let content: Vec<u8> = (0..3_000_000_u32).map(|i| ((i * i) >> 7) as u8).collect();
+        std::fs::write(&path, &content).expect("writes");
+        let file = ObjectFile::open(&Location::from(&path))?;
+        assert_eq!(file.len(), 3_000_000);
+        let ranges = [2_000_000..2_000_100, 5..10, 7..7, 8..300, 2_050_000..3_000_000, 0..0, 500_000..500_001];
+        assert_eq!(join(&ranges), [5..300, 500_000..500_001, 2_000_000..3_000_000]);
+        for (range, bytes) in ranges.iter().zip(file.read(&ranges)?) {
+            assert_eq!(bytes, content[range.start as usize..range.end as usize]);
+        }
+        assert!(file.read(std::slice::from_ref(&(0..3_000_001))).is_err());
+        Ok(())
+    }
+
+    #[test]
+    fn waiting_works_inside_another_runtime_and_survives_a_panic() -> Result<()> {
+        let other = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
+        assert_eq!(other.block_on(async { wait(async { 7 }) })?, Some(7));
+        let panics = wait::<()>(async { std::panic::resume_unwind(Box::new("damaged")) })?;
+        assert_eq!(panics, None);
+        Ok(())
+    }
+}

@@ -1,0 +1,169 @@
+//! [`concat`]: the episodes of several datasets, one after another.
+
+use super::view_hash;
+use crate::dataset::episodes::{EPISODE, Rows, STEP, numbering, words};
+use crate::dataset::reader::{Constants, Episode, Irregularity, Reader, StepRange};
+use crate::dataset::sync::lock;
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex};
+use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
+
+/// The episodes of several datasets, one after another, numbered from 0 on. All have the same columns, in any order.
+///
+/// # Errors
+/// When there is no dataset, or the columns of one differ from those of the first; says which.
+pub fn concat(parts: Vec<Arc<dyn Reader>>) -> Result<Arc<dyn Reader>> {
+    let Some(first) = parts.first() else {
+        return Err(Error::config("concatenation", "there is no dataset", "name at least one"));
+    };
+    let data = |reader: &Arc<dyn Reader>| -> Vec<ColumnSpec> {
+        reader.schema().columns().iter().filter(|c| c.name != EPISODE && c.name != STEP).cloned().collect()
+    };
+    let columns = data(first);
+    for (i, part) in parts.iter().enumerate() {
+        let theirs = data(part);
+        let without = |a: &[ColumnSpec], b: &[ColumnSpec]| {
+            let missing: Vec<ColumnSpec> = a.iter().filter(|&column| !b.contains(column)).cloned().collect();
+            (!missing.is_empty()).then(|| words(&missing))
+        };
+        let (missing, extra) = (without(&columns, &theirs), without(&theirs, &columns));
+        if missing.is_some() || extra.is_some() {
+            return Err(Error::mismatch(
+                format!("concatenating dataset {} to the first", i + 1),
+                format!("besides the columns of both: {}", extra.as_deref().unwrap_or("nothing")),
+                format!("{}; select the columns that both have", missing.as_deref().unwrap_or("nothing")),
+            ));
+        }
+    }
+    let mut rows = Rows::default();
+    parts.iter().flat_map(|part| part.episodes()).for_each(|episode| rows.push(episode.length));
+    let mut first_episodes = vec![0];
+    for part in &parts {
+        first_episodes.push(first_episodes[first_episodes.len() - 1] + part.episodes().len());
+    }
+    let numbers = numbering(first.schema().columns());
+    let schema = Schema::new([&numbers[..], &columns].concat())?;
+    Ok(Arc::new(Concat { parts, first_episodes, rows, schema, scratch: Mutex::default() }))
+}
+
+struct Concat {
+    parts: Vec<Arc<dyn Reader>>,
+    /// The position of the first episode of every part, and the end.
+    first_episodes: Vec<usize>,
+    rows: Rows,
+    schema: Schema,
+    /// Room for what a part reads, kept.
+    scratch: Mutex<Vec<Vec<u8>>>,
+}
+
+impl Concat {
+    /// The part an episode is of, and its position there.
+    fn locate(&self, episode: usize) -> (usize, usize) {
+        let part = self.first_episodes.partition_point(|&first| first <= episode) - 1;
+        (part, episode - self.first_episodes[part])
+    }
+}
+
+impl Reader for Concat {
+    fn schema(&self) -> &Schema {
+        &self.schema
+    }
+
+    fn episodes(&self) -> &[Episode] {
+        self.rows.episodes()
+    }
+
+    fn read_column(&self, column: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        let spec = self.schema.column(column)?;
+        if column == EPISODE || column == STEP {
+            return self.rows.number(spec, ranges, out);
+        }
+        Rows::check_room(spec, ranges, out)?;
+        // The part of every range, where its rows go, and the range as the part knows it.
+        let n = spec.row_bytes();
+        let mut jobs = Vec::with_capacity(ranges.len());
+        let mut place = 0;
+        for range in ranges {
+            self.rows.range(range)?;
+            let (part, episode) = self.locate(range.episode);
+            jobs.push((part, place, StepRange { episode, ..*range }));
+            place += range.length * n;
+        }
+        // Ranges of one part that follow each other are read together, straight to their places.
+        let alone = jobs.iter().all(|job| job.0 == jobs[0].0);
+        if let (true, Some(&(part, ..))) = (alone, jobs.first()) {
+            let ranges: Vec<StepRange> = jobs.iter().map(|job| job.2).collect();
+            return self.parts[part].read_column(column, &ranges, out);
+        }
+        let mut read = lock(&self.scratch).pop().unwrap_or_default();
+        for (i, part) in self.parts.iter().enumerate() {
+            let of_part = jobs.iter().filter(|job| job.0 == i);
+            let ranges: Vec<StepRange> = of_part.clone().map(|job| job.2).collect();
+            if ranges.is_empty() {
+                continue;
+            }
+            read.resize(ranges.iter().map(|range| range.length * n).sum(), 0);
+            part.read_column(column, &ranges, &mut read)?;
+            let mut rest = &read[..];
+            for (_, place, range) in of_part {
+                let (bytes, others) = rest.split_at(range.length * n);
+                out[*place..*place + bytes.len()].copy_from_slice(bytes);
+                rest = others;
+            }
+        }
+        lock(&self.scratch).push(read);
+        Ok(())
+    }
+
+    fn constants(&self, episode: usize) -> Result<Constants> {
+        self.rows.range(&StepRange::new(episode, 0, 0))?;
+        let (part, episode) = self.locate(episode);
+        self.parts[part].constants(episode)
+    }
+
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
+        let mut found = vec![];
+        for (part, first) in self.parts.iter().zip(&self.first_episodes) {
+            found.extend(part.irregularities()?.into_iter().map(|Irregularity { episode, what }| Irregularity {
+                episode: episode.map(|episode| first + episode),
+                what,
+            }));
+        }
+        Ok(found)
+    }
+
+    /// That of the parts, if they agree; or one that holds theirs, and what they agree in of their configurations.
+    fn manifest(&self) -> Option<Manifest> {
+        let manifests: Vec<Manifest> = self.parts.iter().filter_map(|part| part.manifest()).collect();
+        let first = manifests.first()?;
+        if manifests.len() == self.parts.len() && manifests.iter().all(|manifest| manifest == first) {
+            return Some(first.clone());
+        }
+        let mut config = serde_json::Map::new();
+        for (name, value) in first.config.as_object().into_iter().flatten() {
+            if manifests.iter().all(|manifest| manifest.config.get(name) == Some(value)) {
+                config.insert(name.clone(), value.clone());
+            }
+        }
+        config.insert("parts".to_owned(), serde_json::to_value(&manifests).ok()?);
+        Some(Manifest::new("concat", first.seed, config.into()))
+    }
+
+    fn footprint(&self) -> Result<Vec<(String, u64)>> {
+        let mut sizes: BTreeMap<String, u64> = BTreeMap::new();
+        for part in &self.parts {
+            for (name, size) in part.footprint()? {
+                *sizes.entry(name).or_default() += size;
+            }
+        }
+        let mut sizes: Vec<(String, u64)> = sizes.into_iter().collect();
+        sizes.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
+        Ok(sizes)
+    }
+
+    /// A hash of the parts' hashes.
+    fn content_hash(&self) -> Result<String> {
+        let parts: Result<Vec<String>> = self.parts.iter().map(|part| part.content_hash()).collect();
+        Ok(view_hash("concat", parts?))
+    }
+}

@@ -1,0 +1,94 @@
+//! [`merge`]: columns of another dataset beside those of one with the same episodes.
+
+use super::view_hash;
+use crate::dataset::reader::{Constants, Episode, Irregularity, Reader, StepRange};
+use std::sync::Arc;
+use swm_core::{Error, Manifest, Result, Schema};
+
+/// A dataset with these columns of another one, such as embeddings that were computed from its pictures. Both have
+/// episodes of the same lengths in the same order; numbers, provenance and constants are the base's (constants of the
+/// other are added where the base has none of the name).
+///
+/// # Errors
+/// When their episodes differ, a column does not exist, or the base has a column of its name.
+pub fn merge(base: Arc<dyn Reader>, other: Arc<dyn Reader>, columns: &[&str]) -> Result<Arc<dyn Reader>> {
+    let lengths = |reader: &Arc<dyn Reader>| reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>();
+    let (ours, theirs) = (lengths(&base), lengths(&other));
+    if ours != theirs {
+        let differs = ours.iter().zip(&theirs).position(|(a, b)| a != b);
+        let (given, expected) = match differs {
+            Some(i) => (format!("{} rows in episode {i}", theirs[i]), ours[i].to_string()),
+            None => (format!("{} episodes", theirs.len()), ours.len().to_string()),
+        };
+        return Err(Error::mismatch("merging columns of another dataset", given, expected));
+    }
+    let mut all = base.schema().columns().to_vec();
+    for name in columns {
+        let column = other.schema().column(name)?;
+        if base.schema().find(name).is_some() {
+            return Err(Error::config(
+                format!("merging column '{name}'"),
+                "the dataset has a column of that name",
+                "leave one of the two out (select the columns to keep)",
+            ));
+        }
+        all.push(column.clone());
+    }
+    Ok(Arc::new(Merge { schema: Schema::new(all)?, base, other }))
+}
+
+struct Merge {
+    schema: Schema,
+    base: Arc<dyn Reader>,
+    other: Arc<dyn Reader>,
+}
+
+impl Merge {
+    /// The columns that are the other's.
+    fn added(&self) -> impl Iterator<Item = &str> {
+        self.schema.columns().iter().skip(self.base.schema().columns().len()).map(|column| column.name.as_str())
+    }
+}
+
+impl Reader for Merge {
+    fn schema(&self) -> &Schema {
+        &self.schema
+    }
+
+    fn episodes(&self) -> &[Episode] {
+        self.base.episodes()
+    }
+
+    fn read_column(&self, column: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        let reader =
+            if self.schema.index(column)? < self.base.schema().columns().len() { &self.base } else { &self.other };
+        reader.read_column(column, ranges, out)
+    }
+
+    fn constants(&self, episode: usize) -> Result<Constants> {
+        let mut constants = self.other.constants(episode)?;
+        constants.append(&mut self.base.constants(episode)?);
+        Ok(constants)
+    }
+
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
+        self.base.irregularities()
+    }
+
+    fn manifest(&self) -> Option<Manifest> {
+        self.base.manifest()
+    }
+
+    fn footprint(&self) -> Result<Vec<(String, u64)>> {
+        let mut sizes = self.base.footprint()?;
+        sizes.extend(self.other.footprint()?.into_iter().filter(|(name, _)| self.added().any(|added| added == name)));
+        sizes.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
+        Ok(sizes)
+    }
+
+    /// A hash of both hashes and the names of the columns that are added.
+    fn content_hash(&self) -> Result<String> {
+        let hashes = [self.base.content_hash()?, self.other.content_hash()?];
+        Ok(view_hash("merge", hashes.into_iter().chain(self.added().map(str::to_owned))))
+    }
+}

@@ -1,0 +1,78 @@
+//! The contract for storing episodes: [`Writer`] and its options.
+
+use super::reader::Constants;
+use std::time::Duration;
+use swm_core::{Batch, Manifest, Result};
+use swm_image::ImageCodec;
+
+/// What happens when the dataset to write already exists.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum WriteMode {
+    /// Fail: the dataset must be new.
+    #[default]
+    Create,
+    /// Append to it, or create it if there is none.
+    Append,
+    /// Replace it.
+    Overwrite,
+}
+
+/// When finished episodes are committed: as soon as one of these limits is reached. A killed process loses at most the
+/// episodes that were not committed yet.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct CommitPolicy {
+    /// Maximum number of episodes per commit.
+    pub episodes: usize,
+    /// Maximum number of encoded bytes per commit; this also bounds the writer's memory.
+    pub bytes: usize,
+    /// Maximum time between commits. It is checked when an episode arrives.
+    pub interval: Duration,
+}
+
+impl Default for CommitPolicy {
+    fn default() -> Self {
+        Self { episodes: usize::MAX, bytes: 64 << 20, interval: Duration::from_secs(2) }
+    }
+}
+
+/// How a dataset is written.
+#[derive(Clone, Debug, Default)]
+pub struct WriteOptions {
+    /// What happens when the dataset already exists.
+    pub mode: WriteMode,
+    /// How images are encoded.
+    pub codec: ImageCodec,
+    /// Provenance of the data, stored with them. When appending, it replaces the stored manifest.
+    pub manifest: Option<Manifest>,
+    /// When finished episodes are committed.
+    pub commit: CommitPolicy,
+}
+
+/// Stores complete episodes. Committed episodes survive a killed process. Dropping a writer commits the remaining ones,
+/// but only [`Writer::finish`] reports errors of that last commit.
+pub trait Writer: Send {
+    /// Adds one complete episode and its constants. The writer numbers the columns `episode_idx` and `step_idx`
+    /// itself and ignores their values in `episode`.
+    ///
+    /// # Errors
+    /// If the columns differ from the writer's schema, the episode breaks the time convention (the last action NaN or
+    /// -1, all others finite), a value does not fit its stored type, or writing fails.
+    fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()>;
+
+    /// Adds one complete episode without [`Constants`].
+    ///
+    /// # Errors
+    /// As [`Writer::write_episode_with`].
+    fn write_episode(&mut self, episode: &Batch) -> Result<()> {
+        self.write_episode_with(episode, &Constants::new())
+    }
+
+    /// Number of episodes in the dataset, including those that are not committed yet.
+    fn episodes(&self) -> usize;
+
+    /// Commits the remaining episodes.
+    ///
+    /// # Errors
+    /// If writing fails, or another process changed the dataset in the meantime.
+    fn finish(self: Box<Self>) -> Result<()>;
+}

@@ -1,0 +1,154 @@
+//! The journal: episodes that are committed, but not yet in the column files.
+
+use super::{LENGTHS, Pending};
+use crate::dataset::Constants;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions};
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+use swm_core::{ColumnSpec, Error, Result};
+
+/// How a record begins: this, the lengths of its head and its body, the BLAKE3 hash of both.
+const MAGIC: &[u8; 8] = b"swm-ep-1";
+/// Bytes before the head.
+const LEAD: usize = 8 + 8 + 8 + 32;
+
+/// What a record's body holds: the columns of numbers, one after another, then the constants in order of their names.
+#[derive(Serialize, Deserialize)]
+struct Head {
+    episode: usize,
+    rows: usize,
+    constants: BTreeMap<String, usize>,
+}
+
+/// The journal of a folder.
+pub(super) fn path(folder: &Path) -> PathBuf {
+    folder.join(format!("{LENGTHS}.journal"))
+}
+
+/// Appends an episode's record to `out`.
+pub(super) fn record(episode: usize, pending: &Pending, out: &mut Vec<u8>) -> Result<()> {
+    let constants = pending.constants.iter().map(|(name, bytes)| (name.clone(), bytes.len())).collect();
+    let head = serde_json::to_vec(&Head { episode, rows: pending.rows, constants })
+        .map_err(|e| Error::external("describing an episode", e))?;
+    let start = out.len();
+    out.extend([0; LEAD]);
+    out.extend(&head);
+    pending.columns.iter().chain(pending.constants.values()).for_each(|bytes| out.extend(bytes));
+    let body = out.len() - start - LEAD - head.len();
+    let hash = blake3::hash(&out[start + LEAD..]);
+    let lead = &mut out[start..start + LEAD];
+    lead[..8].copy_from_slice(MAGIC);
+    lead[8..16].copy_from_slice(&(head.len() as u64).to_le_bytes());
+    lead[16..24].copy_from_slice(&(body as u64).to_le_bytes());
+    lead[24..].copy_from_slice(hash.as_bytes());
+    Ok(())
+}
+
+/// The episodes of a journal from number `from` on. A record that is not whole, at the end, was never committed.
+///
+/// # Errors
+/// When a record is damaged, or one is missing.
+pub(super) fn replay(path: &Path, mut bytes: &[u8], columns: &[&ColumnSpec], from: usize) -> Result<Vec<Pending>> {
+    let damaged =
+        |problem: String| Error::corrupt(path, problem, "restore it from a copy, or remove it with its episodes");
+    let mut episodes = vec![];
+    while let Some((lead, rest)) = bytes.split_at_checked(LEAD) {
+        let length = |at: usize| u64::from_le_bytes(std::array::from_fn(|i| lead[at + i]));
+        let sizes = usize::try_from(length(8)).ok().zip(usize::try_from(length(16)).ok());
+        let whole = sizes.and_then(|(head, body)| Some((head, rest.split_at_checked(head.checked_add(body)?)?)));
+        let Some((head, (record, rest))) = whole.filter(|_| lead.starts_with(MAGIC)) else { break };
+        if *blake3::hash(record).as_bytes() != lead[24..] {
+            if rest.is_empty() {
+                break;
+            }
+            return Err(damaged(format!("the record after episode {} is damaged", from + episodes.len())));
+        }
+        bytes = rest;
+        let (head, mut body) = record.split_at(head);
+        let head: Head = serde_json::from_slice(head).map_err(|e| damaged(e.to_string()))?;
+        if head.episode < from {
+            continue;
+        }
+        if head.episode != from + episodes.len() {
+            let expected = from + episodes.len();
+            return Err(damaged(format!("episode {} comes where {expected} should", head.episode)));
+        }
+        let mut take = |size: Option<usize>| {
+            let (bytes, rest) = size.and_then(|size| body.split_at_checked(size))?;
+            body = rest;
+            Some(bytes.to_vec())
+        };
+        let numbers: Option<Vec<Vec<u8>>> =
+            columns.iter().map(|column| take(head.rows.checked_mul(column.row_bytes()))).collect();
+        let constants: Option<Constants> =
+            head.constants.into_iter().map(|(name, size)| Some((name, take(Some(size))?))).collect();
+        let (Some(columns), Some(constants)) = (numbers, constants) else {
+            return Err(damaged(format!("episode {} does not have the dataset's columns", head.episode)));
+        };
+        episodes.push(Pending { rows: head.rows, columns, constants });
+    }
+    Ok(episodes)
+}
+
+/// The end of a journal, to write at.
+pub(super) struct Journal {
+    path: PathBuf,
+    file: File,
+    length: u64,
+}
+
+impl Journal {
+    /// Begins an empty journal.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn create(folder: &Path) -> Result<Self> {
+        let path = path(folder);
+        let mut options = OpenOptions::new();
+        let file = options.write(true).create(true).truncate(true).open(&path);
+        let file = file.map_err(|e| Error::io(&path, "creating the journal", e))?;
+        Ok(Self { path, file, length: 0 })
+    }
+
+    /// Appends records and makes sure that they are on the disk; all or none.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn append(&mut self, records: &[u8]) -> Result<()> {
+        let written = self.file.write_all(records).and_then(|()| self.file.sync_data());
+        if let Err(error) = written {
+            // What was written in part would hide what follows.
+            self.truncate(self.length)?;
+            return Err(Error::io(&self.path, "writing the journal", error));
+        }
+        self.length += records.len() as u64;
+        Ok(())
+    }
+
+    /// Forgets all records.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn clear(&mut self) -> Result<()> {
+        self.truncate(0)?;
+        self.length = 0;
+        Ok(())
+    }
+
+    fn truncate(&mut self, length: u64) -> Result<()> {
+        use std::io::Seek as _;
+        let seek = std::io::SeekFrom::Start(length);
+        let cut = self.file.set_len(length).and_then(|()| self.file.seek(seek));
+        cut.map(drop).map_err(|e| Error::io(&self.path, "shortening the journal", e))
+    }
+
+    /// Removes it.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn remove(self) -> Result<()> {
+        std::fs::remove_file(&self.path).map_err(|e| Error::io(&self.path, "removing the journal", e))
+    }
+}

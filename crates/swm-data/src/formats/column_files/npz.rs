@@ -1,0 +1,283 @@
+//! numpy's `.npz` files: zip archives of `.npy` arrays.
+//!
+//! What is read is checked against the archive's checksums. Stored and deflated members are understood, as
+//! `numpy.savez` and `numpy.savez_compressed` write them; ours are stored.
+
+use crate::formats::stored_scalar::{Class, Stored};
+use std::fs::File;
+use std::io::{BufReader, BufWriter, Read as _, Write};
+use std::path::{Path, PathBuf};
+use swm_core::{ColumnSpec, DType, Error, Result};
+use zip::write::SimpleFileOptions;
+use zip::{ZipArchive, ZipWriter};
+
+/// The member that holds the array which `numpy.savez(file, array)` was given.
+const ARRAY: &str = "arr_0.npy";
+/// How an array begins.
+const MAGIC: &[u8] = b"\x93NUMPY";
+/// What deflate makes of a byte at most; an archive that promises more lies.
+const MOST_PER_BYTE: u64 = 1032;
+
+/// What is known of an array before its numbers are read.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Header {
+    /// The type of its numbers; none for text and objects.
+    pub stored: Option<Stored>,
+    /// Its shape, the rows first.
+    pub shape: Vec<usize>,
+}
+
+impl Header {
+    /// How many rows it has.
+    pub fn rows(&self) -> usize {
+        self.shape.first().copied().unwrap_or(1)
+    }
+
+    /// The column whose rows these are, if they are numbers.
+    pub fn spec(&self, name: &str) -> Option<ColumnSpec> {
+        let dtype = self.stored?.dtype()?;
+        Some(ColumnSpec::new(name, dtype, self.shape.get(1..).unwrap_or_default()))
+    }
+}
+
+/// An open archive.
+pub(crate) struct Npz {
+    path: PathBuf,
+    archive: ZipArchive<BufReader<File>>,
+}
+
+impl Npz {
+    /// Opens an archive.
+    ///
+    /// # Errors
+    /// When it is not there or damaged.
+    pub fn open(path: &Path) -> Result<Self> {
+        let file = File::open(path).map_err(|e| Error::io(path, "opening a column file", e))?;
+        let archive = ZipArchive::new(BufReader::new(file)).map_err(|e| damaged(path, e))?;
+        Ok(Self { path: path.to_owned(), archive })
+    }
+
+    /// Whether there is a member of that name.
+    pub fn has(&self, member: &str) -> bool {
+        self.archive.index_for_name(member).is_some()
+    }
+
+    /// Whether there is nothing but the array.
+    pub fn is_plain(&self) -> bool {
+        self.archive.len() == 1
+    }
+
+    /// The bytes of a member.
+    ///
+    /// # Errors
+    /// When it is not there or damaged.
+    pub fn member(&mut self, member: &str) -> Result<Vec<u8>> {
+        let path = self.path.clone();
+        let mut file = self.archive.by_name(member).map_err(|e| damaged(&path, format!("{member}: {e}")))?;
+        if file.size() / MOST_PER_BYTE > file.compressed_size() {
+            return Err(damaged(&path, format!("{member} cannot be {} bytes long", file.size())));
+        }
+        let mut bytes = vec![];
+        file.read_to_end(&mut bytes).map_err(|e| damaged(&path, format!("{member}: {e}")))?;
+        Ok(bytes)
+    }
+
+    /// The type and shape of the array.
+    ///
+    /// # Errors
+    /// When there is none or it is damaged.
+    pub fn header(&mut self) -> Result<Header> {
+        let path = self.path.clone();
+        let file = self.archive.by_name(ARRAY).map_err(|e| damaged(&path, format!("{ARRAY}: {e}")))?;
+        let mut start = vec![];
+        file.take(1 << 16).read_to_end(&mut start).map_err(|e| damaged(&path, format!("{ARRAY}: {e}")))?;
+        Ok(parse(&start).map_err(|problem| damaged(&path, problem))?.0)
+    }
+
+    /// The array's rows as a column of [`Stored::dtype`], and its type and shape.
+    ///
+    /// # Errors
+    /// When there is none, it holds no numbers, or is damaged.
+    pub fn array(&mut self) -> Result<(Header, Vec<u8>)> {
+        let mut bytes = self.member(ARRAY)?;
+        let (header, start) = parse(&bytes).map_err(|problem| damaged(&self.path, problem))?;
+        let Some((stored, dtype)) = header.stored.and_then(|stored| Some((stored, stored.dtype()?))) else {
+            return Err(damaged(&self.path, "it holds no numbers"));
+        };
+        let count = header.shape.iter().try_fold(1_usize, |n, &side| n.checked_mul(side));
+        let Some(count) = count.filter(|n| n.checked_mul(stored.size) == Some(bytes.len() - start)) else {
+            let problem = format!("{} bytes do not make an array {:?}", bytes.len() - start, header.shape);
+            return Err(damaged(&self.path, problem));
+        };
+        if stored.is_plain() {
+            bytes.drain(..start);
+            return Ok((header, bytes));
+        }
+        let mut numbers = vec![0; count * dtype.size()];
+        stored.convert(&bytes[start..], &mut numbers).map_err(|problem| damaged(&self.path, problem))?;
+        Ok((header, numbers))
+    }
+}
+
+fn damaged(path: &Path, problem: impl std::fmt::Display) -> Error {
+    Error::corrupt(path, problem.to_string(), "restore the file from a copy, or rebuild the dataset")
+}
+
+/// Type, shape, and where the numbers begin.
+fn parse(bytes: &[u8]) -> Result<(Header, usize), String> {
+    let cut = || "the array's header is cut off".to_owned();
+    let (start, length) = match bytes.get(..12).ok_or_else(cut)? {
+        [0x93, b'N', b'U', b'M', b'P', b'Y', 1, _, a, b, ..] => (10, u32::from(u16::from_le_bytes([*a, *b]))),
+        [0x93, b'N', b'U', b'M', b'P', b'Y', 2 | 3, _, a, b, c, d] => (12, u32::from_le_bytes([*a, *b, *c, *d])),
+        _ => return Err("it holds no numpy array".to_owned()),
+    };
+    let end = usize::try_from(length).ok().and_then(|length| length.checked_add(start)).ok_or_else(cut)?;
+    let text = std::str::from_utf8(bytes.get(start..end).ok_or_else(cut)?).map_err(|e| e.to_string())?;
+    let field = |name: &str| {
+        let (_, rest) = text.split_once(&format!("'{name}':"))?;
+        Some(rest.trim_start())
+    };
+    let strange = || format!("the array's header makes no sense: {}", text.trim_end());
+    if !field("fortran_order").ok_or_else(strange)?.starts_with("False") {
+        return Err("the array is stored column by column; save numpy.ascontiguousarray of it".to_owned());
+    }
+    let shape = field("shape").and_then(|rest| rest.strip_prefix('(')?.split_once(')')).ok_or_else(strange)?.0;
+    let shape: Result<Vec<usize>, _> =
+        shape.split(',').map(str::trim).filter(|side| !side.is_empty()).map(str::parse).collect();
+    // Records are lists, everything else is a word between quotes.
+    let descr = field("descr").and_then(|rest| rest.strip_prefix('\'')?.split_once('\'')).map(|(word, _)| word);
+    Ok((Header { stored: descr.and_then(number), shape: shape.map_err(|_| strange())? }, end))
+}
+
+/// The number type of numpy's name for it, such as `<f4`.
+fn number(descr: &str) -> Option<Stored> {
+    let (order, rest) = descr.split_at_checked(1)?;
+    let (class, size) = rest.split_at_checked(1)?;
+    let class = match class {
+        "b" => Class::Bool,
+        "i" => Class::Signed,
+        "u" => Class::Unsigned,
+        "f" => Class::Float,
+        _ => return None,
+    };
+    let stored = Stored { class, size: size.parse().ok()?, big_endian: order == ">" };
+    stored.dtype().map(|_| stored)
+}
+
+/// Writes an archive of an array and other members.
+pub(crate) struct NpzWriter {
+    path: PathBuf,
+    zip: ZipWriter<BufWriter<File>>,
+}
+
+impl NpzWriter {
+    /// Begins an archive, in place of a file that may be there.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn create(path: &Path) -> Result<Self> {
+        let file = File::create(path).map_err(|e| Error::io(path, "creating a column file", e))?;
+        Ok(Self { path: path.to_owned(), zip: ZipWriter::new(BufWriter::with_capacity(1 << 20, file)) })
+    }
+
+    /// Adds the array, `[rows, shape…]`, whose bytes come in parts.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn array(&mut self, dtype: DType, rows: usize, shape: &[usize], parts: &[&[u8]]) -> Result<()> {
+        let header = npy_header(dtype, rows, shape);
+        let all: Vec<&[u8]> = std::iter::once(&*header).chain(parts.iter().copied()).collect();
+        self.parts(ARRAY, &all)
+    }
+
+    /// Adds a member.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn member(&mut self, name: &str, bytes: &[u8]) -> Result<()> {
+        self.parts(name, &[bytes])
+    }
+
+    fn parts(&mut self, name: &str, parts: &[&[u8]]) -> Result<()> {
+        let options = SimpleFileOptions::default().compression_method(zip::CompressionMethod::Stored).large_file(true);
+        self.zip.start_file(name, options).map_err(|e| Error::io(&self.path, "writing a column file", e.into()))?;
+        for part in parts {
+            self.zip.write_all(part).map_err(|e| Error::io(&self.path, "writing a column file", e))?;
+        }
+        Ok(())
+    }
+
+    /// Completes the archive and makes sure that it is on the disk.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn finish(self) -> Result<()> {
+        let fail = |e| Error::io(&self.path, "completing a column file", e);
+        let buffered = self.zip.finish().map_err(|e| fail(e.into()))?;
+        buffered.into_inner().map_err(|e| fail(e.into_error()))?.sync_all().map_err(fail)
+    }
+}
+
+fn npy_header(dtype: DType, rows: usize, shape: &[usize]) -> Vec<u8> {
+    let descr = match dtype {
+        DType::Bool => "|b1",
+        DType::U8 => "|u1",
+        DType::Int32 => "<i4",
+        DType::Int64 => "<i8",
+        DType::Float32 => "<f4",
+        DType::Float64 => "<f8",
+    };
+    let sides: String = std::iter::once(rows).chain(shape.iter().copied()).map(|side| format!("{side},")).collect();
+    let mut text = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({sides}), }}");
+    // The numbers begin at a multiple of 64 bytes.
+    let length = (10 + text.len() + 1).next_multiple_of(64) - 10;
+    text.extend(std::iter::repeat_n(' ', length - 1 - text.len()));
+    text.push('\n');
+    let mut header = MAGIC.to_vec();
+    header.extend([1, 0]);
+    #[allow(clippy::cast_possible_truncation)] // a few dozen sides at most
+    header.extend((length as u16).to_le_bytes());
+    header.extend(text.as_bytes());
+    header
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn arrays_come_back() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("a.npz");
+        let mut writer = NpzWriter::create(&path).expect("creates");
+        writer.array(DType::Int32, 3, &[2], &[&[1; 8], &[2; 16]]).expect("writes");
+        writer.member("note", b"hello").expect("writes");
+        writer.finish().expect("finishes");
+        let mut npz = Npz::open(&path).expect("opens");
+        let (header, bytes) = npz.array().expect("an array");
+        assert_eq!((header.rows(), header.spec("a")), (3, Some(ColumnSpec::new("a", DType::Int32, [2]))));
+        assert_eq!(header.stored, Some(Stored::of(DType::Int32)));
+        assert_eq!((&bytes[..8], &bytes[8..]), (&[1; 8][..], &[2; 16][..]));
+        assert_eq!(npz.header().expect("a header"), header);
+        assert_eq!(npz.member("note").expect("is there"), b"hello");
+        assert!(npz.has("note") && !npz.has("other") && npz.member("other").is_err());
+    }
+
+    #[test]
+    fn headers_of_other_arrays() {
+        let array = |text: &str| {
+            let mut bytes = b"\x93NUMPY\x02\x00".to_vec();
+            bytes.extend((text.len() as u32).to_le_bytes());
+            bytes.extend(text.as_bytes());
+            parse(&bytes).map(|(header, _)| header)
+        };
+        let text = array("{'descr': '<U5', 'fortran_order': False, 'shape': (4,), }").expect("text is an array");
+        assert_eq!((text.stored, text.rows()), (None, 4));
+        let scalar = array("{'descr': '>f8', 'fortran_order': False, 'shape': (), }").expect("an array");
+        assert_eq!((scalar.stored.expect("a number").big_endian, scalar.rows()), (true, 1));
+        let columns = array("{'descr': '<f8', 'fortran_order': True, 'shape': (2, 3), }").expect_err("columns");
+        assert!(columns.contains("ascontiguousarray"), "{columns}");
+        assert!(array("{'descr': '<f8', 'fortran_order': False, 'shape': (-2, 3), }").is_err());
+        assert!(parse(b"PK\x03\x04 is something else").expect_err("no array").contains("no numpy array"));
+    }
+}

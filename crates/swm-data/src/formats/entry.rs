@@ -1,0 +1,73 @@
+//! [`FormatEntry`]: the registry row of a dataset format.
+
+use crate::dataset::{Location, Reader, WriteOptions, Writer};
+use std::sync::Arc;
+use swm_core::{Error, Named, Result, Schema};
+
+/// A dataset format: how it is named, recognised, opened and created.
+pub struct FormatEntry {
+    /// Its id, such as `lance`.
+    pub id: &'static str,
+    /// One-sentence description.
+    pub summary: &'static str,
+    /// File name suffixes of its datasets. New datasets get the first.
+    pub suffixes: &'static [&'static str],
+    /// The Cargo feature of `swm-data` that this format requires, if any.
+    pub feature: Option<&'static str>,
+    /// Whether an existing dataset, or the name of one to create, belongs to this format.
+    pub detect: fn(&Location) -> bool,
+    /// The implementation; `None` if the program was built without [`FormatEntry::feature`].
+    pub backend: Option<Backend>,
+}
+
+/// The functions that open and create datasets of a format.
+#[derive(Clone, Copy)]
+pub struct Backend {
+    /// Opens a dataset.
+    pub open: fn(&Location) -> Result<Arc<dyn Reader>>,
+    /// Creates, continues or replaces a dataset.
+    pub create: fn(&Location, &Schema, WriteOptions) -> Result<Box<dyn Writer>>,
+}
+
+impl Named for FormatEntry {
+    fn id(&self) -> &'static str {
+        self.id
+    }
+}
+
+impl FormatEntry {
+    /// Whether the location's name ends in one of the format's suffixes.
+    pub fn has_suffix(&self, location: &Location) -> bool {
+        self.suffixes.iter().any(|suffix| location.has_suffix(suffix))
+    }
+
+    /// Whether this build contains the format's implementation.
+    pub const fn is_available(&self) -> bool {
+        self.backend.is_some()
+    }
+
+    /// Opens a dataset.
+    ///
+    /// # Errors
+    /// If there is no such dataset, it is damaged, or this build lacks the format's feature.
+    pub fn open(&self, location: &Location) -> Result<Arc<dyn Reader>> {
+        (self.backend()?.open)(location)
+    }
+
+    /// Creates, continues or replaces a dataset whose episodes have these columns.
+    ///
+    /// # Errors
+    /// If the dataset exists and must not, the schema differs from that of the dataset to continue, writing fails, or
+    /// this build lacks the format's feature.
+    pub fn create(&self, location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
+        (self.backend()?.create)(location, schema, options)
+    }
+
+    fn backend(&self) -> Result<Backend> {
+        self.backend.ok_or_else(|| {
+            let feature = self.feature.unwrap_or(self.id);
+            let problem = format!("this build lacks the feature {feature}");
+            Error::config(format!("format {}", self.id), problem, format!("build it with `--features {feature}`"))
+        })
+    }
+}

@@ -1,0 +1,220 @@
+//! Reading episodes.
+
+use super::column::{Column, guard};
+use super::layout::{self, LENGTHS, OFFSETS};
+use super::record::Record;
+use super::source::Source;
+use super::table;
+use crate::dataset::Location;
+use crate::dataset::episodes::{EPISODE, Rows, STEP, content_hash, numbering};
+use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
+use std::sync::Arc;
+use swm_core::{Batch, ColumnSpec, DType, Error, Manifest, Result, Schema};
+
+/// Rows that are hashed at once.
+const ROWS_AT_ONCE: usize = 64;
+
+/// Opens a file.
+pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
+    Ok(Arc::new(Hdf5Reader::open(&super::file(location)?)?))
+}
+
+pub(super) struct Hdf5Reader {
+    source: Source,
+    rows: Rows,
+    schema: Schema,
+    columns: Vec<Column>,
+    record: Record,
+    /// Datasets that hold no numbers.
+    left_out: Vec<String>,
+}
+
+impl Hdf5Reader {
+    /// Opens a file.
+    pub fn open(location: &Location) -> Result<Self> {
+        Self::of(Source::open(location)?)
+    }
+
+    /// Reads the structure of a file.
+    pub fn of(source: Source) -> Result<Self> {
+        let damaged = |problem: String| damaged(&source, problem);
+        let file = guard("opening it as HDF5", || hdf5_pure::File::from_source(source.clone())).map_err(damaged)?;
+        let names = guard("listing its datasets", || file.root().datasets()).map_err(damaged)?;
+        let record = layout::record(&source).map_err(damaged)?;
+        let record = record.map(|found| table::read_all(&found, &source)).transpose();
+        let record = record.map_err(|e| damaged(format!("its record: {e}")))?;
+        let column = |name: &str| {
+            let dataset = guard("its header", || file.dataset(name));
+            let column = dataset.and_then(|dataset| Column::new(name, dataset, source.size()));
+            let mut column = column.map_err(|problem| damaged(format!("column '{name}': {problem}")))?;
+            column.iter_mut().for_each(|column| column.ours = record.is_some());
+            Ok(column)
+        };
+        let counts = |name: &str| -> Result<Vec<i64>> {
+            let missing = || damaged(format!("it has no list of numbers '{name}', which says where episodes are"));
+            if !names.iter().any(|known| known == name) {
+                return Err(missing());
+            }
+            let found = column(name)?.filter(|column| column.spec.shape.is_empty()).ok_or_else(missing)?;
+            let bytes = found.read_all(&source).map_err(|problem| damaged(format!("'{name}': {problem}")))?;
+            match found.spec.dtype {
+                DType::Int32 => Ok(bytes.as_chunks().0.iter().map(|&b| i32::from_ne_bytes(b).into()).collect()),
+                DType::Int64 => Ok(bytes.as_chunks().0.iter().map(|&b| i64::from_ne_bytes(b)).collect()),
+                _ => Err(missing()),
+            }
+        };
+        let rows = Rows::at(&counts(LENGTHS)?, &counts(OFFSETS)?).map_err(damaged)?;
+        let (mut columns, mut left_out) = (vec![], vec![]);
+        for name in names.iter().filter(|name| *name != LENGTHS && *name != OFFSETS) {
+            let Some(column) = column(name)? else {
+                left_out.push(name.clone());
+                continue;
+            };
+            if column.rows < rows.total() {
+                let problem = format!("column '{name}' has {} rows, its episodes {}", column.rows, rows.total());
+                return Err(damaged(problem));
+            }
+            columns.push(column);
+        }
+        let record = match record {
+            Some(bytes) => Record::parse(bytes, rows.episodes().len()).map_err(damaged)?,
+            None => Record::default(),
+        };
+        for written in record.schema.iter().flat_map(Schema::columns) {
+            let same = |column: &&Column| column.spec == *written && column.is_plain();
+            if !columns.iter().any(|column| same(&column)) {
+                let problem = format!("column '{}' is not as it was written, or missing", written.name);
+                return Err(damaged(problem));
+            }
+        }
+        let known = record.schema.as_ref().map(Schema::columns).unwrap_or_default();
+        let place = |column: &Column| known.iter().position(|k| k.name == column.spec.name).unwrap_or(known.len());
+        columns.sort_by(|a, b| place(a).cmp(&place(b)).then_with(|| a.spec.name.cmp(&b.spec.name)));
+        let specs: Vec<ColumnSpec> = columns.iter().map(|column| column.spec.clone()).collect();
+        let data = specs.iter().filter(|spec| spec.name != EPISODE && spec.name != STEP).cloned();
+        let schema = Schema::new(numbering(&specs).into_iter().chain(data).collect::<Vec<_>>())?;
+        Ok(Self { source, rows, schema, columns, record, left_out })
+    }
+
+    /// Where the episodes are.
+    pub const fn rows(&self) -> &Rows {
+        &self.rows
+    }
+
+    /// What was recorded beside the columns.
+    pub const fn record(&self) -> &Record {
+        &self.record
+    }
+
+    /// The columns of the file, in the order of the schema.
+    pub fn stored(&self) -> Vec<ColumnSpec> {
+        self.columns.iter().map(|column| column.spec.clone()).collect()
+    }
+
+    /// Datasets that hold no numbers.
+    pub fn left_out(&self) -> &[String] {
+        &self.left_out
+    }
+
+    fn fail(&self, column: &str, problem: &str) -> Error {
+        damaged(&self.source, format!("column '{column}': {problem}"))
+    }
+}
+
+fn damaged(source: &Source, problem: String) -> Error {
+    Error::corrupt(source.label(), problem, "restore it from a copy, or convert what h5py still reads of it")
+}
+
+impl Reader for Hdf5Reader {
+    fn schema(&self) -> &Schema {
+        &self.schema
+    }
+
+    fn episodes(&self) -> &[Episode] {
+        self.rows.episodes()
+    }
+
+    fn read_column(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        let spec = self.schema.column(name)?;
+        if name == EPISODE || name == STEP {
+            return self.rows.number(spec, ranges, out);
+        }
+        let Some(column) = self.columns.iter().find(|column| column.spec.name == name) else {
+            return Err(self.fail(name, "it is not there"));
+        };
+        let mut wanted = self.rows.wanted(spec, ranges, out)?;
+        let first = self.rows.first();
+        if !self.rows.is_contiguous() {
+            wanted.sort_by_key(|&((episode, step), _)| first[episode] + step as u64);
+        }
+        let row_of = |(episode, step): (usize, usize)| first[episode] + step as u64;
+        column.read(&self.source, &mut wanted, row_of).map_err(|problem| self.fail(name, &problem))
+    }
+
+    fn constants(&self, episode: usize) -> Result<Constants> {
+        Ok(self.record.constants(episode))
+    }
+
+    /// Episodes that share rows, and stored steps that do not count up from 0: here steps are numbered by their places.
+    fn irregularities(&self) -> Result<Vec<Irregularity>> {
+        let mut found = vec![];
+        let mut order: Vec<usize> = (0..self.episodes().len()).collect();
+        order.sort_by_key(|&episode| self.rows.first()[episode]);
+        for pair in order.windows(2) {
+            if self.rows.first()[pair[0]] + self.episodes()[pair[0]].length as u64 > self.rows.first()[pair[1]] {
+                let what = format!("some of its rows are also those of episode {}", pair[0]);
+                found.push(Irregularity { episode: Some(pair[1]), what });
+            }
+        }
+        let Some(column) = self.columns.iter().find(|column| column.spec.name == STEP && column.spec.len() == 1) else {
+            return Ok(found);
+        };
+        let mut steps = Batch::zeros(&Schema::new([column.spec.clone()])?, 0);
+        let row_of = |(episode, step): (usize, usize)| self.rows.first()[episode] + step as u64;
+        for (position, episode) in self.episodes().iter().enumerate() {
+            steps.resize(episode.length);
+            let range = [StepRange::new(position, 0, episode.length)];
+            let mut wanted = self.rows.wanted(&column.spec, &range, steps.bytes_mut(0))?;
+            column.read(&self.source, &mut wanted, row_of).map_err(|problem| self.fail(STEP, &problem))?;
+            #[allow(clippy::cast_precision_loss)]
+            if let Some((row, step)) =
+                steps.to_f32(STEP)?.into_iter().enumerate().find(|&(row, step)| step != row as f32)
+            {
+                let what = format!("the stored steps do not count up from 0: {step} stands in row {row}");
+                found.push(Irregularity { episode: Some(position), what });
+            }
+        }
+        Ok(found)
+    }
+
+    fn manifest(&self) -> Option<Manifest> {
+        self.record.manifest.clone()
+    }
+
+    fn footprint(&self) -> Result<Vec<(String, u64)>> {
+        let mut parts = vec![];
+        for column in &self.columns {
+            let size = column.footprint(&self.source).map_err(|problem| self.fail(&column.spec.name, &problem))?;
+            parts.push((column.spec.name.clone(), size));
+        }
+        let known: u64 = parts.iter().map(|(_, size)| size).sum();
+        parts.push(("(structure of the file)".to_owned(), self.source.size().saturating_sub(known)));
+        parts.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
+        Ok(parts)
+    }
+
+    fn content_hash(&self) -> Result<String> {
+        content_hash(&self.rows, &self.schema.columns()[2..], |column, add| {
+            let mut bytes = vec![];
+            for (position, episode) in self.rows.episodes().iter().enumerate() {
+                for start in (0..episode.length).step_by(ROWS_AT_ONCE) {
+                    let length = ROWS_AT_ONCE.min(episode.length - start);
+                    bytes.resize(length * column.row_bytes(), 0);
+                    self.read_column(&column.name, &[StepRange::new(position, start, length)], &mut bytes)?;
+                    bytes.chunks_exact(column.row_bytes()).for_each(&mut *add);
+                }
+            }
+            Ok(())
+        })
+    }
+}

@@ -1,0 +1,371 @@
+//! Writing episodes: rows go to the end of the file at once, and count when they are committed.
+
+use super::layout::{END_AT, Layout, SIGNATURE};
+use super::reader::Hdf5Reader;
+use super::record::RecordWriter;
+use super::source::Source;
+use super::table::{Space, TableWriter};
+use crate::dataset::Location;
+use crate::dataset::episodes::{self, EPISODE, Rows, STEP};
+use crate::dataset::{CommitPolicy, Constants, Reader as _, StepRange, WriteMode, WriteOptions, Writer};
+use std::fs::{File, OpenOptions, TryLockError};
+use std::io;
+use std::os::unix::fs::FileExt as _;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+use swm_core::{Batch, Error, Manifest, Result, Schema};
+
+/// Creates, continues or replaces a file.
+pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
+    let location = super::file(location)?;
+    let path = location.local("hdf5")?;
+    for name in [EPISODE, STEP] {
+        if schema.column(name).is_ok_and(|column| column.len() != 1) {
+            let problem = format!("column '{name}' numbers rows, and must be one number");
+            return Err(Error::config("schema", problem, "leave it out"));
+        }
+    }
+    let manifest = options.manifest.as_ref();
+    let mut writer = match (options.mode, is_there(path)?) {
+        (_, false) => Hdf5Writer::begin(path, lock(path)?, schema, manifest)?,
+        (WriteMode::Create, true) => {
+            let problem = format!("{} exists already", path.display());
+            let fix = "choose another path, or say whether to append to it or to overwrite it";
+            return Err(Error::config("dataset", problem, fix));
+        }
+        (WriteMode::Overwrite, true) => {
+            let _old = lock(path)?;
+            let passing = beside(path);
+            let writer = Hdf5Writer::begin(&passing, lock(&passing)?, schema, manifest)?;
+            take_place(writer, &passing, path)?
+        }
+        (WriteMode::Append, true) => {
+            let old = lock(path)?;
+            let reader =
+                Hdf5Reader::of(Source::of(old.try_clone().map_err(|e| Error::io(path, "opening it", e))?, path)?)?;
+            episodes::check_continued(&location, schema, reader.schema())?;
+            let mut writer = match Hdf5Writer::resume(path, &reader, old)? {
+                Ok(writer) => writer,
+                // Still locked, until its copy is there.
+                Err(_old) => copied(path, &reader)?,
+            };
+            if let Some(manifest) = manifest
+                && reader.manifest().as_ref() != Some(manifest)
+            {
+                writer.record(&RecordWriter::manifest(manifest)?)?;
+                writer.commit()?;
+            }
+            writer
+        }
+    };
+    writer.schema = schema.clone();
+    writer.policy = options.commit;
+    Ok(Box::new(writer))
+}
+
+/// Whether there is a file that was begun properly.
+fn is_there(path: &Path) -> Result<bool> {
+    let mut start = [0; SIGNATURE.len()];
+    match File::open(path) {
+        Ok(file) => {
+            let size = file.read_at(&mut start, 0).map_err(|e| Error::io(path, "reading the file", e))?;
+            // A file is begun with its signature last.
+            Ok(start[..size] != [0; SIGNATURE.len()][..size])
+        }
+        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(false),
+        Err(e) => Err(Error::io(path, "opening the file", e)),
+    }
+}
+
+/// Opens a file, new or not, and locks it against other writers until it is closed or the process ends.
+fn lock(path: &Path) -> Result<File> {
+    if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating the folder", e))?;
+    }
+    let mut open = OpenOptions::new();
+    let file = open.read(true).write(true).create(true).truncate(false).open(path);
+    let file = file.map_err(|e| Error::io(path, "opening the file to write", e))?;
+    match file.try_lock() {
+        Ok(()) => Ok(file),
+        Err(TryLockError::WouldBlock) => {
+            let problem = format!("somebody else writes to {}", path.display());
+            Err(Error::config("dataset", problem, "wait until they are done, or choose another path"))
+        }
+        Err(TryLockError::Error(e)) => Err(Error::io(path, "locking the file", e)),
+    }
+}
+
+/// A new name in the same folder.
+fn beside(path: &Path) -> PathBuf {
+    let name = format!(".{}.tmp", uuid::Uuid::new_v4().simple());
+    path.with_file_name(name)
+}
+
+/// Puts a complete new file in the place of an old one.
+fn take_place(mut writer: Hdf5Writer, passing: &Path, path: &Path) -> Result<Hdf5Writer> {
+    std::fs::rename(passing, path).map_err(|e| Error::io(path, "replacing the file", e))?;
+    writer.path = path.to_owned();
+    Ok(writer)
+}
+
+/// Copies a file of another layout to one of ours, which takes its place.
+fn copied(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
+    if let [name, ..] = reader.left_out() {
+        let problem = format!("its dataset '{name}' holds no numbers, which cannot be continued");
+        return Err(Error::corrupt(path, problem, "convert it to a new dataset, without this column"));
+    }
+    let schema = Schema::new(reader.stored())?;
+    let passing = beside(path);
+    let copy = || {
+        let mut writer = Hdf5Writer::begin(&passing, lock(&passing)?, &schema, reader.manifest().as_ref())?;
+        let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();
+        for (position, episode) in reader.episodes().iter().enumerate() {
+            let batch = reader.read(&names, &[StepRange::new(position, 0, episode.length)])?;
+            writer.append(&batch, &reader.constants(position)?)?;
+        }
+        writer.commit()?;
+        take_place(writer, &passing, path)
+    };
+    copy().inspect_err(|_| {
+        // Nothing refers to it.
+        let _ = std::fs::remove_file(&passing);
+    })
+}
+
+struct Hdf5Writer {
+    path: PathBuf,
+    file: File,
+    space: Space,
+    /// The record, then lengths and beginnings of episodes, then the columns.
+    tables: Vec<TableWriter>,
+    /// The columns that episodes come with.
+    schema: Schema,
+    policy: CommitPolicy,
+    last_commit: Instant,
+    /// The end of the file at the last commit, and the episodes since.
+    committed_end: u64,
+    in_group: usize,
+    /// Whether episodes came since the file was last closed.
+    unclosed: bool,
+    rows: Rows,
+    record: RecordWriter,
+    /// Whether something failed to be written.
+    failed: bool,
+    scratch: Vec<u8>,
+}
+
+/// Places in [`Hdf5Writer::tables`].
+const RECORD: usize = 0;
+/// See [`RECORD`].
+const LENGTHS: usize = 1;
+/// See [`RECORD`].
+const OFFSETS: usize = 2;
+/// See [`RECORD`].
+const COLUMNS: usize = 3;
+
+impl Hdf5Writer {
+    /// Begins a file without episodes.
+    fn begin(path: &Path, file: File, schema: &Schema, manifest: Option<&Manifest>) -> Result<Self> {
+        let layout = Layout::new(schema.columns())?;
+        let io = |e| Error::io(path, "beginning the file", e);
+        let (signature, rest) = layout.bytes.split_at(SIGNATURE.len());
+        file.set_len(0).map_err(io)?;
+        file.write_all_at(rest, signature.len() as u64).map_err(io)?;
+        let space = Space::new(layout.bytes.len() as u64);
+        let tables = layout.tables.into_iter().map(TableWriter::new).collect();
+        let mut writer = Self::of(path, file, space, tables, schema);
+        writer.record(&RecordWriter::schema(schema)?)?;
+        if let Some(manifest) = manifest {
+            writer.record(&RecordWriter::manifest(manifest)?)?;
+        }
+        writer.commit()?;
+        writer.file.write_all_at(signature, 0).map_err(io)?;
+        writer.file.sync_all().map_err(io)?;
+        Ok(writer)
+    }
+
+    /// Continues a file that we laid out; gives back any other.
+    fn resume(path: &Path, reader: &Hdf5Reader, file: File) -> Result<Result<Self, File>> {
+        let Some(schema) = &reader.record().schema else { return Ok(Err(file)) };
+        let layout = Layout::new(schema.columns())?;
+        let mut start = vec![0; layout.bytes.len()];
+        let source = Source::of(file.try_clone().map_err(|e| Error::io(path, "opening it", e))?, path)?;
+        if source.size() < start.len() as u64 {
+            return Ok(Err(file));
+        }
+        source.read(0, &mut start)?;
+        if !layout.is_that_of(&start) || !reader.rows().is_contiguous() {
+            return Ok(Err(file));
+        }
+        let rows = reader.rows().clone();
+        let count = rows.episodes().len() as u64;
+        let counts = [reader.record().committed as u64, count, count];
+        let mut tables = vec![];
+        for (i, table) in layout.tables.into_iter().enumerate() {
+            let name = table.spec.name.clone();
+            let rows = counts.get(i).copied().unwrap_or(rows.total());
+            let table = TableWriter::load(table, &source, rows);
+            tables.push(table.map_err(|problem| {
+                Error::corrupt(path, format!("column '{name}': {problem}"), "convert it to a new dataset")
+            })?);
+        }
+        let record = RecordWriter::continued(reader.record());
+        let mut writer = Self::of(path, file, Space::new(source.size()), tables, schema);
+        (writer.rows, writer.record) = (rows, record);
+        Ok(Ok(writer))
+    }
+
+    fn of(path: &Path, file: File, space: Space, tables: Vec<TableWriter>, schema: &Schema) -> Self {
+        Self {
+            path: path.to_owned(),
+            file,
+            committed_end: space.end,
+            space,
+            tables,
+            schema: schema.clone(),
+            policy: CommitPolicy::default(),
+            last_commit: Instant::now(),
+            in_group: 0,
+            unclosed: false,
+            rows: Rows::default(),
+            record: RecordWriter::default(),
+            failed: false,
+            scratch: vec![],
+        }
+    }
+
+    fn put(&mut self, table: usize, rows: &[u8]) -> Result<()> {
+        let written = self.tables[table].append(&self.file, &mut self.space, rows);
+        written.map_err(|e| Error::io(&self.path, "writing an episode", e))
+    }
+
+    fn record(&mut self, lines: &[u8]) -> Result<()> {
+        self.put(RECORD, lines)
+    }
+
+    /// Adds the rows of an episode.
+    fn append(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
+        let number = self.rows.episodes().len();
+        let first = self.rows.total();
+        let too_many = || Error::mismatch("writing an episode", "more than 2^31 - 1 rows", "fewer");
+        let length = i32::try_from(episode.rows()).map_err(|_| too_many())?;
+        // True until all of it is written: what is written in part must not count.
+        self.failed = true;
+        self.rows.push(episode.rows());
+        for at in COLUMNS..self.tables.len() {
+            let spec = self.tables[at].table.spec.clone();
+            if spec.name == EPISODE || spec.name == STEP {
+                let mut numbers = std::mem::take(&mut self.scratch);
+                numbers.resize(episode.rows() * spec.row_bytes(), 0);
+                self.rows.number(&spec, &[StepRange::new(number, 0, episode.rows())], &mut numbers)?;
+                self.put(at, &numbers)?;
+                self.scratch = numbers;
+            } else {
+                let column = episode.schema().index(&spec.name)?;
+                let written = self.tables[at].append(&self.file, &mut self.space, episode.bytes(column));
+                written.map_err(|e| Error::io(&self.path, "writing an episode", e))?;
+            }
+        }
+        let lines = self.record.episode(number, constants)?;
+        self.record(&lines)?;
+        self.put(OFFSETS, &first.to_le_bytes())?;
+        self.put(LENGTHS, &length.to_le_bytes())?;
+        self.in_group += 1;
+        self.unclosed = true;
+        self.failed = false;
+        Ok(())
+    }
+
+    /// Lets everything that was added count.
+    fn commit(&mut self) -> Result<()> {
+        self.failed = true;
+        self.try_commit().map_err(|e| Error::io(&self.path, "committing episodes", e))?;
+        self.failed = false;
+        (self.in_group, self.committed_end, self.last_commit) = (0, self.space.end, Instant::now());
+        Ok(())
+    }
+
+    fn try_commit(&mut self) -> io::Result<()> {
+        let Self { file, space, tables, .. } = self;
+        for table in &mut *tables {
+            table.write_new(file, space)?;
+        }
+        file.set_len(space.end)?;
+        file.write_all_at(&space.end.to_le_bytes(), END_AT)?;
+        file.sync_data()?;
+        for table in &mut *tables {
+            table.write_changes(file)?;
+        }
+        file.sync_data()?;
+        // The lengths of the episodes last.
+        for at in (COLUMNS..tables.len()).chain([RECORD, OFFSETS, LENGTHS]) {
+            tables[at].write_rows(file)?;
+        }
+        file.sync_data()
+    }
+
+    /// Commits what is left, and that it is all.
+    fn close(&mut self) -> Result<()> {
+        if self.in_group == 0 && !self.unclosed {
+            return Ok(());
+        }
+        self.failed = true;
+        self.record(&RecordWriter::closed(self.rows.episodes().len())?)?;
+        self.commit()?;
+        self.unclosed = false;
+        Ok(())
+    }
+
+    fn lost() -> Error {
+        Error::external("writing an episode", "an earlier one failed to be written; nothing more is kept")
+    }
+}
+
+impl Writer for Hdf5Writer {
+    fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
+        episodes::check(episode, &self.schema)?;
+        if self.failed {
+            return Err(Self::lost());
+        }
+        self.append(episode, constants)?;
+        let due = self.in_group >= self.policy.episodes
+            || self.space.end - self.committed_end >= self.policy.bytes as u64
+            || self.last_commit.elapsed() >= self.policy.interval;
+        if due { self.commit() } else { Ok(()) }
+    }
+
+    fn episodes(&self) -> usize {
+        self.rows.episodes().len()
+    }
+
+    fn finish(mut self: Box<Self>) -> Result<()> {
+        if self.failed {
+            return Err(Self::lost());
+        }
+        self.close()
+    }
+}
+
+impl Drop for Hdf5Writer {
+    fn drop(&mut self) {
+        if !self.failed
+            && let Err(error) = self.close()
+        {
+            tracing::error!(dataset = %self.path.display(), "the last episodes are lost: {error}");
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use swm_core::{ColumnSpec, DType};
+
+    #[test]
+    fn names_that_cannot_be_stored_are_refused() {
+        for name in ["ep_len", "a/b", "."] {
+            let error = Layout::new(&[ColumnSpec::new(name, DType::U8, [])]).err().expect("refused");
+            assert!(error.to_string().contains(name), "{error}");
+        }
+    }
+}

@@ -1,0 +1,195 @@
+//! The data files of a table: found, checked, opened, and kept open for a while.
+
+use super::super::record::{EPISODES_KEY, Record};
+use super::super::store::{self, Store, damaged, wait};
+use super::{LanceReader, lock};
+use crate::dataset::objects::Pieces;
+use bytes::Bytes;
+use futures::{StreamExt as _, TryStreamExt as _};
+use lance_core::datatypes::Schema as LanceSchema;
+use lance_file::reader::{FileReader, ReaderProjection};
+use lance_file::versions::reader_projection_from_field_ids;
+use lance_table::format::DataFile;
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::fs::File;
+use std::path::Path;
+use std::sync::Arc;
+use swm_core::{Error, Result};
+
+/// Data files that are kept open, and files that one read has open at a time. Each takes up to two file descriptors,
+/// of which a process commonly has 1024.
+const OPEN_FILES: usize = 32;
+
+/// The same for data files in an object store, which take memory only.
+const OPEN_OBJECTS: usize = 1024;
+
+/// Data files in an object store that are opened at a time.
+const OPENED_TOGETHER: usize = 16;
+
+/// Data files up to this size are checked before even the numbers of their episodes are read.
+const SMALL_FILE: u64 = 1 << 20;
+
+/// What was used last, by the path of a data file, up to a number of them.
+pub(super) struct Recent<T> {
+    by_path: HashMap<String, Arc<T>>,
+    /// Oldest first.
+    order: VecDeque<String>,
+    limit: usize,
+}
+
+impl<T> Recent<T> {
+    pub(super) fn new(store: &Store) -> Self {
+        Self { by_path: HashMap::new(), order: VecDeque::new(), limit: open_at_once(store) }
+    }
+
+    pub(super) fn get(&self, path: &str) -> Option<Arc<T>> {
+        self.by_path.get(path).map(Arc::clone)
+    }
+
+    pub(super) fn keep(&mut self, path: &str, file: &Arc<T>) {
+        if self.by_path.insert(path.to_owned(), Arc::clone(file)).is_some() {
+            return;
+        }
+        self.order.push_back(path.to_owned());
+        if self.order.len() > self.limit
+            && let Some(oldest) = self.order.pop_front()
+        {
+            self.by_path.remove(&oldest);
+        }
+    }
+}
+
+/// Data files that may be open at a time.
+pub(super) fn open_at_once(store: &Store) -> usize {
+    if store.remote { OPEN_OBJECTS } else { OPEN_FILES }
+}
+
+impl LanceReader {
+    /// Opens data files of an object store that are not yet open, together: each takes a few answers of the store.
+    pub(super) fn open_together(&self, files: Vec<DataFile>) -> Result<()> {
+        let store = self.store.clone();
+        let missing: Vec<DataFile> = {
+            let known = lock(&self.files);
+            files.into_iter().filter(|file| known.get(&file.path).is_none()).collect()
+        };
+        let opened: Vec<(String, FileReader)> = wait(self.folder(), "opening data files", async move {
+            let opening = futures::stream::iter(missing).map(|file| {
+                let store = store.clone();
+                async move { Ok((file.path.clone(), store.open_file(&file).await?)) }
+            });
+            opening.buffered(OPENED_TOGETHER).try_collect().await
+        })?;
+        for (path, reader) in opened {
+            lock(&self.files).keep(&path, &Arc::new(reader));
+        }
+        Ok(())
+    }
+
+    /// The file of a fragment that holds a column, and the table's schema of that column.
+    pub(super) fn data_file(&self, fragment: usize, stored_name: &str) -> Result<(&DataFile, LanceSchema)> {
+        let missing = || damaged(self.folder(), format!("fragment {fragment} has no column '{stored_name}'"));
+        let projected = self.table.schema.project(&[stored_name]).map_err(|_| missing())?;
+        let id = projected.fields.first().ok_or_else(missing)?.id;
+        let holds = |file: &&DataFile| file.fields.contains(&id);
+        let file = self.table.fragments[fragment].files.iter().find(holds).ok_or_else(missing)?;
+        Ok((file, projected))
+    }
+
+    /// Checks a file against the hash in its name, once, before anything in it is decoded: Lance trusts what
+    /// it reads, so a flipped bit could make it ask for any amount of memory. A large file is left alone
+    /// until its data are asked for, as opening a dataset must not read all of it. Object stores check what they hold
+    /// themselves.
+    pub(super) fn verify(&self, file: &DataFile, data_wanted: bool) -> Result<()> {
+        let Some(expected) = store::hash_in_name(&file.path).filter(|_| !self.store.remote) else { return Ok(()) };
+        if lock(&self.verified).contains(&file.path) {
+            return Ok(());
+        }
+        let path = self.store.local(&self.store.data_path(&file.path));
+        let io = |e: std::io::Error| self.missing(&path, e);
+        if !data_wanted && std::fs::metadata(&path).map_err(io)?.len() > SMALL_FILE {
+            return Ok(());
+        }
+        if store::hash_file(&path).map_err(io)? != expected {
+            return Err(damaged(&path, "its content does not match the hash in its name"));
+        }
+        lock(&self.verified).insert(file.path.clone());
+        Ok(())
+    }
+
+    pub(super) fn missing(&self, path: &Path, error: std::io::Error) -> Error {
+        match error.kind() {
+            std::io::ErrorKind::NotFound => damaged(path, "a data file is missing"),
+            std::io::ErrorKind::UnexpectedEof => damaged(path, "a data file is too short"),
+            _ => Error::io(path, "reading a data file", error),
+        }
+    }
+
+    /// The open file of a fragment that holds a column, and where in it.
+    pub(super) fn locate(&self, fragment: usize, stored_name: &str) -> Result<(Arc<FileReader>, ReaderProjection)> {
+        let (file, projected) = self.data_file(fragment, stored_name)?;
+        #[allow(clippy::cast_sign_loss)]
+        let places: BTreeMap<u32, u32> = file
+            .fields
+            .iter()
+            .zip(file.column_indices.iter())
+            .filter(|&(&field, &column)| field >= 0 && column >= 0)
+            .map(|(&field, &column)| (field as u32, column as u32))
+            .collect();
+        let reader = self.file(file)?;
+        let projection = reader_projection_from_field_ids(reader.version(), &projected, &places)
+            .map_err(|e| damaged(self.folder(), e.to_string()))?;
+        Ok((reader, projection))
+    }
+
+    pub(super) fn file(&self, file: &DataFile) -> Result<Arc<FileReader>> {
+        if let Some(reader) = lock(&self.files).get(&file.path) {
+            return Ok(reader);
+        }
+        let (store, data_file) = (self.store.clone(), file.clone());
+        let path = self.folder().join("data").join(&file.path);
+        let reader = wait(&path, "opening a data file", async move { store.open_file(&data_file).await })?;
+        let reader = Arc::new(reader);
+        lock(&self.files).keep(&file.path, &reader);
+        Ok(reader)
+    }
+
+    /// A data file of this machine, open for reading.
+    pub(super) fn handle(&self, path: &str) -> Result<Arc<File>> {
+        if let Some(file) = lock(&self.handles).get(path) {
+            return Ok(file);
+        }
+        let place = self.store.local(&self.store.data_path(path));
+        let file = Arc::new(File::open(&place).map_err(|e| self.missing(&place, e))?);
+        lock(&self.handles).keep(path, &file);
+        Ok(file)
+    }
+
+    /// Bytes of data files in an object store.
+    pub(super) fn bytes(&self, wanted: Vec<Pieces>) -> Result<Vec<Vec<Bytes>>> {
+        let (store, blocks) = (self.store.clone(), Arc::clone(&self.blocks));
+        wait(self.folder(), "reading data files", async move { Ok(blocks.read(store.inner(), &wanted).await?) })
+    }
+
+    /// What a fragment's data file records of its episodes, and the file.
+    pub(super) fn record(&self, fragment: usize) -> Result<Option<(Arc<FileReader>, Record)>> {
+        for file in &self.table.fragments[fragment].files {
+            self.verify(file, false)?;
+            let reader = self.file(file)?;
+            if let Some(stored) = self.buffer(&reader, EPISODES_KEY)? {
+                let record = Record::decode(&stored).map_err(|problem| damaged(self.folder(), problem))?;
+                return Ok(Some((reader, record)));
+            }
+        }
+        Ok(None)
+    }
+
+    /// The global buffer whose number is in the file's metadata.
+    pub(super) fn buffer(&self, reader: &Arc<FileReader>, key: &str) -> Result<Option<Bytes>> {
+        let Some(number) = reader.schema().metadata.get(key).and_then(|number| number.parse::<u32>().ok()) else {
+            return Ok(None);
+        };
+        let reader = Arc::clone(reader);
+        let read = async move { reader.read_global_buffer(number).await.map(Some) };
+        wait(self.folder(), "reading the record of its episodes", read)
+    }
+}

@@ -1,0 +1,578 @@
+//! Reading: numbers from Parquet, kept once they were asked for; frames from videos, by time.
+
+use super::info::{Column, Info, Kind, damaged};
+use super::{CONSTANTS, TASK, table, values};
+use crate::dataset::Location;
+use crate::dataset::clips::ACTION;
+use crate::dataset::episodes::{Rows, content_hash, numbering};
+use crate::dataset::{Constants, Episode, Reader, StepRange};
+use arrow_array::Array as _;
+use arrow_array::cast::AsArray as _;
+use arrow_array::types::Float64Type;
+use rayon::prelude::*;
+use serde::Deserialize;
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, OnceLock};
+use swm_core::{Batch, ColumnSpec, DType, Error, Manifest, Result, Schema};
+use swm_video::{Source, Video, VideoCache};
+
+/// Features that count rows, in every dataset.
+const BOOKKEEPING: [&str; 3] = ["timestamp", "index", "task_index"];
+
+/// Opens a dataset.
+pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
+    Ok(Arc::new(LerobotReader::open(location.local("lerobot")?)?))
+}
+
+/// Where an episode is.
+pub(super) struct Place {
+    tasks: Vec<String>,
+    data: PathBuf,
+    /// For every video feature, its file and when the episode begins there, in seconds.
+    videos: Vec<(PathBuf, f64)>,
+    length: usize,
+    constants: Option<String>,
+    /// The number of its files, counted through all chunks.
+    pub file: usize,
+}
+
+pub(super) struct LerobotReader {
+    root: PathBuf,
+    pub info: Info,
+    fps: f64,
+    schema: Schema,
+    /// Those of the schema after the numbering, then LeRobot's bookkeeping, which is read by name only.
+    columns: Vec<Column>,
+    /// The numbering and all of `columns`.
+    specs: Vec<ColumnSpec>,
+    rows: Rows,
+    pub places: Vec<Place>,
+    /// Data files, and the positions of the episodes in each.
+    files: Vec<(PathBuf, Range<usize>)>,
+    /// The numbers of each column.
+    data: Vec<OnceLock<Vec<u8>>>,
+    /// When each row is, where that is stored.
+    timestamps: OnceLock<Option<Vec<f32>>>,
+    library: VideoCache<PathBuf>,
+}
+
+impl LerobotReader {
+    pub fn open(root: &Path) -> Result<Self> {
+        let info = Info::read(root)?;
+        let fps = info.fps().unwrap_or(1.0);
+        let mut columns = info.columns(root)?;
+        // Our own datasets may have columns of these names.
+        let bookkeeping = |column: &Column| info.stable_worldmodel.is_none() && BOOKKEEPING.contains(&&*column.native);
+        columns.sort_by_key(bookkeeping);
+        let visible = 2 + columns.iter().filter(|column| !bookkeeping(column)).count();
+        let places = if info.is_v3() { places_v3(root, &info)? } else { places_v2(root, &info)? };
+        let mut rows = Rows::default();
+        places.iter().for_each(|place| rows.push(place.length));
+        if info.total_episodes != places.len() || rows.total() != info.total_frames as u64 {
+            let problem = format!(
+                "meta/info.json promises {} episodes of {} rows, {} of {} are described",
+                info.total_episodes,
+                info.total_frames,
+                places.len(),
+                rows.total()
+            );
+            return Err(damaged(root, problem));
+        }
+        let mut files: Vec<(PathBuf, Range<usize>)> = vec![];
+        for (position, place) in places.iter().enumerate() {
+            match files.last_mut() {
+                Some((path, episodes)) if *path == place.data => episodes.end = position + 1,
+                _ => files.push((place.data.clone(), position..position + 1)),
+            }
+        }
+        let recorded = info.stable_worldmodel.as_ref().map(|recorded| recorded.schema.columns()).unwrap_or_default();
+        let specs: Vec<ColumnSpec> =
+            numbering(recorded).into_iter().chain(columns.iter().map(|column| column.spec.clone())).collect();
+        // Room is made for pictures of the promised size.
+        let library = VideoCache::default();
+        for column in &columns {
+            if let (Kind::Video(feature), Some(place)) = (column.kind, places.iter().find(|place| place.length > 0)) {
+                let path = &place.videos[feature].0;
+                let size = library.frame_size(path, || Ok(Source::File(path.clone())))?;
+                if [size.0, size.1] != column.spec.shape[..2] {
+                    let problem =
+                        format!("camera '{}' has pictures of {size:?}, not {:?}", column.native, column.spec.shape);
+                    return Err(damaged(root, problem));
+                }
+            }
+        }
+        Ok(Self {
+            root: root.to_owned(),
+            fps,
+            schema: Schema::new(specs[..visible].to_vec())?,
+            specs,
+            data: columns.iter().map(|_| OnceLock::new()).collect(),
+            columns,
+            rows,
+            places,
+            files,
+            timestamps: OnceLock::new(),
+            library,
+            info,
+        })
+    }
+
+    /// The place of a column in the schema, by our name or by its own.
+    fn index(&self, name: &str) -> Result<usize> {
+        match name {
+            "episode_index" => Ok(0),
+            "frame_index" => Ok(1),
+            _ => match self.columns.iter().position(|column| column.native == name) {
+                Some(place) if self.schema.find(name).is_none() => Ok(place + 2),
+                _ => self.schema.index(name),
+            },
+        }
+    }
+
+    /// All rows of a column of numbers.
+    fn data(&self, place: usize) -> Result<&[u8]> {
+        if let Some(data) = self.data[place].get() {
+            return Ok(data);
+        }
+        let column = &self.columns[place];
+        let mut data = self.read_numbers(&column.native, &column.spec)?;
+        let repeats = self.info.stable_worldmodel.as_ref().is_some_and(|recorded| recorded.last_action_repeats);
+        if repeats && column.spec.name == ACTION {
+            let size = column.spec.row_bytes();
+            for (&first, episode) in self.rows.first().iter().zip(self.rows.episodes()) {
+                // The rows are in memory.
+                #[allow(clippy::cast_possible_truncation)]
+                let last = (first as usize + episode.length) * size;
+                missing(column.spec.dtype, &mut data[last - size..last]);
+            }
+        }
+        Ok(self.data[place].get_or_init(|| data))
+    }
+
+    /// All rows of a feature of numbers, from all files.
+    fn read_numbers(&self, native: &str, spec: &ColumnSpec) -> Result<Vec<u8>> {
+        let parts: Result<Vec<Vec<u8>>> = self
+            .files
+            .par_iter()
+            .with_max_len(1)
+            .map(|(path, episodes)| {
+                let batches = table::read(path, &["episode_index", native], None)?;
+                self.check_rows(path, episodes, &table::whole_numbers(path, &batches, "episode_index")?)?;
+                let mut bytes = vec![];
+                for batch in &batches {
+                    let array = batch.column_by_name(native);
+                    let array = array.ok_or_else(|| damaged(path, format!("it has no column '{native}'")))?;
+                    let added = values::append(array, spec, &mut bytes);
+                    added.map_err(|problem| damaged(path, format!("column '{native}': {problem}")))?;
+                }
+                Ok(bytes)
+            })
+            .collect();
+        Ok(parts?.concat())
+    }
+
+    /// Checks that a file holds the rows of its episodes, and no others.
+    fn check_rows(&self, path: &Path, episodes: &Range<usize>, found: &[i64]) -> Result<()> {
+        let expected =
+            episodes.clone().flat_map(|e| std::iter::repeat_n(self.rows.episodes()[e].index, self.places[e].length));
+        if expected.eq(found.iter().copied()) {
+            return Ok(());
+        }
+        Err(damaged(path, "its rows are not those of the episodes that should be in it".to_owned()))
+    }
+
+    /// When each row of the dataset is, counted from its episode's first.
+    fn timestamps(&self) -> Result<Option<&[f32]>> {
+        if let Some(known) = self.timestamps.get() {
+            return Ok(known.as_deref());
+        }
+        let stored = self.info.features.0.iter().any(|(name, _)| name == "timestamp");
+        let times = if stored {
+            let bytes = self.read_numbers("timestamp", &ColumnSpec::new("timestamp", DType::Float32, []))?;
+            Some(bytes.as_chunks::<4>().0.iter().map(|&b| f32::from_ne_bytes(b)).collect())
+        } else {
+            None
+        };
+        Ok(self.timestamps.get_or_init(|| times).as_deref())
+    }
+
+    fn read_video(&self, column: &ColumnSpec, feature: usize, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        let times = self.timestamps()?;
+        let wanted = self.rows.wanted(column, ranges, out)?;
+        let mut frames = Vec::with_capacity(wanted.len());
+        for ((episode, step), place) in wanted {
+            let (path, begin) = &self.places[episode].videos[feature];
+            frames.push((path.clone(), begin + self.time(times, episode, step), place));
+        }
+        let source = |path: &PathBuf| Ok(Source::File(path.clone()));
+        self.library.read(frames, source, |video, &time| self.frame(video, time))
+    }
+
+    /// Seconds from the episode's beginning to a row.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+    fn time(&self, times: Option<&[f32]>, episode: usize, step: usize) -> f64 {
+        let row = self.rows.first()[episode] as usize + step;
+        times.and_then(|times| times.get(row)).map_or(step as f64 / self.fps, |&time| f64::from(time))
+    }
+
+    /// The frame that is shown at a time.
+    fn frame(&self, video: &Video, time: f64) -> Result<usize> {
+        match video.frame_at(time) {
+            Some((frame, away)) if away <= 0.25 / self.fps => Ok(frame),
+            _ => Err(video.damaged(&format!("has no frame at {time:.3} s"))),
+        }
+    }
+
+    /// Encoded pictures of rows of one episode, each given to `each` with its place among the rows.
+    fn coded_pictures(
+        &self,
+        native: &str,
+        file: usize,
+        rows: Vec<Range<usize>>,
+        mut each: impl FnMut(usize, &[u8]) -> Result<()>,
+    ) -> Result<()> {
+        let path = &self.files[file].0;
+        let mut at = 0;
+        for batch in table::read(path, &[native], Some(rows))? {
+            let stored = batch.column_by_name(native).and_then(|array| array.as_struct_opt());
+            let bytes = stored.and_then(|stored| stored.column_by_name("bytes")?.as_binary_opt::<i32>());
+            let bytes = bytes.ok_or_else(|| damaged(path, format!("column '{native}' holds no pictures")))?;
+            for row in 0..bytes.len() {
+                if bytes.is_null(row) {
+                    let problem = format!("a picture of column '{native}' lies outside of it, which is not read");
+                    return Err(Error::corrupt(path, problem, "embed the pictures with LeRobot's own tools"));
+                }
+                each(at, bytes.value(row))?;
+                at += 1;
+            }
+        }
+        Ok(())
+    }
+
+    fn read_pictures(&self, column: &Column, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        let (height, width) = (column.spec.shape[0], column.spec.shape[1]);
+        let mut wanted = self.rows.wanted(&column.spec, ranges, out)?;
+        let file_of = |episode: usize| self.files.partition_point(|(_, episodes)| episodes.end <= episode);
+        let jobs: Vec<_> = wanted.chunk_by_mut(|a, b| file_of(a.0.0) == file_of(b.0.0)).collect();
+        jobs.into_par_iter().with_max_len(1).try_for_each(|group| {
+            let Some(file) = group.first().map(|((episode, _), _)| file_of(*episode)) else { return Ok(()) };
+            let first = self.rows.first()[self.files[file].1.start];
+            #[allow(clippy::cast_possible_truncation)] // rows of a table in memory
+            let row = |(episode, step): (usize, usize)| (self.rows.first()[episode] - first) as usize + step;
+            let mut groups: Vec<_> = group.chunk_by_mut(|a, b| a.0 == b.0).collect();
+            let rows = groups.iter().map(|places| row(places[0].0)..row(places[0].0) + 1).collect();
+            self.coded_pictures(&column.native, file, rows, |at, bytes| {
+                let Some(((_, place), others)) = groups.get_mut(at).and_then(|places| places.split_first_mut()) else {
+                    return Ok(());
+                };
+                swm_image::decode(bytes, height, width, place)
+                    .map_err(|e| damaged(&self.files[file].0, format!("column '{}': {e}", column.native)))?;
+                others.iter_mut().for_each(|(_, other)| other.copy_from_slice(place));
+                Ok(())
+            })
+        })
+    }
+}
+
+/// Writes that there is no action.
+fn missing(dtype: DType, bytes: &mut [u8]) {
+    match dtype {
+        DType::Float32 => bytes.as_chunks_mut::<4>().0.fill(f32::NAN.to_ne_bytes()),
+        DType::Float64 => bytes.as_chunks_mut::<8>().0.fill(f64::NAN.to_ne_bytes()),
+        DType::Int32 => bytes.as_chunks_mut::<4>().0.fill((-1_i32).to_ne_bytes()),
+        DType::Int64 => bytes.as_chunks_mut::<8>().0.fill((-1_i64).to_ne_bytes()),
+        DType::Bool | DType::U8 => {}
+    }
+}
+
+impl Reader for LerobotReader {
+    fn schema(&self) -> &Schema {
+        &self.schema
+    }
+
+    fn episodes(&self) -> &[Episode] {
+        self.rows.episodes()
+    }
+
+    fn read_column(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        let index = self.index(name)?;
+        let spec = &self.specs[index];
+        let Some(place) = index.checked_sub(2) else { return self.rows.number(spec, ranges, out) };
+        let column = &self.columns[place];
+        match column.kind {
+            Kind::Video(feature) => self.read_video(spec, feature, ranges, out),
+            Kind::Pictures => self.read_pictures(column, ranges, out),
+            Kind::Numbers => {
+                Rows::check_room(spec, ranges, out)?;
+                let (data, size) = (self.data(place)?, spec.row_bytes());
+                let mut rest = out;
+                for range in ranges {
+                    let rows = self.rows.range(range)?;
+                    let (to, after) = rest.split_at_mut(range.length * size);
+                    #[allow(clippy::cast_possible_truncation)] // as many rows as the data in memory have
+                    to.copy_from_slice(&data[rows.start as usize * size..rows.end as usize * size]);
+                    rest = after;
+                }
+                Ok(())
+            }
+        }
+    }
+
+    fn read(&self, columns: &[&str], ranges: &[StepRange]) -> Result<Batch> {
+        // As the trait's own, but native names are known as well.
+        let spec = |name: &&str| -> Result<ColumnSpec> {
+            let index = self.index(name)?;
+            let known = &self.specs[index];
+            // Nothing is made room for before the files have it.
+            if let Some(place) = index.checked_sub(2).filter(|&place| self.columns[place].kind == Kind::Numbers) {
+                self.data(place)?;
+            }
+            Ok(ColumnSpec::new(*name, known.dtype, known.shape.clone()))
+        };
+        let specs: Result<Vec<ColumnSpec>> = columns.iter().map(spec).collect();
+        let mut batch = Batch::zeros(&Schema::new(specs?)?, ranges.iter().map(|range| range.length).sum());
+        for (i, name) in columns.iter().enumerate() {
+            self.read_column(name, ranges, batch.bytes_mut(i))?;
+        }
+        Ok(batch)
+    }
+
+    fn constants(&self, episode: usize) -> Result<Constants> {
+        let Some(place) = self.places.get(episode) else {
+            let given = format!("the episode in position {episode}");
+            return Err(Error::mismatch("reading constants", given, format!("positions below {}", self.places.len())));
+        };
+        let mut constants = Constants::new();
+        if let Some(stored) = &place.constants {
+            let stored: BTreeMap<String, Stored> = serde_json::from_str(stored)
+                .map_err(|e| damaged(&self.root, format!("the constants of episode {episode} are unreadable: {e}")))?;
+            constants.extend(stored.into_iter().map(|(name, value)| (name, value.into_bytes())));
+        } else if !place.tasks.is_empty() {
+            constants.insert(TASK.to_owned(), place.tasks.join("\n").into_bytes());
+        }
+        Ok(constants)
+    }
+
+    fn manifest(&self) -> Option<Manifest> {
+        self.info.stable_worldmodel.as_ref()?.manifest.clone()
+    }
+
+    fn footprint(&self) -> Result<Vec<(String, u64)>> {
+        let mut parts: BTreeMap<String, u64> = BTreeMap::new();
+        let mut todo = vec![self.root.clone()];
+        while let Some(folder) = todo.pop() {
+            let io = |e| Error::io(&folder, "listing the folder", e);
+            for entry in std::fs::read_dir(&folder).map_err(io)? {
+                let entry = entry.map_err(io)?;
+                let metadata = entry.metadata().map_err(io)?;
+                if metadata.is_dir() {
+                    todo.push(entry.path());
+                    continue;
+                }
+                let path = entry.path();
+                let camera = self.columns.iter().find(|column| {
+                    column.spec.is_image() && path.components().any(|part| part.as_os_str() == column.native.as_str())
+                });
+                let part = match camera {
+                    Some(column) => column.spec.name.clone(),
+                    None if path.starts_with(self.root.join("data")) => "(numbers)".to_owned(),
+                    None => "(metadata)".to_owned(),
+                };
+                *parts.entry(part).or_default() += metadata.len();
+            }
+        }
+        let mut parts: Vec<(String, u64)> = parts.into_iter().collect();
+        parts.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
+        Ok(parts)
+    }
+
+    fn content_hash(&self) -> Result<String> {
+        let times = self.timestamps()?;
+        content_hash(&self.rows, &self.schema.columns()[2..], |spec, add| {
+            let place = self.schema.index(&spec.name)? - 2;
+            let column = &self.columns[place];
+            for (position, episode) in self.rows.episodes().iter().enumerate() {
+                match column.kind {
+                    Kind::Numbers => {
+                        let (data, size) = (self.data(place)?, spec.row_bytes());
+                        let rows = self.rows.range(&StepRange::new(position, 0, episode.length))?;
+                        #[allow(clippy::cast_possible_truncation)] // as many rows as the data in memory have
+                        data[rows.start as usize * size..rows.end as usize * size]
+                            .chunks_exact(size)
+                            .for_each(&mut *add);
+                    }
+                    Kind::Pictures => {
+                        let file = self.files.partition_point(|(_, episodes)| episodes.end <= position);
+                        let first = self.rows.first()[position] - self.rows.first()[self.files[file].1.start];
+                        #[allow(clippy::cast_possible_truncation)]
+                        let rows = first as usize..first as usize + episode.length;
+                        self.coded_pictures(&column.native, file, vec![rows], |_, bytes| {
+                            add(bytes);
+                            Ok(())
+                        })?;
+                    }
+                    Kind::Video(feature) => {
+                        let (path, begin) = &self.places[position].videos[feature];
+                        let video = self.library.get(path, || Ok(Source::File(path.clone())))?;
+                        let frames: Result<Vec<usize>> = (0..episode.length)
+                            .map(|step| self.frame(&video, begin + self.time(times, position, step)))
+                            .collect();
+                        video.coded(frames?, &mut *add)?;
+                    }
+                }
+            }
+            Ok(())
+        })
+    }
+}
+
+/// A constant in JSON: text, or bytes that are none.
+#[derive(Deserialize, serde::Serialize)]
+#[serde(untagged)]
+pub(super) enum Stored {
+    Text(String),
+    Bytes(Vec<u8>),
+}
+
+impl Stored {
+    fn into_bytes(self) -> Vec<u8> {
+        match self {
+            Self::Text(text) => text.into_bytes(),
+            Self::Bytes(bytes) => bytes,
+        }
+    }
+}
+
+/// The episodes of version 2.1: a line each, and a file each.
+fn places_v2(root: &Path, info: &Info) -> Result<Vec<Place>> {
+    #[derive(Deserialize)]
+    struct Line {
+        episode_index: usize,
+        #[serde(default)]
+        tasks: Vec<String>,
+        length: usize,
+    }
+    let path = root.join("meta").join("episodes.jsonl");
+    let text = std::fs::read_to_string(&path).map_err(|e| match e.kind() {
+        std::io::ErrorKind::NotFound => damaged(root, "meta/episodes.jsonl is missing".to_owned()),
+        _ => Error::io(&path, "reading the list of episodes", e),
+    })?;
+    let mut places = vec![];
+    for line in text.lines().filter(|line| !line.trim().is_empty()) {
+        let line: Line =
+            serde_json::from_str(line).map_err(|e| damaged(&path, format!("a line is unreadable: {e}")))?;
+        if line.episode_index != places.len() {
+            let problem = format!("episode {} comes where {} should", line.episode_index, places.len());
+            return Err(damaged(&path, problem));
+        }
+        let numbers = [("episode_chunk", places.len() / info.chunks_size), ("episode_index", places.len())];
+        let videos: Result<Vec<(PathBuf, f64)>> =
+            info.video_keys().into_iter().map(|key| Ok((video_file(root, info, key, &numbers)?, 0.0))).collect();
+        places.push(Place {
+            tasks: line.tasks,
+            data: info.file(root, &info.data_path, "", &numbers)?,
+            videos: videos?,
+            length: line.length,
+            constants: None,
+            file: places.len(),
+        });
+    }
+    Ok(places)
+}
+
+fn video_file(root: &Path, info: &Info, key: &str, numbers: &[(&str, usize)]) -> Result<PathBuf> {
+    let template = info.video_path.as_deref();
+    let template = template.ok_or_else(|| damaged(root, "meta/info.json does not say where videos are".to_owned()))?;
+    info.file(root, template, key, numbers)
+}
+
+/// The episodes of version 3.0: a row each.
+fn places_v3(root: &Path, info: &Info) -> Result<Vec<Place>> {
+    let folder = root.join("meta").join("episodes");
+    let mut files = vec![];
+    // None where there is no episode yet.
+    for chunk in std::fs::read_dir(&folder).into_iter().flatten().flatten() {
+        let entries = std::fs::read_dir(chunk.path()).into_iter().flatten().flatten().map(|entry| entry.path());
+        files.extend(entries.filter(|path| path.extension().is_some_and(|suffix| suffix == "parquet")));
+    }
+    files.sort();
+    let keys = info.video_keys();
+    let named = |key: &str, what: &str| format!("videos/{key}/{what}");
+    let mut wanted: Vec<String> =
+        ["episode_index", "tasks", "length", "data/chunk_index", "data/file_index", CONSTANTS]
+            .map(str::to_owned)
+            .to_vec();
+    for key in &keys {
+        wanted.extend(["chunk_index", "file_index", "from_timestamp"].map(|what| named(key, what)));
+    }
+    let wanted: Vec<&str> = wanted.iter().map(String::as_str).collect();
+    let mut places = vec![];
+    for path in &files {
+        let batches = table::read(path, &wanted, None)?;
+        let numbers = |column: &str| -> Result<Vec<usize>> {
+            let sound = |number: i64| usize::try_from(number).ok().filter(|&n| n < 1 << 40);
+            let numbers = table::whole_numbers(path, &batches, column)?.into_iter().map(sound);
+            numbers
+                .collect::<Option<_>>()
+                .ok_or_else(|| damaged(path, format!("a number of '{column}' makes no sense")))
+        };
+        let (index, length) = (numbers("episode_index")?, numbers("length")?);
+        let (chunk, file) = (numbers("data/chunk_index")?, numbers("data/file_index")?);
+        let mut videos = vec![];
+        for key in &keys {
+            let mut begins = vec![];
+            for batch in &batches {
+                let column = batch.column_by_name(&named(key, "from_timestamp"));
+                let column = column.and_then(|array| array.as_primitive_opt::<Float64Type>());
+                let column = column.ok_or_else(|| damaged(path, format!("it does not say when '{key}' begins")))?;
+                begins.extend_from_slice(column.values());
+            }
+            videos.push((numbers(&named(key, "chunk_index"))?, numbers(&named(key, "file_index"))?, begins));
+        }
+        let (mut tasks, mut constants) = (vec![], vec![]);
+        for batch in &batches {
+            tasks.extend(texts(batch, "tasks").unwrap_or_else(|| vec![vec![]; batch.num_rows()]));
+            let stored = batch.column_by_name(CONSTANTS).and_then(|array| array.as_string_opt::<i32>());
+            constants.extend((0..batch.num_rows()).map(|row| stored.map(|stored| stored.value(row).to_owned())));
+        }
+        for row in 0..index.len() {
+            // An interrupted writer may have left more than it committed.
+            if places.len() == info.total_episodes {
+                break;
+            }
+            if index[row] != places.len() {
+                let problem = format!("episode {} comes where {} should", index[row], places.len());
+                return Err(damaged(path, problem));
+            }
+            let at = |chunk: usize, file: usize| [("chunk_index", chunk), ("file_index", file)];
+            let files: Result<Vec<(PathBuf, f64)>> = keys
+                .iter()
+                .zip(&videos)
+                .map(|(key, (chunk, file, begin))| {
+                    Ok((video_file(root, info, key, &at(chunk[row], file[row]))?, begin[row]))
+                })
+                .collect();
+            places.push(Place {
+                tasks: std::mem::take(&mut tasks[row]),
+                data: info.file(root, &info.data_path, "", &at(chunk[row], file[row]))?,
+                videos: files?,
+                length: length[row],
+                constants: constants[row].take(),
+                file: chunk[row].saturating_mul(info.chunks_size).saturating_add(file[row]),
+            });
+        }
+    }
+    Ok(places)
+}
+
+/// A column of lists of texts.
+fn texts(batch: &arrow_array::RecordBatch, column: &str) -> Option<Vec<Vec<String>>> {
+    let lists = batch.column_by_name(column)?.as_list_opt::<i32>()?;
+    let text = |list: arrow_array::ArrayRef| -> Option<Vec<String>> {
+        let text = list.as_string_opt::<i32>()?;
+        Some(text.iter().flatten().map(str::to_owned).collect())
+    };
+    (0..lists.len()).map(|row| text(lists.value(row))).collect()
+}

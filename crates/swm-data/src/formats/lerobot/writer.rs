@@ -1,0 +1,520 @@
+//! Writing version 3.0. Finished episodes gather until the [`CommitPolicy`](crate::CommitPolicy) says that the group is
+//! due; a group becomes one file of numbers, one video a camera, and one file that describes its episodes. All files
+//! appear complete, `meta/info.json` last: it says how many episodes there are, and commits them.
+
+use super::info::{
+    DATA_PATH, EPISODES_PATH, Feature, Features, Info, Recorded, VERSION, VIDEO_PATH, damaged, fill, native_name,
+};
+use super::reader::{LerobotReader, Stored};
+use super::stats::{self, Stats};
+use super::table::{self, put};
+use super::{CONSTANTS, NO_TASK, TASK, values};
+use crate::dataset::Location;
+use crate::dataset::clips::ACTION;
+use crate::dataset::episodes::{self, EPISODE, STEP};
+use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer};
+use crate::formats::column_files::{lock, replace};
+use arrow_array::builder::{ListBuilder, StringBuilder};
+use arrow_array::{ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray};
+use arrow_schema::{DataType, Field, Schema as ArrowSchema};
+use rayon::prelude::*;
+use serde_json::{Value, json};
+use std::collections::{BTreeMap, HashMap};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
+use swm_video::{Encoder, Encoding};
+
+/// Frames a second: what LeRobot's times count in. Steps of simulated worlds have no common rate.
+const FPS: u32 = 25;
+
+/// Creates, continues or replaces a dataset.
+pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
+    Ok(Box::new(LerobotWriter::create(location.local("lerobot")?, schema, options)?))
+}
+
+struct LerobotWriter {
+    root: PathBuf,
+    /// Locked, so that nobody else writes there.
+    _lock: std::fs::File,
+    options: WriteOptions,
+    encoding: Encoding,
+    schema: Schema,
+    info: Info,
+    /// Each column that is stored, and its feature.
+    columns: Vec<(usize, String)>,
+    stats: Vec<Stats>,
+    tasks: Vec<String>,
+    /// The number of the next files, counted through all chunks.
+    file: usize,
+    group: Group,
+    last_commit: Instant,
+    /// Whether something failed half-way.
+    failed: bool,
+}
+
+/// Episodes that are not committed.
+#[derive(Default)]
+struct Group {
+    episodes: Vec<Pending>,
+    /// The bytes of each stored column of numbers.
+    numbers: Vec<Vec<u8>>,
+    /// The video of each stored column of pictures.
+    films: Vec<Option<Encoder>>,
+    rows: usize,
+    bytes: usize,
+}
+
+struct Pending {
+    rows: usize,
+    task: String,
+    constants: String,
+}
+
+impl LerobotWriter {
+    fn create(root: &Path, schema: &Schema, options: WriteOptions) -> Result<Self> {
+        options.codec.check()?;
+        let columns = stored(schema)?;
+        let exists = root.join("meta").join("info.json").is_file();
+        if !exists && root.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
+            let problem = format!("{} holds something else", root.display());
+            return Err(Error::config("dataset", problem, "choose another path"));
+        }
+        if exists && options.mode == WriteMode::Create {
+            let problem = format!("{} exists already", root.display());
+            let fix = "choose another path, or say whether to append to it or to overwrite it";
+            return Err(Error::config("dataset", problem, fix));
+        }
+        if exists && options.mode == WriteMode::Overwrite {
+            replace(root)?;
+        }
+        std::fs::create_dir_all(root).map_err(|e| Error::io(root, "creating the folder", e))?;
+        let lock = lock(root)?;
+        let mut writer = Self {
+            root: root.to_owned(),
+            _lock: lock,
+            encoding: Encoding::training(options.codec),
+            schema: schema.clone(),
+            info: info(schema, &columns, &options),
+            stats: columns.iter().map(|(index, _)| Stats::new(&schema.columns()[*index])).collect(),
+            columns,
+            tasks: vec![],
+            file: 0,
+            group: Group::default(),
+            last_commit: Instant::now(),
+            failed: false,
+            options,
+        };
+        if exists && writer.options.mode == WriteMode::Append {
+            writer.continue_from()?;
+        }
+        writer.clear_group();
+        writer.describe()?;
+        Ok(writer)
+    }
+
+    /// Takes over what is there, and removes what an interrupted writer did not commit.
+    fn continue_from(&mut self) -> Result<()> {
+        let old = LerobotReader::open(&self.root)?;
+        let Some(recorded) = old.info.stable_worldmodel.clone() else {
+            let problem = "another program wrote it, and LeRobot's datasets do not say enough to be continued";
+            return Err(Error::corrupt(&self.root, problem, "convert it to a new dataset first"));
+        };
+        episodes::check_continued(&self.root.display(), &self.schema, old.schema())?;
+        self.file = old.places.last().map_or(0, |place| place.file + 1);
+        let manifest = self.options.manifest.clone().or(recorded.manifest);
+        self.info = Info { stable_worldmodel: Some(Recorded { manifest, ..recorded }), ..old.info };
+        let path = self.root.join("meta").join("stats.json");
+        let read = |path: &Path| std::fs::read(path).map_err(|e| Error::io(path, "reading the statistics", e));
+        if self.info.total_episodes > 0 {
+            let stored: Value =
+                serde_json::from_slice(&read(&path)?).map_err(|e| damaged(&path, format!("is unreadable: {e}")))?;
+            for ((_, native), stats) in self.columns.iter().zip(&mut self.stats) {
+                let known = stats.continue_from(&stored[native.as_str()]);
+                known.ok_or_else(|| damaged(&path, format!("it has no statistics of '{native}'")))?;
+            }
+            let path = self.root.join("meta").join("tasks.parquet");
+            for batch in table::read(&path, &[INDEX], None)? {
+                use arrow_array::cast::AsArray as _;
+                let texts = batch.column_by_name(INDEX).and_then(|array| array.as_string_opt::<i32>());
+                let texts = texts.ok_or_else(|| damaged(&path, "it holds no texts".to_owned()))?;
+                self.tasks.extend(texts.iter().flatten().map(str::to_owned));
+            }
+        }
+        self.remove_uncommitted()
+    }
+
+    /// Removes files that are numbered higher than those in use.
+    fn remove_uncommitted(&self) -> Result<()> {
+        let mut todo = vec![self.root.clone()];
+        while let Some(folder) = todo.pop() {
+            let io = |e| Error::io(&folder, "preparing the folder", e);
+            for entry in std::fs::read_dir(&folder).map_err(io)? {
+                let path = entry.map_err(io)?.path();
+                if path.is_dir() {
+                    todo.push(path);
+                    continue;
+                }
+                let number = |path: &Path, prefix: &str| -> Option<usize> {
+                    path.file_stem()?.to_str()?.strip_prefix(prefix)?.parse().ok()
+                };
+                let chunk = path.parent().and_then(|chunk| number(chunk, "chunk-"));
+                let file = chunk.zip(number(&path, "file-")).map(|(chunk, file)| chunk * self.info.chunks_size + file);
+                let passing = path.extension().is_some_and(|suffix| suffix == "tmp");
+                if passing || file.is_some_and(|file| file >= self.file) {
+                    std::fs::remove_file(&path).map_err(io)?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn clear_group(&mut self) {
+        self.group = Group {
+            numbers: vec![vec![]; self.columns.len()],
+            films: self.columns.iter().map(|_| None).collect(),
+            ..Group::default()
+        };
+    }
+
+    fn add(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
+        let rows = episode.rows();
+        let (schema, group, encoding) = (&self.schema, &mut self.group, self.encoding);
+        let frames = i64::try_from(group.rows).map_err(|e| Error::external("writing an episode", e))?;
+        let work = self.columns.par_iter().zip(&mut group.numbers).zip(&mut group.films).zip(&mut self.stats);
+        work.try_for_each(|((((index, _), numbers), film), stats)| -> Result<()> {
+            let column = &schema.columns()[*index];
+            let bytes = episode.bytes(*index);
+            if !column.is_image() {
+                let start = numbers.len();
+                numbers.extend(bytes);
+                if column.name == ACTION {
+                    repeat_last(&mut numbers[start..], column.row_bytes());
+                }
+                let values = read_numbers(column, &numbers[start..]);
+                stats.add(values.iter().copied(), rows);
+                return Ok(());
+            }
+            let film = match film {
+                Some(film) => film,
+                none => none.insert(Encoder::new(column.shape[1], column.shape[0], FPS, encoding)?),
+            };
+            for (number, frame) in (frames..).zip(bytes.chunks_exact(column.row_bytes())) {
+                film.add_frame(frame, number)?;
+            }
+            stats.add(bytes.iter().map(|&v| f64::from(v)), rows);
+            Ok(())
+        })?;
+        let text = |bytes: &Vec<u8>| String::from_utf8(bytes.clone()).ok();
+        let task = constants.get(TASK).and_then(text).unwrap_or_else(|| NO_TASK.to_owned());
+        let as_json: BTreeMap<&String, Stored> = constants
+            .iter()
+            .map(|(name, bytes)| (name, text(bytes).map_or_else(|| Stored::Bytes(bytes.clone()), Stored::Text)))
+            .collect();
+        let constants = serde_json::to_string(&as_json).map_err(|e| Error::external("describing an episode", e))?;
+        if !self.tasks.contains(&task) {
+            self.tasks.push(task.clone());
+        }
+        group.episodes.push(Pending { rows, task, constants });
+        group.rows += rows;
+        group.bytes += episode.byte_len();
+        Ok(())
+    }
+
+    fn commit(&mut self) -> Result<()> {
+        self.last_commit = Instant::now();
+        if self.group.episodes.is_empty() {
+            return Ok(());
+        }
+        let group = std::mem::take(&mut self.group);
+        let place =
+            [("chunk_index", self.file / self.info.chunks_size), ("file_index", self.file % self.info.chunks_size)];
+        for ((_, native), film) in self.columns.iter().zip(group.films) {
+            if let Some(film) = film {
+                put(&self.root.join(fill(VIDEO_PATH, native, &place)), &film.finish()?)?;
+            }
+        }
+        let (schema, batch) = self.data(&group.episodes, &group.numbers)?;
+        table::write(&self.root.join(fill(DATA_PATH, "", &place)), &schema, &batch)?;
+        let (schema, batch) = self.episodes(&group.episodes, place.map(|(_, number)| number))?;
+        table::write(&self.root.join(fill(EPISODES_PATH, "", &place)), &schema, &batch)?;
+        self.info.total_episodes += group.episodes.len();
+        self.info.total_frames += group.rows;
+        self.file += 1;
+        self.clear_group();
+        self.describe()
+    }
+
+    /// The rows of a group, with the features that LeRobot wants of every dataset.
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
+    fn data(&self, episodes: &[Pending], bytes: &[Vec<u8>]) -> Result<(Arc<ArrowSchema>, RecordBatch)> {
+        let (mut fields, mut arrays): (Vec<Field>, Vec<ArrayRef>) = (vec![], vec![]);
+        for ((index, native), bytes) in self.columns.iter().zip(bytes) {
+            let column = &self.schema.columns()[*index];
+            if !column.is_image() {
+                let (field, array) = values::array(native, column, bytes)?;
+                fields.push(field);
+                arrays.push(array);
+            }
+        }
+        let steps = || episodes.iter().flat_map(|episode| 0..episode.rows);
+        let numbered = || episodes.iter().enumerate().flat_map(|(e, episode)| std::iter::repeat_n(e, episode.rows));
+        let task = |e: usize| self.tasks.iter().position(|task| *task == episodes[e].task).unwrap_or(0) as i64;
+        let times: arrow_array::Float32Array =
+            steps().map(|step| (step as f64 / f64::from(FPS)) as f32).collect::<Vec<_>>().into();
+        fields.push(Field::new("timestamp", DataType::Float32, false));
+        arrays.push(Arc::new(times));
+        let mut whole = |name: &str, values: Vec<i64>| {
+            fields.push(Field::new(name, DataType::Int64, false));
+            arrays.push(Arc::new(Int64Array::from(values)));
+        };
+        whole("frame_index", steps().map(|step| step as i64).collect());
+        whole("episode_index", numbered().map(|e| (self.info.total_episodes + e) as i64).collect());
+        whole("index", (0..steps().count()).map(|row| (self.info.total_frames + row) as i64).collect());
+        whole("task_index", numbered().map(task).collect());
+        record(fields, arrays)
+    }
+
+    /// What describes the episodes of a group.
+    #[allow(clippy::cast_precision_loss, clippy::cast_possible_wrap)]
+    fn episodes(&self, episodes: &[Pending], place: [usize; 2]) -> Result<(Arc<ArrowSchema>, RecordBatch)> {
+        let (mut fields, mut arrays): (Vec<Field>, Vec<ArrayRef>) = (vec![], vec![]);
+        let mut tasks = ListBuilder::new(StringBuilder::new());
+        episodes.iter().for_each(|episode| tasks.append_value([Some(&episode.task)]));
+        let tasks = tasks.finish();
+        fields.push(Field::new("tasks", arrow_array::Array::data_type(&tasks).clone(), true));
+        arrays.push(Arc::new(tasks));
+        let ends: Vec<usize> = episodes
+            .iter()
+            .scan(0, |end, e| {
+                *end += e.rows;
+                Some(*end)
+            })
+            .collect();
+        let starts: Vec<usize> = ends.iter().zip(episodes).map(|(end, episode)| end - episode.rows).collect();
+        let mut whole = |name: String, values: Vec<usize>| {
+            fields.push(Field::new(name, DataType::Int64, false));
+            arrays.push(Arc::new(values.into_iter().map(|value| value as i64).collect::<Int64Array>()));
+        };
+        let same = |value: usize| vec![value; episodes.len()];
+        let [chunk, file] = place;
+        whole("episode_index".to_owned(), (0..episodes.len()).map(|e| self.info.total_episodes + e).collect());
+        whole("length".to_owned(), episodes.iter().map(|episode| episode.rows).collect());
+        for folder in ["data", "meta/episodes"] {
+            whole(format!("{folder}/chunk_index"), same(chunk));
+            whole(format!("{folder}/file_index"), same(file));
+        }
+        let before = self.info.total_frames;
+        whole("dataset_from_index".to_owned(), starts.iter().map(|row| before + row).collect());
+        whole("dataset_to_index".to_owned(), ends.iter().map(|row| before + row).collect());
+        let cameras: Vec<&str> = self.info.video_keys();
+        for camera in &cameras {
+            whole(format!("videos/{camera}/chunk_index"), same(chunk));
+            whole(format!("videos/{camera}/file_index"), same(file));
+        }
+        for camera in &cameras {
+            for (name, rows) in [("from_timestamp", &starts), ("to_timestamp", &ends)] {
+                let times: Vec<f64> = rows.iter().map(|&row| row as f64 / f64::from(FPS)).collect();
+                fields.push(Field::new(format!("videos/{camera}/{name}"), DataType::Float64, false));
+                arrays.push(Arc::new(Float64Array::from(times)));
+            }
+        }
+        let constants: Vec<&str> = episodes.iter().map(|episode| episode.constants.as_str()).collect();
+        fields.push(Field::new(CONSTANTS, DataType::Utf8, false));
+        arrays.push(Arc::new(StringArray::from(constants)));
+        record(fields, arrays)
+    }
+
+    /// Writes what describes the whole dataset; `meta/info.json` commits.
+    #[allow(clippy::cast_possible_wrap)]
+    fn describe(&mut self) -> Result<()> {
+        let meta = self.root.join("meta");
+        if self.info.total_episodes > 0 {
+            let fields =
+                vec![Field::new("task_index", DataType::Int64, false), Field::new(INDEX, DataType::Utf8, false)];
+            let numbers: Int64Array = (0..self.tasks.len() as i64).collect();
+            let (schema, batch) =
+                record(fields, vec![Arc::new(numbers), Arc::new(StringArray::from(self.tasks.clone()))])?;
+            let pandas = HashMap::from([("pandas".to_owned(), pandas())]);
+            let schema = Arc::new(ArrowSchema::clone(&schema).with_metadata(pandas));
+            let batch = batch.with_schema(Arc::clone(&schema)).map_err(|e| Error::external("writing a table", e))?;
+            table::write(&meta.join("tasks.parquet"), &schema, &batch)?;
+            let names = self.columns.iter().map(|(_, native)| native.as_str());
+            put(&meta.join("stats.json"), &stats::file(names.zip(&self.stats))?)?;
+        }
+        self.info.total_tasks = self.tasks.len();
+        self.info.splits = BTreeMap::from([("train".to_owned(), format!("0:{}", self.info.total_episodes))]);
+        let info = serde_json::to_vec_pretty(&self.info).map_err(|e| Error::external("describing the dataset", e))?;
+        put(&meta.join("info.json"), &info)
+    }
+
+    fn complete(&mut self) -> Result<()> {
+        if std::mem::replace(&mut self.failed, true) {
+            return Err(Error::external("writing an episode", "an earlier commit failed; nothing more is kept"));
+        }
+        self.commit()?;
+        self.failed = false;
+        Ok(())
+    }
+}
+
+impl Writer for LerobotWriter {
+    fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
+        episodes::check(episode, &self.schema)?;
+        if std::mem::replace(&mut self.failed, true) {
+            return Err(Error::external("writing an episode", "an earlier commit failed; nothing more is kept"));
+        }
+        self.add(episode, constants)?;
+        let (group, policy) = (&self.group, &self.options.commit);
+        let due = group.episodes.len() >= policy.episodes
+            || group.bytes >= policy.bytes
+            || self.last_commit.elapsed() >= policy.interval;
+        if due {
+            self.commit()?;
+        }
+        self.failed = false;
+        Ok(())
+    }
+
+    fn episodes(&self) -> usize {
+        self.info.total_episodes + self.group.episodes.len()
+    }
+
+    fn finish(mut self: Box<Self>) -> Result<()> {
+        self.complete()
+    }
+}
+
+impl Drop for LerobotWriter {
+    fn drop(&mut self) {
+        if !self.failed
+            && let Err(error) = self.complete()
+        {
+            tracing::error!(dataset = %self.root.display(), "the last episodes are lost: {error}");
+        }
+    }
+}
+
+/// The column of `meta/tasks.parquet` that pandas takes for the index.
+const INDEX: &str = "__index_level_0__";
+
+/// What makes pandas take it so.
+fn pandas() -> String {
+    let column = |name: Value, field: &str, kind: &str, numpy: &str| json!({"name": name, "field_name": field, "pandas_type": kind, "numpy_type": numpy, "metadata": null});
+    json!({
+        "index_columns": [INDEX],
+        "column_indexes": [{
+            "name": null, "field_name": null, "pandas_type": "unicode", "numpy_type": "object",
+            "metadata": {"encoding": "UTF-8"},
+        }],
+        "columns": [
+            column(json!("task_index"), "task_index", "int64", "int64"),
+            column(Value::Null, INDEX, "unicode", "object"),
+        ],
+        "creator": {"library": "stable-worldmodel", "version": env!("CARGO_PKG_VERSION")},
+        "pandas_version": "2.2.0",
+    })
+    .to_string()
+}
+
+fn record(fields: Vec<Field>, arrays: Vec<ArrayRef>) -> Result<(Arc<ArrowSchema>, RecordBatch)> {
+    let schema = Arc::new(ArrowSchema::new(fields));
+    let batch = RecordBatch::try_new(Arc::clone(&schema), arrays).map_err(|e| Error::external("writing a table", e))?;
+    Ok((schema, batch))
+}
+
+/// The columns that are stored, and their features.
+fn stored(schema: &Schema) -> Result<Vec<(usize, String)>> {
+    let mut columns: Vec<(usize, String)> = vec![];
+    for (index, column) in schema.columns().iter().enumerate() {
+        let refuse = |problem: String, fix: &str| Err(Error::config("schema", problem, fix));
+        if column.name == EPISODE || column.name == STEP {
+            continue;
+        }
+        if column.is_empty() {
+            return refuse(format!("column '{}' holds no number", column.name), "leave it out");
+        }
+        let native = native_name(column, schema);
+        let reserved = ["timestamp", "frame_index", "episode_index", "index", "task_index", "task"];
+        let unfit = native.contains(['/', '\\', '\0']) || native.starts_with('.');
+        if unfit || reserved.contains(&&*native) || columns.iter().any(|(_, other)| *other == native) {
+            return refuse(format!("LeRobot can have no feature '{native}' of a column's"), "rename the column");
+        }
+        columns.push((index, native));
+    }
+    if columns.is_empty() {
+        return Err(Error::config("schema", "it has no columns", "an episode needs at least one"));
+    }
+    Ok(columns)
+}
+
+fn info(schema: &Schema, columns: &[(usize, String)], options: &WriteOptions) -> Info {
+    let mut features: Vec<(String, Feature)> = columns
+        .iter()
+        .map(|(index, native)| {
+            let column = &schema.columns()[*index];
+            let feature = if column.is_image() {
+                let names = json!(["height", "width", "channels"]);
+                let details = json!({
+                    "video.height": column.shape[0], "video.width": column.shape[1], "video.codec": "h264",
+                    "video.fps": FPS, "video.channels": 3, "video.is_depth_map": false, "has_audio": false,
+                });
+                Feature { dtype: "video".to_owned(), shape: column.shape.clone(), names, info: Some(details) }
+            } else {
+                // More than one axis would need extensions of Arrow; our own record restores them.
+                let shape = vec![column.len()];
+                Feature { dtype: column.dtype.name().to_owned(), shape, names: Value::Null, info: None }
+            };
+            (native.clone(), feature)
+        })
+        .collect();
+    let mut default = |name: &str, dtype: DType| {
+        let feature = Feature { dtype: dtype.name().to_owned(), shape: vec![1], names: Value::Null, info: None };
+        features.push((name.to_owned(), feature));
+    };
+    default("timestamp", DType::Float32);
+    ["frame_index", "episode_index", "index", "task_index"].iter().for_each(|name| default(name, DType::Int64));
+    let cameras = columns.iter().any(|(index, _)| schema.columns()[*index].is_image());
+    Info {
+        codebase_version: VERSION.to_owned(),
+        robot_type: None,
+        total_episodes: 0,
+        total_frames: 0,
+        total_tasks: 0,
+        chunks_size: 1000,
+        data_files_size_in_mb: 100,
+        video_files_size_in_mb: 200,
+        fps: FPS.into(),
+        splits: BTreeMap::new(),
+        data_path: DATA_PATH.to_owned(),
+        video_path: cameras.then(|| VIDEO_PATH.to_owned()),
+        features: Features(features),
+        stable_worldmodel: Some(Recorded {
+            schema: schema.clone(),
+            manifest: options.manifest.clone(),
+            last_action_repeats: true,
+        }),
+    }
+}
+
+/// The last row, which holds no action, repeats the one before; where there is none it is 0.
+fn repeat_last(bytes: &mut [u8], row: usize) {
+    let last = bytes.len() - row;
+    match last.checked_sub(row) {
+        Some(before) => bytes.copy_within(before..last, last),
+        None => bytes.fill(0),
+    }
+}
+
+/// The numbers of a column.
+#[allow(clippy::cast_precision_loss)]
+fn read_numbers(column: &ColumnSpec, bytes: &[u8]) -> Vec<f64> {
+    match column.dtype {
+        DType::Bool | DType::U8 => bytes.iter().map(|&v| f64::from(v)).collect(),
+        DType::Int32 => bytes.as_chunks().0.iter().map(|&b| f64::from(i32::from_ne_bytes(b))).collect(),
+        DType::Int64 => bytes.as_chunks().0.iter().map(|&b| i64::from_ne_bytes(b) as f64).collect(),
+        DType::Float32 => bytes.as_chunks().0.iter().map(|&b| f64::from(f32::from_ne_bytes(b))).collect(),
+        DType::Float64 => bytes.as_chunks().0.iter().map(|&b| f64::from_ne_bytes(b)).collect(),
+    }
+}

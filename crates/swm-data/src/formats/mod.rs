@@ -1,0 +1,19 @@
+//! Dataset formats on disk, a folder each, with their list in [`registry`].
+//!
+//! A format implements [`Reader`](crate::Reader) and [`Writer`](crate::Writer), and has one row, `ENTRY`, beside its
+//! implementation.
+
+mod column_files;
+pub mod entry;
+mod folder;
+mod hdf5;
+pub mod lance;
+mod lance_video;
+mod lerobot;
+pub mod registry;
+#[cfg_attr(not(feature = "hdf5"), allow(dead_code, reason = "npz files use a part of it only"))]
+mod stored_scalar;
+mod video;
+
+pub use entry::FormatEntry;
+pub use registry::{FORMATS, create, detect, open};

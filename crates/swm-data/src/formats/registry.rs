@@ -1,0 +1,61 @@
+//! The list of dataset formats, and [`open`] and [`create`], which choose a format by a dataset's location.
+
+use super::entry::FormatEntry;
+use super::{folder, hdf5, lance, lance_video, lerobot, video};
+use crate::dataset::{Location, Reader, WriteOptions, Writer};
+use std::sync::Arc;
+use swm_core::{Error, Named, Registry, Result, Schema};
+
+/// All dataset formats. The first one that detects a location is used.
+pub static FORMATS: Registry<FormatEntry> = Registry {
+    kind: "dataset format",
+    hint: "`swm formats` lists them",
+    rows: &[
+        // Precedes `lance`, which also detects folders that contain Lance tables.
+        lance_video::ENTRY,
+        lance::ENTRY,
+        video::ENTRY,
+        folder::ENTRY,
+        hdf5::ENTRY,
+        lerobot::ENTRY,
+    ],
+};
+
+/// The format of an existing dataset, or of a dataset to create under this name.
+pub fn detect(location: &Location) -> Option<&'static FormatEntry> {
+    FORMATS.rows.iter().find(|format| (format.detect)(location))
+}
+
+/// Opens a dataset of any format.
+///
+/// # Errors
+/// If there is no dataset, its format is unknown, or it is damaged.
+pub fn open(location: impl Into<Location>) -> Result<Arc<dyn Reader>> {
+    let location = location.into();
+    if let Some(format) = detect(&location) {
+        return format.open(&location);
+    }
+    let problem = match location.path().map(|path| path.try_exists()) {
+        Some(Ok(false)) => "there is no such dataset",
+        _ => "it is not a dataset of a known format",
+    };
+    let known: Vec<&str> = FORMATS.rows.iter().map(Named::id).collect();
+    let fix = format!("`swm formats` says how each is recognised ({})", known.join(", "));
+    Err(Error::corrupt(location.label(), problem, fix))
+}
+
+/// Creates, continues or replaces a dataset whose episodes have these columns, in the format that the location's suffix
+/// names. Use [`FormatEntry::create`] for locations without such a suffix.
+///
+/// # Errors
+/// If the location names no known format, the dataset exists and must not, the schema differs from that of the dataset
+/// to continue, or writing fails.
+pub fn create(location: impl Into<Location>, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
+    let location = location.into();
+    let Some(format) = detect(&location) else {
+        let problem = format!("{location} has no suffix of a known format");
+        let fix = format!("end it in .{}", lance::ENTRY.suffixes[0]);
+        return Err(Error::config("dataset path", problem, fix));
+    };
+    format.create(&location, schema, options)
+}

@@ -1,0 +1,160 @@
+//! What a dataset or a world looks like, for people: videos of sampled episodes and a contact sheet of them, all
+//! cameras side by side and labelled; and the parts they are made of.
+
+mod label;
+mod sheet;
+mod video;
+
+pub use sheet::contact_sheet;
+pub(crate) use video::Film;
+pub use video::{integer_scale, write_mp4, write_mp4_scaled};
+
+use crate::dataset::{Reader, StepRange};
+use std::path::{Path, PathBuf};
+use swm_core::{Batch, ColumnSpec, Error, Result};
+use swm_image::write_png;
+
+/// What to show of a dataset.
+#[derive(Clone, Debug)]
+pub struct PreviewOptions {
+    /// How many episodes, spread over the dataset.
+    pub episodes: usize,
+    /// The columns of pictures; all of them when there is none.
+    pub columns: Vec<String>,
+    /// Frames in a second of video.
+    pub fps: u32,
+}
+
+impl Default for PreviewOptions {
+    fn default() -> Self {
+        Self { episodes: 4, columns: vec![], fps: 15 }
+    }
+}
+
+/// Frames of an episode on the contact sheet.
+const SHEET_COLUMNS: usize = 8;
+
+/// The side small pictures are enlarged towards, in pixels.
+const WATCHABLE: usize = 256;
+
+/// Rows that are decoded at a time, which bounds the memory.
+const ROWS: usize = 32;
+
+/// Writes `episode_N.mp4` for some episodes and `contact_sheet.png` of all of these into a folder, and returns their
+/// paths. `progress` is told how many episodes are done.
+///
+/// # Errors
+/// When the dataset has no pictures or no such column, is damaged, or the folder cannot be written.
+pub fn preview(
+    reader: &dyn Reader,
+    folder: &Path,
+    options: &PreviewOptions,
+    mut progress: impl FnMut(usize),
+) -> Result<Vec<PathBuf>> {
+    let strip = Strip::new(reader, &options.columns)?;
+    std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating the folder", e))?;
+    let chosen = chosen(reader, options.episodes)?;
+    let (mut written, mut sheet) = (vec![], vec![]);
+    let scale = integer_scale(strip.width, strip.height, WATCHABLE);
+    for (done, &episode) in chosen.iter().enumerate() {
+        let index = reader.episodes()[episode].index;
+        let path = folder.join(format!("episode_{index}.mp4"));
+        let length = reader.episodes()[episode].length;
+        let last = length - 1;
+        let mut film = Film::begin(&path, strip.width, strip.height, options.fps, scale)?;
+        let on_sheet: Vec<usize> = (0..SHEET_COLUMNS).map(|i| i * last / (SHEET_COLUMNS - 1)).collect();
+        for start in (0..length).step_by(ROWS) {
+            let rows = ROWS.min(length - start);
+            let batch = reader.read(&strip.names(), &[StepRange::new(episode, start, rows)])?;
+            for row in 0..rows {
+                let picture = strip.draw(&batch, row, &format!("episode {index} step {}", start + row));
+                film.add(&picture)?;
+                // A short episode shows a frame more than once.
+                let times = on_sheet.iter().filter(|&&step| step == start + row).count();
+                sheet.extend(std::iter::repeat_n(picture, times));
+            }
+        }
+        film.finish()?;
+        written.push(path);
+        progress(done + 1);
+    }
+    let picture = contact_sheet(strip.width, strip.height, &sheet, SHEET_COLUMNS, 1)?;
+    let path = folder.join("contact_sheet.png");
+    write_png(&path, picture.width, picture.height, &picture.rgb)?;
+    written.push(path);
+    Ok(written)
+}
+
+/// Positions of episodes spread over the dataset.
+fn chosen(reader: &dyn Reader, count: usize) -> Result<Vec<usize>> {
+    let all: Vec<usize> = (0..reader.episodes().len()).filter(|&i| reader.episodes()[i].length > 0).collect();
+    let count = count.min(all.len());
+    if count == 0 {
+        return Err(Error::config("preview", "there is no episode to show", "collect some, or ask for at least one"));
+    }
+    Ok((0..count).map(|i| all[i * all.len() / count]).collect())
+}
+
+/// The cameras of a row side by side, below a line of text each.
+struct Strip {
+    cameras: Vec<ColumnSpec>,
+    width: usize,
+    height: usize,
+    /// Pixels of a letter's point.
+    point: usize,
+}
+
+/// Pixels between two cameras.
+const GAP: usize = 2;
+
+impl Strip {
+    fn new(reader: &dyn Reader, names: &[String]) -> Result<Self> {
+        let schema = reader.schema();
+        let cameras: Vec<ColumnSpec> = if names.is_empty() {
+            schema.columns().iter().filter(|column| column.is_image()).cloned().collect()
+        } else {
+            names.iter().map(|name| schema.column(name).cloned()).collect::<Result<_>>()?
+        };
+        if let Some(column) = cameras.iter().find(|column| !column.is_image()) {
+            return Err(Error::mismatch(
+                format!("previewing column '{}'", column.name),
+                format!("{} {:?}", column.dtype.name(), column.shape),
+                "pictures: uint8 [height, width, 3]",
+            ));
+        }
+        let tallest = cameras.iter().map(|camera| camera.shape[0]).max();
+        let Some(tallest) = tallest else {
+            return Err(Error::config("preview", "the dataset has no pictures", "collect it with a picture size"));
+        };
+        let point = (tallest / 112).max(1);
+        let lines = 1 + usize::from(cameras.len() > 1);
+        let wide: usize = cameras.iter().map(|camera| camera.shape[1]).sum::<usize>() + GAP * (cameras.len() - 1);
+        // The first line must fit, however small the pictures are.
+        let width = wide.max(label::width("episode 0000 step 0000", point));
+        Ok(Self { width, height: tallest + lines * label::height(point), point, cameras })
+    }
+
+    fn names(&self) -> Vec<&str> {
+        self.cameras.iter().map(|camera| camera.name.as_str()).collect()
+    }
+
+    fn draw(&self, batch: &Batch, row: usize, title: &str) -> Vec<u8> {
+        let mut rgb = vec![0; self.width * self.height * 3];
+        label::draw(&mut rgb, self.width, (0, 0), self.width, self.point, title);
+        let line = label::height(self.point);
+        let (mut left, top) = (0, if self.cameras.len() > 1 { 2 * line } else { line });
+        for (index, camera) in self.cameras.iter().enumerate() {
+            let width = camera.shape[1];
+            if self.cameras.len() > 1 {
+                label::draw(&mut rgb, self.width, (left, line), left + width, self.point, &camera.name);
+            }
+            let picture = &batch.bytes(index)[row * camera.row_bytes()..][..camera.row_bytes()];
+            for (y, pixels) in picture.chunks_exact(width * 3).enumerate() {
+                let at = ((top + y) * self.width + left) * 3;
+                rgb[at..at + pixels.len()].copy_from_slice(pixels);
+            }
+            left += width + GAP;
+        }
+        rgb
+    }
+}

@@ -1,0 +1,236 @@
+//! Videos for people to watch: H.264 in MP4, as browsers play it.
+
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use swm_core::{Error, Result};
+
+/// Writes `frames` (each `height * width * 3` bytes, RGB, row after row) as an MP4 that browsers play.
+/// Odd sizes gain a black row or column, which H.264's halved colour planes need. The file appears under its
+/// name only when complete. Equal frames give equal bytes with the same FFmpeg.
+///
+/// # Errors
+/// When this build has no videos, FFmpeg has no H.264 encoder, a frame has another size, there is no frame, or the disk
+/// refuses.
+pub fn write_mp4<I>(path: &Path, width: usize, height: usize, fps: u32, frames: I) -> Result<()>
+where
+    I: IntoIterator,
+    I::Item: AsRef<[u8]>,
+{
+    write_mp4_scaled(path, width, height, fps, 1, frames)
+}
+
+/// As [`write_mp4`], every pixel drawn as a square of `scale` by `scale`, so that a 64-pixel world is
+/// watchable and its pixels stay crisp.
+///
+/// # Errors
+/// As [`write_mp4`], and when `scale` is 0.
+pub fn write_mp4_scaled<I>(path: &Path, width: usize, height: usize, fps: u32, scale: usize, frames: I) -> Result<()>
+where
+    I: IntoIterator,
+    I::Item: AsRef<[u8]>,
+{
+    let mut film = Film::begin(path, width, height, fps, scale)?;
+    for frame in frames {
+        film.add(frame.as_ref())?;
+    }
+    film.finish()
+}
+
+/// The factor that brings a picture's longer side nearest to, but not over, `target` pixels; at least 1.
+pub fn integer_scale(width: usize, height: usize, target: usize) -> usize {
+    (target / width.max(height).max(1)).max(1)
+}
+
+/// A video that is being written, frame by frame.
+pub(crate) struct Film {
+    path: PathBuf,
+    width: usize,
+    height: usize,
+    scale: usize,
+    frames: i64,
+    /// The enlarged frame, of even sides.
+    large: Vec<u8>,
+    inner: encoder::Encoder,
+}
+
+impl Film {
+    /// A video of frames of `width * scale` by `height * scale` pixels.
+    pub fn begin(path: &Path, width: usize, height: usize, fps: u32, scale: usize) -> Result<Self> {
+        if width == 0 || height == 0 || fps == 0 || scale == 0 {
+            return Err(Error::config(
+                format!("video {}", path.display()),
+                format!("{width} x {height} pixels at {fps} frames a second, scaled by {scale}"),
+                "give each of them at least 1",
+            ));
+        }
+        let (wide, high) = even(width, height, scale);
+        Ok(Self {
+            path: path.to_owned(),
+            width,
+            height,
+            scale,
+            frames: 0,
+            large: vec![0; wide * high * 3],
+            inner: begin(wide, high, fps)?,
+        })
+    }
+
+    /// Adds a frame, `height * width * 3` bytes.
+    pub fn add(&mut self, rgb: &[u8]) -> Result<()> {
+        let (width, height, scale) = (self.width, self.height, self.scale);
+        if rgb.len() != width * height * 3 {
+            return Err(Error::mismatch(
+                format!("frame {} of {}", self.frames, self.path.display()),
+                format!("{} bytes", rgb.len()),
+                format!("{}, for {width} x {height} RGB pixels", width * height * 3),
+            ));
+        }
+        let line = even(width, height, scale).0 * 3;
+        for (y, row) in self.large.chunks_exact_mut(line).enumerate().take(height * scale) {
+            let from = rgb[y / scale * width * 3..][..width * 3].as_chunks::<3>().0;
+            for (to, pixel) in row.chunks_mut(scale * 3).zip(from) {
+                to.as_chunks_mut::<3>().0.fill(*pixel);
+            }
+        }
+        self.inner.add_frame(&self.large, self.frames)?;
+        self.frames += 1;
+        Ok(())
+    }
+
+    /// Completes the file and gives it its name.
+    pub fn finish(self) -> Result<()> {
+        if self.frames == 0 {
+            let what = format!("video {}", self.path.display());
+            return Err(Error::config(what, "there is no frame to write", "record at least one step"));
+        }
+        let bytes = self.inner.finish()?;
+        let Some(name) = self.path.file_name() else {
+            let problem = format!("'{}' names no file", self.path.display());
+            return Err(Error::config("video path", problem, "end it in .mp4"));
+        };
+        // Two processes that write the same video must not share it.
+        let mut hidden = OsString::from(".");
+        hidden.push(name);
+        hidden.push(format!(".{}.partial", std::process::id()));
+        let passing = self.path.with_file_name(hidden);
+        let written = std::fs::write(&passing, bytes).and_then(|()| std::fs::rename(&passing, &self.path));
+        written.map_err(|source| {
+            // Where it was not even created there is nothing to remove.
+            let _ = std::fs::remove_file(&passing);
+            Error::io(&self.path, "writing the video", source)
+        })
+    }
+}
+
+/// The size of the video: enlarged, then made even.
+fn even(width: usize, height: usize, scale: usize) -> (usize, usize) {
+    ((width * scale).next_multiple_of(2), (height * scale).next_multiple_of(2))
+}
+
+/// Starts the encoder of a video for people.
+#[cfg(feature = "ffmpeg")]
+fn begin(width: usize, height: usize, fps: u32) -> Result<encoder::Encoder> {
+    encoder::Encoder::new(width, height, fps, swm_video::Encoding::viewing())
+}
+
+#[cfg(not(feature = "ffmpeg"))]
+fn begin(_: usize, _: usize, _: u32) -> Result<encoder::Encoder> {
+    Err(encoder::missing())
+}
+
+#[cfg(feature = "ffmpeg")]
+mod encoder {
+    pub use swm_video::Encoder;
+}
+
+/// Replaces the encoder in builds without the feature `ffmpeg`.
+#[cfg(not(feature = "ffmpeg"))]
+mod encoder {
+    use swm_core::{Error, Result};
+
+    pub struct Encoder;
+
+    impl Encoder {
+        pub fn add_frame(&mut self, _: &[u8], _: i64) -> Result<()> {
+            Err(missing())
+        }
+
+        pub fn finish(self) -> Result<Vec<u8>> {
+            Err(missing())
+        }
+    }
+
+    pub fn missing() -> Error {
+        Error::config("videos", "this build lacks the feature ffmpeg", "build it with `--features ffmpeg`")
+    }
+}
+
+#[cfg(all(test, feature = "ffmpeg"))]
+mod tests {
+    use super::*;
+    use swm_video::{DecoderPool, FrameRequest, Source, Video};
+
+    fn frames(width: usize, height: usize, n: usize) -> Vec<Vec<u8>> {
+        (0..n).map(|t| (0..width * height * 3).map(|i| ((i / 9 + t * 11) % 256) as u8).collect()).collect()
+    }
+
+    fn names(folder: &Path) -> Vec<OsString> {
+        std::fs::read_dir(folder).expect("folder").map(|entry| entry.expect("entry").file_name()).collect()
+    }
+
+    #[test]
+    fn every_frame_is_there_and_equal_frames_give_equal_bytes() {
+        let folder = tempfile::tempdir().expect("folder");
+        let [a, b] = ["a.mp4", "b: 2.mp4"].map(|name| folder.path().join(name));
+        let twice = |width, height| {
+            let frames = frames(width, height, 12);
+            [&a, &b].map(|path| {
+                write_mp4(path, width, height, 10, &frames).expect("video");
+                std::fs::read(path).expect("video")
+            })
+        };
+        for (width, height) in [(48, 48), (64, 64), (31, 18)] {
+            let [first, second] = twice(width, height);
+            assert!(first == second, "{width} x {height}");
+        }
+        let frames = frames(31, 18, 12);
+        let open = |path: &Path| Video::open(Source::File(path.to_owned())).expect("opens");
+        assert_eq!((open(&a).size(), open(&a).frames()), ((18, 32), 12));
+        write_mp4_scaled(&b, 31, 18, 10, 4, frames.iter().map(Vec::as_slice)).expect("video");
+        let video = open(&b);
+        assert_eq!((video.size(), video.frames()), ((72, 124), 12));
+        let mut out = vec![0; 72 * 124 * 3];
+        DecoderPool::default().read(vec![FrameRequest { video: &video, frame: 5, out: &mut out }]).expect("decodes");
+        let off: f64 = (0..72 * 124)
+            .map(|i| f64::from(out[i * 3].abs_diff(frames[5][(i / 124 / 4 * 31 + i % 124 / 4) * 3])))
+            .sum();
+        assert!(off / (72.0 * 124.0) < 4.0, "{}", off / (72.0 * 124.0));
+        assert_eq!(names(folder.path()).len(), 2, "nothing but the two videos is left");
+    }
+
+    #[test]
+    fn failures_say_why_and_leave_nothing() {
+        let folder = tempfile::tempdir().expect("folder");
+        let path = folder.path().join("a.mp4");
+        let message = |scale, frames: &[Vec<u8>]| {
+            write_mp4_scaled(&path, 4, 4, 10, scale, frames).expect_err("fails").to_string()
+        };
+        let good = frames(4, 4, 3);
+        assert!(message(0, &good).contains("scaled by 0"));
+        let found = message(1, &[good[0].clone(), vec![0; 5]]);
+        assert!(found.contains("frame 1") && found.contains("5 bytes") && found.contains("48"), "{found}");
+        assert!(message(1, &[]).contains("no frame"));
+        let nowhere = folder.path().join("missing").join("a.mp4");
+        let lost = write_mp4(&nowhere, 4, 4, 10, good).expect_err("fails").to_string();
+        assert!(lost.contains("No such file or directory"), "{lost}");
+        assert!(names(folder.path()).is_empty());
+    }
+
+    #[test]
+    fn small_worlds_are_enlarged_by_whole_factors() {
+        assert_eq!(
+            [(64, 64, 256), (224, 224, 256), (512, 64, 256), (60, 30, 256)].map(|(w, h, t)| integer_scale(w, h, t)),
+            [4, 1, 1, 4]
+        );
+    }
+}

@@ -8,6 +8,7 @@
 
 pub mod allocation;
 pub mod checks;
+pub mod golden;
 
 use swm_core::EnvEntry;
 

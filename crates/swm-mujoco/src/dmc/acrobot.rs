@@ -1,27 +1,34 @@
-//! Two links hang from a bar; a motor between them must swing the tip up to a target. Model after Coulom 2002.
+//! Acrobot: two links hang from a bar; a motor between them must swing the tip up to a target (`dm_control/suite/acrobot.py`,
+//! model after Coulom 2002).
 
-use super::blueprint::Edit;
-use super::env::Seen;
-use super::names::Names;
+use super::domain::{Domain, TaskTable, tasks};
+use super::measures::distance;
+use super::model_edit::ModelEdit;
+use super::model_index::ModelIndex;
+use super::observation::ObservationWriter;
 use super::reward::Tolerance;
-use super::{Domain, distance, entry, factors, start, task_names};
+use super::suite_env::entry;
+use super::{factors, start};
 use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry's row.
+/// The registry row.
 pub const ENTRY: EnvEntry = entry::<Acrobot>(&[]);
 
 /// Radius of the target, in metres.
-const SIZE: f64 = 0.2;
+const TARGET_RADIUS: f64 = 0.2;
 
-/// Whether rewards are given near the target, too.
+/// The reward of the swing-up.
 #[derive(Clone, Copy)]
 pub enum Task {
-    SwingUpSparse,
-    SwingUp,
+    /// 1 within the target, 0 outside.
+    Sparse,
+    /// Falls with the distance from the target.
+    Dense,
 }
 
+/// The indices of the domain's elements.
 pub struct Acrobot {
     task: Task,
     arms: [usize; 2],
@@ -32,11 +39,9 @@ pub struct Acrobot {
 impl Domain for Acrobot {
     type Task = Task;
     const ID: &'static str = "swm/AcrobotDMControl-v0";
-    const SUMMARY: &'static str = "Swing the tip of two hanging links up to a target, with one motor between them";
+    const SUMMARY: &'static str = "Swing the tip of two hanging links up to a target with one motor between them";
     const MODEL: &'static str = "acrobot.xml";
-    const TASKS: &'static [(&'static str, Task)] =
-        &[("swingup_sparse", Task::SwingUpSparse), ("swingup", Task::SwingUp)];
-    const NAMES: &'static [&'static str] = &task_names::<_, 2>(Self::TASKS);
+    const TASKS: TaskTable<Task> = tasks! { "swingup_sparse" => Task::Sparse, "swingup" => Task::Dense };
     const SUBSTEPS: usize = 1;
 
     fn factors() -> Vec<Factor> {
@@ -44,7 +49,7 @@ impl Domain for Acrobot {
             factors::agent_color(),
             factors::density("agent.lower_arm_density"),
             factors::density("agent.upper_arm_density"),
-            factors::choice("agent.upper_arm_locked", 1),
+            factors::binary("agent.upper_arm_locked", 1),
             factors::floor_color(),
         ];
         all.extend(factors::gravity());
@@ -53,50 +58,50 @@ impl Domain for Acrobot {
         all
     }
 
-    fn edit(edit: &mut Edit<'_>, _task: Task) -> Result<()> {
-        edit.scene("light")?;
+    fn edit(edit: &mut ModelEdit<'_>, _task: Task) -> Result<()> {
+        edit.common("light")?;
         edit.gravity();
         edit.density("upper_arm", "agent.upper_arm_density")?;
         edit.density("lower_arm", "agent.lower_arm_density")?;
-        edit.paint("target", "target.color", 1.0)?;
-        edit.target_site(SIZE)
+        edit.material_color("target", "target.color", 1.0)?;
+        edit.target_site(TARGET_RADIUS)
     }
 
     fn new(model: &MjModel, task: Task) -> Result<Self> {
-        let names = Names(model);
+        let index = ModelIndex(model);
         Ok(Self {
             task,
-            arms: [names.body("upper_arm")?, names.body("lower_arm")?],
-            tip: names.site("tip")?,
-            target: names.site("target")?,
+            arms: [index.body("upper_arm")?, index.body("lower_arm")?],
+            tip: index.site("tip")?,
+            target: index.site("target")?,
         })
     }
 
     fn start(&self, physics: &mut Physics, rng: &mut Rng) -> Result<()> {
-        start::random_joints(physics, rng);
+        start::randomize_joints(physics, rng);
         physics.forward_passive();
         Ok(())
     }
 
-    fn observe(&self, physics: &Physics, seen: &mut Seen<'_>) {
+    fn observe(&self, physics: &Physics, observation: &mut ObservationWriter<'_>) {
         let frames = physics.data().xmat();
-        seen.extend(self.arms.map(|arm| frames[arm][2]));
-        seen.extend(self.arms.map(|arm| frames[arm][8]));
-        seen.extend(physics.data().qvel());
+        observation.extend(self.arms.map(|arm| frames[arm][2]));
+        observation.extend(self.arms.map(|arm| frames[arm][8]));
+        observation.extend(physics.data().qvel());
     }
 
-    fn destination(&self, _physics: &Physics, qpos: &mut [f64]) -> bool {
+    fn goal_qpos(&self, _physics: &Physics, qpos: &mut [f64]) -> bool {
         qpos.fill(0.0);
         true
     }
 
     fn reward(&self, physics: &Physics) -> f64 {
-        let places = physics.data().site_xpos();
-        let away = distance(places[self.target], places[self.tip]);
+        let sites = physics.data().site_xpos();
+        let to_target = distance(sites[self.target], sites[self.tip]);
         let near = Tolerance::within(0.0, physics.model().site_size()[self.target][0]);
         match self.task {
-            Task::SwingUpSparse => near.of(away),
-            Task::SwingUp => near.gaussian(1.0).of(away),
+            Task::Sparse => near.of(to_target),
+            Task::Dense => near.gaussian(1.0).of(to_target),
         }
     }
 }

@@ -1,25 +1,31 @@
-//! A ball hangs on a string from a cup that moves in a plane: throw it up and catch it.
+//! Ball in cup: a ball hangs on a string from a cup that moves in a plane; swing it up and catch it
+//! (`dm_control/suite/ball_in_cup.py`).
 
-use super::blueprint::Edit;
-use super::env::Seen;
-use super::names::Names;
-use super::{Domain, entry, factors, norm, start, task_names};
+use super::domain::{Domain, TaskTable, tasks};
+use super::measures::norm;
+use super::model_edit::ModelEdit;
+use super::model_index::ModelIndex;
+use super::observation::ObservationWriter;
+use super::suite_env::entry;
+use super::{factors, start};
 use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use rand::Rng as _;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry's row.
+/// The registry row.
 pub const ENTRY: EnvEntry = entry::<BallInCup>(&[]);
 
-/// Places in `qpos`: the cup's and the ball's slides along x and z.
+/// Indices in `qpos` of the cup's slides along x and z.
 const CUP: [usize; 2] = [0, 1];
+/// Indices in `qpos` of the ball's slides along x and z.
 const BALL: [usize; 2] = [2, 3];
 /// Half the width, depth and height of the inside of the cup, in metres.
-const INSIDE: [f64; 3] = [0.05, 0.006, 0.05];
-/// The ball's slides when it is in the middle of a cup at rest.
+const CUP_INSIDE: [f64; 3] = [0.05, 0.006, 0.05];
+/// The ball's slides, in metres, when it is in the middle of a cup at its origin.
 const CAUGHT: [f64; 2] = [0.0, 0.35];
 
+/// The indices of the domain's elements.
 pub struct BallInCup {
     ball: usize,
     ball_geom: usize,
@@ -27,7 +33,7 @@ pub struct BallInCup {
 }
 
 impl BallInCup {
-    /// Whether the whole ball is inside the cup, in the plane it moves in.
+    /// Whether the whole ball is inside the cup, in the plane of its motion.
     fn caught(&self, physics: &Physics) -> bool {
         let (inside, ball) = (physics.data().site_xpos()[self.inside], physics.data().xpos()[self.ball]);
         let (room, size) = (physics.model().site_size()[self.inside], physics.model().geom_size()[self.ball_geom][0]);
@@ -38,12 +44,11 @@ impl BallInCup {
 impl Domain for BallInCup {
     type Task = ();
     const ID: &'static str = "swm/BallInCupDMControl-v0";
-    const SUMMARY: &'static str = "Catch a ball that hangs on a string in the cup it hangs from";
+    const SUMMARY: &'static str = "Catch a ball in the cup from which it hangs on a string";
     const MODEL: &'static str = "ball_in_cup.xml";
-    const TASKS: &'static [(&'static str, ())] = &[("catch", ())];
-    const NAMES: &'static [&'static str] = &task_names::<_, 1>(Self::TASKS);
+    const TASKS: TaskTable<()> = tasks! { "catch" => () };
     const SUBSTEPS: usize = 10;
-    const NEAR: f64 = 0.02;
+    const GOAL_TOLERANCE: f64 = 0.02;
 
     fn factors() -> Vec<Factor> {
         let mut all = vec![
@@ -51,7 +56,7 @@ impl Domain for BallInCup {
             factors::density("agent.density"),
             factors::color("ball.color", [0.7, 0.5, 0.3]),
             factors::density("ball.density"),
-            factors::number("ball.size", 0.01, 0.05, 0.025),
+            factors::scalar("ball.size", 0.01, 0.05, 0.025),
             factors::floor_color(),
         ];
         all.extend(factors::gravity());
@@ -60,59 +65,59 @@ impl Domain for BallInCup {
         all
     }
 
-    fn edit(edit: &mut Edit<'_>, _task: ()) -> Result<()> {
-        edit.scene("light")?;
+    fn edit(edit: &mut ModelEdit<'_>, _task: ()) -> Result<()> {
+        edit.common("light")?;
         edit.gravity();
         for part in ["cup_part_0", "cup_part_1", "cup_part_2", "cup_part_3", "cup_part_4"] {
             edit.density(part, "agent.density")?;
         }
         edit.density("ball", "ball.density")?;
         edit.radius("ball", "ball.size")?;
-        edit.target_room("target", INSIDE)
+        edit.target_region("target", CUP_INSIDE)
     }
 
     fn new(model: &MjModel, _task: ()) -> Result<Self> {
-        let names = Names(model);
-        Ok(Self { ball: names.body("ball")?, ball_geom: names.geom("ball")?, inside: names.site("target")? })
+        let index = ModelIndex(model);
+        Ok(Self { ball: index.body("ball")?, ball_geom: index.geom("ball")?, inside: index.site("target")? })
     }
 
     fn start(&self, physics: &mut Physics, rng: &mut Rng) -> Result<()> {
-        start::without_contacts(physics, rng, |physics, rng| {
+        start::sample_without_contacts(physics, rng, |physics, rng| {
             let qpos = physics.data_mut().qpos_mut();
             qpos[BALL[0]] = rng.random_range(-0.2..0.2);
             qpos[BALL[1]] = rng.random_range(0.2..0.5);
         })
     }
 
-    fn observe(&self, physics: &Physics, seen: &mut Seen<'_>) {
-        seen.extend(physics.data().qpos());
-        seen.extend(physics.data().qvel());
+    fn observe(&self, physics: &Physics, observation: &mut ObservationWriter<'_>) {
+        observation.extend(physics.data().qpos());
+        observation.extend(physics.data().qvel());
     }
 
     fn reward(&self, physics: &Physics) -> f64 {
         f64::from(u8::from(self.caught(physics)))
     }
 
-    fn destination(&self, _physics: &Physics, qpos: &mut [f64]) -> bool {
+    fn goal_qpos(&self, _physics: &Physics, qpos: &mut [f64]) -> bool {
         qpos[..2].fill(0.0);
         qpos[2..].copy_from_slice(&CAUGHT);
         true
     }
 
-    /// With the ball in the cup, wherever that is, every goal that asks for it is reached.
-    fn reached(&self, physics: &Physics, goal: &[f64]) -> Option<bool> {
+    /// A goal with the ball in the cup is reached whenever the ball is in the cup, wherever the cup is.
+    fn goal_reached(&self, physics: &Physics, goal: &[f64]) -> Option<bool> {
         let [x, z] = off_centre(goal);
         let (room, size) = (physics.model().site_size()[self.inside], physics.model().geom_size()[self.ball_geom][0]);
         (x.abs() < room[0] - size && z.abs() < room[2] - size).then(|| self.caught(physics))
     }
 
-    fn left(&self, physics: &Physics, goal: &[f64]) -> Option<f64> {
-        let wanted = self.reached(physics, goal)?;
-        Some(if wanted { 0.0 } else { norm(&off_centre(physics.data().qpos())) })
+    fn goal_distance(&self, physics: &Physics, goal: &[f64]) -> Option<f64> {
+        let reached = self.goal_reached(physics, goal)?;
+        Some(if reached { 0.0 } else { norm(&off_centre(physics.data().qpos())) })
     }
 }
 
-/// How far the ball is from the middle of the cup, along x and z.
+/// The ball's offset from the middle of the cup along x and z, in metres.
 fn off_centre(qpos: &[f64]) -> [f64; 2] {
     [0, 1].map(|axis| qpos[BALL[axis]] - qpos[CUP[axis]] - CAUGHT[axis])
 }

@@ -1,9 +1,11 @@
-//! A cart on a rail must swing up the pole on it, or keep it up.
+//! Cartpole: a cart on a rail swings up its pole or balances it (`dm_control/suite/cartpole.py`).
 
-use super::blueprint::Edit;
-use super::env::Seen;
+use super::domain::{Domain, TaskTable, tasks};
+use super::factors;
+use super::model_edit::ModelEdit;
+use super::observation::ObservationWriter;
 use super::reward::{Tolerance, mean};
-use super::{Domain, entry, factors, task_names};
+use super::suite_env::entry;
 use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use rand::Rng as _;
@@ -11,16 +13,22 @@ use rand_distr::StandardNormal;
 use std::f64::consts::PI;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry's row.
+/// The registry row.
 pub const ENTRY: EnvEntry = entry::<Cartpole>(&[]);
 
-/// Where a task begins, and what it rewards.
+/// The start and the reward of a task.
 #[derive(Clone, Copy)]
 pub struct Task {
+    /// Whether the pole starts hanging down, not upright.
     swing_up: bool,
+    /// Whether the reward is 0 or 1.
     sparse: bool,
 }
 
+/// The index of the pole's body, after those of the world and the cart.
+const POLE: usize = 2;
+
+/// A cart with a pole.
 pub struct Cartpole {
     task: Task,
 }
@@ -28,21 +36,20 @@ pub struct Cartpole {
 impl Domain for Cartpole {
     type Task = Task;
     const ID: &'static str = "swm/CartpoleDMControl-v0";
-    const SUMMARY: &'static str = "Swing up the pole on a cart, or keep it up";
+    const SUMMARY: &'static str = "Swing up the pole on a cart, or balance it";
     const MODEL: &'static str = "cartpole.xml";
-    const TASKS: &'static [(&'static str, Task)] = &[
-        ("swingup_sparse", Task { swing_up: true, sparse: true }),
-        ("swingup", Task { swing_up: true, sparse: false }),
-        ("balance", Task { swing_up: false, sparse: false }),
-        ("balance_sparse", Task { swing_up: false, sparse: true }),
-    ];
-    const NAMES: &'static [&'static str] = &task_names::<_, 4>(Self::TASKS);
+    const TASKS: TaskTable<Task> = tasks! {
+        "swingup_sparse" => Task { swing_up: true, sparse: true },
+        "swingup" => Task { swing_up: true, sparse: false },
+        "balance" => Task { swing_up: false, sparse: false },
+        "balance_sparse" => Task { swing_up: false, sparse: true },
+    };
     const SUBSTEPS: usize = 1;
 
     fn factors() -> Vec<Factor> {
         let mut all = vec![
-            factors::number("agent.cart_mass", 0.5, 1.5, 1.0),
-            factors::choice("agent.cart_shape", 1),
+            factors::scalar("agent.cart_mass", 0.5, 1.5, 1.0),
+            factors::binary("agent.cart_shape", 1),
             factors::agent_color(),
             factors::density("agent.pole_density"),
             factors::floor_color(),
@@ -52,8 +59,8 @@ impl Domain for Cartpole {
         all
     }
 
-    fn edit(edit: &mut Edit<'_>, _task: Task) -> Result<()> {
-        edit.scene("light")?;
+    fn edit(edit: &mut ModelEdit<'_>, _task: Task) -> Result<()> {
+        edit.common("light")?;
         edit.gravity();
         edit.mass("cart", "agent.cart_mass")?;
         edit.density("pole_1", "agent.pole_density")
@@ -77,10 +84,10 @@ impl Domain for Cartpole {
         Ok(())
     }
 
-    fn observe(&self, physics: &Physics, seen: &mut Seen<'_>) {
+    fn observe(&self, physics: &Physics, observation: &mut ObservationWriter<'_>) {
         let pole = physics.data().xmat()[POLE];
-        seen.extend([physics.data().qpos()[0], pole[8], pole[2]]);
-        seen.extend(physics.data().qvel());
+        observation.extend([physics.data().qpos()[0], pole[8], pole[2]]);
+        observation.extend(physics.data().qvel());
     }
 
     fn reward(&self, physics: &Physics) -> f64 {
@@ -90,16 +97,13 @@ impl Domain for Cartpole {
         }
         let zero = Tolerance::within(0.0, 0.0);
         let centred = f64::midpoint(1.0, zero.gaussian(2.0).of(cart));
-        let calm = (4.0 + mean(zero.quadratic(1.0), physics.data().ctrl())) / 5.0;
+        let small_control = (4.0 + mean(zero.quadratic(1.0), physics.data().ctrl())) / 5.0;
         let slow = f64::midpoint(1.0, zero.gaussian(5.0).of(physics.data().qvel()[1]));
-        f64::midpoint(upright, 1.0) * calm * slow * centred
+        f64::midpoint(upright, 1.0) * small_control * slow * centred
     }
 
-    fn destination(&self, _physics: &Physics, qpos: &mut [f64]) -> bool {
+    fn goal_qpos(&self, _physics: &Physics, qpos: &mut [f64]) -> bool {
         qpos.fill(0.0);
         true
     }
 }
-
-/// The pole's body: after the world and the cart.
-const POLE: usize = 2;

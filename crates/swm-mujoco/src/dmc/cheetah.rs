@@ -1,115 +1,136 @@
-//! A planar cheetah runs, or does tricks. The tricks are those of TD-MPC2 (Hansen et al. 2024) and Newt.
+//! Cheetah: a planar cheetah runs (`dm_control/suite/cheetah.py`), stands, jumps and flips (added by TD-MPC2 and Newt, Hansen et
+//! al. 2024).
 
-use super::blueprint::Edit;
-use super::env::Seen;
-use super::names::Names;
+use super::domain::{Domain, InfoColumn, RewardFn, TaskTable, tasks};
+use super::measures::{forward_spin, height};
+use super::model_edit::ModelEdit;
+use super::model_index::ModelIndex;
+use super::observation::ObservationWriter;
 use super::reward::Tolerance;
-use super::{Domain, entry, factors, start, task_names};
+use super::suite_env::entry;
+use super::{factors, start};
 use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry's row.
+/// The registry row.
 pub const ENTRY: EnvEntry = entry::<Cheetah>(&[]);
 
-/// Time steps in which a start falls to the ground.
-const SETTLE: usize = 200;
-/// A torso or foot this high jumps, in metres.
+/// Time steps in which a random start falls to the ground.
+const SETTLE_STEPS: usize = 200;
+/// Height of torso or foot in a jump, in metres.
 const JUMP: Tolerance = Tolerance::at_least(1.2).gaussian(0.6);
-/// How low lies, in metres.
-const LIE: f64 = 0.25;
-/// An angular momentum that flips.
-const SPIN: Tolerance = Tolerance::at_least(8.0).linear(8.0, 0.0);
+/// Height of a lying torso or foot, in metres.
+const LIE_HEIGHT: f64 = 0.25;
+/// Forward angular momentum of a flip, in kg m²/s.
+const FLIP: Tolerance = Tolerance::at_least(8.0).linear(8.0, 0.0);
 
-/// What there is to do, and how fast, in m/s.
-#[derive(Clone, Copy)]
-pub enum Task {
-    Run,
-    RunBackward,
-    StandFront,
-    StandBack,
-    Jump,
-    RunFront,
-    RunBack,
-    LieDown,
-    LegsUp,
-    Flip,
-    FlipBackward,
-}
-
+/// The reward and the indices of the domain's elements.
 pub struct Cheetah {
-    task: Task,
+    reward: RewardFn<Self>,
     torso: usize,
-    front: usize,
-    back: usize,
+    front_foot: usize,
+    back_foot: usize,
     velocity: usize,
 }
 
 impl Cheetah {
-    /// How fast it moves forward, in m/s.
+    /// The forward velocity, in m/s.
     fn speed(&self, physics: &Physics) -> f64 {
         physics.data().sensordata()[self.velocity]
     }
 
-    /// How fast it turns forward, as angular momentum.
-    fn spin(&self, physics: &Physics) -> f64 {
-        physics.data().subtree_angmom()[self.torso][1]
+    /// Standing on one foot: torso and raised foot up. The speed term is 1 only at a speed of exactly 0, as in the reference.
+    fn stand(&self, physics: &Physics, raised: usize) -> f64 {
+        let up = JUMP.of(f64::midpoint(height(physics, self.torso), height(physics, raised)));
+        (5.0 * up + Tolerance::within(0.0, 0.0).of(self.speed(physics))) / 6.0
     }
 
-    /// Standing on one foot with the other one, and the torso, up. Its speed must be zero to the last digit.
-    fn stand(&self, physics: &Physics, raised: usize) -> f64 {
-        let height = |body: usize| physics.data().xpos()[body][2];
-        let up = JUMP.of(f64::midpoint(height(self.torso), height(raised)));
-        (5.0 * up + Tolerance::within(0.0, 0.0).of(self.speed(physics))) / 6.0
+    /// Both stands at once.
+    fn jump(&self, physics: &Physics) -> f64 {
+        f64::midpoint(self.stand(physics, self.back_foot), self.stand(physics, self.front_foot))
     }
 
     /// One foot and the torso up.
     fn one_foot(&self, physics: &Physics, raised: usize) -> f64 {
-        let height = |body: usize| physics.data().xpos()[body][2];
-        (3.0 * JUMP.of(height(raised)) + 2.0 * JUMP.of(height(self.torso))) / 5.0
+        (3.0 * JUMP.of(height(physics, raised)) + 2.0 * JUMP.of(height(physics, self.torso))) / 5.0
     }
 
-    /// The same while running at half speed.
+    /// Running at half speed with one foot and the torso up.
     fn run_on_one_foot(&self, physics: &Physics, raised: usize) -> f64 {
         let fast = Tolerance::at_least(5.0).linear(5.0, 0.0).of(self.speed(physics));
         self.one_foot(physics, raised) * (5.0 * fast + 1.0) / 6.0
     }
 
-    fn flip(&self, physics: &Physics, forward: f64) -> f64 {
-        let along = Tolerance::at_least(0.0).of(forward * self.speed(physics));
-        (2.0 * SPIN.of(forward * self.spin(physics)) + along) / 3.0
+    /// Torso and feet low.
+    fn lie_down(&self, physics: &Physics) -> f64 {
+        let low = |height| Tolerance::at_most(LIE_HEIGHT).linear(LIE_HEIGHT, 0.0).of(height);
+        let feet = f64::midpoint(height(physics, self.front_foot), height(physics, self.back_foot));
+        (3.0 * low(height(physics, self.torso)) + low(feet)) / 4.0
+    }
+
+    /// Torso low, back foot up.
+    fn legs_up(&self, physics: &Physics) -> f64 {
+        let down = Tolerance::at_most(LIE_HEIGHT).gaussian(LIE_HEIGHT / 2.0).of(height(physics, self.torso));
+        (5.0 * down + self.one_foot(physics, self.back_foot)) / 6.0
+    }
+
+    /// Rotating and moving forward (`direction` 1) or backward (-1).
+    fn flip(&self, physics: &Physics, direction: f64) -> f64 {
+        let along = Tolerance::at_least(0.0).of(direction * self.speed(physics));
+        (2.0 * FLIP.of(direction * forward_spin(physics, self.torso)) + along) / 3.0
     }
 }
 
 impl Domain for Cheetah {
-    type Task = Task;
+    type Task = RewardFn<Self>;
     const ID: &'static str = "swm/CheetahDMControl-v0";
-    const SUMMARY: &'static str = "Run with a planar cheetah, or do tricks";
+    const SUMMARY: &'static str = "Run with a planar cheetah, stand on one foot, jump or flip";
     const MODEL: &'static str = "cheetah.xml";
-    const TASKS: &'static [(&'static str, Task)] = &[
-        ("run", Task::Run),
-        ("run-backward", Task::RunBackward),
-        ("stand-front", Task::StandFront),
-        ("stand-back", Task::StandBack),
-        ("jump", Task::Jump),
-        ("run-front", Task::RunFront),
-        ("run-back", Task::RunBack),
-        ("lie-down", Task::LieDown),
-        ("legs-up", Task::LegsUp),
-        ("flip", Task::Flip),
-        ("flip-backward", Task::FlipBackward),
-    ];
-    const NAMES: &'static [&'static str] = &task_names::<_, 11>(Self::TASKS);
+    const TASKS: TaskTable<RewardFn<Self>> = tasks! {
+        "run" => |cheetah, physics| Tolerance::at_least(10.0).linear(10.0, 0.0).of(cheetah.speed(physics)),
+        "run-backward" => |cheetah, physics| Tolerance::at_most(-10.0).linear(10.0, 0.0).of(cheetah.speed(physics)),
+        "stand-front" => |cheetah, physics| cheetah.stand(physics, cheetah.back_foot),
+        "stand-back" => |cheetah, physics| cheetah.stand(physics, cheetah.front_foot),
+        "jump" => Cheetah::jump,
+        "run-front" => |cheetah, physics| cheetah.run_on_one_foot(physics, cheetah.back_foot),
+        "run-back" => |cheetah, physics| cheetah.run_on_one_foot(physics, cheetah.front_foot),
+        "lie-down" => Cheetah::lie_down,
+        "legs-up" => Cheetah::legs_up,
+        "flip" => |cheetah, physics| cheetah.flip(physics, 1.0),
+        "flip-backward" => |cheetah, physics| cheetah.flip(physics, -1.0),
+    };
     const SUBSTEPS: usize = 1;
-    const LIMIT: usize = 1250;
-    const INFO: &'static [(&'static str, usize)] =
-        &[("speed", 1), ("torso_height", 1), ("bfoot_height", 1), ("ffoot_height", 1), ("angmomentum", 1)];
-    const IDLE: &'static [&'static str] = &["rootx"];
+    const MAX_STEPS: usize = 1250;
+    const INFO: &'static [InfoColumn<Self>] = &[
+        InfoColumn { name: "speed", len: 1, write: |cheetah, physics, into| into[0] = cheetah.speed(physics) },
+        InfoColumn {
+            name: "torso_height",
+            len: 1,
+            write: |cheetah, physics, into| into[0] = height(physics, cheetah.torso),
+        },
+        InfoColumn {
+            name: "bfoot_height",
+            len: 1,
+            write: |cheetah, physics, into| into[0] = height(physics, cheetah.back_foot),
+        },
+        InfoColumn {
+            name: "ffoot_height",
+            len: 1,
+            write: |cheetah, physics, into| into[0] = height(physics, cheetah.front_foot),
+        },
+        InfoColumn {
+            name: "angmomentum",
+            len: 1,
+            write: |cheetah, physics, into| into[0] = forward_spin(physics, cheetah.torso),
+        },
+    ];
+    const IGNORED_JOINTS: &'static [&'static str] = &["rootx"];
 
     fn factors() -> Vec<Factor> {
         let mut all = vec![
             factors::density("agent.back_foot_density"),
-            factors::choice("agent.back_foot_locked", 1),
+            factors::binary("agent.back_foot_locked", 1),
             factors::agent_color(),
             factors::density("agent.torso_density"),
             factors::floor_color(),
@@ -120,69 +141,39 @@ impl Domain for Cheetah {
         all
     }
 
-    fn edit(edit: &mut Edit<'_>, _task: Task) -> Result<()> {
-        edit.scene("light")?;
+    fn edit(edit: &mut ModelEdit<'_>, _reward: RewardFn<Self>) -> Result<()> {
+        edit.common("light")?;
         edit.gravity();
-        edit.friction("ground")?;
+        edit.floor_friction("ground")?;
         edit.density("torso", "agent.torso_density")?;
         edit.density("bfoot", "agent.back_foot_density")
     }
 
-    fn new(model: &MjModel, task: Task) -> Result<Self> {
-        let names = Names(model);
+    fn new(model: &MjModel, reward: RewardFn<Self>) -> Result<Self> {
+        let index = ModelIndex(model);
         Ok(Self {
-            task,
-            torso: names.body("torso")?,
-            front: names.body("ffoot")?,
-            back: names.body("bfoot")?,
-            velocity: names.sensor("torso_subtreelinvel")?,
+            reward,
+            torso: index.body("torso")?,
+            front_foot: index.body("ffoot")?,
+            back_foot: index.body("bfoot")?,
+            velocity: index.sensor("torso_subtreelinvel")?,
         })
     }
 
     fn start(&self, physics: &mut Physics, rng: &mut Rng) -> Result<()> {
-        start::limited_joints(physics, rng);
-        physics.step_control(SETTLE);
+        start::randomize_limited_joints(physics, rng);
+        physics.step_control(SETTLE_STEPS);
         physics.data_mut().set_time(0.0);
         physics.forward_passive();
         Ok(())
     }
 
-    fn observe(&self, physics: &Physics, seen: &mut Seen<'_>) {
-        seen.extend(&physics.data().qpos()[1..]);
-        seen.extend(physics.data().qvel());
+    fn observe(&self, physics: &Physics, observation: &mut ObservationWriter<'_>) {
+        observation.extend(&physics.data().qpos()[1..]);
+        observation.extend(physics.data().qvel());
     }
 
     fn reward(&self, physics: &Physics) -> f64 {
-        let low = |height| Tolerance::at_most(LIE).linear(LIE, 0.0).of(height);
-        let height = |body: usize| physics.data().xpos()[body][2];
-        match self.task {
-            Task::Run => Tolerance::at_least(10.0).linear(10.0, 0.0).of(self.speed(physics)),
-            Task::RunBackward => Tolerance::at_most(-10.0).linear(10.0, 0.0).of(self.speed(physics)),
-            Task::StandFront => self.stand(physics, self.back),
-            Task::StandBack => self.stand(physics, self.front),
-            Task::Jump => f64::midpoint(self.stand(physics, self.back), self.stand(physics, self.front)),
-            Task::RunFront => self.run_on_one_foot(physics, self.back),
-            Task::RunBack => self.run_on_one_foot(physics, self.front),
-            Task::LieDown => {
-                (3.0 * low(height(self.torso)) + low(f64::midpoint(height(self.front), height(self.back)))) / 4.0
-            }
-            Task::LegsUp => {
-                let down = Tolerance::at_most(LIE).gaussian(LIE / 2.0).of(height(self.torso));
-                (5.0 * down + self.one_foot(physics, self.back)) / 6.0
-            }
-            Task::Flip => self.flip(physics, 1.0),
-            Task::FlipBackward => self.flip(physics, -1.0),
-        }
-    }
-
-    fn info(&self, physics: &Physics, column: usize, into: &mut [f64]) {
-        let height = |body: usize| physics.data().xpos()[body][2];
-        into[0] = match column {
-            0 => self.speed(physics),
-            1 => height(self.torso),
-            2 => height(self.back),
-            3 => height(self.front),
-            _ => self.spin(physics),
-        };
+        (self.reward)(self, physics)
     }
 }

@@ -1,33 +1,36 @@
-//! A finger of two links turns a body on a hinge.
+//! Finger: a finger of two links rotates a body on a hinge (`dm_control/suite/finger.py`).
 
-use super::blueprint::Edit;
-use super::env::Seen;
-use super::names::Names;
-use super::{Domain, entry, factors, norm, start, task_names};
+use super::domain::{Domain, InfoColumn, TaskTable, tasks};
+use super::measures::norm;
+use super::model_edit::ModelEdit;
+use super::model_index::ModelIndex;
+use super::observation::ObservationWriter;
+use super::suite_env::entry;
+use super::{factors, start};
 use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use rand::Rng as _;
 use std::f64::consts::PI;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry's row.
+/// The registry row.
 pub const ENTRY: EnvEntry = entry::<Finger>(&[]);
 
-/// The hinge speed that counts as spinning, in rad/s: backwards.
-const SPINNING: f64 = -15.0;
-/// How much a hinge resists that is to be spun.
+/// The hinge velocity at which the body counts as spinning, in rad/s.
+const SPIN_VELOCITY: f64 = -15.0;
+/// Damping of the hinge in the spin task, in N m s/rad.
 const SPIN_DAMPING: f64 = 0.03;
 
-/// What there is to do.
+/// The task.
 #[derive(Clone, Copy)]
 pub enum Task {
     /// Turn the body's tip to a target of this radius, in metres.
     Turn(f64),
-    /// Spin it.
+    /// Spin the body.
     Spin,
 }
 
-/// Where the numbers of a sensor begin.
+/// The indices of sensor values in `sensordata`.
 struct Sensors {
     proximal: usize,
     distal: usize,
@@ -38,6 +41,7 @@ struct Sensors {
     touch: [usize; 2],
 }
 
+/// The indices of the domain's elements.
 pub struct Finger {
     task: Task,
     sensors: Sensors,
@@ -49,15 +53,16 @@ pub struct Finger {
 }
 
 impl Finger {
-    /// A place beside the hinge, in the plane of the finger.
-    fn beside_hinge(&self, physics: &Physics, sensor: usize) -> [f64; 2] {
-        let read = physics.data().sensordata();
-        [0, 2].map(|axis| read[sensor + axis] - read[self.sensors.spinner + axis])
+    /// A sensed position relative to the hinge, in the plane of the finger (x and z), in metres.
+    fn relative_to_hinge(&self, physics: &Physics, sensor: usize) -> [f64; 2] {
+        let values = physics.data().sensordata();
+        [0, 2].map(|axis| values[sensor + axis] - values[self.sensors.spinner + axis])
     }
 
-    /// How far the tip is from the target's surface; negative inside.
+    /// The distance of the tip from the target's surface, in metres; negative inside.
     fn to_target(&self, physics: &Physics) -> f64 {
-        let [tip, target] = [self.sensors.tip, self.sensors.target].map(|sensor| self.beside_hinge(physics, sensor));
+        let sensors = [self.sensors.tip, self.sensors.target];
+        let [tip, target] = sensors.map(|sensor| self.relative_to_hinge(physics, sensor));
         norm(&[target[0] - tip[0], target[1] - tip[1]]) - physics.model().site_size()[self.target][0]
     }
 }
@@ -65,15 +70,34 @@ impl Finger {
 impl Domain for Finger {
     type Task = Task;
     const ID: &'static str = "swm/FingerDMControl-v0";
-    const SUMMARY: &'static str = "Turn a body on a hinge with a finger, to a target or ever faster";
+    const SUMMARY: &'static str = "Turn a body on a hinge to a target with a finger, or spin it";
     const MODEL: &'static str = "finger.xml";
-    const TASKS: &'static [(&'static str, Task)] =
-        &[("turn_hard", Task::Turn(0.03)), ("turn_easy", Task::Turn(0.07)), ("spin", Task::Spin)];
-    const NAMES: &'static [&'static str] = &task_names::<_, 3>(Self::TASKS);
+    const TASKS: TaskTable<Task> = tasks! {
+        "turn_hard" => Task::Turn(0.03),
+        "turn_easy" => Task::Turn(0.07),
+        "spin" => Task::Spin,
+    };
     const SUBSTEPS: usize = 2;
-    const INFO: &'static [(&'static str, usize)] =
-        &[("hinge_velocity", 1), ("target_position", 2), ("tip_position", 2)];
-    const TARGET: usize = 2;
+    const INFO: &'static [InfoColumn<Self>] = &[
+        InfoColumn {
+            name: "hinge_velocity",
+            len: 1,
+            write: |finger, physics, into| into[0] = physics.data().sensordata()[finger.sensors.velocities[2]],
+        },
+        InfoColumn {
+            name: "target_position",
+            len: 2,
+            write: |finger, physics, into| {
+                into.copy_from_slice(&finger.relative_to_hinge(physics, finger.sensors.target));
+            },
+        },
+        InfoColumn {
+            name: "tip_position",
+            len: 2,
+            write: |finger, physics, into| into.copy_from_slice(&finger.relative_to_hinge(physics, finger.sensors.tip)),
+        },
+    ];
+    const TARGET_LEN: usize = 2;
 
     fn factors() -> Vec<Factor> {
         let mut all = vec![
@@ -85,14 +109,14 @@ impl Domain for Finger {
             factors::render_target(),
             factors::color("spinner.color", [0.7, 0.5, 0.3]),
             factors::density("spinner.density"),
-            factors::number("spinner.friction", 0.0, 1.0, 0.1),
+            factors::scalar("spinner.friction", 0.0, 1.0, 0.1),
         ];
         all.extend(factors::target());
         all
     }
 
-    fn edit(edit: &mut Edit<'_>, task: Task) -> Result<()> {
-        edit.scene("light")?;
+    fn edit(edit: &mut ModelEdit<'_>, task: Task) -> Result<()> {
+        edit.common("light")?;
         edit.density("proximal", "agent.proximal_density")?;
         edit.density("fingertip", "agent.fingertip_density")?;
         for cap in ["cap1", "cap2"] {
@@ -108,32 +132,32 @@ impl Domain for Finger {
     }
 
     fn new(model: &MjModel, task: Task) -> Result<Self> {
-        let names = Names(model);
+        let index = ModelIndex(model);
         let sensors = Sensors {
-            proximal: names.sensor("proximal")?,
-            distal: names.sensor("distal")?,
+            proximal: index.sensor("proximal")?,
+            distal: index.sensor("distal")?,
             velocities: [
-                names.sensor("proximal_velocity")?,
-                names.sensor("distal_velocity")?,
-                names.sensor("hinge_velocity")?,
+                index.sensor("proximal_velocity")?,
+                index.sensor("distal_velocity")?,
+                index.sensor("hinge_velocity")?,
             ],
-            tip: names.sensor("tip")?,
-            target: names.sensor("target")?,
-            spinner: names.sensor("spinner")?,
-            touch: [names.sensor("touchtop")?, names.sensor("touchbottom")?],
+            tip: index.sensor("tip")?,
+            target: index.sensor("target")?,
+            spinner: index.sensor("spinner")?,
+            touch: [index.sensor("touchtop")?, index.sensor("touchbottom")?],
         };
         Ok(Self {
             task,
             sensors,
-            target: names.site("target")?,
-            tip: names.site("tip")?,
-            cap: names.geom("cap1")?,
-            hinge: names.joint("hinge")?,
-            hinge_velocity: names.velocity("hinge")?,
+            target: index.site("target")?,
+            tip: index.site("tip")?,
+            cap: index.geom("cap1")?,
+            hinge: index.joint("hinge")?,
+            hinge_velocity: index.qvel("hinge")?,
         })
     }
 
-    fn adapt(&self, physics: &mut Physics) {
+    fn configure_model(&self, physics: &mut Physics) {
         let model = physics.model_mut();
         match self.task {
             Task::Turn(radius) => model.site_size_mut()[self.target][0] = radius,
@@ -150,46 +174,38 @@ impl Domain for Finger {
             let (sin, cos) = rng.random_range(-PI..PI).sin_cos();
             let hinge = physics.data().xanchor()[self.hinge];
             let reach = physics.model().geom_size()[self.cap].iter().sum::<f64>();
-            self.place(physics, &[hinge[0] + reach * sin, hinge[2] + reach * cos]);
+            self.set_target(physics, &[hinge[0] + reach * sin, hinge[2] + reach * cos]);
         }
-        start::without_contacts(physics, rng, start::random_joints)
+        start::sample_without_contacts(physics, rng, start::randomize_joints)
     }
 
     fn target(&self, physics: &Physics, into: &mut [f64]) {
-        let place = physics.model().site_pos()[self.target];
-        into.copy_from_slice(&[place[0], place[2]]);
+        let position = physics.model().site_pos()[self.target];
+        into.copy_from_slice(&[position[0], position[2]]);
     }
 
-    fn place(&self, physics: &mut Physics, target: &[f64]) {
-        let place = &mut physics.model_mut().site_pos_mut()[self.target];
-        (place[0], place[2]) = (target[0], target[1]);
+    fn set_target(&self, physics: &mut Physics, target: &[f64]) {
+        let position = &mut physics.model_mut().site_pos_mut()[self.target];
+        (position[0], position[2]) = (target[0], target[1]);
     }
 
-    fn observe(&self, physics: &Physics, seen: &mut Seen<'_>) {
-        let read = physics.data().sensordata();
-        seen.extend([read[self.sensors.proximal], read[self.sensors.distal]]);
-        seen.extend(self.beside_hinge(physics, self.sensors.tip));
-        seen.extend(self.sensors.velocities.map(|sensor| read[sensor]));
-        seen.extend(self.sensors.touch.map(|sensor| read[sensor].ln_1p()));
+    fn observe(&self, physics: &Physics, observation: &mut ObservationWriter<'_>) {
+        let values = physics.data().sensordata();
+        observation.extend([values[self.sensors.proximal], values[self.sensors.distal]]);
+        observation.extend(self.relative_to_hinge(physics, self.sensors.tip));
+        observation.extend(self.sensors.velocities.map(|sensor| values[sensor]));
+        observation.extend(self.sensors.touch.map(|sensor| values[sensor].ln_1p()));
         if let Task::Turn(_) = self.task {
-            seen.extend(self.beside_hinge(physics, self.sensors.target));
-            seen.push(self.to_target(physics));
+            observation.extend(self.relative_to_hinge(physics, self.sensors.target));
+            observation.push(self.to_target(physics));
         }
     }
 
     fn reward(&self, physics: &Physics) -> f64 {
         let done = match self.task {
             Task::Turn(_) => self.to_target(physics) <= 0.0,
-            Task::Spin => physics.data().sensordata()[self.sensors.velocities[2]] <= SPINNING,
+            Task::Spin => physics.data().sensordata()[self.sensors.velocities[2]] <= SPIN_VELOCITY,
         };
         f64::from(u8::from(done))
-    }
-
-    fn info(&self, physics: &Physics, column: usize, into: &mut [f64]) {
-        match column {
-            0 => into[0] = physics.data().sensordata()[self.sensors.velocities[2]],
-            1 => into.copy_from_slice(&self.beside_hinge(physics, self.sensors.target)),
-            _ => into.copy_from_slice(&self.beside_hinge(physics, self.sensors.tip)),
-        }
     }
 }

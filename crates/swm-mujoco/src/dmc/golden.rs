@@ -1,31 +1,29 @@
-//! The suite against rollouts of the Python reference: those of `SWM_GOLDEN`, and those beside the tests.
+//! Golden tests: every domain reproduces rollouts that the Python reference recorded (`SWM_GOLDEN`, and `tests/golden`).
 //!
-//! They are followed below [`swm_core::Env`], whose actions are single precision: the reference's are not, and where there are
-//! contacts the last digits of an action decide.
+//! The rollouts are replayed below [`swm_core::Env`], whose actions are in single precision: those of the reference are in double
+//! precision, and with contacts the difference grows quickly.
 
-#[path = "../../tests/it/recorded.rs"]
-mod recorded;
-
-use super::env::{Control, parts};
-use super::{Domain, ENTRIES};
+use super::ENTRIES;
+use super::domain::Domain;
+use super::suite_env::{SuiteTask, parts};
 use crate::Physics;
 use crate::render::similarity::ImageSimilarity;
 use crate::render::{self, Choice, FrameBuffer};
 use crate::task::Task as _;
-use recorded::Golden;
 use std::path::Path;
 use std::sync::Arc;
+use swm_conformance::golden::{self, Golden};
 use swm_core::{Batch, ColumnSpec, DType, EnvChoice, Key, Registry, Schema};
 
-/// How far numbers may be apart.
-const NEAR: f64 = 1e-6;
-/// How far pictures may be apart, of 255.
-const ALIKE: f64 = 3.0;
+/// The largest allowed difference of values.
+const TOLERANCE: f64 = 1e-6;
+/// The largest allowed mean difference of images, of 255.
+const IMAGE_TOLERANCE: f64 = 3.0;
 
-/// Where the task's target is. The suite draws it, and shows it to the agent.
+/// The position of the task's target in a recording.
 fn target<D: Domain>(golden: &mut Golden) -> Vec<f64> {
     if golden.has("start.target") {
-        let target = golden.numbers("start.target");
+        let target = golden.values("start.target");
         return match D::MODEL {
             "reacher.xml" => target[..2].to_vec(),
             "finger.xml" => vec![target[0], target[2]],
@@ -34,19 +32,19 @@ fn target<D: Domain>(golden: &mut Golden) -> Vec<f64> {
         };
     }
     match D::MODEL {
-        "reacher.xml" => golden.numbers("info.target_pos")[..2].to_vec(),
-        // Beside the hinge.
+        "reacher.xml" => golden.values("info.target_pos")[..2].to_vec(),
+        // The column is relative to the hinge.
         "finger.xml" => {
-            let beside = golden.numbers("info.target_position");
-            vec![beside[0] + 0.2, beside[1] + 0.4]
+            let relative = golden.values("info.target_position");
+            vec![relative[0] + 0.2, relative[1] + 0.4]
         }
-        // In single precision, at the end of the observation.
-        "manipulator.xml" => golden.numbers("obs")[40..44].to_vec(),
+        // The last elements of the observation, in single precision.
+        "manipulator.xml" => golden.values("obs")[40..44].to_vec(),
         _ => vec![],
     }
 }
 
-/// The greatest difference of two lists; where both are no number, there is none.
+/// The largest difference of two vectors; two NaN count as equal.
 fn apart(a: &[f64], b: &[f64]) -> f64 {
     assert_eq!(a.len(), b.len());
     a.iter()
@@ -55,32 +53,32 @@ fn apart(a: &[f64], b: &[f64]) -> f64 {
         .fold(0.0, |worst, d| if d.is_nan() { f64::INFINITY } else { worst.max(d) })
 }
 
-/// A world while a rollout is followed.
-struct Follower<D: Domain> {
+/// A domain during the replay of a rollout.
+struct Replay<D: Domain> {
     physics: Physics,
-    control: Control<D>,
-    stage: Option<Box<render::AbstractScene>>,
+    task: SuiteTask<D>,
+    scene: Option<Box<render::AbstractScene>>,
     row: Batch,
 }
 
-impl<D: Domain> Follower<D> {
+impl<D: Domain> Replay<D> {
     fn column(&mut self, name: &str) -> Vec<f64> {
-        self.control.observe(&self.physics, &mut self.row.row_mut(0));
+        self.task.observe(&self.physics, &mut self.row.row_mut(0));
         self.row.row(0).to_f64(name).expect("a column")
     }
 
-    /// How far MuJoCo's picture is from a recorded one, of 255, and whether the CPU's is like it.
-    fn picture(&mut self, file: &Path, golden: &mut Golden, name: &str) -> (f64, bool) {
+    /// The difference of MuJoCo's image from a recorded one, of 255, and whether the CPU renderer's is close to it.
+    fn compare_image(&mut self, file: &Path, golden: &mut Golden, name: &str) -> (f64, bool) {
         if !golden.has(name) {
             return (0.0, true);
         }
-        let (height, width, wanted) = golden.picture(name);
+        let (height, width, wanted) = golden.image(name);
         let mut rgb = vec![0; wanted.len()];
-        let camera = self.control.camera();
+        let camera = self.task.camera();
         let mut draw = |choice| {
-            let picture = FrameBuffer::Rgb(&mut rgb);
-            render::with(choice, || render::draw(&mut self.stage, &mut self.physics, camera, (width, height), picture))
-                .expect("a picture");
+            let buffer = FrameBuffer::Rgb(&mut rgb);
+            render::with(choice, || render::draw(&mut self.scene, &mut self.physics, camera, (width, height), buffer))
+                .expect("a frame");
             rgb.clone()
         };
         let (cpu, egl) = (draw(Choice::Cpu), draw(Choice::Egl));
@@ -92,26 +90,26 @@ impl<D: Domain> Follower<D> {
     }
 }
 
-/// How far a rollout is from the recorded one.
+/// The largest differences between a replayed and a recorded rollout.
 #[derive(Debug, Default)]
 struct Worst {
     state: f64,
     observation: f64,
     reward: f64,
     info: f64,
-    pictures: [(f64, bool); 2],
+    images: [(f64, bool); 2],
 }
 
-fn follow_one<D: Domain>(file: &Path) -> Worst {
+fn replay_one<D: Domain>(file: &Path) -> Worst {
     let mut golden = Golden::open(file);
-    let task = if golden.has("task") { golden.text("task") } else { D::NAMES[0].to_owned() };
+    let task = if golden.has("task") { golden.text("task") } else { D::TASKS.names[0].to_owned() };
     let registry = Registry { kind: "environment", hint: "", rows: &ENTRIES };
-    let choice: EnvChoice = registry.choose(&format!("{},task={task}", D::ID)).expect("a world");
-    let (spec, model, mut control) = parts::<D>(&choice).expect("a world");
-    let factors = spec.variation_space.resolve(&golden.variation(), Key::new(0)).expect("possible values");
+    let choice: EnvChoice = registry.choose(&format!("{},task={task}", D::ID)).expect("a registered environment");
+    let (spec, model, mut task) = parts::<D>(&choice).expect("an environment");
+    let factors = spec.variation_space.resolve(&golden.variation(), Key::new(0)).expect("valid factors");
     let mut physics = Physics::new(Arc::clone(&model)).expect("a state");
-    control.apply_factors(&mut physics, &factors).expect("a model");
-    control.start(&mut physics, &factors, Key::new(0)).expect("a start");
+    task.apply_factors(&mut physics, &factors).expect("a model");
+    task.start(&mut physics, &factors, Key::new(0)).expect("a start");
 
     // The recorded start.
     let mut state = vec![];
@@ -119,78 +117,78 @@ fn follow_one<D: Domain>(file: &Path) -> Worst {
         ["time", "qpos", "qvel", "act", "qacc_warmstart", "ctrl", "eq_active"].map(|part| format!("start.{part}"))
     {
         if golden.has(&name) {
-            state.extend(golden.numbers(&name));
+            state.extend(golden.values(&name));
         }
     }
-    let mut memory = vec![0.0; control.task_state_len(&model)];
-    control.save_task_state(&mut memory);
-    memory[1..=D::TARGET].copy_from_slice(&target::<D>(&mut golden));
-    control.load_task_state(&mut physics, &memory);
+    let mut task_state = vec![0.0; task.task_state_len(&model)];
+    task.save_task_state(&mut task_state);
+    task_state[1..=D::TARGET_LEN].copy_from_slice(&target::<D>(&mut golden));
+    task.load_task_state(&mut physics, &task_state);
     physics.set_state(&state).expect("a state");
     physics.forward_passive();
 
-    // As a world has its columns: two of the world's own, then the task's.
+    // The columns as in an environment: two of its own, then the task's.
     let own = [ColumnSpec::new("state", DType::Float64, [1]), ColumnSpec::new("unstable", DType::Bool, [])];
     let columns: Vec<ColumnSpec> = own.into_iter().chain(spec.columns.clone()).collect();
     let row = Batch::zeros(&Schema::new(columns).expect("columns"), 1);
-    let mut follower = Follower { physics, control, stage: None, row };
+    let mut replay = Replay { physics, task, scene: None, row };
 
-    let (actions, rewards, ends) = (golden.numbers("action"), golden.numbers("reward"), golden.numbers("terminated"));
-    let (states, seen) = (golden.numbers("qpos_qvel"), golden.numbers("obs"));
+    let (actions, rewards, ends) = (golden.values("action"), golden.values("reward"), golden.values("terminated"));
+    let (states, observations) = (golden.values("qpos_qvel"), golden.values("obs"));
     let infos: Vec<(&str, Vec<f64>)> =
-        D::INFO.iter().map(|&(name, _)| (name, golden.numbers(&format!("info.{name}")))).collect();
+        D::INFO.iter().map(|info| (info.name, golden.values(&format!("info.{}", info.name)))).collect();
     let mut worst = Worst::default();
-    worst.pictures[0] = follower.picture(file, &mut golden, "frame_first");
+    worst.images[0] = replay.compare_image(file, &mut golden, "frame_first");
     let n = spec.action_space.len();
     for t in 0..=rewards.len() {
         if t > 0 {
-            let step = follower.control.hold(&mut follower.physics, actions[(t - 1) * n..t * n].iter().copied());
+            let step = replay.task.apply_action(&mut replay.physics, actions[(t - 1) * n..t * n].iter().copied());
             worst.reward = worst.reward.max((step.reward - rewards[t - 1]).abs());
             assert_eq!(step.terminated, ends[t - 1] > 0.0, "{}, terminated {t}", file.display());
         }
-        let mut now = follower.column("qpos");
-        now.extend(follower.column("qvel"));
+        let mut now = replay.column("qpos");
+        now.extend(replay.column("qvel"));
         worst.state = worst.state.max(apart(&now, &states[t * now.len()..][..now.len()]));
-        let observation = follower.column("observation");
-        let wanted = &seen[t * observation.len()..][..observation.len()];
+        let observation = replay.column("observation");
+        let wanted = &observations[t * observation.len()..][..observation.len()];
         worst.observation = worst.observation.max(apart(&observation, wanted));
         for (name, recorded) in &infos {
-            let info = follower.column(name);
+            let info = replay.column(name);
             worst.info = worst.info.max(apart(&info, &recorded[t * info.len()..][..info.len()]));
         }
     }
-    worst.pictures[1] = follower.picture(file, &mut golden, "frame_last");
+    worst.images[1] = replay.compare_image(file, &mut golden, "frame_last");
     worst
 }
 
-/// Follows every rollout of a world.
-#[allow(clippy::print_stderr, reason = "how far each is, for who asks with --nocapture")]
-fn follow<D: Domain>() {
-    let files = recorded::files(&format!("{}-", D::ID.replace('/', "_")));
+/// Replays every recorded rollout of a domain.
+#[allow(clippy::print_stderr, reason = "a table for `--nocapture`")]
+fn replay_all<D: Domain>() {
+    let files = golden::files(env!("CARGO_MANIFEST_DIR"), &format!("{}-", D::ID.replace('/', "_")));
     assert!(!files.is_empty(), "the files beside the tests are always there");
     let mut wrong = vec![];
     for file in files {
-        let worst = follow_one::<D>(&file);
+        let worst = replay_one::<D>(&file);
         let name = file.file_name().expect("a name").to_string_lossy().into_owned();
         eprintln!("{name}: {worst:?}");
-        let numbers = worst.state.max(worst.observation).max(worst.reward).max(worst.info);
-        if numbers > NEAR || worst.pictures.iter().any(|(egl, cpu)| *egl > ALIKE || !cpu) {
+        let values = worst.state.max(worst.observation).max(worst.reward).max(worst.info);
+        if values > TOLERANCE || worst.images.iter().any(|(egl, cpu)| *egl > IMAGE_TOLERANCE || !cpu) {
             wrong.push(format!("{name}: {worst:?}"));
         }
     }
     assert!(wrong.is_empty(), "rollouts that differ: {wrong:#?}");
 }
 
-macro_rules! follow {
+macro_rules! replay_tests {
     ($($name:ident $domain:ty;)*) => {$(
         #[test]
         fn $name() {
-            follow::<$domain>();
+            replay_all::<$domain>();
         }
     )*};
 }
 
-follow! {
+replay_tests! {
     acrobot_follows_the_reference super::acrobot::Acrobot;
     ball_in_cup_follows_the_reference super::ball_in_cup::BallInCup;
     cartpole_follows_the_reference super::cartpole::Cartpole;

@@ -1,34 +1,29 @@
-//! A planar one-legged hopper stands, hops and flips. The tricks are those of TD-MPC2 (Hansen et al. 2024) and Newt.
+//! Hopper: a planar one-legged hopper stands and hops (`dm_control/suite/hopper.py`), hops backward and flips (added by TD-MPC2 and
+//! Newt, Hansen et al. 2024).
 
-use super::blueprint::Edit;
-use super::env::Seen;
-use super::names::Names;
+use super::domain::{Domain, InfoColumn, RewardFn, TaskTable, tasks};
+use super::measures::forward_spin;
+use super::model_edit::ModelEdit;
+use super::model_index::ModelIndex;
+use super::observation::ObservationWriter;
 use super::reward::{Tolerance, mean};
-use super::{Domain, entry, factors, start, task_names};
+use super::suite_env::entry;
+use super::{factors, start};
 use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry's row.
+/// The registry row.
 pub const ENTRY: EnvEntry = entry::<Hopper>(&[]);
 
-/// A torso this far above the foot stands, in metres.
+/// Height of the torso above the foot when standing, in metres.
 const STANDING: Tolerance = Tolerance::within(0.6, 2.0);
-/// An angular momentum that flips.
-const SPIN: Tolerance = Tolerance::at_least(5.0).linear(2.5, 0.0);
+/// Forward angular momentum of a flip, in kg m²/s.
+const FLIP: Tolerance = Tolerance::at_least(5.0).linear(2.5, 0.0);
 
-/// What there is to do.
-#[derive(Clone, Copy)]
-pub enum Task {
-    Hop,
-    Stand,
-    HopBackward,
-    Flip,
-    FlipBackward,
-}
-
+/// The reward and the indices of the domain's elements.
 pub struct Hopper {
-    task: Task,
+    reward: RewardFn<Self>,
     torso: usize,
     foot: usize,
     velocity: usize,
@@ -36,45 +31,59 @@ pub struct Hopper {
 }
 
 impl Hopper {
-    /// How fast it moves forward, in m/s.
+    /// The forward velocity, in m/s.
     fn speed(&self, physics: &Physics) -> f64 {
         physics.data().sensordata()[self.velocity]
     }
 
-    /// How far the torso is above the foot, in metres.
+    /// The height of the torso above the foot, in metres.
     fn height(&self, physics: &Physics) -> f64 {
         let centres = physics.data().xipos();
         centres[self.torso][2] - centres[self.foot][2]
     }
 
-    /// How fast it turns forward, as angular momentum.
-    fn spin(&self, physics: &Physics) -> f64 {
-        physics.data().subtree_angmom()[self.torso][1]
+    /// Standing and moving at a speed.
+    fn hop(&self, physics: &Physics, speed: Tolerance) -> f64 {
+        STANDING.of(self.height(physics)) * speed.of(self.speed(physics))
+    }
+
+    /// Standing with small controls.
+    fn stand(&self, physics: &Physics) -> f64 {
+        let standing = STANDING.of(self.height(physics));
+        let small_control = mean(Tolerance::within(0.0, 0.0).quadratic(1.0), physics.data().ctrl());
+        standing * (small_control + 4.0) / 5.0
     }
 }
 
 impl Domain for Hopper {
-    type Task = Task;
+    type Task = RewardFn<Self>;
     const ID: &'static str = "swm/HopperDMControl-v0";
     const SUMMARY: &'static str = "Stand, hop and flip on one leg";
     const MODEL: &'static str = "hopper.xml";
-    const TASKS: &'static [(&'static str, Task)] = &[
-        ("hop", Task::Hop),
-        ("stand", Task::Stand),
-        ("hop-backward", Task::HopBackward),
-        ("flip", Task::Flip),
-        ("flip-backward", Task::FlipBackward),
-    ];
-    const NAMES: &'static [&'static str] = &task_names::<_, 5>(Self::TASKS);
+    const TASKS: TaskTable<RewardFn<Self>> = tasks! {
+        "hop" => |hopper, physics| hopper.hop(physics, Tolerance::at_least(2.0).linear(1.0, 0.5)),
+        "stand" => Hopper::stand,
+        "hop-backward" => |hopper, physics| hopper.hop(physics, Tolerance::at_most(-1.0).linear(0.5, 0.5)),
+        "flip" => |hopper, physics| FLIP.of(forward_spin(physics, hopper.torso)),
+        "flip-backward" => |hopper, physics| FLIP.of(-forward_spin(physics, hopper.torso)),
+    };
     const SUBSTEPS: usize = 4;
-    const INFO: &'static [(&'static str, usize)] = &[("speed", 1), ("height", 1), ("angmomentum", 1)];
-    const IDLE: &'static [&'static str] = &["rootx"];
+    const INFO: &'static [InfoColumn<Self>] = &[
+        InfoColumn { name: "speed", len: 1, write: |hopper, physics, into| into[0] = hopper.speed(physics) },
+        InfoColumn { name: "height", len: 1, write: |hopper, physics, into| into[0] = hopper.height(physics) },
+        InfoColumn {
+            name: "angmomentum",
+            len: 1,
+            write: |hopper, physics, into| into[0] = forward_spin(physics, hopper.torso),
+        },
+    ];
+    const IGNORED_JOINTS: &'static [&'static str] = &["rootx"];
 
     fn factors() -> Vec<Factor> {
         let mut all = vec![
             factors::agent_color(),
             factors::density("agent.foot_density"),
-            factors::choice("agent.foot_locked", 1),
+            factors::binary("agent.foot_locked", 1),
             factors::density("agent.torso_density"),
             factors::floor_color(),
             factors::floor_friction(),
@@ -84,56 +93,38 @@ impl Domain for Hopper {
         all
     }
 
-    fn edit(edit: &mut Edit<'_>, _task: Task) -> Result<()> {
-        edit.scene("top")?;
+    fn edit(edit: &mut ModelEdit<'_>, _reward: RewardFn<Self>) -> Result<()> {
+        edit.common("top")?;
         edit.gravity();
-        edit.friction("floor")?;
+        edit.floor_friction("floor")?;
         edit.density("torso", "agent.torso_density")?;
         edit.density("foot", "agent.foot_density")
     }
 
-    fn new(model: &MjModel, task: Task) -> Result<Self> {
-        let names = Names(model);
+    fn new(model: &MjModel, reward: RewardFn<Self>) -> Result<Self> {
+        let index = ModelIndex(model);
         Ok(Self {
-            task,
-            torso: names.body("torso")?,
-            foot: names.body("foot")?,
-            velocity: names.sensor("torso_subtreelinvel")?,
-            touch: [names.sensor("touch_toe")?, names.sensor("touch_heel")?],
+            reward,
+            torso: index.body("torso")?,
+            foot: index.body("foot")?,
+            velocity: index.sensor("torso_subtreelinvel")?,
+            touch: [index.sensor("touch_toe")?, index.sensor("touch_heel")?],
         })
     }
 
     fn start(&self, physics: &mut Physics, rng: &mut Rng) -> Result<()> {
-        start::random_joints(physics, rng);
+        start::randomize_joints(physics, rng);
         physics.forward_passive();
         Ok(())
     }
 
-    fn observe(&self, physics: &Physics, seen: &mut Seen<'_>) {
-        seen.extend(&physics.data().qpos()[1..]);
-        seen.extend(physics.data().qvel());
-        seen.extend(self.touch.map(|sensor| physics.data().sensordata()[sensor].ln_1p()));
+    fn observe(&self, physics: &Physics, observation: &mut ObservationWriter<'_>) {
+        observation.extend(&physics.data().qpos()[1..]);
+        observation.extend(physics.data().qvel());
+        observation.extend(self.touch.map(|sensor| physics.data().sensordata()[sensor].ln_1p()));
     }
 
     fn reward(&self, physics: &Physics) -> f64 {
-        let standing = STANDING.of(self.height(physics));
-        match self.task {
-            Task::Hop => standing * Tolerance::at_least(2.0).linear(1.0, 0.5).of(self.speed(physics)),
-            Task::HopBackward => standing * Tolerance::at_most(-1.0).linear(0.5, 0.5).of(self.speed(physics)),
-            Task::Stand => {
-                let calm = mean(Tolerance::within(0.0, 0.0).quadratic(1.0), physics.data().ctrl());
-                standing * (calm + 4.0) / 5.0
-            }
-            Task::Flip => SPIN.of(self.spin(physics)),
-            Task::FlipBackward => SPIN.of(-self.spin(physics)),
-        }
-    }
-
-    fn info(&self, physics: &Physics, column: usize, into: &mut [f64]) {
-        into[0] = match column {
-            0 => self.speed(physics),
-            1 => self.height(physics),
-            _ => self.spin(physics),
-        };
+        (self.reward)(self, physics)
     }
 }

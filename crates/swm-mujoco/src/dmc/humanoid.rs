@@ -1,32 +1,37 @@
-//! A humanoid with 21 joints gets up, stands, walks and runs.
+//! Humanoid: a humanoid with 21 joints stands, walks and runs (`dm_control/suite/humanoid.py`).
 
-use super::blueprint::Edit;
-use super::env::Seen;
-use super::names::Names;
+use super::domain::{Domain, InfoColumn, TaskTable, tasks};
+use super::measures::{height, in_frame, norm, uprightness};
+use super::model_edit::ModelEdit;
+use super::model_index::ModelIndex;
+use super::observation::ObservationWriter;
 use super::reward::{Tolerance, mean};
-use super::{Domain, entry, factors, norm, seen_from, start, task_names};
+use super::suite_env::entry;
+use super::{factors, start};
 use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry's row.
+/// The registry row.
 pub const ENTRY: EnvEntry = entry::<Humanoid>(&[]);
 
-/// A head this high stands, in metres.
+/// Head height, in metres.
 const STANDING: Tolerance = Tolerance::at_least(1.4).gaussian(0.35);
-/// How upright a torso stands.
+/// Vertical component of the torso's z-axis.
 const UPRIGHT: Tolerance = Tolerance::at_least(0.9).linear(1.9, 0.0);
-/// Numbers of `qpos` that say where the body is and how it is turned.
-const ROOT: usize = 7;
+/// Elements of `qpos` for position and orientation of the root body.
+const ROOT_LEN: usize = 7;
 
-/// How fast it should move, in m/s, and what is observed.
+/// The speed and the observation of a task.
 #[derive(Clone, Copy)]
 pub struct Task {
+    /// The horizontal speed to reach, in m/s; 0 to stand.
     speed: f64,
-    /// Positions and velocities alone.
+    /// Whether the observation is `qpos` and `qvel` only.
     pure_state: bool,
 }
 
+/// The indices of the domain's elements.
 pub struct Humanoid {
     task: Task,
     torso: usize,
@@ -42,34 +47,45 @@ impl Humanoid {
         std::array::from_fn(|axis| physics.data().sensordata()[self.velocity + axis])
     }
 
-    fn upright(&self, physics: &Physics) -> f64 {
-        physics.data().xmat()[self.torso][8]
-    }
-
     fn head_height(&self, physics: &Physics) -> f64 {
-        physics.data().xpos()[self.head][2]
+        height(physics, self.head)
     }
 }
 
 impl Domain for Humanoid {
     type Task = Task;
     const ID: &'static str = "swm/HumanoidDMControl-v0";
-    const SUMMARY: &'static str = "Get a humanoid up, and walk or run";
+    const SUMMARY: &'static str = "Stand, walk and run with a humanoid of 21 joints";
     const MODEL: &'static str = "humanoid.xml";
-    const TASKS: &'static [(&'static str, Task)] = &[
-        ("walk", Task { speed: 1.0, pure_state: false }),
-        ("stand", Task { speed: 0.0, pure_state: false }),
-        ("run", Task { speed: 10.0, pure_state: false }),
-        ("run_pure_state", Task { speed: 10.0, pure_state: true }),
-    ];
-    const NAMES: &'static [&'static str] = &task_names::<_, 4>(Self::TASKS);
+    const TASKS: TaskTable<Task> = tasks! {
+        "walk" => Task { speed: 1.0, pure_state: false },
+        "stand" => Task { speed: 0.0, pure_state: false },
+        "run" => Task { speed: 10.0, pure_state: false },
+        "run_pure_state" => Task { speed: 10.0, pure_state: true },
+    };
     const SUBSTEPS: usize = 5;
-    const INFO: &'static [(&'static str, usize)] = &[("speed", 1), ("torso_upright", 1), ("head_height", 1)];
+    const INFO: &'static [InfoColumn<Self>] = &[
+        InfoColumn {
+            name: "speed",
+            len: 1,
+            write: |humanoid, physics, into| into[0] = norm(&humanoid.velocity(physics)[..2]),
+        },
+        InfoColumn {
+            name: "torso_upright",
+            len: 1,
+            write: |humanoid, physics, into| into[0] = uprightness(physics, humanoid.torso),
+        },
+        InfoColumn {
+            name: "head_height",
+            len: 1,
+            write: |humanoid, physics, into| into[0] = humanoid.head_height(physics),
+        },
+    ];
 
     fn factors() -> Vec<Factor> {
         let mut all = vec![
             factors::agent_color(),
-            factors::choice("agent.left_knee_locked", 1),
+            factors::binary("agent.left_knee_locked", 1),
             factors::density("agent.right_lower_arm_density"),
             factors::density("agent.torso_density"),
             factors::floor_color(),
@@ -80,70 +96,62 @@ impl Domain for Humanoid {
         all
     }
 
-    fn edit(edit: &mut Edit<'_>, _task: Task) -> Result<()> {
-        edit.scene("top")?;
+    fn edit(edit: &mut ModelEdit<'_>, _task: Task) -> Result<()> {
+        edit.common("top")?;
         edit.gravity();
-        edit.friction("floor")?;
+        edit.floor_friction("floor")?;
         edit.density("torso", "agent.torso_density")?;
         edit.density("right_lower_arm", "agent.right_lower_arm_density")
     }
 
     fn new(model: &MjModel, task: Task) -> Result<Self> {
-        let names = Names(model);
+        let index = ModelIndex(model);
         Ok(Self {
             task,
-            torso: names.body("torso")?,
-            head: names.body("head")?,
+            torso: index.body("torso")?,
+            head: index.body("head")?,
             limbs: [
-                names.body("left_hand")?,
-                names.body("left_foot")?,
-                names.body("right_hand")?,
-                names.body("right_foot")?,
+                index.body("left_hand")?,
+                index.body("left_foot")?,
+                index.body("right_hand")?,
+                index.body("right_foot")?,
             ],
-            velocity: names.sensor("torso_subtreelinvel")?,
+            velocity: index.sensor("torso_subtreelinvel")?,
         })
     }
 
     fn start(&self, physics: &mut Physics, rng: &mut Rng) -> Result<()> {
-        start::without_contacts(physics, rng, start::random_joints)
+        start::sample_without_contacts(physics, rng, start::randomize_joints)
     }
 
-    fn observe(&self, physics: &Physics, seen: &mut Seen<'_>) {
+    fn observe(&self, physics: &Physics, observation: &mut ObservationWriter<'_>) {
         let data = physics.data();
         if self.task.pure_state {
-            seen.extend(data.qpos());
+            observation.extend(data.qpos());
         } else {
-            let (frame, place) = (&data.xmat()[self.torso], data.xpos()[self.torso]);
-            seen.extend(&data.qpos()[ROOT..]);
-            seen.push(self.head_height(physics));
+            let (frame, torso) = (&data.xmat()[self.torso], data.xpos()[self.torso]);
+            observation.extend(&data.qpos()[ROOT_LEN..]);
+            observation.push(self.head_height(physics));
             for limb in self.limbs.map(|limb| data.xpos()[limb]) {
-                seen.extend(seen_from(frame, std::array::from_fn(|axis| limb[axis] - place[axis])));
+                observation.extend(in_frame(frame, std::array::from_fn(|axis| limb[axis] - torso[axis])));
             }
-            seen.extend(&frame[6..]);
-            seen.extend(self.velocity(physics));
+            observation.extend(&frame[6..]);
+            observation.extend(self.velocity(physics));
         }
-        seen.extend(data.qvel());
+        observation.extend(data.qvel());
     }
 
     fn reward(&self, physics: &Physics) -> f64 {
         let zero = Tolerance::within(0.0, 0.0);
-        let standing = STANDING.of(self.head_height(physics)) * UPRIGHT.of(self.upright(physics));
-        let calm = (4.0 + mean(zero.quadratic(1.0), physics.data().ctrl())) / 5.0;
+        let standing = STANDING.of(self.head_height(physics)) * UPRIGHT.of(uprightness(physics, self.torso));
+        let small_control = (4.0 + mean(zero.quadratic(1.0), physics.data().ctrl())) / 5.0;
         let [x, y, _] = self.velocity(physics);
         let speed = self.task.speed;
         if speed == 0.0 {
-            calm * standing * mean(zero.gaussian(2.0), &[x, y])
+            small_control * standing * mean(zero.gaussian(2.0), &[x, y])
         } else {
             let moving = Tolerance::at_least(speed).linear(speed, 0.0).of(norm(&[x, y]));
-            calm * standing * (5.0 * moving + 1.0) / 6.0
+            small_control * standing * (5.0 * moving + 1.0) / 6.0
         }
-    }
-
-    fn info(&self, physics: &Physics, column: usize, into: &mut [f64]) {
-        into[0] = match column {
-            0 => norm(&self.velocity(physics)[..2]),
-            1 => self.upright(physics),
-            _ => self.head_height(physics),
-        };
     }
 }

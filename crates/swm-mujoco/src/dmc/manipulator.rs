@@ -1,56 +1,65 @@
-//! A planar arm with a hand brings a ball or a peg to a target, or inserts it.
+//! Manipulator: a planar arm with a hand brings a ball or a peg to a target, or inserts it
+//! (`dm_control/suite/manipulator.py`).
 
-use super::blueprint::{Edit, without};
-use super::env::Seen;
-use super::names::Names;
+use super::domain::{Domain, TaskTable, tasks};
+use super::measures::distance;
+use super::model_edit::ModelEdit;
+use super::model_index::ModelIndex;
+use super::model_source::without_element;
+use super::observation::ObservationWriter;
 use super::reward::Tolerance;
-use super::{Domain, distance, entry, factors, start, task_names};
+use super::suite_env::entry;
+use super::{factors, start};
 use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use rand::Rng as _;
 use std::f64::consts::PI;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry's row.
+/// The registry row.
 pub const ENTRY: EnvEntry = entry::<Manipulator>(&[]);
 
-/// The joints of arm and hand.
+/// The joints of the arm and the hand.
 const ARM: [&str; 8] =
     ["arm_root", "arm_shoulder", "arm_elbow", "arm_wrist", "finger", "fingertip", "thumb", "thumbtip"];
+/// The touch sensors of the hand.
 const TOUCH: [&str; 5] = ["palm_touch", "finger_touch", "thumb_touch", "fingertip_touch", "thumbtip_touch"];
-/// Everything that can lie about.
+/// The bodies of which a task keeps only its own.
 const PROPS: [&str; 6] = ["ball", "target_ball", "cup", "peg", "target_peg", "slot"];
-/// Things within a centimetre are together.
+/// Distance of two sites, in metres (`_CLOSE` of the suite).
 const CLOSE: Tolerance = Tolerance::within(0.0, 0.01).gaussian(0.02);
 /// Radius of the ball's target, in metres.
-const SIZE: f64 = 0.015;
-/// How often the object begins in the hand, and how often at the target.
-const IN_HAND: f64 = 0.1;
-const AT_TARGET: f64 = 0.1;
+const TARGET_RADIUS: f64 = 0.015;
+/// Probability that the object starts in the hand (`_P_IN_HAND`).
+const P_IN_HAND: f64 = 0.1;
+/// Probability that the object starts at the target (`_P_IN_TARGET`).
+const P_AT_TARGET: f64 = 0.1;
 
-/// What to bring, and whether into something.
+/// The bodies of a task.
 #[derive(Clone, Copy)]
 pub struct Task {
     object: &'static str,
     target: &'static str,
+    /// The body to insert the object into.
     receptacle: Option<&'static str>,
 }
 
 const BALL: Task = Task { object: "ball", target: "target_ball", receptacle: None };
 const PEG: Task = Task { object: "peg", target: "target_peg", receptacle: None };
 
-/// Pairs of sites that belong together.
+/// Pairs of sites whose distances reward the handling of the peg.
 struct Peg {
     grasp: [usize; 2],
     pinch: [usize; 2],
     tip: [usize; 2],
 }
 
+/// The indices of the domain's elements.
 pub struct Manipulator {
     task: Task,
-    /// Joints, and where their coordinates and velocities are.
+    /// Index, `qpos` index and `qvel` index of each joint of [`ARM`].
     arm: [[usize; 3]; 8],
-    /// The object's coordinates along x and z and its turn, and their velocities.
+    /// `qpos` and `qvel` indices of the object's joints along x, along z, and about y.
     object_joints: [[usize; 2]; 3],
     touch: [usize; 5],
     hand: usize,
@@ -58,25 +67,26 @@ pub struct Manipulator {
     target: usize,
     receptacle: Option<usize>,
     grasp: usize,
-    /// The object's site and the target's.
-    together: [usize; 2],
+    /// The sites of object and target.
+    object_and_target: [usize; 2],
     peg: Option<Peg>,
 }
 
 impl Manipulator {
+    /// 1 where two sites are close, less with their distance.
     fn close(&self, physics: &Physics, [a, b]: [usize; 2]) -> f64 {
-        let places = physics.data().site_xpos();
-        CLOSE.of(distance(places[a], places[b]))
+        let sites = physics.data().site_xpos();
+        CLOSE.of(distance(sites[a], sites[b]))
     }
 
-    /// Where a body is in the plane, and its turn as the quaternion's two numbers that are not zero.
-    fn pose(physics: &Physics, body: usize) -> [f64; 4] {
-        let (place, turn) = (physics.data().xpos()[body], physics.data().xquat()[body]);
-        [place[0], place[2], turn[0], turn[2]]
+    /// Position (x, z) of a body, and the two elements of its quaternion (w, y) that are not zero in the plane.
+    fn planar_pose(physics: &Physics, body: usize) -> [f64; 4] {
+        let (position, quat) = (physics.data().xpos()[body], physics.data().xquat()[body]);
+        [position[0], position[2], quat[0], quat[2]]
     }
 
-    /// Draws arm, target and object once.
-    fn scatter(&self, physics: &mut Physics, rng: &mut Rng) {
+    /// Draws configurations of arm, target and object.
+    fn draw_start(&self, physics: &mut Physics, rng: &mut Rng) {
         for [joint, position, _] in self.arm {
             let (limited, [low, high]) = (physics.model().jnt_limited()[joint], physics.model().jnt_range()[joint]);
             let (low, high) = if limited { (low, high) } else { (-PI, PI) };
@@ -86,17 +96,17 @@ impl Manipulator {
         physics.data_mut().qpos_mut()[finger] = physics.data().qpos()[thumb];
 
         let (x, z) = (rng.random_range(-0.4..0.4), rng.random_range(0.1..0.4));
-        let widest = if self.task.receptacle.is_some() { PI / 3.0 } else { PI };
-        let turn: f64 = rng.random_range(-widest..widest);
-        self.place(physics, &[x, z, (turn / 2.0).cos(), (turn / 2.0).sin()]);
+        let max_angle = if self.task.receptacle.is_some() { PI / 3.0 } else { PI };
+        let angle: f64 = rng.random_range(-max_angle..max_angle);
+        self.set_target(physics, &[x, z, (angle / 2.0).cos(), (angle / 2.0).sin()]);
 
-        let chance = rng.random::<f64>();
-        let object = if chance < IN_HAND {
+        let choice = rng.random::<f64>();
+        let object = if choice < P_IN_HAND {
             physics.forward_passive();
-            let (place, frame) = (physics.data().site_xpos()[self.grasp], physics.data().site_xmat()[self.grasp]);
-            [place[0], place[2], PI - frame[6].atan2(frame[0])]
-        } else if chance < IN_HAND + AT_TARGET {
-            [x, z, turn]
+            let (position, frame) = (physics.data().site_xpos()[self.grasp], physics.data().site_xmat()[self.grasp]);
+            [position[0], position[2], PI - frame[6].atan2(frame[0])]
+        } else if choice < P_IN_HAND + P_AT_TARGET {
+            [x, z, angle]
         } else {
             physics.data_mut().qvel_mut()[self.object_joints[0][1]] = rng.random_range(-5.0..5.0);
             [rng.random_range(-0.5..0.5), rng.random_range(0.0..0.7), rng.random_range(0.0..2.0 * PI)]
@@ -112,16 +122,15 @@ impl Domain for Manipulator {
     const ID: &'static str = "swm/ManipulatorDMControl-v0";
     const SUMMARY: &'static str = "Bring a ball or a peg to a target with an arm and a hand, or insert it";
     const MODEL: &'static str = "manipulator.xml";
-    const TASKS: &'static [(&'static str, Task)] = &[
-        ("bring_ball", BALL),
-        ("bring_peg", PEG),
-        ("insert_ball", Task { receptacle: Some("cup"), ..BALL }),
-        ("insert_peg", Task { receptacle: Some("slot"), ..PEG }),
-    ];
-    const NAMES: &'static [&'static str] = &task_names::<_, 4>(Self::TASKS);
+    const TASKS: TaskTable<Task> = tasks! {
+        "bring_ball" => BALL,
+        "bring_peg" => PEG,
+        "insert_ball" => Task { receptacle: Some("cup"), ..BALL },
+        "insert_peg" => Task { receptacle: Some("slot"), ..PEG },
+    };
     const SUBSTEPS: usize = 10;
-    const IDLE: &'static [&'static str] = &["ball_y"];
-    const TARGET: usize = 4;
+    const IGNORED_JOINTS: &'static [&'static str] = &["ball_y"];
+    const TARGET_LEN: usize = 4;
 
     fn factors() -> Vec<Factor> {
         let mut all = vec![
@@ -137,42 +146,42 @@ impl Domain for Manipulator {
         all
     }
 
-    fn draft(text: String, task: Task) -> Result<String> {
-        let kept = [Some(task.object), Some(task.target), task.receptacle];
+    fn prepare_xml(text: String, task: Task) -> Result<String> {
+        let used = [Some(task.object), Some(task.target), task.receptacle];
         PROPS
             .iter()
-            .filter(|&&prop| !kept.contains(&Some(prop)))
-            .try_fold(text, |text, prop| without(&text, "body", prop))
+            .filter(|&&prop| !used.contains(&Some(prop)))
+            .try_fold(text, |text, prop| without_element(&text, "body", prop))
     }
 
-    fn edit(edit: &mut Edit<'_>, task: Task) -> Result<()> {
-        edit.scene("light")?;
+    fn edit(edit: &mut ModelEdit<'_>, task: Task) -> Result<()> {
+        edit.common("light")?;
         edit.density("upper_arm", "agent.upper_arm_density")?;
         edit.density("hand", "agent.hand_density")?;
         edit.target_color()?;
         match task.target {
-            "target_ball" => edit.target_geom("target_ball", SIZE),
+            "target_ball" => edit.target_geom("target_ball", TARGET_RADIUS),
             _ => Ok(()),
         }
     }
 
     fn new(model: &MjModel, task: Task) -> Result<Self> {
-        let names = Names(model);
-        let both = |joint: &str| Ok([names.position(joint)?, names.velocity(joint)?]);
+        let index = ModelIndex(model);
+        let both = |joint: &str| Ok([index.qpos(joint)?, index.qvel(joint)?]);
         let mut arm = [[0; 3]; 8];
-        for (places, name) in arm.iter_mut().zip(ARM) {
-            *places = [names.joint(name)?, names.position(name)?, names.velocity(name)?];
+        for (indices, name) in arm.iter_mut().zip(ARM) {
+            *indices = [index.joint(name)?, index.qpos(name)?, index.qvel(name)?];
         }
         let mut touch = [0; 5];
         for (sensor, name) in touch.iter_mut().zip(TOUCH) {
-            *sensor = names.sensor(name)?;
+            *sensor = index.sensor(name)?;
         }
         let joint = |axis: &str| both(&format!("{}_{axis}", task.object));
         let peg = match task.object {
             "peg" => Some(Peg {
-                grasp: [names.site("peg_grasp")?, names.site("grasp")?],
-                pinch: [names.site("peg_pinch")?, names.site("pinch")?],
-                tip: [names.site("target_peg_tip")?, names.site("peg_tip")?],
+                grasp: [index.site("peg_grasp")?, index.site("grasp")?],
+                pinch: [index.site("peg_pinch")?, index.site("pinch")?],
+                tip: [index.site("target_peg_tip")?, index.site("peg_tip")?],
             }),
             _ => None,
         };
@@ -181,50 +190,50 @@ impl Domain for Manipulator {
             arm,
             object_joints: [joint("x")?, joint("z")?, joint("y")?],
             touch,
-            hand: names.body("hand")?,
-            object: names.body(task.object)?,
-            target: names.body(task.target)?,
-            receptacle: task.receptacle.map(|name| names.body(name)).transpose()?,
-            grasp: names.site("grasp")?,
-            together: [names.site(task.object)?, names.site(task.target)?],
+            hand: index.body("hand")?,
+            object: index.body(task.object)?,
+            target: index.body(task.target)?,
+            receptacle: task.receptacle.map(|name| index.body(name)).transpose()?,
+            grasp: index.site("grasp")?,
+            object_and_target: [index.site(task.object)?, index.site(task.target)?],
             peg,
         })
     }
 
     fn start(&self, physics: &mut Physics, rng: &mut Rng) -> Result<()> {
-        start::without_contacts(physics, rng, |physics, rng| self.scatter(physics, rng))
+        start::sample_without_contacts(physics, rng, |physics, rng| self.draw_start(physics, rng))
     }
 
     fn target(&self, physics: &Physics, into: &mut [f64]) {
-        let (place, turn) = (physics.model().body_pos()[self.target], physics.model().body_quat()[self.target]);
-        into.copy_from_slice(&[place[0], place[2], turn[0], turn[2]]);
+        let (position, quat) = (physics.model().body_pos()[self.target], physics.model().body_quat()[self.target]);
+        into.copy_from_slice(&[position[0], position[2], quat[0], quat[2]]);
     }
 
-    fn place(&self, physics: &mut Physics, target: &[f64]) {
+    fn set_target(&self, physics: &mut Physics, target: &[f64]) {
         for body in [Some(self.target), self.receptacle].into_iter().flatten() {
-            let place = &mut physics.model_mut().body_pos_mut()[body];
-            (place[0], place[2]) = (target[0], target[1]);
-            let turn = &mut physics.model_mut().body_quat_mut()[body];
-            (turn[0], turn[2]) = (target[2], target[3]);
+            let position = &mut physics.model_mut().body_pos_mut()[body];
+            (position[0], position[2]) = (target[0], target[1]);
+            let quat = &mut physics.model_mut().body_quat_mut()[body];
+            (quat[0], quat[2]) = (target[2], target[3]);
         }
     }
 
-    fn observe(&self, physics: &Physics, seen: &mut Seen<'_>) {
+    fn observe(&self, physics: &Physics, observation: &mut ObservationWriter<'_>) {
         let data = physics.data();
         for [_, position, _] in self.arm {
             let (sin, cos) = data.qpos()[position].sin_cos();
-            seen.extend([sin, cos]);
+            observation.extend([sin, cos]);
         }
-        seen.extend(self.arm.map(|[_, _, velocity]| data.qvel()[velocity]));
-        seen.extend(self.touch.map(|sensor| data.sensordata()[sensor].ln_1p()));
-        seen.extend(Self::pose(physics, self.hand));
-        seen.extend(Self::pose(physics, self.object));
-        seen.extend(self.object_joints.map(|[_, velocity]| data.qvel()[velocity]));
-        seen.extend(Self::pose(physics, self.target));
+        observation.extend(self.arm.map(|[_, _, velocity]| data.qvel()[velocity]));
+        observation.extend(self.touch.map(|sensor| data.sensordata()[sensor].ln_1p()));
+        observation.extend(Self::planar_pose(physics, self.hand));
+        observation.extend(Self::planar_pose(physics, self.object));
+        observation.extend(self.object_joints.map(|[_, velocity]| data.qvel()[velocity]));
+        observation.extend(Self::planar_pose(physics, self.target));
     }
 
     fn reward(&self, physics: &Physics) -> f64 {
-        let brought = self.close(physics, self.together);
+        let brought = self.close(physics, self.object_and_target);
         match &self.peg {
             None => brought,
             Some(peg) => {

@@ -1,20 +1,24 @@
-//! A pendulum whose motor is too weak to lift it at once must be swung up.
+//! Pendulum: swing up a pendulum with a motor that is too weak to lift it directly (`dm_control/suite/pendulum.py`).
 
-use super::blueprint::Edit;
-use super::env::Seen;
-use super::names::Names;
+use super::domain::{Domain, TaskTable, tasks};
+use super::measures::uprightness;
+use super::model_edit::ModelEdit;
+use super::model_index::ModelIndex;
+use super::observation::ObservationWriter;
 use super::reward::Tolerance;
-use super::{Domain, entry, factors, start, task_names};
+use super::suite_env::entry;
+use super::{factors, start};
 use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry's row.
+/// The registry row.
 pub const ENTRY: EnvEntry = entry::<Pendulum>(&[]);
 
-/// How far from upright counts as upright, in radians.
-const UPRIGHT: f64 = 8.0 * std::f64::consts::PI / 180.0;
+/// Deviation from the vertical that counts as upright, in radians (8 degrees).
+const UPRIGHT_ANGLE: f64 = 8.0 * std::f64::consts::PI / 180.0;
 
+/// The index of the pole's body.
 pub struct Pendulum {
     pole: usize,
 }
@@ -22,17 +26,16 @@ pub struct Pendulum {
 impl Domain for Pendulum {
     type Task = ();
     const ID: &'static str = "swm/PendulumDMControl-v0";
-    const SUMMARY: &'static str = "Swing up a pendulum with a motor too weak to lift it at once";
+    const SUMMARY: &'static str = "Swing up a pendulum with a motor too weak to lift it directly";
     const MODEL: &'static str = "pendulum.xml";
-    const TASKS: &'static [(&'static str, ())] = &[("swingup", ())];
-    const NAMES: &'static [&'static str] = &task_names::<_, 1>(Self::TASKS);
+    const TASKS: TaskTable<()> = tasks! { "swingup" => () };
     const SUBSTEPS: usize = 1;
 
     fn factors() -> Vec<Factor> {
         let mut all = vec![
             factors::agent_color(),
             factors::density("agent.mass_density"),
-            factors::choice("agent.mass_shape", 1),
+            factors::binary("agent.mass_shape", 1),
             factors::density("agent.pole_density"),
             factors::floor_color(),
         ];
@@ -41,34 +44,34 @@ impl Domain for Pendulum {
         all
     }
 
-    fn edit(edit: &mut Edit<'_>, _task: ()) -> Result<()> {
-        edit.scene("light")?;
+    fn edit(edit: &mut ModelEdit<'_>, _task: ()) -> Result<()> {
+        edit.common("light")?;
         edit.gravity();
         edit.density("pole", "agent.pole_density")?;
         edit.density("mass", "agent.mass_density")
     }
 
     fn new(model: &MjModel, _task: ()) -> Result<Self> {
-        Ok(Self { pole: Names(model).body("pole")? })
+        Ok(Self { pole: ModelIndex(model).body("pole")? })
     }
 
     fn start(&self, physics: &mut Physics, rng: &mut Rng) -> Result<()> {
-        start::random_joints(physics, rng);
+        start::randomize_joints(physics, rng);
         physics.forward_passive();
         Ok(())
     }
 
-    fn observe(&self, physics: &Physics, seen: &mut Seen<'_>) {
+    fn observe(&self, physics: &Physics, observation: &mut ObservationWriter<'_>) {
         let frame = physics.data().xmat()[self.pole];
-        seen.extend([frame[8], frame[2]]);
-        seen.extend(physics.data().qvel());
+        observation.extend([frame[8], frame[2]]);
+        observation.extend(physics.data().qvel());
     }
 
     fn reward(&self, physics: &Physics) -> f64 {
-        Tolerance::within(UPRIGHT.cos(), 1.0).of(physics.data().xmat()[self.pole][8])
+        Tolerance::within(UPRIGHT_ANGLE.cos(), 1.0).of(uprightness(physics, self.pole))
     }
 
-    fn destination(&self, _physics: &Physics, qpos: &mut [f64]) -> bool {
+    fn goal_qpos(&self, _physics: &Physics, qpos: &mut [f64]) -> bool {
         qpos.fill(0.0);
         true
     }

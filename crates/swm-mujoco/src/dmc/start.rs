@@ -1,20 +1,21 @@
-//! How episodes of the suite begin.
+//! Start states of episodes (`dm_control/suite/utils/randomizers.py`).
 
+use super::measures::norm;
 use crate::Physics;
 use mujoco_rs::wrappers::mj_model::MjtJoint;
 use rand::Rng as _;
 use std::f64::consts::PI;
 use swm_core::{Error, Result, Rng};
 
-/// How often a start is drawn before giving up.
-const TRIES: usize = 1000;
+/// Starts drawn before [`sample_without_contacts`] fails.
+const START_TRIES: usize = 1000;
 
-/// Turns every joint at random: those with limits within them, hinges without them anywhere, and bodies that float free.
-/// Free slides keep their place.
+/// Randomises every joint: limited joints within their limits, unlimited hinges over the full circle, free bodies in orientation.
+/// Unlimited slides keep their position.
 ///
-/// A free body's quaternion has no negative numbers, which are not all turns there are: the suite's own slip, kept for the
-/// sake of comparison.
-pub fn random_joints(physics: &mut Physics, rng: &mut Rng) {
+/// The quaternion of a free body is drawn from the positive orthant, which does not contain all rotations: a bug of the suite,
+/// kept so that starts have the same distribution.
+pub fn randomize_joints(physics: &mut Physics, rng: &mut Rng) {
     for joint in 0..physics.model().jnt_type().len() {
         let model = physics.model();
         let (kind, limited, [low, high]) =
@@ -25,17 +26,17 @@ pub fn random_joints(physics: &mut Physics, rng: &mut Rng) {
             MjtJoint::mjJNT_HINGE | MjtJoint::mjJNT_SLIDE if limited => qpos[at] = rng.random_range(low..high),
             MjtJoint::mjJNT_HINGE => qpos[at] = rng.random_range(-PI..PI),
             MjtJoint::mjJNT_FREE => {
-                let turn: [f64; 4] = rng.random();
-                let length = super::norm(&turn);
-                qpos[at + 3..at + 7].copy_from_slice(&turn.map(|number| number / length));
+                let quat: [f64; 4] = rng.random();
+                let length = norm(&quat);
+                qpos[at + 3..at + 7].copy_from_slice(&quat.map(|value| value / length));
             }
             _ => {}
         }
     }
 }
 
-/// Turns the joints that have limits within them.
-pub fn limited_joints(physics: &mut Physics, rng: &mut Rng) {
+/// Randomises the limited joints within their limits.
+pub fn randomize_limited_joints(physics: &mut Physics, rng: &mut Rng) {
     for joint in 0..physics.model().jnt_type().len() {
         let model = physics.model();
         let (limited, [low, high]) = (model.jnt_limited()[joint], model.jnt_range()[joint]);
@@ -46,22 +47,22 @@ pub fn limited_joints(physics: &mut Physics, rng: &mut Rng) {
     }
 }
 
-/// Draws until nothing touches anything.
+/// Draws starts until one has no contacts.
 ///
 /// # Errors
-/// When something always does.
-pub fn without_contacts(
+/// When every drawn start has contacts.
+pub fn sample_without_contacts(
     physics: &mut Physics,
     rng: &mut Rng,
     mut draw: impl FnMut(&mut Physics, &mut Rng),
 ) -> Result<()> {
-    for _ in 0..TRIES {
+    for _ in 0..START_TRIES {
         draw(physics, rng);
         physics.forward_passive();
         if physics.data().contact().is_empty() {
             return Ok(());
         }
     }
-    let constraint = "nothing touches anything".to_owned();
-    Err(Error::Unsatisfiable { factor: "start".to_owned(), constraint, tries: TRIES })
+    let constraint = "free of contacts".to_owned();
+    Err(Error::Unsatisfiable { factor: "start".to_owned(), constraint, tries: START_TRIES })
 }

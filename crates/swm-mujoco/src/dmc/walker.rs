@@ -1,107 +1,154 @@
-//! A planar walker stands, walks, runs, and strikes poses. The poses are those of TD-MPC2 (Hansen et al. 2024) and Newt.
+//! Walker: a planar walker stands, walks and runs (`dm_control/suite/walker.py`), and strikes poses (added by TD-MPC2 and Newt,
+//! Hansen et al. 2024).
 
-use super::blueprint::Edit;
-use super::env::Seen;
-use super::names::Names;
+use super::domain::{Domain, InfoColumn, RewardFn, TaskTable, tasks};
+use super::measures::{height, uprightness};
+use super::model_edit::ModelEdit;
+use super::model_index::ModelIndex;
+use super::observation::ObservationWriter;
 use super::reward::Tolerance;
-use super::{Domain, entry, factors, start, task_names};
+use super::suite_env::entry;
+use super::{factors, start};
 use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry's row.
+/// The registry row.
 pub const ENTRY: EnvEntry = entry::<Walker>(&[]);
 
-/// A torso this high stands, in metres.
+/// Height of a standing torso, in metres.
 const STANDING: Tolerance = Tolerance::at_least(1.2).gaussian(0.6);
-/// What is this high is up, in a pose.
+/// Height of a raised body in a pose, in metres.
 const UP: Tolerance = Tolerance::at_least(1.0).gaussian(0.5);
-/// What is this low lies.
+/// Height of a lying body, in metres.
 const LYING: Tolerance = Tolerance::at_most(0.08).gaussian(0.04);
-/// A foot this low is on the ground, in a pose.
+/// Height of a foot on the ground in a pose, in metres.
 const FOOT_DOWN: Tolerance = Tolerance::at_most(0.08).gaussian(0.5);
-/// Feet this high are up.
+/// Height of raised feet, in metres.
 const FEET_UP: Tolerance = Tolerance::at_least(1.1).gaussian(0.55);
 
-/// What there is to do.
-#[derive(Clone, Copy)]
-pub enum Task {
-    Stand,
-    /// Go forward at this speed, in m/s.
-    Go(f64),
-    WalkBackward,
-    Arabesque,
-    LieDown,
-    LegsUp,
-    Flip,
-}
-
+/// The reward and the indices of the domain's elements.
 pub struct Walker {
-    task: Task,
+    reward: RewardFn<Self>,
     torso: usize,
     /// Left and right.
     feet: [usize; 2],
+    /// Left and right.
     thighs: [usize; 2],
     velocity: usize,
 }
 
+/// The mean height of two bodies, in metres.
+fn mean_height(physics: &Physics, [left, right]: [usize; 2]) -> f64 {
+    f64::midpoint(height(physics, left), height(physics, right))
+}
+
 impl Walker {
-    /// How fast it moves forward, in m/s.
+    /// The forward velocity, in m/s.
     fn speed(&self, physics: &Physics) -> f64 {
         physics.data().sensordata()[self.velocity]
     }
 
-    fn torso_height(&self, physics: &Physics) -> f64 {
-        physics.data().xpos()[self.torso][2]
-    }
-
-    fn upright(&self, physics: &Physics) -> f64 {
-        physics.data().xmat()[self.torso][8]
+    /// From 0 (upright) to 1 (upside down).
+    fn upside_down(&self, physics: &Physics) -> f64 {
+        f64::midpoint(1.0, -uprightness(physics, self.torso))
     }
 
     fn stand(&self, physics: &Physics) -> f64 {
-        let upright = f64::midpoint(1.0, self.upright(physics));
-        (3.0 * STANDING.of(self.torso_height(physics)) + upright) / 4.0
+        let upright = f64::midpoint(1.0, uprightness(physics, self.torso));
+        (3.0 * STANDING.of(height(physics, self.torso)) + upright) / 4.0
     }
 
-    fn go(&self, physics: &Physics, speed: Tolerance) -> f64 {
+    /// Standing and moving at a speed.
+    fn locomotion(&self, physics: &Physics, speed: Tolerance) -> f64 {
         self.stand(physics) * (5.0 * speed.of(self.speed(physics)) + 1.0) / 6.0
+    }
+
+    /// Moving forward at `speed` m/s.
+    fn forward(&self, physics: &Physics, speed: f64) -> f64 {
+        self.locomotion(physics, Tolerance::at_least(speed).linear(speed / 2.0, 0.5))
+    }
+
+    fn arabesque(&self, physics: &Physics) -> f64 {
+        let [left, right] = self.feet.map(|foot| height(physics, foot));
+        let torso = height(physics, self.torso);
+        (3.0 * UP.of(torso) + FOOT_DOWN.of(left) + UP.of(right) + self.upside_down(physics)) / 6.0
+    }
+
+    fn lie_down(&self, physics: &Physics) -> f64 {
+        let (torso, thighs) = (height(physics, self.torso), mean_height(physics, self.thighs));
+        (3.0 * LYING.of(torso) + LYING.of(thighs) + self.upside_down(physics)) / 5.0
+    }
+
+    fn legs_up(&self, physics: &Physics) -> f64 {
+        let torso = height(physics, self.torso);
+        let thighs = LYING.of(mean_height(physics, self.thighs));
+        let feet = FEET_UP.of(mean_height(physics, self.feet));
+        (3.0 * LYING.of(torso) + 2.0 * feet + thighs + self.upside_down(physics)) / 7.0
+    }
+
+    fn flip(&self, physics: &Physics) -> f64 {
+        let (feet, thighs) = (mean_height(physics, self.feet), mean_height(physics, self.thighs));
+        (3.0 * FEET_UP.of(feet) + 2.0 * UP.of(thighs)) / 5.0
     }
 }
 
 impl Domain for Walker {
-    type Task = Task;
+    type Task = RewardFn<Self>;
     const ID: &'static str = "swm/WalkerDMControl-v0";
     const SUMMARY: &'static str = "Stand, walk, run and strike poses with a planar walker";
     const MODEL: &'static str = "walker.xml";
-    const TASKS: &'static [(&'static str, Task)] = &[
-        ("walk", Task::Go(1.0)),
-        ("stand", Task::Stand),
-        ("run", Task::Go(8.0)),
-        ("walk-backward", Task::WalkBackward),
-        ("arabesque", Task::Arabesque),
-        ("lie_down", Task::LieDown),
-        ("legs_up", Task::LegsUp),
-        ("flip", Task::Flip),
-    ];
-    const NAMES: &'static [&'static str] = &task_names::<_, 8>(Self::TASKS);
+    const TASKS: TaskTable<RewardFn<Self>> = tasks! {
+        "walk" => |walker, physics| walker.forward(physics, 1.0),
+        "stand" => Walker::stand,
+        "run" => |walker, physics| walker.forward(physics, 8.0),
+        "walk-backward" => |walker, physics| walker.locomotion(physics, Tolerance::at_most(-1.0).linear(0.5, 0.5)),
+        "arabesque" => Walker::arabesque,
+        "lie_down" => Walker::lie_down,
+        "legs_up" => Walker::legs_up,
+        "flip" => Walker::flip,
+    };
     const SUBSTEPS: usize = 10;
-    const INFO: &'static [(&'static str, usize)] = &[
-        ("speed", 1),
-        ("torso_height", 1),
-        ("torso_upright", 1),
-        ("left_foot_height", 1),
-        ("right_foot_height", 1),
-        ("left_thigh_height", 1),
-        ("right_thigh_height", 1),
+    const INFO: &'static [InfoColumn<Self>] = &[
+        InfoColumn { name: "speed", len: 1, write: |walker, physics, into| into[0] = walker.speed(physics) },
+        InfoColumn {
+            name: "torso_height",
+            len: 1,
+            write: |walker, physics, into| into[0] = height(physics, walker.torso),
+        },
+        InfoColumn {
+            name: "torso_upright",
+            len: 1,
+            write: |walker, physics, into| into[0] = uprightness(physics, walker.torso),
+        },
+        InfoColumn {
+            name: "left_foot_height",
+            len: 1,
+            write: |walker, physics, into| into[0] = height(physics, walker.feet[0]),
+        },
+        InfoColumn {
+            name: "right_foot_height",
+            len: 1,
+            write: |walker, physics, into| into[0] = height(physics, walker.feet[1]),
+        },
+        InfoColumn {
+            name: "left_thigh_height",
+            len: 1,
+            write: |walker, physics, into| into[0] = height(physics, walker.thighs[0]),
+        },
+        InfoColumn {
+            name: "right_thigh_height",
+            len: 1,
+            write: |walker, physics, into| into[0] = height(physics, walker.thighs[1]),
+        },
     ];
-    const IDLE: &'static [&'static str] = &["rootx"];
+    const IGNORED_JOINTS: &'static [&'static str] = &["rootx"];
 
     fn factors() -> Vec<Factor> {
         let mut all = vec![
             factors::agent_color(),
             factors::density("agent.left_foot_density"),
-            factors::choice("agent.right_knee_locked", 1),
+            factors::binary("agent.right_knee_locked", 1),
             factors::density("agent.torso_density"),
             factors::floor_color(),
             factors::floor_friction(),
@@ -112,70 +159,39 @@ impl Domain for Walker {
         all
     }
 
-    fn edit(edit: &mut Edit<'_>, _task: Task) -> Result<()> {
-        edit.scene("light")?;
+    fn edit(edit: &mut ModelEdit<'_>, _reward: RewardFn<Self>) -> Result<()> {
+        edit.common("light")?;
         edit.gravity();
-        edit.friction("floor")?;
-        edit.tilt("floor")?;
+        edit.floor_friction("floor")?;
+        edit.floor_tilt("floor")?;
         edit.density("torso", "agent.torso_density")?;
         edit.density("left_foot", "agent.left_foot_density")
     }
 
-    fn new(model: &MjModel, task: Task) -> Result<Self> {
-        let names = Names(model);
+    fn new(model: &MjModel, reward: RewardFn<Self>) -> Result<Self> {
+        let index = ModelIndex(model);
         Ok(Self {
-            task,
-            torso: names.body("torso")?,
-            feet: [names.body("left_foot")?, names.body("right_foot")?],
-            thighs: [names.body("left_thigh")?, names.body("right_thigh")?],
-            velocity: names.sensor("torso_subtreelinvel")?,
+            reward,
+            torso: index.body("torso")?,
+            feet: [index.body("left_foot")?, index.body("right_foot")?],
+            thighs: [index.body("left_thigh")?, index.body("right_thigh")?],
+            velocity: index.sensor("torso_subtreelinvel")?,
         })
     }
 
     fn start(&self, physics: &mut Physics, rng: &mut Rng) -> Result<()> {
-        start::random_joints(physics, rng);
+        start::randomize_joints(physics, rng);
         physics.forward_passive();
         Ok(())
     }
 
-    fn observe(&self, physics: &Physics, seen: &mut Seen<'_>) {
-        seen.extend(physics.data().xmat()[1..].iter().flat_map(|frame| [frame[0], frame[2]]));
-        seen.push(self.torso_height(physics));
-        seen.extend(physics.data().qvel());
+    fn observe(&self, physics: &Physics, observation: &mut ObservationWriter<'_>) {
+        observation.extend(physics.data().xmat()[1..].iter().flat_map(|frame| [frame[0], frame[2]]));
+        observation.push(height(physics, self.torso));
+        observation.extend(physics.data().qvel());
     }
 
     fn reward(&self, physics: &Physics) -> f64 {
-        let height = |body: usize| physics.data().xpos()[body][2];
-        let middle = |[left, right]: [usize; 2]| f64::midpoint(height(left), height(right));
-        let torso = self.torso_height(physics);
-        let upside_down = f64::midpoint(1.0, -self.upright(physics));
-        match self.task {
-            Task::Stand => self.stand(physics),
-            Task::Go(speed) => self.go(physics, Tolerance::at_least(speed).linear(speed / 2.0, 0.5)),
-            Task::WalkBackward => self.go(physics, Tolerance::at_most(-1.0).linear(0.5, 0.5)),
-            Task::Arabesque => {
-                let [left, right] = self.feet.map(height);
-                (3.0 * UP.of(torso) + FOOT_DOWN.of(left) + UP.of(right) + upside_down) / 6.0
-            }
-            Task::LieDown => (3.0 * LYING.of(torso) + LYING.of(middle(self.thighs)) + upside_down) / 5.0,
-            Task::LegsUp => {
-                let (thighs, feet) = (LYING.of(middle(self.thighs)), FEET_UP.of(middle(self.feet)));
-                (3.0 * LYING.of(torso) + 2.0 * feet + thighs + upside_down) / 7.0
-            }
-            Task::Flip => (3.0 * FEET_UP.of(middle(self.feet)) + 2.0 * UP.of(middle(self.thighs))) / 5.0,
-        }
-    }
-
-    fn info(&self, physics: &Physics, column: usize, into: &mut [f64]) {
-        let height = |body: usize| physics.data().xpos()[body][2];
-        into[0] = match column {
-            0 => self.speed(physics),
-            1 => self.torso_height(physics),
-            2 => self.upright(physics),
-            3 => height(self.feet[0]),
-            4 => height(self.feet[1]),
-            5 => height(self.thighs[0]),
-            _ => height(self.thighs[1]),
-        };
+        (self.reward)(self, physics)
     }
 }

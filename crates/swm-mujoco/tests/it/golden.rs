@@ -1,10 +1,10 @@
 //! Every recorded rollout of a MuJoCo world, step by step: states, observations, rewards, infos, and the first and last
 //! picture. Reads `SWM_GOLDEN` and the folder beside this test.
 
-use crate::recorded::{self, Golden};
 use crate::similarity::ImageSimilarity;
 use std::collections::BTreeMap;
 use std::path::Path;
+use swm_conformance::golden::{Golden, files, image_difference};
 use swm_core::{Action, Batch, Env, FrameMut, ResetOptions, Schema, VariationRequest};
 use swm_mujoco::ENVS;
 use swm_mujoco::render::{self, Choice};
@@ -45,7 +45,7 @@ const FAMILIES: &[Family] = &[
         step: 0.04,
         until: fetch_until,
         renamed: &[("state", "observation"), ("goal_state", "desired_goal")],
-        goal: |golden, goal| *goal = golden.numbers("info.goal_state")[..3].to_vec(),
+        goal: |golden, goal| *goal = golden.values("info.goal_state")[..3].to_vec(),
     },
     Family {
         named: |id| id.starts_with("swm/OGBCube") || id.starts_with("swm/OGBScene"),
@@ -62,7 +62,7 @@ const FAMILIES: &[Family] = &[
         tolerance: 1e-6,
         factors: |_, request| request,
         memory: |golden, memory| {
-            let pose = golden.numbers("qpos_qvel");
+            let pose = golden.values("qpos_qvel");
             let n = memory.len() - 1;
             memory[1..].copy_from_slice(&pose[..n]);
         },
@@ -71,7 +71,7 @@ const FAMILIES: &[Family] = &[
         renamed: &[],
         goal: |golden, state| {
             // Where nobody recorded the goal, nobody reached it: it is out of sight.
-            let goal = if golden.has("goal.xy") { golden.numbers("goal.xy") } else { vec![1e3, 1e3] };
+            let goal = if golden.has("goal.xy") { golden.values("goal.xy") } else { vec![1e3, 1e3] };
             state[1..3].copy_from_slice(&goal);
         },
     },
@@ -79,22 +79,22 @@ const FAMILIES: &[Family] = &[
 
 /// What a table remembers: contact, locks now and before, and the pose before.
 fn table_memory(golden: &mut Golden, memory: &mut [f64]) {
-    memory[0] = golden.numbers("info.proprio/gripper_contact")[0];
+    memory[0] = golden.values("info.proprio/gripper_contact")[0];
     if golden.has("info.button_states") {
-        memory[1..3].copy_from_slice(&golden.numbers("info.button_states")[..2]);
-        memory[3..5].copy_from_slice(&golden.numbers("info.prev_button_states")[..2]);
+        memory[1..3].copy_from_slice(&golden.values("info.button_states")[..2]);
+        memory[3..5].copy_from_slice(&golden.values("info.prev_button_states")[..2]);
     }
-    let [nq, nv] = ["start.qpos", "start.qvel"].map(|part| golden.numbers(part).len());
-    memory[5..5 + nq].copy_from_slice(&golden.numbers("info.prev_qpos")[..nq]);
-    memory[5 + nq..].copy_from_slice(&golden.numbers("info.prev_qvel")[..nv]);
+    let [nq, nv] = ["start.qpos", "start.qvel"].map(|part| golden.values(part).len());
+    memory[5..5 + nq].copy_from_slice(&golden.values("info.prev_qpos")[..nq]);
+    memory[5 + nq..].copy_from_slice(&golden.values("info.prev_qvel")[..nv]);
 }
 
 /// Cubes where their markers are; locks, drawer and window as observed at the goal.
 fn table_goal(golden: &mut Golden, state: &mut [f64]) {
-    let (places, turns) = (golden.numbers("start.mocap_pos"), golden.numbers("start.mocap_quat"));
-    let (poses, joints) = (golden.numbers("start.qpos").len(), state.len());
+    let (places, turns) = (golden.values("start.mocap_pos"), golden.values("start.mocap_quat"));
+    let (poses, joints) = (golden.values("start.qpos").len(), state.len());
     let fixtures = golden.has("info.button_states");
-    let (cubes, target) = (places.len() / 3, golden.numbers("info.target"));
+    let (cubes, target) = (places.len() / 3, golden.values("info.target"));
     // Cubes stand behind the 14 joints of the arm and its gripper.
     for cube in 0..cubes {
         let at = &mut state[1 + 14 + 7 * cube..][..7];
@@ -102,7 +102,7 @@ fn table_goal(golden: &mut Golden, state: &mut [f64]) {
         at[3..].copy_from_slice(&turns[4 * cube..][..4]);
     }
     if fixtures {
-        let memory = joints - (5 + poses + golden.numbers("start.qvel").len());
+        let memory = joints - (5 + poses + golden.values("start.qvel").len());
         (state[memory + 1], state[memory + 2]) = (target[29], target[33]);
         (state[poses - 1], state[poses]) = (target[36] / 18.0, target[38] / 15.0);
     }
@@ -114,7 +114,7 @@ fn fetch_until(file: &str, golden: &mut Golden) -> usize {
     if !file.contains("FetchSlide") {
         return usize::MAX;
     }
-    let known = golden.numbers("info.proprio");
+    let known = golden.values("info.proprio");
     // The puck's velocity is given relative to the gripper's, in metres per action.
     let speeds: Vec<f64> = known.chunks_exact(25).map(|row| (row[14] + row[20]).hypot(row[15] + row[21])).collect();
     let struck = speeds.windows(2).position(|pair| pair[1] - pair[0] > 5e-3).map_or(usize::MAX, |before| before + 1);
@@ -138,7 +138,7 @@ fn rollouts_follow_the_reference() {
     for family in FAMILIES {
         let mut compared = 0;
         for row in ENVS.rows.iter().filter(|row| (family.named)(row.id)) {
-            for file in recorded::files(&row.id.replace('/', "_")) {
+            for file in files(env!("CARGO_MANIFEST_DIR"), &row.id.replace('/', "_")) {
                 compared += 1;
                 let env = recorded_in(&file).unwrap_or_else(|error| panic!("{}: {error}", row.id));
                 problems.extend(Comparison::new(family, env, &file).run());
@@ -163,7 +163,7 @@ fn start(env: &dyn Env, family: &Family, golden: &mut Golden) -> Vec<f64> {
     for part in START {
         let array = format!("start.{part}");
         if names.contains(&array) {
-            physics.extend(golden.numbers(&array));
+            physics.extend(golden.values(&array));
         } else {
             assert!(!["qacc_warmstart", "qvel"].contains(&part), "{array} is not recorded");
         }
@@ -191,9 +191,9 @@ fn table_until(name: &str, golden: &mut Golden) -> usize {
 fn until_it_parts(family: &Family, name: &str, golden: &mut Golden) -> usize {
     let variation = (family.factors)(name, golden.variation());
     let options = ResetOptions { variation, ..ResetOptions::default() };
-    let actions: Vec<f32> = golden.numbers("action").iter().map(|&a| a as f32).collect();
-    let width = actions.len() / golden.numbers("reward").len();
-    let pose = golden.numbers("start.qpos").len();
+    let actions: Vec<f32> = golden.values("action").iter().map(|&a| a as f32).collect();
+    let width = actions.len() / golden.values("reward").len();
+    let pose = golden.values("start.qpos").len();
     let mut play = |nudge: f64| -> Vec<Vec<f64>> {
         let mut env = recorded_in(Path::new(name)).expect("a world");
         env.reset(0, &options).expect("a reset");
@@ -255,17 +255,17 @@ impl<'a> Comparison<'a> {
             .iter()
             .filter_map(|array| array.strip_prefix("info."))
             .filter(|info| !NO_COLUMNS.contains(info))
-            .map(|info| (info.to_owned(), self.golden.numbers(&format!("info.{info}"))))
+            .map(|info| (info.to_owned(), self.golden.values(&format!("info.{info}"))))
             .collect();
         let sights: Vec<(String, Vec<f64>)> = names
             .iter()
             .filter(|array| *array == "obs" || array.starts_with("obs."))
-            .map(|array| (array.clone(), self.golden.numbers(array)))
+            .map(|array| (array.clone(), self.golden.values(array)))
             .collect();
-        let positions = self.golden.numbers("qpos_qvel");
-        let (rewards, endings) = (self.golden.numbers("reward"), self.golden.numbers("terminated"));
+        let positions = self.golden.values("qpos_qvel");
+        let (rewards, endings) = (self.golden.values("reward"), self.golden.values("terminated"));
         let n = self.env.spec().action_dim();
-        let actions: Vec<f32> = self.golden.numbers("action").iter().map(|&a| a as f32).collect();
+        let actions: Vec<f32> = self.golden.values("action").iter().map(|&a| a as f32).collect();
 
         let pose = positions.len() / (rewards.len() + 1);
         let until = (self.family.until)(&self.name, &mut self.golden);
@@ -329,7 +329,7 @@ impl<'a> Comparison<'a> {
 
     /// Compares coordinates, and velocities as distances in a step.
     fn poses(&mut self, step: usize, theirs: &[f64]) {
-        let coordinates = self.golden.numbers("start.qpos").len();
+        let coordinates = self.golden.values("start.qpos").len();
         let scaled = |all: &[f64]| -> Vec<f64> {
             let scale = |i| if i < coordinates { 1.0 } else { self.family.step };
             all.iter().enumerate().map(|(i, x)| x * scale(i)).collect()
@@ -360,7 +360,7 @@ impl<'a> Comparison<'a> {
 
     fn picture(&mut self, array: &str, names: &[String]) {
         if names.iter().any(|name| name == array) {
-            let (height, width, wanted) = self.golden.picture(array);
+            let (height, width, wanted) = self.golden.image(array);
             let mut rgb = vec![0; wanted.len()];
             let frame = FrameMut::new(width, height, &mut rgb);
             render::with(Choice::Cpu, || self.env.render(frame)).unwrap_or_else(|error| panic!("{error}"));
@@ -370,13 +370,7 @@ impl<'a> Comparison<'a> {
             }
             let frame = FrameMut::new(width, height, &mut rgb);
             render::with(Choice::Egl, || self.env.render(frame)).unwrap_or_else(|error| panic!("{error}"));
-            self.apart_at(array, 0, picture_difference(&rgb, &wanted));
+            self.apart_at(array, 0, image_difference(&rgb, &wanted));
         }
     }
-}
-
-/// The mean absolute difference of two pictures, of 255.
-fn picture_difference(a: &[u8], b: &[u8]) -> f64 {
-    assert_eq!(a.len(), b.len());
-    a.iter().zip(b).map(|(&a, &b)| f64::from(a.abs_diff(b))).sum::<f64>() / a.len() as f64
 }

@@ -6,7 +6,6 @@ mod golden;
 mod link;
 mod no_gl;
 mod readout;
-mod recorded;
 #[path = "../../src/render/similarity.rs"]
 mod similarity;
 mod views;

@@ -9,7 +9,7 @@ fn others(i: usize) -> [usize; 2] {
 }
 
 /// The contacts of two boxes at these edges; `None` where an edge is perpendicular to the faces.
-// Over 60 lines: follows one function of MuJoCo 3.3.2 statement by statement, so that the two can be compared.
+#[allow(clippy::too_many_lines, reason = "follows one function of MuJoCo 3.3.2 statement by statement")]
 pub fn edge_contacts(a: &OrientedBox, b: &OrientedBox, edges: &Edges, margin: f64) -> Option<BoxContacts> {
     let &Edges { along: [i, j], sides, normal, inward } = edges;
     let axes: [Vector; 3] = std::array::from_fn(|k| a.local_direction(b.axis(k)));

@@ -7,7 +7,6 @@ use super::{BoxContacts, Face, OrientedBox, TINY, Vector, add, from_face_frame, 
 const STEEP: f64 = 0.5;
 
 /// The contacts on a face of the box `flat`. The normal points from the first box of the pair to the second.
-// Over 60 lines: follows one function of MuJoCo 3.3.2 statement by statement, so that the two can be compared.
 pub fn face_contacts(flat: &OrientedBox, other: &OrientedBox, face: &Face, margin: f64) -> BoxContacts {
     let &Face { of_second, axis, positive } = face;
     let view = |v| to_face_frame(axis, positive, flat.local_direction(v));

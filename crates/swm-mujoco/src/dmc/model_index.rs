@@ -1,13 +1,13 @@
-//! Where the named parts of a model are in its arrays.
+//! [`ModelIndex`]: indices of the named elements of a model.
 
 use mujoco_rs::wrappers::MjModel;
 use mujoco_rs::wrappers::mj_model::MjtObjBase;
 use swm_core::{Error, Result};
 
-/// Places by name. All fail alike: when the model has no part of that name.
-pub struct Names<'a>(pub &'a MjModel);
+/// Looks up elements of a model by name. Every method fails if the model has no element of that name.
+pub struct ModelIndex<'a>(pub &'a MjModel);
 
-impl Names<'_> {
+impl ModelIndex<'_> {
     fn id(&self, kind: MjtObjBase, what: &str, name: &str) -> Result<usize> {
         self.0.name_to_id(kind, name).ok_or_else(|| {
             Error::mismatch(
@@ -18,37 +18,37 @@ impl Names<'_> {
         })
     }
 
-    /// The place of a body.
+    /// The index of a body.
     pub fn body(&self, name: &str) -> Result<usize> {
         self.id(MjtObjBase::mjOBJ_BODY, "body", name)
     }
 
-    /// The place of a geom.
+    /// The index of a geom.
     pub fn geom(&self, name: &str) -> Result<usize> {
         self.id(MjtObjBase::mjOBJ_GEOM, "geom", name)
     }
 
-    /// The place of a site.
+    /// The index of a site.
     pub fn site(&self, name: &str) -> Result<usize> {
         self.id(MjtObjBase::mjOBJ_SITE, "site", name)
     }
 
-    /// The place of a joint.
+    /// The index of a joint.
     pub fn joint(&self, name: &str) -> Result<usize> {
         self.id(MjtObjBase::mjOBJ_JOINT, "joint", name)
     }
 
-    /// Where a joint's coordinates begin in `qpos`.
-    pub fn position(&self, joint: &str) -> Result<usize> {
+    /// The first index of a joint's coordinates in `qpos`.
+    pub fn qpos(&self, joint: &str) -> Result<usize> {
         Ok(self.0.jnt_qposadr()[self.joint(joint)?] as usize)
     }
 
-    /// Where a joint's velocities begin in `qvel`.
-    pub fn velocity(&self, joint: &str) -> Result<usize> {
+    /// The first index of a joint's velocities in `qvel`.
+    pub fn qvel(&self, joint: &str) -> Result<usize> {
         Ok(self.0.jnt_dofadr()[self.joint(joint)?] as usize)
     }
 
-    /// Where a sensor's numbers begin in `sensordata`.
+    /// The first index of a sensor's values in `sensordata`.
     pub fn sensor(&self, name: &str) -> Result<usize> {
         Ok(self.0.sensor_adr()[self.id(MjtObjBase::mjOBJ_SENSOR, "sensor", name)?] as usize)
     }

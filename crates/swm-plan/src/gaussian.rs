@@ -8,6 +8,7 @@
 
 use rand::RngCore as _;
 use swm_core::{Key, Rng};
+use swm_simd::{Kernel, Level, dispatch};
 
 /// Numbers that are made together; the noise of a key is a sequence of such runs.
 pub const RUN: usize = 32;
@@ -27,36 +28,20 @@ pub fn fill(key: Key, first: usize, noise: &mut [f32]) {
 
 fn fill_runs(rng: &mut Rng, runs: &mut [[f32; RUN]]) {
     rng.fill_bytes(bytemuck::cast_slice_mut(runs.as_flattened_mut()));
-    transform_wide(runs);
+    dispatch(Transform(runs));
 }
 
-/// [`transform`] with as many lanes as the processor has. The compiler may neither contract nor reorder what is in it, so
-/// the numbers are the same.
-#[cfg(target_arch = "x86_64")]
-#[allow(unsafe_code)]
-fn transform_wide(runs: &mut [[f32; RUN]]) {
-    #[target_feature(enable = "avx512f")]
-    fn with_avx512(runs: &mut [[f32; RUN]]) {
-        transform(runs);
-    }
-    #[target_feature(enable = "avx2")]
-    fn with_avx2(runs: &mut [[f32; RUN]]) {
-        transform(runs);
-    }
-    if std::arch::is_x86_feature_detected!("avx512f") {
-        // SAFETY: the function asks for AVX-512 F and nothing else; the processor has it.
-        unsafe { with_avx512(runs) }
-    } else if std::arch::is_x86_feature_detected!("avx2") {
-        // SAFETY: the function asks for AVX2 and nothing else; the processor has it.
-        unsafe { with_avx2(runs) }
-    } else {
-        transform(runs);
-    }
-}
+/// [`transform`] with as many lanes as the CPU has. The compiler neither contracts nor reorders its arithmetic, so the
+/// values are the same at every level.
+struct Transform<'a>(&'a mut [[f32; RUN]]);
 
-#[cfg(not(target_arch = "x86_64"))]
-fn transform_wide(runs: &mut [[f32; RUN]]) {
-    transform(runs);
+impl Kernel for Transform<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<L: Level>(self) {
+        transform(self.0);
+    }
 }
 
 /// Random words, as the generator left them in memory, become normal numbers.

@@ -4,9 +4,9 @@
 //! branches. Rays begin near the shape, not at the camera: small shapes far away would drown in rounding.
 
 use crate::scene::{Geom, Shape};
-use crate::simd::vectorised;
 use crate::vector::{V3, add, scale, sub, unrotate};
 use crate::view::View;
+use swm_simd::vectorize;
 
 /// What a unit shape is.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -407,7 +407,7 @@ fn surfaces(
     }
 }
 
-vectorised! {
+vectorize! {
     fn enter_plane(
         solid: &Rectangle, row: &Row, id: u32, x: &[f32], y: &[f32], floor: &[f32], depths: &mut [f32], ids: &mut [u32],
     ) {

@@ -1,13 +1,13 @@
 //! [`Layers`]: what is nearest at every sample of a picture, and how far it is.
 
 use crate::cast::{Posed, Samples};
-use crate::eight::{self, Job, LANES, Plain, Simd};
 use crate::mesh::{Level, Mesh};
 use crate::scene::{Assets, Geom, Shape};
-use crate::simd::vectorised;
 use crate::vector::{V3, add, dot, length, rotate, scale};
 use crate::view::View;
 use std::ops::Range;
+use swm_simd::vectorize;
+use swm_simd::{F32x8, Kernel, LANES, Portable, dispatch_avx2};
 
 /// Nothing is there.
 pub(crate) const NOTHING: u32 = u32::MAX >> 1;
@@ -293,14 +293,14 @@ impl Layers {
         let front = if view.mirrored { 1.0 } else { -1.0 };
         let front = if both_sides { 0.0 } else { front };
         let way = Way { front, near: view.near, floor, rows };
-        eight::run(Faces { layers: self, number: (number, place), level, vertices: &vertices, way });
+        dispatch_avx2(Faces { layers: self, number: (number, place), level, vertices: &vertices, way });
         self.vertices = vertices;
     }
 
     /// Draws a triangle in front of the camera, if it faces it (`front` times its area is positive, or 0).
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     #[inline(always)]
-    fn triangle(&mut self, simd: impl Simd, number: (u32, u32, u32), [a, b, c]: [[f32; 4]; 3], way: &Way<'_>) {
+    fn triangle(&mut self, simd: impl F32x8, number: (u32, u32, u32), [a, b, c]: [[f32; 4]; 3], way: &Way<'_>) {
         let area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
         if area * way.front < 0.0 || area.abs() <= 1e-12 || !area.is_finite() {
             return;
@@ -346,7 +346,7 @@ impl Layers {
         }
         let shares = [bc, ca, ab].map(|row| row.map(|x| (x / determinant) as f32));
         let region = [0, way.rows.start, self.width, way.rows.end];
-        self.fill(Plain, number, [0.0; 2], shares, corners.map(|corner| corner[3]), region, way);
+        self.fill(Portable, number, [0.0; 2], shares, corners.map(|corner| corner[3]), region, way);
     }
 
     /// Draws a triangle by the shares of its corners, divided by `w`, within a region, whose left edge is that of the base.
@@ -354,7 +354,7 @@ impl Layers {
     #[inline(always)]
     fn fill(
         &mut self,
-        simd: impl Simd,
+        simd: impl F32x8,
         (geom, level, face): (u32, u32, u32),
         base: [f32; 2],
         shares: [[f32; 3]; 3],
@@ -387,7 +387,7 @@ impl Layers {
         let (none, near, pixels) = (simd.splat(0.0), simd.splat(way.near), simd.splat((LANES / self.samples) as f32));
         let id = TRIANGLE | self.triangles.len() as u32;
         let wide = ((x1 - x0) * self.samples).next_multiple_of(LANES);
-        let mut drawn = simd.more(none, none);
+        let mut drawn = simd.gt(none, none);
         for y in y0..y1 {
             let begin = self.span(y, x0, x0).start;
             let row = begin..begin + wide;
@@ -406,14 +406,14 @@ impl Layers {
                     *at = simd.add(*at, simd.mul(slope, column));
                 }
                 let [p, q, r, depth] = at;
-                let inside = simd.at_least(simd.min(simd.min(p, q), r), none);
+                let inside = simd.ge(simd.min(simd.min(p, q), r), none);
                 // Where all are 0, this is no number, and not near.
                 let far = simd.div(depth, simd.add(simd.add(p, q), r));
-                let nearer = simd.both(simd.at_least(simd.load(depths), far), simd.more(far, near));
-                let nearer = simd.both(inside, simd.both(nearer, simd.more(far, simd.load(floor))));
-                simd.put(nearer, far, depths);
-                simd.mark(nearer, id, ids);
-                drawn = simd.either(drawn, nearer);
+                let nearer = simd.and(simd.ge(simd.load(depths), far), simd.gt(far, near));
+                let nearer = simd.and(inside, simd.and(nearer, simd.gt(far, simd.load(floor))));
+                simd.store_masked(nearer, far, depths);
+                simd.store_word_masked(nearer, id, ids);
+                drawn = simd.or(drawn, nearer);
                 column = simd.add(column, pixels);
             }
         }
@@ -550,10 +550,13 @@ struct Way<'a> {
     rows: Range<usize>,
 }
 
-impl Job for Faces<'_> {
+impl Kernel for Faces<'_> {
+    type Output = ();
+
     #[allow(clippy::cast_possible_truncation)]
     #[inline(always)]
-    fn run(self, simd: impl Simd) {
+    fn run<L: swm_simd::Level>(self) {
+        let simd = L::f32x8();
         let Self { layers, number, level, vertices, way } = self;
         for (face, &[a, b, c]) in level.faces.iter().enumerate() {
             let corners = [vertices[a as usize], vertices[b as usize], vertices[c as usize]];
@@ -568,7 +571,7 @@ impl Job for Faces<'_> {
     }
 }
 
-vectorised! {
+vectorize! {
     /// Widens what edges reach in rows, from `top` on.
     #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
     fn widen(edges: &Edges, top: usize, lows: &mut [f32], highs: &mut [f32]) {

@@ -53,14 +53,13 @@ extern crate self as swm_raster;
 
 mod canvas;
 mod cast;
-mod eight;
 mod layers;
 mod light;
 mod mesh;
 mod paint;
+mod scalar;
 mod scene;
 mod shadow;
-mod simd;
 mod sky;
 mod split;
 mod still;

@@ -1,8 +1,9 @@
 //! The lighting of OpenGL's fixed pipeline: ambient, scattered and mirrored light, at a point of a surface.
 
+use crate::scalar::power;
 use crate::scene::{Geom, Light, Scene};
-use crate::simd::{power, vectorised};
 use crate::vector::{V3, dot, scale, sub, unit};
+use swm_simd::vectorize;
 
 /// A light, prepared for a picture.
 #[derive(Clone, Copy, Debug)]
@@ -122,7 +123,7 @@ impl Matter {
     }
 }
 
-vectorised! {
+vectorize! {
     fn add_directional(
         lamp: &Lamp, matter: &Matter, eye: V3, places: [&[f32]; 3], normals: [&[f32]; 3], sums: [&mut [f32]; 3],
     ) {

@@ -1,16 +1,17 @@
 //! From what is nearest to colours: the fragments of a picture, gathered by geom and lit many at once.
 
 use crate::cast::Posed;
-use crate::eight::{self, Job, LANES, Simd};
 use crate::layers::{Layers, NOTHING, Region, TRIANGLE};
 use crate::light::{Lamp, Matter};
+use crate::scalar::nearest;
 use crate::scene::{Assets, Axis, Geom, Mapping, Scene, Shape};
 use crate::shadow::Shadow;
-use crate::simd::{nearest, vectorised};
 use crate::texture::{MANY, Reader, Spots, Texture};
 use crate::vector::{V3, add, dot, rotate, scale, sub, unrotate};
 use crate::view::{Rays, View};
 use std::ops::Range;
+use swm_simd::vectorize;
+use swm_simd::{F32x8, Kernel, LANES, dispatch_avx2};
 
 /// Rows that are gathered at once, counted from the top of the picture. How they are lit may depend on what is gathered with them, so
 /// that rows drawn by one thread begin with a band.
@@ -552,7 +553,7 @@ impl Batch {
                 *colour = lattices.colours[corner];
             }
             let run = [begin, begin + same];
-            eight::run(Between { corners, run, within: &self.within, colours: &mut self.pass });
+            dispatch_avx2(Between { corners, run, within: &self.within, colours: &mut self.pass });
             begin += same;
         }
     }
@@ -720,9 +721,12 @@ struct Between<'a> {
     colours: &'a mut [Lane; 3],
 }
 
-impl Job for Between<'_> {
+impl Kernel for Between<'_> {
+    type Output = ();
+
     #[inline(always)]
-    fn run(self, simd: impl Simd) {
+    fn run<L: swm_simd::Level>(self) {
+        let simd = L::f32x8();
         let Self { corners: [a, b, c, d], run: [begin, end], within: [u, v], colours } = self;
         for from in (begin..end).step_by(LANES) {
             let (Some(u), Some(v)) = (u[from..].first_chunk(), v[from..].first_chunk()) else { return };
@@ -739,7 +743,7 @@ impl Job for Between<'_> {
     }
 }
 
-vectorised! {
+vectorize! {
     /// Multiplies light with a texture; more than white is white.
     fn tinted(sums: &mut [f32], tints: &[f32]) {
         for (sum, tint) in sums.iter_mut().zip(tints) {

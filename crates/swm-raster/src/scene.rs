@@ -2,7 +2,7 @@
 //! OpenGL's fixed pipeline and of MuJoCo, which draws with it.
 
 use crate::mesh::Mesh;
-use crate::simd::floor;
+use crate::scalar::floor;
 use crate::texture::Texture;
 use crate::vector::V3;
 use std::sync::Arc;

@@ -3,15 +3,15 @@
 //! The map covers what casts shadows and no more, so that it is sharp although it is small. A convex shape is never in its
 //! own shadow, but where it turns away from the lamp; only meshes need a margin against rounding.
 
-use crate::eight::LANES;
 use crate::layers::{Layers, NOTHING, pattern, touched};
 use crate::light::Lamp;
 use crate::scene::{Assets, Geom, Light, Scene, Shape};
-use crate::simd::vectorised;
 use crate::still::{Setting, Still};
 use crate::texture::MANY;
 use crate::vector::{V3, across, cross, dot, unit};
 use crate::view::View;
+use swm_simd::LANES;
+use swm_simd::vectorize;
 
 /// Texels of a side of the map that the fixed pipeline draws: a finer one is not needed.
 const FINEST: usize = 4096;
@@ -144,7 +144,7 @@ impl Shadow {
     }
 }
 
-vectorised! {
+vectorize! {
     /// Where places are on the map, and how far from the light; x is -1 outside.
     #[allow(clippy::cast_precision_loss)]
     fn project(view: &View, places: [&[f32]; 3], texels: &mut [[f32; MANY]; 3]) {

@@ -2,12 +2,12 @@
 
 use crate::layers::{Layers, NOTHING};
 use crate::scene::{Assets, Geom, Haze, Scene, Shape};
-use crate::simd::vectorised;
 use crate::texture::{MANY, Reader, Spots, Texture};
 use crate::vector::{V3, add, dot, scale, sub, unrotate};
 use crate::view::View;
 use std::ops::Range;
 use std::sync::Arc;
+use swm_simd::vectorize;
 
 /// How far the sky is: just so near that no part of its cylinder is cut off, as a part of the depth one sees.
 const NEAR: f32 = 0.7;
@@ -112,7 +112,7 @@ fn look_up(texture: &Texture, reader: &mut Reader, row: V3, [right, down]: [V3; 
     }
 }
 
-vectorised! {
+vectorize! {
     /// Where on the sky rays of a row meet it, from pixel `from` on.
     #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
     fn find(

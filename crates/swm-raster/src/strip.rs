@@ -2,13 +2,14 @@
 
 use crate::layers::{Layers, NOTHING, Region, touched};
 use crate::paint::{Lit, Look, Painter};
+use crate::scalar::nearest;
 use crate::scene::{Assets, Scene, Shape};
-use crate::simd::{nearest, vectorised};
 use crate::sky::{self, Backdrop, Veil};
 use crate::still::{Setting, Still};
 use crate::vector::{add, dot, scale, sub};
 use crate::view::View;
 use std::ops::Range;
+use swm_simd::vectorize;
 
 /// Rows of a picture, and the memory they need.
 #[derive(Default)]
@@ -240,7 +241,7 @@ fn veil(scene: &Scene, view: &View, main: &Layers, colours: &mut [Vec<f32>; 3]) 
     }
 }
 
-vectorised! {
+vectorize! {
     /// One sees so far where a geom is, and nothing elsewhere.
     fn open(own: u32, far: f32, ids: &[u32], depths: &mut [f32]) {
         for (depth, id) in depths.iter_mut().zip(ids) {

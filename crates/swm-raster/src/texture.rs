@@ -3,7 +3,8 @@
 //! The choice between two versions is that of Mesa's software rasteriser, with which pictures are compared: the larger
 //! of the coordinates' derivatives counts, and versions blend only in the second half of the way from one to the next.
 
-use crate::simd::{nearest, rounded, vectorised};
+use crate::scalar::{nearest, rounded};
+use swm_simd::vectorize;
 
 /// Places looked up at once.
 pub(crate) const MANY: usize = 128;
@@ -298,7 +299,7 @@ impl Seen {
     }
 }
 
-vectorised! {
+vectorize! {
     /// Chooses versions, and brings coordinates into the texture.
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     fn choose(texture: &Texture, s: &[f32], t: &[f32], dense: &[f32], seen: &mut Seen) {

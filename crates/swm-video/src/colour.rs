@@ -6,6 +6,7 @@
 use ffmpeg_next::color::{Range, Space};
 use ffmpeg_next::format::Pixel;
 use ffmpeg_next::frame;
+use swm_simd::vectorize;
 
 /// Bits behind the point of the factors. Everything is 16 bits wide, so that a register holds many.
 const FACTOR: u32 = 13;
@@ -115,28 +116,15 @@ impl<'a> Plane<'a> {
     }
 }
 
-/// Converts all rows with the widest registers there are.
-fn convert(matrix: &Matrix, kind: Planes, planes: &[Plane<'_>; 3], width: usize, out: &mut [u8]) {
-    #[cfg(target_arch = "x86_64")]
-    {
-        /// The same code as elsewhere, compiled for AVX2, which puts three planes together four times as fast.
-        #[target_feature(enable = "avx2")]
-        fn wide(matrix: &Matrix, kind: Planes, planes: &[Plane<'_>; 3], width: usize, out: &mut [u8]) {
-            convert_rows(matrix, kind, planes, width, out);
-        }
-        if is_x86_feature_detected!("avx2") {
-            // SAFETY: the function is safe code; that the processor knows its instructions was just asked.
-            #[allow(unsafe_code)]
-            unsafe {
-                wide(matrix, kind, planes, width, out);
-            }
-            return;
-        }
+vectorize! {
+    /// Converts all rows. AVX2 interleaves the three planes four times as fast as the baseline.
+    fn convert(matrix: &Matrix, kind: Planes, planes: &[Plane<'_>; 3], width: usize, out: &mut [u8]) {
+        convert_rows(matrix, kind, planes, width, out);
     }
-    convert_rows(matrix, kind, planes, width, out);
 }
 
-// What follows is inlined into both of the above; loops instead of closures, which the compiler inlines less surely.
+// The functions below are inlined into `convert`; they use loops instead of closures, which the compiler inlines less
+// reliably.
 
 #[inline(always)]
 fn convert_rows(matrix: &Matrix, kind: Planes, planes: &[Plane<'_>; 3], width: usize, out: &mut [u8]) {

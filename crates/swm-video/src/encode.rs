@@ -10,6 +10,7 @@ use std::io::{Cursor, Seek, SeekFrom, Write};
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
 use swm_image::ImageCodec;
+use swm_simd::CpuLevel;
 
 /// How frames become a video.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -58,7 +59,7 @@ impl Encoding {
             }
             Quality::Crf(crf) => {
                 let mut options = vec![("crf", crf.to_string()), ("preset", "medium".to_owned())];
-                if let Some(instructions) = instructions() {
+                if let Some(instructions) = instruction_set() {
                     options.push(("x264-params", format!("asm={instructions}")));
                 }
                 if !self.small {
@@ -70,15 +71,11 @@ impl Encoding {
     }
 }
 
-/// The instructions that x264 is held to, where it would choose others by itself. For AVX-512 its rate control
-/// (`mbtree`) reads memory that nobody wrote when a picture is at most a few macroblocks wide (x264 164: at 32, 48 and
-/// 64 pixels), and equal frames gave unequal files.
-fn instructions() -> Option<&'static str> {
-    #[cfg(target_arch = "x86_64")]
-    if is_x86_feature_detected!("avx512f") {
-        return Some("AVX2");
-    }
-    None
+/// Returns the instruction set that x264 is limited to, if its own choice is wrong. With AVX-512 the rate control
+/// (`mbtree`) of x264 164 reads uninitialised memory when a frame is at most a few macroblocks wide (seen at 32, 48 and
+/// 64 pixels), so equal frames gave different files.
+fn instruction_set() -> Option<&'static str> {
+    (swm_simd::cpu_level() == CpuLevel::Avx512).then_some("AVX2")
 }
 
 /// Frames from one key frame to the next in videos for training.

@@ -1,14 +1,16 @@
-//! Blocks from their coefficients: the inverse cosine transform by the algorithm of Loeffler, Ligtenberg and Moschytz
-//! (1989) in whole numbers, to the last bit as libjpeg's accurate method (`islow`) rounds it.
+//! The inverse cosine transform of 8 × 8 blocks: the algorithm of Loeffler, Ligtenberg and Moschytz (1989) in integers,
+//! bit for bit as libjpeg's accurate method (`islow`) rounds it.
 
-/// The coefficients of a block, times their steps, row by row.
+use swm_simd::{CpuLevel, Level};
+
+/// The coefficients of a block, times their quantisation steps, `[8, 8]` row-major.
 pub type Block = [i16; 64];
 
-/// A row of eight.
+/// A row of eight values.
 type Row<T> = [T; 8];
 
-/// Products `a·x + b·y` of two rows that make up a transform, in units of 2⁻¹³. The factors are those of the paper's
-/// figure 1 with its three-multiplication rotations multiplied out; no result changes, for all are whole numbers.
+/// Factors of the products `a·x + b·y` of two rows that make up the transform, in units of 2⁻¹³. They are those of the
+/// paper's figure 1 with its three-multiplication rotations multiplied out, which is exact in integers.
 mod factors {
     pub type Pair = (i16, i16);
     pub const SUM: Pair = (8192, 8192);
@@ -27,28 +29,41 @@ mod factors {
     pub const O2: Pair = (-20995, 4177);
 }
 
-/// Bits that the first pass rounds away, keeping two; and the second, with those two and the transform's factor of 8.
+/// Bits that the first pass rounds away; it keeps two.
 const FIRST: i32 = 11;
+/// Bits that the second pass rounds away: those of its factors, the two kept ones and the transform's factor of 8.
 const SECOND: i32 = 18;
 
 /// Writes the 8 × 8 samples of a block, 128 added, as rows that are `stride` apart.
 ///
 /// # Panics
 /// When `to` is shorter than that.
-pub fn transform(block: &Block, to: &mut [u8], stride: usize) {
+#[inline(always)]
+pub fn inverse_dct<L: Level>(block: &Block, to: &mut [u8], stride: usize) {
+    #[cfg(target_arch = "x86_64")]
+    if L::CPU >= CpuLevel::Avx2 {
+        // SAFETY: the CPU supports AVX2, because it runs this level.
+        #[allow(unsafe_code, reason = "calls a function that is compiled for a feature of the CPU")]
+        return unsafe { avx2::inverse_dct(block, to, stride) };
+    }
+    portable(block, to, stride);
+}
+
+/// [`inverse_dct`] without intrinsics.
+fn portable(block: &Block, to: &mut [u8], stride: usize) {
     let mut rows = [[0; 8]; 8];
     rows.as_flattened_mut().copy_from_slice(block);
-    let rows = transposed(pass::<SECOND>(transposed(pass::<FIRST>(rows))));
+    let rows = transpose(pass::<SECOND>(transpose(pass::<FIRST>(rows))));
     for (i, row) in rows.iter().enumerate() {
         to[i * stride..][..8].copy_from_slice(&row.map(|value| (value.clamp(-128, 127) + 128) as u8));
     }
 }
 
-fn transposed(rows: [Row<i16>; 8]) -> [Row<i16>; 8] {
+fn transpose(rows: [Row<i16>; 8]) -> [Row<i16>; 8] {
     std::array::from_fn(|i| rows.map(|row| row[i]))
 }
 
-/// The transform over the first index.
+/// Transforms along the first index.
 fn pass<const BITS: i32>(x: [Row<i16>; 8]) -> [Row<i16>; 8] {
     use factors::{DIFFERENCE, E2, E3, O0, O1, O2, O3, SUM, Z3, Z4};
     let products = |x: Row<i16>, y: Row<i16>, (a, b): factors::Pair| -> Row<i32> {
@@ -76,34 +91,34 @@ fn pass<const BITS: i32>(x: [Row<i16>; 8]) -> [Row<i16>; 8] {
 }
 
 #[cfg(target_arch = "x86_64")]
-pub mod avx2 {
-    //! The same with eight numbers in a register.
+mod avx2 {
+    //! The same with eight values per register.
 
     use super::factors::{DIFFERENCE, E2, E3, O0, O1, O2, O3, Pair, SUM, Z3, Z4};
     use super::{Block, FIRST, SECOND};
-    #[allow(clippy::wildcard_imports)]
+    #[allow(clippy::wildcard_imports, reason = "the list of intrinsics would be longer than the code")]
     use std::arch::x86_64::*;
 
     type Rows = [__m128i; 8];
 
-    /// As [`super::transform`].
+    /// As [`super::portable`].
     #[target_feature(enable = "avx2")]
-    pub fn transform(block: &Block, to: &mut [u8], stride: usize) {
+    pub fn inverse_dct(block: &Block, to: &mut [u8], stride: usize) {
         let mut rows = [_mm_setzero_si128(); 8];
         for (row, from) in rows.iter_mut().zip(block.as_chunks::<8>().0) {
             let [a, b, c, d, e, f, g, h] = *from;
             *row = _mm_setr_epi16(a, b, c, d, e, f, g, h);
         }
-        let rows = transposed(pass::<SECOND>(transposed(pass::<FIRST>(rows))));
+        let rows = transpose(pass::<SECOND>(transpose(pass::<FIRST>(rows))));
         for (i, [upper, lower]) in rows.as_chunks::<2>().0.iter().enumerate() {
-            // Held to ±128 and moved up.
+            // Saturates to -128 ..= 127 and adds 128.
             let both = _mm_xor_si128(_mm_packs_epi16(*upper, *lower), _mm_set1_epi8(-128));
             to[2 * i * stride..][..8].copy_from_slice(&_mm_cvtsi128_si64(both).to_le_bytes());
             to[(2 * i + 1) * stride..][..8].copy_from_slice(&_mm_extract_epi64::<1>(both).to_le_bytes());
         }
     }
 
-    /// Eight pairs of two rows.
+    /// Interleaves two rows into eight pairs.
     #[target_feature(enable = "avx2")]
     fn pairs(x: __m128i, y: __m128i) -> __m256i {
         _mm256_set_m128i(_mm_unpackhi_epi16(x, y), _mm_unpacklo_epi16(x, y))
@@ -137,7 +152,7 @@ pub mod avx2 {
             let even = _mm256_add_epi32(even[i], half);
             let upper = _mm256_srai_epi32::<BITS>(_mm256_add_epi32(even, odd[i]));
             let lower = _mm256_srai_epi32::<BITS>(_mm256_sub_epi32(even, odd[i]));
-            // Packing works on halves of a register; their inner quarters change places.
+            // Packing works on each half of a register, which leaves the inner quarters swapped.
             let both = _mm256_permute4x64_epi64::<0b11_01_10_00>(_mm256_packs_epi32(upper, lower));
             out[i] = _mm256_castsi256_si128(both);
             out[7 - i] = _mm256_extracti128_si256::<1>(both);
@@ -146,7 +161,7 @@ pub mod avx2 {
     }
 
     #[target_feature(enable = "avx2")]
-    fn transposed(x: Rows) -> Rows {
+    fn transpose(x: Rows) -> Rows {
         let mut one = x;
         for i in 0..4 {
             one[2 * i] = _mm_unpacklo_epi16(x[i], x[i + 4]);
@@ -168,26 +183,26 @@ pub mod avx2 {
 
 #[cfg(all(test, target_arch = "x86_64"))]
 mod tests {
-    use super::{avx2, transform};
+    use super::{avx2, portable};
 
     #[test]
-    fn registers_and_numbers_agree() {
-        if !is_x86_feature_detected!("avx2") {
+    fn intrinsics_and_portable_code_agree() {
+        if swm_simd::cpu_level() < swm_simd::CpuLevel::Avx2 {
             return;
         }
         let mut seed = 7_u32;
         for round in 0..3000 {
             let block = std::array::from_fn(|_| {
                 seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                // From small to beyond what a picture has; many zeros.
+                // From small values to larger ones than an image has; many zeros.
                 if seed >> 30 == 0 { (seed as i32 >> 15 >> (round % 16)) as i16 } else { 0 }
             });
             let (mut plain, mut fast) = ([0; 80], [0; 80]);
-            transform(&block, &mut plain, 9);
-            // SAFETY: that the processor knows AVX2 was just asked.
-            #[allow(unsafe_code)]
+            portable(&block, &mut plain, 9);
+            // SAFETY: the CPU supports AVX2.
+            #[allow(unsafe_code, reason = "calls a function that is compiled for a feature of the CPU")]
             unsafe {
-                avx2::transform(&block, &mut fast, 9);
+                avx2::inverse_dct(&block, &mut fast, 9);
             }
             assert_eq!(plain, fast, "{block:?}");
         }

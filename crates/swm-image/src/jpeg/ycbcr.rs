@@ -1,13 +1,23 @@
-//! Planes of brightness and colour to RGB, sixteen pixels at a time, to the last bit as libjpeg does it.
+//! YCbCr to RGB, sixteen pixels at a time, bit for bit as libjpeg converts.
 
-/// One row of sixteen pixels' samples.
+use swm_simd::{CpuLevel, Level};
+
+/// Samples of sixteen neighbouring pixels of a row.
 pub type Samples = [u8; 16];
 
-/// Sixteen pixels whose colour is at half resolution: three quarters of the nearest sample and one of the next, in both
-/// directions. `us` and `vs` are the nearest row and the next; their samples 1 to 8 belong to the pixels, 0 and 9 are
-/// those beside.
-pub fn convert_halved(ys: &Samples, us: [&Samples; 2], vs: [&Samples; 2], out: &mut [u8; 48]) {
-    let spread = |[near, next]: [&Samples; 2]| -> Samples {
+/// Converts sixteen pixels whose chroma is at half resolution.
+///
+/// Chroma is interpolated with weights 3/4 (nearest sample) and 1/4 (next sample) in both directions. `us` and `vs` are
+/// the nearest row and the next one; samples 1 to 8 belong to the pixels, samples 0 and 9 are their neighbours.
+#[inline(always)]
+pub fn convert_halved<L: Level>(ys: &Samples, us: [&Samples; 2], vs: [&Samples; 2], out: &mut [u8; 48]) {
+    #[cfg(target_arch = "x86_64")]
+    if L::CPU >= CpuLevel::Avx2 {
+        // SAFETY: the CPU supports AVX2, because it runs this level.
+        #[allow(unsafe_code, reason = "calls a function that is compiled for a feature of the CPU")]
+        return unsafe { avx2::convert_halved(ys, us, vs, out) };
+    }
+    let interpolate = |[near, next]: [&Samples; 2]| -> Samples {
         let sum = |i: usize| 3 * u16::from(near[i]) + u16::from(next[i]);
         std::array::from_fn(|i| {
             let middle = 3 * sum(i / 2 + 1);
@@ -15,11 +25,18 @@ pub fn convert_halved(ys: &Samples, us: [&Samples; 2], vs: [&Samples; 2], out: &
             (value >> 4) as u8
         })
     };
-    convert(ys, &spread(us), &spread(vs), out);
+    convert::<L>(ys, &interpolate(us), &interpolate(vs), out);
 }
 
-/// YCbCr to RGB, as JFIF defines it and libjpeg rounds it.
-pub fn convert(ys: &Samples, us: &Samples, vs: &Samples, out: &mut [u8; 48]) {
+/// Converts sixteen pixels from YCbCr to RGB, as JFIF defines it and libjpeg rounds it.
+#[inline(always)]
+pub fn convert<L: Level>(ys: &Samples, us: &Samples, vs: &Samples, out: &mut [u8; 48]) {
+    #[cfg(target_arch = "x86_64")]
+    if L::CPU >= CpuLevel::Avx2 {
+        // SAFETY: the CPU supports AVX2, because it runs this level.
+        #[allow(unsafe_code, reason = "calls a function that is compiled for a feature of the CPU")]
+        return unsafe { avx2::convert(ys, us, vs, out) };
+    }
     for (i, pixel) in out.as_chunks_mut::<3>().0.iter_mut().enumerate() {
         let (y, u, v) = (i32::from(ys[i]), i32::from(us[i]) - 128, i32::from(vs[i]) - 128);
         // 1.402, 0.34414, 0.71414 and 1.772, times 2¹⁶.
@@ -31,11 +48,11 @@ pub fn convert(ys: &Samples, us: &Samples, vs: &Samples, out: &mut [u8; 48]) {
 }
 
 #[cfg(target_arch = "x86_64")]
-pub mod avx2 {
-    //! The same in registers.
+mod avx2 {
+    //! The same with AVX2 intrinsics.
 
     use super::Samples;
-    #[allow(clippy::wildcard_imports)]
+    #[allow(clippy::wildcard_imports, reason = "the list of intrinsics would be longer than the code")]
     use std::arch::x86_64::*;
 
     #[target_feature(enable = "avx2")]
@@ -53,7 +70,7 @@ pub mod avx2 {
     /// As [`super::convert_halved`].
     #[target_feature(enable = "avx2")]
     pub fn convert_halved(ys: &Samples, us: [&Samples; 2], vs: [&Samples; 2], out: &mut [u8; 48]) {
-        pixels(load(ys), spread(us), spread(vs), out);
+        pixels(load(ys), interpolate(us), interpolate(vs), out);
     }
 
     /// As [`super::convert`].
@@ -63,7 +80,7 @@ pub mod avx2 {
     }
 
     #[target_feature(enable = "avx2")]
-    fn spread([near, next]: [&Samples; 2]) -> __m128i {
+    fn interpolate([near, next]: [&Samples; 2]) -> __m128i {
         let (near, next) = (_mm256_cvtepu8_epi16(load(near)), _mm256_cvtepu8_epi16(load(next)));
         let sums = _mm256_add_epi16(_mm256_mullo_epi16(near, _mm256_set1_epi16(3)), next);
         let (left, more) = (_mm256_castsi256_si128(sums), _mm256_extracti128_si256::<1>(sums));
@@ -97,7 +114,7 @@ pub mod avx2 {
             |value: __m256i| _mm_packus_epi16(_mm256_castsi256_si128(value), _mm256_extracti128_si256::<1>(value));
         let (red, green, blue) = (bytes(red), bytes(green), bytes(blue));
         for (part, to) in out.as_chunks_mut::<16>().0.iter_mut().enumerate() {
-            let [r, g, b] = PLACES[part];
+            let [r, g, b] = SHUFFLES[part];
             let red = _mm_shuffle_epi8(red, _mm_set_epi64x(r[1], r[0]));
             let green = _mm_shuffle_epi8(green, _mm_set_epi64x(g[1], g[0]));
             let blue = _mm_shuffle_epi8(blue, _mm_set_epi64x(b[1], b[0]));
@@ -106,18 +123,18 @@ pub mod avx2 {
         }
     }
 
-    /// For each third of sixteen pixels and each of red, green and blue, where its bytes come from.
-    const PLACES: [[[i64; 2]; 3]; 3] = {
-        let mut places = [[[0; 2]; 3]; 3];
+    /// For each third of sixteen pixels and each channel, the shuffle that puts its bytes where they belong.
+    const SHUFFLES: [[[i64; 2]; 3]; 3] = {
+        let mut shuffles = [[[0; 2]; 3]; 3];
         let mut i = 0;
         while i < 3 * 48 {
             let (part, channel, byte) = (i / 48, i / 16 % 3, i % 16);
             let at = part * 16 + byte;
-            // A place with its upper bit set gives 0.
-            let place = if at % 3 == channel { at as i64 / 3 } else { 0x80 };
-            places[part][channel][byte / 8] |= place << (byte % 8 * 8);
+            // An index with its upper bit set gives 0.
+            let index = if at % 3 == channel { at as i64 / 3 } else { 0x80 };
+            shuffles[part][channel][byte / 8] |= index << (byte % 8 * 8);
             i += 1;
         }
-        places
+        shuffles
     };
 }

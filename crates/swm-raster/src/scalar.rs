@@ -1,44 +1,4 @@
-//! `vectorised!`: a function compiled for any processor and for AVX2, of which the better one is called.
-//!
-//! The bodies are loops over slices that the compiler turns into vector instructions. Both versions give equal bytes:
-//! neither fuses multiplications with additions, and division and square root are exact in both.
-#![allow(unsafe_code, reason = "AVX2 code is called where the processor has it")]
-
-/// Whether the processor has AVX2.
-#[cfg(target_arch = "x86_64")]
-#[inline]
-pub(crate) fn avx2() -> bool {
-    #[cfg(test)]
-    if tests::PLAIN.get() {
-        return false;
-    }
-    std::arch::is_x86_feature_detected!("avx2")
-}
-
-/// Defines such functions.
-macro_rules! vectorised {
-    ($($(#[$meta:meta])* $vis:vis fn $name:ident($($arg:ident: $type:ty),* $(,)?) $(-> $out:ty)? $body:block)*) => { $(
-        $(#[$meta])*
-        #[allow(clippy::too_many_arguments, unsafe_code)]
-        $vis fn $name($($arg: $type),*) $(-> $out)? {
-            #[inline(always)]
-            fn plain($($arg: $type),*) $(-> $out)? $body
-            #[cfg(target_arch = "x86_64")]
-            {
-                #[target_feature(enable = "avx2")]
-                fn avx2($($arg: $type),*) $(-> $out)? {
-                    plain($($arg),*)
-                }
-                if $crate::simd::avx2() {
-                    // SAFETY: the processor was just asked.
-                    return unsafe { avx2($($arg),*) };
-                }
-            }
-            plain($($arg),*)
-        }
-    )* };
-}
-pub(crate) use vectorised;
+//! Scalar functions that the compiler can vectorise: plain arithmetic with the same bits on every CPU.
 
 /// The whole number next to one from 0 to 2^22; any for others. Conversion by `as` is done one by one.
 #[inline(always)]
@@ -88,21 +48,16 @@ mod tests {
     use crate::Canvas;
     use crate::scenes::{assets, drawn, scene};
     use proptest::prelude::*;
-    use std::cell::Cell;
-
-    thread_local! {
-        /// As if the processor had no AVX2.
-        pub static PLAIN: Cell<bool> = const { Cell::new(false) };
-    }
+    use swm_simd::{CpuLevel, limit_cpu_level};
 
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(1000))]
         #[test]
         fn pictures_are_the_same_on_any_processor(scene in scene()) {
             let seen = drawn(&mut Canvas::new(), &scene, &assets());
-            PLAIN.set(true);
+            limit_cpu_level(CpuLevel::Baseline);
             let plain = drawn(&mut Canvas::new(), &scene, &assets());
-            PLAIN.set(false);
+            limit_cpu_level(CpuLevel::Avx512);
             prop_assert_eq!(seen, plain);
         }
     }

@@ -1,0 +1,148 @@
+//! Kernels: computations that are compiled for every level and dispatched at run time.
+
+use crate::{CpuLevel, F32x8, Portable};
+
+/// The instruction set that a kernel is compiled for.
+///
+/// Only the dispatch functions name the types that implement it, so a kernel that is generic over `Level` runs only on
+/// CPUs that support the level.
+pub trait Level {
+    /// The level.
+    const CPU: CpuLevel;
+    /// Whether [`Level::fma`] is one instruction.
+    const FUSED: bool;
+    /// The implementation of eight floats at once.
+    type F32x8: F32x8;
+
+    /// Returns the operations on eight floats at once.
+    fn f32x8() -> Self::F32x8;
+
+    /// Returns `a * b + c`, rounded once where [`Level::FUSED`] and twice elsewhere.
+    #[inline(always)]
+    fn fma(a: f32, b: f32, c: f32) -> f32 {
+        if Self::FUSED { a.mul_add(b, c) } else { a * b + c }
+    }
+}
+
+/// A computation that is compiled for every level. Every function that it calls must be `#[inline(always)]`, so that it
+/// is compiled for the level, too.
+pub trait Kernel {
+    /// The result.
+    type Output;
+
+    /// Runs the computation. Implementations are `#[inline(always)]`.
+    fn run<L: Level>(self) -> Self::Output;
+}
+
+/// Instructions that every CPU of the architecture supports.
+struct Baseline;
+
+impl Level for Baseline {
+    const CPU: CpuLevel = CpuLevel::Baseline;
+    const FUSED: bool = cfg!(target_arch = "aarch64");
+    type F32x8 = Portable;
+
+    #[inline(always)]
+    fn f32x8() -> Portable {
+        Portable
+    }
+}
+
+/// Runs a kernel at the best level that the CPU supports.
+#[inline]
+pub fn dispatch<K: Kernel>(kernel: K) -> K::Output {
+    #[cfg(target_arch = "x86_64")]
+    if crate::cpu_level() == CpuLevel::Avx512 {
+        // SAFETY: the CPU supports every feature that the function is compiled for.
+        #[allow(unsafe_code, reason = "calls a function that is compiled for features of the CPU")]
+        return unsafe { x86::run_avx512(kernel) };
+    }
+    dispatch_avx2(kernel)
+}
+
+/// Runs a kernel at AVX2 where the CPU supports it and at the baseline elsewhere, for kernels that AVX-512 does not make
+/// faster.
+#[inline]
+pub fn dispatch_avx2<K: Kernel>(kernel: K) -> K::Output {
+    #[cfg(target_arch = "x86_64")]
+    if crate::cpu_level() >= CpuLevel::Avx2 {
+        // SAFETY: the CPU supports every feature that the function is compiled for.
+        #[allow(unsafe_code, reason = "calls a function that is compiled for features of the CPU")]
+        return unsafe { x86::run_avx2(kernel) };
+    }
+    kernel.run::<Baseline>()
+}
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use super::{Kernel, Level};
+    use crate::CpuLevel;
+    use crate::f32x8::Avx2Lanes;
+
+    struct Avx2;
+
+    impl Level for Avx2 {
+        const CPU: CpuLevel = CpuLevel::Avx2;
+        const FUSED: bool = true;
+        type F32x8 = Avx2Lanes;
+
+        #[inline(always)]
+        fn f32x8() -> Avx2Lanes {
+            // SAFETY: only `run_avx2` names this level.
+            #[allow(unsafe_code, reason = "the level shows that the CPU supports AVX2")]
+            unsafe {
+                Avx2Lanes::new()
+            }
+        }
+    }
+
+    struct Avx512;
+
+    impl Level for Avx512 {
+        const CPU: CpuLevel = CpuLevel::Avx512;
+        const FUSED: bool = true;
+        type F32x8 = Avx2Lanes;
+
+        #[inline(always)]
+        fn f32x8() -> Avx2Lanes {
+            // SAFETY: only `run_avx512` names this level.
+            #[allow(unsafe_code, reason = "the level shows that the CPU supports AVX2")]
+            unsafe {
+                Avx2Lanes::new()
+            }
+        }
+    }
+
+    #[target_feature(enable = "avx512f,avx512bw,avx512cd,avx512dq,avx512vl,avx2,fma,bmi1,bmi2")]
+    pub fn run_avx512<K: Kernel>(kernel: K) -> K::Output {
+        kernel.run::<Avx512>()
+    }
+
+    #[target_feature(enable = "avx2,fma,bmi1,bmi2")]
+    pub fn run_avx2<K: Kernel>(kernel: K) -> K::Output {
+        kernel.run::<Avx2>()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    struct Sum<'a>(&'a [f32]);
+
+    impl Kernel for Sum<'_> {
+        type Output = (f32, CpuLevel);
+
+        #[inline(always)]
+        fn run<L: Level>(self) -> (f32, CpuLevel) {
+            (self.0.iter().sum(), L::CPU)
+        }
+    }
+
+    #[test]
+    fn kernels_run_at_the_level_of_the_cpu() {
+        let values = [1.0, 2.5, 4.0];
+        assert_eq!(dispatch(Sum(&values)), (7.5, crate::cpu_level()));
+        assert_eq!(dispatch_avx2(Sum(&values)), (7.5, crate::cpu_level().min(CpuLevel::Avx2)));
+    }
+}

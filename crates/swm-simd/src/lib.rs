@@ -1,0 +1,19 @@
+//! The one choice of the CPU's vector instructions at run time, for every crate of the workspace. Without dependencies.
+//!
+//! - [`dispatch`] and [`dispatch_avx2`] run a [`Kernel`], plain loops that are compiled for several instruction sets, at
+//!   the best level that the CPU supports.
+//! - [`vectorize!`] does the same for single functions.
+//! - [`F32x8`] provides eight floats at once, for loops that are too short for the compiler to vectorise.
+//! - [`cpu_level`] returns the level for code that needs nothing else.
+//!
+//! Rust never contracts `a * b + c` into a fused multiplication, so code that does not call [`Level::fma`] computes the
+//! same bytes at every level.
+
+mod f32x8;
+mod kernel;
+mod level;
+mod vectorize;
+
+pub use f32x8::{F32x8, LANES, Portable};
+pub use kernel::{Kernel, Level, dispatch, dispatch_avx2};
+pub use level::{CpuLevel, cpu_level, limit_cpu_level};

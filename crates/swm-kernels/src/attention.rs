@@ -2,7 +2,7 @@
 
 use crate::functions::{add_scaled, dot, exp};
 use crate::grown;
-use crate::simd::{Kernel, Level, dispatch};
+use swm_simd::{Kernel, Level, dispatch};
 
 /// Replaces the query of every head, given in the tokens' space, by the head's attention output: the mean of the tokens
 /// weighted by the softmax of their scalar products with the query. A row attends to its own token and to earlier ones.

@@ -1,7 +1,7 @@
 //! Element-wise functions, softmax and reductions, written without branches and calls so that compilers vectorise them.
 
 use crate::panels::LANES;
-use crate::simd::{Kernel, Level, dispatch};
+use swm_simd::{Kernel, Level, dispatch};
 
 /// Replaces every element by `x Φ(x)`, with an error below 1e-6.
 ///

@@ -14,7 +14,6 @@ pub mod functions;
 mod norm;
 mod panels;
 mod scratch;
-mod simd;
 mod vit;
 mod vit_gradient;
 

@@ -2,7 +2,7 @@
 
 use crate::Affine;
 use crate::functions::{dot, sum};
-use crate::simd::{Kernel, Level, dispatch};
+use swm_simd::{Kernel, Level, dispatch};
 
 /// A layer normalisation: scale and shift per feature, and the number added to the variance.
 #[derive(Clone, Debug)]

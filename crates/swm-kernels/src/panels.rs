@@ -5,7 +5,7 @@
 //! rows.
 
 use crate::Affine;
-use crate::simd::{Kernel, Level, dispatch};
+use swm_simd::{CpuLevel, Kernel, Level, dispatch};
 
 /// Elements of a vector.
 pub(crate) const LANES: usize = 16;
@@ -152,7 +152,7 @@ impl<const TRANSPOSED: bool> Kernel for Product<'_, TRANSPOSED> {
                 Panel { first: index * WIDTH, elements: &self.weights.elements[index * inputs..][..inputs], bias };
             // Tiles of as many rows as registers hold, then smaller ones.
             let mut row = 0;
-            if L::ROWS >= 12 {
+            if L::CPU == CpuLevel::Avx512 {
                 while rows - row >= 12 {
                     self.tile::<L, 12, 2>(row, panel);
                     row += 12;

@@ -8,8 +8,8 @@ use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 use swm::core::{Batch, Candidates, CostModel, Error, Key, Policy, Schema};
-use swm::families::{Card, load};
 use swm::models::Device;
+use swm::models::{CheckpointInfo, load};
 use swm::plan::ActionScale;
 use swm::plan::objective::ObjectiveConfig;
 
@@ -53,20 +53,20 @@ impl Model {
     fn new(py: Python<'_>, name: &str, device: &str, objective: &str) -> PyResult<Self> {
         let device = swm::models::device::parse(device).map_err(raised)?;
         let objective: Value = json("objective", objective)?;
-        let (path, card) = py
+        let (path, info) = py
             .detach(|| {
                 let path = swm::home::find_checkpoint(name)?;
-                let card = load(&path, &device)?.card()?;
-                Ok((path, card))
+                let info = load(&path, &device)?.info()?;
+                Ok((path, info))
             })
             .map_err(raised)?;
-        let Card { family, weights, config, dataset_info, image, action_block, history, .. } = &card;
+        let CheckpointInfo { family, weights, config, dataset_info, image_size, action_block, history, .. } = &info;
         let described = json!({
             "family": family,
             "weights": weights,
             "config": config,
             "env": dataset_info.env,
-            "image": image,
+            "image": image_size,
             "action_block": action_block,
             "history": history,
             "action_mean": dataset_info.action.mean,
@@ -76,12 +76,12 @@ impl Model {
             path,
             device,
             objective,
-            scale: card.dataset_info.action.clone(),
-            weights: card.weights.clone(),
+            scale: info.dataset_info.action.clone(),
+            weights: info.weights.clone(),
             card: described.to_string(),
             asked: Mutex::new(None),
             acting: Mutex::new(None),
-            env: card.dataset_info.env.clone(),
+            env: info.dataset_info.env.clone(),
         })
     }
 

@@ -24,6 +24,7 @@ mod parallelism;
 pub mod plan;
 pub mod policy;
 pub mod pool;
+pub mod predictor;
 pub mod registry;
 pub mod results;
 pub mod run;
@@ -46,6 +47,7 @@ pub use plan::{
 };
 pub use policy::{Policy, RandomPolicy};
 pub use pool::EnvPool;
+pub use predictor::Predictor;
 pub use registry::{EnvChoice, EnvEntry, EnvOption, ExpertEntry, Named, Registry};
 pub use results::Results;
 pub use space::Space;

@@ -10,30 +10,7 @@ use swm_core::results::{Prediction, Run, Trajectory};
 use swm_core::{Batch, DType, Error, Result};
 use swm_data::{Reader, StepRange};
 
-/// A model whose predictions can be looked at.
-pub trait Predictor: Send {
-    /// Environment steps in one model step.
-    fn frameskip(&self) -> usize;
-
-    /// The columns of an observation that it encodes.
-    fn columns(&self) -> Vec<String>;
-
-    /// Numbers in one latent.
-    fn latent_dim(&self) -> usize;
-
-    /// Writes the latent of every row, `[rows, latent]`. A row's latent does not depend on the other rows.
-    ///
-    /// # Errors
-    /// When the rows are not what the model was trained on.
-    fn encode(&mut self, rows: &Batch, latents: &mut [f32]) -> Result<()>;
-
-    /// Writes the latents after each of `horizon` model steps, `[n, horizon, latent]`, from `start` `[n, latent]` and
-    /// `actions` `[n, horizon, frameskip * action]`, in the environment's units.
-    ///
-    /// # Errors
-    /// When the actions do not fit the model.
-    fn rollout(&mut self, start: &[f32], actions: &[f32], horizon: usize, latents: &mut [f32]) -> Result<()>;
-}
+pub use swm_core::Predictor;
 
 /// Trajectories that are read and predicted at once.
 const AT_ONCE: usize = 16;

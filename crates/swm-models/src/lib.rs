@@ -15,8 +15,10 @@
 //! - [`device`]: where they compute.
 
 pub mod checkpoint;
+mod checks;
 pub mod device;
 pub mod dino_wm;
+pub mod family;
 pub mod feed_forward;
 pub mod gcrl;
 pub mod inverse;
@@ -26,6 +28,7 @@ pub mod online;
 pub mod pixels;
 pub mod pldm;
 pub mod probe;
+pub mod registry;
 pub mod sac;
 pub mod tdmpc2;
 pub mod train;
@@ -33,4 +36,6 @@ pub mod weights;
 
 pub use burn::tensor::Device;
 pub use checkpoint::Checkpoint;
+pub use family::{CheckpointInfo, FamilyEntry, LoadedModel, ModelFamily, OnlineRun, TrainRun, TrainableConfig};
+pub use registry::{FAMILIES, load, load_from};
 pub use train::{Observer, Progress, TrainConfig, TrainOptions, TrainSummary, Trainable, train};

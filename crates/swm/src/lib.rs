@@ -20,9 +20,7 @@ pub use swm_report as report;
 pub mod cli;
 pub mod collect;
 pub mod describe;
-pub mod families;
 pub mod home;
-pub mod predictor;
 pub mod resolver;
 pub mod subject;
 

@@ -1,7 +1,6 @@
 //! [`Home`]: what the names in an evaluation's request stand for: environments, wrappers and solvers of this build,
 //! datasets and checkpoints at home.
 
-use crate::families::{Card, load};
 use crate::home;
 use std::cell::RefCell;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -10,7 +9,7 @@ use swm_core::{Env, EnvEntry, EnvSpec, Error, Named as _, Policy, RandomPolicy, 
 use swm_data::Reader;
 use swm_envs::wrappers::{GoalPicture, Stack, WRAPPERS};
 use swm_eval::{Actor, Acts, Choice, EvalRequest, Model, PolicyRequest, Predictor, Resolver, World};
-use swm_models::Device;
+use swm_models::{CheckpointInfo, Device, load};
 use swm_plan::objective::ObjectiveConfig;
 use swm_plan::problem::pairing;
 use swm_plan::registry::Actions;
@@ -100,11 +99,11 @@ impl Resolver for Home {
             Acts::Random => Ok(Actor::from(Box::new(RandomPolicy::new(spec, slots)) as Box<dyn Policy>)),
             Acts::Expert { id } => scripted(&env.entry, id, world).map(Actor::from),
             Acts::Direct { checkpoint: given, .. } => {
-                let (policy, card) = direct(given, spec, slots)?;
+                let (policy, info) = direct(given, spec, slots)?;
                 Ok(Actor {
-                    weights: Some(card.weights),
-                    libraries: card.manifest.libraries,
-                    device: Some(card.manifest.device),
+                    weights: Some(info.weights),
+                    libraries: info.manifest.libraries,
+                    device: Some(info.manifest.device),
                     ..Actor::from(policy)
                 })
             }
@@ -136,19 +135,19 @@ impl Resolver for Home {
                     }
                     Model::Checkpoint(given) => {
                         let loaded = load(&home::find_checkpoint(given)?, &Device::flex())?;
-                        let card = loaded.card()?;
-                        fits(card.dataset_info.env.as_deref(), given, spec)?;
+                        let info = loaded.info()?;
+                        fits(info.dataset_info.env.as_deref(), given, spec)?;
                         let cost = loaded.cost().ok_or_else(|| {
-                            let problem = format!("a {} acts and does not predict", card.family);
+                            let problem = format!("a {} acts and does not predict", info.family);
                             Error::config(format!("checkpoint {given}"), problem, "let it act (`swm eval` does)")
                         })?;
-                        let (mut cost, scale) = (objective.apply(cost)?, card.dataset_info.action);
+                        let (mut cost, scale) = (objective.apply(cost)?, info.dataset_info.action);
                         pairing(id, &mut *cost, actions)?;
                         let policy = MpcPolicy::new(solver, cost, mpc, scale, spec, slots)?;
                         Ok(Actor {
-                            weights: Some(card.weights),
-                            libraries: card.manifest.libraries,
-                            device: Some(card.manifest.device),
+                            weights: Some(info.weights),
+                            libraries: info.manifest.libraries,
+                            device: Some(info.manifest.device),
                             ..self.planning(&request.name, policy)
                         })
                     }
@@ -173,23 +172,23 @@ pub fn acting(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Po
     if known || !home::checkpoint(name).exists() {
         return Ok((scripted(entry, name, world)?, None));
     }
-    let (policy, card) = direct(name, world.spec(), world.pool().len())?;
-    Ok((policy, Some(card.weights)))
+    let (policy, info) = direct(name, world.spec(), world.pool().len())?;
+    Ok((policy, Some(info.weights)))
 }
 
 /// The policy of a checkpoint that acts by itself, and what the checkpoint holds.
 ///
 /// # Errors
 /// When there is no such checkpoint, it is of another world, or it only predicts.
-pub fn direct(given: &str, spec: &EnvSpec, slots: usize) -> Result<(Box<dyn Policy>, Card)> {
+pub fn direct(given: &str, spec: &EnvSpec, slots: usize) -> Result<(Box<dyn Policy>, CheckpointInfo)> {
     let loaded = load(&home::find_checkpoint(given)?, &Device::flex())?;
-    let card = loaded.card()?;
-    fits(card.dataset_info.env.as_deref(), given, spec)?;
+    let info = loaded.info()?;
+    fits(info.dataset_info.env.as_deref(), given, spec)?;
     let policy = loaded.policy(spec, slots).ok_or_else(|| {
-        let problem = format!("a {} predicts and does not act", card.family);
+        let problem = format!("a {} predicts and does not act", info.family);
         Error::config(format!("checkpoint {given}"), problem, "plan in it (`swm eval` does)")
     })??;
-    Ok((policy, card))
+    Ok((policy, info))
 }
 
 /// Who acts in a world without having been trained: `random`, `expert` (the environment's first), or an expert by name.

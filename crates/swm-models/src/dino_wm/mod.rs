@@ -3,6 +3,7 @@
 
 pub mod config;
 pub mod cost;
+mod family;
 pub mod import;
 pub mod model;
 pub mod predictor;
@@ -11,6 +12,7 @@ mod train;
 
 pub use config::{ColumnConfig, DinoWmConfig};
 pub use cost::DinoWmCost;
+pub use family::ENTRY;
 pub use model::{ColumnEncoder, DinoWm, PatchDecoder};
 pub use predictor::{FramePredictor, FramePredictorConfig};
 pub use train::DinoWmLoss;

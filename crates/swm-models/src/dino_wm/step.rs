@@ -1,6 +1,6 @@
-//! One training step of a DINO-WM: loss and gradients of some clips.
+//! One training step of a DINO-WM (Zhou et al. 2024, section 3): prediction error of patches and its gradients.
 //!
-//! The loss is a mean over clips, so a batch can be cut and its parts computed in parallel.
+//! The loss is a mean over clips, so a batch can be split and its parts computed in parallel.
 
 use super::config::ACTION;
 use super::model::DinoWm;
@@ -10,36 +10,36 @@ use burn::module::Module;
 use burn::tensor::Tensor;
 use swm_core::Rng;
 
-/// Some clips, normalised.
+/// Normalised clips.
 pub struct TrainBatch {
-    /// `[clips * steps, patches, numbers]`.
+    /// `[clips * steps, patches, 3 * patch * patch]`.
     pub patches: Tensor<3>,
-    /// The columns, in the order of the model's, `[clips, steps, numbers]` each.
+    /// The columns in the order of the configuration, `[clips, steps, features]` each.
     pub columns: Vec<Tensor<3>>,
 }
 
-/// What a step found.
-pub struct Found {
+/// Losses and gradients of some clips.
+pub struct DinoWmStep {
     /// The total loss, then its parts.
     pub losses: Vec<(&'static str, f64)>,
     /// Gradients by parameter, flat.
     pub gradients: Named<Tensor<1>>,
 }
 
-/// Loss and gradients of some clips, one frame longer than the history or more. `model` is without autodiff.
-pub fn step(model: &DinoWm, batch: &TrainBatch, noise: Option<&mut Rng>) -> Found {
+/// Computes loss and gradients of clips that are longer than the history. `model` has no autodiff.
+pub fn step(model: &DinoWm, batch: &TrainBatch, noise: Option<&mut Rng>) -> DinoWmStep {
     let [clips, steps] = batch.columns.first().map_or([1, 1], |column| [column.dims()[0], column.dims()[1]]);
-    // The encoder is frozen: it stays outside of the graph, as do all targets.
+    // The encoder is frozen: its features and all targets stay outside the graph.
     let features = model.backbone.patches(batch.patches.clone());
     let [_, patches, width] = features.dims();
-    let pictures = features.clone().reshape([clips, steps, patches, width]);
-    let targets = model.embed(pictures.clone(), &batch.columns);
+    let frame_features = features.clone().reshape([clips, steps, patches, width]);
+    let targets = model.embed(frame_features.clone(), &batch.columns);
     let [_, _, _, dim] = targets.dims();
 
     let learner = model.clone().train();
     let columns: Vec<Tensor<3>> = batch.columns.iter().map(|column| column.clone().autodiff()).collect();
-    let frames = learner.embed(pictures.autodiff(), &columns);
-    // Every window of the history's length that has a next frame, as for a LeWM.
+    let frames = learner.embed(frame_features.autodiff(), &columns);
+    // Every window of the history's length that is followed by a frame, as for a LeWM.
     let history = model.predictor.config().history.min(steps - 1);
     let windows = |x: &Tensor<4>, offset: usize| {
         let part = |s: usize| x.clone().slice([0..clips, s + offset..s + offset + history, 0..patches, 0..dim]);
@@ -49,7 +49,7 @@ pub fn step(model: &DinoWm, batch: &TrainBatch, noise: Option<&mut Rng>) -> Foun
     let error = (predicted - windows(&targets, 1).autodiff()).square();
     let [windows, _, _, _] = error.dims();
     let errors = |range: std::ops::Range<usize>| error.clone().slice([0..windows, 0..history, 0..patches, range]);
-    // Everything is predicted but the actions.
+    // Actions are not prediction targets.
     let pixels = errors(0..width);
     let mut parts = vec![pixels.clone()];
     parts.extend(learner.columns().into_iter().filter(|(name, _)| *name != ACTION).map(|(_, span)| errors(span)));
@@ -61,12 +61,12 @@ pub fn step(model: &DinoWm, batch: &TrainBatch, noise: Option<&mut Rng>) -> Foun
     losses.extend(others.as_ref().map(|others| ("columns", value(others))));
     let mut loss = prediction;
     if let Some(decoder) = &learner.decoder {
-        let pictures = batch.patches.clone().autodiff();
-        let reconstruction = (decoder.forward(features.autodiff()) - pictures).square().mean();
+        let images = batch.patches.clone().autodiff();
+        let reconstruction = (decoder.forward(features.autodiff()) - images).square().mean();
         losses.push(("reconstruction", value(&reconstruction)));
         loss = loss + reconstruction;
     }
     losses.insert(0, ("loss", value(&loss)));
     let gradients = parameters::gradients(&learner, &loss.backward());
-    Found { losses, gradients }
+    DinoWmStep { losses, gradients }
 }

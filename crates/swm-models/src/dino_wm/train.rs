@@ -1,11 +1,12 @@
-//! How a DINO-WM is trained: the loop's side of [`super::step`].
+//! [`Trainable`] for DINO-WM: the training loop's view of [`super::step`].
 
 use super::config::{ACTION, DinoWmConfig};
 use super::model::DinoWm;
-use super::step::{Found, TrainBatch, step};
+use super::step::{DinoWmStep, TrainBatch, step};
+use crate::checks;
 use crate::nn::{Backbone, Named};
-use crate::pixels::{self, ImageNormalization};
-use crate::train::{DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least, shards};
+use crate::pixels;
+use crate::train::{DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, shards};
 use crate::weights;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
@@ -38,16 +39,7 @@ impl Trainable for DinoWm {
 
     fn check(config: &TrainConfig<Self>) -> Result<()> {
         config.model.check()?;
-        at_least(&[("data.num_steps", config.data.num_steps, 2)])?;
-        let (frames, history) = (config.data.num_steps, config.model.predictor.history);
-        if frames - 1 < history {
-            return Err(Error::config(
-                "data.num_steps",
-                format!("{frames} frames train only {} of the {history} steps of history", frames - 1),
-                format!("give at least {}, or lower model.predictor.history", history + 1),
-            ));
-        }
-        Ok(())
+        checks::clip_covers_history(config.data.num_steps, config.model.predictor.history)
     }
 
     fn image_size(config: &DinoWmConfig) -> Option<usize> {
@@ -73,7 +65,7 @@ impl Trainable for DinoWm {
     }
 
     fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
-        let numbers: Result<Vec<usize>> = config
+        let widths: Result<Vec<usize>> = config
             .model
             .columns
             .iter()
@@ -82,7 +74,7 @@ impl Trainable for DinoWm {
                 name => Ok(dataset_info.column(name)?.dim()),
             })
             .collect();
-        Ok(Self::init(&config.model, &numbers?, key, device))
+        Ok(Self::init(&config.model, &widths?, key, device))
     }
 
     fn with_pretrained_weights(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
@@ -96,7 +88,7 @@ impl Trainable for DinoWm {
         self.backbone = match self.backbone {
             Backbone::Vit(vit) => Backbone::Vit(weights::fill(vit, &found, &path, what)?),
             Backbone::Dinov2(dino) => Backbone::Dinov2(weights::fill(dino, &found, &path, what)?),
-            Backbone::PatchCnn(pyramid) => Backbone::PatchCnn(weights::fill(pyramid, &found, &path, what)?),
+            Backbone::PatchCnn(cnn) => Backbone::PatchCnn(weights::fill(cnn, &found, &path, what)?),
         };
         Ok(self)
     }
@@ -117,37 +109,29 @@ impl Trainable for DinoWm {
         shards::mean(batch.rows(), config.shards, |range| {
             let bytes = rgb.len() / batch.rows();
             let part = TrainBatch {
-                patches: model.cut(&rgb[range.start * bytes..range.end * bytes], device)?,
+                patches: model.image_patches(&rgb[range.start * bytes..range.end * bytes], device)?,
                 columns: columns
                     .iter()
                     .map(|column| {
-                        let [_, steps, numbers] = column.dims();
-                        column.clone().slice([range.clone(), 0..steps, 0..numbers])
+                        let [_, steps, features] = column.dims();
+                        column.clone().slice([range.clone(), 0..steps, 0..features])
                     })
                     .collect(),
             };
             let mut noise = key.with("dropout").at(range.start as u64).rng();
-            let Found { losses, gradients } = step(self, &part, training.then_some(&mut noise));
+            let DinoWmStep { losses, gradients } = step(self, &part, training.then_some(&mut noise));
             Ok(StepOutput { metrics: losses, gradients, buffers: Named::new() })
         })
     }
 }
 
-impl DinoWmConfig {
-    /// Pictures as normalised patches.
-    ///
-    /// # Shapes
-    /// `[frames, image, image, 3]` bytes to `[frames, patches, 3 * patch * patch]`.
-    pub(super) fn cut(&self, rgb: &[u8], device: &Device) -> Result<Tensor<3>> {
-        let seen = ImageNormalization { side: self.image, mean: self.pixel_mean, std: self.pixel_std };
-        pixels::patches(&seen, self.encoder.patch(), rgb, device)
-    }
-}
-
-/// A column in units of its spread around its mean; what is missing is 0, its mean.
+/// Standardises a column; missing values (NaN) become 0, the mean.
 ///
 /// # Shapes
-/// `[clips, steps, numbers]`.
+/// Returns `[clips, steps, features]`.
+///
+/// # Errors
+/// When the model was trained without the column.
 pub(super) fn normalised(
     dataset_info: &DatasetInfo,
     name: &str,
@@ -156,11 +140,10 @@ pub(super) fn normalised(
     device: &Device,
 ) -> Result<Tensor<3>> {
     let column = dataset_info.column(name)?;
-    let (mean, spread) = (&column.mean, column.spread());
-    #[allow(clippy::cast_possible_truncation)]
+    let (mean, std) = (&column.mean, column.spread());
     let scaled = |(index, value): (usize, &f32)| {
         let index = index % mean.len();
-        let scaled = ((f64::from(*value) - mean[index]) / spread[index]) as f32;
+        let scaled = ((f64::from(*value) - mean[index]) / std[index]) as f32;
         if scaled.is_nan() { 0.0 } else { scaled }
     };
     let scaled: Vec<f32> = values.iter().enumerate().map(scaled).collect();

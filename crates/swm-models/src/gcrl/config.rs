@@ -1,90 +1,84 @@
-//! [`GcrlConfig`]: the size of a goal-conditioned model.
+//! [`GcrlConfig`]: the sizes of a goal-conditioned model.
 
 use super::transformer::{PatchGrid, TransformerConfig};
+use crate::checks;
 use crate::nn::BackboneConfig;
 use crate::pixels::ImageNormalization;
+use crate::train::at_least;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 
-/// The size of a goal-conditioned model; all its heads are of one size.
+/// The sizes of a goal-conditioned model. All heads have the same sizes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GcrlConfig {
-    /// Side of the square pictures it sees, in pixels.
+    /// Side of the square input images in pixels.
     pub image: usize,
-    /// Mean of the pixels by colour, of 0 ..= 1; pixels are normalised with it.
+    /// Mean of each colour channel for pixel values in 0 ..= 1.
     pub pixel_mean: [f32; 3],
-    /// Spread of the pixels by colour, of 0 ..= 1.
+    /// Standard deviation of each colour channel for pixel values in 0 ..= 1.
     pub pixel_std: [f32; 3],
-    /// Frames it sees: the present one and those before it.
+    /// Input frames: the present one and earlier ones.
     pub history: usize,
-    /// Whether the encoder keeps the weights it begins with.
+    /// Whether the encoder is not trained.
     pub frozen: bool,
-    /// The weights the encoder begins with: a file, a checkpoint or a repository; empty for drawn ones.
+    /// Source of the encoder's initial weights: a file, a checkpoint or a repository; empty for random ones.
     pub weights: String,
     /// The encoder.
     pub encoder: BackboneConfig,
     /// The heads.
     pub head: TransformerConfig,
-    /// Hidden features behind the critic's transformer, where there is a critic.
+    /// Hidden features of the critic's head, for families with a critic.
     #[serde(default = "critic")]
     pub critic: usize,
 }
 
-/// As published.
+/// The published size.
 fn critic() -> usize {
     256
 }
 
 impl GcrlConfig {
-    /// How pictures become numbers.
+    /// Returns the normalisation of input images.
     pub fn pixels(&self) -> ImageNormalization {
         ImageNormalization { side: self.image, mean: self.pixel_mean, std: self.pixel_std }
     }
 
-    /// What the heads look at. An encoder without patches gives one for the whole picture.
+    /// Returns the sizes of the heads' input. An encoder without patches gives one patch per image.
     pub(super) fn patch_grid(&self) -> PatchGrid {
         let patches = self.encoder.patches(self.image);
         PatchGrid { frames: self.history, patches, dim: self.encoder.dim() }
     }
 
-    /// Checks that the sizes fit each other.
+    /// Checks that the sizes are consistent.
     ///
     /// # Errors
-    /// Naming the first that does not.
+    /// Names the first size that is not.
     pub fn check(&self) -> Result<()> {
-        let wrong = |what: &str, problem: String, fix: &str| Err(Error::config(what, problem, fix));
         self.encoder.check("model.encoder", self.image)?;
         let TransformerConfig { depth, heads, dim_head, mlp, dropout, emb_dropout } = self.head;
-        let sizes = [
-            ("model.history", self.history),
-            ("model.head.heads", heads),
-            ("model.head.dim_head", dim_head),
-            ("model.head.mlp", mlp),
-            ("model.critic", self.critic),
-        ];
-        if let Some((what, _)) = sizes.iter().find(|(_, size)| *size == 0) {
-            return wrong(what, "0".to_owned(), "give at least 1");
-        }
+        at_least(&[
+            ("model.history", self.history, 1),
+            ("model.head.heads", heads, 1),
+            ("model.head.dim_head", dim_head, 1),
+            ("model.head.mlp", mlp, 1),
+            ("model.critic", self.critic, 1),
+        ])?;
         if depth < 3 {
-            let problem = format!("with {depth} layers a policy never looks at the goal");
-            return wrong(
+            return Err(Error::config(
                 "model.head.depth",
-                problem,
-                "give at least 3: one for the frames, one for the goal, one to gather",
-            );
+                format!("with {depth} layers a policy never attends to the goal"),
+                "give at least 3: one for the frames, one for the goal, one for pooling",
+            ));
         }
-        for (what, rate) in [("model.head.dropout", dropout), ("model.head.emb_dropout", emb_dropout)] {
-            if !(0.0..1.0).contains(&rate) {
-                return wrong(what, rate.to_string(), "give a probability below 1");
-            }
-        }
-        if self.pixel_std.iter().any(|std| *std <= 0.0) {
-            return wrong("model.pixel_std", format!("{:?}", self.pixel_std), "give three positive numbers");
-        }
+        checks::dropout_rates(&[("model.head.dropout", dropout), ("model.head.emb_dropout", emb_dropout)])?;
+        checks::pixel_std(self.pixel_std)?;
         if self.frozen && self.weights.is_empty() {
-            let problem = "a frozen encoder without weights stays as it was drawn".to_owned();
-            return wrong("model.weights", problem, "name its weights, or say model.frozen=false");
+            return Err(Error::config(
+                "model.weights",
+                "a frozen encoder without weights would keep its random initial values",
+                "name its weights, or say model.frozen=false",
+            ));
         }
         Ok(())
     }

@@ -2,6 +2,7 @@
 //! GCIQL), on the patches of a frozen or a trained encoder. They act without planning. See `docs/models/gcrl.md`.
 
 pub mod config;
+mod family;
 pub mod heads;
 pub mod import;
 pub mod loss;
@@ -12,6 +13,7 @@ mod train;
 pub mod transformer;
 
 pub use config::GcrlConfig;
+pub use family::{GCBC, GCIQL, GCIVL};
 pub use model::{Gcbc, Gciql, Gcivl};
 pub use policy::{Actor, GcrlPolicy};
 pub use train::GoalConditioned;

@@ -1,15 +1,17 @@
-//! An inverse-dynamics policy: which actions lead from one latent to another, learnt on a frozen encoder.
+//! Inverse dynamics: a policy that predicts the actions between two latents of a frozen encoder.
 //!
-//! A network is shown the latents of a frame and of one up to `offset` model steps later, and predicts the actions
-//! between the first frame and the next (mean squared error, normalised actions). Acting, the later latent is the goal's:
-//! no model is rolled out and nothing is searched, so a decision costs one encoding. It is the cheap baseline beside a
-//! planner that uses the same latents. The idea is old (Jordan and Rumelhart 1992, "distal teacher"; as a zero-shot visual
-//! goal policy, Pathak et al. 2018); PLDM and the paper's benchmark use such a model as a term or a probe.
+//! In training, the network reads the latents of a frame and of a frame up to `offset` model steps later, and predicts
+//! the actions between the first frame and the next (mean squared error of normalised actions). The policy reads the
+//! goal's latent as the later one, so a decision costs one encoding and no search. It is the cheap baseline for planners
+//! that use the same latents. Sources: Jordan and Rumelhart 1992 ("distal teacher"); Pathak et al. 2018 (zero-shot visual
+//! imitation). PLDM uses inverse dynamics as a term of its loss.
 
 mod checkpoint;
+mod family;
 mod policy;
 mod train;
 
 pub use checkpoint::InverseCheckpoint;
+pub use family::ENTRY;
 pub use policy::InversePolicy;
 pub use train::{InverseConfig, train};

@@ -1,4 +1,4 @@
-//! Training the network on a frozen encoder.
+//! Training of the inverse-dynamics network on a frozen encoder.
 
 use super::InverseCheckpoint;
 use super::checkpoint::FAMILY;
@@ -19,21 +19,21 @@ use std::time::Instant;
 use swm_core::{Error, Key, Manifest, Result};
 use swm_data::{ClipSpec, Loader, LoaderConfig, Part, Reader};
 
-/// Everything that decides the numbers of a run, apart from the encoder and the data.
+/// The configuration of a run. With the encoder and the data, it determines the result.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct InverseConfig {
-    /// Decides initial weights, order of the data and the goals.
+    /// The seed of initial weights, data order and goals.
     pub seed: u64,
-    /// Model steps from a picture to the farthest goal it is trained to reach.
+    /// The most model steps from a frame to its goal.
     pub offset: usize,
-    /// Hidden features.
+    /// Hidden features of the network.
     pub hidden: usize,
-    /// Clips in a batch.
+    /// Clips per batch.
     pub batch_size: usize,
-    /// Whether the episodes that [`swm_data::Split::default`] holds out are left out.
+    /// Whether training excludes the episodes that [`swm_data::Split::default`] holds out.
     pub hold_out: bool,
-    /// Steps between two lines of the log.
+    /// Steps between log lines.
     pub log_every: usize,
     /// The optimizer.
     pub optim: OptimConfig,
@@ -42,15 +42,15 @@ pub struct InverseConfig {
 }
 
 impl InverseConfig {
-    /// The configuration that comes with the program, as TOML.
+    /// The built-in configuration as TOML.
     pub const PRESET: &str = include_str!("../../presets/inverse.toml");
 
-    /// The configuration that comes with the program, changed by `key=value` words with dots.
+    /// Loads the built-in configuration, changed by `key=value` settings with dotted keys.
     ///
     /// # Errors
-    /// When there is no such key (naming the nearest), or a value does not fit.
-    pub fn load(words: &[String]) -> Result<Self> {
-        let config: Self = config::layered(Self::PRESET, words, &[Self::PRESET])?;
+    /// When a key is unknown (the error names the nearest), or a value is invalid.
+    pub fn load(settings: &[String]) -> Result<Self> {
+        let config: Self = config::layered(Self::PRESET, settings, &[Self::PRESET])?;
         let least = [
             ("offset", config.offset),
             ("hidden", config.hidden),
@@ -64,7 +64,7 @@ impl InverseConfig {
         }
     }
 
-    /// The configuration as TOML.
+    /// Returns the configuration as TOML.
     ///
     /// # Errors
     /// Never for a configuration that was loaded.
@@ -73,15 +73,15 @@ impl InverseConfig {
     }
 }
 
-/// Trains on a dataset with the columns `pixels` and `action`, through the encoder of `world`; the checkpoint and the
-/// logs go to `out`.
+/// Trains on a dataset with the columns `pixels` and `action`, through the encoder of `world_model`; the checkpoint and
+/// the logs go to `out`.
 ///
 /// # Errors
-/// When the configuration contradicts the data, `out` holds a run, the loss is not finite, the run is stopped (nothing
-/// is saved then), or the disk refuses.
+/// When the configuration contradicts the data, `out` holds a run, the loss is not finite, the run is interrupted
+/// (nothing is saved then), or a file cannot be written.
 pub fn train(
     config: &InverseConfig,
-    world: &Checkpoint<Lewm>,
+    world_model: &Checkpoint<Lewm>,
     reader: Arc<dyn Reader>,
     out: &Path,
     threads: usize,
@@ -95,14 +95,13 @@ pub fn train(
             "choose another folder, or remove it",
         ));
     }
-    pixels::check(&world.config.model, reader.schema(), "pixels")?;
-    swm_core::pool::threads(threads)?.install(|| run(config, world, reader, out, observer, stop))
+    pixels::check(&world_model.config.model, reader.schema(), "pixels")?;
+    swm_core::pool::threads(threads)?.install(|| run(config, world_model, reader, out, observer, stop))
 }
 
-#[allow(clippy::cast_precision_loss)]
 fn run(
     config: &InverseConfig,
-    world: &Checkpoint<Lewm>,
+    world_model: &Checkpoint<Lewm>,
     reader: Arc<dyn Reader>,
     out: &Path,
     observer: &mut dyn Observer,
@@ -110,75 +109,51 @@ fn run(
 ) -> Result<TrainSummary> {
     let begun = Instant::now();
     let key = Key::new(config.seed).with(FAMILY);
-    let (block, dim, latent) =
-        (world.config.data.frameskip, world.dataset_info.action.dim(), world.config.model.latent);
-    let mut manifest = Manifest::new("train", config.seed, serde_json::to_value(config).unwrap_or_default());
-    manifest.libraries = world.manifest.libraries.clone();
-    manifest.device = world.manifest.device.clone();
-    manifest.hashes.insert("dataset".to_owned(), reader.content_hash()?);
-    manifest.hashes.insert("encoder".to_owned(), world.hash().to_owned());
-
+    let manifest = manifest(config, world_model, &*reader)?;
     std::fs::create_dir_all(out).map_err(|error| Error::io(out, "creating a folder", error))?;
     let mut log = log::Log::new(out, false)?;
-    let episodes = crate::train::episodes(config.hold_out, Part::Train, &*reader)?;
-    let loader = Loader::new(
-        reader,
-        LoaderConfig {
-            clip: ClipSpec {
-                num_steps: config.offset + 1,
-                frameskip: block,
-                columns: vec!["pixels".to_owned(), "action".to_owned()],
-            },
-            batch_size: config.batch_size,
-            seed: config.seed,
-            threads: 1,
-            drop_last: true,
-            episodes,
-            ..LoaderConfig::default()
-        },
-    )?;
-    let mut model = Mlp::new(&Init::new(key.with("init"), &Device::flex()), 2 * latent, config.hidden, block * dim);
+    let loader = loader(config, world_model.config.data.frameskip, reader)?;
+    let (latent, actions) = (world_model.config.model.latent, world_model.actions());
+    let mut model = Mlp::new(&Init::new(key.with("init"), &Device::flex()), 2 * latent, config.hidden, actions);
     let mut optimizer = AdamW::new(config.optim.clone());
     let (mut step, mut epoch, mut loss) = (0, 0, f64::NAN);
     let (mut waited, mut clips_per_second) = (0.0, 0.0);
+    let mut batches = loader.epoch(epoch, 0);
     while step < config.schedule.steps {
-        let mut batches = loader.epoch(epoch, 0);
-        loop {
-            let asked = Instant::now();
-            let Some(batch) = batches.next() else { break };
-            waited += asked.elapsed().as_secs_f64();
-            if stop.load(Ordering::Relaxed) {
-                return Err(Error::Interrupted);
-            }
-            let pairs = Pairs::draw(world, config.offset, &*batch?, key.with("goals").at(step as u64))?;
-            let share = config.schedule.share(step);
-            let norm;
-            (model, loss, norm) = learn(model, &mut optimizer, share, pairs)?;
-            step += 1;
-            let elapsed = begun.elapsed().as_secs_f64();
-            clips_per_second = (step * config.batch_size) as f64 / elapsed;
-            observer.progress(&Progress {
-                step,
-                steps: config.schedule.steps,
-                epoch,
-                metrics: vec![("loss", loss)],
-                validation: None,
-                lr: config.optim.lr * share,
-                gradient_norm: norm,
-                clips_per_second,
-                data_wait: waited / elapsed,
-            });
-            if step.is_multiple_of(config.log_every) || step == config.schedule.steps {
-                let lr = config.optim.lr * share;
-                log.write(step, &[("loss", loss), ("lr", lr), ("gradient_norm", norm)])?;
-            }
-            if step == config.schedule.steps {
-                break;
-            }
+        let waiting = Instant::now();
+        let Some(batch) = batches.next() else {
+            epoch += 1;
+            batches = loader.epoch(epoch, 0);
+            continue;
+        };
+        waited += waiting.elapsed().as_secs_f64();
+        if stop.load(Ordering::Relaxed) {
+            return Err(Error::Interrupted);
         }
-        epoch += 1;
+        let pairs = Pairs::draw(world_model, config.offset, &*batch?, key.with("goals").at(step as u64))?;
+        let factor = config.schedule.share(step);
+        let norm;
+        (model, loss, norm) = learn(model, &mut optimizer, factor, pairs)?;
+        step += 1;
+        let (elapsed, lr) = (begun.elapsed().as_secs_f64(), config.optim.lr * factor);
+        clips_per_second = (step * config.batch_size) as f64 / elapsed;
+        observer.progress(&Progress {
+            step,
+            steps: config.schedule.steps,
+            epoch,
+            metrics: vec![("loss", loss)],
+            validation: None,
+            lr,
+            gradient_norm: norm,
+            clips_per_second,
+            data_wait: waited / elapsed,
+        });
+        if step.is_multiple_of(config.log_every) || step == config.schedule.steps {
+            log.write(step, &[("loss", loss), ("lr", lr), ("gradient_norm", norm)])?;
+        }
     }
-    let mut checkpoint = InverseCheckpoint { world: world.clone(), model, config: config.clone(), manifest };
+    let world_model = world_model.clone();
+    let mut checkpoint = InverseCheckpoint { world_model, model, config: config.clone(), manifest };
     let weights = checkpoint.save(out)?;
     let seconds = begun.elapsed().as_secs_f64();
     Ok(TrainSummary {
@@ -196,7 +171,32 @@ fn run(
     })
 }
 
-/// What a step learns from: present and goal beside each other, and the actions in between, in model units.
+fn manifest(config: &InverseConfig, world_model: &Checkpoint<Lewm>, reader: &dyn Reader) -> Result<Manifest> {
+    let mut manifest = Manifest::new("train", config.seed, serde_json::to_value(config).unwrap_or_default());
+    manifest.libraries = world_model.manifest.libraries.clone();
+    manifest.device = world_model.manifest.device.clone();
+    manifest.hashes.insert("dataset".to_owned(), reader.content_hash()?);
+    manifest.hashes.insert("encoder".to_owned(), world_model.hash().to_owned());
+    Ok(manifest)
+}
+
+fn loader(config: &InverseConfig, frameskip: usize, reader: Arc<dyn Reader>) -> Result<Loader> {
+    let episodes = crate::train::episodes(config.hold_out, Part::Train, &*reader)?;
+    let clip =
+        ClipSpec { num_steps: config.offset + 1, frameskip, columns: vec!["pixels".to_owned(), "action".to_owned()] };
+    let config = LoaderConfig {
+        clip,
+        batch_size: config.batch_size,
+        seed: config.seed,
+        threads: 1,
+        drop_last: true,
+        episodes,
+        ..LoaderConfig::default()
+    };
+    Loader::new(reader, config)
+}
+
+/// The training examples of a step: pairs of present and goal latents, and the actions taken at present in model units.
 struct Pairs {
     /// `[pairs, 2 * latent]`.
     latents: Vec<f32>,
@@ -205,25 +205,25 @@ struct Pairs {
     count: usize,
 }
 
-/// Frames encoded at once: a fixed number, so that latents do not depend on the number of threads.
+/// Frames that are encoded at once: a constant, so that latents do not depend on the number of threads.
 const FRAMES: usize = 64;
 
 impl Pairs {
-    /// One pair for every frame of every clip but its last: the goal is one of the later frames, at random.
-    fn draw(world: &Checkpoint<Lewm>, offset: usize, batch: &swm_core::Batch, key: Key) -> Result<Self> {
-        let (config, dim) = (&world.config.model, world.dataset_info.action.dim());
-        let (latent, actions) = (config.latent, world.config.data.frameskip * dim);
+    /// Draws one pair for every frame of every clip except the last: the goal is a random later frame.
+    fn draw(world_model: &Checkpoint<Lewm>, offset: usize, batch: &swm_core::Batch, key: Key) -> Result<Self> {
+        let (config, dim) = (&world_model.config.model, world_model.dataset_info.action.dim());
+        let (latent, actions) = (config.latent, world_model.config.data.frameskip * dim);
         let frame = config.image * config.image * 3;
         let encoded: Result<Vec<Vec<f32>>> = batch
             .get::<u8>("pixels")?
             .par_chunks(FRAMES * frame)
             .map(|frames| {
                 let patches = pixels::patches(config, frames, &Device::flex())?;
-                Ok(world.model.encode(patches).into_data().into_f32_vec())
+                Ok(world_model.model.encode(patches).into_data().into_f32_vec())
             })
             .collect();
         let encoded = encoded?.concat();
-        let taken = batch.get::<f32>("action")?;
+        let actions_taken = batch.get::<f32>("action")?;
         let count = batch.rows() * offset;
         let mut pairs =
             Self { latents: Vec::with_capacity(2 * count * latent), actions: vec![0.0; count * actions], count };
@@ -231,13 +231,13 @@ impl Pairs {
             let mut rng = key.at(clip as u64).rng();
             for present in 0..offset {
                 let goal = rng.random_range(present + 1..=offset);
-                for at in [present, goal] {
-                    pairs.latents.extend_from_slice(&encoded[(clip * (offset + 1) + at) * latent..][..latent]);
+                for frame in [present, goal] {
+                    pairs.latents.extend_from_slice(&encoded[(clip * (offset + 1) + frame) * latent..][..latent]);
                 }
-                let from = &taken[(clip * (offset + 1) + present) * actions..][..actions];
+                let from = &actions_taken[(clip * (offset + 1) + present) * actions..][..actions];
                 let to = &mut pairs.actions[(clip * offset + present) * actions..][..actions];
                 for (to, from) in to.chunks_exact_mut(dim).zip(from.chunks_exact(dim)) {
-                    world.dataset_info.action.to_model(from, to);
+                    world_model.dataset_info.action.to_model(from, to);
                 }
             }
         }
@@ -245,15 +245,16 @@ impl Pairs {
     }
 }
 
-/// One step: the network after it, the loss before it and the norm of the gradient.
-fn learn(model: Mlp, optimizer: &mut AdamW, share: f64, pairs: Pairs) -> Result<(Mlp, f64, f64)> {
-    let tensor = |numbers: Vec<f32>| {
-        let width = numbers.len() / pairs.count;
-        Tensor::<2>::from_data(TensorData::new(numbers, [pairs.count, width]), &Device::flex())
+/// Takes one optimizer step with the learning rate times `factor`; returns the new network, the loss before the step and
+/// the norm of the gradient.
+fn learn(model: Mlp, optimizer: &mut AdamW, factor: f64, pairs: Pairs) -> Result<(Mlp, f64, f64)> {
+    let tensor = |values: Vec<f32>| {
+        let width = values.len() / pairs.count;
+        Tensor::<2>::from_data(TensorData::new(values, [pairs.count, width]), &Device::flex())
     };
     let trained = model.clone().train();
-    let said = trained.forward(tensor(pairs.latents).autodiff());
-    let loss = (said - tensor(pairs.actions).autodiff()).square().mean();
+    let predicted = trained.forward(tensor(pairs.latents).autodiff());
+    let loss = (predicted - tensor(pairs.actions).autodiff()).square().mean();
     let value = f64::from(loss.clone().inner().into_scalar::<f32>());
     if !value.is_finite() {
         return Err(Error::NotFinite {
@@ -263,6 +264,6 @@ fn learn(model: Mlp, optimizer: &mut AdamW, share: f64, pairs: Pairs) -> Result<
         });
     }
     let gradients = parameters::gradients(&trained, &loss.backward());
-    let (model, norm) = optimizer.step(model, share, gradients, |_| ParameterGroup::default());
+    let (model, norm) = optimizer.step(model, factor, gradients, |_| ParameterGroup::default());
     Ok((model, value, norm))
 }

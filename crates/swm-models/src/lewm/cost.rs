@@ -1,20 +1,21 @@
-//! [`LewmCost`]: what a candidate action sequence costs, as the squared distance between the latent it is predicted
-//! to end in and the latent of the goal picture.
+//! [`LewmCost`]: the planning cost of a LeWM, the squared distance between the last predicted latent of a candidate and
+//! the latent of the goal image.
 //!
-//! Every environment is evaluated in calls of its own whose shapes do not depend on its neighbours, on one thread
-//! each, of the current rayon pool: the plan of an environment is the same bytes whoever is planned beside it and
-//! however many threads there are.
+//! Every environment is evaluated in calls whose shapes do not depend on the other environments, each on one thread of the
+//! current rayon pool. So the bytes of an environment's plan depend neither on the other environments nor on the number of
+//! threads.
 
 use super::config::LewmConfig;
-use super::encode::HostEncoder;
+use super::host_encoder::HostEncoder;
 use super::model::Lewm;
 use super::pixels;
 use super::rollout::Rollout;
 use crate::checkpoint::Checkpoint;
+use crate::checks;
 use crate::nn::parameters::IntoF32;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
-use swm_core::{Batch, Candidates, CostModel, DifferentiableCost, Error, LatentDynamics, Result, Schema};
+use swm_core::{Batch, Candidates, CostModel, DifferentiableCost, LatentDynamics, Result};
 
 /// The planning cost of a LeWM.
 pub struct LewmCost {
@@ -22,79 +23,51 @@ pub struct LewmCost {
     host: Option<Host>,
     pub(super) config: LewmConfig,
     pub(super) actions: usize,
-    pub(super) scenes: Vec<Scene>,
+    pub(super) contexts: Vec<PlanContext>,
 }
 
-/// The model laid out for the CPU; on other devices, it computes as it is.
+/// The model laid out for the CPU. Other devices use the tensors of the model.
 struct Host {
     rollout: Rollout,
     encoder: Option<HostEncoder>,
 }
 
-/// Present and goal of one environment.
+/// The latents of one environment that its plan starts from and ends at.
 #[derive(Clone)]
-pub(super) struct Scene {
-    /// The latents of the frames seen, oldest first, the present last: `[seen, latent]`.
+pub(super) struct PlanContext {
+    /// The latents of the last frames, oldest first: `[frames, latent]`.
     pub start: Vec<f32>,
-    /// The actions taken between them, in model units: `[seen - 1, actions]`.
+    /// The actions taken between them, in model units: `[frames - 1, actions]`.
     pub past: Vec<f32>,
-    /// The latent of the goal picture, `[latent]`.
+    /// The latent of the goal image, `[latent]`.
     pub goal: Vec<f32>,
 }
 
 impl LewmCost {
-    /// The cost of a trained model.
+    /// The planning cost of a trained model.
     pub fn new(checkpoint: &Checkpoint<Lewm>) -> Self {
         Self::of(&checkpoint.model, &checkpoint.config.model, checkpoint.actions())
     }
 
-    /// The cost of a model of these sizes, whose actions are `actions` numbers.
+    /// The planning cost of a model with these sizes, whose actions have `actions` elements.
     pub fn of(model: &Lewm, config: &LewmConfig, actions: usize) -> Self {
         let on_host = model.device() == Device::flex();
         let host = on_host.then(|| Host { rollout: Rollout::new(model), encoder: HostEncoder::new(model, config) });
-        Self { model: model.clone(), host, config: config.clone(), actions, scenes: vec![] }
+        Self { model: model.clone(), host, config: config.clone(), actions, contexts: vec![] }
     }
 
-    /// Checks that everything needed is there.
-    fn check(&self, schema: &Schema) -> Result<()> {
-        pixels::check(&self.config, schema, "pixels")?;
-        pixels::check(&self.config, schema, "goal")?;
-        if schema.find("history.length").is_some() {
-            let side = self.config.image;
-            let past = schema.column("history.action")?.shape.first().copied().unwrap_or(0);
-            let wanted = [("history.action", vec![past, self.actions]), ("history.pixels", vec![past, side, side, 3])];
-            for (name, shape) in wanted {
-                let given = &schema.column(name)?.shape;
-                if *given != shape {
-                    return Err(Error::mismatch(
-                        format!("reading '{name}'"),
-                        format!("{given:?}"),
-                        format!("{shape:?}, as the model was trained"),
-                    ));
-                }
-            }
-        }
-        Ok(())
+    /// Checks that candidates and costs are for the observed environments.
+    pub(super) fn check_sizes(&self, candidates: &Candidates<'_>, costs: &[f32]) -> Result<()> {
+        checks::candidate_sizes("costs of a LeWM", candidates, costs, [self.contexts.len(), self.actions])
     }
 
-    /// Checks that candidates and costs are those of the observed environments.
-    pub(super) fn fits(&self, candidates: &Candidates<'_>, costs: &[f32]) -> Result<()> {
-        let Candidates { envs, samples, dim, .. } = *candidates;
-        if envs == self.scenes.len() && dim == self.actions && costs.len() == envs * samples {
-            return Ok(());
-        }
-        let words = |envs, dim, costs| format!("{envs} environments, {dim} numbers a model step, {costs} costs");
-        Err(Error::mismatch(
-            "costs of a LeWM",
-            words(envs, dim, costs.len()),
-            words(self.scenes.len(), self.actions, envs * samples),
-        ))
-    }
-
-    /// The latent of one picture, `[image, image, 3]` bytes.
+    /// Returns the latent of one image.
+    ///
+    /// # Shapes
+    /// `rgb` is `[image, image, 3]`; returns `[latent]`.
     ///
     /// # Errors
-    /// When it is of another size.
+    /// When the image has another size.
     pub fn latent_of(&self, rgb: &[u8]) -> Result<Vec<f32>> {
         let patches = pixels::patches(&self.config, rgb, &self.model.device())?;
         Ok(match self.host.as_ref().and_then(|host| host.encoder.as_ref()) {
@@ -103,10 +76,10 @@ impl LewmCost {
         })
     }
 
-    /// Present and goal of one environment.
-    fn look(&self, infos: &Batch, env: usize) -> Result<Scene> {
+    /// Encodes present, recent frames and goal of one environment.
+    fn context(&self, infos: &Batch, env: usize) -> Result<PlanContext> {
         let row = infos.row(env);
-        // Each picture by itself: what a latent is must not depend on how many are encoded at once.
+        // One image per call: a latent must not depend on the number of images in a call.
         let mut start = vec![self.latent_of(row.get::<u8>("pixels")?)?];
         let mut past = vec![];
         if infos.schema().find("history.length").is_some() {
@@ -121,13 +94,16 @@ impl LewmCost {
             }
             past = actions[actions.len() - length * self.actions..].to_vec();
         }
-        Ok(Scene { start: start.concat(), past, goal: self.latent_of(row.get::<u8>("goal")?)? })
+        Ok(PlanContext { start: start.concat(), past, goal: self.latent_of(row.get::<u8>("goal")?)? })
     }
 }
 
-impl Scene {
-    /// The costs of some candidates, `[samples, horizon, numbers]`.
-    fn cost(&self, predictor: &Predicts<'_>, candidates: &[f32], horizon: usize, costs: &mut [f32]) {
+impl PlanContext {
+    /// Writes the costs of candidates.
+    ///
+    /// # Shapes
+    /// `candidates` is `[samples, horizon, actions]`, `costs` is `[samples]`.
+    fn cost(&self, predictor: &RolloutModel<'_>, candidates: &[f32], horizon: usize, costs: &mut [f32]) {
         let (samples, latent) = (costs.len(), self.goal.len());
         let steps = self.start.len() / latent - 1 + horizon;
         let mut actions = Vec::with_capacity(samples * self.past.len() + candidates.len());
@@ -142,31 +118,33 @@ impl Scene {
     }
 }
 
-/// Who predicts.
-enum Predicts<'a> {
+/// The implementation of the rollout.
+enum RolloutModel<'a> {
     Host(&'a Rollout),
     Device(&'a Lewm),
 }
 
-impl Predicts<'_> {
-    /// The last latents of a rollout, `[samples, latent]`, from `start` `[seen, latent]`, with actions
-    /// `[samples, steps, numbers]`.
+impl RolloutModel<'_> {
+    /// Returns the last latents of a rollout.
+    ///
+    /// # Shapes
+    /// `start` is `[frames, latent]`, `actions` is `[samples, steps, actions]`; returns `[samples, latent]`.
     fn last(&self, start: &[f32], actions: Vec<f32>, samples: usize, steps: usize) -> Vec<f32> {
         match self {
             Self::Host(rollout) => rollout.run(start, &actions, samples, steps).pop().unwrap_or_default(),
             Self::Device(model) => {
                 let device = model.device();
                 let latent = model.latent();
-                let (seen, numbers) = (start.len() / latent, actions.len() / (samples * steps));
-                let start = Tensor::<3>::from_data(TensorData::new(start.to_vec(), [1, seen, latent]), &device);
-                let actions = Tensor::from_data(TensorData::new(actions, [samples, steps, numbers]), &device);
-                let all = model.rollout(start.expand([samples, seen, latent]), actions);
+                let (frames, width) = (start.len() / latent, actions.len() / (samples * steps));
+                let start = Tensor::<3>::from_data(TensorData::new(start.to_vec(), [1, frames, latent]), &device);
+                let actions = Tensor::from_data(TensorData::new(actions, [samples, steps, width]), &device);
+                let all = model.rollout(start.expand([samples, frames, latent]), actions);
                 all.slice([0..samples, steps..steps + 1, 0..latent]).into_data().into_f32_vec()
             }
         }
     }
 
-    /// How many of `samples` candidates go together.
+    /// Returns how many of `samples` candidates are rolled out in one call.
     fn part(&self, samples: usize) -> usize {
         match self {
             Self::Host(_) => Rollout::part(samples),
@@ -177,25 +155,25 @@ impl Predicts<'_> {
 
 impl CostModel for LewmCost {
     fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()> {
-        self.check(infos.schema())?;
-        let scenes: Result<Vec<Scene>> = envs.par_iter().map(|&env| self.look(infos, env)).collect();
-        self.scenes = scenes?;
+        checks::planning_images(infos.schema(), self.config.image, self.actions)?;
+        let contexts: Result<Vec<PlanContext>> = envs.par_iter().map(|&env| self.context(infos, env)).collect();
+        self.contexts = contexts?;
         Ok(())
     }
 
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
-        self.fits(&candidates, costs)?;
+        self.check_sizes(&candidates, costs)?;
         let Candidates { actions, samples, horizon, dim, .. } = candidates;
         let predictor = match &self.host {
-            Some(host) => Predicts::Host(&host.rollout),
-            None => Predicts::Device(&self.model),
+            Some(host) => RolloutModel::Host(&host.rollout),
+            None => RolloutModel::Device(&self.model),
         };
-        // Parts are counted from each environment's first candidate.
-        let (scenes, part) = (&self.scenes, predictor.part(samples));
-        costs.par_chunks_mut(samples).zip(actions.par_chunks(samples * horizon * dim)).zip(scenes).for_each(
-            |((costs, actions), scene)| {
+        // Each environment's candidates are split into parts on their own.
+        let (contexts, part) = (&self.contexts, predictor.part(samples));
+        costs.par_chunks_mut(samples).zip(actions.par_chunks(samples * horizon * dim)).zip(contexts).for_each(
+            |((costs, actions), context)| {
                 let parts = costs.par_chunks_mut(part).zip(actions.par_chunks(part * horizon * dim));
-                parts.for_each(|(costs, actions)| scene.cost(&predictor, actions, horizon, costs));
+                parts.for_each(|(costs, actions)| context.cost(&predictor, actions, horizon, costs));
             },
         );
         Ok(())
@@ -215,14 +193,14 @@ mod tests {
     use super::*;
     use crate::TrainConfig;
     use crate::nn::parameters;
-    use swm_core::{ColumnSpec, Key};
+    use swm_core::{ColumnSpec, Key, Schema};
 
     #[test]
-    fn other_devices_come_to_the_same_costs() {
+    fn host_and_device_rollouts_give_equal_costs() {
         let config = TrainConfig::<Lewm>::load("tiny", &["model.predictor.history=3".to_owned()]).expect("a preset");
         let (samples, horizon, dim) = (5, 5, 4);
         let model = Lewm::init(&config.model, dim, Key::new(0), &Device::flex());
-        // Modulations are zero before training; without them actions have no effect.
+        // Modulations are zero-initialised; without them actions have no effect.
         let mut values = parameters::values(&model);
         for (_, tensor) in values.iter_mut().filter(|(name, _)| name.contains("adaLN")) {
             for (i, value) in tensor.values.iter_mut().enumerate() {

@@ -7,7 +7,7 @@
 //! As in the cost, parts are counted from each environment's first row, so that what an environment is given does not
 //! depend on its neighbours.
 
-use super::cost::{LewmCost, Scene};
+use super::cost::{LewmCost, PlanContext};
 use super::model::Lewm;
 use crate::nn::parameters::IntoF32;
 use burn::module::Module;
@@ -34,26 +34,26 @@ fn differentiable(model: &Lewm) -> Lewm {
 /// Costs of some candidates of one environment, `[samples, horizon, dim]`, and their gradients.
 fn cost_and_gradient(
     model: &Lewm,
-    scene: &Scene,
+    context: &PlanContext,
     [samples, horizon, dim]: [usize; 3],
     actions: &[f32],
     costs: &mut [f32],
     gradient: &mut [f32],
 ) {
-    let (latent, past) = (scene.goal.len(), scene.past.len() / dim);
-    let seen = scene.start.len() / latent;
-    let start = tensor(model, scene.start.repeat(samples), [samples, seen, latent]).autodiff();
+    let (latent, past) = (context.goal.len(), context.past.len() / dim);
+    let seen = context.start.len() / latent;
+    let start = tensor(model, context.start.repeat(samples), [samples, seen, latent]).autodiff();
     let free = tensor(model, actions.to_vec(), [samples, horizon, dim]).autodiff().require_grad();
     let taken = match past {
         0 => free.clone(),
         _ => Tensor::cat(
-            vec![tensor(model, scene.past.repeat(samples), [samples, past, dim]).autodiff(), free.clone()],
+            vec![tensor(model, context.past.repeat(samples), [samples, past, dim]).autodiff(), free.clone()],
             1,
         ),
     };
     let last = seen + horizon - 1;
     let end = model.rollout(start, taken).slice([0..samples, last..last + 1, 0..latent]);
-    let goal = tensor(model, scene.goal.repeat(samples), [samples, 1, latent]).autodiff();
+    let goal = tensor(model, context.goal.repeat(samples), [samples, 1, latent]).autodiff();
     let cost = (end - goal).square().sum_dim(2);
     costs.copy_from_slice(&cost.clone().inner().into_data().into_f32_vec());
     let all = cost.sum().backward();
@@ -70,7 +70,7 @@ fn copy_gradient<const D: usize>(found: Option<Tensor<D>>, to: &mut [f32]) {
 
 impl DifferentiableCost for LewmCost {
     fn cost_and_gradient(&mut self, candidates: Candidates<'_>, costs: &mut [f32], gradient: &mut [f32]) -> Result<()> {
-        self.fits(&candidates, costs)?;
+        self.check_sizes(&candidates, costs)?;
         let Candidates { actions, samples, horizon, dim, .. } = candidates;
         if gradient.len() != actions.len() {
             let (given, expected) = (gradient.len().to_string(), actions.len().to_string());
@@ -79,11 +79,11 @@ impl DifferentiableCost for LewmCost {
         let model = differentiable(&self.model);
         let (numbers, part) = (horizon * dim, part(samples));
         let rows = costs.par_chunks_mut(samples).zip(gradient.par_chunks_mut(samples * numbers));
-        rows.zip(actions.par_chunks(samples * numbers)).zip(&self.scenes).for_each(
-            |(((costs, gradient), actions), scene)| {
+        rows.zip(actions.par_chunks(samples * numbers)).zip(&self.contexts).for_each(
+            |(((costs, gradient), actions), context)| {
                 let parts = costs.par_chunks_mut(part).zip(gradient.par_chunks_mut(part * numbers));
                 parts.zip(actions.par_chunks(part * numbers)).for_each(|((costs, gradient), actions)| {
-                    cost_and_gradient(&model, scene, [costs.len(), horizon, dim], actions, costs, gradient);
+                    cost_and_gradient(&model, context, [costs.len(), horizon, dim], actions, costs, gradient);
                 });
             },
         );
@@ -94,7 +94,7 @@ impl DifferentiableCost for LewmCost {
 impl LewmCost {
     /// Checks pairs of latents and actions; returns how many rows of them one environment has.
     fn pairs(&self, latents: &[f32], actions: &[f32], others: &[(&str, usize, usize)]) -> Result<usize> {
-        let (latent, envs) = (self.config.latent, self.scenes.len().max(1));
+        let (latent, envs) = (self.config.latent, self.contexts.len().max(1));
         let n = latents.len() / latent;
         let given = [("latents", latents.len(), latent), ("actions", actions.len(), self.actions)];
         for &(what, numbers, width) in given.iter().chain(others) {
@@ -117,19 +117,19 @@ impl LatentDynamics for LewmCost {
 
     fn encode(&mut self, start: &mut [f32], goal: &mut [f32]) -> Result<()> {
         let latent = self.config.latent;
-        let expected = self.scenes.len() * latent;
-        if self.scenes.is_empty() || start.len() != expected || goal.len() != expected {
+        let expected = self.contexts.len() * latent;
+        if self.contexts.is_empty() || start.len() != expected || goal.len() != expected {
             return Err(Error::mismatch(
                 "the latents of start and goal of a LeWM",
                 format!("{} and {} numbers", start.len(), goal.len()),
-                format!("{latent} of each for every one of {} observed environments", self.scenes.len()),
+                format!("{latent} of each for every one of {} observed environments", self.contexts.len()),
             ));
         }
-        for ((start, goal), scene) in
-            start.chunks_exact_mut(latent).zip(goal.chunks_exact_mut(latent)).zip(&self.scenes)
+        for ((start, goal), context) in
+            start.chunks_exact_mut(latent).zip(goal.chunks_exact_mut(latent)).zip(&self.contexts)
         {
-            start.copy_from_slice(&scene.start[scene.start.len() - latent..]);
-            goal.copy_from_slice(&scene.goal);
+            start.copy_from_slice(&context.start[context.start.len() - latent..]);
+            goal.copy_from_slice(&context.goal);
         }
         Ok(())
     }

@@ -1,8 +1,8 @@
-//! The training step that joint-embedding models share: everything but their regulariser.
+//! The training step that joint-embedding models share, with the regulariser as a parameter.
 //!
-//! The encoder works on a fixed number of shards of the batch, in parallel; what follows it sees the whole batch.
-//! The split is part of the configuration, never of the machine, and gradients are summed in the order of the
-//! shards, so the numbers do not depend on the number of threads.
+//! The encoder processes a fixed number of shards of the batch in parallel; the other modules process the whole batch.
+//! The configuration sets the number of shards, and gradients are summed in the order of the shards, so the result does
+//! not depend on the number of threads.
 
 use super::model::Lewm;
 use super::shard::{Differentiation, Shard};
@@ -14,54 +14,52 @@ use burn::tensor::{Gradients, Tensor};
 use rayon::prelude::*;
 use swm_core::Rng;
 
-/// What a step found.
-pub(crate) struct Found {
+/// Prediction error and gradients of a batch.
+pub(crate) struct JointStep {
     /// Mean squared error of the predicted latents.
     pub prediction: f64,
     /// Gradients by parameter of the model, flat.
     pub gradients: Named<Tensor<1>>,
-    /// Those of whatever else the regulariser is made of.
-    pub others: Gradients,
-    /// Batch statistics of the projections behind the encoder and the predictor.
+    /// All gradients, which include those of the regulariser's own parameters.
+    pub all: Gradients,
+    /// Batch statistics of the projectors after the encoder and after the predictor.
     pub statistics: [BatchStatistics; 2],
 }
 
-/// Prediction error and gradients of a batch, its loss being the prediction error plus what `regularise` makes of the
-/// latents `[clips, steps, latent]`, a number that is differentiated.
-///
-/// `model` is without autodiff; `shards` is at least 1.
+/// Computes prediction error and gradients of a batch. The loss is the prediction error plus `regularise(latents)`, where
+/// the latents are `[clips, steps, latent]`. `model` has no autodiff; `shards` is at least 1.
 pub(crate) fn step(
     model: &Lewm,
     batch: &TrainBatch,
     shards: usize,
     noise: Option<&mut Rng>,
     regularise: impl FnOnce(&Tensor<3>) -> Tensor<1>,
-) -> Found {
+) -> JointStep {
     let [clips, steps, _] = batch.actions.dims();
     let frames = clips * steps;
 
     let size = frames.div_ceil(shards.max(1));
     let ranges: Vec<_> = (0..frames).step_by(size).map(|start| start..(start + size).min(frames)).collect();
-    let [_, count, numbers] = batch.patches.dims();
+    let [_, count, elements] = batch.patches.dims();
     let differentiation = Differentiation::of(&model.encoder, count, &model.device());
     let encoded: Vec<Shard> = ranges
         .par_iter()
         .map(|range| {
-            let patches = batch.patches.clone().slice([range.clone(), 0..count, 0..numbers]);
+            let patches = batch.patches.clone().slice([range.clone(), 0..count, 0..elements]);
             Shard::forward(&differentiation, patches)
         })
         .collect();
 
-    // The rest of the model, from the features on.
+    // The modules after the encoder.
     let head = model.clone().train();
     let features = Tensor::cat(encoded.iter().map(|shard| shard.features.clone()).collect(), 0);
     let features = features.autodiff().require_grad();
     let (latents, projector_statistics) = head.projector.forward_train(features.clone());
     let [_, latent] = latents.dims();
     let latents = latents.reshape([clips, steps, latent]);
-    let pull = regularise(&latents);
-    // Every window of the history's length that has a next frame. One window where the clip is one longer than the
-    // history, as published.
+    let regulariser = regularise(&latents);
+    // Every window of the history's length that is followed by a frame: one window if the clip is one frame longer than
+    // the history, as published.
     let history = head.predictor.config().history.min(steps - 1);
     let windows = |x: &Tensor<3>, offset: usize| {
         let [_, _, width] = x.dims();
@@ -77,7 +75,7 @@ pub(crate) fn step(
     let prediction = (predicted - windows(&latents, 1)).square().mean();
     let prediction_value: f32 = prediction.clone().inner().into_scalar();
 
-    let mut all = (prediction + pull).backward();
+    let mut all = (prediction + regulariser).backward();
     let features_gradient = features.grad_remove(&mut all);
     let mut gradients = parameters::gradients(&head, &all);
 
@@ -102,10 +100,10 @@ pub(crate) fn step(
             }
         }
     }
-    Found {
+    JointStep {
         prediction: f64::from(prediction_value),
         gradients,
-        others: all,
+        all,
         statistics: [projector_statistics, pred_proj_statistics],
     }
 }

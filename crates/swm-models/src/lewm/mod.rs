@@ -3,13 +3,15 @@
 
 pub mod config;
 pub mod cost;
-pub mod encode;
+mod family;
 mod gradient;
+pub mod host_encoder;
 pub mod import;
 pub(crate) mod joint;
 pub mod loss;
 pub mod model;
 pub mod pixels;
+mod predictor;
 pub mod rollout;
 mod shard;
 pub mod step;
@@ -17,5 +19,8 @@ pub(crate) mod train;
 
 pub use config::{EncoderConfig, LewmConfig};
 pub use cost::LewmCost;
+pub use family::ENTRY;
+pub(crate) use family::encode;
 pub use model::{Encoder, Lewm};
+pub use predictor::LewmPredictor;
 pub use rollout::Rollout;

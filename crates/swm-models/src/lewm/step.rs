@@ -1,6 +1,6 @@
-//! One training step of a LeWM: loss and gradients of a batch.
+//! One training step of a LeWM: prediction error plus SIGReg (Maes et al. 2026, LeWorldModel), and its gradients.
 
-use super::joint::{self, Found};
+use super::joint::{self, JointStep};
 use super::loss;
 use super::model::Lewm;
 use crate::nn::BatchStatistics;
@@ -13,23 +13,23 @@ use swm_core::Rng;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SigregConfig {
-    /// Its weight in the loss.
+    /// Its weight in the loss, λ.
     pub weight: f32,
-    /// Random directions a step.
+    /// Random directions per step.
     pub directions: usize,
-    /// Where characteristic functions are compared.
+    /// Points at which characteristic functions are compared.
     pub knots: usize,
 }
 
-/// One batch, normalised.
+/// A normalised batch.
 pub struct TrainBatch {
-    /// `[clips * steps, patches, numbers]`.
+    /// `[clips * steps, patches, 3 * patch * patch]`.
     pub patches: Tensor<3>,
     /// `[clips, steps, actions]`; the actions of the last step are not used.
     pub actions: Tensor<3>,
 }
 
-/// The losses of a batch.
+/// The loss of a batch and its terms.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Losses {
     /// `prediction + weight * sigreg`.
@@ -40,21 +40,22 @@ pub struct Losses {
     pub sigreg: f64,
 }
 
-/// What a step found.
-pub struct StepOutput {
+/// Losses and gradients of a batch.
+pub struct LewmStep {
     /// The losses.
     pub losses: Losses,
     /// Gradients by parameter, flat.
     pub gradients: Named<Tensor<1>>,
-    /// Batch statistics of the projections behind the encoder and the predictor.
+    /// Batch statistics of the projectors after the encoder and after the predictor.
     pub statistics: [BatchStatistics; 2],
     /// The latents, `[clips, steps, latent]`.
     pub latents: Vec<f32>,
 }
 
-/// Loss and gradients of a batch.
+/// Computes loss and gradients of a batch. `model` has no autodiff; `shards` is at least 1.
 ///
-/// `model` is without autodiff; `directions` are `[count, latent]`; `shards` is at least 1.
+/// # Shapes
+/// `directions` is `[count, latent]`.
 pub fn step(
     model: &Lewm,
     batch: &TrainBatch,
@@ -62,19 +63,19 @@ pub fn step(
     directions: &[f32],
     shards: usize,
     noise: Option<&mut Rng>,
-) -> StepOutput {
+) -> LewmStep {
     let (mut host, mut sigreg) = (vec![], 0.0);
-    let found = joint::step(model, batch, shards, noise, |latents| {
+    let step = joint::step(model, batch, shards, noise, |latents| {
         let shape = latents.dims();
         host = latents.clone().inner().into_data().into_f32_vec();
         let (value, gradient) = loss::sigreg(&host, shape[1], shape[2], directions, config.knots);
         sigreg = value;
         let gradient = Tensor::<3>::from_data(TensorData::new(gradient, shape), &latents.device()).autodiff();
-        // A linear form whose gradient is that of the statistic.
+        // A linear function of the latents whose gradient is that of the statistic.
         (latents.clone() * gradient).sum() * config.weight
     });
-    let Found { prediction, gradients, statistics, .. } = found;
-    StepOutput {
+    let JointStep { prediction, gradients, statistics, .. } = step;
+    LewmStep {
         losses: Losses { total: prediction + f64::from(config.weight) * sigreg, prediction, sigreg },
         gradients,
         statistics,

@@ -1,11 +1,12 @@
-//! How a LeWM is trained: the loop's side of [`super::step`].
+//! [`Trainable`] for LeWM: the training loop's view of [`super::step`].
 
-use super::step::{self, SigregConfig, StepOutput as Found, TrainBatch};
+use super::step::{self, LewmStep, SigregConfig, TrainBatch};
 use super::{Lewm, LewmConfig, loss, pixels};
+use crate::checks;
 use crate::nn::{BatchStatistics, Named};
 use crate::train::{DataConfig, DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
 use burn::tensor::{Device, Tensor};
-use swm_core::{Batch, Error, Key, Result, Schema};
+use swm_core::{Batch, Key, Result, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
 
 impl Trainable for Lewm {
@@ -50,7 +51,7 @@ impl Trainable for Lewm {
         let batch = prepare(&config.model, &config.data, dataset_info, batch, device)?;
         let mut noise = key.with("dropout").rng();
         let noise = training.then_some(&mut noise);
-        let Found { losses, gradients, statistics, .. } =
+        let LewmStep { losses, gradients, statistics, .. } =
             step::step(self, &batch, &config.loss, &directions, config.shards, noise);
         let buffers = stored(statistics);
         let metrics = vec![("loss", losses.total), ("prediction", losses.prediction), ("sigreg", losses.sigreg)];
@@ -63,22 +64,13 @@ impl Trainable for Lewm {
     }
 }
 
-/// Checks that the sizes fit each other and the clips.
+/// Checks that the sizes are consistent with each other and with the clips.
 pub(crate) fn check(model: &LewmConfig, data: &DataConfig) -> Result<()> {
     model.check()?;
-    at_least(&[("data.num_steps", data.num_steps, 2)])?;
-    let (frames, history) = (data.num_steps, model.predictor.history);
-    if frames - 1 < history {
-        return Err(Error::config(
-            "data.num_steps",
-            format!("{frames} frames train only {} of the {history} steps of history", frames - 1),
-            format!("give at least {}, or lower model.predictor.history", history + 1),
-        ));
-    }
-    Ok(())
+    checks::clip_covers_history(data.num_steps, model.predictor.history)
 }
 
-/// Clips of pictures and actions.
+/// Returns the loader configuration for clips of images and actions.
 pub(crate) fn loader_config(model: &LewmConfig, data: &DataConfig, schema: &Schema) -> Result<LoaderConfig> {
     pixels::check(model, schema, "pixels")?;
     let columns = vec!["pixels".to_owned(), "action".to_owned()];
@@ -86,7 +78,7 @@ pub(crate) fn loader_config(model: &LewmConfig, data: &DataConfig, schema: &Sche
     Ok(LoaderConfig { clip, ..LoaderConfig::default() })
 }
 
-/// A batch of such clips, normalised.
+/// Normalises a batch of clips.
 pub(crate) fn prepare(
     model: &LewmConfig,
     data: &DataConfig,
@@ -100,10 +92,10 @@ pub(crate) fn prepare(
     })
 }
 
-/// The parts whose statistics follow the batches.
+/// The modules with running batch statistics.
 const TRACKED: [&str; 2] = ["projector", "pred_proj"];
 
-/// Batch statistics as the loop carries them.
+/// Names batch statistics for the training loop.
 pub(crate) fn stored(statistics: [BatchStatistics; 2]) -> Named<Tensor<1>> {
     let mut buffers = Named::new();
     for (name, statistics) in TRACKED.into_iter().zip(statistics) {
@@ -113,7 +105,7 @@ pub(crate) fn stored(statistics: [BatchStatistics; 2]) -> Named<Tensor<1>> {
 }
 
 impl Lewm {
-    /// Moves the running statistics towards [`stored`] ones.
+    /// Updates the running statistics with batch statistics from [`stored`].
     pub(crate) fn track(&mut self, mut buffers: Named<Tensor<1>>) {
         for (name, part) in TRACKED.into_iter().zip([&mut self.projector, &mut self.pred_proj]) {
             if let Some(statistics) = BatchStatistics::take(name, &mut buffers) {

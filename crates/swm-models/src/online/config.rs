@@ -1,6 +1,6 @@
 //! [`OnlineConfig`]: how playing and learning take turns.
 
-use crate::tdmpc2::PlannerConfig;
+use super::planner_config::PlannerConfig;
 use crate::train::config::at_least;
 use serde::{Deserialize, Serialize};
 use swm_core::Result;
@@ -25,7 +25,7 @@ pub struct OnlineConfig {
     pub evaluate_every: usize,
     /// Episodes of an evaluation, always the same ones.
     pub evaluate_episodes: usize,
-    /// How a TD-MPC2 searches for actions; without, its policy's are taken as they are.
+    /// Settings of the search for actions, for a model that plans; without them the model's policy acts directly.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub planner: Option<PlannerConfig>,
 }

@@ -10,17 +10,20 @@ mod collector;
 mod config;
 mod evaluation;
 mod learner;
+mod planner_config;
 mod run;
 mod shared_model;
 mod stochastic_policy;
 mod world;
 
 pub use config::OnlineConfig;
+pub use planner_config::PlannerConfig;
 pub use run::{OnlineSummary, train_online};
 pub use shared_model::SharedModel;
 pub use stochastic_policy::{StochasticActor, StochasticPolicy};
 pub use world::dataset_info;
 
+use crate::checkpoint::Checkpoint;
 use crate::train::{DatasetInfo, TrainConfig, Trainable};
 use swm_core::{EnvSpec, Error, Policy, Result, Schema};
 
@@ -39,6 +42,15 @@ pub trait Agent: Trainable {
         slots: usize,
         explore: bool,
     ) -> Result<Box<dyn Policy>>;
+}
+
+/// Returns the policy of a trained agent, which does not explore.
+///
+/// # Errors
+/// When the model does not fit the environment.
+pub fn policy<M: Agent>(checkpoint: &Checkpoint<M>, spec: &EnvSpec, slots: usize) -> Result<Box<dyn Policy>> {
+    let model = SharedModel::new(checkpoint.model.clone());
+    M::policy(&checkpoint.config, &checkpoint.dataset_info, model, spec, slots, false)
 }
 
 /// Checks that there are rewards to learn from.

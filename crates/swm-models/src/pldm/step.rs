@@ -2,7 +2,7 @@
 
 use super::loss::{PldmLoss, Terms};
 use super::model::Pldm;
-use crate::lewm::joint::{self, Found};
+use crate::lewm::joint::{self, JointStep};
 use crate::lewm::step::TrainBatch;
 use crate::nn::BatchStatistics;
 use crate::nn::parameters::{self, IntoF32, Named};
@@ -10,56 +10,48 @@ use burn::module::Module;
 use burn::tensor::Tensor;
 use swm_core::Rng;
 
-/// What a step found.
-pub struct StepOutput {
-    /// The total loss, then its terms before they are weighted, by the names of their weights.
+/// Losses and gradients of a batch.
+pub struct PldmStep {
+    /// The total loss, then its unweighted terms, by the names of their weights.
     pub losses: Vec<(&'static str, f64)>,
     /// Gradients by parameter, flat.
     pub gradients: Named<Tensor<1>>,
-    /// Batch statistics of the projections behind the encoder and the predictor.
+    /// Batch statistics of the projectors after the encoder and after the predictor.
     pub statistics: [BatchStatistics; 2],
     /// The latents, `[clips, steps, latent]`.
     pub latents: Vec<f32>,
 }
 
-/// Loss and gradients of a batch.
-///
-/// `model` is without autodiff; `shards` is at least 1.
-pub fn step(
-    model: &Pldm,
-    batch: &TrainBatch,
-    weights: &PldmLoss,
-    shards: usize,
-    noise: Option<&mut Rng>,
-) -> StepOutput {
+/// Computes loss and gradients of a batch. `model` has no autodiff; `shards` is at least 1.
+pub fn step(model: &Pldm, batch: &TrainBatch, weights: &PldmLoss, shards: usize, noise: Option<&mut Rng>) -> PldmStep {
     let idm = model.idm.clone().train();
-    let (mut terms, mut host, mut pull) = (vec![], vec![], 0.0);
+    let (mut terms, mut host, mut regulariser) = (vec![], vec![], 0.0);
     let value = |term: &Tensor<1>| f64::from(term.clone().inner().into_scalar::<f32>());
-    let found = joint::step(&model.model, batch, shards, noise, |latents| {
+    let step = joint::step(&model.model, batch, shards, noise, |latents| {
         host = latents.clone().inner().into_data().into_f32_vec();
-        let of = Terms::of(latents.clone());
+        let latent_terms = Terms::of(latents.clone());
         let [clips, steps, actions] = batch.actions.dims();
         let taken = batch.actions.clone().slice([0..clips, 0..steps - 1, 0..actions]).autodiff();
         let inverse = (idm.forward(latents.clone()) - taken).square().mean();
-        let sum = of.sum(weights) + inverse.clone() * weights.idm;
-        pull = value(&sum);
+        let sum = latent_terms.sum(weights) + inverse.clone() * weights.idm;
+        regulariser = value(&sum);
         terms = vec![
-            ("std", value(&of.std)),
-            ("std_t", value(&of.std_t)),
-            ("cov", value(&of.cov)),
-            ("cov_t", value(&of.cov_t)),
-            ("temp_align", value(&of.temp_align)),
+            ("std", value(&latent_terms.std)),
+            ("std_t", value(&latent_terms.std_t)),
+            ("cov", value(&latent_terms.cov)),
+            ("cov_t", value(&latent_terms.cov_t)),
+            ("temp_align", value(&latent_terms.temp_align)),
             ("idm", value(&inverse)),
         ];
-        terms.extend(of.temp_straight.as_ref().map(|straight| ("temp_straight", value(straight))));
+        terms.extend(latent_terms.temp_straight.as_ref().map(|straight| ("temp_straight", value(straight))));
         sum
     });
-    let Found { prediction, gradients, others, statistics } = found;
-    let mut losses = vec![("loss", prediction + pull), ("prediction", prediction)];
+    let JointStep { prediction, gradients, all, statistics } = step;
+    let mut losses = vec![("loss", prediction + regulariser), ("prediction", prediction)];
     losses.extend(terms);
-    let mut all = prefixed("model", gradients);
-    all.extend(prefixed("idm", parameters::gradients(&idm, &others)));
-    StepOutput { losses, gradients: all, statistics, latents: host }
+    let mut named = prefixed("model", gradients);
+    named.extend(prefixed("idm", parameters::gradients(&idm, &all)));
+    PldmStep { losses, gradients: named, statistics, latents: host }
 }
 
 fn prefixed<T>(part: &str, named: Named<T>) -> Named<T> {

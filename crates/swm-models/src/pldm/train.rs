@@ -1,10 +1,9 @@
-//! How a PLDM is trained: the loop's side of [`super::step`].
+//! [`Trainable`] for PLDM: the training loop's view of [`super::step`].
 
 use super::loss::PldmLoss;
 use super::model::Pldm;
-use super::step::{StepOutput as Found, step};
-use crate::checkpoint::Checkpoint;
-use crate::lewm::{LewmConfig, LewmCost, train as lewm};
+use super::step::{PldmStep, step};
+use crate::lewm::{LewmConfig, train as lewm};
 use crate::nn::Named;
 use crate::train::{DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
 use burn::tensor::{Device, Tensor};
@@ -36,7 +35,7 @@ impl Trainable for Pldm {
         if config.loss.temp_straight != 0.0 && config.data.num_steps < 3 {
             return Err(Error::config(
                 "loss.temp_straight",
-                format!("clips of {} frames have no path that could be straight", config.data.num_steps),
+                format!("clips of {} frames have no two consecutive latent differences", config.data.num_steps),
                 "give data.num_steps of at least 3, or the weight 0",
             ));
         }
@@ -61,7 +60,7 @@ impl Trainable for Pldm {
         let batch = lewm::prepare(&config.model, &config.data, dataset_info, batch, device)?;
         let mut noise = key.with("dropout").rng();
         let noise = training.then_some(&mut noise);
-        let Found { losses, gradients, statistics, .. } = step(self, &batch, &config.loss, config.shards, noise);
+        let PldmStep { losses, gradients, statistics, .. } = step(self, &batch, &config.loss, config.shards, noise);
         Ok(StepOutput { metrics: losses, gradients, buffers: lewm::stored(statistics) })
     }
 
@@ -69,9 +68,4 @@ impl Trainable for Pldm {
         self.model.track(buffers);
         self
     }
-}
-
-/// The planning cost of a trained PLDM: its world model plans as a LeWM does.
-pub fn cost(checkpoint: &Checkpoint<Pldm>) -> LewmCost {
-    LewmCost::of(&checkpoint.model.model, &checkpoint.config.model, checkpoint.actions())
 }

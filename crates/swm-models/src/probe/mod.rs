@@ -7,7 +7,6 @@
 //! A latent that knows where things are lets a linear map say so; one that a network alone can read holds it folded; what
 //! neither reads is lost, and no planner can use it.
 
-mod encoders;
 mod fit;
 pub mod reconstruction;
 pub mod ridge;

@@ -2,11 +2,13 @@
 //! playing. Its use here is to demonstrate: `swm collect --policy CHECKPOINT`. See `docs/models/sac.md`.
 
 mod config;
+mod family;
 mod model;
 pub mod step;
 mod train;
 
 pub use config::{SacConfig, SacLoss};
+pub use family::ENTRY;
 pub use model::{Actor, Critic, Critics, Drawn, Hidden, Sac};
 
 /// Acts as a trained SAC does: the mean of its policy, squashed.

@@ -1,72 +1,72 @@
-//! The sizes of a TD-MPC2 and the settings of its loss.
+//! [`Tdmpc2Config`] and [`LossConfig`]: the sizes of a TD-MPC2 and the settings of its loss.
 
 use crate::nn::Bins;
 use crate::train::config::at_least;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 
-/// The column of pictures.
+/// The column of images.
 pub const PIXELS: &str = "pixels";
 
 /// The sizes of a [`super::Tdmpc2`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tdmpc2Config {
-    /// What it observes. The parts of a latent follow in this order, that of the pictures first.
+    /// The observed columns. The parts of a latent have this order; images come first.
     pub encoding: Vec<Encoding>,
-    /// The side of the pictures, where it observes any.
+    /// Side of the square input images in pixels; unused by a state-only model.
     pub image: usize,
-    /// Hidden features of an encoder of numbers.
+    /// Hidden features of the encoder of a column.
     pub encoder: usize,
-    /// Hidden features of everything else.
+    /// Hidden features of all other networks.
     pub hidden: usize,
-    /// Numbers of a latent that add up to 1.
+    /// Size of the groups of latent elements that sum to 1 (SimNorm).
     pub simplex: usize,
     /// Bins of rewards and values.
     pub bins: Bins,
-    /// Q functions.
+    /// Number of Q functions.
     pub critics: usize,
-    /// Dropout behind the first product of a Q function, in training.
+    /// Dropout after the first linear layer of a Q function in training.
     pub dropout: f32,
-    /// Whether it predicts that an episode terminates. The published models do not.
+    /// Whether terminations are predicted. The published models do not.
     pub termination: bool,
 }
 
-/// What becomes of an observed column.
+/// The encoding of an observed column.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Encoding {
-    /// The column: `pixels`, or one of numbers.
+    /// The column: `pixels`, or a numeric column.
     pub column: String,
-    /// Numbers of the latent it becomes.
+    /// Latent elements it is encoded to.
     pub latent: usize,
 }
 
 impl Tdmpc2Config {
-    /// Numbers of a latent.
+    /// Returns the latent dimension.
     pub fn latent(&self) -> usize {
         self.encoding.iter().map(|part| part.latent).sum()
     }
 
-    /// The part that comes from pictures.
-    pub fn pictures(&self) -> Option<&Encoding> {
+    /// Returns the encoding of images, if there is one.
+    pub fn image_encoding(&self) -> Option<&Encoding> {
         self.encoding.iter().find(|part| part.column == PIXELS)
     }
 
-    /// The parts that come from columns of numbers.
-    pub fn numbers(&self) -> impl Iterator<Item = &Encoding> {
+    /// Returns the encodings of the other columns.
+    pub fn column_encodings(&self) -> impl Iterator<Item = &Encoding> {
         self.encoding.iter().filter(|part| part.column != PIXELS)
     }
 
-    /// The columns it observes.
+    /// Returns the names of the observed columns.
     pub fn columns(&self) -> Vec<String> {
         self.encoding.iter().map(|part| part.column.clone()).collect()
     }
 
-    /// Checks that the sizes fit each other.
+    /// Checks that the sizes are consistent.
     ///
     /// # Errors
-    /// Naming the first that does not.
+    /// Names the first size that is not.
     pub fn check(&self) -> Result<()> {
         let Some(first) = self.encoding.first() else {
             let fix = "name a column, such as [{ column = \"state\", latent = 64 }]";
@@ -85,14 +85,14 @@ impl Tdmpc2Config {
                 return Err(Error::config("model.encoding", given, "name every column once"));
             }
         }
-        if self.pictures().is_some_and(|pictures| pictures != first) {
+        if self.image_encoding().is_some_and(|images| images != first) {
             return Err(Error::config("model.encoding", "'pixels' is not its first column", "move it to the front"));
         }
-        if self.pictures().is_some() {
-            super::eyes::check(self.image)?;
+        if self.image_encoding().is_some() {
+            super::image_encoder::check(self.image)?;
         }
         if self.latent() == 0 || !self.latent().is_multiple_of(self.simplex) {
-            let given = format!("latents of {} numbers, {} of which add up to 1", self.latent(), self.simplex);
+            let given = format!("latents of {} elements in groups of {}", self.latent(), self.simplex);
             return Err(Error::config("model.simplex", given, "choose latents that are a multiple of it"));
         }
         if self.bins.low >= self.bins.high {
@@ -106,35 +106,35 @@ impl Tdmpc2Config {
     }
 }
 
-/// The weights and settings of the loss. Those of the publication are in `presets/tdmpc2/paper.toml`.
+/// The weights and settings of the loss. `presets/tdmpc2/paper.toml` has the published values.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LossConfig {
-    /// What a reward one step later is worth, γ.
+    /// Discount per step, γ.
     pub discount: f64,
-    /// How much less each further step of a clip weighs, ρ.
+    /// Weight of each further step of a clip relative to the step before, ρ.
     pub rho: f64,
-    /// The share of the new in target networks and running scale, τ.
+    /// Update rate of target networks and of the running spread, τ.
     pub tau: f64,
-    /// The weight of latents that differ from those of the frames to come.
+    /// Weight of the latent prediction error.
     pub consistency: f64,
-    /// The weight of rewards.
+    /// Weight of the reward loss.
     pub reward: f64,
-    /// The weight of values.
+    /// Weight of the value loss.
     pub value: f64,
-    /// What entropy of the policy is worth.
+    /// Weight of the policy's entropy.
     pub entropy: f64,
-    /// The weight of terminations, where they are predicted.
+    /// Weight of the termination loss, if terminations are predicted.
     pub termination: f64,
-    /// How much disagreement of the Q functions costs a plan, per unit of value.
+    /// Cost of the Q functions' disagreement in a plan, per unit of value.
     pub uncertainty: f64,
 }
 
 impl LossConfig {
-    /// Checks that the settings make sense.
+    /// Checks the settings.
     ///
     /// # Errors
-    /// Naming the first that does not.
+    /// Names the first invalid setting.
     pub fn check(&self) -> Result<()> {
         let shares = [("loss.discount", self.discount), ("loss.rho", self.rho), ("loss.tau", self.tau)];
         for (what, value) in shares {

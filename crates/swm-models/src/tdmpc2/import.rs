@@ -1,4 +1,4 @@
-//! Published checkpoints, both ways: the reference's configuration; its weights carry our names already.
+//! Import and export of checkpoints of the reference implementation, whose weights have the same names.
 
 use super::config::{Encoding, LossConfig, PIXELS, Tdmpc2Config};
 use super::model::Tdmpc2;
@@ -18,11 +18,11 @@ use swm_core::{Error, Key, Manifest, Result};
 
 const CLASS: &str = "stable_worldmodel.wm.tdmpc2.TDMPC2";
 
-/// A TD-MPC2 that the reference trained: a folder with `weights.pt` and `config.json`, or that file. What it does not store is
-/// how actions were brought between -1 and 1, so `dataset_info` must be those of its world or its dataset.
+/// Converts a TD-MPC2 of the reference implementation: a folder with `weights.pt` and `config.json`, or that file. The
+/// files do not store how actions were scaled to -1 ..= 1, so `dataset_info` must describe its environment or dataset.
 ///
 /// # Errors
-/// When it is another model, or damaged, or has other actions than `dataset_info`.
+/// When it is another model, it is damaged, or its actions are not those of `dataset_info`.
 pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Tdmpc2>> {
     let reference = Reference::open(from, "TDMPC2")?;
     let folder = if from.is_dir() { from } else { from.parent().unwrap_or(Path::new("")) };
@@ -32,7 +32,7 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Tdmpc
     if published.action_dim != dataset_info.action.dim() {
         return Err(Error::mismatch(
             "importing a checkpoint",
-            format!("{} numbers an action in the dataset", dataset_info.action.dim()),
+            format!("{} action elements in the dataset", dataset_info.action.dim()),
             format!("{}, as the model was trained", published.action_dim),
         ));
     }
@@ -45,10 +45,10 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Tdmpc
     Ok(Checkpoint { model, config, dataset_info, manifest })
 }
 
-/// Writes `weights.pt` and `config.json` that the reference's `load_pretrained` reads.
+/// Writes the `weights.pt` and `config.json` that `load_pretrained` of the reference implementation reads.
 ///
 /// # Errors
-/// When the model predicts terminations, which the reference does not, or the disk refuses.
+/// When the model predicts terminations, which the reference implementation does not, or a file cannot be written.
 pub fn export(checkpoint: &Checkpoint<Tdmpc2>, folder: &Path) -> Result<()> {
     let (model, loss) = (&checkpoint.config.model, &checkpoint.config.loss);
     if model.termination {
@@ -61,7 +61,7 @@ pub fn export(checkpoint: &Checkpoint<Tdmpc2>, folder: &Path) -> Result<()> {
         action_dim: checkpoint.model.actions(),
         extra_dims: widths.collect(),
         image_size: model.image,
-        wm: World {
+        wm: WorldModel {
             encoding: InOrder(model.encoding.iter().map(|part| (part.column.clone(), part.latent)).collect()),
             enc_dim: model.encoder,
             mlp_dim: model.hidden,
@@ -84,7 +84,7 @@ pub fn export(checkpoint: &Checkpoint<Tdmpc2>, folder: &Path) -> Result<()> {
     write(folder, &Tree { class: CLASS.to_owned(), cfg }, &parameters::values(&checkpoint.model))
 }
 
-/// The class and what it is made with.
+/// The class and its arguments.
 #[derive(Serialize, Deserialize)]
 struct Tree {
     #[serde(rename = "_target_")]
@@ -92,7 +92,7 @@ struct Tree {
     cfg: Published,
 }
 
-/// A configuration as the reference writes it.
+/// A configuration of the reference implementation.
 #[derive(Serialize, Deserialize)]
 pub struct Published {
     action_dim: usize,
@@ -100,13 +100,13 @@ pub struct Published {
     extra_dims: BTreeMap<String, usize>,
     #[serde(default)]
     image_size: usize,
-    wm: World,
+    wm: WorldModel,
 }
 
-/// Defaults are those of the publication.
+/// The model configuration of the reference implementation, with the published values as defaults.
 #[derive(Serialize, Deserialize)]
 #[serde(default)]
-struct World {
+struct WorldModel {
     encoding: InOrder,
     enc_dim: usize,
     mlp_dim: usize,
@@ -126,7 +126,7 @@ struct World {
     value_coef: f64,
 }
 
-impl Default for World {
+impl Default for WorldModel {
     fn default() -> Self {
         Self {
             encoding: InOrder(vec![]),
@@ -150,7 +150,7 @@ impl Default for World {
     }
 }
 
-/// The entries of a JSON object as they are written: parts of a latent follow in that order.
+/// The entries of a JSON object in file order, which is the order of a latent's parts.
 struct InOrder(Vec<(String, usize)>);
 
 impl<'de> Deserialize<'de> for InOrder {
@@ -159,7 +159,7 @@ impl<'de> Deserialize<'de> for InOrder {
         impl<'de> Visitor<'de> for Entries {
             type Value = InOrder;
             fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                f.write_str("numbers by column")
+                f.write_str("latent sizes by column")
             }
             fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> std::result::Result<InOrder, A::Error> {
                 let mut entries = vec![];
@@ -180,10 +180,10 @@ impl Serialize for InOrder {
 }
 
 impl Published {
-    /// Reads the JSON of a configuration.
+    /// Parses the JSON of a configuration.
     ///
     /// # Errors
-    /// When it is no configuration of a TD-MPC2.
+    /// When it is not the configuration of a TD-MPC2.
     pub fn read(json: &str) -> Result<Self> {
         serde_json::from_str(json).map_err(|error| {
             Error::config(
@@ -194,14 +194,14 @@ impl Published {
         })
     }
 
-    /// The same sizes.
+    /// Returns the sizes.
     pub fn model(&self) -> Tdmpc2Config {
-        let World { encoding, enc_dim, mlp_dim, num_bins, vmin, vmax, num_q, simnorm_dim, .. } = &self.wm;
-        // Pictures come first in a latent, wherever they are named.
-        let (seen, read): (Vec<_>, Vec<_>) = encoding.0.iter().partition(|(column, _)| column == PIXELS);
+        let WorldModel { encoding, enc_dim, mlp_dim, num_bins, vmin, vmax, num_q, simnorm_dim, .. } = &self.wm;
+        // Images come first in a latent, wherever the file lists them.
+        let (images, columns): (Vec<_>, Vec<_>) = encoding.0.iter().partition(|(column, _)| column == PIXELS);
         let part = |(column, latent): &(String, usize)| Encoding { column: column.clone(), latent: *latent };
         Tdmpc2Config {
-            encoding: seen.into_iter().chain(read).map(part).collect(),
+            encoding: images.into_iter().chain(columns).map(part).collect(),
             image: self.image_size,
             encoder: *enc_dim,
             hidden: *mlp_dim,
@@ -213,7 +213,7 @@ impl Published {
         }
     }
 
-    /// The same loss.
+    /// Returns the settings of the loss.
     pub fn loss(&self) -> LossConfig {
         LossConfig {
             discount: self.wm.discount,
@@ -228,20 +228,20 @@ impl Published {
         }
     }
 
-    /// The model with published weights.
+    /// Returns the model with published weights.
     ///
     /// # Errors
-    /// When a column's width is not said, or a weight is missing, of another shape, or one too many.
+    /// When the width of a column or a weight is missing, a weight has another shape, or there is an unknown weight.
     pub fn with(&self, weights: &Named<HostTensor>, device: &Device) -> Result<Tdmpc2> {
         let config = self.model();
         config.check()?;
         let width = |part: &Encoding| {
             self.extra_dims.get(&part.column).copied().ok_or_else(|| {
-                let fix = "name it there with the numbers it has";
+                let fix = "add it with its number of elements";
                 Error::config("extra_dims", format!("the column '{}' is not in it", part.column), fix)
             })
         };
-        let widths: Vec<usize> = config.numbers().map(width).collect::<Result<_>>()?;
+        let widths: Vec<usize> = config.column_encodings().map(width).collect::<Result<_>>()?;
         let model = Tdmpc2::init(&config, &widths, self.action_dim, Key::new(0), device);
         let shapes = parameters::shapes(&model);
         for (name, shape) in &shapes {

@@ -1,177 +1,128 @@
-//! Planning as published (section 3.2 and appendix H): model-predictive path integral control in latents, whose population the
-//! policy takes part in, and whose candidates end in a value.
+//! [`Tdmpc2Policy`]: planning as published (section 3.2 and appendix H), by model-predictive path integral control in
+//! latent space.
 //!
-//! Every iteration scores `proposals` rollouts of the policy beside samples of a Gaussian around the mean; the `elites` with
-//! the lowest cost weigh `exp(-temperature (cost - least))` in the next mean and spread. The mean of the plan before, moved
-//! forward, is where a search begins. What is done is the first action of an elite drawn by weight, exploring with noise of
-//! the last spread. (Not the mean's: where left and right are as good, it would do neither.)
+//! Every iteration evaluates `proposals` rollouts of the policy and samples of a Gaussian. The `elites` with the lowest cost
+//! get the weights `exp(-temperature (cost - lowest cost))` in the next mean and standard deviation. A search begins at
+//! the previous plan's mean, shifted by one step. The policy takes the first action of an elite drawn by weight; exploring,
+//! it adds noise with the last standard deviation. (The mean itself is not used: between two equally good actions it may
+//! be a bad one.)
 
 use super::config::Tdmpc2Config;
 use super::model::Tdmpc2;
 use super::rollouts::Rollouts;
-use super::train::glance;
+use super::train::observe_row;
 use crate::Checkpoint;
 use crate::nn::normal;
 use crate::nn::parameters::IntoF32 as _;
-use crate::online::SharedModel;
-use crate::train::config::at_least;
+use crate::online::{PlannerConfig, SharedModel};
 use crate::train::{DatasetInfo, TrainConfig};
 use rand::Rng as _;
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 use std::time::Instant;
 use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result};
 use swm_plan::ActionScale;
 
-/// The settings of a search.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct PlannerConfig {
-    /// Steps ahead.
-    pub horizon: usize,
-    /// Candidates of an iteration.
-    pub samples: usize,
-    /// Iterations.
-    pub iterations: usize,
-    /// Candidates that weigh.
-    pub elites: usize,
-    /// Candidates that are rollouts of the policy.
-    pub proposals: usize,
-    /// The least spread of the samples, of actions between -1 and 1.
-    pub min_std: f32,
-    /// The largest, where a search begins.
-    pub max_std: f32,
-    /// How much a unit of cost counts.
-    pub temperature: f32,
-}
-
-impl PlannerConfig {
-    /// Checks that the settings make sense.
-    ///
-    /// # Errors
-    /// Naming the first that does not.
-    pub fn check(&self) -> Result<()> {
-        at_least(&[
-            ("online.planner.horizon", self.horizon, 1),
-            ("online.planner.samples", self.samples, 1),
-            ("online.planner.iterations", self.iterations, 1),
-            ("online.planner.elites", self.elites, 1),
-        ])?;
-        for (what, part) in [("elites", self.elites), ("proposals", self.proposals)] {
-            if part > self.samples {
-                let given = format!("{part} of {} candidates", self.samples);
-                return Err(Error::config(format!("online.planner.{what}"), given, "choose at most all of them"));
-            }
-        }
-        if !(self.min_std > 0.0 && self.min_std <= self.max_std && self.max_std.is_finite()) {
-            let given = format!("from {} to {}", self.min_std, self.max_std);
-            return Err(Error::config("online.planner.min_std", given, "choose 0 < min_std <= max_std"));
-        }
-        if !(self.temperature.is_finite() && self.temperature > 0.0) {
-            let fix = "choose a number above 0";
-            return Err(Error::config("online.planner.temperature", self.temperature.to_string(), fix));
-        }
-        Ok(())
-    }
-}
-
-/// What a search found.
-pub struct Found {
-    /// The mean of the elites, `[horizon, actions]`.
+/// The result of a search.
+pub struct SearchResult {
+    /// The weighted mean of the elites, `[horizon, actions]`.
     pub mean: Vec<f32>,
-    /// Their spread.
+    /// The weighted standard deviation of the elites, `[horizon, actions]`.
     pub std: Vec<f32>,
-    /// The elites, cheapest first, `[elites, horizon, actions]`.
+    /// The elites in order of cost, `[elites, horizon, actions]`.
     pub elites: Vec<f32>,
-    /// What each weighs; they add up to 1.
+    /// The weights of the elites, which sum to 1: `[elites]`.
     pub weights: Vec<f32>,
 }
 
 impl PlannerConfig {
-    /// Searches from a latent; `mean`, `[horizon, actions]`, is where it begins. Decided by `key`.
-    pub fn search(&self, rollouts: &Rollouts, latent: &[f32], mean: &[f32], key: Key) -> Found {
+    /// Searches for a plan from a latent. `key` determines the samples.
+    ///
+    /// # Shapes
+    /// `latent` is `[latent]`, `mean`, the initial mean, is `[horizon, actions]`.
+    pub fn search(&self, rollouts: &Rollouts, latent: &[f32], mean: &[f32], key: Key) -> SearchResult {
         let len = mean.len();
         let mut candidates = vec![0.0; self.samples * len];
         let (proposals, sampled) = candidates.split_at_mut(self.proposals * len);
         if self.proposals > 0 {
             rollouts.propose(latent, &[], self.horizon, key.with("proposals"), proposals);
         }
-        let mut found = Found { mean: mean.to_vec(), std: vec![self.max_std; len], elites: vec![], weights: vec![] };
-        let numbers = sampled.len();
+        let mut result =
+            SearchResult { mean: mean.to_vec(), std: vec![self.max_std; len], elites: vec![], weights: vec![] };
+        let sampled = sampled.len();
         let mut costs = vec![0.0; self.samples];
         let mut order: Vec<usize> = vec![];
         for iteration in 0..self.iterations {
-            let drawn = normal(&[key.at(iteration as u64)], numbers);
+            let drawn = normal(&[key.at(iteration as u64)], sampled);
             for (i, (to, noise)) in candidates[self.proposals * len..].iter_mut().zip(drawn).enumerate() {
-                *to = (found.mean[i % len] + found.std[i % len] * noise).clamp(-1.0, 1.0);
+                *to = (result.mean[i % len] + result.std[i % len] * noise).clamp(-1.0, 1.0);
             }
             rollouts.cost(latent, &candidates, self.horizon, &mut costs);
             order.clear();
             order.extend(0..self.samples);
             order.sort_by(|&a, &b| costs[a].total_cmp(&costs[b]).then(a.cmp(&b)));
             order.truncate(self.elites);
-            found.elites.clear();
-            order.iter().for_each(|&i| found.elites.extend_from_slice(&candidates[i * len..][..len]));
-            self.weigh(order.iter().map(|&i| costs[i] - costs[order[0]]), &mut found);
+            result.elites.clear();
+            order.iter().for_each(|&i| result.elites.extend_from_slice(&candidates[i * len..][..len]));
+            self.weigh(order.iter().map(|&i| costs[i] - costs[order[0]]), &mut result);
         }
-        found
+        result
     }
 
-    /// Weights of the elites by how much dearer than the cheapest they are; their mean and spread.
-    fn weigh(&self, dearer: impl Iterator<Item = f32>, found: &mut Found) {
-        let Found { mean, std, elites, weights } = found;
+    /// Computes the weights of the elites from their cost above the lowest, and their mean and standard deviation.
+    fn weigh(&self, excess_costs: impl Iterator<Item = f32>, result: &mut SearchResult) {
+        let SearchResult { mean, std, elites, weights } = result;
         weights.clear();
-        weights.extend(dearer.map(|cost| (-self.temperature * cost).exp()));
+        weights.extend(excess_costs.map(|cost| (-self.temperature * cost).exp()));
         let sum: f32 = weights.iter().sum();
         weights.iter_mut().for_each(|weight| *weight /= sum);
         let len = mean.len();
         mean.fill(0.0);
         for (elite, weight) in elites.chunks_exact(len).zip(&*weights) {
-            mean.iter_mut().zip(elite).for_each(|(mean, number)| *mean += weight * number);
+            mean.iter_mut().zip(elite).for_each(|(mean, value)| *mean += weight * value);
         }
         std.fill(0.0);
         for (elite, weight) in elites.chunks_exact(len).zip(&*weights) {
             std.iter_mut()
                 .zip(elite)
                 .zip(&*mean)
-                .for_each(|((std, number), mean)| *std += weight * (number - mean).powi(2));
+                .for_each(|((std, value), mean)| *std += weight * (value - mean).powi(2));
         }
         std.iter_mut().for_each(|std| *std = std.sqrt().clamp(self.min_std, self.max_std));
     }
 }
 
-/// Plans at every step with a TD-MPC2.
+/// A policy that plans at every step with a TD-MPC2.
 pub struct Tdmpc2Policy {
     planner: PlannerConfig,
     model: Tdmpc2Config,
     discount: f64,
     uncertainty: f64,
     scale: ActionScale,
-    live: SharedModel<Tdmpc2>,
+    shared_model: SharedModel<Tdmpc2>,
     explore: bool,
     slots: Vec<Slot>,
     latencies: Vec<f64>,
 }
 
-/// The plan of one world.
+/// The plan of one environment.
 struct Slot {
     key: Key,
-    /// Where the next search begins, `[horizon, actions]`.
+    /// The initial mean of the next search, `[horizon, actions]`.
     mean: Vec<f32>,
     action: Vec<f32>,
     failed: Option<Error>,
 }
 
 impl Tdmpc2Policy {
-    /// A policy for `slots` worlds of `spec`, with the weights that `live` holds at the moment.
+    /// A policy for `slots` environments of `spec` with the current weights of a shared model.
     ///
     /// # Errors
-    /// When the model was trained for other actions, or the settings make no sense.
+    /// When the model was trained for other actions, or a setting is invalid.
     pub fn new(
         planner: &PlannerConfig,
         config: &TrainConfig<Tdmpc2>,
         dataset_info: &DatasetInfo,
-        live: SharedModel<Tdmpc2>,
+        shared_model: SharedModel<Tdmpc2>,
         spec: &EnvSpec,
         slots: usize,
         explore: bool,
@@ -187,7 +138,7 @@ impl Tdmpc2Policy {
             discount: config.loss.discount,
             uncertainty: config.loss.uncertainty,
             scale: dataset_info.action.clone(),
-            live,
+            shared_model,
             explore,
             slots: (0..slots).map(|_| slot()).collect(),
             latencies: vec![],
@@ -199,31 +150,31 @@ impl Tdmpc2Policy {
     /// # Errors
     /// As [`Tdmpc2Policy::new`].
     pub fn of(checkpoint: &Checkpoint<Tdmpc2>, planner: &PlannerConfig, spec: &EnvSpec, slots: usize) -> Result<Self> {
-        let live = SharedModel::new(checkpoint.model.clone());
-        Self::new(planner, &checkpoint.config, &checkpoint.dataset_info, live, spec, slots, false)
+        let shared_model = SharedModel::new(checkpoint.model.clone());
+        Self::new(planner, &checkpoint.config, &checkpoint.dataset_info, shared_model, spec, slots, false)
     }
 }
 
 impl Slot {
-    /// Plans, and says the first action in model units.
+    /// Plans and stores the first action in model units.
     fn plan(&mut self, planner: &PlannerConfig, rollouts: &Rollouts, latent: &[f32], key: Key, explore: bool) {
-        let found = planner.search(rollouts, latent, &self.mean, key);
+        let result = planner.search(rollouts, latent, &self.mean, key);
         let dim = self.action.len();
         let mut draw: f32 = key.with("elite").rng().random();
-        let chosen = found.weights.iter().position(|weight| {
+        let chosen = result.weights.iter().position(|weight| {
             draw -= weight;
             draw < 0.0
         });
         let elite = chosen.unwrap_or(0) * self.mean.len();
-        self.action.copy_from_slice(&found.elites[elite..][..dim]);
+        self.action.copy_from_slice(&result.elites[elite..][..dim]);
         if explore {
             let noise = normal(&[key.with("exploration")], dim);
-            for ((action, noise), std) in self.action.iter_mut().zip(noise).zip(&found.std) {
+            for ((action, noise), std) in self.action.iter_mut().zip(noise).zip(&result.std) {
                 *action = (*action + noise * std).clamp(-1.0, 1.0);
             }
         }
         let len = self.mean.len();
-        self.mean[..len - dim].copy_from_slice(&found.mean[dim..]);
+        self.mean[..len - dim].copy_from_slice(&result.mean[dim..]);
         self.mean[len - dim..].fill(0.0);
     }
 }
@@ -238,9 +189,9 @@ impl Policy for Tdmpc2Policy {
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
         let column = actions.schema().index("action")?;
         let begun = Instant::now();
-        // Of the episode, not of this policy: who comes in later draws the same.
+        // Keyed by the step of the episode, so that a policy attached later draws the same samples.
         let steps = infos.get::<i32>("step_idx")?;
-        let rollouts = Rollouts::new(&self.live.get(), self.discount, self.uncertainty);
+        let rollouts = Rollouts::new(&self.shared_model.get(), self.discount, self.uncertainty);
         let (planner, model, explore) = (&self.planner, &self.model, self.explore);
         self.slots.par_iter_mut().enumerate().filter(|(slot, _)| active[*slot]).for_each(|(row, slot)| {
             match latent(model, rollouts.model(), infos, row) {
@@ -260,20 +211,19 @@ impl Policy for Tdmpc2Policy {
             self.scale.to_env(&slot.action, &mut action);
             actions.row_mut(row).set(column, &action);
         }
-        #[allow(clippy::cast_precision_loss)]
-        let share = begun.elapsed().as_secs_f64() / count.max(1) as f64;
-        self.latencies.extend(std::iter::repeat_n(share, count));
+        let seconds = begun.elapsed().as_secs_f64() / count.max(1) as f64;
+        self.latencies.extend(std::iter::repeat_n(seconds, count));
         Ok(())
     }
 
-    /// Seconds each plan took: worlds planned for together share their time equally.
+    /// Returns the seconds of each plan: the time of a call is divided equally among its environments.
     fn take_latencies(&mut self) -> Vec<f64> {
         std::mem::take(&mut self.latencies)
     }
 }
 
-/// The latent of what a row of the infos shows.
+/// Returns the latent of the observation in a row of the infos, `[latent]`.
 pub(super) fn latent(config: &Tdmpc2Config, model: &Tdmpc2, infos: &Batch, row: usize) -> Result<Vec<f32>> {
-    let observation = glance(config, model, infos.row(row))?;
+    let observation = observe_row(config, model, infos.row(row))?;
     Ok(model.encode(observation).into_data().into_f32_vec())
 }

@@ -1,7 +1,7 @@
-//! [`Rollouts`]: what candidate action sequences bring, without a graph.
+//! [`Rollouts`]: costs of candidate action sequences, without autodiff.
 
 use super::model::Tdmpc2;
-use super::step::numbers;
+use super::step::expected_values;
 use crate::nn::parameters::IntoF32;
 use crate::nn::{DropoutRng, Ensemble, normal};
 use burn::tensor::{Tensor, TensorData};
@@ -11,7 +11,7 @@ use swm_core::Key;
 /// Candidates that are rolled out together; the parts of a population run in parallel.
 const PART: usize = 128;
 
-/// A model made ready for rollouts.
+/// A model prepared for rollouts.
 pub struct Rollouts {
     model: Tdmpc2,
     critics: Ensemble,
@@ -20,26 +20,28 @@ pub struct Rollouts {
 }
 
 impl Rollouts {
-    /// `discount` per step; `uncertainty` is what disagreement of the Q functions costs, per unit of value.
+    /// Rollouts with a `discount` per step; `uncertainty` is the cost of the Q functions' disagreement per unit of value.
     pub fn new(model: &Tdmpc2, discount: f64, uncertainty: f64) -> Self {
         let critics = Ensemble::of(&model.qs.iter().collect::<Vec<_>>());
         Self { model: model.clone(), critics, discount, uncertainty }
     }
 
-    /// The model.
+    /// Returns the model.
     pub fn model(&self) -> &Tdmpc2 {
         &self.model
     }
 
-    /// Writes the costs of candidates `[samples, horizon, actions]` from one latent: the discounted rewards of their steps
-    /// and the value of the policy's action behind them, negated.
+    /// Writes the costs of candidates that start at one latent: the negated sum of the discounted rewards and of the value
+    /// of the policy's action after the last step.
+    ///
+    /// # Shapes
+    /// `latent` is `[latent]`, `candidates` is `[samples, horizon, actions]`, `costs` is `[samples]`.
     pub fn cost(&self, latent: &[f32], candidates: &[f32], horizon: usize, costs: &mut [f32]) {
         let width = horizon * self.model.actions();
         let parts = costs.par_chunks_mut(PART).zip(candidates.par_chunks(PART * width));
         parts.for_each(|(costs, candidates)| costs.copy_from_slice(&self.part(latent, candidates, horizon)));
     }
 
-    #[allow(clippy::cast_precision_loss, clippy::cast_possible_wrap, clippy::cast_possible_truncation)]
     fn part(&self, latent: &[f32], candidates: &[f32], horizon: usize) -> Vec<f32> {
         let model = &self.model;
         let (device, bins, width) = (model.device(), model.config().bins, model.actions());
@@ -49,7 +51,7 @@ impl Rollouts {
         let start = Tensor::<2>::from_data(TensorData::new(latent.to_vec(), [1, latent.len()]), &device);
         let mut latents = start.expand([samples, latent.len()]);
         let mut inputs = vec![];
-        // The chance that the episode goes on, 1 or 0, and what is worth what.
+        // Whether the episode continues, 1 or 0, and the weight of each reward.
         let mut alive = Tensor::<1>::ones([samples], &device);
         let mut weights = vec![];
         for step in 0..horizon {
@@ -64,10 +66,10 @@ impl Rollouts {
             }
         }
         let rewards = bins.expectation(model.reward.forward(Tensor::cat(inputs, 0))) * Tensor::cat(weights, 0);
-        let gained: Tensor<1> = rewards.reshape([horizon, samples]).sum_dim(0).squeeze_dim(0);
+        let returns: Tensor<1> = rewards.reshape([horizon, samples]).sum_dim(0).squeeze_dim(0);
 
         let policy = model.policy(latents.clone()).mean.tanh();
-        let q = numbers(
+        let q = expected_values(
             bins,
             self.critics.forward(Tensor::cat(vec![latents, policy], 1), 0.0, &mut DropoutRng::disabled()),
         );
@@ -76,10 +78,13 @@ impl Rollouts {
         let unbiased = (count as f64 - 1.0).max(1.0);
         let std = ((q - mean.clone()).square().sum_dim(0) / unbiased).sqrt();
         let value: Tensor<1> = (mean.clone() - mean.abs() * std * self.uncertainty).squeeze_dim(0);
-        (gained + value * alive * self.discount.powi(horizon as i32)).neg().into_data().into_f32_vec()
+        (returns + value * alive * self.discount.powi(horizon as i32)).neg().into_data().into_f32_vec()
     }
 
-    /// The policy's action at latents `[rows, latent]`: its mean, or drawn by the key of every row.
+    /// Returns the policy's actions: the mean, or samples drawn with one key per row.
+    ///
+    /// # Shapes
+    /// `latents` is `[rows, latent]`; returns `[rows, actions]`.
     pub fn act(&self, latents: Tensor<2>, keys: Option<&[Key]>) -> Tensor<2> {
         let gaussian = self.model.policy(latents);
         match keys {
@@ -92,8 +97,11 @@ impl Rollouts {
         }
     }
 
-    /// Action sequences of the policy, `[samples, horizon, actions]`, from the latent that the actions `prefix`, which they
-    /// begin with, lead to. Draws are decided by `key` and the number of the sequence.
+    /// Writes action sequences that begin with the actions `prefix` and continue with samples of the policy. `key` and the
+    /// index of a sequence determine its samples.
+    ///
+    /// # Shapes
+    /// `latent` is `[latent]`, `prefix` is `[steps, actions]`, `proposals` is `[samples, horizon, actions]`.
     pub fn propose(&self, latent: &[f32], prefix: &[f32], horizon: usize, key: Key, proposals: &mut [f32]) {
         let (device, width) = (self.model.device(), self.model.actions());
         let samples = proposals.len() / (horizon * width);
@@ -108,8 +116,8 @@ impl Rollouts {
                     self.act(latents.clone(), Some(&keys))
                 }
             };
-            let numbers = actions.to_data().into_f32_vec();
-            for (proposal, action) in proposals.chunks_exact_mut(horizon * width).zip(numbers.chunks_exact(width)) {
+            let values = actions.to_data().into_f32_vec();
+            for (proposal, action) in proposals.chunks_exact_mut(horizon * width).zip(values.chunks_exact(width)) {
                 proposal[step * width..(step + 1) * width].copy_from_slice(action);
             }
             latents = self.model.next(Tensor::cat(vec![latents, actions], 1));

@@ -1,11 +1,11 @@
-//! One training step: losses and gradients of a batch of clips.
+//! One training step (Hansen et al. 2024, equations 3 to 6): losses and gradients of a batch of clips.
 //!
-//! Two graphs, because nothing of the one reaches the other: the world (encoder, dynamics, rewards, values), and the policy,
-//! for which latents and Q functions are given. All that does not depend on the step before it, which is everything but the
-//! dynamics, is computed for all steps of a clip at once; Q functions are one batched product.
+//! World model (encoder, dynamics, rewards, values) and policy have separate autodiff graphs: latents and Q functions are
+//! constants for the policy. Everything except the dynamics is computed for all steps of a clip at once; the Q functions are
+//! one batched product.
 //!
-//! A batch is cut into shards of clips that run in parallel. Their gradients are added in their order; only the spread of
-//! values, by which the policy's loss is scaled, needs all of them.
+//! A batch is split into shards of clips that run in parallel. Their gradients are added in order; only the spread of
+//! values, which scales the policy's loss, is computed over all shards.
 
 use super::config::LossConfig;
 use super::model::{Observation, Tdmpc2};
@@ -18,7 +18,7 @@ use rand_distr::{Distribution as _, StandardNormal};
 use rayon::prelude::*;
 use swm_core::Key;
 
-/// A batch of clips, step after step, each of all clips.
+/// A batch of clips. Rows are ordered by step, then by clip.
 pub struct TrainBatch {
     /// `[(horizon + 1) * clips]` observations.
     pub observations: Observation,
@@ -30,27 +30,27 @@ pub struct TrainBatch {
     pub terminated: Tensor<2>,
 }
 
-/// What is drawn at random in a step.
+/// The random draws of a step.
 pub struct Draws {
-    /// Standard normal, `[horizon, clips, actions]`, for the actions at the frames to come.
+    /// Standard normal, `[horizon, clips, actions]`, for the actions at the next frames.
     pub target: Tensor<3>,
-    /// Standard normal, `[horizon, clips, actions]`, for the actions the policy is judged by.
+    /// Standard normal, `[horizon, clips, actions]`, for the actions of the policy's loss.
     pub policy: Tensor<3>,
-    /// The two target Q functions whose smaller value counts, of every step.
+    /// The two target Q functions of each step whose minimum is the target.
     pub target_critics: Vec<[usize; 2]>,
-    /// The two Q functions whose mean the policy is judged by, of every step.
+    /// The two Q functions of each step whose mean is the value of the policy's actions.
     pub policy_critics: Vec<[usize; 2]>,
-    /// Decides dropout; none in validation.
+    /// Determines dropout; `None` in validation.
     pub dropout: Option<Key>,
 }
 
 impl Draws {
-    /// What a key decides.
+    /// Draws everything that a step needs.
     pub fn new(key: Key, model: &Tdmpc2, shape: [usize; 3], training: bool) -> Self {
         let normal = |purpose: &str| {
             let mut rng = key.with(purpose).rng();
-            let numbers: Vec<f32> = (0..shape.iter().product()).map(|_| StandardNormal.sample(&mut rng)).collect();
-            Tensor::from_data(TensorData::new(numbers, shape), &model.device())
+            let values: Vec<f32> = (0..shape.iter().product()).map(|_| StandardNormal.sample(&mut rng)).collect();
+            Tensor::from_data(TensorData::new(values, shape), &model.device())
         };
         let pairs = |purpose: &str| {
             let mut rng = key.with(purpose).rng();
@@ -72,11 +72,11 @@ impl Draws {
     }
 }
 
-/// What a step found.
-pub struct Step {
-    /// The weighted sum.
+/// Losses and gradients of a batch.
+pub struct Tdmpc2Step {
+    /// The weighted sum of the losses.
     pub total: f64,
-    /// Mean squared difference between predicted latents and those of the frames to come.
+    /// Mean squared error of the predicted latents.
     pub consistency: f64,
     /// Cross-entropy of rewards.
     pub reward: f64,
@@ -88,16 +88,16 @@ pub struct Step {
     pub termination: f64,
     /// The mean value of the policy's actions.
     pub q: f64,
-    /// The mean entropy of the policy, estimated from the actions drawn.
+    /// The mean entropy of the policy, estimated from its samples.
     pub entropy: f64,
-    /// The running spread of values after this step.
+    /// The running spread of values after the step.
     pub scale: f32,
     /// Gradients by parameter, flat.
     pub gradients: Named<Tensor<1>>,
 }
 
-/// Losses and gradients of a batch. `model` is without autodiff; `shards` is at least 1.
-pub fn step(model: &Tdmpc2, batch: &TrainBatch, config: &LossConfig, draws: &Draws, shards: usize) -> Step {
+/// Computes losses and gradients of a batch. `model` has no autodiff; `shards` is at least 1.
+pub fn step(model: &Tdmpc2, batch: &TrainBatch, config: &LossConfig, draws: &Draws, shards: usize) -> Tdmpc2Step {
     let [horizon, clips, _] = batch.actions.dims();
     let size = clips.div_ceil(shards.max(1));
     let parts: Vec<Part> = (0..clips)
@@ -105,22 +105,22 @@ pub fn step(model: &Tdmpc2, batch: &TrainBatch, config: &LossConfig, draws: &Dra
         .enumerate()
         .map(|(i, start)| Part::of(batch, draws, start..(start + size).min(clips), i))
         .collect();
-    let worlds: Vec<World> = parts.par_iter().map(|part| world(model, part, config, draws)).collect();
-    let judged: Vec<Judged> =
-        parts.par_iter().zip(&worlds).map(|(part, world)| judge(model, part, &world.latents, draws)).collect();
+    let world_models: Vec<WorldModelLoss> =
+        parts.par_iter().map(|part| world_model_loss(model, part, config, draws)).collect();
+    let evaluations: Vec<PolicyEvaluation> = (parts.par_iter().zip(&world_models))
+        .map(|(part, world_model)| evaluate_policy(model, part, &world_model.latents, draws))
+        .collect();
 
-    let first: Vec<f32> = judged
-        .iter()
-        .zip(&parts)
-        .flat_map(|(judged, part)| values(judged.q.clone()).into_iter().take(part.clips))
+    let first_step: Vec<f32> = (evaluations.iter().zip(&parts))
+        .flat_map(|(evaluation, part)| values(evaluation.q.clone()).into_iter().take(part.clips))
         .collect();
     let old = values(model.scale.value.val())[0];
-    #[allow(clippy::cast_possible_truncation)]
-    let scale = old + (spread(first) - old) * config.tau as f32;
-    let policies: Vec<Policy> =
-        judged.into_par_iter().zip(&parts).map(|(judged, part)| learn(judged, part, config, scale)).collect();
+    let scale = old + (spread(first_step) - old) * config.tau as f32;
+    let policies: Vec<PolicyLoss> = (evaluations.into_par_iter().zip(&parts))
+        .map(|(evaluation, part)| policy_loss(evaluation, part, config, scale))
+        .collect();
 
-    let mut step = Step {
+    let mut step = Tdmpc2Step {
         total: 0.0,
         consistency: 0.0,
         reward: 0.0,
@@ -132,19 +132,18 @@ pub fn step(model: &Tdmpc2, batch: &TrainBatch, config: &LossConfig, draws: &Dra
         scale,
         gradients: Named::new(),
     };
-    for ((part, world), policy) in parts.iter().zip(worlds).zip(policies) {
-        #[allow(clippy::cast_precision_loss)]
-        let share = part.clips as f64 / clips as f64;
-        let [consistency, reward, value, termination] = world.losses.map(|loss| loss * share);
+    for ((part, world_model), policy) in parts.iter().zip(world_models).zip(policies) {
+        let fraction = part.clips as f64 / clips as f64;
+        let [consistency, reward, value, termination] = world_model.losses.map(|loss| loss * fraction);
         step.consistency += consistency;
         step.reward += reward;
         step.value += value;
         step.termination += termination;
-        step.policy += policy.loss * share;
-        step.q += policy.q * share;
-        step.entropy += policy.entropy * share;
-        for (name, gradient) in world.gradients.into_iter().chain(policy.gradients) {
-            let gradient = gradient * share;
+        step.policy += policy.loss * fraction;
+        step.q += policy.q * fraction;
+        step.entropy += policy.entropy * fraction;
+        for (name, gradient) in world_model.gradients.into_iter().chain(policy.gradients) {
+            let gradient = gradient * fraction;
             let sum = match step.gradients.remove(&name) {
                 Some(sum) => sum + gradient,
                 None => gradient,
@@ -161,7 +160,7 @@ pub fn step(model: &Tdmpc2, batch: &TrainBatch, config: &LossConfig, draws: &Dra
     step
 }
 
-/// Some clips of a batch, in rows: step after step, each of all clips.
+/// Some clips of a batch. Rows are ordered by step, then by clip.
 struct Part {
     index: usize,
     clips: usize,
@@ -203,13 +202,12 @@ impl Part {
         self.horizon * self.clips
     }
 
-    /// The rows of a step.
+    /// Returns the rows of a step.
     fn at(&self, x: &Tensor<2>, step: usize) -> Tensor<2> {
         x.clone().narrow(0, step * self.clips, self.clips)
     }
 
-    /// The weight of every row: `ρ^t`, over the number of rows.
-    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation)]
+    /// Returns the weight of every row: `ρ^t` divided by the number of rows.
     fn weights(&self, rho: f64) -> Tensor<1> {
         let weight = |row: usize| (rho.powf((row / self.clips) as f64) / self.rows() as f64) as f32;
         let weights: Vec<f32> = (0..self.rows()).map(weight).collect();
@@ -217,19 +215,20 @@ impl Part {
     }
 }
 
-struct World {
+/// Losses and gradients of the world model.
+struct WorldModelLoss {
     /// Consistency, reward, value, termination.
     losses: [f64; 4],
     gradients: Named<Tensor<1>>,
-    /// Before every action, `[rows, latent]`.
+    /// The latents before every action, `[rows, latent]`.
     latents: Tensor<2>,
 }
 
-/// Losses and gradients of everything but the policy.
-fn world(model: &Tdmpc2, part: &Part, config: &LossConfig, draws: &Draws) -> World {
+/// Computes losses and gradients of all networks except the policy.
+fn world_model_loss(model: &Tdmpc2, part: &Part, config: &LossConfig, draws: &Draws) -> WorldModelLoss {
     let bins = model.config().bins;
-    let ahead = model.encode(part.future.clone());
-    let goals = bins.two_hot(targets(model, part, &ahead, config, draws));
+    let next_latents = model.encode(part.future.clone());
+    let targets = bins.two_hot(targets(model, part, &next_latents, config, draws));
 
     let live = model.clone().train();
     let weights = part.weights(config.rho);
@@ -244,42 +243,43 @@ fn world(model: &Tdmpc2, part: &Part, config: &LossConfig, draws: &Draws) -> Wor
     }
     let (inputs, predicted) = (Tensor::cat(inputs, 0), Tensor::cat(predicted, 0));
 
-    let weighed = |loss: Tensor<1>| (loss * weights.clone().autodiff()).sum();
-    let consistency = weighed((predicted.clone() - ahead.autodiff()).square().mean_dim(1).squeeze_dim(1));
+    let weighted_sum = |loss: Tensor<1>| (loss * weights.clone().autodiff()).sum();
+    let consistency = weighted_sum((predicted.clone() - next_latents.autodiff()).square().mean_dim(1).squeeze_dim(1));
     let reward =
-        weighed(two_hot::cross_entropy(live.reward.forward(inputs.clone()), bins.two_hot(part.rewards.clone())));
+        weighted_sum(two_hot::cross_entropy(live.reward.forward(inputs.clone()), bins.two_hot(part.rewards.clone())));
     let mut rng = draws.dropout.map(|key| key.at(part.index as u64).rng());
     let critics = Ensemble::of(&live.qs.iter().collect::<Vec<_>>());
     let logits = critics.forward(inputs.clone(), model.config().dropout, &mut DropoutRng(rng.as_mut()));
     let [count, rows, width] = logits.dims();
-    let goals = goals.unsqueeze_dim::<3>(0).expand([count, rows, width]).reshape([count * rows, width]);
+    let targets = targets.unsqueeze_dim::<3>(0).expand([count, rows, width]).reshape([count * rows, width]);
     let value: Tensor<2> =
-        two_hot::cross_entropy(logits.reshape([count * rows, width]), goals).reshape([count, rows]).mean_dim(0);
-    let value = weighed(value.squeeze_dim(0));
+        two_hot::cross_entropy(logits.reshape([count * rows, width]), targets).reshape([count, rows]).mean_dim(0);
+    let value = weighted_sum(value.squeeze_dim(0));
     let mut total =
         consistency.clone() * config.consistency + reward.clone() * config.reward + value.clone() * config.value;
     let mut losses = [value_of(&consistency), value_of(&reward), value_of(&value), 0.0];
     if let Some(head) = &live.termination {
         let logits: Tensor<1> = head.forward(predicted).squeeze_dim(1);
-        // Binary cross-entropy: softplus of the logit against the truth.
-        let against = logits.clone() * (part.terminated.clone() * -2.0 + 1.0).autodiff();
-        let termination = weighed(activation::softplus(against, 1.0));
+        // Binary cross-entropy: softplus of the logit, negated for rows that terminate.
+        let signed = logits.clone() * (part.terminated.clone() * -2.0 + 1.0).autodiff();
+        let termination = weighted_sum(activation::softplus(signed, 1.0));
         losses[3] = value_of(&termination);
         total = total + termination * config.termination;
     }
     let gradients = parameters::gradients(&live, &total.backward());
     let [rows, width] = inputs.dims();
     let latents = inputs.inner().slice([0..rows, 0..width - part.actions.dims()[1]]);
-    World { losses, gradients, latents }
+    WorldModelLoss { losses, gradients, latents }
 }
 
-/// The values that Q functions are to learn: `r + γ min(Q_i, Q_j)` at the frames to come, nothing behind the end of an episode.
-fn targets(model: &Tdmpc2, part: &Part, ahead: &Tensor<2>, config: &LossConfig, draws: &Draws) -> Tensor<1> {
-    let next = model.policy(ahead.clone()).sample(part.target_noise.clone());
-    let input = Tensor::cat(vec![ahead.clone(), next], 1);
+/// Returns the targets of the Q functions, `[rows]`: `r + γ min(Q_i, Q_j)` at the next frames, and `r` where the episode
+/// terminates.
+fn targets(model: &Tdmpc2, part: &Part, next_latents: &Tensor<2>, config: &LossConfig, draws: &Draws) -> Tensor<1> {
+    let next = model.policy(next_latents.clone()).sample(part.target_noise.clone());
+    let input = Tensor::cat(vec![next_latents.clone(), next], 1);
     let least = (0..part.horizon).map(|step| {
         let chosen = chosen(&model.target_qs, draws.target_critics[step]);
-        let q = numbers(
+        let q = expected_values(
             model.config().bins,
             Ensemble::of(&chosen).forward(part.at(&input, step), 0.0, &mut DropoutRng::disabled()),
         );
@@ -289,16 +289,16 @@ fn targets(model: &Tdmpc2, part: &Part, ahead: &Tensor<2>, config: &LossConfig, 
     part.rewards.clone() + q * (part.terminated.clone().neg() + 1.0) * config.discount
 }
 
-/// The policy's actions, judged.
-struct Judged {
+/// Values and entropies of the policy's actions.
+struct PolicyEvaluation {
     policy: Head,
     /// Values of its actions, `[rows]`.
     q: Tensor<1>,
-    /// The logarithm of their density, negated and times their numbers, `[rows]`.
+    /// The negative log-density of the actions times the number of action elements, `[rows]`.
     entropy: Tensor<1>,
 }
 
-fn judge(model: &Tdmpc2, part: &Part, latents: &Tensor<2>, draws: &Draws) -> Judged {
+fn evaluate_policy(model: &Tdmpc2, part: &Part, latents: &Tensor<2>, draws: &Draws) -> PolicyEvaluation {
     let policy = model.pi.clone().train();
     let latents = latents.clone().autodiff();
     let gaussian = super::Gaussian::of(policy.forward(latents.clone()));
@@ -307,35 +307,34 @@ fn judge(model: &Tdmpc2, part: &Part, latents: &Tensor<2>, draws: &Draws) -> Jud
     let [_, width] = actions.dims();
     let normal = (noise.square() * -0.5 - 0.5 * (2.0 * std::f64::consts::PI).ln()).autodiff() - gaussian.log_std;
     let squashed = (activation::relu(actions.clone().square().neg() + 1.0) + 1e-6).log();
-    #[allow(clippy::cast_precision_loss)]
     let entropy = (normal - squashed).sum_dim(1).squeeze_dim(1) * -(width as f64);
     let input = Tensor::cat(vec![latents, actions], 1);
     let means = (0..part.horizon).map(|step| {
         let critics = Ensemble::of(&chosen(&model.qs, draws.policy_critics[step])).frozen();
         let logits = critics.forward(part.at(&input, step), 0.0, &mut DropoutRng::disabled());
-        numbers(model.config().bins, logits).mean_dim(0).squeeze_dim(0)
+        expected_values(model.config().bins, logits).mean_dim(0).squeeze_dim(0)
     });
-    Judged { policy, q: Tensor::cat(means.collect(), 0), entropy }
+    PolicyEvaluation { policy, q: Tensor::cat(means.collect(), 0), entropy }
 }
 
-struct Policy {
+/// Loss and gradients of the policy.
+struct PolicyLoss {
     loss: f64,
     q: f64,
     entropy: f64,
     gradients: Named<Tensor<1>>,
 }
 
-/// The policy's loss and gradients: values in units of their spread, and entropy.
-#[allow(clippy::cast_precision_loss)]
-fn learn(judged: Judged, part: &Part, config: &LossConfig, scale: f32) -> Policy {
-    let Judged { policy, q, entropy } = judged;
+/// Computes the policy's loss, negated values in units of their spread minus weighted entropy, and its gradients.
+fn policy_loss(evaluation: PolicyEvaluation, part: &Part, config: &LossConfig, scale: f32) -> PolicyLoss {
+    let PolicyEvaluation { policy, q, entropy } = evaluation;
     let width = part.actions.dims()[1] as f64;
     let means = [&q, &entropy].map(|x| value_of(&x.clone().mean()));
     let gain = q / scale + entropy * config.entropy;
     let loss = (gain * part.weights(config.rho).autodiff()).sum().neg();
     let value = value_of(&loss);
     let gradients = parameters::gradients(&policy, &loss.backward());
-    Policy {
+    PolicyLoss {
         loss: value,
         q: means[0],
         entropy: means[1] / width,
@@ -347,23 +346,25 @@ fn chosen(heads: &[Head], pair: [usize; 2]) -> [&Head; 2] {
     pair.map(|i| &heads[i])
 }
 
-/// Logits `[heads, rows, bins]` to numbers `[heads, rows]`.
-pub(super) fn numbers(bins: Bins, logits: Tensor<3>) -> Tensor<2> {
+/// Returns the expected values of binned distributions.
+///
+/// # Shapes
+/// `logits` is `[heads, rows, bins]`; returns `[heads, rows]`.
+pub(super) fn expected_values(bins: Bins, logits: Tensor<3>) -> Tensor<2> {
     let [heads, rows, width] = logits.dims();
     bins.expectation(logits.reshape([heads * rows, width])).reshape([heads, rows])
 }
 
-/// From the 5th to the 95th percentile, at least 1e-4; between two numbers it lies on the line.
-#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+/// Returns the distance from the 5th to the 95th percentile (with linear interpolation), at least 1e-4.
 fn spread(mut values: Vec<f32>) -> f32 {
     values.sort_by(f32::total_cmp);
-    let at = |share: f64| {
-        let place = share * (values.len() - 1) as f64;
-        let below = place as usize;
+    let percentile = |fraction: f64| {
+        let position = fraction * (values.len() - 1) as f64;
+        let below = position as usize;
         let above = (below + 1).min(values.len() - 1);
-        values[below] + (values[above] - values[below]) * (place - below as f64) as f32
+        values[below] + (values[above] - values[below]) * (position - below as f64) as f32
     };
-    (at(0.95) - at(0.05)).max(1e-4)
+    (percentile(0.95) - percentile(0.05)).max(1e-4)
 }
 
 fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {

@@ -1,4 +1,4 @@
-//! How a TD-MPC2 is trained on a dataset: the loop's side of [`super::step`].
+//! [`Trainable`] for TD-MPC2: the training loop's view of [`super::step`].
 
 use super::config::{LossConfig, PIXELS, Tdmpc2Config};
 use super::model::{Observation, Tdmpc2};
@@ -17,7 +17,7 @@ use swm_data::{ClipSpec, LoaderConfig};
 impl Trainable for Tdmpc2 {
     const FAMILY: &'static str = "tdmpc2";
     const SUMMARY: &'static str =
-        "TD-MPC2: latents that predict rewards and values, planned through with a policy to start from";
+        "TD-MPC2: latents that predict rewards and values, with a policy that initialises plans";
     const PRESETS: &'static [Preset] = &[
         Preset {
             id: "tiny",
@@ -46,11 +46,11 @@ impl Trainable for Tdmpc2 {
     }
 
     fn image_size(config: &Tdmpc2Config) -> Option<usize> {
-        config.pictures().map(|_| config.image)
+        config.image_encoding().map(|_| config.image)
     }
 
     fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
-        if config.model.pictures().is_some() {
+        if config.model.image_encoding().is_some() {
             pixels::check(config.model.image, schema, PIXELS)?;
         }
         crate::online::has_rewards(schema)?;
@@ -61,7 +61,7 @@ impl Trainable for Tdmpc2 {
     }
 
     fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self> {
-        let widths = config.model.numbers().map(|part| Ok(dataset_info.column(&part.column)?.dim()));
+        let widths = config.model.column_encodings().map(|part| Ok(dataset_info.column(&part.column)?.dim()));
         Ok(Self::init(&config.model, &widths.collect::<Result<Vec<_>>>()?, dataset_info.action.dim(), key, device))
     }
 
@@ -75,31 +75,31 @@ impl Trainable for Tdmpc2 {
         };
         let actions = dataset_info.actions(batch, steps, 1, device)?.swap_dims(0, 1).narrow(0, 0, horizon);
         let batch = TrainBatch {
-            observations: observe(&config.model, batch, steps, device)?,
+            observations: observe_clips(&config.model, batch, steps, device)?,
             actions,
             rewards: flat("reward")?,
             terminated: flat("terminated")?,
         };
         let draws = Draws::new(*key, self, [horizon, clips, width], *training);
-        let found = step(self, &batch, &config.loss, &draws, config.shards);
+        let losses = step(self, &batch, &config.loss, &draws, config.shards);
         let mut metrics = vec![
-            ("loss", found.total),
-            ("consistency", found.consistency),
-            ("reward", found.reward),
-            ("value", found.value),
-            ("policy", found.policy),
-            ("q", found.q),
-            ("entropy", found.entropy),
-            ("scale", f64::from(found.scale)),
+            ("loss", losses.total),
+            ("consistency", losses.consistency),
+            ("reward", losses.reward),
+            ("value", losses.value),
+            ("policy", losses.policy),
+            ("q", losses.q),
+            ("entropy", losses.entropy),
+            ("scale", f64::from(losses.scale)),
         ];
         if self.termination.is_some() {
-            metrics.push(("termination", found.termination));
+            metrics.push(("termination", losses.termination));
         }
-        let scale = Tensor::from_data(TensorData::new(vec![found.scale], [1]), context.device);
-        Ok(StepOutput { metrics, gradients: found.gradients, buffers: Named::from([(SCALE.to_owned(), scale)]) })
+        let scale = Tensor::from_data(TensorData::new(vec![losses.scale], [1]), context.device);
+        Ok(StepOutput { metrics, gradients: losses.gradients, buffers: Named::from([(SCALE.to_owned(), scale)]) })
     }
 
-    /// The running spread is replaced; target networks move towards those that were trained.
+    /// Replaces the running spread and updates the target networks.
     fn after_step(mut self, context: &StepContext<'_, Self>, mut buffers: Named<Tensor<1>>) -> Self {
         self.target_qs = parameters::blend(self.target_qs, &self.qs, 1.0 - context.config.loss.tau);
         if let Some(scale) = buffers.remove(SCALE) {
@@ -108,68 +108,70 @@ impl Trainable for Tdmpc2 {
         self
     }
 
-    /// Gradients of world and policy are clipped apart; the encoders learn more slowly, as published.
+    /// Clips the gradients of world model and policy separately; encoders have a lower learning rate, as published.
     fn parameter_group(name: &str) -> ParameterGroup {
         let encoder = ["cnn.", "pixel_encoder.", "extra_encoders."].iter().any(|part| name.starts_with(part));
         ParameterGroup { clip: usize::from(name.starts_with("pi.")), lr: if encoder { ENCODER_LR } else { 1.0 } }
     }
 }
 
-/// The learning rate of encoders, as a share of the others'.
+/// The learning rate of encoders relative to other parameters.
 const ENCODER_LR: f64 = 0.3;
 const SCALE: &str = "scale.value";
 
-/// Observations of a batch of clips, step after step, each of all clips.
-fn observe(config: &Tdmpc2Config, batch: &Batch, steps: usize, device: &Device) -> Result<Observation> {
+/// Reads the observations of a batch of clips.
+///
+/// # Shapes
+/// Rows are ordered by step, then by clip: `[steps * clips, …]`.
+fn observe_clips(config: &Tdmpc2Config, batch: &Batch, steps: usize, device: &Device) -> Result<Observation> {
     let clips = batch.rows();
-    let numbers = config.numbers().map(|part| {
-        let numbers = batch.to_f32(&part.column)?;
-        let width = numbers.len() / (clips * steps).max(1);
-        let numbers = Tensor::<3>::from_data(TensorData::new(numbers, [clips, steps, width]), device);
-        Ok(numbers.swap_dims(0, 1).reshape([steps * clips, width]))
+    let columns = config.column_encodings().map(|encoding| {
+        let values = batch.to_f32(&encoding.column)?;
+        let width = values.len() / (clips * steps).max(1);
+        let values = Tensor::<3>::from_data(TensorData::new(values, [clips, steps, width]), device);
+        Ok(values.swap_dims(0, 1).reshape([steps * clips, width]))
     });
-    let numbers = numbers.collect::<Result<_>>()?;
-    let pictures = config.pictures().map(|_| {
-        let planes = pixels::planes(&eyes(config), batch.get::<u8>(PIXELS)?, device)?;
+    let columns = columns.collect::<Result<_>>()?;
+    let images = config.image_encoding().map(|_| {
+        let planes = pixels::planes(&normalization(config), batch.get::<u8>(PIXELS)?, device)?;
         let [frames, colours, side, _] = planes.dims();
         let planes: Tensor<5> = planes.reshape([clips, steps, colours, side, side]);
         Ok::<_, Error>(planes.swap_dims(0, 1).reshape([frames, colours, side, side]))
     });
-    Ok(Observation { pixels: pictures.transpose()?, numbers })
+    Ok(Observation { pixels: images.transpose()?, columns })
 }
 
-/// Pictures as numbers from -0.5 to 0.5, as published.
-fn eyes(config: &Tdmpc2Config) -> ImageNormalization {
+/// Returns the normalisation of pixels to -0.5 ..= 0.5, as published.
+fn normalization(config: &Tdmpc2Config) -> ImageNormalization {
     ImageNormalization { side: config.image, mean: [0.5; 3], std: [1.0; 3] }
 }
 
-/// What one row shows.
+/// Reads the observation of one row.
 ///
 /// # Errors
-/// When it lacks what the model observes, or shows it in another shape.
-pub(super) fn glance(config: &Tdmpc2Config, model: &Tdmpc2, row: RowRef<'_>) -> Result<Observation> {
+/// When a column that the model observes is missing or has another shape.
+pub(super) fn observe_row(config: &Tdmpc2Config, model: &Tdmpc2, row: RowRef<'_>) -> Result<Observation> {
     let device = model.device();
-    let numbers = config.numbers().zip(model.extra_encoders.iter()).map(|(part, (_, encoder))| {
+    let columns = config.column_encodings().zip(model.extra_encoders.iter()).map(|(encoding, (_, encoder))| {
         let width = encoder._0.weight.dims()[1];
-        #[allow(clippy::cast_possible_truncation)]
-        let numbers: Vec<f32> = row.to_f64(&part.column)?.into_iter().map(|v| v as f32).collect();
-        if numbers.len() != width {
-            let given = format!("{} numbers in '{}'", numbers.len(), part.column);
+        let values: Vec<f32> = row.to_f64(&encoding.column)?.into_iter().map(|v| v as f32).collect();
+        if values.len() != width {
+            let given = format!("{} elements in '{}'", values.len(), encoding.column);
             return Err(Error::mismatch("acting", given, format!("{width}, as the model was trained")));
         }
-        Ok(Tensor::from_data(TensorData::new(numbers, [1, width]), &device))
+        Ok(Tensor::from_data(TensorData::new(values, [1, width]), &device))
     });
-    let numbers = numbers.collect::<Result<_>>()?;
-    let pictures = config.pictures().map(|_| {
+    let columns = columns.collect::<Result<_>>()?;
+    let images = config.image_encoding().map(|_| {
         pixels::check(config.image, row.schema(), PIXELS)?;
-        pixels::planes(&eyes(config), row.get::<u8>(PIXELS)?, &device)
+        pixels::planes(&normalization(config), row.get::<u8>(PIXELS)?, &device)
     });
-    Ok(Observation { pixels: pictures.transpose()?, numbers })
+    Ok(Observation { pixels: images.transpose()?, columns })
 }
 
 impl StochasticActor for Tdmpc2 {
     fn act(&self, config: &TrainConfig<Self>, row: RowRef<'_>, key: Option<Key>) -> Result<Vec<f32>> {
-        let gaussian = self.policy(self.encode(glance(&config.model, self, row)?));
+        let gaussian = self.policy(self.encode(observe_row(&config.model, self, row)?));
         let action = match key {
             None => gaussian.mean.tanh(),
             Some(key) => {

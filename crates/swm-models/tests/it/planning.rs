@@ -103,7 +103,7 @@ fn what_does_not_fit_is_refused() {
     let actions = vec![0.0; 6];
     let wrong = Candidates { actions: &actions, envs: 1, samples: 1, horizon: 2, dim: 3 };
     let message = cost.cost(wrong, &mut [0.0]).expect_err("three numbers").to_string();
-    assert!(message.contains("4 numbers a model step"), "{message}");
+    assert!(message.contains("4 action elements a model step"), "{message}");
     let schema = Schema::new([ColumnSpec::image("pixels", SIDE, SIDE)]).expect("a column");
     let message = cost.observe(&Batch::zeros(&schema, 1), &[0]).expect_err("no goal").to_string();
     assert!(message.contains("'goal'"), "{message}");

@@ -4,10 +4,9 @@ use super::{emit, emit_json, table};
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use swm::families::{self, Card, FAMILIES};
 use swm::home::{self, names_in};
 use swm_core::{Error, Result};
-use swm_models::{Device, checkpoint};
+use swm_models::{CheckpointInfo, Device, FAMILIES, checkpoint};
 
 /// Arguments of `swm checkpoints`.
 #[derive(Args)]
@@ -74,28 +73,28 @@ pub fn checkpoints(args: &CheckpointsArgs, as_json: bool) -> anyhow::Result<()> 
 }
 
 /// Loads a checkpoint by path or name, which verifies it.
-fn load(given: &str) -> Result<(PathBuf, Card)> {
+fn load(given: &str) -> Result<(PathBuf, CheckpointInfo)> {
     let path = home::find_checkpoint(given)?;
-    let card = families::load(&path, &Device::flex())?.card()?;
-    Ok((path, card))
+    let info = swm_models::load(&path, &Device::flex())?.info()?;
+    Ok((path, info))
 }
 
 fn show(given: &str, as_json: bool) -> anyhow::Result<()> {
-    let (path, card) = load(given)?;
+    let (path, info) = load(given)?;
     if as_json {
         return emit_json(&json!({
             "path": path,
-            "family": card.family,
-            "weights": card.weights,
-            "env": card.dataset_info.env,
-            "config": card.config,
-            "facts": card.dataset_info,
-            "manifest": card.manifest,
+            "family": info.family,
+            "weights": info.weights,
+            "env": info.dataset_info.env,
+            "config": info.config,
+            "facts": info.dataset_info,
+            "manifest": info.manifest,
         }));
     }
-    emit(&format!("{}\n{}, weights {}\n", path.display(), card.family, card.weights));
-    emit(&format!("trained on {}\n", card.dataset_info.env.as_deref().unwrap_or("an unknown environment")));
-    emit(&card.toml);
+    emit(&format!("{}\n{}, weights {}\n", path.display(), info.family, info.weights));
+    emit(&format!("trained on {}\n", info.dataset_info.env.as_deref().unwrap_or("an unknown environment")));
+    emit(&info.toml);
     Ok(())
 }
 
@@ -104,12 +103,12 @@ fn list(as_json: bool) -> anyhow::Result<()> {
     let found: Vec<Value> = names_in(&folder)
         .into_iter()
         .map(|name| match load(&name) {
-            Ok((_, card)) => json!({
+            Ok((_, info)) => json!({
                 "name": name,
-                "family": card.family,
-                "env": card.dataset_info.env,
-                "weights": card.weights,
-                "image": card.image,
+                "family": info.family,
+                "env": info.dataset_info.env,
+                "weights": info.weights,
+                "image": info.image_size,
             }),
             Err(error) => json!({"name": name, "error": error.to_string()}),
         })
@@ -139,21 +138,22 @@ fn list(as_json: bool) -> anyhow::Result<()> {
 fn verify(given: &[String], as_json: bool) -> anyhow::Result<()> {
     let all = names_in(&home::checkpoints());
     let given = if given.is_empty() { &all } else { given };
-    let found: Vec<(&String, Result<(PathBuf, Card)>)> = given.iter().map(|name| (name, load(name))).collect();
-    let damaged = found.iter().filter(|(_, card)| card.is_err()).count();
+    let found: Vec<(&String, Result<(PathBuf, CheckpointInfo)>)> =
+        given.iter().map(|name| (name, load(name))).collect();
+    let damaged = found.iter().filter(|(_, info)| info.is_err()).count();
     if as_json {
         let rows: Vec<Value> = found
             .iter()
-            .map(|(name, card)| match card {
-                Ok((_, card)) => json!({"name": name, "whole": true, "weights": card.weights}),
+            .map(|(name, info)| match info {
+                Ok((_, info)) => json!({"name": name, "whole": true, "weights": info.weights}),
                 Err(error) => json!({"name": name, "whole": false, "error": error.to_string()}),
             })
             .collect();
         emit_json(&rows)?;
     } else {
-        for (name, card) in &found {
-            match card {
-                Ok((_, card)) => emit(&format!("{name}: whole, weights {}\n", card.weights)),
+        for (name, info) in &found {
+            match info {
+                Ok((_, info)) => emit(&format!("{name}: whole, weights {}\n", info.weights)),
                 Err(error) => emit(&format!("{name}: {error}\n")),
             }
         }
@@ -188,9 +188,9 @@ fn import(folder: &Path, model: &str, data: &str, output: &str, as_json: bool) -
 }
 
 fn export(given: &str, folder: &Path, as_json: bool) -> anyhow::Result<()> {
-    let loaded = families::load(&home::find_checkpoint(given)?, &Device::flex())?;
+    let loaded = swm_models::load(&home::find_checkpoint(given)?, &Device::flex())?;
     let Some(done) = loaded.export(folder) else {
-        let problem = format!("the reference has no {}", loaded.card()?.family);
+        let problem = format!("the reference has no {}", loaded.info()?.family);
         anyhow::bail!(Error::config(format!("checkpoint {given}"), problem, "its weights are in weights.safetensors"));
     };
     done?;

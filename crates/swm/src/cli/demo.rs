@@ -7,7 +7,6 @@ use clap::Args;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::time::Instant;
-use swm::families::TrainOn;
 use swm::resolver::Home;
 use swm::{ENVS, home};
 use swm_core::VariationRequest;
@@ -100,7 +99,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
     complain("2/4 train: a small LeWM learns to predict what it will see\n");
     let options = TrainOptions { threads: context.threads, ..TrainOptions::default() };
     let reader = home::open_dataset(&data.to_string_lossy())?;
-    train::run(&config, TrainOn { reader, encoder: None, out: &model, options }, context)?;
+    train::run(&config, swm_models::TrainRun { reader, encoder: None, out: &model, options }, context)?;
     let checkpoint = Checkpoint::<Lewm>::load(&model, &Device::flex())?;
 
     complain("3/4 plan and evaluate: CEM over the model, beside the random floor\n");

@@ -8,8 +8,8 @@ use super::{Context, Progress, emit, emit_json, table};
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
+use swm::home;
 use swm::resolver::{Home, parse_score};
-use swm::{families, home};
 use swm_core::results::{Counting, Proportion, Run};
 use swm_core::{EnvChoice, Error, Result, Results};
 use swm_data::{Part, Split};
@@ -227,19 +227,19 @@ fn find(given: &str, env: Option<&str>) -> Result<Found> {
     }
     let path = home::find_checkpoint(given)?;
     let name = Path::new(given).file_name().map_or(given.to_owned(), |name| name.to_string_lossy().into_owned());
-    let found = families::load(&path, &Device::flex())?;
-    let card = found.card()?;
+    let found = swm_models::load(&path, &Device::flex())?;
+    let info = found.info()?;
     let direct = Acts::Direct { checkpoint: given.to_owned(), settings: Value::Null };
     let kind = match found.cost() {
         Some(_) => Kind::Plans {
             model: Some(given.to_owned()),
-            block: card.action_block,
-            history: card.history,
+            block: info.action_block,
+            history: info.history,
             acts: found.acts().then_some(direct),
         },
         None => Kind::Acts(direct),
     };
-    Ok(Found { name, kind, env: card.dataset_info.env, image: card.image })
+    Ok(Found { name, kind, env: info.dataset_info.env, image: info.image_size })
 }
 
 /// Evaluates with a progress bar and writes `results.json`; `films` is where to, and how many episodes of each run.

@@ -2,7 +2,7 @@
 
 use super::{emit, emit_json, table};
 use serde_json::json;
-use swm::families::FAMILIES;
+use swm_models::FAMILIES;
 
 /// Lists them.
 pub fn models(as_json: bool) -> anyhow::Result<()> {

@@ -4,7 +4,7 @@ use super::{Context, emit, emit_json, table};
 use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
-use swm::{families, home};
+use swm::home;
 use swm_core::Error;
 use swm_data::write_png;
 use swm_models::Device;
@@ -39,9 +39,9 @@ pub struct ProbeArgs {
 /// Probes a checkpoint.
 pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
     let run = home::find_checkpoint(&args.checkpoint)?;
-    let loaded = families::load(&run, &Device::flex())?;
+    let loaded = swm_models::load(&run, &Device::flex())?;
     let Some(encoder) = loaded.encoder() else {
-        let problem = format!("a {} has no encoder of pictures", loaded.card()?.family);
+        let problem = format!("a {} has no encoder of pictures", loaded.info()?.family);
         return Err(Error::config(&args.checkpoint, problem, "probe a model that sees").into());
     };
     if args.columns.is_empty() && args.pictures.is_none() {

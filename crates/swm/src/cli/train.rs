@@ -4,11 +4,10 @@ use super::{Context, Progress, emit, emit_json};
 use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use swm::families::{FAMILIES, PlayOn, TrainOn, Training};
 use swm::home;
 use swm_core::{EnvPool, Error, Result};
 use swm_data::Reader;
-use swm_models::{Observer, TrainOptions, TrainSummary, device};
+use swm_models::{FAMILIES, Observer, OnlineRun, TrainOptions, TrainRun, TrainSummary, TrainableConfig, device};
 
 /// Arguments of `swm train`.
 #[derive(Args)]
@@ -54,12 +53,12 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
     let config = (family.config)(preset, &args.settings)?;
     if args.print_config {
         if context.json {
-            return emit_json(&config.json());
+            return emit_json(&config.to_json());
         }
-        emit(&config.toml()?);
+        emit(&config.to_toml()?);
         return Ok(());
     }
-    if args.encoder.is_some() && !family.borrows {
+    if args.encoder.is_some() && !family.borrows_encoder {
         let problem = format!("{} trains an encoder of its own", family.id);
         anyhow::bail!(Error::config("--encoder", problem, "leave it out, or train inverse"));
     }
@@ -71,11 +70,11 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
         ..TrainOptions::default()
     };
     if let Some(env) = &args.env {
-        return play(args, env, &*config, options, context);
+        return train_online(args, env, &*config, options, context);
     }
     let encoder = args.encoder.as_deref().map(home::find_checkpoint).transpose()?;
     let (reader, out) = args.places()?;
-    let on = TrainOn { reader, encoder: encoder.as_deref(), out: &out, options };
+    let on = TrainRun { reader, encoder: encoder.as_deref(), out: &out, options };
     let summary = run(&*config, on, context)?;
     if context.json {
         return emit_json(&summary);
@@ -85,16 +84,16 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
 }
 
 /// Trains by playing.
-fn play(
+fn train_online(
     args: &TrainArgs,
     env: &str,
-    config: &dyn Training,
+    config: &dyn TrainableConfig,
     options: TrainOptions,
     context: &Context,
 ) -> anyhow::Result<()> {
     let choice = swm::env(env)?;
     let threads = swm_core::pool::threads(context.threads)?;
-    let worlds = |count: usize| {
+    let environments = |count: usize| {
         let envs = (0..count).map(|_| choice.env()).collect::<Result<Vec<_>>>()?;
         EnvPool::new(envs, config.image_size().map(|side| (side, side)), args.max_steps, Arc::clone(&threads))
     };
@@ -104,7 +103,9 @@ fn play(
     });
     let out = home::checkpoint(&name);
     let mut bar = Bar(Progress::new("train", config.steps()));
-    let Some(summary) = config.play(PlayOn { worlds: &worlds, out: &out, options }, &mut bar, &context.stop) else {
+    let Some(summary) =
+        config.train_online(OnlineRun { environments: &environments, out: &out, options }, &mut bar, &context.stop)
+    else {
         let problem = format!("{} learns from datasets only", args.model);
         anyhow::bail!(Error::config("--env", problem, "give a dataset with --data, or train tdmpc2 or sac"));
     };
@@ -145,7 +146,7 @@ impl TrainArgs {
 }
 
 /// Trains with a progress bar.
-pub fn run(config: &dyn Training, on: TrainOn<'_>, context: &Context) -> Result<TrainSummary> {
+pub fn run(config: &dyn TrainableConfig, on: TrainRun<'_>, context: &Context) -> Result<TrainSummary> {
     let out = on.out.to_owned();
     let mut bar = Bar(Progress::new("train", config.steps()));
     let summary = config.train(on, &mut bar, &context.stop)?;

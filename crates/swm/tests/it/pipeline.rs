@@ -61,11 +61,11 @@ fn a_checkpoint_goes_from_training_to_a_report() {
     swm.refuses(&["eval", "small", "--env", "swm/PushT-v1"], 2, &["trained on swm/TwoRoom-v1"]);
     swm.refuses(&["report", "nowhere"], 1, &["nowhere"]);
 
-    // A checkpoint of a family of others, and one that is cut off.
+    // A checkpoint of an unknown family, and a truncated one.
     let file = find(&swm.path("checkpoints/small"), "config.json");
     let config = std::fs::read_to_string(&file).expect("readable");
     std::fs::write(&file, config.replace("\"lewm\"", "\"dreamer\"")).expect("writable");
-    swm.refuses(&["eval", "small"], 1, &["dreamer", "does not know"]);
+    swm.refuses(&["eval", "small"], 1, &["dreamer", "does not support"]);
     std::fs::write(&file, config).expect("writable");
     let weights = find(&swm.path("checkpoints/small"), "weights.safetensors");
     let bytes = std::fs::read(&weights).expect("readable");

@@ -3,7 +3,7 @@
 use super::{Golden, TOLERANCE, check, error, files, values};
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
-use swm_models::lewm::encode::HostEncoder;
+use swm_models::lewm::host_encoder::HostEncoder;
 use swm_models::lewm::step::{SigregConfig, TrainBatch, step};
 use swm_models::lewm::{EncoderConfig, Lewm, LewmConfig, Rollout};
 use swm_models::nn::parameters;

@@ -4,7 +4,7 @@ use super::{Golden, TOLERANCE, check, error, files, values};
 use burn::tensor::{Device, Tensor};
 use swm_models::Checkpoint;
 use swm_models::nn::{DropoutRng, Ensemble, Named, parameters, two_hot};
-use swm_models::tdmpc2::step::{Draws, Step, TrainBatch, step};
+use swm_models::tdmpc2::step::{Draws, Tdmpc2Step, TrainBatch, step};
 use swm_models::tdmpc2::{LossConfig, Observation, Published, Rollouts, Tdmpc2, Tdmpc2Config, export, import};
 use swm_models::train::{DatasetInfo, TrainConfig};
 use swm_plan::ActionScale;
@@ -29,7 +29,7 @@ fn golden_tdmpc2_forward() {
     for golden in forward_files() {
         let (model, published) = golden.tdmpc2();
         let config = published.model();
-        let z = model.encode(Observation { pixels: None, numbers: vec![golden.tensor("i.state")] });
+        let z = model.encode(Observation { pixels: None, columns: vec![golden.tensor("i.state")] });
         check(&golden, "o.z", &values(z.clone()));
         let [envs, samples, horizon, width] = golden.tensor::<4>("i.candidates").dims();
         let first = golden.tensor::<4>("i.candidates").slice([0..envs, 0..1, 0..1, 0..width]).reshape([envs, width]);
@@ -79,7 +79,7 @@ fn golden_tdmpc2_goes_to_the_reference_and_back() {
         assert_eq!(parameters::values(&again.model), parameters::values(&checkpoint.model));
         assert_eq!((&again.config.model, &again.config.loss), (&checkpoint.config.model, &checkpoint.config.loss));
         let other = DatasetInfo { action: ActionScale::identity(1), columns: Named::new(), env: None };
-        assert!(import(folder.path(), other).expect_err("other actions").to_string().contains("numbers an action"));
+        assert!(import(folder.path(), other).expect_err("other actions").to_string().contains("action elements"));
     }
 }
 
@@ -131,7 +131,7 @@ impl Golden {
         draws: &str,
         terminations: bool,
         shards: usize,
-    ) -> Step {
+    ) -> Tdmpc2Step {
         // From clip after clip to step after step.
         let turned = |name: &str| {
             let [clips, steps, width] = self.tensor::<3>(name).dims();
@@ -144,7 +144,7 @@ impl Golden {
         let batch = TrainBatch {
             observations: Observation {
                 pixels: None,
-                numbers: config.numbers().map(|part| turned(&format!("i.{}", part.column))).collect(),
+                columns: config.column_encodings().map(|part| turned(&format!("i.{}", part.column))).collect(),
             },
             actions: turned("i.action").narrow(0, 0, horizon * clips).reshape([horizon, clips, width]),
             rewards: flat("i.reward"),

@@ -1,13 +1,13 @@
-//! The encoder of pictures: four convolutions and a linear map.
+//! [`ImageCnn`]: the image encoder, four convolutions and a linear layer.
 
 use crate::nn::{Init, Linear, normalized_mlp::mish};
 use burn::module::{Module, Param};
 use burn::tensor::{Tensor, module, ops::ConvOptions};
 use swm_core::{Error, Result};
 
-/// Side and stride of the kernels.
+/// Kernel side and stride of each convolution.
 const KERNELS: [[usize; 2]; 4] = [[7, 2], [5, 2], [3, 2], [3, 1]];
-/// Channels of every convolution.
+/// Output channels of every convolution.
 const CHANNELS: usize = 32;
 
 /// A convolution without padding.
@@ -35,21 +35,21 @@ impl Convolution {
     }
 }
 
-/// The convolutions, with Mish behind each. A field `_2` is number 2 of a sequence, as in PyTorch.
+/// The convolutions, each followed by Mish. A field `_2` is number 2 of a sequence, as in PyTorch.
 #[derive(Module, Debug)]
-pub struct Eyes {
-    /// The first.
+pub struct ImageCnn {
+    /// The first convolution.
     pub _0: Convolution,
-    /// The second.
+    /// The second convolution.
     pub _2: Convolution,
-    /// The third.
+    /// The third convolution.
     pub _4: Convolution,
-    /// The last.
+    /// The last convolution.
     pub _6: Convolution,
 }
 
-impl Eyes {
-    /// The convolutions.
+impl ImageCnn {
+    /// Convolutions with random weights.
     pub fn new(init: &Init) -> Self {
         let layer = |name: &str, inputs, kernel: usize| Convolution::new(&init.of(name), inputs, KERNELS[kernel][0]);
         Self {
@@ -60,31 +60,34 @@ impl Eyes {
         }
     }
 
-    /// `[frames, 3, image, image]` to `[frames, features]`.
+    /// Computes the features of images.
+    ///
+    /// # Shapes
+    /// `x` is `[frames, 3, image, image]`; returns `[frames, features]`.
     pub fn forward(&self, x: Tensor<4>) -> Tensor<2> {
         let layers = [&self._0, &self._2, &self._4, &self._6];
         layers.into_iter().zip(KERNELS).fold(x, |x, (layer, [_, stride])| mish(layer.forward(x, stride))).flatten(1, 3)
     }
 }
 
-/// The linear map behind them, for pictures of a side.
+/// Returns the linear layer after the convolutions, for images with the given side.
 pub fn projection(init: &Init, image: usize, latent: usize) -> Linear {
     let side = side(image).unwrap_or(1);
     Linear::normal(init, CHANNELS * side * side, latent, 0.02)
 }
 
-/// The side of what the last convolution makes of a picture; none where a kernel is larger than what it looks at.
+/// Returns the side of the last convolution's output; `None` if a kernel is larger than its input.
 fn side(image: usize) -> Option<usize> {
     KERNELS.iter().try_fold(image, |side, &[kernel, stride]| Some(side.checked_sub(kernel)? / stride + 1))
 }
 
-/// Checks the side of pictures.
+/// Checks the side of the input images.
 ///
 /// # Errors
-/// When they are too small.
+/// When it is too small.
 pub fn check(image: usize) -> Result<()> {
     match side(image) {
         Some(_) => Ok(()),
-        None => Err(Error::config("model.image", image.to_string(), "choose pictures of at least 39 pixels a side")),
+        None => Err(Error::config("model.image", image.to_string(), "choose images with a side of at least 39 pixels")),
     }
 }

@@ -1,13 +1,13 @@
-//! [`LewmPredictor`]: a LeWM whose predictions are compared with recorded trajectories.
+//! [`LewmPredictor`]: predictions of a LeWM for comparison with recorded trajectories.
 
+use super::{Lewm, LewmConfig, Rollout, pixels};
+use crate::nn::kernels::host;
+use burn::tensor::Device;
 use rayon::prelude::*;
-use swm_core::{Batch, Error, Result};
-use swm_eval::Predictor;
-use swm_models::Device;
-use swm_models::lewm::{Lewm, LewmConfig, Rollout, pixels};
+use swm_core::{Batch, Error, Predictor, Result};
 use swm_plan::ActionScale;
 
-/// Rows encoded, and trajectories predicted, at once: each by itself, so that its latents do not depend on the others.
+/// Encodes rows and predicts trajectories, each on its own, so that a latent does not depend on the other rows.
 pub struct LewmPredictor {
     model: Lewm,
     config: LewmConfig,
@@ -42,26 +42,24 @@ impl Predictor for LewmPredictor {
         let bytes = config.image * config.image * 3;
         let work = latents.par_chunks_exact_mut(config.latent).zip(rows.get::<u8>("pixels")?.par_chunks_exact(bytes));
         work.try_for_each(|(latent, rgb)| {
-            let encoded = model.encode(pixels::patches(config, rgb, &Device::flex())?);
-            let numbers: Vec<f32> = encoded.into_data().iter().collect();
-            latent.copy_from_slice(&numbers);
+            latent.copy_from_slice(&host(model.encode(pixels::patches(config, rgb, &Device::flex())?)));
             Ok(())
         })
     }
 
     fn rollout(&mut self, start: &[f32], actions: &[f32], horizon: usize, latents: &mut [f32]) -> Result<()> {
         let (latent, scale) = (self.config.latent, &self.scale);
-        let numbers = self.frameskip() * scale.dim();
+        let action_dim = self.frameskip() * scale.dim();
         let n = start.len() / latent;
-        if actions.len() != n * horizon * numbers {
+        if actions.len() != n * horizon * action_dim {
             return Err(Error::mismatch(
                 "the actions of predicted trajectories",
-                format!("{} numbers", actions.len()),
-                format!("{n} trajectories x {horizon} model steps x {numbers}, as the model was trained"),
+                format!("{} elements", actions.len()),
+                format!("{n} trajectories x {horizon} model steps x {action_dim}, as the model was trained"),
             ));
         }
         let work = latents.par_chunks_exact_mut(horizon * latent).zip(start.par_chunks_exact(latent));
-        work.zip(actions.par_chunks_exact(horizon * numbers)).for_each(|((latents, start), actions)| {
+        work.zip(actions.par_chunks_exact(horizon * action_dim)).for_each(|((latents, start), actions)| {
             let mut scaled = vec![0.0; actions.len()];
             for (to, from) in scaled.chunks_exact_mut(scale.dim()).zip(actions.chunks_exact(scale.dim())) {
                 scale.to_model(from, to);

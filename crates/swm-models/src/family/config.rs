@@ -1,0 +1,74 @@
+//! [`TrainableConfig`]: a complete training configuration of any family.
+
+use super::contract::{ModelFamily, OnlineRun, TrainRun};
+use crate::online::OnlineSummary;
+use crate::train::{Observer, TrainConfig, TrainSummary, train};
+use serde_json::{Value, json};
+use std::sync::atomic::AtomicBool;
+use swm_core::Result;
+
+/// A complete training configuration of any family.
+pub trait TrainableConfig {
+    /// Returns the configuration as TOML.
+    ///
+    /// # Errors
+    /// Never for a configuration that was loaded.
+    fn to_toml(&self) -> Result<String>;
+
+    /// Returns the configuration as JSON.
+    fn to_json(&self) -> Value;
+
+    /// Returns the number of training steps.
+    fn steps(&self) -> usize;
+
+    /// Returns the side of the model's square images in pixels; `None` for a state-only model.
+    fn image_size(&self) -> Option<usize>;
+
+    /// Trains by acting in environments; `None` for a family that learns from datasets only.
+    ///
+    /// # Errors
+    /// As [`crate::online::train_online`].
+    fn train_online(
+        &self,
+        run: OnlineRun<'_>,
+        observer: &mut dyn Observer,
+        stop: &AtomicBool,
+    ) -> Option<Result<OnlineSummary>>;
+
+    /// Trains on a dataset.
+    ///
+    /// # Errors
+    /// As [`crate::train`].
+    fn train(&self, run: TrainRun<'_>, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainSummary>;
+}
+
+impl<M: ModelFamily> TrainableConfig for TrainConfig<M> {
+    fn to_toml(&self) -> Result<String> {
+        Self::to_toml(self)
+    }
+
+    fn to_json(&self) -> Value {
+        json!(self)
+    }
+
+    fn steps(&self) -> usize {
+        self.schedule.steps
+    }
+
+    fn image_size(&self) -> Option<usize> {
+        M::image_size(&self.model)
+    }
+
+    fn train_online(
+        &self,
+        run: OnlineRun<'_>,
+        observer: &mut dyn Observer,
+        stop: &AtomicBool,
+    ) -> Option<Result<OnlineSummary>> {
+        M::train_online(self, run, observer, stop)
+    }
+
+    fn train(&self, run: TrainRun<'_>, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainSummary> {
+        train(self, run.reader, run.out, &run.options, observer, stop)
+    }
+}

@@ -1,0 +1,62 @@
+//! [`FamilyEntry`]: the row of a model family in a registry.
+
+use super::config::TrainableConfig;
+use super::contract::ModelFamily;
+use super::loaded::LoadedModel;
+use crate::checkpoint::Checkpoint;
+use crate::train::{DatasetInfo, Preset, TrainConfig};
+use burn::tensor::Device;
+use std::path::Path;
+use swm_core::{Named, Result};
+use swm_data::Reader;
+
+/// The row of a model family in a registry.
+#[derive(Clone, Copy)]
+pub struct FamilyEntry {
+    /// The id, such as `lewm`.
+    pub id: &'static str,
+    /// One sentence about the family.
+    pub summary: &'static str,
+    /// The configurations that come with the family; the first is the default.
+    pub presets: &'static [Preset],
+    /// Whether training uses the encoder of another checkpoint.
+    pub borrows_encoder: bool,
+    /// Loads a configuration from a preset (its name or the path of a TOML file) and `key=value` settings.
+    pub config: fn(&str, &[String]) -> Result<Box<dyn TrainableConfig>>,
+    /// Loads the checkpoint of a run folder.
+    pub load: fn(&Path, &Device) -> Result<Box<dyn LoadedModel>>,
+    /// Converts a checkpoint of the reference implementation (`weights.pt` and `config.json` in the first folder), which
+    /// was trained on the given dataset, into a checkpoint in the last folder; returns the hash of its weights. `None` if
+    /// the reference implementation has no such family.
+    pub import: fn(&Path, &dyn Reader, &Path) -> Option<Result<String>>,
+}
+
+impl FamilyEntry {
+    /// The row of a family.
+    pub const fn of<M: ModelFamily>() -> Self {
+        Self {
+            id: M::FAMILY,
+            summary: M::SUMMARY,
+            presets: M::PRESETS,
+            borrows_encoder: false,
+            config: |preset, settings| Ok(Box::new(TrainConfig::<M>::load(preset, settings)?)),
+            load: |run, device| Ok(Box::new(Checkpoint::<M>::load(run, device)?)),
+            import: import::<M>,
+        }
+    }
+}
+
+impl Named for FamilyEntry {
+    fn id(&self) -> &'static str {
+        self.id
+    }
+}
+
+fn import<M: ModelFamily>(from: &Path, reader: &dyn Reader, out: &Path) -> Option<Result<String>> {
+    let columns: Vec<String> = reader.schema().columns().iter().map(|column| column.name.clone()).collect();
+    let dataset_info = match DatasetInfo::from_reader(reader, &columns, M::BOUNDED_ACTIONS) {
+        Ok(dataset_info) => dataset_info,
+        Err(error) => return Some(Err(error)),
+    };
+    Some(M::import(from, dataset_info)?.and_then(|mut checkpoint| checkpoint.save_to(out)))
+}

@@ -1,0 +1,98 @@
+//! The uses of an inverse-dynamics policy. It has a training loop and a checkpoint of its own, because it is trained on
+//! the latents of another checkpoint.
+
+use super::checkpoint::FAMILY;
+use super::{InverseCheckpoint, InverseConfig, InversePolicy, train};
+use crate::checkpoint::Checkpoint;
+use crate::family::{CheckpointInfo, FamilyEntry, LoadedModel, OnlineRun, TrainRun, TrainableConfig};
+use crate::lewm::Lewm;
+use crate::online::OnlineSummary;
+use crate::probe::ImageEncoder;
+use crate::train::{Observer, Preset, TrainSummary, Trainable as _};
+use serde_json::{Value, json};
+use std::sync::atomic::AtomicBool;
+use swm_core::{EnvSpec, Error, Policy, Result};
+
+/// The registry row of inverse dynamics.
+pub const ENTRY: FamilyEntry = FamilyEntry {
+    id: FAMILY,
+    summary: "inverse dynamics on the frozen encoder of another checkpoint: acts without planning, the cheap baseline",
+    presets: &[Preset {
+        id: "tiny",
+        summary: "trains in seconds on two CPU cores, given --encoder",
+        toml: InverseConfig::PRESET,
+    }],
+    borrows_encoder: true,
+    config: |_, settings| Ok(Box::new(InverseConfig::load(settings)?)),
+    load: |run, device| Ok(Box::new(InverseCheckpoint::load(run, device)?)),
+    import: |_, _, _| None,
+};
+
+impl TrainableConfig for InverseConfig {
+    fn to_toml(&self) -> Result<String> {
+        Self::to_toml(self)
+    }
+
+    fn to_json(&self) -> Value {
+        json!(self)
+    }
+
+    fn steps(&self) -> usize {
+        self.schedule.steps
+    }
+
+    fn image_size(&self) -> Option<usize> {
+        None
+    }
+
+    fn train_online(&self, _: OnlineRun<'_>, _: &mut dyn Observer, _: &AtomicBool) -> Option<Result<OnlineSummary>> {
+        None
+    }
+
+    fn train(&self, run: TrainRun<'_>, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainSummary> {
+        let Some(encoder) = run.encoder else {
+            return Err(Error::config(
+                "--encoder",
+                "an inverse-dynamics policy uses the encoder of another model",
+                "name a checkpoint with --encoder (`swm checkpoints` lists them)",
+            ));
+        };
+        if run.options.resume {
+            return Err(Error::config(
+                "--resume",
+                "an inverse-dynamics run takes seconds and cannot be resumed",
+                "leave out --resume and choose another --output",
+            ));
+        }
+        let world_model = Checkpoint::<Lewm>::load(encoder, &run.options.device)?;
+        train(self, &world_model, run.reader, run.out, run.options.threads, observer, stop)
+    }
+}
+
+impl LoadedModel for InverseCheckpoint {
+    fn info(&self) -> Result<CheckpointInfo> {
+        Ok(CheckpointInfo {
+            family: FAMILY,
+            weights: self.hash().to_owned(),
+            config: json!(self.config),
+            toml: self.config.to_toml()?,
+            dataset_info: self.world_model.dataset_info.clone(),
+            image_size: Lewm::image_size(&self.world_model.config.model),
+            action_block: self.world_model.config.data.frameskip,
+            history: 1,
+            manifest: self.manifest.clone(),
+        })
+    }
+
+    fn acts(&self) -> bool {
+        true
+    }
+
+    fn policy(&self, spec: &EnvSpec, slots: usize) -> Option<Result<Box<dyn Policy>>> {
+        Some(InversePolicy::new(self.clone(), spec, slots).map(|policy| Box::new(policy) as Box<dyn Policy>))
+    }
+
+    fn encoder(&self) -> Option<Box<dyn ImageEncoder>> {
+        Some(Box::new(self.world_model.clone()))
+    }
+}

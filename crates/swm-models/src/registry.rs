@@ -1,0 +1,47 @@
+//! [`FAMILIES`]: the model families of this build, and loading a checkpoint of any of them.
+
+use crate::family::{FamilyEntry, LoadedModel};
+use crate::{checkpoint, dino_wm, gcrl, inverse, lewm, pldm, sac, tdmpc2};
+use burn::tensor::Device;
+use std::path::Path;
+use swm_core::{Error, Registry, Result};
+
+/// The families, in the order of listings.
+pub static FAMILIES: Registry<FamilyEntry> = Registry {
+    kind: "model",
+    hint: "`swm models` lists them",
+    rows: &[
+        lewm::ENTRY,
+        pldm::ENTRY,
+        dino_wm::ENTRY,
+        tdmpc2::ENTRY,
+        gcrl::GCBC,
+        gcrl::GCIVL,
+        gcrl::GCIQL,
+        sac::ENTRY,
+        inverse::ENTRY,
+    ],
+};
+
+/// Loads the checkpoint of a run folder, of any family in [`FAMILIES`].
+///
+/// # Errors
+/// When there is none, its family is unknown, it is damaged, or its weights do not fit its configuration.
+pub fn load(run: &Path, device: &Device) -> Result<Box<dyn LoadedModel>> {
+    load_from(FAMILIES.rows, run, device)
+}
+
+/// Loads the checkpoint of a run folder, of any of the given families.
+///
+/// # Errors
+/// As [`load`].
+pub fn load_from(families: &[FamilyEntry], run: &Path, device: &Device) -> Result<Box<dyn LoadedModel>> {
+    let Some(family) = checkpoint::family(run) else {
+        return Err(Error::corrupt(run, "there is no checkpoint", "give the folder that `swm train` wrote to"));
+    };
+    let Some(row) = families.iter().find(|row| row.id == family) else {
+        let problem = format!("it holds a model of the family '{family}', which this program does not support");
+        return Err(Error::corrupt(run, problem, "give another checkpoint; `swm models` lists the families"));
+    };
+    (row.load)(run, device)
+}

@@ -1,0 +1,29 @@
+//! The uses of a trained SAC.
+
+use super::Sac;
+use crate::checkpoint::Checkpoint;
+use crate::family::{FamilyEntry, ModelFamily, OnlineRun};
+use crate::online::{self, OnlineSummary, train_online};
+use crate::train::{Observer, TrainConfig};
+use std::sync::atomic::AtomicBool;
+use swm_core::{EnvSpec, Policy, Result};
+
+/// The registry row of SAC.
+pub const ENTRY: FamilyEntry = FamilyEntry::of::<Sac>();
+
+impl ModelFamily for Sac {
+    const ACTS: bool = true;
+
+    fn policy(checkpoint: &Checkpoint<Self>, spec: &EnvSpec, slots: usize) -> Option<Result<Box<dyn Policy>>> {
+        Some(online::policy(checkpoint, spec, slots))
+    }
+
+    fn train_online(
+        config: &TrainConfig<Self>,
+        run: OnlineRun<'_>,
+        observer: &mut dyn Observer,
+        stop: &AtomicBool,
+    ) -> Option<Result<OnlineSummary>> {
+        Some(train_online(config, run.environments, run.out, &run.options, observer, stop))
+    }
+}

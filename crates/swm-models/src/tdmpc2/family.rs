@@ -1,0 +1,42 @@
+//! The uses of a trained TD-MPC2.
+
+use super::{Tdmpc2, Tdmpc2Cost, export, import};
+use crate::checkpoint::Checkpoint;
+use crate::family::{FamilyEntry, ModelFamily, OnlineRun};
+use crate::online::{self, OnlineSummary, train_online};
+use crate::train::{DatasetInfo, Observer, TrainConfig};
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+use swm_core::{CostModel, EnvSpec, Policy, Result};
+
+/// The registry row of TD-MPC2.
+pub const ENTRY: FamilyEntry = FamilyEntry::of::<Tdmpc2>();
+
+impl ModelFamily for Tdmpc2 {
+    const ACTS: bool = true;
+
+    fn cost(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn CostModel>> {
+        Some(Box::new(Tdmpc2Cost::new(checkpoint)))
+    }
+
+    fn policy(checkpoint: &Checkpoint<Self>, spec: &EnvSpec, slots: usize) -> Option<Result<Box<dyn Policy>>> {
+        Some(online::policy(checkpoint, spec, slots))
+    }
+
+    fn train_online(
+        config: &TrainConfig<Self>,
+        run: OnlineRun<'_>,
+        observer: &mut dyn Observer,
+        stop: &AtomicBool,
+    ) -> Option<Result<OnlineSummary>> {
+        Some(train_online(config, run.environments, run.out, &run.options, observer, stop))
+    }
+
+    fn import(from: &Path, dataset_info: DatasetInfo) -> Option<Result<Checkpoint<Self>>> {
+        Some(import(from, dataset_info))
+    }
+
+    fn export(checkpoint: &Checkpoint<Self>, folder: &Path) -> Option<Result<()>> {
+        Some(export(checkpoint, folder))
+    }
+}

@@ -1,13 +1,12 @@
-//! Native 2-D worlds: one folder each, with physics, render, expert and a README side by side.
+//! Native 2-D environments, one folder each with physics, rendering, experts and a README, and the visual wrappers that
+//! change the frames of any environment.
 
 pub mod classic;
 mod draw;
-mod factors;
 pub mod piecewise;
+mod point_agent;
 pub mod point_maze;
 pub mod push_t;
-#[cfg(test)]
-mod trial;
 pub mod two_room;
 pub mod wrappers;
 

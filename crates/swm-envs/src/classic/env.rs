@@ -2,9 +2,9 @@
 
 use super::picture::Picture;
 use super::{World, factors};
-use crate::factors as values;
 use rand::Rng as _;
 use rand::seq::IndexedRandom as _;
+use swm_core::factors as values;
 use swm_core::{
     Action, ColumnSpec, DType, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, Rng, RowMut,
     RowRef, Snapshot, Space, Transition, VariationRequest,

@@ -1,8 +1,8 @@
-//! A canvas of palette indices and the shapes one can fill on it.
+//! [`Canvas`]: an image of palette indices and shapes to fill in it, pixel for pixel those of pygame 2.6.
 
 use std::ops::Range;
 
-/// A whole pixel: column and row; may lie outside the canvas.
+/// A pixel by column and row; it may lie outside the canvas.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Point {
     /// Column.
@@ -11,17 +11,16 @@ pub struct Point {
     pub y: i32,
 }
 
-/// Coordinates are cut to this, far outside of any canvas, so that no arithmetic overflows.
+/// Coordinates are clipped to this magnitude, far outside any canvas, so that no arithmetic overflows.
 const FAR: f64 = 8192.0;
 
 impl Point {
-    /// A pixel.
+    /// The pixel in a column and a row.
     pub const fn new(x: i32, y: i32) -> Self {
         Self { x, y }
     }
 
-    /// The nearest pixel; halves go to the even one.
-    #[allow(clippy::cast_possible_truncation)]
+    /// The pixel nearest to a point; halves round to even.
     pub fn nearest(x: f64, y: f64) -> Self {
         let whole = |v: f64| v.round_ties_even().clamp(-FAR, FAR) as i32;
         Self { x: whole(x), y: whole(y) }
@@ -32,7 +31,7 @@ impl Point {
     }
 }
 
-/// A rectangle of pixels, the ends excluded.
+/// A rectangle of pixels; its upper ends are excluded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Area {
     low: Point,
@@ -40,10 +39,10 @@ pub struct Area {
 }
 
 impl Area {
-    /// No pixel.
+    /// The area without pixels.
     pub const EMPTY: Self = Self { low: Point::new(i32::MAX, i32::MAX), high: Point::new(i32::MIN, i32::MIN) };
 
-    /// The smallest area that also holds the pixels within `reach` of `point`.
+    /// Returns the smallest area that also contains the pixels within `reach` of `point`.
     #[must_use]
     pub fn with(self, point: Point, reach: i32) -> Self {
         Self {
@@ -52,27 +51,25 @@ impl Area {
         }
     }
 
-    /// All of a canvas of `side`².
-    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
+    /// The area of a canvas of `side`² pixels.
     pub const fn square(side: usize) -> Self {
         Self { low: Point::new(0, 0), high: Point::new(side as i32, side as i32) }
     }
 
-    /// Whether the two share a pixel.
+    /// Returns whether two areas share a pixel.
     pub fn touches(self, other: Self) -> bool {
         self.low.x < other.high.x && other.low.x < self.high.x && self.low.y < other.high.y && other.low.y < self.high.y
     }
 
-    /// The part inside a canvas of `side`², as columns and rows.
-    #[allow(clippy::cast_sign_loss, clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
+    /// Returns the columns and rows that lie inside a canvas of `side`² pixels.
     pub fn within(self, side: usize) -> (Range<usize>, Range<usize>) {
         let cut = |v: i32| v.clamp(0, side as i32) as usize;
         (cut(self.low.x)..cut(self.high.x), cut(self.low.y)..cut(self.high.y))
     }
 }
 
-/// The colours that indices stand for. Those of mixed pixels are added while drawing and dropped by
-/// [`Palette::forget_mixed`].
+/// The colours of the indices. Colours of blended pixels are added while drawing and dropped by
+/// [`Palette::drop_blended`].
 #[derive(Clone, Debug)]
 pub struct Palette {
     colors: [[u8; 3]; 256],
@@ -81,7 +78,7 @@ pub struct Palette {
 }
 
 impl Palette {
-    /// The indices 0, 1, … stand for these colours.
+    /// Makes a palette whose indices 0, 1, … are these colours.
     pub fn new<const N: usize>(colors: &[[u8; 3]; N]) -> Self {
         let mut all = [[0; 3]; 256];
         all[..N].copy_from_slice(colors);
@@ -93,17 +90,16 @@ impl Palette {
         self.colors[usize::from(index)]
     }
 
-    /// Drops the colours of mixed pixels.
-    pub fn forget_mixed(&mut self) {
+    /// Drops the colours of blended pixels.
+    pub fn drop_blended(&mut self) {
         self.used = self.fixed;
     }
 
-    /// The index of a share of `color` over what `under` stands for; `under` itself once all indices are taken.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    fn mixed(&mut self, color: [u8; 3], share: f32, under: u8) -> u8 {
+    /// Returns the index of `color` blended over the colour of `under`; `under` itself once all indices are in use.
+    fn blended(&mut self, color: [u8; 3], share: f32, under: u8) -> u8 {
         let below = self.color(under);
-        let Some(place) = self.colors.get_mut(self.used) else { return under };
-        *place = std::array::from_fn(|i| (f32::from(color[i]) * share + f32::from(below[i]) * (1.0 - share)) as u8);
+        let Some(slot) = self.colors.get_mut(self.used) else { return under };
+        *slot = std::array::from_fn(|i| (f32::from(color[i]) * share + f32::from(below[i]) * (1.0 - share)) as u8);
         self.used += 1;
         (self.used - 1) as u8
     }
@@ -117,27 +113,27 @@ pub struct Canvas {
 }
 
 impl Canvas {
-    /// A canvas of `side`² pixels of index 0.
+    /// Makes a canvas of `side`² pixels with index 0.
     pub fn new(side: usize) -> Self {
         Self { side, pixels: vec![0; side * side] }
     }
 
-    /// Pixels along a side.
+    /// The number of pixels along a side.
     pub fn side(&self) -> usize {
         self.side
     }
 
-    /// One row.
+    /// The indices of one row.
     pub fn row(&self, y: usize) -> &[u8] {
         &self.pixels[y * self.side..][..self.side]
     }
 
-    /// Makes every pixel `index`.
+    /// Sets every pixel to `index`.
     pub fn clear(&mut self, index: u8) {
         self.pixels.fill(index);
     }
 
-    /// Takes an area over from another canvas of the same size.
+    /// Copies an area from another canvas of the same size.
     pub fn copy_area(&mut self, from: &Self, area: Area) {
         let (columns, rows) = area.within(self.side);
         for y in rows {
@@ -147,8 +143,7 @@ impl Canvas {
         }
     }
 
-    /// The pixels from `x0` to `x1`, both included, in either order.
-    #[allow(clippy::cast_sign_loss, clippy::cast_possible_wrap, clippy::cast_possible_truncation)]
+    /// Fills the pixels of a row from `x0` to `x1`, both included, in either order.
     fn span(&mut self, y: i32, x0: i32, x1: i32, index: u8) {
         let last = self.side as i32 - 1;
         let (from, to) = (x0.min(x1).max(0), x0.max(x1).min(last));
@@ -160,9 +155,8 @@ impl Canvas {
 
     /// Fills a polygon of up to [`MAX_CORNERS`] corners.
     ///
-    /// A row is covered from one edge, rounded down, to the next, rounded down; edges own their upper end only,
-    /// but for the last row; level edges are drawn whole.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
+    /// A row is covered from one edge, rounded down, to the next, rounded down. An edge covers its upper end but not its
+    /// lower end, except in the last row. Horizontal edges are drawn completely.
     pub fn fill_polygon(&mut self, corners: &[Point], index: u8) {
         let (top, bottom) = corners.iter().fold((i32::MAX, i32::MIN), |(a, b), p| (a.min(p.y), b.max(p.y)));
         if top == bottom {
@@ -187,13 +181,13 @@ impl Canvas {
                 if y >= edge.top && y < edge.end {
                     let at = edge.x;
                     edge.advance();
-                    // Insertion keeps the few crossings in order.
-                    let mut place = crossed;
-                    while place > 0 && crossings[place - 1] > at {
-                        crossings[place] = crossings[place - 1];
-                        place -= 1;
+                    // Insertion sort, because there are few crossings.
+                    let mut slot = crossed;
+                    while slot > 0 && crossings[slot - 1] > at {
+                        crossings[slot] = crossings[slot - 1];
+                        slot -= 1;
                     }
-                    crossings[place] = at;
+                    crossings[slot] = at;
                     crossed += 1;
                 }
             }
@@ -231,8 +225,8 @@ impl Canvas {
         }
     }
 
-    /// Draws a line of [`WIDTH`] by Bresenham's algorithm, thick along the axis it runs across, its ends flat.
-    fn thick_line(&mut self, from: Point, to: Point, index: u8) {
+    /// Draws a line of [`WIDTH`] with flat ends by Bresenham's algorithm. Its thickness lies along the minor axis.
+    fn flat_line(&mut self, from: Point, to: Point, index: u8) {
         if from == to {
             return;
         }
@@ -264,21 +258,20 @@ impl Canvas {
         }
     }
 
-    /// Where a strip of [`WIDTH`] pixels from `first` to the right or down begins, if all of it is on the canvas.
+    /// Returns the offset of a strip of [`WIDTH`] pixels from `first` to the right or down, if it lies on the canvas.
     fn strip(&self, first: Point, right: bool) -> Option<usize> {
         let (x, y) = (usize::try_from(first.x).ok()?, usize::try_from(first.y).ok()?);
         let (last_x, last_y) = if right { (x + WIDTH as usize - 1, y) } else { (x, y + WIDTH as usize - 1) };
         (last_x < self.side && last_y < self.side).then_some(y * self.side + x)
     }
 
-    /// Draws a bar of [`WIDTH`]: a thick line with round ends. A bar without length is not drawn.
+    /// Draws a thick line of [`WIDTH`] with round ends. A line without length is not drawn.
     ///
-    /// Its sides are found from absolute differences, as the reference's debug drawing does, so they lie askew
-    /// where a bar falls from left to right.
-    #[allow(clippy::cast_possible_truncation)]
-    pub fn bar(&mut self, from: Point, to: Point, index: u8) {
+    /// Its sides follow from absolute differences, as in the reference's debug drawing, so they are skewed where the line
+    /// descends from left to right.
+    pub fn thick_line(&mut self, from: Point, to: Point, index: u8) {
         let radius = WIDTH / 2;
-        self.thick_line(from, to, index);
+        self.flat_line(from, to, index);
         let across = [(to.y - from.y).abs(), (to.x - from.x).abs()].map(f64::from);
         if across == [0.0, 0.0] {
             return;
@@ -290,8 +283,7 @@ impl Canvas {
         self.fill_circle(to, radius, index);
     }
 
-    /// Draws a line one pixel wide, mixed with what is below where it lies between pixels.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+    /// Draws an anti-aliased line, one pixel wide.
     pub fn fine_line(&mut self, from: Point, to: Point, color: [u8; 3], palette: &mut Palette) {
         let steep = (to.x - from.x).abs() < (to.y - from.y).abs();
         let flip = |p: Point| if steep { Point::new(p.y, p.x) } else { p };
@@ -299,45 +291,45 @@ impl Canvas {
         if a.x > b.x {
             std::mem::swap(&mut a, &mut b);
         }
-        self.mix(flip(a), color, 1.0, palette);
+        self.blend(flip(a), color, 1.0, palette);
         let slope = (b.y - a.y) as f32 / (b.x - a.x).max(1) as f32;
         let mut y = a.y as f32;
         for x in a.x + 1..b.x {
             y += slope;
             let above = y.floor();
-            self.mix(flip(Point::new(x, above as i32)), color, 1.0 - (y - above), palette);
+            self.blend(flip(Point::new(x, above as i32)), color, 1.0 - (y - above), palette);
             if y > above {
-                self.mix(flip(Point::new(x, above as i32 + 1)), color, y - above, palette);
+                self.blend(flip(Point::new(x, above as i32 + 1)), color, y - above, palette);
             }
         }
         if b != a {
-            self.mix(flip(b), color, 1.0, palette);
+            self.blend(flip(b), color, 1.0, palette);
         }
     }
 
-    fn mix(&mut self, at: Point, color: [u8; 3], share: f32, palette: &mut Palette) {
+    fn blend(&mut self, at: Point, color: [u8; 3], share: f32, palette: &mut Palette) {
         let (Ok(x), Ok(y)) = (usize::try_from(at.x), usize::try_from(at.y)) else { return };
         if x < self.side && y < self.side {
             let pixel = &mut self.pixels[y * self.side + x];
-            *pixel = palette.mixed(color, share, *pixel);
+            *pixel = palette.blended(color, share, *pixel);
         }
     }
 }
 
-/// The width of bars, in pixels.
+/// The width of thick lines, in pixels.
 pub const WIDTH: i32 = 4;
-/// The most corners a polygon may have.
+/// The maximal number of corners of a polygon.
 const MAX_CORNERS: usize = 8;
 
-/// An edge of a polygon, followed row by row in whole numbers.
+/// An edge of a polygon, followed row by row in integer arithmetic.
 #[derive(Clone, Copy, Default)]
 struct Edge {
     top: i32,
-    /// The row after its last.
+    /// The row after its last row.
     end: i32,
-    /// Where it crosses the current row, rounded down.
+    /// The column at which it crosses the current row, rounded down.
     x: i32,
-    /// What is lost by rounding, in units of 1 / height.
+    /// The remainder of rounding, in units of 1 / height.
     rest: i32,
     step: i32,
     step_rest: i32,
@@ -345,7 +337,7 @@ struct Edge {
 }
 
 impl Edge {
-    /// The edge between two corners, at its first row from `first` on.
+    /// Makes the edge between two corners, at its first row from `first` on.
     fn new(a: Point, b: Point, first: i32, bottom: i32) -> Self {
         let (upper, lower) = if a.y < b.y { (a, b) } else { (b, a) };
         let (width, height) = (lower.x - upper.x, lower.y - upper.y);
@@ -375,17 +367,17 @@ impl Edge {
 mod tests {
     use super::*;
 
-    /// The canvas as text, for pictures in tests.
-    fn picture(canvas: &Canvas) -> Vec<String> {
+    /// The canvas as text.
+    fn text(canvas: &Canvas) -> Vec<String> {
         (0..canvas.side()).map(|y| canvas.row(y).iter().map(|&p| if p == 0 { '.' } else { '#' }).collect()).collect()
     }
 
     #[test]
-    fn polygons_cover_what_pygame_covers() {
+    fn polygons_cover_the_pixels_of_pygame() {
         // pygame.draw.polygon(surface, 1, [(1, 1), (11, 4), (8, 14), (-2, 11)]), moved by 4 columns.
         let mut canvas = Canvas::new(18);
         canvas.fill_polygon(&[Point::new(5, 1), Point::new(15, 4), Point::new(12, 14), Point::new(2, 11)], 1);
-        let wanted = [
+        let expected = [
             "..................",
             ".....#............",
             "....#####.........",
@@ -402,17 +394,17 @@ mod tests {
             "........#####.....",
             "............#.....",
         ];
-        assert_eq!(picture(&canvas)[..wanted.len()], wanted);
+        assert_eq!(text(&canvas)[..expected.len()], expected);
     }
 
     #[test]
-    fn what_leaves_the_canvas_is_cut() {
+    fn shapes_are_clipped_to_the_canvas() {
         let mut canvas = Canvas::new(8);
         let far = Point::nearest(1e300, f64::NEG_INFINITY);
         canvas.fill_polygon(&[Point::new(-5, -5), Point::new(20, -5), Point::new(20, 20), Point::new(-5, 20)], 1);
         assert!(canvas.row(7).iter().all(|&p| p == 1));
-        canvas.bar(Point::new(4, 4), far, 2);
-        canvas.bar(far, far, 2);
+        canvas.thick_line(Point::new(4, 4), far, 2);
+        canvas.thick_line(far, far, 2);
         canvas.fill_circle(far, 30, 3);
         canvas.fine_line(far, Point::new(4, 4), [1, 2, 3], &mut Palette::new(&[[0; 3]; 4]));
         canvas.fill_circle(Point::new(0, 0), 3, 4);

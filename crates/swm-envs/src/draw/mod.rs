@@ -1,22 +1,23 @@
-//! Drawing the way the Python references do: at the reference's own size, resized to the asked one.
+//! Drawing of frames the way the Python reference does it: at the reference's own size, then resized.
 //!
-//! A [`Canvas`] holds one byte a pixel, an index into a [`Palette`]; its primitives cover the same pixels as those
-//! of pygame 2.6. A [`Resampler`] turns it into RGB of any size with the arithmetic of OpenCV's bilinear resize.
-//! So pictures equal the reference's byte for byte, and only what moved needs to be drawn and resampled again.
-//!
-//! [`Pixels`] are RGB, for shapes with smooth edges as matplotlib draws them. A [`Stage`] keeps what does not move, and
-//! resizes with a [`Tent`] as Pillow does. A [`Brush`] draws soft discs at any size.
+//! A [`Canvas`] holds one byte per pixel, an index into a [`Palette`]; its shapes cover the same pixels as those of
+//! pygame 2.6, and a [`Resampler`] converts it to RGB of any size with the arithmetic of OpenCV's bilinear resize.
+//! [`Pixels`] is an RGB image for shapes with anti-aliased edges as matplotlib draws them, and a [`Background`] caches
+//! the static part of such images and resizes with a [`Tent`], the filter of Pillow. A [`Brush`] blends soft discs at
+//! any size.
 
+mod background;
+mod by_size;
 mod canvas;
 mod pixels;
 mod resample;
-mod soft;
-mod stage;
+mod soft_disc;
 mod tent;
 
+pub use background::Background;
+pub use by_size::BySize;
 pub use canvas::{Area, Canvas, Palette, Point, WIDTH};
 pub use pixels::{Pixels, Rgb, rect};
 pub use resample::Resampler;
-pub use soft::{Brush, Disc};
-pub use stage::Stage;
+pub use soft_disc::{Brush, SoftDisc};
 pub use tent::Tent;

@@ -1,4 +1,4 @@
-//! RGB pixels and the shapes one can lay over them with smooth edges.
+//! [`Pixels`]: a square RGB image and anti-aliased shapes to draw into it, as matplotlib draws them.
 
 use super::{Area, Point};
 use std::ops::Range;
@@ -6,30 +6,30 @@ use std::ops::Range;
 /// A colour: red, green and blue.
 pub type Rgb = [u8; 3];
 
-/// The pixels from `low` (column and row) to `high`, the latter excluded.
+/// Returns the pixels from `low` (column and row) to `high`, which is excluded.
 pub fn rect(low: [i32; 2], high: [i32; 2]) -> Area {
     Area::EMPTY.with(Point::new(low[0], low[1]), 0).with(Point::new(high[0] - 1, high[1] - 1), 0)
 }
 
-/// A square picture. Places are in pixels from its upper left corner, so the middle of the first pixel is (½, ½).
+/// A square RGB image. Coordinates are in pixels from its upper left corner, so the centre of the first pixel is (½, ½).
 pub struct Pixels<'a> {
     side: usize,
     rgb: &'a mut [u8],
 }
 
 impl<'a> Pixels<'a> {
-    /// A picture of `side`² over these bytes.
+    /// Makes an image of `side`² pixels over `rgb`, `[side, side, 3]`.
     pub fn new(side: usize, rgb: &'a mut [u8]) -> Self {
         debug_assert_eq!(rgb.len(), side * side * 3);
         Self { side, rgb }
     }
 
-    /// All bytes, row after row.
+    /// All bytes, `[side, side, 3]`.
     pub fn bytes(&mut self) -> &mut [u8] {
         self.rgb
     }
 
-    /// Covers a rectangle of whole pixels.
+    /// Fills a rectangle of whole pixels.
     pub fn fill(&mut self, area: Area, color: Rgb) {
         let (columns, rows) = area.within(self.side);
         let first = rows.start * self.side;
@@ -44,7 +44,7 @@ impl<'a> Pixels<'a> {
         }
     }
 
-    /// Lays a colour over a rectangle of whole pixels.
+    /// Blends a colour over a rectangle of whole pixels.
     pub fn tint(&mut self, area: Area, color: Rgb, opacity: f64) {
         let (columns, rows) = area.within(self.side);
         for y in rows {
@@ -52,19 +52,19 @@ impl<'a> Pixels<'a> {
         }
     }
 
-    /// Lays a circle over the part of the picture inside `clip`. A pixel is covered as far as its middle lies inside.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss, clippy::cast_sign_loss)]
+    /// Blends a filled circle into the part of the image inside `clip`. The coverage of a pixel follows from the distance
+    /// of its centre to the circle.
     pub fn circle(&mut self, [cx, cy]: [f64; 2], radius: f64, color: Rgb, opacity: f64, clip: Area) {
         let (columns, rows) = clip.within(self.side);
         let cut = |v: f64, within: &Range<usize>| (v.max(0.0) as usize).clamp(within.start, within.end);
         let (outer, inner) = (radius + 0.5, (radius - 0.5).max(0.0));
-        // Along a row `dy` off the centre, the circle of this radius reaches so far to both sides.
+        // Half the chord of a circle of this radius, in a row `dy` from its centre.
         let reach = |radius: f64, dy: f64| (radius * radius - dy * dy).max(0.0).sqrt();
         for y in cut((cy - outer).floor(), &rows)..cut((cy + outer).ceil(), &rows) {
             let dy = y as f64 + 0.5 - cy;
             let (far, near) = (reach(outer, dy), reach(inner, dy));
             let (left, right) = (cut((cx - far).floor(), &columns), cut((cx + far).ceil(), &columns));
-            // Pixels whose middle is within the inner circle are covered whole.
+            // Pixels whose centre is within the inner circle are covered completely.
             let (first, last) = if near > 0.0 {
                 let first = cut((cx - near + 0.5).floor(), &(left..right));
                 (first, cut((cx + near + 0.5).floor(), &(first..right)))
@@ -72,13 +72,13 @@ impl<'a> Pixels<'a> {
                 (right, right)
             };
             let row = self.span(y, left..right);
-            let mut edge = |x: usize| {
+            let mut blend_edge = |x: usize| {
                 let dx = x as f64 + 0.5 - cx;
                 let covered = outer - (dx * dx + dy * dy).sqrt();
                 mix(&mut row[x - left], color, opacity * covered.clamp(0.0, 1.0));
             };
-            (left..first).for_each(&mut edge);
-            (last..right).for_each(&mut edge);
+            (left..first).for_each(&mut blend_edge);
+            (last..right).for_each(&mut blend_edge);
             if opacity < 1.0 {
                 row[first - left..last - left].iter_mut().for_each(|pixel| mix(pixel, color, opacity));
             } else {
@@ -87,14 +87,12 @@ impl<'a> Pixels<'a> {
         }
     }
 
-    /// The pixels a circle can touch.
-    #[allow(clippy::cast_possible_truncation)]
-    pub fn around([cx, cy]: [f64; 2], radius: f64) -> Area {
+    /// Returns the pixels that a circle can touch.
+    pub fn circle_bounds([cx, cy]: [f64; 2], radius: f64) -> Area {
         Area::EMPTY.with(Point::nearest(cx, cy), radius.ceil() as i32 + 1)
     }
 
-    /// Lays a polygon over the picture. A pixel is covered by the share of its area that lies inside.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss, clippy::cast_sign_loss)]
+    /// Blends a filled polygon into the image. The coverage of a pixel is the share of its area that lies inside.
     pub fn polygon(&mut self, corners: &[[f64; 2]], color: Rgb, opacity: f64) {
         let side = self.side as f64;
         let bound = |axis: usize, pick: fn(f64, f64) -> f64| {
@@ -102,7 +100,7 @@ impl<'a> Pixels<'a> {
         };
         let columns = bound(0, f64::min) as usize..bound(0, f64::max).ceil() as usize;
         let rows = bound(1, f64::min) as usize..bound(1, f64::max).ceil() as usize;
-        // What each edge adds to the pixel it crosses, and to all pixels right of it.
+        // For each pixel, what the edges add to its own coverage and to that of all pixels right of it.
         let mut added = vec![[0.0; 2]; columns.len()];
         for y in rows {
             added.fill([0.0; 2]);
@@ -118,24 +116,22 @@ impl<'a> Pixels<'a> {
         }
     }
 
-    /// Some pixels of one row.
+    /// The pixels of one row within some columns.
     fn span(&mut self, y: usize, columns: Range<usize>) -> &mut [Rgb] {
         let row = &mut self.rgb.as_chunks_mut::<3>().0[y * self.side..][..self.side];
         &mut row[columns.start.min(columns.end)..columns.end]
     }
 }
 
-/// Lays a share of `color` over a pixel.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+/// Blends a share of `color` over a pixel.
 fn mix(pixel: &mut Rgb, color: Rgb, share: f64) {
     for (under, over) in pixel.iter_mut().zip(color) {
         *under = (f64::from(*under) + (f64::from(over) - f64::from(*under)) * share + 0.5) as u8;
     }
 }
 
-/// Adds the part of an edge within the row from `top` to `top + 1`: to each pixel it crosses the signed area to its
-/// right there, and the signed height for the pixels beyond.
-#[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss, clippy::cast_sign_loss)]
+/// Adds the part of an edge within the row from `top` to `top + 1`: for each pixel that it crosses the signed area right
+/// of it within the pixel, and the signed height for the pixels beyond.
 fn add_edge(added: &mut [[f64; 2]], columns: &Range<usize>, from: [f64; 2], to: [f64; 2], top: f64) {
     let (low, high, sign) = if from[1] < to[1] { (from, to, 1.0) } else { (to, from, -1.0) };
     let (y0, y1) = (low[1].max(top), high[1].min(top + 1.0));
@@ -165,37 +161,37 @@ mod tests {
         rgb.chunks(3).map(|pixel| pixel[0]).collect()
     }
 
-    fn area_of(picture: &[u8]) -> f64 {
-        picture.iter().map(|&v| f64::from(v) / 255.0).sum()
+    fn area_of(image: &[u8]) -> f64 {
+        image.iter().map(|&v| f64::from(v) / 255.0).sum()
     }
 
     #[test]
-    fn polygons_cover_shares_of_pixels() {
+    fn polygon_coverage_is_the_area_inside() {
         let square = [[1.25, 1.0], [3.5, 1.0], [3.5, 2.5], [1.25, 2.5]];
-        let picture = painted(5, |pixels| pixels.polygon(&square, [255; 3], 1.0));
-        assert_eq!(picture[5..10], [0, 191, 255, 128, 0]);
-        assert_eq!(picture[10..15], [0, 96, 128, 64, 0]);
+        let image = painted(5, |pixels| pixels.polygon(&square, [255; 3], 1.0));
+        assert_eq!(image[5..10], [0, 191, 255, 128, 0]);
+        assert_eq!(image[10..15], [0, 96, 128, 64, 0]);
         let turned =
             painted(5, |pixels| pixels.polygon(&[[2.5, 0.5], [4.5, 2.5], [2.5, 4.5], [0.5, 2.5]], [255; 3], 1.0));
         assert!((area_of(&turned) - 8.0).abs() < 0.05, "{turned:?}");
         assert_eq!((turned[12], turned[0]), (255, 0));
-        // What leaves the picture is cut.
+        // Parts outside the image are clipped.
         let cut =
             painted(4, |pixels| pixels.polygon(&[[-3.0, -3.0], [2.0, -3.0], [2.0, 9.0], [-3.0, 9.0]], [255; 3], 1.0));
         assert_eq!(cut, [255, 255, 0, 0].repeat(4));
     }
 
     #[test]
-    fn circles_cover_their_area() {
+    fn circle_coverage_adds_up_to_its_area() {
         for (x, y, radius) in [(20.0, 20.0, 10.0), (19.3, 20.7, 5.2), (15.5, 15.5, 2.7), (22.1, 18.0, 14.9)] {
             let all = Area::square(40);
-            let picture = painted(40, |pixels| pixels.circle([x, y], radius, [255; 3], 1.0, all));
-            let wanted = std::f64::consts::PI * radius * radius;
-            assert!((area_of(&picture) / wanted - 1.0).abs() < 0.02 + 0.2 / wanted, "radius {radius}");
+            let image = painted(40, |pixels| pixels.circle([x, y], radius, [255; 3], 1.0, all));
+            let expected = std::f64::consts::PI * radius * radius;
+            assert!((area_of(&image) / expected - 1.0).abs() < 0.02 + 0.2 / expected, "radius {radius}");
             let half = painted(40, |pixels| pixels.circle([x, y], radius, [255; 3], 0.5, all));
-            assert!((area_of(&half) / wanted - 0.5).abs() < 0.02, "radius {radius}, half opaque");
-            let around = Pixels::around([x, y], radius);
-            assert_eq!(picture, painted(40, |pixels| pixels.circle([x, y], radius, [255; 3], 1.0, around)));
+            assert!((area_of(&half) / expected - 0.5).abs() < 0.02, "radius {radius}, half opaque");
+            let bounds = Pixels::circle_bounds([x, y], radius);
+            assert_eq!(image, painted(40, |pixels| pixels.circle([x, y], radius, [255; 3], 1.0, bounds)));
         }
         let outside = painted(8, |pixels| pixels.circle([-50.0, 4.0], 3.0, [255; 3], 1.0, Area::square(8)));
         assert_eq!(area_of(&outside), 0.0);

@@ -3,28 +3,30 @@
 //! Sizes and proportions are those of the reference's vector field (matplotlib's `quiver` with the settings of
 //! `piecewise_env.py`).
 
-use super::physics::{BORDER, GRID, SIZE, ZONES};
+use super::physics::{GRID, ZONES};
 use crate::draw::{Pixels, Rgb};
+use crate::point_agent::room::{BORDER, SIZE};
 use std::f64::consts::PI;
 
 const COLOR: Rgb = [17; 3];
 const OPACITY: f64 = 0.85;
 /// Arrows along a side of a zone.
 const PER_ZONE: usize = 3;
-/// Thickness of a shaft, in pixels: the unit of the lengths below.
+/// Thickness of a shaft, in pixels. It is the unit of the lengths below.
 const THICKNESS: f64 = 0.006 * SIZE;
-/// How wide a head is, how far back its barbs reach, and where it meets the shaft.
+/// Width of a head.
 const HEAD_WIDTH: f64 = 4.0;
+/// Length of a head, from its tip to the ends of its barbs.
 const HEAD: f64 = 4.0;
+/// Length of a head along the shaft, from its tip to where it meets the shaft.
 const HEAD_AXIS: f64 = 3.5;
-/// An arrow shorter than this is a dot of this diameter.
-const LEAST: f64 = 0.5;
+/// An arrow shorter than this is drawn as a dot of this diameter.
+const MIN_LENGTH: f64 = 0.5;
 
-/// Draws the arrows of all zones.
-#[allow(clippy::cast_precision_loss)]
+/// Draws the arrows of all zones for their drift in pixels per step.
 pub fn draw(drift: &[[f64; 2]; ZONES], pixels: &mut Pixels<'_>) {
     let zone = (SIZE - 2.0 * BORDER) / GRID as f64;
-    // A drift of 5 along both axes would take 15 % of a zone's side.
+    // A drift of 5 pixels along both axes is drawn as long as 15 % of a zone's side.
     let scale = zone * 0.15 / (5.0 * 2.0_f64.sqrt());
     let spacing = zone / PER_ZONE as f64;
     for row in 0..GRID * PER_ZONE {
@@ -36,23 +38,23 @@ pub fn draw(drift: &[[f64; 2]; ZONES], pixels: &mut Pixels<'_>) {
     }
 }
 
-/// Draws an arrow of so many thicknesses from its tail.
+/// Draws an arrow from its tail, `length` thicknesses long.
 fn arrow(tail: [f64; 2], length: f64, angle: f64, pixels: &mut Pixels<'_>) {
     let (sin, cos) = angle.sin_cos();
-    let place = |[x, y]: [f64; 2]| {
+    let at = |[x, y]: [f64; 2]| {
         let [x, y] = [x * THICKNESS, y * THICKNESS];
         [tail[0] + x * cos - y * sin, tail[1] + x * sin + y * cos]
     };
-    if length < LEAST {
+    if length < MIN_LENGTH {
         let corner = |i: u8| (f64::from(i) * PI / 3.0).sin_cos();
-        let dot = [0, 1, 2, 3, 4, 5].map(corner).map(|(sin, cos)| place([cos * LEAST / 2.0, sin * LEAST / 2.0]));
+        let dot = [0, 1, 2, 3, 4, 5].map(corner).map(|(sin, cos)| at([cos * MIN_LENGTH / 2.0, sin * MIN_LENGTH / 2.0]));
         pixels.polygon(&dot, COLOR, OPACITY);
         return;
     }
-    // A shaft is there where the head leaves room for it; shorter arrows are smaller all over.
+    // An arrow shorter than a head is a head scaled down, without a shaft.
     let (shaft, size) = if length < HEAD { (HEAD, length / HEAD) } else { (length, 1.0) };
     let half = [[0.0, 0.5], [shaft - HEAD_AXIS, 0.5], [shaft - HEAD, HEAD_WIDTH / 2.0], [shaft, 0.0]];
     let [a, b, c, tip] = half.map(|p| p.map(|v| v * size));
     let flip = |[x, y]: [f64; 2]| [x, -y];
-    pixels.polygon(&[a, b, c, tip, flip(c), flip(b), flip(a)].map(place), COLOR, OPACITY);
+    pixels.polygon(&[a, b, c, tip, flip(c), flip(b), flip(a)].map(at), COLOR, OPACITY);
 }

@@ -1,9 +1,11 @@
-//! Who can demonstrate the task: `expert` makes up for the drift, `explore` wanders everywhere.
+//! The experts: `expert` steers against the drift to the target, `explore` walks randomly.
 //!
-//! Both read `state`, `goal_state` and `dynamics` of the infos row and nothing else.
+//! Both read only the columns `state`, `goal_state` and `dynamics`.
 
-use super::physics::{BORDER, Dynamics, Point, SIZE, distance};
-use super::route::{Detour, walk};
+use super::paths::{Detours, steer_to};
+use super::physics::Dynamics;
+use crate::point_agent::room::{BORDER, SIZE, distance};
+use crate::point_agent::{Explorer, Leg, Position, RandomWalk, position, widen};
 use rand::Rng as _;
 use swm_core::policy::Expert;
 use swm_core::{ExpertEntry, Key, Result, Rng, RowRef};
@@ -13,106 +15,80 @@ pub const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
         summary: "straight to the target, making up for the drift, or around drift that is too strong",
-        make: || Box::new(Steersman { plan: None }),
+        make: || Box::new(SteeringExpert { plan: None }),
     },
     ExpertEntry {
         id: "explore",
         summary: "a smooth random walk through all zones",
-        make: || Box::new(Explorer::new(Key::new(0).rng())),
+        make: || Box::new(Explorer::<ZoneWalk>::new()),
     },
 ];
 
-#[allow(clippy::cast_possible_truncation)]
-fn place(row: RowRef<'_>, column: &str) -> Result<Point> {
-    let value = row.to_f64(column)?;
-    Ok([value[0] as f32, value[1] as f32])
-}
-
-/// Heads straight for the target where that leads there, and takes a detour where it does not.
-struct Steersman {
+/// Heads straight for the target where that reaches it, and takes a detour otherwise.
+struct SteeringExpert {
     plan: Option<Plan>,
 }
 
-/// How to get to a target of one world.
+/// How to reach a target with given dynamics.
 struct Plan {
     dynamics: Dynamics,
-    to: Point,
-    detour: Option<Detour>,
+    to: Position,
+    /// The detours to the target, where steering straight does not reach it.
+    detours: Option<Detours>,
 }
 
-impl Expert for Steersman {
+impl Expert for SteeringExpert {
     fn begin(&mut self, _key: Key) {
         self.plan = None;
     }
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
         let dynamics = Dynamics::from_row(&row.to_f64("dynamics")?);
-        let (at, to) = (place(row, "state")?, place(row, "goal_state")?);
+        let (at, to) = (position(&row.to_f64("state")?), position(&row.to_f64("goal_state")?));
         let known = self.plan.take().filter(|plan| plan.dynamics == dynamics && plan.to == to);
         let plan = self.plan.insert(known.unwrap_or_else(|| {
-            let straight = walk(&dynamics, at, to).1.is_some();
-            Plan { dynamics, to, detour: (!straight).then(|| Detour::new(&dynamics, to)) }
+            let is_straight = steer_to(&dynamics, at, to).1.is_some();
+            Plan { dynamics, to, detours: (!is_straight).then(|| Detours::new(&dynamics, to)) }
         }));
-        let next = plan.detour.as_ref().and_then(|detour| detour.next(at)).unwrap_or(to);
+        let next = plan.detours.as_ref().and_then(|detours| detours.next(at)).unwrap_or(to);
         action.copy_from_slice(&dynamics.steer(at, next).map(f64::from));
         Ok(())
     }
 }
 
-/// Wanders: picks a place anywhere and heads there for a while, with a pace of its own for each place and slowly
-/// changing noise on every step; sometimes it lets itself drift.
-struct Explorer {
-    rng: Rng,
-    /// Where it is heading.
-    to: Point,
-    /// How much of the way there it wants to go each step; 0 drifts.
-    pace: f64,
-    /// Steps before it changes its mind.
-    patience: u32,
-    /// What is added to every action: an autoregressive process.
-    noise: [f64; 2],
-}
-
-/// Share of the time it drifts.
-const DRIFTING: f64 = 0.15;
-/// What is kept of the noise from step to step, and the width of what is added.
-const NOISE: (f64, f64) = (0.8, 0.2);
-/// Nearer than this a place is reached, in pixels.
+/// Share of legs on which the agent drifts.
+const DRIFT_SHARE: f64 = 0.15;
+/// The end of a leg counts as reached within this distance, in pixels.
 const NEAR: f32 = 10.0;
 
-impl Explorer {
-    fn new(rng: Rng) -> Self {
-        Self { rng, to: [0.0; 2], pace: 0.0, patience: 0, noise: [0.0; 2] }
+/// The random walk of `explore`: straight to random positions, and on some legs drifting with the zone.
+#[derive(Default)]
+struct ZoneWalk;
+
+impl RandomWalk for ZoneWalk {
+    const ACTION_SCALE: f64 = 1.0;
+
+    /// The dynamics and the agent's position.
+    type Observed = (Dynamics, Position);
+
+    fn read(row: RowRef<'_>) -> Result<Self::Observed> {
+        Ok((Dynamics::from_row(&row.to_f64("dynamics")?), position(&row.to_f64("state")?)))
     }
 
-    #[allow(clippy::cast_possible_truncation)]
-    fn choose(&mut self) {
-        self.to = [(); 2].map(|()| self.rng.random_range(BORDER..SIZE - BORDER) as f32);
-        let drifting = self.rng.random_bool(DRIFTING);
-        self.pace = if drifting { 0.0 } else { self.rng.random_range(0.4..1.4) };
-        self.patience = self.rng.random_range(if drifting { 5..15 } else { 20..50 });
-    }
-}
-
-impl Expert for Explorer {
-    fn begin(&mut self, key: Key) {
-        *self = Self::new(key.rng());
+    fn draw_leg(rng: &mut Rng) -> Leg {
+        let to = [(); 2].map(|()| rng.random_range(BORDER..SIZE - BORDER) as f32);
+        let drifts = rng.random_bool(DRIFT_SHARE);
+        let pace = if drifts { 0.0 } else { rng.random_range(0.4..1.4) };
+        let steps = rng.random_range(if drifts { 5..15 } else { 20..50 });
+        Leg { to: widen(to), pace, steps, avoids_walls: false }
     }
 
-    fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
-        let dynamics = Dynamics::from_row(&row.to_f64("dynamics")?);
-        let at = place(row, "state")?;
-        if self.patience == 0 || distance(at, self.to) < NEAR {
-            self.choose();
-        }
-        self.patience -= 1;
-        let steer = dynamics.steer(at, self.to);
-        for (i, steer) in steer.into_iter().enumerate() {
-            let (keep, width) = NOISE;
-            self.noise[i] = keep * self.noise[i] + width * self.rng.random_range(-1.0..1.0);
-            action[i] = (self.pace * f64::from(steer) + self.noise[i]).clamp(-1.0, 1.0);
-        }
-        Ok(())
+    fn has_arrived((_, at): &Self::Observed, leg: &Leg) -> bool {
+        distance(*at, position(&leg.to)) < NEAR
+    }
+
+    fn action(&mut self, (dynamics, at): &Self::Observed, leg: &Leg) -> [f64; 2] {
+        dynamics.steer(*at, position(&leg.to)).map(|steer| leg.pace * f64::from(steer))
     }
 }
 
@@ -120,27 +96,26 @@ impl Expert for Explorer {
 mod tests {
     use super::*;
     use crate::piecewise::ENTRY;
-    use crate::trial::{play, reached_of_200};
+    use crate::point_agent::trial::{play, reached_of_200};
     use swm_core::ResetOptions;
 
     #[test]
-    fn the_expert_reaches_the_target() {
-        let in_reach = reached_of_200(&ENTRY, 100, 400);
-        // The other targets lie behind drift that is stronger than the agent, or nearly so.
-        assert_eq!(in_reach, 190, "everything varied, targets anywhere");
+    fn expert_reaches_the_target() {
+        let reached = reached_of_200(&ENTRY, 100, 400);
+        // The other targets lie behind a drift that is stronger than the agent, or nearly so.
+        assert_eq!(reached, 190, "all factors varied, targets of the reset");
     }
 
     #[test]
-    fn the_explorer_sees_the_whole_room() {
-        // The target is kept out of the way, so that episodes last.
-        let apart = ResetOptions { goal_state: Some(vec![0.0, 0.0]), ..ResetOptions::default() };
-        let mut seen = std::collections::BTreeSet::new();
+    fn explorer_visits_the_whole_room() {
+        // A target in the corner does not end episodes early.
+        let far_goal = ResetOptions { goal_state: Some(vec![0.0, 0.0]), ..ResetOptions::default() };
+        let mut visited = std::collections::BTreeSet::new();
         for seed in 0..50 {
-            let (places, _) = play(&ENTRY, &EXPERTS[1], seed, &apart, false, 100);
-            #[allow(clippy::cast_possible_truncation)]
-            seen.extend(places.iter().map(|p| p.map(|v| (v / 16.0) as i64)));
+            let (positions, _) = play(&ENTRY, &EXPERTS[1], seed, &far_goal, false, 100);
+            visited.extend(positions.iter().map(|p| p.map(|v| (v / 16.0) as i64)));
         }
         // 12 x 12 cells of 16 pixels.
-        assert!(seen.len() >= 130, "{} cells seen", seen.len());
+        assert!(visited.len() >= 130, "{} cells visited", visited.len());
     }
 }

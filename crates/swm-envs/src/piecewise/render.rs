@@ -1,77 +1,74 @@
-//! The picture: a room with a frame of lines, zones and their drift where they are shown, and soft discs for target and
-//! agent, drawn at the reference's 224 pixels.
+//! Rendering: a room within lines, the zones and their drift where they are shown, and soft discs for target and agent,
+//! drawn at the reference's 224 pixels.
 
 use super::arrows;
-use super::physics::{BORDER, GRID, SIZE, ZONES};
-use crate::draw::{Area, Brush, Disc, Rgb, Stage, rect};
+use super::physics::{GRID, ZONES};
+use crate::draw::{Area, Background, Brush, Rgb, SoftDisc, rect};
+use crate::point_agent::room::{BORDER, LINE, SIZE};
 use swm_core::FrameMut;
 
-/// Side of the picture as it is drawn.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+/// Side of the frame as it is drawn, in pixels.
 const SIDE: usize = SIZE as usize;
-/// The lines that frame the room are this thick, ending where it begins.
-const LINE: i32 = 4;
 
-/// What keeps still during an episode.
+/// Colours and geometry of everything but the agent.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Scene {
-    /// The colour of everything else.
+pub struct ZonesAppearance {
+    /// Colour of the floor and of the border.
     pub background: Rgb,
-    /// The colour of the lines that frame the room.
+    /// Colour of the lines around the room.
     pub border: Rgb,
-    /// The zones' colours, where they are shown.
+    /// Colours of the zones, if they are shown.
     pub zones: Option<[Rgb; ZONES]>,
-    /// The zones' drift, where it is shown.
+    /// Drift of the zones in pixels per step, if it is shown.
     pub drift: Option<[[f64; 2]; ZONES]>,
-    /// The target, where it is shown.
-    pub target: Option<Disc>,
+    /// The target, if it is shown.
+    pub target: Option<SoftDisc>,
 }
 
-/// Draws frames, remembering the last scene.
-pub struct Renderer {
-    scene: Option<Scene>,
-    stage: Stage,
+/// Draws frames. It caches the background of the last appearance.
+pub struct ZonesRenderer {
+    appearance: Option<ZonesAppearance>,
+    background: Background,
     brush: Brush,
 }
 
-impl Default for Renderer {
+impl Default for ZonesRenderer {
     fn default() -> Self {
-        Self { scene: None, stage: Stage::new(SIDE), brush: Brush::default() }
+        Self { appearance: None, background: Background::new(SIDE), brush: Brush::default() }
     }
 }
 
-impl Renderer {
-    /// Draws a scene and the agent in it.
-    pub fn draw(&mut self, scene: &Scene, agent: &Disc, mut frame: FrameMut<'_>) {
-        if self.scene.as_ref() != Some(scene) {
-            self.set(scene);
-            self.scene = Some(scene.clone());
+impl ZonesRenderer {
+    /// Draws a frame with the agent.
+    pub fn draw(&mut self, appearance: &ZonesAppearance, agent: &SoftDisc, mut frame: FrameMut<'_>) {
+        if self.appearance.as_ref() != Some(appearance) {
+            self.draw_background(appearance);
+            self.appearance = Some(appearance.clone());
         }
-        match self.stage.fill(&mut frame) {
+        match self.background.copy_to(&mut frame) {
             None => self.brush.blend(agent, SIDE, SIDE, frame.rgb),
             Some(tent) => self.brush.blend_resized(agent, tent, frame.rgb),
         }
     }
 
-    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
-    fn set(&mut self, scene: &Scene) {
-        let (side, low) = (SIDE as i32, BORDER as i32);
+    fn draw_background(&mut self, appearance: &ZonesAppearance) {
+        let (side, line, low) = (SIDE as i32, LINE as i32, BORDER as i32);
         let high = side - low;
-        let room = (high - low) / GRID as i32;
-        self.stage.set(|pixels| {
-            pixels.fill(Area::square(SIDE), scene.background);
-            for (i, &color) in scene.zones.iter().flatten().enumerate() {
-                let [x, y] = [i % GRID, i / GRID].map(|cell| low + cell as i32 * room);
-                pixels.fill(rect([x, y], [x + room, y + room]), color);
+        let zone = (high - low) / GRID as i32;
+        self.background.redraw(|pixels| {
+            pixels.fill(Area::square(SIDE), appearance.background);
+            for (i, &color) in appearance.zones.iter().flatten().enumerate() {
+                let [x, y] = [i % GRID, i / GRID].map(|cell| low + cell as i32 * zone);
+                pixels.fill(rect([x, y], [x + zone, y + zone]), color);
             }
-            for start in [low - LINE, high] {
-                pixels.fill(rect([start, 0], [start + LINE, side]), scene.border);
-                pixels.fill(rect([0, start], [side, start + LINE]), scene.border);
+            for start in [low - line, high] {
+                pixels.fill(rect([start, 0], [start + line, side]), appearance.border);
+                pixels.fill(rect([0, start], [side, start + line]), appearance.border);
             }
-            if let Some(target) = &scene.target {
+            if let Some(target) = &appearance.target {
                 self.brush.blend(target, SIDE, SIDE, pixels.bytes());
             }
-            if let Some(drift) = &scene.drift {
+            if let Some(drift) = &appearance.drift {
                 arrows::draw(drift, pixels);
             }
         });

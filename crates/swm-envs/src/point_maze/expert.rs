@@ -1,9 +1,10 @@
-//! Who can demonstrate the task: `expert` takes the shortest way, `explore` wanders everywhere.
+//! The experts: `expert` takes the shortest path to the goal, `explore` walks randomly.
 //!
-//! Both read `state`, `goal_state` and `layout` of the infos row and nothing else.
+//! Both read only the columns `state`, `goal_state` and `layout`.
 
+use super::paths::{ShortestPaths, VisibilityGraph};
 use super::physics::{Layout, MAX_ACTION, SIZE};
-use super::route::{Map, Place, Ways};
+use crate::point_agent::{Explorer, Leg, Position64, RandomWalk, distance64, read_position};
 use rand::Rng as _;
 use swm_core::policy::Expert;
 use swm_core::{ExpertEntry, Key, Result, Rng, RowRef};
@@ -13,166 +14,141 @@ pub const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
         summary: "the shortest way to the goal, around the walls",
-        make: || Box::new(Shortest { guide: None }),
+        make: || Box::new(ShortestPathExpert { planner: None }),
     },
     ExpertEntry {
         id: "explore",
         summary: "a smooth random walk around the walls and into them",
-        make: || Box::new(Explorer::new(Key::new(0).rng())),
+        make: || Box::new(Explorer::<MazeWalk>::new()),
     },
 ];
 
-fn place(row: RowRef<'_>, column: &str) -> Result<Place> {
-    let value = row.to_f64(column)?;
-    Ok([value[0], value[1]])
+/// The shortest paths to one position in one maze.
+struct Planner {
+    graph: VisibilityGraph,
+    to: Position64,
+    paths: ShortestPaths,
 }
 
-/// Knows the shortest ways to one place in one world.
-struct Guide {
-    map: Map,
-    to: Place,
-    ways: Ways,
-}
-
-impl Guide {
-    /// The guide to a place; what is known already is kept.
-    fn to(known: Option<Self>, layout: &Layout, to: Place) -> Self {
-        match known {
-            Some(guide) if guide.map.layout() == layout && guide.to == to => guide,
-            known => {
-                let map = known.map(|guide| guide.map).filter(|map| map.layout() == layout);
-                let map = map.unwrap_or_else(|| Map::new(layout));
-                let ways = map.ways(map.stand(to));
-                Self { map, to, ways }
+impl Planner {
+    /// Makes a planner for a position. It takes over what a previous planner has found for the same maze.
+    fn new(previous: Option<Self>, layout: &Layout, to: Position64) -> Self {
+        match previous {
+            Some(planner) if planner.graph.layout() == layout && planner.to == to => planner,
+            previous => {
+                let graph = previous.map(|planner| planner.graph).filter(|graph| graph.layout() == layout);
+                let graph = graph.unwrap_or_else(|| VisibilityGraph::new(layout));
+                let paths = graph.shortest_paths(graph.nearest_free(to));
+                Self { graph, to, paths }
             }
         }
     }
 
-    /// The step, of length 1 along its longer axis at most, from a place; straight where no way is known.
-    fn step(&self, from: Place) -> Place {
-        let next = self.map.next(from, &self.ways).map_or(self.to, |(next, _)| next);
-        step(self.map.layout(), from, next)
+    /// Returns the step from a position along its path, components at most 1; straight where there is no path.
+    fn step(&self, from: Position64) -> Position64 {
+        let next = self.graph.next(from, &self.paths).map_or(self.to, |(next, _)| next);
+        step_towards(self.graph.layout(), from, next)
     }
 }
 
-/// The step towards `next`: as far as the agent gets along a straight line, but never past it.
-fn step(layout: &Layout, from: Place, next: Place) -> Place {
+/// Returns the step towards `next`: as far as the agent gets along a straight line, but not beyond `next`.
+fn step_towards(layout: &Layout, from: Position64, next: Position64) -> Position64 {
     let away = [0, 1].map(|i| next[i] - from[i]);
-    let far = f64::from(layout.speed * MAX_ACTION);
-    let divisor = away[0].abs().max(away[1].abs()).max(far);
+    let longest = f64::from(layout.speed * MAX_ACTION);
+    let divisor = away[0].abs().max(away[1].abs()).max(longest);
     away.map(|v| v / divisor)
 }
 
-/// Walks from turn to turn of the shortest way.
-struct Shortest {
-    guide: Option<Guide>,
+/// Walks along the shortest path.
+struct ShortestPathExpert {
+    planner: Option<Planner>,
 }
 
-impl Expert for Shortest {
+impl Expert for ShortestPathExpert {
     fn begin(&mut self, _key: Key) {
-        self.guide = None;
+        self.planner = None;
     }
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
         let layout = Layout::from_row(&row.to_f64("layout")?);
-        let guide = Guide::to(self.guide.take(), &layout, place(row, "goal_state")?);
-        let step = guide.step(place(row, "state")?);
+        let planner = Planner::new(self.planner.take(), &layout, read_position(row, "goal_state")?);
+        let step = planner.step(read_position(row, "state")?);
         action.copy_from_slice(&step.map(|v| v * f64::from(MAX_ACTION)));
-        self.guide = Some(guide);
+        self.planner = Some(planner);
         Ok(())
     }
 }
 
-/// Wanders: picks a place anywhere, walks there around the walls, or straight and into them, with a pace of its own
-/// for each place and slowly changing noise on every step.
-struct Explorer {
-    rng: Rng,
-    /// Where it is heading.
-    to: Place,
-    guide: Option<Guide>,
-    /// Whether walls are walked around or into.
-    careful: bool,
-    /// Length of the step before noise; above 1 it is cut.
-    pace: f64,
-    /// Steps before it changes its mind.
-    patience: u32,
-    /// What is added to every step: an autoregressive process.
-    noise: [f64; 2],
+/// Share of legs that lead around the walls instead of straight into them.
+const AROUND_SHARE: f64 = 0.7;
+/// Steps of a leg around the walls, at most.
+const AROUND_LEG_STEPS: u32 = 40;
+
+/// The random walk of `explore`: around the walls, or straight and into them.
+#[derive(Default)]
+struct MazeWalk {
+    planner: Option<Planner>,
 }
 
-/// Share of places that are walked to around the walls.
-const CAREFUL: f64 = 0.7;
-/// What is kept of the noise from step to step, and the width of what is added.
-const NOISE: (f64, f64) = (0.8, 0.2);
+impl RandomWalk for MazeWalk {
+    const ACTION_SCALE: f64 = MAX_ACTION as f64;
 
-impl Explorer {
-    fn new(rng: Rng) -> Self {
-        Self { rng, to: [0.0; 2], guide: None, careful: false, pace: 1.0, patience: 0, noise: [0.0; 2] }
+    /// The layout and the agent's position.
+    type Observed = (Layout, Position64);
+
+    fn read(row: RowRef<'_>) -> Result<Self::Observed> {
+        Ok((Layout::from_row(&row.to_f64("layout")?), read_position(row, "state")?))
     }
 
-    fn choose(&mut self) {
-        self.to = [(); 2].map(|()| self.rng.random_range(0.0..f64::from(SIZE)));
-        self.careful = self.rng.random_bool(CAREFUL);
-        self.pace = self.rng.random_range(0.4..1.4);
-        self.patience = if self.careful { 40 } else { self.rng.random_range(5..20) };
-    }
-}
-
-impl Expert for Explorer {
-    fn begin(&mut self, key: Key) {
-        *self = Self::new(key.rng());
+    fn draw_leg(rng: &mut Rng) -> Leg {
+        let to = [(); 2].map(|()| rng.random_range(0.0..f64::from(SIZE)));
+        let avoids_walls = rng.random_bool(AROUND_SHARE);
+        let pace = rng.random_range(0.4..1.4);
+        let steps = if avoids_walls { AROUND_LEG_STEPS } else { rng.random_range(5..20) };
+        Leg { to, pace, steps, avoids_walls }
     }
 
-    fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
-        let layout = Layout::from_row(&row.to_f64("layout")?);
-        let at = place(row, "state")?;
-        let near = f64::from(2.0 * layout.speed * MAX_ACTION);
-        if self.patience == 0 || (self.to[0] - at[0]).hypot(self.to[1] - at[1]) < near {
-            self.choose();
-        }
-        self.patience -= 1;
-        let step = if self.careful {
-            let guide = Guide::to(self.guide.take(), &layout, self.to);
-            self.guide.insert(guide).step(at)
+    fn has_arrived((layout, at): &Self::Observed, leg: &Leg) -> bool {
+        distance64(leg.to, *at) < f64::from(2.0 * layout.speed * MAX_ACTION)
+    }
+
+    fn action(&mut self, (layout, at): &Self::Observed, leg: &Leg) -> [f64; 2] {
+        let step = if leg.avoids_walls {
+            let planner = Planner::new(self.planner.take(), layout, leg.to);
+            self.planner.insert(planner).step(*at)
         } else {
-            step(&layout, at, self.to)
+            step_towards(layout, *at, leg.to)
         };
-        for (i, step) in step.into_iter().enumerate() {
-            let (keep, width) = NOISE;
-            self.noise[i] = keep * self.noise[i] + width * self.rng.random_range(-1.0..1.0);
-            action[i] = (self.pace * step + self.noise[i]).clamp(-1.0, 1.0) * f64::from(MAX_ACTION);
-        }
-        Ok(())
+        step.map(|step| leg.pace * step)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::point_agent::trial::{play, reached_of_200};
     use crate::point_maze::ENTRY;
-    use crate::trial::{play, reached_of_200};
     use swm_core::ResetOptions;
 
     #[test]
-    fn the_expert_reaches_the_goal() {
-        let in_reach = reached_of_200(&ENTRY, 100, 1000);
-        // Walls cut the other goals off from all that the agent can walk to.
-        assert_eq!(in_reach, 191, "everything varied, goals anywhere");
+    fn expert_reaches_the_goal() {
+        let reached = reached_of_200(&ENTRY, 100, 1000);
+        // Walls cut the other goals off from everywhere the agent can walk.
+        assert_eq!(reached, 191, "all factors varied, goals of the reset");
     }
 
     #[test]
-    fn the_explorer_sees_the_whole_maze() {
-        let mut seen = std::collections::BTreeSet::new();
+    fn explorer_visits_the_whole_maze() {
+        let mut visited = std::collections::BTreeSet::new();
         let mut stopped = 0;
-        // The goal is kept out of the way, so that episodes last.
-        let apart = ResetOptions { goal_state: Some(vec![0.0, 0.0]), ..ResetOptions::default() };
+        // A goal in the corner does not end episodes early.
+        let far_goal = ResetOptions { goal_state: Some(vec![0.0, 0.0]), ..ResetOptions::default() };
         for seed in 0..50 {
-            let (places, _) = play(&ENTRY, &EXPERTS[1], seed, &apart, false, 100);
-            #[allow(clippy::cast_possible_truncation)]
-            seen.extend(places.iter().map(|p| p.map(|v| (v * 2.0).min(9.0) as i64)));
-            stopped += places.windows(2).filter(|p| p[0] == p[1]).count();
+            let (positions, _) = play(&ENTRY, &EXPERTS[1], seed, &far_goal, false, 100);
+            visited.extend(positions.iter().map(|p| p.map(|v| (v * 2.0).min(9.0) as i64)));
+            stopped += positions.windows(2).filter(|p| p[0] == p[1]).count();
         }
         // 10 x 10 cells of half a unit, less those inside walls.
-        assert!(seen.len() >= 80 && stopped >= 100, "{} cells seen, stopped {stopped} times", seen.len());
+        assert!(visited.len() >= 80 && stopped >= 100, "{} cells visited, stopped {stopped} times", visited.len());
     }
 }

@@ -1,43 +1,48 @@
-//! The picture: walls, a half transparent goal and the agent in a thin frame, drawn at the reference's 500 pixels.
+//! Rendering: walls, a half transparent goal and the agent within a thin border line, drawn at the reference's 500
+//! pixels.
 
-use super::physics::{Layout, Point, SIZE};
-use crate::draw::{Area, Pixels, Rgb, Stage, rect};
-use swm_core::FrameMut;
+use super::factors;
+use super::physics::{Layout, SIZE};
+use crate::draw::{Area, Background, Pixels, Rgb, rect};
+use crate::point_agent::Position;
+use swm_core::{FactorValues, FrameMut};
 
-/// Side of the picture as it is drawn.
+/// Side of the frame as it is drawn, in pixels.
 const SIDE: usize = 500;
-/// Pixels in a unit of the world.
+/// Pixels per maze unit.
 const SCALE: f64 = SIDE as f64 / SIZE as f64;
-/// How much of the goal hides what is below it.
+/// Opacity of the goal.
 const GOAL_OPACITY: f64 = 0.5;
-/// The frame is a black line of 1.11 pixels (0.8 points) along the picture's edge: left and above it covers the first
-/// pixel and this share of the second, right and below the same share of the last.
-const FRAME_SHARE: f64 = 0.0556;
+/// Coverage of the pixels that the border line covers in part. It is a black line of 1.11 pixels (0.8 points) along the
+/// edge of the frame: left and above it covers the first pixel and this share of the second, right and below the same
+/// share of the last.
+const BORDER_COVERAGE: f64 = 0.0556;
 
-/// A disc in the world.
+/// A disc in the maze.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Disc {
-    /// Its middle.
-    pub center: Point,
-    /// Its radius.
+    /// Its centre, in maze units.
+    pub center: Position,
+    /// Its radius, in maze units.
     pub radius: f32,
     /// Its colour.
     pub color: Rgb,
 }
 
 impl Disc {
-    fn pixel(&self) -> ([f64; 2], f64) {
+    /// Returns centre and radius in pixels of the frame, y down.
+    fn in_pixels(&self) -> ([f64; 2], f64) {
         let [x, y] = self.center.map(|v| f64::from(v) * SCALE);
         ([x, SIDE as f64 - y], f64::from(self.radius) * SCALE)
     }
 }
 
-/// What keeps still during an episode.
+/// Geometry and colours of everything but the agent.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Scene {
-    /// The floor's colour.
+pub struct MazeAppearance {
+    /// Colour of the floor.
     pub background: Rgb,
-    /// The walls' colour.
+    /// Colour of the walls.
     pub wall: Rgb,
     /// The walls.
     pub layout: Layout,
@@ -45,74 +50,87 @@ pub struct Scene {
     pub goal: Disc,
 }
 
-/// Draws frames, remembering the last scene.
-pub struct Renderer {
-    scene: Option<Scene>,
-    stage: Stage,
-}
-
-impl Default for Renderer {
-    fn default() -> Self {
-        Self { scene: None, stage: Stage::new(SIDE) }
-    }
-}
-
-impl Renderer {
-    /// Draws a scene and the agent in it.
-    pub fn draw(&mut self, scene: &Scene, agent: &Disc, frame: FrameMut<'_>) {
-        if self.scene.as_ref() != Some(scene) {
-            self.stage.set(|pixels| backdrop(scene, pixels));
-            self.scene = Some(scene.clone());
+impl MazeAppearance {
+    /// The appearance that the factors describe.
+    pub fn new(factors: &FactorValues, layout: Layout) -> Self {
+        Self {
+            background: factors.rgb("background.color"),
+            wall: factors.rgb("walls.color"),
+            layout,
+            goal: factors::disc(factors, "goal"),
         }
-        self.stage.show(frame, |pixels| below_the_frame(agent, pixels));
     }
 }
 
-fn backdrop(scene: &Scene, pixels: &mut Pixels<'_>) {
+/// Draws frames. It caches the background of the last appearance.
+pub struct MazeRenderer {
+    appearance: Option<MazeAppearance>,
+    background: Background,
+}
+
+impl Default for MazeRenderer {
+    fn default() -> Self {
+        Self { appearance: None, background: Background::new(SIDE) }
+    }
+}
+
+impl MazeRenderer {
+    /// Draws a frame with the agent.
+    pub fn draw(&mut self, appearance: &MazeAppearance, agent: &Disc, frame: FrameMut<'_>) {
+        if self.appearance.as_ref() != Some(appearance) {
+            self.background.redraw(|pixels| draw_background(appearance, pixels));
+            self.appearance = Some(appearance.clone());
+        }
+        self.background.draw_over(frame, |pixels| draw_agent(agent, pixels));
+    }
+}
+
+fn draw_background(appearance: &MazeAppearance, pixels: &mut Pixels<'_>) {
     let whole = Area::square(SIDE);
-    pixels.fill(whole, scene.background);
-    for wall in scene.layout.walls() {
-        // To whole pixels, as matplotlib snaps rectangles.
+    pixels.fill(whole, appearance.background);
+    for wall in appearance.layout.walls() {
+        // Rounded to whole pixels, as matplotlib snaps rectangles.
         let [left, bottom] = wall.low.map(|v| f64::from(v) * SCALE);
         let [right, top] = wall.high.map(|v| f64::from(v) * SCALE);
-        let low = nearest(left, SIDE as f64 - top);
-        let high = nearest(right, SIDE as f64 - bottom);
-        pixels.fill(rect(low, high), scene.wall);
+        let low = nearest_pixel(left, SIDE as f64 - top);
+        let high = nearest_pixel(right, SIDE as f64 - bottom);
+        pixels.fill(rect(low, high), appearance.wall);
     }
-    let (center, radius) = scene.goal.pixel();
-    pixels.circle(center, radius, scene.goal.color, GOAL_OPACITY, whole);
-    for (start, end) in [SHADED[0], SHADED[1]] {
-        pixels.tint(rect([start, 0], [end, END]), [0; 3], FRAME_SHARE);
-        pixels.tint(rect([0, start], [END, end]), [0; 3], FRAME_SHARE);
+    let (center, radius) = appearance.goal.in_pixels();
+    pixels.circle(center, radius, appearance.goal.color, GOAL_OPACITY, whole);
+    for (start, end) in PARTLY_COVERED {
+        pixels.tint(rect([start, 0], [end, END]), [0; 3], BORDER_COVERAGE);
+        pixels.tint(rect([0, start], [END, end]), [0; 3], BORDER_COVERAGE);
     }
     pixels.fill(rect([0, 0], [1, END]), [0; 3]);
     pixels.fill(rect([0, 0], [END, 1]), [0; 3]);
 }
 
 const END: i32 = SIDE as i32;
-/// Where, along x and along y, the frame covers a share of the pixels.
-const SHADED: [(i32, i32); 2] = [(1, 2), (END - 1, END)];
+/// The ranges of columns, and of rows, that the border line covers in part.
+const PARTLY_COVERED: [(i32, i32); 2] = [(1, 2), (END - 1, END)];
 
-/// Draws the agent as if the frame were drawn over it: in darker colours where the frame covers a share.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-fn below_the_frame(agent: &Disc, pixels: &mut Pixels<'_>) -> Area {
-    let (center, radius) = agent.pixel();
-    let around = Pixels::around(center, radius);
-    let bands = [(SHADED[0], 1), ((SHADED[0].1, SHADED[1].0), 0), (SHADED[1], 1)];
-    for ((left, right), shaded_x) in bands {
-        for ((top, bottom), shaded_y) in bands {
+/// Draws the agent as if the border line were drawn over it: darkened where the line covers a share of the pixels.
+/// Returns the area it may have changed.
+fn draw_agent(agent: &Disc, pixels: &mut Pixels<'_>) -> Area {
+    let (center, radius) = agent.in_pixels();
+    let bounds = Pixels::circle_bounds(center, radius);
+    let [first, last] = PARTLY_COVERED;
+    // Each band with how often the line covers it in part.
+    let bands = [(first, 1), ((first.1, last.0), 0), (last, 1)];
+    for ((left, right), covered_x) in bands {
+        for ((top, bottom), covered_y) in bands {
             let clip = rect([left, top], [right, bottom]);
-            if clip.touches(around) {
-                let light = (1.0 - FRAME_SHARE).powi(shaded_x + shaded_y);
-                let color = agent.color.map(|v| (f64::from(v) * light + 0.5) as u8);
+            if clip.touches(bounds) {
+                let brightness = (1.0 - BORDER_COVERAGE).powi(covered_x + covered_y);
+                let color = agent.color.map(|v| (f64::from(v) * brightness + 0.5) as u8);
                 pixels.circle(center, radius, color, 1.0, clip);
             }
         }
     }
-    around
+    bounds
 }
 
-#[allow(clippy::cast_possible_truncation)]
-fn nearest(x: f64, y: f64) -> [i32; 2] {
+fn nearest_pixel(x: f64, y: f64) -> [i32; 2] {
     [x, y].map(|v| (v + 0.5).floor() as i32)
 }

@@ -9,11 +9,11 @@ mod physics;
 mod render;
 mod shapes;
 
-use crate::factors;
 use physics::{AGENT, BLOCK, Body, Shape, Vec2, WALLS, World, put, take_array};
 use render::{Renderer, Scene};
 use shapes::Design;
 use std::f64::consts::{PI, TAU};
+use swm_core::factors;
 use swm_core::{
     Action, ColumnSpec, DType, Env, EnvEntry, EnvSpec, Error, ExpertEntry, Factor, FactorValues, FrameMut, Key,
     ResetOptions, Result, RowMut, RowRef, Snapshot, Space, Transition, VariationRequest, VariationSpace,

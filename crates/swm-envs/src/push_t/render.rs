@@ -146,7 +146,7 @@ impl Renderer {
                 self.table.fill_polygon(&rect.map(|corner| pixel(pose.point(corner))), GOAL);
             }
         }
-        walls().iter().for_each(|&[from, to]| self.table.bar(from, to, WALL));
+        walls().iter().for_each(|&[from, to]| self.table.thick_line(from, to, WALL));
         self.canvas.copy_area(&self.table, Area::square(SIDE));
         self.resting = None;
         self.pictures.iter_mut().for_each(|picture| (picture.current, picture.resting) = (false, false));
@@ -202,7 +202,7 @@ impl Renderer {
         for area in areas {
             self.canvas.copy_area(&self.table, area);
         }
-        self.palette.forget_mixed();
+        self.palette.drop_blended();
     }
 
     /// Draws all of a body.
@@ -273,7 +273,7 @@ impl Canvas {
         let corners = design.rects[part].map(|corner| pixel(pose.point(corner)));
         self.fill_polygon(&corners, inside);
         for i in 0..4 {
-            self.bar(corners[i], corners[(i + 1) % 4], rim);
+            self.thick_line(corners[i], corners[(i + 1) % 4], rim);
         }
     }
 
@@ -281,7 +281,7 @@ impl Canvas {
     fn draw_walls(&mut self, areas: &[Area]) {
         for wall in walls() {
             if areas.iter().any(|area| area.touches(around(&wall))) {
-                self.bar(wall[0], wall[1], WALL);
+                self.thick_line(wall[0], wall[1], WALL);
             }
         }
     }

@@ -1,9 +1,11 @@
-//! Who can demonstrate the task: `expert` takes the shortest way, `explore` wanders everywhere.
+//! The experts: `expert` takes the shortest path to the target, `explore` walks randomly.
 //!
-//! Both read `state`, `goal_state` and `layout` of the infos row and nothing else.
+//! Both read only the columns `state`, `goal_state` and `layout`.
 
-use super::physics::{BORDER, Layout, SIZE};
-use super::route::{self, Place};
+use super::paths;
+use super::physics::Layout;
+use crate::point_agent::room::{BORDER, SIZE};
+use crate::point_agent::{Explorer, Leg, Position64, RandomWalk, distance64, read_position};
 use rand::Rng as _;
 use swm_core::policy::Expert;
 use swm_core::{ExpertEntry, Key, Result, Rng, RowRef};
@@ -13,126 +15,100 @@ pub const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
         summary: "the shortest way to the target, through the best door",
-        make: || Box::new(Shortest),
+        make: || Box::new(ShortestPath),
     },
     ExpertEntry {
         id: "explore",
         summary: "a smooth random walk through both rooms, the doors and against the walls",
-        make: || Box::new(Explorer::new(Key::new(0).rng())),
+        make: || Box::new(Explorer::<RoomWalk>::new()),
     },
 ];
 
-fn place(row: RowRef<'_>, column: &str) -> Result<Place> {
-    let value = row.to_f64(column)?;
-    Ok([value[0], value[1]])
-}
+/// Walks straight to the target, or through the door of the shortest path.
+struct ShortestPath;
 
-/// Walks straight to the target, or through the door that makes the way shortest.
-struct Shortest;
-
-impl Expert for Shortest {
+impl Expert for ShortestPath {
     fn begin(&mut self, _key: Key) {}
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
         let layout = Layout::from_row(&row.to_f64("layout")?);
-        let (at, goal) = (place(row, "state")?, place(row, "goal_state")?);
-        let next = route::waypoint(&layout, at, goal);
+        let (at, goal) = (read_position(row, "state")?, read_position(row, "goal_state")?);
+        let next = paths::waypoint(&layout, at, goal);
         let [dx, dy] = [next[0] - at[0], next[1] - at[1]];
-        // Full speed, but never past the next turn.
+        // Full speed, but not beyond the waypoint.
         let divisor = dx.hypot(dy).max(layout.speed);
         action.copy_from_slice(&[dx / divisor, dy / divisor]);
         Ok(())
     }
 }
 
-/// Wanders: picks a place anywhere, walks there through the doors, or straight and into the walls, with a pace of
-/// its own for each place and slowly changing noise on every step.
-struct Explorer {
-    rng: Rng,
-    /// Where it is heading.
-    to: Place,
-    /// Whether walls are walked around or into.
-    careful: bool,
-    /// Length of the action before noise; above 1 its corners are clipped.
-    pace: f64,
-    /// Steps before it changes its mind.
-    patience: u32,
-    /// What is added to every action: an autoregressive process.
-    noise: [f64; 2],
-}
+/// Share of legs that lead through the doors instead of straight into the walls.
+const DOOR_SHARE: f64 = 0.7;
+/// Steps of a leg through the doors, at most.
+const DOOR_LEG_STEPS: u32 = 60;
 
-/// Share of places that are walked to through the doors.
-const CAREFUL: f64 = 0.7;
-/// What is kept of the noise from step to step, and the width of what is added.
-const NOISE: (f64, f64) = (0.8, 0.2);
+/// The random walk of `explore`: through the doors, or straight and into the walls.
+#[derive(Default)]
+struct RoomWalk;
 
-impl Explorer {
-    fn new(rng: Rng) -> Self {
-        Self { rng, to: [0.0; 2], careful: true, pace: 1.0, patience: 0, noise: [0.0; 2] }
+impl RandomWalk for RoomWalk {
+    const ACTION_SCALE: f64 = 1.0;
+
+    /// The layout and the agent's position.
+    type Observed = (Layout, Position64);
+
+    fn read(row: RowRef<'_>) -> Result<Self::Observed> {
+        Ok((Layout::from_row(&row.to_f64("layout")?), read_position(row, "state")?))
     }
 
-    fn choose(&mut self) {
-        self.to = [(); 2].map(|()| self.rng.random_range(BORDER..SIZE - BORDER));
-        self.careful = self.rng.random_bool(CAREFUL);
-        self.pace = self.rng.random_range(0.4..1.4);
-        self.patience = if self.careful { 60 } else { self.rng.random_range(5..25) };
-    }
-}
-
-impl Expert for Explorer {
-    fn begin(&mut self, key: Key) {
-        *self = Self::new(key.rng());
+    fn draw_leg(rng: &mut Rng) -> Leg {
+        let to = [(); 2].map(|()| rng.random_range(BORDER..SIZE - BORDER));
+        let avoids_walls = rng.random_bool(DOOR_SHARE);
+        let pace = rng.random_range(0.4..1.4);
+        let steps = if avoids_walls { DOOR_LEG_STEPS } else { rng.random_range(5..25) };
+        Leg { to, pace, steps, avoids_walls }
     }
 
-    fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
-        let layout = Layout::from_row(&row.to_f64("layout")?);
-        let at = place(row, "state")?;
-        let arrived = (self.to[0] - at[0]).hypot(self.to[1] - at[1]) < 2.0 * layout.speed;
-        if self.patience == 0 || (arrived && self.careful) {
-            self.choose();
-        }
-        self.patience -= 1;
-        let next = if self.careful { route::waypoint(&layout, at, self.to) } else { self.to };
+    fn has_arrived((layout, at): &Self::Observed, leg: &Leg) -> bool {
+        leg.avoids_walls && distance64(*at, leg.to) < 2.0 * layout.speed
+    }
+
+    fn action(&mut self, (layout, at): &Self::Observed, leg: &Leg) -> [f64; 2] {
+        let next = if leg.avoids_walls { paths::waypoint(layout, *at, leg.to) } else { leg.to };
         let [dx, dy] = [next[0] - at[0], next[1] - at[1]];
         let divisor = dx.hypot(dy).max(1e-9);
-        for (i, step) in [dx, dy].into_iter().enumerate() {
-            let (keep, width) = NOISE;
-            self.noise[i] = keep * self.noise[i] + width * self.rng.random_range(-1.0..1.0);
-            action[i] = (self.pace * step / divisor + self.noise[i]).clamp(-1.0, 1.0);
-        }
-        Ok(())
+        [dx, dy].map(|step| leg.pace * step / divisor)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::trial::{play, reached_of_200};
+    use crate::point_agent::trial::{play, reached_of_200};
     use crate::two_room::ENTRY;
     use swm_core::ResetOptions;
 
     #[test]
-    fn the_expert_reaches_the_target() {
-        let in_reach = reached_of_200(&ENTRY, 100, 400);
-        // Eight of these targets lie deep in the wall, or behind doors too near the border for the agent.
-        assert_eq!(in_reach, 192, "everything varied, targets anywhere");
+    fn expert_reaches_the_target() {
+        let reached = reached_of_200(&ENTRY, 100, 400);
+        // The other eight targets lie deep in the wall, or behind doors too near the border for the agent.
+        assert_eq!(reached, 192, "all factors varied, targets of the reset");
     }
 
     #[test]
-    fn the_explorer_sees_all_of_both_rooms() {
-        // The target is kept out of the way, so that episodes last.
-        let apart = ResetOptions { goal_state: Some(vec![0.0, 0.0]), ..ResetOptions::default() };
-        let mut seen = std::collections::BTreeSet::new();
+    fn explorer_visits_both_rooms() {
+        // A target in the corner does not end episodes early.
+        let far_goal = ResetOptions { goal_state: Some(vec![0.0, 0.0]), ..ResetOptions::default() };
+        let mut visited = std::collections::BTreeSet::new();
         let (mut crossings, mut touches) = (0, 0);
         for seed in 0..50 {
-            let (places, _) = play(&ENTRY, &EXPERTS[1], seed, &apart, false, 100);
-            #[allow(clippy::cast_possible_truncation)]
-            seen.extend(places.iter().map(|p| p.map(|v| (v / 16.0) as i64)));
-            crossings += places.windows(2).filter(|p| (p[0][0] < 112.0) != (p[1][0] < 112.0)).count();
-            touches += places.iter().filter(|p| p[0] == 99.5 || p[0] == 124.5).count();
+            let (positions, _) = play(&ENTRY, &EXPERTS[1], seed, &far_goal, false, 100);
+            visited.extend(positions.iter().map(|p| p.map(|v| (v / 16.0) as i64)));
+            crossings += positions.windows(2).filter(|p| (p[0][0] < 112.0) != (p[1][0] < 112.0)).count();
+            touches += positions.iter().filter(|p| p[0] == 99.5 || p[0] == 124.5).count();
         }
         // 12 x 12 cells of 16 pixels, less those inside the wall.
-        assert!(seen.len() >= 130, "{} cells seen", seen.len());
+        assert!(visited.len() >= 130, "{} cells visited", visited.len());
         assert!(crossings >= 50 && touches >= 100, "{crossings} crossings, {touches} touches of the wall");
     }
 }

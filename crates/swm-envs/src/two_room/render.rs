@@ -1,52 +1,51 @@
-//! The picture: floor, walls and doors as an exact area average of the 224-pixel world at any size, soft discs
-//! for target and agent on top.
+//! Rendering: floor, walls and doors as an exact area average of the 224-pixel frame at any size, with soft discs for
+//! target and agent over them.
 //!
-//! Everything but the agent keeps still during an episode, so it is drawn once into a background that frames
-//! begin with. At 224 pixels the background equals the reference's bit for bit (the line in `border_color`
-//! aside), and the discs are within a rounding of it.
+//! Everything but the agent is static during an episode, so it is drawn once per frame size. At 224 pixels this
+//! background equals the reference's bit for bit (apart from the line in `border_color`), and the discs are within a
+//! rounding of it.
 
-use super::physics::{BORDER, CENTER, SIZE};
-use crate::draw::{Brush, Disc, Rgb};
+use super::physics::WALL_CENTER;
+use crate::draw::{Brush, BySize, Rgb, SoftDisc};
+use crate::point_agent::room::{BORDER, LINE, SIZE};
 use swm_core::FrameMut;
 
-/// The lines that frame the world are this thick, ending where the rooms begin.
-const LINE: f64 = 4.0;
-/// The outermost part of them, drawn in `border_color`. The reference ignores that colour: a hairline makes it seen
-/// and leaves pictures the same, but for little.
+/// Width of the outermost part of the room's lines, drawn in `border_color`, in pixels. The reference ignores that
+/// colour; a narrow line shows it and hardly changes the frame.
 const EDGE: f64 = 0.5;
 
-/// What keeps still during an episode.
+/// Geometry and colours of everything but the agent. Lengths are in pixels of the 224-pixel frame.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Scene {
-    /// The floor's colour.
+pub struct RoomAppearance {
+    /// Colour of the floor.
     pub floor: Rgb,
-    /// The colour of the wall and of the lines that frame the world.
+    /// Colour of the wall and of the lines around the room.
     pub wall: Rgb,
-    /// The colour of the frame's outer edge.
+    /// Colour of the outer edge of these lines.
     pub border: Rgb,
-    /// The doors' colour.
+    /// Colour of the doors.
     pub door: Rgb,
-    /// The coordinate one changes to get from room to room.
+    /// The axis that crosses the wall: 0 (x) or 1 (y).
     pub across: usize,
     /// Half the wall's thickness.
-    pub half: f64,
-    /// Middle and half-width of every door, along the wall.
+    pub half_thickness: f64,
+    /// Centre and half-width of every door, along the wall.
     pub doors: Vec<[f64; 2]>,
-    /// The target, where it is drawn.
-    pub target: Option<Disc>,
+    /// The target, if it is drawn.
+    pub target: Option<SoftDisc>,
 }
 
-impl Scene {
-    /// The colour at a place, in pixels of the 224-pixel picture from its upper left corner.
+impl RoomAppearance {
+    /// Returns the colour at a point of the 224-pixel frame, measured from its upper left corner.
     fn color_at(&self, p: [f64; 2]) -> Rgb {
-        // How far inside the outer edge of the frame's lines a coordinate is; negative is outside.
+        // How far inside the outer edge of the room's lines a coordinate is; negative outside.
         let depth = p.map(|v| v.min(SIZE - v) - (BORDER - LINE));
         let on = |depth: f64, width: f64| (0.0..width).contains(&depth);
         if depth.iter().all(|&d| d >= 0.0) && depth.iter().any(|&d| on(d, EDGE)) {
             self.border
         } else if depth.iter().any(|&d| on(d, LINE)) {
             self.wall
-        } else if (p[self.across] - (CENTER + 0.5)).abs() > self.half + 0.5 {
+        } else if (p[self.across] - (WALL_CENTER + 0.5)).abs() > self.half_thickness + 0.5 {
             self.floor
         } else if self.doors.iter().any(|&[center, size]| (p[1 - self.across] - (center + 0.5)).abs() < size + 0.5) {
             self.door
@@ -55,7 +54,7 @@ impl Scene {
         }
     }
 
-    /// Where colours may change along the x (0) or y (1) axis, ascending, from 0 to the world's size.
+    /// Returns the coordinates along the x (0) or y (1) axis at which colours may change, ascending, from 0 to [`SIZE`].
     fn breaks(&self, axis: usize) -> Vec<f64> {
         let outer = BORDER - LINE;
         let mut breaks = vec![0.0, outer, outer + EDGE, BORDER];
@@ -63,7 +62,7 @@ impl Scene {
             breaks.push(SIZE - breaks[i]);
         }
         if axis == self.across {
-            breaks.extend([CENTER - self.half, CENTER + self.half + 1.0]);
+            breaks.extend([WALL_CENTER - self.half_thickness, WALL_CENTER + self.half_thickness + 1.0]);
         } else {
             breaks.extend(self.doors.iter().flat_map(|[center, size]| [center - size, center + size + 1.0]));
         }
@@ -73,14 +72,13 @@ impl Scene {
         breaks
     }
 
-    /// Draws the scene, without the target: every pixel is the average of the world over its area.
-    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    /// Draws everything but the target into `rgb`, `[height, width, 3]`: every pixel is the average over its area.
     fn draw(&self, width: usize, height: usize, rgb: &mut [u8]) {
         let [xs, ys] = [self.breaks(0), self.breaks(1)];
-        let columns: Vec<Vec<(usize, f64)>> = (0..width).map(|i| parts(&xs, i, width)).collect();
+        let columns: Vec<Vec<(usize, f64)>> = (0..width).map(|i| overlaps(&xs, i, width)).collect();
         let mut above: Option<Vec<(usize, f64)>> = None;
         for y in 0..height {
-            let row = parts(&ys, y, height);
+            let row = overlaps(&ys, y, height);
             let (drawn, rest) = rgb.split_at_mut(y * width * 3);
             if above.as_ref() == Some(&row) {
                 rest[..width * 3].copy_from_slice(&drawn[(y - 1) * width * 3..]);
@@ -100,66 +98,46 @@ impl Scene {
     }
 }
 
-/// Which cells between `breaks` a pixel lies in, and with which share of it.
-#[allow(clippy::cast_precision_loss)]
-fn parts(breaks: &[f64], pixel: usize, pixels: usize) -> Vec<(usize, f64)> {
+/// Returns the cells between `breaks` that a pixel overlaps, each with its share of the pixel.
+fn overlaps(breaks: &[f64], pixel: usize, pixels: usize) -> Vec<(usize, f64)> {
     let scale = SIZE / pixels as f64;
     let (start, end) = (pixel as f64 * scale, (pixel + 1) as f64 * scale);
     let overlap = |i: usize| (breaks[i + 1].min(end) - breaks[i].max(start)) / scale;
     (0..breaks.len() - 1).map(|i| (i, overlap(i))).filter(|&(_, share)| share > 1e-9).collect()
 }
 
-fn average(parts: &[(usize, f64)], color: impl Fn(usize) -> [f64; 3]) -> [f64; 3] {
-    parts.iter().fold([0.0; 3], |sum, &(i, share)| {
+/// Returns the weighted mean of the colours of some cells.
+fn average(cells: &[(usize, f64)], color: impl Fn(usize) -> [f64; 3]) -> [f64; 3] {
+    cells.iter().fold([0.0; 3], |sum, &(i, share)| {
         let color = color(i);
         std::array::from_fn(|c| sum[c] + color[c] * share)
     })
 }
 
-/// Draws frames, remembering the last scene at the sizes it was asked for.
+/// Draws frames. It caches the background of the last appearance at the sizes in use.
 #[derive(Default)]
-pub struct Renderer {
-    scene: Option<Scene>,
-    /// The newest first.
-    backgrounds: Vec<Background>,
+pub struct RoomRenderer {
+    appearance: Option<RoomAppearance>,
+    backgrounds: BySize<Vec<u8>>,
     brush: Brush,
 }
 
-/// What keeps still, at one size.
-struct Background {
-    size: [usize; 2],
-    rgb: Vec<u8>,
-    /// Whether `rgb` shows the last scene.
-    current: bool,
-}
-
-/// At how many sizes the background is kept.
-const MAX_BACKGROUNDS: usize = 4;
-
-impl Renderer {
-    /// Draws a scene and the agent in it.
-    pub fn draw(&mut self, scene: &Scene, agent: &Disc, frame: FrameMut<'_>) {
+impl RoomRenderer {
+    /// Draws a frame with the agent.
+    pub fn draw(&mut self, appearance: &RoomAppearance, agent: &SoftDisc, frame: FrameMut<'_>) {
         let FrameMut { width, height, rgb } = frame;
-        if self.scene.as_ref() != Some(scene) {
-            self.scene = Some(scene.clone());
-            self.backgrounds.iter_mut().for_each(|background| background.current = false);
+        if self.appearance.as_ref() != Some(appearance) {
+            self.appearance = Some(appearance.clone());
+            self.backgrounds.invalidate();
         }
-        let size = [width, height];
-        let known = self.backgrounds.iter().position(|background| background.size == size);
-        let place = known.unwrap_or_else(|| {
-            self.backgrounds.truncate(MAX_BACKGROUNDS - 1);
-            self.backgrounds.insert(0, Background { size, rgb: vec![0; width * height * 3], current: false });
-            0
-        });
-        let background = &mut self.backgrounds[place];
-        if !background.current {
-            scene.draw(width, height, &mut background.rgb);
-            if let Some(target) = &scene.target {
-                self.brush.blend(target, width, height, &mut background.rgb);
+        let create = || vec![0; width * height * 3];
+        let slot = self.backgrounds.slot(width, height, create, |background| {
+            appearance.draw(width, height, background);
+            if let Some(target) = &appearance.target {
+                self.brush.blend(target, width, height, background);
             }
-            background.current = true;
-        }
-        rgb.copy_from_slice(&background.rgb);
+        });
+        rgb.copy_from_slice(&self.backgrounds[slot]);
         self.brush.blend(agent, width, height, rgb);
     }
 }
@@ -168,40 +146,37 @@ impl Renderer {
 mod tests {
     use super::*;
 
-    fn scene() -> Scene {
-        Scene {
+    fn drawn(width: usize, height: usize) -> Vec<u8> {
+        let appearance = RoomAppearance {
             floor: [250, 200, 100],
             wall: [10, 20, 30],
             border: [40, 50, 60],
             door: [70, 80, 90],
             across: 0,
-            half: 5.0,
+            half_thickness: 5.0,
             doors: vec![[60.0, 14.0], [3.0, 9.0]],
             target: None,
-        }
+        };
+        let mut rgb = vec![0; width * height * 3];
+        appearance.draw(width, height, &mut rgb);
+        rgb
     }
 
     #[test]
     fn other_sizes_are_area_averages() {
-        let full = |w: usize, h: usize| {
-            let mut rgb = vec![0; w * h * 3];
-            scene().draw(w, h, &mut rgb);
-            rgb
-        };
-        let world = full(224, 224);
+        let native = drawn(224, 224);
         for (w, h) in [(112, 112), (32, 56), (7, 1)] {
-            let picture = full(w, h);
             let (dx, dy) = (224 / w, 224 / h);
-            for (i, &byte) in picture.iter().enumerate() {
+            for (i, &byte) in drawn(w, h).iter().enumerate() {
                 let (x, y, c) = (i / 3 % w, i / 3 / w, i % 3);
-                let cells = (0..dx * dy).map(|k| world[((y * dy + k / dx) * 224 + x * dx + k % dx) * 3 + c]);
+                let cells = (0..dx * dy).map(|k| native[((y * dy + k / dx) * 224 + x * dx + k % dx) * 3 + c]);
                 let mean = cells.map(f64::from).sum::<f64>() / (dx * dy) as f64;
                 assert!((f64::from(byte) - mean).abs() <= 0.501, "{w} x {h}, pixel {x} {y}: {byte}, not {mean}");
             }
         }
-        // Shrinking by two what is drawn twice as large gives the same again.
-        let large = full(448, 448);
-        for (i, &byte) in world.iter().enumerate() {
+        // Averaging 2 x 2 pixels of the frame drawn at twice the size gives the native frame.
+        let large = drawn(448, 448);
+        for (i, &byte) in native.iter().enumerate() {
             let (x, y, c) = (i / 3 % 224, i / 3 / 224, i % 3);
             let four = [(0, 0), (1, 0), (0, 1), (1, 1)].map(|(u, v)| large[((2 * y + v) * 448 + 2 * x + u) * 3 + c]);
             let mean = four.map(f64::from).iter().sum::<f64>() / 4.0;

@@ -11,7 +11,7 @@ pub mod tools;
 
 pub use dataset::{
     CacheConfig, ClipSpec, Clips, ColumnStats, CommitPolicy, Constants, Episode, Epoch, GoalMixture, GoalSpec,
-    Irregularity, Loaded, Loader, LoaderConfig, Location, Part, Reader, ReplayBuffer, ReplayConfig, ReplayLoader,
+    Irregularity, LoadedBatch, Loader, LoaderConfig, Location, Part, Reader, ReplayBuffer, ReplayConfig, ReplayLoader,
     Split, StepRange, WriteMode, WriteOptions, Writer, column_quantiles, column_stats, goals, objects, views,
 };
 pub use formats::{FORMATS, FormatEntry, create, lance, open};

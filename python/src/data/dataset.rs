@@ -9,8 +9,8 @@ use pyo3::exceptions::{PyIndexError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict};
 use std::sync::{Arc, Mutex, PoisonError};
+use swm::core::columns::ACTION;
 use swm::core::{Batch, ColumnSpec, Error, Result, Schema};
-use swm::data::dataset::clips::ACTION;
 use swm::data::{CacheConfig, FORMATS, Reader, StepRange, views};
 use swm::home;
 

@@ -1,39 +1,38 @@
-//! Clips: short windows of an episode, the unit that world models train on.
+//! Clips: short windows of episodes, the samples that world models train on.
 //!
-//! A clip of `num_steps` steps with frameskip `f` that begins at row `s` covers the `num_steps * f` rows from
-//! `s`, all of one episode. Step `k` shows row `s + k * f` and carries the `f` actions of rows
-//! `s + k * f .. s + (k + 1) * f`, one after another. The last row of an episode has no action (NaN or -1), so
-//! only the very last action of a clip can be missing: models must ignore or replace it. This is the rule of
-//! the reference's `Dataset`, so both see the same clips.
+//! A clip with `num_steps` steps and frameskip `f` that starts at row `s` covers `num_steps * f` rows of one episode.
+//! Step `k` holds the observation of row `s + k * f` and the concatenated actions of rows `s + k * f .. s + (k + 1) *
+//! f`. The last row of an episode has no action (NaN or -1), so only the very last action of a clip can be missing;
+//! models must ignore or replace it. The reference's `Dataset` defines clips in the same way.
 
 use crate::dataset::reader::{Episode, StepRange};
+use swm_core::columns::ACTION;
 use swm_core::{ColumnSpec, Error, Result, Schema};
 
-/// The column whose skipped rows are kept, grouped with their step.
-pub const ACTION: &str = "action";
-
-/// What a clip holds.
+/// Shape and columns of clips.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ClipSpec {
-    /// Frames in a clip.
+    /// Steps per clip.
     pub num_steps: usize,
-    /// Rows from one frame to the next.
+    /// Rows from one step to the next.
     pub frameskip: usize,
     /// The columns to load.
     pub columns: Vec<String>,
 }
 
 impl ClipSpec {
-    /// Rows that a clip covers.
+    /// Number of rows that a clip covers.
     pub fn span(&self) -> usize {
         self.num_steps * self.frameskip
     }
 
-    /// Checks that it describes clips of this dataset, and gives the columns of a batch of clips: `[num_steps,
-    /// shape…]`, for actions `[num_steps, frameskip * numbers]`.
+    /// Checks the spec against a dataset and returns the columns of a batch of clips.
+    ///
+    /// # Shapes
+    /// `[num_steps, shape…]` per clip; actions are `[num_steps, frameskip * action_dim]`.
     ///
     /// # Errors
-    /// When a count is zero or a column does not exist.
+    /// If `num_steps` or `frameskip` is 0, or a column does not exist.
     pub fn schema(&self, dataset: &Schema) -> Result<Schema> {
         for (name, value) in [("num_steps", self.num_steps), ("frameskip", self.frameskip)] {
             if value == 0 {
@@ -57,11 +56,11 @@ impl ClipSpec {
     }
 }
 
-/// All clips of some episodes, in order. Holds one number an episode, however many clips there are.
+/// All clips of some episodes, in order. Memory is proportional to the number of episodes, not of clips.
 #[derive(Clone, Debug)]
 pub struct Clips {
     span: usize,
-    /// `(position of the episode, clips before it)`, episodes long enough for a clip only.
+    /// `(position of the episode, preceding clips)` of the episodes that are long enough.
     episodes: Vec<(usize, usize)>,
     total: usize,
 }
@@ -70,13 +69,13 @@ impl Clips {
     /// The clips of the episodes at these positions.
     ///
     /// # Errors
-    /// When a position does not exist, or none of the episodes is long enough.
+    /// If a position does not exist, or no episode is long enough.
     pub fn new(spec: &ClipSpec, episodes: &[Episode], positions: &[usize]) -> Result<Self> {
         Self::reaching(spec, spec.span(), episodes, positions)
     }
 
-    /// The clips whose episode goes on until `reach` rows from their first one at least, such as for a goal that comes
-    /// after them.
+    /// The clips whose episode continues for at least `reach` rows from the clip's first row, so that a goal after the
+    /// clip exists.
     ///
     /// # Errors
     /// As [`Clips::new`].
@@ -112,12 +111,12 @@ impl Clips {
         Ok(clips)
     }
 
-    /// How many clips there are.
+    /// Number of clips.
     pub fn len(&self) -> usize {
         self.total
     }
 
-    /// Whether there is none; never true of one that was made.
+    /// Whether there are no clips. Constructors never return an empty set.
     pub fn is_empty(&self) -> bool {
         self.total == 0
     }
@@ -125,7 +124,7 @@ impl Clips {
     /// The rows of a clip.
     ///
     /// # Panics
-    /// When there are not that many clips.
+    /// If `clip` is not below [`Clips::len`].
     pub fn get(&self, clip: usize) -> StepRange {
         assert!(clip < self.total, "clip {clip} of {}", self.total);
         let at = self.episodes.partition_point(|&(_, before)| before <= clip) - 1;
@@ -142,7 +141,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn clips_are_all_windows_and_never_cross_episodes(
+        fn lists_all_windows_within_episodes(
             lengths in prop::collection::vec(1usize..40, 1..12),
             num_steps in 1usize..5,
             frameskip in 1usize..6,
@@ -174,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn actions_are_grouped_with_their_step() {
+    fn concatenates_the_actions_of_a_step() {
         let dataset = Schema::new([
             ColumnSpec::image("pixels", 4, 5),
             ColumnSpec::new("action", DType::Float32, [2]),

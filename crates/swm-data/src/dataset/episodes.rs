@@ -1,67 +1,60 @@
-//! What every format needs of episodes: where their rows are, how they are numbered, and whether they keep the time
-//! convention.
+//! Where the rows of episodes are in a dataset, index columns, and the time convention that writers check.
 
-use crate::dataset::clips::ACTION;
 use crate::dataset::reader::{Episode, StepRange};
 use std::ops::Range;
+use swm_core::columns::{ACTION, EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
 
-/// The columns that number episodes and steps. Readers compute them.
-pub(crate) const EPISODE: &str = "episode_idx";
-/// See [`EPISODE`].
-pub(crate) const STEP: &str = "step_idx";
+/// A row to read, as `(position of its episode, step)`, and the part of the output that receives it.
+pub(crate) type RowSlot<'a> = ((usize, usize), &'a mut [u8]);
 
-/// A row and where it is wanted.
-pub(crate) type Wanted<'a> = ((usize, usize), &'a mut [u8]);
-
-/// Episodes one after another in a table of rows.
+/// Lengths and first rows of the episodes of a dataset whose rows form one table.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Rows {
+pub(crate) struct EpisodeRows {
     episodes: Vec<Episode>,
     /// The first row of each episode.
-    first: Vec<u64>,
+    first_rows: Vec<u64>,
     total: u64,
 }
 
-impl Rows {
-    /// Episodes of these lengths that begin in these rows.
+impl EpisodeRows {
+    /// Episodes with these lengths that start at these rows.
     ///
     /// # Errors
-    /// When there are fewer beginnings than lengths, or a number is too large.
-    pub fn at(lengths: &[i64], first: &[i64]) -> Result<Self, String> {
+    /// If there are fewer first rows than lengths, or a value is negative or too large.
+    pub fn from_lengths(lengths: &[i64], first: &[i64]) -> Result<Self, String> {
         let Some(first) = first.get(..lengths.len()) else {
-            return Err(format!("{} episodes have a length, and {} a beginning", lengths.len(), first.len()));
+            return Err(format!("there are {} episode lengths, but only {} first rows", lengths.len(), first.len()));
         };
         let mut rows = Self::default();
         let mut total = 0;
         for (episode, (&length, &first)) in lengths.iter().zip(first).enumerate() {
             let (Ok(length), Ok(first)) = (usize::try_from(length), u64::try_from(first)) else {
-                return Err(format!("episode {episode} has {length} rows from row {first}"));
+                return Err(format!("episode {episode} has {length} rows starting at row {first}"));
             };
             rows.push(length);
-            rows.first[episode] = first;
-            let end = first.checked_add(length as u64).ok_or_else(|| format!("episode {episode} ends nowhere"))?;
+            rows.first_rows[episode] = first;
+            let end = first.checked_add(length as u64).ok_or_else(|| format!("episode {episode} has too many rows"))?;
             total = total.max(end);
         }
         rows.total = total;
         Ok(rows)
     }
 
-    /// Whether every episode begins where the one before ends, so that more can follow.
+    /// Whether every episode starts where the previous one ends, so that episodes can be appended.
     pub fn is_contiguous(&self) -> bool {
         let mut next = 0;
-        self.episodes.iter().zip(&self.first).all(|(episode, &first)| {
+        self.episodes.iter().zip(&self.first_rows).all(|(episode, &first)| {
             let fits = first == next;
             next = first + episode.length as u64;
             fits
         })
     }
 
-    /// One more episode.
+    /// Appends an episode after the last row.
     pub fn push(&mut self, length: usize) {
-        #[allow(clippy::cast_possible_wrap)]
         self.episodes.push(Episode { index: self.episodes.len() as i64, length });
-        self.first.push(self.total);
+        self.first_rows.push(self.total);
         self.total = self.total.saturating_add(length as u64);
     }
 
@@ -70,25 +63,25 @@ impl Rows {
         &self.episodes
     }
 
-    /// Rows of all episodes.
+    /// Number of rows of all episodes.
     pub const fn total(&self) -> u64 {
         self.total
     }
 
     /// The first row of each episode.
-    pub fn first(&self) -> &[u64] {
-        &self.first
+    pub fn first_rows(&self) -> &[u64] {
+        &self.first_rows
     }
 
-    /// The rows of a range in the whole table.
+    /// The rows of a range, counted from the first row of the table.
     ///
     /// # Errors
-    /// When they do not exist.
+    /// If the rows do not exist.
     pub fn range(&self, range: &StepRange) -> Result<Range<u64>> {
         let end = range.start.checked_add(range.length);
         match self.episodes.get(range.episode) {
             Some(episode) if end.is_some_and(|end| end <= episode.length) => {
-                let first = self.first[range.episode] + range.start as u64;
+                let first = self.first_rows[range.episode] + range.start as u64;
                 Ok(first..first + range.length as u64)
             }
             Some(episode) => Err(Error::mismatch(
@@ -98,17 +91,17 @@ impl Rows {
             )),
             None => Err(Error::mismatch(
                 "reading rows",
-                format!("the episode in position {}", range.episode),
+                format!("episode position {}", range.episode),
                 format!("positions below {}", self.episodes.len()),
             )),
         }
     }
 
-    /// Checks that `out` has room for the rows of a column, and gives their number.
+    /// Checks that `out` is as long as the requested rows of a column, and returns the number of rows.
     ///
     /// # Errors
-    /// When it has more or less.
-    pub fn check_room(column: &ColumnSpec, ranges: &[StepRange], out: &[u8]) -> Result<usize> {
+    /// If `out` is longer or shorter.
+    pub fn check_output(column: &ColumnSpec, ranges: &[StepRange], out: &[u8]) -> Result<usize> {
         let rows: usize = ranges.iter().map(|range| range.length).sum();
         let expected = rows * column.row_bytes();
         if out.len() == expected {
@@ -116,48 +109,51 @@ impl Rows {
         }
         Err(Error::mismatch(
             format!("reading column '{}'", column.name),
-            format!("room for {} bytes", out.len()),
+            format!("an output of {} bytes", out.len()),
             format!("{expected} for {rows} rows"),
         ))
     }
 
-    /// Every wanted row, as `(position of its episode, step)`, with its place in `out`, in stored order.
+    /// Pairs every requested row with its part of `out`. Sorted in stored order.
     ///
     /// # Errors
-    /// When a row does not exist, or `out` has another length.
-    pub fn wanted<'a>(&self, column: &ColumnSpec, ranges: &[StepRange], out: &'a mut [u8]) -> Result<Vec<Wanted<'a>>> {
-        let rows = Self::check_room(column, ranges, out)?;
-        let mut wanted = Vec::with_capacity(rows);
-        let mut places = out.chunks_exact_mut(column.row_bytes());
+    /// If a row does not exist, or `out` has the wrong length.
+    pub fn row_slots<'a>(
+        &self,
+        column: &ColumnSpec,
+        ranges: &[StepRange],
+        out: &'a mut [u8],
+    ) -> Result<Vec<RowSlot<'a>>> {
+        let rows = Self::check_output(column, ranges, out)?;
+        let mut requested = Vec::with_capacity(rows);
+        let mut slots = out.chunks_exact_mut(column.row_bytes());
         for range in ranges {
             self.range(range)?;
             let steps = range.start..range.start + range.length;
-            wanted.extend(steps.map(|step| (range.episode, step)).zip(places.by_ref()));
+            requested.extend(steps.map(|step| (range.episode, step)).zip(slots.by_ref()));
         }
-        wanted.sort_by_key(|(row, _)| *row);
-        Ok(wanted)
+        requested.sort_by_key(|(row, _)| *row);
+        Ok(requested)
     }
 
-    /// Fills `out` with a column of [`numbering`].
+    /// Computes an index column ([`index_columns`]) for these ranges.
     ///
     /// # Errors
-    /// When a row does not exist, or `out` has another length.
-    pub fn number(&self, column: &ColumnSpec, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
-        Self::check_room(column, ranges, out)?;
-        let mut places = out.chunks_exact_mut(column.dtype.size().max(1));
+    /// If a row does not exist, or `out` has the wrong length.
+    pub fn fill_index_column(&self, column: &ColumnSpec, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        Self::check_output(column, ranges, out)?;
+        let mut slots = out.chunks_exact_mut(column.dtype.size().max(1));
         for range in ranges {
             self.range(range)?;
             let index = self.episodes[range.episode].index;
-            for (step, place) in (range.start..range.start + range.length).zip(places.by_ref()) {
-                #[allow(clippy::cast_possible_wrap)]
-                let value = if column.name == EPISODE { index } else { step as i64 };
-                #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss, clippy::cast_sign_loss)]
+            for (step, slot) in (range.start..range.start + range.length).zip(slots.by_ref()) {
+                let value = if column.name == EPISODE_IDX { index } else { step as i64 };
                 match column.dtype {
-                    DType::Bool | DType::U8 => place[0] = value as u8,
-                    DType::Int32 => place.copy_from_slice(&(value as i32).to_ne_bytes()),
-                    DType::Int64 => place.copy_from_slice(&value.to_ne_bytes()),
-                    DType::Float32 => place.copy_from_slice(&(value as f32).to_ne_bytes()),
-                    DType::Float64 => place.copy_from_slice(&(value as f64).to_ne_bytes()),
+                    DType::Bool | DType::U8 => slot[0] = value as u8,
+                    DType::Int32 => slot.copy_from_slice(&(value as i32).to_ne_bytes()),
+                    DType::Int64 => slot.copy_from_slice(&value.to_ne_bytes()),
+                    DType::Float32 => slot.copy_from_slice(&(value as f32).to_ne_bytes()),
+                    DType::Float64 => slot.copy_from_slice(&(value as f64).to_ne_bytes()),
                 }
             }
         }
@@ -165,28 +161,29 @@ impl Rows {
     }
 }
 
-/// The columns [`EPISODE`] and [`STEP`], with the type they have in `columns` where they are there as scalars.
-pub(crate) fn numbering(columns: &[ColumnSpec]) -> [ColumnSpec; 2] {
-    [EPISODE, STEP].map(|name| {
+/// Specs of the index columns [`EPISODE_IDX`] and [`STEP_IDX`]: as declared in `columns` if they are scalars there,
+/// otherwise `int32`.
+pub(crate) fn index_columns(columns: &[ColumnSpec]) -> [ColumnSpec; 2] {
+    [EPISODE_IDX, STEP_IDX].map(|name| {
         let declared = columns.iter().find(|column| column.name == name && column.len() == 1);
         declared.cloned().unwrap_or_else(|| ColumnSpec::new(name, DType::Int32, []))
     })
 }
 
-/// A schema in words, for messages.
-pub(crate) fn words(columns: &[ColumnSpec]) -> String {
-    let words: Vec<String> = columns.iter().map(|c| format!("{} {}{:?}", c.name, c.dtype.name(), c.shape)).collect();
-    words.join(", ")
+/// Names, types and shapes of columns, for messages.
+pub(crate) fn describe_columns(columns: &[ColumnSpec]) -> String {
+    let columns: Vec<String> = columns.iter().map(|c| format!("{} {}{:?}", c.name, c.dtype.name(), c.shape)).collect();
+    columns.join(", ")
 }
 
-/// Checks that columns to append are those of the dataset, in whatever order; numbering aside.
+/// Checks that the columns of new episodes equal those of the dataset, in any order and ignoring index columns.
 ///
 /// # Errors
-/// When they are not.
-pub(crate) fn check_continued(dataset: &impl std::fmt::Display, incoming: &Schema, known: &Schema) -> Result<()> {
+/// If the columns differ.
+pub(crate) fn check_appendable(dataset: &impl std::fmt::Display, incoming: &Schema, known: &Schema) -> Result<()> {
     let sorted = |schema: &Schema| {
         let mut columns: Vec<ColumnSpec> =
-            schema.columns().iter().filter(|c| c.name != EPISODE && c.name != STEP).cloned().collect();
+            schema.columns().iter().filter(|c| c.name != EPISODE_IDX && c.name != STEP_IDX).cloned().collect();
         columns.sort_by(|a, b| a.name.cmp(&b.name));
         columns
     };
@@ -194,22 +191,30 @@ pub(crate) fn check_continued(dataset: &impl std::fmt::Display, incoming: &Schem
     if incoming == known {
         return Ok(());
     }
-    let expected = format!("the columns it has: {}", words(&known));
-    Err(Error::mismatch(format!("appending to {dataset}"), words(&incoming), expected))
+    let expected = format!("the columns it has: {}", describe_columns(&known));
+    Err(Error::mismatch(format!("appending to {dataset}"), describe_columns(&incoming), expected))
 }
 
-/// Checks that an episode has the columns a writer was made for and keeps the time convention: the last row's action
-/// is missing, all others are there.
+/// Checks that an episode has the columns of the writer's schema and follows the time convention: the action of the
+/// last row is missing, all others are present and finite.
 ///
 /// # Errors
-/// When it does not.
-pub(crate) fn check(episode: &Batch, schema: &Schema) -> Result<()> {
+/// If it does not.
+pub(crate) fn check_episode(episode: &Batch, schema: &Schema) -> Result<()> {
     if episode.schema() != schema {
-        return Err(Error::mismatch("writing an episode", words(episode.schema().columns()), words(schema.columns())));
+        return Err(Error::mismatch(
+            "writing an episode",
+            describe_columns(episode.schema().columns()),
+            describe_columns(schema.columns()),
+        ));
     }
     let rows = episode.rows();
     if rows == 0 {
-        return Err(Error::mismatch("writing an episode", "no rows", "at least the final observation"));
+        return Err(Error::mismatch(
+            "writing an episode",
+            "an episode without rows",
+            "at least the row of the final observation",
+        ));
     }
     let Some(index) = schema.find(ACTION) else { return Ok(()) };
     let (float, missing) = match schema.columns()[index].dtype {
@@ -237,14 +242,15 @@ pub(crate) fn check(episode: &Batch, schema: &Schema) -> Result<()> {
     Ok(())
 }
 
-/// The BLAKE3 hash of a dataset's content: of its episodes' lengths, then of every column and each of its rows.
+/// The BLAKE3 hash of a dataset's content: the lengths of its episodes, then every column with the stored bytes of its
+/// rows.
 ///
-/// `each_row` calls the function it is given with the stored bytes of every row of a column, in order.
+/// `each_row` must call the function it receives with the stored bytes of every row of a column, in order.
 ///
 /// # Errors
 /// Those of `each_row`.
 pub(crate) fn content_hash(
-    rows: &Rows,
+    rows: &EpisodeRows,
     columns: &[ColumnSpec],
     mut each_row: impl FnMut(&ColumnSpec, &mut dyn FnMut(&[u8])) -> Result<()>,
 ) -> Result<String> {

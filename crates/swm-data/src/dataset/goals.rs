@@ -1,10 +1,12 @@
-//! Goals for goal-conditioned learning: for every clip, a row of the dataset that it shall lead to.
+//! Goal sampling for goal-conditioned learning: every clip gets a row of the dataset as its goal.
 //!
-//! Goals come from a mixture of places. Those of the future lie a whole number of model steps (frameskips) behind the
-//! *anchor*, the step of the clip that is thought of as now. The mixture of [`GoalMixture::default`], and the rule that
-//! clips without a future are left out, are those of the reference's `GoalDataset`; the geometric law with discount
-//! γ is that of hindsight relabelling in GCRL (Eysenbach et al. 2022, OGBench): the goal is `k` steps ahead with
-//! probability `(1 - γ) γ^(k - 1)`, and what would lie behind the end of the episode is its last such step.
+//! Goals are drawn from a mixture of distributions relative to the *anchor*, the step of the clip that counts as the
+//! current one. Goals in the future are a whole number of model steps (frameskips) after the anchor.
+//!
+//! [`GoalMixture::default`], and the rule that clips without a future step are excluded, are those of the reference's
+//! `GoalDataset`. The geometric distribution with discount γ is that of hindsight relabelling in GCRL (Eysenbach et al.
+//! 2022, OGBench): the goal is `k` steps ahead with probability `(1 - γ) γ^(k - 1)`; goals beyond the end of the
+//! episode become its last such step.
 
 use crate::dataset::clips::ClipSpec;
 use crate::dataset::reader::{Episode, StepRange};
@@ -12,21 +14,21 @@ use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Key, Result};
 
-/// From where goals are drawn: the chance of each place. The chances add up to 1.
+/// Mixture of goal distributions. The probabilities add up to 1.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct GoalMixture {
-    /// The last row of the episode.
+    /// Probability of the last row of the episode.
     pub last: f64,
-    /// A later step of the episode, all of them equally likely.
+    /// Probability of a later step of the episode, uniformly distributed.
     pub future: f64,
-    /// A later step of the episode, nearer ones more likely: see [`GoalMixture::discount`].
+    /// Probability of a later step of the episode, geometrically distributed: see [`GoalMixture::discount`].
     pub geometric: f64,
-    /// Any row of any episode, all rows equally likely.
+    /// Probability of a row of the whole dataset, uniformly distributed.
     pub random: f64,
-    /// The anchor itself.
+    /// Probability of the anchor itself.
     pub current: f64,
-    /// γ of the geometric law, in 0 .. 1; on average the goal lies `1 / (1 - γ)` steps ahead.
+    /// γ of the geometric distribution, in `[0, 1)`. The goal is `1 / (1 - γ)` steps ahead on average.
     pub discount: f64,
 }
 
@@ -34,12 +36,12 @@ impl GoalMixture {
     const NOTHING: Self = Self { last: 0.0, future: 0.0, geometric: 0.0, random: 0.0, current: 0.0, discount: 0.99 };
     /// Always the last row of the episode.
     pub const LAST: Self = Self { last: 1.0, ..Self::NOTHING };
-    /// Always a later step of the episode, all of them equally likely.
+    /// Always a later step of the episode, uniformly distributed.
     pub const FUTURE: Self = Self { future: 1.0, ..Self::NOTHING };
-    /// Always any row of the dataset.
+    /// Always a row of the whole dataset, uniformly distributed.
     pub const RANDOM: Self = Self { random: 1.0, ..Self::NOTHING };
 
-    /// Always a later step of the episode, nearer ones more likely.
+    /// Always a later step of the episode, geometrically distributed.
     pub const fn geometric(discount: f64) -> Self {
         Self { geometric: 1.0, discount, ..Self::NOTHING }
     }
@@ -51,29 +53,29 @@ impl Default for GoalMixture {
     }
 }
 
-/// Goals to load with every clip, as the columns `NAME_COLUMN`, `[1, shape…]`, and `NAME_offset`: rows from the anchor to
-/// the goal, -1 where the goal is not in what follows the anchor.
+/// Goals to load with every clip. They become the columns `NAME_COLUMN` (`[1, shape…]`) and `NAME_offset`: the number
+/// of rows from the anchor to the goal, or -1 if the goal is not a later row of the same episode.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GoalSpec {
-    /// What its columns' names begin with. Two kinds of goals of one clip are drawn independently, by their names.
+    /// Prefix of the goal's columns. Goals with different names are drawn independently.
     pub name: String,
-    /// The columns of the goal.
+    /// The columns of the goal to load.
     pub columns: Vec<String>,
-    /// The step of the clip that counts as now; the last one for `None`.
+    /// The step of the clip that counts as the current one; the last step for `None`.
     pub anchor: Option<usize>,
-    /// Where goals are drawn from.
+    /// The distribution of goals.
     pub mixture: GoalMixture,
 }
 
-/// A goal that was drawn.
+/// A drawn goal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Goal {
-    /// The position of its episode.
+    /// Position of its episode.
     pub episode: usize,
-    /// Its row in the episode.
+    /// Its row within the episode.
     pub row: usize,
-    /// Rows from the anchor to it, -1 if it does not follow it.
+    /// Rows from the anchor to it; -1 if it does not follow the anchor.
     pub offset: i64,
 }
 
@@ -81,17 +83,17 @@ impl GoalSpec {
     /// Checks the mixture and the anchor.
     ///
     /// # Errors
-    /// When they make no sense; says why.
+    /// If the probabilities are negative or do not add up to 1, or the discount or the anchor is out of range.
     pub fn check(&self, clip: &ClipSpec) -> Result<()> {
         let GoalMixture { last, future, geometric, random, current, discount } = self.mixture;
-        let chances = [last, future, geometric, random, current];
-        if !chances.iter().all(|chance| (0.0..=1.0).contains(chance))
-            || (chances.iter().sum::<f64>() - 1.0).abs() > 1e-6
+        let probabilities = [last, future, geometric, random, current];
+        if !probabilities.iter().all(|probability| (0.0..=1.0).contains(probability))
+            || (probabilities.iter().sum::<f64>() - 1.0).abs() > 1e-6
         {
             return Err(Error::OutOfSpace {
-                what: format!("the chances of '{}' (last, future, geometric, random, current)", self.name),
-                given: format!("{chances:?}"),
-                expected: "chances of at least 0 that add up to 1".to_owned(),
+                what: format!("the probabilities of '{}' (last, future, geometric, random, current)", self.name),
+                given: format!("{probabilities:?}"),
+                expected: "values of at least 0 that add up to 1".to_owned(),
             });
         }
         if !(0.0..1.0).contains(&discount) {
@@ -111,41 +113,35 @@ impl GoalSpec {
         Ok(())
     }
 
-    /// The anchor's row, counted from the clip's first.
+    /// The anchor's row, counted from the clip's first row.
     fn anchor_row(&self, clip: &ClipSpec) -> usize {
         self.anchor.unwrap_or_else(|| clip.num_steps.saturating_sub(1)) * clip.frameskip
     }
 
-    /// Rows an episode must have from a clip's first on, so that there is a goal.
+    /// Rows that an episode must have, from the clip's first row, for a goal to exist.
     pub(crate) fn reach(&self, clip: &ClipSpec) -> usize {
         let later = self.mixture.future > 0.0 || self.mixture.geometric > 0.0;
         self.anchor_row(clip) + 1 + if later { clip.frameskip } else { 0 }
     }
 
     /// Draws the goal of a clip.
-    #[allow(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        clippy::cast_precision_loss,
-        clippy::cast_possible_wrap
-    )]
     pub(crate) fn draw(&self, spec: &ClipSpec, clip: &StepRange, goals: &Goals, key: Key) -> Goal {
         let mixture = self.mixture;
         let now = clip.start + self.anchor_row(spec);
         let end = goals.length(clip.episode) - 1;
-        // Steps that are left behind the anchor.
+        // Model steps after the anchor.
         let steps = (end - now) / spec.frameskip;
         let mut rng = key.rng();
-        let mut place = rng.random::<f64>();
-        let mut chosen = |chance: f64| {
-            let hit = place < chance;
-            place -= chance;
+        let mut remaining = rng.random::<f64>();
+        let mut chosen = |probability: f64| {
+            let hit = remaining < probability;
+            remaining -= probability;
             hit
         };
         let (episode, row) = if chosen(mixture.random) {
             goals.row(rng.random_range(0..goals.rows as u64) as usize)
         } else if chosen(mixture.geometric) {
-            // The inverse of the law's distribution function at a uniform number.
+            // Inverse transform sampling.
             let u = 1.0 - rng.random::<f64>();
             let k = 1.0 + (u.ln() / mixture.discount.ln()).floor();
             (clip.episode, now + k.clamp(1.0, steps as f64) as usize * spec.frameskip)
@@ -164,9 +160,9 @@ impl GoalSpec {
 /// The rows that goals are drawn from.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Goals {
-    /// Rows of every episode of the dataset.
+    /// Length of every episode of the dataset, in rows.
     lengths: Vec<usize>,
-    /// `(position, rows before it)` of those that are used.
+    /// `(position, preceding rows)` of the episodes that random goals come from.
     used: Vec<(usize, usize)>,
     rows: usize,
 }
@@ -186,7 +182,7 @@ impl Goals {
         self.lengths[position]
     }
 
-    /// The episode and the row in it.
+    /// The episode position and the row within it of a row counted over all used episodes.
     fn row(&self, row: usize) -> (usize, usize) {
         let at = self.used.partition_point(|&(_, before)| before <= row) - 1;
         let (position, before) = self.used[at];
@@ -219,19 +215,19 @@ mod tests {
     }
 
     #[test]
-    fn each_place_is_where_it_says() {
-        // The anchor is row 4 + 2 * 2 = 8 of 40: steps 10, 12 .. 38 are left, 15 of them.
+    fn draws_from_each_distribution() {
+        // The anchor is row 4 + 2 * 2 = 8 of 40, so 15 steps follow it: rows 10, 12 .. 38.
         assert!(drawn(GoalMixture::LAST).iter().all(|goal| (goal.episode, goal.row, goal.offset) == (1, 39, 31)));
         let current = GoalMixture { random: 0.0, geometric: 0.0, current: 1.0, ..GoalMixture::default() };
         assert!(drawn(current).iter().all(|goal| (goal.row, goal.offset) == (8, 0)));
-        let mut seen = [0; 40];
+        let mut counts = [0; 40];
         for goal in drawn(GoalMixture::FUTURE) {
             assert_eq!((goal.episode, goal.offset), (1, goal.row as i64 - 8));
-            seen[goal.row] += 1;
+            counts[goal.row] += 1;
         }
-        for (row, &count) in seen.iter().enumerate() {
+        for (row, &count) in counts.iter().enumerate() {
             let possible = row >= 10 && row % 2 == 0;
-            // Five standard deviations of 20000 draws at 1 of 15.
+            // Five standard deviations of 20000 draws with probability 1/15.
             assert!(if possible { (count as f64 - 1333.3).abs() < 180.0 } else { count == 0 }, "{row}: {count}");
         }
         let mut rows = [0; 2];
@@ -244,25 +240,25 @@ mod tests {
     }
 
     #[test]
-    fn the_geometric_law_has_its_discount() {
+    fn geometric_goals_follow_the_discount() {
         let discount: f64 = 0.8;
         let goals = drawn(GoalMixture::geometric(discount));
         for k in 1..=15_usize {
-            let share = goals.iter().filter(|goal| goal.offset == 2 * k as i64).count() as f64 / 20_000.0;
+            let frequency = goals.iter().filter(|goal| goal.offset == 2 * k as i64).count() as f64 / 20_000.0;
             let before = discount.powi(k as i32 - 1);
-            // What would lie behind the end is the last step.
+            // Goals beyond the end of the episode become its last step.
             let expected = if k == 15 { before } else { before * (1.0 - discount) };
-            assert!((share - expected).abs() < 5.0 * (expected / 20_000.0).sqrt(), "{k}: {share} {expected}");
+            assert!((frequency - expected).abs() < 5.0 * (expected / 20_000.0).sqrt(), "{k}: {frequency} {expected}");
         }
         let nearest = drawn(GoalMixture::geometric(0.0));
-        assert!(nearest.iter().all(|goal| goal.offset == 2), "no discount, no patience");
+        assert!(nearest.iter().all(|goal| goal.offset == 2), "a discount of 0 always draws the next step");
     }
 
     #[test]
-    fn a_mixture_mixes_and_names_are_independent() {
+    fn draws_mixtures_and_different_names_independently() {
         let goals = drawn(GoalMixture::default());
         let current = goals.iter().filter(|goal| goal.offset == 0).count() as f64;
-        // A fifth, and the random goals that hit the anchor.
+        // A fifth of the goals, plus the random goals that hit the anchor.
         assert!((current - 20_000.0 * (0.2 + 0.3 / 43.0)).abs() < 300.0, "{current}");
         let of = |name: &str| {
             let goals = Goals::new(&episodes(), &[1, 2]);
@@ -274,15 +270,15 @@ mod tests {
     }
 
     #[test]
-    fn clips_leave_room_for_the_goal_and_nonsense_is_refused() {
+    fn reserves_rows_for_the_goal_and_rejects_invalid_specs() {
         let spec = spec();
         assert_eq!(goal(GoalMixture::LAST, None).reach(&spec), 5);
         assert_eq!(goal(GoalMixture::FUTURE, None).reach(&spec), 7);
         assert_eq!(goal(GoalMixture::FUTURE, Some(0)).reach(&spec), 3);
-        let words = |goal: GoalSpec| goal.check(&spec).expect_err("nonsense").to_string();
-        assert!(words(goal(GoalMixture { last: 0.4, ..GoalMixture::FUTURE }, None)).contains("add up to 1"));
-        assert!(words(goal(GoalMixture::geometric(1.0), None)).contains("below 1"));
-        assert!(words(goal(GoalMixture::LAST, Some(3))).contains("below 3"));
+        let message = |goal: GoalSpec| goal.check(&spec).expect_err("nonsense").to_string();
+        assert!(message(goal(GoalMixture { last: 0.4, ..GoalMixture::FUTURE }, None)).contains("add up to 1"));
+        assert!(message(goal(GoalMixture::geometric(1.0), None)).contains("below 1"));
+        assert!(message(goal(GoalMixture::LAST, Some(3))).contains("below 3"));
         assert!(goal(GoalMixture::default(), Some(2)).check(&spec).is_ok());
     }
 }

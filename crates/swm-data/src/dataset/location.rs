@@ -1,27 +1,27 @@
-//! [`Location`]: where a dataset is, a path on this machine or a URI of an object store.
+//! [`Location`]: a path on this machine, or a URI of an object store.
 
 use std::fmt;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Result};
 use url::Url;
 
-/// The schemes of object stores.
+/// URI schemes of object stores.
 const SCHEMES: [&str; 5] = ["s3", "gs", "az", "http", "https"];
 
-/// Where a dataset is.
+/// The location of a dataset.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub enum Location {
-    /// On this machine.
+    /// A path on this machine.
     Path(PathBuf),
-    /// In an object store: `s3://bucket/key`, `gs://bucket/key`, `az://container/key`, `http(s)://host/path`.
+    /// A URI of an object store: `s3://bucket/key`, `gs://bucket/key`, `az://container/key`, `http(s)://host/path`.
     Uri(Url),
 }
 
 impl Location {
-    /// Reads a path or a URI. `file://` URIs are paths.
+    /// Parses a path or a URI. `file://` URIs become paths.
     ///
     /// # Errors
-    /// When it has the form of a URI, and its scheme is none of an object store's or the rest makes no sense.
+    /// If it is a URI with an unknown scheme, or is malformed.
     pub fn parse(given: &str) -> Result<Self> {
         let Some((scheme, rest)) = given.split_once("://") else { return Ok(Self::Path(given.into())) };
         if scheme == "file" {
@@ -29,14 +29,15 @@ impl Location {
         }
         if !SCHEMES.contains(&scheme) {
             let fix = "use a path, or a URI that begins with s3://, gs://, az://, http:// or https://";
-            return Err(Error::config("dataset", format!("nothing is known about {scheme}://"), fix));
+            return Err(Error::config("dataset", format!("the scheme {scheme}:// is not supported"), fix));
         }
-        let url = Url::parse(given)
-            .map_err(|error| Error::config("dataset", format!("{given} is no URI: {error}"), "check its spelling"))?;
+        let url = Url::parse(given).map_err(|error| {
+            Error::config("dataset", format!("{given} is not a valid URI: {error}"), "check its spelling")
+        })?;
         Ok(Self::Uri(url))
     }
 
-    /// The path, if it is on this machine.
+    /// The path, unless it is a URI.
     pub fn path(&self) -> Option<&Path> {
         match self {
             Self::Path(path) => Some(path),
@@ -44,18 +45,18 @@ impl Location {
         }
     }
 
-    /// The path.
+    /// The path; an error for URIs.
     ///
     /// # Errors
-    /// When it is in an object store, which `format` cannot use.
+    /// If it is a URI, which `format` cannot read or write.
     pub fn local(&self, format: &str) -> Result<&Path> {
         self.path().ok_or_else(|| {
             let fix = "copy it to this machine, or use the format lance or hdf5, which are read from object stores";
-            Error::config("dataset", format!("the format {format} is not read from {self}"), fix)
+            Error::config("dataset", format!("the format {format} does not support object stores: {self}"), fix)
         })
     }
 
-    /// What an error message calls it.
+    /// How error messages show it.
     pub fn label(&self) -> PathBuf {
         match self {
             Self::Path(path) => path.clone(),
@@ -63,7 +64,7 @@ impl Location {
         }
     }
 
-    /// The last part of it: a file's or folder's name.
+    /// The last component: the name of a file or folder.
     pub fn name(&self) -> &str {
         match self {
             Self::Path(path) => path.file_name().and_then(|name| name.to_str()).unwrap_or_default(),
@@ -71,7 +72,7 @@ impl Location {
         }
     }
 
-    /// Whether its name ends in `.suffix`, in any case of letters.
+    /// Whether the name ends in `.suffix`, ignoring case.
     pub fn has_suffix(&self, suffix: &str) -> bool {
         self.name().rsplit_once('.').is_some_and(|(stem, end)| !stem.is_empty() && end.eq_ignore_ascii_case(suffix))
     }
@@ -115,7 +116,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn paths_and_uris_are_told_apart() -> Result<()> {
+    fn parses_paths_and_uris() -> Result<()> {
         let path = Location::parse("runs/pusht.lance")?;
         assert_eq!(path.path(), Some(Path::new("runs/pusht.lance")));
         assert_eq!(Location::parse("file:///tmp/a.h5")?, Location::Path("/tmp/a.h5".into()));
@@ -127,7 +128,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_object_store_is_said() {
+    fn rejects_unknown_schemes() {
         let error = Location::parse("ftp://host/a.lance").expect_err("an unknown scheme").to_string();
         assert!(error.contains("ftp://") && error.contains("s3://"), "{error}");
     }

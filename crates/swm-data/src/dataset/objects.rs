@@ -1,13 +1,13 @@
-//! Object stores: `s3://`, `gs://`, `az://`, `http(s)://`, and this machine's files in the same terms.
+//! Access to object stores (`s3://`, `gs://`, `az://`, `http(s)://`) and to local files through the same interface.
 //!
-//! Credentials and endpoints come from the environment, under the names that each provider's own tools use:
-//! `AWS_ACCESS_KEY_ID`, `AWS_SECRET_ACCESS_KEY`, `AWS_SESSION_TOKEN`, `AWS_REGION`, `AWS_ENDPOINT_URL`,
-//! `AWS_SKIP_SIGNATURE=true` for public buckets; `GOOGLE_APPLICATION_CREDENTIALS`; `AZURE_STORAGE_ACCOUNT_NAME`,
-//! `AZURE_STORAGE_ACCOUNT_KEY`. Each kind of store is a feature of this crate.
+//! Credentials and endpoints come from the environment variables of each provider's own tools: `AWS_ACCESS_KEY_ID`,
+//! `AWS_SECRET_ACCESS_KEY`, `AWS_SESSION_TOKEN`, `AWS_REGION`, `AWS_ENDPOINT_URL`, `AWS_SKIP_SIGNATURE=true` for public
+//! buckets; `GOOGLE_APPLICATION_CREDENTIALS`; `AZURE_STORAGE_ACCOUNT_NAME`, `AZURE_STORAGE_ACCOUNT_KEY`. Each kind of
+//! store is a Cargo feature.
 
 mod blocks;
 
-pub(crate) use blocks::{Blocks, Pieces};
+pub(crate) use blocks::{BlockCache, ObjectRanges};
 
 use crate::dataset::location::Location;
 use futures::FutureExt as _;
@@ -26,21 +26,24 @@ use url::Url;
 /// Bytes of an object.
 pub use bytes::Bytes;
 
-/// Ranges nearer than this are fetched with what is between them: at 100 MB/s it costs a millisecond, and a request
-/// several.
+/// Ranges with a smaller gap than this are fetched in one request. At 100 MB/s such a gap costs one millisecond, a
+/// request several.
 const GAP: u64 = 128 << 10;
 
-/// Requests in flight for one read.
+/// Maximum number of concurrent requests per read.
 const REQUESTS: usize = 32;
 
-/// How long a store that does not answer is asked again: about six seconds in all.
-#[cfg_attr(not(any(feature = "s3", feature = "gs", feature = "az", feature = "http")), allow(unused))]
-fn patience() -> RetryConfig {
+/// Retries for a store that does not answer, for about six seconds in total.
+#[cfg_attr(
+    not(any(feature = "s3", feature = "gs", feature = "az", feature = "http")),
+    allow(unused, reason = "local files need no retries")
+)]
+fn retry_config() -> RetryConfig {
     RetryConfig { max_retries: 6, retry_timeout: Duration::from_secs(60), ..RetryConfig::default() }
 }
 
-/// Asynchronous code runs on two threads of its own, made at first use and never ended. A process that was forked, as
-/// Python's are, has none of the threads of the one it was forked from, and makes its own.
+/// The runtime for asynchronous code: two threads, started at first use and never stopped. A forked process (Python
+/// forks) does not inherit threads, so it starts a runtime of its own.
 fn runtime() -> Result<&'static Runtime> {
     static RUNTIME: Mutex<Option<(u32, &'static Runtime)>> = Mutex::new(None);
     let mut made = RUNTIME.lock().unwrap_or_else(PoisonError::into_inner);
@@ -58,25 +61,25 @@ fn runtime() -> Result<&'static Runtime> {
     Ok(runtime)
 }
 
-/// Runs asynchronous code to its end, from any thread, be it one of another runtime. `None` when it panics, which
-/// damaged files can provoke in the libraries that read them.
+/// Runs a future to completion; may be called from any thread, including threads of another runtime. Returns `None` if
+/// the future panics, which damaged files can cause in the libraries that read them.
 ///
 /// # Errors
-/// When the system has no threads left.
-pub(crate) fn wait<T: Send + 'static>(future: impl Future<Output = T> + Send + 'static) -> Result<Option<T>> {
+/// If the runtime's threads cannot be started.
+pub(crate) fn block_on<T: Send + 'static>(future: impl Future<Output = T> + Send + 'static) -> Result<Option<T>> {
     let (sender, receiver) = mpsc::sync_channel(1);
     runtime()?.spawn(async move {
-        // The receiver waits below, so sending cannot fail.
+        // The receiver below outlives the future, so sending cannot fail.
         let _ = sender.send(AssertUnwindSafe(future).catch_unwind().await);
     });
     Ok(receiver.recv().ok().and_then(std::result::Result::ok))
 }
 
-/// The store that a location is in, and its path there.
+/// The object store of a location, and the path within it.
 ///
 /// # Errors
-/// When the location names no bucket, this build lacks the feature for it, or the environment's settings for it make
-/// no sense.
+/// If the location names no bucket, this build lacks the feature for the store, or the store's environment variables
+/// are invalid.
 pub fn store(location: &Location) -> Result<(Arc<dyn ObjectStore>, StorePath)> {
     match location {
         Location::Path(path) => {
@@ -93,10 +96,13 @@ pub fn store(location: &Location) -> Result<(Arc<dyn ObjectStore>, StorePath)> {
     }
 }
 
-#[cfg_attr(not(any(feature = "s3", feature = "gs", feature = "az", feature = "http")), allow(unused))]
+#[cfg_attr(
+    not(any(feature = "s3", feature = "gs", feature = "az", feature = "http")),
+    allow(unused, reason = "without these features every URI is an error")
+)]
 fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
     let wrong = |e: object_store::Error| {
-        let fix = "the environment says how it is reached, such as AWS_ENDPOINT_URL, AWS_REGION and AWS_ACCESS_KEY_ID";
+        let fix = "check the store's environment variables, such as AWS_ENDPOINT_URL, AWS_REGION and AWS_ACCESS_KEY_ID";
         Error::config("dataset", format!("{url}: {e}"), fix)
     };
     #[cfg(feature = "tls")]
@@ -104,26 +110,26 @@ fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
     match url.scheme() {
         #[cfg(feature = "s3")]
         "s3" => {
-            // An endpoint that says http:// means it.
+            // AWS_ENDPOINT_URL may name a server without TLS.
             let builder = object_store::aws::AmazonS3Builder::from_env().with_url(url.as_str()).with_allow_http(true);
-            Ok(Arc::new(builder.with_retry(patience()).build().map_err(wrong)?))
+            Ok(Arc::new(builder.with_retry(retry_config()).build().map_err(wrong)?))
         }
         #[cfg(feature = "gs")]
         "gs" => {
             let builder = object_store::gcp::GoogleCloudStorageBuilder::from_env().with_url(url.as_str());
-            Ok(Arc::new(builder.with_retry(patience()).build().map_err(wrong)?))
+            Ok(Arc::new(builder.with_retry(retry_config()).build().map_err(wrong)?))
         }
         #[cfg(feature = "az")]
         "az" => {
             let builder = object_store::azure::MicrosoftAzureBuilder::from_env().with_url(url.as_str());
-            Ok(Arc::new(builder.with_allow_http(true).with_retry(patience()).build().map_err(wrong)?))
+            Ok(Arc::new(builder.with_allow_http(true).with_retry(retry_config()).build().map_err(wrong)?))
         }
         #[cfg(feature = "http")]
         "http" | "https" => {
             let options = object_store::ClientOptions::new().with_allow_http(true);
             let server = &url[..url::Position::BeforePath];
             let builder = object_store::http::HttpBuilder::new().with_url(server).with_client_options(options);
-            Ok(Arc::new(builder.with_retry(patience()).build().map_err(wrong)?))
+            Ok(Arc::new(builder.with_retry(retry_config()).build().map_err(wrong)?))
         }
         scheme => {
             let feature = if scheme == "https" { "http" } else { scheme };
@@ -134,26 +140,26 @@ fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
     }
 }
 
-/// Makes ring the process's provider of cryptography, unless the process already has one.
+/// Installs ring as the cryptography provider of the process, unless one is installed.
 #[cfg(feature = "tls")]
 fn provide_tls() {
-    // An error means that a provider is installed, which serves as well.
+    // An error means that another provider is installed already.
     let _ = rustls::crypto::ring::default_provider().install_default();
 }
 
-/// An error of a store in our words.
-pub(crate) fn explain(label: &Path, action: &str, error: &object_store::Error) -> Error {
+/// Converts an error of a store.
+pub(crate) fn store_error(label: &Path, action: &str, error: &object_store::Error) -> Error {
     match error {
         object_store::Error::NotFound { .. } => Error::corrupt(
             label,
             format!("{action}: there is no such object"),
-            "check the name; the store tells apart upper and lower case",
+            "check the name; names in object stores are case-sensitive",
         ),
         other => Error::external(format!("{}: {action}", label.display()), other),
     }
 }
 
-/// A file, wherever it is, read by ranges of bytes. Safe to share between threads.
+/// A local or remote file, read by byte ranges. Several threads may read at the same time.
 pub struct ObjectFile {
     store: Arc<dyn ObjectStore>,
     path: StorePath,
@@ -165,30 +171,30 @@ impl ObjectFile {
     /// Opens a file.
     ///
     /// # Errors
-    /// When there is none, or the store does not answer.
+    /// If it does not exist, or the store does not answer.
     pub fn open(location: &Location) -> Result<Self> {
         let (store, path) = store(location)?;
         let label = location.label();
         let (asked, place) = (Arc::clone(&store), path.clone());
-        let meta = Self::finish(&label, "opening it", wait(async move { asked.head(&place).await })?)?;
+        let meta = Self::finish(&label, "opening it", block_on(async move { asked.head(&place).await })?)?;
         Ok(Self { store, path, label, len: meta.size })
     }
 
-    /// How many bytes it has.
+    /// Size in bytes.
     pub fn len(&self) -> u64 {
         self.len
     }
 
-    /// Whether it has none.
+    /// Whether the file has no bytes.
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }
 
-    /// The bytes of all ranges, in the given order. Ranges that lie near each other are fetched in one request, and
-    /// all requests at once.
+    /// Reads all ranges, returned in the given order. Ranges close to each other share a request, and all requests run
+    /// concurrently.
     ///
     /// # Errors
-    /// When a range is not within the file, or the store does not answer.
+    /// If a range exceeds the file, or the store does not answer.
     pub fn read(&self, ranges: &[Range<u64>]) -> Result<Vec<Bytes>> {
         if let Some(range) = ranges.iter().find(|range| range.start > range.end || range.end > self.len) {
             let given = format!("bytes {}..{} of {}", range.start, range.end, self.label.display());
@@ -197,26 +203,26 @@ impl ObjectFile {
         let (store, path) = (Arc::clone(&self.store), self.path.clone());
         let ranges = ranges.to_vec();
         let action = "reading it";
-        let result = wait(async move { fetch(&*store, &path, &ranges).await })?;
+        let result = block_on(async move { fetch(&*store, &path, &ranges).await })?;
         Self::finish(&self.label, action, result)
     }
 
     fn finish<T>(label: &Path, action: &str, result: Option<object_store::Result<T>>) -> Result<T> {
         match result {
-            Some(result) => result.map_err(|e| explain(label, action, &e)),
+            Some(result) => result.map_err(|e| store_error(label, action, &e)),
             None => Err(Error::external(format!("{}: {action}", label.display()), "the store's client panicked")),
         }
     }
 }
 
-/// The bytes of some ranges of an object.
+/// Reads ranges of an object.
 pub(crate) async fn fetch(
     store: &dyn ObjectStore,
     path: &StorePath,
     ranges: &[Range<u64>],
 ) -> object_store::Result<Vec<Bytes>> {
     use futures::{StreamExt as _, TryStreamExt as _};
-    let joined = join(ranges);
+    let joined = merge_ranges(ranges);
     let parts: Vec<Bytes> = futures::stream::iter(joined.clone())
         .map(|range| store.get_range(path, range))
         .buffered(REQUESTS)
@@ -232,16 +238,19 @@ pub(crate) async fn fetch(
             let start = (range.start - joined[at].start) as usize;
             let end = (range.end - joined[at].start) as usize;
             if end > parts[at].len() {
-                // The object shrank since its size was asked for.
-                return Err(object_store::Error::Generic { store: "object", source: "it ends too early".into() });
+                // The object shrank after its size was read.
+                return Err(object_store::Error::Generic {
+                    store: "object",
+                    source: "the object is shorter than expected".into(),
+                });
             }
             Ok(parts[at].slice(start..end))
         })
         .collect()
 }
 
-/// The requests that cover all ranges: sorted, and those near each other joined.
-fn join(ranges: &[Range<u64>]) -> Vec<Range<u64>> {
+/// Merges ranges with small gaps into sorted, disjoint requests.
+fn merge_ranges(ranges: &[Range<u64>]) -> Vec<Range<u64>> {
     let mut sorted: Vec<Range<u64>> = ranges.iter().filter(|range| !range.is_empty()).cloned().collect();
     sorted.sort_unstable_by_key(|range| (range.start, range.end));
     let mut joined: Vec<Range<u64>> = vec![];
@@ -267,7 +276,7 @@ mod tests {
         let file = ObjectFile::open(&Location::from(&path))?;
         assert_eq!(file.len(), 3_000_000);
         let ranges = [2_000_000..2_000_100, 5..10, 7..7, 8..300, 2_050_000..3_000_000, 0..0, 500_000..500_001];
-        assert_eq!(join(&ranges), [5..300, 500_000..500_001, 2_000_000..3_000_000]);
+        assert_eq!(merge_ranges(&ranges), [5..300, 500_000..500_001, 2_000_000..3_000_000]);
         for (range, bytes) in ranges.iter().zip(file.read(&ranges)?) {
             assert_eq!(bytes, content[range.start as usize..range.end as usize]);
         }
@@ -278,8 +287,8 @@ mod tests {
     #[test]
     fn waiting_works_inside_another_runtime_and_survives_a_panic() -> Result<()> {
         let other = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
-        assert_eq!(other.block_on(async { wait(async { 7 }) })?, Some(7));
-        let panics = wait::<()>(async { std::panic::resume_unwind(Box::new("damaged")) })?;
+        assert_eq!(other.block_on(async { block_on(async { 7 }) })?, Some(7));
+        let panics = block_on::<()>(async { std::panic::resume_unwind(Box::new("damaged")) })?;
         assert_eq!(panics, None);
         Ok(())
     }

@@ -1,15 +1,14 @@
-//! [`ReplayBuffer`]: the latest episodes of a running collection, in memory, to train on while it goes on.
+//! [`ReplayBuffer`]: the most recent episodes of a running collection, in memory, for training during collection.
 //!
-//! It is a [`Writer`] to whoever plays, so that a world collects into it as into a dataset, and a [`Reader`] to whoever
-//! learns: [`ReplayBuffer::snapshot`] is what it holds at one moment, and stays so while the buffer goes on. When an
-//! episode does not fit, the oldest ones leave as a whole.
+//! Collection writes into the buffer through its [`Writer`]; training reads a [`ReplayBuffer::snapshot`], which does
+//! not change while the buffer does. When a new episode does not fit, the oldest episodes are evicted.
 //!
-//! What is drawn is a function of the key and of what the buffer holds, and of nothing else.
+//! Samples depend only on the key and on the buffer's content.
 
 use crate::dataset::clips::{ClipSpec, Clips};
-use crate::dataset::episodes::{EPISODE, Rows, STEP, check};
+use crate::dataset::episodes::{EpisodeRows, check_episode};
 use crate::dataset::goals::{GoalSpec, Goals};
-use crate::dataset::loader::{Anchors, Epoch, Filler, Loaded, Produce, Spare, Workers, window};
+use crate::dataset::loader::{BatchFiller, BatchPool, BatchRows, BatchSource, Epoch, LoadedBatch, Workers, window};
 use crate::dataset::reader::{Constants, Episode, Reader, StepRange};
 use crate::dataset::sync::lock;
 use crate::dataset::writer::{WriteOptions, Writer};
@@ -17,83 +16,85 @@ use rand::Rng as _;
 use serde_json::json;
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, OnceLock};
+use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, DType, Error, Key, Manifest, Result, Schema};
 
-/// Evicted episodes whose memory is kept for the next ones.
+/// Number of evicted episodes whose memory is reused.
 const SPARE: usize = 2;
 
-/// The latest episodes. Cheap to clone; all clones are the same buffer.
+/// The most recent episodes. Clones share the same buffer.
 #[derive(Clone)]
 pub struct ReplayBuffer(Arc<Inner>);
 
 struct Inner {
-    /// The columns of the episodes that come.
+    /// Columns of the episodes that are added.
     schema: Schema,
-    /// Those of the dataset that it is to readers.
-    numbered: Schema,
+    /// Columns of the buffer as a dataset: index columns, then the others.
+    dataset_schema: Schema,
     capacity: usize,
     state: Mutex<State>,
 }
 
 #[derive(Default)]
 struct State {
-    stored: VecDeque<Arc<Stored>>,
+    stored: VecDeque<Arc<StoredEpisode>>,
     rows: usize,
-    /// Episodes that ever came, those that left included.
+    /// Number of episodes ever added.
     added: u64,
     spare: Vec<Batch>,
-    /// What is held now, once somebody asked.
+    /// A snapshot of the current content, if one was requested.
     snapshot: OnceLock<Arc<Snapshot>>,
 }
 
-struct Stored {
-    /// How many episodes came before it.
+struct StoredEpisode {
+    /// Number of episodes added before this one.
     number: u64,
     rows: Batch,
     constants: Constants,
 }
 
 impl ReplayBuffer {
-    /// A buffer for episodes with these columns, of at most `capacity` rows. (An episode of `n` steps has `n + 1`.)
+    /// A buffer of at most `capacity` rows for episodes with these columns. An episode of `n` steps has `n + 1` rows.
     ///
     /// # Errors
-    /// When the capacity is 0.
+    /// If the capacity is 0.
     pub fn new(schema: &Schema, capacity: usize) -> Result<Self> {
         if capacity == 0 {
             return Err(Error::config("replay buffer", "its capacity is 0 rows", "make room for one episode at least"));
         }
-        let numbered = numbered(schema)?;
-        Ok(Self(Arc::new(Inner { schema: schema.clone(), numbered, capacity, state: Mutex::default() })))
+        let dataset_schema = dataset_schema(schema)?;
+        Ok(Self(Arc::new(Inner { schema: schema.clone(), dataset_schema, capacity, state: Mutex::default() })))
     }
 
-    /// Rows it holds.
+    /// Number of rows in the buffer.
     pub fn rows(&self) -> usize {
         lock(&self.0.state).rows
     }
 
-    /// Episodes it holds.
+    /// Number of episodes in the buffer.
     pub fn episodes(&self) -> usize {
         lock(&self.0.state).stored.len()
     }
 
-    /// Episodes that ever came, those that left included.
+    /// Number of episodes ever added, including evicted ones.
     pub fn added(&self) -> u64 {
         lock(&self.0.state).added
     }
 
-    /// Adds an episode; the oldest ones leave to make room.
+    /// Adds an episode and evicts the oldest ones to make room.
     ///
     /// # Errors
-    /// When its columns differ from the buffer's, it breaks the time convention, or it is longer than the buffer.
+    /// If the columns differ from the buffer's, the episode breaks the time convention, or it is longer than the
+    /// buffer.
     pub fn add(&self, episode: &Batch, constants: &Constants) -> Result<()> {
         let Inner { schema, capacity, state, .. } = &*self.0;
-        check(episode, schema)?;
+        check_episode(episode, schema)?;
         let rows = episode.rows();
         if rows > *capacity {
             let expected = format!("at most {capacity}, the buffer's capacity");
             return Err(Error::mismatch("adding an episode to a replay buffer", format!("{rows} rows"), expected));
         }
-        // Copying happens without the lock: learners go on meanwhile.
+        // Copies without holding the lock, so that readers continue.
         let spare = lock(state).spare.pop();
         let mut copy = spare.unwrap_or_else(|| Batch::zeros(schema, 0));
         copy.resize(rows);
@@ -104,7 +105,7 @@ impl ReplayBuffer {
         while state.rows + rows > *capacity {
             let Some(oldest) = state.stored.pop_front() else { break };
             state.rows -= oldest.rows.rows();
-            // Snapshots may still look at it; then its memory goes with the last of them.
+            // If a snapshot still uses the episode, its memory is freed with the last such snapshot.
             if let Some(oldest) = Arc::into_inner(oldest)
                 && state.spare.len() < SPARE
             {
@@ -112,20 +113,20 @@ impl ReplayBuffer {
             }
         }
         let number = state.added;
-        state.stored.push_back(Arc::new(Stored { number, rows: copy, constants: constants.clone() }));
+        state.stored.push_back(Arc::new(StoredEpisode { number, rows: copy, constants: constants.clone() }));
         state.rows += rows;
         state.added += 1;
         state.snapshot = OnceLock::new();
         Ok(())
     }
 
-    /// A writer into the buffer. Its number of episodes is that of all that ever came, so that a collection that is
-    /// continued goes on with new episodes.
+    /// A writer into the buffer. [`Writer::episodes`] returns the number of episodes ever added, so that a resumed
+    /// collection continues with new episodes.
     pub fn writer(&self) -> Box<dyn Writer> {
         Box::new(ReplayWriter(self.clone()))
     }
 
-    /// What it holds now, as a dataset that stays what it is. Costs a list of its episodes, not their data.
+    /// The current content as a dataset that does not change. Copies the list of episodes, not their data.
     pub fn snapshot(&self) -> Arc<dyn Reader> {
         self.now()
     }
@@ -135,8 +136,8 @@ impl ReplayBuffer {
         Arc::clone(state.snapshot.get_or_init(|| Arc::new(Snapshot::new(&self.0, &state))))
     }
 
-    /// Writes the stored episodes to a dataset that `create` makes, with the settings that [`ReplayBuffer::restore`]
-    /// needs in its manifest.
+    /// Writes the stored episodes to a dataset that `create` makes. Its manifest records what [`ReplayBuffer::restore`]
+    /// needs.
     pub(crate) fn save_with(
         &self,
         mut options: WriteOptions,
@@ -153,18 +154,18 @@ impl ReplayBuffer {
         writer.finish()
     }
 
-    /// Fills a new buffer from a dataset, the last episodes of it where not all fit. Of one that [`ReplayBuffer::save`]
-    /// wrote, episodes have the numbers they had, and those to come the numbers they would have had.
+    /// Fills a new buffer from a dataset, with the last episodes if not all fit. If [`ReplayBuffer::save`] wrote the
+    /// dataset, stored and future episodes get the same `episode_idx` as in the original buffer.
     ///
     /// # Errors
-    /// When the dataset is damaged, or its last episode is longer than the buffer.
+    /// If the dataset is damaged, or its last episode is longer than the buffer.
     pub fn restore(reader: &dyn Reader, capacity: usize) -> Result<Self> {
-        let columns = reader.schema().columns().iter().filter(|c| c.name != EPISODE && c.name != STEP);
+        let columns = reader.schema().columns().iter().filter(|c| c.name != EPISODE_IDX && c.name != STEP_IDX);
         let columns: Vec<ColumnSpec> = columns.cloned().collect();
         let names: Vec<&str> = columns.iter().map(|column| column.name.as_str()).collect();
         let buffer = Self::new(&Schema::new(columns.clone())?, capacity)?;
         let episodes = reader.episodes();
-        // The first episode from which on all fit.
+        // Counts the trailing episodes that fit.
         let mut rows = 0;
         let fits = |episode: &&Episode| {
             rows += episode.length;
@@ -180,15 +181,15 @@ impl ReplayBuffer {
         Ok(buffer)
     }
 
-    /// Draws batches of it, from whatever it holds when each one is loaded.
+    /// Samples batches from the buffer's content at the time each batch is loaded.
     ///
     /// # Errors
-    /// When a column does not exist, a count is zero, or a goal's chances make no sense.
+    /// If a column does not exist, a count is 0, or a goal's probabilities are invalid.
     pub fn loader(&self, config: ReplayConfig) -> Result<ReplayLoader> {
         if config.batch_size == 0 {
             return Err(Error::config("batch_size", "it is 0", "a batch needs at least one clip"));
         }
-        let filler = Filler::new(&self.0.numbered, config.clip, config.goals)?;
+        let filler = BatchFiller::new(&self.0.dataset_schema, config.clip, config.goals)?;
         let prefetch = window(filler.schema(), config.batch_size, config.prefetch, config.prefetch_bytes);
         Ok(ReplayLoader {
             workers: Workers::new(config.threads)?,
@@ -198,19 +199,19 @@ impl ReplayBuffer {
                 key: Key::new(config.seed).with("replay"),
                 batch_size: config.batch_size,
                 recent: config.recent,
-                drawn_from: Mutex::default(),
+                windows: Mutex::default(),
                 scratch: Mutex::default(),
-                spare: Spare::new(prefetch + 2),
+                pool: BatchPool::new(prefetch + 2),
             }),
             prefetch,
         })
     }
 }
 
-/// The columns of an episode behind those that number episodes and steps.
-fn numbered(schema: &Schema) -> Result<Schema> {
-    let numbers = [EPISODE, STEP].map(|name| ColumnSpec::new(name, DType::Int64, []));
-    let data = schema.columns().iter().filter(|column| column.name != EPISODE && column.name != STEP);
+/// The index columns, followed by the columns of an episode.
+fn dataset_schema(schema: &Schema) -> Result<Schema> {
+    let numbers = [EPISODE_IDX, STEP_IDX].map(|name| ColumnSpec::new(name, DType::Int64, []));
+    let data = schema.columns().iter().filter(|column| column.name != EPISODE_IDX && column.name != STEP_IDX);
     Schema::new(numbers.into_iter().chain(data.cloned()).collect::<Vec<_>>())
 }
 
@@ -221,7 +222,6 @@ impl Writer for ReplayWriter {
         self.0.add(episode, constants)
     }
 
-    #[allow(clippy::cast_possible_truncation)]
     fn episodes(&self) -> usize {
         self.0.added() as usize
     }
@@ -231,21 +231,20 @@ impl Writer for ReplayWriter {
     }
 }
 
-/// What a buffer held at one moment.
+/// The buffer's content at one moment.
 struct Snapshot {
     schema: Schema,
     episodes: Vec<Episode>,
-    stored: Vec<Arc<Stored>>,
+    stored: Vec<Arc<StoredEpisode>>,
     added: u64,
     capacity: usize,
 }
 
 impl Snapshot {
-    #[allow(clippy::cast_possible_wrap)]
     fn new(buffer: &Inner, state: &State) -> Self {
-        let episode = |stored: &Arc<Stored>| Episode { index: stored.number as i64, length: stored.rows.rows() };
+        let episode = |stored: &Arc<StoredEpisode>| Episode { index: stored.number as i64, length: stored.rows.rows() };
         Self {
-            schema: buffer.numbered.clone(),
+            schema: buffer.dataset_schema.clone(),
             episodes: state.stored.iter().map(episode).collect(),
             stored: state.stored.iter().cloned().collect(),
             added: state.added,
@@ -263,10 +262,9 @@ impl Reader for Snapshot {
         &self.episodes
     }
 
-    #[allow(clippy::cast_possible_wrap)]
     fn read_column(&self, column: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let spec = self.schema.column(column)?;
-        Rows::check_room(spec, ranges, out)?;
+        EpisodeRows::check_output(spec, ranges, out)?;
         let n = spec.row_bytes();
         let mut rest = out;
         for range in ranges {
@@ -274,20 +272,20 @@ impl Reader for Snapshot {
                 |episode: &Episode| range.start.checked_add(range.length).is_some_and(|end| end <= episode.length);
             if !self.episodes.get(range.episode).is_some_and(known) {
                 let given = format!("{} rows from row {} of episode {}", range.length, range.start, range.episode);
-                return Err(Error::mismatch("reading rows", given, "rows that the replay buffer held"));
+                return Err(Error::mismatch("reading rows", given, "rows of the snapshot"));
             }
-            let (place, others) = rest.split_at_mut(range.length * n);
-            rest = others;
+            let (target, after) = rest.split_at_mut(range.length * n);
+            rest = after;
             let stored = &self.stored[range.episode];
-            if column == EPISODE || column == STEP {
-                for (row, place) in place.chunks_exact_mut(n).enumerate() {
+            if column == EPISODE_IDX || column == STEP_IDX {
+                for (row, target) in target.chunks_exact_mut(n).enumerate() {
                     let step = (range.start + row) as i64;
-                    let number = if column == EPISODE { stored.number as i64 } else { step };
-                    place.copy_from_slice(&number.to_ne_bytes());
+                    let number = if column == EPISODE_IDX { stored.number as i64 } else { step };
+                    target.copy_from_slice(&number.to_ne_bytes());
                 }
             } else {
                 let bytes = stored.rows.bytes(stored.rows.schema().index(column)?);
-                place.copy_from_slice(&bytes[range.start * n..(range.start + range.length) * n]);
+                target.copy_from_slice(&bytes[range.start * n..(range.start + range.length) * n]);
             }
         }
         Ok(())
@@ -298,11 +296,11 @@ impl Reader for Snapshot {
     }
 
     fn manifest(&self) -> Option<Manifest> {
-        let what = json!({"replay": {"capacity": self.capacity, "added": self.added}});
-        Some(Manifest::new("replay", 0, what))
+        let config = json!({"replay": {"capacity": self.capacity, "added": self.added}});
+        Some(Manifest::new("replay", 0, config))
     }
 
-    /// In memory, that is.
+    /// Bytes in memory.
     fn footprint(&self) -> Result<Vec<(String, u64)>> {
         let rows: u64 = self.episodes.iter().map(|episode| episode.length as u64).sum();
         let mut sizes: Vec<(String, u64)> =
@@ -327,24 +325,24 @@ impl Reader for Snapshot {
     }
 }
 
-/// What to draw from a buffer and how.
+/// Settings of a [`ReplayLoader`].
 #[derive(Clone, Debug)]
 pub struct ReplayConfig {
-    /// What is drawn: windows of `num_steps` steps, single rows for one.
+    /// Shape and columns of the sampled windows; `num_steps = 1` samples single rows.
     pub clip: ClipSpec,
     /// Goals to draw for every window.
     pub goals: Vec<GoalSpec>,
-    /// Windows in a batch.
+    /// Windows per batch.
     pub batch_size: usize,
-    /// Draw from the latest episodes only, as many as make up so many rows; from all for `None`.
+    /// Sample only from the latest episodes, as many as have this many rows in total; from all for `None`.
     pub recent: Option<usize>,
-    /// Decides what is drawn, together with the number of the batch and what the buffer holds.
+    /// Seed of the samples; combined with the number of the batch and the buffer's content.
     pub seed: u64,
-    /// Threads that load ahead; 0 loads in the caller's thread.
+    /// Prefetching threads; 0 loads in the caller's thread.
     pub threads: usize,
-    /// Batches loaded ahead, at most: what is drawn is that old.
+    /// Maximum number of prefetched batches. Prefetched samples do not contain episodes that were added later.
     pub prefetch: usize,
-    /// Bytes of batches loaded ahead, at most; one batch is loaded ahead in any case.
+    /// Maximum number of bytes of prefetched batches; at least one batch is prefetched.
     pub prefetch_bytes: usize,
 }
 
@@ -363,7 +361,7 @@ impl Default for ReplayConfig {
     }
 }
 
-/// Draws batches from a buffer that grows.
+/// Samples batches from a growing buffer.
 pub struct ReplayLoader {
     source: Arc<Source>,
     workers: Arc<Workers>,
@@ -371,37 +369,42 @@ pub struct ReplayLoader {
 }
 
 impl ReplayLoader {
-    /// The columns of a batch, as [`crate::Loader::schema`] has them.
+    /// The columns of a batch; shapes as in [`crate::Loader::schema`].
     pub fn schema(&self) -> &Schema {
         self.source.filler.schema()
     }
 
-    /// The batch that a key draws from what the buffer holds now: every window is equally likely, and may come more than
-    /// once.
+    /// Samples a batch from the current content with a key. All windows are equally likely; a window may appear more
+    /// than once.
     ///
     /// # Errors
-    /// When no episode is long enough for a window.
-    pub fn sample(&self, key: Key) -> Result<Loaded> {
+    /// If no episode is long enough for a window.
+    pub fn sample(&self, key: Key) -> Result<LoadedBatch> {
         self.source.sample(key)
     }
 
-    /// Batches without end, from the one of this number on. The stream ends with the first error, as when the buffer
-    /// holds no window yet.
+    /// Batches from number `first` on, without end. Iteration ends with the first error, for example while the buffer
+    /// holds no window.
     pub fn batches(&self, first: usize) -> Epoch {
-        Workers::start(&self.workers, Arc::clone(&self.source) as Arc<dyn Produce>, first..usize::MAX, self.prefetch)
+        Workers::start(
+            &self.workers,
+            Arc::clone(&self.source) as Arc<dyn BatchSource>,
+            first..usize::MAX,
+            self.prefetch,
+        )
     }
 }
 
 struct Source {
     buffer: ReplayBuffer,
-    filler: Filler,
+    filler: BatchFiller,
     key: Key,
     batch_size: usize,
     recent: Option<usize>,
     /// The windows of the latest snapshot.
-    drawn_from: Mutex<Option<Arc<Windows>>>,
-    scratch: Mutex<Vec<Anchors>>,
-    spare: Arc<Spare>,
+    windows: Mutex<Option<Arc<Windows>>>,
+    scratch: Mutex<Vec<BatchRows>>,
+    pool: Arc<BatchPool>,
 }
 
 /// All windows of a snapshot.
@@ -412,10 +415,10 @@ struct Windows {
 }
 
 impl Source {
-    /// The windows of what the buffer holds now.
+    /// The windows of the current content.
     fn windows(&self) -> Result<Arc<Windows>> {
         let snapshot = self.buffer.now();
-        let mut known = lock(&self.drawn_from);
+        let mut known = lock(&self.windows);
         if let Some(windows) = known.as_ref().filter(|windows| Arc::ptr_eq(&windows.snapshot, &snapshot)) {
             return Ok(Arc::clone(windows));
         }
@@ -435,24 +438,23 @@ impl Source {
         Ok(windows)
     }
 
-    fn sample(&self, key: Key) -> Result<Loaded> {
+    fn sample(&self, key: Key) -> Result<LoadedBatch> {
         let windows = self.windows()?;
         let mut rng = key.rng();
-        let mut anchors = lock(&self.scratch).pop().unwrap_or_default();
-        anchors.clear();
-        #[allow(clippy::cast_possible_truncation)]
+        let mut rows = lock(&self.scratch).pop().unwrap_or_default();
+        rows.clear();
         let mut draw = || windows.clips.get(rng.random_range(0..windows.clips.len() as u64) as usize);
-        anchors.extend((0..self.batch_size).map(|_| draw()));
-        let mut out = self.spare.take(self.filler.schema());
+        rows.extend((0..self.batch_size).map(|_| draw()));
+        let mut out = self.pool.take(self.filler.schema());
         let goals = key.with("goals");
-        self.filler.fill(&*windows.snapshot, &mut anchors, &windows.goals, |i| goals.at(i as u64), &mut out)?;
-        lock(&self.scratch).push(anchors);
+        self.filler.fill(&*windows.snapshot, &mut rows, &windows.goals, |i| goals.at(i as u64), &mut out)?;
+        lock(&self.scratch).push(rows);
         Ok(out)
     }
 }
 
-impl Produce for Source {
-    fn produce(&self, batch: usize) -> Result<Loaded> {
+impl BatchSource for Source {
+    fn produce(&self, batch: usize) -> Result<LoadedBatch> {
         self.sample(self.key.at(batch as u64))
     }
 }

@@ -1,7 +1,7 @@
-//! [`Split`]: which episodes of a dataset a model is trained on, and which are held out.
+//! [`Split`]: divides the episodes of a dataset into training, validation and test.
 //!
-//! Every episode is put into a part by a keyed hash of its number and of nothing else: a dataset that grows keeps the
-//! parts it had, and whoever trains and whoever evaluates agree by naming the same split.
+//! A keyed hash of an episode's index decides its part, independently of all other episodes. A growing dataset
+//! therefore keeps its parts, and training and evaluation agree whenever they use the same split.
 
 use crate::dataset::reader::Reader;
 use serde::{Deserialize, Serialize};
@@ -13,11 +13,11 @@ use swm_core::{Error, Key, Result};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Part {
-    /// What models are trained on.
+    /// For training models.
     Train,
-    /// What settings are chosen by.
+    /// For choosing settings.
     Validation,
-    /// What is looked at in the end.
+    /// For the final evaluation.
     Test,
 }
 
@@ -25,31 +25,30 @@ pub enum Part {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Split {
-    /// The chance of an episode to be held out for validation.
+    /// Fraction of episodes held out for validation.
     pub validation: f64,
-    /// The chance to be held out for the test.
+    /// Fraction of episodes held out for the test.
     pub test: f64,
-    /// What decides.
+    /// Seed of the hash.
     pub seed: u64,
 }
 
 impl Default for Split {
-    /// A tenth each is held out.
+    /// Holds out a tenth each for validation and test.
     fn default() -> Self {
         Self { validation: 0.1, test: 0.1, seed: 0 }
     }
 }
 
 impl Split {
-    /// The part of an episode, by its number in the column `episode_idx`.
-    #[allow(clippy::cast_precision_loss, clippy::cast_sign_loss)]
+    /// The part of an episode, given its value in the column `episode_idx`.
     pub fn part(&self, episode: i64) -> Part {
-        // 53 bits of the hash: a number in 0 .. 1.
+        // 53 bits of the hash give a value in [0, 1).
         let hash = Key::new(self.seed).with("held out").at(episode as u64).seed() >> 11;
-        let place = hash as f64 / (1u64 << 53) as f64;
-        match place {
-            place if place < self.test => Part::Test,
-            place if place < self.test + self.validation => Part::Validation,
+        let fraction = hash as f64 / (1u64 << 53) as f64;
+        match fraction {
+            fraction if fraction < self.test => Part::Test,
+            fraction if fraction < self.test + self.validation => Part::Validation,
             _ => Part::Train,
         }
     }
@@ -57,14 +56,14 @@ impl Split {
     /// The positions of a part's episodes in [`Reader::episodes`], in order.
     ///
     /// # Errors
-    /// When the chances are none, or no episode falls into the part.
+    /// If a fraction is out of range, or no episode falls into the part.
     pub fn episodes(&self, reader: &dyn Reader, part: Part) -> Result<Vec<usize>> {
-        let chances = [self.validation, self.test, 1.0 - self.validation - self.test];
-        if !chances.iter().all(|chance| (0.0..=1.0).contains(chance)) {
+        let fractions = [self.validation, self.test, 1.0 - self.validation - self.test];
+        if !fractions.iter().all(|fraction| (0.0..=1.0).contains(fraction)) {
             return Err(Error::OutOfSpace {
-                what: "the held-out shares".to_owned(),
+                what: "the held-out fractions".to_owned(),
                 given: format!("validation {}, test {}", self.validation, self.test),
-                expected: "shares of at least 0 that add up to at most 1".to_owned(),
+                expected: "fractions of at least 0 that add up to at most 1".to_owned(),
             });
         }
         let all = reader.episodes();
@@ -73,7 +72,7 @@ impl Split {
             return Err(Error::config(
                 format!("the {part} split"),
                 format!("none of the dataset's {} episodes falls into it", all.len()),
-                "collect more episodes, hold out a larger share, or choose another split seed",
+                "collect more episodes, hold out a larger fraction, or choose another split seed",
             ));
         }
         Ok(chosen)
@@ -107,22 +106,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn shares_are_about_as_asked_and_the_seed_decides() {
+    fn fractions_are_approximate_and_the_seed_decides() {
         let split = Split { validation: 0.2, test: 0.1, seed: 3 };
         let parts: Vec<Part> = (0..10_000).map(|episode| split.part(episode)).collect();
         let count = |part| parts.iter().filter(|&&given| given == part).count();
-        // Three standard deviations of a binomial: 120 of 2000, 90 of 1000.
+        // Three standard deviations of the binomial distribution: 120 of 2000, 90 of 1000.
         assert!(count(Part::Validation).abs_diff(2000) < 120 && count(Part::Test).abs_diff(1000) < 90);
         let other = Split { seed: 4, ..split };
         let moved = (0..10_000).filter(|&episode| other.part(episode) != split.part(episode)).count();
         assert!(moved > 3000, "{moved}");
-        // Pinned: published results depend on it.
+        // Pinned, because published results depend on it.
         let held = |part| (0..40).filter(|&episode| Split::default().part(episode) == part).collect::<Vec<i64>>();
         assert_eq!((held(Part::Test), held(Part::Validation)), (vec![14], vec![4, 6, 16, 23, 24, 32]));
     }
 
     #[test]
-    fn holding_more_out_for_validation_leaves_the_test_alone() {
+    fn validation_fraction_does_not_change_the_test_part() {
         let [few, many] = [0.1, 0.4].map(|validation| Split { validation, ..Split::default() });
         assert!((0..1000).all(|i| (few.part(i) == Part::Test) == (many.part(i) == Part::Test)));
         assert_eq!("validation".parse::<Part>().expect("a part"), Part::Validation);

@@ -1,35 +1,35 @@
-//! Column statistics, for normalising.
+//! Column statistics, for normalisation.
 
 use crate::dataset::reader::{Reader, StepRange};
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 
-/// Statistics of a column, for each number of a row.
+/// Statistics of a column, per element of a row.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ColumnStats {
-    /// How many rows had a number there, NaN not counted.
+    /// Number of rows that are not NaN in this element.
     pub count: Vec<u64>,
-    /// The mean.
+    /// Mean.
     pub mean: Vec<f64>,
-    /// The standard deviation of the population.
+    /// Population standard deviation.
     pub std: Vec<f64>,
-    /// The smallest.
+    /// Minimum.
     pub min: Vec<f64>,
-    /// The largest.
+    /// Maximum.
     pub max: Vec<f64>,
 }
 
 /// Rows read at once.
 const ROWS: usize = 16 << 10;
 
-/// The statistics of a column over some episodes (all of them for `None`), NaN left out: the missing action
-/// of a last row does not count. For integer actions that is the caller's business, as -1 is a number.
+/// The statistics of a column over some episodes (all for `None`), ignoring NaN, so that the missing action of a last
+/// row does not count. Integer actions mark it with -1, which does count.
 ///
 /// # Errors
-/// When there is no such column, it holds pictures, an episode does not exist, or the data are damaged.
+/// If there is no such column, it holds images, an episode does not exist, or the data is damaged.
 pub fn column_stats(reader: &dyn Reader, column: &str, episodes: Option<&[usize]>) -> Result<ColumnStats> {
     let n = reader.schema().column(column)?.len();
-    // Welford's update, which stays exact for columns far from zero.
+    // Welford's algorithm, which is accurate for columns far from zero.
     let mut stats = ColumnStats {
         count: vec![0; n],
         mean: vec![0.0; n],
@@ -41,7 +41,6 @@ pub fn column_stats(reader: &dyn Reader, column: &str, episodes: Option<&[usize]
         for (k, &value) in row.iter().enumerate().filter(|(_, value)| !value.is_nan()) {
             stats.count[k] += 1;
             let delta = value - stats.mean[k];
-            #[allow(clippy::cast_precision_loss)]
             let count = stats.count[k] as f64;
             stats.mean[k] += delta / count;
             stats.std[k] += delta * (value - stats.mean[k]);
@@ -50,17 +49,16 @@ pub fn column_stats(reader: &dyn Reader, column: &str, episodes: Option<&[usize]
         }
     })?;
     for k in 0..n {
-        #[allow(clippy::cast_precision_loss)]
         let count = stats.count[k] as f64;
         if count == 0.0 {
-            return Err(Error::mismatch("column statistics", format!("no number in '{column}'"), "at least one row"));
+            return Err(Error::mismatch("column statistics", format!("no value in '{column}'"), "at least one row"));
         }
         stats.std[k] = (stats.std[k] / count).sqrt();
     }
     Ok(stats)
 }
 
-/// Calls `each` with every row of a column of numbers, over some episodes (all of them for `None`).
+/// Calls `each` with every row of a column, over some episodes (all for `None`).
 fn for_each_row(
     reader: &dyn Reader,
     column: &str,
@@ -68,7 +66,11 @@ fn for_each_row(
     mut each: impl FnMut(&[f64]),
 ) -> Result<()> {
     if reader.schema().column(column)?.is_image() {
-        return Err(Error::mismatch("column statistics", format!("'{column}', which holds pictures"), "numbers"));
+        return Err(Error::mismatch(
+            "column statistics",
+            format!("'{column}', which holds images"),
+            "a column of numeric values",
+        ));
     }
     let all: Vec<usize>;
     let positions = match episodes {
@@ -99,25 +101,28 @@ fn for_each_row(
     Ok(())
 }
 
-/// Quantiles of a column, for each number of a row, over some episodes (all of them for `None`), NaN left out: bounds that
-/// a few outliers do not move, such as those at 0.01 and 0.99 that the reference scales percentiles to -1 .. 1 by. Between
-/// two values of the column a quantile is interpolated linearly. The result has one list of numbers a share.
+/// Quantiles of a column, per element of a row, over some episodes (all for `None`), ignoring NaN. Quantiles between
+/// two values are interpolated linearly. Unlike minimum and maximum they are robust to outliers: the reference scales
+/// the range between the 0.01 and 0.99 quantiles to `[-1, 1]`.
 ///
-/// Holds the column in memory.
+/// The whole column is held in memory. `quantiles` are fractions in `0 ..= 1`.
+///
+/// # Shapes
+/// `[quantiles, elements of a row]`.
 ///
 /// # Errors
-/// As [`column_stats`], and when a share is not within 0 ..= 1.
+/// As [`column_stats`], and if a quantile is not within `0 ..= 1`.
 pub fn column_quantiles(
     reader: &dyn Reader,
     column: &str,
     episodes: Option<&[usize]>,
-    shares: &[f64],
+    quantiles: &[f64],
 ) -> Result<Vec<Vec<f64>>> {
-    if let Some(share) = shares.iter().find(|share| !(0.0..=1.0).contains(*share)) {
+    if let Some(quantile) = quantiles.iter().find(|quantile| !(0.0..=1.0).contains(*quantile)) {
         return Err(Error::OutOfSpace {
             what: "quantile".to_owned(),
-            given: share.to_string(),
-            expected: "a number in 0 ..= 1".to_owned(),
+            given: quantile.to_string(),
+            expected: "a value in 0 ..= 1".to_owned(),
         });
     }
     let mut values: Vec<Vec<f64>> = vec![];
@@ -126,16 +131,15 @@ pub fn column_quantiles(
         values.iter_mut().zip(row).filter(|(_, value)| !value.is_nan()).for_each(|(values, &value)| values.push(value));
     })?;
     if values.is_empty() || values.iter().any(Vec::is_empty) {
-        return Err(Error::mismatch("column quantiles", format!("no number in '{column}'"), "at least one row"));
+        return Err(Error::mismatch("column quantiles", format!("no value in '{column}'"), "at least one row"));
     }
     values.iter_mut().for_each(|values| values.sort_by(f64::total_cmp));
-    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    let quantile = |values: &Vec<f64>, share: f64| {
-        let place = share * (values.len() - 1) as f64;
-        let (below, above) = (values[place.floor() as usize], values[place.ceil() as usize]);
-        below + (above - below) * place.fract()
+    let interpolate = |values: &Vec<f64>, quantile: f64| {
+        let position = quantile * (values.len() - 1) as f64;
+        let (below, above) = (values[position.floor() as usize], values[position.ceil() as usize]);
+        below + (above - below) * position.fract()
     };
-    Ok(shares.iter().map(|&share| values.iter().map(|values| quantile(values, share)).collect()).collect())
+    Ok(quantiles.iter().map(|&quantile| values.iter().map(|values| interpolate(values, quantile)).collect()).collect())
 }
 
 #[cfg(test)]
@@ -145,11 +149,11 @@ mod tests {
     use swm_core::{Batch, ColumnSpec, DType, Schema};
 
     #[test]
-    fn quantiles_lie_between_the_values() {
+    fn interpolates_quantiles() {
         let schema = Schema::new([ColumnSpec::new("state", DType::Float32, [2])]).expect("schema");
         let buffer = ReplayBuffer::new(&schema, 1000).expect("a buffer");
         let mut episode = Batch::zeros(&schema, 6);
-        // Numbers in no order, one of them missing.
+        // Unsorted values, one of them missing.
         let values = [[4.0, 0.5], [1.0, f32::NAN], [3.0, 0.1], [0.0, 0.4], [2.0, 0.2], [5.0, 0.3]];
         episode.get_mut::<f32>("state").expect("states").copy_from_slice(values.as_flattened());
         buffer.add(&episode, &Constants::new()).expect("adds");
@@ -160,7 +164,7 @@ mod tests {
             assert!((found - expected).abs() < 1e-6, "{found} {expected}");
         }
         assert!(
-            column_quantiles(&*reader, "state", None, &[1.5]).expect_err("no share").to_string().contains("0 ..= 1")
+            column_quantiles(&*reader, "state", None, &[1.5]).expect_err("no quantile").to_string().contains("0 ..= 1")
         );
         assert!(column_quantiles(&*reader, "state", Some(&[3]), &[0.5]).is_err(), "no such episode");
     }

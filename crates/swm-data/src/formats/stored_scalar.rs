@@ -1,8 +1,8 @@
-//! Numbers as other programs store them, and how they become the numbers of a column.
+//! Numeric types of files of other programs, and their conversion to the types of columns.
 
 use swm_core::DType;
 
-/// What kind of number.
+/// Class of a numeric type.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Class {
     Bool,
@@ -11,17 +11,17 @@ pub(crate) enum Class {
     Float,
 }
 
-/// The type of a stored number.
+/// A numeric type in a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Stored {
+pub(crate) struct StoredScalar {
     pub class: Class,
-    /// Bytes of one number.
+    /// Size of a value in bytes.
     pub size: usize,
     pub big_endian: bool,
 }
 
-impl Stored {
-    /// How a column of this type is stored by us.
+impl StoredScalar {
+    /// The type that files written here use for a column of this type.
     pub const fn of(dtype: DType) -> Self {
         let class = match dtype {
             DType::Bool => Class::Bool,
@@ -32,7 +32,7 @@ impl Stored {
         Self { class, size: dtype.size(), big_endian: false }
     }
 
-    /// The narrowest column that holds such numbers without loss (of 64-bit unsigned ones those below 2^63).
+    /// The narrowest column type that holds all values without loss (unsigned 64-bit values must be below 2^63).
     pub const fn dtype(self) -> Option<DType> {
         Some(match (self.class, self.size) {
             (Class::Bool, 1) => DType::Bool,
@@ -45,16 +45,16 @@ impl Stored {
         })
     }
 
-    /// Whether the stored bytes are those of the column.
+    /// Whether the stored bytes equal the bytes of the column.
     pub fn is_plain(self) -> bool {
         let little = Self { big_endian: self.big_endian && self.size > 1, ..self };
         self.dtype().is_some_and(|dtype| little == Self::of(dtype))
     }
 
-    /// Converts stored numbers to the bytes of a column of [`Stored::dtype`]; there are as many of one as of the other.
+    /// Converts stored values to the bytes of a column with type [`StoredScalar::dtype`].
     ///
     /// # Errors
-    /// When an unsigned number is 2^63 or more.
+    /// If an unsigned value is 2^63 or more.
     pub fn convert(self, from: &[u8], to: &mut [u8]) -> Result<(), String> {
         if self.is_plain() {
             to.copy_from_slice(from);
@@ -73,7 +73,7 @@ impl Stored {
                     value.to_ne_bytes()
                 });
                 if i64::try_from(largest).is_err() {
-                    return Err(format!("{largest} is too large for 64 signed bits"));
+                    return Err(format!("{largest} is too large for a signed 64-bit integer"));
                 }
             }
             (Class::Float, 2) => put(from, to, |b| half(self.order(b, u16::from_le_bytes)).to_ne_bytes()),
@@ -96,13 +96,13 @@ fn put<const N: usize, const M: usize>(from: &[u8], to: &mut [u8], mut convert: 
     to.iter_mut().zip(from).for_each(|(to, from)| *to = convert(*from));
 }
 
-/// A number of half precision (IEEE 754 binary16).
+/// Converts half precision (IEEE 754 binary16).
 fn half(bits: u16) -> f32 {
     let sign = u32::from(bits >> 15) << 31;
     let exponent = u32::from(bits >> 10) & 31;
     let fraction = u32::from(bits & 0x3ff);
     match exponent {
-        // Subnormal: a multiple of 2^-24, exact in single precision.
+        // A subnormal value is a multiple of 2^-24, which is exact in single precision.
         0 => f32::from_bits(sign) + f32::from_bits(sign | 1.0_f32.to_bits()) * f32::from(bits & 0x3ff) / 16_777_216.0,
         31 => f32::from_bits(sign | 0x7f80_0000 | fraction << 13),
         _ => f32::from_bits(sign | (exponent + 112) << 23 | fraction << 13),
@@ -114,8 +114,8 @@ mod tests {
     use super::*;
 
     fn convert(class: Class, size: usize, big_endian: bool, from: &[u8]) -> Result<Vec<u8>, String> {
-        let stored = Stored { class, size, big_endian };
-        let dtype = stored.dtype().expect("a number");
+        let stored = StoredScalar { class, size, big_endian };
+        let dtype = stored.dtype().expect("a numeric type");
         let mut to = vec![0; from.len() / size * dtype.size()];
         stored.convert(from, &mut to).map(|()| to)
     }
@@ -128,7 +128,7 @@ mod tests {
         assert_eq!(convert(Class::Float, 8, true, &1.5_f64.to_be_bytes()), Ok(1.5_f64.to_ne_bytes().to_vec()));
         assert_eq!(convert(Class::Unsigned, 8, false, &7_u64.to_le_bytes()), Ok(7_i64.to_ne_bytes().to_vec()));
         assert!(convert(Class::Unsigned, 8, false, &u64::MAX.to_le_bytes()).expect_err("too large").contains("64"));
-        assert_eq!(Stored { class: Class::Float, size: 16, big_endian: false }.dtype(), None);
+        assert_eq!(StoredScalar { class: Class::Float, size: 16, big_endian: false }.dtype(), None);
     }
 
     #[test]

@@ -1,11 +1,10 @@
 //! Converting a dataset to any format, resumed where it was killed, and compared with its source in the end.
 //!
-//! What is compared is what readers get: pictures as pixels, numbers as numbers. A lossless target must give every byte
+//! What is compared is what readers get: pictures as pixels, values as values. A lossless target must give every byte
 //! back; a lossy one every number, and pictures with a peak signal-to-noise ratio that is told and must not be too low.
 
 use crate::dataset::Location;
-use crate::dataset::clips::ACTION;
-use crate::dataset::episodes::{EPISODE, STEP, words};
+use crate::dataset::episodes::describe_columns;
 use crate::dataset::{CommitPolicy, Constants, Reader, StepRange, WriteMode, WriteOptions};
 use crate::formats::{FORMATS, FormatEntry, create, open};
 use rayon::prelude::*;
@@ -14,6 +13,7 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
 use std::thread::scope;
+use swm_core::columns::{ACTION, EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
 use swm_image::ImageCodec;
 
@@ -86,24 +86,24 @@ pub struct Converted {
     /// The BLAKE3 hash of what readers get of the source, see [`checksum`]; of what was compared only.
     pub checksum: Option<String>,
     /// How the columns compare, those that were compared.
-    pub columns: Vec<Compared>,
+    pub columns: Vec<ColumnComparison>,
 }
 
 /// A column of the target beside the source's.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Compared {
+pub struct ColumnComparison {
     /// Its name.
     pub column: String,
     /// Whether every byte is equal.
     pub exact: bool,
-    /// The largest difference of two numbers.
+    /// The largest difference of two values.
     pub max_error: f64,
     /// The peak signal-to-noise ratio of pictures in decibels, where they differ.
     pub psnr: Option<f64>,
     #[serde(skip)]
     squares: f64,
     #[serde(skip)]
-    numbers: u64,
+    values: u64,
 }
 
 /// The hash of what a reader gets: of the columns' names and types, and of every row in decoded form. Two datasets of
@@ -114,12 +114,12 @@ pub struct Compared {
 pub fn checksum(reader: &dyn Reader) -> Result<String> {
     let source = Source::new(reader);
     let mut batch = Batch::zeros(&source.schema, 0);
-    let mut sums = vec![];
+    let mut hashes = vec![];
     for episode in 0..reader.episodes().len() {
         source.read(episode, &mut batch)?;
-        sums.push(sum(&batch));
+        hashes.push(episode_hash(&batch));
     }
-    Ok(total(&source.schema, &sums))
+    Ok(dataset_hash(&source.schema, &hashes))
 }
 
 /// Writes a dataset to another place. `progress` is told the stage, the episodes done and their number, and stops the
@@ -143,13 +143,13 @@ pub fn convert(
         rows: 0,
         last_actions: 0,
         checksum: None,
-        columns: data(&source.schema).map(|(_, column)| Compared::new(column)).collect(),
+        columns: data_columns(&source.schema).map(|(_, column)| ColumnComparison::new(column)).collect(),
     };
     let there = match options.mode {
         ConvertMode::Resume | ConvertMode::Append => existing(target, format)?,
         ConvertMode::Create | ConvertMode::Overwrite => None,
     };
-    let mut sums = vec![None; all];
+    let mut hashes = vec![None; all];
     // Where the source's first episode is in the target, and the first that is not there yet.
     let (mut base, mut first) = (0, 0);
     if let Some(there) = &there {
@@ -157,21 +157,21 @@ pub fn convert(
         match options.mode {
             ConvertMode::Append => base = episodes,
             _ if episodes > all => {
-                return Err(another(target, format!("{episodes} episodes, more than the source's {all}")));
+                return Err(not_a_prefix(target, format!("{episodes} episodes, more than the source's {all}")));
             }
             _ => first = episodes,
         }
         report.kept = first;
         let mut step = |done| progress(Stage::Comparing, done, first);
-        source.compare(&**there, 0..first, 0, &mut sums, &mut report.columns, &mut step).map_err(
+        source.compare(&**there, 0..first, 0, &mut hashes, &mut report.columns, &mut step).map_err(
             |error| match error {
                 Error::Mismatch { operation, given, expected } => {
-                    another(target, format!("{operation}: {given}, expected {expected}"))
+                    not_a_prefix(target, format!("{operation}: {given}, expected {expected}"))
                 }
                 other => other,
             },
         )?;
-        source.judge(&report.columns, options).map_err(|error| another(target, error.to_string()))?;
+        source.check_psnr(&report.columns, options).map_err(|error| not_a_prefix(target, error.to_string()))?;
     }
     drop(there);
     if first < all || all == 0 {
@@ -181,7 +181,7 @@ pub fn convert(
             ConvertMode::Overwrite => WriteMode::Overwrite,
         };
         let write = WriteOptions { mode, codec: options.codec, manifest: reader.manifest(), commit: options.commit };
-        source.copy(target, format, write, first..all, &mut sums, &mut report, options.verify, progress)?;
+        source.copy(target, format, write, first..all, &mut hashes, &mut report, options.verify, progress)?;
     }
     report.episodes = base + all;
     if options.verify {
@@ -194,12 +194,12 @@ pub fn convert(
             ));
         }
         let mut step = |done| progress(Stage::Verifying, done, all - first);
-        source.compare(&*written, first..all, base, &mut sums, &mut report.columns, &mut step)?;
-        source.judge(&report.columns, options)?;
-        let sums: Vec<[u8; 32]> = sums.into_iter().flatten().collect();
-        report.checksum = Some(total(&source.schema, &sums));
+        source.compare(&*written, first..all, base, &mut hashes, &mut report.columns, &mut step)?;
+        source.check_psnr(&report.columns, options)?;
+        let hashes: Vec<[u8; 32]> = hashes.into_iter().flatten().collect();
+        report.checksum = Some(dataset_hash(&source.schema, &hashes));
     } else {
-        report.columns.retain(|column| column.numbers > 0);
+        report.columns.retain(|column| column.values > 0);
     }
     Ok(report)
 }
@@ -219,24 +219,24 @@ fn reopen(target: &Location, format: Option<&FormatEntry>) -> Result<Arc<dyn Rea
 }
 
 /// The error of a target that holds something else.
-fn another(target: &Location, problem: String) -> Error {
+fn not_a_prefix(target: &Location, problem: String) -> Error {
     let fix = "convert to another place, replace it (overwrite), or add to it (append)";
     Error::config(format!("continuing {target}"), format!("it is not the beginning of the source: {problem}"), fix)
 }
 
-/// A dataset to be copied, numbering and all; but its episodes get the numbers that their places give them.
+/// A dataset to be copied, numbering and all; but its episodes get the values that their places give them.
 struct Source<'a> {
     reader: &'a dyn Reader,
     schema: Schema,
 }
 
 /// The columns that are compared, with their places: those that hold data.
-fn data(schema: &Schema) -> impl Iterator<Item = (usize, &ColumnSpec)> {
-    schema.columns().iter().enumerate().filter(|(_, column)| column.name != EPISODE && column.name != STEP)
+fn data_columns(schema: &Schema) -> impl Iterator<Item = (usize, &ColumnSpec)> {
+    schema.columns().iter().enumerate().filter(|(_, column)| column.name != EPISODE_IDX && column.name != STEP_IDX)
 }
 
 /// An episode on its way to the writer.
-struct Parcel {
+struct SourceEpisode {
     rows: Batch,
     constants: Constants,
     sum: Option<[u8; 32]>,
@@ -264,9 +264,9 @@ impl<'a> Source<'a> {
         format: Option<&FormatEntry>,
         options: WriteOptions,
         episodes: Range<usize>,
-        sums: &mut [Option<[u8; 32]>],
+        hashes: &mut [Option<[u8; 32]>],
         report: &mut Converted,
-        summed: bool,
+        hashed: bool,
         progress: &mut dyn FnMut(Stage, usize, usize) -> bool,
     ) -> Result<()> {
         let mut writer = match format {
@@ -275,13 +275,13 @@ impl<'a> Source<'a> {
         };
         let (first, all) = (episodes.start, self.reader.episodes().len());
         let outcome = scope(|scope| {
-            let (to_writer, parcels) = sync_channel(1);
+            let (to_writer, episodes_read) = sync_channel(1);
             let (back, empty) = channel();
-            scope.spawn(move || self.send(episodes, &to_writer, &empty, summed));
-            for (done, parcel) in parcels.into_iter().enumerate() {
-                let Parcel { rows, constants, sum, cut } = parcel?;
+            scope.spawn(move || self.send(episodes, &to_writer, &empty, hashed));
+            for (done, read) in episodes_read.into_iter().enumerate() {
+                let SourceEpisode { rows, constants, sum, cut } = read?;
                 writer.write_episode_with(&rows, &constants)?;
-                sums[first + done] = sum;
+                hashes[first + done] = sum;
                 report.rows += rows.rows();
                 report.last_actions += usize::from(cut);
                 // The reader may have come to its end.
@@ -301,38 +301,38 @@ impl<'a> Source<'a> {
     fn send(
         &self,
         episodes: Range<usize>,
-        to_writer: &SyncSender<Result<Parcel>>,
+        to_writer: &SyncSender<Result<SourceEpisode>>,
         empty: &Receiver<Batch>,
-        summed: bool,
+        hashed: bool,
     ) {
         for episode in episodes {
             let mut rows = empty.try_recv().unwrap_or_else(|_| Batch::zeros(&self.schema, 0));
-            let parcel = self.read(episode, &mut rows).and_then(|cut| {
+            let read = self.read(episode, &mut rows).and_then(|cut| {
                 let constants = self.reader.constants(episode)?;
-                let sum = summed.then(|| sum(&rows));
-                Ok(Parcel { rows, constants, sum, cut })
+                let sum = hashed.then(|| episode_hash(&rows));
+                Ok(SourceEpisode { rows, constants, sum, cut })
             });
-            let failed = parcel.is_err();
-            if to_writer.send(parcel).is_err() || failed {
+            let failed = read.is_err();
+            if to_writer.send(read).is_err() || failed {
                 return;
             }
         }
     }
 
-    /// Compares episodes with those of a copy, `base` positions further on there, and notes their sums.
+    /// Compares episodes with those of a copy, `base` positions further on there, and notes their hashes.
     fn compare(
         &self,
         copy: &dyn Reader,
         episodes: Range<usize>,
         base: usize,
-        sums: &mut [Option<[u8; 32]>],
-        columns: &mut [Compared],
+        hashes: &mut [Option<[u8; 32]>],
+        columns: &mut [ColumnComparison],
         step: &mut dyn FnMut(usize) -> bool,
     ) -> Result<()> {
-        for (_, column) in data(&self.schema) {
+        for (_, column) in data_columns(&self.schema) {
             let theirs = copy.schema().column(&column.name)?;
             if theirs.dtype != column.dtype || theirs.len() != column.len() {
-                let [given, expected] = [theirs, column].map(|column| words(std::slice::from_ref(column)));
+                let [given, expected] = [theirs, column].map(|column| describe_columns(std::slice::from_ref(column)));
                 return Err(Error::mismatch(format!("column '{}'", column.name), given, expected));
             }
         }
@@ -343,15 +343,15 @@ impl<'a> Source<'a> {
                 return Err(Error::mismatch(format!("episode {episode}"), format!("{found} rows"), length.to_string()));
             }
             read(copy, &self.schema, base + episode, length, &mut theirs)?;
-            let known = sums[episode];
-            if known.is_some_and(|known| known == sum(&theirs)) {
-                for (column, (_, spec)) in columns.iter_mut().zip(data(&self.schema)) {
-                    column.numbers += (length * spec.len()) as u64;
+            let known = hashes[episode];
+            if known.is_some_and(|known| known == episode_hash(&theirs)) {
+                for (column, (_, spec)) in columns.iter_mut().zip(data_columns(&self.schema)) {
+                    column.values += (length * spec.len()) as u64;
                 }
             } else {
                 self.read(episode, &mut ours)?;
-                sums[episode] = Some(sum(&ours));
-                for (column, (i, spec)) in columns.iter_mut().zip(data(&self.schema)) {
+                hashes[episode] = Some(episode_hash(&ours));
+                for (column, (i, spec)) in columns.iter_mut().zip(data_columns(&self.schema)) {
                     column.add(spec, ours.bytes(i), theirs.bytes(i)).map_err(|(given, expected)| {
                         Error::mismatch(format!("column '{}' of episode {episode}", spec.name), given, expected)
                     })?;
@@ -372,7 +372,7 @@ impl<'a> Source<'a> {
     }
 
     /// Checks that pictures are near enough.
-    fn judge(&self, columns: &[Compared], options: &ConvertOptions) -> Result<()> {
+    fn check_psnr(&self, columns: &[ColumnComparison], options: &ConvertOptions) -> Result<()> {
         let bad = columns.iter().find(|column| column.psnr.is_some_and(|psnr| psnr < options.least_psnr));
         bad.map_or(Ok(()), |column| {
             Err(Error::mismatch(
@@ -387,7 +387,7 @@ impl<'a> Source<'a> {
 fn read(reader: &dyn Reader, schema: &Schema, episode: usize, length: usize, rows: &mut Batch) -> Result<()> {
     rows.resize(length);
     let range = [StepRange::new(episode, 0, length)];
-    for (i, column) in data(schema) {
+    for (i, column) in data_columns(schema) {
         reader.read_column(&column.name, &range, rows.bytes_mut(i))?;
     }
     Ok(())
@@ -413,11 +413,11 @@ fn cut_last_action(rows: &mut Batch) -> bool {
 }
 
 /// The hash of an episode: of the hashes of its rows, which are made in parallel.
-fn sum(rows: &Batch) -> [u8; 32] {
+fn episode_hash(rows: &Batch) -> [u8; 32] {
     /// Bytes hashed at once; small rows are taken together.
     const PIECE: usize = 128 << 10;
     let mut hasher = blake3::Hasher::new();
-    for (i, column) in data(rows.schema()) {
+    for (i, column) in data_columns(rows.schema()) {
         let piece = (PIECE / column.row_bytes().max(1)).max(1) * column.row_bytes().max(1);
         let pieces: Vec<blake3::Hash> = rows.bytes(i).par_chunks(piece).map(blake3::hash).collect();
         pieces.iter().for_each(|piece| {
@@ -429,25 +429,24 @@ fn sum(rows: &Batch) -> [u8; 32] {
 }
 
 /// The hash of all episodes.
-fn total(schema: &Schema, sums: &[[u8; 32]]) -> String {
+fn dataset_hash(schema: &Schema, hashes: &[[u8; 32]]) -> String {
     let mut hasher = blake3::Hasher::new();
-    let columns: Vec<ColumnSpec> = data(schema).map(|(_, column)| column.clone()).collect();
-    hasher.update(words(&columns).as_bytes());
-    sums.iter().for_each(|sum| {
+    let columns: Vec<ColumnSpec> = data_columns(schema).map(|(_, column)| column.clone()).collect();
+    hasher.update(describe_columns(&columns).as_bytes());
+    hashes.iter().for_each(|sum| {
         hasher.update(sum);
     });
     hasher.finalize().to_hex().to_string()
 }
 
-impl Compared {
+impl ColumnComparison {
     fn new(spec: &ColumnSpec) -> Self {
-        Self { column: spec.name.clone(), exact: true, max_error: 0.0, psnr: None, squares: 0.0, numbers: 0 }
+        Self { column: spec.name.clone(), exact: true, max_error: 0.0, psnr: None, squares: 0.0, values: 0 }
     }
 
-    /// Adds the values of an episode; says what is wrong if numbers are not what they were.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+    /// Adds the values of an episode; says what is wrong if values are not what they were.
     fn add(&mut self, spec: &ColumnSpec, ours: &[u8], theirs: &[u8]) -> Result<(), (String, String)> {
-        self.numbers += (ours.len() / spec.dtype.size()) as u64;
+        self.values += (ours.len() / spec.dtype.size()) as u64;
         if ours == theirs {
             return Ok(());
         }
@@ -463,12 +462,12 @@ impl Compared {
             self.exact = false;
             self.squares += sum as f64;
             self.max_error = self.max_error.max(most as f64);
-            self.psnr = Some(10.0 * (255.0_f64.powi(2) * self.numbers as f64 / self.squares).log10());
+            self.psnr = Some(10.0 * (255.0_f64.powi(2) * self.values as f64 / self.squares).log10());
             return Ok(());
         }
         let size = spec.dtype.size();
         for (a, b) in ours.chunks_exact(size).zip(theirs.chunks_exact(size)).filter(|(a, b)| a != b) {
-            let (a, b) = (number(spec.dtype, a), number(spec.dtype, b));
+            let (a, b) = (scalar(spec.dtype, a), scalar(spec.dtype, b));
             // Formats that know single precision only round what is double; that is their nature, and told.
             let rounded = spec.dtype == DType::Float64 && f64::from(a as f32) == b;
             if !(a.is_nan() && b.is_nan()) {
@@ -483,8 +482,7 @@ impl Compared {
     }
 }
 
-#[allow(clippy::cast_precision_loss)]
-fn number(dtype: DType, bytes: &[u8]) -> f64 {
+fn scalar(dtype: DType, bytes: &[u8]) -> f64 {
     match dtype {
         DType::Bool | DType::U8 => f64::from(bytes[0]),
         DType::Int32 => f64::from(bytemuck::pod_read_unaligned::<i32>(bytes)),

@@ -4,7 +4,7 @@ use crate::sample::{rows, write};
 use std::path::PathBuf;
 use std::sync::Arc;
 use swm_core::{Batch, DType};
-use swm_data::{CacheConfig, ClipSpec, Loaded, Loader, LoaderConfig, Reader, WriteMode, open};
+use swm_data::{CacheConfig, ClipSpec, LoadedBatch, Loader, LoaderConfig, Reader, WriteMode, open};
 
 const EPISODES: usize = 9;
 
@@ -145,7 +145,7 @@ fn memory_is_reused_and_two_epochs_can_be_read_at_once() {
     let (first, second) = (read(1), read(2));
     // Batches that were dropped are filled anew, with as many rows as the next one has.
     let addresses = || -> Vec<(usize, Vec<u8>)> {
-        let look = |batch: Loaded| (batch.bytes(0).as_ptr() as usize, batch.bytes(0).to_vec());
+        let look = |batch: LoadedBatch| (batch.bytes(0).as_ptr() as usize, batch.bytes(0).to_vec());
         loader.epoch(1, 0).map(|batch| look(batch.expect("a batch"))).collect()
     };
     let (once, twice) = (addresses(), addresses());
@@ -154,10 +154,11 @@ fn memory_is_reused_and_two_epochs_can_be_read_at_once() {
     places.sort_unstable();
     places.dedup();
     assert!(places.len() <= loader.prefetch() + 3, "{} buffers for {} batches", places.len(), 2 * once.len());
-    let both: Vec<(Loaded, Loaded)> =
+    let both: Vec<(LoadedBatch, LoadedBatch)> =
         loader.epoch(1, 0).zip(loader.epoch(2, 0)).map(|(a, b)| (a.expect("a batch"), b.expect("a batch"))).collect();
-    let split =
-        |pick: fn(&(Loaded, Loaded)) -> &Loaded| both.iter().map(|pair| Batch::clone(pick(pair))).collect::<Vec<_>>();
+    let split = |pick: fn(&(LoadedBatch, LoadedBatch)) -> &LoadedBatch| {
+        both.iter().map(|pair| Batch::clone(pick(pair))).collect::<Vec<_>>()
+    };
     assert!(bytes(&split(|pair| &pair.0)) == bytes(&first) && bytes(&split(|pair| &pair.1)) == bytes(&second));
 }
 

@@ -1,15 +1,16 @@
-//! Rows in a file that is mapped into memory.
+//! A cache of decoded rows in memory-mapped files.
 //!
-//! A cache is two files in a folder that is named by the dataset's content hash: `COLUMN.rows`, where row `r` lies at `r *
-//! row_bytes` (rows that are not kept are holes and take no space), and `COLUMN.marks`, eight bytes a row: zero, or the
-//! beginning of the BLAKE3 hash of the row's bytes. A row is written first and marked afterwards, and its mark is compared
-//! when a process meets it for the first time. So a row that was half written when the power went, or that somebody
-//! changed, is decoded again instead of being believed; and as the name follows the content, a dataset that changed finds
-//! no cache at all.
+//! The cache of a column consists of two files, in a folder named after the dataset's content hash. `COLUMN.rows`
+//! stores row `r` at `r * row_bytes`; rows that are not cached are holes and take no space. `COLUMN.marks` stores eight
+//! bytes per row: zero, or the first bytes of the BLAKE3 hash of the row.
 //!
-//! Who holds the lock on the marks fills the cache; others read what they find.
+//! A row is written before its mark, and each process verifies the mark when it first reads the row. A row that was
+//! only half written at a power failure, or that was changed later, is therefore decoded again. A dataset with changed
+//! content has another folder name and starts with an empty cache.
+//!
+//! The process that holds the lock on the marks file fills the cache; other processes only read it.
 
-use super::{Budget, KeptRows};
+use super::{Budget, RowCache};
 use memmap2::Mmap;
 use std::fs::{File, OpenOptions};
 use std::os::unix::fs::FileExt as _;
@@ -18,16 +19,16 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 use swm_core::{ColumnSpec, Error, Result};
 
-/// Bytes of a mark.
+/// Size of a mark in bytes.
 const MARK: usize = 8;
 
-/// What this process knows of a row.
+/// State of a row in this process.
 const UNKNOWN: u8 = 0;
-const SOUND: u8 = 1;
+const VALID: u8 = 1;
 const ABSENT: u8 = 2;
 
-/// Rows of a column in a mapped file.
-pub struct DiskRows {
+/// Cached rows of a column in a mapped file.
+pub struct DiskRowCache {
     map: Mmap,
     file: File,
     marks: File,
@@ -38,12 +39,12 @@ pub struct DiskRows {
     budget: Arc<Budget>,
 }
 
-impl DiskRows {
-    /// Opens the cache of a column, or makes it.
+impl DiskRowCache {
+    /// Opens or creates the cache of a column.
     pub fn open(folder: &Path, identity: &str, column: &ColumnSpec, rows: usize, budget: Arc<Budget>) -> Result<Self> {
         let folder = folder.join(identity);
-        std::fs::create_dir_all(&folder).map_err(|e| Error::io(&folder, "making the cache's folder", e))?;
-        // Column names may hold what file names may not.
+        std::fs::create_dir_all(&folder).map_err(|e| Error::io(&folder, "creating the cache's folder", e))?;
+        // Column names may contain characters that are not allowed in file names.
         let name = &blake3::hash(column.name.as_bytes()).to_hex()[..16];
         let open = |suffix: &str, size: usize| {
             let path = folder.join(format!("{name}.{suffix}"));
@@ -68,15 +69,15 @@ impl DiskRows {
             fills,
             budget,
         };
-        // What is kept already counts.
-        let kept = cache.marked().map_err(|e| Error::io(&folder, "reading the cache's marks", e))?;
-        for _ in 0..kept {
+        // Rows that are already cached count towards the budget.
+        let count = cache.marked().map_err(|e| Error::io(&folder, "reading the cache's marks", e))?;
+        for _ in 0..count {
             cache.budget.take(row_bytes);
         }
         Ok(cache)
     }
 
-    /// How many rows are marked.
+    /// Number of rows with a mark.
     fn marked(&self) -> std::io::Result<usize> {
         let mut marks = vec![0; self.known.len() * MARK];
         self.marks.read_exact_at(&mut marks, 0)?;
@@ -94,14 +95,14 @@ impl DiskRows {
     }
 }
 
-impl KeptRows for DiskRows {
+impl RowCache for DiskRowCache {
     fn get(&self, row: usize, out: &mut [u8]) -> bool {
         match self.known[row].load(Ordering::Acquire) {
-            SOUND => {
+            VALID => {
                 out.copy_from_slice(self.row(row));
                 return true;
             }
-            // Who does not fill looks again: the other process may have come by.
+            // A process that does not fill the cache checks again, because the other process may have added the row.
             ABSENT if self.fills => return false,
             _ => {}
         }
@@ -110,25 +111,25 @@ impl KeptRows for DiskRows {
             return false;
         };
         out.copy_from_slice(self.row(row));
-        let sound = hash(out) == mark;
-        self.known[row].store(if sound { SOUND } else { ABSENT }, Ordering::Release);
-        sound
+        let intact = hash(out) == mark;
+        self.known[row].store(if intact { VALID } else { ABSENT }, Ordering::Release);
+        intact
     }
 
     fn put(&self, row: usize, bytes: &[u8]) {
-        if !self.fills || self.known[row].load(Ordering::Acquire) == SOUND || !self.budget.take(bytes.len()) {
+        if !self.fills || self.known[row].load(Ordering::Acquire) == VALID || !self.budget.take(bytes.len()) {
             return;
         }
-        // A full disk, say: the row is simply not kept.
+        // If writing fails, for example because the disk is full, the row is not cached.
         let written = self.file.write_all_at(bytes, (row * self.row_bytes) as u64).is_ok()
             && self.marks.write_all_at(&hash(bytes), (row * MARK) as u64).is_ok();
         if written {
-            self.known[row].store(SOUND, Ordering::Release);
+            self.known[row].store(VALID, Ordering::Release);
         }
     }
 }
 
-/// The mark of a row: never zero.
+/// The mark of a row; never zero.
 fn hash(bytes: &[u8]) -> [u8; MARK] {
     let mut mark = [0; MARK];
     mark.copy_from_slice(&blake3::hash(bytes).as_bytes()[..MARK]);
@@ -136,10 +137,10 @@ fn hash(bytes: &[u8]) -> [u8; MARK] {
     mark
 }
 
-#[allow(unsafe_code)]
+#[allow(unsafe_code, reason = "mapping a file")]
 fn map(file: &File) -> std::io::Result<Mmap> {
-    // SAFETY: the file is ours, and as long as it is mapped it is neither made shorter (it has the size that the dataset's
-    // content gives it before anybody maps it) nor changed where a row was handed out: a row is written once, before it
-    // is marked, and read only when it is marked. A row whose bytes do not fit its mark is copied, compared and not used.
+    // SAFETY: the cache owns the file. Its size follows from the dataset's content and is set before any process maps
+    // it, so the file never shrinks while it is mapped. A row is written once, before its mark, and only marked rows
+    // are read. A row that does not match its mark is copied and compared, but not used.
     unsafe { Mmap::map(file) }
 }

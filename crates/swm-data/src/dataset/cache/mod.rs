@@ -1,17 +1,16 @@
-//! Decoded rows that are kept, so that they need not be decoded again: in memory, or on disk where the system's page
-//! cache holds as much of them as memory allows.
+//! Caches of decoded rows: in memory, or on disk, where the operating system's page cache serves as memory.
 //!
-//! A cache is filled by whoever reads, first come, first kept, up to its limit in bytes; nothing is ever replaced. A
-//! loader asks for every row about once an epoch, in a new order each time: what was used least recently is then no
-//! less likely to come next than anything else. Replacing would keep no more hits, and cost a copy for every miss.
+//! A cache stores rows in the order in which they are first read, up to its limit in bytes, and never evicts any. A
+//! loader reads every row about once per epoch in random order, so the least recently used row is as likely to be read
+//! next as any other. Eviction would not add hits, but cost a copy for every miss.
 
 mod disk;
 mod memory;
 
-use crate::dataset::episodes::Rows;
+use crate::dataset::episodes::EpisodeRows;
 use crate::dataset::reader::{Constants, Episode, Irregularity, Reader, StepRange};
-use disk::DiskRows;
-use memory::MemoryRows;
+use disk::DiskRowCache;
+use memory::MemoryRowCache;
 use std::cell::RefCell;
 use std::ops::Range;
 use std::path::PathBuf;
@@ -20,135 +19,133 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Mutex, OnceLock};
 use swm_core::{Manifest, Result, Schema};
 
-/// Where decoded rows are kept.
+/// Where decoded rows are cached.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum CacheConfig {
-    /// Nowhere: every row is decoded whenever it is asked for.
+    /// No cache: every row is decoded whenever it is read.
     #[default]
     Off,
     /// In memory.
     Memory {
-        /// How much, in bytes.
+        /// Maximum size in bytes.
         bytes: usize,
     },
-    /// Pictures in files below a folder, named by the content they belong to; other columns, which are small, in
-    /// memory. Of several processes with the same files one fills them, and all read what is there.
+    /// Images in files below a folder, named after the dataset's content; other columns, which are small, in memory. If
+    /// several processes use the same files, one fills them and all read them.
     Disk {
-        /// The folder, shared by any number of datasets.
+        /// The folder; several datasets may share it.
         folder: PathBuf,
-        /// How much of this dataset, in bytes.
+        /// Maximum size for this dataset, in bytes.
         bytes: usize,
     },
 }
 
 impl CacheConfig {
-    /// A reader that keeps what it reads of these columns.
+    /// Wraps a reader with a cache for these columns.
     ///
     /// # Errors
-    /// When a column does not exist, the dataset's content cannot be hashed, or the folder cannot be written.
+    /// If a column does not exist, the dataset's content cannot be hashed, or the folder cannot be written.
     pub fn over(&self, reader: Arc<dyn Reader>, columns: &[&str]) -> Result<Arc<dyn Reader>> {
         let bytes = match *self {
             Self::Off => return Ok(reader),
             Self::Memory { bytes } | Self::Disk { bytes, .. } => bytes,
         };
         let budget = Arc::new(Budget { left: AtomicUsize::new(bytes) });
-        let mut places = Rows::default();
-        reader.episodes().iter().for_each(|episode| places.push(episode.length));
-        #[allow(clippy::cast_possible_truncation)]
-        let rows = places.total() as usize;
-        let mut kept: Vec<Kept> = reader.schema().columns().iter().map(|_| Kept::Not).collect();
+        let mut rows_of_episodes = EpisodeRows::default();
+        reader.episodes().iter().for_each(|episode| rows_of_episodes.push(episode.length));
+        let rows = rows_of_episodes.total() as usize;
+        let mut caches: Vec<ColumnCache> = reader.schema().columns().iter().map(|_| ColumnCache::Uncached).collect();
         let mut identity = None;
         for name in columns {
             let index = reader.schema().index(name)?;
             let spec = &reader.schema().columns()[index];
-            kept[index] = match self {
-                // A column of numbers is read as a whole, if it fits: row by row it would be mostly bookkeeping.
+            caches[index] = match self {
+                // Columns of values are cached as a whole if they fit, because caching their small rows one by one
+                // costs more than reading them.
                 _ if !spec.is_image() => match budget.take(rows.saturating_mul(spec.row_bytes())) {
-                    true => Kept::Whole(OnceLock::new(), Mutex::default()),
-                    false => Kept::Not,
+                    true => ColumnCache::Whole(OnceLock::new(), Mutex::default()),
+                    false => ColumnCache::Uncached,
                 },
                 Self::Disk { folder, .. } => {
                     let identity = match &identity {
                         Some(identity) => identity,
                         None => identity.insert(reader.content_hash()?),
                     };
-                    Kept::Rows(Box::new(DiskRows::open(folder, identity, spec, rows, Arc::clone(&budget))?))
+                    ColumnCache::ByRow(Box::new(DiskRowCache::open(folder, identity, spec, rows, Arc::clone(&budget))?))
                 }
-                _ => Kept::Rows(Box::new(MemoryRows::new(rows, Arc::clone(&budget)))),
+                _ => ColumnCache::ByRow(Box::new(MemoryRowCache::new(rows, Arc::clone(&budget)))),
             };
         }
-        Ok(Arc::new(CachedReader { inner: reader, places, kept }))
+        Ok(Arc::new(CachedReader { inner: reader, rows_of_episodes, columns: caches }))
     }
 }
 
-/// Bytes that may still be kept.
+/// Remaining bytes of a cache.
 pub(crate) struct Budget {
     left: AtomicUsize,
 }
 
 impl Budget {
-    /// Takes so many bytes if they are left.
+    /// Reserves `bytes` if that many are left.
     fn take(&self, bytes: usize) -> bool {
         self.left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| left.checked_sub(bytes)).is_ok()
     }
 }
 
-/// Rows of one column, kept one by one. Used by several threads at once.
-trait KeptRows: Send + Sync {
-    /// Copies a row, if it is kept.
+/// Cached rows of one column. Several threads use it at once.
+trait RowCache: Send + Sync {
+    /// Copies a row to `out` if it is cached, and returns whether it is.
     fn get(&self, row: usize, out: &mut [u8]) -> bool;
 
-    /// Keeps a row, if there is room. That it cannot be kept is no error: it will be decoded again.
+    /// Caches a row if the budget allows. Failing to cache is not an error, because the row can be decoded again.
     fn put(&self, row: usize, bytes: &[u8]);
 }
 
-/// What is kept of a column.
-enum Kept {
-    /// Nothing.
-    Not,
-    /// All of it, once it was asked for; the lock is held by who reads it.
+/// How one column is cached.
+enum ColumnCache {
+    /// Not at all.
+    Uncached,
+    /// As a whole, read at the first access; the mutex is held during that read.
     Whole(OnceLock<Vec<u8>>, Mutex<()>),
     /// Row by row.
-    Rows(Box<dyn KeptRows>),
+    ByRow(Box<dyn RowCache>),
 }
 
-/// A reader that keeps what it reads.
+/// A reader with a cache.
 struct CachedReader {
     inner: Arc<dyn Reader>,
-    /// Where every episode lies in the whole dataset.
-    places: Rows,
-    /// For every column of the schema.
-    kept: Vec<Kept>,
+    /// Rows of every episode, counted over the whole dataset.
+    rows_of_episodes: EpisodeRows,
+    /// One entry per column of the schema.
+    columns: Vec<ColumnCache>,
 }
 
 impl CachedReader {
-    /// The rows of a range in the whole dataset, if they exist.
-    #[allow(clippy::cast_possible_truncation)]
+    /// The rows of a range, counted over the whole dataset, if they exist.
     fn rows(&self, range: &StepRange) -> Option<Range<usize>> {
-        self.places.range(range).ok().map(|rows| rows.start as usize..rows.end as usize)
+        self.rows_of_episodes.range(range).ok().map(|rows| rows.start as usize..rows.end as usize)
     }
 
-    /// A column as a whole.
-    fn whole<'a>(&self, column: &str, kept: &'a OnceLock<Vec<u8>>, reading: &Mutex<()>) -> Result<&'a [u8]> {
-        if let Some(bytes) = kept.get() {
+    /// A column that is cached as a whole.
+    fn whole<'a>(&self, column: &str, cache: &'a OnceLock<Vec<u8>>, reading: &Mutex<()>) -> Result<&'a [u8]> {
+        if let Some(bytes) = cache.get() {
             return Ok(bytes);
         }
         let _reading = crate::dataset::sync::lock(reading);
-        if let Some(bytes) = kept.get() {
+        if let Some(bytes) = cache.get() {
             return Ok(bytes);
         }
         let episodes = self.inner.episodes();
         let all: Vec<StepRange> = (0..episodes.len()).map(|i| StepRange::new(i, 0, episodes[i].length)).collect();
-        #[allow(clippy::cast_possible_truncation)]
-        let rows = self.places.total() as usize;
+        let rows = self.rows_of_episodes.total() as usize;
         let mut bytes = vec![0; rows * self.schema().column(column)?.row_bytes()];
         self.inner.read_column(column, &all, &mut bytes)?;
-        Ok(kept.get_or_init(|| bytes))
+        Ok(cache.get_or_init(|| bytes))
     }
 }
 
 thread_local! {
-    /// Where a loader's thread decodes what is not kept; fresh memory for every batch would cost as much as decoding.
+    /// Buffer of a loader thread for rows that are not cached; allocating one per batch would cost as much as decoding.
     static DECODED: RefCell<Vec<u8>> = const { RefCell::new(vec![]) };
 }
 
@@ -164,51 +161,51 @@ impl Reader for CachedReader {
     fn read_column(&self, column: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let index = self.schema().index(column)?;
         let n = self.schema().columns()[index].row_bytes();
-        let wanted: usize = ranges.iter().map(|range| range.length).sum();
-        let sound = out.len() == wanted * n && ranges.iter().all(|range| self.rows(range).is_some());
+        let requested: usize = ranges.iter().map(|range| range.length).sum();
+        let valid = out.len() == requested * n && ranges.iter().all(|range| self.rows(range).is_some());
         let rows = ranges.iter().filter_map(|range| self.rows(range));
-        match &self.kept[index] {
-            // What makes no sense, the dataset itself explains best.
-            _ if !sound => self.inner.read_column(column, ranges, out),
-            Kept::Not => self.inner.read_column(column, ranges, out),
-            Kept::Whole(kept, reading) => {
-                let bytes = self.whole(column, kept, reading)?;
+        match &self.columns[index] {
+            // The inner reader reports invalid requests.
+            _ if !valid => self.inner.read_column(column, ranges, out),
+            ColumnCache::Uncached => self.inner.read_column(column, ranges, out),
+            ColumnCache::Whole(cache, reading) => {
+                let bytes = self.whole(column, cache, reading)?;
                 let mut out = out;
                 for rows in rows {
-                    let (place, rest) = out.split_at_mut(rows.len() * n);
-                    place.copy_from_slice(&bytes[rows.start * n..rows.end * n]);
+                    let (slot, rest) = out.split_at_mut(rows.len() * n);
+                    slot.copy_from_slice(&bytes[rows.start * n..rows.end * n]);
                     out = rest;
                 }
                 Ok(())
             }
-            Kept::Rows(kept) => {
-                // The places whose row is not kept, and their rows as ranges of one.
+            ColumnCache::ByRow(cache) => {
+                // `(position in the output, row, range of that row)` of all rows that are not cached.
                 let mut missing: Vec<(usize, usize, StepRange)> = vec![];
-                let mut place = 0;
+                let mut slot = 0;
                 for (range, rows) in ranges.iter().zip(rows) {
                     for (i, row) in rows.enumerate() {
-                        if !kept.get(row, &mut out[place * n..(place + 1) * n]) {
-                            missing.push((place, row, StepRange::new(range.episode, range.start + i, 1)));
+                        if !cache.get(row, &mut out[slot * n..(slot + 1) * n]) {
+                            missing.push((slot, row, StepRange::new(range.episode, range.start + i, 1)));
                         }
-                        place += 1;
+                        slot += 1;
                     }
                 }
                 if missing.is_empty() {
                     return Ok(());
                 }
                 let ranges: Vec<StepRange> = missing.iter().map(|&(_, _, range)| range).collect();
-                if missing.len() == wanted {
+                if missing.len() == requested {
                     self.inner.read_column(column, &ranges, out)?;
-                    missing.iter().zip(out.chunks_exact(n)).for_each(|((_, row, _), bytes)| kept.put(*row, bytes));
+                    missing.iter().zip(out.chunks_exact(n)).for_each(|((_, row, _), bytes)| cache.put(*row, bytes));
                     return Ok(());
                 }
-                // Taken while it is used: the reader below may be a cache as well.
+                // The buffer is taken out while it is in use, because the inner reader may be a cache, too.
                 let mut decoded = DECODED.take();
                 decoded.resize(missing.len() * n, 0);
                 let read = self.inner.read_column(column, &ranges, &mut decoded);
-                for ((place, row, _), bytes) in missing.iter().zip(decoded.chunks_exact(n)).filter(|_| read.is_ok()) {
-                    out[place * n..(place + 1) * n].copy_from_slice(bytes);
-                    kept.put(*row, bytes);
+                for ((slot, row, _), bytes) in missing.iter().zip(decoded.chunks_exact(n)).filter(|_| read.is_ok()) {
+                    out[slot * n..(slot + 1) * n].copy_from_slice(bytes);
+                    cache.put(*row, bytes);
                 }
                 DECODED.set(decoded);
                 read

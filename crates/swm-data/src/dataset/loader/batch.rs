@@ -1,22 +1,23 @@
-//! From clips to a batch: which rows of which column, in one plan for the whole batch.
+//! Assembles batches from clips and goals: selects the rows, then reads each column with one call.
 
-use crate::dataset::clips::{ACTION, ClipSpec};
+use crate::dataset::clips::ClipSpec;
 use crate::dataset::goals::{GoalSpec, Goals};
 use crate::dataset::reader::{Reader, StepRange};
+use swm_core::columns::ACTION;
 use swm_core::{Batch, ColumnSpec, DType, Key, Result, Schema};
 
-/// Clips of a batch and the rows they need, kept to be made again.
+/// Rows of a batch; the lists are reused between batches.
 #[derive(Default)]
-pub(crate) struct Anchors {
+pub(crate) struct BatchRows {
     /// All rows of every clip.
     clips: Vec<StepRange>,
-    /// The rows shown: one for every step.
+    /// One row per step of every clip.
     frames: Vec<StepRange>,
-    /// The rows that one kind of goal shows.
+    /// One row per clip: its goal.
     goals: Vec<StepRange>,
 }
 
-impl Anchors {
+impl BatchRows {
     pub fn clear(&mut self) {
         self.clips.clear();
     }
@@ -27,13 +28,13 @@ impl Anchors {
 }
 
 /// Fills batches with clips and their goals.
-pub(crate) struct Filler {
+pub(crate) struct BatchFiller {
     clip: ClipSpec,
     goals: Vec<GoalSpec>,
     schema: Schema,
 }
 
-impl Filler {
+impl BatchFiller {
     pub fn new(dataset: &Schema, clip: ClipSpec, goals: Vec<GoalSpec>) -> Result<Self> {
         let mut columns = clip.schema(dataset)?.columns().to_vec();
         for goal in &goals {
@@ -57,7 +58,7 @@ impl Filler {
         &self.schema
     }
 
-    /// The columns of the dataset that are read.
+    /// The columns of the dataset to read.
     pub fn columns(&self) -> Vec<&str> {
         let mut names: Vec<&str> = vec![];
         for name in self.clip.columns.iter().chain(self.goals.iter().flat_map(|goal| &goal.columns)) {
@@ -68,21 +69,21 @@ impl Filler {
         names
     }
 
-    /// Rows an episode must have from a clip's first on.
+    /// Rows that an episode must have, from a clip's first row.
     pub fn reach(&self) -> usize {
         self.goals.iter().map(|goal| goal.reach(&self.clip)).fold(self.clip.span(), usize::max)
     }
 
-    /// Reads the clips. The goals of the clip in place `i` are drawn from `key(i)`.
+    /// Reads a batch of clips. The goals of sample `i` are drawn with `key(i)`.
     pub fn fill(
         &self,
         reader: &dyn Reader,
-        anchors: &mut Anchors,
+        rows: &mut BatchRows,
         episodes: &Goals,
         key: impl Fn(usize) -> Key,
         out: &mut Batch,
     ) -> Result<()> {
-        let Anchors { clips, frames, goals } = anchors;
+        let BatchRows { clips, frames, goals } = rows;
         let (steps, skip) = (self.clip.num_steps, self.clip.frameskip);
         frames.clear();
         frames.extend(

@@ -1,18 +1,18 @@
-//! [`Loader`]: batches of clips, shuffled and prefetched.
+//! [`Loader`]: shuffled and prefetched batches of clips.
 //!
-//! The order of clips is a function of `(seed, epoch)` and nothing else, so any batch of any epoch can be asked
-//! for again: training resumes exactly where it stopped, with any number of threads.
+//! The order of clips depends only on `(seed, epoch)`, so any batch of any epoch can be loaded again. Training
+//! therefore resumes exactly where it stopped, with any number of threads.
 //!
-//! - `batch`: which rows a batch needs; one call of [`Reader::read_column`] plans all of a column.
-//! - `workers`: the threads that load ahead, within a budget of bytes.
-//! - [`Loaded`]: a batch whose memory goes back to the loader.
+//! - `batch`: selects the rows of a batch; one call of [`Reader::read_column`] reads all rows of a column.
+//! - `workers`: threads that prefetch batches within a budget of bytes.
+//! - [`LoadedBatch`]: a batch whose memory returns to the loader.
 
 mod batch;
 mod workers;
 
-pub(crate) use batch::{Anchors, Filler};
-pub use workers::{Epoch, Loaded};
-pub(crate) use workers::{Produce, Spare, Workers};
+pub(crate) use batch::{BatchFiller, BatchRows};
+pub(crate) use workers::{BatchPool, BatchSource, Workers};
+pub use workers::{Epoch, LoadedBatch};
 
 use crate::dataset::cache::CacheConfig;
 use crate::dataset::clips::{ClipSpec, Clips};
@@ -23,30 +23,30 @@ use rand::Rng as _;
 use std::sync::{Arc, Mutex};
 use swm_core::{Error, Key, Result, Schema};
 
-/// What to load and how.
+/// Settings of a [`Loader`].
 #[derive(Clone, Debug)]
 pub struct LoaderConfig {
-    /// What a clip holds.
+    /// Shape and columns of clips.
     pub clip: ClipSpec,
     /// Goals to draw for every clip.
     pub goals: Vec<GoalSpec>,
-    /// Clips in a batch.
+    /// Clips per batch.
     pub batch_size: usize,
     /// Whether clips come in random order (over the whole dataset) or in stored order.
     pub shuffle: bool,
-    /// Decides the random order and the goals, together with the epoch.
+    /// Seed of the random order and of the goals; combined with the epoch.
     pub seed: u64,
-    /// Threads that load ahead; 0 loads in the caller's thread. Pictures are decoded by them and rayon's pool.
+    /// Prefetching threads; 0 loads in the caller's thread. Images are decoded by these threads and rayon's pool.
     pub threads: usize,
-    /// Batches loaded ahead, at most.
+    /// Maximum number of prefetched batches.
     pub prefetch: usize,
-    /// Bytes of batches loaded ahead, at most; one batch is loaded ahead in any case.
+    /// Maximum number of bytes of prefetched batches; at least one batch is prefetched.
     pub prefetch_bytes: usize,
     /// Positions of the episodes to use; all for `None`.
     pub episodes: Option<Vec<usize>>,
-    /// Whether a last batch with fewer clips is left out.
+    /// Whether an incomplete last batch is dropped.
     pub drop_last: bool,
-    /// Where decoded rows are kept, so that later epochs need not decode them again.
+    /// Cache of decoded rows, so that later epochs need not decode them again.
     pub cache: CacheConfig,
 }
 
@@ -78,13 +78,13 @@ pub struct Loader {
 }
 
 impl Loader {
-    /// A loader. Its threads live as long as it does.
+    /// Creates a loader. Dropping it stops its threads.
     ///
     /// # Errors
-    /// When a column or an episode does not exist, no episode is long enough for a clip, a count is zero, a goal's
-    /// chances make no sense, or the cache's folder cannot be used.
+    /// If a column or an episode does not exist, no episode is long enough for a clip, a count is 0, a goal's
+    /// probabilities are invalid, or the cache's folder cannot be used.
     pub fn new(reader: Arc<dyn Reader>, config: LoaderConfig) -> Result<Self> {
-        let filler = Filler::new(reader.schema(), config.clip, config.goals)?;
+        let filler = BatchFiller::new(reader.schema(), config.clip, config.goals)?;
         if config.batch_size == 0 {
             return Err(Error::config("batch_size", "it is 0", "a batch needs at least one clip"));
         }
@@ -118,36 +118,37 @@ impl Loader {
             key: Key::new(config.seed),
             batch_size: config.batch_size,
             scratch: Mutex::default(),
-            spare: Spare::new(prefetch + 2),
+            pool: BatchPool::new(prefetch + 2),
         };
         Ok(Self { source: Arc::new(source), workers, shuffle: config.shuffle, batches, prefetch })
     }
 
-    /// The columns of a batch: `[num_steps, shape…]` a clip, actions `[num_steps, frameskip * numbers]`, goals
-    /// `[1, shape…]`.
+    /// The columns of a batch.
+    ///
+    /// # Shapes
+    /// Per clip `[num_steps, shape…]`, for actions `[num_steps, frameskip * action_dim]`, for goals `[1, shape…]`.
     pub fn schema(&self) -> &Schema {
         self.source.filler.schema()
     }
 
-    /// How many clips there are.
+    /// Number of clips.
     pub fn clips(&self) -> usize {
         self.source.clips.len()
     }
 
-    /// Batches in an epoch.
+    /// Batches per epoch.
     pub fn batches_per_epoch(&self) -> usize {
         self.batches
     }
 
-    /// Batches loaded ahead, at most.
+    /// Maximum number of prefetched batches.
     pub fn prefetch(&self) -> usize {
         self.prefetch
     }
 
-    /// The batches of an epoch, from `first_batch` on.
+    /// The batches of an epoch, starting at `first_batch`.
     pub fn epoch(&self, epoch: u64, first_batch: usize) -> Epoch {
         let order = self.shuffle.then(|| {
-            #[allow(clippy::cast_possible_truncation)] // checked in `new`
             let mut order: Vec<u32> = (0..self.source.clips.len() as u32).collect();
             shuffle(&mut order, self.source.key.with("loader").at(epoch));
             order
@@ -157,13 +158,13 @@ impl Loader {
     }
 }
 
-/// How many batches fit into the budget.
+/// How many batches fit into `bytes`; at least 1, at most `batches`.
 pub(crate) fn window(schema: &Schema, batch_size: usize, batches: usize, bytes: usize) -> usize {
     let batch: usize = schema.columns().iter().map(|column| column.row_bytes() * batch_size).sum();
     batches.min(bytes / batch.max(1)).max(1)
 }
 
-/// Puts items in an order that the key decides (Fisher–Yates).
+/// Shuffles items with a keyed generator (Fisher–Yates).
 pub(crate) fn shuffle<T>(items: &mut [T], key: Key) {
     let mut rng = key.rng();
     for i in (1..items.len()).rev() {
@@ -171,17 +172,17 @@ pub(crate) fn shuffle<T>(items: &mut [T], key: Key) {
     }
 }
 
-/// What all epochs share.
+/// State shared by all epochs.
 struct Source {
     reader: Arc<dyn Reader>,
     clips: Clips,
     goals: Goals,
-    filler: Filler,
+    filler: BatchFiller,
     key: Key,
     batch_size: usize,
-    /// Lists of rows to be made again.
-    scratch: Mutex<Vec<Anchors>>,
-    spare: Arc<Spare>,
+    /// Reusable lists of rows.
+    scratch: Mutex<Vec<BatchRows>>,
+    pool: Arc<BatchPool>,
 }
 
 /// The batches of one epoch.
@@ -191,21 +192,21 @@ struct EpochSource {
     epoch: u64,
 }
 
-impl Produce for EpochSource {
-    fn produce(&self, batch: usize) -> Result<Loaded> {
+impl BatchSource for EpochSource {
+    fn produce(&self, batch: usize) -> Result<LoadedBatch> {
         let source = &*self.source;
         let first = batch * source.batch_size;
         let samples = first..(first + source.batch_size).min(source.clips.len());
-        let mut anchors = lock(&source.scratch).pop().unwrap_or_default();
-        anchors.clear();
-        anchors.extend(
+        let mut rows = lock(&source.scratch).pop().unwrap_or_default();
+        rows.clear();
+        rows.extend(
             samples.clone().map(|i| source.clips.get(self.order.as_ref().map_or(i, |order| order[i] as usize))),
         );
-        let mut out = source.spare.take(source.filler.schema());
-        // The goal of a sample depends on its place in the epoch, whatever the batch size.
+        let mut out = source.pool.take(source.filler.schema());
+        // The goal of a sample depends on its position in the epoch, not on the batch size.
         let key = source.key.with("goals").at(self.epoch);
-        source.filler.fill(&*source.reader, &mut anchors, &source.goals, |i| key.at((first + i) as u64), &mut out)?;
-        lock(&source.scratch).push(anchors);
+        source.filler.fill(&*source.reader, &mut rows, &source.goals, |i| key.at((first + i) as u64), &mut out)?;
+        lock(&source.scratch).push(rows);
         Ok(out)
     }
 }

@@ -1,4 +1,4 @@
-//! Threads that make numbered batches ahead of whoever consumes them, in order, and never more than fit.
+//! Worker threads that load numbered batches ahead of their consumer, in order, within a bounded window.
 
 use crate::dataset::sync::lock;
 use std::collections::VecDeque;
@@ -9,67 +9,67 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 use swm_core::{Batch, Error, Result, Schema};
 
-/// Makes numbered batches. Called by several threads at once.
-pub(crate) trait Produce: Send + Sync {
-    /// The batch of that number; the same whenever it is asked for.
-    fn produce(&self, batch: usize) -> Result<Loaded>;
+/// Produces numbered batches. Several threads call it at once.
+pub(crate) trait BatchSource: Send + Sync {
+    /// Produces a batch. The same number always gives the same batch.
+    fn produce(&self, batch: usize) -> Result<LoadedBatch>;
 }
 
-/// A batch that a loader made. Dropped, its memory is filled again: fresh memory for large pictures costs as much as
-/// a fast decoder takes.
-pub struct Loaded {
-    /// Taken only when it leaves.
+/// A batch from a loader. When it is dropped, the loader reuses its memory, because allocating memory for large images
+/// costs as much as decoding them.
+pub struct LoadedBatch {
+    /// `None` only after [`LoadedBatch::into_batch`].
     batch: Option<Batch>,
-    spare: Arc<Spare>,
+    pool: Arc<BatchPool>,
 }
 
-impl Loaded {
-    /// The batch for good; the loader will ask for other memory.
+impl LoadedBatch {
+    /// Takes the batch out; the loader allocates new memory instead.
     pub fn into_batch(mut self) -> Batch {
-        self.batch.take().expect("a batch leaves once")
+        self.batch.take().expect("into_batch consumes self")
     }
 }
 
-impl Deref for Loaded {
+impl Deref for LoadedBatch {
     type Target = Batch;
 
     fn deref(&self) -> &Batch {
-        self.batch.as_ref().expect("a batch leaves with its owner")
+        self.batch.as_ref().expect("only into_batch takes the batch")
     }
 }
 
-impl DerefMut for Loaded {
+impl DerefMut for LoadedBatch {
     fn deref_mut(&mut self) -> &mut Batch {
-        self.batch.as_mut().expect("a batch leaves with its owner")
+        self.batch.as_mut().expect("only into_batch takes the batch")
     }
 }
 
-impl Drop for Loaded {
+impl Drop for LoadedBatch {
     fn drop(&mut self) {
         if let Some(batch) = self.batch.take() {
-            let mut kept = lock(&self.spare.batches);
-            if kept.len() < self.spare.limit {
+            let mut kept = lock(&self.pool.batches);
+            if kept.len() < self.pool.limit {
                 kept.push(batch);
             }
         }
     }
 }
 
-/// Batches that came back.
-pub(crate) struct Spare {
+/// Batches to reuse.
+pub(crate) struct BatchPool {
     batches: Mutex<Vec<Batch>>,
     limit: usize,
 }
 
-impl Spare {
+impl BatchPool {
     pub fn new(limit: usize) -> Arc<Self> {
         Arc::new(Self { batches: Mutex::default(), limit })
     }
 
-    /// A batch to fill, of any number of rows and any content.
-    pub fn take(self: &Arc<Self>, schema: &Schema) -> Loaded {
+    /// A batch to fill, with any number of rows and any content.
+    pub fn take(self: &Arc<Self>, schema: &Schema) -> LoadedBatch {
         let batch = lock(&self.batches).pop().unwrap_or_else(|| Batch::zeros(schema, 0));
-        Loaded { batch: Some(batch), spare: Arc::clone(self) }
+        LoadedBatch { batch: Some(batch), pool: Arc::clone(self) }
     }
 }
 
@@ -87,25 +87,25 @@ struct Shared {
 
 #[derive(Default)]
 struct State {
-    /// Epochs that are being consumed, oldest first; commonly one.
+    /// Epochs in use, oldest first; usually one.
     jobs: Vec<Job>,
-    /// What the next job is called.
-    name: u64,
+    /// Id of the next job.
+    next_id: u64,
     stop: bool,
 }
 
 struct Job {
-    name: u64,
-    producer: Arc<dyn Produce>,
-    /// The batch the consumer gets next.
-    wanted: usize,
-    /// The first batch nobody has begun.
+    id: u64,
+    producer: Arc<dyn BatchSource>,
+    /// The batch that the consumer gets next.
+    next_out: usize,
+    /// The first batch that no thread has started.
     next: usize,
     end: usize,
-    /// Batches begun and not consumed, at most.
+    /// Maximum number of batches that are started and not consumed.
     window: usize,
-    /// Batches `wanted ..`, those that are made.
-    made: VecDeque<Option<Result<Loaded>>>,
+    /// Batches from `next_out` on, if finished.
+    made: VecDeque<Option<Result<LoadedBatch>>>,
 }
 
 impl Shared {
@@ -120,26 +120,26 @@ impl Shared {
     fn work(&self) {
         let mut state = self.lock();
         while !state.stop {
-            let due = |job: &&mut Job| job.next < job.end && job.next < job.wanted + job.window;
+            let due = |job: &&mut Job| job.next < job.end && job.next < job.next_out + job.window;
             let Some(job) = state.jobs.iter_mut().find(due) else {
                 state = self.wait(state);
                 continue;
             };
-            let (name, batch, producer) = (job.name, job.next, Arc::clone(&job.producer));
+            let (id, batch, producer) = (job.id, job.next, Arc::clone(&job.producer));
             job.next += 1;
             drop(state);
-            // A panic is the consumer's to hear of; it must not wait for a thread that is gone.
+            // A panic becomes an error for the consumer, which would otherwise wait forever.
             let made = catch_unwind(AssertUnwindSafe(|| producer.produce(batch)))
                 .unwrap_or_else(|_| Err(Error::external("loading a batch", "a loader thread panicked; this is a bug")));
             drop(producer);
             state = self.lock();
-            // The consumer may have gone; nobody wants the batch then.
-            if let Some(job) = state.jobs.iter_mut().find(|job| job.name == name) {
-                let place = batch - job.wanted;
-                if job.made.len() <= place {
-                    job.made.resize_with(place + 1, || None);
+            // If the consumer dropped the epoch, its job is gone and the batch is dropped.
+            if let Some(job) = state.jobs.iter_mut().find(|job| job.id == id) {
+                let slot = batch - job.next_out;
+                if job.made.len() <= slot {
+                    job.made.resize_with(slot + 1, || None);
                 }
-                job.made[place] = Some(made);
+                job.made[slot] = Some(made);
                 self.changed.notify_all();
             }
         }
@@ -159,21 +159,21 @@ impl Workers {
         Ok(Arc::new(Self { shared, threads }))
     }
 
-    /// Begins to make batches, at most `window` ahead.
-    pub fn start(workers: &Arc<Self>, producer: Arc<dyn Produce>, batches: Range<usize>, window: usize) -> Epoch {
-        let mut name = 0;
+    /// Starts loading batches, at most `window` ahead.
+    pub fn start(workers: &Arc<Self>, producer: Arc<dyn BatchSource>, batches: Range<usize>, window: usize) -> Epoch {
+        let mut id = 0;
         if !workers.threads.is_empty() {
             let mut state = workers.shared.lock();
-            name = state.name;
-            state.name += 1;
+            id = state.next_id;
+            state.next_id += 1;
             let (first, end) = (batches.start, batches.end);
             let made = VecDeque::with_capacity(window);
             let producer = Arc::clone(&producer);
-            state.jobs.push(Job { name, producer, wanted: first, next: first, end, window, made });
+            state.jobs.push(Job { id, producer, next_out: first, next: first, end, window, made });
             drop(state);
             workers.shared.changed.notify_all();
         }
-        Epoch { workers: Arc::clone(workers), producer, name, left: batches }
+        Epoch { workers: Arc::clone(workers), producer, id, left: batches }
     }
 }
 
@@ -182,22 +182,22 @@ impl Drop for Workers {
         self.shared.lock().stop = true;
         self.shared.changed.notify_all();
         for thread in self.threads.drain(..) {
-            // They catch what panics.
+            // Workers catch panics, so joining cannot fail.
             let _ = thread.join();
         }
     }
 }
 
-/// The batches of one epoch, in order. Dropping it ends the loading ahead.
+/// The batches of one epoch, in order. Dropping it stops prefetching.
 pub struct Epoch {
     workers: Arc<Workers>,
-    producer: Arc<dyn Produce>,
-    name: u64,
+    producer: Arc<dyn BatchSource>,
+    id: u64,
     left: Range<usize>,
 }
 
 impl Iterator for Epoch {
-    type Item = Result<Loaded>;
+    type Item = Result<LoadedBatch>;
 
     fn next(&mut self) -> Option<Self::Item> {
         let batch = self.left.next()?;
@@ -214,31 +214,31 @@ impl Iterator for Epoch {
 }
 
 impl Epoch {
-    /// Waits until [`Iterator::next`] has an answer, at most for so long, and says whether it has. Who must look after
-    /// something else meanwhile, such as signals, asks again and again.
+    /// Waits until [`Iterator::next`] can return without blocking, at most for `at_most`. Returns whether it can.
+    /// Callers that must also check for signals call it repeatedly.
     pub fn wait(&self, at_most: Duration) -> bool {
         if self.left.is_empty() || self.workers.threads.is_empty() {
             return true;
         }
         let shared = &self.workers.shared;
         let waiting = |state: &mut State| {
-            let job = state.jobs.iter().find(|job| job.name == self.name);
+            let job = state.jobs.iter().find(|job| job.id == self.id);
             job.is_some_and(|job| !matches!(job.made.front(), Some(Some(_))))
         };
         let waited = shared.changed.wait_timeout_while(shared.lock(), at_most, waiting);
         !waited.unwrap_or_else(PoisonError::into_inner).1.timed_out()
     }
 
-    fn wait_for(&self, batch: usize) -> Result<Loaded> {
+    fn wait_for(&self, batch: usize) -> Result<LoadedBatch> {
         let shared = &self.workers.shared;
         let mut state = shared.lock();
         loop {
-            let Some(job) = state.jobs.iter_mut().find(|job| job.name == self.name) else {
+            let Some(job) = state.jobs.iter_mut().find(|job| job.id == self.id) else {
                 return Err(Error::external("loading a batch", "its epoch has ended; this is a bug"));
             };
             if let Some(made) = job.made.front_mut().and_then(Option::take) {
                 job.made.pop_front();
-                job.wanted = batch + 1;
+                job.next_out = batch + 1;
                 drop(state);
                 shared.changed.notify_all();
                 return made;
@@ -251,9 +251,9 @@ impl Epoch {
 impl Drop for Epoch {
     fn drop(&mut self) {
         let mut state = self.workers.shared.lock();
-        let ended = state.jobs.iter().position(|job| job.name == self.name).map(|place| state.jobs.remove(place));
+        let ended = state.jobs.iter().position(|job| job.id == self.id).map(|slot| state.jobs.remove(slot));
         drop(state);
-        // Batches are freed without the lock.
+        // Frees the batches after the lock is released.
         drop(ended);
     }
 }

@@ -1,5 +1,5 @@
-//! [`Blocks`]: parts of objects kept in memory. A request costs as much as a megabyte, so small pieces in random order,
-//! as training reads them, are not fetched one by one.
+//! [`BlockCache`]: an in-memory cache of blocks of objects. A request costs as much as transferring a megabyte, so
+//! small ranges in random order, as training reads them, are not fetched one by one.
 
 use bytes::{Bytes, BytesMut};
 use futures::{StreamExt as _, TryStreamExt as _};
@@ -9,90 +9,91 @@ use std::collections::{HashMap, VecDeque};
 use std::ops::Range;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-/// Bytes that are kept.
-const ROOM: u64 = 1 << 30;
+/// Capacity of the cache in bytes.
+const CAPACITY: u64 = 1 << 30;
 
-/// A block where all blocks fit: each is wanted sooner or later.
+/// Block size in bytes if all blocks fit into the cache, because each is read sooner or later.
 const LARGE: u64 = 1 << 20;
 
-/// A block where most are gone before they are wanted again.
+/// Block size in bytes if most blocks are evicted before they are read again.
 const SMALL: u64 = 64 << 10;
 
-/// Neighbouring blocks that are fetched at once.
-const JOINED: u64 = 8;
+/// Maximum number of neighbouring blocks per request.
+const MAX_BLOCKS_PER_REQUEST: u64 = 8;
 
-/// Pieces of one object that are wanted.
-pub(crate) struct Pieces {
-    /// The object.
+/// Ranges of one object to read.
+pub(crate) struct ObjectRanges {
+    /// Path of the object.
     pub path: StorePath,
-    /// Its bytes.
+    /// Size of the object in bytes.
     pub size: u64,
-    /// The pieces.
+    /// Byte ranges.
     pub ranges: Vec<Range<u64>>,
 }
 
-/// Parts of some objects, the first that were fetched leaving first.
-pub(crate) struct Blocks {
+/// Cached blocks of some objects; the oldest blocks are evicted first.
+pub(crate) struct BlockCache {
     block: u64,
-    room: u64,
-    kept: Mutex<Kept>,
-    /// One reader fetches at a time: what the next one wants has often come by then.
+    capacity: u64,
+    cached: Mutex<Cached>,
+    /// Serialises fetches: after waiting, a reader often finds its blocks in the cache.
     fetching: tokio::sync::Mutex<()>,
 }
 
 #[derive(Default)]
-struct Kept {
+struct Cached {
     blocks: HashMap<(StorePath, u64), Bytes>,
     order: VecDeque<(StorePath, u64)>,
     bytes: u64,
 }
 
-impl Blocks {
-    /// For objects of so many bytes together.
+impl BlockCache {
+    /// A cache for objects with `total` bytes in all.
     pub(crate) fn new(total: u64) -> Self {
-        Self::with(if total <= ROOM { LARGE } else { SMALL }, ROOM)
+        Self::with(if total <= CAPACITY { LARGE } else { SMALL }, CAPACITY)
     }
 
-    fn with(block: u64, room: u64) -> Self {
-        Self { block, room, kept: Mutex::default(), fetching: tokio::sync::Mutex::default() }
+    fn with(block: u64, capacity: u64) -> Self {
+        Self { block, capacity, cached: Mutex::default(), fetching: tokio::sync::Mutex::default() }
     }
 
-    fn kept(&self) -> MutexGuard<'_, Kept> {
-        self.kept.lock().unwrap_or_else(PoisonError::into_inner)
+    fn cached(&self) -> MutexGuard<'_, Cached> {
+        self.cached.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// The bytes of all pieces, in the given order.
+    /// Reads all ranges, returned in the given order.
     pub(crate) async fn read(
         &self,
         store: &dyn ObjectStore,
-        wanted: &[Pieces],
+        objects: &[ObjectRanges],
     ) -> object_store::Result<Vec<Vec<Bytes>>> {
         let mut held = HashMap::new();
-        if !self.hold(wanted, &mut held) {
+        if !self.hold(objects, &mut held) {
             let _one = self.fetching.lock().await;
-            // What another reader fetched meanwhile need not be fetched again.
-            self.hold(wanted, &mut held);
-            self.fetch(store, wanted, &mut held).await?;
+            // Another reader may have fetched these blocks in the meantime.
+            self.hold(objects, &mut held);
+            self.fetch(store, objects, &mut held).await?;
         }
-        wanted
+        objects
             .iter()
-            .map(|pieces| pieces.ranges.iter().map(|range| self.piece(pieces, range, &held)).collect())
+            .map(|object| object.ranges.iter().map(|range| self.read_range(object, range, &held)).collect())
             .collect()
     }
 
-    /// The blocks that a range touches.
+    /// The indices of the blocks that overlap a range.
     fn touched(&self, range: &Range<u64>) -> Range<u64> {
         if range.is_empty() { 0..0 } else { range.start / self.block..range.end.div_ceil(self.block) }
     }
 
-    /// Takes hold of the kept blocks that are wanted, so that they stay while they are used; whether these were all.
-    fn hold(&self, wanted: &[Pieces], held: &mut HashMap<(StorePath, u64), Bytes>) -> bool {
-        let kept = self.kept();
+    /// Copies references to the requested cached blocks into `held`, so that they outlive eviction. Returns whether all
+    /// requested blocks are cached.
+    fn hold(&self, objects: &[ObjectRanges], held: &mut HashMap<(StorePath, u64), Bytes>) -> bool {
+        let cached = self.cached();
         let mut complete = true;
-        for pieces in wanted {
-            for block in pieces.ranges.iter().flat_map(|range| self.touched(range)) {
-                let key = (pieces.path.clone(), block);
-                match kept.blocks.get(&key) {
+        for object in objects {
+            for block in object.ranges.iter().flat_map(|range| self.touched(range)) {
+                let key = (object.path.clone(), block);
+                match cached.blocks.get(&key) {
                     Some(bytes) => drop(held.insert(key, bytes.clone())),
                     None => complete = false,
                 }
@@ -101,53 +102,57 @@ impl Blocks {
         complete
     }
 
-    /// Fetches the wanted blocks that are not held, neighbours together.
+    /// Fetches the requested blocks that are not in `held`, several neighbours per request.
     async fn fetch(
         &self,
         store: &dyn ObjectStore,
-        wanted: &[Pieces],
+        objects: &[ObjectRanges],
         held: &mut HashMap<(StorePath, u64), Bytes>,
     ) -> object_store::Result<()> {
-        let mut requests: Vec<(&Pieces, Range<u64>)> = vec![];
-        for pieces in wanted {
-            let mut missing: Vec<u64> = pieces.ranges.iter().flat_map(|range| self.touched(range)).collect();
+        let mut requests: Vec<(&ObjectRanges, Range<u64>)> = vec![];
+        for object in objects {
+            let mut missing: Vec<u64> = object.ranges.iter().flat_map(|range| self.touched(range)).collect();
             missing.sort_unstable();
             missing.dedup();
-            missing.retain(|&block| !held.contains_key(&(pieces.path.clone(), block)));
+            missing.retain(|&block| !held.contains_key(&(object.path.clone(), block)));
             for block in missing {
                 match requests.last_mut() {
-                    Some((of, run)) if of.path == pieces.path && run.end == block && run.end - run.start < JOINED => {
+                    Some((of, run))
+                        if of.path == object.path
+                            && run.end == block
+                            && run.end - run.start < MAX_BLOCKS_PER_REQUEST =>
+                    {
                         run.end += 1;
                     }
-                    _ => requests.push((pieces, block..block + 1)),
+                    _ => requests.push((object, block..block + 1)),
                 }
             }
         }
-        let places: Vec<(StorePath, Range<u64>)> = requests
+        let ranges: Vec<(StorePath, Range<u64>)> = requests
             .iter()
             .map(|(of, run)| (of.path.clone(), run.start * self.block..(run.end * self.block).min(of.size)))
             .collect();
-        let fetched: Vec<Bytes> = futures::stream::iter(places)
+        let fetched: Vec<Bytes> = futures::stream::iter(ranges)
             .map(|(path, range)| async move { store.get_range(&path, range).await })
             .buffered(super::REQUESTS)
             .try_collect()
             .await?;
-        let mut kept = self.kept();
-        for ((pieces, run), bytes) in requests.into_iter().zip(fetched) {
+        let mut cached = self.cached();
+        for ((object, run), bytes) in requests.into_iter().zip(fetched) {
             for (at, block) in run.enumerate() {
                 let start = (at as u64 * self.block) as usize;
-                // A copy of its own: a part of the run would keep all of it.
+                // Copied, because a slice would keep the whole response in memory.
                 let part = Bytes::copy_from_slice(&bytes[start..bytes.len().min(start + self.block as usize)]);
-                held.insert((pieces.path.clone(), block), part.clone());
-                kept.keep((pieces.path.clone(), block), part, self.room);
+                held.insert((object.path.clone(), block), part.clone());
+                cached.insert((object.path.clone(), block), part, self.capacity);
             }
         }
         Ok(())
     }
 
-    fn piece(
+    fn read_range(
         &self,
-        pieces: &Pieces,
+        object: &ObjectRanges,
         range: &Range<u64>,
         held: &HashMap<(StorePath, u64), Bytes>,
     ) -> object_store::Result<Bytes> {
@@ -155,9 +160,12 @@ impl Blocks {
         for block in self.touched(range) {
             let start = block * self.block;
             let (from, to) = (range.start.max(start) - start, range.end.min(start + self.block) - start);
-            let bytes = held.get(&(pieces.path.clone(), block)).filter(|bytes| to <= bytes.len() as u64);
+            let bytes = held.get(&(object.path.clone(), block)).filter(|bytes| to <= bytes.len() as u64);
             let Some(bytes) = bytes else {
-                return Err(object_store::Error::Generic { store: "object", source: "it ends too early".into() });
+                return Err(object_store::Error::Generic {
+                    store: "object",
+                    source: "the object is shorter than expected".into(),
+                });
             };
             parts.push(bytes.slice(from as usize..to as usize));
         }
@@ -172,15 +180,15 @@ impl Blocks {
     }
 }
 
-impl Kept {
-    fn keep(&mut self, key: (StorePath, u64), bytes: Bytes, room: u64) {
+impl Cached {
+    fn insert(&mut self, key: (StorePath, u64), bytes: Bytes, capacity: u64) {
         self.bytes += bytes.len() as u64;
-        if let Some(twice) = self.blocks.insert(key.clone(), bytes) {
-            self.bytes -= twice.len() as u64;
+        if let Some(duplicate) = self.blocks.insert(key.clone(), bytes) {
+            self.bytes -= duplicate.len() as u64;
         } else {
             self.order.push_back(key);
         }
-        while self.bytes > room
+        while self.bytes > capacity
             && let Some(oldest) = self.order.pop_front()
             && let Some(bytes) = self.blocks.remove(&oldest)
         {
@@ -197,7 +205,7 @@ mod tests {
     use swm_core::Key;
 
     #[test]
-    fn pieces_come_back_and_the_room_is_kept() {
+    fn reads_ranges_within_the_capacity() {
         let runtime = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
         runtime.block_on(async {
             let store = InMemory::new();
@@ -206,29 +214,29 @@ mod tests {
             for (path, content) in paths.iter().zip(&contents) {
                 store.put(path, content.clone().into()).await.expect("puts");
             }
-            let blocks = Blocks::with(16, 200);
+            let blocks = BlockCache::with(16, 200);
             let mut rng = Key::new(3).rng();
             for _ in 0..50 {
-                let wanted: Vec<Pieces> = (0..3)
+                let objects: Vec<ObjectRanges> = (0..3)
                     .map(|of| {
                         let size = contents[of].len() as u64;
                         let ranges = (0..5).map(|_| {
                             let start = rng.random_range(0..=size);
                             start..rng.random_range(start..=size.min(start + 70))
                         });
-                        Pieces { path: paths[of].clone(), size, ranges: ranges.collect() }
+                        ObjectRanges { path: paths[of].clone(), size, ranges: ranges.collect() }
                     })
                     .collect();
-                let read = blocks.read(&store, &wanted).await.expect("reads");
-                for ((pieces, read), content) in wanted.iter().zip(&read).zip(&contents) {
-                    for (range, bytes) in pieces.ranges.iter().zip(read) {
+                let read = blocks.read(&store, &objects).await.expect("reads");
+                for ((object, read), content) in objects.iter().zip(&read).zip(&contents) {
+                    for (range, bytes) in object.ranges.iter().zip(read) {
                         assert_eq!(bytes, &content[range.start as usize..range.end as usize]);
                     }
                 }
-                let kept = blocks.kept();
-                assert!(kept.bytes <= 200 && kept.order.len() == kept.blocks.len());
+                let cached = blocks.cached();
+                assert!(cached.bytes <= 200 && cached.order.len() == cached.blocks.len());
             }
-            let gone = Pieces { path: "none".into(), size: 10, ranges: vec![0..4, 5..6] };
+            let gone = ObjectRanges { path: "none".into(), size: 10, ranges: vec![0..4, 5..6] };
             assert!(blocks.read(&store, &[gone]).await.is_err());
         });
     }

@@ -1,63 +1,67 @@
 //! [`concat`]: the episodes of several datasets, one after another.
 
 use super::view_hash;
-use crate::dataset::episodes::{EPISODE, Rows, STEP, numbering, words};
+use crate::dataset::episodes::{EpisodeRows, describe_columns, index_columns};
 use crate::dataset::reader::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::dataset::sync::lock;
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
+use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
 
-/// The episodes of several datasets, one after another, numbered from 0 on. All have the same columns, in any order.
+/// Concatenates datasets with the same columns (in any order). Episodes are numbered from 0.
 ///
 /// # Errors
-/// When there is no dataset, or the columns of one differ from those of the first; says which.
+/// If there is no dataset, or a dataset has other columns than the first; the error lists them.
 pub fn concat(parts: Vec<Arc<dyn Reader>>) -> Result<Arc<dyn Reader>> {
     let Some(first) = parts.first() else {
         return Err(Error::config("concatenation", "there is no dataset", "name at least one"));
     };
     let data = |reader: &Arc<dyn Reader>| -> Vec<ColumnSpec> {
-        reader.schema().columns().iter().filter(|c| c.name != EPISODE && c.name != STEP).cloned().collect()
+        reader.schema().columns().iter().filter(|c| c.name != EPISODE_IDX && c.name != STEP_IDX).cloned().collect()
     };
     let columns = data(first);
     for (i, part) in parts.iter().enumerate() {
         let theirs = data(part);
         let without = |a: &[ColumnSpec], b: &[ColumnSpec]| {
             let missing: Vec<ColumnSpec> = a.iter().filter(|&column| !b.contains(column)).cloned().collect();
-            (!missing.is_empty()).then(|| words(&missing))
+            (!missing.is_empty()).then(|| describe_columns(&missing))
         };
         let (missing, extra) = (without(&columns, &theirs), without(&theirs, &columns));
         if missing.is_some() || extra.is_some() {
             return Err(Error::mismatch(
                 format!("concatenating dataset {} to the first", i + 1),
-                format!("besides the columns of both: {}", extra.as_deref().unwrap_or("nothing")),
-                format!("{}; select the columns that both have", missing.as_deref().unwrap_or("nothing")),
+                format!("columns that the first lacks: {}", extra.as_deref().unwrap_or("nothing")),
+                format!(
+                    "columns that only the first has: {}; select the common columns",
+                    missing.as_deref().unwrap_or("nothing")
+                ),
             ));
         }
     }
-    let mut rows = Rows::default();
+    let mut rows = EpisodeRows::default();
     parts.iter().flat_map(|part| part.episodes()).for_each(|episode| rows.push(episode.length));
     let mut first_episodes = vec![0];
     for part in &parts {
         first_episodes.push(first_episodes[first_episodes.len() - 1] + part.episodes().len());
     }
-    let numbers = numbering(first.schema().columns());
-    let schema = Schema::new([&numbers[..], &columns].concat())?;
+    let indices = index_columns(first.schema().columns());
+    let schema = Schema::new([&indices[..], &columns].concat())?;
     Ok(Arc::new(Concat { parts, first_episodes, rows, schema, scratch: Mutex::default() }))
 }
 
 struct Concat {
     parts: Vec<Arc<dyn Reader>>,
-    /// The position of the first episode of every part, and the end.
+    /// Position of the first episode of every part, followed by the number of episodes.
     first_episodes: Vec<usize>,
-    rows: Rows,
+    rows: EpisodeRows,
     schema: Schema,
-    /// Room for what a part reads, kept.
+    /// Reusable buffers for reading from the parts.
     scratch: Mutex<Vec<Vec<u8>>>,
 }
 
 impl Concat {
-    /// The part an episode is of, and its position there.
+    /// The part that contains an episode, and the episode's position in it.
     fn locate(&self, episode: usize) -> (usize, usize) {
         let part = self.first_episodes.partition_point(|&first| first <= episode) - 1;
         (part, episode - self.first_episodes[part])
@@ -75,23 +79,23 @@ impl Reader for Concat {
 
     fn read_column(&self, column: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let spec = self.schema.column(column)?;
-        if column == EPISODE || column == STEP {
-            return self.rows.number(spec, ranges, out);
+        if column == EPISODE_IDX || column == STEP_IDX {
+            return self.rows.fill_index_column(spec, ranges, out);
         }
-        Rows::check_room(spec, ranges, out)?;
-        // The part of every range, where its rows go, and the range as the part knows it.
+        EpisodeRows::check_output(spec, ranges, out)?;
+        // `(part, byte offset in the output, range within the part)` for every range.
         let n = spec.row_bytes();
         let mut jobs = Vec::with_capacity(ranges.len());
-        let mut place = 0;
+        let mut offset = 0;
         for range in ranges {
             self.rows.range(range)?;
             let (part, episode) = self.locate(range.episode);
-            jobs.push((part, place, StepRange { episode, ..*range }));
-            place += range.length * n;
+            jobs.push((part, offset, StepRange { episode, ..*range }));
+            offset += range.length * n;
         }
-        // Ranges of one part that follow each other are read together, straight to their places.
-        let alone = jobs.iter().all(|job| job.0 == jobs[0].0);
-        if let (true, Some(&(part, ..))) = (alone, jobs.first()) {
+        // If all ranges belong to one part, it reads directly into the output.
+        let single_part = jobs.iter().all(|job| job.0 == jobs[0].0);
+        if let (true, Some(&(part, ..))) = (single_part, jobs.first()) {
             let ranges: Vec<StepRange> = jobs.iter().map(|job| job.2).collect();
             return self.parts[part].read_column(column, &ranges, out);
         }
@@ -105,9 +109,9 @@ impl Reader for Concat {
             read.resize(ranges.iter().map(|range| range.length * n).sum(), 0);
             part.read_column(column, &ranges, &mut read)?;
             let mut rest = &read[..];
-            for (_, place, range) in of_part {
+            for (_, offset, range) in of_part {
                 let (bytes, others) = rest.split_at(range.length * n);
-                out[*place..*place + bytes.len()].copy_from_slice(bytes);
+                out[*offset..*offset + bytes.len()].copy_from_slice(bytes);
                 rest = others;
             }
         }
@@ -132,7 +136,8 @@ impl Reader for Concat {
         Ok(found)
     }
 
-    /// That of the parts, if they agree; or one that holds theirs, and what they agree in of their configurations.
+    /// The manifest of the parts if they all have the same. Otherwise a manifest with those of the parts and the config
+    /// entries that all of them share.
     fn manifest(&self) -> Option<Manifest> {
         let manifests: Vec<Manifest> = self.parts.iter().filter_map(|part| part.manifest()).collect();
         let first = manifests.first()?;

@@ -1,16 +1,16 @@
-//! [`merge`]: columns of another dataset beside those of one with the same episodes.
+//! [`merge`]: a dataset with additional columns from another dataset of the same episodes.
 
 use super::view_hash;
 use crate::dataset::reader::{Constants, Episode, Irregularity, Reader, StepRange};
 use std::sync::Arc;
 use swm_core::{Error, Manifest, Result, Schema};
 
-/// A dataset with these columns of another one, such as embeddings that were computed from its pictures. Both have
-/// episodes of the same lengths in the same order; numbers, provenance and constants are the base's (constants of the
-/// other are added where the base has none of the name).
+/// Adds columns of `other` to `base`, such as embeddings computed from its images. Both must have episodes of the same
+/// lengths in the same order. Episode indices, manifest and constants come from `base`; constants of `other` are added
+/// if `base` has none of that name.
 ///
 /// # Errors
-/// When their episodes differ, a column does not exist, or the base has a column of its name.
+/// If the episodes differ, a column does not exist, or `base` already has a column of that name.
 pub fn merge(base: Arc<dyn Reader>, other: Arc<dyn Reader>, columns: &[&str]) -> Result<Arc<dyn Reader>> {
     let lengths = |reader: &Arc<dyn Reader>| reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>();
     let (ours, theirs) = (lengths(&base), lengths(&other));
@@ -28,7 +28,7 @@ pub fn merge(base: Arc<dyn Reader>, other: Arc<dyn Reader>, columns: &[&str]) ->
         if base.schema().find(name).is_some() {
             return Err(Error::config(
                 format!("merging column '{name}'"),
-                "the dataset has a column of that name",
+                "the dataset already has a column of that name",
                 "leave one of the two out (select the columns to keep)",
             ));
         }
@@ -44,7 +44,7 @@ struct Merge {
 }
 
 impl Merge {
-    /// The columns that are the other's.
+    /// Names of the columns that come from `other`.
     fn added(&self) -> impl Iterator<Item = &str> {
         self.schema.columns().iter().skip(self.base.schema().columns().len()).map(|column| column.name.as_str())
     }
@@ -86,7 +86,7 @@ impl Reader for Merge {
         Ok(sizes)
     }
 
-    /// A hash of both hashes and the names of the columns that are added.
+    /// A hash of both content hashes and the names of the added columns.
     fn content_hash(&self) -> Result<String> {
         let hashes = [self.base.content_hash()?, self.other.content_hash()?];
         Ok(view_hash("merge", hashes.into_iter().chain(self.added().map(str::to_owned))))

@@ -1,10 +1,10 @@
-//! Datasets made of datasets: readers over readers, which compose and copy nothing.
+//! Views: readers that combine or restrict other readers without copying data.
 //!
 //! - [`concat`](fn@concat): the episodes of several datasets, one after another.
-//! - [`merge`](fn@merge): columns of another dataset beside those of one with the same episodes.
+//! - [`merge`](fn@merge): additional columns from another dataset of the same episodes.
 //! - [`subset`] and [`select`]: some of the episodes, some of the columns.
 //!
-//! A part held out for validation is `subset(reader, split.episodes(&*reader, Part::Validation)?)`.
+//! For example, `subset(reader, split.episodes(&*reader, Part::Validation)?)` holds the validation episodes.
 
 mod concat;
 mod merge;
@@ -14,7 +14,7 @@ pub use concat::concat;
 pub use merge::merge;
 pub use subset::{select, subset};
 
-/// A hash of a view: of what it does and of what it looks at.
+/// A hash of a view: of its name and its parts.
 fn view_hash(view: &str, parts: impl IntoIterator<Item = String>) -> String {
     let mut hasher = blake3::Hasher::new();
     for part in std::iter::once(view.to_owned()).chain(parts) {

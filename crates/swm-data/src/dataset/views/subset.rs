@@ -1,15 +1,15 @@
-//! [`subset`] and [`select`]: some of a dataset's episodes, some of its columns.
+//! [`subset`] and [`select`]: some episodes or some columns of a dataset.
 
 use super::view_hash;
-use crate::dataset::episodes::{EPISODE, STEP};
 use crate::dataset::reader::{Constants, Episode, Irregularity, Reader, StepRange};
 use std::sync::Arc;
+use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
 
-/// The episodes at these positions, in this order, under the numbers they have.
+/// The episodes at these positions, in this order. They keep their `episode_idx`.
 ///
 /// # Errors
-/// When there is none, a position does not exist, or one is named twice.
+/// If there is none, a position does not exist, or a position appears twice.
 pub fn subset(reader: Arc<dyn Reader>, positions: Vec<usize>) -> Result<Arc<dyn Reader>> {
     let all = reader.episodes();
     let mut seen = vec![false; all.len()];
@@ -30,33 +30,34 @@ pub fn subset(reader: Arc<dyn Reader>, positions: Vec<usize>) -> Result<Arc<dyn 
         }
     }
     if positions.is_empty() {
-        return Err(Error::mismatch("choosing episodes", "none", "at least one"));
+        return Err(Error::mismatch("choosing episodes", "no episode", "at least one"));
     }
     let episodes = positions.iter().map(|&position| all[position]).collect();
     let schema = reader.schema().clone();
     Ok(Arc::new(Subset { reader, positions: Some(positions), episodes, schema }))
 }
 
-/// Some of the columns, in this order; those that number episodes and steps stay.
+/// Some of the columns, in this order, preceded by the index columns.
 ///
 /// # Errors
-/// When a column does not exist.
+/// If a column does not exist.
 pub fn select(reader: Arc<dyn Reader>, columns: &[&str]) -> Result<Arc<dyn Reader>> {
-    let numbers = reader.schema().columns().iter().filter(|column| column.name == EPISODE || column.name == STEP);
-    let mut kept: Vec<ColumnSpec> = numbers.cloned().collect();
+    let indices =
+        reader.schema().columns().iter().filter(|column| column.name == EPISODE_IDX || column.name == STEP_IDX);
+    let mut selected: Vec<ColumnSpec> = indices.cloned().collect();
     for name in columns {
         let column = reader.schema().column(name)?;
-        if !kept.contains(column) {
-            kept.push(column.clone());
+        if !selected.contains(column) {
+            selected.push(column.clone());
         }
     }
     let episodes = reader.episodes().to_vec();
-    Ok(Arc::new(Subset { reader, positions: None, episodes, schema: Schema::new(kept)? }))
+    Ok(Arc::new(Subset { reader, positions: None, episodes, schema: Schema::new(selected)? }))
 }
 
 struct Subset {
     reader: Arc<dyn Reader>,
-    /// Where its episodes are; where they are for `None`.
+    /// Positions of the selected episodes in the inner reader; `None` if all are selected.
     positions: Option<Vec<usize>>,
     episodes: Vec<Episode>,
     schema: Schema,
@@ -66,7 +67,7 @@ impl Subset {
     fn position(&self, episode: usize) -> Result<usize> {
         if episode >= self.episodes.len() {
             let known = format!("positions below {}", self.episodes.len());
-            return Err(Error::mismatch("reading rows", format!("the episode in position {episode}"), known));
+            return Err(Error::mismatch("reading rows", format!("episode position {episode}"), known));
         }
         Ok(self.positions.as_ref().map_or(episode, |positions| positions[episode]))
     }
@@ -92,14 +93,14 @@ impl Reader for Subset {
         self.reader.constants(self.position(episode)?)
     }
 
-    /// Those of the dataset as a whole and of the episodes that are chosen.
+    /// The irregularities of the whole dataset and of the selected episodes.
     fn irregularities(&self) -> Result<Vec<Irregularity>> {
-        let place = |episode| match &self.positions {
-            Some(positions) => positions.iter().position(|&position| position == episode),
+        let position = |episode| match &self.positions {
+            Some(positions) => positions.iter().position(|&selected| selected == episode),
             None => Some(episode),
         };
         let found = self.reader.irregularities()?.into_iter().filter_map(|found| match found.episode {
-            Some(episode) => place(episode).map(|episode| Irregularity { episode: Some(episode), ..found }),
+            Some(episode) => position(episode).map(|episode| Irregularity { episode: Some(episode), ..found }),
             None => Some(found),
         });
         Ok(found.collect())
@@ -109,13 +110,13 @@ impl Reader for Subset {
         self.reader.manifest()
     }
 
-    /// That of the whole dataset, the columns that are left out aside.
+    /// The footprint of the whole dataset, without unselected columns.
     fn footprint(&self) -> Result<Vec<(String, u64)>> {
-        let kept = |name: &str| self.schema.find(name).is_some() || self.reader.schema().find(name).is_none();
-        Ok(self.reader.footprint()?.into_iter().filter(|(name, _)| kept(name)).collect())
+        let selected = |name: &str| self.schema.find(name).is_some() || self.reader.schema().find(name).is_none();
+        Ok(self.reader.footprint()?.into_iter().filter(|(name, _)| selected(name)).collect())
     }
 
-    /// A hash of the dataset's, the positions and the columns.
+    /// A hash of the inner content hash, the columns and the positions.
     fn content_hash(&self) -> Result<String> {
         let positions = self.positions.iter().flatten().map(usize::to_string);
         let columns = self.schema.columns().iter().map(|column| column.name.clone());

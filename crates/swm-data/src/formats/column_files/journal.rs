@@ -1,6 +1,6 @@
-//! The journal: episodes that are committed, but not yet in the column files.
+//! The journal: episodes that are committed but not yet in the column files.
 
-use super::{LENGTHS, Pending};
+use super::{LENGTHS, PendingEpisode};
 use crate::dataset::Constants;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -9,12 +9,13 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use swm_core::{ColumnSpec, Error, Result};
 
-/// How a record begins: this, the lengths of its head and its body, the BLAKE3 hash of both.
+/// Each record starts with this tag, the lengths of its head and body, and the BLAKE3 hash of both.
 const MAGIC: &[u8; 8] = b"swm-ep-1";
 /// Bytes before the head.
 const LEAD: usize = 8 + 8 + 8 + 32;
 
-/// What a record's body holds: the columns of numbers, one after another, then the constants in order of their names.
+/// The head of a record. The body holds the numeric columns, one after another, then the constants in order of their
+/// names.
 #[derive(Serialize, Deserialize)]
 struct Head {
     episode: usize,
@@ -22,13 +23,13 @@ struct Head {
     constants: BTreeMap<String, usize>,
 }
 
-/// The journal of a folder.
+/// The path of a folder's journal.
 pub(super) fn path(folder: &Path) -> PathBuf {
     folder.join(format!("{LENGTHS}.journal"))
 }
 
-/// Appends an episode's record to `out`.
-pub(super) fn record(episode: usize, pending: &Pending, out: &mut Vec<u8>) -> Result<()> {
+/// Appends the record of an episode to `out`.
+pub(super) fn record(episode: usize, pending: &PendingEpisode, out: &mut Vec<u8>) -> Result<()> {
     let constants = pending.constants.iter().map(|(name, bytes)| (name.clone(), bytes.len())).collect();
     let head = serde_json::to_vec(&Head { episode, rows: pending.rows, constants })
         .map_err(|e| Error::external("describing an episode", e))?;
@@ -46,11 +47,17 @@ pub(super) fn record(episode: usize, pending: &Pending, out: &mut Vec<u8>) -> Re
     Ok(())
 }
 
-/// The episodes of a journal from number `from` on. A record that is not whole, at the end, was never committed.
+/// The episodes of a journal, the first of which has index `from`. An incomplete record at the end was never committed
+/// and is ignored.
 ///
 /// # Errors
-/// When a record is damaged, or one is missing.
-pub(super) fn replay(path: &Path, mut bytes: &[u8], columns: &[&ColumnSpec], from: usize) -> Result<Vec<Pending>> {
+/// If a record is damaged, or one is missing.
+pub(super) fn replay(
+    path: &Path,
+    mut bytes: &[u8],
+    columns: &[&ColumnSpec],
+    from: usize,
+) -> Result<Vec<PendingEpisode>> {
     let damaged =
         |problem: String| Error::corrupt(path, problem, "restore it from a copy, or remove it with its episodes");
     let mut episodes = vec![];
@@ -73,26 +80,26 @@ pub(super) fn replay(path: &Path, mut bytes: &[u8], columns: &[&ColumnSpec], fro
         }
         if head.episode != from + episodes.len() {
             let expected = from + episodes.len();
-            return Err(damaged(format!("episode {} comes where {expected} should", head.episode)));
+            return Err(damaged(format!("found episode {} instead of {expected}", head.episode)));
         }
         let mut take = |size: Option<usize>| {
             let (bytes, rest) = size.and_then(|size| body.split_at_checked(size))?;
             body = rest;
             Some(bytes.to_vec())
         };
-        let numbers: Option<Vec<Vec<u8>>> =
+        let data: Option<Vec<Vec<u8>>> =
             columns.iter().map(|column| take(head.rows.checked_mul(column.row_bytes()))).collect();
         let constants: Option<Constants> =
             head.constants.into_iter().map(|(name, size)| Some((name, take(Some(size))?))).collect();
-        let (Some(columns), Some(constants)) = (numbers, constants) else {
+        let (Some(columns), Some(constants)) = (data, constants) else {
             return Err(damaged(format!("episode {} does not have the dataset's columns", head.episode)));
         };
-        episodes.push(Pending { rows: head.rows, columns, constants });
+        episodes.push(PendingEpisode { rows: head.rows, columns, constants });
     }
     Ok(episodes)
 }
 
-/// The end of a journal, to write at.
+/// A journal opened for appending.
 pub(super) struct Journal {
     path: PathBuf,
     file: File,
@@ -100,10 +107,10 @@ pub(super) struct Journal {
 }
 
 impl Journal {
-    /// Begins an empty journal.
+    /// Creates an empty journal.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// If writing fails.
     pub fn create(folder: &Path) -> Result<Self> {
         let path = path(folder);
         let mut options = OpenOptions::new();
@@ -112,14 +119,14 @@ impl Journal {
         Ok(Self { path, file, length: 0 })
     }
 
-    /// Appends records and makes sure that they are on the disk; all or none.
+    /// Appends records and syncs them to disk, all or none.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// If writing fails.
     pub fn append(&mut self, records: &[u8]) -> Result<()> {
         let written = self.file.write_all(records).and_then(|()| self.file.sync_data());
         if let Err(error) = written {
-            // What was written in part would hide what follows.
+            // A partial record would hide the following ones.
             self.truncate(self.length)?;
             return Err(Error::io(&self.path, "writing the journal", error));
         }
@@ -127,10 +134,10 @@ impl Journal {
         Ok(())
     }
 
-    /// Forgets all records.
+    /// Removes all records.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// If writing fails.
     pub fn clear(&mut self) -> Result<()> {
         self.truncate(0)?;
         self.length = 0;
@@ -141,13 +148,13 @@ impl Journal {
         use std::io::Seek as _;
         let seek = std::io::SeekFrom::Start(length);
         let cut = self.file.set_len(length).and_then(|()| self.file.seek(seek));
-        cut.map(drop).map_err(|e| Error::io(&self.path, "shortening the journal", e))
+        cut.map(drop).map_err(|e| Error::io(&self.path, "truncating the journal", e))
     }
 
-    /// Removes it.
+    /// Deletes the journal.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// If deleting fails.
     pub fn remove(self) -> Result<()> {
         std::fs::remove_file(&self.path).map_err(|e| Error::io(&self.path, "removing the journal", e))
     }

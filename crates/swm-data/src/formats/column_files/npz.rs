@@ -1,9 +1,9 @@
-//! numpy's `.npz` files: zip archives of `.npy` arrays.
+//! NumPy's `.npz` files: zip archives of `.npy` arrays.
 //!
-//! What is read is checked against the archive's checksums. Stored and deflated members are understood, as
-//! `numpy.savez` and `numpy.savez_compressed` write them; ours are stored.
+//! Reading verifies the archive's checksums and supports stored and deflated members, as `numpy.savez` and
+//! `numpy.savez_compressed` write them. Writing stores members uncompressed.
 
-use crate::formats::stored_scalar::{Class, Stored};
+use crate::formats::stored_scalar::{Class, StoredScalar};
 use std::fs::File;
 use std::io::{BufReader, BufWriter, Read as _, Write};
 use std::path::{Path, PathBuf};
@@ -11,29 +11,29 @@ use swm_core::{ColumnSpec, DType, Error, Result};
 use zip::write::SimpleFileOptions;
 use zip::{ZipArchive, ZipWriter};
 
-/// The member that holds the array which `numpy.savez(file, array)` was given.
+/// The member that holds the array passed to `numpy.savez(file, array)`.
 const ARRAY: &str = "arr_0.npy";
-/// How an array begins.
+/// The magic number of an array.
 const MAGIC: &[u8] = b"\x93NUMPY";
-/// What deflate makes of a byte at most; an archive that promises more lies.
-const MOST_PER_BYTE: u64 = 1032;
+/// Maximum compression ratio of deflate. An archive that declares more is damaged.
+const MAX_COMPRESSION: u64 = 1032;
 
-/// What is known of an array before its numbers are read.
+/// The header of an array.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Header {
-    /// The type of its numbers; none for text and objects.
-    pub stored: Option<Stored>,
-    /// Its shape, the rows first.
+    /// The type of its elements; `None` for text and objects.
+    pub stored: Option<StoredScalar>,
+    /// Its shape; the first axis is rows.
     pub shape: Vec<usize>,
 }
 
 impl Header {
-    /// How many rows it has.
+    /// Number of rows.
     pub fn rows(&self) -> usize {
         self.shape.first().copied().unwrap_or(1)
     }
 
-    /// The column whose rows these are, if they are numbers.
+    /// The column that the array holds, if its elements are numeric.
     pub fn spec(&self, name: &str) -> Option<ColumnSpec> {
         let dtype = self.stored?.dtype()?;
         Some(ColumnSpec::new(name, dtype, self.shape.get(1..).unwrap_or_default()))
@@ -50,19 +50,19 @@ impl Npz {
     /// Opens an archive.
     ///
     /// # Errors
-    /// When it is not there or damaged.
+    /// If it does not exist or is damaged.
     pub fn open(path: &Path) -> Result<Self> {
         let file = File::open(path).map_err(|e| Error::io(path, "opening a column file", e))?;
         let archive = ZipArchive::new(BufReader::new(file)).map_err(|e| damaged(path, e))?;
         Ok(Self { path: path.to_owned(), archive })
     }
 
-    /// Whether there is a member of that name.
+    /// Whether the archive has a member of this name.
     pub fn has(&self, member: &str) -> bool {
         self.archive.index_for_name(member).is_some()
     }
 
-    /// Whether there is nothing but the array.
+    /// Whether the array is the only member.
     pub fn is_plain(&self) -> bool {
         self.archive.len() == 1
     }
@@ -70,11 +70,11 @@ impl Npz {
     /// The bytes of a member.
     ///
     /// # Errors
-    /// When it is not there or damaged.
+    /// If it does not exist or is damaged.
     pub fn member(&mut self, member: &str) -> Result<Vec<u8>> {
         let path = self.path.clone();
         let mut file = self.archive.by_name(member).map_err(|e| damaged(&path, format!("{member}: {e}")))?;
-        if file.size() / MOST_PER_BYTE > file.compressed_size() {
+        if file.size() / MAX_COMPRESSION > file.compressed_size() {
             return Err(damaged(&path, format!("{member} cannot be {} bytes long", file.size())));
         }
         let mut bytes = vec![];
@@ -82,10 +82,10 @@ impl Npz {
         Ok(bytes)
     }
 
-    /// The type and shape of the array.
+    /// Reads the header of the array.
     ///
     /// # Errors
-    /// When there is none or it is damaged.
+    /// If there is no array, or it is damaged.
     pub fn header(&mut self) -> Result<Header> {
         let path = self.path.clone();
         let file = self.archive.by_name(ARRAY).map_err(|e| damaged(&path, format!("{ARRAY}: {e}")))?;
@@ -94,15 +94,15 @@ impl Npz {
         Ok(parse(&start).map_err(|problem| damaged(&path, problem))?.0)
     }
 
-    /// The array's rows as a column of [`Stored::dtype`], and its type and shape.
+    /// Reads the array as a column with type [`StoredScalar::dtype`], and its header.
     ///
     /// # Errors
-    /// When there is none, it holds no numbers, or is damaged.
+    /// If there is no array, its elements are not numeric, or it is damaged.
     pub fn array(&mut self) -> Result<(Header, Vec<u8>)> {
         let mut bytes = self.member(ARRAY)?;
         let (header, start) = parse(&bytes).map_err(|problem| damaged(&self.path, problem))?;
         let Some((stored, dtype)) = header.stored.and_then(|stored| Some((stored, stored.dtype()?))) else {
-            return Err(damaged(&self.path, "it holds no numbers"));
+            return Err(damaged(&self.path, "its elements are not numeric"));
         };
         let count = header.shape.iter().try_fold(1_usize, |n, &side| n.checked_mul(side));
         let Some(count) = count.filter(|n| n.checked_mul(stored.size) == Some(bytes.len() - start)) else {
@@ -113,9 +113,9 @@ impl Npz {
             bytes.drain(..start);
             return Ok((header, bytes));
         }
-        let mut numbers = vec![0; count * dtype.size()];
-        stored.convert(&bytes[start..], &mut numbers).map_err(|problem| damaged(&self.path, problem))?;
-        Ok((header, numbers))
+        let mut converted = vec![0; count * dtype.size()];
+        stored.convert(&bytes[start..], &mut converted).map_err(|problem| damaged(&self.path, problem))?;
+        Ok((header, converted))
     }
 }
 
@@ -123,13 +123,13 @@ fn damaged(path: &Path, problem: impl std::fmt::Display) -> Error {
     Error::corrupt(path, problem.to_string(), "restore the file from a copy, or rebuild the dataset")
 }
 
-/// Type, shape, and where the numbers begin.
+/// Parses a header. Returns it with the offset of the elements.
 fn parse(bytes: &[u8]) -> Result<(Header, usize), String> {
     let cut = || "the array's header is cut off".to_owned();
     let (start, length) = match bytes.get(..12).ok_or_else(cut)? {
         [0x93, b'N', b'U', b'M', b'P', b'Y', 1, _, a, b, ..] => (10, u32::from(u16::from_le_bytes([*a, *b]))),
         [0x93, b'N', b'U', b'M', b'P', b'Y', 2 | 3, _, a, b, c, d] => (12, u32::from_le_bytes([*a, *b, *c, *d])),
-        _ => return Err("it holds no numpy array".to_owned()),
+        _ => return Err("it is not a numpy array".to_owned()),
     };
     let end = usize::try_from(length).ok().and_then(|length| length.checked_add(start)).ok_or_else(cut)?;
     let text = std::str::from_utf8(bytes.get(start..end).ok_or_else(cut)?).map_err(|e| e.to_string())?;
@@ -137,20 +137,20 @@ fn parse(bytes: &[u8]) -> Result<(Header, usize), String> {
         let (_, rest) = text.split_once(&format!("'{name}':"))?;
         Some(rest.trim_start())
     };
-    let strange = || format!("the array's header makes no sense: {}", text.trim_end());
+    let strange = || format!("the array's header is invalid: {}", text.trim_end());
     if !field("fortran_order").ok_or_else(strange)?.starts_with("False") {
-        return Err("the array is stored column by column; save numpy.ascontiguousarray of it".to_owned());
+        return Err("the array is in Fortran order; save numpy.ascontiguousarray of it".to_owned());
     }
     let shape = field("shape").and_then(|rest| rest.strip_prefix('(')?.split_once(')')).ok_or_else(strange)?.0;
     let shape: Result<Vec<usize>, _> =
         shape.split(',').map(str::trim).filter(|side| !side.is_empty()).map(str::parse).collect();
-    // Records are lists, everything else is a word between quotes.
+    // Structured types are lists; all others are quoted strings.
     let descr = field("descr").and_then(|rest| rest.strip_prefix('\'')?.split_once('\'')).map(|(word, _)| word);
-    Ok((Header { stored: descr.and_then(number), shape: shape.map_err(|_| strange())? }, end))
+    Ok((Header { stored: descr.and_then(scalar_type), shape: shape.map_err(|_| strange())? }, end))
 }
 
-/// The number type of numpy's name for it, such as `<f4`.
-fn number(descr: &str) -> Option<Stored> {
+/// Parses a numeric NumPy type, such as `<f4`.
+fn scalar_type(descr: &str) -> Option<StoredScalar> {
     let (order, rest) = descr.split_at_checked(1)?;
     let (class, size) = rest.split_at_checked(1)?;
     let class = match class {
@@ -160,7 +160,7 @@ fn number(descr: &str) -> Option<Stored> {
         "f" => Class::Float,
         _ => return None,
     };
-    let stored = Stored { class, size: size.parse().ok()?, big_endian: order == ">" };
+    let stored = StoredScalar { class, size: size.parse().ok()?, big_endian: order == ">" };
     stored.dtype().map(|_| stored)
 }
 
@@ -171,19 +171,19 @@ pub(crate) struct NpzWriter {
 }
 
 impl NpzWriter {
-    /// Begins an archive, in place of a file that may be there.
+    /// Creates an archive, replacing an existing file.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// If writing fails.
     pub fn create(path: &Path) -> Result<Self> {
         let file = File::create(path).map_err(|e| Error::io(path, "creating a column file", e))?;
         Ok(Self { path: path.to_owned(), zip: ZipWriter::new(BufWriter::with_capacity(1 << 20, file)) })
     }
 
-    /// Adds the array, `[rows, shape…]`, whose bytes come in parts.
+    /// Adds the array with shape `[rows, shape…]`; `parts` are its concatenated bytes.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// If writing fails.
     pub fn array(&mut self, dtype: DType, rows: usize, shape: &[usize], parts: &[&[u8]]) -> Result<()> {
         let header = npy_header(dtype, rows, shape);
         let all: Vec<&[u8]> = std::iter::once(&*header).chain(parts.iter().copied()).collect();
@@ -193,7 +193,7 @@ impl NpzWriter {
     /// Adds a member.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// If writing fails.
     pub fn member(&mut self, name: &str, bytes: &[u8]) -> Result<()> {
         self.parts(name, &[bytes])
     }
@@ -207,10 +207,10 @@ impl NpzWriter {
         Ok(())
     }
 
-    /// Completes the archive and makes sure that it is on the disk.
+    /// Completes the archive and syncs it to disk.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// If writing fails.
     pub fn finish(self) -> Result<()> {
         let fail = |e| Error::io(&self.path, "completing a column file", e);
         let buffered = self.zip.finish().map_err(|e| fail(e.into()))?;
@@ -229,13 +229,12 @@ fn npy_header(dtype: DType, rows: usize, shape: &[usize]) -> Vec<u8> {
     };
     let sides: String = std::iter::once(rows).chain(shape.iter().copied()).map(|side| format!("{side},")).collect();
     let mut text = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({sides}), }}");
-    // The numbers begin at a multiple of 64 bytes.
+    // The elements start at a multiple of 64 bytes.
     let length = (10 + text.len() + 1).next_multiple_of(64) - 10;
     text.extend(std::iter::repeat_n(' ', length - 1 - text.len()));
     text.push('\n');
     let mut header = MAGIC.to_vec();
     header.extend([1, 0]);
-    #[allow(clippy::cast_possible_truncation)] // a few dozen sides at most
     header.extend((length as u16).to_le_bytes());
     header.extend(text.as_bytes());
     header
@@ -256,7 +255,7 @@ mod tests {
         let mut npz = Npz::open(&path).expect("opens");
         let (header, bytes) = npz.array().expect("an array");
         assert_eq!((header.rows(), header.spec("a")), (3, Some(ColumnSpec::new("a", DType::Int32, [2]))));
-        assert_eq!(header.stored, Some(Stored::of(DType::Int32)));
+        assert_eq!(header.stored, Some(StoredScalar::of(DType::Int32)));
         assert_eq!((&bytes[..8], &bytes[8..]), (&[1; 8][..], &[2; 16][..]));
         assert_eq!(npz.header().expect("a header"), header);
         assert_eq!(npz.member("note").expect("is there"), b"hello");
@@ -278,6 +277,6 @@ mod tests {
         let columns = array("{'descr': '<f8', 'fortran_order': True, 'shape': (2, 3), }").expect_err("columns");
         assert!(columns.contains("ascontiguousarray"), "{columns}");
         assert!(array("{'descr': '<f8', 'fortran_order': False, 'shape': (-2, 3), }").is_err());
-        assert!(parse(b"PK\x03\x04 is something else").expect_err("no array").contains("no numpy array"));
+        assert!(parse(b"PK\x03\x04 is something else").expect_err("no array").contains("not a numpy array"));
     }
 }

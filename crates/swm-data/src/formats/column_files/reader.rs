@@ -1,32 +1,33 @@
-//! Reading the columns of numbers.
+//! Reads numeric columns from column files.
 
 use super::npz::Npz;
-use super::{LENGTHS, OFFSETS, Pending, RECORDED, Recorded, constant_member, file, journal};
-use crate::dataset::episodes::{EPISODE, Rows, STEP, numbering};
+use super::{LENGTHS, METADATA, Metadata, OFFSETS, PendingEpisode, column_path, constant_member, journal};
+use crate::dataset::episodes::{EpisodeRows, index_columns};
 use crate::dataset::{Constants, StepRange};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
+use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema};
 
-/// The columns of numbers of a folder, and where its episodes begin. A column is read when it is first asked for, and
-/// kept.
+/// The numeric columns of a folder, and the rows of its episodes. A column is read at its first access and kept in
+/// memory.
 pub(crate) struct ColumnFiles {
     folder: PathBuf,
-    rows: Rows,
-    recorded: Recorded,
+    rows: EpisodeRows,
+    recorded: Metadata,
     columns: Vec<Column>,
-    left_out: Vec<String>,
-    /// Constants of the episodes that are in the journal only.
+    skipped: Vec<String>,
+    /// Constants of the episodes that are only in the journal.
     pending_constants: Vec<Constants>,
 }
 
 struct Column {
     spec: ColumnSpec,
-    /// Committed rows that are in its file, which may hold more.
+    /// Number of committed rows in the column's file, which may hold more.
     in_file: usize,
-    /// Rows that are in the journal only.
-    tail: Vec<u8>,
+    /// Rows that are only in the journal.
+    unmerged_rows: Vec<u8>,
     data: OnceLock<Vec<u8>>,
 }
 
@@ -34,46 +35,49 @@ impl ColumnFiles {
     /// Opens the column files of a folder.
     ///
     /// # Errors
-    /// When they are damaged or contradict each other.
+    /// If they are damaged or inconsistent.
     pub fn open(folder: &Path) -> Result<Self> {
-        // Before the lengths: what is folded into the files meanwhile is skipped then.
+        // The journal is read before the lengths: episodes merged in between are then skipped as duplicates.
         let journal_path = journal::path(folder);
         let journal = match std::fs::read(&journal_path) {
             Ok(bytes) => bytes,
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => vec![],
             Err(e) => return Err(Error::io(&journal_path, "reading the journal", e)),
         };
-        let lengths_path = file(folder, LENGTHS);
+        let lengths_path = column_path(folder, LENGTHS);
         let mut lengths_file = Npz::open(&lengths_path)?;
-        let lengths = whole_numbers(&mut lengths_file, &lengths_path)?;
-        let offsets_path = file(folder, OFFSETS);
-        let offsets = whole_numbers(&mut Npz::open(&offsets_path)?, &offsets_path)?;
+        let lengths = integers(&mut lengths_file, &lengths_path)?;
+        let offsets_path = column_path(folder, OFFSETS);
+        let offsets = integers(&mut Npz::open(&offsets_path)?, &offsets_path)?;
         let damaged =
             |problem: String| Error::corrupt(folder, problem, "restore it from a copy, or rebuild the dataset");
-        let mut rows = Rows::at(&lengths, &offsets).map_err(damaged)?;
-        let recorded: Recorded = if lengths_file.has(RECORDED) {
-            serde_json::from_slice(&lengths_file.member(RECORDED)?)
-                .map_err(|e| damaged(format!("what {LENGTHS}.npz records is unreadable: {e}")))?
+        let mut rows = EpisodeRows::from_lengths(&lengths, &offsets).map_err(damaged)?;
+        let recorded: Metadata = if lengths_file.has(METADATA) {
+            serde_json::from_slice(&lengths_file.member(METADATA)?)
+                .map_err(|e| damaged(format!("the metadata in {LENGTHS}.npz is unreadable: {e}")))?
         } else if lengths_file.is_plain() {
-            Recorded::default()
+            Metadata::default()
         } else {
-            return Err(damaged(format!("{LENGTHS}.npz holds something that nobody writes")));
+            return Err(damaged(format!("{LENGTHS}.npz has unknown members")));
         };
         let in_files = usize::try_from(rows.total()).map_err(|e| damaged(e.to_string()))?;
-        let (mut columns, left_out) = columns(folder, &recorded, in_files)?;
+        let (mut columns, skipped) = columns(folder, &recorded, in_files)?;
         let specs: Vec<&ColumnSpec> = columns.iter().map(|column| &column.spec).collect();
         let pending = journal::replay(&journal_path, &journal, &specs, lengths.len())?;
         let mut pending_constants = vec![];
-        for Pending { rows: length, columns: tails, constants } in pending {
+        for PendingEpisode { rows: length, columns: unmerged, constants } in pending {
             rows.push(length);
-            columns.iter_mut().zip(tails).for_each(|(column, tail)| column.tail.extend(tail));
+            columns
+                .iter_mut()
+                .zip(unmerged)
+                .for_each(|(column, unmerged_rows)| column.unmerged_rows.extend(unmerged_rows));
             pending_constants.push(constants);
         }
-        Ok(Self { folder: folder.to_owned(), rows, recorded, columns, left_out, pending_constants })
+        Ok(Self { folder: folder.to_owned(), rows, recorded, columns, skipped, pending_constants })
     }
 
-    /// The episodes and their rows.
-    pub const fn rows(&self) -> &Rows {
+    /// The rows of the episodes.
+    pub const fn rows(&self) -> &EpisodeRows {
         &self.rows
     }
 
@@ -82,80 +86,80 @@ impl ColumnFiles {
         &self.folder
     }
 
-    /// The columns of numbers.
+    /// The numeric columns.
     pub fn columns(&self) -> impl Iterator<Item = &ColumnSpec> {
         self.columns.iter().map(|column| &column.spec)
     }
 
-    /// All columns as the writer was given them, pictures included; none where another program wrote them.
+    /// The schema passed to the writer, including image columns; `None` for datasets of other programs.
     pub const fn recorded(&self) -> Option<&Schema> {
         self.recorded.schema.as_ref()
     }
 
-    /// What readers see: the numbering, then numbers and `pictures` in the order that was recorded, else by name.
+    /// The schema for readers: index columns, then numeric and image columns in recorded order, or by name if none is
+    /// recorded.
     ///
     /// # Errors
-    /// When two columns share a name.
-    pub fn schema(&self, pictures: Vec<ColumnSpec>) -> Result<Schema> {
+    /// If two columns have the same name.
+    pub fn schema(&self, images: Vec<ColumnSpec>) -> Result<Schema> {
         let known = self.recorded().map(Schema::columns).unwrap_or_default();
-        let all: Vec<ColumnSpec> = self.columns().cloned().chain(pictures).collect();
-        let numbers = numbering(if known.is_empty() { &all } else { known });
-        let mut columns: Vec<ColumnSpec> = all.into_iter().filter(|c| c.name != EPISODE && c.name != STEP).collect();
-        let place = |column: &ColumnSpec| known.iter().position(|k| k.name == column.name).unwrap_or(known.len());
-        columns.sort_by(|a, b| place(a).cmp(&place(b)).then_with(|| a.name.cmp(&b.name)));
-        columns.splice(0..0, numbers);
+        let all: Vec<ColumnSpec> = self.columns().cloned().chain(images).collect();
+        let indices = index_columns(if known.is_empty() { &all } else { known });
+        let mut columns: Vec<ColumnSpec> =
+            all.into_iter().filter(|c| c.name != EPISODE_IDX && c.name != STEP_IDX).collect();
+        let position = |column: &ColumnSpec| known.iter().position(|k| k.name == column.name).unwrap_or(known.len());
+        columns.sort_by(|a, b| position(a).cmp(&position(b)).then_with(|| a.name.cmp(&b.name)));
+        columns.splice(0..0, indices);
         Schema::new(columns)
     }
 
-    /// Whether the numbers of this column are here.
+    /// Whether this is an index column or a numeric column.
     pub fn has(&self, name: &str) -> bool {
-        self.columns().any(|column| column.name == name) || name == EPISODE || name == STEP
+        self.columns().any(|column| column.name == name) || name == EPISODE_IDX || name == STEP_IDX
     }
 
-    /// The rows of some ranges of a column of numbers, or of the numbering.
+    /// Reads ranges of rows of a numeric column or an index column.
     ///
     /// # Errors
     /// As [`Reader::read_column`](crate::Reader::read_column).
     pub fn read(&self, spec: &ColumnSpec, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
-        if spec.name == EPISODE || spec.name == STEP {
-            return self.rows.number(spec, ranges, out);
+        if spec.name == EPISODE_IDX || spec.name == STEP_IDX {
+            return self.rows.fill_index_column(spec, ranges, out);
         }
-        Rows::check_room(spec, ranges, out)?;
+        EpisodeRows::check_output(spec, ranges, out)?;
         let data = self.data(&spec.name)?;
         let size = spec.row_bytes();
         let mut rest = out;
         for range in ranges {
             let rows = self.rows.range(range)?;
-            let (place, after) = rest.split_at_mut(range.length * size);
-            // The rows are below the column's, which are a `usize`.
-            #[allow(clippy::cast_possible_truncation)]
-            place.copy_from_slice(&data[rows.start as usize * size..rows.end as usize * size]);
+            let (target, after) = rest.split_at_mut(range.length * size);
+            target.copy_from_slice(&data[rows.start as usize * size..rows.end as usize * size]);
             rest = after;
         }
         Ok(())
     }
 
-    /// All rows of a column of numbers.
+    /// All rows of a numeric column.
     ///
     /// # Errors
-    /// When there is no such column, or its file is damaged.
+    /// If there is no such column, or its file is damaged.
     pub fn data(&self, name: &str) -> Result<&[u8]> {
         let column = self.column(name)?;
         if let Some(data) = column.data.get() {
             return Ok(data);
         }
         let mut data = self.in_file(name)?;
-        data.extend(&column.tail);
+        data.extend(&column.unmerged_rows);
         Ok(column.data.get_or_init(|| data))
     }
 
-    /// The committed rows of a column that are in its file.
+    /// The committed rows of a column in its file.
     pub(super) fn in_file(&self, name: &str) -> Result<Vec<u8>> {
         let column = self.column(name)?;
         if column.in_file == 0 {
             return Ok(vec![]);
         }
-        let path = file(&self.folder, name);
+        let path = column_path(&self.folder, name);
         let (header, mut data) = Npz::open(&path)?.array()?;
         if header.spec(name).as_ref() != Some(&column.spec) || header.rows() < column.in_file {
             return Err(Error::corrupt(path, "it changed since the dataset was opened", "open the dataset again"));
@@ -166,11 +170,11 @@ impl ColumnFiles {
 
     fn column(&self, name: &str) -> Result<&Column> {
         self.columns.iter().find(|column| column.spec.name == name).ok_or_else(|| {
-            Error::unknown("column", name, self.columns().map(|c| c.name.as_str()), "it is none of numbers")
+            Error::unknown("column", name, self.columns().map(|c| c.name.as_str()), "there is no such numeric column")
         })
     }
 
-    /// Where the data come from.
+    /// The stored manifest.
     pub fn manifest(&self) -> Option<Manifest> {
         self.recorded.manifest.clone()
     }
@@ -178,7 +182,7 @@ impl ColumnFiles {
     /// The constants of an episode.
     ///
     /// # Errors
-    /// When they are damaged.
+    /// If they are damaged.
     pub fn constants(&self, episode: usize) -> Result<Constants> {
         let in_file = self.rows.episodes().len() - self.pending_constants.len();
         if let Some(pending) = episode.checked_sub(in_file).and_then(|i| self.pending_constants.get(i)) {
@@ -187,36 +191,36 @@ impl ColumnFiles {
         let Some(named) = self.recorded.constants.get(episode).filter(|named| !named.is_empty()) else {
             return Ok(Constants::new());
         };
-        let mut lengths = Npz::open(&file(&self.folder, LENGTHS))?;
+        let mut lengths = Npz::open(&column_path(&self.folder, LENGTHS))?;
         named.iter().map(|(name, &index)| Ok((name.clone(), lengths.member(&constant_member(index))?))).collect()
     }
 
-    /// Columns in files that hold no numbers.
-    pub(super) fn left_out(&self) -> &[String] {
-        &self.left_out
+    /// Columns in files without numeric elements.
+    pub(super) fn skipped(&self) -> &[String] {
+        &self.skipped
     }
 
     /// The constants in `ep_len.npz`, in the order of its members.
     pub(super) fn stored_constants(&self) -> Result<Vec<Vec<u8>>> {
         let count = self.recorded.constants.iter().flat_map(BTreeMap::values).max().map_or(0, |last| last + 1);
-        let mut lengths = Npz::open(&file(&self.folder, LENGTHS))?;
+        let mut lengths = Npz::open(&column_path(&self.folder, LENGTHS))?;
         (0..count).map(|index| lengths.member(&constant_member(index))).collect()
     }
 
-    /// Names of the constants that are in `ep_len.npz`, and the members that hold them.
+    /// For each episode in `ep_len.npz`, the names of its constants and the indices of their members.
     pub(super) fn constants_in_file(&self) -> &[BTreeMap<String, usize>] {
         &self.recorded.constants
     }
 
-    /// How many episodes are in the files.
+    /// Number of episodes in the column files.
     pub(super) fn episodes_in_files(&self) -> usize {
         self.rows.episodes().len() - self.pending_constants.len()
     }
 
-    /// What takes how many bytes, largest first: columns, subfolders included, and the rest.
+    /// Bytes per column (including subfolders) and for the rest, largest first.
     ///
     /// # Errors
-    /// When the folder cannot be listed.
+    /// If the folder cannot be listed.
     pub fn footprint(&self) -> Result<Vec<(String, u64)>> {
         let mut parts: BTreeMap<String, u64> = BTreeMap::new();
         let io = |e| Error::io(&self.folder, "listing the folder", e);
@@ -240,7 +244,7 @@ impl ColumnFiles {
     }
 }
 
-/// Bytes of all files in a folder of pictures.
+/// Size of all files in a folder of images, in bytes.
 fn folder_size(folder: &Path) -> Result<u64> {
     let io = |e| Error::io(folder, "listing the folder", e);
     std::fs::read_dir(folder)
@@ -249,27 +253,28 @@ fn folder_size(folder: &Path) -> Result<u64> {
         .sum()
 }
 
-/// The columns of numbers: those recorded, else whatever files of numbers there are. And the names of files without.
-fn columns(folder: &Path, recorded: &Recorded, rows: usize) -> Result<(Vec<Column>, Vec<String>)> {
+/// The numeric columns: as recorded, or all files with numeric elements. Also returns the names of files without such
+/// elements.
+fn columns(folder: &Path, recorded: &Metadata, rows: usize) -> Result<(Vec<Column>, Vec<String>)> {
     let names: Vec<String> = match &recorded.schema {
         Some(schema) => schema.columns().iter().filter(|c| !c.is_image()).map(|c| c.name.clone()).collect(),
         None => names_of_files(folder)?,
     };
-    let (mut columns, mut left_out) = (vec![], vec![]);
+    let (mut columns, mut skipped) = (vec![], vec![]);
     for name in names {
         super::check_name(&name)?;
-        let path = file(folder, &name);
+        let path = column_path(folder, &name);
         let known = recorded.schema.as_ref().and_then(|schema| schema.column(&name).ok());
         let mut spec = known.cloned();
-        // Of a dataset without committed rows, columns need not be there yet.
+        // A dataset without committed rows need not have column files yet.
         if rows > 0 || known.is_none() {
             let header = Npz::open(&path)?.header()?;
             let Some(found) = header.spec(&name).filter(|spec| !spec.is_empty()) else {
-                left_out.push(name);
+                skipped.push(name);
                 continue;
             };
             let problem = if known.is_some_and(|known| *known != found) {
-                format!("it holds {} {:?}, unlike recorded", found.dtype.name(), found.shape)
+                format!("it holds {} {:?}, which contradicts the recorded schema", found.dtype.name(), found.shape)
             } else if header.rows() < rows {
                 format!("it has {} rows; the episodes have {rows}", header.rows())
             } else {
@@ -281,10 +286,10 @@ fn columns(folder: &Path, recorded: &Recorded, rows: usize) -> Result<(Vec<Colum
             spec = Some(found);
         }
         if let Some(spec) = spec {
-            columns.push(Column { spec, in_file: rows, tail: vec![], data: OnceLock::new() });
+            columns.push(Column { spec, in_file: rows, unmerged_rows: vec![], data: OnceLock::new() });
         }
     }
-    Ok((columns, left_out))
+    Ok((columns, skipped))
 }
 
 /// The columns of a folder that another program wrote, by name.
@@ -303,12 +308,12 @@ fn names_of_files(folder: &Path) -> Result<Vec<String>> {
     Ok(names)
 }
 
-/// The array of an archive, as whole numbers.
-fn whole_numbers(npz: &mut Npz, path: &Path) -> Result<Vec<i64>> {
+/// The array of an archive, as integers.
+fn integers(npz: &mut Npz, path: &Path) -> Result<Vec<i64>> {
     let (header, bytes) = npz.array()?;
     match header.spec("").filter(|_| header.shape.len() == 1).map(|spec| spec.dtype) {
         Some(DType::Int32) => Ok(bytes.as_chunks().0.iter().map(|&b| i64::from(i32::from_ne_bytes(b))).collect()),
         Some(DType::Int64) => Ok(bytes.as_chunks().0.iter().map(|&b| i64::from_ne_bytes(b)).collect()),
-        _ => Err(Error::corrupt(path, "it holds no list of whole numbers", "rebuild the dataset")),
+        _ => Err(Error::corrupt(path, "it is not a one-dimensional array of integers", "rebuild the dataset")),
     }
 }

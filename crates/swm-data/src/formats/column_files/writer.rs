@@ -1,44 +1,48 @@
-//! Writing the columns of numbers: journal first, column files now and then.
+//! Writes numeric columns: to the journal at every commit, to column files when the journal is merged.
 
 use super::journal::{self, Journal};
 use super::npz::NpzWriter;
-use super::{ColumnFiles, LENGTHS, OFFSETS, Pending, RECORDED, Recorded, check_name, constant_member, file, is_there};
-use crate::dataset::episodes::{self, EPISODE, Rows, STEP};
+use super::{
+    ColumnFiles, LENGTHS, METADATA, Metadata, OFFSETS, PendingEpisode, check_name, column_path, constant_member, exists,
+};
+use crate::dataset::episodes::{self, EpisodeRows};
 use crate::dataset::{CommitPolicy, Constants, StepRange, WriteMode, WriteOptions};
 use std::collections::{BTreeMap, HashMap};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
 
-/// The journal is folded into the column files when it is half as long as they are, but not below and always above
-/// these bytes, which also bound the memory.
-const FOLD: std::ops::RangeInclusive<usize> = 16 << 20..=256 << 20;
+/// Bounds in bytes for the size at which the journal is merged; within them it is half the size of the column files.
+/// They also bound the memory.
+const MERGE_BYTES: std::ops::RangeInclusive<usize> = 16 << 20..=256 << 20;
 
-/// Commits episodes' numbers. A format writes the pictures of an episode first, then calls [`ColumnFilesWriter::write`].
+/// Commits the numeric columns of episodes. Formats write an episode's images first, then call
+/// [`ColumnFilesWriter::write`].
 pub(crate) struct ColumnFilesWriter {
     folder: PathBuf,
-    /// Locked, so that nobody else writes there.
+    /// Holds the lock of the folder against other writers.
     _lock: File,
     journal: Option<Journal>,
     schema: Schema,
-    /// The columns of numbers.
+    /// The numeric columns.
     columns: Vec<ColumnSpec>,
-    recorded: Recorded,
+    recorded: Metadata,
     policy: CommitPolicy,
     last_commit: Instant,
-    /// All episodes, committed or not.
-    rows: Rows,
-    /// Records of episodes that are not committed.
+    /// All episodes, including uncommitted ones.
+    rows: EpisodeRows,
+    /// Records of uncommitted episodes.
     group: Vec<u8>,
     in_group: usize,
-    /// Rows that are in the files, and their bytes.
+    /// Number of rows in the column files, and their size in bytes.
     rows_in_files: usize,
     bytes_in_files: usize,
-    /// What is not in the files: the bytes of each column, and constants.
-    tails: Vec<Vec<u8>>,
+    /// Data that is not in the column files: the bytes of each column, and constants.
+    unmerged: Vec<Vec<u8>>,
     new_constants: Vec<Vec<u8>>,
-    /// Members that hold constants, and which of them holds what, by its hash.
+    /// Number of members that hold constants, and their indices by hash of the content.
     constants: usize,
     known_constants: HashMap<blake3::Hash, usize>,
     /// Whether a commit failed.
@@ -46,51 +50,50 @@ pub(crate) struct ColumnFilesWriter {
 }
 
 impl ColumnFilesWriter {
-    /// Creates, continues or replaces the column files of a folder. When they are to be continued, `known` is what its
-    /// reader says of the columns.
+    /// Creates, continues or replaces the column files of a folder. `known` is the schema of the dataset to continue.
     ///
     /// # Errors
-    /// When there is a dataset and must not be, its columns differ, somebody else writes to it, or the disk refuses.
+    /// If the dataset exists and must not, its columns differ, another process writes to it, or writing fails.
     pub fn create(folder: &Path, schema: &Schema, options: &WriteOptions, known: Option<&Schema>) -> Result<Self> {
         for column in schema.columns() {
             check_name(&column.name)?;
             let problem = match &*column.name {
-                _ if column.is_empty() => "holds no number",
-                EPISODE | STEP if column.len() != 1 => "numbers rows, and must be one number",
+                _ if column.is_empty() => "has no elements",
+                EPISODE_IDX | STEP_IDX if column.len() != 1 => "must be a scalar",
                 _ => continue,
             };
             return Err(Error::config("schema", format!("column '{}' {problem}", column.name), "leave it out"));
         }
-        let exists = is_there(folder);
+        let exists = exists(folder);
         if !exists && folder.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
-            let problem = format!("{} holds something else", folder.display());
+            let problem = format!("{} holds other files", folder.display());
             return Err(Error::config("dataset", problem, "choose another path"));
         }
         if exists {
             match options.mode {
                 WriteMode::Create => {
                     let problem = format!("{} exists already", folder.display());
-                    let fix = "choose another path, or say whether to append to it or to overwrite it";
+                    let fix = "choose another path, append to it, or overwrite it";
                     return Err(Error::config("dataset", problem, fix));
                 }
-                WriteMode::Overwrite => replace(folder)?,
+                WriteMode::Overwrite => remove_dataset(folder)?,
                 WriteMode::Append => {}
             }
         }
         std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating the folder", e))?;
-        let lock = lock(folder)?;
+        let lock = lock_folder(folder)?;
         let columns = schema.columns().iter().filter(|c| !c.is_image()).cloned().collect::<Vec<_>>();
         let mut writer = Self {
             folder: folder.to_owned(),
             _lock: lock,
             journal: None,
             schema: schema.clone(),
-            tails: vec![vec![]; columns.len()],
+            unmerged: vec![vec![]; columns.len()],
             columns,
-            recorded: Recorded { schema: Some(schema.clone()), manifest: options.manifest.clone(), constants: vec![] },
+            recorded: Metadata { schema: Some(schema.clone()), manifest: options.manifest.clone(), constants: vec![] },
             policy: options.commit,
             last_commit: Instant::now(),
-            rows: Rows::default(),
+            rows: EpisodeRows::default(),
             group: vec![],
             in_group: 0,
             rows_in_files: 0,
@@ -103,55 +106,55 @@ impl ColumnFilesWriter {
         if exists && options.mode == WriteMode::Append {
             writer.continue_from(known)?;
         }
-        writer.fold()?;
+        writer.merge_journal()?;
         writer.journal = Some(Journal::create(folder)?);
         Ok(writer)
     }
 
-    /// Takes over what is there; what an interrupted writer left in the journal is folded next.
+    /// Loads the state of the existing dataset, including the journal of an interrupted writer.
     fn continue_from(&mut self, known: Option<&Schema>) -> Result<()> {
         let old = ColumnFiles::open(&self.folder)?;
-        if let [name, ..] = old.left_out() {
-            let problem = format!("its column '{name}' holds no numbers, which cannot be continued");
+        if let [name, ..] = old.skipped() {
+            let problem = format!("its column '{name}' is not numeric and cannot be appended to");
             return Err(Error::corrupt(&self.folder, problem, "convert it to a new dataset, without this column"));
         }
         let known = match known {
             Some(known) => known.clone(),
             None => old.schema(vec![])?,
         };
-        episodes::check_continued(&self.folder.display(), &self.schema, &known)?;
+        episodes::check_appendable(&self.folder.display(), &self.schema, &known)?;
         if !old.rows().is_contiguous() {
-            let problem = "its episodes do not follow each other";
+            let problem = "its episodes are not contiguous";
             return Err(Error::corrupt(&self.folder, problem, "convert it to a new dataset first"));
         }
         let in_files = old.episodes_in_files();
         self.rows_in_files = old.rows().episodes()[..in_files].iter().map(|episode| episode.length).sum();
         self.columns = old.columns().cloned().collect();
-        self.tails = vec![];
+        self.unmerged = vec![];
         for column in &self.columns {
             let in_file = self.rows_in_files * column.row_bytes();
             self.bytes_in_files += in_file;
-            self.tails.push(old.data(&column.name)?[in_file..].to_vec());
+            self.unmerged.push(old.data(&column.name)?[in_file..].to_vec());
         }
-        // What is stored stays as it is, numbering included; only new pictures and numbers come.
+        // Existing columns, including index columns, keep their type.
         let stored = |column: &&ColumnSpec| column.is_image() || self.columns.contains(column);
         let columns: Vec<ColumnSpec> = known.columns().iter().filter(stored).cloned().collect();
         self.recorded.schema = Some(old.recorded().cloned().map_or_else(|| Schema::new(columns), Ok)?);
         self.recorded.manifest = self.recorded.manifest.take().or_else(|| old.manifest());
         self.recorded.constants = old.constants_in_file().to_vec();
-        // A foreign dataset has none.
+        // Third-party datasets have no constants.
         self.recorded.constants.resize(in_files, BTreeMap::new());
         let stored = old.stored_constants()?;
         self.constants = stored.len();
         self.known_constants.extend(stored.iter().map(|bytes| blake3::hash(bytes)).zip(0..));
         for episode in in_files..old.rows().episodes().len() {
-            self.remember(&old.constants(episode)?);
+            self.add_constants(&old.constants(episode)?);
         }
         self.rows = old.rows().clone();
         Ok(())
     }
 
-    /// Episodes, committed or not.
+    /// Number of episodes, including uncommitted ones.
     pub fn episodes(&self) -> usize {
         self.rows.episodes().len()
     }
@@ -161,21 +164,24 @@ impl ColumnFilesWriter {
         &self.folder
     }
 
-    /// Adds the numbers of an episode, which [`episodes::check`] has seen, and commits when it is time.
+    /// Adds the numeric columns of an episode that passed [`episodes::check_episode`], and commits if it is time.
     ///
     /// # Errors
-    /// When a commit fails, now or before.
+    /// If this or an earlier commit failed.
     pub fn write(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
         if self.failed {
-            return Err(Error::external("writing an episode", "an earlier commit failed; nothing more is kept"));
+            return Err(Error::external(
+                "writing an episode",
+                "an earlier commit failed; later episodes are not stored",
+            ));
         }
         let number = self.episodes();
         self.rows.push(episode.rows());
-        let mut pending = Pending { rows: episode.rows(), columns: vec![], constants: constants.clone() };
+        let mut pending = PendingEpisode { rows: episode.rows(), columns: vec![], constants: constants.clone() };
         for column in &self.columns {
-            if column.name == EPISODE || column.name == STEP {
+            if column.name == EPISODE_IDX || column.name == STEP_IDX {
                 let mut bytes = vec![0; episode.rows() * column.row_bytes()];
-                self.rows.number(column, &[StepRange::new(number, 0, episode.rows())], &mut bytes)?;
+                self.rows.fill_index_column(column, &[StepRange::new(number, 0, episode.rows())], &mut bytes)?;
                 pending.columns.push(bytes);
             } else {
                 pending.columns.push(episode.bytes(episode.schema().index(&column.name)?).to_vec());
@@ -183,15 +189,15 @@ impl ColumnFilesWriter {
         }
         journal::record(number, &pending, &mut self.group)?;
         self.in_group += 1;
-        self.tails.iter_mut().zip(&pending.columns).for_each(|(tail, bytes)| tail.extend(bytes));
-        self.remember(constants);
+        self.unmerged.iter_mut().zip(&pending.columns).for_each(|(unmerged_rows, bytes)| unmerged_rows.extend(bytes));
+        self.add_constants(constants);
         let due = self.in_group >= self.policy.episodes
             || self.group.len() >= self.policy.bytes
             || self.last_commit.elapsed() >= self.policy.interval;
         if due { self.commit() } else { Ok(()) }
     }
 
-    fn remember(&mut self, constants: &Constants) {
+    fn add_constants(&mut self, constants: &Constants) {
         let mut named = BTreeMap::new();
         for (name, bytes) in constants {
             let index = *self.known_constants.entry(blake3::hash(bytes)).or_insert(self.constants);
@@ -204,19 +210,19 @@ impl ColumnFilesWriter {
         self.recorded.constants.push(named);
     }
 
-    /// Commits what is not yet committed.
+    /// Commits the uncommitted episodes.
     fn commit(&mut self) -> Result<()> {
         self.last_commit = Instant::now();
         let Some(journal) = self.journal.as_mut() else { return Ok(()) };
-        // True until it is done.
+        // Stays set if an error returns early.
         self.failed = true;
         if self.in_group > 0 {
             journal.append(&self.group)?;
             (self.in_group, self.group) = (0, vec![]);
         }
-        let waiting: usize = self.tails.iter().chain(&self.new_constants).map(Vec::len).sum();
-        if waiting >= (self.bytes_in_files / 2).clamp(*FOLD.start(), *FOLD.end()) {
-            self.fold()?;
+        let waiting: usize = self.unmerged.iter().chain(&self.new_constants).map(Vec::len).sum();
+        if waiting >= (self.bytes_in_files / 2).clamp(*MERGE_BYTES.start(), *MERGE_BYTES.end()) {
+            self.merge_journal()?;
             if let Some(journal) = self.journal.as_mut() {
                 journal.clear()?;
             }
@@ -225,66 +231,68 @@ impl ColumnFilesWriter {
         Ok(())
     }
 
-    /// Writes the column files anew, with the rows that are only in the journal. Each appears at once, complete; the
-    /// lengths are the last.
-    fn fold(&mut self) -> Result<()> {
-        let old = is_there(&self.folder).then(|| ColumnFiles::open(&self.folder)).transpose()?;
+    /// Merges the journal into new column files. Each file is replaced atomically, the lengths last.
+    fn merge_journal(&mut self) -> Result<()> {
+        let old = exists(&self.folder).then(|| ColumnFiles::open(&self.folder)).transpose()?;
         let old_constants = old.as_ref().map_or_else(|| Ok(vec![]), ColumnFiles::stored_constants)?;
         let rows = usize::try_from(self.rows.total()).map_err(|e| Error::external("writing columns", e))?;
-        for (column, tail) in self.columns.iter().zip(&self.tails) {
-            if tail.is_empty() {
+        for (column, unmerged_rows) in self.columns.iter().zip(&self.unmerged) {
+            if unmerged_rows.is_empty() {
                 continue;
             }
             let before = old.as_ref().map_or_else(|| Ok(vec![]), |old| old.in_file(&column.name))?;
-            self.put(&column.name, |npz| npz.array(column.dtype, rows, &column.shape, &[&before, tail]))?;
+            self.replace_column(&column.name, |npz| {
+                npz.array(column.dtype, rows, &column.shape, &[&before, unmerged_rows])
+            })?;
         }
         let list = |values: &[i64]| -> Vec<u8> { values.iter().flat_map(|value| value.to_ne_bytes()).collect() };
-        #[allow(clippy::cast_possible_wrap)]
-        let first: Vec<i64> = self.rows.first().iter().map(|&row| row as i64).collect();
-        #[allow(clippy::cast_possible_wrap)]
+        let first: Vec<i64> = self.rows.first_rows().iter().map(|&row| row as i64).collect();
         let lengths: Vec<i64> = self.rows.episodes().iter().map(|episode| episode.length as i64).collect();
         let count = lengths.len();
-        self.put(OFFSETS, |npz| npz.array(DType::Int64, count, &[], &[&list(&first)]))?;
+        self.replace_column(OFFSETS, |npz| npz.array(DType::Int64, count, &[], &[&list(&first)]))?;
         let recorded = serde_json::to_vec(&self.recorded).map_err(|e| Error::external("describing the dataset", e))?;
-        self.put(LENGTHS, |npz| {
+        self.replace_column(LENGTHS, |npz| {
             npz.array(DType::Int64, count, &[], &[&list(&lengths)])?;
-            npz.member(RECORDED, &recorded)?;
+            npz.member(METADATA, &recorded)?;
             let constants = old_constants.iter().chain(&self.new_constants);
             for (index, bytes) in constants.enumerate() {
                 npz.member(&constant_member(index), bytes)?;
             }
             Ok(())
         })?;
-        self.bytes_in_files += self.tails.iter().map(Vec::len).sum::<usize>();
+        self.bytes_in_files += self.unmerged.iter().map(Vec::len).sum::<usize>();
         self.rows_in_files = rows;
-        self.tails.iter_mut().for_each(Vec::clear);
+        self.unmerged.iter_mut().for_each(Vec::clear);
         self.new_constants.clear();
         Ok(())
     }
 
-    /// Writes a file beside the one it replaces, then puts it in its place.
-    fn put(&self, name: &str, fill: impl FnOnce(&mut NpzWriter) -> Result<()>) -> Result<()> {
-        // The one name that the reference does not take for a column's.
-        let passing = self.folder.join(format!("{LENGTHS}.tmp"));
-        let mut npz = NpzWriter::create(&passing)?;
+    /// Replaces a file atomically.
+    fn replace_column(&self, name: &str, fill: impl FnOnce(&mut NpzWriter) -> Result<()>) -> Result<()> {
+        // The reference ignores names that start with `ep_len`.
+        let temporary = self.folder.join(format!("{LENGTHS}.tmp"));
+        let mut npz = NpzWriter::create(&temporary)?;
         fill(&mut npz)?;
         npz.finish()?;
-        let path = file(&self.folder, name);
-        std::fs::rename(&passing, &path).map_err(|e| Error::io(&path, "replacing a column file", e))
+        let path = column_path(&self.folder, name);
+        std::fs::rename(&temporary, &path).map_err(|e| Error::io(&path, "replacing a column file", e))
     }
 
-    /// Commits everything and completes the column files.
+    /// Commits all episodes and completes the column files.
     ///
     /// # Errors
-    /// When a commit fails, now or before.
+    /// If this or an earlier commit failed.
     pub fn finish(&mut self) -> Result<()> {
         if self.failed {
-            return Err(Error::external("completing the dataset", "an earlier commit failed; nothing more is kept"));
+            return Err(Error::external(
+                "completing the dataset",
+                "an earlier commit failed; later episodes are not stored",
+            ));
         }
         self.commit()?;
         let Some(journal) = self.journal.take() else { return Ok(()) };
         self.failed = true;
-        self.fold()?;
+        self.merge_journal()?;
         journal.remove()?;
         self.failed = false;
         Ok(())
@@ -296,32 +304,32 @@ impl Drop for ColumnFilesWriter {
         if !self.failed
             && let Err(error) = self.finish()
         {
-            tracing::error!(dataset = %self.folder.display(), "the last episodes are lost: {error}");
+            tracing::error!(dataset = %self.folder.display(), "the last episodes could not be stored: {error}");
         }
     }
 }
 
 /// Locks a folder against other writers, until the file is dropped or the process ends.
-pub(crate) fn lock(folder: &Path) -> Result<File> {
+pub(crate) fn lock_folder(folder: &Path) -> Result<File> {
     let file = File::open(folder).map_err(|e| Error::io(folder, "opening the folder", e))?;
     match file.try_lock() {
         Ok(()) => Ok(file),
         Err(std::fs::TryLockError::WouldBlock) => {
-            let problem = format!("somebody else writes to {}", folder.display());
-            Err(Error::config("dataset", problem, "wait until they are done, or choose another path"))
+            let problem = format!("another process writes to {}", folder.display());
+            Err(Error::config("dataset", problem, "wait until it is done, or choose another path"))
         }
         Err(std::fs::TryLockError::Error(e)) => Err(Error::io(folder, "locking the folder", e)),
     }
 }
 
-/// Removes a dataset. It is renamed first, so that nothing is ever half there.
-pub(crate) fn replace(folder: &Path) -> Result<()> {
-    let _lock = lock(folder)?;
+/// Removes a dataset. It is renamed first, so that it never exists in part.
+pub(crate) fn remove_dataset(folder: &Path) -> Result<()> {
+    let _lock = lock_folder(folder)?;
     let mut aside = folder.as_os_str().to_owned();
     aside.push(format!(".replaced-{}", uuid::Uuid::new_v4().simple()));
     std::fs::rename(folder, &aside).map_err(|e| Error::io(folder, "replacing the dataset", e))?;
     if let Err(error) = std::fs::remove_dir_all(&aside) {
-        tracing::warn!(folder = %Path::new(&aside).display(), "a replaced dataset stays: {error}");
+        tracing::warn!(folder = %Path::new(&aside).display(), "a replaced dataset could not be removed: {error}");
     }
     Ok(())
 }

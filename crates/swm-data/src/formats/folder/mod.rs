@@ -1,54 +1,54 @@
-//! The format `folder`: numbers in column files, and one picture file a step, which any program can look at.
+//! The format `folder`: numeric columns in column files, and one image file per step, which any program can display.
 //!
 //! ```text
 //! NAME.folder/
 //!   ep_len.npz, ep_offset.npz, action.npz, …    see `column_files`
-//!   pixels/ep_0_step_0.jpeg, …                  a picture each
+//!   pixels/ep_0_step_0.jpeg, …                  one image each
 //! ```
 //!
-//! It is the layout of the reference's `FolderDataset`, which looks for names that end in `.jpeg` or `.jpg` only, but
-//! takes pictures for what their first bytes say. So every picture we write ends in `.jpeg`, and is a lossless PNG unless
-//! another codec is asked for. We read `.png` as well.
+//! This is the layout of the reference's `FolderDataset`, which accepts only names ending in `.jpeg` or `.jpg`, but
+//! recognises the codec by the first bytes. Therefore every image file written here ends in `.jpeg`, even with a
+//! lossless codec. Names ending in `.png` are read as well.
 //!
-//! Pictures of an episode are written before its numbers are committed. They are not forced to the disk one by one:
-//! a killed process loses nothing that was committed, a power cut may lose pictures of the last seconds, and reading
-//! them says so.
+//! The images of an episode are written before its numeric columns are committed, without syncing each file. A killed
+//! process loses nothing that was committed; a power failure may lose images of the last seconds, and reading reports
+//! them as missing.
 
 mod reader;
 mod writer;
 
 use crate::dataset::Location;
-use crate::formats::column_files::{holds_videos, is_there};
+use crate::formats::column_files::{contains_videos, exists};
 use crate::formats::entry::{Backend, FormatEntry};
 use std::path::{Path, PathBuf};
 
 /// The registry row of this format.
 pub const ENTRY: FormatEntry = FormatEntry {
     id: "folder",
-    summary: "folder NAME.folder of numpy's npz files and one picture a step; the reference opens it",
+    summary: "folder NAME.folder of numpy's npz files and one image per step; the reference opens it",
     suffixes: &["folder"],
     feature: None,
     detect,
     backend: Some(Backend { open: reader::open, create: writer::create }),
 };
 
-/// A name that ends so says that a picture is stored; the first is what we write.
+/// File name suffixes of images. The first is used for writing.
 const SUFFIXES: [&str; 3] = ["jpeg", "jpg", "png"];
 
 fn detect(location: &Location) -> bool {
     let Some(path) = location.path() else { return false };
     if path.exists() {
-        return is_there(path) && !holds_videos(path) || ENTRY.has_suffix(location) && path.is_dir();
+        return exists(path) && !contains_videos(path) || ENTRY.has_suffix(location) && path.is_dir();
     }
     ENTRY.has_suffix(location)
 }
 
-/// The file of a picture.
-fn picture(folder: &Path, column: &str, episode: usize, step: usize, suffix: &str) -> PathBuf {
+/// The file of an image.
+fn image_path(folder: &Path, column: &str, episode: usize, step: usize, suffix: &str) -> PathBuf {
     folder.join(column).join(format!("ep_{episode}_step_{step}.{suffix}"))
 }
 
-/// The episode whose picture a file of that name holds.
+/// The episode of an image file, by its name.
 fn episode_of(name: &str) -> Option<usize> {
     let (episode, _) = name.strip_prefix("ep_")?.split_once("_step_")?;
     episode.parse().ok()

@@ -1,17 +1,17 @@
-//! Reading a folder: numbers from its column files, pictures from their own.
+//! Reads a folder: numeric columns from column files, images from image files.
 
-use super::{SUFFIXES, picture};
+use super::{SUFFIXES, image_path};
 use crate::dataset::Location;
-use crate::dataset::episodes::{Rows, content_hash};
+use crate::dataset::episodes::{EpisodeRows, content_hash};
 use crate::dataset::{Constants, Episode, Reader, StepRange};
-use crate::formats::column_files::{ColumnFiles, is_there};
+use crate::formats::column_files::{ColumnFiles, exists};
 use rayon::prelude::*;
 use std::path::Path;
 use std::sync::Arc;
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
 
-/// What a picture's file makes of a byte at most (deflate's limit); one that promises more is damaged.
-const MOST_PER_BYTE: usize = 1032;
+/// Maximum compression ratio of an image file (deflate's limit). A header that declares more is damaged.
+const MAX_COMPRESSION: usize = 1032;
 
 /// Opens a folder.
 pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
@@ -25,31 +25,31 @@ pub(super) struct FolderReader {
 
 impl FolderReader {
     pub fn open(folder: &Path) -> Result<Self> {
-        if !is_there(folder) {
+        if !exists(folder) {
             let problem = if folder.exists() { "it holds no ep_len.npz" } else { "there is no such dataset" };
             return Err(Error::corrupt(folder, problem, "check the path; `swm datasets` lists those at home"));
         }
         let files = ColumnFiles::open(folder)?;
-        let pictures = match files.recorded() {
+        let images = match files.recorded() {
             Some(recorded) => recorded.columns().iter().filter(|column| column.is_image()).cloned().collect(),
-            None => foreign_pictures(&files)?,
+            None => infer_image_columns(&files)?,
         };
-        let schema = files.schema(pictures)?;
+        let schema = files.schema(images)?;
         Ok(Self { files, schema })
     }
 
-    fn read_pictures(&self, column: &ColumnSpec, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
-        let mut wanted = self.files.rows().wanted(column, ranges, out)?;
+    fn read_images(&self, column: &ColumnSpec, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+        let mut slots = self.files.rows().row_slots(column, ranges, out)?;
         let (height, width) = (column.shape[0], column.shape[1]);
-        // One group for every picture: the places that want it.
-        wanted.par_chunk_by_mut(|a, b| a.0 == b.0).try_for_each(|group| {
+        // One group per distinct image: the output slots that receive it.
+        slots.par_chunk_by_mut(|a, b| a.0 == b.0).try_for_each(|group| {
             let Some((((episode, step), first), others)) = group.split_first_mut() else { return Ok(()) };
-            let bytes = picture_bytes(self.files.folder(), &column.name, *episode, *step)?;
+            let bytes = read_image(self.files.folder(), &column.name, *episode, *step)?;
             swm_image::decode(&bytes, height, width, first).map_err(|problem| {
-                let path = picture(self.files.folder(), &column.name, *episode, *step, SUFFIXES[0]);
+                let path = image_path(self.files.folder(), &column.name, *episode, *step, SUFFIXES[0]);
                 Error::corrupt(path, problem.to_string(), "restore it from a copy, or rebuild the dataset")
             })?;
-            others.iter_mut().for_each(|(_, place)| place.copy_from_slice(first));
+            others.iter_mut().for_each(|(_, slot)| slot.copy_from_slice(first));
             Ok(())
         })
     }
@@ -66,11 +66,7 @@ impl Reader for FolderReader {
 
     fn read_column(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let column = self.schema.column(name)?;
-        if self.files.has(name) {
-            self.files.read(column, ranges, out)
-        } else {
-            self.read_pictures(column, ranges, out)
-        }
+        if self.files.has(name) { self.files.read(column, ranges, out) } else { self.read_images(column, ranges, out) }
     }
 
     fn constants(&self, episode: usize) -> Result<Constants> {
@@ -86,18 +82,17 @@ impl Reader for FolderReader {
     }
 
     fn content_hash(&self) -> Result<String> {
-        let rows: &Rows = self.files.rows();
+        let rows: &EpisodeRows = self.files.rows();
         content_hash(rows, &self.schema.columns()[2..], |column, add| {
             let data = if self.files.has(&column.name) { self.files.data(&column.name)? } else { &[] };
             for (position, episode) in rows.episodes().iter().enumerate() {
                 if column.is_image() {
                     for step in 0..episode.length {
-                        add(&picture_bytes(self.files.folder(), &column.name, position, step)?);
+                        add(&read_image(self.files.folder(), &column.name, position, step)?);
                     }
                 } else {
                     let rows = rows.range(&StepRange::new(position, 0, episode.length))?;
                     let size = column.row_bytes();
-                    #[allow(clippy::cast_possible_truncation)] // as many rows as the data in memory have
                     data[rows.start as usize * size..rows.end as usize * size].chunks_exact(size).for_each(&mut *add);
                 }
             }
@@ -106,9 +101,9 @@ impl Reader for FolderReader {
     }
 }
 
-/// The columns of pictures of a folder that another program wrote: its subfolders, by name. The first picture says how
-/// large all are.
-fn foreign_pictures(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
+/// The image columns of a folder that another program wrote: its subfolders, by name. The first image determines the
+/// size of all.
+fn infer_image_columns(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
     let folder = files.folder();
     let Some(first) = files.rows().episodes().iter().position(|episode| episode.length > 0) else { return Ok(vec![]) };
     let io = |e| Error::io(folder, "listing the folder", e);
@@ -119,31 +114,31 @@ fn foreign_pictures(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
         if !entry.path().is_dir() {
             continue;
         }
-        let bytes = picture_bytes(folder, &name, first, 0)?;
+        let bytes = read_image(folder, &name, first, 0)?;
         let damaged = |problem: String| {
-            let path = picture(folder, &name, first, 0, SUFFIXES[0]);
+            let path = image_path(folder, &name, first, 0, SUFFIXES[0]);
             Error::corrupt(path, problem, "restore it from a copy, or rebuild the dataset")
         };
         let (height, width) = swm_image::image_size(&bytes).map_err(|problem| damaged(problem.to_string()))?;
         let column = ColumnSpec::image(&name, height, width);
-        if column.is_empty() || column.row_bytes() / MOST_PER_BYTE > bytes.len() {
-            return Err(damaged(format!("{} bytes are no picture of {height} x {width}", bytes.len())));
+        if column.is_empty() || column.row_bytes() / MAX_COMPRESSION > bytes.len() {
+            return Err(damaged(format!("{} bytes cannot be an image of {height} x {width}", bytes.len())));
         }
         columns.push(column);
     }
     Ok(columns)
 }
 
-/// The file of a picture, whatever its suffix.
-fn picture_bytes(folder: &Path, column: &str, episode: usize, step: usize) -> Result<Vec<u8>> {
+/// Reads the file of an image, with any of the suffixes.
+fn read_image(folder: &Path, column: &str, episode: usize, step: usize) -> Result<Vec<u8>> {
     for suffix in SUFFIXES {
-        let path = picture(folder, column, episode, step, suffix);
+        let path = image_path(folder, column, episode, step, suffix);
         match std::fs::read(&path) {
             Ok(bytes) => return Ok(bytes),
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => {}
-            Err(e) => return Err(Error::io(path, "reading a picture", e)),
+            Err(e) => return Err(Error::io(path, "reading an image", e)),
         }
     }
-    let path = picture(folder, column, episode, step, SUFFIXES[0]);
-    Err(Error::corrupt(path, "the picture is missing", "restore it from a copy, or rebuild the dataset"))
+    let path = image_path(folder, column, episode, step, SUFFIXES[0]);
+    Err(Error::corrupt(path, "the image is missing", "restore it from a copy, or rebuild the dataset"))
 }

@@ -1,11 +1,11 @@
-//! Writing a folder: an episode's pictures first, then its numbers, which commit it.
+//! Writes a folder: the images of an episode first, then its numeric columns, which commit it.
 
 use super::reader::FolderReader;
-use super::{SUFFIXES, episode_of, picture};
+use super::{SUFFIXES, episode_of, image_path};
 use crate::dataset::Location;
 use crate::dataset::episodes;
 use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer};
-use crate::formats::column_files::{ColumnFilesWriter, is_there};
+use crate::formats::column_files::{ColumnFilesWriter, exists};
 use rayon::prelude::*;
 use std::path::Path;
 use swm_core::{Batch, Error, Result, Schema};
@@ -15,19 +15,19 @@ use swm_image::ImageCodec;
 pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     let folder = location.local("folder")?;
     options.codec.check()?;
-    let known = if options.mode == WriteMode::Append && is_there(folder) {
+    let known = if options.mode == WriteMode::Append && exists(folder) {
         Some(FolderReader::open(folder)?.schema().clone())
     } else {
         None
     };
-    let numbers = ColumnFilesWriter::create(folder, schema, &options, known.as_ref())?;
+    let columns = ColumnFilesWriter::create(folder, schema, &options, known.as_ref())?;
     for column in schema.columns().iter().filter(|column| column.is_image()) {
-        prepare(&folder.join(&column.name), numbers.episodes())?;
+        prepare(&folder.join(&column.name), columns.episodes())?;
     }
-    Ok(Box::new(FolderWriter { numbers, schema: schema.clone(), codec: options.codec }))
+    Ok(Box::new(FolderWriter { columns, schema: schema.clone(), codec: options.codec }))
 }
 
-/// Makes the folder of a column of pictures, and removes pictures of episodes that were never committed.
+/// Creates the folder of an image column and removes images of uncommitted episodes.
 fn prepare(folder: &Path, episodes: usize) -> Result<()> {
     let io = |e| Error::io(folder, "preparing the folder", e);
     std::fs::create_dir_all(folder).map_err(io)?;
@@ -41,33 +41,33 @@ fn prepare(folder: &Path, episodes: usize) -> Result<()> {
 }
 
 struct FolderWriter {
-    numbers: ColumnFilesWriter,
+    columns: ColumnFilesWriter,
     schema: Schema,
     codec: ImageCodec,
 }
 
 impl Writer for FolderWriter {
     fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
-        episodes::check(episode, &self.schema)?;
-        let number = self.numbers.episodes();
+        episodes::check_episode(episode, &self.schema)?;
+        let number = self.columns.episodes();
         for (index, column) in self.schema.columns().iter().enumerate().filter(|(_, column)| column.is_image()) {
             let (height, width) = (column.shape[0], column.shape[1]);
             let frames = episode.bytes(index).par_chunks_exact(column.row_bytes());
             frames.enumerate().with_max_len(1).try_for_each_init(Vec::new, |bytes, (step, frame)| {
                 bytes.clear();
                 self.codec.encode(frame, height, width, bytes)?;
-                let path = picture(self.numbers.folder(), &column.name, number, step, SUFFIXES[0]);
-                std::fs::write(&path, &*bytes).map_err(|e| Error::io(path, "writing a picture", e))
+                let path = image_path(self.columns.folder(), &column.name, number, step, SUFFIXES[0]);
+                std::fs::write(&path, &*bytes).map_err(|e| Error::io(path, "writing an image", e))
             })?;
         }
-        self.numbers.write(episode, constants)
+        self.columns.write(episode, constants)
     }
 
     fn episodes(&self) -> usize {
-        self.numbers.episodes()
+        self.columns.episodes()
     }
 
     fn finish(mut self: Box<Self>) -> Result<()> {
-        self.numbers.finish()
+        self.columns.finish()
     }
 }

@@ -2,9 +2,9 @@
 
 use super::filters::{Pipeline, Scratch};
 use super::source::Source;
-use crate::dataset::episodes::Wanted;
+use crate::dataset::episodes::RowSlot;
 use crate::dataset::objects::Bytes;
-use crate::formats::stored_scalar::{Class, Stored};
+use crate::formats::stored_scalar::{Class, StoredScalar};
 use hdf5_pure::{Dataset, Datatype, DatatypeByteOrder, FloatingPointLayout, Layout};
 use rayon::prelude::*;
 use std::cell::RefCell;
@@ -15,10 +15,10 @@ use std::sync::OnceLock;
 use swm_core::ColumnSpec;
 
 /// Chunks larger than this are refused: nobody writes them, and damaged files promise any size.
-const LARGEST_CHUNK: u64 = 128 << 20;
+const MAX_CHUNK_BYTES: u64 = 128 << 20;
 
 /// Bytes of a contiguous dataset that are read at once.
-const RUN: u64 = 1 << 20;
+const RUN_BYTES: u64 = 1 << 20;
 
 thread_local! {
     static BUFFERS: RefCell<Buffers> = RefCell::default();
@@ -39,13 +39,13 @@ pub(super) struct Column {
     /// How many rows it has.
     pub rows: u64,
     dataset: Dataset,
-    stored: Stored,
-    place: Place,
+    stored: StoredScalar,
+    storage: Storage,
     /// Whether we wrote it: then every chunk is there.
-    pub ours: bool,
+    pub written_here: bool,
 }
 
-enum Place {
+enum Storage {
     /// One row after another from this byte on, or in the dataset's header.
     Contiguous(Option<u64>),
     Compact,
@@ -58,7 +58,7 @@ enum Place {
     },
 }
 
-/// Where the chunks are, by their place in the grid of chunks.
+/// Where the chunks are, by their slot in the grid of chunks.
 struct Index {
     chunks: Vec<Chunk>,
     /// The decoded last row of chunks, when its chunks hold several rows: a writer at work moves it.
@@ -71,11 +71,14 @@ struct Chunk {
     number: u64,
     address: u64,
     size: u32,
-    skipped: u32,
+    filter_mask: u32,
 }
 
 /// Runs code of `hdf5-pure`, in which a damaged file may provoke a panic.
-pub(super) fn guard<T, E: std::fmt::Display>(what: &str, code: impl FnOnce() -> Result<T, E>) -> Result<T, String> {
+pub(super) fn catch_panic<T, E: std::fmt::Display>(
+    what: &str,
+    code: impl FnOnce() -> Result<T, E>,
+) -> Result<T, String> {
     match catch_unwind(AssertUnwindSafe(code)) {
         Ok(result) => result.map_err(|e| format!("{what}: {e}")),
         Err(_) => Err(format!("{what}: the library that reads HDF5 gave up on it")),
@@ -83,7 +86,7 @@ pub(super) fn guard<T, E: std::fmt::Display>(what: &str, code: impl FnOnce() -> 
 }
 
 /// The number type of a dataset; none for text and records.
-fn number(datatype: &Datatype) -> Option<Stored> {
+fn scalar_type(datatype: &Datatype) -> Option<StoredScalar> {
     let (class, size, order) = match datatype {
         Datatype::FixedPoint { size, byte_order, layout } => {
             if layout.bit_offset != 0 || u32::from(layout.bit_precision) != size * 8 {
@@ -112,7 +115,7 @@ fn number(datatype: &Datatype) -> Option<Stored> {
         Datatype::Enumeration { size: 1, members, .. } if members.len() == 2 => {
             (Class::Bool, 1, DatatypeByteOrder::LittleEndian)
         }
-        Datatype::Enumeration { base_type, .. } => return number(base_type),
+        Datatype::Enumeration { base_type, .. } => return scalar_type(base_type),
         _ => return None,
     };
     let big_endian = match order {
@@ -120,7 +123,7 @@ fn number(datatype: &Datatype) -> Option<Stored> {
         DatatypeByteOrder::BigEndian => true,
         DatatypeByteOrder::Vax => return None,
     };
-    let stored = Stored { class, size: size as usize, big_endian };
+    let stored = StoredScalar { class, size: size as usize, big_endian };
     stored.dtype().map(|_| stored)
 }
 
@@ -130,40 +133,40 @@ impl Column {
     /// # Errors
     /// When it is damaged, or stored in a way that is not understood.
     pub fn new(name: &str, dataset: Dataset, file_size: u64) -> Result<Option<Self>, String> {
-        let Some(stored) = number(&guard("its type", || dataset.datatype())?) else { return Ok(None) };
+        let Some(stored) = scalar_type(&catch_panic("its type", || dataset.datatype())?) else { return Ok(None) };
         let Some(dtype) = stored.dtype() else { return Ok(None) };
-        let shape = guard("its shape", || dataset.shape())?;
+        let shape = catch_panic("its shape", || dataset.shape())?;
         let Some((&rows, sides)) = shape.split_first() else { return Ok(None) };
         let sides: Vec<usize> = sides.iter().map(|&side| side as usize).collect();
         let row_bytes = sides.iter().try_fold(dtype.size() as u64, |n, &side| n.checked_mul(side as u64));
         if row_bytes == Some(0) {
             return Ok(None);
         }
-        if row_bytes.is_none_or(|n| n > LARGEST_CHUNK) {
+        if row_bytes.is_none_or(|n| n > MAX_CHUNK_BYTES) {
             return Err(format!("its rows have the shape {sides:?}, which is too large"));
         }
-        let layout = guard("its layout", || dataset.layout()).map_err(|problem| match problem {
+        let layout = catch_panic("its layout", || dataset.layout()).map_err(|problem| match problem {
             newest if newest.contains("layout version: 5") => {
                 format!("{newest} (HDF5 2 with libver='latest'; `h5repack --high=3` makes it readable)")
             }
             other => other,
         })?;
-        let place = match layout {
+        let storage = match layout {
             Layout::Contiguous { address, .. } => {
                 let bytes = sides.iter().product::<usize>() as u64 * stored.size as u64;
                 let end = bytes.checked_mul(rows).and_then(|bytes| bytes.checked_add(address.unwrap_or(0)));
                 if end.is_none_or(|end| end > file_size) {
                     return Err(format!("{rows} rows of {bytes} bytes do not fit the file"));
                 }
-                Place::Contiguous(address)
+                Storage::Contiguous(address)
             }
-            Layout::Compact { .. } => Place::Compact,
+            Layout::Compact { .. } => Storage::Compact,
             Layout::Chunked { chunk_shape, .. } => {
-                let filters = guard("its filters", || Ok::<_, String>(dataset.filter_pipeline()))?;
+                let filters = catch_panic("its filters", || Ok::<_, String>(dataset.filter_pipeline()))?;
                 let pipeline = Pipeline::new(&filters, stored.size)?;
                 let bytes = chunk_shape.iter().try_fold(stored.size as u64, |n, &side| n.checked_mul(side));
                 let block = row_bytes.and_then(|n| n.checked_mul(*chunk_shape.first()?));
-                let fits = |n: Option<u64>| n.is_some_and(|n| (1..=LARGEST_CHUNK).contains(&n));
+                let fits = |n: Option<u64>| n.is_some_and(|n| (1..=MAX_CHUNK_BYTES).contains(&n));
                 if chunk_shape.len() != shape.len() || !fits(bytes) || !fits(block) {
                     return Err(format!("its chunks have the shape {chunk_shape:?}, which is too large"));
                 }
@@ -176,7 +179,7 @@ impl Column {
                 if chunks.and_then(|n| (n / 2).checked_mul(least)).is_none_or(|n| n > file_size) {
                     return Err(format!("{rows} rows in chunks of {chunk_shape:?} do not fit the file"));
                 }
-                Place::Chunked {
+                Storage::Chunked {
                     pipeline,
                     rows: chunk_shape[0],
                     sides: chunk_shape[1..].iter().map(|&side| side as usize).collect(),
@@ -185,7 +188,14 @@ impl Column {
             }
             other => return Err(format!("its data are {other}, which is not read")),
         };
-        Ok(Some(Self { spec: ColumnSpec::new(name, dtype, sides), rows, dataset, stored, place, ours: false }))
+        Ok(Some(Self {
+            spec: ColumnSpec::new(name, dtype, sides),
+            rows,
+            dataset,
+            stored,
+            storage,
+            written_here: false,
+        }))
     }
 
     /// Whether numbers are stored as we store them.
@@ -200,9 +210,9 @@ impl Column {
 
     /// Bytes in the file.
     pub fn footprint(&self, source: &Source) -> Result<u64, String> {
-        match &self.place {
-            Place::Contiguous(_) | Place::Compact => Ok(self.rows * self.stored_row() as u64),
-            Place::Chunked { .. } => Ok(self.index(source)?.chunks.iter().map(|chunk| u64::from(chunk.size)).sum()),
+        match &self.storage {
+            Storage::Contiguous(_) | Storage::Compact => Ok(self.rows * self.stored_row() as u64),
+            Storage::Chunked { .. } => Ok(self.index(source)?.chunks.iter().map(|chunk| u64::from(chunk.size)).sum()),
         }
     }
 
@@ -213,35 +223,35 @@ impl Column {
     pub fn read_all(&self, source: &Source) -> Result<Vec<u8>, String> {
         let size = self.spec.row_bytes();
         let mut all = vec![0; self.rows as usize * size];
-        let mut wanted: Vec<Wanted<'_>> =
-            all.chunks_exact_mut(size).enumerate().map(|(row, place)| ((0, row), place)).collect();
-        self.read(source, &mut wanted, |(_, row)| row as u64)?;
+        let mut slots: Vec<RowSlot<'_>> =
+            all.chunks_exact_mut(size).enumerate().map(|(row, slot)| ((0, row), slot)).collect();
+        self.read(source, &mut slots, |(_, row)| row as u64)?;
         Ok(all)
     }
 
-    /// Reads rows of the table, each to its place. They are sorted by `row_of` their keys.
+    /// Reads rows of the table, each to its slot. They are sorted by `row_of` their keys.
     ///
     /// # Errors
     /// When they are damaged.
     pub fn read(
         &self,
         source: &Source,
-        wanted: &mut [Wanted<'_>],
+        slots: &mut [RowSlot<'_>],
         row_of: impl Fn((usize, usize)) -> u64 + Sync,
     ) -> Result<(), String> {
-        match &self.place {
-            Place::Compact => {
-                let all = guard("its data", || self.dataset.read_raw())?;
-                self.copy_rows(&all, 0, wanted, &row_of)
+        match &self.storage {
+            Storage::Compact => {
+                let all = catch_panic("its data", || self.dataset.read_raw())?;
+                self.copy_rows(&all, 0, slots, &row_of)
             }
-            Place::Contiguous(None) => {
-                wanted.iter_mut().for_each(|(_, place)| place.fill(0));
+            Storage::Contiguous(None) => {
+                slots.iter_mut().for_each(|(_, slot)| slot.fill(0));
                 Ok(())
             }
-            Place::Contiguous(Some(address)) => self.read_contiguous(source, *address, wanted, &row_of),
-            Place::Chunked { pipeline, rows, sides, .. } => {
+            Storage::Contiguous(Some(address)) => self.read_contiguous(source, *address, slots, &row_of),
+            Storage::Chunked { pipeline, rows, sides, .. } => {
                 let grid = Grid::new(*rows, sides, self);
-                self.read_chunks(source, pipeline, &grid, wanted, &row_of)
+                self.read_chunks(source, pipeline, &grid, slots, &row_of)
             }
         }
     }
@@ -250,15 +260,15 @@ impl Column {
         &self,
         source: &Source,
         address: u64,
-        wanted: &mut [Wanted<'_>],
+        slots: &mut [RowSlot<'_>],
         row_of: &(impl Fn((usize, usize)) -> u64 + Sync),
     ) -> Result<(), String> {
         let size = self.stored_row() as u64;
-        let most = (RUN / size).max(1);
+        let most = (RUN_BYTES / size).max(1);
         // Runs of rows that follow each other, each read in one go.
-        let runs: Vec<&mut [Wanted<'_>]> = {
+        let runs: Vec<&mut [RowSlot<'_>]> = {
             let mut runs = vec![];
-            let mut rest = wanted;
+            let mut rest = slots;
             while let Some(((key, _), _)) = rest.split_first() {
                 let first = row_of(*key);
                 let mut last = first;
@@ -277,7 +287,7 @@ impl Column {
             }
             runs
         };
-        let bounds = |run: &[Wanted<'_>]| row_of(run[0].0)..row_of(run[run.len() - 1].0) + 1;
+        let bounds = |run: &[RowSlot<'_>]| row_of(run[0].0)..row_of(run[run.len() - 1].0) + 1;
         let ranges: Vec<Range<u64>> = runs
             .iter()
             .map(|run| bounds(run))
@@ -289,8 +299,8 @@ impl Column {
             if let Some(bytes) = fetched.get(i) {
                 return self.copy_rows(bytes, first, run, row_of);
             }
-            if let ([(_, place)], true) = (&mut *run, self.stored.is_plain()) {
-                return source.read(ranges[i].start, place).map_err(|e| e.to_string());
+            if let ([(_, slot)], true) = (&mut *run, self.stored.is_plain()) {
+                return source.read(ranges[i].start, slot).map_err(|e| e.to_string());
             }
             BUFFERS.with_borrow_mut(|buffers| {
                 buffers.stored.resize((ranges[i].end - ranges[i].start) as usize, 0);
@@ -300,19 +310,19 @@ impl Column {
         })
     }
 
-    /// Copies wanted rows from stored ones, the first of which is row `first`.
+    /// Copies slots rows from stored ones, the first of which is row `first`.
     fn copy_rows(
         &self,
         stored: &[u8],
         first: u64,
-        wanted: &mut [Wanted<'_>],
+        slots: &mut [RowSlot<'_>],
         row_of: &impl Fn((usize, usize)) -> u64,
     ) -> Result<(), String> {
         let size = self.stored_row();
-        for (key, place) in wanted {
+        for (key, slot) in slots {
             let at = (row_of(*key) - first) as usize * size;
             let row = stored.get(at..at + size).ok_or("its data are cut off")?;
-            self.stored.convert(row, place)?;
+            self.stored.convert(row, slot)?;
         }
         Ok(())
     }
@@ -322,21 +332,21 @@ impl Column {
         source: &Source,
         pipeline: &Pipeline,
         grid: &Grid,
-        wanted: &mut [Wanted<'_>],
+        slots: &mut [RowSlot<'_>],
         row_of: &(impl Fn((usize, usize)) -> u64 + Sync),
     ) -> Result<(), String> {
         let index = self.index(source)?;
-        let same_chunks = |a: &Wanted<'_>, b: &Wanted<'_>| row_of(a.0) / grid.rows == row_of(b.0) / grid.rows;
+        let same_chunks = |a: &RowSlot<'_>, b: &RowSlot<'_>| row_of(a.0) / grid.rows == row_of(b.0) / grid.rows;
         // From far away, all chunks are fetched at once.
         let mut ranges: Vec<Range<u64>> = vec![];
         if source.is_remote() {
-            let rows = wanted.chunk_by(same_chunks).map(|group| row_of(group[0].0) / grid.rows);
+            let rows = slots.chunk_by(same_chunks).map(|group| row_of(group[0].0) / grid.rows);
             ranges.extend(rows.flat_map(|row| index.row(row, grid)).map(Chunk::range));
         }
         let fetched = source.fetch(&ranges).map_err(|e| e.to_string())?;
         let fetched: HashMap<u64, Bytes> = ranges.iter().map(|range| range.start).zip(fetched).collect();
         let fetched = |chunk: &Chunk| fetched.get(&chunk.address);
-        let groups: Vec<&mut [Wanted<'_>]> = wanted.chunk_by_mut(same_chunks).collect();
+        let groups: Vec<&mut [RowSlot<'_>]> = slots.chunk_by_mut(same_chunks).collect();
         groups.into_par_iter().with_max_len(1).try_for_each(|group| {
             let row = row_of(group[0].0) / grid.rows;
             if let Some((tail, decoded)) = &index.tail
@@ -347,9 +357,9 @@ impl Column {
             BUFFERS.with_borrow_mut(|buffers| {
                 let Buffers { stored, chunk, numbers, scratch } = buffers;
                 let chunks = index.row(row, grid);
-                // The usual case: the chunk is the row, wanted once.
-                if let ([found], [(_, place)], true) = (chunks, &mut *group, self.stored.is_plain() && grid.is_row()) {
-                    return read_chunk(source, pipeline, found, fetched(found), stored, scratch, place);
+                // The usual case: the chunk is the row, slots once.
+                if let ([found], [(_, slot)], true) = (chunks, &mut *group, self.stored.is_plain() && grid.is_row()) {
+                    return read_chunk(source, pipeline, found, fetched(found), stored, scratch, slot);
                 }
                 numbers.resize(grid.rows as usize * self.stored_row(), 0);
                 if chunks.len() != grid.per_row() {
@@ -362,7 +372,7 @@ impl Column {
                     } else {
                         chunk.resize(grid.chunk_bytes, 0);
                         read_chunk(source, pipeline, found, fetched(found), stored, scratch, chunk)?;
-                        grid.place(found.number, chunk, numbers);
+                        grid.copy_chunk(found.number, chunk, numbers);
                     }
                 }
                 self.copy_rows(numbers, row * grid.rows, group, row_of)
@@ -372,7 +382,7 @@ impl Column {
 
     /// Where the chunks are. Read when it is first asked for.
     fn index(&self, source: &Source) -> Result<&Index, String> {
-        let Place::Chunked { pipeline, rows, sides, index } = &self.place else {
+        let Storage::Chunked { pipeline, rows, sides, index } = &self.storage else {
             return Err("it has no chunks".to_owned());
         };
         let grid = Grid::new(*rows, sides, self);
@@ -381,7 +391,7 @@ impl Column {
     }
 
     fn read_index(&self, source: &Source, pipeline: &Pipeline, grid: &Grid) -> Result<Index, String> {
-        let listed = guard("the list of its chunks", || self.dataset.chunks())?;
+        let listed = catch_panic("the list of its chunks", || self.dataset.chunks())?;
         let mut chunks = Vec::with_capacity(listed.len());
         for chunk in listed {
             let whole = pipeline.is_empty() && chunk.storage_size != grid.chunk_bytes as u64;
@@ -393,22 +403,22 @@ impl Column {
                 return Err(format!("a chunk lies at byte {}, beyond the end of the file", chunk.address));
             }
             let number = grid.number(&chunk.offset).ok_or("a chunk lies outside its grid")?;
-            chunks.push(Chunk { number, address: chunk.address, size, skipped: chunk.filter_mask });
+            chunks.push(Chunk { number, address: chunk.address, size, filter_mask: chunk.filter_mask });
         }
         chunks.sort_unstable_by_key(|chunk| chunk.number);
         if chunks.windows(2).any(|pair| pair[0].number == pair[1].number) {
-            return Err("two chunks are in the same place".to_owned());
+            return Err("two chunks are in the same slot".to_owned());
         }
         // Files of others may be sparse, though more often they are damaged.
         let expected = self.rows.div_ceil(grid.rows).saturating_mul(grid.per_row() as u64);
         let present = chunks.partition_point(|chunk| chunk.number < expected) as u64;
-        if present < if self.ours { expected } else { expected / 2 } {
+        if present < if self.written_here { expected } else { expected / 2 } {
             return Err(format!("of its {expected} chunks there are {present}"));
         }
         let mut addresses: Vec<u64> = chunks.iter().map(|chunk| chunk.address).collect();
         addresses.sort_unstable();
         if addresses.windows(2).any(|pair| pair[0] == pair[1]) {
-            return Err("two chunks lie in the same place of the file".to_owned());
+            return Err("two chunks lie in the same slot of the file".to_owned());
         }
         let mut index = Index { chunks, tail: None };
         if grid.rows > 1
@@ -436,14 +446,14 @@ fn read_chunk(
 ) -> Result<(), String> {
     let within = |problem: String| format!("chunk {}: {problem}", chunk.number);
     if let Some(bytes) = fetched {
-        return pipeline.decode(bytes, chunk.skipped, scratch, out).map_err(within);
+        return pipeline.decode(bytes, chunk.filter_mask, scratch, out).map_err(within);
     }
     if pipeline.is_empty() {
         return source.read(chunk.address, out).map_err(|e| within(e.to_string()));
     }
     stored.resize(chunk.size as usize, 0);
     source.read(chunk.address, stored).map_err(|e| within(e.to_string()))?;
-    pipeline.decode(stored, chunk.skipped, scratch, out).map_err(within)
+    pipeline.decode(stored, chunk.filter_mask, scratch, out).map_err(within)
 }
 
 impl Chunk {
@@ -512,8 +522,8 @@ impl<'a> Grid<'a> {
         Some(number)
     }
 
-    /// Copies what a chunk holds to its place in the rows of the grid's row.
-    fn place(&self, number: u64, chunk: &[u8], rows: &mut [u8]) {
+    /// Copies what a chunk holds to its slot in the rows of the grid's row.
+    fn copy_chunk(&self, number: u64, chunk: &[u8], rows: &mut [u8]) {
         let mut rest = number as usize;
         let mut begin = vec![0; self.sides.len()];
         for axis in (0..self.sides.len()).rev() {

@@ -30,7 +30,7 @@ const ROOT_TREE_AT: u64 = 80;
 pub(super) const ROOT: u64 = 96;
 /// See [`ROOT`].
 const ATTRIBUTE: &str = "stable_worldmodel.record";
-/// Room in the root's header, so that other programs which add attributes leave ours where it is.
+/// Room in the root's header, so that other programs which add attributes leave written_here where it is.
 const ROOM: usize = 64;
 /// The least half of a node of a group's B-tree; the library's default.
 const GROUP_K: u16 = 16;
@@ -192,7 +192,7 @@ impl Layout {
         Self { bytes: out, tables }
     }
 
-    /// Whether a file begins as one of ours does, but for the numbers that change.
+    /// Whether a file begins as one of written_here does, but for the numbers that change.
     pub fn is_that_of(&self, file: &[u8]) -> bool {
         if file.len() != self.bytes.len() {
             return false;
@@ -225,8 +225,8 @@ pub(super) fn record(source: &Source) -> Result<Option<Table>, String> {
     source.read(ROOT, &mut root).map_err(|e| e.to_string())?;
     let number = |at: usize| u64::from_le_bytes(std::array::from_fn(|i| root[at + i]));
     let (tree, heap, record) = (number(24), number(32), number(root.len() - 8));
-    let ours = header(&root_messages(tree, heap, record));
-    if root[16..] != ours[16..root.len()] {
+    let expected = header(&root_messages(tree, heap, record));
+    if root[16..] != expected[16..root.len()] {
         // No other program puts the root's B-tree there; the superblock says where it is as well.
         let place = ROOT + ROOT_BYTES + 8 + ROOM as u64;
         if tree == place || read_u64(source, ROOT_TREE_AT)? == place {

@@ -1,14 +1,15 @@
 //! Reading episodes.
 
-use super::column::{Column, guard};
+use super::column::{Column, catch_panic};
 use super::layout::{self, LENGTHS, OFFSETS};
 use super::record::Record;
 use super::source::Source;
 use super::table;
 use crate::dataset::Location;
-use crate::dataset::episodes::{EPISODE, Rows, STEP, content_hash, numbering};
+use crate::dataset::episodes::{EpisodeRows, content_hash, index_columns};
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
 use std::sync::Arc;
+use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, DType, Error, Manifest, Result, Schema};
 
 /// Rows that are hashed at once.
@@ -21,7 +22,7 @@ pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
 
 pub(super) struct Hdf5Reader {
     source: Source,
-    rows: Rows,
+    rows: EpisodeRows,
     schema: Schema,
     columns: Vec<Column>,
     record: Record,
@@ -38,16 +39,17 @@ impl Hdf5Reader {
     /// Reads the structure of a file.
     pub fn of(source: Source) -> Result<Self> {
         let damaged = |problem: String| damaged(&source, problem);
-        let file = guard("opening it as HDF5", || hdf5_pure::File::from_source(source.clone())).map_err(damaged)?;
-        let names = guard("listing its datasets", || file.root().datasets()).map_err(damaged)?;
+        let file =
+            catch_panic("opening it as HDF5", || hdf5_pure::File::from_source(source.clone())).map_err(damaged)?;
+        let names = catch_panic("listing its datasets", || file.root().datasets()).map_err(damaged)?;
         let record = layout::record(&source).map_err(damaged)?;
         let record = record.map(|found| table::read_all(&found, &source)).transpose();
         let record = record.map_err(|e| damaged(format!("its record: {e}")))?;
         let column = |name: &str| {
-            let dataset = guard("its header", || file.dataset(name));
+            let dataset = catch_panic("its header", || file.dataset(name));
             let column = dataset.and_then(|dataset| Column::new(name, dataset, source.size()));
             let mut column = column.map_err(|problem| damaged(format!("column '{name}': {problem}")))?;
-            column.iter_mut().for_each(|column| column.ours = record.is_some());
+            column.iter_mut().for_each(|column| column.written_here = record.is_some());
             Ok(column)
         };
         let counts = |name: &str| -> Result<Vec<i64>> {
@@ -63,7 +65,7 @@ impl Hdf5Reader {
                 _ => Err(missing()),
             }
         };
-        let rows = Rows::at(&counts(LENGTHS)?, &counts(OFFSETS)?).map_err(damaged)?;
+        let rows = EpisodeRows::from_lengths(&counts(LENGTHS)?, &counts(OFFSETS)?).map_err(damaged)?;
         let (mut columns, mut left_out) = (vec![], vec![]);
         for name in names.iter().filter(|name| *name != LENGTHS && *name != OFFSETS) {
             let Some(column) = column(name)? else {
@@ -91,13 +93,13 @@ impl Hdf5Reader {
         let place = |column: &Column| known.iter().position(|k| k.name == column.spec.name).unwrap_or(known.len());
         columns.sort_by(|a, b| place(a).cmp(&place(b)).then_with(|| a.spec.name.cmp(&b.spec.name)));
         let specs: Vec<ColumnSpec> = columns.iter().map(|column| column.spec.clone()).collect();
-        let data = specs.iter().filter(|spec| spec.name != EPISODE && spec.name != STEP).cloned();
-        let schema = Schema::new(numbering(&specs).into_iter().chain(data).collect::<Vec<_>>())?;
+        let data = specs.iter().filter(|spec| spec.name != EPISODE_IDX && spec.name != STEP_IDX).cloned();
+        let schema = Schema::new(index_columns(&specs).into_iter().chain(data).collect::<Vec<_>>())?;
         Ok(Self { source, rows, schema, columns, record, left_out })
     }
 
     /// Where the episodes are.
-    pub const fn rows(&self) -> &Rows {
+    pub const fn rows(&self) -> &EpisodeRows {
         &self.rows
     }
 
@@ -136,14 +138,14 @@ impl Reader for Hdf5Reader {
 
     fn read_column(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let spec = self.schema.column(name)?;
-        if name == EPISODE || name == STEP {
-            return self.rows.number(spec, ranges, out);
+        if name == EPISODE_IDX || name == STEP_IDX {
+            return self.rows.fill_index_column(spec, ranges, out);
         }
         let Some(column) = self.columns.iter().find(|column| column.spec.name == name) else {
             return Err(self.fail(name, "it is not there"));
         };
-        let mut wanted = self.rows.wanted(spec, ranges, out)?;
-        let first = self.rows.first();
+        let mut wanted = self.rows.row_slots(spec, ranges, out)?;
+        let first = self.rows.first_rows();
         if !self.rows.is_contiguous() {
             wanted.sort_by_key(|&((episode, step), _)| first[episode] + step as u64);
         }
@@ -159,26 +161,28 @@ impl Reader for Hdf5Reader {
     fn irregularities(&self) -> Result<Vec<Irregularity>> {
         let mut found = vec![];
         let mut order: Vec<usize> = (0..self.episodes().len()).collect();
-        order.sort_by_key(|&episode| self.rows.first()[episode]);
+        order.sort_by_key(|&episode| self.rows.first_rows()[episode]);
         for pair in order.windows(2) {
-            if self.rows.first()[pair[0]] + self.episodes()[pair[0]].length as u64 > self.rows.first()[pair[1]] {
+            if self.rows.first_rows()[pair[0]] + self.episodes()[pair[0]].length as u64
+                > self.rows.first_rows()[pair[1]]
+            {
                 let what = format!("some of its rows are also those of episode {}", pair[0]);
                 found.push(Irregularity { episode: Some(pair[1]), what });
             }
         }
-        let Some(column) = self.columns.iter().find(|column| column.spec.name == STEP && column.spec.len() == 1) else {
+        let Some(column) = self.columns.iter().find(|column| column.spec.name == STEP_IDX && column.spec.len() == 1)
+        else {
             return Ok(found);
         };
         let mut steps = Batch::zeros(&Schema::new([column.spec.clone()])?, 0);
-        let row_of = |(episode, step): (usize, usize)| self.rows.first()[episode] + step as u64;
+        let row_of = |(episode, step): (usize, usize)| self.rows.first_rows()[episode] + step as u64;
         for (position, episode) in self.episodes().iter().enumerate() {
             steps.resize(episode.length);
             let range = [StepRange::new(position, 0, episode.length)];
-            let mut wanted = self.rows.wanted(&column.spec, &range, steps.bytes_mut(0))?;
-            column.read(&self.source, &mut wanted, row_of).map_err(|problem| self.fail(STEP, &problem))?;
-            #[allow(clippy::cast_precision_loss)]
+            let mut wanted = self.rows.row_slots(&column.spec, &range, steps.bytes_mut(0))?;
+            column.read(&self.source, &mut wanted, row_of).map_err(|problem| self.fail(STEP_IDX, &problem))?;
             if let Some((row, step)) =
-                steps.to_f32(STEP)?.into_iter().enumerate().find(|&(row, step)| step != row as f32)
+                steps.to_f32(STEP_IDX)?.into_iter().enumerate().find(|&(row, step)| step != row as f32)
             {
                 let what = format!("the stored steps do not count up from 0: {step} stands in row {row}");
                 found.push(Irregularity { episode: Some(position), what });

@@ -22,12 +22,12 @@ pub(super) struct Source(Arc<Kind>);
 
 enum Kind {
     Local { file: File, path: PathBuf, len: u64 },
-    Remote { file: ObjectFile, label: PathBuf, pieces: Mutex<Pieces> },
+    Remote { file: ObjectFile, label: PathBuf, pieces: Mutex<ObjectRanges> },
 }
 
-/// Pieces of a remote file, for the many small reads that its structure takes.
+/// ObjectRanges of a remote file, for the many small reads that its structure takes.
 #[derive(Default)]
-struct Pieces {
+struct ObjectRanges {
     by_number: HashMap<u64, Bytes>,
     /// Oldest first.
     order: VecDeque<u64>,
@@ -102,7 +102,6 @@ impl Source {
                 while !rest.is_empty() {
                     let number = at / PIECE;
                     let piece = piece(file, pieces, number)?;
-                    #[allow(clippy::cast_possible_truncation)] // below the size of a piece
                     let begin = (at - number * PIECE) as usize;
                     let size = rest.len().min(piece.len() - begin);
                     let (now, later) = rest.split_at_mut(size);
@@ -126,7 +125,7 @@ impl Source {
     }
 }
 
-fn piece(file: &ObjectFile, pieces: &Mutex<Pieces>, number: u64) -> Result<Bytes> {
+fn piece(file: &ObjectFile, pieces: &Mutex<ObjectRanges>, number: u64) -> Result<Bytes> {
     let lock = || pieces.lock().unwrap_or_else(PoisonError::into_inner);
     if let Some(piece) = lock().by_number.get(&number) {
         return Ok(piece.clone());

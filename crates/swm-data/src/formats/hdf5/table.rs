@@ -145,8 +145,8 @@ impl TableWriter {
         file.write_all_at(&self.writing, address)?;
         let first = self.rows - count as u64;
         for ((chunk, smaller), row) in self.encoded.iter().zip(smaller).zip(first..) {
-            let skipped = if smaller { 0 } else { NOT_COMPRESSED };
-            let entry = Entry { size: chunk.len() as u32, skipped, row, address };
+            let filter_mask = if smaller { 0 } else { NOT_COMPRESSED };
+            let entry = Entry { size: chunk.len() as u32, filter_mask, row, address };
             self.tree.push(entry, &mut |size| space.take_node(size));
             address += chunk.len() as u64;
         }
@@ -166,7 +166,7 @@ impl TableWriter {
             self.freed.extend(self.tree.move_last(address));
         } else {
             let row = self.tree.last().map_or(0, |last| last.row + self.table.chunk_rows as u64);
-            let entry = Entry { size: size as u32, skipped: 0, row, address };
+            let entry = Entry { size: size as u32, filter_mask: 0, row, address };
             self.tree.push(entry, &mut |size| space.take_node(size));
         }
         self.stored = self.open.len();
@@ -217,7 +217,7 @@ pub(super) fn read_all(table: &Table, source: &Source) -> Result<Vec<u8>, String
 }
 
 fn read_chunk(table: &Table, source: &Source, entry: &Entry) -> Result<Vec<u8>, String> {
-    if entry.size as usize != summed_bytes(table) || entry.skipped != 0 {
+    if entry.size as usize != summed_bytes(table) || entry.filter_mask != 0 {
         return Err(format!("a chunk has {} bytes instead of {}", entry.size, summed_bytes(table)));
     }
     let mut bytes = vec![0; entry.size as usize];

@@ -18,7 +18,7 @@ const FULL: usize = 64;
 pub(super) struct Entry {
     /// Stored bytes of the (first) chunk, and the filters left out.
     pub size: u32,
-    pub skipped: u32,
+    pub filter_mask: u32,
     /// Its first row.
     pub row: u64,
     pub address: u64,
@@ -104,7 +104,6 @@ impl Tree {
         let size = self.node_bytes();
         let fresh = |left: u64, address: u64| Node {
             address,
-            #[allow(clippy::cast_possible_truncation)] // 64^11 chunks are more than fit a file
             level: level as u8,
             left,
             right: UNDEFINED,
@@ -215,14 +214,14 @@ impl Tree {
     /// The bytes of a node from the key of an entry to the key beyond all.
     fn tail(&self, node: &Node, from: usize) -> Vec<u8> {
         let mut out = vec![];
-        let key = |out: &mut Vec<u8>, size: u32, skipped: u32, row: u64| {
+        let key = |out: &mut Vec<u8>, size: u32, filter_mask: u32, row: u64| {
             out.extend(size.to_le_bytes());
-            out.extend(skipped.to_le_bytes());
+            out.extend(filter_mask.to_le_bytes());
             out.extend(row.to_le_bytes());
             out.resize(out.len() + 8 * (self.sides - 1), 0);
         };
         for entry in &node.entries[from..] {
-            key(&mut out, entry.size, entry.skipped, entry.row);
+            key(&mut out, entry.size, entry.filter_mask, entry.row);
             out.extend(entry.address.to_le_bytes());
         }
         key(&mut out, 0, 0, node.end);
@@ -242,7 +241,7 @@ impl Tree {
         let entry = |i: usize| {
             let at = self.key_at(i) as usize;
             let address = u64_at(at + self.key_bytes() as usize);
-            Entry { size: u32_at(at), skipped: u32_at(at + 4), row: u64_at(at + 8), address }
+            Entry { size: u32_at(at), filter_mask: u32_at(at + 4), row: u64_at(at + 8), address }
         };
         Ok(Node {
             address,
@@ -261,7 +260,6 @@ impl Node {
     fn head(&self) -> Vec<u8> {
         let mut out = b"TREE\x01".to_vec();
         out.push(self.level);
-        #[allow(clippy::cast_possible_truncation)] // 64 at most
         out.extend((self.entries.len() as u16).to_le_bytes());
         out.extend(self.left.to_le_bytes());
         out.extend(self.right.to_le_bytes());

@@ -6,20 +6,21 @@ use super::record::RecordWriter;
 use super::source::Source;
 use super::table::{Space, TableWriter};
 use crate::dataset::Location;
-use crate::dataset::episodes::{self, EPISODE, Rows, STEP};
+use crate::dataset::episodes::{self, EpisodeRows};
 use crate::dataset::{CommitPolicy, Constants, Reader as _, StepRange, WriteMode, WriteOptions, Writer};
 use std::fs::{File, OpenOptions, TryLockError};
 use std::io;
 use std::os::unix::fs::FileExt as _;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, Error, Manifest, Result, Schema};
 
 /// Creates, continues or replaces a file.
 pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     let location = super::file(location)?;
     let path = location.local("hdf5")?;
-    for name in [EPISODE, STEP] {
+    for name in [EPISODE_IDX, STEP_IDX] {
         if schema.column(name).is_ok_and(|column| column.len() != 1) {
             let problem = format!("column '{name}' numbers rows, and must be one number");
             return Err(Error::config("schema", problem, "leave it out"));
@@ -43,7 +44,7 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
             let old = lock(path)?;
             let reader =
                 Hdf5Reader::of(Source::of(old.try_clone().map_err(|e| Error::io(path, "opening it", e))?, path)?)?;
-            episodes::check_continued(&location, schema, reader.schema())?;
+            episodes::check_appendable(&location, schema, reader.schema())?;
             let mut writer = match Hdf5Writer::resume(path, &reader, old)? {
                 Ok(writer) => writer,
                 // Still locked, until its copy is there.
@@ -108,7 +109,7 @@ fn take_place(mut writer: Hdf5Writer, passing: &Path, path: &Path) -> Result<Hdf
     Ok(writer)
 }
 
-/// Copies a file of another layout to one of ours, which takes its place.
+/// Copies a file of another layout to one of written_here, which takes its place.
 fn copied(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
     if let [name, ..] = reader.left_out() {
         let problem = format!("its dataset '{name}' holds no numbers, which cannot be continued");
@@ -147,7 +148,7 @@ struct Hdf5Writer {
     in_group: usize,
     /// Whether episodes came since the file was last closed.
     unclosed: bool,
-    rows: Rows,
+    rows: EpisodeRows,
     record: RecordWriter,
     /// Whether something failed to be written.
     failed: bool,
@@ -227,7 +228,7 @@ impl Hdf5Writer {
             last_commit: Instant::now(),
             in_group: 0,
             unclosed: false,
-            rows: Rows::default(),
+            rows: EpisodeRows::default(),
             record: RecordWriter::default(),
             failed: false,
             scratch: vec![],
@@ -254,10 +255,10 @@ impl Hdf5Writer {
         self.rows.push(episode.rows());
         for at in COLUMNS..self.tables.len() {
             let spec = self.tables[at].table.spec.clone();
-            if spec.name == EPISODE || spec.name == STEP {
+            if spec.name == EPISODE_IDX || spec.name == STEP_IDX {
                 let mut numbers = std::mem::take(&mut self.scratch);
                 numbers.resize(episode.rows() * spec.row_bytes(), 0);
-                self.rows.number(&spec, &[StepRange::new(number, 0, episode.rows())], &mut numbers)?;
+                self.rows.fill_index_column(&spec, &[StepRange::new(number, 0, episode.rows())], &mut numbers)?;
                 self.put(at, &numbers)?;
                 self.scratch = numbers;
             } else {
@@ -323,7 +324,7 @@ impl Hdf5Writer {
 
 impl Writer for Hdf5Writer {
     fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
-        episodes::check(episode, &self.schema)?;
+        episodes::check_episode(episode, &self.schema)?;
         if self.failed {
             return Err(Self::lost());
         }

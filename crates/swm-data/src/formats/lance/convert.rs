@@ -1,4 +1,4 @@
-//! From Arrow's values to the bytes of a column.
+//! Converts Arrow values to the bytes of a column.
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{
@@ -10,8 +10,8 @@ use arrow_schema::DataType;
 use std::sync::Arc;
 use swm_core::{DType, Error, Result};
 
-/// The stored bytes of a picture.
-pub fn blob(values: &ArrayRef, row: usize) -> Result<&[u8]> {
+/// The encoded image in a row.
+pub fn image_bytes(values: &ArrayRef, row: usize) -> Result<&[u8]> {
     let bytes = if let Some(values) = values.as_binary_opt::<i32>() {
         (!values.is_null(row)).then(|| values.value(row))
     } else if let Some(values) = values.as_binary_opt::<i64>() {
@@ -19,75 +19,74 @@ pub fn blob(values: &ArrayRef, row: usize) -> Result<&[u8]> {
     } else {
         None
     };
-    bytes.ok_or_else(|| Error::mismatch("reading pictures", format!("{} or null", values.data_type()), "encoded bytes"))
+    bytes.ok_or_else(|| Error::mismatch("reading images", format!("{} or null", values.data_type()), "encoded bytes"))
 }
 
-/// Converts stored values, a scalar or a list of `n` a row, to the bytes of a column of `dtype`.
+/// Converts stored values (a scalar or a list of `n` per row) to the bytes of a column with type `dtype`.
 pub fn convert(values: &ArrayRef, n: usize, dtype: DType, out: &mut [u8]) -> Result<(), String> {
-    let numbers = match values.as_fixed_size_list_opt() {
+    let elements = match values.as_fixed_size_list_opt() {
         Some(lists) if lists.value_length() as usize == n && lists.null_count() == 0 => {
             // `values` has the list's offset applied by slicing.
             lists.values().slice(lists.value_offset(0) as usize, lists.len() * n)
         }
-        Some(lists) => return Err(format!("lists of {}, {} of them null", lists.value_length(), lists.null_count())),
+        Some(lists) => {
+            return Err(format!("lists of {} elements, {} of them null", lists.value_length(), lists.null_count()));
+        }
         None => Arc::clone(values),
     };
-    if numbers.len() * dtype.size() != out.len() {
-        return Err(format!("{} numbers for {} bytes", numbers.len(), out.len()));
+    if elements.len() * dtype.size() != out.len() {
+        return Err(format!("{} values for {} bytes", elements.len(), out.len()));
     }
-    match numbers.data_type() {
-        DataType::Float32 => cast_all::<Float32Type, f64>(&numbers, dtype, out),
-        DataType::Float64 => cast_all::<Float64Type, f64>(&numbers, dtype, out),
+    match elements.data_type() {
+        DataType::Float32 => cast_all::<Float32Type, f64>(&elements, dtype, out),
+        DataType::Float64 => cast_all::<Float64Type, f64>(&elements, dtype, out),
         DataType::Float16 => {
-            let values = numbers.as_primitive::<Float16Type>();
+            let values = elements.as_primitive::<Float16Type>();
             cast(values.iter().map(|v| v.map_or(f64::NAN, f64::from)), dtype, out);
             Ok(())
         }
-        DataType::Int8 => cast_all::<Int8Type, i64>(&numbers, dtype, out),
-        DataType::Int16 => cast_all::<Int16Type, i64>(&numbers, dtype, out),
-        DataType::Int32 => cast_all::<Int32Type, i64>(&numbers, dtype, out),
-        DataType::Int64 => cast_all::<Int64Type, i64>(&numbers, dtype, out),
-        DataType::UInt8 => cast_all::<UInt8Type, i64>(&numbers, dtype, out),
-        DataType::UInt16 => cast_all::<UInt16Type, i64>(&numbers, dtype, out),
-        DataType::UInt32 => cast_all::<UInt32Type, i64>(&numbers, dtype, out),
+        DataType::Int8 => cast_all::<Int8Type, i64>(&elements, dtype, out),
+        DataType::Int16 => cast_all::<Int16Type, i64>(&elements, dtype, out),
+        DataType::Int32 => cast_all::<Int32Type, i64>(&elements, dtype, out),
+        DataType::Int64 => cast_all::<Int64Type, i64>(&elements, dtype, out),
+        DataType::UInt8 => cast_all::<UInt8Type, i64>(&elements, dtype, out),
+        DataType::UInt16 => cast_all::<UInt16Type, i64>(&elements, dtype, out),
+        DataType::UInt32 => cast_all::<UInt32Type, i64>(&elements, dtype, out),
         DataType::UInt64 => {
-            #[allow(clippy::cast_possible_wrap)]
-            let values = numbers.as_primitive::<UInt64Type>().values().iter().map(|&v| v as i64);
+            let values = elements.as_primitive::<UInt64Type>().values().iter().map(|&v| v as i64);
             cast(values, dtype, out);
             Ok(())
         }
-        DataType::Boolean if numbers.null_count() == 0 => {
-            cast(numbers.as_boolean().values().iter().map(i64::from), dtype, out);
+        DataType::Boolean if elements.null_count() == 0 => {
+            cast(elements.as_boolean().values().iter().map(i64::from), dtype, out);
             Ok(())
         }
-        other => Err(format!("{other} is no number that can be read")),
+        other => Err(format!("{other} is not a supported numeric type")),
     }
 }
 
-/// A number on its way to the type of a column.
-pub trait Number: Copy {
-    /// What a missing value becomes, if anything can stand for it.
+/// A value that is converted to the type of a column.
+pub trait Scalar: Copy {
+    /// What a null becomes, if the type can represent it.
     const MISSING: Option<Self>;
-    /// The number, rounded to what an `f64` holds.
+    /// The value, rounded to `f64`.
     fn f64(self) -> f64;
-    /// The number without its fraction.
+    /// The value without its fraction.
     fn i64(self) -> i64;
 }
 
-impl Number for f64 {
+impl Scalar for f64 {
     const MISSING: Option<Self> = Some(Self::NAN);
     fn f64(self) -> f64 {
         self
     }
-    #[allow(clippy::cast_possible_truncation)]
     fn i64(self) -> i64 {
         self as i64
     }
 }
 
-impl Number for i64 {
+impl Scalar for i64 {
     const MISSING: Option<Self> = None;
-    #[allow(clippy::cast_precision_loss)]
     fn f64(self) -> f64 {
         self as f64
     }
@@ -99,24 +98,23 @@ impl Number for i64 {
 fn cast_all<T, N>(values: &ArrayRef, dtype: DType, out: &mut [u8]) -> Result<(), String>
 where
     T: ArrowPrimitiveType,
-    N: Number + From<T::Native>,
+    N: Scalar + From<T::Native>,
 {
     let values = values.as_primitive::<T>();
     if values.null_count() == 0 {
         cast(values.values().iter().map(|&v| N::from(v)), dtype, out);
         return Ok(());
     }
-    let Some(missing) = N::MISSING else { return Err(format!("{} missing numbers", values.null_count())) };
+    let Some(missing) = N::MISSING else { return Err(format!("{} nulls", values.null_count())) };
     cast(values.iter().map(|v| v.map_or(missing, N::from)), dtype, out);
     Ok(())
 }
 
-/// Writes numbers as a column of `dtype` holds them.
-pub fn cast<N: Number>(values: impl Iterator<Item = N>, dtype: DType, out: &mut [u8]) {
+/// Writes values as a column with type `dtype`.
+pub fn cast<N: Scalar>(values: impl Iterator<Item = N>, dtype: DType, out: &mut [u8]) {
     fn put<const SIZE: usize>(out: &mut [u8], values: impl Iterator<Item = [u8; SIZE]>) {
         out.chunks_exact_mut(SIZE).zip(values).for_each(|(place, value)| place.copy_from_slice(&value));
     }
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     match dtype {
         DType::Bool => put(out, values.map(|v| [u8::from(v.f64() != 0.0)])),
         DType::U8 => put(out, values.map(|v| [v.i64() as u8])),
@@ -127,8 +125,8 @@ pub fn cast<N: Number>(values: impl Iterator<Item = N>, dtype: DType, out: &mut 
     }
 }
 
-/// Whole numbers of any width.
-pub fn whole_numbers(values: &ArrayRef, out: &mut [i64]) -> Result<()> {
+/// Reads integers of any width.
+pub fn integers(values: &ArrayRef, out: &mut [i64]) -> Result<()> {
     convert(values, 1, DType::Int64, bytemuck::cast_slice_mut(out))
-        .map_err(|problem| Error::mismatch("reading the numbers of episodes", problem, "whole numbers"))
+        .map_err(|problem| Error::mismatch("reading index columns", problem, "integers"))
 }

@@ -1,4 +1,4 @@
-//! From an episode to the values that a data file holds.
+//! Encodes episodes as the values of a data file.
 
 use super::record::ContentHash;
 use super::schema::{self, Kind, Precision, StoredColumn};
@@ -10,34 +10,34 @@ use std::sync::Arc;
 use swm_core::{Batch, DType, Error, Result};
 use swm_image::ImageCodec;
 
-/// An episode ready to be stored; only its number is open.
-pub struct Encoded {
-    /// Its rows.
+/// An encoded episode; its index is assigned when it is committed.
+pub struct EncodedEpisode {
+    /// Number of rows.
     pub rows: i32,
-    /// `step_idx`, and the columns in the order of the table.
+    /// `step_idx`, then the columns in the order of the table.
     pub values: Vec<ArrayRef>,
     /// See [`ContentHash`].
     pub hash: String,
-    /// What is the same in all rows.
+    /// The constants of the episode.
     pub constants: Constants,
 }
 
-impl Encoded {
-    /// Encodes an episode, all pictures in parallel.
+impl EncodedEpisode {
+    /// Encodes an episode, with all images in parallel.
     ///
     /// # Errors
-    /// When it is too long, or a number does not fit its stored type.
+    /// If it is too long, or a value does not fit its stored type.
     pub fn new(columns: &[StoredColumn], episode: &Batch, codec: ImageCodec, constants: &Constants) -> Result<Self> {
         let Ok(rows) = i32::try_from(episode.rows()) else {
-            return Err(Error::mismatch("writing an episode", "2^31 rows or more", "fewer"));
+            return Err(Error::mismatch("writing an episode", "2^31 or more rows", "fewer rows"));
         };
         let mut values: Vec<ArrayRef> = vec![Arc::new(Int32Array::from_iter_values(0..rows))];
         let mut hash = ContentHash::new();
         for column in columns {
             let index = episode.schema().index(&column.spec.name)?;
             let stored: ArrayRef = match column.kind {
-                Kind::Image => Arc::new(pictures(episode, index, codec)?),
-                Kind::Numbers(precision) => Arc::new(numbers(episode, index, precision)?),
+                Kind::Image => Arc::new(encode_images(episode, index, codec)?),
+                Kind::Values(precision) => Arc::new(encode_values(episode, index, precision)?),
             };
             hash.add(column, &stored).map_err(|problem| Error::external("writing an episode", problem))?;
             values.push(stored);
@@ -45,15 +45,16 @@ impl Encoded {
         Ok(Self { rows, values, hash: hash.finish(constants), constants: constants.clone() })
     }
 
-    /// Bytes of memory it takes.
+    /// Size in memory, in bytes.
     pub fn bytes(&self) -> usize {
         let constants: usize = self.constants.values().map(Vec::len).sum();
         constants + self.values.iter().map(|values| values.get_array_memory_size()).sum::<usize>()
     }
 }
 
-/// Encodes the pictures of a column, in parallel. A picture equal to the one before (a goal) is encoded once.
-fn pictures(episode: &Batch, index: usize, codec: ImageCodec) -> Result<BinaryArray> {
+/// Encodes the images of a column in parallel. An image that equals the previous one (a goal, for example) is encoded
+/// once.
+fn encode_images(episode: &Batch, index: usize, codec: ImageCodec) -> Result<BinaryArray> {
     let spec = &episode.schema().columns()[index];
     let (height, width) = (spec.shape[0], spec.shape[1]);
     let frames: Vec<&[u8]> = episode.bytes(index).chunks_exact(spec.row_bytes()).collect();
@@ -70,7 +71,7 @@ fn pictures(episode: &Batch, index: usize, codec: ImageCodec) -> Result<BinaryAr
         })
         .collect();
     let encoded = encoded?;
-    // Where each row's bytes are.
+    // For every row, the index of the encoded image to store.
     let sources: Vec<usize> = repeats
         .iter()
         .enumerate()
@@ -84,7 +85,7 @@ fn pictures(episode: &Batch, index: usize, codec: ImageCodec) -> Result<BinaryAr
         return Err(Error::mismatch(
             format!("writing column '{}'", spec.name),
             format!("{total} bytes in one episode"),
-            "less than 2 GiB; write shorter episodes or smaller pictures",
+            "less than 2 GiB; write shorter episodes or smaller images",
         ));
     }
     let mut values = Vec::with_capacity(total);
@@ -92,13 +93,13 @@ fn pictures(episode: &Batch, index: usize, codec: ImageCodec) -> Result<BinaryAr
         values.extend_from_slice(&encoded[i]);
     }
     let offsets = OffsetBuffer::from_lengths(sources.iter().map(|&i| encoded[i].len()));
-    BinaryArray::try_new(offsets, Buffer::from_vec(values), None).map_err(|e| Error::external("storing pictures", e))
+    BinaryArray::try_new(offsets, Buffer::from_vec(values), None).map_err(|e| Error::external("storing images", e))
 }
 
-/// A column of numbers as lists.
-fn numbers(episode: &Batch, index: usize, precision: Precision) -> Result<FixedSizeListArray> {
+/// Converts a numeric column to fixed-size lists.
+fn encode_values(episode: &Batch, index: usize, precision: Precision) -> Result<FixedSizeListArray> {
     let spec = &episode.schema().columns()[index];
-    // Whole numbers must survive: float32 holds them up to 2^24.
+    // `float32` represents integers exactly up to 2^24.
     let exact = |v: i64| v.unsigned_abs() <= 1 << 24;
     let bytes = episode.bytes(index);
     let lossy = match spec.dtype {
@@ -110,11 +111,10 @@ fn numbers(episode: &Batch, index: usize, precision: Precision) -> Result<FixedS
         return Err(Error::OutOfSpace {
             what: format!("a value of column '{}'", spec.name),
             given: value.to_string(),
-            expected: "whole numbers within ±2^24, as the table stores float32; split larger ones into two columns"
+            expected: "integers within ±2^24, because the table stores float32; split larger values into two columns"
                 .to_owned(),
         });
     }
-    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
     let n = spec.len() as i32;
     let values: ArrayRef = match precision {
         Precision::Double => {
@@ -123,7 +123,7 @@ fn numbers(episode: &Batch, index: usize, precision: Precision) -> Result<FixedS
         Precision::Single => Arc::new(Float32Array::new(ScalarBuffer::from(episode.to_f32(&spec.name)?), None)),
     };
     FixedSizeListArray::try_new(schema::list_item(precision), n, values, None)
-        .map_err(|e| Error::external("storing numbers", e))
+        .map_err(|e| Error::external("storing numeric values", e))
 }
 
 fn values_of<T: bytemuck::Pod>(bytes: &[u8]) -> impl Iterator<Item = T> {

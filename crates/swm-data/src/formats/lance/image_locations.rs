@@ -1,8 +1,8 @@
-//! Where the encoded pictures of a column lie in a data file, so that any of them is one read away.
+//! Locations of the encoded images of a column within a data file, so that each can be read directly.
 //!
-//! Lance's own decoder plans every read anew: for a batch of single pictures that takes longer than decoding them. Its
-//! "full zip" pages, which it writes for values of this size, are simple enough to be read directly: a buffer of
-//! values, each after its length, and a buffer of where each row ends. Everything else is left to Lance.
+//! Lance's decoder plans every read anew, which takes longer than decoding for a batch of single images. Its "full zip"
+//! pages, which it uses for values of this size, have a simple layout: a buffer of values, each with a length prefix,
+//! and a buffer of row bounds. Columns with any other layout are read with Lance's decoder.
 
 use bytes::Bytes;
 use lance_encoding::decoder::{ColumnInfo, PageEncoding, PageInfo};
@@ -11,29 +11,29 @@ use lance_encoding::format::metadata::full_zip_layout::Details;
 use lance_encoding::format::metadata::page_layout::Layout;
 use std::ops::Range;
 
-/// The places of all pictures of one column in one data file.
-pub struct Places {
+/// Locations of all images of one column in one data file.
+pub struct ImageLocations {
     pages: Vec<Page>,
 }
 
 struct Page {
-    /// The first row, in the file.
+    /// First row of the page, counted within the file.
     first: u64,
     rows: u64,
-    /// Where the values are, in the file.
+    /// Byte range of the values within the file.
     values: Range<u64>,
-    /// Where each row begins in `values`, and the last ends: little-endian numbers of `width` bytes.
+    /// Start of each row within `values` and the end of the last: little-endian integers of `width` bytes.
     bounds: Bytes,
     width: usize,
-    /// Bytes of the length before each value.
+    /// Size of the length prefix of each value, in bytes.
     prefix: usize,
 }
 
-impl Places {
-    /// Reads the places, `None` where the column is not laid out so. `read` gives bytes of the file.
+impl ImageLocations {
+    /// Reads the locations; `None` if the column has another layout. `read` returns byte ranges of the file.
     ///
     /// # Errors
-    /// What `read` fails with.
+    /// Errors of `read`.
     pub fn read<E>(
         column: &ColumnInfo,
         file_size: u64,
@@ -47,16 +47,15 @@ impl Places {
         let mut first = 0;
         let mut pages = vec![];
         for (layout, bounds) in layouts.into_iter().zip(read(&wanted)?) {
-            let Zip { values, rows, width, prefix, .. } = layout;
+            let FullZipPage { values, rows, width, prefix, .. } = layout;
             pages.push(Page { first, rows, values, bounds, width, prefix });
             first += rows;
         }
         Ok(Some(Self { pages }))
     }
 
-    /// Where the picture of a row of the file is, after [`Self::prefix`] bytes that state its length; `None` where the
-    /// stored bounds contradict each other or the file is shorter.
-    pub fn find(&self, row: u64) -> Option<Place> {
+    /// The location of the image in a row of the file; `None` if the stored bounds are inconsistent or exceed the file.
+    pub fn find(&self, row: u64) -> Option<ImageLocation> {
         let page = &self.pages[self.pages.partition_point(|page| page.first <= row).checked_sub(1)?];
         let row = row - page.first;
         if row >= page.rows {
@@ -65,7 +64,7 @@ impl Places {
         let (start, end) = (page.bound(row)?, page.bound(row + 1)?);
         let length = end.checked_sub(start)?.checked_sub(page.prefix as u64)?;
         let bytes = page.values.start + start..page.values.start + end;
-        (bytes.end <= page.values.end).then_some(Place { bytes, prefix: page.prefix, length })
+        (bytes.end <= page.values.end).then_some(ImageLocation { bytes, prefix: page.prefix, length })
     }
 }
 
@@ -79,29 +78,29 @@ impl Page {
     }
 }
 
-/// Where one picture is.
+/// Location of one image.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Place {
-    /// Its bytes in the file, the stated length before it included.
+pub struct ImageLocation {
+    /// Byte range within the file, including the length prefix.
     pub bytes: Range<u64>,
-    /// Bytes of the stated length.
+    /// Size of the length prefix in bytes.
     pub prefix: usize,
-    /// The length that it must state.
+    /// Expected value of the length prefix.
     length: u64,
 }
 
-impl Place {
-    /// The encoded picture in the bytes at this place; `None` when they state another length.
-    pub fn picture<'a>(&self, bytes: &'a [u8]) -> Option<&'a [u8]> {
-        let (stated, picture) = bytes.split_at_checked(self.prefix)?;
+impl ImageLocation {
+    /// The encoded image in the bytes of this location; `None` if the length prefix differs from the bounds.
+    pub fn image<'a>(&self, bytes: &'a [u8]) -> Option<&'a [u8]> {
+        let (stated, image) = bytes.split_at_checked(self.prefix)?;
         let mut number = [0; 8];
         number[..self.prefix].copy_from_slice(stated);
-        (u64::from_le_bytes(number) == self.length && picture.len() as u64 == self.length).then_some(picture)
+        (u64::from_le_bytes(number) == self.length && image.len() as u64 == self.length).then_some(image)
     }
 }
 
-/// What a page of plain full-zip values says of itself.
-struct Zip {
+/// Layout of a page of plain full-zip values.
+struct FullZipPage {
     rows: u64,
     values: Range<u64>,
     bounds: Range<u64>,
@@ -109,16 +108,16 @@ struct Zip {
     prefix: usize,
 }
 
-fn layout(page: &PageInfo, file_size: u64) -> Option<Zip> {
+fn layout(page: &PageInfo, file_size: u64) -> Option<FullZipPage> {
     let PageEncoding::Structural(structure) = &page.encoding else { return None };
     let Some(Layout::FullZipLayout(zip)) = &structure.layout else { return None };
-    // No missing values, no lists: nothing stands between the rows.
+    // Requires a page without nulls and lists.
     let items = u64::from(zip.num_items);
     if zip.bits_rep != 0 || zip.bits_def != 0 || items != page.num_rows || u64::from(zip.num_visible_items) != items {
         return None;
     }
     let Some(Details::BitsPerOffset(bits @ (32 | 64))) = zip.details else { return None };
-    // Values as they came.
+    // Requires uncompressed values.
     let Some(Compression::Variable(variable)) = zip.value_compression.as_ref()?.compression.as_ref() else {
         return None;
     };
@@ -129,10 +128,10 @@ fn layout(page: &PageInfo, file_size: u64) -> Option<Zip> {
     let [values, bounds] = page.buffer_offsets_and_sizes[..] else { return None };
     let range = |(start, size): (u64, u64)| Some(start..start.checked_add(size).filter(|&end| end <= file_size)?);
     let (values, bounds) = (range(values)?, range(bounds)?);
-    let (size, numbers) = (bounds.end - bounds.start, items.checked_add(1)?);
-    let width = size / numbers;
-    if size % numbers != 0 || !matches!(width, 1 | 2 | 4 | 8) {
+    let (size, bounds_count) = (bounds.end - bounds.start, items.checked_add(1)?);
+    let width = size / bounds_count;
+    if size % bounds_count != 0 || !matches!(width, 1 | 2 | 4 | 8) {
         return None;
     }
-    Some(Zip { rows: items, values, bounds, width: width as usize, prefix: bits as usize / 8 })
+    Some(FullZipPage { rows: items, values, bounds, width: width as usize, prefix: bits as usize / 8 })
 }

@@ -1,15 +1,15 @@
-//! The default format: Lance tables, through the crates below Lance's query engine.
+//! The default format: Lance tables, read and written with the crates below Lance's query engine.
 //!
-//! One row a step, episodes one after another. `episode_idx` and `step_idx` are 32-bit integers, pictures are
-//! encoded bytes, every other column is a fixed-size list of `float32` (a scalar is a list of one; columns of `float64`
-//! keep their precision), and `.` in a name becomes `_`: the layout of the reference's `LanceWriter`, so its reader and
-//! the Python `lance` package open what is written here, and the other way round. The original names, types and shapes
-//! are kept in the table's metadata, and what is the same in all steps of an episode in its data file, both of which
-//! foreign readers ignore.
+//! A table has one row per step, and stores episodes one after another. `episode_idx` and `step_idx` are 32-bit
+//! integers; images are encoded bytes; every other column is a fixed-size list of `float32` (`float64` for `float64`
+//! columns), with one element for a scalar. A `.` in a column name becomes `_`. This is the layout of the reference's
+//! `LanceWriter`, so the reference and the Python `lance` package open tables written here, and vice versa. The table's
+//! metadata stores the original names, types and shapes; data files store the constants of episodes. Other readers
+//! ignore both.
 //!
-//! A table is a folder on this machine, or a prefix in an object store. Every version is one object that is created on
-//! the condition that there is none of its name, so of two writers that commit at once one is told to look again.
-//! Readers of several machines need nothing but the store; several machines write one dataset with [`create_shard`].
+//! A table is a local folder or a prefix in an object store. Each version is one object that is created only if no
+//! object of that name exists, so of two concurrent commits one fails and is retried. Readers need nothing but the
+//! store. Several machines write one dataset with [`create_shard`].
 
 mod convert;
 mod encode;
@@ -34,6 +34,6 @@ pub const ENTRY: FormatEntry = FormatEntry {
     summary: "Lance table, one folder NAME.lance; opens in Python's lance and lancedb",
     suffixes: &["lance"],
     feature: None,
-    detect: store::looks_like,
+    detect: store::detect,
     backend: Some(Backend { open: reader::open, create: writer::create }),
 };

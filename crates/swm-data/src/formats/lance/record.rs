@@ -1,7 +1,7 @@
-//! What a data file records of its episodes beside their rows: a hash of their content, and what is the same in all of
-//! their steps. It lies in the file's global buffers, which foreign readers leave alone.
+//! The record of a data file: the content hash and the constants of each of its episodes. It is stored in the file's
+//! global buffers, which other readers ignore.
 
-use super::convert::{blob, convert};
+use super::convert::{convert, image_bytes};
 use super::schema::{self, Kind, StoredColumn};
 use crate::dataset::Constants;
 use arrow_array::{Array as _, ArrayRef};
@@ -11,32 +11,32 @@ use std::collections::BTreeMap;
 use std::io::Read as _;
 use swm_core::{Error, Result};
 
-/// Keys in the file's metadata: the numbers of the global buffers.
+/// Keys of the file's metadata whose values are indices of global buffers.
 pub const EPISODES_KEY: &str = "stable_worldmodel.episodes";
 /// See [`EPISODES_KEY`].
 pub const CONSTANTS_KEY: &str = "stable_worldmodel.constants";
 
-/// The episodes of a data file, in stored order.
+/// The record of a data file, with episodes in stored order.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub struct Record {
     pub episodes: Vec<RecordedEpisode>,
-    /// Bytes of each constant's value. Equal values of several episodes are stored once.
+    /// Size in bytes of each constant's value. Equal values of several episodes are stored once.
     sizes: Vec<u64>,
-    /// The values, one after another.
+    /// The concatenated values.
     #[serde(skip)]
     values: Vec<u8>,
     #[serde(skip)]
     known: BTreeMap<[u8; 32], usize>,
 }
 
-/// One episode of a data file.
+/// The record of one episode.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct RecordedEpisode {
-    /// Its rows.
+    /// Number of rows.
     pub rows: u64,
-    /// See [`content_hash`].
+    /// See [`ContentHash`].
     pub hash: String,
-    /// The name of each constant, and which value it has.
+    /// The name of each constant and the index of its value.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub constants: BTreeMap<String, usize>,
 }
@@ -47,20 +47,20 @@ impl Record {
         let mut names = BTreeMap::new();
         for (name, value) in constants {
             let next = self.sizes.len();
-            let place = *self.known.entry(*blake3::hash(value).as_bytes()).or_insert(next);
-            if place == next {
+            let index = *self.known.entry(*blake3::hash(value).as_bytes()).or_insert(next);
+            if index == next {
                 self.sizes.push(value.len() as u64);
                 self.values.extend_from_slice(value);
             }
-            names.insert(name.clone(), place);
+            names.insert(name.clone(), index);
         }
         self.episodes.push(RecordedEpisode { rows, hash, constants: names });
     }
 
-    /// What is stored: the record, and the values of the constants, if there are any.
+    /// The serialised record, and the compressed values of the constants if there are any.
     ///
     /// # Errors
-    /// When it cannot be compressed.
+    /// If compression fails.
     pub fn encode(&self) -> Result<(Bytes, Option<Bytes>)> {
         let record = schema::json(self)?.into_bytes().into();
         let pack = || zstd::bulk::compress(&self.values, 3).map_err(|e| Error::external("storing constants", e));
@@ -68,18 +68,18 @@ impl Record {
         Ok((record, values.map(Bytes::from)))
     }
 
-    /// A stored record.
+    /// Parses a stored record.
     pub fn decode(stored: &[u8]) -> Result<Self, String> {
         serde_json::from_slice(stored).map_err(|e| format!("the record of its episodes is unreadable: {e}"))
     }
 
-    /// The constants of the episode in this position of the file, out of the stored values.
+    /// Extracts the constants of an episode from the stored values. `position` is its position in the file.
     pub fn constants(&self, position: usize, stored: &[u8]) -> Result<Constants, String> {
         let Some(episode) = self.episodes.get(position) else {
             return Err(format!("episode {position} has no record"));
         };
         let unreadable = |e: std::io::Error| format!("its constants are unreadable: {e}");
-        // What is asked for grows with what is there, not with what a damaged size says.
+        // Limits the output to the recorded size, so that a damaged file cannot expand without bound.
         let total = self.sizes.iter().fold(0_u64, |sum, &size| sum.saturating_add(size));
         let mut values = vec![];
         let reader = zstd::stream::read::Decoder::new(stored).map_err(unreadable)?;
@@ -87,49 +87,50 @@ impl Record {
         if values.len() as u64 != total {
             return Err(format!("its constants have {} bytes instead of {total}", values.len()));
         }
-        let value = |&place: &usize| {
-            let start = self.sizes[..place.min(self.sizes.len())].iter().sum::<u64>() as usize;
-            let end = start + *self.sizes.get(place)? as usize;
+        let value = |&index: &usize| {
+            let start = self.sizes[..index.min(self.sizes.len())].iter().sum::<u64>() as usize;
+            let end = start + *self.sizes.get(index)? as usize;
             Some(values[start..end].to_vec())
         };
         let constants = episode.constants.iter();
-        let found: Option<Constants> = constants.map(|(name, place)| Some((name.clone(), value(place)?))).collect();
+        let found: Option<Constants> = constants.map(|(name, index)| Some((name.clone(), value(index)?))).collect();
         found.ok_or_else(|| "a constant has no value".to_owned())
     }
 }
 
-/// A BLAKE3 hash of an episode's values as they are stored, column after column, and of its constants: what
-/// [`crate::Reader::content_hash`] is made of. Neither its number nor the file's layout is part of it.
+/// A BLAKE3 hash of the stored values of an episode, column by column, and of its constants.
+/// [`crate::Reader::content_hash`] combines these hashes. They depend neither on `episode_idx` nor on the file's
+/// layout.
 pub struct ContentHash(blake3::Hasher);
 
 impl ContentHash {
-    /// Of no values yet.
+    /// The hash of no values.
     pub fn new() -> Self {
         Self(blake3::Hasher::new())
     }
 
-    /// Adds some rows of a column.
+    /// Adds rows of a column.
     ///
     /// # Errors
-    /// When the values are not what the column says.
+    /// If the values do not match the column.
     pub fn add(&mut self, column: &StoredColumn, values: &ArrayRef) -> Result<(), String> {
         match column.kind {
             Kind::Image => {
                 for row in 0..values.len() {
-                    self.bytes(blob(values, row).map_err(|e| e.to_string())?);
+                    self.bytes(image_bytes(values, row).map_err(|e| e.to_string())?);
                 }
             }
-            Kind::Numbers(_) => {
+            Kind::Values(_) => {
                 let mut bytes = vec![0; column.spec.row_bytes() * values.len()];
                 convert(values, column.spec.len(), column.spec.dtype, &mut bytes)?;
-                // All rows have one length, so they need none between them.
+                // All rows have the same length, so no length prefix is needed.
                 self.0.update(&bytes);
             }
         }
         Ok(())
     }
 
-    /// The hash in hexadecimal, after all columns.
+    /// Adds the constants and returns the hash in hexadecimal.
     pub fn finish(mut self, constants: &Constants) -> String {
         for (name, value) in constants {
             self.bytes(name.as_bytes());

@@ -1,4 +1,4 @@
-//! How our columns become Lance columns, and back.
+//! Mapping between dataset columns and Lance columns.
 
 use arrow_schema::{DataType, Field, Schema as ArrowSchema};
 use lance_core::datatypes::Schema as LanceSchema;
@@ -6,52 +6,48 @@ use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::path::Path;
 use std::sync::Arc;
+use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema, columns};
 use swm_image::{self, ImageCodec};
 
-/// The columns that number episodes and steps; the writer fills them.
-pub const EPISODE: &str = "episode_idx";
-/// See [`EPISODE`].
-pub const STEP: &str = "step_idx";
-
-/// Metadata keys of the table.
+/// Keys of the table's metadata.
 const SCHEMA_KEY: &str = "stable_worldmodel.schema";
 /// See [`SCHEMA_KEY`].
 pub const MANIFEST_KEY: &str = "stable_worldmodel.manifest";
 
-/// What we record beside the data, so that types and shapes come back as they were.
+/// Stored in the table's metadata to restore types and shapes.
 #[derive(Serialize, Deserialize)]
-struct Recorded {
+struct RecordedSchema {
     columns: Schema,
     codec: ImageCodec,
 }
 
-/// How one of our columns is stored.
+/// How a dataset column is stored.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StoredColumn {
-    /// The column as readers see it.
+    /// The column as readers return it.
     pub spec: ColumnSpec,
     /// Its name in the table.
     pub name: String,
-    /// What the table holds.
+    /// The kind of its stored values.
     pub kind: Kind,
 }
 
-/// What a table holds in a column.
+/// The kind of values in a table's column.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
-    /// Encoded pictures.
+    /// Encoded images.
     Image,
-    /// Numbers: a scalar, or a fixed-size list. Where they are written here, of this precision.
-    Numbers(Precision),
+    /// Numeric values: a scalar or a fixed-size list, with the precision to write.
+    Values(Precision),
 }
 
-/// What numbers are written as.
+/// The type that numeric values are written as.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Precision {
-    /// `float32`, as the reference writes all numbers.
+    /// `float32`, as the reference writes all numeric columns.
     Single,
-    /// `float64`, so that nothing is rounded.
+    /// `float64`, without rounding.
     Double,
 }
 
@@ -68,16 +64,16 @@ impl Precision {
     }
 }
 
-/// The stored form of the columns an episode has; `episode_idx` and `step_idx` are left out.
+/// The stored columns of an episode, without the index columns.
 ///
 /// # Errors
-/// When two columns get the same name, or a column is empty.
+/// If two columns get the same stored name, a column has no elements, or there are no columns.
 pub fn columns_to_write(schema: &Schema) -> Result<Vec<StoredColumn>> {
     let mut columns: Vec<StoredColumn> = vec![];
     for spec in schema.columns() {
-        // Lance reads a dot as a path into a structure.
+        // Lance interprets a dot as a path into a structure.
         let name = columns::flat(&spec.name);
-        if name == EPISODE || name == STEP {
+        if name == EPISODE_IDX || name == STEP_IDX {
             continue;
         }
         if let Some(other) = columns.iter().find(|other| other.name == name) {
@@ -88,9 +84,9 @@ pub fn columns_to_write(schema: &Schema) -> Result<Vec<StoredColumn>> {
             ));
         }
         if spec.is_empty() {
-            return Err(Error::config("schema", format!("column '{}' holds no number", spec.name), "leave it out"));
+            return Err(Error::config("schema", format!("column '{}' has no elements", spec.name), "leave it out"));
         }
-        let kind = if spec.is_image() { Kind::Image } else { Kind::Numbers(Precision::of(spec.dtype)) };
+        let kind = if spec.is_image() { Kind::Image } else { Kind::Values(Precision::of(spec.dtype)) };
         columns.push(StoredColumn { spec: spec.clone(), name, kind });
     }
     if columns.is_empty() {
@@ -99,14 +95,13 @@ pub fn columns_to_write(schema: &Schema) -> Result<Vec<StoredColumn>> {
     Ok(columns)
 }
 
-/// The table's columns in Arrow's terms.
+/// The Arrow schema of the table.
 pub fn arrow_schema(columns: &[StoredColumn]) -> ArrowSchema {
-    let mut fields = vec![Field::new(EPISODE, DataType::Int32, true), Field::new(STEP, DataType::Int32, true)];
+    let mut fields = vec![Field::new(EPISODE_IDX, DataType::Int32, true), Field::new(STEP_IDX, DataType::Int32, true)];
     for column in columns {
         fields.push(match column.kind {
             Kind::Image => Field::new(&column.name, DataType::Binary, true).with_metadata(plain_values()),
-            #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
-            Kind::Numbers(precision) => {
+            Kind::Values(precision) => {
                 let list = DataType::FixedSizeList(list_item(precision), column.spec.len() as i32);
                 Field::new(&column.name, list, true)
             }
@@ -115,19 +110,19 @@ pub fn arrow_schema(columns: &[StoredColumn]) -> ArrowSchema {
     ArrowSchema::new(fields)
 }
 
-/// How Lance is to store pictures: as they are, since they are compressed already; each on its own, unless a few stand
-/// for many, such as the goals of episodes.
+/// Field metadata for images: no compression, because they are already encoded, and a dictionary only if few distinct
+/// images repeat often, such as the goals of episodes.
 fn plain_values() -> HashMap<String, String> {
     let settings = [("lance-encoding:compression", "none"), ("lance-encoding:dict-size-ratio", "0.25")];
     settings.map(|(key, value)| (key.to_owned(), value.to_owned())).into()
 }
 
-/// The field of a list's numbers.
+/// The field of a list's elements.
 pub fn list_item(precision: Precision) -> Arc<Field> {
     Arc::new(Field::new("item", precision.data_type(), true))
 }
 
-/// What a table holds in a column of numbers that is to be continued.
+/// The precision of an existing numeric column.
 pub fn stored_precision(data_type: &DataType) -> Option<Precision> {
     match data_type {
         DataType::FixedSizeList(item, _) if *item.data_type() == DataType::Float32 => Some(Precision::Single),
@@ -139,9 +134,9 @@ pub fn stored_precision(data_type: &DataType) -> Option<Precision> {
 /// The table's metadata.
 ///
 /// # Errors
-/// When the manifest cannot be written as JSON.
+/// If it cannot be serialised as JSON.
 pub fn metadata(schema: &Schema, codec: ImageCodec, manifest: Option<&Manifest>) -> Result<HashMap<String, String>> {
-    let recorded = Recorded { columns: schema.clone(), codec };
+    let recorded = RecordedSchema { columns: schema.clone(), codec };
     let mut metadata = HashMap::from([(SCHEMA_KEY.to_owned(), json(&recorded)?)]);
     if let Some(manifest) = manifest {
         metadata.insert(MANIFEST_KEY.to_owned(), json(manifest)?);
@@ -149,7 +144,7 @@ pub fn metadata(schema: &Schema, codec: ImageCodec, manifest: Option<&Manifest>)
     Ok(metadata)
 }
 
-/// A value as JSON.
+/// Serialises a value as JSON.
 pub fn json(value: &impl Serialize) -> Result<String> {
     serde_json::to_string(value).map_err(|e| Error::external("describing the dataset", e))
 }
@@ -159,36 +154,37 @@ pub fn manifest(lance: &LanceSchema) -> Option<Manifest> {
     serde_json::from_str(lance.metadata.get(MANIFEST_KEY)?).ok()
 }
 
-/// The codec with which a table was begun.
+/// The codec in a table's metadata.
 pub fn codec(lance: &LanceSchema) -> Option<ImageCodec> {
-    serde_json::from_str::<Recorded>(lance.metadata.get(SCHEMA_KEY)?).ok().map(|recorded| recorded.codec)
+    serde_json::from_str::<RecordedSchema>(lance.metadata.get(SCHEMA_KEY)?).ok().map(|recorded| recorded.codec)
 }
 
-/// The columns of a table: as recorded where it was written here, else inferred. Text and nested columns of
-/// foreign tables are left out. Comes with the schema that readers see, which begins with `episode_idx` and
-/// `step_idx`.
+/// The columns of a table, and the schema for readers, which starts with the index columns. Columns come from the
+/// table's metadata if it was written here, and are inferred otherwise. Text and nested columns of third-party tables
+/// are skipped.
 ///
-/// `first_picture` gives the first stored picture of a column, for its size; `None` where there are no rows.
+/// `first_image` returns the first stored image of a column, or `None` if there are no rows. Its header gives the image
+/// size.
 ///
 /// # Errors
-/// When the table has no `episode_idx`, or its columns contradict what was recorded.
+/// If the table has no index columns, or its columns contradict the recorded schema.
 pub fn columns_to_read(
     folder: &Path,
     lance: &LanceSchema,
-    first_picture: impl Fn(&str) -> Result<Option<Vec<u8>>>,
+    first_image: impl Fn(&str) -> Result<Option<Vec<u8>>>,
 ) -> Result<(Vec<StoredColumn>, Schema)> {
     let arrow = ArrowSchema::from(lance);
-    for name in [EPISODE, STEP] {
+    for name in [EPISODE_IDX, STEP_IDX] {
         let field = arrow.field_with_name(name).ok();
         if !field.is_some_and(|field| field.data_type().is_integer()) {
             return Err(Error::corrupt(
                 folder,
                 format!("the table has no integer column '{name}'"),
-                "only tables of episodes can be read: one row a step, numbered by episode_idx and step_idx",
+                "only tables of episodes can be read: one row per step, with episode_idx and step_idx",
             ));
         }
     }
-    let recorded: Option<Recorded> = match lance.metadata.get(SCHEMA_KEY) {
+    let recorded: Option<RecordedSchema> = match lance.metadata.get(SCHEMA_KEY) {
         None => None,
         Some(text) => Some(
             serde_json::from_str(text)
@@ -198,22 +194,25 @@ pub fn columns_to_read(
     let mut columns = vec![];
     for field in arrow.fields() {
         let name = field.name();
-        if name == EPISODE || name == STEP {
+        if name == EPISODE_IDX || name == STEP_IDX {
             continue;
         }
         let known = recorded
             .as_ref()
             .and_then(|recorded| recorded.columns.columns().iter().find(|spec| columns::flat(&spec.name) == *name));
         let contradiction = |held: &str| {
-            super::store::damaged(folder, format!("column '{name}' holds {held}, unlike its recorded schema says"))
+            super::store::damaged(
+                folder,
+                format!("column '{name}' holds {held}, which contradicts the recorded schema"),
+            )
         };
         let (spec, kind) = match field.data_type() {
             DataType::Binary | DataType::LargeBinary => match known {
                 Some(spec) if spec.is_image() => (spec.clone(), Kind::Image),
-                Some(_) => return Err(contradiction("encoded pictures")),
+                Some(_) => return Err(contradiction("encoded images")),
                 None => {
-                    let Some(bytes) = first_picture(name)? else { continue };
-                    // Binary columns of foreign tables need not be pictures.
+                    let Some(bytes) = first_image(name)? else { continue };
+                    // Binary columns of third-party tables may hold other data than images.
                     let Ok((height, width)) = swm_image::image_size(&bytes) else { continue };
                     (ColumnSpec::image(name, height, width), Kind::Image)
                 }
@@ -226,10 +225,10 @@ pub fn columns_to_read(
                 let Some(dtype) = number_type(item) else { continue };
                 match known {
                     Some(spec) if !spec.is_image() && spec.len() == shape.iter().product::<usize>() => {
-                        (spec.clone(), Kind::Numbers(Precision::of(dtype)))
+                        (spec.clone(), Kind::Values(Precision::of(dtype)))
                     }
                     Some(_) => return Err(contradiction(&format!("{other}"))),
-                    None => (ColumnSpec::new(name, dtype, shape), Kind::Numbers(Precision::of(dtype))),
+                    None => (ColumnSpec::new(name, dtype, shape), Kind::Values(Precision::of(dtype))),
                 }
             }
         };
@@ -237,17 +236,18 @@ pub fn columns_to_read(
             columns.push(StoredColumn { spec, name: name.clone(), kind });
         }
     }
-    // The numbers come first, with the type they were declared with where an episode carried them.
+    // Index columns come first, with their declared type if the written episodes contained them.
     let declared = |name| {
         let spec = recorded.as_ref()?.columns.columns().iter().find(|spec| spec.name == name)?;
         (spec.len() == 1 && !spec.is_image()).then(|| spec.clone())
     };
-    let numbers = [EPISODE, STEP].map(|name| declared(name).unwrap_or_else(|| ColumnSpec::new(name, DType::Int32, [])));
-    let visible: Vec<ColumnSpec> = numbers.into_iter().chain(columns.iter().map(|c| c.spec.clone())).collect();
+    let indices =
+        [EPISODE_IDX, STEP_IDX].map(|name| declared(name).unwrap_or_else(|| ColumnSpec::new(name, DType::Int32, [])));
+    let visible: Vec<ColumnSpec> = indices.into_iter().chain(columns.iter().map(|c| c.spec.clone())).collect();
     Ok((columns, Schema::new(visible)?))
 }
 
-/// The type that holds Arrow's numbers without loss.
+/// The narrowest column type that holds Arrow's values without loss.
 fn number_type(data_type: &DataType) -> Option<DType> {
     Some(match data_type {
         DataType::Boolean => DType::Bool,

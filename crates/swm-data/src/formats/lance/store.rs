@@ -1,4 +1,4 @@
-//! A Lance table: where it is, its newest version, and how a new version is committed.
+//! Storage of a Lance table: its location, its newest version, and commits of new versions.
 
 use super::ENTRY;
 use crate::dataset::{Location, objects};
@@ -29,19 +29,19 @@ use std::sync::Arc;
 use swm_core::{Error, Result};
 use url::Url;
 
-/// Runs asynchronous code to its end. A panic in Lance, which damaged files can provoke, becomes an error.
-pub fn wait<T, F>(label: &Path, action: &str, future: F) -> Result<T>
+/// Runs a future to completion. A panic in Lance, which damaged files can cause, becomes an error.
+pub fn block_on<T, F>(label: &Path, action: &str, future: F) -> Result<T>
 where
     T: Send + 'static,
     F: Future<Output = lance_core::Result<T>> + Send + 'static,
 {
-    match objects::wait(future)? {
-        Some(result) => result.map_err(|e| explain(label, action, &e)),
-        None => Err(damaged(label, format!("{action}: its content makes no sense"))),
+    match objects::block_on(future)? {
+        Some(result) => result.map_err(|e| lance_error(label, action, &e)),
+        None => Err(damaged(label, format!("{action}: the content is invalid"))),
     }
 }
 
-/// The error of a dataset whose files are damaged.
+/// The error for a dataset with damaged files.
 pub fn damaged(path: &Path, problem: impl Into<String>) -> Error {
     Error::corrupt(
         path,
@@ -50,11 +50,11 @@ pub fn damaged(path: &Path, problem: impl Into<String>) -> Error {
     )
 }
 
-/// Lance's error in our words: what the operating system refused is [`Error::Io`], what a store on the network refused
-/// is its own message, all else means that the files are not what they should be.
-fn explain(label: &Path, action: &str, error: &lance_core::Error) -> Error {
+/// Converts Lance's errors: errors of the operating system become [`Error::Io`], errors of a remote store keep their
+/// message, and all others mean that files are damaged.
+fn lance_error(label: &Path, action: &str, error: &lance_core::Error) -> Error {
     let text = error.to_string();
-    // Lance turns some system errors into text; their number survives.
+    // Lance converts some system errors to text, which still contains their code.
     let code =
         text.split("(os error ").nth(1).and_then(|rest| rest.split(')').next()).and_then(|number| number.parse().ok());
     let remote = label.to_str().is_some_and(|label| label.contains("://"));
@@ -64,18 +64,18 @@ fn explain(label: &Path, action: &str, error: &lance_core::Error) -> Error {
         (_, lance_core::Error::NotSupported { .. } | lance_core::Error::VersionConflict { .. }) => Error::corrupt(
             label,
             format!("{action}: {text}"),
-            "this build cannot read that; rewrite it with a current Lance",
+            "this version cannot be read; rewrite the table with a current Lance",
         ),
         (_, lance_core::Error::IO { .. }) if remote => Error::external(format!("{}: {action}", label.display()), text),
         _ => damaged(label, format!("{action}: {text}")),
     }
 }
 
-/// What a table leaves in its folder when it is killed before its first commit.
+/// Folders that a table killed before its first commit may leave.
 const FOLDERS: [&str; 4] = ["_versions", "_transactions", "_shards", "data"];
 
-/// Whether a location names a Lance table: it ends in `.lance`, or is a folder that holds one that does.
-pub fn looks_like(location: &Location) -> bool {
+/// Whether a location is a Lance table: its name ends in `.lance`, or it is a folder that contains such a table.
+pub fn detect(location: &Location) -> bool {
     ENTRY.has_suffix(location)
         || location.path().is_some_and(|path| tables_in(path).is_ok_and(|tables| !tables.is_empty()))
 }
@@ -92,7 +92,7 @@ fn tables_in(folder: &Path) -> std::io::Result<Vec<PathBuf>> {
     Ok(tables)
 }
 
-/// The table that a location names.
+/// The table at a location.
 fn table(location: &Location) -> Result<Location> {
     let Some(path) = location.path().filter(|_| !location.has_suffix("lance")) else { return Ok(location.clone()) };
     let tables = tables_in(path).map_err(|e| Error::io(path, "listing the folder", e))?;
@@ -100,7 +100,11 @@ fn table(location: &Location) -> Result<Location> {
         [table] => Ok(Location::from(table)),
         _ => {
             let names: Vec<String> = tables.iter().map(|t| t.display().to_string()).collect();
-            Err(Error::config("dataset", format!("{} holds several: {}", path.display(), names.join(", ")), "name one"))
+            Err(Error::config(
+                "dataset",
+                format!("{} holds several tables: {}", path.display(), names.join(", ")),
+                "name one of them",
+            ))
         }
     }
 }
@@ -110,49 +114,49 @@ fn table(location: &Location) -> Result<Location> {
 pub struct Version {
     /// Fragments, schema and metadata.
     pub manifest: Arc<Manifest>,
-    /// Indices that others may have built; carried along.
+    /// Indices that other tools may have built; copied to new versions.
     pub indices: Vec<IndexMetadata>,
 }
 
-/// A table's folder and the machinery to reach it.
+/// Location of a table and access to its objects.
 #[derive(Clone)]
 pub struct Store {
-    /// What messages call it: its absolute path or its URI.
+    /// How messages show it: the absolute path or the URI.
     pub label: PathBuf,
     /// Whether it is in an object store.
     pub remote: bool,
-    /// Whether objects can be listed; a web server commonly cannot.
+    /// Whether objects can be listed. Web servers usually cannot list.
     pub lists: bool,
     base: StorePath,
     objects: Arc<ObjectStore>,
 }
 
 impl Store {
-    /// The table of a location, which need not exist.
+    /// The storage at a location, which need not exist yet.
     ///
     /// # Errors
-    /// When the location makes no sense, or this build does not reach it.
+    /// If the location is invalid, or this build does not support its scheme.
     pub fn new(location: &Location) -> Result<Self> {
         let location = table(location)?;
         let (store, base) = objects::store(&location)?;
         let Location::Uri(url) = &location else {
-            let label =
-                std::path::absolute(location.label()).map_err(|e| Error::io(location.label(), "finding it", e))?;
+            let label = std::path::absolute(location.label())
+                .map_err(|e| Error::io(location.label(), "resolving the path", e))?;
             let objects = Arc::new(ObjectStore::local());
             return Ok(Self { label, remote: false, lists: true, base, objects });
         };
         let lists = !url.scheme().starts_with("http");
-        // The stores that Lance would make itself are left out of this build. What it wants to know of one it is told
-        // here, so any scheme serves that it has heard of.
+        // This build does not include Lance's own stores, so it passes one in. The scheme only has to be one that Lance
+        // knows.
         let scheme = Url::parse("memory:///").map_err(|e| Error::external("opening an object store", e))?;
         let objects = ObjectStore::new(store, scheme, Some(BLOCK), None, false, lists, REQUESTS, RETRIES, None);
         Ok(Self { label: location.label(), remote: true, lists, base, objects: Arc::new(objects) })
     }
 
-    /// Checks that it is a place to write to.
+    /// Checks that the location can be written.
     ///
     /// # Errors
-    /// When it is a web server's.
+    /// If it is on a web server.
     pub fn check_writable(&self) -> Result<()> {
         if self.lists {
             return Ok(());
@@ -161,29 +165,29 @@ impl Store {
         Err(Error::config("dataset", problem, "write to a path or to s3://, gs:// or az://"))
     }
 
-    /// The newest version; `None` where there is no table yet.
+    /// The newest version; `None` if there is no table yet.
     ///
     /// # Errors
-    /// When the folder holds something else, or the newest version cannot be read.
+    /// If the folder holds other files, or the newest version cannot be read.
     pub fn latest(&self) -> Result<Option<Version>> {
         if self.lists && !self.has_versions()? {
             return self.check_free().map(|()| None);
         }
         let store = self.clone();
-        wait(&self.label, "reading the newest version", async move {
-            let location = store.newest().await?;
+        block_on(&self.label, "reading the newest version", async move {
+            let location = store.latest_location().await?;
             let bytes = store.objects.inner.get(&location.path).await?.bytes().await?;
-            check_seal(&bytes)?;
-            // Lance reads what was checked, not what may be there by now.
+            verify_checksum(&bytes)?;
+            // Lance parses the verified bytes, not the object, which may have changed.
             let memory = ObjectStore::memory();
             memory.put(&location.path, &bytes).await?;
             let manifest = read_manifest(&memory, &location.path, Some(bytes.len() as u64)).await?;
             if manifest.version != location.version {
-                return Err(corrupt(format!("version {} is named {}", manifest.version, location.version)));
+                return Err(corrupt(format!("version {} is stored as version {}", manifest.version, location.version)));
             }
             ensure_can_read_manifest(&manifest)?;
             let indices = read_manifest_indexes(&memory, &location, &manifest).await?;
-            // Lance panics on types it does not know, once it is too late to report them.
+            // Converting the schema here turns Lance's panic on unknown types into an error.
             let _ = ArrowSchema::from(&manifest.schema);
             Ok(Some(Version { manifest: Arc::new(manifest), indices }))
         })
@@ -193,8 +197,8 @@ impl Store {
         Ok(self.list("_versions")?.iter().any(|meta| meta.location.extension() == Some("manifest")))
     }
 
-    /// Checks that the folder holds nothing but what a table that was never committed may have left. In an object
-    /// store there are no folders, and nothing of others is in the way.
+    /// Checks that a local folder holds nothing but leftovers of a table that was never committed. Object stores have
+    /// no folders, so other objects do not conflict.
     fn check_free(&self) -> Result<()> {
         if self.remote {
             return Ok(());
@@ -202,14 +206,14 @@ impl Store {
         for name in self.entries()? {
             let hidden = name.as_encoded_bytes().starts_with(b".");
             if !hidden && !FOLDERS.iter().any(|&known| name == known) {
-                let problem = format!("the folder holds '{}' and is no Lance table", name.display());
+                let problem = format!("the folder holds '{}' and is not a Lance table", name.display());
                 return Err(Error::corrupt(&self.label, problem, "choose another path"));
             }
         }
         Ok(())
     }
 
-    /// The names in the folder; none where there is no such folder.
+    /// Names in the folder; empty if it does not exist.
     fn entries(&self) -> Result<Vec<OsString>> {
         let io = |e| Error::io(&self.label, "listing the folder", e);
         match std::fs::read_dir(&self.label) {
@@ -219,12 +223,12 @@ impl Store {
         }
     }
 
-    /// Applies an operation to `current` (`None`: there is no table yet) and commits the result as the next version,
-    /// atomically: `None` when somebody else committed it meanwhile. Gives the new version, and the path of its
-    /// manifest.
+    /// Applies an operation to version `current` (`None` if there is no table yet) and commits the result atomically as
+    /// the next version. Returns the new version and the path of its manifest, or `None` if another process committed
+    /// that version first.
     ///
     /// # Errors
-    /// When the operation does not fit the table, or the system refuses.
+    /// If the operation does not fit the table, or writing fails.
     pub fn commit(
         &self,
         current: Option<&Version>,
@@ -233,11 +237,11 @@ impl Store {
     ) -> Result<Option<(Version, StorePath)>> {
         let store = self.clone();
         let current = current.cloned();
-        wait(&self.label, "committing a version", async move {
+        block_on(&self.label, "committing a version", async move {
             let manifest = current.as_ref().map(|version| &*version.manifest);
             if let Some(manifest) = manifest {
                 ensure_can_write_manifest(manifest)?;
-                if store.newest().await?.version != manifest.version {
+                if store.latest_location().await?.version != manifest.version {
                     return Ok(None);
                 }
             }
@@ -248,7 +252,7 @@ impl Store {
             };
             let transaction = Transaction::new(manifest.map_or(0, |m| m.version), operation, None);
             let indices = current.as_ref().map(|version| version.indices.clone()).unwrap_or_default();
-            // The transaction is stored in the manifest itself, so it needs no file.
+            // The manifest contains the transaction, so it needs no separate file.
             let (mut next, indices) = transaction.build_manifest(manifest, indices, "", &config)?;
             let result = ConditionalPutCommitHandler
                 .commit(
@@ -256,7 +260,7 @@ impl Store {
                     (!indices.is_empty()).then(|| indices.clone()),
                     &store.base,
                     &store.objects,
-                    write_sealed,
+                    write_with_checksum,
                     ManifestNamingScheme::V2,
                     Some((&transaction).try_into()?),
                 )
@@ -266,7 +270,7 @@ impl Store {
                 Err(CommitError::CommitConflict) => return Ok(None),
                 Err(CommitError::OtherError(error)) => return Err(error),
             };
-            if !store.holds(next.version, &appended).await? {
+            if !store.contains(next.version, &appended).await? {
                 store.objects.delete(&location.path).await?;
                 return Ok(None);
             }
@@ -274,15 +278,15 @@ impl Store {
         })
     }
 
-    /// Where the newest version is.
-    async fn newest(&self) -> lance_core::Result<ManifestLocation> {
+    /// Location of the newest version.
+    async fn latest_location(&self) -> lance_core::Result<ManifestLocation> {
         ConditionalPutCommitHandler.resolve_latest_location(&self.base, &self.objects).await
     }
 
-    /// Whether what was appended in a version is part of the newest one. Old versions are removed, so who commits late
-    /// may find the name of one free that others long committed, and went on from.
-    async fn holds(&self, version: u64, appended: &[Fragment]) -> lance_core::Result<bool> {
-        let newest = self.newest().await?;
+    /// Whether the newest version contains the appended fragments. Because old versions are deleted, a late commit may
+    /// reuse the number of a version that others already replaced.
+    async fn contains(&self, version: u64, appended: &[Fragment]) -> lance_core::Result<bool> {
+        let newest = self.latest_location().await?;
         if newest.version == version || appended.is_empty() {
             return Ok(true);
         }
@@ -291,7 +295,7 @@ impl Store {
         Ok(appended.iter().flat_map(|fragment| &fragment.files).all(holds))
     }
 
-    /// The path of a file below the table's folder, its parts separated by `/`.
+    /// The path of a file below the table's folder; `inside` uses `/` as separator.
     pub fn path(&self, inside: &str) -> StorePath {
         inside.split('/').filter(|part| !part.is_empty()).fold(self.base.clone(), StorePath::join)
     }
@@ -301,18 +305,18 @@ impl Store {
         self.base.clone().join("data").join(name)
     }
 
-    /// Where a file of this machine is.
+    /// The local path of a file.
     pub fn local(&self, path: &StorePath) -> PathBuf {
         Path::new("/").join(path.as_ref())
     }
 
-    /// All files below a part of the folder; none where there is no such part.
+    /// All files below a part of the folder; empty if it does not exist.
     ///
     /// # Errors
-    /// When the system refuses.
+    /// If listing fails.
     pub fn list(&self, part: &str) -> Result<Vec<ObjectMeta>> {
         let (objects, prefix) = (Arc::clone(&self.objects), self.path(part));
-        let mut files: Vec<ObjectMeta> = wait(&self.label, "listing the dataset", async move {
+        let mut files: Vec<ObjectMeta> = block_on(&self.label, "listing the dataset", async move {
             match objects.inner.list(Some(&prefix)).try_collect().await {
                 Err(object_store::Error::NotFound { .. }) => Ok(vec![]),
                 listed => Ok(listed?),
@@ -322,48 +326,48 @@ impl Store {
         Ok(files)
     }
 
-    /// A whole file.
+    /// Reads a whole file.
     ///
     /// # Errors
-    /// When there is none, or the system refuses.
+    /// If it does not exist or reading fails.
     pub fn read(&self, path: &StorePath) -> Result<Bytes> {
         let (objects, path) = (Arc::clone(&self.objects), path.clone());
-        wait(&self.label, "reading a file", async move { Ok(objects.inner.get(&path).await?.bytes().await?) })
+        block_on(&self.label, "reading a file", async move { Ok(objects.inner.get(&path).await?.bytes().await?) })
     }
 
-    /// Writes a whole file, which appears when it is complete.
+    /// Writes a whole file, which becomes visible when it is complete.
     ///
     /// # Errors
-    /// When the system refuses.
+    /// If writing fails.
     pub fn write(&self, path: &StorePath, content: Bytes) -> Result<()> {
         let (objects, path, remote) = (Arc::clone(&self.objects), path.clone(), self.remote);
-        wait(&self.label, "writing a file", async move {
+        block_on(&self.label, "writing a file", async move {
             if remote {
-                // In parts, which are tried again one by one.
+                // A multipart upload, which retries each part separately.
                 objects.put(&path, &content).await?;
             } else {
-                // Not Lance's writer, which does not notice that a disk is full.
+                // Lance's own writer does not report a full disk.
                 objects.inner.put(&path, content.into()).await?;
             }
             Ok(())
         })
     }
 
-    /// Removes a file that nothing needs any more; that it stays does no harm but for its size.
+    /// Removes a file that is no longer used. A failure only wastes space, so it is logged and ignored.
     pub fn remove(&self, path: &StorePath) {
         let (objects, gone) = (Arc::clone(&self.objects), path.clone());
-        let removed = wait(&self.label, "removing a file", async move { objects.delete(&gone).await });
+        let removed = block_on(&self.label, "removing a file", async move { objects.delete(&gone).await });
         if let Err(error) = removed {
-            tracing::warn!(file = %path, "an old file of the dataset stays: {error}");
+            tracing::warn!(file = %path, "an unused file of the dataset could not be removed: {error}");
         }
     }
 
-    /// Where objects are read by ranges.
+    /// The object store, for reading byte ranges.
     pub fn inner(&self) -> &dyn object_store::ObjectStore {
         &*self.objects.inner
     }
 
-    /// Opens a data file for reading. Must run inside [`wait`].
+    /// Opens a data file for reading. Must run inside [`block_on`].
     pub async fn open_file(&self, file: &DataFile) -> lance_core::Result<FileReader> {
         let scheduler = ScanScheduler::new(Arc::clone(&self.objects), SchedulerConfig::max_bandwidth(&self.objects));
         let scheduler = scheduler.open_file(&self.data_path(&file.path), &file.file_size_bytes).await?;
@@ -372,23 +376,23 @@ impl Store {
     }
 }
 
-/// What Lance reads at once of an object, how many requests it has in flight, and how often it tries again.
+/// Bytes that Lance reads at once from an object, maximum number of concurrent requests, and number of retries.
 const BLOCK: usize = 64 << 10;
 /// See [`BLOCK`].
 const REQUESTS: usize = 64;
 /// See [`BLOCK`].
 const RETRIES: usize = 3;
 
-/// A mark, and after it a BLAKE3 hash of all other bytes of a manifest's file. It stands before Lance's message, whose
-/// place is in the file's last bytes, so that others pass over it.
-const SEAL: &[u8; 8] = b"swmSEAL1";
-/// See [`SEAL`].
-const SEAL_LEN: usize = SEAL.len() + 32;
-/// Where the message begins, format versions, and a magic number.
+/// Tag followed by a BLAKE3 hash of all other bytes of a manifest's file. It is stored before Lance's message, whose
+/// offset is in the file's footer, so other readers skip it.
+const CHECKSUM_TAG: &[u8; 8] = b"swmSEAL1";
+/// See [`CHECKSUM_TAG`].
+const CHECKSUM_LEN: usize = CHECKSUM_TAG.len() + 32;
+/// Size of the footer: offset of the message, format versions, and magic number.
 const FOOTER: usize = 16;
 
-/// Writes a manifest as Lance does, with a seal.
-fn write_sealed<'a>(
+/// Writes a manifest as Lance does, with a checksum.
+fn write_with_checksum<'a>(
     objects: &'a ObjectStore,
     manifest: &'a mut Manifest,
     indices: Option<Vec<IndexMetadata>>,
@@ -399,34 +403,37 @@ fn write_sealed<'a>(
         let memory = ObjectStore::memory();
         write_manifest_file_to_path(&memory, manifest, indices, path, transaction).await?;
         let plain = memory.read_one_all(path).await?;
-        objects.put(path, &sealed(&plain)?).await
+        objects.put(path, &with_checksum(&plain)?).await
     })
 }
 
-/// Where the message of a manifest's file begins.
+/// Offset of the message in a manifest's file.
 fn message_start(file: &[u8]) -> lance_core::Result<usize> {
     let start = file.len().checked_sub(FOOTER).and_then(|at| file[at..].first_chunk());
     let start = start.and_then(|&bytes| usize::try_from(u64::from_le_bytes(bytes)).ok());
-    start.filter(|&start| start <= file.len() - FOOTER).ok_or_else(|| corrupt("a manifest has no end".to_owned()))
+    start.filter(|&start| start <= file.len() - FOOTER).ok_or_else(|| corrupt("a manifest is truncated".to_owned()))
 }
 
-/// A manifest's file with a seal before its message.
-fn sealed(plain: &[u8]) -> lance_core::Result<Vec<u8>> {
+/// Adds a checksum before the message of a manifest's file.
+fn with_checksum(plain: &[u8]) -> lance_core::Result<Vec<u8>> {
     let start = message_start(plain)?;
     let (before, message) = plain.split_at(start);
     let mut after = message.to_vec();
     let footer = after.len() - FOOTER;
-    after[footer..footer + 8].copy_from_slice(&((start + SEAL_LEN) as u64).to_le_bytes());
+    after[footer..footer + 8].copy_from_slice(&((start + CHECKSUM_LEN) as u64).to_le_bytes());
     let hash = blake3::Hasher::new().update(before).update(&after).finalize();
-    Ok([before, SEAL, hash.as_bytes(), &after].concat())
+    Ok([before, CHECKSUM_TAG, hash.as_bytes(), &after].concat())
 }
 
-/// Checks the seal of a manifest's file, if it has one: those that others wrote do not.
-fn check_seal(file: &[u8]) -> lance_core::Result<()> {
+/// Verifies the checksum of a manifest's file if it has one. Manifests of other writers do not.
+fn verify_checksum(file: &[u8]) -> lance_core::Result<()> {
     let start = message_start(file)?;
-    let Some(seal) = start.checked_sub(SEAL_LEN).filter(|&seal| file[seal..].starts_with(SEAL)) else { return Ok(()) };
-    let hash = blake3::Hasher::new().update(&file[..seal]).update(&file[start..]).finalize();
-    if file[seal + SEAL.len()..start] == *hash.as_bytes() {
+    let Some(checksum) = start.checked_sub(CHECKSUM_LEN).filter(|&checksum| file[checksum..].starts_with(CHECKSUM_TAG))
+    else {
+        return Ok(());
+    };
+    let hash = blake3::Hasher::new().update(&file[..checksum]).update(&file[start..]).finalize();
+    if file[checksum + CHECKSUM_TAG.len()..start] == *hash.as_bytes() {
         return Ok(());
     }
     Err(corrupt("the newest manifest does not match its hash".to_owned()))
@@ -436,7 +443,7 @@ fn corrupt(problem: String) -> lance_core::Error {
     lance_core::Error::internal(problem)
 }
 
-/// The name of a data file with that hash: its content is in its name, so damage is found before it does harm.
+/// The name of a data file: the hash of its content, so that damage can be detected before decoding.
 pub fn name_of_hash(hash: blake3::Hash) -> String {
     format!("{}.lance", hash.to_hex())
 }
@@ -448,7 +455,7 @@ pub fn hash_file(path: &Path) -> std::io::Result<String> {
     Ok(hasher.finalize().to_hex().to_string())
 }
 
-/// The hash in the name of a data file, where it was written here. Other tools name theirs otherwise.
+/// The hash in the name of a data file; `None` for files of other tools.
 pub fn hash_in_name(name: &str) -> Option<&str> {
     let stem = name.strip_suffix(".lance")?;
     (stem.len() == 64 && stem.bytes().all(|b| b.is_ascii_hexdigit())).then_some(stem)
@@ -461,24 +468,24 @@ mod tests {
     #[test]
     fn system_errors_keep_their_reason() {
         let full = lance_core::Error::io("failed to persist: No space left on device (os error 28)".to_owned());
-        let error = explain(Path::new("x.lance"), "writing", &full);
+        let error = lance_error(Path::new("x.lance"), "writing", &full);
         assert!(matches!(&error, Error::Io { source, .. } if source.kind() == ErrorKind::StorageFull));
         assert!(error.to_string().contains("committed episodes are kept"));
     }
 
     #[test]
-    fn a_seal_finds_every_flipped_bit_but_its_own() {
+    fn checksum_detects_every_flipped_bit_but_its_own() {
         let plain = [&b"transaction"[..], &7_u32.to_le_bytes(), b"message", &11_u64.to_le_bytes(), b"\0\0\x02\0LANC"];
         let plain = plain.concat();
-        assert!(check_seal(&plain).is_ok(), "those of others have none");
-        let sound = sealed(&plain).expect("seals");
-        assert_eq!(&sound[message_start(&sound).expect("a message")..][4..11], b"message");
-        assert!(check_seal(&sound).is_ok());
-        for at in (0..sound.len()).filter(|at| !(11..19).contains(at)) {
-            let mut damaged = sound.clone();
+        assert!(verify_checksum(&plain).is_ok(), "other writers store none");
+        let intact = with_checksum(&plain).expect("adds a checksum");
+        assert_eq!(&intact[message_start(&intact).expect("a message")..][4..11], b"message");
+        assert!(verify_checksum(&intact).is_ok());
+        for at in (0..intact.len()).filter(|at| !(11..19).contains(at)) {
+            let mut damaged = intact.clone();
             damaged[at] ^= 4;
-            let in_place = at >= sound.len() - FOOTER && at < sound.len() - 8;
-            assert!(check_seal(&damaged).is_err() || in_place, "byte {at}");
+            let in_place = at >= intact.len() - FOOTER && at < intact.len() - 8;
+            assert!(verify_checksum(&damaged).is_err() || in_place, "byte {at}");
         }
     }
 }

@@ -1,10 +1,10 @@
-//! A table that is written to: its data files, its versions.
+//! A table that is being written: its data files and its versions.
 
-use super::encode::Encoded;
+use super::encode::EncodedEpisode;
 use super::reader::LanceReader;
 use super::record::{CONSTANTS_KEY, EPISODES_KEY, Record};
-use super::schema::{self, EPISODE};
-use super::store::{self, Store, Version, wait};
+use super::schema;
+use super::store::{self, Store, Version, block_on};
 use arrow_array::{ArrayRef, Int32Array, RecordBatch};
 use arrow_schema::Schema as ArrowSchema;
 use bytes::Bytes;
@@ -20,26 +20,27 @@ use std::collections::VecDeque;
 use std::num::NonZero;
 use std::sync::Arc;
 use std::time::SystemTime;
+use swm_core::columns::EPISODE_IDX;
 use swm_core::{Error, Result};
 
-/// The file format of new tables, which is also what the reference's tables have.
+/// The file format of new tables; the reference uses the same.
 const FILE_VERSION: ConcreteFileVersion = ConcreteFileVersion::V2_2;
 
-/// Versions of our own that are kept, for readers that just opened one. Each holds the list of all fragments,
-/// so keeping every version of a long collection would take space that grows with its square.
-const KEPT_VERSIONS: usize = 8;
+/// Versions of this writer that are retained for readers that have just opened one. Every version lists all fragments,
+/// so retaining all versions would take space quadratic in the number of commits.
+const RETAINED_VERSIONS: usize = 8;
 
-/// The key in a data file's metadata that makes it unlike all others.
+/// The key in a data file's metadata that makes every file unique.
 const MADE_KEY: &str = "stable_worldmodel.made";
 
-/// How often a commit is tried again because others were faster. Each of them got something done.
-pub const TRIES: usize = 1000;
+/// Maximum number of attempts per commit. Each failed attempt means that another writer committed.
+pub const MAX_ATTEMPTS: usize = 1000;
 
 /// A table and its newest version.
 pub struct Table {
     pub store: Store,
     pub version: Option<Version>,
-    /// The fields of new tables, as the first version will have them.
+    /// The schema of the first version, if the table is new.
     fresh: LanceSchema,
     file_version: ConcreteFileVersion,
     /// Manifests of versions that this writer committed, oldest first.
@@ -47,27 +48,27 @@ pub struct Table {
 }
 
 impl Table {
-    /// The table of a store: in this version, or one that is not there yet, with these fields.
+    /// The table at this version, or a new table with this schema.
     pub fn new(store: Store, version: Option<Version>, fresh: LanceSchema) -> Self {
         let file_version =
             version.as_ref().map_or(FILE_VERSION, |version| version.manifest.data_storage_format.lance_file_format());
         Self { store, version, fresh, file_version, manifests: VecDeque::new() }
     }
 
-    /// The fields; their ids are those of the table, which a foreign table may number differently.
+    /// The schema. Its field ids are those of the existing table.
     pub fn fields(&self) -> &LanceSchema {
         self.version.as_ref().map_or(&self.fresh, |version| &version.manifest.schema)
     }
 
-    /// The operation that makes the table anew, of these fragments.
-    pub fn made_anew(&self, fragments: Vec<Fragment>) -> Operation {
+    /// The operation that replaces the table's content with these fragments.
+    pub fn overwrite_operation(&self, fragments: Vec<Fragment>) -> Operation {
         Operation::Overwrite { fragments, schema: self.fresh.clone(), config_upsert_values: None, initial_bases: None }
     }
 
-    /// Commits an operation; `false` when somebody else committed meanwhile, and nothing was done.
+    /// Commits an operation. Returns `false`, without any effect, if another process committed in the meantime.
     ///
     /// # Errors
-    /// When the system refuses.
+    /// If writing fails.
     pub fn commit(&mut self, operation: Operation) -> Result<bool> {
         let config = ManifestBuildConfig {
             auto_set_feature_flags: true,
@@ -85,7 +86,7 @@ impl Table {
         };
         self.version = Some(version);
         self.manifests.push_back(manifest);
-        if self.manifests.len() > KEPT_VERSIONS
+        if self.manifests.len() > RETAINED_VERSIONS
             && let Some(oldest) = self.manifests.pop_front()
         {
             self.store.remove(&oldest);
@@ -93,14 +94,14 @@ impl Table {
         Ok(true)
     }
 
-    /// Looks what others committed, and gives the number of the next episode.
+    /// Loads the version that another process committed, and returns the next free `episode_idx`.
     ///
     /// # Errors
-    /// When they removed the table or gave it other columns.
+    /// If the table was removed or its columns changed.
     pub fn refresh(&mut self) -> Result<i64> {
         let replaced = || {
             let problem = format!("another process replaced {} meanwhile", self.store.label.display());
-            Error::config("dataset", problem, "write to one of another name, or collect these episodes again")
+            Error::config("dataset", problem, "write to a dataset with another name, or collect these episodes again")
         };
         let latest = self.store.latest()?.ok_or_else(replaced)?;
         let columns = |schema: &LanceSchema| {
@@ -115,8 +116,8 @@ impl Table {
         Ok(reader.next_episode())
     }
 
-    /// The operation that replaces the stored manifest (where the data come from), unless it is the same.
-    pub fn described(&self, manifest: String) -> Option<Operation> {
+    /// The operation that replaces the stored manifest, or `None` if it is unchanged.
+    pub fn manifest_operation(&self, manifest: String) -> Option<Operation> {
         if self.fields().metadata.get(schema::MANIFEST_KEY) == Some(&manifest) {
             return None;
         }
@@ -129,12 +130,12 @@ impl Table {
         })
     }
 
-    /// Writes episodes to a new data file: numbered from `first` on, or without numbers, which are then to be added by
-    /// [`Table::write_numbers`].
+    /// Writes episodes to a new data file. They are numbered from `first` on; with `None` they get no `episode_idx`,
+    /// and [`Table::write_episode_indices`] must add it.
     ///
     /// # Errors
-    /// When there are too many episodes, or the system refuses.
-    pub fn write_episodes(&self, episodes: &[Encoded], first: Option<i64>) -> Result<Fragment> {
+    /// If there are too many episodes, or writing fails.
+    pub fn write_episodes(&self, episodes: &[EncodedEpisode], first: Option<i64>) -> Result<Fragment> {
         let mut record = Record::default();
         let mut batches = vec![];
         let all = ArrowSchema::from(self.fields());
@@ -147,8 +148,8 @@ impl Table {
         };
         let arrow = Arc::new(ArrowSchema::new(all.fields().iter().skip(skipped).cloned().collect::<Vec<_>>()));
         for (at, episode) in (0_i64..).zip(episodes) {
-            let numbers = first.map(|first| numbers(first + at, episode.rows as usize)).transpose()?;
-            let values = numbers.into_iter().chain(episode.values.iter().cloned()).collect();
+            let indices = first.map(|first| episode_indices(first + at, episode.rows as usize)).transpose()?;
+            let values = indices.into_iter().chain(episode.values.iter().cloned()).collect();
             let batch = RecordBatch::try_new(Arc::clone(&arrow), values);
             batches.push(batch.map_err(|e| Error::external("writing an episode", e))?);
             record.push(episode.rows as u64, episode.hash.clone(), &episode.constants);
@@ -158,25 +159,25 @@ impl Table {
         Ok(Fragment { files: vec![file], ..Fragment::new(0) }.with_physical_rows(rows))
     }
 
-    /// Writes the numbers of a fragment's episodes, which have so many rows each, to a data file of their own.
+    /// Writes `episode_idx` of a fragment to a separate data file. `rows` are the lengths of its episodes.
     ///
     /// # Errors
     /// As [`Table::write_episodes`].
-    pub fn write_numbers(&self, rows: &[u64], first: i64) -> Result<DataFile> {
-        let fields = self.fields().project(&[EPISODE]).map_err(|e| Error::external("numbering episodes", e))?;
+    pub fn write_episode_indices(&self, rows: &[u64], first: i64) -> Result<DataFile> {
+        let fields = self.fields().project(&[EPISODE_IDX]).map_err(|e| Error::external("numbering episodes", e))?;
         let arrow = Arc::new(ArrowSchema::from(&fields));
         let batches: Result<Vec<RecordBatch>> = (first..)
             .zip(rows)
             .map(|(number, &rows)| {
-                let batch = RecordBatch::try_new(Arc::clone(&arrow), vec![numbers(number, rows as usize)?]);
+                let batch = RecordBatch::try_new(Arc::clone(&arrow), vec![episode_indices(number, rows as usize)?]);
                 batch.map_err(|e| Error::external("numbering episodes", e))
             })
             .collect();
         self.write_file(fields, batches?, None)
     }
 
-    /// Writes a data file. It is made in memory, as its name is the hash of its content; and so it is there as a whole
-    /// or not at all.
+    /// Writes a data file. It is assembled in memory, because its name is the hash of its content, and becomes visible
+    /// only when it is complete.
     fn write_file(
         &self,
         fields: LanceSchema,
@@ -184,7 +185,7 @@ impl Table {
         record: Option<(Bytes, Option<Bytes>)>,
     ) -> Result<DataFile> {
         let version = self.file_version;
-        let (file, ids, columns) = wait(&self.store.label, "writing a data file", async move {
+        let (file, ids, columns) = block_on(&self.store.label, "writing a data file", async move {
             let (memory, path) = (ObjectStore::memory(), StorePath::from("file"));
             let mut writer = create_writer(version, memory.create(&path).await?, fields, FileWriterOptions::default())?;
             for batch in &batches {
@@ -198,12 +199,11 @@ impl Table {
                     writer.add_schema_metadata(CONSTANTS_KEY, number.to_string());
                 }
             }
-            // Two writers never make the same file, of which one would be the other's to remove.
+            // A unique key, so that two writers never produce the same file and one cannot remove the other's.
             writer.add_schema_metadata(MADE_KEY, uuid::Uuid::new_v4().simple().to_string());
             writer.finish().await?;
-            let places = writer.field_id_to_column_indices().iter().copied();
-            #[allow(clippy::cast_possible_wrap)]
-            let (ids, columns): (Vec<i32>, Vec<i32>) = places.map(|(id, column)| (id as i32, column as i32)).unzip();
+            let indices = writer.field_id_to_column_indices().iter().copied();
+            let (ids, columns): (Vec<i32>, Vec<i32>) = indices.map(|(id, column)| (id as i32, column as i32)).unzip();
             Ok((memory.read_one_all(&path).await?, ids, columns))
         })?;
         let name = store::name_of_hash(blake3::hash(&file));
@@ -219,7 +219,7 @@ impl Table {
         }
     }
 
-    /// Removes what only older versions use, after everything was replaced.
+    /// Removes data files and manifests of replaced versions.
     pub fn remove_replaced(&self, old: &Version) {
         old.manifest.fragments.iter().for_each(|fragment| self.discard(fragment));
         for version in self.store.list("_versions").unwrap_or_default() {
@@ -231,10 +231,10 @@ impl Table {
     }
 }
 
-/// The number of an episode, once a row.
-fn numbers(number: i64, rows: usize) -> Result<ArrayRef> {
+/// An `episode_idx` column: the same value in every row.
+fn episode_indices(number: i64, rows: usize) -> Result<ArrayRef> {
     let Ok(number) = i32::try_from(number) else {
-        return Err(Error::mismatch("writing an episode", "2^31 episodes or more", "fewer"));
+        return Err(Error::mismatch("writing an episode", "2^31 or more episodes", "fewer episodes"));
     };
     Ok(Arc::new(Int32Array::from(vec![number; rows])))
 }

@@ -1,18 +1,18 @@
-//! Writing episodes: encode in the caller's thread (all pictures in parallel), commit in a thread of our own.
+//! Writes episodes: encodes them in the caller's thread (images in parallel), and commits in a background thread.
 //!
-//! Finished episodes gather until the [`CommitPolicy`] says that the group is due; the group becomes one
-//! fragment (one data file) and one new version of the table, committed atomically. So a reader never sees a
-//! part of an episode, and a killed process loses the current group at most.
+//! Finished episodes accumulate until the [`CommitPolicy`] requires a commit. They then become one fragment (one data
+//! file) and one new version of the table, committed atomically. Readers therefore never see a part of an episode, and
+//! a killed process loses only uncommitted episodes.
 //!
-//! Several writers may append at once: who finds that another one committed first numbers its episodes anew, after
-//! those of the other.
+//! Several writers may append concurrently. If another writer commits first, this writer renumbers its episodes after
+//! the new ones and retries.
 
-use super::encode::Encoded;
+use super::encode::EncodedEpisode;
 use super::reader::LanceReader;
-use super::schema::{self, EPISODE, Kind, STEP, StoredColumn};
+use super::schema::{self, Kind, StoredColumn};
 use super::shard::ShardLog;
 use super::store::{Store, Version};
-use super::table::{TRIES, Table};
+use super::table::{MAX_ATTEMPTS, Table};
 use crate::dataset::{CommitPolicy, Constants, WriteMode, WriteOptions, Writer};
 use crate::dataset::{Location, episodes};
 use arrow_schema::Schema as ArrowSchema;
@@ -24,10 +24,12 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Instant;
+use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, Error, Result, Schema};
 use swm_image::ImageCodec;
 
-/// Episodes that may wait for the committing thread; bounds the memory together with the policy's bytes.
+/// Maximum number of episodes queued for the committing thread. Together with the policy's byte limit it bounds the
+/// memory.
 const WAITING: usize = 2;
 
 /// Creates, continues or replaces a table.
@@ -35,59 +37,60 @@ pub fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Re
     options.codec.check()?;
     let store = Store::new(location)?;
     store.check_writable()?;
-    for _ in 0..TRIES {
-        // Somebody else may make, continue or replace it at this moment: then there is another state to begin from.
-        if let Some(begun) = begin(&store, schema, &options)? {
+    for _ in 0..MAX_ATTEMPTS {
+        // If another process creates, continues or replaces the table in between, the next attempt starts from the new
+        // state.
+        if let Some(begun) = prepare(&store, schema, &options)? {
             return begun.start(schema, &options);
         }
     }
-    Err(busy(&store.label))
+    Err(too_many_conflicts(&store.label))
 }
 
-pub fn busy(label: &Path) -> Error {
-    let problem = format!("others write to {} without a pause", label.display());
-    Error::config("dataset", problem, "try again, or write to a dataset of your own and merge")
+pub fn too_many_conflicts(label: &Path) -> Error {
+    let problem = format!("commits of other writers to {} keep getting ahead of this one", label.display());
+    Error::config("dataset", problem, "try again, or write to a separate dataset and merge it")
 }
 
 /// A table that is ready for episodes.
-pub struct Begun {
+pub struct PreparedWriter {
     pub sink: Sink,
     /// The columns in the order of the table.
     pub columns: Vec<StoredColumn>,
-    /// Episodes that are there.
+    /// Number of episodes in the table.
     pub episodes: usize,
 }
 
-/// Where groups of episodes go.
+/// Where committed episodes go.
 pub enum Sink {
-    /// Into a version of the table each.
+    /// Each commit becomes a version of the table.
     Table {
         /// The table.
         table: Table,
-        /// The number of the next episode.
+        /// `episode_idx` of the next episode.
         next: i64,
     },
-    /// Into the log of one of several machines.
+    /// Each commit becomes an entry in the log of a shard.
     Shard(ShardLog),
 }
 
-/// The fields of a new table.
-pub fn fresh(columns: &[StoredColumn], schema: &Schema, options: &WriteOptions) -> Result<LanceSchema> {
+/// The Lance schema of a new table.
+pub fn new_table_schema(columns: &[StoredColumn], schema: &Schema, options: &WriteOptions) -> Result<LanceSchema> {
     let mut fresh =
-        LanceSchema::try_from(&schema::arrow_schema(columns)).map_err(|e| Error::external("making the table", e))?;
+        LanceSchema::try_from(&schema::arrow_schema(columns)).map_err(|e| Error::external("creating the table", e))?;
     fresh.metadata = schema::metadata(schema, options.codec, options.manifest.as_ref())?;
     Ok(fresh)
 }
 
-/// Makes, continues or replaces the table; `None` when somebody else did so meanwhile.
-fn begin(store: &Store, schema: &Schema, options: &WriteOptions) -> Result<Option<Begun>> {
+/// Creates, continues or replaces the table. Returns `None` if another process did so at the same time.
+fn prepare(store: &Store, schema: &Schema, options: &WriteOptions) -> Result<Option<PreparedWriter>> {
     let mut columns = schema::columns_to_write(schema)?;
-    let fresh = fresh(&columns, schema, options)?;
+    let fresh = new_table_schema(&columns, schema, options)?;
     let found = store.latest()?;
     let mut table = Table::new(store.clone(), found.clone(), fresh);
     let (mut episodes, mut next) = (0, 0);
     let committed = match (options.mode, found) {
-        (_, None) => table.commit(table.made_anew(vec![]))?,
+        (_, None) => table.commit(table.overwrite_operation(vec![]))?,
         (WriteMode::Create, Some(_)) => {
             return Err(Error::config(
                 "dataset",
@@ -96,7 +99,7 @@ fn begin(store: &Store, schema: &Schema, options: &WriteOptions) -> Result<Optio
             ));
         }
         (WriteMode::Overwrite, Some(old)) => {
-            let committed = table.commit(table.made_anew(vec![]))?;
+            let committed = table.commit(table.overwrite_operation(vec![]))?;
             if committed {
                 table.remove_replaced(&old);
             }
@@ -104,21 +107,21 @@ fn begin(store: &Store, schema: &Schema, options: &WriteOptions) -> Result<Optio
         }
         (WriteMode::Append, Some(old)) => {
             let known = LanceReader::of(store.clone(), Arc::clone(&old.manifest))?;
-            columns = continued(&store.label, columns, &old, crate::Reader::schema(&known))?;
+            columns = match_table_columns(&store.label, columns, &old, crate::Reader::schema(&known))?;
             episodes = crate::Reader::episodes(&known).len();
             next = known.next_episode();
             let manifest = options.manifest.as_ref().map(schema::json).transpose()?;
-            match manifest.and_then(|manifest| table.described(manifest)) {
+            match manifest.and_then(|manifest| table.manifest_operation(manifest)) {
                 Some(operation) => table.commit(operation)?,
                 None => true,
             }
         }
     };
-    Ok(committed.then_some(Begun { sink: Sink::Table { table, next }, columns, episodes }))
+    Ok(committed.then_some(PreparedWriter { sink: Sink::Table { table, next }, columns, episodes }))
 }
 
-impl Begun {
-    /// Starts the thread that commits.
+impl PreparedWriter {
+    /// Starts the committing thread.
     pub fn start(self, schema: &Schema, options: &WriteOptions) -> Result<Box<dyn Writer>> {
         let folder = match &self.sink {
             Sink::Table { table, .. } => table.store.label.clone(),
@@ -146,8 +149,8 @@ impl Begun {
     }
 }
 
-/// The incoming columns in the order of the table to continue, and with the precision it has.
-pub fn continued(
+/// Puts the columns to append in the order of the existing table, with its precision.
+pub fn match_table_columns(
     folder: &Path,
     mut incoming: Vec<StoredColumn>,
     old: &Version,
@@ -155,9 +158,9 @@ pub fn continued(
 ) -> Result<Vec<StoredColumn>> {
     let stored = ArrowSchema::from(&old.manifest.schema);
     for column in &mut incoming {
-        // Tables of older versions, and of the reference, hold all numbers in single precision.
+        // The reference, and older versions of this format, store all numeric columns as `float32`.
         let precision = stored.field_with_name(&column.name).ok().and_then(|f| schema::stored_precision(f.data_type()));
-        if let (Kind::Numbers(own), Some(precision)) = (&mut column.kind, precision) {
+        if let (Kind::Values(own), Some(precision)) = (&mut column.kind, precision) {
             *own = precision;
         }
     }
@@ -176,7 +179,7 @@ pub fn continued(
             format!("the columns it has: {}", describe(&stored)),
         ));
     }
-    // Types and picture sizes are recorded too, where the table was written here.
+    // Tables written here also record types and image sizes.
     for column in &incoming {
         if let Ok(spec) = known.column(&column.spec.name)
             && (spec.dtype, &spec.shape) != (column.spec.dtype, &column.spec.shape)
@@ -186,29 +189,29 @@ pub fn continued(
             return Err(Error::mismatch(
                 format!("appending to {}", folder.display()),
                 words(&column.spec),
-                format!("what it has: {}", words(spec)),
+                format!("the existing column: {}", words(spec)),
             ));
         }
     }
     incoming.sort_by_key(|column| stored.index_of(&column.name).unwrap_or(usize::MAX));
-    // The numbers lead in every table we write; foreign tables could have them elsewhere.
-    let leads = stored.fields().iter().take(2).map(|field| field.name().as_str()).eq([EPISODE, STEP]);
+    // Tables written here start with the index columns; third-party tables may not.
+    let leads = stored.fields().iter().take(2).map(|field| field.name().as_str()).eq([EPISODE_IDX, STEP_IDX]);
     if !leads {
         return Err(Error::mismatch(
             format!("appending to {}", folder.display()),
             describe(&stored),
-            format!("a table that begins with {EPISODE} and {STEP}; convert it first"),
+            format!("a table that begins with {EPISODE_IDX} and {STEP_IDX}; convert it first"),
         ));
     }
     Ok(incoming)
 }
 
-/// Shared between the writer and its committing thread.
+/// State shared by the writer and its committing thread.
 #[derive(Default)]
 struct Shared {
     /// The error that stopped the thread.
     failure: Mutex<Option<Error>>,
-    /// Whether no episode is missing, as opposed to a writer that was dropped.
+    /// Whether [`Writer::finish`] was called, as opposed to dropping the writer.
     complete: AtomicBool,
 }
 
@@ -224,17 +227,17 @@ struct LanceWriter {
     columns: Vec<StoredColumn>,
     codec: ImageCodec,
     episodes: usize,
-    queue: Option<SyncSender<Encoded>>,
+    queue: Option<SyncSender<EncodedEpisode>>,
     thread: Option<JoinHandle<()>>,
     shared: Arc<Shared>,
-    /// Whether the caller knows of the failure.
+    /// Whether the caller received the failure.
     reported: bool,
 }
 
 impl Writer for LanceWriter {
     fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
-        episodes::check(episode, &self.incoming)?;
-        let encoded = Encoded::new(&self.columns, episode, self.codec, constants)?;
+        episodes::check_episode(episode, &self.incoming)?;
+        let encoded = EncodedEpisode::new(&self.columns, episode, self.codec, constants)?;
         let queue = self.queue.as_ref();
         if queue.is_none_or(|queue| queue.send(encoded).is_err()) {
             return Err(self.failed());
@@ -254,11 +257,13 @@ impl Writer for LanceWriter {
 }
 
 impl LanceWriter {
-    /// Why the committing thread stopped.
+    /// The error that stopped the committing thread.
     fn failed(&mut self) -> Error {
         self.reported = true;
         let known = self.shared.failure().take();
-        known.unwrap_or_else(|| Error::external("writing an episode", "an earlier commit failed; nothing more is kept"))
+        known.unwrap_or_else(|| {
+            Error::external("writing an episode", "an earlier commit failed; later episodes are not stored")
+        })
     }
 
     fn close(&mut self) -> Result<()> {
@@ -278,28 +283,28 @@ impl Drop for LanceWriter {
         if let Err(error) = self.close()
             && !reported
         {
-            tracing::error!(dataset = %self.folder.display(), "the last episodes are lost: {error}");
+            tracing::error!(dataset = %self.folder.display(), "the last episodes could not be stored: {error}");
         }
     }
 }
 
-/// The thread that turns groups of episodes into fragments.
+/// The state of the committing thread.
 struct Committer {
     sink: Sink,
     policy: CommitPolicy,
-    group: Vec<Encoded>,
+    group: Vec<EncodedEpisode>,
     bytes: usize,
     shared: Arc<Shared>,
 }
 
 impl Committer {
-    fn run(mut self, episodes: &Receiver<Encoded>) {
+    fn run(mut self, episodes: &Receiver<EncodedEpisode>) {
         if let Err(error) = self.receive(episodes) {
             *self.shared.failure() = Some(error);
         }
     }
 
-    fn receive(&mut self, episodes: &Receiver<Encoded>) -> Result<()> {
+    fn receive(&mut self, episodes: &Receiver<EncodedEpisode>) -> Result<()> {
         let mut due = None;
         loop {
             let received = match due {
@@ -335,9 +340,9 @@ impl Committer {
         self.commit_episodes(&group)
     }
 
-    /// Commits some episodes. Those for which there is no room together are tried in halves, so that a disk that
-    /// fills up keeps as many finished episodes as it has room for.
-    fn commit_episodes(&mut self, episodes: &[Encoded]) -> Result<()> {
+    /// Commits episodes. If the disk is full, commits them in halves, so that as many finished episodes as possible are
+    /// stored.
+    fn commit_episodes(&mut self, episodes: &[EncodedEpisode]) -> Result<()> {
         if episodes.is_empty() {
             return Ok(());
         }
@@ -356,9 +361,9 @@ impl Committer {
     }
 }
 
-/// Commits some episodes as one version, after those of others.
-fn append(table: &mut Table, next: &mut i64, episodes: &[Encoded]) -> Result<()> {
-    for _ in 0..TRIES {
+/// Commits episodes as one version, numbered after all existing episodes.
+fn append(table: &mut Table, next: &mut i64, episodes: &[EncodedEpisode]) -> Result<()> {
+    for _ in 0..MAX_ATTEMPTS {
         let fragment = table.write_episodes(episodes, Some(*next))?;
         match table.commit(Operation::Append { fragments: vec![fragment.clone()] }) {
             Ok(true) => {
@@ -371,17 +376,17 @@ fn append(table: &mut Table, next: &mut i64, episodes: &[Encoded]) -> Result<()>
             }
             Err(error) => {
                 if is_full(&error) {
-                    // The manifest had no room: what it would have named is of no use.
+                    // The manifest was not written, so nothing refers to the data file.
                     table.discard(&fragment);
                 }
                 return Err(error);
             }
         }
     }
-    Err(busy(&table.store.label))
+    Err(too_many_conflicts(&table.store.label))
 }
 
-/// Whether an error says that the disk is full.
+/// Whether an error means that the disk is full.
 fn is_full(error: &Error) -> bool {
     use std::io::ErrorKind::{QuotaExceeded, StorageFull};
     matches!(error, Error::Io { source, .. } if matches!(source.kind(), StorageFull | QuotaExceeded))

@@ -1,14 +1,14 @@
-//! The format `lance-video`: a Lance table of the numbers, and one MP4 blob an episode and column of pictures.
+//! The format `lance-video`: a Lance table of the numeric columns, with one MP4 per episode and image column.
 //!
 //! ```text
 //! NAME.lance-video/
-//!   steps.lance      the numbers, a row a step; with every episode its videos and the full list of columns
+//!   steps.lance      numeric columns, one row per step; the videos and the schema as constants of each episode
 //! ```
 //!
-//! The videos are constants of their episode (`Writer::write_episode_with`), so an episode is committed with its
-//! pictures at once, and whatever Lance's tables can do (object stores, several writers) holds for these. Constants of
-//! one data file are read together; data files are therefore kept small. How pictures are stored follows from
-//! [`ImageCodec`](swm_image::ImageCodec) as in the format `video`.
+//! Videos are constants of their episode ([`Constants`](crate::Constants)), so one commit covers an episode with its
+//! frames, and all features of Lance tables (object stores, concurrent writers) apply. All constants of a data file are
+//! read together, so data files are kept small. [`ImageCodec`](swm_image::ImageCodec) determines the encoding as in the
+//! format `video`.
 
 #[cfg(feature = "ffmpeg")]
 mod reader;
@@ -21,7 +21,7 @@ use crate::formats::entry::{Backend, FormatEntry};
 /// The registry row of this format.
 pub const ENTRY: FormatEntry = FormatEntry {
     id: "lance-video",
-    summary: "folder NAME.lance-video of a Lance table with one MP4 an episode",
+    summary: "folder NAME.lance-video of a Lance table with one MP4 per episode",
     suffixes: &["lance-video"],
     feature: Some("ffmpeg"),
     detect,
@@ -37,10 +37,10 @@ fn detect(location: &Location) -> bool {
     ENTRY.has_suffix(location)
 }
 
-/// What the names of constants begin with that are ours; a video's ends with its column's name.
+/// Prefix of the constants that hold videos; the column's name follows.
 #[cfg(feature = "ffmpeg")]
 const VIDEO: &str = "lance-video/video/";
-/// The constant that lists all columns, pictures included.
+/// The constant that holds the schema, including image columns.
 #[cfg(feature = "ffmpeg")]
 const SCHEMA: &str = "lance-video/schema.json";
 

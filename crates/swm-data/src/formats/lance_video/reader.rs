@@ -1,8 +1,8 @@
-//! Reading: numbers from the table, frames from the blobs.
+//! Reads numeric columns from the table, and frames from the videos in its constants.
 
 use super::{SCHEMA, VIDEO, table};
 use crate::dataset::Location;
-use crate::dataset::episodes::Rows;
+use crate::dataset::episodes::EpisodeRows;
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
 use crate::formats::lance;
 use std::path::PathBuf;
@@ -12,33 +12,33 @@ use swm_video::{Source, VideoCache};
 
 /// Opens a folder.
 pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
-    let numbers = lance::ENTRY.open(&table(location)?)?;
-    let schema = match numbers.episodes() {
-        [] => numbers.schema().clone(),
+    let steps = lance::ENTRY.open(&table(location)?)?;
+    let schema = match steps.episodes() {
+        [] => steps.schema().clone(),
         _ => {
-            let constants = numbers.constants(0)?;
+            let constants = steps.constants(0)?;
             let listed = constants.get(SCHEMA).and_then(|bytes| serde_json::from_slice::<Schema>(bytes).ok());
             let listed = listed.ok_or_else(|| damaged(location, "its first episode does not list the columns"))?;
-            seen(numbers.schema(), &listed)?
+            full_schema(steps.schema(), &listed)?
         }
     };
-    let mut rows = Rows::default();
-    numbers.episodes().iter().for_each(|episode| rows.push(episode.length));
-    Ok(Arc::new(LanceVideoReader { label: location.label(), numbers, schema, rows, library: VideoCache::default() }))
+    let mut rows = EpisodeRows::default();
+    steps.episodes().iter().for_each(|episode| rows.push(episode.length));
+    Ok(Arc::new(LanceVideoReader { label: location.label(), steps, schema, rows, videos: VideoCache::default() }))
 }
 
 fn damaged(location: &Location, problem: &str) -> Error {
     Error::corrupt(location.label(), problem, "restore it from a copy, or rebuild the dataset")
 }
 
-/// What readers see: the numbering, then the columns in the order in which they were written.
-fn seen(numbers: &Schema, listed: &Schema) -> Result<Schema> {
-    let mut columns: Vec<ColumnSpec> = numbers.columns().iter().take(2).cloned().collect();
+/// The schema for readers: index columns, then the columns in the order in which they were written.
+fn full_schema(steps: &Schema, listed: &Schema) -> Result<Schema> {
+    let mut columns: Vec<ColumnSpec> = steps.columns().iter().take(2).cloned().collect();
     for column in listed.columns() {
         if column.is_image() {
             columns.push(column.clone());
-        } else if let Some(index) = numbers.find(&column.name).filter(|&index| index >= 2) {
-            columns.push(numbers.columns()[index].clone());
+        } else if let Some(index) = steps.find(&column.name).filter(|&index| index >= 2) {
+            columns.push(steps.columns()[index].clone());
         }
     }
     Schema::new(columns)
@@ -46,18 +46,18 @@ fn seen(numbers: &Schema, listed: &Schema) -> Result<Schema> {
 
 struct LanceVideoReader {
     label: PathBuf,
-    numbers: Arc<dyn Reader>,
+    steps: Arc<dyn Reader>,
     schema: Schema,
-    rows: Rows,
-    /// By column and episode.
-    library: VideoCache<(usize, usize)>,
+    rows: EpisodeRows,
+    /// Videos by column index and episode position.
+    videos: VideoCache<(usize, usize)>,
 }
 
 impl LanceVideoReader {
     fn source(&self, &(column, episode): &(usize, usize)) -> Result<Source> {
         let name = &self.schema.columns()[column].name;
         let label = self.label.join(format!("episode {episode}, {name}"));
-        match self.numbers.constants(episode)?.remove(&format!("{VIDEO}{name}")) {
+        match self.steps.constants(episode)?.remove(&format!("{VIDEO}{name}")) {
             Some(bytes) => Ok(Source::Memory(label, bytes.into())),
             None => {
                 Err(Error::corrupt(label, "the video is missing", "restore it from a copy, or rebuild the dataset"))
@@ -72,22 +72,22 @@ impl Reader for LanceVideoReader {
     }
 
     fn episodes(&self) -> &[Episode] {
-        self.numbers.episodes()
+        self.steps.episodes()
     }
 
     fn read_column(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let index = self.schema.index(name)?;
         let column = &self.schema.columns()[index];
         if !column.is_image() {
-            return self.numbers.read_column(name, ranges, out);
+            return self.steps.read_column(name, ranges, out);
         }
-        let wanted = self.rows.wanted(column, ranges, out)?;
-        let wanted = wanted.into_iter().map(|((episode, step), place)| ((index, episode), step, place)).collect();
-        self.library.read(wanted, |key| self.source(key), |_, &step| Ok(step))
+        let slots = self.rows.row_slots(column, ranges, out)?;
+        let requests = slots.into_iter().map(|((episode, step), slot)| ((index, episode), step, slot)).collect();
+        self.videos.read(requests, |key| self.source(key), |_, &step| Ok(step))
     }
 
     fn constants(&self, episode: usize) -> Result<Constants> {
-        let mut constants = self.numbers.constants(episode)?;
+        let mut constants = self.steps.constants(episode)?;
         constants.retain(|name, _| name != SCHEMA && !name.starts_with(VIDEO));
         Ok(constants)
     }
@@ -97,24 +97,24 @@ impl Reader for LanceVideoReader {
         let found = cameras.flat_map(|(index, column)| {
             self.episodes().iter().enumerate().filter_map(move |(position, episode)| {
                 let key = (index, position);
-                let what = self.library.irregularity(&key, || self.source(&key), &column.name, episode.length)?;
+                let what = self.videos.irregularity(&key, || self.source(&key), &column.name, episode.length)?;
                 Some(Irregularity { episode: Some(position), what })
             })
         });
-        let mut all = self.numbers.irregularities()?;
+        let mut all = self.steps.irregularities()?;
         all.extend(found);
         Ok(all)
     }
 
     fn manifest(&self) -> Option<Manifest> {
-        self.numbers.manifest()
+        self.steps.manifest()
     }
 
     fn footprint(&self) -> Result<Vec<(String, u64)>> {
-        self.numbers.footprint()
+        self.steps.footprint()
     }
 
     fn content_hash(&self) -> Result<String> {
-        self.numbers.content_hash()
+        self.steps.content_hash()
     }
 }

@@ -114,9 +114,9 @@ impl<'de> Deserialize<'de> for Features {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
     /// In the data files.
-    Numbers,
+    Values,
     /// As encoded pictures in the data files.
-    Pictures,
+    Images,
     /// In videos; the place among the features that are.
     Video(usize),
 }
@@ -186,14 +186,14 @@ impl Info {
                     damaged(root, format!("the camera '{native}' has pictures of {:?}", feature.shape))
                 })?;
                 let name = if std::mem::take(&mut primary) { "pixels" } else { native };
-                let kind = if feature.dtype == "video" { Kind::Video(videos) } else { Kind::Pictures };
+                let kind = if feature.dtype == "video" { Kind::Video(videos) } else { Kind::Images };
                 videos += usize::from(feature.dtype == "video");
                 (ColumnSpec::image(name, height, width), kind)
             } else {
                 let Some(dtype) = feature.number() else { continue };
                 let name = if native == "observation.state" { "proprio" } else { native };
                 let shape = if feature.shape == [1] { vec![] } else { feature.shape.clone() };
-                (ColumnSpec::new(name, dtype, shape), Kind::Numbers)
+                (ColumnSpec::new(name, dtype, shape), Kind::Values)
             };
             let spec = match recorded {
                 Some(known) if known.len() == spec.len() && known.is_image() == camera => known.clone(),

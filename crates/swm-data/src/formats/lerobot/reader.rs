@@ -3,8 +3,7 @@
 use super::info::{Column, Info, Kind, damaged};
 use super::{CONSTANTS, TASK, table, values};
 use crate::dataset::Location;
-use crate::dataset::clips::ACTION;
-use crate::dataset::episodes::{Rows, content_hash, numbering};
+use crate::dataset::episodes::{EpisodeRows, content_hash, index_columns};
 use crate::dataset::{Constants, Episode, Reader, StepRange};
 use arrow_array::Array as _;
 use arrow_array::cast::AsArray as _;
@@ -15,11 +14,12 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
+use swm_core::columns::ACTION;
 use swm_core::{Batch, ColumnSpec, DType, Error, Manifest, Result, Schema};
 use swm_video::{Source, Video, VideoCache};
 
 /// Features that count rows, in every dataset.
-const BOOKKEEPING: [&str; 3] = ["timestamp", "index", "task_index"];
+const ROW_COUNTERS: [&str; 3] = ["timestamp", "index", "task_index"];
 
 /// Opens a dataset.
 pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
@@ -27,7 +27,7 @@ pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
 }
 
 /// Where an episode is.
-pub(super) struct Place {
+pub(super) struct EpisodeFiles {
     tasks: Vec<String>,
     data: PathBuf,
     /// For every video feature, its file and when the episode begins there, in seconds.
@@ -43,19 +43,19 @@ pub(super) struct LerobotReader {
     pub info: Info,
     fps: f64,
     schema: Schema,
-    /// Those of the schema after the numbering, then LeRobot's bookkeeping, which is read by name only.
+    /// Those of the schema after the index_columns, then LeRobot's bookkeeping, which is read by name only.
     columns: Vec<Column>,
     /// The numbering and all of `columns`.
     specs: Vec<ColumnSpec>,
-    rows: Rows,
-    pub places: Vec<Place>,
+    rows: EpisodeRows,
+    pub files_of_episodes: Vec<EpisodeFiles>,
     /// Data files, and the positions of the episodes in each.
     files: Vec<(PathBuf, Range<usize>)>,
     /// The numbers of each column.
     data: Vec<OnceLock<Vec<u8>>>,
     /// When each row is, where that is stored.
     timestamps: OnceLock<Option<Vec<f32>>>,
-    library: VideoCache<PathBuf>,
+    videos: VideoCache<PathBuf>,
 }
 
 impl LerobotReader {
@@ -64,24 +64,25 @@ impl LerobotReader {
         let fps = info.fps().unwrap_or(1.0);
         let mut columns = info.columns(root)?;
         // Our own datasets may have columns of these names.
-        let bookkeeping = |column: &Column| info.stable_worldmodel.is_none() && BOOKKEEPING.contains(&&*column.native);
+        let bookkeeping = |column: &Column| info.stable_worldmodel.is_none() && ROW_COUNTERS.contains(&&*column.native);
         columns.sort_by_key(bookkeeping);
         let visible = 2 + columns.iter().filter(|column| !bookkeeping(column)).count();
-        let places = if info.is_v3() { places_v3(root, &info)? } else { places_v2(root, &info)? };
-        let mut rows = Rows::default();
-        places.iter().for_each(|place| rows.push(place.length));
-        if info.total_episodes != places.len() || rows.total() != info.total_frames as u64 {
+        let files_of_episodes =
+            if info.is_v3() { episode_files_v3(root, &info)? } else { episode_files_v2(root, &info)? };
+        let mut rows = EpisodeRows::default();
+        files_of_episodes.iter().for_each(|place| rows.push(place.length));
+        if info.total_episodes != files_of_episodes.len() || rows.total() != info.total_frames as u64 {
             let problem = format!(
                 "meta/info.json promises {} episodes of {} rows, {} of {} are described",
                 info.total_episodes,
                 info.total_frames,
-                places.len(),
+                files_of_episodes.len(),
                 rows.total()
             );
             return Err(damaged(root, problem));
         }
         let mut files: Vec<(PathBuf, Range<usize>)> = vec![];
-        for (position, place) in places.iter().enumerate() {
+        for (position, place) in files_of_episodes.iter().enumerate() {
             match files.last_mut() {
                 Some((path, episodes)) if *path == place.data => episodes.end = position + 1,
                 _ => files.push((place.data.clone(), position..position + 1)),
@@ -89,13 +90,15 @@ impl LerobotReader {
         }
         let recorded = info.stable_worldmodel.as_ref().map(|recorded| recorded.schema.columns()).unwrap_or_default();
         let specs: Vec<ColumnSpec> =
-            numbering(recorded).into_iter().chain(columns.iter().map(|column| column.spec.clone())).collect();
+            index_columns(recorded).into_iter().chain(columns.iter().map(|column| column.spec.clone())).collect();
         // Room is made for pictures of the promised size.
-        let library = VideoCache::default();
+        let videos = VideoCache::default();
         for column in &columns {
-            if let (Kind::Video(feature), Some(place)) = (column.kind, places.iter().find(|place| place.length > 0)) {
+            if let (Kind::Video(feature), Some(place)) =
+                (column.kind, files_of_episodes.iter().find(|place| place.length > 0))
+            {
                 let path = &place.videos[feature].0;
-                let size = library.frame_size(path, || Ok(Source::File(path.clone())))?;
+                let size = videos.frame_size(path, || Ok(Source::File(path.clone())))?;
                 if [size.0, size.1] != column.spec.shape[..2] {
                     let problem =
                         format!("camera '{}' has pictures of {size:?}, not {:?}", column.native, column.spec.shape);
@@ -111,10 +114,10 @@ impl LerobotReader {
             data: columns.iter().map(|_| OnceLock::new()).collect(),
             columns,
             rows,
-            places,
+            files_of_episodes,
             files,
             timestamps: OnceLock::new(),
-            library,
+            videos,
             info,
         })
     }
@@ -137,13 +140,12 @@ impl LerobotReader {
             return Ok(data);
         }
         let column = &self.columns[place];
-        let mut data = self.read_numbers(&column.native, &column.spec)?;
+        let mut data = self.read_values(&column.native, &column.spec)?;
         let repeats = self.info.stable_worldmodel.as_ref().is_some_and(|recorded| recorded.last_action_repeats);
         if repeats && column.spec.name == ACTION {
             let size = column.spec.row_bytes();
-            for (&first, episode) in self.rows.first().iter().zip(self.rows.episodes()) {
+            for (&first, episode) in self.rows.first_rows().iter().zip(self.rows.episodes()) {
                 // The rows are in memory.
-                #[allow(clippy::cast_possible_truncation)]
                 let last = (first as usize + episode.length) * size;
                 missing(column.spec.dtype, &mut data[last - size..last]);
             }
@@ -152,14 +154,14 @@ impl LerobotReader {
     }
 
     /// All rows of a feature of numbers, from all files.
-    fn read_numbers(&self, native: &str, spec: &ColumnSpec) -> Result<Vec<u8>> {
+    fn read_values(&self, native: &str, spec: &ColumnSpec) -> Result<Vec<u8>> {
         let parts: Result<Vec<Vec<u8>>> = self
             .files
             .par_iter()
             .with_max_len(1)
             .map(|(path, episodes)| {
                 let batches = table::read(path, &["episode_index", native], None)?;
-                self.check_rows(path, episodes, &table::whole_numbers(path, &batches, "episode_index")?)?;
+                self.check_rows(path, episodes, &table::integers(path, &batches, "episode_index")?)?;
                 let mut bytes = vec![];
                 for batch in &batches {
                     let array = batch.column_by_name(native);
@@ -175,8 +177,9 @@ impl LerobotReader {
 
     /// Checks that a file holds the rows of its episodes, and no others.
     fn check_rows(&self, path: &Path, episodes: &Range<usize>, found: &[i64]) -> Result<()> {
-        let expected =
-            episodes.clone().flat_map(|e| std::iter::repeat_n(self.rows.episodes()[e].index, self.places[e].length));
+        let expected = episodes
+            .clone()
+            .flat_map(|e| std::iter::repeat_n(self.rows.episodes()[e].index, self.files_of_episodes[e].length));
         if expected.eq(found.iter().copied()) {
             return Ok(());
         }
@@ -190,7 +193,7 @@ impl LerobotReader {
         }
         let stored = self.info.features.0.iter().any(|(name, _)| name == "timestamp");
         let times = if stored {
-            let bytes = self.read_numbers("timestamp", &ColumnSpec::new("timestamp", DType::Float32, []))?;
+            let bytes = self.read_values("timestamp", &ColumnSpec::new("timestamp", DType::Float32, []))?;
             Some(bytes.as_chunks::<4>().0.iter().map(|&b| f32::from_ne_bytes(b)).collect())
         } else {
             None
@@ -200,20 +203,19 @@ impl LerobotReader {
 
     fn read_video(&self, column: &ColumnSpec, feature: usize, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let times = self.timestamps()?;
-        let wanted = self.rows.wanted(column, ranges, out)?;
+        let wanted = self.rows.row_slots(column, ranges, out)?;
         let mut frames = Vec::with_capacity(wanted.len());
         for ((episode, step), place) in wanted {
-            let (path, begin) = &self.places[episode].videos[feature];
+            let (path, begin) = &self.files_of_episodes[episode].videos[feature];
             frames.push((path.clone(), begin + self.time(times, episode, step), place));
         }
         let source = |path: &PathBuf| Ok(Source::File(path.clone()));
-        self.library.read(frames, source, |video, &time| self.frame(video, time))
+        self.videos.read(frames, source, |video, &time| self.frame(video, time))
     }
 
     /// Seconds from the episode's beginning to a row.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
     fn time(&self, times: Option<&[f32]>, episode: usize, step: usize) -> f64 {
-        let row = self.rows.first()[episode] as usize + step;
+        let row = self.rows.first_rows()[episode] as usize + step;
         times.and_then(|times| times.get(row)).map_or(step as f64 / self.fps, |&time| f64::from(time))
     }
 
@@ -226,7 +228,7 @@ impl LerobotReader {
     }
 
     /// Encoded pictures of rows of one episode, each given to `each` with its place among the rows.
-    fn coded_pictures(
+    fn each_encoded_image(
         &self,
         native: &str,
         file: usize,
@@ -251,20 +253,24 @@ impl LerobotReader {
         Ok(())
     }
 
-    fn read_pictures(&self, column: &Column, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+    fn read_images(&self, column: &Column, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let (height, width) = (column.spec.shape[0], column.spec.shape[1]);
-        let mut wanted = self.rows.wanted(&column.spec, ranges, out)?;
+        let mut wanted = self.rows.row_slots(&column.spec, ranges, out)?;
         let file_of = |episode: usize| self.files.partition_point(|(_, episodes)| episodes.end <= episode);
         let jobs: Vec<_> = wanted.chunk_by_mut(|a, b| file_of(a.0.0) == file_of(b.0.0)).collect();
         jobs.into_par_iter().with_max_len(1).try_for_each(|group| {
             let Some(file) = group.first().map(|((episode, _), _)| file_of(*episode)) else { return Ok(()) };
-            let first = self.rows.first()[self.files[file].1.start];
-            #[allow(clippy::cast_possible_truncation)] // rows of a table in memory
-            let row = |(episode, step): (usize, usize)| (self.rows.first()[episode] - first) as usize + step;
+            let first = self.rows.first_rows()[self.files[file].1.start];
+            let row = |(episode, step): (usize, usize)| (self.rows.first_rows()[episode] - first) as usize + step;
             let mut groups: Vec<_> = group.chunk_by_mut(|a, b| a.0 == b.0).collect();
-            let rows = groups.iter().map(|places| row(places[0].0)..row(places[0].0) + 1).collect();
-            self.coded_pictures(&column.native, file, rows, |at, bytes| {
-                let Some(((_, place), others)) = groups.get_mut(at).and_then(|places| places.split_first_mut()) else {
+            let rows = groups
+                .iter()
+                .map(|files_of_episodes| row(files_of_episodes[0].0)..row(files_of_episodes[0].0) + 1)
+                .collect();
+            self.each_encoded_image(&column.native, file, rows, |at, bytes| {
+                let Some(((_, place), others)) =
+                    groups.get_mut(at).and_then(|files_of_episodes| files_of_episodes.split_first_mut())
+                else {
                     return Ok(());
                 };
                 swm_image::decode(bytes, height, width, place)
@@ -299,19 +305,18 @@ impl Reader for LerobotReader {
     fn read_column(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let index = self.index(name)?;
         let spec = &self.specs[index];
-        let Some(place) = index.checked_sub(2) else { return self.rows.number(spec, ranges, out) };
+        let Some(place) = index.checked_sub(2) else { return self.rows.fill_index_column(spec, ranges, out) };
         let column = &self.columns[place];
         match column.kind {
             Kind::Video(feature) => self.read_video(spec, feature, ranges, out),
-            Kind::Pictures => self.read_pictures(column, ranges, out),
-            Kind::Numbers => {
-                Rows::check_room(spec, ranges, out)?;
+            Kind::Images => self.read_images(column, ranges, out),
+            Kind::Values => {
+                EpisodeRows::check_output(spec, ranges, out)?;
                 let (data, size) = (self.data(place)?, spec.row_bytes());
                 let mut rest = out;
                 for range in ranges {
                     let rows = self.rows.range(range)?;
                     let (to, after) = rest.split_at_mut(range.length * size);
-                    #[allow(clippy::cast_possible_truncation)] // as many rows as the data in memory have
                     to.copy_from_slice(&data[rows.start as usize * size..rows.end as usize * size]);
                     rest = after;
                 }
@@ -326,7 +331,7 @@ impl Reader for LerobotReader {
             let index = self.index(name)?;
             let known = &self.specs[index];
             // Nothing is made room for before the files have it.
-            if let Some(place) = index.checked_sub(2).filter(|&place| self.columns[place].kind == Kind::Numbers) {
+            if let Some(place) = index.checked_sub(2).filter(|&place| self.columns[place].kind == Kind::Values) {
                 self.data(place)?;
             }
             Ok(ColumnSpec::new(*name, known.dtype, known.shape.clone()))
@@ -340,9 +345,13 @@ impl Reader for LerobotReader {
     }
 
     fn constants(&self, episode: usize) -> Result<Constants> {
-        let Some(place) = self.places.get(episode) else {
+        let Some(place) = self.files_of_episodes.get(episode) else {
             let given = format!("the episode in position {episode}");
-            return Err(Error::mismatch("reading constants", given, format!("positions below {}", self.places.len())));
+            return Err(Error::mismatch(
+                "reading constants",
+                given,
+                format!("positions below {}", self.files_of_episodes.len()),
+            ));
         };
         let mut constants = Constants::new();
         if let Some(stored) = &place.constants {
@@ -395,27 +404,25 @@ impl Reader for LerobotReader {
             let column = &self.columns[place];
             for (position, episode) in self.rows.episodes().iter().enumerate() {
                 match column.kind {
-                    Kind::Numbers => {
+                    Kind::Values => {
                         let (data, size) = (self.data(place)?, spec.row_bytes());
                         let rows = self.rows.range(&StepRange::new(position, 0, episode.length))?;
-                        #[allow(clippy::cast_possible_truncation)] // as many rows as the data in memory have
                         data[rows.start as usize * size..rows.end as usize * size]
                             .chunks_exact(size)
                             .for_each(&mut *add);
                     }
-                    Kind::Pictures => {
+                    Kind::Images => {
                         let file = self.files.partition_point(|(_, episodes)| episodes.end <= position);
-                        let first = self.rows.first()[position] - self.rows.first()[self.files[file].1.start];
-                        #[allow(clippy::cast_possible_truncation)]
+                        let first = self.rows.first_rows()[position] - self.rows.first_rows()[self.files[file].1.start];
                         let rows = first as usize..first as usize + episode.length;
-                        self.coded_pictures(&column.native, file, vec![rows], |_, bytes| {
+                        self.each_encoded_image(&column.native, file, vec![rows], |_, bytes| {
                             add(bytes);
                             Ok(())
                         })?;
                     }
                     Kind::Video(feature) => {
-                        let (path, begin) = &self.places[position].videos[feature];
-                        let video = self.library.get(path, || Ok(Source::File(path.clone())))?;
+                        let (path, begin) = &self.files_of_episodes[position].videos[feature];
+                        let video = self.videos.get(path, || Ok(Source::File(path.clone())))?;
                         let frames: Result<Vec<usize>> = (0..episode.length)
                             .map(|step| self.frame(&video, begin + self.time(times, position, step)))
                             .collect();
@@ -446,7 +453,7 @@ impl Stored {
 }
 
 /// The episodes of version 2.1: a line each, and a file each.
-fn places_v2(root: &Path, info: &Info) -> Result<Vec<Place>> {
+fn episode_files_v2(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     #[derive(Deserialize)]
     struct Line {
         episode_index: usize,
@@ -459,27 +466,28 @@ fn places_v2(root: &Path, info: &Info) -> Result<Vec<Place>> {
         std::io::ErrorKind::NotFound => damaged(root, "meta/episodes.jsonl is missing".to_owned()),
         _ => Error::io(&path, "reading the list of episodes", e),
     })?;
-    let mut places = vec![];
+    let mut files_of_episodes = vec![];
     for line in text.lines().filter(|line| !line.trim().is_empty()) {
         let line: Line =
             serde_json::from_str(line).map_err(|e| damaged(&path, format!("a line is unreadable: {e}")))?;
-        if line.episode_index != places.len() {
-            let problem = format!("episode {} comes where {} should", line.episode_index, places.len());
+        if line.episode_index != files_of_episodes.len() {
+            let problem = format!("episode {} comes where {} should", line.episode_index, files_of_episodes.len());
             return Err(damaged(&path, problem));
         }
-        let numbers = [("episode_chunk", places.len() / info.chunks_size), ("episode_index", places.len())];
+        let numbers =
+            [("episode_chunk", files_of_episodes.len() / info.chunks_size), ("episode_index", files_of_episodes.len())];
         let videos: Result<Vec<(PathBuf, f64)>> =
             info.video_keys().into_iter().map(|key| Ok((video_file(root, info, key, &numbers)?, 0.0))).collect();
-        places.push(Place {
+        files_of_episodes.push(EpisodeFiles {
             tasks: line.tasks,
             data: info.file(root, &info.data_path, "", &numbers)?,
             videos: videos?,
             length: line.length,
             constants: None,
-            file: places.len(),
+            file: files_of_episodes.len(),
         });
     }
-    Ok(places)
+    Ok(files_of_episodes)
 }
 
 fn video_file(root: &Path, info: &Info, key: &str, numbers: &[(&str, usize)]) -> Result<PathBuf> {
@@ -489,7 +497,7 @@ fn video_file(root: &Path, info: &Info, key: &str, numbers: &[(&str, usize)]) ->
 }
 
 /// The episodes of version 3.0: a row each.
-fn places_v3(root: &Path, info: &Info) -> Result<Vec<Place>> {
+fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     let folder = root.join("meta").join("episodes");
     let mut files = vec![];
     // None where there is no episode yet.
@@ -508,12 +516,12 @@ fn places_v3(root: &Path, info: &Info) -> Result<Vec<Place>> {
         wanted.extend(["chunk_index", "file_index", "from_timestamp"].map(|what| named(key, what)));
     }
     let wanted: Vec<&str> = wanted.iter().map(String::as_str).collect();
-    let mut places = vec![];
+    let mut files_of_episodes = vec![];
     for path in &files {
         let batches = table::read(path, &wanted, None)?;
         let numbers = |column: &str| -> Result<Vec<usize>> {
             let sound = |number: i64| usize::try_from(number).ok().filter(|&n| n < 1 << 40);
-            let numbers = table::whole_numbers(path, &batches, column)?.into_iter().map(sound);
+            let numbers = table::integers(path, &batches, column)?.into_iter().map(sound);
             numbers
                 .collect::<Option<_>>()
                 .ok_or_else(|| damaged(path, format!("a number of '{column}' makes no sense")))
@@ -539,11 +547,11 @@ fn places_v3(root: &Path, info: &Info) -> Result<Vec<Place>> {
         }
         for row in 0..index.len() {
             // An interrupted writer may have left more than it committed.
-            if places.len() == info.total_episodes {
+            if files_of_episodes.len() == info.total_episodes {
                 break;
             }
-            if index[row] != places.len() {
-                let problem = format!("episode {} comes where {} should", index[row], places.len());
+            if index[row] != files_of_episodes.len() {
+                let problem = format!("episode {} comes where {} should", index[row], files_of_episodes.len());
                 return Err(damaged(path, problem));
             }
             let at = |chunk: usize, file: usize| [("chunk_index", chunk), ("file_index", file)];
@@ -554,7 +562,7 @@ fn places_v3(root: &Path, info: &Info) -> Result<Vec<Place>> {
                     Ok((video_file(root, info, key, &at(chunk[row], file[row]))?, begin[row]))
                 })
                 .collect();
-            places.push(Place {
+            files_of_episodes.push(EpisodeFiles {
                 tasks: std::mem::take(&mut tasks[row]),
                 data: info.file(root, &info.data_path, "", &at(chunk[row], file[row]))?,
                 videos: files?,
@@ -564,7 +572,7 @@ fn places_v3(root: &Path, info: &Info) -> Result<Vec<Place>> {
             });
         }
     }
-    Ok(places)
+    Ok(files_of_episodes)
 }
 
 /// A column of lists of texts.

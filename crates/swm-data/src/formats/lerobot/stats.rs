@@ -32,7 +32,6 @@ impl Stats {
     }
 
     /// Adds rows of numbers, `f64` values row after row; of a camera, its pixels.
-    #[allow(clippy::cast_precision_loss)]
     pub fn add(&mut self, values: impl Iterator<Item = f64> + Clone, rows: usize) {
         let width = self.dims.len();
         let mut added = vec![NOTHING; width];

@@ -22,7 +22,7 @@ const ROWS: usize = 4096;
 /// Reads columns of a file; rows of some rising ranges, or all of them. `None` for a column that is not there.
 ///
 /// # Errors
-/// When the file cannot be read or is damaged, and also when that makes the library panic.
+/// When the file cannot be read or is damaged, and also when that makes the videos panic.
 pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> Result<Vec<RecordBatch>> {
     let file = File::open(path).map_err(|e| match e.kind() {
         std::io::ErrorKind::NotFound => damaged(path, "the file is missing".to_owned()),
@@ -36,9 +36,9 @@ pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> R
         let builder = ParquetRecordBatchReaderBuilder::try_new_with_options(file, options).map_err(|e| failed(&e))?;
         let total = usize::try_from(builder.metadata().file_metadata().num_rows()).map_err(|e| failed(&e))?;
         let fields = builder.parquet_schema().root_schema().get_fields();
-        let places: Vec<usize> =
+        let files_of_episodes: Vec<usize> =
             columns.iter().filter_map(|name| fields.iter().position(|field| field.name() == *name)).collect();
-        let mask = ProjectionMask::roots(builder.parquet_schema(), places);
+        let mask = ProjectionMask::roots(builder.parquet_schema(), files_of_episodes);
         let mut builder = builder.with_projection(mask).with_batch_size(ROWS);
         if let Some(rows) = rows {
             if rows.last().is_some_and(|range| range.end > total) {
@@ -56,7 +56,7 @@ pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> R
 ///
 /// # Errors
 /// When there is no such column, or it holds something else.
-pub fn whole_numbers(path: &Path, batches: &[RecordBatch], column: &str) -> Result<Vec<i64>> {
+pub fn integers(path: &Path, batches: &[RecordBatch], column: &str) -> Result<Vec<i64>> {
     let mut numbers = vec![];
     for batch in batches {
         let values = batch.column_by_name(column).and_then(|array| {

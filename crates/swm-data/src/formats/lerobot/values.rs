@@ -67,7 +67,6 @@ fn check_offsets(offsets: &[i32]) -> Result<(), String> {
     if steady { Ok(()) } else { Err("its rows have different lengths".to_owned()) }
 }
 
-#[allow(clippy::cast_precision_loss, clippy::cast_possible_wrap)]
 fn whole<T: ArrowPrimitiveType>(leaf: &ArrayRef, column: &ColumnSpec, out: &mut Vec<u8>)
 where
     T::Native: ArrowNativeType + TryInto<i64>,
@@ -77,12 +76,10 @@ where
     put(values, column.dtype, out, |v| v, |v| v as f64);
 }
 
-#[allow(clippy::cast_possible_truncation)]
 fn real(values: impl Iterator<Item = f64>, column: &ColumnSpec, out: &mut Vec<u8>) {
     put(values, column.dtype, out, |v| v as i64, |v| v);
 }
 
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn put<V: Copy>(
     values: impl Iterator<Item = V>,
     dtype: DType,

@@ -10,10 +10,9 @@ use super::stats::{self, Stats};
 use super::table::{self, put};
 use super::{CONSTANTS, NO_TASK, TASK, values};
 use crate::dataset::Location;
-use crate::dataset::clips::ACTION;
-use crate::dataset::episodes::{self, EPISODE, STEP};
+use crate::dataset::episodes;
 use crate::dataset::{Constants, Reader as _, WriteMode, WriteOptions, Writer};
-use crate::formats::column_files::{lock, replace};
+use crate::formats::column_files::{lock_folder, remove_dataset};
 use arrow_array::builder::{ListBuilder, StringBuilder};
 use arrow_array::{ArrayRef, Float64Array, Int64Array, RecordBatch, StringArray};
 use arrow_schema::{DataType, Field, Schema as ArrowSchema};
@@ -23,11 +22,12 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
+use swm_core::columns::{ACTION, EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
 use swm_video::{Encoder, Encoding};
 
 /// Frames a second: what LeRobot's times count in. Steps of simulated worlds have no common rate.
-const FPS: u32 = 25;
+const FRAMES_PER_SECOND: u32 = 25;
 
 /// Creates, continues or replaces a dataset.
 pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
@@ -57,16 +57,16 @@ struct LerobotWriter {
 /// Episodes that are not committed.
 #[derive(Default)]
 struct Group {
-    episodes: Vec<Pending>,
+    episodes: Vec<PendingEpisode>,
     /// The bytes of each stored column of numbers.
     numbers: Vec<Vec<u8>>,
     /// The video of each stored column of pictures.
-    films: Vec<Option<Encoder>>,
+    encoders: Vec<Option<Encoder>>,
     rows: usize,
     bytes: usize,
 }
 
-struct Pending {
+struct PendingEpisode {
     rows: usize,
     task: String,
     constants: String,
@@ -87,10 +87,10 @@ impl LerobotWriter {
             return Err(Error::config("dataset", problem, fix));
         }
         if exists && options.mode == WriteMode::Overwrite {
-            replace(root)?;
+            remove_dataset(root)?;
         }
         std::fs::create_dir_all(root).map_err(|e| Error::io(root, "creating the folder", e))?;
-        let lock = lock(root)?;
+        let lock = lock_folder(root)?;
         let mut writer = Self {
             root: root.to_owned(),
             _lock: lock,
@@ -121,8 +121,8 @@ impl LerobotWriter {
             let problem = "another program wrote it, and LeRobot's datasets do not say enough to be continued";
             return Err(Error::corrupt(&self.root, problem, "convert it to a new dataset first"));
         };
-        episodes::check_continued(&self.root.display(), &self.schema, old.schema())?;
-        self.file = old.places.last().map_or(0, |place| place.file + 1);
+        episodes::check_appendable(&self.root.display(), &self.schema, old.schema())?;
+        self.file = old.files_of_episodes.last().map_or(0, |place| place.file + 1);
         let manifest = self.options.manifest.clone().or(recorded.manifest);
         self.info = Info { stable_worldmodel: Some(Recorded { manifest, ..recorded }), ..old.info };
         let path = self.root.join("meta").join("stats.json");
@@ -173,7 +173,7 @@ impl LerobotWriter {
     fn clear_group(&mut self) {
         self.group = Group {
             numbers: vec![vec![]; self.columns.len()],
-            films: self.columns.iter().map(|_| None).collect(),
+            encoders: self.columns.iter().map(|_| None).collect(),
             ..Group::default()
         };
     }
@@ -182,8 +182,8 @@ impl LerobotWriter {
         let rows = episode.rows();
         let (schema, group, encoding) = (&self.schema, &mut self.group, self.encoding);
         let frames = i64::try_from(group.rows).map_err(|e| Error::external("writing an episode", e))?;
-        let work = self.columns.par_iter().zip(&mut group.numbers).zip(&mut group.films).zip(&mut self.stats);
-        work.try_for_each(|((((index, _), numbers), film), stats)| -> Result<()> {
+        let work = self.columns.par_iter().zip(&mut group.numbers).zip(&mut group.encoders).zip(&mut self.stats);
+        work.try_for_each(|((((index, _), numbers), encoder), stats)| -> Result<()> {
             let column = &schema.columns()[*index];
             let bytes = episode.bytes(*index);
             if !column.is_image() {
@@ -192,16 +192,16 @@ impl LerobotWriter {
                 if column.name == ACTION {
                     repeat_last(&mut numbers[start..], column.row_bytes());
                 }
-                let values = read_numbers(column, &numbers[start..]);
+                let values = read_values(column, &numbers[start..]);
                 stats.add(values.iter().copied(), rows);
                 return Ok(());
             }
-            let film = match film {
-                Some(film) => film,
-                none => none.insert(Encoder::new(column.shape[1], column.shape[0], FPS, encoding)?),
+            let encoder = match encoder {
+                Some(encoder) => encoder,
+                none => none.insert(Encoder::new(column.shape[1], column.shape[0], FRAMES_PER_SECOND, encoding)?),
             };
             for (number, frame) in (frames..).zip(bytes.chunks_exact(column.row_bytes())) {
-                film.add_frame(frame, number)?;
+                encoder.add_frame(frame, number)?;
             }
             stats.add(bytes.iter().map(|&v| f64::from(v)), rows);
             Ok(())
@@ -216,7 +216,7 @@ impl LerobotWriter {
         if !self.tasks.contains(&task) {
             self.tasks.push(task.clone());
         }
-        group.episodes.push(Pending { rows, task, constants });
+        group.episodes.push(PendingEpisode { rows, task, constants });
         group.rows += rows;
         group.bytes += episode.byte_len();
         Ok(())
@@ -230,9 +230,9 @@ impl LerobotWriter {
         let group = std::mem::take(&mut self.group);
         let place =
             [("chunk_index", self.file / self.info.chunks_size), ("file_index", self.file % self.info.chunks_size)];
-        for ((_, native), film) in self.columns.iter().zip(group.films) {
-            if let Some(film) = film {
-                put(&self.root.join(fill(VIDEO_PATH, native, &place)), &film.finish()?)?;
+        for ((_, native), encoder) in self.columns.iter().zip(group.encoders) {
+            if let Some(encoder) = encoder {
+                put(&self.root.join(fill(VIDEO_PATH, native, &place)), &encoder.finish()?)?;
             }
         }
         let (schema, batch) = self.data(&group.episodes, &group.numbers)?;
@@ -247,8 +247,7 @@ impl LerobotWriter {
     }
 
     /// The rows of a group, with the features that LeRobot wants of every dataset.
-    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
-    fn data(&self, episodes: &[Pending], bytes: &[Vec<u8>]) -> Result<(Arc<ArrowSchema>, RecordBatch)> {
+    fn data(&self, episodes: &[PendingEpisode], bytes: &[Vec<u8>]) -> Result<(Arc<ArrowSchema>, RecordBatch)> {
         let (mut fields, mut arrays): (Vec<Field>, Vec<ArrayRef>) = (vec![], vec![]);
         for ((index, native), bytes) in self.columns.iter().zip(bytes) {
             let column = &self.schema.columns()[*index];
@@ -262,7 +261,7 @@ impl LerobotWriter {
         let numbered = || episodes.iter().enumerate().flat_map(|(e, episode)| std::iter::repeat_n(e, episode.rows));
         let task = |e: usize| self.tasks.iter().position(|task| *task == episodes[e].task).unwrap_or(0) as i64;
         let times: arrow_array::Float32Array =
-            steps().map(|step| (step as f64 / f64::from(FPS)) as f32).collect::<Vec<_>>().into();
+            steps().map(|step| (step as f64 / f64::from(FRAMES_PER_SECOND)) as f32).collect::<Vec<_>>().into();
         fields.push(Field::new("timestamp", DataType::Float32, false));
         arrays.push(Arc::new(times));
         let mut whole = |name: &str, values: Vec<i64>| {
@@ -277,8 +276,7 @@ impl LerobotWriter {
     }
 
     /// What describes the episodes of a group.
-    #[allow(clippy::cast_precision_loss, clippy::cast_possible_wrap)]
-    fn episodes(&self, episodes: &[Pending], place: [usize; 2]) -> Result<(Arc<ArrowSchema>, RecordBatch)> {
+    fn episodes(&self, episodes: &[PendingEpisode], place: [usize; 2]) -> Result<(Arc<ArrowSchema>, RecordBatch)> {
         let (mut fields, mut arrays): (Vec<Field>, Vec<ArrayRef>) = (vec![], vec![]);
         let mut tasks = ListBuilder::new(StringBuilder::new());
         episodes.iter().for_each(|episode| tasks.append_value([Some(&episode.task)]));
@@ -315,7 +313,7 @@ impl LerobotWriter {
         }
         for camera in &cameras {
             for (name, rows) in [("from_timestamp", &starts), ("to_timestamp", &ends)] {
-                let times: Vec<f64> = rows.iter().map(|&row| row as f64 / f64::from(FPS)).collect();
+                let times: Vec<f64> = rows.iter().map(|&row| row as f64 / f64::from(FRAMES_PER_SECOND)).collect();
                 fields.push(Field::new(format!("videos/{camera}/{name}"), DataType::Float64, false));
                 arrays.push(Arc::new(Float64Array::from(times)));
             }
@@ -327,7 +325,6 @@ impl LerobotWriter {
     }
 
     /// Writes what describes the whole dataset; `meta/info.json` commits.
-    #[allow(clippy::cast_possible_wrap)]
     fn describe(&mut self) -> Result<()> {
         let meta = self.root.join("meta");
         if self.info.total_episodes > 0 {
@@ -361,7 +358,7 @@ impl LerobotWriter {
 
 impl Writer for LerobotWriter {
     fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
-        episodes::check(episode, &self.schema)?;
+        episodes::check_episode(episode, &self.schema)?;
         if std::mem::replace(&mut self.failed, true) {
             return Err(Error::external("writing an episode", "an earlier commit failed; nothing more is kept"));
         }
@@ -412,7 +409,7 @@ fn pandas() -> String {
             column(json!("task_index"), "task_index", "int64", "int64"),
             column(Value::Null, INDEX, "unicode", "object"),
         ],
-        "creator": {"library": "stable-worldmodel", "version": env!("CARGO_PKG_VERSION")},
+        "creator": {"videos": "stable-worldmodel", "version": env!("CARGO_PKG_VERSION")},
         "pandas_version": "2.2.0",
     })
     .to_string()
@@ -429,7 +426,7 @@ fn stored(schema: &Schema) -> Result<Vec<(usize, String)>> {
     let mut columns: Vec<(usize, String)> = vec![];
     for (index, column) in schema.columns().iter().enumerate() {
         let refuse = |problem: String, fix: &str| Err(Error::config("schema", problem, fix));
-        if column.name == EPISODE || column.name == STEP {
+        if column.name == EPISODE_IDX || column.name == STEP_IDX {
             continue;
         }
         if column.is_empty() {
@@ -458,7 +455,7 @@ fn info(schema: &Schema, columns: &[(usize, String)], options: &WriteOptions) ->
                 let names = json!(["height", "width", "channels"]);
                 let details = json!({
                     "video.height": column.shape[0], "video.width": column.shape[1], "video.codec": "h264",
-                    "video.fps": FPS, "video.channels": 3, "video.is_depth_map": false, "has_audio": false,
+                    "video.fps": FRAMES_PER_SECOND, "video.channels": 3, "video.is_depth_map": false, "has_audio": false,
                 });
                 Feature { dtype: "video".to_owned(), shape: column.shape.clone(), names, info: Some(details) }
             } else {
@@ -485,7 +482,7 @@ fn info(schema: &Schema, columns: &[(usize, String)], options: &WriteOptions) ->
         chunks_size: 1000,
         data_files_size_in_mb: 100,
         video_files_size_in_mb: 200,
-        fps: FPS.into(),
+        fps: FRAMES_PER_SECOND.into(),
         splits: BTreeMap::new(),
         data_path: DATA_PATH.to_owned(),
         video_path: cameras.then(|| VIDEO_PATH.to_owned()),
@@ -508,8 +505,7 @@ fn repeat_last(bytes: &mut [u8], row: usize) {
 }
 
 /// The numbers of a column.
-#[allow(clippy::cast_precision_loss)]
-fn read_numbers(column: &ColumnSpec, bytes: &[u8]) -> Vec<f64> {
+fn read_values(column: &ColumnSpec, bytes: &[u8]) -> Vec<f64> {
     match column.dtype {
         DType::Bool | DType::U8 => bytes.iter().map(|&v| f64::from(v)).collect(),
         DType::Int32 => bytes.as_chunks().0.iter().map(|&b| f64::from(i32::from_ne_bytes(b))).collect(),

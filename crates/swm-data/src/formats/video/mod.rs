@@ -1,22 +1,22 @@
-//! The format `video`: numbers in column files, and one MP4 an episode and column of pictures.
+//! The format `video`: numeric columns in column files, and one MP4 per episode and image column.
 //!
 //! ```text
 //! NAME.video/
 //!   ep_len.npz, ep_offset.npz, action.npz, …    see `column_files`
-//!   pixels/ep_0.mp4, …                          H.264, a frame a row
+//!   pixels/ep_0.mp4, …                          H.264, one frame per row
 //! ```
 //!
-//! It is the layout of the reference's `VideoDataset`, which opens ours as we open its. Any frame is found by its number
-//! in the order of presentation; frames from its key frame on are decoded to see it, so our files have a key frame every
-//! few frames, where the reference's have one every 250.
+//! This is the layout of the reference's `VideoDataset`; each opens the other's datasets. Frames are addressed by their
+//! presentation index. Decoding a frame requires decoding from the preceding key frame, so videos written here have a
+//! key frame every few frames; those of the reference have one every 250.
 //!
-//! How pictures are stored follows from [`ImageCodec`](swm_image::ImageCodec): a lossless one becomes lossless H.264 of red,
-//! green and blue (profile High 4:4:4 Predictive, which FFmpeg and with it decord, PyAV and torchcodec decode, but few
-//! browsers); JPEG of quality `q` becomes H.264 of 4:2:0 with the constant rate factor 8 + 2 (100 − `q`).
+//! [`ImageCodec`](swm_image::ImageCodec) determines the encoding. A lossless codec becomes lossless H.264 in RGB
+//! (profile High 4:4:4 Predictive, which FFmpeg, and thus decord, PyAV and torchcodec, decode, but few browsers). JPEG
+//! with quality `q` becomes H.264 4:2:0 with the constant rate factor 8 + 2 (100 − `q`).
 //!
-//! An episode's videos are written before its numbers are committed, each beside its place and then renamed. They carry
-//! checksums of their tables and of every coded picture in a box that players skip, so that a flipped bit is an error
-//! and not another picture.
+//! The videos of an episode are written before its numeric columns are committed, each to a temporary file that is then
+//! renamed. A box that players skip holds checksums of the video's tables and of every encoded frame, so that damage is
+//! an error instead of a wrong frame.
 
 #[cfg(feature = "ffmpeg")]
 mod reader;
@@ -24,7 +24,7 @@ mod reader;
 mod writer;
 
 use crate::dataset::Location;
-use crate::formats::column_files::{holds_videos, is_there};
+use crate::formats::column_files::{contains_videos, exists};
 use crate::formats::entry::{Backend, FormatEntry};
 #[cfg(feature = "ffmpeg")]
 use std::path::{Path, PathBuf};
@@ -32,7 +32,7 @@ use std::path::{Path, PathBuf};
 /// The registry row of this format.
 pub const ENTRY: FormatEntry = FormatEntry {
     id: "video",
-    summary: "folder NAME.video of numpy's npz files and one MP4 an episode; the reference opens it",
+    summary: "folder NAME.video of numpy's npz files and one MP4 per episode; the reference opens it",
     suffixes: &["video"],
     feature: Some("ffmpeg"),
     detect,
@@ -47,13 +47,13 @@ const BACKEND: Option<Backend> = None;
 fn detect(location: &Location) -> bool {
     let Some(path) = location.path() else { return false };
     if path.exists() {
-        return is_there(path) && holds_videos(path) || ENTRY.has_suffix(location) && path.is_dir();
+        return exists(path) && contains_videos(path) || ENTRY.has_suffix(location) && path.is_dir();
     }
     ENTRY.has_suffix(location)
 }
 
 /// The video of an episode.
 #[cfg(feature = "ffmpeg")]
-fn file(folder: &Path, column: &str, episode: usize) -> PathBuf {
+fn video_path(folder: &Path, column: &str, episode: usize) -> PathBuf {
     folder.join(column).join(format!("ep_{episode}.mp4"))
 }

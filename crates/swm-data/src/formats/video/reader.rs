@@ -1,10 +1,10 @@
-//! Reading: numbers from the column files, frames from the videos.
+//! Reads numeric columns from column files, and frames from videos.
 
-use super::file;
+use super::video_path;
 use crate::dataset::Location;
 use crate::dataset::episodes::content_hash;
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
-use crate::formats::column_files::{ColumnFiles, is_there};
+use crate::formats::column_files::{ColumnFiles, exists};
 use std::path::Path;
 use std::sync::Arc;
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
@@ -18,27 +18,27 @@ pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
 pub(super) struct VideoReader {
     files: ColumnFiles,
     schema: Schema,
-    /// By column and episode.
-    library: VideoCache<(usize, usize)>,
+    /// Videos by column index and episode position.
+    videos: VideoCache<(usize, usize)>,
 }
 
 impl VideoReader {
     pub fn open(folder: &Path) -> Result<Self> {
-        if !is_there(folder) {
+        if !exists(folder) {
             let problem = if folder.exists() { "it holds no ep_len.npz" } else { "there is no such dataset" };
             return Err(Error::corrupt(folder, problem, "check the path; `swm datasets` lists those at home"));
         }
         let files = ColumnFiles::open(folder)?;
-        let pictures = match files.recorded() {
+        let images = match files.recorded() {
             Some(recorded) => recorded.columns().iter().filter(|column| column.is_image()).cloned().collect(),
-            None => foreign_pictures(&files)?,
+            None => infer_image_columns(&files)?,
         };
-        let schema = files.schema(pictures)?;
-        Ok(Self { files, schema, library: VideoCache::default() })
+        let schema = files.schema(images)?;
+        Ok(Self { files, schema, videos: VideoCache::default() })
     }
 
     fn source(&self, &(column, episode): &(usize, usize)) -> Result<Source> {
-        Ok(Source::File(file(self.files.folder(), &self.schema.columns()[column].name, episode)))
+        Ok(Source::File(video_path(self.files.folder(), &self.schema.columns()[column].name, episode)))
     }
 }
 
@@ -57,9 +57,9 @@ impl Reader for VideoReader {
         if self.files.has(name) {
             return self.files.read(column, ranges, out);
         }
-        let wanted = self.files.rows().wanted(column, ranges, out)?;
-        let wanted = wanted.into_iter().map(|((episode, step), place)| ((index, episode), step, place)).collect();
-        self.library.read(wanted, |key| self.source(key), |_, &step| Ok(step))
+        let slots = self.files.rows().row_slots(column, ranges, out)?;
+        let requests = slots.into_iter().map(|((episode, step), slot)| ((index, episode), step, slot)).collect();
+        self.videos.read(requests, |key| self.source(key), |_, &step| Ok(step))
     }
 
     fn constants(&self, episode: usize) -> Result<Constants> {
@@ -71,7 +71,7 @@ impl Reader for VideoReader {
         let found = cameras.flat_map(|(index, column)| {
             self.episodes().iter().enumerate().filter_map(move |(position, episode)| {
                 let key = (index, position);
-                let what = self.library.irregularity(&key, || self.source(&key), &column.name, episode.length)?;
+                let what = self.videos.irregularity(&key, || self.source(&key), &column.name, episode.length)?;
                 Some(Irregularity { episode: Some(position), what })
             })
         });
@@ -93,14 +93,13 @@ impl Reader for VideoReader {
                 let index = self.schema.index(&column.name)?;
                 for (position, episode) in rows.episodes().iter().enumerate() {
                     let key = (index, position);
-                    self.library.get(&key, || self.source(&key))?.coded(0..episode.length, &mut *add)?;
+                    self.videos.get(&key, || self.source(&key))?.coded(0..episode.length, &mut *add)?;
                 }
                 return Ok(());
             }
             let (data, size) = (self.files.data(&column.name)?, column.row_bytes());
             for (position, episode) in rows.episodes().iter().enumerate() {
                 let rows = rows.range(&StepRange::new(position, 0, episode.length))?;
-                #[allow(clippy::cast_possible_truncation)] // as many rows as the data in memory have
                 data[rows.start as usize * size..rows.end as usize * size].chunks_exact(size).for_each(&mut *add);
             }
             Ok(())
@@ -108,9 +107,9 @@ impl Reader for VideoReader {
     }
 }
 
-/// The columns of pictures of a folder that another program wrote: its subfolders, by name. The first video says how
-/// large all pictures are.
-fn foreign_pictures(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
+/// The image columns of a folder that another program wrote: its subfolders, by name. The first video determines the
+/// frame size.
+fn infer_image_columns(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
     let folder = files.folder();
     let Some(first) = files.rows().episodes().iter().position(|episode| episode.length > 0) else { return Ok(vec![]) };
     let io = |e| Error::io(folder, "listing the folder", e);
@@ -119,7 +118,7 @@ fn foreign_pictures(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
         let entry = entry.map_err(io)?;
         let Ok(name) = entry.file_name().into_string() else { continue };
         if entry.path().is_dir() {
-            let source = Source::File(file(folder, &name, first));
+            let source = Source::File(video_path(folder, &name, first));
             let (height, width) = VideoCache::default().frame_size(&(), || Ok(source))?;
             columns.push(ColumnSpec::image(name, height, width));
         }

@@ -9,8 +9,6 @@ mod models;
 pub use models::{Fitness, fitness};
 
 use crate::dataset::Location;
-use crate::dataset::clips::ACTION;
-use crate::dataset::episodes::{EPISODE, STEP};
 use crate::dataset::views::subset;
 use crate::dataset::{Reader, StepRange};
 use crate::formats::{lance, open};
@@ -18,6 +16,7 @@ use crate::tools::convert::{ConvertOptions, Converted, Stage, convert};
 use serde::Serialize;
 use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
+use swm_core::columns::{ACTION, EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
 
 /// How bad it is.
@@ -99,7 +98,7 @@ pub fn examine(reader: &dyn Reader, progress: &mut dyn FnMut(usize) -> bool) -> 
     if episodes.is_empty() {
         found.problem(None, "there is no episode".to_owned());
     }
-    let data = |name: &str| name != EPISODE && name != STEP;
+    let data = |name: &str| name != EPISODE_IDX && name != STEP_IDX;
     let columns: Vec<&ColumnSpec> = reader.schema().columns().iter().filter(|column| data(&column.name)).collect();
     if !columns.iter().any(|column| column.name == "reward") {
         found.note(None, "there is no reward".to_owned());
@@ -118,7 +117,7 @@ pub fn examine(reader: &dyn Reader, progress: &mut dyn FnMut(usize) -> bool) -> 
         if let Err(error) = reader.constants(position) {
             found.problem(Some(position), format!("its constants cannot be read: {error}"));
         }
-        for column in std::iter::once(STEP).chain(columns.iter().map(|column| &column.name[..])) {
+        for column in std::iter::once(STEP_IDX).chain(columns.iter().map(|column| &column.name[..])) {
             match reader.read(&[column], &[StepRange::new(position, 0, episode.length)]) {
                 Ok(batch) => examine_column(&batch, column, position, &mut found)?,
                 Err(error) => found.problem(Some(position), format!("'{column}' cannot be read: {error}")),
@@ -192,9 +191,8 @@ fn examine_column(rows: &Batch, column: &str, position: usize, found: &mut Findi
     let (count, spec) = (rows.rows(), &rows.schema().columns()[0]);
     let last = count.saturating_sub(1);
     match column {
-        STEP => {
-            let steps = rows.to_f32(STEP)?;
-            #[allow(clippy::cast_precision_loss)]
+        STEP_IDX => {
+            let steps = rows.to_f32(STEP_IDX)?;
             if let Some(row) = (0..count.min(1 << 24)).find(|&row| steps[row] != row as f32) {
                 found.problem(Some(position), format!("step {} stands in row {row}", steps[row]));
             }

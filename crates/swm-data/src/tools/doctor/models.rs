@@ -1,8 +1,8 @@
 //! What models need of a dataset.
 
 use super::is_picture;
-use crate::dataset::clips::ACTION;
 use serde::Serialize;
+use swm_core::columns::ACTION;
 use swm_core::{DType, Schema};
 
 /// Whether a model can be trained on a dataset.

@@ -6,7 +6,7 @@ mod sheet;
 mod video;
 
 pub use sheet::contact_sheet;
-pub(crate) use video::Film;
+pub(crate) use video::VideoFile;
 pub use video::{integer_scale, write_mp4, write_mp4_scaled};
 
 use crate::dataset::{Reader, StepRange};
@@ -61,20 +61,20 @@ pub fn preview(
         let path = folder.join(format!("episode_{index}.mp4"));
         let length = reader.episodes()[episode].length;
         let last = length - 1;
-        let mut film = Film::begin(&path, strip.width, strip.height, options.fps, scale)?;
+        let mut video = VideoFile::begin(&path, strip.width, strip.height, options.fps, scale)?;
         let on_sheet: Vec<usize> = (0..SHEET_COLUMNS).map(|i| i * last / (SHEET_COLUMNS - 1)).collect();
         for start in (0..length).step_by(ROWS) {
             let rows = ROWS.min(length - start);
             let batch = reader.read(&strip.names(), &[StepRange::new(episode, start, rows)])?;
             for row in 0..rows {
                 let picture = strip.draw(&batch, row, &format!("episode {index} step {}", start + row));
-                film.add(&picture)?;
+                video.add(&picture)?;
                 // A short episode shows a frame more than once.
                 let times = on_sheet.iter().filter(|&&step| step == start + row).count();
                 sheet.extend(std::iter::repeat_n(picture, times));
             }
         }
-        film.finish()?;
+        video.finish()?;
         written.push(path);
         progress(done + 1);
     }

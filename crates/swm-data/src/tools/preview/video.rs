@@ -29,11 +29,11 @@ where
     I: IntoIterator,
     I::Item: AsRef<[u8]>,
 {
-    let mut film = Film::begin(path, width, height, fps, scale)?;
+    let mut video = VideoFile::begin(path, width, height, fps, scale)?;
     for frame in frames {
-        film.add(frame.as_ref())?;
+        video.add(frame.as_ref())?;
     }
-    film.finish()
+    video.finish()
 }
 
 /// The factor that brings a picture's longer side nearest to, but not over, `target` pixels; at least 1.
@@ -42,7 +42,7 @@ pub fn integer_scale(width: usize, height: usize, target: usize) -> usize {
 }
 
 /// A video that is being written, frame by frame.
-pub(crate) struct Film {
+pub(crate) struct VideoFile {
     path: PathBuf,
     width: usize,
     height: usize,
@@ -53,7 +53,7 @@ pub(crate) struct Film {
     inner: encoder::Encoder,
 }
 
-impl Film {
+impl VideoFile {
     /// A video of frames of `width * scale` by `height * scale` pixels.
     pub fn begin(path: &Path, width: usize, height: usize, fps: u32, scale: usize) -> Result<Self> {
         if width == 0 || height == 0 || fps == 0 || scale == 0 {

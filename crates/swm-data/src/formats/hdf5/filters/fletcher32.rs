@@ -13,7 +13,6 @@ pub fn sum(bytes: &[u8]) -> u32 {
     let (words, odd) = bytes.as_chunks::<2>();
     for block in words.chunks(BLOCK) {
         // Over a block of n words the plain sum enters the weighted one n times, and word i of it n - i times.
-        #[allow(clippy::cast_possible_truncation)]
         let n = block.len() as u32;
         let (mut sum, mut sums) = (0_u32, 0_u32);
         for (&word, weight) in block.iter().zip((1..=n).rev()) {
@@ -31,7 +30,6 @@ pub fn sum(bytes: &[u8]) -> u32 {
     // HDF5 folds carries instead of dividing, which leaves the modulus where division leaves 0, unless all was 0.
     let fold = |sum: u64, any: bool| if sum == 0 && any { MODULUS } else { sum };
     let any = bytes.iter().any(|&byte| byte != 0);
-    #[allow(clippy::cast_possible_truncation)]
     let folded = (fold(weighted, any) << 16 | fold(plain, any)) as u32;
     folded
 }

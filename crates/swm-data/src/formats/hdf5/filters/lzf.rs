@@ -80,7 +80,6 @@ impl Encoder {
             // Positions are stored one higher, as 0 means none.
             let slot = &mut self.0[hash as usize];
             let before = (*slot as usize).checked_sub(1);
-            #[allow(clippy::cast_possible_truncation)] // chunks are below 4 GiB
             {
                 *slot = at as u32 + 1;
             }
@@ -121,7 +120,6 @@ fn common(a: &[u8], b: &[u8]) -> usize {
     whole + a[whole..].iter().zip(&b[whole..]).take_while(|(x, y)| x == y).count()
 }
 
-#[allow(clippy::cast_possible_truncation)] // all fit their bits
 fn put_literals(literals: &[u8], out: &mut Vec<u8>) {
     for run in literals.chunks(MAX_LITERALS) {
         out.push(run.len() as u8 - 1);
@@ -129,7 +127,6 @@ fn put_literals(literals: &[u8], out: &mut Vec<u8>) {
     }
 }
 
-#[allow(clippy::cast_possible_truncation)] // all fit their bits
 fn put_match(distance: usize, length: usize, out: &mut Vec<u8>) {
     let (distance, length) = (distance - 1, length - 2);
     if length < 7 {

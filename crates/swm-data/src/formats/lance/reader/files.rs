@@ -1,9 +1,9 @@
-//! The data files of a table: found, checked, opened, and kept open for a while.
+//! The data files of a table: locating, verifying and opening them, and keeping recently used ones open.
 
-use super::super::record::{EPISODES_KEY, Record};
-use super::super::store::{self, Store, damaged, wait};
 use super::{LanceReader, lock};
-use crate::dataset::objects::Pieces;
+use crate::dataset::objects::ObjectRanges;
+use crate::formats::lance::record::{EPISODES_KEY, Record};
+use crate::formats::lance::store::{self, Store, block_on, damaged};
 use bytes::Bytes;
 use futures::{StreamExt as _, TryStreamExt as _};
 use lance_core::datatypes::Schema as LanceSchema;
@@ -16,28 +16,27 @@ use std::path::Path;
 use std::sync::Arc;
 use swm_core::{Error, Result};
 
-/// Data files that are kept open, and files that one read has open at a time. Each takes up to two file descriptors,
-/// of which a process commonly has 1024.
+/// Maximum number of open local data files. Each takes up to two file descriptors; a process usually has 1024.
 const OPEN_FILES: usize = 32;
 
-/// The same for data files in an object store, which take memory only.
+/// Maximum number of open data files in an object store, which only take memory.
 const OPEN_OBJECTS: usize = 1024;
 
-/// Data files in an object store that are opened at a time.
+/// Data files in an object store that are opened concurrently.
 const OPENED_TOGETHER: usize = 16;
 
-/// Data files up to this size are checked before even the numbers of their episodes are read.
+/// Data files up to this size are verified before even their episode indices are read.
 const SMALL_FILE: u64 = 1 << 20;
 
-/// What was used last, by the path of a data file, up to a number of them.
-pub(super) struct Recent<T> {
+/// The most recently opened files by path, up to `limit`.
+pub(super) struct RecentFiles<T> {
     by_path: HashMap<String, Arc<T>>,
     /// Oldest first.
     order: VecDeque<String>,
     limit: usize,
 }
 
-impl<T> Recent<T> {
+impl<T> RecentFiles<T> {
     pub(super) fn new(store: &Store) -> Self {
         Self { by_path: HashMap::new(), order: VecDeque::new(), limit: open_at_once(store) }
     }
@@ -59,20 +58,20 @@ impl<T> Recent<T> {
     }
 }
 
-/// Data files that may be open at a time.
+/// Maximum number of data files open at a time.
 pub(super) fn open_at_once(store: &Store) -> usize {
     if store.remote { OPEN_OBJECTS } else { OPEN_FILES }
 }
 
 impl LanceReader {
-    /// Opens data files of an object store that are not yet open, together: each takes a few answers of the store.
+    /// Opens data files in an object store concurrently, because each takes several requests. Skips open files.
     pub(super) fn open_together(&self, files: Vec<DataFile>) -> Result<()> {
         let store = self.store.clone();
         let missing: Vec<DataFile> = {
             let known = lock(&self.files);
             files.into_iter().filter(|file| known.get(&file.path).is_none()).collect()
         };
-        let opened: Vec<(String, FileReader)> = wait(self.folder(), "opening data files", async move {
+        let opened: Vec<(String, FileReader)> = block_on(self.folder(), "opening data files", async move {
             let opening = futures::stream::iter(missing).map(|file| {
                 let store = store.clone();
                 async move { Ok((file.path.clone(), store.open_file(&file).await?)) }
@@ -85,7 +84,7 @@ impl LanceReader {
         Ok(())
     }
 
-    /// The file of a fragment that holds a column, and the table's schema of that column.
+    /// The file of a fragment that contains a column, and the table's schema of that column.
     pub(super) fn data_file(&self, fragment: usize, stored_name: &str) -> Result<(&DataFile, LanceSchema)> {
         let missing = || damaged(self.folder(), format!("fragment {fragment} has no column '{stored_name}'"));
         let projected = self.table.schema.project(&[stored_name]).map_err(|_| missing())?;
@@ -95,17 +94,16 @@ impl LanceReader {
         Ok((file, projected))
     }
 
-    /// Checks a file against the hash in its name, once, before anything in it is decoded: Lance trusts what
-    /// it reads, so a flipped bit could make it ask for any amount of memory. A large file is left alone
-    /// until its data are asked for, as opening a dataset must not read all of it. Object stores check what they hold
-    /// themselves.
+    /// Verifies a local file against the hash in its name, once, before anything in it is decoded. Lance trusts its
+    /// input, so a flipped bit could make it allocate any amount of memory. A large file is verified only when its data
+    /// is read, so that opening a dataset does not read all of it. Object stores verify their content themselves.
     pub(super) fn verify(&self, file: &DataFile, data_wanted: bool) -> Result<()> {
         let Some(expected) = store::hash_in_name(&file.path).filter(|_| !self.store.remote) else { return Ok(()) };
         if lock(&self.verified).contains(&file.path) {
             return Ok(());
         }
         let path = self.store.local(&self.store.data_path(&file.path));
-        let io = |e: std::io::Error| self.missing(&path, e);
+        let io = |e: std::io::Error| self.file_error(&path, e);
         if !data_wanted && std::fs::metadata(&path).map_err(io)?.len() > SMALL_FILE {
             return Ok(());
         }
@@ -116,7 +114,7 @@ impl LanceReader {
         Ok(())
     }
 
-    pub(super) fn missing(&self, path: &Path, error: std::io::Error) -> Error {
+    pub(super) fn file_error(&self, path: &Path, error: std::io::Error) -> Error {
         match error.kind() {
             std::io::ErrorKind::NotFound => damaged(path, "a data file is missing"),
             std::io::ErrorKind::UnexpectedEof => damaged(path, "a data file is too short"),
@@ -124,11 +122,10 @@ impl LanceReader {
         }
     }
 
-    /// The open file of a fragment that holds a column, and where in it.
+    /// The open file of a fragment that contains a column, and the column's projection in it.
     pub(super) fn locate(&self, fragment: usize, stored_name: &str) -> Result<(Arc<FileReader>, ReaderProjection)> {
         let (file, projected) = self.data_file(fragment, stored_name)?;
-        #[allow(clippy::cast_sign_loss)]
-        let places: BTreeMap<u32, u32> = file
+        let indices: BTreeMap<u32, u32> = file
             .fields
             .iter()
             .zip(file.column_indices.iter())
@@ -136,7 +133,7 @@ impl LanceReader {
             .map(|(&field, &column)| (field as u32, column as u32))
             .collect();
         let reader = self.file(file)?;
-        let projection = reader_projection_from_field_ids(reader.version(), &projected, &places)
+        let projection = reader_projection_from_field_ids(reader.version(), &projected, &indices)
             .map_err(|e| damaged(self.folder(), e.to_string()))?;
         Ok((reader, projection))
     }
@@ -147,30 +144,30 @@ impl LanceReader {
         }
         let (store, data_file) = (self.store.clone(), file.clone());
         let path = self.folder().join("data").join(&file.path);
-        let reader = wait(&path, "opening a data file", async move { store.open_file(&data_file).await })?;
+        let reader = block_on(&path, "opening a data file", async move { store.open_file(&data_file).await })?;
         let reader = Arc::new(reader);
         lock(&self.files).keep(&file.path, &reader);
         Ok(reader)
     }
 
-    /// A data file of this machine, open for reading.
+    /// A local data file, opened for reading at offsets.
     pub(super) fn handle(&self, path: &str) -> Result<Arc<File>> {
         if let Some(file) = lock(&self.handles).get(path) {
             return Ok(file);
         }
-        let place = self.store.local(&self.store.data_path(path));
-        let file = Arc::new(File::open(&place).map_err(|e| self.missing(&place, e))?);
+        let local = self.store.local(&self.store.data_path(path));
+        let file = Arc::new(File::open(&local).map_err(|e| self.file_error(&local, e))?);
         lock(&self.handles).keep(path, &file);
         Ok(file)
     }
 
-    /// Bytes of data files in an object store.
-    pub(super) fn bytes(&self, wanted: Vec<Pieces>) -> Result<Vec<Vec<Bytes>>> {
+    /// Reads byte ranges of data files in an object store.
+    pub(super) fn bytes(&self, ranges: Vec<ObjectRanges>) -> Result<Vec<Vec<Bytes>>> {
         let (store, blocks) = (self.store.clone(), Arc::clone(&self.blocks));
-        wait(self.folder(), "reading data files", async move { Ok(blocks.read(store.inner(), &wanted).await?) })
+        block_on(self.folder(), "reading data files", async move { Ok(blocks.read(store.inner(), &ranges).await?) })
     }
 
-    /// What a fragment's data file records of its episodes, and the file.
+    /// The record of a fragment's data file, and the file that contains it.
     pub(super) fn record(&self, fragment: usize) -> Result<Option<(Arc<FileReader>, Record)>> {
         for file in &self.table.fragments[fragment].files {
             self.verify(file, false)?;
@@ -183,13 +180,13 @@ impl LanceReader {
         Ok(None)
     }
 
-    /// The global buffer whose number is in the file's metadata.
+    /// The global buffer whose index is stored under `key` in the file's metadata.
     pub(super) fn buffer(&self, reader: &Arc<FileReader>, key: &str) -> Result<Option<Bytes>> {
         let Some(number) = reader.schema().metadata.get(key).and_then(|number| number.parse::<u32>().ok()) else {
             return Ok(None);
         };
         let reader = Arc::clone(reader);
         let read = async move { reader.read_global_buffer(number).await.map(Some) };
-        wait(self.folder(), "reading the record of its episodes", read)
+        block_on(self.folder(), "reading the record of its episodes", read)
     }
 }

@@ -1,12 +1,12 @@
-//! Pictures of a batch, read from where they lie and decoded in parallel.
+//! Reads the images of a batch from their locations and decodes them in parallel.
 
-use super::super::convert::blob;
-use super::super::image_locations::{Place, Places};
-use super::super::schema::StoredColumn;
-use super::super::store::{damaged, wait};
 use super::files::open_at_once;
-use super::{LanceReader, Wanted, lock, merged};
-use crate::dataset::objects::{self, Pieces};
+use super::{LanceReader, RowSlot, lock, merged};
+use crate::dataset::objects::{self, ObjectRanges};
+use crate::formats::lance::convert::image_bytes;
+use crate::formats::lance::image_locations::{ImageLocation, ImageLocations};
+use crate::formats::lance::schema::StoredColumn;
+use crate::formats::lance::store::{block_on, damaged};
 use rayon::prelude::*;
 use std::cell::RefCell;
 use std::os::unix::fs::FileExt as _;
@@ -14,20 +14,20 @@ use std::path::Path;
 use std::sync::Arc;
 use swm_core::Result;
 
-/// The pictures of one column in one data file.
-pub(super) struct LaidOut {
-    /// The data file.
+/// The images of one column in one data file.
+pub(super) struct FileImages {
+    /// Name of the data file.
     path: String,
-    /// Its bytes.
+    /// Size of the file in bytes.
     size: u64,
-    places: Places,
+    locations: ImageLocations,
 }
 
 impl LanceReader {
-    /// Where the pictures of a column are in a fragment; `None` where they are not laid out one by one.
-    pub(super) fn places(&self, fragment: usize, column: &str) -> Result<Option<Arc<LaidOut>>> {
+    /// Locations of a column's images in a fragment; `None` if the column has another layout.
+    pub(super) fn locate_images(&self, fragment: usize, column: &str) -> Result<Option<Arc<FileImages>>> {
         let key = (fragment, column.to_owned());
-        if let Some(known) = lock(&self.places).get(&key) {
+        if let Some(known) = lock(&self.image_locations).get(&key) {
             return Ok(known.clone());
         }
         let (file, _) = self.data_file(fragment, column)?;
@@ -36,10 +36,10 @@ impl LanceReader {
         let metadata = reader.metadata();
         let found = match projection.column_indices[..] {
             [index] => match metadata.column_infos.get(index as usize) {
-                Some(info) => Places::read(info, metadata.file_size_bytes, |ranges| {
+                Some(info) => ImageLocations::read(info, metadata.file_size_bytes, |ranges| {
                     let store = self.store.clone();
                     let (path, ranges) = (store.data_path(&file.path), ranges.to_vec());
-                    wait(self.folder(), "reading where pictures are", async move {
+                    block_on(self.folder(), "reading the locations of images", async move {
                         Ok(objects::fetch(store.inner(), &path, &ranges).await?)
                     })
                 })?,
@@ -47,36 +47,37 @@ impl LanceReader {
             },
             _ => None,
         };
-        let found =
-            found.map(|places| Arc::new(LaidOut { path: file.path.clone(), size: metadata.file_size_bytes, places }));
-        lock(&self.places).insert(key, found.clone());
+        let found = found.map(|locations| {
+            Arc::new(FileImages { path: file.path.clone(), size: metadata.file_size_bytes, locations })
+        });
+        lock(&self.image_locations).insert(key, found.clone());
         Ok(found)
     }
 
-    /// No pieces yet of a data file.
-    pub(super) fn pieces_of(&self, file: &LaidOut) -> Pieces {
-        Pieces { path: self.store.data_path(&file.path), size: file.size, ranges: vec![] }
+    /// Empty ranges of a data file.
+    pub(super) fn ranges_of(&self, file: &FileImages) -> ObjectRanges {
+        ObjectRanges { path: self.store.data_path(&file.path), size: file.size, ranges: vec![] }
     }
 
-    pub(super) fn read_pictures(&self, column: &StoredColumn, wanted: &mut [Wanted]) -> Result<()> {
-        let mut laid_out = vec![];
-        let mut others: Vec<&mut Wanted> = vec![];
-        for rows in wanted.chunk_by_mut(|a, b| self.fragment_of(a.0) == self.fragment_of(b.0)) {
+    pub(super) fn read_images(&self, column: &StoredColumn, requested: &mut [RowSlot]) -> Result<()> {
+        let mut located = vec![];
+        let mut others: Vec<&mut RowSlot> = vec![];
+        for rows in requested.chunk_by_mut(|a, b| self.fragment_of(a.0) == self.fragment_of(b.0)) {
             let fragment = self.fragment_of(rows[0].0);
-            match self.places(fragment, &column.name)? {
-                Some(pictures) => laid_out.push((self.fragment_rows[fragment], pictures, rows)),
+            match self.locate_images(fragment, &column.name)? {
+                Some(images) => located.push((self.fragment_rows[fragment], images, rows)),
                 None => others.extend(rows),
             }
         }
-        for fragments in laid_out.chunks_mut(open_at_once(&self.store)) {
-            self.read_laid_out(column, fragments)?;
+        for fragments in located.chunks_mut(open_at_once(&self.store)) {
+            self.read_located_images(column, fragments)?;
         }
-        let pieces = self.pieces(&column.name, &merged(&others))?;
+        let stored = self.stored_rows(&column.name, &merged(&others))?;
         let mut groups = others.chunk_by_mut(|a, b| a.0 == b.0);
         let mut jobs = vec![];
-        for piece in &pieces {
-            for (i, group) in (0..piece.rows).zip(groups.by_ref()) {
-                jobs.push((blob(&piece.values, i)?, group));
+        for rows in &stored {
+            for (i, group) in (0..rows.rows).zip(groups.by_ref()) {
+                jobs.push((image_bytes(&rows.values, i)?, group));
             }
         }
         jobs.into_par_iter().with_max_len(1).try_for_each(|(bytes, group)| {
@@ -84,55 +85,55 @@ impl LanceReader {
                 return Ok(());
             };
             self.decode(column, row, bytes, first)?;
-            others.iter_mut().for_each(|(_, place)| place.copy_from_slice(first));
+            others.iter_mut().for_each(|(_, slot)| slot.copy_from_slice(first));
             Ok(())
         })
     }
 
-    /// Reads and decodes pictures whose places are known, of some fragments.
-    pub(super) fn read_laid_out(
+    /// Reads and decodes images with known locations, from some fragments.
+    pub(super) fn read_located_images(
         &self,
         column: &StoredColumn,
-        fragments: &mut [(u64, Arc<LaidOut>, &mut [Wanted])],
+        fragments: &mut [(u64, Arc<FileImages>, &mut [RowSlot])],
     ) -> Result<()> {
-        let files: Vec<Arc<LaidOut>> = fragments.iter().map(|(_, pictures, _)| Arc::clone(pictures)).collect();
+        let files: Vec<Arc<FileImages>> = fragments.iter().map(|(_, images, _)| Arc::clone(images)).collect();
         let mut jobs = vec![];
-        for (at, (first_row, pictures, rows)) in fragments.iter_mut().enumerate() {
+        for (at, (first_row, images, rows)) in fragments.iter_mut().enumerate() {
             for group in rows.chunk_by_mut(|a, b| a.0 == b.0) {
                 let row = group[0].0;
-                let place = pictures.places.find(row - *first_row).ok_or_else(|| {
-                    damaged(self.folder(), format!("row {row} of column '{}' is not in its data file", column.name))
+                let location = images.locations.find(row - *first_row).ok_or_else(|| {
+                    damaged(self.folder(), format!("row {row} of column '{}' lies outside its data file", column.name))
                 })?;
-                jobs.push((at, place, group));
+                jobs.push((at, location, group));
             }
         }
-        let finish = |place: &Place, bytes: &[u8], group: &mut [Wanted]| {
+        let finish = |location: &ImageLocation, bytes: &[u8], group: &mut [RowSlot]| {
             let Some(((row, first), others)) = group.split_first_mut() else { return Ok(()) };
-            let picture = place.picture(bytes).ok_or_else(|| {
-                damaged(self.folder(), format!("row {row} of column '{}' states another length", column.name))
+            let image = location.image(bytes).ok_or_else(|| {
+                damaged(self.folder(), format!("row {row} of column '{}' has a wrong length prefix", column.name))
             })?;
-            self.decode(column, *row, picture, first)?;
-            others.iter_mut().for_each(|(_, place)| place.copy_from_slice(first));
+            self.decode(column, *row, image, first)?;
+            others.iter_mut().for_each(|(_, slot)| slot.copy_from_slice(first));
             Ok(())
         };
         if self.store.remote {
-            let mut wanted: Vec<Pieces> = files.iter().map(|file| self.pieces_of(file)).collect();
-            jobs.iter().for_each(|(at, place, _)| wanted[*at].ranges.push(place.bytes.clone()));
-            let fetched = self.bytes(wanted)?.into_iter().flatten();
+            let mut requested: Vec<ObjectRanges> = files.iter().map(|file| self.ranges_of(file)).collect();
+            jobs.iter().for_each(|(at, location, _)| requested[*at].ranges.push(location.bytes.clone()));
+            let fetched = self.bytes(requested)?.into_iter().flatten();
             let jobs: Vec<_> = jobs.into_iter().zip(fetched).collect();
             return jobs
                 .into_par_iter()
                 .with_max_len(1)
-                .try_for_each(|((_, place, group), bytes)| finish(&place, &bytes, group));
+                .try_for_each(|((_, location, group), bytes)| finish(&location, &bytes, group));
         }
         let handles = files.iter().map(|file| self.handle(&file.path)).collect::<Result<Vec<_>>>()?;
-        jobs.into_par_iter().with_max_len(1).try_for_each(|(at, place, group)| {
+        jobs.into_par_iter().with_max_len(1).try_for_each(|(at, location, group)| {
             SCRATCH.with_borrow_mut(|scratch| {
-                scratch.resize((place.bytes.end - place.bytes.start) as usize, 0);
+                scratch.resize((location.bytes.end - location.bytes.start) as usize, 0);
                 handles[at]
-                    .read_exact_at(scratch, place.bytes.start)
-                    .map_err(|e| self.missing(Path::new(&files[at].path), e))?;
-                finish(&place, scratch, group)
+                    .read_exact_at(scratch, location.bytes.start)
+                    .map_err(|e| self.file_error(Path::new(&files[at].path), e))?;
+                finish(&location, scratch, group)
             })
         })
     }
@@ -140,12 +141,12 @@ impl LanceReader {
     pub(super) fn decode(&self, column: &StoredColumn, row: u64, bytes: &[u8], out: &mut [u8]) -> Result<()> {
         let (height, width) = (column.spec.shape[0], column.spec.shape[1]);
         swm_image::decode(bytes, height, width, out).map_err(|problem| {
-            damaged(self.folder(), format!("picture of row {row}, column '{}': {problem}", column.spec.name))
+            damaged(self.folder(), format!("image of row {row}, column '{}': {problem}", column.spec.name))
         })
     }
 }
 
 thread_local! {
-    /// An encoded picture, between reading and decoding.
+    /// Buffer for an encoded image between reading and decoding.
     static SCRATCH: RefCell<Vec<u8>> = const { RefCell::new(vec![]) };
 }

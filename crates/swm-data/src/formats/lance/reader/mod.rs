@@ -1,23 +1,23 @@
-//! Reading episodes: all ranges of a batch are sorted, merged and read together, pictures are decoded in
-//! parallel into the batch.
+//! Reads episodes: sorts and merges the ranges of a batch, reads them together, and decodes images in parallel.
 //!
-//! [`numbers`] and [`pictures`] say how; what is laid out unlike they expect, or does not fit, goes through Lance's
-//! decoder ([`pieces`]). [`files`] opens data files and checks them.
+//! - [`values`]: numeric columns, cached per fragment; [`images`]: images, read directly from their locations.
+//! - [`stored_rows`]: everything else, read with Lance's decoder.
+//! - [`files`]: opens and verifies data files.
 
 mod files;
 mod images;
-mod pieces;
+mod stored_rows;
 mod values;
 
-use self::files::Recent;
-use self::images::LaidOut;
-use self::values::Numbers;
-use super::convert::{blob, cast, whole_numbers};
+use self::files::RecentFiles;
+use self::images::FileImages;
+use self::values::ValueCache;
+use super::convert::{cast, image_bytes, integers};
 use super::record::{CONSTANTS_KEY, ContentHash};
-use super::schema::{self, EPISODE, Kind, STEP, StoredColumn};
+use super::schema::{self, Kind, StoredColumn};
 use super::store::{Store, damaged};
 use crate::dataset::Location;
-use crate::dataset::objects::Blocks;
+use crate::dataset::objects::BlockCache;
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
 use lance_file::reader::FileReader;
 use lance_table::format::Manifest as Table;
@@ -27,6 +27,7 @@ use std::ops::Range;
 use std::path::Path;
 use std::slice;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Error, Manifest, Result, Schema};
 
 /// Opens a table.
@@ -41,38 +42,38 @@ pub struct LanceReader {
     schema: Schema,
     columns: Vec<StoredColumn>,
     episodes: Vec<Episode>,
-    /// The first row of each episode, in the whole table.
+    /// First row of each episode, counted over the table.
     first_rows: Vec<u64>,
-    /// The first row of each fragment, and the end.
+    /// First row of each fragment, followed by the number of rows.
     fragment_rows: Vec<u64>,
-    files: Mutex<Recent<FileReader>>,
-    /// Data files of this machine, open for reading.
-    handles: Mutex<Recent<File>>,
-    /// Where pictures are.
-    places: Mutex<Places>,
-    numbers: Mutex<Numbers>,
-    /// What was fetched from an object store.
-    blocks: Arc<Blocks>,
-    /// Data files whose content was checked.
+    files: Mutex<RecentFiles<FileReader>>,
+    /// Local data files, opened for reading at offsets.
+    handles: Mutex<RecentFiles<File>>,
+    /// Known locations of images.
+    image_locations: Mutex<KnownImages>,
+    value_cache: Mutex<ValueCache>,
+    /// Cached blocks of an object store.
+    blocks: Arc<BlockCache>,
+    /// Data files whose content was verified.
     verified: Mutex<HashSet<String>>,
 }
 
-/// By fragment and name of the column; `None` where pictures are laid out otherwise and Lance must look.
-type Places = HashMap<(usize, String), Option<Arc<LaidOut>>>;
+/// Locations by fragment and column name; `None` if the column must be read with Lance's decoder.
+type KnownImages = HashMap<(usize, String), Option<Arc<FileImages>>>;
 
-/// A row of the table, and the place in a batch that wants it.
-type Wanted<'a> = (u64, &'a mut [u8]);
+/// A row of the table, and the part of the output that receives it.
+type RowSlot<'a> = (u64, &'a mut [u8]);
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // What is guarded is valid at every step, so a thread that panicked did no harm.
+    // The guarded data is valid after every statement, so poisoning is ignored.
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl LanceReader {
-    /// Opens a table.
+    /// Opens the newest version of a table.
     ///
     /// # Errors
-    /// When there is none, or it is damaged.
+    /// If there is no table, or it is damaged.
     pub fn open(location: &Location) -> Result<Self> {
         let store = Store::new(location)?;
         let Some(version) = store.latest()? else {
@@ -83,10 +84,10 @@ impl LanceReader {
         Self::of(store, version.manifest)
     }
 
-    /// The table in one of its versions.
+    /// Opens a version of a table.
     ///
     /// # Errors
-    /// When it is damaged.
+    /// If it is damaged.
     pub fn of(store: Store, table: Arc<Table>) -> Result<Self> {
         let label = store.label.clone();
         let mut fragment_rows = vec![0];
@@ -104,9 +105,9 @@ impl LanceReader {
         }
         let files = table.fragments.iter().flat_map(|fragment| &fragment.files);
         let total = files.filter_map(|file| file.file_size_bytes.get()).map(|size| size.get()).sum();
-        let (files, handles) = (Recent::new(&store), Recent::new(&store));
+        let (files, handles) = (RecentFiles::new(&store), RecentFiles::new(&store));
         let mut reader = Self {
-            blocks: Arc::new(Blocks::new(total)),
+            blocks: Arc::new(BlockCache::new(total)),
             store,
             table,
             schema: Schema::new([])?,
@@ -116,20 +117,20 @@ impl LanceReader {
             fragment_rows,
             files: Mutex::new(files),
             handles: Mutex::new(handles),
-            places: Mutex::default(),
-            numbers: Mutex::default(),
+            image_locations: Mutex::default(),
+            value_cache: Mutex::default(),
             verified: Mutex::default(),
         };
         let (columns, schema) = schema::columns_to_read(&label, &reader.table.schema, |column| {
-            let pieces = reader.pieces(column, slice::from_ref(&(0..1.min(reader.rows()))))?;
-            pieces.first().map(|piece| blob(&piece.values, 0).map(<[u8]>::to_vec)).transpose()
+            let stored = reader.stored_rows(column, slice::from_ref(&(0..1.min(reader.rows()))))?;
+            stored.first().map(|rows_read| image_bytes(&rows_read.values, 0).map(<[u8]>::to_vec)).transpose()
         })?;
         (reader.columns, reader.schema) = (columns, schema);
         reader.find_episodes()?;
         Ok(reader)
     }
 
-    /// The number of the next episode.
+    /// The next free `episode_idx`.
     pub fn next_episode(&self) -> i64 {
         self.episodes.last().map_or(0, |episode| episode.index + 1)
     }
@@ -142,18 +143,18 @@ impl LanceReader {
         self.fragment_rows[self.fragment_rows.len() - 1]
     }
 
-    /// The fragment that holds a row.
+    /// The fragment that contains a row.
     fn fragment_of(&self, row: u64) -> usize {
         self.fragment_rows.partition_point(|&first| first <= row) - 1
     }
 
-    /// Reads where episodes begin and end.
+    /// Reads `episode_idx` and derives the episodes and their first rows.
     fn find_episodes(&mut self) -> Result<()> {
         let mut row = 0;
         let mut episodes: Vec<Episode> = vec![];
-        for piece in self.pieces(EPISODE, slice::from_ref(&(0..self.rows())))? {
-            let mut indices = vec![0_i64; piece.rows];
-            whole_numbers(&piece.values, &mut indices)?;
+        for rows_read in self.stored_rows(EPISODE_IDX, slice::from_ref(&(0..self.rows())))? {
+            let mut indices = vec![0_i64; rows_read.rows];
+            integers(&rows_read.values, &mut indices)?;
             for index in indices {
                 match episodes.last_mut() {
                     Some(episode) if episode.index == index => episode.length += 1,
@@ -161,7 +162,7 @@ impl LanceReader {
                         return Err(Error::corrupt(
                             self.folder(),
                             format!("episode {index} comes after episode {} in row {row}", episode.index),
-                            "rows of an episode must follow each other, episodes in rising order; rebuild the dataset",
+                            "rows of an episode must be consecutive, and episodes must be in ascending order; rebuild the dataset",
                         ));
                     }
                     _ => {
@@ -176,13 +177,13 @@ impl LanceReader {
         Ok(())
     }
 
-    /// The column of that name, by our name or its name in the table.
+    /// A column by its original name or its name in the table.
     fn column(&self, name: &str) -> Result<&StoredColumn> {
         let index = self.schema.index(name)?;
         Ok(&self.columns[index - 2])
     }
 
-    /// The rows of a range in the whole table.
+    /// The rows of a range, counted over the table.
     fn table_rows(&self, range: &StepRange) -> Result<Range<u64>> {
         match self.episodes.get(range.episode) {
             Some(episode) if range.start + range.length <= episode.length => {
@@ -196,21 +197,20 @@ impl LanceReader {
             )),
             None => Err(Error::mismatch(
                 "reading rows",
-                format!("the episode in position {}", range.episode),
+                format!("episode position {}", range.episode),
                 format!("positions below {}", self.episodes.len()),
             )),
         }
     }
 
-    /// `episode_idx` or `step_idx`, which need no reading.
-    fn numbering(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
+    /// Computes `episode_idx` or `step_idx` without reading.
+    fn read_index_column(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let mut values = vec![];
         for range in ranges {
             self.table_rows(range)?;
             let index = self.episodes[range.episode].index;
             values.extend((range.start..range.start + range.length).map(|step| match name {
-                EPISODE => index,
-                #[allow(clippy::cast_possible_wrap)]
+                EPISODE_IDX => index,
                 _ => step as i64,
             }));
         }
@@ -227,7 +227,7 @@ impl LanceReader {
         }
         Err(Error::mismatch(
             format!("reading column '{name}'"),
-            format!("room for {} bytes", out.len()),
+            format!("an output of {} bytes", out.len()),
             format!("{expected} for {rows} rows"),
         ))
     }
@@ -243,46 +243,45 @@ impl Reader for LanceReader {
     }
 
     fn read_column(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
-        if name == EPISODE || name == STEP {
-            return self.numbering(name, ranges, out);
+        if name == EPISODE_IDX || name == STEP_IDX {
+            return self.read_index_column(name, ranges, out);
         }
         let column = self.column(name)?;
         let rows: usize = ranges.iter().map(|range| range.length).sum();
         self.check_length(name, rows, out)?;
-        // Every wanted row with its place in `out`, in the order of the table.
-        let mut wanted: Vec<Wanted> = Vec::with_capacity(rows);
-        let mut places = out.chunks_exact_mut(column.spec.row_bytes());
+        // Every requested row with its part of `out`, sorted by row.
+        let mut requested: Vec<RowSlot> = Vec::with_capacity(rows);
+        let mut slots = out.chunks_exact_mut(column.spec.row_bytes());
         for range in ranges {
-            wanted.extend(self.table_rows(range)?.zip(places.by_ref()));
+            requested.extend(self.table_rows(range)?.zip(slots.by_ref()));
         }
-        wanted.sort_by_key(|(row, _)| *row);
+        requested.sort_by_key(|(row, _)| *row);
         match column.kind {
-            Kind::Numbers(_) => self.read_numbers(column, &mut wanted),
-            Kind::Image => self.read_pictures(column, &mut wanted),
+            Kind::Values(_) => self.read_values(column, &mut requested),
+            Kind::Image => self.read_images(column, &mut requested),
         }
     }
 
-    /// Steps are numbered by their places here; what is stored should say the same. Where two episodes were written under one
-    /// number, it does not.
+    /// Compares the stored `step_idx` with the position in the episode. They differ if two episodes were written with
+    /// the same index.
     fn irregularities(&self) -> Result<Vec<Irregularity>> {
         let mut found = vec![];
-        if self.table.schema.field(STEP).is_none() {
+        if self.table.schema.field(STEP_IDX).is_none() {
             return Ok(found);
         }
-        let (mut episode, mut expected, mut sound) = (0, 0, true);
-        for piece in self.pieces(STEP, slice::from_ref(&(0..self.rows())))? {
-            let mut steps = vec![0_i64; piece.rows];
-            whole_numbers(&piece.values, &mut steps)?;
+        let (mut episode, mut expected, mut valid) = (0, 0, true);
+        for rows_read in self.stored_rows(STEP_IDX, slice::from_ref(&(0..self.rows())))? {
+            let mut steps = vec![0_i64; rows_read.rows];
+            integers(&rows_read.values, &mut steps)?;
             for step in steps {
-                if step != expected && sound {
-                    let what = format!("the stored steps do not count up from 0: {step} stands in row {expected}");
+                if step != expected && valid {
+                    let what = format!("the stored steps do not count up from 0: row {expected} holds {step}");
                     found.push(Irregularity { episode: Some(episode), what });
-                    sound = false;
+                    valid = false;
                 }
                 expected += 1;
-                #[allow(clippy::cast_possible_wrap)]
                 if expected == self.episodes[episode].length as i64 {
-                    (episode, expected, sound) = (episode + 1, 0, true);
+                    (episode, expected, valid) = (episode + 1, 0, true);
                 }
             }
         }
@@ -314,7 +313,7 @@ impl Reader for LanceReader {
 
     fn constants(&self, episode: usize) -> Result<Constants> {
         let Some(&row) = self.first_rows.get(episode) else {
-            let problem = format!("the episode in position {episode}");
+            let problem = format!("episode position {episode}");
             return Err(Error::mismatch(
                 "reading constants",
                 problem,
@@ -354,8 +353,7 @@ impl Reader for LanceReader {
 }
 
 impl LanceReader {
-    /// The hashes of a fragment's episodes: as recorded, where the fragment was written here, so that a large dataset
-    /// need not be read for them.
+    /// The hashes of a fragment's episodes: from its record if it was written here, so that the data need not be read.
     fn hashes(&self, fragment: usize, episodes: Range<usize>) -> Result<Vec<String>> {
         if let Some((_, record)) = self.record(fragment)? {
             let stored = self.episodes[episodes.clone()].iter().map(|episode| episode.length as u64);
@@ -363,26 +361,26 @@ impl LanceReader {
                 return Ok(record.episodes.into_iter().map(|episode| episode.hash).collect());
             }
         }
-        episodes.map(|episode| self.hash_of(episode)).collect()
+        episodes.map(|episode| self.compute_hash(episode)).collect()
     }
 
-    /// The hash of an episode, from all that is stored of it.
-    fn hash_of(&self, episode: usize) -> Result<String> {
+    /// Computes the hash of an episode from its stored values.
+    fn compute_hash(&self, episode: usize) -> Result<String> {
         let rows = self.table_rows(&StepRange::new(episode, 0, self.episodes[episode].length))?;
         let mut hash = ContentHash::new();
         for column in &self.columns {
-            for piece in self.pieces(&column.name, slice::from_ref(&rows))? {
-                hash.add(column, &piece.values).map_err(|problem| damaged(self.folder(), problem))?;
+            for rows_read in self.stored_rows(&column.name, slice::from_ref(&rows))? {
+                hash.add(column, &rows_read.values).map_err(|problem| damaged(self.folder(), problem))?;
             }
         }
         Ok(hash.finish(&self.constants(episode)?))
     }
 }
 
-/// The ranges of rising rows.
-fn merged(wanted: &[&mut Wanted]) -> Vec<Range<u64>> {
+/// Merges sorted rows into ranges.
+fn merged(requested: &[&mut RowSlot]) -> Vec<Range<u64>> {
     let mut merged: Vec<Range<u64>> = vec![];
-    for &&mut (row, _) in wanted {
+    for &&mut (row, _) in requested {
         match merged.last_mut() {
             Some(range) if row < range.end => {}
             Some(range) if row == range.end => range.end += 1,

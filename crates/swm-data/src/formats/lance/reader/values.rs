@@ -1,96 +1,96 @@
-//! Numbers of a batch. They are small: those of a data file are decoded whole when the first of them is wanted, and kept
-//! as long as there is room.
+//! Reads the numeric values of a batch. They are small, so the first access decodes the whole column of a fragment and
+//! caches it while the limit allows.
 
-use super::super::convert::convert;
-use super::super::schema::StoredColumn;
-use super::super::store::damaged;
-use super::pieces::Piece;
-use super::{LanceReader, Wanted, lock, merged};
+use super::stored_rows::StoredRows;
+use super::{LanceReader, RowSlot, lock, merged};
+use crate::formats::lance::convert::convert;
+use crate::formats::lance::schema::StoredColumn;
+use crate::formats::lance::store::damaged;
 use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::Arc;
 use swm_core::Result;
 
-/// Bytes of decoded numbers that are kept. A hundred thousand steps of sixty numbers take a quarter of it.
-const KEPT_NUMBERS: usize = 128 << 20;
+/// Maximum size of cached values in bytes. 100,000 steps with 60 elements take a quarter of it.
+const CACHED_BYTES: usize = 128 << 20;
 
-/// Decoded numbers, by fragment and name of the column.
+/// Decoded values by fragment and column name.
 #[derive(Default)]
-pub(super) struct Numbers {
-    kept: HashMap<(usize, String), Arc<Vec<u8>>>,
+pub(super) struct ValueCache {
+    columns: HashMap<(usize, String), Arc<Vec<u8>>>,
     bytes: usize,
 }
 
 impl LanceReader {
-    pub(super) fn read_numbers(&self, column: &StoredColumn, wanted: &mut [Wanted]) -> Result<()> {
-        self.keep_numbers(column, wanted)?;
+    pub(super) fn read_values(&self, column: &StoredColumn, requested: &mut [RowSlot]) -> Result<()> {
+        self.cache_values(column, requested)?;
         let n = column.spec.row_bytes();
         let mut others = vec![];
-        for rows in wanted.chunk_by_mut(|a, b| self.fragment_of(a.0) == self.fragment_of(b.0)) {
+        for rows in requested.chunk_by_mut(|a, b| self.fragment_of(a.0) == self.fragment_of(b.0)) {
             let fragment = self.fragment_of(rows[0].0);
-            let kept = lock(&self.numbers).kept.get(&(fragment, column.name.clone())).map(Arc::clone);
-            match kept {
+            let cached = lock(&self.value_cache).columns.get(&(fragment, column.name.clone())).map(Arc::clone);
+            match cached {
                 Some(values) => {
-                    for (row, place) in rows {
+                    for (row, slot) in rows {
                         let at = (*row - self.fragment_rows[fragment]) as usize * n;
-                        place.copy_from_slice(&values[at..at + n]);
+                        slot.copy_from_slice(&values[at..at + n]);
                     }
                 }
                 None => others.extend(rows),
             }
         }
-        let pieces = self.pieces(&column.name, &merged(&others))?;
-        // One group for every stored row: the places that want it.
+        let stored = self.stored_rows(&column.name, &merged(&others))?;
+        // One group per stored row: the output slots that receive it.
         let mut groups = others.chunk_by_mut(|a, b| a.0 == b.0);
         let mut bytes = vec![];
-        for piece in &pieces {
-            bytes.resize(piece.rows * n, 0);
-            self.convert(column, piece, &mut bytes)?;
+        for rows_read in &stored {
+            bytes.resize(rows_read.rows * n, 0);
+            self.convert(column, rows_read, &mut bytes)?;
             for (value, group) in bytes.chunks_exact(n).zip(groups.by_ref()) {
-                group.iter_mut().for_each(|(_, place)| place.copy_from_slice(value));
+                group.iter_mut().for_each(|(_, slot)| slot.copy_from_slice(value));
             }
         }
         Ok(())
     }
 
-    pub(super) fn convert(&self, column: &StoredColumn, piece: &Piece, out: &mut [u8]) -> Result<()> {
-        convert(&piece.values, column.spec.len(), column.spec.dtype, out)
+    pub(super) fn convert(&self, column: &StoredColumn, rows_read: &StoredRows, out: &mut [u8]) -> Result<()> {
+        convert(&rows_read.values, column.spec.len(), column.spec.dtype, out)
             .map_err(|problem| damaged(self.folder(), format!("column '{}': {problem}", column.spec.name)))
     }
 
-    /// Decodes the numbers of all fragments that have a wanted row, as long as there is room for them.
-    pub(super) fn keep_numbers(&self, column: &StoredColumn, wanted: &[Wanted]) -> Result<()> {
+    /// Decodes and caches the column in all fragments with a requested row, while the limit allows.
+    pub(super) fn cache_values(&self, column: &StoredColumn, requested: &[RowSlot]) -> Result<()> {
         let n = column.spec.row_bytes();
         let mut ranges: Vec<Range<u64>> = vec![];
         {
-            let numbers = lock(&self.numbers);
-            let mut room = KEPT_NUMBERS.saturating_sub(numbers.bytes);
-            for rows in wanted.chunk_by(|a, b| self.fragment_of(a.0) == self.fragment_of(b.0)) {
+            let cache = lock(&self.value_cache);
+            let mut remaining = CACHED_BYTES.saturating_sub(cache.bytes);
+            for rows in requested.chunk_by(|a, b| self.fragment_of(a.0) == self.fragment_of(b.0)) {
                 let fragment = self.fragment_of(rows[0].0);
                 let range = self.fragment_rows[fragment]..self.fragment_rows[fragment + 1];
                 let size = (range.end - range.start).saturating_mul(n as u64);
-                let known = numbers.kept.contains_key(&(fragment, column.name.clone()));
-                if !known && size <= room as u64 {
-                    room -= size as usize;
+                let known = cache.columns.contains_key(&(fragment, column.name.clone()));
+                if !known && size <= remaining as u64 {
+                    remaining -= size as usize;
                     ranges.push(range);
                 }
             }
         }
-        let mut pieces = self.pieces(&column.name, &ranges)?.into_iter();
+        let mut stored = self.stored_rows(&column.name, &ranges)?.into_iter();
         for range in ranges {
             let mut values = vec![0; (range.end - range.start) as usize * n];
             let mut at = 0;
             while at < values.len() {
-                let Some(piece) = pieces.next() else { break };
-                let end = (at + piece.rows * n).min(values.len());
-                self.convert(column, &piece, &mut values[at..end])?;
+                let Some(rows_read) = stored.next() else { break };
+                let end = (at + rows_read.rows * n).min(values.len());
+                self.convert(column, &rows_read, &mut values[at..end])?;
                 at = end;
             }
-            let mut numbers = lock(&self.numbers);
-            numbers.bytes += values.len();
+            let mut cache = lock(&self.value_cache);
+            cache.bytes += values.len();
             let key = (self.fragment_of(range.start), column.name.clone());
-            if let Some(twice) = numbers.kept.insert(key, Arc::new(values)) {
-                numbers.bytes -= twice.len();
+            if let Some(duplicate) = cache.columns.insert(key, Arc::new(values)) {
+                cache.bytes -= duplicate.len();
             }
         }
         Ok(())

@@ -1,9 +1,8 @@
-//! Values as Lance decodes them, from any rows of the table.
+//! Reads any rows of a column with Lance's decoder.
 
-use super::super::store::wait;
 use super::LanceReader;
 use super::files::open_at_once;
-use crate::formats::lance::schema::EPISODE;
+use crate::formats::lance::store::block_on;
 use arrow_array::ArrayRef;
 use futures::{StreamExt as _, TryStreamExt as _};
 use lance_encoding::decoder::FilterExpression;
@@ -11,20 +10,21 @@ use lance_io::ReadBatchParams;
 use std::ops::Range;
 use std::sync::Arc;
 use swm_core::Result;
+use swm_core::columns::EPISODE_IDX;
 
-/// Rows per decoded piece; more only costs memory.
-const ROWS_PER_PIECE: u32 = 4096;
+/// Rows per decoded chunk; a larger value only increases memory use.
+const ROWS_PER_CHUNK: u32 = 4096;
 
-/// Consecutive rows of one fragment, as stored.
-pub(super) struct Piece {
+/// Consecutive stored rows of one fragment.
+pub(super) struct StoredRows {
     pub(super) values: ArrayRef,
     pub(super) rows: usize,
 }
 
 impl LanceReader {
-    /// The stored values of disjoint rising ranges of rows of the whole table.
-    pub(super) fn pieces(&self, stored_name: &str, ranges: &[Range<u64>]) -> Result<Vec<Piece>> {
-        // Cut the ranges at the fragments' borders.
+    /// The stored values of disjoint ascending ranges of rows, counted over the table.
+    pub(super) fn stored_rows(&self, stored_name: &str, ranges: &[Range<u64>]) -> Result<Vec<StoredRows>> {
+        // Splits the ranges at fragment boundaries.
         let mut jobs: Vec<(usize, Vec<Range<u64>>)> = vec![];
         for range in ranges.iter().filter(|range| !range.is_empty()) {
             let mut start = range.start;
@@ -41,45 +41,49 @@ impl LanceReader {
                 fragment += 1;
             }
         }
-        let mut pieces = vec![];
+        let mut chunks = vec![];
         for jobs in jobs.chunks(open_at_once(&self.store)) {
-            pieces.extend(self.read_pieces(stored_name, jobs)?);
+            chunks.extend(self.read_stored_rows(stored_name, jobs)?);
         }
-        Ok(pieces)
+        Ok(chunks)
     }
 
     /// The stored values of some rows of some fragments.
-    pub(super) fn read_pieces(&self, stored_name: &str, jobs: &[(usize, Vec<Range<u64>>)]) -> Result<Vec<Piece>> {
+    pub(super) fn read_stored_rows(
+        &self,
+        stored_name: &str,
+        jobs: &[(usize, Vec<Range<u64>>)],
+    ) -> Result<Vec<StoredRows>> {
         if self.store.remote {
             let files = jobs.iter().map(|(fragment, _)| Ok(self.data_file(*fragment, stored_name)?.0.clone()));
             self.open_together(files.collect::<Result<_>>()?)?;
         }
         let mut reads = vec![];
         for (fragment, parts) in jobs {
-            self.verify(self.data_file(*fragment, stored_name)?.0, stored_name != EPISODE)?;
+            self.verify(self.data_file(*fragment, stored_name)?.0, stored_name != EPISODE_IDX)?;
             let (file, projection) = self.locate(*fragment, stored_name)?;
-            let wanted: u64 = parts.iter().map(|part| part.end - part.start).sum();
-            reads.push((file, projection, parts.clone(), wanted));
+            let expected: u64 = parts.iter().map(|part| part.end - part.start).sum();
+            reads.push((file, projection, parts.clone(), expected));
         }
         let action = format!("reading column '{stored_name}'");
-        let lists = wait(self.folder(), &action, async move {
-            futures::stream::iter(reads.into_iter().map(|(file, projection, parts, wanted)| async move {
+        let lists = block_on(self.folder(), &action, async move {
+            futures::stream::iter(reads.into_iter().map(|(file, projection, parts, expected)| async move {
                 let params = ReadBatchParams::Ranges(parts.into());
                 let mut tasks =
-                    file.read_tasks(params, ROWS_PER_PIECE, Some(projection), FilterExpression::no_filter()).await?;
-                let mut pieces = vec![];
+                    file.read_tasks(params, ROWS_PER_CHUNK, Some(projection), FilterExpression::no_filter()).await?;
+                let mut chunks = vec![];
                 while let Some(task) = tasks.next().await {
                     let batch = task.task.await?;
-                    pieces.push(Piece { rows: batch.num_rows(), values: Arc::clone(batch.column(0)) });
+                    chunks.push(StoredRows { rows: batch.num_rows(), values: Arc::clone(batch.column(0)) });
                 }
-                let rows: u64 = pieces.iter().map(|piece| piece.rows as u64).sum();
-                if rows != wanted {
-                    return Err(lance_core::Error::internal(format!("got {rows} rows instead of {wanted}")));
+                let rows: u64 = chunks.iter().map(|chunk| chunk.rows as u64).sum();
+                if rows != expected {
+                    return Err(lance_core::Error::internal(format!("got {rows} rows instead of {expected}")));
                 }
-                Ok(pieces)
+                Ok(chunks)
             }))
             .buffered(16)
-            .try_collect::<Vec<Vec<Piece>>>()
+            .try_collect::<Vec<Vec<StoredRows>>>()
             .await
         })?;
         Ok(lists.into_iter().flatten().collect())

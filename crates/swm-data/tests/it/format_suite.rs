@@ -144,7 +144,7 @@ fn wrong_episodes(path: &Path) {
     missing.row_mut(last).set(1, &[0.5_f32, 0.5]);
     assert!(writer.write_episode(&missing).expect_err("an action").to_string().contains("final observation"));
     let empty = Batch::zeros(&schema(), 0);
-    assert!(writer.write_episode(&empty).expect_err("empty").to_string().contains("no rows"));
+    assert!(writer.write_episode(&empty).expect_err("empty").to_string().contains("without rows"));
     let few = Batch::zeros(&Schema::new(schema().columns()[1..].to_vec()).expect("schema"), 3);
     assert!(writer.write_episode(&few).expect_err("no pixels").to_string().contains("pixels"));
     assert_eq!(writer.episodes(), 5, "nothing of these was taken");
@@ -156,7 +156,7 @@ fn one_writer_at_a_time(path: &Path) {
     let first = writer(path, WriteMode::Create).expect("creates");
     for mode in [WriteMode::Append, WriteMode::Overwrite] {
         let error = writer(path, mode).err().expect("somebody writes there").to_string();
-        assert!(error.contains("somebody else writes"), "{error}");
+        assert!(error.contains("another process writes"), "{error}");
     }
     drop(first);
     write(path, WriteMode::Append, 0..1);

@@ -363,7 +363,7 @@ fn places_that_cannot_be_written_say_why() {
     for mode in [WriteMode::Create, WriteMode::Append, WriteMode::Overwrite] {
         assert!(failure(&other, &schema(), mode).contains("thesis.tex"));
     }
-    assert!(open(&other).err().expect("no dataset").to_string().contains("no Lance table"));
+    assert!(open(&other).err().expect("no dataset").to_string().contains("not a Lance table"));
 }
 
 #[test]

@@ -28,13 +28,13 @@ fn failure(path: &Path) -> String {
 fn parts_become_one_version() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
-    assert!(failure(&path).contains("none to commit"));
+    assert!(failure(&path).contains("no shards to commit"));
     // In any order, and on several threads as on several machines.
     std::thread::scope(|scope| {
         scope.spawn(|| write_part(&path, 2, 3, 7..12));
         scope.spawn(|| write_part(&path, 0, 3, 0..5));
     });
-    assert!(failure(&path).contains("part 1 of 3 is missing"));
+    assert!(failure(&path).contains("shard 1 of 3 is missing"));
     assert!(open(&path).is_err(), "nothing is seen before the commit");
     write_part(&path, 1, 3, 5..7);
     assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 12);
@@ -45,7 +45,7 @@ fn parts_become_one_version() {
     for e in [0, 4, 5, 11] {
         assert_eq!(reader.constants(e).expect("reads")["number"], e.to_string().into_bytes());
     }
-    assert!(failure(&path).contains("none to commit"), "the log is gone");
+    assert!(failure(&path).contains("no shards to commit"), "the log is gone");
     // The content is that of one writer's.
     let whole = folder.path().join("whole.lance");
     write(&whole, WriteMode::Create, 100, 0..12);
@@ -75,8 +75,8 @@ fn a_part_that_was_interrupted_is_continued_or_begun_again() {
         writer.write_episode(&episode(e)).expect("writes");
     }
     drop(writer);
-    assert!(failure(&path).contains("part 0 of 2 is not finished"));
-    assert!(part(&path, WriteMode::Create, 0, 2).err().expect("refused").to_string().contains("begun already"));
+    assert!(failure(&path).contains("shard 0 of 2 is not finished"));
+    assert!(part(&path, WriteMode::Create, 0, 2).err().expect("refused").to_string().contains("already exists"));
     let mut writer = part(&path, WriteMode::Append, 0, 2).expect("continues");
     assert_eq!(writer.episodes(), 2);
     for e in 2..4 {
@@ -104,7 +104,7 @@ fn a_commit_that_was_killed_before_it_cleaned_up_is_not_repeated() {
     crate::fuzz::copy_all(&folder.path().join("kept"), &path.join("_shards"));
     assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 0);
     assert_eq!(open(&path).expect("opens").episodes().len(), 3);
-    assert!(failure(&path).contains("none to commit"));
+    assert!(failure(&path).contains("no shards to commit"));
 }
 
 #[test]
@@ -112,14 +112,14 @@ fn parts_that_do_not_fit_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     let location = Location::from(&path);
-    assert!(part(&path, WriteMode::Create, 3, 3).err().expect("refused").to_string().contains("no part 3 of 3"));
+    assert!(part(&path, WriteMode::Create, 3, 3).err().expect("refused").to_string().contains("no shard 3 of 3"));
     write_part(&path, 0, 2, 0..2);
     write_part(&path, 0, 3, 0..2);
-    assert!(failure(&path).contains("some are parts of"));
+    assert!(failure(&path).contains("there are shards of"));
     drop(part(&path, WriteMode::Overwrite, 0, 3).expect("begins again"));
     std::fs::remove_dir_all(path.join("_shards/0-of-3")).expect("removes");
     let other = Schema::new([ColumnSpec::new("other", DType::Float32, [])]).expect("schema");
     let shard = Shard { index: 1, count: 2 };
     create_shard(&location, &other, options(WriteMode::Create), shard).expect("begins").finish().expect("finishes");
-    assert!(failure(&path).contains("writing a part of"));
+    assert!(failure(&path).contains("writing a shard of"));
 }

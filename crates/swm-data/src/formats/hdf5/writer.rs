@@ -89,7 +89,7 @@ fn lock(path: &Path) -> Result<File> {
     match file.try_lock() {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => {
-            let problem = format!("somebody else writes to {}", path.display());
+            let problem = format!("another process writes to {}", path.display());
             Err(Error::config("dataset", problem, "wait until they are done, or choose another path"))
         }
         Err(TryLockError::Error(e)) => Err(Error::io(path, "locking the file", e)),

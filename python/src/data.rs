@@ -23,7 +23,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use std::ops::Deref;
 use swm::core::{Batch, ColumnSpec, DType, Schema};
-use swm::data::{Constants, ImageCodec, Loaded, WriteMode};
+use swm::data::{Constants, ImageCodec, LoadedBatch, WriteMode};
 
 /// A batch that numpy arrays look at; it goes when the last of them does.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
@@ -32,7 +32,7 @@ struct Held(Kept);
 enum Kept {
     Own(Batch),
     /// Goes back to the loader that made it.
-    Lent(Loaded),
+    Lent(LoadedBatch),
 }
 
 impl Deref for Held {

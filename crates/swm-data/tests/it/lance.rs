@@ -166,7 +166,7 @@ fn episodes_that_break_the_convention_are_refused() {
     refuse(&|e| e.get_mut::<f32>("action").expect("actions")[3] = f32::NAN, "row 1 of 7");
     refuse(&|e| e.get_mut::<f32>("action").expect("actions")[13] = 0.0, "final observation");
     refuse(&|e| e.get_mut::<i64>("variation.agent.color").expect("colours")[4] = 1 << 30, "within ±2^24");
-    refuse(&|e| e.resize(0), "no rows");
+    refuse(&|e| e.resize(0), "without rows");
     assert_eq!(writer.episodes(), 0);
     writer.write_episode(&episode(0)).expect("a good one is still welcome");
     writer.finish().expect("finishes");

@@ -409,7 +409,7 @@ fn pandas() -> String {
             column(json!("task_index"), "task_index", "int64", "int64"),
             column(Value::Null, INDEX, "unicode", "object"),
         ],
-        "creator": {"videos": "stable-worldmodel", "version": env!("CARGO_PKG_VERSION")},
+        "creator": {"library": "stable-worldmodel", "version": env!("CARGO_PKG_VERSION")},
         "pandas_version": "2.2.0",
     })
     .to_string()

@@ -48,11 +48,6 @@ impl Resampler {
         self.columns.len()
     }
 
-    /// Rows of the picture.
-    pub fn height(&self) -> usize {
-        self.rows.len()
-    }
-
     /// Draws the part of the picture that an area of the canvas shows up in.
     pub fn draw(&self, canvas: &Canvas, palette: &Palette, area: Area, rgb: &mut [u8]) {
         let (columns, rows) = area.within(canvas.side());

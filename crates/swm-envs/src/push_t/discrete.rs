@@ -1,7 +1,7 @@
 //! `swm/PushT-Discrete-v1`: Push-T with actions from a polar grid, for planners and models of discrete actions.
 //!
-//! Everything but the actions is [`super::PushT`]'s. The grid is the reference's (`quantizer.py`): equal bins of
-//! radius and of angle, each standing for its middle.
+//! Only the actions differ from [`super::PushT`]. The grid is that of the reference (`quantizer.py`): equal bins of the
+//! radius and of the angle, each of which represents its centre.
 
 use super::{PushT, expert};
 use std::f64::consts::TAU;
@@ -20,45 +20,43 @@ pub const ENTRY: EnvEntry = EnvEntry {
 const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
-        summary: "pushes planned with the world's own physics",
+        summary: "pushes planned with the environment's own physics",
         make: || Box::new(OnGrid(expert::Pusher::new(rounded))),
     },
     ExpertEntry {
         id: "weak",
         summary: "random actions that stay near the block",
-        make: || Box::new(OnGrid(expert::Weak::default())),
+        make: || Box::new(OnGrid(expert::WeakExpert::default())),
     },
 ];
 
-/// Bins of the radius, from 0 to 1, and of the angle, from x towards y.
+/// The number of bins of the radius, from 0 to 1, and of the angle, from x towards y.
 const BINS: [i64; 2] = [16, 16];
 
-/// The actions: bins of radius and angle.
+/// The action space: the bins of radius and angle.
 pub fn space() -> Space {
     Space::MultiDiscrete { nvec: BINS.to_vec(), start: vec![0, 0] }
 }
 
-/// The continuous action that two bins stand for.
-#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation)]
+/// Returns the continuous action that a pair of bins represents.
 pub fn action(bins: &[i64]) -> [f32; 2] {
-    let middle = |i: usize| (bins[i] as f64 + 0.5) / BINS[i] as f64;
-    let (radius, angle) = (middle(0), middle(1) * TAU);
+    let centre = |i: usize| (bins[i] as f64 + 0.5) / BINS[i] as f64;
+    let (radius, angle) = (centre(0), centre(1) * TAU);
     [(radius * angle.cos()) as f32, (radius * angle.sin()) as f32]
 }
 
-/// The bins that a continuous action lies in; outside the circle the outermost.
-#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation)]
+/// Returns the bins of a continuous action; outside the unit circle those of the outermost ring.
 pub fn bins([x, y]: [f64; 2]) -> [i64; 2] {
     let shares = [x.hypot(y), y.atan2(x).rem_euclid(TAU) / TAU];
     std::array::from_fn(|i| ((shares[i] * BINS[i] as f64) as i64).clamp(0, BINS[i] - 1))
 }
 
-/// The action of the grid that stands for a continuous one.
-fn rounded(wanted: [f64; 2]) -> [f64; 2] {
-    action(&bins(wanted)).map(f64::from)
+/// Rounds a continuous action to the grid.
+fn rounded(continuous: [f64; 2]) -> [f64; 2] {
+    action(&bins(continuous)).map(f64::from)
 }
 
-/// An expert of the continuous world whose actions are rounded to the grid.
+/// An expert of the continuous environment whose actions are rounded to the grid.
 struct OnGrid<E>(E);
 
 impl<E: Expert> Expert for OnGrid<E> {
@@ -66,11 +64,10 @@ impl<E: Expert> Expert for OnGrid<E> {
         self.0.begin(key);
     }
 
-    #[allow(clippy::cast_precision_loss)]
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
-        let mut wanted = [0.0; 2];
-        self.0.act(row, &mut wanted)?;
-        action.copy_from_slice(&bins(wanted).map(|bin| bin as f64));
+        let mut continuous = [0.0; 2];
+        self.0.act(row, &mut continuous)?;
+        action.copy_from_slice(&bins(continuous).map(|bin| bin as f64));
         Ok(())
     }
 }
@@ -80,13 +77,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_bin_stands_for_an_action_in_it() {
+    fn every_bin_contains_its_action() {
         for radius in 0..BINS[0] {
             for angle in 0..BINS[1] {
                 assert_eq!(bins(action(&[radius, angle]).map(f64::from)), [radius, angle]);
             }
         }
-        // Corners of the square lie outside the circle; angles are counted from x towards y.
+        // Corners of the square lie outside the circle; angles increase from x towards y.
         assert_eq!(bins([-1.0, -1.0]), [15, 10]);
         assert_eq!(bins([0.0, 0.0]), [0, 0]);
         assert_eq!(bins([0.5, -1e-300]), [8, 15]);

@@ -1,129 +1,131 @@
-//! What the world looks like: the goal pose, the block and the agent with outlines, walls, and red ticks where
-//! shapes touch, as the reference draws it on 512 x 512 pixels and resizes it.
+//! Rendering: the goal pose, the block and the agent with outlines, the walls, and red marks at contacts, drawn at 512 x
+//! 512 pixels as in the reference and resized.
 //!
-//! The table with goal pose and walls does not change within an episode: it is drawn once, and resampled once for
-//! each size. A frame copies it, draws what moves on the canvas, resamples that area, and puts the table back. While
-//! nothing touches the block it rests, so it stays on the canvas from frame to frame and only the agent is drawn.
+//! The table with goal pose and walls is static during an episode: it is drawn once, and resampled once per frame size.
+//! A frame copies it, draws agent and block on the canvas, resamples their area, and restores the canvas. While nothing
+//! touches the block it does not move, so it stays on the canvas from frame to frame and only the agent is drawn.
 
-use super::physics::{AGENT, BLOCK, Pose, Vec2, World};
-use super::shapes::Design;
-use super::{TABLE, WALL_LINES, design};
-use crate::draw::{Area, Canvas, Palette, Point, Resampler, WIDTH};
+use super::factors::body_shape;
+use super::physics::{AGENT, BLOCK, Pose, Simulation, Vec2, visiting_order};
+use super::shapes::BodyShape;
+use super::table::{TABLE, WALL_LINES};
+use crate::draw::{Area, BySize, Canvas, Palette, Point, Resampler, WIDTH};
 use swm_core::{FactorValues, FrameMut};
 
-/// Pixels along a side of the canvas.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+/// Side of the canvas, in pixels.
 const SIDE: usize = TABLE as usize;
-/// How much smaller the light part of a circle is.
+/// Width of the outline of a circle, in pixels.
 const RIM: f64 = 4.0;
-/// By how much the inside of a shape is lighter than its outline.
+/// Factor by which the inside of a shape is lighter than its outline.
 const LIGHTER: f32 = 1.2;
-/// The walls (X11's light gray).
+/// Colour of the walls (X11's light gray).
 const WALL_COLOR: [u8; 3] = [211, 211, 211];
-/// The ticks (pymunk's debug drawing), and how far they reach on both sides of a contact.
-const TICK_COLOR: [u8; 3] = [231, 76, 60];
-const TICK: f64 = 2.0;
-/// The most ticks a picture shows.
-const MAX_TICKS: usize = 32;
+/// Colour of contact marks (pymunk's debug drawing).
+const MARK_COLOR: [u8; 3] = [231, 76, 60];
+/// Length of a contact mark on each side of the contact, in pixels.
+const MARK_LENGTH: f64 = 2.0;
+/// The maximal number of contact marks in a frame.
+const MAX_MARKS: usize = 32;
 
-/// Indices of the palette.
+// Indices of the palette.
 const BACKGROUND: u8 = 0;
 const GOAL: u8 = 1;
 const WALL: u8 = 2;
-/// The outline of the agent; its inside is the next, the block's are the next two.
+/// Indices of the outlines of agent and block; the inside of each has the next index.
 const BODIES: [u8; 2] = [3, 5];
 
-/// What a picture needs to know.
+/// The part of the simulation's state that a frame shows.
 #[derive(Clone)]
-pub struct Scene {
+pub struct DrawnState {
     poses: [Pose; 2],
-    ticks: [Tick; MAX_TICKS],
-    touching: usize,
+    /// The contact marks; the first `contacts` are valid.
+    marks: [ContactMark; MAX_MARKS],
+    contacts: usize,
 }
 
-/// A short line across a contact, and the body it is drawn with.
+/// A short line across a contact.
 #[derive(Clone, Copy, Default)]
-struct Tick {
+struct ContactMark {
+    /// Both ends, in pixels of the table.
     ends: [Vec2; 2],
+    /// The body whose area it belongs to.
     body: usize,
 }
 
-impl Scene {
-    /// The world as it is.
-    pub fn of(world: &World) -> Self {
-        let poses = [world.bodies[AGENT].pose, world.bodies[BLOCK].pose];
-        let mut scene = Self { poses, ticks: [Tick::default(); MAX_TICKS], touching: 0 };
-        for arbiter in world.touching() {
+impl DrawnState {
+    /// Reads the state of a simulation.
+    pub fn of(simulation: &Simulation) -> Self {
+        let poses = [simulation.bodies[AGENT].pose, simulation.bodies[BLOCK].pose];
+        let mut drawn = Self { poses, marks: [ContactMark::default(); MAX_MARKS], contacts: 0 };
+        for arbiter in simulation.touching() {
             let [a, b] = arbiter.bodies();
-            let centres = [a, b].map(|body| world.bodies[body].centre);
+            let centres = [a, b].map(|body| simulation.bodies[body].centre);
             for contact in arbiter.contacts() {
-                let Some(tick) = scene.ticks.get_mut(scene.touching) else { return scene };
-                let ends = [(0, -TICK), (1, TICK)].map(|(i, by)| centres[i] + contact.arms[i] + arbiter.normal * by);
-                *tick = Tick { ends, body: a.min(b) };
-                scene.touching += 1;
+                let Some(mark) = drawn.marks.get_mut(drawn.contacts) else { return drawn };
+                let ends = [(0, -MARK_LENGTH), (1, MARK_LENGTH)]
+                    .map(|(i, by)| centres[i] + contact.arms[i] + arbiter.normal * by);
+                *mark = ContactMark { ends, body: a.min(b) };
+                drawn.contacts += 1;
             }
         }
-        scene
+        drawn
     }
 }
 
-/// Draws scenes of one episode.
-pub struct Renderer {
-    designs: [Design; 2],
-    /// Which rectangles or circles are drawn when, as (body, place in its design).
+/// Draws the frames of an episode.
+pub struct TableRenderer {
+    shapes: [BodyShape; 2],
+    /// The order in which the parts of bodies are drawn, as (body, index of the rectangle).
     order: Vec<(usize, usize)>,
     palette: Palette,
     /// Background, goal pose and walls.
     table: Canvas,
-    /// The same between two frames, with the block where it rests.
+    /// The table, with the block while it does not move.
     canvas: Canvas,
-    resting: Option<Resting>,
-    /// The table at sizes asked for before, the last one first.
-    pictures: Vec<Picture>,
+    /// The block on the canvas.
+    drawn_block: Option<DrawnBlock>,
+    /// The table at the frame sizes in use.
+    resampled: BySize<ResampledTable>,
 }
 
-/// A block on the canvas.
+/// A block that is drawn on the canvas.
 #[derive(Clone, Copy)]
-struct Resting {
+struct DrawnBlock {
     pose: Pose,
     area: Area,
 }
 
-/// The table at one size.
-struct Picture {
+/// The table at one frame size.
+struct ResampledTable {
     resampler: Resampler,
+    /// `[height, width, 3]`.
     table: Vec<u8>,
-    /// Whether `table` shows the table of this episode.
-    current: bool,
-    /// The same with the block where it rests, and whether it does.
-    still: Vec<u8>,
-    resting: bool,
+    /// The table with the block, `[height, width, 3]`; valid if `has_block` is set.
+    with_block: Vec<u8>,
+    has_block: bool,
 }
 
-/// At how many sizes the table is kept.
-const MAX_PICTURES: usize = 4;
-
-impl Renderer {
-    /// A renderer for an episode with these factors.
+impl TableRenderer {
+    /// Makes a renderer for an episode with these factors.
     pub fn new(factors: &FactorValues) -> Self {
         let mut renderer = Self {
-            designs: ["agent", "block"].map(|name| design(factors, name)),
+            shapes: ["agent", "block"].map(|name| body_shape(factors, name)),
             order: vec![],
             palette: Palette::new(&[]),
             table: Canvas::new(SIDE),
             canvas: Canvas::new(SIDE),
-            resting: None,
-            pictures: vec![],
+            drawn_block: None,
+            resampled: BySize::default(),
         };
-        renderer.begin(factors);
+        renderer.begin_episode(factors);
         renderer
     }
 
-    /// Turns to another episode.
-    pub fn begin(&mut self, factors: &FactorValues) {
-        self.designs = ["agent", "block"].map(|name| design(factors, name));
-        let parts = [AGENT, BLOCK].map(|body| self.designs[body].rects.len().max(1));
-        self.order = super::physics::visiting_order(WALL_LINES.len(), parts[0] + parts[1])
+    /// Changes to an episode with these factors.
+    pub fn begin_episode(&mut self, factors: &FactorValues) {
+        self.shapes = ["agent", "block"].map(|name| body_shape(factors, name));
+        let parts = [AGENT, BLOCK].map(|body| self.shapes[body].rects.len().max(1));
+        self.order = visiting_order(WALL_LINES.len(), parts[0] + parts[1])
             .into_iter()
             .map(|i| if i < parts[0] { (AGENT, i) } else { (BLOCK, i - parts[0]) })
             .collect();
@@ -141,60 +143,60 @@ impl Renderer {
         if factors.integer("rendering.render_goal") != 0 {
             let at = factors.get("goal.position");
             let pose = Pose::new(Vec2::new(at[0], at[1]), factors.scalar("goal.angle"), Vec2::ZERO);
-            // As large as the block: the reference samples `goal.scale` and does not look at it.
-            for rect in &self.designs[BLOCK].rects {
+            // As large as the block: the reference samples `goal.scale` and ignores it.
+            for rect in &self.shapes[BLOCK].rects {
                 self.table.fill_polygon(&rect.map(|corner| pixel(pose.point(corner))), GOAL);
             }
         }
         walls().iter().for_each(|&[from, to]| self.table.thick_line(from, to, WALL));
         self.canvas.copy_area(&self.table, Area::square(SIDE));
-        self.resting = None;
-        self.pictures.iter_mut().for_each(|picture| (picture.current, picture.resting) = (false, false));
+        self.drawn_block = None;
+        self.resampled.invalidate();
     }
 
-    /// Draws a scene.
-    pub fn draw(&mut self, scene: &Scene, frame: FrameMut<'_>) {
-        let picture = self.picture(frame.width, frame.height);
-        let areas = [AGENT, BLOCK].map(|body| self.area(body, &scene.poses[body]));
-        if scene.touching == 0 && !areas[AGENT].touches(areas[BLOCK]) {
-            self.rest(&scene.poses[BLOCK], areas[BLOCK]);
-            self.draw_moving(scene, areas[AGENT], picture, frame);
+    /// Draws a frame.
+    pub fn draw(&mut self, drawn: &DrawnState, frame: FrameMut<'_>) {
+        let slot = self.slot(frame.width, frame.height);
+        let areas = [AGENT, BLOCK].map(|body| self.area(body, &drawn.poses[body]));
+        if drawn.contacts == 0 && !areas[AGENT].touches(areas[BLOCK]) {
+            self.draw_block(&drawn.poses[BLOCK], areas[BLOCK]);
+            self.draw_agent(drawn, areas[AGENT], slot, frame);
         } else {
-            self.draw_touching(scene, areas, picture, frame);
+            self.draw_both(drawn, areas, slot, frame);
         }
     }
 
-    /// Draws the agent beside the block where it rests.
-    fn draw_moving(&mut self, scene: &Scene, area: Area, picture: usize, frame: FrameMut<'_>) {
-        let Picture { resampler, table, still, resting, .. } = &mut self.pictures[picture];
-        if !*resting {
-            still.copy_from_slice(table);
-            let block = self.resting.map_or(Area::EMPTY, |block| block.area);
-            resampler.draw(&self.canvas, &self.palette, block, still);
-            *resting = true;
+    /// Draws a frame with the agent apart from the block, which is on the canvas already.
+    fn draw_agent(&mut self, drawn: &DrawnState, area: Area, slot: usize, frame: FrameMut<'_>) {
+        let ResampledTable { resampler, table, with_block, has_block } = &mut self.resampled[slot];
+        if !*has_block {
+            with_block.copy_from_slice(table);
+            let block = self.drawn_block.map_or(Area::EMPTY, |block| block.area);
+            resampler.draw(&self.canvas, &self.palette, block, with_block);
+            *has_block = true;
         }
-        // The area of the agent alone is taken back afterwards; the block is not in it.
-        self.draw_body(AGENT, &scene.poses[AGENT]);
+        // Only the area of the agent is restored afterwards; the block is outside it.
+        self.draw_body(AGENT, &drawn.poses[AGENT]);
         self.canvas.draw_walls(&[area]);
-        let Picture { resampler, still, .. } = &self.pictures[picture];
-        frame.rgb.copy_from_slice(still);
+        let ResampledTable { resampler, with_block, .. } = &self.resampled[slot];
+        frame.rgb.copy_from_slice(with_block);
         resampler.draw(&self.canvas, &self.palette, area, frame.rgb);
         self.canvas.copy_area(&self.table, area);
     }
 
-    /// Draws everything that moves, part by part in the reference's order, and ticks where it touches.
-    fn draw_touching(&mut self, scene: &Scene, mut areas: [Area; 2], picture: usize, frame: FrameMut<'_>) {
-        self.lift();
+    /// Draws a frame with both bodies, part by part in the reference's order, and marks at their contacts.
+    fn draw_both(&mut self, drawn: &DrawnState, mut areas: [Area; 2], slot: usize, frame: FrameMut<'_>) {
+        self.erase_block();
         for &(body, part) in &self.order {
-            self.canvas.draw_part(&self.designs[body], body, part, &scene.poses[body]);
+            self.canvas.draw_part(&self.shapes[body], body, part, &drawn.poses[body]);
         }
         self.canvas.draw_walls(&areas);
-        for tick in &scene.ticks[..scene.touching] {
-            let [from, to] = tick.ends.map(pixel);
-            self.canvas.fine_line(from, to, TICK_COLOR, &mut self.palette);
-            areas[tick.body] = areas[tick.body].with(from, 1).with(to, 1);
+        for mark in &drawn.marks[..drawn.contacts] {
+            let [from, to] = mark.ends.map(pixel);
+            self.canvas.fine_line(from, to, MARK_COLOR, &mut self.palette);
+            areas[mark.body] = areas[mark.body].with(from, 1).with(to, 1);
         }
-        let Picture { resampler, table, .. } = &self.pictures[picture];
+        let ResampledTable { resampler, table, .. } = &self.resampled[slot];
         frame.rgb.copy_from_slice(table);
         for area in areas {
             resampler.draw(&self.canvas, &self.palette, area, frame.rgb);
@@ -205,144 +207,139 @@ impl Renderer {
         self.palette.drop_blended();
     }
 
-    /// Draws all of a body.
+    /// Draws all parts of a body on the canvas.
     fn draw_body(&mut self, body: usize, pose: &Pose) {
         for &(_, part) in self.order.iter().filter(|(owner, _)| *owner == body) {
-            self.canvas.draw_part(&self.designs[body], body, part, pose);
+            self.canvas.draw_part(&self.shapes[body], body, part, pose);
         }
     }
 
-    /// Puts the block on the canvas, unless it rests there already.
-    fn rest(&mut self, pose: &Pose, area: Area) {
-        if self.resting.is_some_and(|block| block.pose == *pose) {
+    /// Draws the block on the canvas, unless it is there already.
+    fn draw_block(&mut self, pose: &Pose, area: Area) {
+        if self.drawn_block.is_some_and(|block| block.pose == *pose) {
             return;
         }
-        self.lift();
+        self.erase_block();
         self.draw_body(BLOCK, pose);
         self.canvas.draw_walls(&[area]);
-        self.resting = Some(Resting { pose: *pose, area });
+        self.drawn_block = Some(DrawnBlock { pose: *pose, area });
     }
 
-    /// Takes the block off the canvas.
-    fn lift(&mut self) {
-        if let Some(block) = self.resting.take() {
+    /// Removes the block from the canvas.
+    fn erase_block(&mut self) {
+        if let Some(block) = self.drawn_block.take() {
             self.canvas.copy_area(&self.table, block.area);
-            self.pictures.iter_mut().for_each(|picture| picture.resting = false);
+            self.resampled.values_mut().for_each(|resampled| resampled.has_block = false);
         }
     }
 
-    /// The pixels of a body.
+    /// Returns an area that contains the pixels of a body.
     fn area(&self, body: usize, pose: &Pose) -> Area {
-        let design = &self.designs[body];
-        if design.is_circle() {
-            return Area::EMPTY.with(pixel(pose.origin), whole(design.radius));
+        let shape = &self.shapes[body];
+        if shape.is_circle() {
+            return Area::EMPTY.with(pixel(pose.origin), whole(shape.radius));
         }
-        let corners = design.rects.iter().flatten().map(|&corner| pixel(pose.point(corner)));
+        let corners = shape.rects.iter().flatten().map(|&corner| pixel(pose.point(corner)));
         corners.fold(Area::EMPTY, |area, corner| area.with(corner, WIDTH / 2 + 1))
     }
 
-    /// The place of the table at this size.
-    fn picture(&mut self, width: usize, height: usize) -> usize {
-        let is_it = |picture: &Picture| (picture.resampler.width(), picture.resampler.height()) == (width, height);
-        let place = self.pictures.iter().position(is_it).unwrap_or_else(|| {
+    /// Returns the cache slot of the table at a frame size.
+    fn slot(&mut self, width: usize, height: usize) -> usize {
+        let create = || {
             let blank = || vec![0; width * height * 3];
-            let (resampler, table, still) = (Resampler::new(SIDE, width, height), blank(), blank());
-            self.pictures.truncate(MAX_PICTURES - 1);
-            self.pictures.insert(0, Picture { resampler, table, current: false, still, resting: false });
-            0
-        });
-        let picture = &mut self.pictures[place];
-        if !picture.current {
-            picture.resampler.draw(&self.table, &self.palette, Area::square(SIDE), &mut picture.table);
-            picture.current = true;
-        }
-        place
+            let resampler = Resampler::new(SIDE, width, height);
+            ResampledTable { resampler, table: blank(), with_block: blank(), has_block: false }
+        };
+        self.resampled.slot(width, height, create, |resampled| {
+            resampled.resampler.draw(&self.table, &self.palette, Area::square(SIDE), &mut resampled.table);
+            resampled.has_block = false;
+        })
     }
 }
 
 impl Canvas {
     /// Draws a rectangle of a body, or its circle.
-    fn draw_part(&mut self, design: &Design, body: usize, part: usize, pose: &Pose) {
+    fn draw_part(&mut self, shape: &BodyShape, body: usize, part: usize, pose: &Pose) {
         let (rim, inside) = (BODIES[body], BODIES[body] + 1);
-        if design.is_circle() {
+        if shape.is_circle() {
             let centre = pixel(pose.origin);
-            self.fill_circle(centre, whole(design.radius), rim);
-            self.fill_circle(centre, whole(design.radius - RIM), inside);
+            self.fill_circle(centre, whole(shape.radius), rim);
+            self.fill_circle(centre, whole(shape.radius - RIM), inside);
             return;
         }
-        let corners = design.rects[part].map(|corner| pixel(pose.point(corner)));
+        let corners = shape.rects[part].map(|corner| pixel(pose.point(corner)));
         self.fill_polygon(&corners, inside);
         for i in 0..4 {
             self.thick_line(corners[i], corners[(i + 1) % 4], rim);
         }
     }
 
-    /// Draws the walls again that bodies in these areas may cover.
+    /// Draws again the walls that bodies in these areas may cover.
     fn draw_walls(&mut self, areas: &[Area]) {
         for wall in walls() {
-            if areas.iter().any(|area| area.touches(around(&wall))) {
+            if areas.iter().any(|area| area.touches(line_area(&wall))) {
                 self.thick_line(wall[0], wall[1], WALL);
             }
         }
     }
 }
 
-/// The pixel of the canvas at a place of the table.
-fn pixel(place: Vec2) -> Point {
-    Point::nearest(place.x, place.y)
+/// Returns the pixel of the canvas at a point of the table.
+fn pixel(point: Vec2) -> Point {
+    Point::nearest(point.x, point.y)
 }
 
-#[allow(clippy::cast_possible_truncation)]
 fn whole(radius: f64) -> i32 {
     radius.round_ties_even() as i32
 }
 
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn lighter(color: [u8; 3]) -> [u8; 3] {
     color.map(|v| (f32::from(v) * LIGHTER).round_ties_even().min(255.0) as u8)
 }
 
-/// The middle lines of the walls.
+/// The centre lines of the walls, in pixels of the canvas.
 fn walls() -> [[Point; 2]; 4] {
     WALL_LINES.map(|line| line.map(|[x, y]| Point::nearest(x, y)))
 }
 
-/// The pixels of a bar.
-fn around(bar: &[Point; 2]) -> Area {
-    bar.iter().fold(Area::EMPTY, |area, &end| area.with(end, WIDTH / 2 + 1))
+/// Returns an area that contains the pixels of a thick line.
+fn line_area(line: &[Point; 2]) -> Area {
+    line.iter().fold(Area::EMPTY, |area, &end| area.with(end, WIDTH / 2 + 1))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::push_t::{place, settle, start_of, variation_space, world_of};
+    use crate::push_t::factors::variation_space;
+    use crate::push_t::state::{set_state, settled, start_state, state_of};
+    use crate::push_t::table::simulation;
     use swm_core::{Key, VariationRequest};
 
     #[test]
-    fn a_block_that_rests_on_the_canvas_changes_no_picture() {
+    fn keeping_the_block_on_the_canvas_changes_no_frame() {
         let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
         let space = variation_space();
         let mut apart = 0;
         for seed in 0..40 {
             let factors = space.resolve(&all, Key::new(seed)).expect("factors");
-            let mut renderer = Renderer::new(&factors);
-            let mut world = settle(world_of(&factors), &start_of(&factors));
+            let mut renderer = TableRenderer::new(&factors);
+            let mut simulation = settled(simulation(&factors), &start_state(&factors));
             for t in 0..6 {
                 // The block moves every third time, the agent always.
-                let mut state = crate::push_t::state_of(&world);
+                let mut state = state_of(&simulation);
                 state[0] = (state[0] + 71.0 * f64::from(t)) % TABLE;
                 state[2] = if t % 3 == 2 { (state[2] + 150.0) % TABLE } else { state[2] };
-                place(&mut world, &state);
-                let scene = Scene { touching: if t == 4 { 1 } else { 0 }, ..Scene::of(&world) };
+                set_state(&mut simulation, &state);
+                let drawn = DrawnState { contacts: if t == 4 { 1 } else { 0 }, ..DrawnState::of(&simulation) };
                 for side in [64, 100] {
-                    let [mut got, mut wanted] = [vec![0; side * side * 3], vec![0; side * side * 3]];
-                    renderer.draw(&scene, FrameMut::new(side, side, &mut got));
-                    let mut other = Renderer::new(&factors);
-                    let areas = [AGENT, BLOCK].map(|body| other.area(body, &scene.poses[body]));
-                    apart += usize::from(scene.touching == 0 && !areas[AGENT].touches(areas[BLOCK]));
-                    let picture = other.picture(side, side);
-                    other.draw_touching(&scene, areas, picture, FrameMut::new(side, side, &mut wanted));
-                    assert!(got == wanted, "seed {seed}, frame {t}, {side} pixels");
+                    let [mut frame, mut expected] = [vec![0; side * side * 3], vec![0; side * side * 3]];
+                    renderer.draw(&drawn, FrameMut::new(side, side, &mut frame));
+                    let mut other = TableRenderer::new(&factors);
+                    let areas = [AGENT, BLOCK].map(|body| other.area(body, &drawn.poses[body]));
+                    apart += usize::from(drawn.contacts == 0 && !areas[AGENT].touches(areas[BLOCK]));
+                    let slot = other.slot(side, side);
+                    other.draw_both(&drawn, areas, slot, FrameMut::new(side, side, &mut expected));
+                    assert!(frame == expected, "seed {seed}, frame {t}, {side} pixels");
                 }
             }
         }

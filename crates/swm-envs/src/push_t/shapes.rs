@@ -1,61 +1,60 @@
-//! The shapes of the agent and the block: a circle, or a few rectangles glued together.
+//! The shapes of the agent and the block: a circle, or a union of rectangles.
 //!
-//! Dimensions, the way the centre of gravity is chosen (the mean of the rectangles' centres, whatever their
-//! size) and the moments of inertia are those of the reference (env.py), oddities included: some shapes add up
-//! the moment of their first rectangle.
+//! Dimensions, centres of gravity and moments of inertia are those of the reference (`env.py`). The centre of gravity is
+//! the mean of the rectangles' centres, whatever their size, and some shapes count the moment of their first rectangle
+//! several times, as there.
 
 use super::physics::{Body, Shape, Vec2};
 use std::f64::consts::{PI, TAU};
 
-/// A radius for a scale of 1.
+/// The radius of a circle of scale 1, in pixels.
 const CIRCLE_RADIUS: f32 = 0.375;
 
-/// A rectangle: `[left, top, right, bottom]`, in body coordinates.
+/// A rectangle `[left, top, right, bottom]`, in body coordinates.
 type Rect = [f32; 4];
 
-/// What a body looks like.
+/// The shape of a body. Lengths are in pixels, coordinates relative to the body's origin.
 #[derive(Clone, Debug)]
-pub struct Design {
-    /// The rectangles; none for a circle.
+pub struct BodyShape {
+    /// The corners of the rectangles; empty for a circle.
     pub rects: Vec<[Vec2; 4]>,
     /// The radius of a circle.
     pub radius: f64,
-    /// The centre of gravity, in body coordinates.
+    /// The centre of gravity.
     pub cog: Vec2,
-    /// The moment of inertia at mass 1.
+    /// The moment of inertia at mass 1, in pixels².
     inertia: f64,
 }
 
-impl Design {
-    /// A shape by its number (0 circle, 1 L, 2 T, 3 Z, 4 square, 5 I, 6 small T, 7 +), at this scale.
+impl BodyShape {
+    /// Makes the shape of an index (0 circle, 1 L, 2 T, 3 Z, 4 square, 5 I, 6 small T, 7 +) at a scale in pixels.
     ///
-    /// Corners are computed in single precision because scales are sampled in it.
-    #[allow(clippy::cast_possible_truncation)]
+    /// Corners are computed in single precision, because scales are sampled in it.
     pub fn new(shape: i64, scale: f64) -> Self {
         let s = scale as f32;
         match shape {
             0 => Self { rects: vec![], radius: f64::from(CIRCLE_RADIUS * s), cog: Vec2::ZERO, inertia: f64::INFINITY },
-            1 => Self::of(&[[0.0, 0.0, s, s * 2.0], [0.0, -s, s * 2.0, 0.0]], &[0, 1]),
-            2 => Self::of(&[[-2.0 * s, 0.0, 2.0 * s, s], [-s / 2.0, s, s / 2.0, 4.0 * s]], &[0, 0]),
+            1 => Self::union(&[[0.0, 0.0, s, s * 2.0], [0.0, -s, s * 2.0, 0.0]], &[0, 1]),
+            2 => Self::union(&[[-2.0 * s, 0.0, 2.0 * s, s], [-s / 2.0, s, s / 2.0, 4.0 * s]], &[0, 0]),
             3 => {
                 let (half, wide) = (s / 2.0, 3.0 * s / 2.0);
-                Self::of(&[[-half, 0.0, wide, s], [-wide, -s, half, 0.0]], &[0, 1])
+                Self::union(&[[-half, 0.0, wide, s], [-wide, -s, half, 0.0]], &[0, 1])
             }
-            4 => Self::of(&[[-s, -s, s, s]], &[0]),
-            5 => Self::of(&[[-s / 2.0, -2.0 * s, s / 2.0, 2.0 * s]], &[0]),
+            4 => Self::union(&[[-s, -s, s, s]], &[0]),
+            5 => Self::union(&[[-s / 2.0, -2.0 * s, s / 2.0, 2.0 * s]], &[0]),
             6 => {
                 let wide = 3.0 * s / 2.0;
-                Self::of(&[[-wide, 0.0, wide, s], [-s / 2.0, s, s / 2.0, 2.0 * s]], &[0, 1])
+                Self::union(&[[-wide, 0.0, wide, s], [-s / 2.0, s, s / 2.0, 2.0 * s]], &[0, 1])
             }
             _ => {
                 let (wide, half) = (3.0 * s / 2.0, s / 2.0);
-                Self::of(&[[-wide, -half, wide, half], [-half, half, half, wide], [-half, -wide, half, -half]], &[0; 3])
+                Self::union(&[[-wide, -half, wide, half], [-half, half, half, wide], [-half, -wide, half, -half]], &[0; 3])
             }
         }
     }
 
-    /// Rectangles; `inertias` names those whose moments are added up.
-    fn of(rects: &[Rect], inertias: &[usize]) -> Self {
+    /// Makes a union of rectangles; `inertias` are the indices of those whose moments are summed.
+    fn union(rects: &[Rect], inertias: &[usize]) -> Self {
         let rects: Vec<[Vec2; 4]> = rects
             .iter()
             .map(|rect| {
@@ -64,14 +63,13 @@ impl Design {
             })
             .collect();
         let sum = rects.iter().map(centroid).reduce(|a, b| a + b).unwrap_or_default();
-        #[allow(clippy::cast_precision_loss)]
         let count = rects.len() as f64;
         let cog = Vec2::new(sum.x / count, sum.y / count);
         let inertia = inertias.iter().map(|&i| moment(&rects[i])).sum();
         Self { rects, radius: 0.0, cog, inertia }
     }
 
-    /// The smallest turn after which a shape looks the same.
+    /// Returns the smallest rotation after which a shape looks the same, in radians.
     pub fn symmetry(shape: i64) -> f64 {
         match shape {
             3 | 5 => PI,
@@ -80,19 +78,19 @@ impl Design {
         }
     }
 
-    /// Whether it is a circle, which moves like a hand: nothing pushes it.
+    /// Returns whether the shape is a circle. Circles have infinite mass, so nothing pushes them.
     pub fn is_circle(&self) -> bool {
         self.rects.is_empty()
     }
 
-    /// A body of this shape, at the origin.
+    /// Makes a body of this shape at the origin.
     pub fn body(&self) -> Body {
         let mass = if self.is_circle() { f64::INFINITY } else { 1.0 };
         Body::new(mass, self.inertia, self.cog)
     }
 
-    /// Its collision shapes, for the body of this place.
-    pub fn shapes(&self, body: usize) -> Vec<Shape> {
+    /// Makes the collision shapes for the body of this index.
+    pub fn colliders(&self, body: usize) -> Vec<Shape> {
         if self.is_circle() {
             return vec![Shape::circle(body, self.radius)];
         }
@@ -104,7 +102,7 @@ fn edges(corners: &[Vec2; 4]) -> impl Iterator<Item = (Vec2, Vec2)> {
     (0..4).map(|i| (corners[i], corners[(i + 1) % 4]))
 }
 
-/// The centroid of a polygon.
+/// Returns the centroid of a polygon.
 fn centroid(corners: &[Vec2; 4]) -> Vec2 {
     let (mut area, mut sum) = (0.0, Vec2::ZERO);
     for (a, b) in edges(corners) {
@@ -115,7 +113,7 @@ fn centroid(corners: &[Vec2; 4]) -> Vec2 {
     sum * (1.0 / (3.0 * area))
 }
 
-/// The moment of inertia of a polygon of mass 1 about the origin of its coordinates.
+/// Returns the moment of inertia of a polygon of mass 1 about the origin of its coordinates.
 fn moment(corners: &[Vec2; 4]) -> f64 {
     let (mut weighted, mut area) = (0.0, 0.0);
     for (a, b) in edges(corners) {
@@ -131,19 +129,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_long_tee_has_the_moment_and_centre_of_the_reference() {
-        let tee = Design::new(2, 30.0);
-        assert_eq!(tee.cog, Vec2::new(0.0, 45.0));
+    fn long_t_has_the_moment_and_centre_of_the_reference() {
+        let long_t = BodyShape::new(2, 30.0);
+        assert_eq!(long_t.cog, Vec2::new(0.0, 45.0));
         // Two moments of a 120 x 30 bar about the middle of its long side.
-        assert!((tee.inertia - 2.0 * (120.0f64.powi(2) + 4.0 * 30.0f64.powi(2)) / 12.0).abs() < 1e-9);
+        assert!((long_t.inertia - 2.0 * (120.0f64.powi(2) + 4.0 * 30.0f64.powi(2)) / 12.0).abs() < 1e-9);
     }
 
     #[test]
-    fn every_shape_but_the_circle_can_be_pushed() {
+    fn every_shape_but_the_circle_is_dynamic() {
         for shape in 0..8 {
-            let design = Design::new(shape, 40.0);
-            assert_eq!(design.body().is_dynamic(), shape != 0, "shape {shape}");
-            assert!(!design.shapes(0).is_empty());
+            let body_shape = BodyShape::new(shape, 40.0);
+            assert_eq!(body_shape.body().is_dynamic(), shape != 0, "shape {shape}");
+            assert!(!body_shape.colliders(0).is_empty());
         }
     }
 }

@@ -1,10 +1,11 @@
-//! Who demonstrates.
+//! The experts of Push-T: [`Pusher`] plans pushes in a copy of the simulation, [`WeakExpert`] acts at random near the
+//! block.
 
-mod model;
+mod configuration_space;
+mod paths;
+mod push_model;
 mod pusher;
-mod room;
-mod route;
 mod weak;
 
 pub use pusher::Pusher;
-pub use weak::Weak;
+pub use weak::WeakExpert;

@@ -1,85 +1,91 @@
-//! Pushes planned with the world's own physics.
+//! [`Pusher`]: the expert that plans pushes in a copy of the simulation.
 //!
-//! A plan is a way around the block to a place beside it, and a push from there: a direction, a strength, and for
-//! how many steps. Every place around the block is tried in a copy of the world, and the push that brings the block
-//! nearer to its goal fastest wins. Where none does, a push is looked for that makes another one possible. When the block
-//! is in place, the agent walks to its own goal.
+//! A plan is a path around the block to a point beside it, and a push from there: a direction, a strength and a number of
+//! steps. Pushes from all around the block are tried in the model, and the one that reduces the error fastest wins. Where
+//! none does, the expert searches for a push that makes a good one possible. When the block is at its goal, the agent
+//! walks to its own goal.
 
-use super::model::{Choices, Model, Push, Situation};
-use super::route::Ways;
+use super::paths::ShortestPaths;
+use super::push_model::{Candidates, Observation, Push, PushModel};
+use crate::push_t::TABLE;
 use crate::push_t::physics::Vec2;
-use crate::push_t::{State, TABLE, checked};
+use crate::push_t::state::{State, checked};
 use swm_core::policy::Expert;
 use swm_core::{Key, Result, Rng, RowRef};
 
-/// The pushes tried first, and the coarser ones tried after each of some random pushes.
-const FINE: Choices<'_> = Choices { spacing: 20.0, leans: &[0.0, -0.45, 0.45], strengths: &[0.3, 1.0] };
-const COARSE: Choices<'_> = Choices { spacing: 40.0, leans: &[0.0], strengths: &[1.0] };
-/// How many random pushes.
+/// The pushes that are tried first.
+const FINE: Candidates<'_> = Candidates { spacing: 20.0, angles: &[0.0, -0.45, 0.45], strengths: &[0.3, 1.0] };
+/// The pushes that are tried after each random push.
+const COARSE: Candidates<'_> = Candidates { spacing: 40.0, angles: &[0.0], strengths: &[1.0] };
+/// The number of random pushes that are tried.
 const DETOURS: usize = 40;
-/// A push should bring the block nearer by this many pixels, and by this many in a step.
-const PROGRESS: f64 = 0.5;
-const PACE: f64 = 0.1;
-/// The block is left alone when it is nearer to its goal than this, in pixels and radians.
+/// The least reduction of the error that a push must achieve, in pixels.
+const MIN_PROGRESS: f64 = 0.5;
+/// The least reduction of the error per step that a push must achieve, in pixels.
+const MIN_RATE: f64 = 0.1;
+/// The block is not pushed any more when it is nearer to its goal than this, in pixels and radians.
 const IN_PLACE: (f64, f64) = (12.0, 0.28);
-/// A place on the way is passed at the first distance, in pixels; a push begins at the second.
+/// A waypoint counts as passed within this distance, in pixels.
 const PASSED: f64 = 5.0;
+/// A push starts within this distance of its starting point, in pixels.
 const ARRIVED: f64 = 2.0;
-/// After this many steps a plan that has not ended is given up.
+/// A plan that has not ended after this many steps is abandoned.
 const PATIENCE: usize = 60;
 
 /// The expert.
 pub struct Pusher {
-    /// What the world makes of an action.
-    snap: fn([f64; 2]) -> [f64; 2],
+    /// Rounds an action to one that the environment has.
+    round_action: fn([f64; 2]) -> [f64; 2],
     rng: Rng,
-    model: Option<Model>,
+    model: Option<PushModel>,
     plan: Plan,
 }
 
-/// What to do next.
+/// A path and the push at its end.
 #[derive(Default)]
 struct Plan {
-    /// Places to go to first, the next one last.
-    way: Vec<Vec2>,
-    /// The action of the push, and how many steps of it are left.
+    /// The remaining waypoints, in reverse order.
+    waypoints: Vec<Vec2>,
+    /// The action of the push.
     push: [f64; 2],
+    /// The remaining steps of the push.
     steps: usize,
-    /// Steps until the plan is given up.
+    /// Steps until the plan is abandoned.
     patience: usize,
 }
 
 impl From<Push> for Plan {
     fn from(push: Push) -> Self {
-        Self { way: push.way, push: push.action, steps: push.steps, patience: PATIENCE }
+        Self { waypoints: push.waypoints, push: push.action, steps: push.steps, patience: PATIENCE }
     }
 }
 
 impl Plan {
-    fn walk(way: Vec<Vec2>) -> Self {
-        Self { way, patience: PATIENCE, ..Self::default() }
+    /// Makes a plan that only walks.
+    fn walk(waypoints: Vec<Vec2>) -> Self {
+        Self { waypoints, patience: PATIENCE, ..Self::default() }
     }
 
-    /// Forgets the places of the way that are reached.
-    fn pass(&mut self, agent: Vec2) {
-        while let Some(&next) = self.way.last() {
-            let near = if self.way.len() == 1 && self.steps > 0 { ARRIVED } else { PASSED };
+    /// Drops the waypoints that the agent has reached.
+    fn drop_reached(&mut self, agent: Vec2) {
+        while let Some(&next) = self.waypoints.last() {
+            let near = if self.waypoints.len() == 1 && self.steps > 0 { ARRIVED } else { PASSED };
             if (next - agent).length() >= near {
                 break;
             }
-            self.way.pop();
+            self.waypoints.pop();
         }
     }
 
     fn is_over(&self) -> bool {
-        (self.way.is_empty() && self.steps == 0) || self.patience == 0
+        (self.waypoints.is_empty() && self.steps == 0) || self.patience == 0
     }
 }
 
 impl Pusher {
-    /// An expert for a world that turns every action into `snap` of it.
-    pub fn new(snap: fn([f64; 2]) -> [f64; 2]) -> Self {
-        Self { snap, rng: Key::new(0).rng(), model: None, plan: Plan::default() }
+    /// Makes an expert for an environment that rounds actions by `round_action`.
+    pub fn new(round_action: fn([f64; 2]) -> [f64; 2]) -> Self {
+        Self { round_action, rng: Key::new(0).rng(), model: None, plan: Plan::default() }
     }
 }
 
@@ -93,16 +99,16 @@ impl Expert for Pusher {
         let state = checked(row.get::<f64>("state")?, "state")?;
         let goal = checked(row.get::<f64>("goal_state")?, "goal_state")?;
         let shapes: [f64; 4] = row.get::<f64>("shapes")?.try_into().unwrap_or_default();
-        let now = Situation { state, angle: row.get::<f64>("agent_pose")?[2] };
+        let now = Observation { state, agent_angle: row.get::<f64>("agent_pose")?[2] };
         let known = self.model.take().filter(|model| model.shapes == shapes);
-        let model = self.model.insert(known.unwrap_or_else(|| Model::new(shapes, self.snap)));
-        self.plan.pass(now.agent());
+        let model = self.model.insert(known.unwrap_or_else(|| PushModel::new(shapes, self.round_action)));
+        self.plan.drop_reached(now.agent());
         if self.plan.is_over() {
-            self.plan = plan(model, &now, &goal, &mut self.rng);
-            self.plan.pass(now.agent());
+            self.plan = next_plan(model, &now, &goal, &mut self.rng);
+            self.plan.drop_reached(now.agent());
         }
         self.plan.patience = self.plan.patience.saturating_sub(1);
-        let wanted = match self.plan.way.last() {
+        let planned = match self.plan.waypoints.last() {
             Some(&next) => model.approach(&now, next),
             None if self.plan.steps > 0 => {
                 self.plan.steps -= 1;
@@ -110,28 +116,28 @@ impl Expert for Pusher {
             }
             None => [0.0; 2],
         };
-        action.copy_from_slice(&wanted);
+        action.copy_from_slice(&planned);
         Ok(())
     }
 }
 
-/// What to do now.
-fn plan(model: &mut Model, now: &Situation, goal: &State, rng: &mut Rng) -> Plan {
-    let (apart, turn) = model.apart(&now.state, goal);
-    if apart < IN_PLACE.0 && turn < IN_PLACE.1 {
-        let room = model.room(now);
-        let ways = Ways::from(&room, now.agent());
-        let home = Vec2::new(goal[0], goal[1]);
-        return Plan::walk(ways.to(home).map_or_else(|| vec![home], |(_, node)| ways.places(home, node)));
+/// Makes the plan for the observed state.
+fn next_plan(model: &mut PushModel, now: &Observation, goal: &State, rng: &mut Rng) -> Plan {
+    let (distance, angle) = model.block_distance(&now.state, goal);
+    if distance < IN_PLACE.0 && angle < IN_PLACE.1 {
+        let space = model.configuration_space(now);
+        let paths = ShortestPaths::from(&space, now.agent());
+        let end = Vec2::new(goal[0], goal[1]);
+        return Plan::walk(paths.to(end).map_or_else(|| vec![end], |(_, node)| paths.waypoints(end, node)));
     }
-    let wanted = model.error(&now.state, goal) - PROGRESS;
-    let good = |push: &Push| push.error < wanted && push.rate > PACE;
-    if let Some(push) = model.best_push(now, goal, &FINE).filter(good) {
+    let max_error = model.error(&now.state, goal) - MIN_PROGRESS;
+    let is_good = |push: &Push| push.error < max_error && push.rate > MIN_RATE;
+    if let Some(push) = model.best_push(now, goal, &FINE).filter(is_good) {
         return push.into();
     }
     match model.best_detour(now, goal, DETOURS, &COARSE, rng) {
         Some(push) => push.into(),
-        // Nowhere to push from: perhaps from the middle of the table.
+        // No starting point is reachable. From the centre of the table one may be.
         None => Plan::walk(vec![Vec2::new(TABLE / 2.0, TABLE / 2.0)]),
     }
 }

@@ -1,25 +1,26 @@
-//! Random actions near the block.
+//! [`WeakExpert`]: random actions near the block.
 
 use crate::push_t::ACTION_SCALE;
 use rand::Rng as _;
 use swm_core::policy::Expert;
 use swm_core::{Key, Result, Rng, RowRef};
 
-/// Uniformly random actions whose targets stay near the block, so that something happens now and then.
-pub struct Weak {
+/// Uniformly random actions whose targets stay near the block, so that the agent pushes it now and then.
+pub struct WeakExpert {
     rng: Rng,
 }
 
-/// How far from the block's origin targets may lie, along each axis, in pixels (reference: expert_policy.py).
+/// The maximal distance of a target from the block's origin along each axis, in pixels (`expert_policy.py` of the
+/// reference).
 const NEAR: f64 = 100.0;
 
-impl Default for Weak {
+impl Default for WeakExpert {
     fn default() -> Self {
         Self { rng: Key::new(0).rng() }
     }
 }
 
-impl Expert for Weak {
+impl Expert for WeakExpert {
     fn begin(&mut self, key: Key) {
         self.rng = key.rng();
     }

@@ -1,9 +1,9 @@
-//! Axis-aligned boxes.
+//! Axis-aligned bounding boxes.
 
-use super::Vec2;
+use super::vec2::Vec2;
 use bytemuck::{Pod, Zeroable};
 
-/// An axis-aligned box.
+/// An axis-aligned bounding box, in pixels of the table.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Bounds {
@@ -14,22 +14,22 @@ pub struct Bounds {
 }
 
 impl Bounds {
-    /// The box of no point.
-    pub const NOTHING: Self =
+    /// The empty box.
+    pub const EMPTY: Self =
         Self { low: Vec2::new(f64::INFINITY, f64::INFINITY), high: Vec2::new(f64::NEG_INFINITY, f64::NEG_INFINITY) };
 
-    /// The box that also holds `p`.
+    /// Returns the smallest box that also contains `p`.
     pub fn with(self, p: Vec2) -> Self {
         self.merged(Self { low: p, high: p })
     }
 
-    /// The box with `by` more on every side.
+    /// Returns the box enlarged by `by` on every side.
     pub fn grown(self, by: f64) -> Self {
         let by = Vec2::new(by, by);
         Self { low: self.low - by, high: self.high + by }
     }
 
-    /// The box of both.
+    /// Returns the smallest box that contains both.
     pub fn merged(self, other: Self) -> Self {
         Self {
             low: Vec2::new(self.low.x.min(other.low.x), self.low.y.min(other.low.y)),
@@ -37,7 +37,7 @@ impl Bounds {
         }
     }
 
-    /// Whether the boxes touch.
+    /// Returns whether the boxes touch.
     pub fn intersects(&self, other: &Self) -> bool {
         self.low.x <= other.high.x
             && other.low.x <= self.high.x
@@ -45,7 +45,7 @@ impl Bounds {
             && other.low.y <= self.high.y
     }
 
-    /// Whether `other` lies inside.
+    /// Returns whether `other` lies inside.
     pub fn contains(&self, other: &Self) -> bool {
         self.low.x <= other.low.x
             && self.high.x >= other.high.x
@@ -53,7 +53,7 @@ impl Bounds {
             && self.high.y >= other.high.y
     }
 
-    /// The middle.
+    /// The centre.
     pub fn centre(&self) -> Vec2 {
         self.low.lerp(self.high, 0.5)
     }
@@ -63,7 +63,7 @@ impl Bounds {
         (self.high.x - self.low.x) * (self.high.y - self.low.y)
     }
 
-    /// How far the middles are apart, in a norm that is cheap.
+    /// Returns twice the Manhattan distance between the centres.
     pub fn proximity(&self, other: &Self) -> f64 {
         (self.low.x + self.high.x - other.low.x - other.high.x).abs()
             + (self.low.y + self.high.y - other.low.y - other.high.y).abs()

@@ -1,41 +1,43 @@
-//! Where two shapes touch.
+//! Contact search between two shapes, operation by operation that of Chipmunk (`cpCollision.c`).
 //!
-//! Shapes overlap when their Minkowski difference, grown by their radii, holds the origin. GJK walks towards
-//! the edge of the difference nearest to the origin; when the origin lies inside, EPA grows the polygon it
-//! has found until that edge is on the surface. The edges of the two shapes that face each other there are
-//! clipped against each other, which gives up to two contacts.
+//! Shapes overlap when their Minkowski difference, enlarged by their radii, contains the origin. GJK (Gilbert, Johnson
+//! and Keerthi 1988) finds the edge of the difference nearest to the origin. When the origin lies inside, EPA (the
+//! expanding polytope algorithm) expands the polygon until that edge is on the surface. The edges of the two shapes that
+//! face each other there are clipped against each other, which gives up to two contacts.
 
+use super::contact::Contact;
 use super::shape::{Kind, Shape};
-use super::{Contact, Vec2};
+use super::vec2::Vec2;
 
-/// Walks end after so many steps, found or not.
+/// The maximal number of iterations of GJK and of EPA.
 const MAX_ITERATIONS: usize = 30;
 
-/// Contacts of a pair of shapes, in world coordinates.
-pub struct Touch {
-    /// From the first shape to the second.
+/// The contacts of a pair of shapes, in table coordinates.
+pub struct Manifold {
+    /// Unit vector from the first shape to the second.
     pub normal: Vec2,
-    /// The contacts; `arms` still hold points, not offsets.
+    /// The contacts; the first `count` are valid. Their `arms` hold points instead of lever arms.
     pub contacts: [Contact; 2],
-    /// How many there are.
+    /// The number of contacts.
     pub count: usize,
-    /// Where to start next time: the corners of the nearest edge of the Minkowski difference.
+    /// The corners of the nearest edge of the Minkowski difference, with which the next search starts.
     pub hint: u32,
 }
 
-/// Finds the contacts of two shapes, `a.kind <= b.kind`, starting from the hint of last time (0: none).
-pub fn touch(a: &Shape, b: &Shape, hashes: [u64; 2], hint: u32) -> Touch {
+/// Finds the contacts of two shapes with `a.kind <= b.kind`, starting from the hint of the last search (0: none).
+pub fn manifold(a: &Shape, b: &Shape, hashes: [u64; 2], hint: u32) -> Manifold {
     let nearest = Pair { a, b }.nearest(hint);
-    let mut touch = Touch { normal: nearest.normal, contacts: [Contact::default(); 2], count: 0, hint: nearest.hint };
+    let mut manifold =
+        Manifold { normal: nearest.normal, contacts: [Contact::default(); 2], count: 0, hint: nearest.hint };
     if nearest.distance > a.radius + b.radius {
-        return touch;
+        return manifold;
     }
     let n = nearest.normal;
     if a.kind == Kind::Circle {
-        touch.add(nearest.on_a + n * a.radius, nearest.on_b + n * -b.radius, 0);
-        return touch;
+        manifold.add(nearest.on_a + n * a.radius, nearest.on_b + n * -b.radius, 0);
+        return manifold;
     }
-    // Each end of one edge is set against the other edge, all projected on the direction along the surface.
+    // Each end of one edge is projected onto the other edge, along the surface.
     let (edge_a, edge_b) = (Edge::facing(a, n, hashes[0]), Edge::facing(b, -n, hashes[1]));
     let (a_from, a_to) = (edge_a.from.cross(n), edge_a.to.cross(n));
     let (b_from, b_to) = (edge_b.from.cross(n), edge_b.to.cross(n));
@@ -49,20 +51,20 @@ pub fn touch(a: &Shape, b: &Shape, hashes: [u64; 2], hint: u32) -> Touch {
         let on_a = n * a.radius + edge_a.from.lerp(edge_a.to, clamp01(along_a * per_a));
         let on_b = n * -b.radius + edge_b.from.lerp(edge_b.to, clamp01(along_b * per_b));
         if (on_b - on_a).dot(n) <= 0.0 {
-            touch.add(on_a, on_b, hash_pair(hashes[0], hashes[1]));
+            manifold.add(on_a, on_b, hash_pair(hashes[0], hashes[1]));
         }
     }
-    touch
+    manifold
 }
 
-impl Touch {
+impl Manifold {
     fn add(&mut self, on_a: Vec2, on_b: Vec2, hash: u64) {
         self.contacts[self.count] = Contact { arms: [on_a, on_b], hash, ..Contact::default() };
         self.count += 1;
     }
 }
 
-/// A symmetric hash of two, by which a contact is known again in the next step.
+/// Returns a symmetric hash of two, which identifies a contact in the next step.
 fn hash_pair(a: u64, b: u64) -> u64 {
     const FACTOR: u64 = 3_344_921_057;
     a.wrapping_mul(FACTOR) ^ b.wrapping_mul(FACTOR)
@@ -72,7 +74,7 @@ fn clamp01(t: f64) -> f64 {
     t.clamp(0.0, 1.0)
 }
 
-/// An edge of a shape.
+/// An edge of a shape, with hashes of its ends.
 struct Edge {
     from: Vec2,
     to: Vec2,
@@ -110,24 +112,25 @@ struct Corner {
     id: u32,
 }
 
-/// Whether `c` lies left of the line from `a` to `b`, told from the two middles for the sake of precision.
+/// Returns whether `c` lies left of the line from `a` to `b`, computed from midpoints for precision.
 fn is_left(a: Vec2, b: Vec2, c: Vec2) -> bool {
     (b.y - a.y) * (a.x + b.x - 2.0 * c.x) > (b.x - a.x) * (a.y + b.y - 2.0 * c.y)
 }
 
-/// Where on the segment from `a` (-1) to `b` (1) the point nearest to the origin is.
+/// Returns the parameter, from -1 at `a` to 1 at `b`, of the point of the segment nearest to the origin.
 fn nearest_t(a: Vec2, b: Vec2) -> f64 {
     let delta = b - a;
     let squared = delta.length_squared();
     if squared == 0.0 { 0.0 } else { -(delta.dot(a + b) / squared).clamp(-1.0, 1.0) }
 }
 
-/// The point at `t` on the segment from `a` (-1) to `b` (1).
+/// Returns the point of the segment at parameter `t`, from -1 at `a` to 1 at `b`.
 fn at_t(a: Vec2, b: Vec2, t: f64) -> Vec2 {
     let half = 0.5 * t;
     a * (0.5 - half) + b * (0.5 + half)
 }
 
+/// Returns the squared distance of a segment from the origin.
 fn distance_squared(a: Vec2, b: Vec2) -> f64 {
     at_t(a, b, nearest_t(a, b)).length_squared()
 }
@@ -143,13 +146,13 @@ impl Nearest {
         if distance <= 0.0 || (-1.0 < t && t < 1.0) {
             return Self { on_a, on_b, normal, distance, hint };
         }
-        // Two corners: the direction between them is no normal of an edge.
+        // The nearest points are corners, so the normal is the direction between them.
         let distance = gap.length();
         Self { on_a, on_b, normal: gap * (1.0 / (distance + f64::MIN_POSITIVE)), distance, hint }
     }
 }
 
-/// Two shapes being compared.
+/// The two shapes of a search.
 struct Pair<'a> {
     a: &'a Shape,
     b: &'a Shape,
@@ -158,12 +161,11 @@ struct Pair<'a> {
 impl Pair<'_> {
     fn corner(&self, a: usize, b: usize) -> Corner {
         let (point_a, point_b) = (self.a.points[a], self.b.points[b]);
-        #[allow(clippy::cast_possible_truncation)]
         let id = (a as u32) << 8 | b as u32;
         Corner { a: point_a, b: point_b, ab: point_b - point_a, id }
     }
 
-    /// The corner of the difference farthest along `n`.
+    /// Returns the corner of the difference farthest along `n`.
     fn support(&self, n: Vec2) -> Corner {
         self.corner(self.a.support(-n), self.b.support(n))
     }
@@ -173,7 +175,7 @@ impl Pair<'_> {
         self.corner(valid(id >> 8 & 0xff, self.a), valid(id & 0xff, self.b))
     }
 
-    /// GJK.
+    /// Finds the closest points by GJK.
     fn nearest(&self, hint: u32) -> Nearest {
         let (mut v0, mut v1) = if hint == 0 {
             let axis = (self.a.bounds.centre() - self.b.bounds.centre()).perp();
@@ -182,7 +184,7 @@ impl Pair<'_> {
             (self.hinted(hint >> 16), self.hinted(hint & 0xffff))
         };
         for _ in 0..MAX_ITERATIONS {
-            // The origin belongs on the near side of the edge.
+            // Orients the edge so that the search goes towards the origin.
             if is_left(v1.ab, v0.ab, Vec2::ZERO) {
                 std::mem::swap(&mut v0, &mut v1);
             }
@@ -204,7 +206,7 @@ impl Pair<'_> {
         Nearest::between(&v0, &v1)
     }
 
-    /// EPA, from a triangle of the difference that holds the origin.
+    /// Finds the closest points of overlapping shapes by EPA, from a triangle of the difference that contains the origin.
     fn penetration(&self, triangle: [Corner; 3]) -> Nearest {
         let mut hull = [triangle[0]; MAX_ITERATIONS + 3];
         hull[..3].copy_from_slice(&triangle);
@@ -226,19 +228,19 @@ impl Pair<'_> {
             if known || !is_left(v0.ab, v1.ab, p.ab) || iteration >= MAX_ITERATIONS {
                 return Nearest::between(&v0, &v1);
             }
-            // The hull of the old corners and p, which comes first.
+            // The new hull starts with p; old corners inside it are dropped.
             let old = hull;
             hull[0] = p;
-            let mut kept = 1;
+            let mut kept_count = 1;
             for i in 0..count {
                 let index = (nearest.0 + 1 + i) % count;
                 let next = if i + 1 < count { old[(index + 1) % count].ab } else { p.ab };
-                if is_left(hull[kept - 1].ab, next, old[index].ab) {
-                    hull[kept] = old[index];
-                    kept += 1;
+                if is_left(hull[kept_count - 1].ab, next, old[index].ab) {
+                    hull[kept_count] = old[index];
+                    kept_count += 1;
                 }
             }
-            count = kept;
+            count = kept_count;
             iteration += 1;
         }
     }

@@ -1,8 +1,10 @@
-//! Collision shapes: circles, thick segments and convex quadrilaterals, all of them a few points with a radius.
+//! Collision shapes: circles, thick segments and convex quadrilaterals, each represented by points with a radius.
 
-use super::{Body, Bounds, Vec2};
+use super::body::Body;
+use super::bounds::Bounds;
+use super::vec2::Vec2;
 
-/// What a shape is; the order is the one in which a pair of shapes is presented to the contact search.
+/// The kinds of shapes, in the order that the contact search requires of a pair.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
     /// One point and a radius.
@@ -16,21 +18,22 @@ pub enum Kind {
 /// A collision shape of a body.
 #[derive(Clone, Debug)]
 pub struct Shape {
-    /// What it is.
+    /// The kind.
     pub kind: Kind,
-    /// Which body it belongs to.
+    /// Index of its body.
     pub body: usize,
-    /// What it grows by in every direction.
+    /// The distance by which it extends beyond its points, in pixels.
     pub radius: f64,
     /// Corners in body coordinates; the first [`Shape::len`] count.
     pub corners: [Vec2; 4],
-    /// Outward normal of the edge that ends in the corner of the same place (a segment: of its right side).
+    /// Outward normal of the edge that ends in the corner of the same index, in body coordinates (for a segment: of its
+    /// right side).
     normals: [Vec2; 4],
-    /// Corners in the world.
+    /// Corners in table coordinates.
     pub points: [Vec2; 4],
-    /// Normals in the world.
+    /// Normals in table coordinates.
     pub edges: [Vec2; 4],
-    /// What it covers, in the world.
+    /// Bounding box in table coordinates.
     pub bounds: Bounds,
 }
 
@@ -39,24 +42,24 @@ impl Shape {
         Self { kind, body, radius, corners, normals, points: corners, edges: normals, bounds: Bounds::default() }
     }
 
-    /// A circle about the body's origin.
+    /// Makes a circle about the body's origin.
     pub fn circle(body: usize, radius: f64) -> Self {
         Self::new(Kind::Circle, body, radius, [Vec2::ZERO; 4], [Vec2::ZERO; 4])
     }
 
-    /// A segment from `a` to `b`, `radius` thick on either side.
+    /// Makes a segment from `a` to `b` that extends by `radius` on either side.
     pub fn segment(body: usize, a: Vec2, b: Vec2, radius: f64) -> Self {
         let normal = (b - a).normalized().rperp();
         Self::new(Kind::Segment, body, radius, [a, b, b, b], [normal; 4])
     }
 
-    /// A convex quadrilateral with corners from x towards y.
+    /// Makes a convex quadrilateral; its corners are ordered from x towards y.
     pub fn quad(body: usize, corners: [Vec2; 4]) -> Self {
         let normals = std::array::from_fn(|i| (corners[i] - corners[(i + 3) % 4]).rperp().normalized());
         Self::new(Kind::Quad, body, 0.0, corners, normals)
     }
 
-    /// How many corners it has.
+    /// The number of corners.
     pub fn len(&self) -> usize {
         match self.kind {
             Kind::Circle => 1,
@@ -65,9 +68,9 @@ impl Shape {
         }
     }
 
-    /// Follows its body.
+    /// Moves the shape to the pose of its body.
     pub fn update(&mut self, body: &Body) {
-        let mut bounds = Bounds::NOTHING;
+        let mut bounds = Bounds::EMPTY;
         for i in 0..self.len() {
             let point = body.pose.point(self.corners[i]);
             self.points[i] = point;
@@ -77,7 +80,7 @@ impl Shape {
         self.bounds = bounds.grown(self.radius);
     }
 
-    /// The corner farthest along `n`.
+    /// Returns the index of the corner farthest along `n`.
     pub fn support(&self, n: Vec2) -> usize {
         match self.kind {
             Kind::Circle => 0,
@@ -95,7 +98,7 @@ impl Shape {
         }
     }
 
-    /// The corners `(from, to)` of the edge that faces `n`.
+    /// Returns the corners `(from, to)` of the edge that faces `n`.
     pub fn facing_edge(&self, n: Vec2) -> (usize, usize) {
         match self.kind {
             Kind::Circle => (0, 0),

@@ -1,10 +1,10 @@
-//! A world as bytes and back: bodies, trees, pairs and what contacts remember, everything the next step depends on.
+//! The state of a [`Simulation`] as bytes: bodies, trees, pairs and contacts, everything the next step depends on.
 
-use super::World;
+use super::simulation::Simulation;
 use bytemuck::Pod;
 
-impl World {
-    /// Appends the state to `bytes`. What never changes in an episode (shapes, walls) is not part of it.
+impl Simulation {
+    /// Appends the state to `bytes`, without the shapes and walls, which never change during an episode.
     pub fn save(&self, bytes: &mut Vec<u8>) {
         put(bytes, &self.bodies);
         put(bytes, &self.tree.nodes);
@@ -14,8 +14,8 @@ impl World {
         put(bytes, &self.active);
     }
 
-    /// Reads a state that [`World::save`] wrote for a world of the same shapes; what follows it stays in `bytes`.
-    /// Returns `None`, with the world in an unspecified state, when the bytes are none.
+    /// Reads a state that [`Simulation::save`] wrote for the same shapes, and advances `bytes` past it. Returns `None`, and
+    /// leaves the simulation in an unspecified state, when the bytes are invalid.
     pub fn load(&mut self, bytes: &mut &[u8]) -> Option<()> {
         self.bodies = take_array(bytes)?;
         take(bytes, &mut self.tree.nodes)?;
@@ -31,20 +31,20 @@ impl World {
     }
 }
 
-/// Appends a number of items and the items.
+/// Appends the number of items, then the items.
 pub fn put<T: Pod>(bytes: &mut Vec<u8>, items: &[T]) {
     bytes.extend_from_slice(&(items.len() as u64).to_le_bytes());
     bytes.extend_from_slice(bytemuck::cast_slice(items));
 }
 
-/// Reads what [`put`] wrote.
+/// Reads items that [`put`] wrote into a vector.
 pub fn take<T: Pod>(bytes: &mut &[u8], items: &mut Vec<T>) -> Option<()> {
     items.clear();
     items.extend(take_items::<T>(bytes)?);
     Some(())
 }
 
-/// Reads `N` items that [`put`] wrote.
+/// Reads exactly `N` items that [`put`] wrote.
 pub fn take_array<T: Pod, const N: usize>(bytes: &mut &[u8]) -> Option<[T; N]> {
     let mut items = take_items(bytes)?;
     let mut array = [T::zeroed(); N];

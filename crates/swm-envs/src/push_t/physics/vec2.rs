@@ -1,15 +1,15 @@
-//! Points and directions of the plane.
+//! [`Vec2`]: points and directions of the plane.
 
 use bytemuck::{Pod, Zeroable};
 use std::ops::{Add, AddAssign, Mul, Neg, Sub};
 
-/// A point or a direction, in pixels of the 512 × 512 world unless said otherwise; `y` points down on screen.
+/// A point or a direction, in pixels of the 512 × 512 table unless stated otherwise.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
 #[repr(C)]
 pub struct Vec2 {
     /// To the right.
     pub x: f64,
-    /// Down the picture.
+    /// Down the frame.
     pub y: f64,
 }
 
@@ -17,7 +17,7 @@ impl Vec2 {
     /// The origin.
     pub const ZERO: Self = Self::new(0.0, 0.0);
 
-    /// A vector of these coordinates.
+    /// Makes a vector of these coordinates.
     pub const fn new(x: f64, y: f64) -> Self {
         Self { x, y }
     }
@@ -32,12 +32,12 @@ impl Vec2 {
         self.x * other.y - self.y * other.x
     }
 
-    /// Turned by a quarter from x towards y.
+    /// Rotates the vector by a quarter turn from x towards y.
     pub fn perp(self) -> Self {
         Self::new(-self.y, self.x)
     }
 
-    /// Turned by a quarter from y towards x.
+    /// Rotates the vector by a quarter turn from y towards x.
     pub fn rperp(self) -> Self {
         Self::new(self.y, -self.x)
     }
@@ -52,12 +52,12 @@ impl Vec2 {
         self.length_squared().sqrt()
     }
 
-    /// The direction, of length 1; zero stays zero.
+    /// Returns the direction with length 1; the zero vector stays zero.
     pub fn normalized(self) -> Self {
         self * (1.0 / (self.length() + f64::MIN_POSITIVE))
     }
 
-    /// The point at `t` on the way to `other`.
+    /// Interpolates linearly: 0 is `self`, 1 is `other`.
     pub fn lerp(self, other: Self, t: f64) -> Self {
         self * (1.0 - t) + other * t
     }

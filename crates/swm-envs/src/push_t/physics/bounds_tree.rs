@@ -1,58 +1,58 @@
-//! A binary tree of bounding boxes: which shapes may touch, in which order.
+//! [`BoundsTree`]: a binary tree of bounding boxes, which finds the shapes that may touch.
 //!
-//! The order in which pairs are found decides the order in which contacts are solved, and with it the last
-//! digits of every trajectory, so the tree grows exactly as Chipmunk's does: a leaf goes where the areas of
-//! the boxes grow least, and moves only when its shape leaves a box that was widened by its velocity.
+//! The order in which pairs are found decides the order in which contacts are solved, and with it the last digits of
+//! every trajectory. So the tree grows exactly as Chipmunk's (`cpBBTree.c`): a leaf is inserted where the areas of the
+//! boxes grow least, and moves only when its shape leaves a box that was widened by its velocity.
 
-use super::{Bounds, Vec2};
+use super::bounds::Bounds;
+use super::vec2::Vec2;
 use bytemuck::{Pod, Zeroable};
 
-/// No node.
+/// The index of no node.
 pub const NONE: u32 = u32::MAX;
 
-/// A leaf (the first nodes of a tree, one a shape) or the parent of two nodes.
+/// A leaf (the first nodes of a tree, one per shape) or an inner node with two children.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub struct Node {
-    /// What lies below.
+    /// The bounding box of all leaves below.
     pub bounds: Bounds,
-    /// The node above, or [`NONE`].
+    /// The parent, or [`NONE`].
     pub parent: u32,
     /// The children of an inner node.
     pub children: [u32; 2],
-    /// When a leaf was last moved within the tree.
+    /// The stamp of the last insertion of a leaf.
     pub stamp: u32,
 }
 
-/// A tree over a fixed set of shapes.
+/// A tree of the bounding boxes of a fixed set of shapes.
 #[derive(Clone, Debug)]
-pub struct Tree {
+pub struct BoundsTree {
     /// Leaves, then inner nodes.
     pub nodes: Vec<Node>,
-    /// The top, or [`NONE`].
+    /// The root, or [`NONE`].
     pub root: u32,
-    /// How many nodes are leaves.
+    /// The number of leaves.
     pub leaves: u32,
-    /// An inner node out of use, or [`NONE`]: taking a leaf out frees one, putting it back needs one.
+    /// An unused inner node, or [`NONE`]: removing a leaf frees one, inserting it again needs one.
     pub spare: u32,
 }
 
-impl Tree {
-    /// A tree for `leaves` shapes, none of which is in it yet.
+impl BoundsTree {
+    /// Makes an empty tree for `leaves` shapes.
     pub fn new(leaves: usize) -> Self {
         let leaf = Node { bounds: Bounds::default(), parent: NONE, children: [NONE; 2], stamp: 0 };
         let mut nodes = Vec::with_capacity(2 * leaves);
         nodes.resize(leaves, leaf);
-        #[allow(clippy::cast_possible_truncation)]
         Self { nodes, root: NONE, leaves: leaves as u32, spare: NONE }
     }
 
-    /// Whether a node is a leaf.
+    /// Returns whether a node is a leaf.
     pub fn is_leaf(&self, node: u32) -> bool {
         node < self.leaves
     }
 
-    /// A node.
+    /// Returns a node.
     pub fn node(&self, node: u32) -> &Node {
         &self.nodes[node as usize]
     }
@@ -65,7 +65,7 @@ impl Tree {
         self.node(node).bounds
     }
 
-    /// Puts a leaf in, with these bounds.
+    /// Inserts a leaf with these bounds.
     pub fn insert(&mut self, leaf: u32, bounds: Bounds, stamp: u32) {
         *self.node_mut(leaf) = Node { bounds, parent: NONE, children: [NONE; 2], stamp };
         if self.root == NONE {
@@ -84,13 +84,13 @@ impl Tree {
             }
             at = if cost_b < cost_a { b } else { a };
         }
-        let above = self.node(at).parent;
+        let parent = self.node(at).parent;
         let joint = self.join(leaf, at);
-        if above == NONE {
+        if parent == NONE {
             self.root = joint;
         } else {
-            self.replace_child(above, at, joint);
-            let mut up = above;
+            self.replace_child(parent, at, joint);
+            let mut up = parent;
             while up != NONE {
                 let node = self.node_mut(up);
                 node.bounds = node.bounds.merged(bounds);
@@ -99,7 +99,7 @@ impl Tree {
         }
     }
 
-    /// Takes a leaf out.
+    /// Removes a leaf.
     pub fn remove(&mut self, leaf: u32) {
         let parent = self.node(leaf).parent;
         if parent == NONE {
@@ -108,15 +108,15 @@ impl Tree {
         }
         let [a, b] = self.node(parent).children;
         let other = if a == leaf { b } else { a };
-        let above = self.node(parent).parent;
-        self.node_mut(other).parent = above;
+        let grandparent = self.node(parent).parent;
+        self.node_mut(other).parent = grandparent;
         self.spare = parent;
-        if above == NONE {
+        if grandparent == NONE {
             self.root = other;
             return;
         }
-        self.replace_child(above, parent, other);
-        let mut up = above;
+        self.replace_child(grandparent, parent, other);
+        let mut up = grandparent;
         while up != NONE {
             let [a, b] = self.node(up).children;
             let bounds = self.bounds(a).merged(self.bounds(b));
@@ -126,7 +126,7 @@ impl Tree {
         }
     }
 
-    /// Calls `found` for the leaves below `from` whose boxes touch `bounds`, first children first.
+    /// Calls `found` for the leaves below `from` whose boxes touch `bounds`, depth first, first children first.
     pub fn query(&self, from: u32, bounds: &Bounds, mut found: impl FnMut(u32)) {
         let mut stack = Stack::of(from);
         while let Some(at) = stack.pop() {
@@ -143,7 +143,7 @@ impl Tree {
         }
     }
 
-    /// Calls `found` for every leaf, first children first.
+    /// Calls `found` for every leaf, depth first, first children first.
     pub fn each_leaf(&self, mut found: impl FnMut(u32)) {
         let mut stack = Stack::of(self.root);
         while let Some(at) = stack.pop() {
@@ -162,9 +162,7 @@ impl Tree {
         let node = Node { bounds, parent: NONE, children: [a, b], stamp: 0 };
         let at = if self.spare == NONE {
             self.nodes.push(node);
-            #[allow(clippy::cast_possible_truncation)]
-            let at = self.nodes.len() as u32 - 1;
-            at
+            self.nodes.len() as u32 - 1
         } else {
             let at = std::mem::replace(&mut self.spare, NONE);
             *self.node_mut(at) = node;
@@ -182,19 +180,19 @@ impl Tree {
     }
 }
 
-/// The box of a moving shape, widened so that it stays inside for a while.
+/// Returns the box of a moving shape, widened so that the shape stays inside for some steps.
 pub fn widened(bounds: Bounds, velocity: Vec2) -> Bounds {
-    // Single precision in Chipmunk; ties between boxes hang on it.
-    const SHARE: f64 = 0.1f32 as f64;
-    let margin = (bounds.high - bounds.low) * SHARE;
-    let ahead = velocity * SHARE;
+    // A single-precision constant in Chipmunk; it decides ties between boxes.
+    const MARGIN_SHARE: f64 = 0.1f32 as f64;
+    let margin = (bounds.high - bounds.low) * MARGIN_SHARE;
+    let ahead = velocity * MARGIN_SHARE;
     Bounds {
         low: bounds.low + Vec2::new((-margin.x).min(ahead.x), (-margin.y).min(ahead.y)),
         high: bounds.high + Vec2::new(margin.x.max(ahead.x), margin.y.max(ahead.y)),
     }
 }
 
-/// Nodes still to visit. A tree of a dozen leaves is never deeper than this.
+/// The nodes still to visit. The capacity suffices for a tree of a dozen leaves.
 struct Stack {
     nodes: [u32; 16],
     len: usize,

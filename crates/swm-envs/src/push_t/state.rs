@@ -1,0 +1,117 @@
+//! The state vector of Push-T: reading it from the simulation, writing it back, and comparing it with a goal.
+
+use super::physics::{AGENT, BLOCK, Simulation, Vec2};
+use super::shapes::BodyShape;
+use std::f64::consts::{PI, TAU};
+use swm_core::{Error, FactorValues, Result};
+
+/// Agent x y, block x y (pixels), block angle (radians), agent velocity x y (pixels per second).
+pub type State = [f64; 7];
+
+/// The goal is reached when the positions of agent and block together are nearer than this, in pixels,
+pub const REACH: f64 = 20.0;
+/// and the block's angle is nearer than this, in radians.
+pub const REACH_ANGLE: f64 = PI / 9.0;
+/// Weight of the agent's distance in [`goal_distance`], relative to the block's. It is small, because the agent has to
+/// leave its goal to push the block: a plan that minimised both alike would park the agent and leave the block.
+const AGENT_WEIGHT: f64 = 0.05;
+
+/// Moves the bodies to a state.
+pub fn set_state(simulation: &mut Simulation, state: &State) {
+    let [x, y, block_x, block_y, angle, vx, vy] = *state;
+    simulation.bodies[AGENT].velocity = Vec2::new(vx, vy);
+    simulation.bodies[AGENT].set_position(Vec2::new(x, y));
+    simulation.bodies[BLOCK].set_angle(angle);
+    simulation.bodies[BLOCK].set_position(Vec2::new(block_x, block_y));
+}
+
+/// Sets a state and runs one physics step, as the reference does when it sets states.
+pub fn settled(mut simulation: Simulation, state: &State) -> Simulation {
+    set_state(&mut simulation, state);
+    simulation.step();
+    simulation
+}
+
+/// Reads the state of a simulation; the block's angle is wrapped to 0 .. 2π.
+pub fn state_of(simulation: &Simulation) -> State {
+    let [agent, block, _] = &simulation.bodies;
+    let (a, b) = (agent.position(), block.position());
+    [a.x, a.y, b.x, b.y, block.angle.rem_euclid(TAU), agent.velocity.x, agent.velocity.y]
+}
+
+/// The start state that the factors describe.
+pub fn start_state(factors: &FactorValues) -> State {
+    let (agent, block) = (factors.get("agent.start_position"), factors.get("block.start_position"));
+    let velocity = factors.get("agent.velocity");
+    [agent[0], agent[1], block[0], block[1], factors.scalar("block.angle"), velocity[0], velocity[1]]
+}
+
+/// Checks a state that a caller gave.
+///
+/// # Errors
+/// When it has not 7 values, or one of them is not finite.
+pub fn checked(state: &[f64], what: &str) -> Result<State> {
+    if let Some(bad) = state.iter().find(|v| !v.is_finite()) {
+        let fix = "give finite positions, angle and velocities".to_owned();
+        return Err(Error::NotFinite { what: what.to_owned(), given: bad.to_string(), fix });
+    }
+    state.try_into().map_err(|_| {
+        let expected = "7: agent x y, block x y, block angle, agent velocity x y";
+        Error::mismatch(format!("reading a {what}"), format!("{} values", state.len()), expected)
+    })
+}
+
+/// Returns the Euclidean distance of two states over all 7 values, the negative of the reward.
+pub fn state_distance(a: &State, b: &State) -> f64 {
+    a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt()
+}
+
+/// Returns whether a state counts as the goal: agent and block in position, and the block at an angle at which it looks
+/// the same.
+pub fn is_reached(factors: &FactorValues, goal: &State, state: &State) -> bool {
+    let distance = goal[..4].iter().zip(state).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt();
+    distance < REACH && angle_between(factors.integer("block.shape"), goal[4], state[4]) < REACH_ANGLE
+}
+
+/// Returns the smallest rotation between two angles of a block, up to its symmetry, in radians.
+pub fn angle_between(shape: i64, from: f64, to: f64) -> f64 {
+    let symmetry = BodyShape::symmetry(shape);
+    let angle = (from - to).rem_euclid(symmetry);
+    angle.min(symmetry - angle)
+}
+
+/// Returns the distance to the goal in units of the tolerances: the Euclidean norm of the block's distance, its rotation
+/// and the weighted distance of the agent.
+pub fn goal_distance(factors: &FactorValues, goal: &State, state: &State) -> f64 {
+    let distance = |x: usize| (state[x] - goal[x]).hypot(state[x + 1] - goal[x + 1]) / REACH;
+    let angle = angle_between(factors.integer("block.shape"), goal[4], state[4]) / REACH_ANGLE;
+    (AGENT_WEIGHT * distance(0)).hypot(distance(2)).hypot(angle)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::push_t::factors::variation_space;
+    use swm_core::{Key, VariationRequest};
+
+    #[test]
+    fn goals_are_reached_up_to_the_symmetry_of_the_block() {
+        let pinned = |shape: f64| VariationRequest {
+            variation: Some(vec![]),
+            variation_values: [("block.shape".to_owned(), vec![shape])].into(),
+        };
+        let goal = [100.0, 100.0, 200.0, 200.0, -3.0, 0.0, 0.0];
+        // Square and + look the same after a quarter turn, Z and I after half a turn, L and both T after a full one.
+        for (shape, quarter, half) in
+            [(1, false, false), (2, false, false), (3, false, true), (4, true, true), (5, false, true), (7, true, true)]
+        {
+            let factors = variation_space().resolve(&pinned(f64::from(shape)), Key::new(0)).expect("a shape");
+            for (angle, expected) in [(0.0, true), (TAU, true), (0.4, false), (PI / 2.0, quarter), (PI, half)] {
+                let state = [110.0, 100.0, 200.0, 210.0, goal[4] + angle, 50.0, 0.0];
+                assert_eq!(is_reached(&factors, &goal, &state), expected, "shape {shape}, rotated by {angle}");
+            }
+            let far = [115.0, 100.0, 200.0, 215.0, goal[4], 0.0, 0.0];
+            assert!(!is_reached(&factors, &goal, &far), "agent and block are 21 pixels off together");
+        }
+    }
+}

@@ -1,131 +1,133 @@
-//! An environment of any [`World`].
+//! [`ClassicEnv`]: the [`Env`] of any [`ControlTask`].
 
-use super::picture::Picture;
-use super::{World, factors};
+use super::factors::{color_swaps, physics, variation_space};
+use super::frame::FrameRenderer;
+use super::task::ControlTask;
 use rand::Rng as _;
 use rand::seq::IndexedRandom as _;
-use swm_core::factors as values;
+use swm_core::factors::{foreign, from_row, restored, snapshot};
 use swm_core::{
     Action, ColumnSpec, DType, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, Rng, RowMut,
     RowRef, Snapshot, Space, Transition, VariationRequest,
 };
 
-/// Paths from which [`Env::sample_goal`] takes a goal before it gives up.
+/// Rollouts from which [`Env::sample_goal`] takes a goal before it fails.
 const GOAL_TRIES: u64 = 16;
-/// How often chance acts where the expert goes: in a world without chance there is one way, and few goals.
-const CHANCE: f64 = 0.02;
-/// The most steps of such a path.
+/// Share of random actions in the expert's rollouts. In a deterministic environment all rollouts would be equal without
+/// them, and few goals would result.
+const RANDOM_SHARE: f64 = 0.02;
+/// Steps of a rollout, at most.
 const GOAL_STEPS: usize = 200;
+/// The maximal number of values in a `state` column.
+const MAX_STATE_LEN: usize = 8;
 
-/// Places in [`EnvSpec::columns`].
-mod columns {
+/// Indices in [`EnvSpec::columns`].
+mod index {
     pub const STATE: usize = 0;
     pub const GOAL_STATE: usize = 1;
     pub const PHYSICS: usize = 2;
 }
 
-/// A world, where it is and where it should go.
-pub struct Classic<W: World> {
+/// A classic-control environment: a task, its state and its goal.
+pub struct ClassicEnv<T: ControlTask> {
     spec: EnvSpec,
     factors: FactorValues,
-    /// The values of [`World::PHYSICS`].
+    /// The `physics` column: the values of [`ControlTask::PHYSICS_FACTORS`].
     physics: Vec<f32>,
-    world: W,
-    state: W::State,
-    goal: W::State,
-    /// Made when the first frame is asked for.
-    picture: Option<Picture>,
-    /// Whether `picture` shows this episode's background and colours.
-    current: bool,
+    task: T,
+    state: T::State,
+    goal: T::State,
+    /// Made for the first frame.
+    renderer: Option<FrameRenderer>,
+    /// Whether the renderer has the background and colours of this episode.
+    is_renderer_current: bool,
 }
 
 /// The bounds of a `state` column, in single precision as the reference has them.
-#[allow(clippy::cast_possible_truncation)]
-fn observed<W: World>() -> Space {
-    let (low, high) = W::OBSERVED.iter().map(|&(low, high)| (f64::from(low as f32), f64::from(high as f32))).unzip();
-    Space::Box { shape: vec![W::OBSERVED.len()], dtype: DType::Float32, low, high }
+fn observation_space<T: ControlTask>() -> Space {
+    let single = |bound: f64| f64::from(bound as f32);
+    let (low, high) = T::STATE_BOUNDS.iter().map(|&(low, high)| (single(low), single(high))).unzip();
+    Space::Box { shape: vec![T::STATE_BOUNDS.len()], dtype: DType::Float32, low, high }
 }
 
-impl<W: World> Classic<W> {
-    /// The world with every factor at its default.
+impl<T: ControlTask> ClassicEnv<T> {
+    /// Makes the environment with every factor at its default.
     pub fn new() -> Self {
+        let state_len = T::STATE_BOUNDS.len();
         let spec = EnvSpec {
-            id: W::ID.to_owned(),
-            action_space: W::action_space(),
+            id: T::ID.to_owned(),
+            action_space: T::action_space(),
             columns: vec![
-                ColumnSpec::new("state", DType::Float32, [W::OBSERVED.len()]),
-                ColumnSpec::new("goal_state", DType::Float32, [W::OBSERVED.len()]),
-                ColumnSpec::new("physics", DType::Float32, [W::PHYSICS.len()]),
+                ColumnSpec::new("state", DType::Float32, [state_len]),
+                ColumnSpec::new("goal_state", DType::Float32, [state_len]),
+                ColumnSpec::new("physics", DType::Float32, [T::PHYSICS_FACTORS.len()]),
             ],
-            observation_space: vec![("state", observed::<W>())],
-            variation_space: factors::space::<W>(),
-            max_episode_steps: W::LIMIT,
+            observation_space: vec![("state", observation_space::<T>())],
+            variation_space: variation_space::<T>(),
+            max_episode_steps: T::MAX_EPISODE_STEPS,
             cameras: vec![],
         };
-        let none = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
-        let factors = spec.variation_space.resolve(&none, Key::new(0)).expect("defaults are in their spaces");
-        let physics = factors::physics::<W>(&factors);
-        let world = W::new(&physics);
+        let defaults = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
+        let factors = spec.variation_space.resolve(&defaults, Key::new(0)).expect("defaults are in their spaces");
+        let physics = physics::<T>(&factors);
+        let task = T::new(&physics);
         let mut rng = Key::new(0).rng();
-        let (state, goal) = (W::start(&mut rng), W::task(&mut rng));
-        Self { spec, factors, physics, world, state, goal, picture: None, current: false }
+        let (state, goal) = (T::sample_start(&mut rng), T::sample_task_goal(&mut rng));
+        Self { spec, factors, physics, task, state, goal, renderer: None, is_renderer_current: false }
     }
 
-    /// Makes the world that of these factors, at this state.
-    fn arrange(&mut self, factors: FactorValues, state: W::State, goal: W::State) {
-        // Most episodes look like the one before.
-        self.current &= factors.iter().eq(self.factors.iter());
-        self.physics = factors::physics::<W>(&factors);
-        self.world = W::new(&self.physics);
+    /// Starts an episode with these factors, state and goal.
+    fn begin(&mut self, factors: FactorValues, state: T::State, goal: T::State) {
+        // Most episodes have the factors of the one before, so the renderer's background stays valid.
+        self.is_renderer_current &= factors.iter().eq(self.factors.iter());
+        self.physics = physics::<T>(&factors);
+        self.task = T::new(&self.physics);
         (self.factors, self.state, self.goal) = (factors, state, goal);
     }
 
-    fn show(&mut self, state: W::State, frame: FrameMut<'_>) {
-        let picture = self.picture.get_or_insert_with(|| Picture::new(W::SIZE));
-        if !self.current {
-            picture.begin(|surface| self.world.draw_background(surface), &factors::swaps::<W>(&self.factors));
-            self.current = true;
+    /// Draws a state into a frame.
+    fn draw(&mut self, state: T::State, frame: FrameMut<'_>) {
+        let renderer = self.renderer.get_or_insert_with(|| FrameRenderer::new(T::FRAME_SIZE));
+        if !self.is_renderer_current {
+            renderer.begin_episode(|surface| self.task.draw_background(surface), &color_swaps::<T>(&self.factors));
+            self.is_renderer_current = true;
         }
-        picture.show(|surface| self.world.draw(&state, surface), frame);
+        renderer.draw(|surface| self.task.draw(&state, surface), frame);
     }
 
-    /// The states the world comes through within some steps: in the first tries while the expert carries out a task,
-    /// in the later ones by chance. What ends an episode is left out unless it is the task's goal; in the last tries
-    /// nothing is.
-    #[allow(clippy::cast_possible_truncation)]
-    fn path(&self, rng: &mut Rng, attempt: u64) -> Vec<W::State> {
-        let (expert, everything) = (attempt < GOAL_TRIES / 2, attempt >= GOAL_TRIES * 3 / 4);
-        let (mut state, task, mut path) = (self.state, W::task(rng), vec![]);
-        while path.len() < GOAL_STEPS {
-            let action = if expert && !rng.random_bool(CHANCE) {
-                self.world.control(&state, &task)
+    /// Returns the states of a rollout: in the first half of the attempts with the expert's actions, later with random
+    /// ones. Terminal states are left out unless they are the task's goal; in the last quarter they are included.
+    fn rollout(&self, rng: &mut Rng, attempt: u64) -> Vec<T::State> {
+        let (is_expert, with_terminal) = (attempt < GOAL_TRIES / 2, attempt >= GOAL_TRIES * 3 / 4);
+        let (mut state, goal, mut states) = (self.state, T::sample_task_goal(rng), vec![]);
+        while states.len() < GOAL_STEPS {
+            let action = if is_expert && !rng.random_bool(RANDOM_SHARE) {
+                self.task.control(&state, &goal)
             } else {
                 self.spec.action_space.sample(rng)[0]
             };
-            let ended = self.world.step(&mut state, f64::from(action as f32)).terminated;
-            let reached = self.world.reached(&state, &task);
-            if reached || !ended || everything {
-                path.push(state);
+            let terminated = self.task.step(&mut state, f64::from(action as f32)).terminated;
+            let reached = self.task.is_reached(&state, &goal);
+            if reached || !terminated || with_terminal {
+                states.push(state);
             }
-            if (reached && expert) || (ended && !everything) {
+            if (reached && is_expert) || (terminated && !with_terminal) {
                 break;
             }
         }
-        path
+        states
     }
 
-    /// A goal as everybody else sees it: through the `goal_state` column.
-    fn seen(&self, state: &W::State) -> Result<W::State> {
-        let mut row = [0.0; MAX_OBSERVED];
-        W::observe(state, &mut row[..W::OBSERVED.len()]);
-        W::parse("a sampled goal", &row.map(f64::from)[..W::OBSERVED.len()])
+    /// Rounds a state to what the `goal_state` column can represent.
+    fn observable(&self, state: &T::State) -> Result<T::State> {
+        let mut row = [0.0; MAX_STATE_LEN];
+        let len = T::STATE_BOUNDS.len();
+        T::observe(state, &mut row[..len]);
+        T::parse_state("a sampled goal", &row.map(f64::from)[..len])
     }
 }
 
-/// The most numbers a `state` column has.
-const MAX_OBSERVED: usize = 8;
-
-impl<W: World> Env for Classic<W> {
+impl<T: ControlTask> Env for ClassicEnv<T> {
     fn spec(&self) -> &EnvSpec {
         &self.spec
     }
@@ -134,39 +136,38 @@ impl<W: World> Env for Classic<W> {
         let key = Key::new(seed);
         let factors = self.spec.variation_space.resolve(&options.variation, key)?;
         let state = match &options.state {
-            Some(state) => W::parse("state", state)?,
-            None => W::start(&mut key.with("start").rng()),
+            Some(state) => T::parse_state("state", state)?,
+            None => T::sample_start(&mut key.with("start").rng()),
         };
         let goal = match &options.goal_state {
-            Some(goal) => W::parse("goal_state", goal)?,
-            None => W::task(&mut key.with("task").rng()),
+            Some(goal) => T::parse_state("goal_state", goal)?,
+            None => T::sample_task_goal(&mut key.with("task").rng()),
         };
-        self.arrange(factors, state, goal);
+        self.begin(factors, state, goal);
         Ok(())
     }
 
     fn step(&mut self, action: Action<'_>) -> Result<Transition> {
         let action = match self.spec.action_space {
             Space::Box { .. } => f64::from(action.continuous(1)?[0]),
-            #[allow(clippy::cast_precision_loss)]
             _ => action.discrete(&self.spec.action_space)?[0] as f64,
         };
-        Ok(self.world.step(&mut self.state, action))
+        Ok(self.task.step(&mut self.state, action))
     }
 
     fn observe(&self, row: &mut RowMut<'_>) {
-        W::observe(&self.state, row.at(columns::STATE));
-        W::observe(&self.goal, row.at(columns::GOAL_STATE));
-        row.set(columns::PHYSICS, &self.physics);
+        T::observe(&self.state, row.at(index::STATE));
+        T::observe(&self.goal, row.at(index::GOAL_STATE));
+        row.set(index::PHYSICS, &self.physics);
     }
 
     fn render(&mut self, frame: FrameMut<'_>) -> Result<()> {
-        self.show(self.state, frame);
+        self.draw(self.state, frame);
         Ok(())
     }
 
     fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()> {
-        self.show(self.goal, frame);
+        self.draw(self.goal, frame);
         Ok(())
     }
 
@@ -175,41 +176,41 @@ impl<W: World> Env for Classic<W> {
     }
 
     fn snapshot(&self) -> Snapshot {
-        let numbers = self.state.as_ref().iter().chain(self.goal.as_ref());
-        values::snapshot(W::ID, &self.factors, numbers.flat_map(|number| number.to_le_bytes()))
+        let values = self.state.as_ref().iter().chain(self.goal.as_ref());
+        snapshot(T::ID, &self.factors, values.flat_map(|value| value.to_le_bytes()))
     }
 
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let (factors, rest) = values::restored(W::ID, &self.spec.variation_space, &self.factors, snapshot)?;
-        let (mut state, mut goal) = (W::State::default(), W::State::default());
-        let numbers = state.as_mut().iter_mut().chain(goal.as_mut());
-        let (chunks, tail) = rest.as_chunks();
-        if chunks.len() != numbers.size_hint().0 || !tail.is_empty() {
-            return Err(values::foreign(W::ID, format!("{} bytes of state and goal", rest.len())));
+        let (factors, bytes) = restored(T::ID, &self.spec.variation_space, &self.factors, snapshot)?;
+        let (mut state, mut goal) = (T::State::default(), T::State::default());
+        let values = state.as_mut().iter_mut().chain(goal.as_mut());
+        let (chunks, tail) = bytes.as_chunks();
+        if chunks.len() != values.size_hint().0 || !tail.is_empty() {
+            return Err(foreign(T::ID, format!("{} bytes of state and goal", bytes.len())));
         }
-        numbers.zip(chunks).for_each(|(number, &bytes)| *number = f64::from_le_bytes(bytes));
+        values.zip(chunks).for_each(|(value, &bytes)| *value = f64::from_le_bytes(bytes));
         match factors {
-            Some(factors) => self.arrange(factors, state, goal),
+            Some(factors) => self.begin(factors, state, goal),
             None => (self.state, self.goal) = (state, goal),
         }
         Ok(())
     }
 
     fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()> {
-        let state = W::parse("state", &start.to_f64("state")?)?;
-        let goal = W::parse("goal state", &goal.to_f64("state")?)?;
-        let factors = values::from_row(&self.spec.variation_space, &self.factors, start)?;
-        self.arrange(factors, state, goal);
+        let state = T::parse_state("state", &start.to_f64("state")?)?;
+        let goal = T::parse_state("goal state", &goal.to_f64("state")?)?;
+        let factors = from_row(&self.spec.variation_space, &self.factors, start)?;
+        self.begin(factors, state, goal);
         Ok(())
     }
 
     fn sample_goal(&mut self, key: Key) -> Result<()> {
         for attempt in 0..GOAL_TRIES {
             let mut rng = key.at(attempt).rng();
-            let mut goals = self.path(&mut rng, attempt);
-            goals.retain_mut(|goal| match self.seen(goal) {
-                Ok(seen) if !self.world.reached(&self.state, &seen) => {
-                    *goal = seen;
+            let mut goals = self.rollout(&mut rng, attempt);
+            goals.retain_mut(|goal| match self.observable(goal) {
+                Ok(observable) if !self.task.is_reached(&self.state, &observable) => {
+                    *goal = observable;
                     true
                 }
                 _ => false,
@@ -221,16 +222,16 @@ impl<W: World> Env for Classic<W> {
         }
         Err(Error::Unsatisfiable {
             factor: "goal".to_owned(),
-            constraint: "on the way of the expert or of chance, and not reached already".to_owned(),
+            constraint: "on a rollout of the expert or of random actions, and not reached already".to_owned(),
             tries: GOAL_TRIES as usize,
         })
     }
 
     fn is_success(&self) -> bool {
-        self.world.reached(&self.state, &self.goal)
+        self.task.is_reached(&self.state, &self.goal)
     }
 
     fn goal_distance(&self) -> f64 {
-        self.world.distance(&self.state, &self.goal)
+        self.task.goal_distance(&self.state, &self.goal)
     }
 }

@@ -1,21 +1,20 @@
-//! What the experts' READMEs report.
+//! Trials of experts: the success counts that the READMEs report.
 
 use swm_core::{Action, Batch, EnvEntry, Key, ResetOptions, Schema, Space, VariationRequest};
 
-/// Episodes of seeds 0 to 199.
+/// The results of the episodes of seeds 0 to 199.
 #[derive(Debug, Default)]
 pub struct Tally {
-    /// In how many the goal was reached.
+    /// Episodes in which the goal was reached.
     pub successes: usize,
-    /// Steps until then, the shortest first.
+    /// Steps until the goal was reached, ascending.
     pub steps: Vec<usize>,
-    /// All rewards.
+    /// The sum of all rewards.
     pub reward: f64,
 }
 
-/// Lets the first expert play 200 episodes of full length or until they terminate, with the default factors or with all
-/// varied, towards the goal of the reset or one of `sample_goal`.
-#[allow(clippy::cast_possible_truncation)]
+/// Plays 200 episodes with the first expert until they terminate or are truncated: with the default factors or with `all`
+/// varied, towards the goal of the reset or one that `sample_goal` draws.
 pub fn tally(entry: &EnvEntry, all: bool, sampled: bool) -> Tally {
     let variation = VariationRequest { variation: all.then(|| vec!["all".to_owned()]), ..VariationRequest::default() };
     let options = ResetOptions { variation, ..ResetOptions::default() };

@@ -1,10 +1,10 @@
-//! The controller.
+//! The controller: an energy pump.
 
 use super::physics::State;
 
-/// The torque that adds energy: the way the joint turns.
-pub fn torque(&[_, _, _, fold]: &State) -> f64 {
-    if fold >= 0.0 { 1.0 } else { -1.0 }
+/// Returns the torque that adds energy: it has the sign of the joint's angular velocity.
+pub fn torque(&[_, _, _, joint_velocity]: &State) -> f64 {
+    if joint_velocity >= 0.0 { 1.0 } else { -1.0 }
 }
 
 #[cfg(test)]
@@ -13,9 +13,9 @@ mod tests {
     use crate::classic::measure::tally;
 
     #[test]
-    fn the_expert_gets_above_the_line() {
+    fn expert_lifts_the_end_above_the_line() {
         assert_eq!(tally(&ENTRY, false, false).successes, 200, "the line");
-        assert_eq!(tally(&ENTRY, true, false).successes, 199, "the line, everything varied");
-        assert!(tally(&ENTRY, false, true).successes >= 160, "sampled goals are on its way, but for chance");
+        assert_eq!(tally(&ENTRY, true, false).successes, 199, "the line, all factors varied");
+        assert!(tally(&ENTRY, false, true).successes >= 160, "sampled goals lie on its rollouts, apart from random actions");
     }
 }

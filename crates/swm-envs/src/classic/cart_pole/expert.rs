@@ -1,21 +1,21 @@
-//! The controller.
+//! The controller: state feedback on a flat output.
 
 use super::physics::Physics;
 
-/// Where all four poles of the closed loop lie, in units of the pole's own rate of falling.
+/// The four coinciding poles of the closed loop, in units of the rate at which the pole falls.
 const RATE: f64 = 0.8;
-/// The most the cart may be away from where it should be, in metres: beyond, it only goes as fast.
-const FAR: f64 = 0.5;
+/// Position errors are clipped to this, in metres.
+const MAX_ERROR: f64 = 0.5;
 
-/// Whether to push to the right, to bring the cart to `goal` with the pole up.
+/// Returns whether to push to the right, in order to bring the cart to `goal` (in metres) with the pole up.
 ///
-/// Near upright, the motion follows from one quantity alone, the place `y = x + c θ` with `c` the ratio of what a force
-/// does to cart and pole (a flat output): its second derivative is proportional to the angle, the fourth contains the
-/// force. Feedback puts all four poles of the loop at one place, which says how `y` should be accelerated; the force
-/// that would do so says which way to push.
+/// Near upright, the motion has the flat output `y = x + c θ`, where `c` is the ratio of the accelerations that a force
+/// causes in cart and pole: the second derivative of `y` is proportional to the angle, and the fourth contains the force.
+/// State feedback places all four poles of the closed loop at one value, which gives the desired fourth derivative; the
+/// sign of the force that achieves it is the direction of the push.
 pub fn pushes_right(physics: &Physics, state: &[f64; 5], goal: f64) -> bool {
     let Physics { gravity, length, pole, total, .. } = *physics;
-    let [x, v, angle, turn, _] = *state;
+    let [x, v, angle, angular_velocity, _] = *state;
     // θ'' = fall θ - β u and x'' = γ u - δ θ for a force u.
     let lever = length * (4.0 / 3.0 - pole / total);
     let (fall, beta) = (gravity / lever, 1.0 / (total * lever));
@@ -23,11 +23,11 @@ pub fn pushes_right(physics: &Physics, state: &[f64; 5], goal: f64) -> bool {
     let (gamma, delta) = (1.0 / total + drag * beta, drag * fall);
     let c = gamma / beta;
     let pull = c * fall - delta;
-    // y and its derivatives.
-    let away = (x + c * angle - goal).clamp(-FAR, FAR);
-    let (speed, acceleration, jerk) = (v + c * turn, pull * angle, pull * turn);
+    // The error of y, and its first three derivatives.
+    let error = (x + c * angle - goal).clamp(-MAX_ERROR, MAX_ERROR);
+    let (speed, acceleration, jerk) = (v + c * angular_velocity, pull * angle, pull * angular_velocity);
     let p = RATE * fall.sqrt();
-    let wanted = -(p.powi(4) * away + 4.0 * p.powi(3) * speed + 6.0 * p * p * acceleration + 4.0 * p * jerk);
+    let wanted = -(p.powi(4) * error + 4.0 * p.powi(3) * speed + 6.0 * p * p * acceleration + 4.0 * p * jerk);
     // y'''' = pull (fall θ - β u)
     fall * angle - wanted / pull > 0.0
 }
@@ -38,7 +38,7 @@ mod tests {
     use crate::classic::measure::{Tally, tally};
 
     #[test]
-    fn the_expert_reaches_the_goal_and_keeps_the_pole_up() {
+    fn expert_reaches_the_goal_and_keeps_the_pole_up() {
         for (all, sampled, reached) in [(false, false, 200), (false, true, 200), (true, false, 199), (true, true, 198)]
         {
             let what = format!("all varied: {all}, sampled goal: {sampled}");

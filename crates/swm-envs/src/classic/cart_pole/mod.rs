@@ -4,7 +4,7 @@ mod expert;
 mod physics;
 mod render;
 
-use super::{Classic, Paint, Parameter, Surface, World};
+use super::{ClassicEnv, ColorFactor, ControlTask, Controller, PhysicsFactor, Surface};
 use physics::Physics;
 use rand::Rng as _;
 use swm_core::{DType, EnvEntry, ExpertEntry, Rng, Space, Transition};
@@ -12,52 +12,53 @@ use swm_core::{DType, EnvEntry, ExpertEntry, Rng, Space, Transition};
 /// The registry row.
 pub const ENTRY: EnvEntry = EnvEntry {
     id: CartPole::ID,
-    summary: "push a cart left or right so that the pole on it stays up, and take it to a place",
+    summary: "push a cart left or right so that the pole on it stays up, and take it to a position",
     options: &[],
-    make: |_| Ok(Box::new(Classic::<CartPole>::new())),
+    make: |_| Ok(Box::new(ClassicEnv::<CartPole>::new())),
     experts: &[ExpertEntry {
         id: "expert",
         summary: "drives the cart to the goal without letting the pole fall (state feedback)",
-        make: || Box::new(super::Controller::<CartPole>::new()),
+        make: || Box::new(Controller::<CartPole>::new()),
     }],
 };
 
 /// A cart with a pole on it.
 struct CartPole(Physics);
 
-/// The start is drawn from this around 0, every number.
+/// Half-width of the uniform distribution of the start around 0, for every value of the state.
 const START: f64 = 0.05;
-/// The goal of an episode is this far from the middle of the track, at least and at most.
+/// Least and greatest distance of the goal from the centre of the track, in metres.
 const GOAL: [f64; 2] = [0.5, 1.5];
-/// How near to the goal the cart, in metres, and the pole, in radians, must be.
+/// The goal is reached when cart (metres) and pole (radians) are both nearer than this.
 const NEAR: [f64; 2] = [0.1, 0.1];
-/// Twice the tilt at which an episode ends, in radians: what the reference names as the bound of an observation.
-const TILT: f64 = 24.0 * std::f64::consts::PI / 180.0;
-/// States asked for are bounded by this: far beyond what anyone can make of an episode.
-const FAR: f64 = 1000.0;
+/// Twice the angle at which an episode ends, in radians: the bound of the observation in the reference.
+const MAX_ANGLE: f64 = 24.0 * std::f64::consts::PI / 180.0;
+/// Bound of the states that a caller may give, far beyond those that occur in an episode.
+const MAX_STATE: f64 = 1000.0;
 
-impl World for CartPole {
+impl ControlTask for CartPole {
     const ID: &'static str = "swm/CartPoleControl-v1";
-    const LIMIT: usize = 500;
-    const OBSERVED: &'static [(f64, f64)] =
-        &[(-4.8, 4.8), (f64::NEG_INFINITY, f64::INFINITY), (-TILT, TILT), (f64::NEG_INFINITY, f64::INFINITY)];
-    const SIZE: (usize, usize) = render::SIZE;
-    const PHYSICS: &'static [Parameter] = &[
-        Parameter("force_mag", [5.0, 15.0], 10.0),
-        Parameter("gravity", [4.9, 14.7], 9.8),
-        Parameter("length", [0.25, 0.75], 0.5),
-        Parameter("masscart", [0.5, 1.5], 1.0),
-        Parameter("masspole", [0.05, 0.5], 0.1),
-        Parameter("tau", [0.01, 0.04], 0.02),
+    const MAX_EPISODE_STEPS: usize = 500;
+    const STATE_BOUNDS: &'static [(f64, f64)] =
+        &[(-4.8, 4.8), (f64::NEG_INFINITY, f64::INFINITY), (-MAX_ANGLE, MAX_ANGLE), (f64::NEG_INFINITY, f64::INFINITY)];
+    const FRAME_SIZE: (usize, usize) = render::SIZE;
+    const PHYSICS_FACTORS: &'static [PhysicsFactor] = &[
+        PhysicsFactor("force_mag", [5.0, 15.0], 10.0),
+        PhysicsFactor("gravity", [4.9, 14.7], 9.8),
+        PhysicsFactor("length", [0.25, 0.75], 0.5),
+        PhysicsFactor("masscart", [0.5, 1.5], 1.0),
+        PhysicsFactor("masspole", [0.05, 0.5], 0.1),
+        PhysicsFactor("tau", [0.01, 0.04], 0.02),
     ];
-    const VISUALS: &'static [Paint] = &[
-        Paint("bg", [0.6, 1.0], [255; 3]),
-        Paint("cart", [0.0, 0.4], render::CART),
-        Paint("pole", [0.0, 1.0], render::POLE),
-        Paint("axle", [0.0, 1.0], render::AXLE),
+    const COLOR_FACTORS: &'static [ColorFactor] = &[
+        ColorFactor("bg", [0.6, 1.0], [255; 3]),
+        ColorFactor("cart", [0.0, 0.4], render::CART),
+        ColorFactor("pole", [0.0, 1.0], render::POLE),
+        ColorFactor("axle", [0.0, 1.0], render::AXLE),
     ];
 
-    /// Place and speed of the cart, angle and speed of the pole, and 1 once it fell.
+    /// Position (m) and velocity (m/s) of the cart, angle (rad) and angular velocity (rad/s) of the pole, and 1 once the
+    /// pole has fallen.
     type State = [f64; 5];
 
     fn action_space() -> Space {
@@ -68,12 +69,12 @@ impl World for CartPole {
         Self(Physics::new(physics))
     }
 
-    fn start(rng: &mut Rng) -> Self::State {
-        let [x, v, angle, turn] = [(); 4].map(|()| rng.random_range(-START..START));
-        [x, v, angle, turn, 0.0]
+    fn sample_start(rng: &mut Rng) -> Self::State {
+        let [x, v, angle, angular_velocity] = [(); 4].map(|()| rng.random_range(-START..START));
+        [x, v, angle, angular_velocity, 0.0]
     }
 
-    fn task(rng: &mut Rng) -> Self::State {
+    fn sample_task_goal(rng: &mut Rng) -> Self::State {
         let side = if rng.random() { 1.0 } else { -1.0 };
         [side * rng.random_range(GOAL[0]..GOAL[1]), 0.0, 0.0, 0.0, 0.0]
     }
@@ -82,24 +83,23 @@ impl World for CartPole {
         self.0.step(state, action == 1.0)
     }
 
-    #[allow(clippy::cast_possible_truncation)]
     fn observe(state: &Self::State, row: &mut [f32]) {
-        row.iter_mut().zip(state).for_each(|(number, &value)| *number = value as f32);
+        row.iter_mut().zip(state).for_each(|(slot, &value)| *slot = value as f32);
     }
 
-    fn states() -> Space {
-        Space::uniform_box([Self::OBSERVED.len()], DType::Float64, -FAR, FAR)
+    fn state_space() -> Space {
+        Space::uniform_box([Self::STATE_BOUNDS.len()], DType::Float64, -MAX_STATE, MAX_STATE)
     }
 
-    fn shown(observed: &[f64]) -> Self::State {
+    fn read_state(observed: &[f64]) -> Self::State {
         [observed[0], observed[1], observed[2], observed[3], 0.0]
     }
 
-    fn reached(&self, state: &Self::State, goal: &Self::State) -> bool {
+    fn is_reached(&self, state: &Self::State, goal: &Self::State) -> bool {
         (state[0] - goal[0]).abs() <= NEAR[0] && (state[2] - goal[2]).abs() <= NEAR[1]
     }
 
-    fn distance(&self, state: &Self::State, goal: &Self::State) -> f64 {
+    fn goal_distance(&self, state: &Self::State, goal: &Self::State) -> f64 {
         (state[0] - goal[0]).abs() / NEAR[0] + (state[2] - goal[2]).abs() / NEAR[1]
     }
 

@@ -1,31 +1,36 @@
-//! The picture: a track, a cart, a pole and its axle, on 600 x 400 pixels for 4.8 metres of track.
+//! Rendering: a track, a cart, a pole and its axle, at 600 x 400 pixels for 4.8 metres of track.
 
-use crate::classic::picture::{Color, Surface, pixel};
-use crate::classic::turned;
+use crate::classic::frame::{Color, Surface, pixel};
+use crate::classic::geometry::rotated;
 
-/// Width and height of the drawing.
+/// Width and height of the frame as it is drawn, in pixels.
 pub const SIZE: (usize, usize) = (600, 400);
-/// The colours of the drawing: cart and track, pole, axle.
+/// Colour of cart and track.
 pub const CART: [u8; 3] = [0, 0, 0];
+/// Colour of the pole.
 pub const POLE: [u8; 3] = [202, 152, 101];
+/// Colour of the axle.
 pub const AXLE: [u8; 3] = [129, 132, 203];
 
-/// Pixels in a metre, and where the middle of the track is.
+/// Pixels per metre.
 const SCALE: f64 = 600.0 / 4.8;
+/// Column of the centre of the track.
 const MIDDLE: f64 = 300.0;
-/// The row of the track; the middle of the cart.
+/// Row of the track, at the centre of the cart.
 const TRACK: i32 = 100;
-/// Half the cart's width and height, how far the axle is above its middle, half the pole's width: all in pixels.
+/// Half the width and height of the cart, in pixels.
 const CART_HALF: [f64; 2] = [25.0, 15.0];
+/// Height of the axle above the centre of the cart, in pixels.
 const AXLE_ABOVE: f64 = 7.5;
+/// Half the width of the pole, in pixels.
 const POLE_HALF: f64 = 5.0;
 
 /// Draws the track.
 pub fn track(surface: &mut Surface) {
-    surface.level(TRACK, 0, SIZE.0 as i32, Color::new(CART));
+    surface.horizontal_line(TRACK, 0, SIZE.0 as i32, Color::new(CART));
 }
 
-/// Draws cart, pole and axle, and the track that crosses them. `length` is half the pole's.
+/// Draws cart, pole and axle, and the track that crosses them. `length` is half the length of the pole, in metres.
 pub fn cart(surface: &mut Surface, state: &[f64; 5], length: f64) {
     let (x, y) = (state[0] * SCALE + MIDDLE, f64::from(TRACK));
     let [wide, high] = CART_HALF;
@@ -34,14 +39,13 @@ pub fn cart(surface: &mut Surface, state: &[f64; 5], length: f64) {
 
     let top = SCALE * (2.0 * length) - POLE_HALF;
     let corners = [[-POLE_HALF, -POLE_HALF], [-POLE_HALF, top], [POLE_HALF, top], [POLE_HALF, -POLE_HALF]];
-    let place = |corner| {
-        let [dx, dy] = turned(corner, -state[2]);
+    let to_pixel = |corner| {
+        let [dx, dy] = rotated(corner, -state[2]);
         pixel([x + dx, y + AXLE_ABOVE + dy])
     };
-    surface.polygon(&corners.map(place), Color::new(POLE));
-    #[allow(clippy::cast_possible_truncation)]
+    surface.polygon(&corners.map(to_pixel), Color::new(POLE));
     surface.disc(pixel([x, y + AXLE_ABOVE]), POLE_HALF as i32, Color::new(AXLE));
 
-    // Only where something was drawn: a frame costs what differs from the background.
-    surface.level_over(TRACK, Color::new(CART));
+    // Only the drawn columns, because the resizing of a frame costs time for every drawn pixel.
+    surface.fill_drawn(TRACK, Color::new(CART));
 }

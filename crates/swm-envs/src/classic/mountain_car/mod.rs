@@ -4,70 +4,70 @@ mod expert;
 mod physics;
 mod render;
 
-use super::{Classic, Controller, Paint, Parameter, Surface, World};
-use physics::{ENDS, FASTEST, Hill, height};
+use super::{ClassicEnv, ColorFactor, ControlTask, Controller, PhysicsFactor, Surface};
+use physics::{ENDS, Hill, MAX_SPEED, height};
 use rand::Rng as _;
 use std::marker::PhantomData;
 use swm_core::{DType, EnvEntry, ExpertEntry, Rng, Space, Transition};
 
-/// The registry row of the world with three actions.
+/// The registry row of the environment with three actions.
 pub const ENTRY: EnvEntry = EnvEntry {
     id: Discrete::ID,
     summary: "swing a car with a weak motor out of a valley, up to the flag",
     options: &[],
-    make: |_| Ok(Box::new(Classic::<MountainCar<Discrete>>::new())),
+    make: |_| Ok(Box::new(ClassicEnv::<MountainCar<Discrete>>::new())),
     experts: &[ExpertEntry { make: || Box::new(Controller::<MountainCar<Discrete>>::new()), ..PUMP }],
 };
 
-/// The registry row of the world in which one chooses the motor's power.
+/// The registry row of the environment with continuous motor power.
 pub const CONTINUOUS: EnvEntry = EnvEntry {
     id: Continuous::ID,
     summary: "swing a car with a weak motor out of a valley, up to the flag, with little power",
     options: &[],
-    make: |_| Ok(Box::new(Classic::<MountainCar<Continuous>>::new())),
+    make: |_| Ok(Box::new(ClassicEnv::<MountainCar<Continuous>>::new())),
     experts: &[ExpertEntry { make: || Box::new(Controller::<MountainCar<Continuous>>::new()), ..PUMP }],
 };
 
-/// Both experts' name.
+/// Id and summary of both experts.
 const PUMP: ExpertEntry = ExpertEntry {
     id: "expert",
     summary: "pushes the way the car rolls, so that it swings higher and higher",
     make: || Box::new(Controller::<MountainCar<Discrete>>::new()),
 };
 
-/// What tells the two worlds apart.
+/// The differences between the two environments.
 trait Variant: Send + 'static {
     const ID: &'static str;
-    const LIMIT: usize;
-    const PHYSICS: &'static [Parameter];
-    /// Where the flag is.
+    const MAX_EPISODE_STEPS: usize;
+    const PHYSICS_FACTORS: &'static [PhysicsFactor];
+    /// Position of the flag, in track units.
     const FLAG: f64;
 
     fn action_space() -> Space;
 
-    /// The hill with these values of `PHYSICS`.
+    /// Makes the hill with these values of `PHYSICS_FACTORS`.
     fn hill(physics: &[f32]) -> Hill;
 
-    /// The state after a step.
+    /// Returns the state after a step.
     fn step(hill: &Hill, state: [f64; 2], action: f64) -> [f64; 2];
 
-    /// The reward of a step.
+    /// Returns the reward of a step.
     fn reward(action: f64, terminated: bool) -> f64;
 
-    /// Full power to the right or to the left.
+    /// Returns the action of full power to the right or to the left.
     fn push(right: bool) -> f64;
 }
 
-/// Push left, do nothing, push right.
+/// Three actions: push left, do nothing, push right.
 struct Discrete;
 
 impl Variant for Discrete {
     const ID: &'static str = "swm/MountainCarControl-v0";
-    const LIMIT: usize = 200;
-    const PHYSICS: &'static [Parameter] = &[
-        Parameter("force", [0.0005, 0.0015], 0.001),
-        Parameter("gravity", [0.00125, 0.00375], 0.0025),
-        Parameter("max_speed", [0.035, FASTEST], 0.07),
+    const MAX_EPISODE_STEPS: usize = 200;
+    const PHYSICS_FACTORS: &'static [PhysicsFactor] = &[
+        PhysicsFactor("force", [0.0005, 0.0015], 0.001),
+        PhysicsFactor("gravity", [0.00125, 0.00375], 0.0025),
+        PhysicsFactor("max_speed", [0.035, MAX_SPEED], 0.07),
     ];
     const FLAG: f64 = 0.5;
 
@@ -93,14 +93,14 @@ impl Variant for Discrete {
     }
 }
 
-/// Any power from -1 to 1, which costs.
+/// Continuous power from -1 to 1, at a cost.
 struct Continuous;
 
 impl Variant for Continuous {
     const ID: &'static str = "swm/MountainCarContinuousControl-v0";
-    const LIMIT: usize = 999;
-    const PHYSICS: &'static [Parameter] =
-        &[Parameter("max_speed", [0.035, FASTEST], 0.07), Parameter("power", [0.00075, 0.00225], 0.0015)];
+    const MAX_EPISODE_STEPS: usize = 999;
+    const PHYSICS_FACTORS: &'static [PhysicsFactor] =
+        &[PhysicsFactor("max_speed", [0.035, MAX_SPEED], 0.07), PhysicsFactor("power", [0.00075, 0.00225], 0.0015)];
     const FLAG: f64 = 0.45;
 
     fn action_space() -> Space {
@@ -112,7 +112,7 @@ impl Variant for Continuous {
     }
 
     fn step(hill: &Hill, state: [f64; 2], action: f64) -> [f64; 2] {
-        hill.smooth_step(state, action)
+        hill.continuous_step(state, action)
     }
 
     fn reward(action: f64, terminated: bool) -> f64 {
@@ -127,33 +127,32 @@ impl Variant for Continuous {
 /// A car in a valley.
 struct MountainCar<V>(Hill, PhantomData<V>);
 
-/// The start is drawn from here, at rest.
+/// Bounds of the start position, in track units; the car starts at rest.
 const START: [f64; 2] = [-0.6, -0.4];
-/// How near to a goal below the flag the car must be.
+/// A goal below the flag is reached when the car is nearer than this, in track units.
 const NEAR: f64 = 0.05;
-/// How much more a unit of height counts in the goal distance than one of the way.
-const CLIMB: f64 = 10.0;
+/// Weight of a unit of missing height in the goal distance, relative to a unit of distance.
+const HEIGHT_WEIGHT: f64 = 10.0;
 
 impl<V: Variant> MountainCar<V> {
-    /// The place of the flag as the `state` column shows it.
-    #[allow(clippy::cast_possible_truncation)]
+    /// Position of the flag, rounded to the precision of the `state` column.
     const FLAG: f64 = V::FLAG as f32 as f64;
 
-    /// Whether the car is at the flag and does not roll back.
+    /// Returns whether the car is at the flag and does not roll back.
     fn at_flag(state: &[f64; 2]) -> bool {
         state[0] >= Self::FLAG.min(V::FLAG) && state[1] >= 0.0
     }
 }
 
-impl<V: Variant> World for MountainCar<V> {
+impl<V: Variant> ControlTask for MountainCar<V> {
     const ID: &'static str = V::ID;
-    const LIMIT: usize = V::LIMIT;
-    const OBSERVED: &'static [(f64, f64)] = &[(-1.2, 0.6), (-0.07, 0.07)];
-    const SIZE: (usize, usize) = render::SIZE;
-    const PHYSICS: &'static [Parameter] = V::PHYSICS;
-    const VISUALS: &'static [Paint] = &[Paint("bg", [0.6, 1.0], [255; 3]), Paint("fg", [0.0, 0.4], render::INK)];
+    const MAX_EPISODE_STEPS: usize = V::MAX_EPISODE_STEPS;
+    const STATE_BOUNDS: &'static [(f64, f64)] = &[(-1.2, 0.6), (-0.07, 0.07)];
+    const FRAME_SIZE: (usize, usize) = render::SIZE;
+    const PHYSICS_FACTORS: &'static [PhysicsFactor] = V::PHYSICS_FACTORS;
+    const COLOR_FACTORS: &'static [ColorFactor] = &[ColorFactor("bg", [0.6, 1.0], [255; 3]), ColorFactor("fg", [0.0, 0.4], render::INK)];
 
-    /// Place and speed.
+    /// Position (track units) and velocity (track units per step).
     type State = [f64; 2];
 
     fn action_space() -> Space {
@@ -164,12 +163,11 @@ impl<V: Variant> World for MountainCar<V> {
         Self(V::hill(physics), PhantomData)
     }
 
-    #[allow(clippy::cast_possible_truncation)]
-    fn start(rng: &mut Rng) -> Self::State {
+    fn sample_start(rng: &mut Rng) -> Self::State {
         [f64::from(rng.random_range(START[0]..START[1]) as f32), 0.0]
     }
 
-    fn task(_rng: &mut Rng) -> Self::State {
+    fn sample_task_goal(_rng: &mut Rng) -> Self::State {
         [Self::FLAG, 0.0]
     }
 
@@ -179,33 +177,31 @@ impl<V: Variant> World for MountainCar<V> {
         Transition { reward: V::reward(action, terminated), terminated, truncated: false }
     }
 
-    #[allow(clippy::cast_possible_truncation)]
     fn observe(state: &Self::State, row: &mut [f32]) {
         row.copy_from_slice(&state.map(|v| v as f32));
     }
 
-    #[allow(clippy::cast_possible_truncation)]
-    fn states() -> Space {
+    fn state_space() -> Space {
         let [low, high] = ENDS.map(|end| f64::from(end as f32));
-        let fastest = f64::from(FASTEST);
-        Space::Box { shape: vec![2], dtype: DType::Float64, low: vec![low, -fastest], high: vec![high, fastest] }
+        let max_speed = f64::from(MAX_SPEED);
+        Space::Box { shape: vec![2], dtype: DType::Float64, low: vec![low, -max_speed], high: vec![high, max_speed] }
     }
 
-    fn shown(observed: &[f64]) -> Self::State {
+    fn read_state(observed: &[f64]) -> Self::State {
         [observed[0].clamp(ENDS[0], ENDS[1]), observed[1]]
     }
 
-    fn reached(&self, state: &Self::State, goal: &Self::State) -> bool {
+    fn is_reached(&self, state: &Self::State, goal: &Self::State) -> bool {
         if Self::at_flag(goal) { Self::at_flag(state) } else { (state[0] - goal[0]).abs() <= NEAR }
     }
 
-    fn distance(&self, state: &Self::State, goal: &Self::State) -> f64 {
-        if Self::at_flag(goal) && self.reached(state, goal) {
+    fn goal_distance(&self, state: &Self::State, goal: &Self::State) -> f64 {
+        if Self::at_flag(goal) && self.is_reached(state, goal) {
             return 0.0;
         }
-        let lift = |state: &[f64; 2]| height(state[0]) / 1.35 * self.0.gravity;
-        let missing = (lift(goal) - lift(state) - state[1] * state[1] / 2.0).max(0.0) / self.0.gravity;
-        (state[0] - goal[0]).abs() + CLIMB * missing
+        let potential = |state: &[f64; 2]| height(state[0]) / 1.35 * self.0.gravity;
+        let missing_height = (potential(goal) - potential(state) - state[1] * state[1] / 2.0).max(0.0) / self.0.gravity;
+        (state[0] - goal[0]).abs() + HEIGHT_WEIGHT * missing_height
     }
 
     fn control(&self, state: &Self::State, _goal: &Self::State) -> f64 {

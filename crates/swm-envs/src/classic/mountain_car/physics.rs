@@ -1,31 +1,31 @@
-//! The dynamics: a car in a sinusoidal valley whose motor is weaker than gravity (Moore 1990), one step at a time.
+//! The dynamics: a car in a sinusoidal valley whose motor is weaker than gravity (Moore 1990).
 //!
-//! Constants, the order of operations and their precision are those of Gymnasium's MountainCar (double) and
-//! Continuous_MountainCar (single, because its state is).
+//! Constants, the order of operations and their precision are those of Gymnasium's MountainCar (double precision) and
+//! Continuous_MountainCar (single precision, as its state). Lengths are in track units, times in steps.
 
-/// Where the valley ends on both sides. Walls stop the car.
+/// Positions of the walls at both ends of the track, in track units.
 pub const ENDS: [f64; 2] = [-1.2, 0.6];
-/// How fast a car may be with any factors.
-pub const FASTEST: f32 = 0.105;
+/// The maximal speed with any factors, in track units per step.
+pub const MAX_SPEED: f32 = 0.105;
 
-/// The physical factors of an episode, in units of the track and of a step.
+/// The physical factors of an episode.
 #[derive(Clone, Copy, Debug)]
 pub struct Hill {
-    /// What the motor adds to the speed at full power.
+    /// Acceleration by the motor at full power, in track units per step².
     pub push: f64,
-    /// What gravity adds to it where the hill is steepest.
+    /// Acceleration by gravity where the hill is steepest, in track units per step².
     pub gravity: f64,
-    /// The most the car moves in a step.
+    /// The maximal speed, in track units per step.
     pub max_speed: f64,
 }
 
-/// The height of the hill.
+/// Returns the height of the hill at a position, in track units.
 pub fn height(x: f64) -> f64 {
     (3.0 * x).sin() * 0.45 + 0.55
 }
 
 impl Hill {
-    /// One step with the motor at -1, 0 or 1.
+    /// Returns position and velocity after a step with a motor power of -1, 0 or 1.
     pub fn step(&self, [x, speed]: [f64; 2], power: f64) -> [f64; 2] {
         let speed = speed + (power * self.push + (3.0 * x).cos() * -self.gravity);
         let speed = speed.clamp(-self.max_speed, self.max_speed);
@@ -33,12 +33,11 @@ impl Hill {
         [x, if x == ENDS[0] && speed < 0.0 { 0.0 } else { speed }]
     }
 
-    /// One step in single precision with the motor anywhere from -1 to 1; more is cut.
-    #[allow(clippy::cast_possible_truncation)]
-    pub fn smooth_step(&self, [x, speed]: [f64; 2], power: f64) -> [f64; 2] {
+    /// Returns position and velocity after a step in single precision, with a motor power that is clipped to -1 ..= 1.
+    pub fn continuous_step(&self, [x, speed]: [f64; 2], power: f64) -> [f64; 2] {
         let [mut x, mut speed, power, limit] = [x, speed, power, self.max_speed].map(|v| v as f32);
         let slope = self.gravity * f64::from(3.0 * x).cos();
-        // numpy rounds every operation with a number of the action, and once where the action was cut.
+        // numpy rounds every operation with an element of the action, and only once where the action was clipped.
         speed += if (-1.0..=1.0).contains(&power) {
             power * self.push as f32 - slope as f32
         } else {

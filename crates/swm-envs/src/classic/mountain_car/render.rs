@@ -1,62 +1,66 @@
-//! The picture: the hill as a line, a car on two wheels, and a flag, on 600 x 400 pixels.
+//! Rendering: the hill as a line, a car on two wheels, and a flag, at 600 x 400 pixels.
 
 use super::physics::{ENDS, height};
-use crate::classic::picture::{Color, Surface, pixel};
-use crate::classic::turned;
+use crate::classic::frame::{Color, Surface, pixel};
+use crate::classic::geometry::rotated;
 use crate::draw::Point;
 
-/// Width and height of the drawing.
+/// Width and height of the frame as it is drawn, in pixels.
 pub const SIZE: (usize, usize) = (600, 400);
-/// The colour of hill, car and flag-pole.
+/// Colour of hill, car and flagpole.
 pub const INK: [u8; 3] = [0, 0, 0];
+/// Colour of the wheels.
 const WHEEL: [u8; 3] = [128, 128, 128];
+/// Colour of the flag.
 const FLAG: [u8; 3] = [204, 204, 0];
 
-/// Pixels in a unit of the track.
+/// Pixels per track unit.
 const SCALE: f64 = 600.0 / (ENDS[1] - ENDS[0]);
-/// Places at which the hill's line bends.
-const BENDS: usize = 100;
-/// Half the car's length, its height, and how far it is above the hill; where wheels are, and their radius: pixels.
+/// Points of the polyline of the hill.
+const HILL_POINTS: usize = 100;
+/// Half the length and the height of the car, in pixels.
 const CAR: [f64; 2] = [20.0, 20.0];
+/// Height of the car above the hill, in pixels.
 const CLEARANCE: f64 = 10.0;
+/// Distance of the wheels from the centre of the car, in pixels.
 const WHEELS: f64 = 10.0;
+/// Radius of the wheels, in pixels.
 const WHEEL_RADIUS: i32 = 8;
-/// The flag-pole's height, the flag's height and length: pixels.
+/// Height of the flagpole, in pixels.
 const POLE: i32 = 50;
+/// Length and width of the flag, in pixels.
 const FLAG_SIZE: [i32; 2] = [25, 10];
 
-/// A place on the hill.
-fn place(x: f64) -> [f64; 2] {
+/// Returns the point of the hill at a position, in pixels, y up.
+fn hill_point(x: f64) -> [f64; 2] {
     [(x - ENDS[0]) * SCALE, height(x) * SCALE]
 }
 
-/// Draws the hill: straight lines between places of it.
-#[allow(clippy::cast_precision_loss)]
+/// Draws the hill as a polyline.
 pub fn hill(surface: &mut Surface) {
-    let bend = |i: usize| place(ENDS[0] + (ENDS[1] - ENDS[0]) * i as f64 / (BENDS - 1) as f64);
-    for i in 1..BENDS {
-        surface.fine_line(bend(i - 1), bend(i), Color::new(INK));
+    let point = |i: usize| hill_point(ENDS[0] + (ENDS[1] - ENDS[0]) * i as f64 / (HILL_POINTS - 1) as f64);
+    for i in 1..HILL_POINTS {
+        surface.fine_line(point(i - 1), point(i), Color::new(INK));
     }
 }
 
-/// Draws the car, and the flag before it.
-#[allow(clippy::cast_possible_truncation)]
+/// Draws the car at a position, and the flag in front of it.
 pub fn car(surface: &mut Surface, x: f64, flag: f64) {
     let ink = Color::new(INK);
-    let [at, above] = place(x);
-    let from_car = |corner| {
-        let [dx, dy] = turned(corner, (3.0 * x).cos());
-        pixel([dx + at, dy + CLEARANCE + above])
+    let [at, height] = hill_point(x);
+    let to_pixel = |corner| {
+        let [dx, dy] = rotated(corner, (3.0 * x).cos());
+        pixel([dx + at, dy + CLEARANCE + height])
     };
     let [half, top] = CAR;
-    surface.polygon(&[[-half, 0.0], [-half, top], [half, top], [half, 0.0]].map(from_car), ink);
+    surface.polygon(&[[-half, 0.0], [-half, top], [half, top], [half, 0.0]].map(to_pixel), ink);
     for wheel in [WHEELS, -WHEELS] {
-        surface.disc(from_car([wheel, 0.0]), WHEEL_RADIUS, Color::new(WHEEL));
+        surface.disc(to_pixel([wheel, 0.0]), WHEEL_RADIUS, Color::new(WHEEL));
     }
 
-    let foot = pixel(place(flag));
+    let foot = pixel(hill_point(flag));
     let (tip, [length, width]) = (foot.y + POLE, FLAG_SIZE);
-    surface.upright(foot.x, foot.y, tip, ink);
+    surface.vertical_line(foot.x, foot.y, tip, ink);
     let corners = [(0, 0), (0, -width), (length, -width / 2)].map(|(dx, dy)| Point::new(foot.x + dx, tip + dy));
     surface.polygon(&corners, Color::new(FLAG));
 }

@@ -1,27 +1,27 @@
-//! The controller.
+//! The controller: it pumps energy into the rod, then stabilises it upright by state feedback.
 
-use super::angle::between;
 use super::physics::Physics;
+use crate::classic::angle::between;
 
-/// Near enough to upright to be caught, in units of what the motor can hold.
+/// State feedback starts when the torque it needs is at most this, as a share of the maximal torque.
 const CATCH: f64 = 1.0;
-/// Where both poles of the closed loop lie near upright, in units of the rod's own rate of falling.
+/// The two coinciding poles of the closed loop near upright, in units of the rate at which the rod falls.
 const RATE: f64 = 1.5;
 
-/// The torque, at most `limit`, that swings the rod up and holds it.
-pub fn torque(physics: &Physics, &[angle, turn, _]: &[f64; 3], limit: f64) -> f64 {
-    let (fall, push) = (physics.fall(), physics.per_torque());
-    let (off, limit) = (between(0.0, angle), limit.min(physics.max_torque));
-    // Upright, θ'' = fall θ + push u.
+/// Returns the torque, at most `limit`, that swings the rod up and holds it, in N m.
+pub fn torque(physics: &Physics, &[angle, velocity, _]: &[f64; 3], limit: f64) -> f64 {
+    let (fall, push) = (physics.gravity_acceleration(), physics.acceleration_per_torque());
+    let (error, limit) = (between(0.0, angle), limit.min(physics.max_torque));
+    // Near upright, θ'' = fall θ + push u for a torque u.
     let rate = RATE * fall.sqrt();
-    let wanted = -((fall + rate * rate) * off + 2.0 * rate * turn) / push;
+    let wanted = -((fall + rate * rate) * error + 2.0 * rate * velocity) / push;
     if wanted.abs() <= CATCH * limit {
         return wanted.clamp(-limit, limit);
     }
-    // The energy that is missing for standing upright; a torque the way the rod turns adds to it.
-    let missing = fall * (1.0 - off.cos()) - turn * turn / 2.0;
-    let way = if turn == 0.0 { 1.0 } else { turn.signum() };
-    limit.copysign(missing * way)
+    // The energy that is missing for standing upright. A torque in the direction of motion adds energy.
+    let missing_energy = fall * (1.0 - error.cos()) - velocity * velocity / 2.0;
+    let direction = if velocity == 0.0 { 1.0 } else { velocity.signum() };
+    limit.copysign(missing_energy * direction)
 }
 
 #[cfg(test)]
@@ -30,9 +30,9 @@ mod tests {
     use crate::classic::pendulum::ENTRY;
 
     #[test]
-    fn the_expert_swings_up_and_holds() {
+    fn expert_swings_the_rod_up_and_holds_it() {
         assert_eq!(tally(&ENTRY, false, false).successes, 200, "upright");
-        assert_eq!(tally(&ENTRY, true, false).successes, 169, "upright, everything varied: some motors are too weak");
-        assert!(tally(&ENTRY, false, true).successes >= 180, "sampled goals are on its way, but for chance");
+        assert_eq!(tally(&ENTRY, true, false).successes, 169, "upright, all factors varied: some motors are too weak");
+        assert!(tally(&ENTRY, false, true).successes >= 180, "sampled goals lie on its rollouts, apart from random actions");
     }
 }

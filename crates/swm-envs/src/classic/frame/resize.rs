@@ -101,11 +101,6 @@ impl Resize {
         }
     }
 
-    /// Pixels in a row of the picture, and rows.
-    pub fn size(&self) -> (usize, usize) {
-        (self.columns.taps.len(), self.rows.taps.len())
-    }
-
     /// Takes over a background, all of which counts as drawn.
     pub fn set_background(&mut self, background: &Surface, swaps: Swaps<'_>) {
         let mut picture = std::mem::take(&mut self.picture);
@@ -202,7 +197,7 @@ mod tests {
     fn surface(shown: impl Fn(usize, usize) -> bool) -> Surface {
         let mut surface = Surface::new(9, 6, Color::new([77; 3]));
         for (x, y) in (0..54).map(|i| (i % 9, i / 9)).filter(|&(x, y)| shown(x, y)) {
-            surface.level(5 - y as i32, x as i32, x as i32, Color::new([grey(x, y); 3]));
+            surface.horizontal_line(5 - y as i32, x as i32, x as i32, Color::new([grey(x, y); 3]));
         }
         surface
     }
@@ -227,7 +222,7 @@ mod tests {
                 for (x, y) in (0..54).map(|i| (i % 9, i / 9)) {
                     if (x + y) % 4 >= part {
                         front.blend(Point::new(x as i32, 5 - y as i32), Color::new([0; 3]), 0);
-                        front.level(5 - y as i32, x as i32, x as i32, Color::new([grey(x, y); 3]));
+                        front.horizontal_line(5 - y as i32, x as i32, x as i32, Color::new([grey(x, y); 3]));
                     }
                 }
                 for _ in 0..2 {

@@ -48,7 +48,10 @@ impl BodyShape {
             }
             _ => {
                 let (wide, half) = (3.0 * s / 2.0, s / 2.0);
-                Self::union(&[[-wide, -half, wide, half], [-half, half, half, wide], [-half, -wide, half, -half]], &[0; 3])
+                Self::union(
+                    &[[-wide, -half, wide, half], [-half, half, half, wide], [-half, -wide, half, -half]],
+                    &[0; 3],
+                )
             }
         }
     }

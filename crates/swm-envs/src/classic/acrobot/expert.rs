@@ -16,6 +16,9 @@ mod tests {
     fn expert_lifts_the_end_above_the_line() {
         assert_eq!(tally(&ENTRY, false, false).successes, 200, "the line");
         assert_eq!(tally(&ENTRY, true, false).successes, 199, "the line, all factors varied");
-        assert!(tally(&ENTRY, false, true).successes >= 160, "sampled goals lie on its rollouts, apart from random actions");
+        assert!(
+            tally(&ENTRY, false, true).successes >= 160,
+            "sampled goals lie on its rollouts, apart from random actions"
+        );
     }
 }

@@ -88,7 +88,12 @@ impl ControlTask for Acrobot {
 
     fn read_state(observed: &[f64]) -> Self::State {
         let speed = |i: usize| observed[4 + i].clamp(-MAX_SPEED[i], MAX_SPEED[i]);
-        [angle::from_cos_sin(observed[0], observed[1]), angle::from_cos_sin(observed[2], observed[3]), speed(0), speed(1)]
+        [
+            angle::from_cos_sin(observed[0], observed[1]),
+            angle::from_cos_sin(observed[2], observed[3]),
+            speed(0),
+            speed(1),
+        ]
     }
 
     fn parse_state(what: &str, observed: &[f64]) -> Result<Self::State> {
@@ -106,7 +111,8 @@ impl ControlTask for Acrobot {
     }
 
     fn goal_distance(&self, state: &Self::State, goal: &Self::State) -> f64 {
-        let missing_energy = (self.0.energy(goal) - self.0.energy(state)).max(0.0) / self.0.energy(&[PI, 0.0, 0.0, 0.0]);
+        let missing_energy =
+            (self.0.energy(goal) - self.0.energy(state)).max(0.0) / self.0.energy(&[PI, 0.0, 0.0, 0.0]);
         let distance = if height(goal) > LINE {
             if self.is_reached(state, goal) {
                 return 0.0;

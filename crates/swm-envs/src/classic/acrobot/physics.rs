@@ -58,8 +58,7 @@ impl Physics {
         let [d1, d2] = self.inertias(joint);
         let coriolis = m2 * l1 * c2 * joint.sin();
         let phi2 = m2 * c2 * GRAVITY * (angle + joint - PI / 2.0).cos();
-        let phi1 = -coriolis * (joint_velocity * joint_velocity)
-            - 2.0 * coriolis * joint_velocity * velocity
+        let phi1 = -coriolis * (joint_velocity * joint_velocity) - 2.0 * coriolis * joint_velocity * velocity
             + (m1 * c1 + m2 * l1) * GRAVITY * (angle - PI / 2.0).cos()
             + phi2;
         let joint_acceleration = (torque + d2 / d1 * phi1 - coriolis * (velocity * velocity) - phi2)

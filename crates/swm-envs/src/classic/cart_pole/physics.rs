@@ -42,8 +42,7 @@ impl Physics {
         let force = if right { self.force } else { -self.force };
         let (sin, cos) = (angle.sin(), angle.cos());
         let push = (force + pole * length * (angular_velocity * angular_velocity) * sin) / total;
-        let angular_acceleration =
-            (gravity * sin - cos * push) / (length * (4.0 / 3.0 - pole * (cos * cos) / total));
+        let angular_acceleration = (gravity * sin - cos * push) / (length * (4.0 / 3.0 - pole * (cos * cos) / total));
         let acceleration = push - pole * length * angular_acceleration * cos / total;
         let (x, angle) = (x + tau * v, angle + tau * angular_velocity);
         let terminated = x.abs() > TRACK || angle.abs() > FALLEN;

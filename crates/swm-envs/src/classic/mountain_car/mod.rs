@@ -150,7 +150,8 @@ impl<V: Variant> ControlTask for MountainCar<V> {
     const STATE_BOUNDS: &'static [(f64, f64)] = &[(-1.2, 0.6), (-0.07, 0.07)];
     const FRAME_SIZE: (usize, usize) = render::SIZE;
     const PHYSICS_FACTORS: &'static [PhysicsFactor] = V::PHYSICS_FACTORS;
-    const COLOR_FACTORS: &'static [ColorFactor] = &[ColorFactor("bg", [0.6, 1.0], [255; 3]), ColorFactor("fg", [0.0, 0.4], render::INK)];
+    const COLOR_FACTORS: &'static [ColorFactor] =
+        &[ColorFactor("bg", [0.6, 1.0], [255; 3]), ColorFactor("fg", [0.0, 0.4], render::INK)];
 
     /// Position (track units) and velocity (track units per step).
     type State = [f64; 2];

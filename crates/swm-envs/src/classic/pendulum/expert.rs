@@ -33,6 +33,9 @@ mod tests {
     fn expert_swings_the_rod_up_and_holds_it() {
         assert_eq!(tally(&ENTRY, false, false).successes, 200, "upright");
         assert_eq!(tally(&ENTRY, true, false).successes, 169, "upright, all factors varied: some motors are too weak");
-        assert!(tally(&ENTRY, false, true).successes >= 180, "sampled goals lie on its rollouts, apart from random actions");
+        assert!(
+            tally(&ENTRY, false, true).successes >= 180,
+            "sampled goals lie on its rollouts, apart from random actions"
+        );
     }
 }

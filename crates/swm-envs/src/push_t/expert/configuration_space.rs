@@ -98,7 +98,8 @@ impl ConfigurationSpace {
             high = Vec2::new(high.x.max(corner.x), high.y.max(corner.y));
         }
         let inset = Vec2::new(MARGIN, MARGIN);
-        let obstacles = block.iter().flat_map(|part| agent.iter().map(|agent| Obstacle::minkowski_difference(part, agent)));
+        let obstacles =
+            block.iter().flat_map(|part| agent.iter().map(|agent| Obstacle::minkowski_difference(part, agent)));
         Self { low: inset - low, high: Vec2::new(TABLE, TABLE) - inset - high, obstacles: obstacles.collect() }
     }
 
@@ -143,8 +144,10 @@ mod tests {
     #[test]
     fn agent_touches_the_block_at_the_edge_of_the_difference() {
         // The agent extends 10 pixels to the left and up, 20 to the right and down.
-        let space = ConfigurationSpace::new(&[rect(-10.0, -10.0, 20.0, 20.0).to_vec()], &[rect(200.0, 200.0, 300.0, 250.0)]);
-        for (x, y, expected) in [(170.0, 225.0, 10.0), (320.0, 225.0, 10.0), (250.0, 175.0, 5.0), (250.0, 225.0, -35.0)] {
+        let space =
+            ConfigurationSpace::new(&[rect(-10.0, -10.0, 20.0, 20.0).to_vec()], &[rect(200.0, 200.0, 300.0, 250.0)]);
+        for (x, y, expected) in [(170.0, 225.0, 10.0), (320.0, 225.0, 10.0), (250.0, 175.0, 5.0), (250.0, 225.0, -35.0)]
+        {
             assert!((space.clearance(Vec2::new(x, y)) - expected).abs() < 1e-9, "at {x} {y}");
         }
         assert!(space.contains(Vec2::new(MARGIN + 10.0, TABLE - MARGIN - 20.0)));

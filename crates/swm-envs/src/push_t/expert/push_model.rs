@@ -91,8 +91,11 @@ impl PushModel {
         // A round agent is a critically damped spring of 10 / s for 0.1 s: it covers 1 - 2 / e of the distance, and moves
         // velocity / 10 e farther. Other agents lose their velocity in every physics step: each step covers a hundredth
         // of the remaining distance.
-        let (covered, drift, max_steps) =
-            if body_shapes[AGENT].is_circle() { (1.0 - 2.0 * e, 0.1 * e, 6) } else { (1.0 - 0.99f64.powi(10), 0.0, 24) };
+        let (covered, drift, max_steps) = if body_shapes[AGENT].is_circle() {
+            (1.0 - 2.0 * e, 0.1 * e, 6)
+        } else {
+            (1.0 - 0.99f64.powi(10), 0.0, 24)
+        };
         let initial = assemble(&body_shapes, bodies);
         Self {
             shapes,
@@ -240,8 +243,7 @@ impl PushModel {
         path: f64,
     ) -> Push {
         self.set_start(now, from);
-        let mut best =
-            Push { waypoints: vec![], action, steps: 1, error: before, time: path, rate: f64::NEG_INFINITY };
+        let mut best = Push { waypoints: vec![], action, steps: 1, error: before, time: path, rate: f64::NEG_INFINITY };
         for steps in 1..=self.max_steps {
             self.advance(action);
             let error = self.error(&state_of(&self.simulation), goal);

@@ -1,76 +1,78 @@
-//! Where the joints must be for the flange to be at a pose: damped least squares.
+//! Inverse kinematics of the arm by damped least squares.
 //!
-//! The iteration is OGBench's `DiffIKController`: at most 20 steps, none of which turns a joint by more than 45°, until
-//! place and turn are within 10⁻⁴ m and rad.
+//! The iteration is that of OGBench's `DiffIKController`: at most 20 steps of at most 45° per joint, until position and
+//! orientation are within 10⁻⁴ m and rad.
 
 use super::pose::{Pose, Vec3, about, cross, inverse, log, mul, norm, normalized, rotate, sub};
 
-/// Joints of the arm.
+/// The number of joints of the arm.
 pub const JOINTS: usize = 6;
 
-const ITERATIONS: usize = 20;
+const MAX_ITERATIONS: usize = 20;
+/// In metres and radians.
 const TOLERANCE: f64 = 1e-4;
 const DAMPING: f64 = 1e-12;
-const LARGEST_TURN: f64 = std::f64::consts::FRAC_PI_4;
+/// The most a joint rotates in one iteration, in radians.
+const MAX_STEP: f64 = std::f64::consts::FRAC_PI_4;
 
-/// One joint: where its link is seen from the link before, and the axis it turns about, seen from its link.
+/// A link of the arm and the joint that moves it.
 #[derive(Clone, Copy, Debug)]
 pub struct Link {
-    /// Where the link is while the joint is at 0.
-    pub at: Pose,
-    /// The joint's axis through the link's origin, of length 1.
+    /// The pose in the frame of the previous link at joint angle 0.
+    pub rest: Pose,
+    /// The joint's axis through the link's origin, a unit vector in the frame of the link.
     pub axis: Vec3,
 }
 
-/// An arm of hinges.
+/// A kinematic chain of hinges.
 #[derive(Clone, Debug)]
 pub struct Chain {
-    /// Where the arm stands.
+    /// The pose of the base in the world.
     pub base: Pose,
-    /// Its links, from the base on.
+    /// The links, from the base on.
     pub links: [Link; JOINTS],
-    /// Where the flange is, seen from the last link.
+    /// The pose of the flange in the frame of the last link.
     pub flange: Pose,
 }
 
-/// Three rows for the velocity of the flange, three for its angular velocity.
+/// Three rows for the linear velocity of the flange, three for its angular velocity.
 type Jacobian = [[f64; JOINTS]; 6];
 
 impl Chain {
-    /// Joint positions that bring the flange to `target`, near `start`.
+    /// Joint angles (rad) that bring the flange to `target`, starting from `start`.
     pub fn solve(&self, target: Pose, start: [f64; JOINTS]) -> [f64; JOINTS] {
         let mut joints = start;
-        for _ in 0..ITERATIONS {
+        for _ in 0..MAX_ITERATIONS {
             let (flange, jacobian) = self.forward(&joints);
-            let away = sub(target.place, flange.place);
-            let turned = log(mul(target.turn, inverse(flange.turn)));
-            if norm(&away) <= TOLERANCE && norm(&turned) <= TOLERANCE {
+            let offset = sub(target.position, flange.position);
+            let rotation = log(mul(target.rotation, inverse(flange.rotation)));
+            if norm(&offset) <= TOLERANCE && norm(&rotation) <= TOLERANCE {
                 break;
             }
-            let error = [away[0], away[1], away[2], turned[0], turned[1], turned[2]];
+            let error = [offset[0], offset[1], offset[2], rotation[0], rotation[1], rotation[2]];
             let mut step = least_squares(&jacobian, error);
-            let largest = step.iter().fold(0.0, |most: f64, turn| most.max(turn.abs()));
-            if largest > LARGEST_TURN {
-                step = step.map(|turn| turn * (LARGEST_TURN / largest));
+            let largest = step.iter().fold(0.0, |most: f64, angle| most.max(angle.abs()));
+            if largest > MAX_STEP {
+                step = step.map(|angle| angle * (MAX_STEP / largest));
             }
             joints = std::array::from_fn(|i| joints[i] + step[i]);
         }
         joints
     }
 
-    /// Where the flange is, and how it moves with each joint.
+    /// The pose of the flange and its Jacobian.
     fn forward(&self, joints: &[f64; JOINTS]) -> (Pose, Jacobian) {
         let mut pose = self.base;
         let mut axes = [([0.0; 3], [0.0; 3]); JOINTS];
         for ((link, &angle), axis) in self.links.iter().zip(joints).zip(&mut axes) {
-            pose = pose.then(link.at);
-            pose.turn = normalized(mul(pose.turn, about(link.axis, angle)));
-            *axis = (rotate(pose.turn, link.axis), pose.place);
+            pose = pose.then(link.rest);
+            pose.rotation = normalized(mul(pose.rotation, about(link.axis, angle)));
+            *axis = (rotate(pose.rotation, link.axis), pose.position);
         }
         let flange = pose.then(self.flange);
         let mut jacobian = [[0.0; JOINTS]; 6];
         for (joint, (axis, anchor)) in axes.into_iter().enumerate() {
-            let velocity = cross(axis, sub(flange.place, anchor));
+            let velocity = cross(axis, sub(flange.position, anchor));
             for row in 0..3 {
                 jacobian[row][joint] = velocity[row];
                 jacobian[row + 3][joint] = axis[row];
@@ -80,7 +82,7 @@ impl Chain {
     }
 }
 
-/// `Jᵀ (J Jᵀ + λ I)⁻¹ error`.
+/// Solves damped least squares: `Jᵀ (J Jᵀ + λ I)⁻¹ error`.
 fn least_squares(jacobian: &Jacobian, error: [f64; 6]) -> [f64; JOINTS] {
     let square = std::array::from_fn(|i| {
         std::array::from_fn(|j| {
@@ -92,7 +94,7 @@ fn least_squares(jacobian: &Jacobian, error: [f64; 6]) -> [f64; JOINTS] {
     std::array::from_fn(|joint| (0..6).map(|row| jacobian[row][joint] * solution[row]).sum())
 }
 
-/// Solves a system of six equations by elimination, the largest pivot first.
+/// Solves a linear system of six equations by Gaussian elimination with partial pivoting.
 fn solve(mut matrix: [[f64; 6]; 6], mut right: [f64; 6]) -> [f64; 6] {
     for column in 0..6 {
         let size = |row: &usize| matrix[*row][column].abs();
@@ -120,15 +122,15 @@ mod tests {
     use super::super::pose::{IDENTITY, Quat, distance};
     use super::*;
 
-    fn link(place: Vec3, turn: Quat, axis: Vec3) -> Link {
-        Link { at: Pose { place, turn: normalized(turn) }, axis }
+    fn link(position: Vec3, rotation: Quat, axis: Vec3) -> Link {
+        Link { rest: Pose { position, rotation: normalized(rotation) }, axis }
     }
 
-    /// The UR5e's measures.
+    /// The dimensions of the UR5e.
     fn arm() -> Chain {
         let (y, z) = ([0.0, 1.0, 0.0], [0.0, 0.0, 1.0]);
         Chain {
-            base: Pose { place: [0.0; 3], turn: normalized([1.0, 0.0, 0.0, 1.0]) },
+            base: Pose { position: [0.0; 3], rotation: normalized([1.0, 0.0, 0.0, 1.0]) },
             links: [
                 link([0.0, 0.0, 0.163], IDENTITY, z),
                 link([0.0, 0.138, 0.0], [1.0, 0.0, 1.0, 0.0], y),
@@ -137,35 +139,37 @@ mod tests {
                 link([0.0, 0.127, 0.0], IDENTITY, z),
                 link([0.0, 0.0, 0.1], IDENTITY, y),
             ],
-            flange: Pose { place: [0.0, 0.1, 0.0], turn: normalized([-1.0, 1.0, 0.0, 0.0]) },
+            flange: Pose { position: [0.0, 0.1, 0.0], rotation: normalized([-1.0, 1.0, 0.0, 0.0]) },
         }
     }
 
     #[test]
-    fn the_jacobian_is_the_derivative() {
+    fn jacobian_equals_finite_differences() {
         let (arm, joints) = (arm(), [0.3, -1.2, 1.4, -0.9, -1.5, 0.2]);
         let (before, jacobian) = arm.forward(&joints);
         for joint in 0..JOINTS {
             let mut moved = joints;
             moved[joint] += 1e-6;
             let (after, _) = arm.forward(&moved);
-            let (way, turn) = (sub(after.place, before.place), log(mul(after.turn, inverse(before.turn))));
+            let offset = sub(after.position, before.position);
+            let rotation = log(mul(after.rotation, inverse(before.rotation)));
             for row in 0..3 {
-                assert!((way[row] / 1e-6 - jacobian[row][joint]).abs() < 1e-5);
-                assert!((turn[row] / 1e-6 - jacobian[row + 3][joint]).abs() < 1e-5);
+                assert!((offset[row] / 1e-6 - jacobian[row][joint]).abs() < 1e-5);
+                assert!((rotation[row] / 1e-6 - jacobian[row + 3][joint]).abs() < 1e-5);
             }
         }
     }
 
     #[test]
-    fn the_flange_arrives() {
+    fn solve_reaches_target() {
         use std::f64::consts::FRAC_PI_2 as RIGHT;
         let (arm, home) = (arm(), [-RIGHT, -RIGHT, RIGHT, -RIGHT, -RIGHT, 0.0]);
         let (start, _) = arm.forward(&home);
-        let target = Pose { place: [start.place[0] + 0.1, start.place[1] - 0.2, start.place[2] - 0.1], ..start };
+        let [x, y, z] = start.position;
+        let target = Pose { position: [x + 0.1, y - 0.2, z - 0.1], ..start };
         let (reached, _) = arm.forward(&arm.solve(target, home));
-        assert!(distance(reached.place, target.place) <= TOLERANCE);
-        assert!(norm(&log(mul(target.turn, inverse(reached.turn)))) <= TOLERANCE);
-        assert_eq!(arm.solve(start, home), home, "who is there does not move");
+        assert!(distance(reached.position, target.position) <= TOLERANCE);
+        assert!(norm(&log(mul(target.rotation, inverse(reached.rotation)))) <= TOLERANCE);
+        assert_eq!(arm.solve(start, home), home, "the arm does not move if it is at the target");
     }
 }

@@ -1,8 +1,8 @@
-//! The arm: a UR5e with a Robotiq 2F-85 gripper that points down.
+//! The robot: a UR5e arm with a Robotiq 2F-85 gripper that points down.
 //!
-//! An action moves the gripper relative to where it is: up to 5 cm along each axis, 0.3 rad about the vertical, and the
-//! whole way of its fingers. The pose asked for is kept in the workspace; inverse kinematics makes joint positions of it,
-//! which the arm's position actuators hold for one control step.
+//! An action moves the gripper relative to its present pose: up to 5 cm along each axis, 0.3 rad about the vertical, and the
+//! full range of the fingers. The target pose is clipped to the workspace and converted to joint angles by inverse kinematics;
+//! the arm's position actuators hold these for one control step. Constants are OGBench's (`manipspace/envs/manipspace_env.py`).
 
 pub mod ik;
 pub mod pose;
@@ -15,24 +15,25 @@ use pose::{Pose, Quat, Vec3};
 use std::f64::consts::FRAC_PI_2;
 use swm_core::{Error, Result};
 
-/// Numbers of an action.
+/// Elements of an action.
 pub const ACTION: usize = 5;
-/// Actuators: six joints, and the fingers.
+/// Actuators: six joints and the fingers.
 pub const CONTROLS: usize = JOINTS + 1;
 
-/// What the largest action means: metres, radians, and the share of the fingers' way.
-const REACH: [f64; ACTION] = [0.05, 0.05, 0.05, 0.3, 1.0];
-/// The turn of a gripper that points down.
+/// The effect of an action of 1: metres along x, y and z, radians of yaw, and fraction of the fingers' range.
+const ACTION_SCALE: [f64; ACTION] = [0.05, 0.05, 0.05, 0.3, 1.0];
+/// The orientation of a gripper that points down.
 const DOWN: Quat = [0.0, 1.0, 0.0, 0.0];
-/// Where the joints are at home, in radians.
+/// The home position of the joints, in radians.
 pub const HOME: [f64; JOINTS] = [-FRAC_PI_2, -FRAC_PI_2, FRAC_PI_2, -FRAC_PI_2, -FRAC_PI_2, 0.0];
-/// Where the finger joint is when the gripper is closed, in radians.
+/// The finger joint of a closed gripper, in radians.
 const CLOSED: f64 = 0.8;
-/// What closes the fingers.
-const FINGER_CONTROL: f64 = 255.0;
-/// The force on a finger's pad that counts as full contact, in newtons and newton metres.
+/// The control of a closed gripper.
+const CLOSED_CONTROL: f64 = 255.0;
+/// The norm of force (N) and torque (N m) on a finger's pad that counts as full contact.
 const FULL_CONTACT: f64 = 50.0;
 
+/// The links of the arm and their joints.
 /// The links of the arm and the joint that each turns about.
 const LINKS: [(&str, &str); JOINTS] = [
     ("ur5e/shoulder_link", "ur5e/shoulder_pan_joint"),
@@ -43,39 +44,38 @@ const LINKS: [(&str, &str); JOINTS] = [
     ("ur5e/wrist_3_link", "ur5e/wrist_3_joint"),
 ];
 
-/// The place of a name in the model.
+/// The index of a named element of a model.
 ///
 /// # Errors
-/// When the model has no such thing: its files are not those of the pinned version.
+/// When the model has no such element: its files are not those of the pinned version.
 pub fn find(model: &MjModel, kind: MjtObjBase, name: &str) -> Result<usize> {
-    model.name_to_id(kind, name).ok_or_else(|| Error::external("looking into OGBench's model", format!("no '{name}'")))
+    model.name_to_id(kind, name).ok_or_else(|| Error::external("searching OGBench's model", format!("no '{name}'")))
 }
 
-/// The arm, and where it is in a model. Its joints and actuators come first: they have the first places of positions,
-/// velocities and controls.
+/// The arm in a model. Its joints and actuators have the first indices in `qpos`, `qvel` and `ctrl`.
 #[derive(Clone, Debug)]
 pub struct Arm {
     chain: Chain,
-    /// From the place between the fingers to the flange.
-    grip_to_flange: Pose,
+    /// The pose of the flange in the frame of the pinch site.
+    pinch_to_flange: Pose,
     /// The site between the fingers.
-    grip: usize,
-    /// The body of the pad that feels contact.
+    pinch: usize,
+    /// The body of the pad that measures contact.
     pad: usize,
 }
 
-/// What the arm feels.
+/// The state of the gripper.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Proprioception {
-    /// Where the place between the fingers is.
-    pub place: Vec3,
-    /// How the gripper is turned about the vertical.
+    /// Position of the pinch site, in metres.
+    pub position: Vec3,
+    /// Rotation of the gripper about the vertical, in radians.
     pub yaw: f64,
-    /// How far the fingers are closed, 0 to 1.
+    /// How far the fingers are closed: 0 (open) to 1 (closed).
     pub closed: f64,
-    /// How fast they close, in radians a second.
+    /// Velocity of the finger joint, in rad/s.
     pub closing: f64,
-    /// How firmly they hold something, 0 to 1.
+    /// Contact with an object: 0 (none) to 1 (full).
     pub contact: f64,
 }
 
@@ -83,80 +83,81 @@ impl Arm {
     /// Finds the arm in a model.
     ///
     /// # Errors
-    /// When it is not there.
+    /// When the model lacks a part of it.
     pub fn new(model: &MjModel) -> Result<Self> {
         let body = |name| find(model, MjtObjBase::mjOBJ_BODY, name);
         let site = |name| find(model, MjtObjBase::mjOBJ_SITE, name);
-        let at = |body: usize| Pose { place: model.body_pos()[body], turn: model.body_quat()[body] };
-        let on = |site: usize| Pose { place: model.site_pos()[site], turn: model.site_quat()[site] };
-        let mut links = [Link { at: at(0), axis: [0.0; 3] }; JOINTS];
+        let at = |body: usize| Pose { position: model.body_pos()[body], rotation: model.body_quat()[body] };
+        let on = |site: usize| Pose { position: model.site_pos()[site], rotation: model.site_quat()[site] };
+        let mut links = [Link { rest: at(0), axis: [0.0; 3] }; JOINTS];
         for (link, (body_name, joint_name)) in links.iter_mut().zip(LINKS) {
             let joint = find(model, MjtObjBase::mjOBJ_JOINT, joint_name)?;
-            *link = Link { at: at(body(body_name)?), axis: model.jnt_axis()[joint] };
+            *link = Link { rest: at(body(body_name)?), axis: model.jnt_axis()[joint] };
         }
-        let (flange, grip) = (on(site("ur5e/attachment_site")?), site("ur5e/robotiq/pinch")?);
-        // From the last link to the gripper, and on to the place between its fingers.
+        let (flange, pinch) = (on(site("ur5e/attachment_site")?), site("ur5e/robotiq/pinch")?);
+        // The pose of the gripper's base in the frame of the last link.
         let mut gripper = at(body("ur5e/robotiq/")?);
         for name in ["ur5e/robotiq/base_mount", "ur5e/robotiq/base"] {
             gripper = gripper.then(at(body(name)?));
         }
         Ok(Self {
             chain: Chain { base: at(body("ur5e/base")?), links, flange },
-            grip_to_flange: gripper.then(on(grip)).inverse().then(flange),
-            grip,
+            pinch_to_flange: gripper.then(on(pinch)).inverse().then(flange),
+            pinch,
             pad: body("ur5e/robotiq/right_pad")?,
         })
     }
 
-    /// Where the gripper is and how it is turned about the vertical.
+    /// Position (m) and yaw (rad) of the pinch site.
     fn pose(&self, physics: &Physics) -> (Vec3, f64) {
         let data = physics.data();
-        (data.site_xpos()[self.grip], pose::yaw_of_matrix(&data.site_xmat()[self.grip]))
+        (data.site_xpos()[self.pinch], pose::yaw_of_matrix(&data.site_xmat()[self.pinch]))
     }
 
-    /// Sets the controls for an action from -1 to 1.
-    pub fn act(&self, physics: &mut Physics, action: &[f32], workspace: &[Vec3; 2]) {
-        // Halved in single precision, as the reference does.
-        let share = |i: usize| f64::from(0.5 * (action[i] + 1.0)) * (2.0 * REACH[i]) - REACH[i];
-        let (place, yaw) = self.pose(physics);
-        let place = std::array::from_fn(|i| (place[i] + share(i)).clamp(workspace[0][i], workspace[1][i]));
-        let joints = self.joints_of(physics);
-        let target = self.reach(place, yaw + share(3), joints);
-        let closed = (fingers(physics) + share(4)).clamp(0.0, 1.0);
+    /// Sets the controls for an action in [-1, 1].
+    pub fn apply_action(&self, physics: &mut Physics, action: &[f32], workspace: &[Vec3; 2]) {
+        // Halved in single precision, as in the reference.
+        let scaled = |i: usize| f64::from(0.5 * (action[i] + 1.0)) * (2.0 * ACTION_SCALE[i]) - ACTION_SCALE[i];
+        let (position, yaw) = self.pose(physics);
+        let position = std::array::from_fn(|i| (position[i] + scaled(i)).clamp(workspace[0][i], workspace[1][i]));
+        let joints = self.joints(physics);
+        let target = self.solve(position, yaw + scaled(3), joints);
+        let closed = (closed_fraction(physics) + scaled(4)).clamp(0.0, 1.0);
         let controls = physics.data_mut().ctrl_mut();
         controls[..JOINTS].copy_from_slice(&target);
-        controls[JOINTS] = FINGER_CONTROL * closed;
+        controls[JOINTS] = CLOSED_CONTROL * closed;
     }
 
-    /// Joint positions near `start` with the gripper at a place, pointing down and turned by `yaw`.
-    pub fn reach(&self, place: Vec3, yaw: f64, start: [f64; JOINTS]) -> [f64; JOINTS] {
-        let grip = Pose { place, turn: pose::mul(pose::about_z(pose::wrap(yaw)), DOWN) };
-        self.chain.solve(grip.then(self.grip_to_flange), start)
+    /// Joint angles (rad) near `start` that put the pinch site at a position (m), pointing down, rotated by `yaw` (rad).
+    pub fn solve(&self, position: Vec3, yaw: f64, start: [f64; JOINTS]) -> [f64; JOINTS] {
+        let pinch = Pose { position, rotation: pose::mul(pose::about_z(pose::wrap(yaw)), DOWN) };
+        self.chain.solve(pinch.then(self.pinch_to_flange), start)
     }
 
-    /// Where the joints are.
-    pub fn joints_of(&self, physics: &Physics) -> [f64; JOINTS] {
+    /// The joint angles, in radians.
+    fn joints(&self, physics: &Physics) -> [f64; JOINTS] {
         std::array::from_fn(|i| physics.data().qpos()[i])
     }
 
-    /// Puts the joints somewhere; the caller computes what follows.
-    pub fn put(&self, physics: &mut Physics, joints: [f64; JOINTS]) {
+    /// Sets the joint angles; the caller updates derived quantities.
+    pub fn set_joints(&self, physics: &mut Physics, joints: [f64; JOINTS]) {
         physics.data_mut().qpos_mut()[..JOINTS].copy_from_slice(&joints);
     }
 
-    /// How firmly the fingers hold something. Valid where contact forces were computed.
+    /// Contact of the gripper, 0 to 1. Valid after [`Physics::contact_forces`].
     pub fn contact(&self, physics: &Physics) -> f64 {
         (pose::norm(&physics.data().cfrc_ext()[self.pad]) / FULL_CONTACT).clamp(0.0, 1.0)
     }
 
-    /// What the arm feels; `contact` as it was when forces were computed.
-    pub fn feel(&self, physics: &Physics, contact: f64) -> Proprioception {
-        let (place, yaw) = self.pose(physics);
-        Proprioception { place, yaw, closed: fingers(physics), closing: physics.data().qvel()[JOINTS], contact }
+    /// The state of the gripper. `contact` is the value computed with the last contact forces.
+    pub fn proprioception(&self, physics: &Physics, contact: f64) -> Proprioception {
+        let (position, yaw) = self.pose(physics);
+        let closing = physics.data().qvel()[JOINTS];
+        Proprioception { position, yaw, closed: closed_fraction(physics), closing, contact }
     }
 }
 
-/// How far the fingers are closed.
-fn fingers(physics: &Physics) -> f64 {
+/// How far the fingers are closed: 0 (open) to 1 (closed).
+fn closed_fraction(physics: &Physics) -> f64 {
     (physics.data().qpos()[JOINTS] / CLOSED).clamp(0.0, 1.0)
 }

@@ -1,11 +1,11 @@
-//! Rotations and rigid transforms: quaternions are `[w, x, y, z]` of length 1, as MuJoCo's.
+//! Rotations and rigid transforms. Quaternions are unit quaternions `[w, x, y, z]`, as in MuJoCo.
 
-/// A place or a direction.
+/// A position or direction.
 pub type Vec3 = [f64; 3];
 /// A rotation.
 pub type Quat = [f64; 4];
 
-/// No rotation.
+/// The identity rotation.
 pub const IDENTITY: Quat = [1.0, 0.0, 0.0, 0.0];
 
 /// `a + b`.
@@ -18,27 +18,27 @@ pub fn sub(a: Vec3, b: Vec3) -> Vec3 {
     std::array::from_fn(|i| a[i] - b[i])
 }
 
-/// `a` times a number.
+/// `by * a`.
 pub fn scale(a: Vec3, by: f64) -> Vec3 {
     a.map(|v| v * by)
 }
 
-/// The vector product.
+/// The cross product.
 pub fn cross(a: Vec3, b: Vec3) -> Vec3 {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-/// The Euclidean length of any number of numbers.
+/// The Euclidean norm of a vector of any length.
 pub fn norm(a: &[f64]) -> f64 {
     a.iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
-/// The distance of two places.
+/// The distance of two points.
 pub fn distance(a: Vec3, b: Vec3) -> f64 {
     norm(&sub(a, b))
 }
 
-/// First `b`, then `a`.
+/// The quaternion product: rotation by `b`, then by `a`.
 pub fn mul(a: Quat, b: Quat) -> Quat {
     [
         a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
@@ -48,35 +48,35 @@ pub fn mul(a: Quat, b: Quat) -> Quat {
     ]
 }
 
-/// The rotation back.
+/// The inverse rotation.
 pub fn inverse(q: Quat) -> Quat {
     [q[0], -q[1], -q[2], -q[3]]
 }
 
-/// The quaternion of length 1.
+/// The quaternion scaled to length 1.
 pub fn normalized(q: Quat) -> Quat {
     q.map(|v| v / norm(&q))
 }
 
-/// The rotated vector.
+/// Rotates a vector.
 pub fn rotate(q: Quat, v: Vec3) -> Vec3 {
     let (w, u) = (q[0], [q[1], q[2], q[3]]);
     let t = scale(cross(u, v), 2.0);
     add(add(v, scale(t, w)), cross(u, t))
 }
 
-/// The rotation about an axis of length 1.
+/// The rotation by `angle` (rad) about a unit axis.
 pub fn about(axis: Vec3, angle: f64) -> Quat {
     let (sin, cos) = (angle / 2.0).sin_cos();
     [cos, axis[0] * sin, axis[1] * sin, axis[2] * sin]
 }
 
-/// The rotation about the vertical.
+/// The rotation by `angle` (rad) about the vertical.
 pub fn about_z(angle: f64) -> Quat {
     about([0.0, 0.0, 1.0], angle)
 }
 
-/// The axis of a rotation, as long as its angle, which is at most a half turn.
+/// The rotation vector: the axis times the angle (rad), which is at most π.
 pub fn log(q: Quat) -> Vec3 {
     let (w, u) = (q[0], [q[1], q[2], q[3]]);
     let sin = norm(&u);
@@ -87,42 +87,45 @@ pub fn log(q: Quat) -> Vec3 {
     scale(u, angle / sin)
 }
 
-/// The angle about the vertical, where a rotation is split into roll, pitch and yaw.
+/// The yaw (rad) of a rotation, in the decomposition into roll, pitch and yaw.
 pub fn yaw(q: Quat) -> f64 {
     (2.0 * (q[0] * q[3] + q[1] * q[2])).atan2(1.0 - 2.0 * (q[2] * q[2] + q[3] * q[3]))
 }
 
-/// [`yaw`] of a rotation matrix, row after row.
+/// The [`yaw`] of a row-major rotation matrix.
 pub fn yaw_of_matrix(m: &[f64; 9]) -> f64 {
     m[3].atan2(m[0])
 }
 
-/// The same angle between -π and π.
+/// The equivalent angle in [-π, π].
 pub fn wrap(angle: f64) -> f64 {
     use std::f64::consts::{PI, TAU};
     let wrapped = (angle + PI).rem_euclid(TAU) - PI;
     if wrapped == -PI && angle > 0.0 { PI } else { wrapped }
 }
 
-/// Where something is and how it is turned.
+/// A position and an orientation, or the rigid transform to them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {
-    /// Where.
-    pub place: Vec3,
-    /// How.
-    pub turn: Quat,
+    /// The position, in metres.
+    pub position: Vec3,
+    /// The orientation.
+    pub rotation: Quat,
 }
 
 impl Pose {
-    /// What is at `inner` as seen from here, seen from where this pose is seen.
+    /// The composition of transforms: the pose `inner`, given in the frame of `self`, in the frame that `self` is given in.
     pub fn then(self, inner: Self) -> Self {
-        Self { place: add(self.place, rotate(self.turn, inner.place)), turn: mul(self.turn, inner.turn) }
+        Self {
+            position: add(self.position, rotate(self.rotation, inner.position)),
+            rotation: mul(self.rotation, inner.rotation),
+        }
     }
 
-    /// The transform back.
+    /// The inverse transform.
     pub fn inverse(self) -> Self {
-        let turn = inverse(self.turn);
-        Self { place: scale(rotate(turn, self.place), -1.0), turn }
+        let rotation = inverse(self.rotation);
+        Self { position: scale(rotate(rotation, self.position), -1.0), rotation }
     }
 }
 
@@ -136,20 +139,20 @@ mod tests {
     }
 
     #[test]
-    fn rotations_compose_and_undo() {
+    fn rotations_compose_and_invert() {
         let (a, b) = (about([0.6, 0.0, 0.8], 1.1), about([0.0, 1.0, 0.0], -2.3));
         let v = [0.3, -0.2, 0.9];
         assert!(close(&rotate(mul(a, b), v), &rotate(a, rotate(b, v))));
-        let pose = Pose { place: [1.0, 2.0, 3.0], turn: a };
+        let pose = Pose { position: [1.0, 2.0, 3.0], rotation: a };
         let home = pose.then(pose.inverse());
-        assert!(close(&home.place, &[0.0; 3]) && close(&home.turn, &IDENTITY));
+        assert!(close(&home.position, &[0.0; 3]) && close(&home.rotation, &IDENTITY));
         assert!(close(&log(b), &[0.0, -2.3, 0.0]));
         assert!(close(&log(about([1.0, 0.0, 0.0], 4.0)), &[4.0 - 2.0 * PI, 0.0, 0.0]));
         assert_eq!(log(IDENTITY), [0.0; 3]);
     }
 
     #[test]
-    fn yaw_is_the_turn_about_the_vertical() {
+    fn yaw_is_the_rotation_about_the_vertical() {
         for angle in [-3.0, -0.4, 0.0, 1.2, 3.1] {
             let down = mul(about_z(angle), [0.0, 1.0, 0.0, 0.0]);
             assert!((yaw(about_z(angle)) - angle).abs() < 1e-12);

@@ -1,34 +1,34 @@
-//! Who finds the way through a maze: from cell to cell, along the shortest way. There is nobody who walks an ant.
+//! The scripted expert of mazes: moves a point from cell to cell along the shortest path. There is no expert for the ant.
 
-use super::STRIDE;
+use super::task::POINT_STEP;
 use swm_core::policy::Expert;
 use swm_core::{Error, ExpertEntry, Key, Result, RowRef};
 
-/// The experts.
+/// The experts of mazes.
 pub const EXPERTS: &[ExpertEntry] = &[ExpertEntry {
     id: "expert",
-    summary: "leads a point from cell to cell, along the shortest way; cannot walk an ant",
-    make: || Box::new(Walker),
+    summary: "moves a point from cell to cell along the shortest path; cannot control the ant",
+    make: || Box::new(PathFollower),
 }];
 
-/// Heads for the next place on the way.
-struct Walker;
+/// Moves towards the column `goal/next_xy`.
+struct PathFollower;
 
-impl Expert for Walker {
+impl Expert for PathFollower {
     fn begin(&mut self, _: Key) {}
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
         if action.len() != 2 {
-            let problem = format!("it leads a point, not an agent of {} joints", action.len());
+            let problem = format!("it controls the point, not an agent with {} actuators", action.len());
             return Err(Error::config(
                 "expert of swm/OGBMaze-v0",
                 problem,
-                "leave loco_env_type=ant, or bring a policy",
+                "choose loco_env_type=point, or use a policy for the ant",
             ));
         }
         let (here, next) = (row.to_f64("xy")?, row.to_f64("goal/next_xy")?);
         for (i, by) in action.iter_mut().enumerate() {
-            *by = ((next[i] - here[i]) / f64::from(STRIDE)).clamp(-1.0, 1.0);
+            *by = ((next[i] - here[i]) / f64::from(POINT_STEP)).clamp(-1.0, 1.0);
         }
         Ok(())
     }

@@ -1,13 +1,16 @@
-//! The mazes, their tasks, and the way through them.
+//! The maps of the mazes with their tasks, and shortest paths through them. Maps and tasks are OGBench's
+//! (`locomaze/maze.py`).
 
 use std::collections::VecDeque;
 
 /// Side of a cell, in metres.
 pub const UNIT: f64 = 4.0;
-/// How far the centre of the first cell is from the origin, back along both axes.
+/// Radius of a teleport, in metres.
+pub const TELEPORT_RADIUS: f64 = 1.0;
+/// Distance of the first cell's centre from the origin along both axes, in the negative direction, in metres.
 const OFFSET: f64 = 4.0;
 
-/// A place in a plane.
+/// A point in the plane, in metres.
 pub type Xy = [f64; 2];
 /// Row and column.
 pub type Cell = (usize, usize);
@@ -16,11 +19,11 @@ pub type Cell = (usize, usize);
 pub struct Map {
     /// Its name.
     pub name: &'static str,
-    /// Rows of cells; `#` is a wall.
+    /// Rows of cells; `#` is a wall, `.` is free.
     pub rows: &'static [&'static str],
-    /// Where tasks begin and end.
+    /// Start and goal cell of each task.
     pub tasks: &'static [(Cell, Cell)],
-    /// Where one is taken from, and to.
+    /// Entrance cells and exit cells of teleports.
     pub teleports: (&'static [Cell], &'static [Cell]),
 }
 
@@ -91,109 +94,123 @@ pub static MAPS: [Map; 5] = [
     },
 ];
 
-/// The middle of a cell.
-pub fn middle((row, column): Cell) -> Xy {
+/// The centre of a cell.
+pub fn center((row, column): Cell) -> Xy {
     [column as f64 * UNIT - OFFSET, row as f64 * UNIT - OFFSET]
 }
 
-fn apart(a: Xy, b: Xy) -> f64 {
+/// The distance of two points, in metres.
+pub fn distance(a: Xy, b: Xy) -> f64 {
     (a[0] - b[0]).hypot(a[1] - b[1])
 }
 
 impl Map {
-    /// Rows and columns.
+    /// The numbers of columns and rows, as floating-point values.
+    pub fn extent(&self) -> [f64; 2] {
+        let (rows, columns) = self.size();
+        [columns as f64, rows as f64]
+    }
+
+    /// The point that OGBench's camera looks at, in metres.
+    pub fn camera_center(&self) -> Xy {
+        self.extent().map(|cells| 2.0 * (cells - 3.0))
+    }
+
+    /// The number of rows and columns.
     pub fn size(&self) -> (usize, usize) {
         (self.rows.len(), self.rows[0].len())
     }
 
-    /// Every cell.
+    /// Every cell, row by row.
     pub fn cells(&self) -> impl Iterator<Item = Cell> {
         let (rows, columns) = self.size();
         (0..rows).flat_map(move |row| (0..columns).map(move |column| (row, column)))
     }
 
-    /// Whether a cell is no wall.
+    /// Whether a cell is inside the map and not a wall.
     pub fn is_free(&self, (row, column): Cell) -> bool {
         self.rows.get(row).and_then(|cells| cells.as_bytes().get(column)) == Some(&b'.')
     }
 
-    /// The cell of a place, the nearest one for places outside.
+    /// The cell of a point; the nearest one for a point outside.
     pub fn cell(&self, [x, y]: Xy) -> Cell {
         let (rows, columns) = self.size();
         let at = |v: f64, n: usize| (((v + OFFSET) / UNIT + 0.5).max(0.0) as usize).min(n - 1);
         (at(y, rows), at(x, columns))
     }
 
-    /// The cells beside a cell, itself first, that are no walls.
-    fn around(&self, (row, column): Cell) -> impl Iterator<Item = Cell> {
-        let beside = [(0, 0), (-1, 0), (0, -1), (1, 0), (0, 1)];
+    /// The free cells adjacent to a cell, itself first.
+    fn neighbours(&self, (row, column): Cell) -> impl Iterator<Item = Cell> {
+        let offsets = [(0, 0), (-1, 0), (0, -1), (1, 0), (0, 1)];
         let step = move |(i, j): (isize, isize)| Some((row.checked_add_signed(i)?, column.checked_add_signed(j)?));
-        beside.into_iter().filter_map(step).filter(|&cell| self.is_free(cell))
+        offsets.into_iter().filter_map(step).filter(|&cell| self.is_free(cell))
     }
 }
 
-/// The ways to a goal: for every cell, how many steps from cell to cell it is away.
-pub struct Ways {
+/// Shortest paths to a goal.
+pub struct ShortestPaths {
     map: &'static Map,
     goal: Xy,
+    /// Steps from each cell to the goal's cell; `None` where there is no path.
     steps: Vec<Option<u16>>,
 }
 
-impl Ways {
-    /// The ways to a place.
+impl ShortestPaths {
+    /// The shortest paths to a point.
     pub fn new(map: &'static Map, goal: Xy) -> Self {
         let (rows, columns) = map.size();
-        let mut ways = Self { map, goal, steps: vec![None; rows * columns] };
-        ways.aim(goal);
-        ways
+        let mut paths = Self { map, goal, steps: vec![None; rows * columns] };
+        paths.set_goal(goal);
+        paths
     }
 
-    /// Changes the goal.
-    pub fn aim(&mut self, goal: Xy) {
+    /// Changes the goal, by breadth-first search.
+    pub fn set_goal(&mut self, goal: Xy) {
         self.goal = goal;
         self.steps.fill(None);
         let start = self.map.cell(goal);
         let mut next = VecDeque::from([(start, 0)]);
         while let Some((cell, steps)) = next.pop_front() {
-            let place = self.place(cell);
-            if self.steps[place].is_none() {
-                self.steps[place] = Some(steps);
-                next.extend(self.map.around(cell).map(|beside| (beside, steps + 1)));
+            let index = self.index(cell);
+            if self.steps[index].is_none() {
+                self.steps[index] = Some(steps);
+                next.extend(self.map.neighbours(cell).map(|neighbour| (neighbour, steps + 1)));
             }
         }
     }
 
-    fn place(&self, (row, column): Cell) -> usize {
+    fn index(&self, (row, column): Cell) -> usize {
         row * self.map.size().1 + column
     }
 
-    /// Whether one can walk there.
-    pub fn reach(&self, from: Xy) -> bool {
-        self.steps[self.place(self.map.cell(from))].is_some()
+    /// Whether there is a path from a point to the goal.
+    pub fn is_reachable(&self, from: Xy) -> bool {
+        self.steps[self.index(self.map.cell(from))].is_some()
     }
 
-    /// Where to go next: the goal, if it is in this cell, else the middle of the cell beside that is nearer.
+    /// The next point on the path: the goal in its own cell, otherwise the centre of the neighbouring cell nearest to the goal.
     pub fn next(&self, from: Xy) -> Xy {
         let cell = self.map.cell(from);
         if cell == self.map.cell(self.goal) {
             return self.goal;
         }
-        let steps = |&cell: &Cell| self.steps[self.place(cell)].unwrap_or(u16::MAX);
-        self.map.around(cell).min_by_key(steps).map_or(self.goal, middle)
+        let steps = |&cell: &Cell| self.steps[self.index(cell)].unwrap_or(u16::MAX);
+        self.map.neighbours(cell).min_by_key(steps).map_or(self.goal, center)
     }
 
-    /// How far it is to walk, through the middles of cells.
+    /// The length of the path through the centres of cells, in metres.
     pub fn length(&self, from: Xy) -> f64 {
         let cell = self.map.cell(from);
         if cell == self.map.cell(self.goal) {
-            return apart(from, self.goal);
+            return distance(from, self.goal);
         }
-        let last = apart(middle(self.map.cell(self.goal)), self.goal);
+        let last = distance(center(self.map.cell(self.goal)), self.goal);
         let through = |cell: Cell| {
-            let steps = self.steps[self.place(cell)]?;
-            Some(apart(from, middle(cell)) + UNIT * f64::from(steps) + last)
+            let steps = self.steps[self.index(cell)]?;
+            Some(distance(from, center(cell)) + UNIT * f64::from(steps) + last)
         };
-        self.map.around(cell).filter_map(through).min_by(f64::total_cmp).unwrap_or_else(|| apart(from, self.goal))
+        let lengths = self.map.neighbours(cell).filter_map(through);
+        lengths.min_by(f64::total_cmp).unwrap_or_else(|| distance(from, self.goal))
     }
 }
 
@@ -202,18 +219,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn every_task_has_a_way() {
+    fn every_task_has_a_path() {
         for map in &MAPS {
             assert!(map.rows.iter().all(|row| row.len() == map.size().1), "{}", map.name);
             for &(start, goal) in map.tasks {
                 assert!(map.is_free(start) && map.is_free(goal), "{}: {start:?} to {goal:?}", map.name);
-                let ways = Ways::new(map, middle(goal));
-                let (mut place, mut left) = (middle(start), ways.length(middle(start)));
-                assert!(ways.reach(place), "{}: {start:?} to {goal:?}", map.name);
-                while place != middle(goal) {
-                    place = ways.next(place);
-                    assert!(ways.length(place) < left, "{}: nearer with every cell", map.name);
-                    left = ways.length(place);
+                let paths = ShortestPaths::new(map, center(goal));
+                let (mut at, mut left) = (center(start), paths.length(center(start)));
+                assert!(paths.is_reachable(at), "{}: {start:?} to {goal:?}", map.name);
+                while at != center(goal) {
+                    at = paths.next(at);
+                    assert!(paths.length(at) < left, "{}: the path gets shorter with every cell", map.name);
+                    left = paths.length(at);
                 }
                 assert_eq!(left, 0.0);
             }
@@ -221,10 +238,10 @@ mod tests {
     }
 
     #[test]
-    fn cells_and_places_match() {
+    fn cells_and_points_correspond() {
         let map = &MAPS[0];
         for cell in map.cells() {
-            let [x, y] = middle(cell);
+            let [x, y] = center(cell);
             assert_eq!(map.cell([x + 1.9, y - 1.9]), cell);
         }
         assert_eq!(map.cell([-99.0, 99.0]), (8, 0));

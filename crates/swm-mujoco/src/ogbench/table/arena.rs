@@ -1,11 +1,11 @@
-//! The table: floor and walls, the arm with its gripper, cubes, and for the scene its buttons, drawer and window.
+//! The model of a table: floor and walls, the arm with its gripper, cubes, and in the scene buttons, a drawer and a window.
 //!
-//! OGBench puts these together from its MJCF files with `dm_control.mjcf`; here MuJoCo's own model editing does, in the
-//! order that gives every body, geom and material the same number. The compiled models are equal, names of unnamed things
-//! aside.
+//! OGBench composes its MJCF files with `dm_control.mjcf`. This module composes the same files with MuJoCo's model editing, in
+//! the order that gives every body, geom and material the same index. The compiled models are equal, apart from the names of
+//! unnamed elements.
 #![allow(unsafe_code, reason = "`mjs_attach`, which `mujoco-rs` does not wrap")]
 
-use super::setup::{Bounds, Setup};
+use super::config::{Bounds, TableConfig};
 use crate::{assets, link};
 use mujoco_rs::mujoco_c::{_mjtGeomBase, mjs_attach, mjtCone, mjtIntegrator};
 use mujoco_rs::wrappers::MjModel;
@@ -15,18 +15,18 @@ use std::ffi::CStr;
 use std::path::PathBuf;
 use swm_core::{Error, Result};
 
-/// Half the metres between two cubes of the model; episodes put them elsewhere.
+/// Half the initial distance of two adjacent cubes, in metres; episodes move them.
 const SPACING: f64 = 0.05;
 
-/// Stiffness and damping of the arm's position actuators.
+/// Stiffness (N m/rad) and damping (N m s/rad) of the arm's position actuators.
 const GAINS: [(f64, f64); 6] =
     [(4500.0, 450.0), (4500.0, 450.0), (4500.0, 450.0), (2000.0, 200.0), (2000.0, 200.0), (500.0, 50.0)];
 
-/// Seconds of a physics step.
+/// The time step, in seconds.
 const TIMESTEP: f64 = 0.002;
 
-/// What one sees through, where an agent sees pictures, and how much of it.
-const TRANSPARENT: [(&str, f32); 9] = [
+/// The materials that are transparent with `ob_type=pixels`, and their alpha.
+const TRANSPARENT_MATERIALS: [(&str, f32); 9] = [
     ("ur5e/robotiq/metal", 0.1),
     ("ur5e/robotiq/silicone", 0.1),
     ("ur5e/robotiq/gray", 0.1),
@@ -38,46 +38,46 @@ const TRANSPARENT: [(&str, f32); 9] = [
     ("ur5e/lightblue", 0.1),
 ];
 
-/// Whose pictures a model is for.
+/// The rendering of the arm.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Look {
-    /// An agent that is told the state.
-    Solid,
-    /// An agent that sees: the arm is transparent and does not hide the cubes.
+pub enum ArmRendering {
+    /// Opaque, for `ob_type=states`.
+    Opaque,
+    /// Transparent, for `ob_type=pixels`: the arm does not hide the cubes.
     Transparent,
 }
 
 /// Compiles the model.
 ///
 /// # Errors
-/// When MuJoCo or the files of OGBench are not installed, or MuJoCo refuses them.
-pub fn compile(setup: &Setup, look: Look) -> Result<MjModel> {
+/// When MuJoCo or the files of OGBench are not installed, or MuJoCo rejects them.
+pub fn compile(config: &TableConfig, arm_rendering: ArmRendering) -> Result<MjModel> {
     link::load()?;
     let files = Files(assets::path("ogbench")?.join("ogbench/manipspace/descriptions"));
     let mut arena = files.read("floor_wall.xml")?;
-    settle_options(&mut arena);
-    // The arm's body stands before those of the objects, but its meshes and materials come behind theirs: so its place is
-    // made now, and the arm attached at the end.
+    set_options(&mut arena);
+    // The arm's body precedes those of the objects, but its meshes and materials follow theirs: the body is therefore added
+    // now, and its content attached at the end.
     arena.world_body_mut().add_body().with_name("ur5e/");
-    for cube in 0..setup.cubes {
+    for cube in 0..config.cubes {
         let mut spec = files.read("cube.xml")?;
-        number_cube(&mut spec, cube, setup.cubes)?;
+        number_cube(&mut spec, cube, config.cubes)?;
         attach(arena.world_body_mut(), spec, c"")?;
     }
-    for file in if setup.fixtures { &["buttons.xml", "drawer.xml", "window.xml"][..] } else { &[] } {
+    for file in if config.fixtures { &["buttons.xml", "drawer.xml", "window.xml"][..] } else { &[] } {
         attach(arena.world_body_mut(), files.read(file)?, c"")?;
     }
     let arm = files.arm()?;
     attach(body(&mut arena, "ur5e/")?, arm, c"ur5e/")?;
     let world = arena.world_body_mut();
-    for camera in setup.cameras {
-        let made = world.add_camera().with_name(camera.name).with_pos(camera.place);
-        made.alt_mut().set_xy_axis(&camera.axes);
+    for camera in config.cameras {
+        let added = world.add_camera().with_name(camera.name).with_pos(camera.position);
+        added.alt_mut().set_xy_axis(&camera.axes);
     }
-    bounding_box(world, "object_bounds", &lifted(setup.object_bounds), [0.6, 0.3, 0.3, 0.2]);
-    bounding_box(world, "arm_bounds", &setup.arm_bounds, [0.3, 0.6, 0.3, 0.2]);
+    bounding_box(world, "object_bounds", &at_cube_height(config.object_bounds), [0.6, 0.3, 0.3, 0.2]);
+    bounding_box(world, "arm_bounds", &config.arm_bounds, [0.3, 0.6, 0.3, 0.2]);
     let mut model = arena.compile().map_err(|error| Error::external("compiling OGBench's table", error))?;
-    tune(&mut model, look);
+    configure_arm(&mut model, arm_rendering);
     Ok(model)
 }
 
@@ -90,21 +90,21 @@ impl Files {
         MjSpec::from_xml(&path).map_err(|error| Error::external(format!("reading {}", path.display()), error))
     }
 
-    /// The arm with the gripper on its flange.
+    /// The arm with the gripper attached to its flange.
     fn arm(&self) -> Result<MjSpec> {
         let mut arm = self.read("universal_robots_ur5e/ur5e.xml")?;
-        let refused = |error| Error::external("preparing OGBench's arm", error);
+        let failed = |error| Error::external("preparing OGBench's arm", error);
         if let Some(light) = arm.light_mut("spotlight") {
-            // SAFETY: the light is of this description, and nothing refers to it.
-            unsafe { light.delete() }.map_err(refused)?;
+            // SAFETY: the light belongs to this description, and no other element refers to it.
+            unsafe { light.delete() }.map_err(failed)?;
         }
         if let Some(key) = arm.key_mut("home") {
-            // SAFETY: as above.
-            unsafe { key.delete() }.map_err(refused)?;
+            // SAFETY: as for the light.
+            unsafe { key.delete() }.map_err(failed)?;
         }
         let Some(flange) = arm.site("attachment_site") else { return Err(missing("attachment_site")) };
-        let (place, turn) = (*flange.pos(), *flange.quat());
-        body(&mut arm, "wrist_3_link")?.add_body().with_name("robotiq/").with_pos(place).with_quat(turn);
+        let (position, quat) = (*flange.pos(), *flange.quat());
+        body(&mut arm, "wrist_3_link")?.add_body().with_name("robotiq/").with_pos(position).with_quat(quat);
         attach(body(&mut arm, "robotiq/")?, self.read("robotiq_2f85/2f85.xml")?, c"robotiq/")?;
         Ok(arm)
     }
@@ -118,19 +118,19 @@ fn body<'a>(spec: &'a mut MjSpec, name: &str) -> Result<&'a mut MjsBody> {
     spec.body_mut(name).ok_or_else(|| missing(name))
 }
 
-/// Makes everything of `child` a part of `parent`, under names with a prefix.
+/// Adds the content of `child` to `parent`; `prefix` is prepended to the names.
 fn attach(parent: &mut MjsBody, mut child: MjSpec, prefix: &CStr) -> Result<()> {
     let frame = parent.add_frame().element_mut_pointer();
-    // SAFETY: both are elements of live descriptions; MuJoCo counts who refers to the child, which may be dropped after.
+    // SAFETY: both are elements of live descriptions; MuJoCo counts references to the child, which may be dropped afterwards.
     let attached = unsafe { mjs_attach(frame, child.ffi_mut().element, prefix.as_ptr(), c"".as_ptr()) };
     match attached.is_null() {
         false => Ok(()),
-        true => Err(Error::external("putting OGBench's table together", "a part cannot be attached")),
+        true => Err(Error::external("composing OGBench's table", "MuJoCo could not attach a part")),
     }
 }
 
-/// What `dm_control` gathers from all files, and what the environment sets.
-fn settle_options(arena: &mut MjSpec) {
+/// Sets the options that `dm_control` collects from all files, and those that the environment sets.
+fn set_options(arena: &mut MjSpec) {
     let option = arena.option_mut();
     option.timestep = TIMESTEP;
     option.cone = mjtCone::mjCONE_ELLIPTIC as i32;
@@ -143,32 +143,32 @@ fn settle_options(arena: &mut MjSpec) {
     (visual.map.znear, visual.map.zfar) = (0.1, 10.0);
 }
 
-/// Gives the cube of `cube.xml` its number and its place among `cubes`.
+/// Numbers the elements of `cube.xml` and moves the cube to its position among `cubes`.
 fn number_cube(spec: &mut MjSpec, cube: usize, cubes: usize) -> Result<()> {
-    let aside = 2.0 * SPACING * cube as f64 - SPACING * (cubes as f64 - 1.0);
+    let offset = 2.0 * SPACING * cube as f64 - SPACING * (cubes as f64 - 1.0);
     let named = |stem: &str| format!("{stem}_{cube}");
-    let taken = |error| Error::external("numbering OGBench's cubes", error);
+    let failed = |error| Error::external("numbering OGBench's cubes", error);
     for stem in ["object", "object_target"] {
         let body = body(spec, &format!("{stem}_0"))?;
-        body.pos_mut()[1] = aside;
-        body.set_name(&named(stem)).map_err(taken)?;
+        body.pos_mut()[1] = offset;
+        body.set_name(&named(stem)).map_err(failed)?;
     }
     for stem in ["object", "target_object"] {
         let geom = spec.geom_mut(&format!("{stem}_0")).ok_or_else(|| missing(stem))?;
-        geom.set_name(&named(stem)).map_err(taken)?;
+        geom.set_name(&named(stem)).map_err(failed)?;
     }
     let joint = spec.joint_mut("object_joint_0").ok_or_else(|| missing("object_joint_0"))?;
-    joint.set_name(&named("object_joint")).map_err(taken)?;
+    joint.set_name(&named("object_joint")).map_err(failed)?;
     let site = spec.site_mut("com_0").ok_or_else(|| missing("com_0"))?;
-    site.set_name(&named("com")).map_err(taken)
+    site.set_name(&named("com")).map_err(failed)
 }
 
-/// Places of objects, at the height of a cube's middle.
-fn lifted([low, high]: Bounds<2>) -> Bounds<3> {
+/// Extends bounds in the plane to the height of a cube's centre.
+fn at_cube_height([low, high]: Bounds<2>) -> Bounds<3> {
     [[low[0], low[1], 0.02], [high[0], high[1], 0.02]]
 }
 
-/// A box that shows bounds, in a group that is not drawn unless asked for.
+/// Adds a site that displays bounds, in a group that is not rendered by default.
 fn bounding_box(world: &mut MjsBody, name: &str, [low, high]: &Bounds<3>, color: [f32; 4]) {
     let each = |f: fn(f64, f64) -> f64| std::array::from_fn(|i| f(low[i], high[i]));
     let site = world.add_site().with_name(name);
@@ -179,18 +179,17 @@ fn bounding_box(world: &mut MjsBody, name: &str, [low, high]: &Bounds<3>, color:
     site.set_group(4);
 }
 
-/// The arm's gains, and its look.
-fn tune(model: &mut MjModel, look: Look) {
+/// Sets the gains of the arm's actuators and the transparency of its materials.
+fn configure_arm(model: &mut MjModel, arm_rendering: ArmRendering) {
     for (i, (stiffness, damping)) in GAINS.into_iter().enumerate() {
-        // The damping stays in the actuator's bias as the file has it: the reference writes it to the gains, where it does
-        // nothing.
+        // The actuator's bias keeps the damping of the file: the reference writes it to the gains, where it has no effect.
         // SAFETY: any finite gain is valid.
         let gain = unsafe { &mut model.actuator_gainprm_mut()[i] };
         (gain[0], gain[2]) = (stiffness, -damping);
         model.actuator_biasprm_mut()[i][1] = -stiffness;
     }
-    if look == Look::Transparent {
-        for (name, alpha) in TRANSPARENT {
+    if arm_rendering == ArmRendering::Transparent {
+        for (name, alpha) in TRANSPARENT_MATERIALS {
             let Some(id) = model.name_to_id(MjtObjBase::mjOBJ_MATERIAL, name) else { continue };
             model.mat_rgba_mut()[id][3] = alpha;
         }

@@ -1,181 +1,199 @@
-//! Who sets a table: one job after the other, each told from where things are, so that a slip is mended.
+//! The scripted expert of tables: performs one job after another, planning every action from the present columns, so that it
+//! recovers from errors.
 //!
-//! OGBench's oracles carry out one job at a time (above, down, grasp, up, over, down, release). So do these; what to do next
-//! is planned here, as a goal may ask for several: lower cubes before those on top of them, whatever is in the way aside,
-//! unlocking before pulling, and locks last.
+//! As OGBench's oracles, a job consists of moves above an object, down, grasp, up, over the target, down, release. The order of
+//! jobs is planned here, because a goal may include several: lower cubes before those on top, obstacles first, unlocking before
+//! sliding, and locks last.
 
-use super::goal::{NEAR, Subject};
-use super::start::OPEN;
+use super::config::OPEN;
+use super::goal::{GOAL_TOLERANCE, Subject};
 use crate::ogbench::arm::pose::{Vec3, add, distance, scale, sub, wrap};
 use std::f64::consts::{FRAC_PI_2, PI};
 use swm_core::policy::Expert;
 use swm_core::{ExpertEntry, Key, Result, RowRef};
 
-/// The experts of both tables.
+/// The experts of the tables.
 pub const EXPERTS: &[ExpertEntry] = &[ExpertEntry {
     id: "expert",
-    summary: "puts one cube after the other in its place, unlocks, opens and closes drawer and window, sets the locks",
-    make: || Box::<Setter>::default(),
+    summary: "places one cube after another, unlocks and slides drawer and window, sets the locks",
+    make: || Box::<TableExpert>::default(),
 }];
 
-/// Metres an action of 1 asks for, and radians.
-const REACH: f64 = 0.05;
-const TURN: f64 = 0.3;
-/// How much more than the way left is asked for: the arm gives way to its weight and to what it holds.
-const EAGER: f64 = 1.6;
-/// How high one hovers over things, and carries cubes, in metres above them.
+/// Displacement for an action of 1, in metres.
+const ACTION_POSITION: f64 = 0.05;
+/// Rotation for an action of 1, in radians.
+const ACTION_YAW: f64 = 0.3;
+/// Factor on the remaining displacement: the arm lags behind its targets under load.
+const GAIN: f64 = 1.6;
+/// Height above objects at which the gripper approaches and carries, in metres.
 const HOVER: f64 = 0.09;
-/// How exactly one is above something before going down, and at something before grasping it.
-const ABOVE: f64 = 0.012;
-const AT: f64 = 0.012;
-/// How near to its place a cube is set down.
-const PLACED: f64 = 0.012;
-/// From where on a contact is a grasp, and until where none.
-const HELD: f64 = 0.5;
-/// How high one lifts away from a cube, a handle or a button.
-const CLEAR: f64 = 0.06;
-/// Cubes nearer than this are in each other's way.
-const WIDE: f64 = 0.06;
-/// How far a button is pressed below its top.
-const PRESS: f64 = 0.035;
-/// Where a cube is let go to fall into the open drawer.
+/// Horizontal tolerance before the gripper moves down, in metres.
+const ABOVE_TOLERANCE: f64 = 0.012;
+/// Tolerance before the gripper grasps, in metres.
+const GRASP_TOLERANCE: f64 = 0.012;
+/// Horizontal tolerance before a cube is released, in metres.
+const RELEASE_TOLERANCE: f64 = 0.012;
+/// Contact above which a cube counts as grasped.
+const GRASP_CONTACT: f64 = 0.5;
+/// Height to which the gripper rises above a cube, a handle or a button, in metres.
+const CLEARANCE: f64 = 0.06;
+/// Distance below which cubes obstruct each other, in metres.
+const OBSTACLE_DISTANCE: f64 = 0.06;
+/// Depth of a button press below the top, in metres.
+const PRESS_DEPTH: f64 = 0.035;
+/// Where a cube is released to fall into the open drawer, in metres.
 const OVER_DRAWER: Vec3 = [0.33, -0.24, 0.09];
-/// What is beyond this is in the drawer.
+/// Objects below this y coordinate are in the drawer, in metres.
 const DRAWER_EDGE: f64 = -0.16;
-/// Steps after which a job is thought over.
-const PATIENCE: usize = 120;
+/// Steps after which a job is planned again.
+const MAX_JOB_STEPS: usize = 120;
 
-/// One thing to do.
+/// A job.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Job {
-    /// A cube goes somewhere, turned somehow.
+    /// Carry a cube to a position (m) and yaw (rad).
     Carry(usize, Vec3, f64),
-    /// A button is pressed.
+    /// Press a button.
     Press(usize),
-    /// The drawer (0) or the window (1) goes to an opening.
+    /// Slide the drawer (0) or the window (1) to an opening (m).
     Slide(usize, f64),
 }
 
-/// Does one job after the other.
+/// Performs one job after another.
 #[derive(Default)]
-struct Setter {
+struct TableExpert {
     job: Option<Job>,
-    /// Steps spent on it.
-    spent: usize,
-    /// How the locks stood when it began.
+    /// Steps since the job started.
+    steps: usize,
+    /// The locks when the job started.
     locks: [i64; 2],
-    /// Whether the gripper leaves what it worked on before the next job.
-    leaving: bool,
+    /// Whether the gripper must still move away from the object of the last job.
+    retreating: bool,
 }
 
-/// What one sees.
-struct View {
-    hand: Vec3,
+/// The columns that the expert reads. Positions are in metres, angles in radians.
+struct Inputs {
+    gripper: Vec3,
     yaw: f64,
+    /// How far the fingers are closed, 0 to 1.
     closed: f64,
     contact: f64,
+    /// Position and yaw of each cube.
     cubes: Vec<(Vec3, f64)>,
+    /// Goal position and yaw of each cube.
     goals: Vec<(Vec3, f64)>,
     subject: Subject,
-    fixtures: Option<Fixtures>,
+    fixtures: Option<FixtureInputs>,
 }
 
-struct Fixtures {
+/// The columns about buttons, drawer and window.
+struct FixtureInputs {
     locks: [i64; 2],
-    wanted_locks: [i64; 2],
+    goal_locks: [i64; 2],
     openings: [f64; 2],
-    wanted: [f64; 2],
+    goal_openings: [f64; 2],
+    /// Position and yaw of the handles.
     handles: [(Vec3, f64); 2],
+    /// Positions of the buttons' tops.
     tops: [Vec3; 2],
 }
 
-impl View {
+/// Reads a column of three elements.
+fn vector(row: RowRef<'_>, name: &str) -> Result<Vec3> {
+    let value = row.to_f64(name)?;
+    Ok([value[0], value[1], value[2]])
+}
+
+/// Reads the first element of a column.
+fn scalar(row: RowRef<'_>, name: &str) -> Result<f64> {
+    Ok(row.to_f64(name)?[0])
+}
+
+impl Inputs {
     fn new(row: RowRef<'_>) -> Result<Self> {
-        let vector = |name: &str| -> Result<Vec3> {
-            let value = row.to_f64(name)?;
-            Ok([value[0], value[1], value[2]])
-        };
-        let number = |name: &str| Ok(row.to_f64(name)?[0]);
-        let places = row.to_f64("goal/block_pos")?;
+        let positions = row.to_f64("goal/block_pos")?;
         let yaws = row.to_f64("goal/block_yaw")?;
         let goals: Vec<(Vec3, f64)> =
-            places.chunks_exact(3).zip(yaws).map(|(place, yaw)| ([place[0], place[1], place[2]], yaw)).collect();
+            positions.chunks_exact(3).zip(yaws).map(|(at, yaw)| ([at[0], at[1], at[2]], yaw)).collect();
         let cube = |i: usize| {
             let name = format!("privileged/block_{i}");
-            Ok((vector(&format!("{name}_pos"))?, number(&format!("{name}_yaw"))?))
+            Ok((vector(row, &format!("{name}_pos"))?, scalar(row, &format!("{name}_yaw"))?))
         };
-        let subject = Subject::from_number(number("goal/subject")? as i64);
+        let subject = Subject::from_code(scalar(row, "goal/subject")? as i64);
         Ok(Self {
-            hand: vector("proprio/effector_pos")?,
-            yaw: number("proprio/effector_yaw")?,
-            closed: number("proprio/gripper_opening")?,
-            contact: number("proprio/gripper_contact")?,
+            gripper: vector(row, "proprio/effector_pos")?,
+            yaw: scalar(row, "proprio/effector_yaw")?,
+            closed: scalar(row, "proprio/gripper_opening")?,
+            contact: scalar(row, "proprio/gripper_contact")?,
             cubes: (0..goals.len()).map(cube).collect::<Result<_>>()?,
             goals,
             subject,
             fixtures: match row.schema().find("button_states") {
-                Some(_) => Some(Fixtures::new(row)?),
+                Some(_) => Some(FixtureInputs::new(row)?),
                 None => None,
             },
         })
     }
 
-    /// Whether something must be as the goal says.
-    fn asks(&self, one: Subject) -> bool {
+    /// Whether the goal includes a subject.
+    fn includes(&self, one: Subject) -> bool {
         self.subject == Subject::All || self.subject == one
     }
 
-    fn is_home(&self, cube: usize) -> bool {
-        !self.asks(Subject::Cube(cube)) || distance(self.cubes[cube].0, self.goals[cube].0) <= 0.7 * NEAR
+    /// Whether a cube is at its goal, with a margin to the tolerance.
+    fn is_placed(&self, cube: usize) -> bool {
+        !self.includes(Subject::Cube(cube)) || distance(self.cubes[cube].0, self.goals[cube].0) <= 0.7 * GOAL_TOLERANCE
     }
 
-    /// The cube that stands on this one.
+    /// The cube on top of a cube.
     fn on_top(&self, cube: usize) -> Option<usize> {
         let at = self.cubes[cube].0;
         (0..self.cubes.len()).find(|&other| {
-            let place = self.cubes[other].0;
-            other != cube && place[2] > at[2] + 0.015 && across(place, at) < 0.03
+            let position = self.cubes[other].0;
+            other != cube && position[2] > at[2] + 0.015 && horizontal_distance(position, at) < 0.03
         })
     }
 
-    /// The cube that is where another one should go.
-    fn in_the_way(&self, cube: usize, place: Vec3) -> Option<usize> {
+    /// The cube that occupies a position.
+    fn obstacle(&self, cube: usize, position: Vec3) -> Option<usize> {
         (0..self.cubes.len()).find(|&other| {
             let at = self.cubes[other].0;
-            other != cube && across(at, place) < 0.045 && at[2] > place[2] - 0.02
+            other != cube && horizontal_distance(at, position) < 0.045 && at[2] > position[2] - 0.02
         })
     }
 
-    /// Somewhere on the table where nothing is and nothing should go.
-    fn aside(&self, cube: usize) -> Vec3 {
-        let free = |place: &Vec3| {
-            let far = |other: &Vec3| across(*other, *place) >= 1.3 * WIDE;
+    /// The free position on the table nearest to a cube, away from all cubes and goals.
+    fn free_position(&self, cube: usize) -> Vec3 {
+        let is_free = |position: &Vec3| {
+            let far = |other: &Vec3| horizontal_distance(*other, *position) >= 1.3 * OBSTACLE_DISTANCE;
             (0..self.cubes.len()).all(|i| i == cube || far(&self.cubes[i].0))
                 && self.goals.iter().all(|(goal, _)| far(goal))
         };
         let grid =
             (0..6).flat_map(|i| (0..13).map(move |j| [0.3 + 0.05 * f64::from(i), -0.3 + 0.05 * f64::from(j), 0.02]));
         let here = self.cubes[cube].0;
-        grid.filter(free).min_by(|a, b| across(*a, here).total_cmp(&across(*b, here))).unwrap_or([0.425, 0.0, 0.02])
+        let free = grid.filter(is_free);
+        free.min_by(|a, b| horizontal_distance(*a, here).total_cmp(&horizontal_distance(*b, here)))
+            .unwrap_or([0.425, 0.0, 0.02])
     }
 
-    /// What to do next, `None` when all is done.
-    fn next(&self) -> Option<Job> {
-        self.next_of_scene().or_else(|| self.next_cube()).or_else(|| self.next_fixture())
+    /// The next job; `None` when the goal is reached.
+    fn next_job(&self) -> Option<Job> {
+        self.next_drawer_job().or_else(|| self.next_cube_job()).or_else(|| self.next_fixture_job())
     }
 
-    /// What must be done before a cube can go into the drawer or out of it.
-    fn next_of_scene(&self) -> Option<Job> {
+    /// The next job before the cube can move into the drawer or out of it.
+    fn next_drawer_job(&self) -> Option<Job> {
         let fixtures = self.fixtures.as_ref()?;
         let (cube, goal) = (self.cubes[0], self.goals[0]);
-        let inside = |place: Vec3| place[1] < DRAWER_EDGE;
-        if self.is_home(0) || !(inside(goal.0) || inside(cube.0)) {
+        let inside = |position: Vec3| position[1] < DRAWER_EDGE;
+        if self.is_placed(0) || !(inside(goal.0) || inside(cube.0)) {
             return None;
         }
         if fixtures.openings[0] > OPEN[0] + 0.03 {
-            // A cube in the drawer moves with it.
-            let there = inside(cube.0) && inside(goal.0);
-            return if there { None } else { Some(fixtures.slide(0, OPEN[0])) };
+            // A cube in the drawer moves with the drawer.
+            let both_inside = inside(cube.0) && inside(goal.0);
+            return if both_inside { None } else { Some(fixtures.slide(0, OPEN[0])) };
         }
         match inside(goal.0) {
             true if !inside(cube.0) => Some(Job::Carry(0, OVER_DRAWER, cube.1)),
@@ -184,248 +202,250 @@ impl View {
         }
     }
 
-    /// The next cube to move: to its goal, or out of the way of another.
-    fn next_cube(&self) -> Option<Job> {
-        let mut open: Vec<usize> = (0..self.cubes.len()).filter(|&cube| !self.is_home(cube)).collect();
+    /// The next cube to carry: to its goal, or away from the goal of another cube.
+    fn next_cube_job(&self) -> Option<Job> {
+        let mut open: Vec<usize> = (0..self.cubes.len()).filter(|&cube| !self.is_placed(cube)).collect();
         if self.fixtures.is_some() && self.goals[0].0[1] < DRAWER_EDGE {
             return None;
         }
         open.sort_by(|&a, &b| self.goals[a].0[2].total_cmp(&self.goals[b].0[2]));
         let mut obstacle = None;
         for &cube in &open {
-            let (place, yaw) = self.goals[cube];
-            let supported = place[2] < 0.03
+            let (goal, yaw) = self.goals[cube];
+            let supported = goal[2] < 0.03
                 || (0..self.cubes.len()).any(|other| {
                     let at = self.cubes[other].0;
-                    other != cube && across(at, place) < 0.03 && (at[2] - place[2]).abs() > 0.015 && at[2] < place[2]
+                    let is_below = (at[2] - goal[2]).abs() > 0.015 && at[2] < goal[2];
+                    other != cube && horizontal_distance(at, goal) < 0.03 && is_below
                 });
             if !supported {
                 continue;
             }
-            match self.on_top(cube).or_else(|| self.in_the_way(cube, place)) {
-                None => return Some(Job::Carry(cube, place, yaw)),
+            match self.on_top(cube).or_else(|| self.obstacle(cube, goal)) {
+                None => return Some(Job::Carry(cube, goal, yaw)),
                 Some(other) => obstacle = obstacle.or(Some(other)),
             }
         }
-        // Whatever stands on what is in the way goes first.
+        // Cubes on top of the obstacle are removed first.
         let mut other = obstacle.or_else(|| open.first().copied())?;
         while let Some(top) = self.on_top(other) {
             other = top;
         }
-        Some(Job::Carry(other, self.aside(other), self.cubes[other].1))
+        Some(Job::Carry(other, self.free_position(other), self.cubes[other].1))
     }
 
-    /// Drawer, window, and at last the locks.
-    fn next_fixture(&self) -> Option<Job> {
+    /// The next job on drawer, window and, last, locks.
+    fn next_fixture_job(&self) -> Option<Job> {
         let fixtures = self.fixtures.as_ref()?;
         for (i, subject) in [Subject::Drawer, Subject::Window].into_iter().enumerate() {
-            let away = (fixtures.openings[i] - fixtures.wanted[i]).abs();
-            if self.asks(subject) && away > 0.75 * NEAR {
-                return Some(fixtures.slide(i, fixtures.wanted[i]));
+            let away = (fixtures.openings[i] - fixtures.goal_openings[i]).abs();
+            if self.includes(subject) && away > 0.75 * GOAL_TOLERANCE {
+                return Some(fixtures.slide(i, fixtures.goal_openings[i]));
             }
         }
-        let wrong = |i: &usize| self.asks(Subject::Button(*i)) && fixtures.locks[*i] != fixtures.wanted_locks[*i];
+        let wrong = |i: &usize| self.includes(Subject::Button(*i)) && fixtures.locks[*i] != fixtures.goal_locks[*i];
         (0..2).find(wrong).map(Job::Press)
     }
 }
 
-impl Fixtures {
+impl FixtureInputs {
     fn new(row: RowRef<'_>) -> Result<Self> {
-        let vector = |name: &str| -> Result<Vec3> {
-            let value = row.to_f64(name)?;
-            Ok([value[0], value[1], value[2]])
-        };
-        let number = |name: &str| -> Result<f64> { Ok(row.to_f64(name)?[0]) };
         let pair = |name: &str| -> Result<[i64; 2]> {
             let value = row.to_f64(name)?;
             Ok([value[0] as i64, value[1] as i64])
         };
         let handle = |name: &str| -> Result<(Vec3, f64)> {
-            Ok((vector(&format!("privileged/{name}_handle_pos"))?, number(&format!("privileged/{name}_handle_yaw"))?))
+            let (position, yaw) = (format!("privileged/{name}_handle_pos"), format!("privileged/{name}_handle_yaw"));
+            Ok((vector(row, &position)?, scalar(row, &yaw)?))
         };
         Ok(Self {
             locks: pair("button_states")?,
-            wanted_locks: pair("goal/button_states")?,
-            openings: [number("privileged/drawer_pos")?, number("privileged/window_pos")?],
-            wanted: [number("goal/drawer_pos")?, number("goal/window_pos")?],
+            goal_locks: pair("goal/button_states")?,
+            openings: [scalar(row, "privileged/drawer_pos")?, scalar(row, "privileged/window_pos")?],
+            goal_openings: [scalar(row, "goal/drawer_pos")?, scalar(row, "goal/window_pos")?],
             handles: [handle("drawer")?, handle("window")?],
-            tops: [vector("privileged/button_0_top_pos")?, vector("privileged/button_1_top_pos")?],
+            tops: [vector(row, "privileged/button_0_top_pos")?, vector(row, "privileged/button_1_top_pos")?],
         })
     }
 
-    /// Moving the drawer or the window, or unlocking it first.
+    /// The job that slides the drawer or the window, or unlocks it first.
     fn slide(&self, which: usize, to: f64) -> Job {
         if self.locks[which] == 0 { Job::Press(which) } else { Job::Slide(which, to) }
     }
 }
 
-/// How far two places are apart, seen from above.
-fn across(a: Vec3, b: Vec3) -> f64 {
+/// The horizontal distance of two points, in metres.
+fn horizontal_distance(a: Vec3, b: Vec3) -> f64 {
     (a[0] - b[0]).hypot(a[1] - b[1])
 }
 
-/// The turn nearest to `from` that looks like `to`, when a turn by `period` changes nothing.
-fn alike(from: f64, to: f64, period: f64) -> f64 {
-    let apart = wrap(to - from);
-    apart - (apart / period).round() * period
+/// The smallest rotation (rad) from `from` to an angle equivalent to `to`, for objects with rotational symmetry `period`.
+fn symmetric_rotation(from: f64, to: f64, period: f64) -> f64 {
+    let difference = wrap(to - from);
+    difference - (difference / period).round() * period
 }
 
-/// Where the hand goes, how it turns, and whether it closes.
+/// The motion of the gripper in a step.
 struct Move {
+    /// The target position, in metres.
     to: Vec3,
-    turn: f64,
+    /// The remaining rotation, in radians.
+    rotation: f64,
+    /// Whether the fingers close.
     close: bool,
 }
 
-impl Setter {
-    /// The move for a job, `None` when it is done.
-    fn carry_out(&mut self, job: Job, view: &View) -> Option<Move> {
+impl TableExpert {
+    /// The move for a job; `None` when the job is done.
+    fn perform(&mut self, job: Job, inputs: &Inputs) -> Option<Move> {
         match job {
-            Job::Carry(cube, place, yaw) => self.carry(view, cube, place, yaw),
-            Job::Press(button) => self.press(view, button),
-            Job::Slide(which, to) => slide(view, which, to),
+            Job::Carry(cube, target, yaw) => self.carry(inputs, cube, target, yaw),
+            Job::Press(button) => self.press(inputs, button),
+            Job::Slide(which, to) => slide(inputs, which, to),
         }
     }
 
-    fn carry(&mut self, view: &View, cube: usize, place: Vec3, yaw: f64) -> Option<Move> {
-        let (at, turn) = view.cubes[cube];
-        let away = sub(view.hand, at);
-        let grasped = view.contact > HELD && distance(view.hand, at) < 0.035;
-        let there = across(at, place) <= PLACED;
-        let turn_to_grasp = alike(view.yaw, turn, FRAC_PI_2);
-        if there && (at[2] - place[2]).abs() <= PLACED.max(0.5 * (place[2] - 0.05)) {
-            self.leaving = true;
+    fn carry(&mut self, inputs: &Inputs, cube: usize, target: Vec3, yaw: f64) -> Option<Move> {
+        let (at, cube_yaw) = inputs.cubes[cube];
+        let gripper = inputs.gripper;
+        let offset = sub(gripper, at);
+        let grasped = inputs.contact > GRASP_CONTACT && distance(gripper, at) < 0.035;
+        let above_target = horizontal_distance(at, target) <= RELEASE_TOLERANCE;
+        let grasp_rotation = symmetric_rotation(inputs.yaw, cube_yaw, FRAC_PI_2);
+        if above_target && (at[2] - target[2]).abs() <= RELEASE_TOLERANCE.max(0.5 * (target[2] - 0.05)) {
+            self.retreating = true;
             return None;
         }
         if grasped {
-            let turn = alike(view.yaw, yaw + alike(turn, view.yaw, FRAC_PI_2), FRAC_PI_2);
-            let cruise = (place[2].max(at[2].min(0.12)) + HOVER).min(0.3);
-            let to = if there {
-                add(place, away)
-            } else if at[2] < cruise - 0.03 && across(at, place) > WIDE {
-                [view.hand[0], view.hand[1], cruise + 0.02]
+            let gripper_goal = yaw + symmetric_rotation(cube_yaw, inputs.yaw, FRAC_PI_2);
+            let rotation = symmetric_rotation(inputs.yaw, gripper_goal, FRAC_PI_2);
+            let cruise = (target[2].max(at[2].min(0.12)) + HOVER).min(0.3);
+            let to = if above_target {
+                add(target, offset)
+            } else if at[2] < cruise - 0.03 && horizontal_distance(at, target) > OBSTACLE_DISTANCE {
+                [gripper[0], gripper[1], cruise + 0.02]
             } else {
-                [place[0] + away[0], place[1] + away[1], cruise]
+                [target[0] + offset[0], target[1] + offset[1], cruise]
             };
-            return Some(Move { to, turn, close: true });
+            return Some(Move { to, rotation, close: true });
         }
-        let near = across(view.hand, at);
-        let to = if near > ABOVE && view.hand[2] < at[2] + CLEAR && near > 0.03 {
-            [view.hand[0], view.hand[1], at[2] + HOVER + 0.03]
-        } else if near > ABOVE || (turn_to_grasp.abs() > 0.15 && view.hand[2] > at[2] + 0.03) {
-            [at[0], at[1], (at[2] + HOVER).min(view.hand[2].max(at[2]))]
+        let near = horizontal_distance(gripper, at);
+        let to = if near > ABOVE_TOLERANCE && gripper[2] < at[2] + CLEARANCE && near > 0.03 {
+            [gripper[0], gripper[1], at[2] + HOVER + 0.03]
+        } else if near > ABOVE_TOLERANCE || (grasp_rotation.abs() > 0.15 && gripper[2] > at[2] + 0.03) {
+            [at[0], at[1], (at[2] + HOVER).min(gripper[2].max(at[2]))]
         } else {
             at
         };
-        let close = distance(view.hand, at) <= AT || (view.closed > 0.3 && near < 0.02 && view.hand[2] < at[2] + 0.02);
-        Some(Move { to, turn: turn_to_grasp, close })
+        let close = distance(gripper, at) <= GRASP_TOLERANCE
+            || (inputs.closed > 0.3 && near < 0.02 && gripper[2] < at[2] + 0.02);
+        Some(Move { to, rotation: grasp_rotation, close })
     }
 
-    fn press(&mut self, view: &View, button: usize) -> Option<Move> {
-        let fixtures = view.fixtures.as_ref()?;
+    fn press(&mut self, inputs: &Inputs, button: usize) -> Option<Move> {
+        let fixtures = inputs.fixtures.as_ref()?;
         if fixtures.locks[button] != self.locks[button] {
-            self.leaving = true;
+            self.retreating = true;
             return None;
         }
-        let top = fixtures.tops[button];
-        let to = if across(view.hand, top) > 0.02 {
-            let height = top[2] + CLEAR;
-            if view.hand[2] < height - 0.03 {
-                [view.hand[0], view.hand[1], height + 0.05]
-            } else {
-                [top[0], top[1], height]
-            }
+        let (top, gripper) = (fixtures.tops[button], inputs.gripper);
+        let to = if horizontal_distance(gripper, top) > 0.02 {
+            let height = top[2] + CLEARANCE;
+            if gripper[2] < height - 0.03 { [gripper[0], gripper[1], height + 0.05] } else { [top[0], top[1], height] }
         } else {
-            [top[0], top[1], top[2] - PRESS]
+            [top[0], top[1], top[2] - PRESS_DEPTH]
         };
-        Some(Move { to, turn: 0.0, close: true })
+        Some(Move { to, rotation: 0.0, close: true })
+    }
+
+    /// Updates whether the gripper must still retreat: until it is above all nearby objects and open.
+    fn update_retreat(&mut self, inputs: &Inputs) {
+        let height = inputs.gripper[2];
+        let cubes = inputs.cubes.iter().map(|(at, _)| height - at[2]).fold(height, f64::min);
+        let fixtures = inputs.fixtures.as_ref().map_or(f64::MAX, |fixtures| {
+            let points = fixtures.handles.iter().map(|(at, _)| *at).chain(fixtures.tops);
+            let near = points.filter(|at| horizontal_distance(*at, inputs.gripper) < OBSTACLE_DISTANCE);
+            near.map(|at| height - at[2]).fold(f64::MAX, f64::min)
+        });
+        self.retreating = cubes.min(fixtures) < CLEARANCE || (inputs.closed > 0.25 && self.steps < 2 * MAX_JOB_STEPS);
+        if !self.retreating {
+            self.steps = 0;
+        }
     }
 }
 
-fn slide(view: &View, which: usize, to: f64) -> Option<Move> {
-    let fixtures = view.fixtures.as_ref()?;
+fn slide(inputs: &Inputs, which: usize, to: f64) -> Option<Move> {
+    let fixtures = inputs.fixtures.as_ref()?;
     let (handle, yaw) = fixtures.handles[which];
-    let left = to - fixtures.openings[which];
-    if left.abs() <= 0.01 {
+    let remaining = to - fixtures.openings[which];
+    if remaining.abs() <= 0.01 {
         return None;
     }
     // The drawer opens along y, the window along x.
-    let along = if which == 0 { [0.0, -left, 0.0] } else { [left, 0.0, 0.0] };
-    let turn = alike(view.yaw, yaw, PI);
-    let near = across(view.hand, handle);
-    let gripped = near <= 0.025 && view.hand[2] < handle[2] + 0.03;
+    let along = if which == 0 { [0.0, -remaining, 0.0] } else { [remaining, 0.0, 0.0] };
+    let rotation = symmetric_rotation(inputs.yaw, yaw, PI);
+    let gripper = inputs.gripper;
+    let near = horizontal_distance(gripper, handle);
+    let gripped = near <= 0.025 && gripper[2] < handle[2] + 0.03;
     let target = if gripped {
         add(handle, along)
-    } else if near > ABOVE {
-        let height = handle[2] + CLEAR + 0.02;
-        if view.hand[2] < height - 0.03 && near > 0.03 {
-            [view.hand[0], view.hand[1], height + 0.03]
+    } else if near > ABOVE_TOLERANCE {
+        let height = handle[2] + CLEARANCE + 0.02;
+        if gripper[2] < height - 0.03 && near > 0.03 {
+            [gripper[0], gripper[1], height + 0.03]
         } else {
             [handle[0], handle[1], height]
         }
     } else {
         handle
     };
-    Some(Move { to: target, turn, close: gripped && which == 1 })
+    Some(Move { to: target, rotation, close: gripped && which == 1 })
 }
 
-impl Expert for Setter {
+impl Expert for TableExpert {
     fn begin(&mut self, _: Key) {
         *self = Self::default();
     }
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
-        let view = View::new(row)?;
-        if self.spent >= PATIENCE {
-            (self.job, self.leaving) = (None, true);
+        let inputs = Inputs::new(row)?;
+        if self.steps >= MAX_JOB_STEPS {
+            (self.job, self.retreating) = (None, true);
         }
         let mut chosen = None;
         for _ in 0..2 {
-            if self.leaving {
+            if self.retreating {
                 break;
             }
             if self.job.is_none() {
-                self.job = view.next();
-                self.spent = 0;
-                self.locks = view.fixtures.as_ref().map_or([0; 2], |fixtures| fixtures.locks);
+                self.job = inputs.next_job();
+                self.steps = 0;
+                self.locks = inputs.fixtures.as_ref().map_or([0; 2], |fixtures| fixtures.locks);
             }
             let Some(job) = self.job else { break };
-            chosen = self.carry_out(job, &view);
+            chosen = self.perform(job, &inputs);
             if chosen.is_some() {
                 break;
             }
-            (self.job, self.leaving) = (None, true);
+            (self.job, self.retreating) = (None, true);
         }
-        self.spent += 1;
-        // Let go and rise before anything else.
-        let lifted = [view.hand[0], view.hand[1], view.hand[2] + 0.04];
-        let rising = Move { to: if view.closed > 0.25 { view.hand } else { lifted }, turn: 0.0, close: false };
-        let way = chosen.unwrap_or(rising);
-        if self.leaving {
-            let nearest = view.cubes.iter().map(|(at, _)| view.hand[2] - at[2]).fold(view.hand[2], f64::min);
-            let handles = view.fixtures.as_ref().map_or(f64::MAX, |fixtures| {
-                let near = fixtures.handles.iter().map(|(at, _)| *at).chain(fixtures.tops);
-                near.filter(|at| across(*at, view.hand) < WIDE).map(|at| view.hand[2] - at[2]).fold(f64::MAX, f64::min)
-            });
-            self.leaving = nearest.min(handles) < CLEAR || (view.closed > 0.25 && self.spent < 2 * PATIENCE);
-            if !self.leaving {
-                self.spent = 0;
-            }
+        self.steps += 1;
+        // Without a job, the gripper opens and then rises.
+        let [x, y, z] = inputs.gripper;
+        let to = if inputs.closed > 0.25 { inputs.gripper } else { [x, y, z + 0.04] };
+        let motion = chosen.unwrap_or(Move { to, rotation: 0.0, close: false });
+        if self.retreating {
+            self.update_retreat(&inputs);
         }
-        let step = scale(sub(way.to, view.hand), EAGER / REACH);
+        let step = scale(sub(motion.to, inputs.gripper), GAIN / ACTION_POSITION);
         for (i, part) in action.iter_mut().enumerate() {
-            *part = match i {
+            let value = match i {
                 0..3 => step[i],
-                3 => way.turn / TURN,
-                _ => {
-                    if way.close {
-                        1.0
-                    } else {
-                        -1.0
-                    }
-                }
-            }
-            .clamp(-1.0, 1.0);
+                3 => motion.rotation / ACTION_YAW,
+                _ if motion.close => 1.0,
+                _ => -1.0,
+            };
+            *part = value.clamp(-1.0, 1.0);
         }
         Ok(())
     }

@@ -1,8 +1,8 @@
-//! The factors of a table, and how the compiled model is edited for them. Names, bounds, defaults and order are the
-//! reference's.
+//! The factors of variation of a table, and their edits of the compiled model. Names, bounds, defaults and order are those of
+//! the reference.
 
+use super::config::{CUBE_COLORS, Camera, FRONT, SIDE, TableConfig};
 use super::parts::Parts;
-use super::setup::{CUBE_COLORS, Camera, FRONT, SIDE, Setup};
 use crate::Physics;
 use crate::ogbench::arm::find;
 use crate::ogbench::arm::pose::{Quat, Vec3, cross, norm, normalized, scale, sub};
@@ -12,20 +12,20 @@ use mujoco_rs::mujoco_c::mjtSameFrame;
 use std::f64::consts::TAU;
 use swm_core::{DType, Factor, FactorValues, Result, Space, VariationSpace};
 
-/// Kilograms in a cubic metre of a cube.
+/// The density of a cube, in kg/m³.
 const DENSITY: f64 = 1240.0;
-/// Half an edge of a cube: single precision in the reference.
+/// Half the edge of a cube, in metres; in single precision, as in the reference.
 const HALF_EDGE: f64 = 0.02_f32 as f64;
-/// The colour of the gripper.
+/// The default colour of the gripper.
 const PURPLE: [f64; 3] = [0.61, 0.28, 0.82];
-/// What has the colour of the gripper.
-const GRIPPER: [&str; 2] = ["ur5e/robotiq/black", "ur5e/robotiq/pad_gray"];
-/// A lock that is closed.
-const LOCK: [f64; 3] = CUBE_COLORS[0];
+/// The materials of the gripper that have the agent's colour.
+const GRIPPER_MATERIALS: [&str; 2] = ["ur5e/robotiq/black", "ur5e/robotiq/pad_gray"];
+/// The default colour of a closed lock.
+const LOCK_COLOR: [f64; 3] = CUBE_COLORS[0];
 
-/// The factors of a table that is seen by the first of `cameras`, or by both.
-pub fn space(setup: &Setup, cameras: usize) -> VariationSpace {
-    let n = setup.cubes;
+/// The factors of a table of which `cameras` cameras (1 or 2) vary.
+pub fn space(config: &TableConfig, cameras: usize) -> VariationSpace {
+    let n = config.cubes;
     let boxed = |shape: &[usize], low: &[f64], high: &[f64]| Space::Box {
         shape: shape.to_vec(),
         dtype: DType::Float64,
@@ -33,31 +33,31 @@ pub fn space(setup: &Setup, cameras: usize) -> VariationSpace {
         high: high.to_vec(),
     };
     let same = |shape: &[usize], low, high| Space::uniform_box(shape, DType::Float64, low, high);
-    let [low, high] = setup.object_bounds;
-    let places = || boxed(&[n, 2], &low.repeat(n), &high.repeat(n));
-    let [arm_low, arm_high] = setup.arm_bounds;
+    let [low, high] = config.object_bounds;
+    let positions = || boxed(&[n, 2], &low.repeat(n), &high.repeat(n));
+    let [arm_low, arm_high] = config.arm_bounds;
     let middle: Vec<f64> = (0..3).map(|i| (arm_low[i] + arm_high[i]) / 2.0).collect();
-    let (color, turn) = (|shape: &[usize]| same(shape, 0.0, 1.0), setup.factors.camera_turn);
+    let (color, max_angle) = (|shape: &[usize]| same(shape, 0.0, 1.0), config.factors.camera_angle);
     let mut factors = vec![
         Factor::new("agent.color", color(&[3]), PURPLE),
         Factor::new("agent.ee_start_position", boxed(&[3], &arm_low, &arm_high), middle),
-        Factor::new("camera.angle_delta", same(&[cameras, 2], -turn, turn), vec![0.0; 2 * cameras]),
+        Factor::new("camera.angle_delta", same(&[cameras, 2], -max_angle, max_angle), vec![0.0; 2 * cameras]),
         Factor::new("cube.color", color(&[n, 3]), CUBE_COLORS[..n].concat()),
-        Factor::new("cube.goal_position", places(), setup.factors.cube.repeat(n)),
+        Factor::new("cube.goal_position", positions(), config.factors.cube.repeat(n)),
         Factor::new("cube.goal_yaw", same(&[n], 0.0, TAU), vec![0.0; n]),
         Factor::new("cube.size", same(&[n], 0.01, 0.03), vec![HALF_EDGE; n]),
-        Factor::new("cube.start_position", places(), setup.factors.cube.repeat(n)),
+        Factor::new("cube.start_position", positions(), config.factors.cube.repeat(n)),
         Factor::new("cube.start_yaw", same(&[n], 0.0, TAU), vec![0.0; n]),
         Factor::new("floor.color", color(&[2, 3]), floor::COLORS.concat()),
-        Factor::new("light.intensity", color(&[1]), [setup.factors.light]),
+        Factor::new("light.intensity", color(&[1]), [config.factors.light]),
     ];
-    if setup.fixtures {
-        factors.push(Factor::new("lock_color", color(&[2, 3]), [LOCK, LOCK].concat()));
+    if config.fixtures {
+        factors.push(Factor::new("lock_color", color(&[2, 3]), [LOCK_COLOR, LOCK_COLOR].concat()));
     }
-    VariationSpace::new(factors, setup.factors.defaults)
+    VariationSpace::new(factors, config.factors.sampled_by_default)
 }
 
-/// The colours of the locks.
+/// The colours of the two locks.
 pub fn lock_colors(factors: &FactorValues) -> [[f32; 3]; 2] {
     let value = factors.get("lock_color");
     [color(&value[..3]), color(&value[3..])]
@@ -70,49 +70,49 @@ fn color(value: &[f64]) -> [f32; 3] {
 /// Edits the model for these factors.
 ///
 /// # Errors
-/// When the model lacks what they name.
-pub fn apply(physics: &mut Physics, setup: &Setup, parts: &Parts, factors: &FactorValues) -> Result<()> {
+/// When the model lacks an element.
+pub fn apply(physics: &mut Physics, config: &TableConfig, parts: &Parts, factors: &FactorValues) -> Result<()> {
     let find = |physics: &Physics, kind, name: &str| find(physics.model(), kind, name);
-    for name in GRIPPER {
+    for name in GRIPPER_MATERIALS {
         let material = find(physics, mjOBJ_MATERIAL, name)?;
         physics.model_mut().mat_rgba_mut()[material][..3].copy_from_slice(&color(factors.get("agent.color")));
     }
     let light = find(physics, mjOBJ_LIGHT, "global")?;
     let intensity = factors.scalar("light.intensity") as f32;
     physics.model_mut().light_diffuse_mut()[light] = [intensity; 3];
-    let turns = factors.get("camera.angle_delta");
-    for (name, turn) in [FRONT, SIDE].into_iter().zip(turns.chunks_exact(2)) {
+    let angles = factors.get("camera.angle_delta");
+    for (name, angle) in [FRONT, SIDE].into_iter().zip(angles.chunks_exact(2)) {
         let at = find(physics, mjOBJ_CAMERA, name)?;
-        let Some(camera) = setup.cameras.iter().find(|camera| camera.name == name) else { continue };
-        physics.model_mut().cam_quat_mut()[at] = turned(camera, [turn[0], turn[1]]);
+        let Some(camera) = config.cameras.iter().find(|camera| camera.name == name) else { continue };
+        physics.model_mut().cam_quat_mut()[at] = rotated_camera(camera, [angle[0], angle[1]]);
     }
     for (i, cube) in parts.cubes.iter().enumerate() {
-        let paint = color(&factors.get("cube.color")[3 * i..][..3]);
+        let color = color(&factors.get("cube.color")[3 * i..][..3]);
         let half = factors.get("cube.size")[i];
         for (body, geom) in cube.bodies.into_iter().zip(cube.geoms) {
-            physics.model_mut().geom_rgba_mut()[geom][..3].copy_from_slice(&paint);
-            resize(physics, body, geom, half);
+            physics.model_mut().geom_rgba_mut()[geom][..3].copy_from_slice(&color);
+            resize_cube(physics, body, geom, half);
         }
     }
     physics.set_const();
-    // Marks stand elsewhere than their bodies: MuJoCo takes a short cut where both were at the same place.
+    // Markers are moved relative to their bodies. MuJoCo would skip the transform of geoms that coincide with their bodies.
     for cube in &parts.cubes {
         physics.model_mut().geom_sameframe_mut()[cube.geoms[1]] = mjtSameFrame::mjSAMEFRAME_NONE;
     }
-    set_means(physics);
-    floor::paint(physics, factors.get("floor.color"))
+    set_mean_inertia(physics);
+    floor::set_colors(physics, factors.get("floor.color"))
 }
 
-/// The means that the compiler computes once: MuJoCo's solver stops at a share of the mean inertia.
-fn set_means(physics: &mut Physics) {
-    let mean = |numbers: &[f64]| numbers.iter().sum::<f64>() / numbers.len() as f64;
+/// Updates the means that only the compiler computes: the solver's tolerance is relative to the mean inertia.
+fn set_mean_inertia(physics: &mut Physics) {
+    let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
     let (inertia, mass) = (mean(physics.model().dof_m0()), mean(&physics.model().body_mass()[1..]));
     let means = physics.data_mut().model_stat_mut();
     (means.meaninertia, means.meanmass) = (inertia, mass);
 }
 
-/// Makes a body that is one cube of this half edge: its size, what its collisions are looked for with, and its inertia.
-fn resize(physics: &mut Physics, body: usize, geom: usize, half: f64) {
+/// Sets half the edge of a cube (m): size, collision bounds, mass and inertia.
+fn resize_cube(physics: &mut Physics, body: usize, geom: usize, half: f64) {
     let model = physics.model_mut();
     let bounds = [0.0, 0.0, 0.0, half, half, half];
     model.geom_size_mut()[geom] = [half; 3];
@@ -127,19 +127,19 @@ fn resize(physics: &mut Physics, body: usize, geom: usize, half: f64) {
     model.body_inertia_mut()[body] = [mass / 12.0 * (8.0 * half * half); 3];
 }
 
-/// The turn of a camera whose axes are turned by yaw and then by pitch, in degrees.
-fn turned(camera: &Camera, [yaw, pitch]: [f64; 2]) -> Quat {
+/// The orientation of a camera whose axes are rotated by yaw and then by pitch, in degrees.
+fn rotated_camera(camera: &Camera, [yaw, pitch]: [f64; 2]) -> Quat {
     let ((sy, cy), (sp, cp)) = (yaw.to_radians().sin_cos(), pitch.to_radians().sin_cos());
-    let turn = |[x, y, z]: Vec3| {
+    let rotate = |[x, y, z]: Vec3| {
         let [x, y] = [cy * x - sy * y, sy * x + cy * y];
         [x, cp * y - sp * z, sp * y + cp * z]
     };
     let [ax, ay, az, bx, by, bz] = camera.axes;
-    let (right, up) = (turn([ax, ay, az]), turn([bx, by, bz]));
+    let (right, up) = (rotate([ax, ay, az]), rotate([bx, by, bz]));
     frame(right, up)
 }
 
-/// The rotation whose first axis is `right`, and whose second is as near to `up` as can be.
+/// The rotation whose first axis is parallel to `right`, and whose second axis is as close as possible to `up`.
 fn frame(right: Vec3, up: Vec3) -> Quat {
     let unit = |v: Vec3| scale(v, 1.0 / norm(&v));
     let right = unit(right);
@@ -149,7 +149,7 @@ fn frame(right: Vec3, up: Vec3) -> Quat {
     matrix_to_quat([right, up, back])
 }
 
-/// The rotation of three columns: the largest of the four numbers first, as MuJoCo does.
+/// The quaternion of a rotation matrix given by its columns, computed from its largest element as MuJoCo does.
 fn matrix_to_quat([x, y, z]: [Vec3; 3]) -> Quat {
     let q = if x[0] + y[1] + z[2] > 0.0 {
         let w = 0.5 * (1.0 + x[0] + y[1] + z[2]).sqrt();
@@ -169,23 +169,23 @@ fn matrix_to_quat([x, y, z]: [Vec3; 3]) -> Quat {
 
 #[cfg(test)]
 mod tests {
-    use super::super::arena::{self, Look};
-    use super::super::setup::CUBES;
+    use super::super::arena::{self, ArmRendering};
+    use super::super::config::CUBES;
     use super::*;
     use std::sync::Arc;
     use swm_core::{Key, VariationRequest};
 
     #[test]
-    fn factors_leave_nothing_of_those_before() -> Result<()> {
-        let setup = &CUBES[0];
-        let model = Arc::new(arena::compile(setup, Look::Solid)?);
-        let space = space(setup, 1);
+    fn applying_factors_overwrites_all_earlier_edits() -> Result<()> {
+        let config = &CUBES[0];
+        let model = Arc::new(arena::compile(config, ArmRendering::Opaque)?);
+        let space = space(config, 1);
         let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
         let bytes = |seeds: &[u64]| -> Result<Vec<u8>> {
             let mut physics = Physics::new(Arc::clone(&model))?;
-            let parts = Parts::new(physics.model(), setup)?;
+            let parts = Parts::new(physics.model(), config)?;
             for &seed in seeds {
-                apply(&mut physics, setup, &parts, &space.resolve(&all, Key::new(seed))?)?;
+                apply(&mut physics, config, &parts, &space.resolve(&all, Key::new(seed))?)?;
                 physics.reset();
                 physics.forward();
             }
@@ -194,9 +194,9 @@ mod tests {
             Ok(bytes)
         };
         let (fresh, used) = (bytes(&[1])?, bytes(&[90, 1])?);
-        let apart: Vec<usize> =
+        let differing: Vec<usize> =
             fresh.iter().zip(&used).enumerate().filter(|(_, (a, b))| a != b).map(|(i, _)| i).collect();
-        assert!(apart.is_empty(), "bytes {:?} of {}", &apart[..apart.len().min(20)], fresh.len());
+        assert!(differing.is_empty(), "bytes {:?} of {}", &differing[..differing.len().min(20)], fresh.len());
         Ok(())
     }
 }

@@ -1,15 +1,15 @@
-//! What should become of a table, and how far it is from that.
+//! The goal of a table: what it includes, whether it is reached, and the distance to it.
 
+use super::config::FixtureState;
 use super::parts::Parts;
-use super::setup::Fixed;
 use crate::ogbench::arm::pose::{Quat, Vec3, distance};
 
-/// How near is near enough: metres for cubes and for the openings of drawer and window.
-pub const NEAR: f64 = 0.04;
-/// What a lock that stands wrong counts, in metres.
-const WRONG_LOCK: f64 = 0.1;
+/// The distance within which cubes and openings are at their goal, in metres.
+pub const GOAL_TOLERANCE: f64 = 0.04;
+/// The distance that a wrong lock counts, in metres.
+const WRONG_LOCK_DISTANCE: f64 = 0.1;
 
-/// What must be as the goal says.
+/// The objects that a goal includes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Subject {
     /// Everything.
@@ -25,8 +25,8 @@ pub enum Subject {
 }
 
 impl Subject {
-    /// Numbers for [`Subject::from_number`], which the memory of a task holds.
-    pub fn number(self) -> i64 {
+    /// The integer that the column `goal/subject` contains.
+    pub fn code(self) -> i64 {
         match self {
             Self::All => -1,
             Self::Cube(i) => i as i64,
@@ -36,9 +36,9 @@ impl Subject {
         }
     }
 
-    /// The subject of a number; what is none is everything.
-    pub fn from_number(number: i64) -> Self {
-        match number {
+    /// The subject of a code; [`Subject::All`] for an unknown one.
+    pub fn from_code(code: i64) -> Self {
+        match code {
             i @ 0..100 => Self::Cube(i as usize),
             i @ 100..200 => Self::Button(i as usize - 100),
             200 => Self::Drawer,
@@ -48,51 +48,53 @@ impl Subject {
     }
 }
 
-/// One thing that is not as it should be.
+/// One object of a goal.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Gap {
-    /// How far from its goal, in metres.
-    pub size: f64,
-    /// Whether that is near enough.
-    pub closed: bool,
-    /// Where the gripper has to go to change it.
+pub struct GoalTerm {
+    /// The distance from its goal, in metres.
+    pub distance: f64,
+    /// Whether it is at its goal.
+    pub reached: bool,
+    /// The position at which the gripper manipulates it, in metres.
     pub grip: Vec3,
 }
 
-/// Where things are that goals are about.
-pub struct Sight<'a> {
-    /// Where everything is found.
+/// A state and a goal to compare.
+pub struct GoalCheck<'a> {
+    /// The indices of all objects.
     pub parts: &'a Parts,
-    /// Positions of all joints.
+    /// The joint positions of the state.
     pub qpos: &'a [f64],
-    /// Places of all sites.
+    /// The positions of all sites, in metres.
     pub sites: &'a [Vec3],
-    /// How the fixtures stand.
-    pub now: Fixed,
-    /// Where the cubes should be.
+    /// The present state of the fixtures.
+    pub now: FixtureState,
+    /// The goal pose of each cube.
     pub cubes: &'a [(Vec3, Quat)],
-    /// How the fixtures should stand.
-    pub goal: Fixed,
+    /// The goal state of the fixtures.
+    pub goal: FixtureState,
 }
 
-impl Sight<'_> {
-    /// What the goal is about: the cubes, then buttons, drawer and window.
-    pub fn gaps(&self, subject: Subject) -> impl Iterator<Item = Gap> {
-        let asked = move |one: Subject| subject == Subject::All || subject == one;
-        let near = |size: f64, grip| Gap { size, closed: size <= NEAR, grip };
-        let cubes =
-            self.parts.cubes.iter().enumerate().filter(move |(i, _)| asked(Subject::Cube(*i))).map(move |(i, cube)| {
-                let place = cube.place(self.qpos);
-                near(distance(place, self.cubes[i].0), place)
-            });
+impl GoalCheck<'_> {
+    /// The terms of a goal: cubes, then buttons, drawer and window.
+    pub fn terms(&self, subject: Subject) -> impl Iterator<Item = GoalTerm> {
+        let included = move |one: Subject| subject == Subject::All || subject == one;
+        let within = |distance: f64, grip| GoalTerm { distance, reached: distance <= GOAL_TOLERANCE, grip };
+        let cubes = self.parts.cubes.iter().enumerate().filter(move |(i, _)| included(Subject::Cube(*i))).map(
+            move |(i, cube)| {
+                let position = cube.position(self.qpos);
+                within(distance(position, self.cubes[i].0), position)
+            },
+        );
         let fixtures = self.parts.fixtures.iter().flat_map(move |fixtures| {
             let button = |i: usize| {
                 let right = self.now.buttons[i] == self.goal.buttons[i];
-                let size = if right { 0.0 } else { WRONG_LOCK };
-                (Subject::Button(i), Gap { size, closed: right, grip: self.sites[fixtures.buttons[i].top] })
+                let distance = if right { 0.0 } else { WRONG_LOCK_DISTANCE };
+                let grip = self.sites[fixtures.buttons[i].top];
+                (Subject::Button(i), GoalTerm { distance, reached: right, grip })
             };
             let opening =
-                |subject, now: f64, goal: f64, site: usize| (subject, near((now - goal).abs(), self.sites[site]));
+                |subject, now: f64, goal: f64, site: usize| (subject, within((now - goal).abs(), self.sites[site]));
             let (now, goal) = (self.now, self.goal);
             [
                 button(0),
@@ -101,23 +103,23 @@ impl Sight<'_> {
                 opening(Subject::Window, now.window, goal.window, fixtures.window.handles[0]),
             ]
             .into_iter()
-            .filter(move |(one, _)| asked(*one))
-            .map(|(_, gap)| gap)
+            .filter(move |(one, _)| included(*one))
+            .map(|(_, term)| term)
         });
         cubes.chain(fixtures)
     }
 
-    /// Whether everything is near enough.
+    /// Whether all terms are reached.
     pub fn reached(&self, subject: Subject) -> bool {
-        self.gaps(subject).all(|gap| gap.closed)
+        self.terms(subject).all(|term| term.reached)
     }
 
-    /// How far everything that is not near enough is from its goal, and the gripper at `grip` from the nearest of it, in
+    /// The sum of the distances of all terms that are not reached, plus the distance of the gripper from the nearest of them, in
     /// metres.
-    pub fn distance(&self, subject: Subject, grip: Vec3) -> f64 {
-        let open = || self.gaps(subject).filter(|gap| !gap.closed);
-        let away: f64 = open().map(|gap| gap.size).sum();
-        let reach = open().map(|gap| distance(gap.grip, grip)).min_by(f64::total_cmp);
-        away + reach.unwrap_or(0.0)
+    pub fn distance(&self, subject: Subject, gripper: Vec3) -> f64 {
+        let open = || self.terms(subject).filter(|term| !term.reached);
+        let terms: f64 = open().map(|term| term.distance).sum();
+        let reach = open().map(|term| distance(term.grip, gripper)).min_by(f64::total_cmp);
+        terms + reach.unwrap_or(0.0)
     }
 }

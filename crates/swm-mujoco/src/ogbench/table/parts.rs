@@ -1,6 +1,6 @@
-//! Where cubes, buttons, drawer and window are in a model, and how they are read and moved.
+//! [`Parts`]: indices of cubes, buttons, drawer and window in a model, and how they are read and moved.
 
-use super::setup::{Fixed, Setup};
+use super::config::{FixtureState, TableConfig};
 use crate::Physics;
 use crate::ogbench::arm::find;
 use crate::ogbench::arm::pose::{IDENTITY, Pose, Quat, Vec3};
@@ -8,58 +8,58 @@ use mujoco_rs::mujoco_c::_mjtObjBase::{mjOBJ_BODY, mjOBJ_GEOM, mjOBJ_JOINT, mjOB
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{Error, Result};
 
-/// A cube and the marker of its goal.
+/// The indices of a cube and the marker of its goal.
 #[derive(Clone, Copy, Debug)]
 pub struct Cube {
-    /// Its place in `qpos`: where it is, how it is turned.
+    /// The first index of its free joint in `qpos`: position, then quaternion.
     pub qpos: usize,
-    /// Its place in `qvel`.
+    /// The first index of its free joint in `qvel`.
     pub qvel: usize,
     /// Bodies of cube and marker.
     pub bodies: [usize; 2],
     /// Geoms of cube and marker.
     pub geoms: [usize; 2],
-    /// The marker among the bodies that are moved by hand.
+    /// The index of the marker among the mocap bodies.
     pub mocap: usize,
 }
 
-/// One coordinate that slides.
+/// The indices of a slide joint.
 #[derive(Clone, Copy, Debug)]
 pub struct Slide {
-    /// Its place in `qpos`.
+    /// Its index in `qpos`.
     pub qpos: usize,
-    /// Its place in `qvel`.
+    /// Its index in `qvel`.
     pub qvel: usize,
 }
 
-/// A drawer or a window: it slides, has a handle, and a button locks it.
+/// The indices of a drawer or a window.
 #[derive(Clone, Copy, Debug)]
 pub struct Sliding {
-    /// How far it is open.
+    /// The joint; its position is the opening.
     pub slide: Slide,
-    /// Its handle, and where the handle is at the goal.
+    /// The sites of the handle and of the handle at the goal.
     pub handles: [usize; 2],
-    /// The axis along which the handle's goal moves with the opening.
+    /// The axis along which the goal site moves with the opening.
     pub axis: usize,
-    /// What its handle is painted with.
-    pub paint: usize,
+    /// The material of the handle.
+    pub material: usize,
 }
 
-/// A button: pressed down, it toggles a lock.
+/// The indices of a button, which toggles a lock when pressed.
 #[derive(Clone, Copy, Debug)]
 pub struct Button {
-    /// How far it is pressed.
+    /// The joint; its position is negative when pressed.
     pub slide: Slide,
-    /// Its top geom, which shows the lock's state.
+    /// The geom of its top, whose colour shows the lock.
     pub geom: usize,
-    /// The middle of its top.
+    /// The site at the centre of its top.
     pub top: usize,
 }
 
-/// What a scene has beside cubes.
+/// The indices of buttons, drawer and window.
 #[derive(Clone, Copy, Debug)]
 pub struct Fixtures {
-    /// The first locks the drawer, the second the window.
+    /// The button that locks the drawer, and the one that locks the window.
     pub buttons: [Button; 2],
     /// The drawer.
     pub drawer: Sliding,
@@ -67,28 +67,28 @@ pub struct Fixtures {
     pub window: Sliding,
 }
 
-/// Everything on a table.
+/// The indices of everything on a table.
 #[derive(Clone, Debug)]
 pub struct Parts {
-    /// The cubes, in their order.
+    /// The cubes.
     pub cubes: Vec<Cube>,
-    /// Buttons, drawer and window, where there are any.
+    /// Buttons, drawer and window, in the scene only.
     pub fixtures: Option<Fixtures>,
 }
 
-/// Where a button's joint must come to toggle its lock, in metres.
+/// The button position at which the lock toggles, in metres.
 const PRESSED: f64 = -0.02;
-/// How drawer and window resist when locked and when not, in newtons a metre per second.
+/// Damping of drawer and window when locked and when unlocked, in N s/m.
 const DAMPING: [f64; 2] = [1e6, 2.0];
-/// The paint of what is not locked.
-const UNLOCKED: [f32; 3] = [0.9; 3];
+/// The colour of unlocked fixtures.
+const UNLOCKED_COLOR: [f32; 3] = [0.9; 3];
 
 impl Parts {
     /// Finds everything in a model.
     ///
     /// # Errors
-    /// When something is not there.
-    pub fn new(model: &MjModel, setup: &Setup) -> Result<Self> {
+    /// When the model lacks an element.
+    pub fn new(model: &MjModel, config: &TableConfig) -> Result<Self> {
         let id = |kind, name: &str| find(model, kind, name);
         let slide = |name: &str| {
             let joint = id(mjOBJ_JOINT, name)?;
@@ -114,7 +114,7 @@ impl Parts {
                 slide: slide(&format!("{name}_slide"))?,
                 handles: [site("")?, site("_target")?],
                 axis,
-                paint: id(mjOBJ_MATERIAL, &format!("{name}_handle"))?,
+                material: id(mjOBJ_MATERIAL, &format!("{name}_handle"))?,
             })
         };
         let fixtures = || -> Result<Fixtures> {
@@ -125,82 +125,83 @@ impl Parts {
             })
         };
         Ok(Self {
-            cubes: (0..setup.cubes).map(cube).collect::<Result<_>>()?,
-            fixtures: if setup.fixtures { Some(fixtures()?) } else { None },
+            cubes: (0..config.cubes).map(cube).collect::<Result<_>>()?,
+            fixtures: if config.fixtures { Some(fixtures()?) } else { None },
         })
     }
 }
 
-/// A place in one of MuJoCo's arrays.
-fn index(place: i32) -> Result<usize> {
-    usize::try_from(place).map_err(|error| Error::external("looking into OGBench's model", error))
+/// Converts an index of MuJoCo's.
+fn index(number: i32) -> Result<usize> {
+    usize::try_from(number).map_err(|error| Error::external("searching OGBench's model", error))
 }
 
 impl Cube {
-    /// Where it is.
-    pub fn place(&self, qpos: &[f64]) -> Vec3 {
+    /// The position in a configuration, in metres.
+    pub fn position(&self, qpos: &[f64]) -> Vec3 {
         [qpos[self.qpos], qpos[self.qpos + 1], qpos[self.qpos + 2]]
     }
 
-    /// How it is turned.
-    pub fn turn(&self, qpos: &[f64]) -> Quat {
+    /// The orientation in a configuration.
+    pub fn rotation(&self, qpos: &[f64]) -> Quat {
         std::array::from_fn(|i| qpos[self.qpos + 3 + i])
     }
 
-    /// Puts it somewhere.
-    pub fn put(&self, physics: &mut Physics, place: Vec3, turn: Quat) {
+    /// Sets the pose; the caller updates derived quantities.
+    pub fn set_pose(&self, physics: &mut Physics, position: Vec3, rotation: Quat) {
         let qpos = &mut physics.data_mut().qpos_mut()[self.qpos..];
-        qpos[..3].copy_from_slice(&place);
-        qpos[3..7].copy_from_slice(&turn);
+        qpos[..3].copy_from_slice(&position);
+        qpos[3..7].copy_from_slice(&rotation);
     }
 
-    /// Makes the marker appear at its goal while the body it belongs to is elsewhere: that body is a part of the state, which is
-    /// the same wherever cubes should go.
-    pub fn mark(&self, physics: &mut Physics, body: Pose, goal: Pose) {
-        let inner = if body == goal { Pose { place: [0.0; 3], turn: IDENTITY } } else { body.inverse().then(goal) };
+    /// Moves the marker's geom to the goal, relative to its mocap body at `body`. The body itself is part of the state, which must
+    /// not depend on the goal.
+    pub fn place_marker(&self, physics: &mut Physics, body: Pose, goal: Pose) {
+        let identity = Pose { position: [0.0; 3], rotation: IDENTITY };
+        let relative = if body == goal { identity } else { body.inverse().then(goal) };
         let model = physics.model_mut();
-        model.geom_pos_mut()[self.geoms[1]] = inner.place;
-        model.geom_quat_mut()[self.geoms[1]] = inner.turn;
+        model.geom_pos_mut()[self.geoms[1]] = relative.position;
+        model.geom_quat_mut()[self.geoms[1]] = relative.rotation;
     }
 
-    /// Makes the marker visible or not.
-    pub fn show_mark(&self, physics: &mut Physics, visible: bool) {
+    /// Shows or hides the marker.
+    pub fn set_marker_visible(&self, physics: &mut Physics, visible: bool) {
         physics.model_mut().geom_rgba_mut()[self.geoms[1]][3] = if visible { 0.2 } else { 0.0 };
     }
 }
 
 impl Fixtures {
-    /// How drawer and window stand in `qpos`, with these buttons.
-    pub fn read(&self, qpos: &[f64], buttons: [u8; 2]) -> Fixed {
-        Fixed { buttons, drawer: qpos[self.drawer.slide.qpos], window: qpos[self.window.slide.qpos] }
+    /// The state of the fixtures in a configuration with these buttons.
+    pub fn state(&self, qpos: &[f64], buttons: [u8; 2]) -> FixtureState {
+        FixtureState { buttons, drawer: qpos[self.drawer.slide.qpos], window: qpos[self.window.slide.qpos] }
     }
 
-    /// Opens drawer and window that far.
-    pub fn put(&self, physics: &mut Physics, fixed: Fixed) {
+    /// Sets the openings of drawer and window; the caller updates derived quantities.
+    pub fn set_openings(&self, physics: &mut Physics, state: FixtureState) {
         let qpos = physics.data_mut().qpos_mut();
-        qpos[self.drawer.slide.qpos] = fixed.drawer;
-        qpos[self.window.slide.qpos] = fixed.window;
+        qpos[self.drawer.slide.qpos] = state.drawer;
+        qpos[self.window.slide.qpos] = state.window;
     }
 
-    /// Makes the model that of these locks: what is locked hardly moves, and is painted in the colour of its lock.
-    pub fn lock(&self, physics: &mut Physics, buttons: [u8; 2], colors: &[[f32; 3]; 2]) {
+    /// Sets damping and colours for these locks. A locked drawer or window hardly moves and has the colour of its lock.
+    pub fn apply_locks(&self, physics: &mut Physics, buttons: [u8; 2], colors: &[[f32; 3]; 2]) {
         let model = physics.model_mut();
         for (i, sliding) in [self.drawer, self.window].into_iter().enumerate() {
-            let paint = if buttons[i] == 0 { colors[i] } else { UNLOCKED };
-            model.geom_rgba_mut()[self.buttons[i].geom][..3].copy_from_slice(&paint);
-            model.mat_rgba_mut()[sliding.paint][..3].copy_from_slice(&paint);
+            let color = if buttons[i] == 0 { colors[i] } else { UNLOCKED_COLOR };
+            model.geom_rgba_mut()[self.buttons[i].geom][..3].copy_from_slice(&color);
+            model.mat_rgba_mut()[sliding.material][..3].copy_from_slice(&color);
             model.dof_damping_mut()[sliding.slide.qvel] = DAMPING[usize::from(buttons[i])];
         }
     }
 
-    /// Marks where the handles should be.
-    pub fn mark(&self, physics: &mut Physics, goal: Fixed) {
-        for (sliding, open) in [(self.drawer, goal.drawer), (self.window, goal.window)] {
-            physics.model_mut().site_pos_mut()[sliding.handles[1]][sliding.axis] = open;
+    /// Moves the goal sites of the handles.
+    pub fn place_markers(&self, physics: &mut Physics, goal: FixtureState) {
+        for (sliding, opening) in [(self.drawer, goal.drawer), (self.window, goal.window)] {
+            physics.model_mut().site_pos_mut()[sliding.handles[1]][sliding.axis] = opening;
         }
     }
 
-    /// The buttons after a step: each that came down since `before` toggles.
+    /// The buttons after a step from configuration `before` to `qpos`: a button that was pressed toggles.
     pub fn toggled(&self, buttons: [u8; 2], before: &[f64], qpos: &[f64]) -> [u8; 2] {
         std::array::from_fn(|i| {
             let at = self.buttons[i].slide.qpos;

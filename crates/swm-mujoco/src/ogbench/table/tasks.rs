@@ -1,24 +1,25 @@
-//! The tasks of OGBench's tables: where cubes and fixtures begin, and where they should go.
+//! The tasks of OGBench's tables: initial and goal positions (m) of the cubes, and states of the fixtures. Copied from
+//! `manipspace/envs/cube_env.py` and `scene_env.py`.
 
-use super::setup::{Fixed, Task};
+use super::config::{FixtureState, Task};
 
-/// A task of cubes alone.
+/// A task with cubes only.
 const fn cubes(starts: &'static [[f64; 3]], goals: &'static [[f64; 3]]) -> Task {
-    let still = Fixed { buttons: [0; 2], drawer: 0.0, window: 0.0 };
-    Task { starts, goals, fixtures: [still, still] }
+    let unused = FixtureState { buttons: [0; 2], drawer: 0.0, window: 0.0 };
+    Task { starts, goals, fixtures: [unused, unused] }
 }
 
-/// A task of one cube and the fixtures.
-const fn scene(cube: [&'static [[f64; 3]]; 2], fixtures: [Fixed; 2]) -> Task {
+/// A task with one cube and the fixtures.
+const fn scene(cube: [&'static [[f64; 3]]; 2], fixtures: [FixtureState; 2]) -> Task {
     Task { starts: cube[0], goals: cube[1], fixtures }
 }
 
-/// How the fixtures stand.
-const fn fixed(buttons: [u8; 2], drawer: f64, window: f64) -> Fixed {
-    Fixed { buttons, drawer, window }
+/// A state of the fixtures.
+const fn fixed(buttons: [u8; 2], drawer: f64, window: f64) -> FixtureState {
+    FixtureState { buttons, drawer, window }
 }
 
-/// One cube: to the side, away, nearer, and along both diagonals.
+/// One cube: move it sideways, away, nearer, and along both diagonals.
 pub const SINGLE: &[Task] = &[
     cubes(&[[0.425, 0.1, 0.02]], &[[0.425, -0.1, 0.02]]),
     cubes(&[[0.35, 0.0, 0.02]], &[[0.5, 0.0, 0.02]]),
@@ -27,7 +28,7 @@ pub const SINGLE: &[Task] = &[
     cubes(&[[0.35, 0.2, 0.02]], &[[0.5, -0.2, 0.02]]),
 ];
 
-/// Two cubes: one or both elsewhere, both apart, swapped, stacked.
+/// Two cubes: move one, move both, spread, swap, stack.
 pub const DOUBLE: &[Task] = &[
     cubes(&[[0.425, 0.0, 0.02], [0.425, -0.1, 0.02]], &[[0.425, 0.0, 0.02], [0.425, 0.1, 0.02]]),
     cubes(&[[0.35, -0.1, 0.02], [0.5, -0.1, 0.02]], &[[0.35, 0.1, 0.02], [0.5, 0.1, 0.02]]),
@@ -36,7 +37,7 @@ pub const DOUBLE: &[Task] = &[
     cubes(&[[0.425, -0.2, 0.02], [0.425, 0.2, 0.02]], &[[0.425, 0.0, 0.02], [0.425, 0.0, 0.06]]),
 ];
 
-/// Three cubes: one or all elsewhere, off a stack, around in a circle, onto a stack.
+/// Three cubes: move one, move all, unstack, rotate in a cycle, stack.
 pub const TRIPLE: &[Task] = &[
     cubes(
         &[[0.35, -0.1, 0.02], [0.35, 0.1, 0.02], [0.5, -0.1, 0.02]],
@@ -60,7 +61,7 @@ pub const TRIPLE: &[Task] = &[
     ),
 ];
 
-/// Four cubes: two or all elsewhere, out of a square, around in a circle, onto a stack.
+/// Four cubes: move two, move all, unstack a square, rotate in a cycle, stack.
 pub const QUADRUPLE: &[Task] = &[
     cubes(
         &[[0.35, -0.1, 0.02], [0.35, 0.1, 0.02], [0.5, -0.1, 0.02], [0.5, 0.1, 0.02]],
@@ -84,7 +85,7 @@ pub const QUADRUPLE: &[Task] = &[
     ),
 ];
 
-/// Eight cubes: four or all elsewhere, in two ways, from stacks of two and onto them.
+/// Eight cubes: move four, move all (twice), unstack pairs, stack pairs.
 pub const OCTUPLE: &[Task] = &[
     cubes(
         &[
@@ -198,7 +199,7 @@ pub const OCTUPLE: &[Task] = &[
     ),
 ];
 
-/// Open both; lock and close both; rearrange; put the cube into the drawer; into the locked drawer, with the window open.
+/// Open both fixtures; close and lock both; rearrange; cube into the drawer; cube into the locked drawer with the window open.
 pub const SCENE: &[Task] = &[
     scene([&[[0.35, 0.05, 0.02]], &[[0.35, 0.05, 0.02]]], [fixed([1, 1], 0.0, 0.0), fixed([1, 1], -0.16, 0.2)]),
     scene([&[[0.35, -0.05, 0.02]], &[[0.35, -0.05, 0.02]]], [fixed([0, 0], -0.16, 0.2), fixed([0, 0], 0.0, 0.0)]),

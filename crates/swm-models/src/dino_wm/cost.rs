@@ -87,14 +87,14 @@ impl DinoWmCost {
             }
             past = actions[actions.len() - length * self.actions..].to_vec();
         }
-        let seen = frames.len();
+        let count = frames.len();
         let features: Tensor<4> = Tensor::cat(frames, 0).unsqueeze_dim(0);
         let inputs: Result<Vec<Tensor<3>>> = self
             .config
             .columns
             .iter()
             .map(|spec| match spec.name.as_str() {
-                ACTION => Ok(Tensor::zeros([1, seen, self.actions], &device)),
+                ACTION => Ok(Tensor::zeros([1, count, self.actions], &device)),
                 name => column(name, row.get::<f32>(name)?),
             })
             .collect();
@@ -124,16 +124,16 @@ impl PlanContext {
     fn cost(&self, model: &DinoWm, candidates: Tensor<3>) -> Tensor<1> {
         // If the candidates are differentiated, all operands must be in their graph.
         let differentiated = candidates.is_autodiff();
-        let [samples, _, numbers] = candidates.dims();
-        let [_, seen, patches, dim] = self.start.dims();
-        let past = TensorData::new(self.past.repeat(samples), [samples, seen - 1, numbers]);
+        let [samples, _, elements] = candidates.dims();
+        let [_, frames, patches, dim] = self.start.dims();
+        let past = TensorData::new(self.past.repeat(samples), [samples, frames - 1, elements]);
         let past = Tensor::<3>::from_data(past, &Device::flex());
         let (start, past, goal) = (self.start.clone(), past, self.goal.clone());
         let (start, past, goal) =
             if differentiated { (start.autodiff(), past.autodiff(), goal.autodiff()) } else { (start, past, goal) };
-        let actions = if seen > 1 { Tensor::cat(vec![past, candidates], 1) } else { candidates };
+        let actions = if frames > 1 { Tensor::cat(vec![past, candidates], 1) } else { candidates };
         let [_, steps, _] = actions.dims();
-        let all = model.rollout(start.expand([samples, seen, patches, dim]), actions);
+        let all = model.rollout(start.expand([samples, frames, patches, dim]), actions);
         let end = all.slice([0..samples, steps..steps + 1, 0..patches, 0..dim]).reshape([samples, patches, dim]);
         let [_, _, width] = goal.dims();
         let squared = (end.clone().slice([0..samples, 0..patches, 0..width]) - goal).square();

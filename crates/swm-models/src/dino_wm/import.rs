@@ -1,4 +1,4 @@
-//! DINO-WM checkpoints of the reference implementation (its class `PreJEPA`), both ways.
+//! Import and export of DINO-WM checkpoints of the reference implementation (its class `PreJEPA`).
 
 use super::config::{ACTION, ColumnConfig, DinoWmConfig};
 use super::model::DinoWm;
@@ -20,46 +20,46 @@ use swm_core::{Error, Key, Manifest, Result};
 const MODULES: &str = "stable_worldmodel.wm.prejepa.module";
 const CLASS: &str = "stable_worldmodel.wm.PreJEPA";
 
-/// A DINO-WM that the reference trained: a folder with `weights.pt` and `config.json`, or that file. What it does not
-/// store is how columns were normalised, so `dataset_info` must be those of its dataset.
+/// Converts a DINO-WM of the reference implementation: a folder with `weights.pt` and `config.json`, or that file. The
+/// files do not store how columns were normalised, so `dataset_info` must describe the dataset it was trained on.
 ///
 /// # Errors
-/// When it is another model, its encoder is no DINOv2, it is damaged, or its columns are not those in `dataset_info`.
+/// When it is another model, its encoder is not DINOv2, it is damaged, or its columns are not those of `dataset_info`.
 pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<DinoWm>> {
     let mut reference = Reference::open(from, "PreJEPA")?;
-    // A wrapper that keeps the encoder from training adds its name.
+    // The wrapper of the frozen encoder adds a prefix.
     let weights = std::mem::take(&mut reference.weights);
     let plain = |name: String| match name.strip_prefix("backbone.backbone.") {
         Some(rest) => format!("backbone.{rest}"),
         None => name,
     };
     reference.weights = weights.into_iter().map(|(name, tensor)| (plain(name), tensor)).collect();
-    // The masks of the attention are computed here.
+    // Attention masks are computed, not loaded.
     reference.weights.retain(|name, weight| !is_mask(name, &weight.shape));
     let dino = reference.dinov2("backbone.")?;
 
-    let size = |at: &str| reference.size(at);
-    let (mut columns, mut numbers, mut frameskip) = (vec![], vec![], 1);
+    let size = |path: &str| reference.size(path);
+    let (mut columns, mut widths, mut frameskip) = (vec![], vec![], 1);
     let listed = reference.keys.at("extra_encoders.modules").map_or(&[][..], |keys| &keys.0);
     for name in listed.iter().map(|(name, _)| name.clone()) {
         let weight = reference.shape(&format!("extra_encoders.{name}.patch_embed.weight"))?;
         let [dim, given, _] = *weight else {
-            return Err(reference.wrong(format!("the encoder of '{name}' is no convolution over time")));
+            return Err(reference.wrong(format!("the encoder of '{name}' is not a convolution over time")));
         };
-        let wanted = if name == ACTION { dataset_info.action.dim() } else { dataset_info.column(&name)?.dim() };
-        let whole = if name == ACTION { given.is_multiple_of(wanted.max(1)) } else { given == wanted };
+        let expected = if name == ACTION { dataset_info.action.dim() } else { dataset_info.column(&name)?.dim() };
+        let whole = if name == ACTION { given.is_multiple_of(expected.max(1)) } else { given == expected };
         if !whole {
             return Err(Error::mismatch(
                 format!("importing the column '{name}'"),
-                format!("{wanted} numbers in the dataset"),
+                format!("{expected} elements in the dataset"),
                 format!("{given}, as the model was trained"),
             ));
         }
         if name == ACTION {
-            frameskip = given / wanted.max(1);
+            frameskip = given / expected.max(1);
         }
         columns.push(ColumnConfig { name, dim });
-        numbers.push(given);
+        widths.push(given);
     }
     let (mean, std) = ImageNormalization::IMAGENET;
     let sizes = DinoWmConfig {
@@ -80,7 +80,7 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<DinoW
         },
         decoder: 0,
     };
-    let model = DinoWm::init(&sizes, &numbers, Key::new(0), &Device::flex());
+    let model = DinoWm::init(&sizes, &widths, Key::new(0), &Device::flex());
     let model = weights::fill(model, &reference.weights, &reference.path, "config.json")?;
     let mut config = TrainConfig::<DinoWm>::load("paper", &[])?;
     config.data.num_steps = sizes.predictor.history + 1;
@@ -91,10 +91,10 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<DinoW
     Ok(Checkpoint { model, config, dataset_info, manifest })
 }
 
-/// Writes `weights.pt` and `config.json` that the reference's `load_pretrained` reads.
+/// Writes the `weights.pt` and `config.json` that `load_pretrained` of the reference implementation reads.
 ///
 /// # Errors
-/// When the encoder is no published DINOv2, or the disk refuses.
+/// When the encoder is not a published DINOv2, or a file cannot be written.
 pub fn export(checkpoint: &Checkpoint<DinoWm>, folder: &Path, naming: Naming) -> Result<()> {
     let (model, sizes) = (&checkpoint.model, &checkpoint.config.model);
     let name = match &sizes.encoder {
@@ -104,18 +104,18 @@ pub fn export(checkpoint: &Checkpoint<DinoWm>, folder: &Path, naming: Naming) ->
         _ => {
             return Err(Error::config(
                 "exporting a model",
-                "the reference makes its encoder from a published one, and this is none",
+                "the reference implementation builds its encoder from a published one, and this encoder is not published",
                 "train with DINOv2-small, -base or -large",
             ));
         }
     };
     let predictor = &sizes.predictor;
     let encoders = model.extra_encoders.iter().map(|(name, encoder)| {
-        let [dim, numbers, _] = encoder.patch_embed.weight.dims();
+        let [dim, elements, _] = encoder.patch_embed.weight.dims();
         let class = format!("{MODULES}.Embedder");
-        (name.to_owned(), json!({ "_target_": class, "in_chans": numbers, "emb_dim": dim }))
+        (name.to_owned(), json!({ "_target_": class, "in_chans": elements, "emb_dim": dim }))
     });
-    // Its columns are applied in the order of the file.
+    // The reference implementation applies columns in the order of the file.
     let encoders = ExtraEncoders { _target_: "torch.nn.ModuleDict", modules: InOrder(encoders.collect()) };
     let config = json!({
         "_target_": CLASS,
@@ -141,21 +141,22 @@ struct Tree {
     extra_encoders: ExtraEncoders,
 }
 
-/// The encoders of columns.
+/// The encoders of columns, in order.
 #[derive(Serialize)]
 struct ExtraEncoders {
     _target_: &'static str,
     modules: InOrder<Value>,
 }
 
-/// The state dict of a model, as the reference's class has it: without the decoder, with the masks of the attention.
+/// Returns the state dict of a model in the layout of the reference implementation: without the decoder, with attention
+/// masks.
 pub fn state(model: &DinoWm, naming: Naming) -> Named<HostTensor> {
     let mut weights = parameters::values(model);
     weights.retain(|name, _| !name.starts_with("decoder."));
     let patches = model.predictor.patches();
     let tokens = model.predictor.config().history * patches;
-    let seen = |place: usize| (place % tokens) / patches <= (place / tokens) / patches;
-    let values: Vec<f32> = (0..tokens * tokens).map(|place| if seen(place) { 1.0 } else { 0.0 }).collect();
+    let is_visible = |index: usize| (index % tokens) / patches <= (index / tokens) / patches;
+    let values: Vec<f32> = (0..tokens * tokens).map(|index| if is_visible(index) { 1.0 } else { 0.0 }).collect();
     for layer in 0..model.predictor.config().depth {
         let mask = HostTensor { shape: vec![1, 1, tokens, tokens], values: values.clone() };
         weights.insert(format!("predictor.transformer.layers.{layer}.0.bias"), mask);

@@ -1,5 +1,5 @@
-//! DINO-WM (Zhou et al. 2024, arXiv 2411.04983): a frozen encoder of patches, and a predictor of the patches of the next
-//! frame. See `docs/models/dino-wm.md`.
+//! DINO-WM (Zhou et al. 2024, arXiv 2411.04983): a predictor of the next frame's patches in the features of a frozen
+//! encoder. See `docs/models/dino-wm.md`.
 
 pub mod config;
 pub mod cost;

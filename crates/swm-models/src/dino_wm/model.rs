@@ -1,4 +1,4 @@
-//! [`DinoWm`]: a frozen encoder of patches, encoders of columns, the predictor, and a decoder of pictures.
+//! [`DinoWm`]: a frozen encoder of patches, encoders of columns, the predictor, and an image decoder.
 
 use super::config::{ACTION, DinoWmConfig};
 use super::predictor::FramePredictor;
@@ -9,70 +9,74 @@ use burn::tensor::{Device, Tensor};
 use std::ops::Range;
 use swm_core::Key;
 
-/// A DINO-WM: from the patches of frames and the actions between them to the patches of the next frame.
+/// A DINO-WM: predicts the patches of the next frame from the patches of frames and the actions between them.
 #[derive(Module, Debug)]
 pub struct DinoWm {
-    /// From pictures to features of patches; frozen.
+    /// From images to features of patches; frozen.
     pub backbone: Backbone,
-    /// From a window of frames to the next.
+    /// From a window of frames to the next frame.
     pub predictor: FramePredictor,
-    /// From columns to what stands beside the features of every patch.
+    /// From columns to the features that are appended to every patch.
     pub extra_encoders: ModuleDict<ColumnEncoder>,
     /// From features of patches to their pixels.
     pub decoder: Option<PatchDecoder>,
 }
 
-/// A convolution over time with one tap: a linear map.
+/// The encoder of a column: a convolution over time with kernel size 1, which is a linear layer.
 #[derive(Module, Debug)]
 pub struct ColumnEncoder {
-    /// `[dim, numbers, 1]`.
+    /// `[dim, elements, 1]`.
     pub patch_embed: PointwiseConv,
 }
 
-/// From the features of a patch to its pixels: linear, GELU, and a transposed convolution whose stride is its kernel,
-/// which is one matrix product.
+/// The image decoder, from the features of a patch to its pixels: linear, GELU, and a transposed convolution whose stride
+/// is its kernel size, which is one matrix product.
 #[derive(Module, Debug)]
 pub struct PatchDecoder {
     /// Into the hidden features.
     pub hidden: Linear,
-    /// Out of them.
+    /// From the hidden features.
     pub pixels: Linear,
 }
 
 impl ColumnEncoder {
-    #[allow(clippy::cast_precision_loss)]
-    fn new(init: &Init, numbers: usize, dim: usize) -> Self {
-        let bound = 1.0 / (numbers as f32).sqrt();
-        let weight = init.uniform("weight", [dim, numbers, 1], bound);
+    fn new(init: &Init, elements: usize, dim: usize) -> Self {
+        let bound = 1.0 / (elements as f32).sqrt();
+        let weight = init.uniform("weight", [dim, elements, 1], bound);
         Self { patch_embed: PointwiseConv { weight, bias: init.uniform("bias", [dim], bound) } }
     }
 
+    /// Encodes a column.
+    ///
     /// # Shapes
-    /// `[clips, frames, numbers]` to `[clips, frames, dim]`.
+    /// `x` is `[clips, frames, elements]`; returns `[clips, frames, dim]`.
     pub fn forward(&self, x: Tensor<3>) -> Tensor<3> {
-        let [clips, frames, numbers] = x.dims();
+        let [clips, frames, elements] = x.dims();
         let weight: Tensor<2> = self.patch_embed.weight.val().squeeze_dim(2);
         let [dim, _] = weight.dims();
-        let y = x.reshape([clips * frames, numbers]).matmul(weight.transpose());
+        let y = x.reshape([clips * frames, elements]).matmul(weight.transpose());
         (y + self.patch_embed.bias.val().unsqueeze()).reshape([clips, frames, dim])
     }
 }
 
 impl PatchDecoder {
+    /// Decodes the normalised pixels of patches.
+    ///
     /// # Shapes
-    /// Features `[frames, patches, dim]` to normalised pixels `[frames, patches, 3 * patch * patch]`.
+    /// `features` is `[frames, patches, dim]`; returns `[frames, patches, 3 * patch * patch]`.
     pub fn forward(&self, features: Tensor<3>) -> Tensor<3> {
         self.pixels.forward(Activation::Gelu.forward(self.hidden.forward(features)))
     }
 }
 
 impl DinoWm {
-    /// A model drawn from `key`; `numbers` are those of each column in a frame, in the order of the configuration.
-    pub fn init(config: &DinoWmConfig, numbers: &[usize], key: Key, device: &Device) -> Self {
+    /// A model with random weights. `widths` are the element counts of the columns per frame, in the order of the
+    /// configuration.
+    pub fn init(config: &DinoWmConfig, widths: &[usize], key: Key, device: &Device) -> Self {
         let init = Init::new(key, device);
-        let columns = config.columns.iter().zip(numbers).map(|(column, numbers)| {
+        let columns = config.columns.iter().zip(widths).map(|(column, width)| {
             let init = init.of("extra_encoders").of(&column.name);
-            (column.name.clone(), ColumnEncoder::new(&init, *numbers, column.dim))
+            (column.name.clone(), ColumnEncoder::new(&init, *width, column.dim))
         });
         let pixels = 3 * config.encoder.patch().pow(2);
         let decoder = init.of("decoder");
@@ -87,7 +91,7 @@ impl DinoWm {
         }
     }
 
-    /// Which features of a patch stand for each column; those of the picture come before.
+    /// Returns the range of each column among the features of a patch; the image features come first.
     pub fn columns(&self) -> Vec<(&str, Range<usize>)> {
         let width = |encoder: &ColumnEncoder| encoder.patch_embed.bias.dims()[0];
         let all: usize = self.extra_encoders.iter().map(|(_, encoder)| width(encoder)).sum();
@@ -101,21 +105,22 @@ impl DinoWm {
         self.extra_encoders.iter().map(|(name, encoder)| (name, span(encoder))).collect()
     }
 
-    /// The features of whole frames: those of the patches, with those of the columns beside each.
+    /// Appends the features of the columns to the features of every patch.
     ///
     /// # Shapes
-    /// `[clips, frames, patches, features]` and, in order, `[clips, frames, numbers]` to `[clips, frames, patches, dim]`.
+    /// `features` is `[clips, frames, patches, features]`, each column is `[clips, frames, elements]`; returns
+    /// `[clips, frames, patches, dim]`.
     pub fn embed(&self, features: Tensor<4>, columns: &[Tensor<3>]) -> Tensor<4> {
         let [_, _, patches, _] = features.dims();
-        let beside = self.extra_encoders.iter().zip(columns);
-        let beside = beside.map(|((_, encoder), column)| tiled(encoder.forward(column.clone()), patches));
-        Tensor::cat(std::iter::once(features).chain(beside).collect(), 3)
+        let encoded = self.extra_encoders.iter().zip(columns);
+        let encoded = encoded.map(|((_, encoder), column)| tiled(encoder.forward(column.clone()), patches));
+        Tensor::cat(std::iter::once(features).chain(encoded).collect(), 3)
     }
 
-    /// Frames with other actions beside their patches.
+    /// Replaces the action features of frames.
     ///
     /// # Shapes
-    /// `[clips, frames, patches, dim]` and `[clips, frames, numbers]` to the former.
+    /// `frames` is `[clips, frames, patches, dim]`, `actions` is `[clips, frames, actions]`; returns the shape of `frames`.
     pub fn with_actions(&self, frames: Tensor<4>, actions: Tensor<3>) -> Tensor<4> {
         let mut columns = self.extra_encoders.iter().zip(self.columns());
         let Some(((_, encoder), (_, span))) = columns.find(|((name, _), _)| *name == ACTION) else { return frames };
@@ -128,28 +133,27 @@ impl DinoWm {
         Tensor::cat(parts, 3)
     }
 
-    /// The frame after each of a window.
+    /// Predicts the frame after each frame of a window.
     ///
     /// # Shapes
-    /// `[clips, frames, patches, dim]`, `frames` at most the history, to the same.
-    pub fn predict(&self, frames: Tensor<4>, noise: &mut DropoutRng<'_>) -> Tensor<4> {
+    /// `frames` is `[clips, frames, patches, dim]` with at most as many frames as the history; returns the same shape.
+    pub fn predict(&self, frames: Tensor<4>, rng: &mut DropoutRng<'_>) -> Tensor<4> {
         let [clips, steps, patches, dim] = frames.dims();
-        self.predictor
-            .forward(frames.reshape([clips, steps * patches, dim]), noise)
-            .reshape([clips, steps, patches, dim])
+        self.predictor.forward(frames.reshape([clips, steps * patches, dim]), rng).reshape([clips, steps, patches, dim])
     }
 
-    /// All frames of a rollout: those given, then one predicted after each further action.
+    /// Rolls the model out: returns the given frames, then one predicted frame after each further action. The action features
+    /// of `given` are replaced; those of the last frame have no meaning.
     ///
     /// # Shapes
-    /// `[clips, given, patches, dim]` and `[clips, steps, numbers]`, `steps >= given`, to `[clips, steps + 1, patches,
-    /// dim]`. The actions beside the frames given do not matter; the last frame has none of meaning beside it.
+    /// `given` is `[clips, given, patches, dim]`, `actions` is `[clips, steps, actions]` with `steps >= given`; returns
+    /// `[clips, steps + 1, patches, dim]`.
     pub fn rollout(&self, given: Tensor<4>, actions: Tensor<3>) -> Tensor<4> {
-        let ([clips, seen, patches, dim], [_, steps, numbers]) = (given.dims(), actions.dims());
+        let ([clips, count, patches, dim], [_, steps, elements]) = (given.dims(), actions.dims());
         let history = self.predictor.config().history;
-        let taken = |range: Range<usize>| actions.clone().slice([0..clips, range, 0..numbers]);
-        let mut all = self.with_actions(given, taken(0..seen));
-        for end in seen..=steps {
+        let taken = |range: Range<usize>| actions.clone().slice([0..clips, range, 0..elements]);
+        let mut all = self.with_actions(given, taken(0..count));
+        for end in count..=steps {
             let window = all.clone().slice([0..clips, end.saturating_sub(history)..end, 0..patches, 0..dim]);
             let next = self.predict(window, &mut DropoutRng::disabled());
             let [_, count, _, _] = next.dims();
@@ -163,7 +167,10 @@ impl DinoWm {
     }
 }
 
-/// The same features beside every patch: `[clips, frames, dim]` to `[clips, frames, patches, dim]`.
+/// Repeats the features of a frame for every patch.
+///
+/// # Shapes
+/// `features` is `[clips, frames, dim]`; returns `[clips, frames, patches, dim]`.
 fn tiled(features: Tensor<3>, patches: usize) -> Tensor<4> {
     let [clips, frames, dim] = features.dims();
     let features: Tensor<4> = features.unsqueeze_dim(2);

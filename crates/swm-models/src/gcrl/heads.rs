@@ -1,35 +1,35 @@
-//! The heads of goal-conditioned models, on the patches that an encoder made of frames and goal: what to do
-//! ([`Head`]), what a state is worth ([`Head`] of one number), what an action is worth ([`Critic`]).
+//! The heads of goal-conditioned models on the patches of frames and goal: policies and values ([`Head`]) and critics
+//! ([`Critic`]).
 
 use super::transformer::{PatchGrid, Pool, Transformer, TransformerConfig};
 use crate::nn::{Activation, DropoutRng, Init, Linear};
 use burn::module::{Module, Param};
 use burn::tensor::Tensor;
 
-/// Numbers for every frame, given the goal: a policy's mean action, or a value.
+/// Outputs for every frame given the goal: the mean action of a policy, or a value.
 #[derive(Module, Debug)]
 pub struct Head {
-    /// Where a patch is, and in which frame, `[1, frames * patches, dim]`.
+    /// Position embeddings of the frames' patches, `[1, frames * patches, dim]`.
     pub pos_embedding: Param<Tensor<3>>,
-    /// Where a patch of the goal is, `[1, patches, dim]`.
+    /// Position embeddings of the goal's patches, `[1, patches, dim]`.
     pub pos_embedding_goal: Param<Tensor<3>>,
-    /// Looks at frames and goal.
+    /// The transformer over frames and goal.
     pub transformer: Transformer,
-    /// To the numbers.
+    /// To the outputs.
     pub out_proj: Linear,
     emb_dropout: f32,
 }
 
-/// The value of an action, given frame and goal.
+/// The value of an action given frame and goal.
 #[derive(Module, Debug)]
 pub struct Critic {
-    /// Where a patch is, and in which frame, `[1, frames * patches, dim]`.
+    /// Position embeddings of the frames' patches, `[1, frames * patches, dim]`.
     pub pos_embedding: Param<Tensor<3>>,
-    /// Where a patch of the goal is, `[1, patches, dim]`.
+    /// Position embeddings of the goal's patches, `[1, patches, dim]`.
     pub pos_embedding_goal: Param<Tensor<3>>,
-    /// Looks at frames and goal.
+    /// The transformer over frames and goal.
     pub transformer: Transformer,
-    /// From what it saw, and the action, to the value.
+    /// From the transformer's output and the action to the value.
     pub q_head: CriticHead,
     emb_dropout: f32,
 }
@@ -39,14 +39,14 @@ pub struct Critic {
 pub struct CriticHead {
     /// Into hidden features.
     pub _0: Linear,
-    /// From hidden features to hidden features.
+    /// Between the hidden features.
     pub _2: Linear,
     /// To the value.
     pub _4: Linear,
 }
 
 impl Head {
-    /// A head of `outputs` numbers.
+    /// A head with `outputs` outputs and random weights.
     pub fn new(init: &Init, size: &TransformerConfig, grid: PatchGrid, pool: Pool, outputs: usize) -> Self {
         let [pos_embedding, pos_embedding_goal] = positions(init, grid);
         Self {
@@ -58,18 +58,20 @@ impl Head {
         }
     }
 
+    /// Computes the outputs of every frame.
+    ///
     /// # Shapes
-    /// Frames `[rows, frames * patches, dim]`, at most as many as the head was made for, and a goal
-    /// `[rows, patches, dim]` to `[rows, frames, outputs]`.
-    pub fn forward(&self, frames: &Tensor<3>, goal: &Tensor<3>, noise: &mut DropoutRng<'_>) -> Tensor<3> {
+    /// `frames` is `[rows, frames * patches, dim]` with at most as many frames as the head was made for, `goal` is
+    /// `[rows, patches, dim]`; returns `[rows, frames, outputs]`.
+    pub fn forward(&self, frames: &Tensor<3>, goal: &Tensor<3>, rng: &mut DropoutRng<'_>) -> Tensor<3> {
         let (frames, goal) = add_positions([&self.pos_embedding, &self.pos_embedding_goal], frames, goal);
-        let frames = noise.dropout(frames, self.emb_dropout);
-        self.out_proj.forward(self.transformer.forward(frames, &goal, noise))
+        let frames = rng.dropout(frames, self.emb_dropout);
+        self.out_proj.forward(self.transformer.forward(frames, &goal, rng))
     }
 }
 
 impl Critic {
-    /// A critic of `actions` numbers an action, with `hidden` features behind the transformer.
+    /// A critic for actions of `actions` elements, with `hidden` features after the transformer and random weights.
     pub fn new(
         init: &Init,
         size: &TransformerConfig,
@@ -92,29 +94,31 @@ impl Critic {
         }
     }
 
+    /// Computes the value of the actions at every frame.
+    ///
     /// # Shapes
-    /// As [`Head::forward`], with actions `[rows, frames, actions]`, to `[rows, frames, 1]`.
+    /// As [`Head::forward`]; `actions` is `[rows, frames, actions]`; returns `[rows, frames, 1]`.
     pub fn forward(
         &self,
         frames: &Tensor<3>,
         actions: Tensor<3>,
         goal: &Tensor<3>,
-        noise: &mut DropoutRng<'_>,
+        rng: &mut DropoutRng<'_>,
     ) -> Tensor<3> {
         let (frames, goal) = add_positions([&self.pos_embedding, &self.pos_embedding_goal], frames, goal);
-        let frames = noise.dropout(frames, self.emb_dropout);
-        let seen = self.transformer.forward(frames, &goal, noise);
+        let frames = rng.dropout(frames, self.emb_dropout);
+        let features = self.transformer.forward(frames, &goal, rng);
         let head = &self.q_head;
-        let hidden = Activation::Relu.forward(head._0.forward(Tensor::cat(vec![seen, actions], 2)));
+        let hidden = Activation::Relu.forward(head._0.forward(Tensor::cat(vec![features, actions], 2)));
         head._4.forward(Activation::Relu.forward(head._2.forward(hidden)))
     }
 }
 
-/// The spread of initial positions. The reference draws them with a spread of 1, that of DINOv2's features; an encoder that is
-/// trained along begins with features of a tenth of that, which such positions would drown.
+/// The standard deviation of initial position embeddings. The reference implementation uses 1, that of DINOv2's features;
+/// a trained encoder begins with features a tenth of that size, which such positions would dominate.
 const POSITION_STD: f32 = 0.02;
 
-/// Positions of frames and goal.
+/// Draws the position embeddings of frames and goal.
 fn positions(init: &Init, PatchGrid { frames, patches, dim }: PatchGrid) -> [Param<Tensor<3>>; 2] {
     [
         init.normal("pos_embedding", [1, frames * patches, dim], POSITION_STD),
@@ -124,9 +128,9 @@ fn positions(init: &Init, PatchGrid { frames, patches, dim }: PatchGrid) -> [Par
 
 /// Adds the position embeddings to frames and goal.
 fn add_positions(positions: [&Param<Tensor<3>>; 2], frames: &Tensor<3>, goal: &Tensor<3>) -> (Tensor<3>, Tensor<3>) {
-    let placed = |position: &Param<Tensor<3>>, x: &Tensor<3>| {
+    let with_position = |position: &Param<Tensor<3>>, x: &Tensor<3>| {
         let [_, tokens, dim] = x.dims();
         x.clone() + position.val().slice([0..1, 0..tokens, 0..dim])
     };
-    (placed(positions[0], frames), placed(positions[1], goal))
+    (with_position(positions[0], frames), with_position(positions[1], goal))
 }

@@ -1,7 +1,7 @@
-//! Goal-conditioned checkpoints of the reference implementation (its class `GCRL`), both ways.
+//! Import and export of goal-conditioned checkpoints of the reference implementation (its class `GCRL`).
 //!
-//! Its training scripts store their own settings as `config.json`, `load_pretrained` wants a tree of classes: sizes are
-//! therefore read off the weights, and of the file only what weights do not tell, the attention heads.
+//! Its training scripts store their own settings as `config.json`, while `load_pretrained` requires a class tree. So sizes
+//! are read from the weights, and only the number of attention heads is read from the file.
 
 use super::config::GcrlConfig;
 use super::loss::LOG_STD;
@@ -23,28 +23,28 @@ use swm_core::{Error, Key, Manifest, Result};
 const CLASS: &str = "stable_worldmodel.wm.gcrl.GCRL";
 const MODULE: &str = "stable_worldmodel.wm.gcrl.module";
 
-/// A model that the reference trained: a folder with `weights.pt` and `config.json`, or a file of weights beside such a
-/// file. What it does not store is how actions were normalised, so `dataset_info` must be those of its dataset.
+/// Converts a model of the reference implementation: a folder with `weights.pt` and `config.json`, or a weights file next to
+/// such a file. The files do not store how actions were normalised, so `dataset_info` must describe the dataset it was
+/// trained on.
 ///
-/// A policy's checkpoint holds the values without their slow copy, which then begins as they are.
+/// A policy's checkpoint has no target networks; they are initialised with the values' weights.
 ///
 /// # Errors
-/// When a part of the family is missing (the critic is not stored with the policies of GCIQL: import those as `gcivl`), it
-/// sees more than pictures, it is damaged, or its actions are not those in `dataset_info`.
+/// When a network of the family is missing (policies of GCIQL are stored without the critic: import them as `gcivl`), the
+/// model has inputs other than images, it is damaged, or its actions are not those of `dataset_info`.
 pub fn import<M>(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<M>>
 where
     M: GoalConditioned<Config = GcrlConfig>,
 {
     let path = if from.is_dir() { from.join("weights.pt") } else { from.to_owned() };
-    let mut found = Found { weights: plain(weights::read(&path)?), path: &path };
+    let mut found = StoredWeights { weights: plain(weights::read(&path)?), path: &path };
     let settings = path.with_file_name("config.json");
     let text = std::fs::read(&settings).map_err(|error| Error::io(&settings, "reading a checkpoint", error))?;
     let settings: Value = serde_json::from_slice(&text).map_err(|error| found.wrong(error.to_string()))?;
     if found.weights.keys().any(|name| name.starts_with("extra_encoders.")) {
-        return Err(found.wrong("it sees other columns beside pictures".to_owned()));
+        return Err(found.wrong("it has inputs other than images".to_owned()));
     }
     let sizes = found.sizes(&settings)?;
-    // What belongs to a larger family is left where it is.
     let model = |config: &TrainConfig<M>| M::new(config, &dataset_info, Key::new(0), &Device::flex());
     let actions = found.shape("log_stds")?[0];
     let mut config = TrainConfig::<M>::load("paper", &[])?;
@@ -52,8 +52,8 @@ where
     if dim == 0 || !actions.is_multiple_of(dim) {
         return Err(Error::mismatch(
             "importing a policy",
-            format!("{dim} numbers an action in the dataset"),
-            format!("a divisor of {actions}, what the model says at a time"),
+            format!("{dim} action elements in the dataset"),
+            format!("a divisor of {actions}, the action elements of a model step"),
         ));
     }
     config.data.frameskip = actions / dim;
@@ -61,19 +61,19 @@ where
     config.model = GcrlConfig { weights: path.display().to_string(), ..sizes };
     config.check()?;
     let drawn = model(&config)?;
-    let wanted = parameters::shapes(&drawn);
-    found.weights.retain(|name, _| wanted.contains_key(name) || !extra(name));
+    let expected = parameters::shapes(&drawn);
+    found.weights.retain(|name, _| expected.contains_key(name) || !is_optional(name));
     let model = weights::fill(drawn, &found.weights, &path, &format!("a {}", M::FAMILY))?;
     let manifest = Manifest::new("import", 0, json!({ "from": from.display().to_string() }));
     Ok(Checkpoint { model, config, dataset_info, manifest })
 }
 
-/// Whether a weight is of a part that only some families have.
-fn extra(name: &str) -> bool {
+/// Returns whether a weight belongs to a network that only some families have.
+fn is_optional(name: &str) -> bool {
     ["value_predictor.", "critic_predictor."].iter().any(|part| name.starts_with(part))
 }
 
-/// Names without wrappers and masks; values and critics as a network and its slow copy.
+/// Removes wrappers and masks from names, and duplicates values and critics as their target networks.
 fn plain(weights: Named<HostTensor>) -> Named<HostTensor> {
     let mut plain = Named::new();
     for (name, weight) in weights {
@@ -97,15 +97,15 @@ fn plain(weights: Named<HostTensor>) -> Named<HostTensor> {
     names::to_published(plain, "encoder.")
 }
 
-/// Weights and where they were.
-struct Found<'a> {
+/// Weights and the path of their file.
+struct StoredWeights<'a> {
     weights: Named<HostTensor>,
     path: &'a Path,
 }
 
-impl Found<'_> {
+impl StoredWeights<'_> {
     fn wrong(&self, problem: String) -> Error {
-        Error::corrupt(self.path, problem, "give a checkpoint of the reference's class GCRL")
+        Error::corrupt(self.path, problem, "give a checkpoint of the reference implementation's class GCRL")
     }
 
     fn shape(&self, name: &str) -> Result<&[usize]> {
@@ -113,25 +113,25 @@ impl Found<'_> {
         shape.filter(|shape| !shape.is_empty()).ok_or_else(|| self.wrong(format!("'{name}' is missing")))
     }
 
-    /// A side of a weight.
+    /// Returns the size of an axis of a weight.
     fn side(&self, name: &str, axis: usize) -> Result<usize> {
         self.shape(name)?.get(axis).copied().ok_or_else(|| self.wrong(format!("'{name}' has another shape")))
     }
 
-    /// How many weights have such names.
+    /// Counts the weights whose names have this prefix and suffix.
     fn count(&self, prefix: &str, end: &str) -> usize {
         self.weights.keys().filter(|name| name.starts_with(prefix) && name.ends_with(end)).count()
     }
 
     fn sizes(&self, settings: &Value) -> Result<GcrlConfig> {
-        let number = |at: [&str; 2]| settings[at[0]][at[1]].as_u64().and_then(|n| usize::try_from(n).ok());
+        let setting = |path: [&str; 2]| settings[path[0]][path[1]].as_u64().and_then(|n| usize::try_from(n).ok());
         let encoder = |name: &str| format!("encoder.{name}");
         let (dim, patch) = {
             let name = encoder("embeddings.patch_embeddings.projection.weight");
             (self.side(&name, 0)?, self.side(&name, 2)?)
         };
-        // All that were published have heads of 64 features.
-        let heads = number(["encoder", "num_attention_heads"]).unwrap_or((dim / 64).max(1));
+        // All published models have heads of 64 features.
+        let heads = setting(["encoder", "num_attention_heads"]).unwrap_or((dim / 64).max(1));
         let encoder = if self.weights.contains_key("encoder.encoder.layer.0.layer_scale1.lambda1") {
             BackboneConfig::Dinov2(DinoConfig {
                 patch,
@@ -154,7 +154,7 @@ impl Found<'_> {
         let policy = |name: &str| format!("action_predictor.{name}");
         let patches = self.side(&policy("pos_embedding_goal"), 1)?;
         let inner = self.side(&policy("transformer.layers.0.0.to_q.weight"), 0)?;
-        let heads = number(["action_predictor", "heads"]).or(number(["predictor", "heads"])).unwrap_or(inner / 64);
+        let heads = setting(["action_predictor", "heads"]).or(setting(["predictor", "heads"])).unwrap_or(inner / 64);
         if heads == 0 || !inner.is_multiple_of(heads) {
             return Err(self.wrong(format!("{inner} features do not split into {heads} attention heads")));
         }
@@ -181,9 +181,9 @@ impl Found<'_> {
     }
 }
 
-/// A model that the reference can use.
+/// A model that the reference implementation has.
 pub trait Exportable: GoalConditioned {
-    /// The parts beside encoder and policy, with their classes.
+    /// The networks other than encoder and policy, with their classes.
     const PARTS: &'static [(&'static str, &'static str)];
 }
 
@@ -200,11 +200,11 @@ impl Exportable for Gciql {
         &[("value_predictor", "Predictor"), ("critic_predictor", "QPredictor")];
 }
 
-/// Writes `weights.pt` and `config.json` that the reference's `load_pretrained` reads. Values and critic are stored
-/// without their slow copies.
+/// Writes the `weights.pt` and `config.json` that `load_pretrained` of the reference implementation reads, without target
+/// networks.
 ///
 /// # Errors
-/// When the reference has no encoder like the model's, or the disk refuses.
+/// When the reference implementation has no such encoder, or a file cannot be written.
 pub fn export<M>(checkpoint: &Checkpoint<M>, folder: &Path, naming: Naming) -> Result<()>
 where
     M: Exportable<Config = GcrlConfig>,
@@ -227,7 +227,7 @@ where
         _ => {
             return Err(Error::config(
                 "exporting a model",
-                "the reference has no such encoder",
+                "the reference implementation has no such encoder",
                 "train with model.encoder.vit or a published DINOv2",
             ));
         }
@@ -248,25 +248,26 @@ where
         "log_std_min": LOG_STD[0], "log_std_max": LOG_STD[1],
     });
     for &(part, kind) in M::PARTS {
-        let mut made = class(kind, "mean");
+        let mut network = class(kind, "mean");
         if kind == "QPredictor" {
-            (made["action_dim"], made["q_hidden_dim"]) = (json!(actions), json!(sizes.critic));
+            (network["action_dim"], network["q_hidden_dim"]) = (json!(actions), json!(sizes.critic));
         } else {
-            made["out_dim"] = json!(1);
+            network["out_dim"] = json!(1);
         }
-        tree[part] = made;
+        tree[part] = network;
     }
     write(folder, &tree, &state(&checkpoint.model, sizes, naming))
 }
 
-/// The state dict of a model, as the reference's class has it: with the masks of the attention, without slow copies.
+/// Returns the state dict of a model in the layout of the reference implementation: with attention masks, without target
+/// networks.
 fn state<M: GoalConditioned>(model: &M, sizes: &GcrlConfig, naming: Naming) -> Named<HostTensor> {
     let grid = sizes.patch_grid();
     let keys = grid.frames * grid.patches;
     let mask = |queries: usize| {
         let frame = |query: usize| query * grid.frames / queries;
-        let seen = |place: usize| place % keys / grid.patches <= frame(place / keys);
-        let values = (0..queries * keys).map(|place| if seen(place) { 1.0 } else { 0.0 }).collect();
+        let is_visible = |index: usize| index % keys / grid.patches <= frame(index / keys);
+        let values = (0..queries * keys).map(|index| if is_visible(index) { 1.0 } else { 0.0 }).collect();
         HostTensor { shape: vec![1, 1, queries, keys], values }
     };
     let mut weights = Named::new();
@@ -275,13 +276,13 @@ fn state<M: GoalConditioned>(model: &M, sizes: &GcrlConfig, naming: Naming) -> N
             continue;
         }
         let name = name.replacen(".student.", ".", 1);
-        // Every layer that does not look at the goal has a mask.
+        // Every layer that does not attend to the goal has a mask.
         if let Some(layer) = name.strip_suffix(".0.to_q.weight")
             && let Some(index) = layer.rsplit('.').next().and_then(|index| index.parse::<usize>().ok())
         {
-            let gathers = layer.starts_with("action_predictor.") && index + 1 == sizes.head.depth;
-            if gathers || index.is_multiple_of(2) {
-                weights.insert(format!("{layer}.0.causal_mask"), mask(if gathers { grid.frames } else { keys }));
+            let pools = layer.starts_with("action_predictor.") && index + 1 == sizes.head.depth;
+            if pools || index.is_multiple_of(2) {
+                weights.insert(format!("{layer}.0.causal_mask"), mask(if pools { grid.frames } else { keys }));
             }
         }
         weights.insert(name, weight);

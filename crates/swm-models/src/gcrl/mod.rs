@@ -1,5 +1,5 @@
 //! Goal-conditioned learning from offline data: behavioural cloning (GCBC) and implicit value and Q-learning (GCIVL,
-//! GCIQL), on the patches of a frozen or a trained encoder. They act without planning. See `docs/models/gcrl.md`.
+//! GCIQL), on the patches of a frozen or trained encoder. The policies act without planning. See `docs/models/gcrl.md`.
 
 pub mod config;
 mod family;

@@ -1,4 +1,5 @@
-//! The models: an encoder, a policy head, and what values its data need. Parameters carry the published names.
+//! [`Gcbc`], [`Gcivl`] and [`Gciql`]: an encoder, a policy head, and the value networks that the method needs, with the
+//! published parameter names.
 
 use super::config::GcrlConfig;
 use super::heads::{Critic, Head};
@@ -11,11 +12,11 @@ use swm_core::Key;
 /// Goal-conditioned behavioural cloning.
 #[derive(Module, Debug)]
 pub struct Gcbc {
-    /// From pictures to patches.
+    /// From images to patches.
     pub encoder: Backbone,
     /// The mean action.
     pub action_predictor: Head,
-    /// The logarithm of the actions' spread, which cloning does not learn.
+    /// The logarithm of the actions' standard deviation, which cloning does not train.
     pub log_stds: Param<Tensor<1>>,
     #[module(skip)]
     pub(super) config: GcrlConfig,
@@ -24,14 +25,14 @@ pub struct Gcbc {
 /// Goal-conditioned implicit value learning.
 #[derive(Module, Debug)]
 pub struct Gcivl {
-    /// From pictures to patches.
+    /// From images to patches.
     pub encoder: Backbone,
     /// The mean action.
     pub action_predictor: Head,
-    /// The logarithm of the actions' spread.
+    /// The logarithm of the actions' standard deviation.
     pub log_stds: Param<Tensor<1>>,
-    /// What a state is worth.
-    pub value_predictor: Slow<Head>,
+    /// The value of a state.
+    pub value_predictor: WithTarget<Head>,
     #[module(skip)]
     pub(super) config: GcrlConfig,
 }
@@ -39,49 +40,49 @@ pub struct Gcivl {
 /// Goal-conditioned implicit Q-learning.
 #[derive(Module, Debug)]
 pub struct Gciql {
-    /// From pictures to patches.
+    /// From images to patches.
     pub encoder: Backbone,
     /// The mean action.
     pub action_predictor: Head,
-    /// The logarithm of the actions' spread.
+    /// The logarithm of the actions' standard deviation.
     pub log_stds: Param<Tensor<1>>,
-    /// What a state is worth.
-    pub value_predictor: Slow<Head>,
-    /// What an action is worth.
-    pub critic_predictor: Slow<Critic>,
+    /// The value of a state.
+    pub value_predictor: WithTarget<Head>,
+    /// The value of an action.
+    pub critic_predictor: WithTarget<Critic>,
     #[module(skip)]
     pub(super) config: GcrlConfig,
 }
 
-/// A network, and a copy that follows it slowly, which gives the targets.
+/// A network and its target network, an exponential moving average.
 #[derive(Module, Debug)]
-pub struct Slow<N: Module> {
-    /// What is trained.
+pub struct WithTarget<N: Module> {
+    /// The trained network.
     pub student: N,
-    /// What follows.
+    /// The target network.
     pub teacher: N,
 }
 
-impl<N: Module> Slow<N> {
+impl<N: Module> WithTarget<N> {
     fn new(network: N) -> Self {
         Self { teacher: network.clone().no_grad(), student: network }
     }
 
-    /// Moves the copy: it keeps a share of what it was.
+    /// Updates the target network, which keeps the fraction `keep` of its weights.
     #[must_use]
-    pub fn follow(self, keep: f64) -> Self {
+    pub fn update_target(self, keep: f64) -> Self {
         Self { teacher: parameters::blend(self.teacher, &self.student, keep), student: self.student }
     }
 }
 
-/// The parts that all models begin with, drawn.
-struct Parts<'a> {
+/// Creates the networks of a model with random weights.
+struct Builder<'a> {
     config: &'a GcrlConfig,
     actions: usize,
     init: Init,
 }
 
-impl<'a> Parts<'a> {
+impl<'a> Builder<'a> {
     fn new(config: &'a GcrlConfig, actions: usize, key: Key, device: &Device) -> Self {
         Self { config, actions, init: Init::new(key, device) }
     }
@@ -100,22 +101,22 @@ impl<'a> Parts<'a> {
         self.init.constant([self.actions], 0.0)
     }
 
-    fn value(&self) -> Slow<Head> {
+    fn value(&self) -> WithTarget<Head> {
         let init = self.init.of("value_predictor");
-        Slow::new(Head::new(&init, &self.config.head, self.config.patch_grid(), Pool::Mean, 1))
+        WithTarget::new(Head::new(&init, &self.config.head, self.config.patch_grid(), Pool::Mean, 1))
     }
 
-    fn critic(&self) -> Slow<Critic> {
+    fn critic(&self) -> WithTarget<Critic> {
         let GcrlConfig { head, critic, .. } = self.config;
         let init = self.init.of("critic_predictor");
-        Slow::new(Critic::new(&init, head, self.config.patch_grid(), Pool::Mean, self.actions, *critic))
+        WithTarget::new(Critic::new(&init, head, self.config.patch_grid(), Pool::Mean, self.actions, *critic))
     }
 }
 
 impl Gcbc {
-    /// A model of `actions` numbers an action (of all environment steps in a model step), drawn from `key`.
+    /// A model with random weights for actions of `actions` elements per model step.
     pub fn init(config: &GcrlConfig, actions: usize, key: Key, device: &Device) -> Self {
-        let parts = Parts::new(config, actions, key, device);
+        let parts = Builder::new(config, actions, key, device);
         Self {
             encoder: parts.encoder(),
             action_predictor: parts.policy(),
@@ -126,9 +127,9 @@ impl Gcbc {
 }
 
 impl Gcivl {
-    /// As [`Gcbc::init`].
+    /// A model with random weights, as [`Gcbc::init`].
     pub fn init(config: &GcrlConfig, actions: usize, key: Key, device: &Device) -> Self {
-        let parts = Parts::new(config, actions, key, device);
+        let parts = Builder::new(config, actions, key, device);
         Self {
             encoder: parts.encoder(),
             action_predictor: parts.policy(),
@@ -140,9 +141,9 @@ impl Gcivl {
 }
 
 impl Gciql {
-    /// As [`Gcbc::init`].
+    /// A model with random weights, as [`Gcbc::init`].
     pub fn init(config: &GcrlConfig, actions: usize, key: Key, device: &Device) -> Self {
-        let parts = Parts::new(config, actions, key, device);
+        let parts = Builder::new(config, actions, key, device);
         Self {
             encoder: parts.encoder(),
             action_predictor: parts.policy(),

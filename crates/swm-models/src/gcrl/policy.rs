@@ -1,4 +1,4 @@
-//! Acting with a goal-conditioned policy: the mean action, given the present frame, those before it, and the goal.
+//! [`GcrlPolicy`]: acting with the mean action of a goal-conditioned policy, given recent frames and the goal.
 
 use super::config::GcrlConfig;
 use super::heads::Head;
@@ -13,10 +13,10 @@ use std::collections::VecDeque;
 use swm_core::{EnvSpec, Result, RowRef, Schema};
 use swm_plan::ActionScale;
 
-/// Does what a trained model says, a model step at a time.
+/// Acts with a trained model, one model step at a time.
 pub type GcrlPolicy = FeedForwardPolicy<Actor>;
 
-/// What of a model acts.
+/// The encoder and policy head of a model.
 pub struct Actor {
     pub(super) encoder: Backbone,
     pub(super) head: Head,
@@ -24,11 +24,11 @@ pub struct Actor {
     pub(super) scale: ActionScale,
 }
 
-/// Patches seen in an episode, `[1, patches, dim]` each.
+/// Patches of an episode, `[1, patches, dim]` each.
 #[derive(Default)]
-pub struct Seen {
+pub struct EpisodePatches {
     goal: Option<Tensor<3>>,
-    /// The frames of the model steps before, oldest first, as many as the history has.
+    /// The frames of the last model steps, oldest first, at most as many as the history.
     frames: VecDeque<Tensor<3>>,
 }
 
@@ -41,7 +41,10 @@ impl Actor {
         FeedForwardPolicy::new(self, spec, slots)
     }
 
-    /// The patches of pictures, `[frames, patches, dim]`.
+    /// Encodes images.
+    ///
+    /// # Shapes
+    /// `rgb` is `[frames, image, image, 3]`; returns `[frames, patches, dim]`.
     fn patches(&self, rgb: &[u8]) -> Result<Tensor<3>> {
         let (pixels, patch) = (self.config.pixels(), self.config.encoder.patch());
         Ok(self.encoder.patches(pixels::patches(&pixels, patch, rgb, &Device::flex())?))
@@ -64,7 +67,7 @@ impl ImageEncoder for Actor {
 }
 
 impl ActionNetwork for Actor {
-    type EpisodeState = Seen;
+    type EpisodeState = EpisodePatches;
 
     fn scale(&self) -> &ActionScale {
         &self.scale
@@ -74,18 +77,18 @@ impl ActionNetwork for Actor {
         ["pixels", "goal"].into_iter().try_for_each(|name| pixels::check(self.config.image, infos, name))
     }
 
-    fn next_actions(&self, seen: &mut Seen, row: RowRef<'_>) -> Result<Vec<f32>> {
-        if seen.frames.len() == self.config.history {
-            seen.frames.pop_front();
+    fn next_actions(&self, episode: &mut EpisodePatches, row: RowRef<'_>) -> Result<Vec<f32>> {
+        if episode.frames.len() == self.config.history {
+            episode.frames.pop_front();
         }
-        seen.frames.push_back(self.patches(row.get("pixels")?)?);
-        let goal = match &mut seen.goal {
+        episode.frames.push_back(self.patches(row.get("pixels")?)?);
+        let goal = match &mut episode.goal {
             Some(goal) => goal,
             none => none.insert(self.patches(row.get("goal")?)?),
         };
-        let frames = Tensor::cat(seen.frames.iter().cloned().collect(), 1);
+        let frames = Tensor::cat(episode.frames.iter().cloned().collect(), 1);
         let means = self.head.forward(&frames, goal, &mut DropoutRng::disabled());
-        let [_, steps, numbers] = means.dims();
-        Ok(means.slice([0..1, steps - 1..steps, 0..numbers]).into_data().into_f32_vec())
+        let [_, steps, elements] = means.dims();
+        Ok(means.slice([0..1, steps - 1..steps, 0..elements]).into_data().into_f32_vec())
     }
 }

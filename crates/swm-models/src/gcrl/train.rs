@@ -1,4 +1,4 @@
-//! How goal-conditioned models are trained: the loop's side of [`super::step`].
+//! [`Trainable`] for goal-conditioned models: the training loop's view of [`super::step`].
 
 use super::config::GcrlConfig;
 use super::loss::{CloningLoss, ValueLoss};
@@ -15,11 +15,11 @@ use std::path::Path;
 use swm_core::{Batch, Error, Key, Result, Schema};
 use swm_data::{ClipSpec, GoalMixture, GoalSpec, LoaderConfig};
 
-/// Names of goals: columns of a batch are named after them.
+/// Names of goals, which prefix the columns of a batch.
 const GOAL: &str = "goal";
 const POLICY_GOAL: &str = "policy_goal";
 
-const TINY: &str = "64 px, a small convolutional encoder trained along: minutes on two CPU cores";
+const TINY: &str = "64 px, a small trained convolutional encoder: minutes on two CPU cores";
 const PAPER: &str = "224 px, frozen DINOv2-small, heads of 6 layers, history 3: the published size, for a GPU";
 
 macro_rules! presets {
@@ -35,13 +35,13 @@ macro_rules! presets {
     };
 }
 
-/// A trained goal-conditioned model, whatever it was trained by.
+/// A trained goal-conditioned model of any family.
 pub trait GoalConditioned: Trainable {
-    /// What of it acts.
+    /// Returns the encoder and policy head, which act.
     fn actor(checkpoint: &Checkpoint<Self>) -> Actor;
 }
 
-macro_rules! acts {
+macro_rules! goal_conditioned {
     ($($model:ty),*) => {
         $(impl GoalConditioned for $model {
             fn actor(checkpoint: &Checkpoint<Self>) -> Actor {
@@ -56,18 +56,19 @@ macro_rules! acts {
         })*
     };
 }
-acts!(Gcbc, Gcivl, Gciql);
+goal_conditioned!(Gcbc, Gcivl, Gciql);
 
 impl Trainable for Gcbc {
     const FAMILY: &'static str = "gcbc";
-    const SUMMARY: &'static str = "goal-conditioned behavioural cloning: a policy that imitates what led to a goal";
+    const SUMMARY: &'static str =
+        "goal-conditioned behavioural cloning: a policy that imitates actions that led to a goal";
     const PRESETS: &'static [Preset] = presets!("gcbc");
     type Config = GcrlConfig;
     type Loss = CloningLoss;
 
     fn check(config: &TrainConfig<Self>) -> Result<()> {
         config.model.check()?;
-        frames(config.data.num_steps, config.model.history)?;
+        check_frames(config.data.num_steps, config.model.history)?;
         goals(&config.loss.goals, GOAL, &config.model).check(&clip(config.data.num_steps, config.data.frameskip))
     }
 
@@ -89,14 +90,19 @@ impl Trainable for Gcbc {
     }
 
     fn with_pretrained_weights(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
-        self.encoder = see_with(self.encoder, &config.model.weights, cache)?;
+        self.encoder = with_weights(self.encoder, &config.model.weights, cache)?;
         Ok(self)
     }
 
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
         let StepContext { config, dataset_info, key, device, training } = context;
-        let read =
-            Read::new(&config.model, dataset_info, (config.data.num_steps, config.data.frameskip), batch, device)?;
+        let read = BatchReader::new(
+            &config.model,
+            dataset_info,
+            (config.data.num_steps, config.data.frameskip),
+            batch,
+            device,
+        )?;
         shards::mean(batch.rows(), config.shards, |range| {
             let mut rng = key.with("dropout").at(range.start as u64).rng();
             let mut noise = DropoutRng(training.then_some(&mut rng));
@@ -117,7 +123,7 @@ macro_rules! value_learner {
             fn check(config: &TrainConfig<Self>) -> Result<()> {
                 config.model.check()?;
                 config.loss.check()?;
-                frames(config.data.num_steps, config.model.history + 1)?;
+                check_frames(config.data.num_steps, config.model.history + 1)?;
                 let clip = clip(config.data.num_steps, config.data.frameskip);
                 goals(&config.loss.goals, GOAL, &config.model).check(&clip)?;
                 goals(&config.loss.policy_goals, POLICY_GOAL, &config.model).check(&clip)
@@ -144,14 +150,14 @@ macro_rules! value_learner {
             }
 
             fn with_pretrained_weights(mut self, config: &TrainConfig<Self>, cache: &Path) -> Result<Self> {
-                self.encoder = see_with(self.encoder, &config.model.weights, cache)?;
+                self.encoder = with_weights(self.encoder, &config.model.weights, cache)?;
                 Ok(self)
             }
 
             fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
                 let StepContext { config, dataset_info, key, device, training } = context;
                 let steps = (config.data.num_steps, config.data.frameskip);
-                let read = Read::new(&config.model, dataset_info, steps, batch, device)?;
+                let read = BatchReader::new(&config.model, dataset_info, steps, batch, device)?;
                 shards::mean(batch.rows(), config.shards, |range| {
                     let mut rng = key.with("dropout").at(range.start as u64).rng();
                     let mut noise = DropoutRng(training.then_some(&mut rng));
@@ -162,7 +168,7 @@ macro_rules! value_learner {
 
             fn after_step(mut self, context: &StepContext<'_, Self>, _: Named<Tensor<1>>) -> Self {
                 let keep = f64::from(context.config.loss.target);
-                $(self.$slow = self.$slow.follow(keep);)*
+                $(self.$slow = self.$slow.update_target(keep);)*
                 self
             }
 
@@ -175,18 +181,19 @@ macro_rules! value_learner {
 value_learner!(
     Gcivl,
     "gcivl",
-    "goal-conditioned implicit value learning: values by expectile regression, a policy weighted by what an action gains",
+    "goal-conditioned implicit value learning: values by expectile regression, advantage-weighted policy regression",
     [value_predictor]
 );
 value_learner!(
     Gciql,
     "gciql",
-    "goal-conditioned implicit Q-learning: a critic beside the values, a policy weighted by an action's advantage",
+    "goal-conditioned implicit Q-learning: critic and values, advantage-weighted policy regression",
     [value_predictor, critic_predictor]
 );
 
-/// An encoder with the weights that `from` names, if it names any: those of an encoder, or of a model that has one.
-fn see_with(encoder: Backbone, from: &str, cache: &Path) -> Result<Backbone> {
+/// Returns the encoder with the weights that `from` names, of an encoder or of a model with one; unchanged if `from` is
+/// empty.
+fn with_weights(encoder: Backbone, from: &str, cache: &Path) -> Result<Backbone> {
     if from.is_empty() {
         return Ok(encoder);
     }
@@ -199,7 +206,7 @@ fn see_with(encoder: Backbone, from: &str, cache: &Path) -> Result<Backbone> {
     weights::fill(encoder, &found, &path, "model.encoder")
 }
 
-/// Every network is clipped by itself, as it has an optimizer of its own in the published scripts.
+/// Clips every network's gradient separately, as the published scripts have one optimizer per network.
 fn parameter_group(name: &str) -> ParameterGroup {
     let clip = match name.split('.').next() {
         Some("action_predictor" | "log_stds") => 1,
@@ -212,11 +219,11 @@ fn parameter_group(name: &str) -> ParameterGroup {
 
 impl ValueLoss {
     fn check(&self) -> Result<()> {
-        let shares =
+        let fractions =
             [("loss.discount", self.discount), ("loss.expectile", self.expectile), ("loss.target", self.target)];
-        for (what, share) in shares {
-            if !(0.0..1.0).contains(&share) {
-                return Err(Error::config(what, share.to_string(), "give at least 0 and below 1"));
+        for (what, fraction) in fractions {
+            if !(0.0..1.0).contains(&fraction) {
+                return Err(Error::config(what, fraction.to_string(), "give at least 0 and below 1"));
             }
         }
         if !(self.temperature.is_finite() && self.temperature >= 0.0) {
@@ -227,15 +234,15 @@ impl ValueLoss {
     }
 }
 
-/// The frames of a clip are decided by the history.
-fn frames(given: usize, wanted: usize) -> Result<()> {
-    if given == wanted {
+/// Checks the number of frames in a clip, which the history determines.
+fn check_frames(given: usize, expected: usize) -> Result<()> {
+    if given == expected {
         return Ok(());
     }
     Err(Error::config(
         "data.num_steps",
         format!("{given} frames in a clip"),
-        format!("say {wanted}, what model.history asks for, or change that"),
+        format!("give {expected}, which model.history requires, or change model.history"),
     ))
 }
 
@@ -243,7 +250,7 @@ fn clip(num_steps: usize, frameskip: usize) -> ClipSpec {
     ClipSpec { num_steps, frameskip, columns: vec!["pixels".to_owned(), "action".to_owned()] }
 }
 
-/// Pictures of goals; now is the last frame of the history.
+/// Returns the specification of goal images, relative to the last frame of the history.
 fn goals(mixture: &GoalMixture, name: &str, model: &GcrlConfig) -> GoalSpec {
     GoalSpec {
         name: name.to_owned(),
@@ -253,8 +260,8 @@ fn goals(mixture: &GoalMixture, name: &str, model: &GcrlConfig) -> GoalSpec {
     }
 }
 
-/// A batch, read a range of clips at a time.
-struct Read<'a> {
+/// A batch whose clips are read in ranges.
+struct BatchReader<'a> {
     config: &'a GcrlConfig,
     device: &'a Device,
     /// Frames of a clip.
@@ -264,7 +271,7 @@ struct Read<'a> {
     actions: Tensor<3>,
 }
 
-impl<'a> Read<'a> {
+impl<'a> BatchReader<'a> {
     fn new(
         config: &'a GcrlConfig,
         dataset_info: &DatasetInfo,
@@ -276,14 +283,14 @@ impl<'a> Read<'a> {
         Ok(Self { config, device, steps, frames: batch.get("pixels")?, batch, actions })
     }
 
-    /// The pictures of some clips, of a column that holds `each` of them a clip.
-    fn part<'b>(&self, pictures: &'b [u8], each: usize, clips: &Range<usize>) -> &'b [u8] {
-        let bytes = each * self.config.image * self.config.image * 3;
-        &pictures[clips.start * bytes..clips.end * bytes]
+    /// Returns the images of some clips from a column with `per_clip` images per clip.
+    fn part<'b>(&self, images: &'b [u8], per_clip: usize, clips: &Range<usize>) -> &'b [u8] {
+        let bytes = per_clip * self.config.image * self.config.image * 3;
+        &images[clips.start * bytes..clips.end * bytes]
     }
 
-    fn patches(&self, pictures: &[u8]) -> Result<Tensor<3>> {
-        pixels::patches(&self.config.pixels(), self.config.encoder.patch(), pictures, self.device)
+    fn patches(&self, images: &[u8]) -> Result<Tensor<3>> {
+        pixels::patches(&self.config.pixels(), self.config.encoder.patch(), images, self.device)
     }
 
     fn goals(&self, name: &str) -> Result<&[u8]> {
@@ -291,18 +298,18 @@ impl<'a> Read<'a> {
     }
 
     fn clips(&self, clips: Range<usize>) -> Result<Clips> {
-        let [_, _, numbers] = self.actions.dims();
+        let [_, _, elements] = self.actions.dims();
         Ok(Clips {
             frames: self.patches(self.part(self.frames, self.steps, &clips))?,
             goal: self.patches(self.part(self.goals(GOAL)?, 1, &clips))?,
-            actions: self.actions.clone().slice([clips, 0..self.config.history, 0..numbers]),
+            actions: self.actions.clone().slice([clips, 0..self.config.history, 0..elements]),
         })
     }
 
     fn relabelled(&self, clips: Range<usize>) -> Result<Relabelled> {
         let bytes = self.config.image * self.config.image * 3;
         let (frames, goals) = (self.part(self.frames, self.steps, &clips), self.part(self.goals(GOAL)?, 1, &clips));
-        // A goal is reached where its very picture is seen.
+        // A goal is reached if the frame equals the goal image.
         let reached: Vec<f32> = frames
             .chunks_exact(self.steps * bytes)
             .zip(goals.chunks_exact(bytes))

@@ -1,11 +1,11 @@
-//! Gradients of [`LewmCost`] with respect to actions, and one step of its dynamics with vector-Jacobian products, by
-//! Burn's automatic differentiation of [`Lewm::rollout`].
+//! Gradients of [`LewmCost`] with respect to actions, and latent dynamics with vector-Jacobian products, by Burn's autodiff
+//! of [`Lewm::rollout`].
 //!
-//! The latent state a solver sees is that of one frame: [`LatentDynamics::predict`] is the predictor with a window of one
-//! latent, as it is trained on the first frame of every clip. The cost and its gradient see the whole window.
+//! The latent state of a solver is that of one frame: [`LatentDynamics::predict`] uses a window of one latent, which the
+//! predictor is trained on at the first frame of every clip. The cost and its gradient use the whole window.
 //!
-//! As in the cost, parts are counted from each environment's first row, so that what an environment is given does not
-//! depend on its neighbours.
+//! The rows of each environment are split into parts on their own, so that its results do not depend on the other
+//! environments.
 
 use super::cost::{LewmCost, PlanContext};
 use super::model::Lewm;
@@ -15,23 +15,26 @@ use burn::tensor::{Tensor, TensorData};
 use rayon::prelude::*;
 use swm_core::{Candidates, DifferentiableCost, Error, LatentDynamics, Result};
 
-/// Rows of numbers as a tensor, where a model computes.
-fn tensor<const D: usize>(model: &Lewm, numbers: Vec<f32>, shape: [usize; D]) -> Tensor<D> {
-    Tensor::from_data(TensorData::new(numbers, shape), &model.device().inner())
+/// Creates a tensor on the device of a model.
+fn tensor<const D: usize>(model: &Lewm, values: Vec<f32>, shape: [usize; D]) -> Tensor<D> {
+    Tensor::from_data(TensorData::new(values, shape), &model.device().inner())
 }
 
-/// How many of `rows` are differentiated at once: equal parts of at most 80. Burn's products depend on it, so it does not
-/// depend on the machine.
+/// Returns how many of `rows` are differentiated at once: equal parts of at most 80. The rounding of Burn's products depends
+/// on this number, so it must not depend on the machine.
 fn part(rows: usize) -> usize {
     rows.div_ceil(rows.div_ceil(80).max(1)).max(1)
 }
 
-/// The model, as differentiation wants it: its weights are constants.
+/// Returns the model in an autodiff graph with constant weights.
 fn differentiable(model: &Lewm) -> Lewm {
     model.clone().train().no_grad()
 }
 
-/// Costs of some candidates of one environment, `[samples, horizon, dim]`, and their gradients.
+/// Writes costs of candidates of one environment and their gradients.
+///
+/// # Shapes
+/// `actions` and `gradient` are `[samples, horizon, dim]`, `costs` is `[samples]`.
 fn cost_and_gradient(
     model: &Lewm,
     context: &PlanContext,
@@ -41,8 +44,8 @@ fn cost_and_gradient(
     gradient: &mut [f32],
 ) {
     let (latent, past) = (context.goal.len(), context.past.len() / dim);
-    let seen = context.start.len() / latent;
-    let start = tensor(model, context.start.repeat(samples), [samples, seen, latent]).autodiff();
+    let frames = context.start.len() / latent;
+    let start = tensor(model, context.start.repeat(samples), [samples, frames, latent]).autodiff();
     let free = tensor(model, actions.to_vec(), [samples, horizon, dim]).autodiff().require_grad();
     let taken = match past {
         0 => free.clone(),
@@ -51,7 +54,7 @@ fn cost_and_gradient(
             1,
         ),
     };
-    let last = seen + horizon - 1;
+    let last = frames + horizon - 1;
     let end = model.rollout(start, taken).slice([0..samples, last..last + 1, 0..latent]);
     let goal = tensor(model, context.goal.repeat(samples), [samples, 1, latent]).autodiff();
     let cost = (end - goal).square().sum_dim(2);
@@ -60,10 +63,10 @@ fn cost_and_gradient(
     copy_gradient(free.grad(&all), gradient);
 }
 
-/// The gradient of a leaf; none where nothing depends on it.
-fn copy_gradient<const D: usize>(found: Option<Tensor<D>>, to: &mut [f32]) {
-    match found {
-        Some(found) => to.copy_from_slice(&found.into_data().into_f32_vec()),
+/// Copies the gradient of a leaf; zeros if nothing depends on it.
+fn copy_gradient<const D: usize>(gradient: Option<Tensor<D>>, to: &mut [f32]) {
+    match gradient {
+        Some(gradient) => to.copy_from_slice(&gradient.into_data().into_f32_vec()),
         None => to.fill(0.0),
     }
 }
@@ -74,15 +77,15 @@ impl DifferentiableCost for LewmCost {
         let Candidates { actions, samples, horizon, dim, .. } = candidates;
         if gradient.len() != actions.len() {
             let (given, expected) = (gradient.len().to_string(), actions.len().to_string());
-            return Err(Error::mismatch("the gradient of a LeWM's cost, in numbers", given, expected));
+            return Err(Error::mismatch("the number of elements in the gradient of a LeWM's cost", given, expected));
         }
         let model = differentiable(&self.model);
-        let (numbers, part) = (horizon * dim, part(samples));
-        let rows = costs.par_chunks_mut(samples).zip(gradient.par_chunks_mut(samples * numbers));
-        rows.zip(actions.par_chunks(samples * numbers)).zip(&self.contexts).for_each(
+        let (width, part) = (horizon * dim, part(samples));
+        let rows = costs.par_chunks_mut(samples).zip(gradient.par_chunks_mut(samples * width));
+        rows.zip(actions.par_chunks(samples * width)).zip(&self.contexts).for_each(
             |(((costs, gradient), actions), context)| {
-                let parts = costs.par_chunks_mut(part).zip(gradient.par_chunks_mut(part * numbers));
-                parts.zip(actions.par_chunks(part * numbers)).for_each(|((costs, gradient), actions)| {
+                let parts = costs.par_chunks_mut(part).zip(gradient.par_chunks_mut(part * width));
+                parts.zip(actions.par_chunks(part * width)).for_each(|((costs, gradient), actions)| {
                     cost_and_gradient(&model, context, [costs.len(), horizon, dim], actions, costs, gradient);
                 });
             },
@@ -92,17 +95,17 @@ impl DifferentiableCost for LewmCost {
 }
 
 impl LewmCost {
-    /// Checks pairs of latents and actions; returns how many rows of them one environment has.
+    /// Checks the lengths of latents, actions and other arrays (name, length, width); returns the rows per environment.
     fn pairs(&self, latents: &[f32], actions: &[f32], others: &[(&str, usize, usize)]) -> Result<usize> {
         let (latent, envs) = (self.config.latent, self.contexts.len().max(1));
         let n = latents.len() / latent;
         let given = [("latents", latents.len(), latent), ("actions", actions.len(), self.actions)];
-        for &(what, numbers, width) in given.iter().chain(others) {
-            if numbers != n * width || !n.is_multiple_of(envs) {
+        for &(what, length, width) in given.iter().chain(others) {
+            if length != n * width || !n.is_multiple_of(envs) {
                 return Err(Error::mismatch(
                     format!("one step of a LeWM: {what}"),
-                    format!("{numbers} numbers"),
-                    format!("{n} rows of {width}, equally many for each of {envs} environments"),
+                    format!("{length} elements"),
+                    format!("{n} rows of {width}, the same number for each of {envs} environments"),
                 ));
             }
         }
@@ -121,8 +124,8 @@ impl LatentDynamics for LewmCost {
         if self.contexts.is_empty() || start.len() != expected || goal.len() != expected {
             return Err(Error::mismatch(
                 "the latents of start and goal of a LeWM",
-                format!("{} and {} numbers", start.len(), goal.len()),
-                format!("{latent} of each for every one of {} observed environments", self.contexts.len()),
+                format!("{} and {} elements", start.len(), goal.len()),
+                format!("{latent} of each for each of {} observed environments", self.contexts.len()),
             ));
         }
         for ((start, goal), context) in
@@ -166,14 +169,14 @@ impl LatentDynamics for LewmCost {
         let model = differentiable(&self.model);
         let given =
             chunks(latents, rows, latent).zip(chunks(actions, rows, dim)).zip(chunks(next_gradient, rows, latent));
-        let asked = chunks_mut(latent_gradient, rows, latent).zip(chunks_mut(action_gradient, rows, dim));
-        let mut work: Vec<_> = given.zip(asked).collect();
-        work.par_iter_mut().for_each(|(((latents, actions), pull), (latent_gradient, action_gradient))| {
+        let outputs = chunks_mut(latent_gradient, rows, latent).zip(chunks_mut(action_gradient, rows, dim));
+        let mut work: Vec<_> = given.zip(outputs).collect();
+        work.par_iter_mut().for_each(|(((latents, actions), cotangent), (latent_gradient, action_gradient))| {
             let n = latents.len() / latent;
             let from = tensor(&model, latents.to_vec(), [n, 1, latent]).autodiff().require_grad();
             let by = tensor(&model, actions.to_vec(), [n, 1, dim]).autodiff().require_grad();
             let next = model.predict(from.clone(), model.embed_actions(by.clone()));
-            let all = (next * tensor(&model, pull.to_vec(), [n, 1, latent]).autodiff()).sum().backward();
+            let all = (next * tensor(&model, cotangent.to_vec(), [n, 1, latent]).autodiff()).sum().backward();
             copy_gradient(from.grad(&all), latent_gradient);
             copy_gradient(by.grad(&all), action_gradient);
         });
@@ -181,14 +184,14 @@ impl LatentDynamics for LewmCost {
     }
 }
 
-/// Rows of `width` numbers in the parts they are computed in: each environment's `rows` by themselves.
-fn chunks(numbers: &[f32], rows: usize, width: usize) -> impl Iterator<Item = &[f32]> {
+/// Splits rows of `width` elements into the parts that are computed together; no part spans two environments.
+fn chunks(values: &[f32], rows: usize, width: usize) -> impl Iterator<Item = &[f32]> {
     let part = part(rows);
-    numbers.chunks(rows.max(1) * width).flat_map(move |env| env.chunks(part * width))
+    values.chunks(rows.max(1) * width).flat_map(move |env| env.chunks(part * width))
 }
 
-/// As [`chunks`], to be written.
-fn chunks_mut(numbers: &mut [f32], rows: usize, width: usize) -> impl Iterator<Item = &mut [f32]> {
+/// Splits mutable rows as [`chunks`] does.
+fn chunks_mut(values: &mut [f32], rows: usize, width: usize) -> impl Iterator<Item = &mut [f32]> {
     let part = part(rows);
-    numbers.chunks_mut(rows.max(1) * width).flat_map(move |env| env.chunks_mut(part * width))
+    values.chunks_mut(rows.max(1) * width).flat_map(move |env| env.chunks_mut(part * width))
 }

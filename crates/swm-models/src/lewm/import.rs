@@ -1,4 +1,4 @@
-//! LeWM checkpoints of the reference implementation, both ways. A PLDM's are the same but for the class.
+//! Import and export of LeWM checkpoints of the reference implementation. PLDM checkpoints differ in the class only.
 
 use super::config::{EncoderConfig, LewmConfig};
 use super::model::Lewm;
@@ -14,18 +14,18 @@ use serde_json::{Value, json};
 use std::path::Path;
 use swm_core::{Error, Key, Manifest, Result};
 
-/// Names of modules in the reference, of this family.
+/// The reference implementation's module of building blocks for this family.
 const MODULES: &str = "stable_worldmodel.wm.lewm.module";
 const CLASS: &str = "stable_worldmodel.wm.lewm.LeWM";
 
-/// A LeWM that the reference trained: a folder with `weights.pt` and `config.json`, or that file. What it does not
-/// store is how actions were normalised, so `dataset_info` must be those of its dataset.
+/// Converts a LeWM of the reference implementation: a folder with `weights.pt` and `config.json`, or that file. The files
+/// do not store how actions were normalised, so `dataset_info` must describe the dataset it was trained on.
 ///
 /// # Errors
-/// When it is another model, of a kind that is not known here, or damaged, or its actions are not a whole number of
-/// those in `dataset_info`.
+/// When it is another model or an unsupported variant, it is damaged, or its action size is no multiple of that in
+/// `dataset_info`.
 pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Lewm>> {
-    let (model, sizes, frameskip) = world(Reference::open(from, "LeWM")?, &dataset_info)?;
+    let (model, sizes, frameskip) = world_model(Reference::open(from, "LeWM")?, &dataset_info)?;
     let mut config = TrainConfig::<Lewm>::load("paper", &[])?;
     config.data.num_steps = sizes.predictor.history + 1;
     config.data.frameskip = frameskip;
@@ -35,26 +35,29 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Lewm>
     Ok(Checkpoint { model, config, dataset_info, manifest })
 }
 
-/// Writes `weights.pt` and `config.json` that the reference's `load_pretrained` reads.
+/// Writes the `weights.pt` and `config.json` that `load_pretrained` of the reference implementation reads.
 ///
 /// # Errors
-/// When the encoder is none that the reference has, or the disk refuses.
+/// When the reference implementation has no such encoder, or a file cannot be written.
 pub fn export(checkpoint: &Checkpoint<Lewm>, folder: &Path, naming: Naming) -> Result<()> {
     let actions = checkpoint.actions();
     let config = tree(&checkpoint.config.model, actions, CLASS, MODULES)?;
     write(folder, &config, &state(&checkpoint.model, naming))
 }
 
-/// The world model of a checkpoint, its size, and environment steps in a model step.
-pub(crate) fn world(mut reference: Reference, dataset_info: &DatasetInfo) -> Result<(Lewm, LewmConfig, usize)> {
+/// Returns the world model of a checkpoint, its sizes, and the number of environment steps in a model step.
+///
+/// # Errors
+/// As [`import`].
+pub(crate) fn world_model(mut reference: Reference, dataset_info: &DatasetInfo) -> Result<(Lewm, LewmConfig, usize)> {
     let (vit, image) = reference.vit("encoder")?;
     for part in ["projector", "pred_proj"] {
         let norm = reference.class(&format!("{part}.norm_fn"));
         if norm != "BatchNorm1d" {
-            return Err(reference.wrong(format!("its {part} has '{norm}' where BatchNorm1d is known")));
+            return Err(reference.wrong(format!("its {part} has '{norm}' where BatchNorm1d is expected")));
         }
     }
-    let size = |at: &str| reference.size(at);
+    let size = |path: &str| reference.size(path);
     let latent = size("projector.output_dim")?;
     let (mean, std) = ImageNormalization::IMAGENET;
     let predictor = PredictorConfig {
@@ -82,8 +85,8 @@ pub(crate) fn world(mut reference: Reference, dataset_info: &DatasetInfo) -> Res
     if dim == 0 || !actions.is_multiple_of(dim) {
         return Err(Error::mismatch(
             "importing a checkpoint",
-            format!("{dim} numbers an action in the dataset"),
-            format!("a divisor of {actions}, the numbers of a model step's actions"),
+            format!("{dim} action elements in the dataset"),
+            format!("a divisor of {actions}, the action elements of a model step"),
         ));
     }
     let model = Lewm::init(&config, actions, Key::new(0), &Device::flex());
@@ -91,7 +94,7 @@ pub(crate) fn world(mut reference: Reference, dataset_info: &DatasetInfo) -> Res
     Ok((model, config, actions / dim))
 }
 
-/// The state dict of a world model, as the reference's class has it.
+/// Returns the state dict of a world model in the layout of the reference implementation.
 pub(crate) fn state(model: &Lewm, naming: Naming) -> Named<HostTensor> {
     let mut weights = names::to_naming(parameters::values(model), "encoder.", naming);
     for part in ["projector", "pred_proj"] {
@@ -101,12 +104,15 @@ pub(crate) fn state(model: &Lewm, naming: Naming) -> Named<HostTensor> {
     weights
 }
 
-/// The tree of classes that a world model is made with.
+/// Returns the class tree from which the reference implementation builds a world model.
+///
+/// # Errors
+/// When the reference implementation has no such encoder.
 pub(crate) fn tree(config: &LewmConfig, actions: usize, class: &str, modules: &str) -> Result<Value> {
     let EncoderConfig::Vit(VitConfig { patch, dim, depth, heads, mlp }) = &config.encoder else {
         return Err(Error::config(
             "exporting a model",
-            "the reference has no encoder like 'pyramid'",
+            "the reference implementation has no encoder like 'pyramid'",
             "train with model.encoder.vit, such as the preset `paper` does",
         ));
     };

@@ -1,21 +1,22 @@
-//! SIGReg, the regulariser that keeps latents from collapsing (LeJEPA, arXiv 2511.08544; published settings: 17
-//! knots up to 3).
+//! SIGReg, the regulariser that keeps latents from collapsing (LeJEPA, arXiv 2511.08544; published settings: 17 knots up
+//! to 3).
 //!
-//! Random directions are drawn, the latents of a batch projected on each, and the empirical characteristic
-//! function of each projection compared with that of a standard normal distribution (the Epps-Pulley
-//! statistic, with trapezoid weights under a Gaussian window). Value and gradient are computed here in one
-//! pass on the host: the characteristic functions at equidistant knots are powers of one complex number, so a
-//! point costs one sine and one cosine instead of one for every knot.
+//! The latents of a batch are projected on random directions, and the empirical characteristic function of each
+//! projection is compared with that of a standard normal distribution by the Epps-Pulley statistic, integrated by the
+//! trapezoid rule under a Gaussian window. Value and gradient are computed in one pass on the host. The characteristic
+//! functions at equidistant knots are powers of one complex number, so a projection costs one sine and one cosine.
 
 use rand_distr::{Distribution as _, StandardNormal};
 use rayon::prelude::*;
 use swm_core::Key;
 
-/// Where the characteristic functions are compared last.
+/// The largest argument of the characteristic functions.
 const LAST_KNOT: f32 = 3.0;
 
-/// `count` random directions of unit length, `[count, dim]`.
-#[allow(clippy::cast_possible_truncation)]
+/// Draws random directions of unit length.
+///
+/// # Shapes
+/// Returns `[count, dim]`.
 pub fn directions(key: Key, dim: usize, count: usize) -> Vec<f32> {
     let mut rng = key.rng();
     let mut all = Vec::with_capacity(dim * count);
@@ -27,11 +28,11 @@ pub fn directions(key: Key, dim: usize, count: usize) -> Vec<f32> {
     all
 }
 
-/// The statistic, averaged over steps and directions, and its gradient with respect to the latents.
+/// Computes the Epps-Pulley statistic, `n ∫ |φ_n(t) - exp(-t²/2)|² exp(-t²/2) dt` averaged over steps and directions, and its
+/// gradient with respect to the latents.
 ///
 /// # Shapes
-/// `latents` is `[batch, steps, dim]`, `directions` is `[count, dim]`; the gradient is of the latents' shape.
-#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation)]
+/// `latents` is `[batch, steps, dim]`, `directions` is `[count, dim]`; the gradient has the shape of the latents.
 pub fn sigreg(latents: &[f32], steps: usize, dim: usize, directions: &[f32], knots: usize) -> (f64, Vec<f32>) {
     let batch = latents.len() / (steps * dim);
     let count = directions.len() / dim;
@@ -40,8 +41,8 @@ pub fn sigreg(latents: &[f32], steps: usize, dim: usize, directions: &[f32], kno
     let weights: Vec<f32> =
         (0..knots).map(|k| target[k] * spacing * if k == 0 || k == knots - 1 { 1.0 } else { 2.0 }).collect();
 
-    // One task a step and direction; each returns its statistic and the gradient of its projections, so the sums
-    // below run in one order whatever the number of threads.
+    // One task per step and direction returns its statistic and the gradient of its projections, so that the sums below
+    // have the same order on any number of threads.
     let tasks: Vec<(f64, Vec<f32>)> = (0..steps * count)
         .into_par_iter()
         .map(|task| {
@@ -63,8 +64,7 @@ pub fn sigreg(latents: &[f32], steps: usize, dim: usize, directions: &[f32], kno
                 .collect();
             let n = batch as f32;
             let mut statistic = 0.0f64;
-            // Derivatives of the statistic by the sums of cosines and sines, times the knot: what a projection's
-            // gradient is made of.
+            // Derivatives of the statistic with respect to the sums of cosines and sines, times the knot.
             let (mut by_cos, mut by_sin) = (vec![0.0f32; knots], vec![0.0f32; knots]);
             for k in 0..knots {
                 let (real, imaginary) = (cos[k] / n - target[k], sin[k] / n);
@@ -88,15 +88,15 @@ pub fn sigreg(latents: &[f32], steps: usize, dim: usize, directions: &[f32], kno
         })
         .collect();
 
-    let share = 1.0 / (steps * count) as f32;
-    let value = tasks.iter().map(|(statistic, _)| statistic).sum::<f64>() * f64::from(share);
+    let factor = 1.0 / (steps * count) as f32;
+    let value = tasks.iter().map(|(statistic, _)| statistic).sum::<f64>() * f64::from(factor);
     let mut gradient = vec![0.0f32; latents.len()];
-    gradient.par_chunks_mut(dim).enumerate().for_each(|(place, row)| {
-        let (sample, step) = (place / steps, place % steps);
-        for index in 0..count {
-            let factor = tasks[step * count + index].1[sample] * share;
-            for (to, by) in row.iter_mut().zip(&directions[index * dim..][..dim]) {
-                *to += factor * by;
+    gradient.par_chunks_mut(dim).enumerate().for_each(|(index, row)| {
+        let (sample, step) = (index / steps, index % steps);
+        for direction in 0..count {
+            let slope = tasks[step * count + direction].1[sample] * factor;
+            for (to, component) in row.iter_mut().zip(&directions[direction * dim..][..dim]) {
+                *to += slope * component;
             }
         }
     });

@@ -1,5 +1,5 @@
-//! LeWM (LeWorldModel): an encoder and a predictor trained end to end to predict the next latent, kept from
-//! collapsing by [SIGReg](loss). See `docs/models/lewm.md`.
+//! LeWM (LeWorldModel): an encoder and a predictor trained end to end to predict the next latent, with [SIGReg](loss)
+//! against collapse. See `docs/models/lewm.md`.
 
 pub mod config;
 pub mod cost;

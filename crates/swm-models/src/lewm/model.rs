@@ -1,4 +1,4 @@
-//! [`Lewm`]: encoder, action encoder, predictor and projections.
+//! [`Lewm`]: encoder, action encoder, predictor and projectors.
 
 use super::config::LewmConfig;
 pub use crate::nn::Backbone as Encoder;
@@ -7,10 +7,10 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
 
-/// A LeWM: from pictures to latents, and from latents and actions to the next latents.
+/// A LeWM: encodes images to latents, and predicts the next latents from latents and actions.
 #[derive(Module, Debug)]
 pub struct Lewm {
-    /// From pictures to features.
+    /// From images to features.
     pub encoder: Encoder,
     /// From features to latents.
     pub projector: Projector,
@@ -18,12 +18,12 @@ pub struct Lewm {
     pub action_encoder: Embedder,
     /// From latents and conditions to features of the next latents.
     pub predictor: Predictor,
-    /// From those to latents.
+    /// From features of the predictor to latents.
     pub pred_proj: Projector,
 }
 
 impl Lewm {
-    /// A model of `actions` numbers an action (of all environment steps in a model step), drawn from `key`.
+    /// A model with random weights for actions of `actions` elements per model step.
     pub fn init(config: &LewmConfig, actions: usize, key: Key, device: &Device) -> Self {
         let init = Init::new(key, device);
         let features = config.encoder.dim();
@@ -38,18 +38,18 @@ impl Lewm {
         }
     }
 
-    /// Where it computes.
+    /// Returns the device of the weights.
     pub fn device(&self) -> Device {
         self.predictor.pos_embedding.val().device()
     }
 
-    /// Numbers of a latent.
+    /// Returns the latent dimension.
     pub fn latent(&self) -> usize {
         let [_, _, latent] = self.predictor.pos_embedding.dims();
         latent
     }
 
-    /// The latents of pictures.
+    /// Encodes images.
     ///
     /// # Shapes
     /// `[frames, patches, 3 * patch * patch]` to `[frames, latent]`.
@@ -57,28 +57,31 @@ impl Lewm {
         self.projector.forward(self.encoder.forward(patches))
     }
 
-    /// The conditions of actions.
+    /// Embeds actions as conditions of the predictor.
     ///
     /// # Shapes
     /// `[windows, steps, actions]` to `[windows, steps, latent]`.
     pub fn embed_actions(&self, actions: Tensor<3>) -> Tensor<3> {
-        let [windows, steps, numbers] = actions.dims();
-        let embedded = self.action_encoder.forward(actions.reshape([windows * steps, numbers]));
+        let [windows, steps, elements] = actions.dims();
+        let embedded = self.action_encoder.forward(actions.reshape([windows * steps, elements]));
         let [_, latent] = embedded.dims();
         embedded.reshape([windows, steps, latent])
     }
 
-    /// The latent after each latent of a window.
+    /// Predicts the latent after each latent of a window.
     ///
     /// # Shapes
-    /// `[windows, steps, latent]`, twice, to the same.
+    /// `latents` and `conditions` are `[windows, steps, latent]`; returns the same shape.
     pub fn predict(&self, latents: Tensor<3>, conditions: Tensor<3>) -> Tensor<3> {
         let features = self.predictor.forward(latents, conditions, &mut DropoutRng::disabled());
         let [windows, steps, latent] = features.dims();
         self.pred_proj.forward(features.reshape([windows * steps, latent])).reshape([windows, steps, latent])
     }
 
-    /// As [`Lewm::predict`], with the statistics of the batch and dropout.
+    /// Predicts as [`Lewm::predict`], with batch statistics and dropout.
+    ///
+    /// # Shapes
+    /// As [`Lewm::predict`].
     pub fn predict_train(
         &self,
         latents: Tensor<3>,
@@ -91,10 +94,10 @@ impl Lewm {
         (latents.reshape([windows, steps, latent]), statistics)
     }
 
-    /// All latents of a rollout: those given, then one predicted after each further action.
+    /// Rolls the model out: returns the given latents, then one predicted latent after each further action.
     ///
     /// # Shapes
-    /// Latents `[windows, given, latent]` and actions `[windows, steps, actions]`, `steps >= given`, to
+    /// `latents` is `[windows, given, latent]`, `actions` is `[windows, steps, actions]` with `steps >= given`; returns
     /// `[windows, steps + 1, latent]`.
     pub fn rollout(&self, latents: Tensor<3>, actions: Tensor<3>) -> Tensor<3> {
         let [windows, given, latent] = latents.dims();
@@ -105,8 +108,8 @@ impl Lewm {
         for end in given..=steps {
             let window = [0..windows, end.saturating_sub(history)..end, 0..latent];
             let next = self.predict(all.clone().slice(window.clone()), conditions.clone().slice(window));
-            let [_, seen, _] = next.dims();
-            all = Tensor::cat(vec![all, next.slice([0..windows, seen - 1..seen, 0..latent])], 1);
+            let [_, count, _] = next.dims();
+            all = Tensor::cat(vec![all, next.slice([0..windows, count - 1..count, 0..latent])], 1);
         }
         all
     }

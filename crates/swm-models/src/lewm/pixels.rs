@@ -1,30 +1,30 @@
-//! Pictures as a LeWM sees them.
+//! Conversion of images to the inputs of a LeWM.
 
 use super::config::LewmConfig;
 use crate::pixels::{self, ImageNormalization};
 use burn::tensor::{Device, Tensor};
 use swm_core::{Result, Schema};
 
-/// Checks that a column holds pictures of the size the model sees.
+/// Checks that a column holds images of the model's size.
 ///
 /// # Errors
-/// When there is no such column, or it holds something else.
+/// When the column is missing or has another type or shape.
 pub fn check(config: &LewmConfig, schema: &Schema, column: &str) -> Result<()> {
     pixels::check(config.image, schema, column)
 }
 
-/// Pictures as normalised patches.
+/// Converts images to normalised patches.
 ///
 /// # Shapes
 /// `[frames, image, image, 3]` bytes to `[frames, patches, 3 * patch * patch]`.
 ///
 /// # Errors
-/// When the bytes are not whole pictures of the configured size.
+/// When the bytes are not a whole number of images.
 pub fn patches(config: &LewmConfig, rgb: &[u8], device: &Device) -> Result<Tensor<3>> {
-    pixels::patches(&seen(config), config.encoder.patch(), rgb, device)
+    pixels::patches(&normalization(config), config.encoder.patch(), rgb, device)
 }
 
-/// Pictures as normalised planes.
+/// Converts images to normalised colour planes.
 ///
 /// # Shapes
 /// `[frames, image, image, 3]` bytes to `[frames, 3, image, image]`.
@@ -32,9 +32,9 @@ pub fn patches(config: &LewmConfig, rgb: &[u8], device: &Device) -> Result<Tenso
 /// # Errors
 /// As [`patches`].
 pub fn planes(config: &LewmConfig, rgb: &[u8], device: &Device) -> Result<Tensor<4>> {
-    pixels::planes(&seen(config), rgb, device)
+    pixels::planes(&normalization(config), rgb, device)
 }
 
-fn seen(config: &LewmConfig) -> ImageNormalization {
+fn normalization(config: &LewmConfig) -> ImageNormalization {
     ImageNormalization { side: config.image, mean: config.pixel_mean, std: config.pixel_std }
 }

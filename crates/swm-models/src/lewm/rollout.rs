@@ -1,20 +1,20 @@
-//! [`Rollout`]: predicting many action sequences from one present, as fast as a CPU does it.
+//! [`Rollout`]: rollouts of many action sequences from one present, with the CPU kernels of `swm-kernels`.
 //!
-//! The same numbers as [`Lewm::rollout`], computed once where that computes them again, or not at all:
+//! The result equals [`Lewm::rollout`] up to rounding, with less work:
 //!
-//! - actions are embedded, and turned into modulations, once for the whole sequence;
-//! - what a token shows to those after it is kept while the window of latents grows; it is computed anew only when the
-//!   window slides, as the positions of its tokens change then;
-//! - in the last layer, and behind it, only the last token is computed;
-//! - keys and values are never computed. A window holds a few tokens of `dim` numbers, all heads together have many times
-//!   that: so a query is taken back through the matrix of the keys, `(W_k y)ᵀq = yᵀ(W_kᵀ q)`, compared with the tokens
-//!   themselves, and what it sees of them goes through the matrix of the values, `Σ a_j W_v y_j = W_v Σ a_j y_j`. That
-//!   costs a token that asks what keys and values cost one that is asked, of which there are more; the first token sees
-//!   itself alone, and value and output are one small matrix;
+//! - actions are embedded and converted to modulations once for the whole sequence;
+//! - the normalised tokens of a layer are cached while the window of latents grows, and recomputed only when the window
+//!   slides, because the positions of its tokens change then;
+//! - the last layer and the modules after it compute only the last token;
+//! - keys and values are never computed. A window holds a few tokens of `dim` features, and the heads together have many
+//!   more features. So a query is multiplied by the transposed key matrix, `(W_k y)ᵀq = yᵀ(W_kᵀ q)`, and compared with the
+//!   tokens themselves; the weighted mean of the tokens is multiplied by the value matrix, `Σ a_j W_v y_j = W_v Σ a_j y_j`.
+//!   This costs as much per query as keys and values cost per token, and there are fewer queries. The first token attends
+//!   to itself alone, so its value and output projections are one matrix;
 //! - batch normalisation is folded into the linear layer before it.
 //!
-//! Rows are ordered by token, then by sample, so that tokens are contiguous. Every row is computed on its own: costs do
-//! not depend on what else is planned.
+//! Rows are ordered by token, then by sample, so that tokens are contiguous. Every row is computed on its own, so costs do
+//! not depend on the other candidates.
 
 use super::model::Lewm;
 use crate::nn::Linear;
@@ -24,13 +24,13 @@ use burn::module::Param;
 use swm_kernels::functions::{gelu, silu};
 use swm_kernels::{Modulation, Norm, Panels, ScratchPool, add_gated, causal_attention, grown};
 
-/// Rows that go through a layer together: as many as leave what they need in between near a core; each block reads all
-/// weights once more.
+/// Rows that a layer processes together: few enough that their activations fit into a core's cache, and many, because each
+/// block reads all weights.
 const BLOCK: usize = 80;
-/// Shift, scale and gate of the attention, then those of the feed-forward part.
+/// Parts of a modulation: shift, scale and gate of the attention, then of the feed-forward block.
 const PARTS: usize = 6;
 
-/// The weights a rollout needs.
+/// The weights of a model, laid out for rollouts.
 pub struct Rollout {
     history: usize,
     latent: usize,
@@ -49,13 +49,13 @@ pub struct Rollout {
 struct Layer {
     modulation: Panels,
     norm: Norm,
-    /// What comes out for a token that sees itself alone, `[dim, dim]`.
+    /// Value and output projection of a token that attends to itself alone, `[dim, dim]`.
     alone: Panels,
     /// `[dim, heads * width]`.
     query: Panels,
-    /// For each head, from its query back to tokens, `[width, dim]`, scaled.
+    /// For each head, from its query to the space of tokens, `[width, dim]`, scaled.
     key: Vec<Panels>,
-    /// For each head, from what it sees of the tokens, `[dim, width]`.
+    /// For each head, from the weighted mean of the tokens to its values, `[dim, width]`.
     value: Vec<Panels>,
     /// `[heads * width, dim]`; absent for a single head of the tokens' size.
     out: Option<Panels>,
@@ -63,21 +63,21 @@ struct Layer {
     mlp: [Panels; 2],
 }
 
-/// Memory between calls.
+/// Memory that is reused between calls.
 #[derive(Default)]
 struct Scratch {
-    /// Actions by step, then whatever they become, `[steps, samples, …]`.
+    /// Actions ordered by step, then their embeddings, `[steps, samples, …]`.
     actions: Vec<f32>,
     hidden: Vec<f32>,
     /// For each layer, `[steps, samples, 6 * dim]`.
     modulations: Vec<Vec<f32>>,
-    /// For each layer, the normalised tokens of the window, `[tokens, samples, dim]`.
-    seen: Vec<Vec<f32>>,
+    /// For each layer, the cached normalised tokens of the window, `[tokens, samples, dim]`.
+    cached: Vec<Vec<f32>>,
     x: Vec<f32>,
     block: BlockScratch,
 }
 
-/// What a block of rows needs in between.
+/// Memory of one block of rows.
 #[derive(Default)]
 struct BlockScratch {
     narrow: Vec<f32>,
@@ -87,13 +87,12 @@ struct BlockScratch {
 }
 
 impl Layer {
-    #[allow(clippy::cast_precision_loss)]
     fn new(block: &Block, dim: usize, heads: usize, width: usize) -> Self {
         let inner = heads * width;
         let weights = host(block.attn.to_qkv.weight.val());
         let (key, value) = (&weights[inner * dim..2 * inner * dim], &weights[2 * inner * dim..]);
         let scale = 1.0 / (width as f32).sqrt();
-        // The matrix of the values, `[dim, inner]`, is what a token that sees itself alone goes through.
+        // A token that attends to itself alone is multiplied by the value matrix, `[dim, inner]`.
         let values: Vec<f32> = (0..dim * inner).map(|i| value[i % inner * dim + i / inner]).collect();
         let (alone, out) = match &block.attn.to_out {
             Some(out) => {
@@ -123,7 +122,7 @@ impl Layer {
 }
 
 impl Rollout {
-    /// The weights of a model.
+    /// Lays out the weights of a model.
     pub fn new(model: &Lewm) -> Self {
         let predictor = &model.predictor;
         let config = predictor.config();
@@ -152,17 +151,17 @@ impl Rollout {
         }
     }
 
-    /// How many of `samples` candidates a thread runs at once: its share, within what keeps the matrix products efficient.
-    /// What a candidate comes to does not depend on it.
+    /// Returns how many of `samples` candidates a thread rolls out at once: an equal part, within limits that keep the matrix
+    /// products efficient. The result of a candidate does not depend on it.
     pub fn part(samples: usize) -> usize {
         samples.div_ceil(rayon::current_num_threads()).clamp(24, 160)
     }
 
-    /// The latents of a rollout from one present: those given, then one predicted after each further action.
+    /// Returns the latents of a rollout from one present: the given ones, then one predicted after each further action.
     ///
     /// # Shapes
-    /// `start` is `[seen, latent]`, `actions` is `[samples, steps, numbers]` with `steps >= seen`; returns `steps +
-    /// 1` times `[samples, latent]`.
+    /// `start` is `[frames, latent]`, `actions` is `[samples, steps, actions]` with `steps >= frames`; returns `steps + 1`
+    /// arrays `[samples, latent]`.
     pub fn run(&self, start: &[f32], actions: &[f32], samples: usize, steps: usize) -> Vec<Vec<f32>> {
         self.scratch.with(|scratch| self.run_with(scratch, start, actions, samples, steps))
     }
@@ -175,17 +174,17 @@ impl Rollout {
         samples: usize,
         steps: usize,
     ) -> Vec<Vec<f32>> {
-        let seen = start.len() / self.latent;
+        let frames = start.len() / self.latent;
         self.modulate(scratch, actions, samples, steps);
-        let Scratch { modulations, seen: kept, x, hidden, block, .. } = scratch;
+        let Scratch { modulations, cached, x, hidden, block, .. } = scratch;
         let mut latents: Vec<Vec<f32>> = start.chunks_exact(self.latent).map(|one| one.repeat(samples)).collect();
-        kept.resize_with(self.layers.len(), Vec::new);
-        kept.iter_mut().for_each(Vec::clear);
+        cached.resize_with(self.layers.len(), Vec::new);
+        cached.iter_mut().for_each(Vec::clear);
         let mut tokens = 0;
-        for end in seen..=steps {
+        for end in frames..=steps {
             let first = end.saturating_sub(self.history);
             if first > 0 {
-                kept.iter_mut().for_each(Vec::clear);
+                cached.iter_mut().for_each(Vec::clear);
                 tokens = 0;
             }
             let fresh = tokens..end - first;
@@ -202,7 +201,7 @@ impl Rollout {
                 let per_step = samples * PARTS * self.dim;
                 let modulation = &modulations[index][(first + fresh.start) * per_step..end * per_step];
                 let last = index + 1 == self.layers.len();
-                self.layer(layer, x, modulation, &mut kept[index], [samples, tokens], last, block);
+                self.layer(layer, x, modulation, &mut cached[index], [samples, tokens], last, block);
             }
             let mut next = vec![0.0; samples * self.latent];
             for (x, next) in x.chunks_mut(BLOCK * self.dim).zip(next.chunks_mut(BLOCK * self.latent)) {
@@ -213,7 +212,7 @@ impl Rollout {
         latents
     }
 
-    /// From tokens behind the last layer to latents.
+    /// Computes latents from the tokens after the last layer.
     fn finish(&self, x: &[f32], next: &mut [f32], scratch: &mut BlockScratch) {
         let rows = x.len() / self.dim;
         let narrow = grown(&mut scratch.narrow, x.len());
@@ -233,14 +232,14 @@ impl Rollout {
         out.apply(hidden, next);
     }
 
-    /// The modulations of all layers for all actions.
+    /// Computes the modulations of all layers for all actions.
     fn modulate(&self, scratch: &mut Scratch, actions: &[f32], samples: usize, steps: usize) {
         let Scratch { actions: x, hidden, modulations, .. } = scratch;
-        let numbers = actions.len() / (samples * steps);
+        let width = actions.len() / (samples * steps);
         x.clear();
         for step in 0..steps {
             for sample in 0..samples {
-                x.extend_from_slice(&actions[(sample * steps + step) * numbers..][..numbers]);
+                x.extend_from_slice(&actions[(sample * steps + step) * width..][..width]);
             }
         }
         let [tap, into, out] = &self.action;
@@ -257,46 +256,46 @@ impl Rollout {
         }
     }
 
-    /// One layer on the fresh tokens of a window of `tokens`; the last layer leaves the last token only.
-    #[allow(clippy::too_many_arguments)]
+    /// Computes one layer for the new tokens of a window of `tokens`; after the last layer, `x` holds the last token only.
+    #[allow(clippy::too_many_arguments, reason = "the scratch buffers are borrowed separately")]
     fn layer(
         &self,
         layer: &Layer,
         x: &mut Vec<f32>,
         mut modulation: &[f32],
-        seen: &mut Vec<f32>,
+        cached: &mut Vec<f32>,
         [samples, tokens]: [usize; 2],
         last: bool,
         scratch: &mut BlockScratch,
     ) {
         let (dim, token) = (self.dim, samples * self.dim);
-        let known = seen.len();
-        seen.resize(known + x.len(), 0.0);
-        layer.norm.apply_modulated(shifted(modulation, 0), x, &mut seen[known..]);
+        let known = cached.len();
+        cached.resize(known + x.len(), 0.0);
+        layer.norm.apply_modulated(shifted(modulation, 0), x, &mut cached[known..]);
         if last {
-            // From here on, only the last token matters.
-            let idle = x.len() - token;
-            x.drain(..idle);
-            modulation = &modulation[idle * PARTS..];
+            // Only the last token is needed from here on.
+            let unused = x.len() - token;
+            x.drain(..unused);
+            modulation = &modulation[unused * PARTS..];
         }
         let first = tokens * samples - x.len() / dim;
         for (index, x) in x.chunks_mut(BLOCK * dim).enumerate() {
             let rows = first + index * BLOCK..first + index * BLOCK + x.len() / dim;
             let modulation = &modulation[index * BLOCK * PARTS * dim..][..x.len() * PARTS];
-            // The first token sees itself alone.
+            // The first token attends to itself alone.
             let alone = rows.start.min(samples)..rows.end.min(samples);
             let mixed = grown(&mut scratch.mixed, x.len());
-            let (of_first, of_others) = mixed.split_at_mut(alone.len() * dim);
+            let (first_token, others) = mixed.split_at_mut(alone.len() * dim);
             if !alone.is_empty() {
-                layer.alone.apply(&seen[alone.start * dim..alone.end * dim], of_first);
+                layer.alone.apply(&cached[alone.start * dim..alone.end * dim], first_token);
             }
-            if !of_others.is_empty() {
-                let rows = rows.end - of_others.len() / dim..rows.end;
+            if !others.is_empty() {
+                let rows = rows.end - others.len() / dim..rows.end;
                 layer.attend(
-                    seen,
+                    cached,
                     rows,
                     samples,
-                    of_others,
+                    others,
                     &mut scratch.narrow,
                     &mut scratch.wide,
                     &mut scratch.scores,
@@ -316,11 +315,11 @@ impl Rollout {
 }
 
 impl Layer {
-    /// What comes out for some rows of a window, each of which sees itself and the tokens before it.
-    #[allow(clippy::too_many_arguments)]
+    /// Computes the attention output of some rows of a window, each of which attends to its own token and earlier ones.
+    #[allow(clippy::too_many_arguments, reason = "the scratch buffers are borrowed separately")]
     fn attend(
         &self,
-        seen: &[f32],
+        cached: &[f32],
         rows: std::ops::Range<usize>,
         samples: usize,
         mixed: &mut [f32],
@@ -332,12 +331,12 @@ impl Layer {
         let (count, width) = (rows.len(), self.query.outputs() / heads);
         let inner = grown(inner, count * heads * width);
         let wide = grown(wide, count * heads * dim);
-        self.query.apply(&seen[rows.start * dim..rows.end * dim], inner);
+        self.query.apply(&cached[rows.start * dim..rows.end * dim], inner);
         for (head, key) in self.key.iter().enumerate() {
             let (from, to) = (&inner[head * width..], &mut wide[head * dim..]);
             key.apply_strided(count, (from, heads * width), (to, heads * dim));
         }
-        causal_attention(wide, seen, rows.start, [samples, dim, heads], scores);
+        causal_attention(wide, cached, rows.start, [samples, dim, heads], scores);
         for (head, value) in self.value.iter().enumerate() {
             let (from, to) = (&wide[head * dim..], &mut inner[head * width..]);
             value.apply_strided(count, (from, heads * dim), (to, heads * width));
@@ -349,13 +348,12 @@ impl Layer {
     }
 }
 
-/// Shift and scale from part `shift` on.
-#[allow(clippy::cast_possible_truncation)]
+/// Returns the shift and scale that begin at part `shift`.
 fn shifted(values: &[f32], shift: usize) -> Modulation<'_> {
     Modulation { values, parts: PARTS, shift, epsilon: MODULATED_EPSILON as f32 }
 }
 
-/// Rows through a layer, if there is one; `spare` is memory to use.
+/// Applies a layer to rows, if there is one; `spare` is scratch memory.
 fn through(layer: Option<&Panels>, x: &mut Vec<f32>, spare: &mut Vec<f32>) {
     if let Some(layer) = layer {
         spare.resize(x.len() / layer.inputs() * layer.outputs(), 0.0);

@@ -1,6 +1,6 @@
-//! [`Shard`]: some pictures of a batch through the encoder and back.
+//! [`Shard`]: forward and backward pass of the encoder for some images of a batch.
 //!
-//! On the CPU a vision transformer is differentiated by hand ([`VitGradient`]); everything else by Burn.
+//! On the CPU, [`VitGradient`] differentiates vision transformers; Burn differentiates all other encoders.
 
 use super::model::Encoder;
 use crate::nn::kernels::{host, named_vit_gradients, vit_gradient};
@@ -9,67 +9,73 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use swm_kernels::{Tape, VitGradient};
 
-/// How an encoder is differentiated.
+/// The implementation of the encoder's gradient.
 pub(crate) enum Differentiation<'a> {
-    /// By Burn; every shard differentiates its own copy: their graphs share nothing.
+    /// Burn's autodiff. Every shard has its own copy of the encoder, so that their graphs share nothing.
     Burn(&'a Encoder),
-    /// By hand.
+    /// The CPU kernels.
     Host(Box<VitGradient>),
 }
 
 impl<'a> Differentiation<'a> {
-    /// The fastest way on a device.
+    /// Chooses the fastest implementation for a device.
     pub fn of(encoder: &'a Encoder, patches: usize, device: &Device) -> Self {
-        let by_hand = match encoder {
+        let kernels = match encoder {
             Encoder::Vit(vit) if *device == Device::flex() => vit_gradient(vit, patches),
             _ => None,
         };
-        by_hand.map_or(Self::Burn(encoder), |by_hand| Self::Host(Box::new(by_hand)))
+        kernels.map_or(Self::Burn(encoder), |kernels| Self::Host(Box::new(kernels)))
     }
 }
 
-/// Some pictures on their way.
+/// Encoded images and the state of their backward pass.
 pub(crate) struct Shard {
-    /// `[pictures, features]`.
+    /// `[images, features]`.
     pub features: Tensor<2>,
-    way: Way,
+    state: BackwardState,
 }
 
-enum Way {
+enum BackwardState {
     Burn(Box<(Encoder, Tensor<2>)>),
     Host { patches: Vec<f32>, tapes: Vec<Tape> },
 }
 
 impl Shard {
-    /// ImageEncoder `[pictures, patches, numbers]`.
+    /// Encodes images.
+    ///
+    /// # Shapes
+    /// `patches` is `[images, patches, 3 * patch * patch]`.
     pub fn forward(differentiation: &Differentiation<'_>, patches: Tensor<3>) -> Self {
-        let ([pictures, count, width], device) = (patches.dims(), patches.device());
+        let ([images, count, width], device) = (patches.dims(), patches.device());
         match differentiation {
             Differentiation::Burn(encoder) => {
                 let encoder = (*encoder).clone().train();
                 let features = encoder.forward(patches.autodiff());
-                Self { features: features.clone().inner(), way: Way::Burn(Box::new((encoder, features))) }
+                Self { features: features.clone().inner(), state: BackwardState::Burn(Box::new((encoder, features))) }
             }
             Differentiation::Host(vit) => {
                 let (patches, mut scratch) = (host(patches), vit.scratch());
                 let (features, tapes): (Vec<_>, Vec<_>) =
-                    patches.chunks_exact(count * width).map(|picture| vit.forward(picture, &mut scratch)).unzip();
-                let features = TensorData::new(features.concat(), [pictures, vit.dim()]);
-                Self { features: Tensor::from_data(features, &device), way: Way::Host { patches, tapes } }
+                    patches.chunks_exact(count * width).map(|image| vit.forward(image, &mut scratch)).unzip();
+                let features = TensorData::new(features.concat(), [images, vit.dim()]);
+                Self { features: Tensor::from_data(features, &device), state: BackwardState::Host { patches, tapes } }
             }
         }
     }
 
-    /// The gradients of the encoder's parameters, from that of the features.
+    /// Returns the gradients of the encoder's parameters, flat.
+    ///
+    /// # Shapes
+    /// `gradient`, the gradient of the features, is `[images, features]`.
     pub fn backward(self, differentiation: &Differentiation<'_>, gradient: Tensor<2>) -> Named<Tensor<1>> {
         let device = gradient.device();
-        match (self.way, differentiation) {
-            (Way::Host { patches, tapes }, Differentiation::Host(vit)) => {
+        match (self.state, differentiation) {
+            (BackwardState::Host { patches, tapes }, Differentiation::Host(vit)) => {
                 let (mut sums, mut scratch) = (vit.sums(), vit.scratch());
                 let gradient = host(gradient);
-                let pictures = patches.chunks_exact(patches.len() / tapes.len().max(1)).zip(&tapes);
-                for ((picture, tape), gradient) in pictures.zip(gradient.chunks_exact(vit.dim())) {
-                    vit.backward(picture, tape, gradient, &mut sums, &mut scratch);
+                let images = patches.chunks_exact(patches.len() / tapes.len().max(1)).zip(&tapes);
+                for ((image, tape), gradient) in images.zip(gradient.chunks_exact(vit.dim())) {
+                    vit.backward(image, tape, gradient, &mut sums, &mut scratch);
                 }
                 let tensor = |values: Vec<f32>| {
                     let shape = [values.len()];
@@ -80,12 +86,12 @@ impl Shard {
                     .map(|(name, values)| (name, tensor(values)))
                     .collect()
             }
-            (Way::Burn(way), _) => {
-                let (encoder, features) = *way;
+            (BackwardState::Burn(graph), _) => {
+                let (encoder, features) = *graph;
                 let all = (features * gradient.autodiff()).sum().backward();
                 parameters::gradients(&encoder, &all)
             }
-            (Way::Host { .. }, Differentiation::Burn(_)) => Named::new(),
+            (BackwardState::Host { .. }, Differentiation::Burn(_)) => Named::new(),
         }
     }
 }

@@ -3,7 +3,7 @@
 
 use super::model::{Idm, Pldm};
 use crate::checkpoint::Checkpoint;
-use crate::lewm::import::{state, tree, world};
+use crate::lewm::import::{state, tree, world_model};
 use crate::nn::Init;
 use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::Naming;
@@ -13,16 +13,16 @@ use serde_json::json;
 use std::path::Path;
 use swm_core::{Key, Manifest, Result};
 
-/// Names of modules in the reference, of this family.
+/// The reference implementation's module of building blocks for this family.
 const MODULES: &str = "stable_worldmodel.wm.pldm.module";
 const CLASS: &str = "stable_worldmodel.wm.pldm.pldm.PLDM";
 
-/// As [`crate::lewm::import::import`], of a PLDM.
+/// Converts a PLDM of the reference implementation, as [`crate::lewm::import::import`] converts a LeWM.
 ///
 /// # Errors
-/// As that does.
+/// As [`crate::lewm::import::import`].
 pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Pldm>> {
-    let (model, sizes, frameskip) = world(Reference::open(from, "PLDM")?, &dataset_info)?;
+    let (model, sizes, frameskip) = world_model(Reference::open(from, "PLDM")?, &dataset_info)?;
     let mut config = TrainConfig::<Pldm>::load("paper", &[])?;
     config.data.num_steps = sizes.predictor.history + 1;
     config.data.frameskip = frameskip;
@@ -34,10 +34,10 @@ pub fn import(from: &Path, dataset_info: DatasetInfo) -> Result<Checkpoint<Pldm>
     Ok(Checkpoint { model: Pldm { model, idm }, config, dataset_info, manifest })
 }
 
-/// As [`crate::lewm::import::export`], of a PLDM.
+/// Writes the `weights.pt` and `config.json` that `load_pretrained` of the reference implementation reads.
 ///
 /// # Errors
-/// As that does.
+/// As [`crate::lewm::import::export`].
 pub fn export(checkpoint: &Checkpoint<Pldm>, folder: &Path, naming: Naming) -> Result<()> {
     let config = tree(&checkpoint.config.model, checkpoint.actions(), CLASS, MODULES)?;
     write(folder, &config, &state(&checkpoint.model.model, naming))

@@ -1,5 +1,5 @@
-//! PLDM (Sobal et al. 2025, arXiv 2502.14819): encoder and predictor of a LeWM, kept from collapsing by variance and
-//! covariance, and in order by temporal alignment and inverse dynamics. See `docs/models/pldm.md`.
+//! PLDM (Sobal et al. 2025, arXiv 2502.14819): the encoder and predictor of a LeWM, trained with variance, covariance,
+//! temporal alignment and inverse-dynamics terms. See `docs/models/pldm.md`.
 
 mod family;
 pub mod import;

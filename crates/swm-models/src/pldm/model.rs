@@ -1,4 +1,4 @@
-//! [`Pldm`]: a world model and the inverse dynamics it is trained beside.
+//! [`Pldm`]: a world model and the inverse dynamics of its training loss.
 
 use crate::lewm::{Lewm, LewmConfig};
 use crate::nn::{Activation, Init, LayerNorm, Linear};
@@ -6,12 +6,12 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
 
-/// A PLDM as it is trained. What plans is its world model; the inverse dynamics exist for the loss.
+/// A PLDM. Planning uses the world model only; the inverse dynamics are part of the loss.
 #[derive(Module, Debug)]
 pub struct Pldm {
-    /// The world model, which is that of a LeWM.
+    /// The world model, with the networks of a LeWM.
     pub model: Lewm,
-    /// From a latent and the next one to the action between them.
+    /// Predicts the action between a latent and the next one.
     pub idm: Idm,
 }
 
@@ -27,18 +27,18 @@ pub struct Idm {
 pub struct IdmNet {
     /// Into the hidden features.
     pub _0: Linear,
-    /// Normalises them.
+    /// The normalisation.
     pub _1: LayerNorm,
-    /// Out of them.
+    /// From the hidden features.
     pub _3: Linear,
 }
 
-/// What the normalisation adds to the variance.
+/// Number added to the variance by the normalisation.
 const EPSILON: f64 = 1e-5;
 
 impl Pldm {
-    /// A model of `actions` numbers an action (of all environment steps in a model step), whose inverse dynamics have
-    /// `hidden` features, drawn from `key`.
+    /// A model with random weights for actions of `actions` elements per model step, whose inverse dynamics have `hidden`
+    /// features.
     pub fn init(config: &LewmConfig, actions: usize, hidden: usize, key: Key, device: &Device) -> Self {
         let init = Init::new(key, device).of("idm");
         let model = Lewm::init(config, actions, key, device);
@@ -47,7 +47,7 @@ impl Pldm {
 }
 
 impl Idm {
-    /// Inverse dynamics of `latent` numbers.
+    /// Inverse dynamics for latents of dimension `latent`, with random weights.
     pub fn new(init: &Init, latent: usize, hidden: usize, actions: usize) -> Self {
         Self {
             net: IdmNet {
@@ -58,14 +58,14 @@ impl Idm {
         }
     }
 
-    /// The action between each latent and the next.
+    /// Predicts the action between each latent and the next.
     ///
     /// # Shapes
-    /// `[clips, steps, latent]` to `[clips, steps - 1, actions]`.
+    /// `latents` is `[clips, steps, latent]`; returns `[clips, steps - 1, actions]`.
     pub fn forward(&self, latents: Tensor<3>) -> Tensor<3> {
         let [clips, steps, latent] = latents.dims();
         let frames = |from: usize, to: usize| latents.clone().slice([0..clips, from..to, 0..latent]);
-        // The later one first, as published.
+        // The later latent comes first, as published.
         let pairs = Tensor::cat(vec![frames(1, steps), frames(0, steps - 1)], 2);
         let hidden = self.net._1.forward(self.net._0.forward(pairs));
         self.net._3.forward(Activation::Gelu.forward(hidden))

@@ -1,4 +1,4 @@
-//! The sizes of a SAC and the settings of its loss.
+//! [`SacConfig`] and [`SacLoss`]: the sizes of a SAC and the settings of its loss.
 
 use crate::train::config::at_least;
 use serde::{Deserialize, Serialize};
@@ -8,17 +8,17 @@ use swm_core::{Error, Result};
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SacConfig {
-    /// The columns it observes, one after another.
+    /// The observed columns, which are concatenated.
     pub columns: Vec<String>,
     /// Hidden features of both hidden layers of every network.
     pub hidden: usize,
 }
 
 impl SacConfig {
-    /// Checks that there is something to see and to compute with.
+    /// Checks the sizes.
     ///
     /// # Errors
-    /// Naming what is missing.
+    /// Names the first invalid size or column.
     pub fn check(&self) -> Result<()> {
         at_least(&[("model.hidden", self.hidden, 1)])?;
         if self.columns.is_empty() {
@@ -27,8 +27,8 @@ impl SacConfig {
         if self.columns.iter().any(|column| column == "pixels") {
             return Err(Error::config(
                 "model.columns",
-                "'pixels' is a column of pictures",
-                "name columns of numbers, or train tdmpc2, which sees pictures",
+                "'pixels' is a column of images",
+                "name numeric columns, or train tdmpc2, which has an image encoder",
             ));
         }
         Ok(())
@@ -39,21 +39,21 @@ impl SacConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SacLoss {
-    /// What a reward one step later is worth, γ.
+    /// Discount per step, γ.
     pub discount: f64,
-    /// The share of the new in target networks, τ.
+    /// Update rate of the target networks, τ.
     pub tau: f64,
-    /// The entropy a number of an action is to keep; -1 as published.
+    /// Target entropy per action element; -1 as published.
     pub entropy: f64,
-    /// The temperature of the beginning, α.
+    /// Initial temperature, α.
     pub temperature: f64,
 }
 
 impl SacLoss {
-    /// Checks that the settings make sense.
+    /// Checks the settings.
     ///
     /// # Errors
-    /// Naming the first that does not.
+    /// Names the first invalid setting.
     pub fn check(&self) -> Result<()> {
         let positive = [("loss.discount", self.discount, 1.0), ("loss.tau", self.tau, 1.0)];
         let positive = positive.into_iter().chain([("loss.temperature", self.temperature, f64::MAX)]);

@@ -1,5 +1,5 @@
-//! SAC, soft actor-critic (Haarnoja et al. 2018, arXiv 1812.05905): a stochastic policy that is paid for entropy, learnt by
-//! playing. Its use here is to demonstrate: `swm collect --policy CHECKPOINT`. See `docs/models/sac.md`.
+//! SAC, soft actor-critic (Haarnoja et al. 2018, arXiv 1812.05905): a stochastic policy trained online with an entropy
+//! bonus. It collects demonstrations: `swm collect --policy CHECKPOINT`. See `docs/models/sac.md`.
 
 mod config;
 mod family;
@@ -9,7 +9,7 @@ mod train;
 
 pub use config::{SacConfig, SacLoss};
 pub use family::ENTRY;
-pub use model::{Actor, Critic, Critics, Drawn, Hidden, Sac};
+pub use model::{ActionSample, Actor, Critic, Critics, Hidden, Sac};
 
-/// Acts as a trained SAC does: the mean of its policy, squashed.
+/// Acts with a trained SAC: `tanh` of the policy's mean.
 pub type SacPolicy = crate::online::StochasticPolicy<Sac>;

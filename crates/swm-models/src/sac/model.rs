@@ -1,4 +1,4 @@
-//! [`Sac`]: the networks, under the names that Stable-Baselines3 gives their weights.
+//! [`Sac`]: the networks, with the parameter names of Stable-Baselines3.
 
 use super::config::{SacConfig, SacLoss};
 use crate::nn::{Activation, Init, Linear};
@@ -6,7 +6,7 @@ use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
 
-/// A policy, two Q functions, their running averages, and the temperature. A field `_2` is number 2 of a sequence, as in
+/// A policy, two Q functions, their target networks, and the temperature. A field `_2` is number 2 of a sequence, as in
 /// PyTorch.
 #[derive(Module, Debug)]
 pub struct Sac {
@@ -14,13 +14,13 @@ pub struct Sac {
     pub actor: Actor,
     /// The Q functions.
     pub critic: Critics,
-    /// Their running averages.
+    /// The target networks: exponential moving averages of the Q functions.
     pub critic_target: Critics,
     /// The logarithm of the temperature, `[1]`.
     pub log_ent_coef: Param<Tensor<1>>,
 }
 
-/// Mean and spread of actions before they are squashed.
+/// The policy: mean and standard deviation of actions before `tanh`.
 #[derive(Module, Debug)]
 pub struct Actor {
     /// Two hidden layers.
@@ -43,9 +43,9 @@ pub struct Hidden {
 /// Two Q functions.
 #[derive(Module, Debug)]
 pub struct Critics {
-    /// One.
+    /// The first Q function.
     pub qf0: Critic,
-    /// The other.
+    /// The second Q function.
     pub qf1: Critic,
 }
 
@@ -56,21 +56,20 @@ pub struct Critic {
     pub _0: Linear,
     /// The second.
     pub _2: Linear,
-    /// The read-out.
+    /// The output layer.
     pub _4: Linear,
 }
 
-/// Actions and the logarithm of their density, `[rows, actions]` and `[rows]`.
-pub struct Drawn {
-    /// Squashed.
+/// Sampled actions and the logarithm of their density.
+pub struct ActionSample {
+    /// The actions after `tanh`, `[rows, actions]`.
     pub actions: Tensor<2>,
-    /// The logarithm of their density.
+    /// The logarithm of their density, `[rows]`.
     pub log_density: Tensor<1>,
 }
 
 impl Sac {
-    /// Networks for observations of `inputs` numbers and actions of `actions`.
-    #[allow(clippy::cast_possible_truncation)]
+    /// Networks with random weights for observations of `inputs` elements and actions of `actions` elements.
     pub fn init(config: &SacConfig, loss: &SacLoss, inputs: usize, actions: usize, key: Key, device: &Device) -> Self {
         let init = Init::new(key, device);
         let hidden = config.hidden;
@@ -99,34 +98,43 @@ impl Sac {
         }
     }
 
-    /// Numbers of an observation.
+    /// Returns the number of elements of an observation.
     pub fn inputs(&self) -> usize {
         self.actor.latent_pi._0.weight.dims()[1]
     }
 }
 
 impl Actor {
-    /// Mean and logarithm of the standard deviation, which lies between -20 and 2.
+    /// Returns mean and logarithm of the standard deviation, which is clamped to -20 ..= 2.
+    ///
+    /// # Shapes
+    /// `observations` is `[rows, inputs]`; returns `[rows, actions]` twice.
     pub fn forward(&self, observations: Tensor<2>) -> (Tensor<2>, Tensor<2>) {
         let relu = |x| Activation::Relu.forward(x);
         let hidden = relu(self.latent_pi._2.forward(relu(self.latent_pi._0.forward(observations))));
         (self.mu.forward(hidden.clone()), self.log_std.forward(hidden).clamp(-20.0, 2.0))
     }
 
-    /// Draws actions with standard normal `noise`.
-    pub fn draw(&self, observations: Tensor<2>, noise: Tensor<2>) -> Drawn {
+    /// Samples actions with standard normal `noise`.
+    ///
+    /// # Shapes
+    /// `observations` is `[rows, inputs]`, `noise` is `[rows, actions]`.
+    pub fn sample(&self, observations: Tensor<2>, noise: Tensor<2>) -> ActionSample {
         let (mean, log_std) = self.forward(observations);
         let raw = mean + log_std.clone().exp() * noise.clone();
         let normal = (noise.square() + (2.0 * std::f64::consts::PI).ln()) * -0.5 - log_std;
-        // ln(1 - tanh² x) = 2 (ln 2 - x - softplus(-2 x)), which does not run out of digits.
+        // ln(1 - tanh² x) = 2 (ln 2 - x - softplus(-2 x)), which is accurate for large x.
         let squash =
             (raw.clone() + burn::tensor::activation::softplus(raw.clone() * -2.0, 1.0)).neg() + std::f64::consts::LN_2;
-        Drawn { actions: raw.tanh(), log_density: (normal - squash * 2.0).sum_dim(1).squeeze_dim(1) }
+        ActionSample { actions: raw.tanh(), log_density: (normal - squash * 2.0).sum_dim(1).squeeze_dim(1) }
     }
 }
 
 impl Critics {
-    /// The values of `[rows, inputs + actions]`, `[rows]` each.
+    /// Returns the values of both Q functions.
+    ///
+    /// # Shapes
+    /// `x` is `[rows, inputs + actions]`; returns `[rows]` twice.
     pub fn forward(&self, x: Tensor<2>) -> [Tensor<1>; 2] {
         [self.qf0.forward(x.clone()), self.qf1.forward(x)]
     }

@@ -1,7 +1,7 @@
-//! One training step: losses and gradients of a batch of transitions.
+//! One training step (Haarnoja et al. 2018, equations 5, 7 and 18): losses and gradients of a batch of transitions.
 //!
-//! Three losses that share nothing but numbers: the Q functions', the policy's, the temperature's. All gradients are taken
-//! at the same weights; the publication and its descendants move the Q functions before the policy looks at them.
+//! The losses of Q functions, policy and temperature have separate graphs. All gradients are computed at the same weights;
+//! the publication updates the Q functions before it computes the policy's loss.
 
 use super::config::SacLoss;
 use super::model::{Critics, Sac};
@@ -10,7 +10,7 @@ use crate::nn::parameters;
 use burn::module::Module;
 use burn::tensor::Tensor;
 
-/// Transitions.
+/// A batch of transitions.
 pub struct Transitions {
     /// `[rows, inputs]`.
     pub observations: Tensor<2>,
@@ -22,19 +22,19 @@ pub struct Transitions {
     pub terminated: Tensor<1>,
     /// `[rows, inputs]`.
     pub next: Tensor<2>,
-    /// Standard normal, `[rows, actions]`: for the actions at the next observations, and for those the policy is judged by.
+    /// Standard normal, `[rows, actions]` each: for the actions at the next observations, and for those of the policy's loss.
     pub noise: [Tensor<2>; 2],
 }
 
-/// What a step found.
-pub struct Step {
+/// Losses and gradients of a batch.
+pub struct SacStep {
     /// Half the mean squared error of both Q functions.
     pub critic: f64,
-    /// What the policy lowers: temperature times log-density, less value.
+    /// The policy's loss: temperature times log-density minus value.
     pub actor: f64,
     /// The temperature.
     pub temperature: f64,
-    /// The mean entropy of the policy, estimated from the actions drawn.
+    /// The mean entropy of the policy, estimated from its samples.
     pub entropy: f64,
     /// The mean value of the policy's actions.
     pub q: f64,
@@ -42,19 +42,18 @@ pub struct Step {
     pub gradients: Named<Tensor<1>>,
 }
 
-/// Losses and gradients of a batch. `model` is without autodiff.
-#[allow(clippy::cast_precision_loss)]
-pub fn step(model: &Sac, batch: &Transitions, config: &SacLoss) -> Step {
+/// Computes losses and gradients of a batch. `model` has no autodiff.
+pub fn step(model: &Sac, batch: &Transitions, config: &SacLoss) -> SacStep {
     let Transitions { observations, actions, rewards, terminated, next, noise: [next_noise, noise] } = batch;
     let temperature = f64::from(model.log_ent_coef.val().into_scalar::<f32>()).exp();
     let mut gradients = Named::new();
-    let mut keep = |prefix: &str, found: Named<Tensor<1>>| {
-        gradients.extend(found.into_iter().map(|(name, gradient)| (format!("{prefix}.{name}"), gradient)));
+    let mut insert = |prefix: &str, new: Named<Tensor<1>>| {
+        gradients.extend(new.into_iter().map(|(name, gradient)| (format!("{prefix}.{name}"), gradient)));
     };
 
-    let drawn = model.actor.draw(next.clone(), next_noise.clone());
-    let [first, second] = model.critic_target.forward(Tensor::cat(vec![next.clone(), drawn.actions], 1));
-    let soft = first.min_pair(second) - drawn.log_density * temperature;
+    let sample = model.actor.sample(next.clone(), next_noise.clone());
+    let [first, second] = model.critic_target.forward(Tensor::cat(vec![next.clone(), sample.actions], 1));
+    let soft = first.min_pair(second) - sample.log_density * temperature;
     let target = (rewards.clone() + soft * (terminated.clone().neg() + 1.0) * config.discount).autodiff();
     let critic = model.critic.clone().train();
     let errors = critic
@@ -62,23 +61,23 @@ pub fn step(model: &Sac, batch: &Transitions, config: &SacLoss) -> Step {
         .map(|q| (q - target.clone()).square().mean());
     let [first, second] = errors;
     let critic_loss = (first + second) * 0.5;
-    keep("critic", parameters::gradients(&critic, &critic_loss.backward()));
+    insert("critic", parameters::gradients(&critic, &critic_loss.backward()));
 
     let actor = model.actor.clone().train();
     let observations = observations.clone().autodiff();
-    let drawn = actor.draw(observations.clone(), noise.clone().autodiff());
-    let [first, second] = still(&model.critic).forward(Tensor::cat(vec![observations, drawn.actions], 1));
+    let sample = actor.sample(observations.clone(), noise.clone().autodiff());
+    let [first, second] = constants(&model.critic).forward(Tensor::cat(vec![observations, sample.actions], 1));
     let q = first.min_pair(second).mean();
-    let density = drawn.log_density.mean();
+    let density = sample.log_density.mean();
     let actor_loss = density.clone() * temperature - q.clone();
-    keep("actor", parameters::gradients(&actor, &actor_loss.backward()));
+    insert("actor", parameters::gradients(&actor, &actor_loss.backward()));
 
     // The temperature's loss is -ln α (ln π + H), whose gradient needs no graph.
     let entropy = -value_of(&density);
-    let wanted = config.entropy * actions.dims()[1] as f64;
-    let gradient = model.log_ent_coef.val().zeros_like() + (entropy - wanted);
+    let target_entropy = config.entropy * actions.dims()[1] as f64;
+    let gradient = model.log_ent_coef.val().zeros_like() + (entropy - target_entropy);
     gradients.insert("log_ent_coef".to_owned(), gradient);
-    Step {
+    SacStep {
         critic: value_of(&critic_loss),
         actor: value_of(&actor_loss),
         temperature,
@@ -88,8 +87,8 @@ pub fn step(model: &Sac, batch: &Transitions, config: &SacLoss) -> Step {
     }
 }
 
-/// The Q functions as constants of a graph: gradients flow through them, not to them.
-fn still(critics: &Critics) -> Critics {
+/// Returns the Q functions as constants of an autodiff graph: gradients pass through them to their inputs only.
+fn constants(critics: &Critics) -> Critics {
     critics.clone().train().no_grad()
 }
 

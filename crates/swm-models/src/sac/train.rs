@@ -1,4 +1,4 @@
-//! How a SAC is trained: the loop's side of [`super::step`].
+//! [`Trainable`] for SAC: the training loop's view of [`super::step`].
 
 use super::config::{SacConfig, SacLoss};
 use super::model::Sac;
@@ -14,7 +14,7 @@ use swm_data::{ClipSpec, LoaderConfig};
 impl Trainable for Sac {
     const FAMILY: &'static str = "sac";
     const SUMMARY: &'static str =
-        "soft actor-critic: a policy for continuous control that learns by playing, to demonstrate";
+        "soft actor-critic: a policy for continuous control, trained online, for demonstrations";
     const PRESETS: &'static [Preset] = &[
         Preset {
             id: "tiny",
@@ -39,11 +39,11 @@ impl Trainable for Sac {
             return Err(Error::config(
                 "data.num_steps",
                 given,
-                "choose 2 frames and a frameskip of 1, which are one transition",
+                "choose 2 frames and a frameskip of 1, which make one transition",
             ));
         }
         if config.online.as_ref().is_some_and(|online| online.planner.is_some()) {
-            let fix = "leave the table out: this is a policy without a model to plan in";
+            let fix = "leave the table out: SAC has no model to plan with";
             return Err(Error::config("online.planner", "it is given to a SAC", fix));
         }
         Ok(())
@@ -71,19 +71,19 @@ impl Trainable for Sac {
         let (config, device) = (context.config, context.device);
         let (rows, width, inputs) = (batch.rows(), context.dataset_info.action.dim(), self.inputs());
         let columns = config.model.columns.iter().map(|column| {
-            let numbers = batch.to_f32(column)?;
-            let width = numbers.len() / (2 * rows).max(1);
-            Ok(Tensor::<3>::from_data(TensorData::new(numbers, [rows, 2, width]), device))
+            let values = batch.to_f32(column)?;
+            let width = values.len() / (2 * rows).max(1);
+            Ok(Tensor::<3>::from_data(TensorData::new(values, [rows, 2, width]), device))
         });
-        let seen = Tensor::cat(columns.collect::<Result<Vec<_>>>()?, 2);
-        let frame = |i| seen.clone().slice([0..rows, i..i + 1]).reshape([rows, inputs]);
+        let observations = Tensor::cat(columns.collect::<Result<Vec<_>>>()?, 2);
+        let frame = |i| observations.clone().slice([0..rows, i..i + 1]).reshape([rows, inputs]);
         let first = |name: &str| {
             let column = Tensor::<2>::from_data(TensorData::new(batch.to_f32(name)?, [rows, 2]), device);
             Ok::<_, Error>(column.slice([0..rows, 0..1]).reshape([rows]))
         };
         let noise = |purpose: &str| {
-            let numbers = normal(&[context.key.with(purpose)], rows * width);
-            Tensor::from_data(TensorData::new(numbers, [rows, width]), device)
+            let values = normal(&[context.key.with(purpose)], rows * width);
+            Tensor::from_data(TensorData::new(values, [rows, width]), device)
         };
         let actions = context.dataset_info.actions(batch, 2, 1, device)?.slice([0..rows, 0..1]).reshape([rows, width]);
         let batch = Transitions {
@@ -94,16 +94,16 @@ impl Trainable for Sac {
             next: frame(1),
             noise: [noise("next actions"), noise("actions")],
         };
-        let found = step(self, &batch, &config.loss);
+        let losses = step(self, &batch, &config.loss);
         let metrics = vec![
-            ("loss", found.critic + found.actor),
-            ("critic", found.critic),
-            ("actor", found.actor),
-            ("q", found.q),
-            ("entropy", found.entropy),
-            ("temperature", found.temperature),
+            ("loss", losses.critic + losses.actor),
+            ("critic", losses.critic),
+            ("actor", losses.actor),
+            ("q", losses.q),
+            ("entropy", losses.entropy),
+            ("temperature", losses.temperature),
         ];
-        Ok(StepOutput { metrics, gradients: found.gradients, buffers: Named::new() })
+        Ok(StepOutput { metrics, gradients: losses.gradients, buffers: Named::new() })
     }
 
     fn after_step(mut self, context: &StepContext<'_, Self>, _: Named<Tensor<1>>) -> Self {
@@ -111,7 +111,7 @@ impl Trainable for Sac {
         self
     }
 
-    /// Gradients of Q functions, policy and temperature are clipped apart.
+    /// Clips the gradients of Q functions, policy and temperature separately.
     fn parameter_group(name: &str) -> ParameterGroup {
         let clip = ["critic.", "actor."].iter().position(|part| name.starts_with(part)).unwrap_or(2);
         ParameterGroup { clip, ..ParameterGroup::default() }
@@ -121,17 +121,16 @@ impl Trainable for Sac {
 impl StochasticActor for Sac {
     fn act(&self, config: &TrainConfig<Self>, row: RowRef<'_>, key: Option<Key>) -> Result<Vec<f32>> {
         let device = self.log_ent_coef.val().device();
-        let mut seen = vec![];
+        let mut observation = vec![];
         for column in &config.model.columns {
-            #[allow(clippy::cast_possible_truncation)]
-            seen.extend(row.to_f64(column)?.into_iter().map(|v| v as f32));
+            observation.extend(row.to_f64(column)?.into_iter().map(|v| v as f32));
         }
         let inputs = self.inputs();
-        if seen.len() != inputs {
-            let given = format!("{} numbers in {}", seen.len(), config.model.columns.join(", "));
+        if observation.len() != inputs {
+            let given = format!("{} elements in {}", observation.len(), config.model.columns.join(", "));
             return Err(Error::mismatch("acting", given, format!("{inputs}, as the policy was trained")));
         }
-        let (mean, log_std) = self.actor.forward(Tensor::from_data(TensorData::new(seen, [1, inputs]), &device));
+        let (mean, log_std) = self.actor.forward(Tensor::from_data(TensorData::new(observation, [1, inputs]), &device));
         let raw = match key {
             None => mean,
             Some(key) => {
@@ -148,11 +147,11 @@ impl Agent for Sac {
     fn policy(
         config: &TrainConfig<Self>,
         dataset_info: &DatasetInfo,
-        live: SharedModel<Self>,
+        model: SharedModel<Self>,
         spec: &EnvSpec,
         slots: usize,
         explore: bool,
     ) -> Result<Box<dyn Policy>> {
-        Ok(Box::new(StochasticPolicy::new(config, dataset_info, live, spec, slots, explore)?))
+        Ok(Box::new(StochasticPolicy::new(config, dataset_info, model, spec, slots, explore)?))
     }
 }

@@ -188,14 +188,14 @@ impl Agent for Tdmpc2 {
     fn policy(
         config: &TrainConfig<Self>,
         dataset_info: &DatasetInfo,
-        live: SharedModel<Self>,
+        model: SharedModel<Self>,
         spec: &EnvSpec,
         slots: usize,
         explore: bool,
     ) -> Result<Box<dyn Policy>> {
         Ok(match config.online.as_ref().and_then(|online| online.planner.as_ref()) {
-            Some(planner) => Box::new(Tdmpc2Policy::new(planner, config, dataset_info, live, spec, slots, explore)?),
-            None => Box::new(StochasticPolicy::new(config, dataset_info, live, spec, slots, explore)?),
+            Some(planner) => Box::new(Tdmpc2Policy::new(planner, config, dataset_info, model, spec, slots, explore)?),
+            None => Box::new(StochasticPolicy::new(config, dataset_info, model, spec, slots, explore)?),
         })
     }
 }

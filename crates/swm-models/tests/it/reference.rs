@@ -120,7 +120,7 @@ fn what_does_not_fit_is_told() {
     let other = message(lewm::import::import(&folder("pldm"), dataset_info(2)));
     assert!(other.contains("PLDM") && other.contains("class LeWM"), "{other}");
     let actions = message(lewm::import::import(&folder("lewm"), dataset_info(3)));
-    assert!(actions.contains("3 numbers an action") && actions.contains("divisor of 4"), "{actions}");
+    assert!(actions.contains("3 action elements") && actions.contains("divisor of 4"), "{actions}");
     let none = message(lewm::import::import(Path::new("nowhere"), dataset_info(2)));
     assert!(none.contains("nowhere"), "{none}");
     // Weights of another size than config.json says.

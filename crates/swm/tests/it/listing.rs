@@ -3,7 +3,7 @@
 use crate::{Swm, text};
 use serde_json::Value;
 
-/// DatasetInfo of the reference's environments in two dimensions, cut from `reference/envs.json`; no bound is null.
+/// Facts of the reference's environments in two dimensions, cut from `reference/envs.json`; no bound is null.
 const REFERENCE: &str = include_str!("reference_envs.json");
 
 #[test]

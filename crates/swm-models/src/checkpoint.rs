@@ -1,19 +1,20 @@
-//! [`Checkpoint`]: a folder that holds a trained model and all that is needed to use it or to train on.
+//! [`Checkpoint`]: a folder that holds a trained model and all that is needed to use it or to continue its training.
 //!
-//! | file | what |
+//! | file | content |
 //! | --- | --- |
-//! | `config.json` | family, configuration, dataset info |
+//! | `config.json` | family, configuration, statistics of the dataset |
 //! | `weights.safetensors` | weights under their published names |
-//! | `optimizer.safetensors`, `state.json` | what training needs to continue exactly |
-//! | `raw.safetensors` | the weights that are trained, where those to use are their average |
-//! | `manifest.json` | where it came from, and the hashes of the files above |
+//! | `optimizer.safetensors`, `state.json` | the state of the optimizer and the run, to continue it exactly |
+//! | `raw.safetensors` | the trained weights, where `weights.safetensors` holds their moving average |
+//! | `manifest.json` | provenance, and the hashes of the files above |
 //!
-//! A new checkpoint is written beside the old one and takes its place by renaming, so a killed process leaves one
-//! of the two.
+//! A new checkpoint is written to a second folder, which then replaces the old one by renaming, so that a killed process
+//! leaves a complete checkpoint.
 
 use crate::nn::parameters::{self, HostTensor, Named};
-use crate::train::run::RunState;
+use crate::train::run_state::RunState;
 use crate::train::{DatasetInfo, TrainConfig, Trainable};
+use crate::weights;
 use burn::tensor::Device;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
@@ -25,30 +26,30 @@ use swm_core::{Error, Key, Manifest, Result, manifest};
 pub struct Checkpoint<M: Trainable> {
     /// The model.
     pub model: M,
-    /// How it was trained.
+    /// The configuration of its training.
     pub config: TrainConfig<M>,
-    /// What it knows of the data it was trained on.
+    /// Statistics of the dataset it was trained on.
     pub dataset_info: DatasetInfo,
-    /// Where it came from; `hashes["weights"]` names the checkpoint.
+    /// Its provenance; `hashes["weights"]` identifies the checkpoint.
     pub manifest: Manifest,
 }
 
-/// What training needs to continue exactly.
+/// The state that training needs to continue exactly.
 pub(crate) struct TrainState<M> {
-    /// How far it is.
-    pub position: RunState,
+    /// The progress of the run.
+    pub state: RunState,
     /// The state of the optimizer.
     pub moments: Named<HostTensor>,
-    /// The weights that are trained, where those of the checkpoint are their average.
+    /// The trained weights, where the checkpoint holds their moving average.
     pub raw: Option<M>,
 }
 
 /// The content of `config.json`.
 #[derive(Serialize, Deserialize)]
-struct Card {
+struct ConfigFile {
     family: String,
     env: Option<String>,
-    /// The side of the pictures it sees.
+    /// The side of the model's images, in pixels.
     image: Option<usize>,
     action_block: usize,
     #[serde(rename = "facts")]
@@ -65,7 +66,7 @@ const OPTIMIZER: &str = "optimizer.safetensors";
 const STATE: &str = "state.json";
 
 impl<M: Trainable> Checkpoint<M> {
-    /// Whether a folder holds a checkpoint.
+    /// Returns whether a folder holds a checkpoint.
     pub fn exists(run: &Path) -> bool {
         locate(run).is_some()
     }
@@ -75,23 +76,23 @@ impl<M: Trainable> Checkpoint<M> {
         self.manifest.hashes.get("weights").map_or("", String::as_str)
     }
 
-    /// Numbers of one model step's actions: those of an environment's action, times the frameskip.
+    /// The dimension of the actions of one model step: that of an environment action, times the frameskip.
     pub fn actions(&self) -> usize {
         self.config.data.frameskip * self.dataset_info.action.dim()
     }
 
-    /// Saves it into the run folder `run`, which keeps the last checkpoint only. Returns the hash of the weights.
+    /// Saves the checkpoint in the run folder `run`, replacing the one that is there. Returns the hash of the weights.
     ///
     /// # Errors
-    /// When the disk refuses; the checkpoint that was there is kept.
+    /// When the disk refuses; an earlier checkpoint is kept.
     pub fn save_to(&mut self, run: &Path) -> Result<String> {
         std::fs::create_dir_all(run).map_err(|error| Error::io(run, "creating a folder", error))?;
         self.save(run, None)
     }
 
-    /// As [`Checkpoint::save_to`], with what training needs to continue.
+    /// Saves as [`Checkpoint::save_to`] does, with the state to continue from.
     pub(crate) fn save(&mut self, run: &Path, state: Option<&TrainState<M>>) -> Result<String> {
-        let card = Card {
+        let config = ConfigFile {
             family: M::FAMILY.to_owned(),
             env: self.dataset_info.env.clone(),
             image: M::image_size(&self.config.model),
@@ -104,14 +105,14 @@ impl<M: Trainable> Checkpoint<M> {
             let optimizer = pack(&state.moments)?;
             self.manifest.hashes.insert("optimizer".to_owned(), manifest::hash(&optimizer));
             more.push((OPTIMIZER, optimizer));
-            more.push((STATE, text(&state.position)?.into_bytes()));
+            more.push((STATE, text(&state.state)?.into_bytes()));
             if let Some(raw) = &state.raw {
                 let raw = pack(&parameters::values(raw))?;
                 self.manifest.hashes.insert("raw".to_owned(), manifest::hash(&raw));
                 more.push((RAW, raw));
             }
         }
-        install(run, &card, &mut self.manifest, &parameters::values(&self.model), &more)
+        write(run, &config, &mut self.manifest, &parameters::values(&self.model), &more)
     }
 
     /// Loads the checkpoint of a run folder (or the checkpoint folder itself).
@@ -122,56 +123,57 @@ impl<M: Trainable> Checkpoint<M> {
         Ok(Self::read(run, device)?.0)
     }
 
-    /// The checkpoint and its folder.
+    /// Loads the checkpoint and returns it with its folder.
     fn read(run: &Path, device: &Device) -> Result<(Self, PathBuf)> {
-        let Stored { folder, card, manifest, config } = Stored::<TrainConfig<M>>::read(run, M::FAMILY)?;
+        let StoredCheckpoint { folder, file, manifest, config } =
+            StoredCheckpoint::<TrainConfig<M>>::read(run, M::FAMILY)?;
         config.check()?;
-        let card: Card =
-            serde_json::from_value(card).map_err(|error| broken(&folder.join(CONFIG), error.to_string()))?;
-        let model = M::new(&config, &card.dataset_info, Key::new(0), device)?;
-        let model = fill(model, &folder.join(WEIGHTS), manifest.hashes.get("weights"))?;
-        Ok((Self { model, config, dataset_info: card.dataset_info, manifest }, folder))
+        let ConfigFile { dataset_info, .. } =
+            serde_json::from_value(file).map_err(|error| broken(&folder.join(CONFIG), error.to_string()))?;
+        let model = M::new(&config, &dataset_info, Key::new(0), device)?;
+        let model = load_weights(model, &folder.join(WEIGHTS), manifest.hashes.get("weights"))?;
+        Ok((Self { model, config, dataset_info, manifest }, folder))
     }
 
-    /// Loads the checkpoint and what training needs to continue.
+    /// Loads the checkpoint and the state to continue from.
     ///
     /// # Errors
-    /// As [`Checkpoint::load`], and when the checkpoint was saved without that.
+    /// As [`Checkpoint::load`], and when the checkpoint was saved without that state.
     pub(crate) fn load_to_resume(run: &Path, device: &Device) -> Result<(Self, TrainState<M>)> {
         let (checkpoint, folder) = Self::read(run, device)?;
         let path = folder.join(STATE);
-        let position = serde_json::from_slice(&read(&path)?)
+        let state = serde_json::from_slice(&read(&path)?)
             .map_err(|error| Error::corrupt(&path, error.to_string(), "train again from the beginning"))?;
         let hashes = &checkpoint.manifest.hashes;
         let moments = unpack(&folder.join(OPTIMIZER), hashes.get("optimizer"))?;
         let raw = match checkpoint.config.optim.ema > 0.0 {
-            true => Some(fill(checkpoint.model.clone(), &folder.join(RAW), hashes.get("raw"))?),
+            true => Some(load_weights(checkpoint.model.clone(), &folder.join(RAW), hashes.get("raw"))?),
             false => None,
         };
-        Ok((checkpoint, TrainState { position, moments, raw }))
+        Ok((checkpoint, TrainState { state, moments, raw }))
     }
 }
 
-/// The family of the model a run folder holds, if it holds one.
+/// The family of the model in a run folder; `None` where there is no checkpoint.
 pub fn family(run: &Path) -> Option<String> {
-    let card: serde_json::Value = serde_json::from_slice(&read(&locate(run)?.join(CONFIG)).ok()?).ok()?;
-    Some(card.get("family")?.as_str()?.to_owned())
+    let file: serde_json::Value = serde_json::from_slice(&read(&locate(run)?.join(CONFIG)).ok()?).ok()?;
+    Some(file.get("family")?.as_str()?.to_owned())
 }
 
-/// What every family stores beside its weights.
-pub(crate) struct Stored<C> {
+/// The files of a checkpoint beside its weights, of any family.
+pub(crate) struct StoredCheckpoint<C> {
     /// The checkpoint's folder.
     pub folder: PathBuf,
     /// The whole `config.json`.
-    pub card: serde_json::Value,
-    /// Its part `config`.
+    pub file: serde_json::Value,
+    /// Its field `config`.
     pub config: C,
-    /// Where the checkpoint came from.
+    /// The provenance of the checkpoint.
     pub manifest: Manifest,
 }
 
-impl<C: serde::de::DeserializeOwned> Stored<C> {
-    /// Reads it.
+impl<C: serde::de::DeserializeOwned> StoredCheckpoint<C> {
+    /// Reads the checkpoint of a run folder (or the checkpoint folder itself).
     ///
     /// # Errors
     /// When there is none, it is of another family, or it is damaged.
@@ -180,9 +182,9 @@ impl<C: serde::de::DeserializeOwned> Stored<C> {
             Error::corrupt(run, "there is no checkpoint", "give the folder that `swm train` wrote to")
         })?;
         let path = folder.join(CONFIG);
-        let wrong = |error: serde_json::Error| broken(&path, error.to_string());
-        let card: serde_json::Value = serde_json::from_slice(&read(&path)?).map_err(wrong)?;
-        let found = card.get("family").and_then(|family| family.as_str()).unwrap_or("unknown");
+        let invalid = |error: serde_json::Error| broken(&path, error.to_string());
+        let file: serde_json::Value = serde_json::from_slice(&read(&path)?).map_err(invalid)?;
+        let found = file.get("family").and_then(|family| family.as_str()).unwrap_or("unknown");
         if found != family {
             return Err(Error::corrupt(
                 &path,
@@ -190,82 +192,79 @@ impl<C: serde::de::DeserializeOwned> Stored<C> {
                 format!("give a checkpoint of the family '{family}'"),
             ));
         }
-        let config = serde_json::from_value(card["config"].clone()).map_err(wrong)?;
+        let config = serde_json::from_value(file["config"].clone()).map_err(invalid)?;
         let path = folder.join(MANIFEST);
         let manifest = serde_json::from_slice(&read(&path)?).map_err(|error| broken(&path, error.to_string()))?;
-        Ok(Self { folder, card, config, manifest })
+        Ok(Self { folder, file, config, manifest })
     }
 }
 
-/// Writes a checkpoint beside the old one and puts it in its place. Notes the hash of the weights in the manifest and
-/// returns it.
-pub(crate) fn install(
+/// Writes a checkpoint with additional files to a new folder and replaces the old one with it. Stores the hash of the
+/// weights in the manifest and returns it.
+pub(crate) fn write(
     run: &Path,
-    card: &impl Serialize,
+    config: &impl Serialize,
     manifest: &mut Manifest,
     weights: &Named<HostTensor>,
-    more: &[(&str, Vec<u8>)],
+    additional: &[(&str, Vec<u8>)],
 ) -> Result<String> {
     let new = run.join(format!("{FOLDER}.new"));
     if new.exists() {
         std::fs::remove_dir_all(&new).map_err(|error| Error::io(&new, "removing an unfinished checkpoint", error))?;
     }
     std::fs::create_dir_all(&new).map_err(|error| Error::io(&new, "creating a checkpoint", error))?;
-    let write = |name: &str, bytes: &[u8]| {
+    let write_file = |name: &str, bytes: &[u8]| {
         let path = new.join(name);
         std::fs::write(&path, bytes).map_err(|error| Error::io(&path, "writing a checkpoint", error))
     };
-    write(CONFIG, text(card)?.as_bytes())?;
+    write_file(CONFIG, text(config)?.as_bytes())?;
     let weights = pack(weights)?;
     let hash = manifest::hash(&weights);
-    write(WEIGHTS, &weights)?;
+    write_file(WEIGHTS, &weights)?;
     manifest.hashes.insert("weights".to_owned(), hash.clone());
-    more.iter().try_for_each(|(name, bytes)| write(name, bytes))?;
-    write(MANIFEST, text(manifest)?.as_bytes())?;
-
-    let (place, old) = (run.join(FOLDER), run.join(format!("{FOLDER}.old")));
-    let rename = |from: &Path, to: &Path| {
-        std::fs::rename(from, to).map_err(|error| Error::io(to, "putting a checkpoint in its place", error))
-    };
-    if old.exists() && place.exists() {
-        std::fs::remove_dir_all(&old).map_err(|error| Error::io(&old, "removing an old checkpoint", error))?;
-    }
-    if place.exists() {
-        rename(&place, &old)?;
-    }
-    rename(&new, &place)?;
-    if old.exists() {
-        std::fs::remove_dir_all(&old).map_err(|error| Error::io(&old, "removing an old checkpoint", error))?;
-    }
+    additional.iter().try_for_each(|(name, bytes)| write_file(name, bytes))?;
+    write_file(MANIFEST, text(manifest)?.as_bytes())?;
+    replace(run, &new)?;
     Ok(hash)
 }
 
-/// A model with the weights of a file of a checkpoint.
-pub(crate) fn fill<M: burn::module::Module>(model: M, path: &Path, hash: Option<&String>) -> Result<M> {
+/// Renames the folder `new` to that of the checkpoint and removes the old checkpoint.
+fn replace(run: &Path, new: &Path) -> Result<()> {
+    let (current, old) = (run.join(FOLDER), run.join(format!("{FOLDER}.old")));
+    let rename = |from: &Path, to: &Path| {
+        std::fs::rename(from, to).map_err(|error| Error::io(to, "replacing a checkpoint", error))
+    };
+    if old.exists() && current.exists() {
+        std::fs::remove_dir_all(&old).map_err(|error| Error::io(&old, "removing an old checkpoint", error))?;
+    }
+    if current.exists() {
+        rename(&current, &old)?;
+    }
+    rename(new, &current)?;
+    if old.exists() {
+        std::fs::remove_dir_all(&old).map_err(|error| Error::io(&old, "removing an old checkpoint", error))?;
+    }
+    Ok(())
+}
+
+/// Loads a checkpoint's file of weights into a model, after checking the hash, where there is one.
+///
+/// # Errors
+/// When the file is damaged, or its weights are not those of the model.
+pub(crate) fn load_weights<M: burn::module::Module>(model: M, path: &Path, hash: Option<&String>) -> Result<M> {
     let weights = unpack(path, hash)?;
-    let wanted = parameters::shapes(&model);
-    for (name, shape) in &wanted {
-        match weights.get(name) {
-            Some(tensor) if &tensor.shape == shape => {}
-            Some(tensor) => {
-                let problem = format!("'{name}' is {:?}, but {CONFIG} makes it {shape:?}", tensor.shape);
-                return Err(broken(path, problem));
-            }
-            None => return Err(broken(path, format!("'{name}' is missing, which {CONFIG} asks for"))),
-        }
+    match weights::mismatch(&parameters::shapes(&model), &weights, CONFIG) {
+        Some(problem) => Err(broken(path, problem)),
+        None => Ok(parameters::load(model, &weights)),
     }
-    if let Some(name) = weights.keys().find(|name| !wanted.contains_key(*name)) {
-        return Err(broken(path, format!("'{name}' is no weight of the model that {CONFIG} describes")));
-    }
-    Ok(parameters::load(model, &weights))
 }
 
 fn broken(path: &Path, problem: String) -> Error {
     Error::corrupt(path, problem, "train again, or copy the checkpoint again from where it came")
 }
 
-/// Where the checkpoint of a run is: in place, or moved aside by a process that was killed before the new one was
-/// in place.
+/// The folder of a run's checkpoint: the folder itself, its checkpoint, or the old checkpoint that a killed process had
+/// not yet replaced.
 fn locate(run: &Path) -> Option<PathBuf> {
     [run.to_owned(), run.join(FOLDER), run.join(format!("{FOLDER}.old"))]
         .into_iter()
@@ -284,7 +283,7 @@ fn text<T: Serialize>(value: &T) -> Result<String> {
     serde_json::to_string_pretty(value).map_err(|error| Error::external("writing JSON", error))
 }
 
-/// Tensors as a safetensors file.
+/// Encodes tensors as a safetensors file.
 fn pack(tensors: &Named<HostTensor>) -> Result<Vec<u8>> {
     let failed = |error| Error::external("writing safetensors", error);
     let bytes: Vec<(&String, Vec<usize>, Vec<u8>)> = tensors
@@ -298,7 +297,7 @@ fn pack(tensors: &Named<HostTensor>) -> Result<Vec<u8>> {
     safetensors::serialize(views?, None).map_err(failed)
 }
 
-/// The tensors of a safetensors file.
+/// Reads the tensors of a safetensors file, after checking its hash, where there is one.
 fn unpack(path: &Path, hash: Option<&String>) -> Result<Named<HostTensor>> {
     let bytes = read(path)?;
     let broken = |problem: String| broken(path, problem);

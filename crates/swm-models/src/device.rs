@@ -1,14 +1,14 @@
-//! Where models compute: `cpu`, or a GPU where its backend was built in.
+//! The device a model computes on: `cpu`, or a GPU whose backend was built in.
 
 use burn::tensor::Device;
 use swm_core::{Error, Result};
 
-/// The backends that can be asked for, and whether this program has them.
+/// The backends by name, and whether this build has them.
 const BACKENDS: [(&str, bool); 3] =
     [("cpu", true), ("vulkan", cfg!(feature = "vulkan")), ("cuda", cfg!(feature = "cuda"))];
 
-/// The device of a name: `cpu`, `vulkan` or `cuda` (followed by `:1` for the second such GPU), or `auto`, which is the
-/// first GPU backend that was built in, and else the CPU.
+/// Parses the name of a device: `cpu`, `vulkan` or `cuda` (followed by `:1` for the second such GPU), or `auto`, which is a
+/// GPU backend that was built in, or else the CPU.
 ///
 /// # Errors
 /// When there is no such device, or this program was built without it.
@@ -20,24 +20,31 @@ pub fn parse(name: &str) -> Result<Device> {
     let (backend, index) = match name.split_once(':') {
         None => (name, 0),
         Some((backend, index)) => {
-            let wrong =
-                |_| Error::config("--device", format!("'{index}' is no number of a GPU"), "write it like vulkan:0");
-            (backend, index.parse().map_err(wrong)?)
+            let invalid =
+                |_| Error::config("--device", format!("'{index}' is not a GPU index"), "write it like vulkan:0");
+            (backend, index.parse().map_err(invalid)?)
         }
     };
     let Some((_, built)) = BACKENDS.iter().find(|(known, _)| *known == backend) else {
         let known = BACKENDS.iter().map(|(known, _)| *known).chain(["auto"]);
-        return Err(Error::unknown("device", backend, known, "a GPU's number follows a colon, such as vulkan:0"));
+        return Err(Error::unknown("device", backend, known, "a GPU index follows a colon, such as vulkan:0"));
     };
     if !built {
         let problem = format!("this program was built without {backend}");
-        let fix = format!("build it with `--features {backend}` (`make gpu` does for Vulkan), or say --device cpu");
+        let fix = format!("build it with `--features {backend}` (`make gpu` does for Vulkan), or pass --device cpu");
         return Err(Error::config("--device", problem, fix));
     }
     open(backend, index)
 }
 
-#[cfg_attr(not(any(feature = "vulkan", feature = "cuda")), allow(unused_variables, clippy::unnecessary_wraps))]
+#[cfg_attr(
+    not(any(feature = "vulkan", feature = "cuda")),
+    allow(
+        unused_variables,
+        clippy::unnecessary_wraps,
+        reason = "the index and the result matter to GPU backends only"
+    )
+)]
 fn open(backend: &str, index: usize) -> Result<Device> {
     match backend {
         #[cfg(feature = "vulkan")]
@@ -48,7 +55,7 @@ fn open(backend: &str, index: usize) -> Result<Device> {
     }
 }
 
-/// What manifests call a device.
+/// The name of a device in manifests.
 pub fn name(device: &Device) -> String {
     if *device == Device::flex() { "cpu (flex)".to_owned() } else { format!("{device:?}") }
 }
@@ -58,11 +65,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_cpu_is_always_there_and_others_say_how_to_get_them() {
+    fn cpu_is_always_available_and_errors_name_the_fix() {
         assert_eq!(name(&parse("cpu").expect("always")), "cpu (flex)");
-        let message = |name: &str| parse(name).expect_err("wrong").to_string();
+        let message = |name: &str| parse(name).expect_err("invalid").to_string();
         assert!(message("cdua").contains("did you mean cuda"), "{}", message("cdua"));
-        assert!(message("cpu:x").contains("no number"), "{}", message("cpu:x"));
+        assert!(message("cpu:x").contains("not a GPU index"), "{}", message("cpu:x"));
         if !cfg!(feature = "cuda") {
             assert!(message("cuda:0").contains("without cuda"), "{}", message("cuda:0"));
         }

@@ -2,9 +2,9 @@
 
 use super::contract::{ModelFamily, OnlineRun, TrainRun};
 use crate::online::OnlineSummary;
-use crate::train::{Observer, TrainConfig, TrainSummary, train};
+use crate::train::{TrainConfig, TrainSummary, train};
 use serde_json::{Value, json};
-use std::sync::atomic::AtomicBool;
+use swm_core::run::Control;
 use swm_core::Result;
 
 /// A complete training configuration of any family.
@@ -31,15 +31,14 @@ pub trait TrainableConfig {
     fn train_online(
         &self,
         run: OnlineRun<'_>,
-        observer: &mut dyn Observer,
-        stop: &AtomicBool,
+        control: &mut Control<'_>,
     ) -> Option<Result<OnlineSummary>>;
 
     /// Trains on a dataset.
     ///
     /// # Errors
     /// As [`crate::train`].
-    fn train(&self, run: TrainRun<'_>, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainSummary>;
+    fn train(&self, run: TrainRun<'_>, control: &mut Control<'_>) -> Result<TrainSummary>;
 }
 
 impl<M: ModelFamily> TrainableConfig for TrainConfig<M> {
@@ -62,13 +61,12 @@ impl<M: ModelFamily> TrainableConfig for TrainConfig<M> {
     fn train_online(
         &self,
         run: OnlineRun<'_>,
-        observer: &mut dyn Observer,
-        stop: &AtomicBool,
+        control: &mut Control<'_>,
     ) -> Option<Result<OnlineSummary>> {
-        M::train_online(self, run, observer, stop)
+        M::train_online(self, run, control)
     }
 
-    fn train(&self, run: TrainRun<'_>, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainSummary> {
-        train(self, run.reader, run.out, &run.options, observer, stop)
+    fn train(&self, run: TrainRun<'_>, control: &mut Control<'_>) -> Result<TrainSummary> {
+        train(self, run.reader, run.out, &run.options, control)
     }
 }

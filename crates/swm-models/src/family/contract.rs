@@ -3,10 +3,10 @@
 use crate::checkpoint::Checkpoint;
 use crate::online::OnlineSummary;
 use crate::probe::ImageEncoder;
-use crate::train::{DatasetInfo, Observer, TrainConfig, TrainOptions, Trainable};
+use crate::train::{DatasetInfo, TrainConfig, TrainOptions, Trainable};
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use swm_core::run::Control;
 use swm_core::{CostModel, EnvPool, EnvSpec, Policy, Predictor, Result};
 use swm_data::Reader;
 
@@ -66,8 +66,7 @@ pub trait ModelFamily: Trainable {
     fn train_online(
         _config: &TrainConfig<Self>,
         _run: OnlineRun<'_>,
-        _observer: &mut dyn Observer,
-        _stop: &AtomicBool,
+        _control: &mut Control<'_>,
     ) -> Option<Result<OnlineSummary>> {
         None
     }

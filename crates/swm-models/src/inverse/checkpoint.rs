@@ -42,7 +42,7 @@ impl InverseCheckpoint {
         self.world_model.save_to(&run.join(WORLD_MODEL))?;
         let env = &self.world_model.dataset_info.env;
         let description = serde_json::json!({"family": FAMILY, "env": env, "config": self.config});
-        checkpoint::install(run, &description, &mut self.manifest, &parameters::values(&self.model), &[])
+        checkpoint::write(run, &description, &mut self.manifest, &parameters::values(&self.model), &[])
     }
 
     /// Loads the checkpoint of a run folder.
@@ -50,13 +50,13 @@ impl InverseCheckpoint {
     /// # Errors
     /// When there is none, it is of another family, it is damaged, or its weights do not fit its configuration.
     pub fn load(run: &Path, device: &Device) -> Result<Self> {
-        let stored = checkpoint::Stored::<InverseConfig>::read(run, FAMILY)?;
+        let stored = checkpoint::StoredCheckpoint::<InverseConfig>::read(run, FAMILY)?;
         let world_model = Checkpoint::<Lewm>::load(&run.join(WORLD_MODEL), device)?;
         let config = stored.config;
         let (latent, actions) = (world_model.config.model.latent, world_model.actions());
         let model = Mlp::new(&Init::new(Key::new(0), device), 2 * latent, config.hidden, actions);
         let model =
-            checkpoint::fill(model, &stored.folder.join("weights.safetensors"), stored.manifest.hashes.get("weights"))?;
+            checkpoint::load_weights(model, &stored.folder.join("weights.safetensors"), stored.manifest.hashes.get("weights"))?;
         Ok(Self { world_model, model, config, manifest: stored.manifest })
     }
 }

@@ -8,9 +8,9 @@ use crate::family::{CheckpointInfo, FamilyEntry, LoadedModel, OnlineRun, TrainRu
 use crate::lewm::Lewm;
 use crate::online::OnlineSummary;
 use crate::probe::ImageEncoder;
-use crate::train::{Observer, Preset, TrainSummary, Trainable as _};
+use crate::train::{Preset, TrainSummary, Trainable as _};
 use serde_json::{Value, json};
-use std::sync::atomic::AtomicBool;
+use swm_core::run::Control;
 use swm_core::{EnvSpec, Error, Policy, Result};
 
 /// The registry row of inverse dynamics.
@@ -45,11 +45,11 @@ impl TrainableConfig for InverseConfig {
         None
     }
 
-    fn train_online(&self, _: OnlineRun<'_>, _: &mut dyn Observer, _: &AtomicBool) -> Option<Result<OnlineSummary>> {
+    fn train_online(&self, _: OnlineRun<'_>, _: &mut Control<'_>) -> Option<Result<OnlineSummary>> {
         None
     }
 
-    fn train(&self, run: TrainRun<'_>, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainSummary> {
+    fn train(&self, run: TrainRun<'_>, control: &mut Control<'_>) -> Result<TrainSummary> {
         let Some(encoder) = run.encoder else {
             return Err(Error::config(
                 "--encoder",
@@ -65,7 +65,7 @@ impl TrainableConfig for InverseConfig {
             ));
         }
         let world_model = Checkpoint::<Lewm>::load(encoder, &run.options.device)?;
-        train(self, &world_model, run.reader, run.out, run.options.threads, observer, stop)
+        train(self, &world_model, run.reader, run.out, run.options.threads, control)
     }
 }
 

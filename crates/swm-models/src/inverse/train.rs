@@ -6,7 +6,7 @@ use crate::checkpoint::Checkpoint;
 use crate::lewm::{Lewm, pixels};
 use crate::nn::parameters::{self, IntoF32};
 use crate::nn::{Init, Mlp};
-use crate::train::{AdamW, Observer, OptimConfig, ParameterGroup, Progress, ScheduleConfig, TrainSummary, config, log};
+use crate::train::{AdamW, OptimConfig, ParameterGroup, ScheduleConfig, TrainSummary, log, presets};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::Rng as _;
@@ -14,8 +14,8 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
+use swm_core::run::{Control, Progress};
 use swm_core::{Error, Key, Manifest, Result};
 use swm_data::{ClipSpec, Loader, LoaderConfig, Part, Reader};
 
@@ -50,7 +50,7 @@ impl InverseConfig {
     /// # Errors
     /// When a key is unknown (the error names the nearest), or a value is invalid.
     pub fn load(settings: &[String]) -> Result<Self> {
-        let config: Self = config::layered(Self::PRESET, settings, &[Self::PRESET])?;
+        let config: Self = presets::parse(Self::PRESET, settings, &[Self::PRESET])?;
         let least = [
             ("offset", config.offset),
             ("hidden", config.hidden),
@@ -85,8 +85,7 @@ pub fn train(
     reader: Arc<dyn Reader>,
     out: &Path,
     threads: usize,
-    observer: &mut dyn Observer,
-    stop: &AtomicBool,
+    control: &mut Control<'_>,
 ) -> Result<TrainSummary> {
     if Checkpoint::<Lewm>::exists(out) {
         return Err(Error::config(
@@ -96,7 +95,7 @@ pub fn train(
         ));
     }
     pixels::check(&world_model.config.model, reader.schema(), "pixels")?;
-    swm_core::pool::threads(threads)?.install(|| run(config, world_model, reader, out, observer, stop))
+    swm_core::pool::threads(threads)?.install(|| run(config, world_model, reader, out, control))
 }
 
 fn run(
@@ -104,8 +103,7 @@ fn run(
     world_model: &Checkpoint<Lewm>,
     reader: Arc<dyn Reader>,
     out: &Path,
-    observer: &mut dyn Observer,
-    stop: &AtomicBool,
+    control: &mut Control<'_>,
 ) -> Result<TrainSummary> {
     let begun = Instant::now();
     let key = Key::new(config.seed).with(FAMILY);
@@ -127,27 +125,23 @@ fn run(
             continue;
         };
         waited += waiting.elapsed().as_secs_f64();
-        if stop.load(Ordering::Relaxed) {
-            return Err(Error::Interrupted);
-        }
+        control.check()?;
         let pairs = Pairs::draw(world_model, config.offset, &*batch?, key.with("goals").at(step as u64))?;
-        let factor = config.schedule.share(step);
+        let factor = config.schedule.lr_factor(step);
         let norm;
         (model, loss, norm) = learn(model, &mut optimizer, factor, pairs)?;
         step += 1;
         let (elapsed, lr) = (begun.elapsed().as_secs_f64(), config.optim.lr * factor);
         clips_per_second = (step * config.batch_size) as f64 / elapsed;
-        observer.progress(&Progress {
-            step,
-            steps: config.schedule.steps,
-            epoch,
-            metrics: vec![("loss", loss)],
-            validation: None,
-            lr,
-            gradient_norm: norm,
-            clips_per_second,
-            data_wait: waited / elapsed,
-        });
+        let metrics = [
+                ("loss", loss),
+                ("lr", lr),
+                ("gradient_norm", norm),
+                ("clips_per_second", clips_per_second),
+                ("data_wait", waited / elapsed),
+            ];
+            let total = config.schedule.steps;
+            control.progress(Progress { stage: "train", done: step, total, unit: "steps", metrics: &metrics });
         if step.is_multiple_of(config.log_every) || step == config.schedule.steps {
             log.write(step, &[("loss", loss), ("lr", lr), ("gradient_norm", norm)])?;
         }

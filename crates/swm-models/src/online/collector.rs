@@ -1,64 +1,72 @@
-//! [`Collector`]: plays worlds side by side, and hands what happens to the replay buffer, a part of an episode at a time.
+//! [`Collector`]: steps environments with a policy and adds their transitions to the replay buffer, segment by segment.
 //!
-//! A part ends with an observation that the next one begins with, so no transition is lost; of windows of several steps,
-//! those across the border are.
+//! A segment ends with the observation that the next one begins with, so that no transition is lost; only clips of several
+//! steps across the border of two segments are.
 
 use serde::{Deserialize, Serialize};
+use swm_core::columns::{ACTION, REWARD, TERMINATED, TRUNCATED};
 use swm_core::pool::Reset;
 use swm_core::{Batch, EnvPool, Error, Key, Policy, ResetOptions, Result, Schema};
 use swm_data::{Constants, ReplayBuffer};
 
-/// Plays.
+/// Environments that run episode after episode into a replay buffer.
 pub(super) struct Collector {
     pool: EnvPool,
     replay: ReplayBuffer,
-    /// Of the recorded columns that are observed: where they are in the infos, and where in a recording.
+    /// For every recorded column that is an observation: its index in the infos, and in a recorded row.
     observed: Vec<(usize, usize)>,
-    /// Where a recording has action, reward and termination.
+    /// Indices of the other columns in a recorded row.
     action: usize,
     reward: usize,
     terminated: usize,
+    /// The episode of every slot.
     running: Vec<Running>,
     actions: Batch,
     active: Vec<bool>,
     key: Key,
-    /// Steps of a part.
-    part: usize,
+    /// Steps of a segment.
+    segment: usize,
     /// The number of the next episode.
     next: u64,
-    /// Environment steps.
+    /// Environment steps done.
     pub steps: usize,
-    /// Returns of the episodes that ended since somebody took them.
+    /// Undiscounted returns of the episodes that ended since they were last taken.
     pub returns: Vec<f64>,
 }
 
-/// An episode being played.
+/// A running episode.
 struct Running {
     number: u64,
-    /// The part that is being recorded, and how many of its rows are.
+    /// The segment being recorded, with spare rows at the end.
     rows: Batch,
+    /// Recorded rows of the segment.
     length: usize,
-    /// All actions of the episode, and its return.
+    /// All actions of the episode, row-major `[steps, action_dim]`.
     actions: Vec<f32>,
+    /// Its undiscounted return so far.
     total: f64,
 }
 
-/// Where a collector is: what it needs to play on.
+/// The state of a [`Collector`], from which it can continue.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Place {
+pub(super) struct CollectorState {
     steps: usize,
     next: u64,
-    /// Number and actions of every running episode: worlds do the same again.
+    /// Number and actions of every running episode; the environments are restored by repeating the actions.
     running: Vec<(u64, Vec<f32>)>,
 }
 
 impl Collector {
-    /// Records the columns of `replay` in the worlds of `pool`, in parts of `part` steps. What is played is decided by `key`.
-    pub fn new(pool: EnvPool, replay: &ReplayBuffer, schema: &Schema, part: usize, key: Key) -> Result<Self> {
+    /// Records the columns of `replay` in the environments of `pool`, in segments of `segment` steps. `key` decides the
+    /// episodes.
+    ///
+    /// # Errors
+    /// When the environments lack a column.
+    pub fn new(pool: EnvPool, replay: &ReplayBuffer, schema: &Schema, segment: usize, key: Key) -> Result<Self> {
         let infos = pool.infos().schema();
         let mut observed = vec![];
         for (to, column) in schema.columns().iter().enumerate() {
-            if !["action", "reward", "terminated"].contains(&column.name.as_str()) {
+            if ![ACTION, REWARD, TERMINATED].contains(&column.name.as_str()) {
                 observed.push((infos.index(&column.name)?, to));
             }
         }
@@ -68,15 +76,15 @@ impl Collector {
         Ok(Self {
             replay: replay.clone(),
             observed,
-            action: schema.index("action")?,
-            reward: schema.index("reward")?,
-            terminated: schema.index("terminated")?,
+            action: schema.index(ACTION)?,
+            reward: schema.index(REWARD)?,
+            terminated: schema.index(TERMINATED)?,
             running: running.collect(),
             actions: Batch::zeros(&Schema::new(vec![pool.spec().action_column()])?, slots),
             active: vec![true; slots],
             pool,
             key,
-            part,
+            segment,
             next: 0,
             steps: 0,
             returns: vec![],
@@ -84,33 +92,39 @@ impl Collector {
     }
 
     /// Starts an episode in every slot.
+    ///
+    /// # Errors
+    /// When an environment fails.
     pub fn start(&mut self) -> Result<()> {
         let slots: Vec<usize> = (0..self.pool.len()).collect();
         self.begin(&slots)
     }
 
-    /// Tells a policy of the episodes that are running.
-    pub fn introduce(&self, policy: &mut dyn Policy) {
+    /// Announces the running episodes to a policy that takes over.
+    pub fn begin_policy(&self, policy: &mut dyn Policy) {
         for (slot, running) in self.running.iter().enumerate() {
-            policy.begin(slot, self.episode(running.number));
+            policy.begin(slot, self.key.at(running.number));
         }
     }
 
-    /// One step of every world.
-    pub fn play(&mut self, policy: &mut dyn Policy) -> Result<()> {
+    /// Makes one step of every environment.
+    ///
+    /// # Errors
+    /// When the policy or an environment fails.
+    pub fn step(&mut self, policy: &mut dyn Policy) -> Result<()> {
         policy.observe_envs(&self.pool, &self.active)?;
         policy.act(self.pool.infos(), &self.active, &mut self.actions)?;
         let ended = self.advance(true)?;
         self.begin(&ended)?;
         for &slot in &ended {
-            policy.begin(slot, self.episode(self.running[slot].number));
+            policy.begin(slot, self.key.at(self.running[slot].number));
         }
         Ok(())
     }
 
-    /// Executes the actions in the active slots; returns those whose episode ended. Parts that are complete go to the replay
-    /// buffer if they are `news`.
-    fn advance(&mut self, news: bool) -> Result<Vec<usize>> {
+    /// Executes the actions in the active slots and returns the slots whose episode ended. With `record`, complete segments
+    /// go to the replay buffer.
+    fn advance(&mut self, record: bool) -> Result<Vec<usize>> {
         let Self { pool, running, observed, actions, active, .. } = self;
         for (slot, running) in running.iter_mut().enumerate().filter(|&(slot, _)| active[slot]) {
             running.observe(observed, pool.infos(), slot);
@@ -122,7 +136,7 @@ impl Collector {
         pool.step(actions, active)?;
         let infos = pool.infos();
         let (rewards, terminated, truncated) =
-            (infos.get::<f32>("reward")?, infos.get::<u8>("terminated")?, infos.get::<u8>("truncated")?);
+            (infos.get::<f32>(REWARD)?, infos.get::<u8>(TERMINATED)?, infos.get::<u8>(TRUNCATED)?);
         let mut ended = vec![];
         for (slot, running) in running.iter_mut().enumerate().filter(|&(slot, _)| active[slot]) {
             self.steps += 1;
@@ -131,14 +145,14 @@ impl Collector {
             row.set(self.reward, &[rewards[slot]]);
             row.set(self.terminated, &[terminated[slot]]);
             let over = terminated[slot] + truncated[slot] > 0;
-            if over || running.length >= self.part {
+            if over || running.length >= self.segment {
                 running.observe(observed, infos, slot);
                 let mut row = running.rows.row_mut(running.length - 1);
                 row.at::<f32>(self.action).fill(f32::NAN);
                 row.set(self.reward, &[0.0f32]);
                 row.set(self.terminated, &[0u8]);
                 running.rows.resize(running.length);
-                if news {
+                if record {
                     self.replay.add(&running.rows, &Constants::default())?;
                 }
                 running.length = 0;
@@ -160,7 +174,7 @@ impl Collector {
         self.reset(slots)
     }
 
-    /// Starts the episodes of these slots.
+    /// Resets the environments of these slots to the start of their episodes.
     fn reset(&mut self, slots: &[usize]) -> Result<()> {
         if slots.is_empty() {
             return Ok(());
@@ -176,35 +190,31 @@ impl Collector {
         self.pool.reset(&resets)
     }
 
-    fn episode(&self, number: u64) -> Key {
-        self.key.at(number)
-    }
-
-    /// Where it is.
-    pub fn place(&self) -> Place {
+    /// The state to continue from.
+    pub fn state(&self) -> CollectorState {
         let running = self.running.iter().map(|running| (running.number, running.actions.clone()));
-        Place { steps: self.steps, next: self.next, running: running.collect() }
+        CollectorState { steps: self.steps, next: self.next, running: running.collect() }
     }
 
-    /// Goes to a place where a collector with the same key was.
+    /// Restores a state of a collector with the same key, by repeating the actions of its running episodes.
     ///
     /// # Errors
-    /// When it had another number of worlds, or they do not do the same again.
-    pub fn go_to(&mut self, place: &Place) -> Result<()> {
-        if place.running.len() != self.running.len() {
-            let expected = format!("{}, as before", place.running.len());
-            return Err(Error::mismatch("continuing", format!("{} worlds", self.running.len()), expected));
+    /// When the number of environments differs, or an episode now ends earlier than it did.
+    pub fn restore(&mut self, state: &CollectorState) -> Result<()> {
+        if state.running.len() != self.running.len() {
+            let expected = format!("{}, as before", state.running.len());
+            return Err(Error::mismatch("continuing", format!("{} environments", self.running.len()), expected));
         }
-        for (running, (number, _)) in self.running.iter_mut().zip(&place.running) {
+        for (running, (number, _)) in self.running.iter_mut().zip(&state.running) {
             running.number = *number;
         }
         let slots: Vec<usize> = (0..self.running.len()).collect();
         self.reset(&slots)?;
-        let width = self.pool.spec().action_dim();
-        let longest = place.running.iter().map(|(_, actions)| actions.len() / width).max().unwrap_or(0);
+        let dim = self.pool.spec().action_dim();
+        let longest = state.running.iter().map(|(_, actions)| actions.len() / dim).max().unwrap_or(0);
         for step in 0..longest {
-            for (slot, (_, actions)) in place.running.iter().enumerate() {
-                let action = actions.get(step * width..(step + 1) * width);
+            for (slot, (_, actions)) in state.running.iter().enumerate() {
+                let action = actions.get(step * dim..(step + 1) * dim);
                 self.active[slot] = action.is_some();
                 if let Some(action) = action {
                     self.actions.row_mut(slot).set(0, action);
@@ -213,25 +223,25 @@ impl Collector {
             if !self.advance(false)?.is_empty() {
                 return Err(Error::mismatch(
                     "continuing",
-                    "an episode that ends where it went on before",
-                    "the worlds the run began with (the same version of this program)",
+                    "an episode that ends where it continued before",
+                    "the environments the run began with (the same version of this program)",
                 ));
             }
         }
         self.active.fill(true);
-        (self.steps, self.next) = (place.steps, place.next);
+        (self.steps, self.next) = (state.steps, state.next);
         self.returns.clear();
         Ok(())
     }
 }
 
 impl Running {
-    /// Records what is observed as the next row.
+    /// Records the observation of a slot as the next row.
     fn observe(&mut self, observed: &[(usize, usize)], infos: &Batch, slot: usize) {
         let row = self.length;
         self.length += 1;
         if self.rows.rows() < self.length {
-            // Rows to spare, so that memory moves rarely.
+            // Doubling keeps reallocations rare.
             self.rows.resize((2 * self.length).max(64));
         }
         for &(from, to) in observed {

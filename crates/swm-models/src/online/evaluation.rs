@@ -1,32 +1,33 @@
-//! Evaluations: whole episodes without exploration, always the same ones.
+//! Evaluation during online training: whole episodes without exploration, always the same ones.
 
+use swm_core::columns::{REWARD, TERMINATED, TRUNCATED};
 use swm_core::pool::Reset;
 use swm_core::{Batch, EnvPool, Key, Policy, ResetOptions, Result, Schema};
 
-/// The returns of `episodes` episodes, in their order. Each is decided by `key` and its number.
+/// Runs `episodes` episodes and returns their undiscounted returns in order. `key` and its number decide each episode.
 pub(super) fn returns(pool: &mut EnvPool, policy: &mut dyn Policy, episodes: usize, key: Key) -> Result<Vec<f64>> {
     let slots = pool.len();
     let mut actions = Batch::zeros(&Schema::new(vec![pool.spec().action_column()])?, slots);
     let mut returns = vec![0.0; episodes];
-    // The episode of every slot, while it has one.
-    let mut playing: Vec<Option<usize>> = vec![None; slots];
+    // The episode that runs in each slot, if any.
+    let mut running: Vec<Option<usize>> = vec![None; slots];
     let mut next = 0;
     loop {
         let mut resets = vec![];
-        for (slot, playing) in playing.iter_mut().enumerate() {
-            if playing.is_none() && next < episodes {
+        for (slot, running) in running.iter_mut().enumerate() {
+            if running.is_none() && next < episodes {
                 let key = key.at(next as u64);
-                // The highest bit is left out, as in evaluations elsewhere.
+                // Without the highest bit, as all reset seeds.
                 resets.push(Reset { slot, seed: key.seed() >> 1, options: ResetOptions::default() });
                 policy.begin(slot, key);
-                *playing = Some(next);
+                *running = Some(next);
                 next += 1;
             }
         }
         if !resets.is_empty() {
             pool.reset(&resets)?;
         }
-        let active: Vec<bool> = playing.iter().map(Option::is_some).collect();
+        let active: Vec<bool> = running.iter().map(Option::is_some).collect();
         if active.iter().all(|&active| !active) {
             return Ok(returns);
         }
@@ -35,12 +36,12 @@ pub(super) fn returns(pool: &mut EnvPool, policy: &mut dyn Policy, episodes: usi
         pool.step(&actions, &active)?;
         let infos = pool.infos();
         let (rewards, terminated, truncated) =
-            (infos.get::<f32>("reward")?, infos.get::<u8>("terminated")?, infos.get::<u8>("truncated")?);
-        for (slot, playing) in playing.iter_mut().enumerate() {
-            if let Some(episode) = *playing {
+            (infos.get::<f32>(REWARD)?, infos.get::<u8>(TERMINATED)?, infos.get::<u8>(TRUNCATED)?);
+        for (slot, running) in running.iter_mut().enumerate() {
+            if let Some(episode) = *running {
                 returns[episode] += f64::from(rewards[slot]);
                 if terminated[slot] + truncated[slot] > 0 {
-                    *playing = None;
+                    *running = None;
                 }
             }
         }

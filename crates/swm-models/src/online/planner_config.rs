@@ -1,36 +1,36 @@
-//! [`PlannerConfig`]: the settings of a model-predictive path integral search.
+//! [`PlannerConfig`]: the settings of a planner that selects actions during online training.
 
-use crate::train::config::at_least;
+use crate::train::at_least;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 
-/// The settings of a model-predictive path integral search.
+/// The settings of model-predictive path integral control (Williams et al. 2015) in latents, guided by a policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PlannerConfig {
-    /// Steps of a plan.
+    /// Model steps of a plan.
     pub horizon: usize,
-    /// Candidates of an iteration.
+    /// Candidates per iteration.
     pub samples: usize,
-    /// Number of iterations.
+    /// Iterations.
     pub iterations: usize,
-    /// Candidates with the lowest cost, which determine the next sampling distribution.
+    /// Candidates that are weighted in the next mean and standard deviation.
     pub elites: usize,
     /// Candidates that are rollouts of the policy.
     pub proposals: usize,
-    /// The smallest standard deviation of the samples, for actions between -1 and 1.
+    /// The smallest standard deviation of the samples, of actions from -1 to 1.
     pub min_std: f32,
-    /// The largest standard deviation, with which a search begins.
+    /// The largest standard deviation, with which a search starts.
     pub max_std: f32,
-    /// Inverse temperature of the elites' weights, `exp(-temperature (cost - lowest cost))`.
+    /// The factor of the cost in the weights `exp(-temperature (cost - lowest cost))`.
     pub temperature: f32,
 }
 
 impl PlannerConfig {
-    /// Checks the settings.
+    /// Checks the ranges of the settings.
     ///
     /// # Errors
-    /// Names the first invalid setting.
+    /// Naming the first that is out of range.
     pub fn check(&self) -> Result<()> {
         at_least(&[
             ("online.planner.horizon", self.horizon, 1),
@@ -38,10 +38,10 @@ impl PlannerConfig {
             ("online.planner.iterations", self.iterations, 1),
             ("online.planner.elites", self.elites, 1),
         ])?;
-        for (what, part) in [("elites", self.elites), ("proposals", self.proposals)] {
-            if part > self.samples {
-                let given = format!("{part} of {} candidates", self.samples);
-                return Err(Error::config(format!("online.planner.{what}"), given, "choose at most all of them"));
+        for (name, count) in [("elites", self.elites), ("proposals", self.proposals)] {
+            if count > self.samples {
+                let given = format!("{count} of {} candidates", self.samples);
+                return Err(Error::config(format!("online.planner.{name}"), given, "choose at most all of them"));
             }
         }
         if !(self.min_std > 0.0 && self.min_std <= self.max_std && self.max_std.is_finite()) {
@@ -49,7 +49,7 @@ impl PlannerConfig {
             return Err(Error::config("online.planner.min_std", given, "choose 0 < min_std <= max_std"));
         }
         if !(self.temperature.is_finite() && self.temperature > 0.0) {
-            let fix = "choose a number above 0";
+            let fix = "choose a positive number";
             return Err(Error::config("online.planner.temperature", self.temperature.to_string(), fix));
         }
         Ok(())

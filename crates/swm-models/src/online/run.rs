@@ -1,303 +1,374 @@
-//! The loop: play, learn, evaluate, save.
+//! [`train_online`]: the loop that alternates interaction, learning, evaluation and saving.
 
-use super::collector::{Collector, Place};
-use super::learner::Learner;
-use super::{Agent, OnlineConfig, SharedModel, evaluation, world};
+use super::agent::Agent;
+use super::collector::{Collector, CollectorState};
+use super::config::OnlineConfig;
+use super::evaluation;
+use super::shared_model::SharedModel;
 use crate::checkpoint::Checkpoint;
-use crate::nn::parameters;
-use crate::train::run::{BEST, Window, due, same_run};
-use crate::train::{Observer, Progress, TrainConfig, TrainOptions, log};
+use crate::train::config::LoopConfig;
+use crate::train::learner::{self, Learn, Learner, Update};
+use crate::train::metrics::{MetricWindow, Metrics};
+use crate::train::run::STAGE;
+use crate::train::run_state::is_due;
+use crate::train::{DatasetInfo, TrainConfig, TrainOptions, failed_batch, log};
 use serde::Serialize;
 use serde_json::json;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
-use swm_core::{ColumnSpec, EnvPool, Error, Key, Manifest, Policy, RandomPolicy, Result, Schema};
+use swm_core::run::{Control, Event, Progress, Stage};
+use swm_core::{ColumnSpec, EnvPool, Error, Key, Policy, RandomPolicy, Result, Schema};
 use swm_data::{LoaderConfig, ReplayBuffer, ReplayConfig, ReplayLoader, WriteOptions};
 
-/// How a run ended.
+/// The result of an online run.
 #[derive(Clone, Debug, Serialize)]
 pub struct OnlineSummary {
-    /// The checkpoint.
+    /// The run folder, which holds the checkpoint.
     pub checkpoint: PathBuf,
-    /// The hash of its weights.
+    /// The hash of the weights.
     pub weights: String,
-    /// Gradient steps done.
+    /// Optimizer steps done.
     pub steps: usize,
-    /// Environment steps played.
+    /// Environment steps done.
     pub env_steps: usize,
-    /// Whether it was stopped before its end; training again with `resume` continues it.
+    /// Whether the run was interrupted; training again with `resume` continues it.
     pub interrupted: bool,
     /// The mean return of the last evaluation.
     pub evaluated: Option<f64>,
-    /// The gradient step and the mean return of the best evaluation; its weights are in `best`.
+    /// The optimizer step and the mean return of the best evaluation, whose weights are in `best/`.
     pub best: Option<(usize, f64)>,
-    /// Parameters trained.
+    /// The number of trained scalars.
     pub parameters: usize,
-    /// Seconds in all.
+    /// Duration of the run in seconds.
     pub seconds: f64,
-    /// The share of them that playing took.
+    /// The fraction of the time spent on interaction.
     pub playing: f64,
 }
 
-/// Trains a model by playing in the worlds that `worlds` makes, as many as it is asked for; the checkpoint, the best
-/// checkpoint so far and the logs go to `out`.
+/// Trains a model by interaction with environments; the checkpoint, the best checkpoint so far and the logs go to the
+/// folder `out`. `make_pool` makes a pool of as many environments as it is asked for.
 ///
-/// `stop` ends the run after the current round; what was learnt and played is saved, and `options.resume` goes on with it.
+/// `control` is checked before every round. An interrupted run saves its weights and its replay buffer and returns a summary
+/// with `interrupted`; `options.resume` continues it. The metrics of the progress events are the model's, then `env_steps`,
+/// `return` (of the last episodes), `evaluation_return`, `lr`, `gradient_norm`, `clips_per_second` and `data_wait`, the
+/// fraction of the time spent on interaction.
 ///
 /// # Errors
-/// When the configuration contradicts itself or the worlds, `out` holds a run that may not or cannot be continued, a loss is
-/// not finite, a world fails, or the disk refuses.
+/// When the configuration contradicts itself or the environments, `out` holds a run that cannot be continued, a loss is not
+/// finite, an environment fails, the caller's poll fails (after saving), or the disk refuses.
 pub fn train_online<M: Agent>(
     config: &TrainConfig<M>,
-    worlds: &dyn Fn(usize) -> Result<EnvPool>,
+    make_pool: &dyn Fn(usize) -> Result<EnvPool>,
     out: &Path,
     options: &TrainOptions,
-    observer: &mut dyn Observer,
-    stop: &AtomicBool,
+    control: &mut Control<'_>,
 ) -> Result<OnlineSummary> {
     config.check()?;
-    let Some(settings) = &config.online else {
+    let Some(online) = &config.online else {
         let fix = "choose a preset that has one (`--print-config` shows it), or train on a dataset with --data";
         return Err(Error::config("online", "the configuration has no such table", fix));
     };
-    settings.check()?;
-    if config.data.num_steps > settings.part + 1 {
-        let given = format!("parts of {} steps hold no clip of {} frames", settings.part, config.data.num_steps);
-        return Err(Error::config("online.part", given, "choose longer parts, or lower data.num_steps"));
+    online.check()?;
+    if config.data.num_steps > online.segment + 1 {
+        let given = format!("segments of {} steps hold no clip of {} frames", online.segment, config.data.num_steps);
+        return Err(Error::config("online.part", given, "choose longer segments, or lower data.num_steps"));
     }
-    let (play, judge) = (worlds(settings.envs)?, worlds(settings.envs.min(settings.evaluate_episodes))?);
+    let pool = make_pool(online.envs)?;
+    let evaluation_pool = make_pool(online.envs.min(online.evaluate_episodes))?;
     let threads = swm_core::pool::threads(options.threads)?;
-    // Worlds are not shared between threads, but may move to those that compute.
-    threads.install(|| Run::new(config, settings, play, judge, out, options)?.go(observer, stop))
+    // A pool is not shared between threads, but may move to those that compute.
+    threads.install(|| start(config, online, pool, evaluation_pool, out, options)?(control))
 }
 
-/// A run in progress.
-struct Run<'a, M: Agent> {
-    settings: &'a OnlineConfig,
+type Loop<'a> = Box<dyn FnOnce(&mut Control<'_>) -> Result<OnlineSummary> + 'a>;
+
+/// Prepares a run, or the continuation of the one in `out`.
+fn start<'a, M: Agent>(
+    config: &'a TrainConfig<M>,
+    online: &'a OnlineConfig,
+    pool: EnvPool,
+    evaluation_pool: EnvPool,
     out: &'a Path,
+    options: &'a TrainOptions,
+) -> Result<Loop<'a>> {
+    let spec = pool.spec().clone();
+    let offered = pool.infos().schema().columns().iter().cloned().chain([spec.action_column()]);
+    let offered = Schema::new(offered.collect::<Vec<_>>())?;
+    let loader_config = M::loader_config(config, &offered)?;
+    let columns = &loader_config.clip.columns;
+    let dataset_info = DatasetInfo::from_env(&spec, columns)?;
+    let recorded: Result<Vec<ColumnSpec>> = columns.iter().map(|name| offered.column(name).cloned()).collect();
+    let recorded = Schema::new(recorded?)?;
+
+    let mut manifest = learner::manifest(config, format!("played in {}", spec.id), &options.device);
+    let burn = std::mem::replace(&mut manifest.libraries, pool.env(0).libraries());
+    manifest.libraries.extend(burn);
+    let resumed = Learner::resume(config, &dataset_info, &manifest, out, options)?;
+    let saved = resumed.as_ref().map(|learner| saved_data(out, learner.state().step));
+    let data = Data::new(&config.loop_config(), online, loader_config, pool, &recorded, saved)?;
+    let learner = match resumed {
+        Some(learner) => learner,
+        None => Learner::start(config, dataset_info, manifest, out, &options.device)?,
+    };
+    let shared = SharedModel::new(learner.model().clone());
+    let policy = |slots, explore| M::policy(config, learner.dataset_info(), shared.clone(), &spec, slots, explore);
+    let run = Run {
+        config: config.loop_config(),
+        online,
+        out,
+        data,
+        random: Box::new(RandomPolicy::new(&spec, online.envs)),
+        explorer: policy(online.envs, true)?,
+        evaluated: policy(evaluation_pool.len(), false)?,
+        evaluation_pool,
+        log: log::Log::new(out, learner.state().step > 0)?,
+        key: Key::new(config.seed).with("online"),
+        learner: Box::new(OnlineLearner { learner, shared }),
+    };
+    Ok(Box::new(move |control| run.go(M::FAMILY, control)))
+}
+
+/// A learner whose weights the policies share, for models of any family.
+trait LearnOnline {
+    fn learner(&self) -> &dyn Learn;
+    fn learner_mut(&mut self) -> &mut dyn Learn;
+    /// Makes the policies act with the present weights.
+    fn publish(&self);
+}
+
+struct OnlineLearner<'a, M: Agent> {
     learner: Learner<'a, M>,
-    live: SharedModel<M>,
+    shared: SharedModel<M>,
+}
+
+impl<M: Agent> LearnOnline for OnlineLearner<'_, M> {
+    fn learner(&self) -> &dyn Learn {
+        &self.learner
+    }
+
+    fn learner_mut(&mut self) -> &mut dyn Learn {
+        &mut self.learner
+    }
+
+    fn publish(&self) {
+        self.shared.set(self.learner.model().clone());
+    }
+}
+
+/// The source of batches: environments, replay buffer, and the loader that draws from it.
+struct Data {
     collector: Collector,
     replay: ReplayBuffer,
     loader: ReplayLoader,
-    /// Who plays until there is something to learn from, and who plays then.
-    novice: Box<dyn Policy>,
-    player: Box<dyn Policy>,
-    judge: EnvPool,
-    judged: Box<dyn Policy>,
+}
+
+/// A run in progress.
+struct Run<'a> {
+    config: LoopConfig,
+    online: &'a OnlineConfig,
+    out: &'a Path,
+    learner: Box<dyn LearnOnline + 'a>,
+    data: Data,
+    /// The policy of the warm-up.
+    random: Box<dyn Policy>,
+    /// The policy after the warm-up.
+    explorer: Box<dyn Policy>,
+    evaluation_pool: EnvPool,
+    /// The policy of evaluations, which does not explore.
+    evaluated: Box<dyn Policy>,
     log: log::Log,
     key: Key,
 }
 
+/// Measurements of a run between its steps.
+struct Meter {
+    start: Instant,
+    /// The optimizer step at which the run began or continued.
+    first_step: usize,
+    /// Seconds spent on interaction.
+    playing: f64,
+    /// Metrics since the last line of the log.
+    window: MetricWindow,
+    /// The mean return of the last episodes that ended.
+    played_return: Option<f64>,
+    /// The mean return of the last evaluation.
+    evaluated_return: Option<f64>,
+}
+
 const REPLAY: &str = "replay.lance";
-const PLACE: &str = "place.json";
+const COLLECTOR: &str = "place.json";
+const PLAYED: &str = "played-";
 
-impl<'a, M: Agent> Run<'a, M> {
+impl Data {
+    /// The data of a new run, or those that an earlier one saved in the folder `saved`.
     fn new(
-        config: &'a TrainConfig<M>,
-        settings: &'a OnlineConfig,
+        config: &LoopConfig,
+        online: &OnlineConfig,
+        loader_config: LoaderConfig,
         pool: EnvPool,
-        judge: EnvPool,
-        out: &'a Path,
-        options: &'a TrainOptions,
+        schema: &Schema,
+        saved: Option<PathBuf>,
     ) -> Result<Self> {
-        let spec = pool.spec().clone();
-        // Everything a world shows; of it, what the model wants.
-        let shown: Vec<ColumnSpec> =
-            pool.infos().schema().columns().iter().cloned().chain([spec.action_column()]).collect();
-        let shown = Schema::new(shown)?;
-        let LoaderConfig { clip, goals, .. } = M::loader_config(config, &shown)?;
-        let dataset_info = world::dataset_info(&spec, &clip.columns)?;
-        let columns: Result<Vec<ColumnSpec>> = clip.columns.iter().map(|name| shown.column(name).cloned()).collect();
-        let schema = Schema::new(columns?)?;
-
-        let mut manifest = Manifest::new("train", config.seed, serde_json::to_value(config).unwrap_or_default());
-        manifest.libraries = pool.env(0).libraries();
-        manifest.libraries.insert("burn".to_owned(), "0.22.1".to_owned());
-        manifest.hashes.insert("dataset".to_owned(), format!("played in {}", spec.id));
-        manifest.device = crate::device::name(&options.device);
-
-        let key = Key::new(config.seed).with("online");
-        let mut learner = Learner::new(config, dataset_info, manifest, &options.device)?;
-        let mut replay = ReplayBuffer::new(&schema, settings.capacity)?;
-        let mut place = None;
-        if Checkpoint::<M>::exists(out) {
-            if !options.resume {
-                return Err(Error::config(
-                    out.display().to_string(),
-                    "holds a training run already",
-                    "continue it with `resume`, or choose another folder",
-                ));
-            }
-            let (checkpoint, state) = Checkpoint::<M>::load_to_resume(out, &options.device)?;
-            same_run(out, &checkpoint.manifest, &learner.manifest)?;
-            let folder = played(out, state.position.step);
-            place = Some(read_place(&folder)?);
-            replay = ReplayBuffer::restore(&*swm_data::open(folder.join(REPLAY))?, settings.capacity)?;
-            learner.restore(checkpoint, state);
-        } else {
-            std::fs::create_dir_all(out).map_err(|error| Error::io(out, "creating a folder", error))?;
-        }
-        let mut collector = Collector::new(pool, &replay, &schema, settings.part, key.with("episode"))?;
-        match &place {
-            Some(place) => collector.go_to(place)?,
+        let replay = match &saved {
+            Some(folder) => ReplayBuffer::restore(&*swm_data::open(folder.join(REPLAY))?, online.capacity)?,
+            None => ReplayBuffer::new(schema, online.capacity)?,
+        };
+        let key = Key::new(config.seed).with("online").with("episode");
+        let mut collector = Collector::new(pool, &replay, schema, online.segment, key)?;
+        match &saved {
+            Some(folder) => collector.restore(&read_collector(folder)?)?,
             None => collector.start()?,
         }
         let loader = replay.loader(ReplayConfig {
-            clip,
-            goals,
+            clip: loader_config.clip,
+            goals: loader_config.goals,
             batch_size: config.data.batch_size,
             seed: config.seed,
             threads: 0,
             ..ReplayConfig::default()
         })?;
-        let live = SharedModel::new(learner.model.clone());
-        let policy = |slots, explore| M::policy(config, &learner.dataset_info, live.clone(), &spec, slots, explore);
-        Ok(Self {
-            settings,
-            out,
-            collector,
-            replay,
-            loader,
-            novice: Box::new(RandomPolicy::new(&spec, settings.envs)),
-            player: policy(settings.envs, true)?,
-            judged: policy(judge.len(), false)?,
-            judge,
-            log: log::Log::new(out, learner.state.step > 0)?,
-            live,
-            learner,
-            key,
-        })
+        Ok(Self { collector, replay, loader })
     }
+}
 
-    #[allow(clippy::cast_precision_loss)]
-    fn go(mut self, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<OnlineSummary> {
-        let config = self.learner.config;
-        let steps = config.schedule.steps;
-        let begun = Instant::now();
-        let first = self.learner.state.step;
-        let (mut playing, mut interrupted, mut evaluated) = (0.0, false, None);
-        let mut window = Window::default();
-        let mut played = None;
-        let mut skilled = false;
-        self.collector.introduce(&mut *self.novice);
-        while self.learner.state.step < steps {
-            if stop.load(Ordering::Relaxed) {
-                interrupted = true;
+impl Run<'_> {
+    fn go(mut self, family: &'static str, control: &mut Control<'_>) -> Result<OnlineSummary> {
+        let steps = self.config.schedule.steps;
+        control.emit(Event::Started(Stage { name: STAGE, subject: &[family], total: steps, unit: "steps" }));
+        let mut meter = Meter::new(self.step());
+        let (mut stop, mut warm) = (None, false);
+        self.data.collector.begin_policy(&mut *self.random);
+        while self.step() < steps {
+            if let Err(error) = control.check() {
+                stop = Some(error);
                 break;
             }
-            let learns = self.collector.steps >= self.settings.warmup && self.replay.episodes() > 0;
-            if learns && !skilled {
-                skilled = true;
-                self.collector.introduce(&mut *self.player);
+            let learns = self.data.collector.steps >= self.online.warmup && self.data.replay.episodes() > 0;
+            if learns && !warm {
+                warm = true;
+                self.data.collector.begin_policy(&mut *self.explorer);
             }
-            let asked = Instant::now();
-            self.collector.play(if skilled { &mut *self.player } else { &mut *self.novice })?;
-            playing += asked.elapsed().as_secs_f64();
-            if !self.collector.returns.is_empty() {
-                let returns = std::mem::take(&mut self.collector.returns);
-                played = Some(mean(&returns));
+            let start = Instant::now();
+            self.data.collector.step(if warm { &mut *self.explorer } else { &mut *self.random })?;
+            meter.playing += start.elapsed().as_secs_f64();
+            if !self.data.collector.returns.is_empty() {
+                meter.played_return = Some(mean(&std::mem::take(&mut self.data.collector.returns)));
             }
             if !learns {
                 continue;
             }
-            for _ in 0..self.settings.updates.min(steps - self.learner.state.step) {
-                let step = self.learner.state.step;
-                let batch = self.loader.sample(self.key.with("batch").at(step as u64))?;
-                let learnt = self.learner.learn(&batch, self.out)?;
-                window.add(&learnt.metrics, learnt.gradient_norm);
-                let done = self.learner.state.step;
-                let elapsed = begun.elapsed().as_secs_f64();
-                let rate = ((done - first) * config.data.batch_size) as f64 / elapsed;
-                if due(self.settings.evaluate_every, done, steps) {
-                    evaluated = Some(self.evaluate()?);
-                }
-                let mut metrics = learnt.metrics;
-                metrics.push(("env_steps", self.collector.steps as f64));
-                metrics.extend(played.map(|value| ("return", value)));
-                observer.progress(&Progress {
-                    step: done,
-                    steps,
-                    epoch: 0,
-                    metrics,
-                    validation: evaluated,
-                    lr: config.optim.lr * config.schedule.share(step),
-                    gradient_norm: learnt.gradient_norm,
-                    clips_per_second: rate,
-                    data_wait: playing / elapsed,
-                });
-                if due(config.log_every, done, steps) {
-                    let (mut line, norm) = window.take();
-                    line.extend([("gradient_norm", norm), ("env_steps", self.collector.steps as f64)]);
-                    line.extend(played.map(|value| ("return", value)));
-                    line.extend([("clips_per_second", rate), ("playing", playing / elapsed), ("seconds", elapsed)]);
-                    self.log.write(done, &line)?;
-                }
+            for _ in 0..self.online.updates.min(steps - self.step()) {
+                self.learn(&mut meter, control)?;
             }
-            self.live.set(self.learner.model.clone());
-            let done = self.learner.state.step;
-            // Between rounds only: a round that was interrupted could not be continued.
-            let save = config.save_every;
-            if save > 0 && done / save > (done - self.settings.updates.min(done)) / save && done < steps {
+            self.learner.publish();
+            let (done, save_every) = (self.step(), self.config.save_every);
+            // Saved between rounds only: a round that was interrupted could not be continued.
+            let before = done - self.online.updates.min(done);
+            if save_every > 0 && done / save_every > before / save_every && done < steps {
                 self.save()?;
+                control.emit(Event::Saved(self.out));
             }
         }
         let weights = self.save()?;
-        let seconds = begun.elapsed().as_secs_f64();
-        Ok(OnlineSummary {
-            checkpoint: self.out.to_owned(),
-            weights,
-            steps: self.learner.state.step,
-            env_steps: self.collector.steps,
-            interrupted,
-            evaluated,
-            best: self.learner.state.best.map(|(step, loss)| (step, -loss)),
-            parameters: parameters::trained_count(&self.learner.model),
-            seconds,
-            playing: if seconds > 0.0 { playing / seconds } else { 0.0 },
-        })
+        control.emit(Event::Saved(self.out));
+        let interrupted = match stop {
+            None => false,
+            Some(Error::Interrupted) => true,
+            Some(error) => return Err(error),
+        };
+        if !interrupted {
+            let metrics = meter.evaluated_return.map(|value| ("evaluation_return", value));
+            control.emit(Event::Finished { stage: STAGE, metrics: metrics.as_slice() });
+        }
+        Ok(self.summary(weights, interrupted, &meter))
     }
 
-    /// The mean return of an evaluation; keeps the best weights so far.
-    fn evaluate(&mut self) -> Result<f64> {
-        self.live.set(self.learner.model.clone());
-        let episodes = self.settings.evaluate_episodes;
-        let key = self.key.with("evaluation");
-        let returns = evaluation::returns(&mut self.judge, &mut *self.judged, episodes, key)?;
-        let mean = mean(&returns);
-        let (low, high) =
-            returns.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), &v| (low.min(v), high.max(v)));
-        let step = self.learner.state.step;
-        self.log.write(
-            step,
-            &[
-                ("evaluation/return", mean),
-                ("evaluation/lowest", low),
-                ("evaluation/highest", high),
-                ("env_steps", self.collector.steps as f64),
-            ],
-        )?;
-        // The loop's position keeps a loss, of which less is better.
-        if self.learner.state.best.is_none_or(|(_, best)| -mean < best) {
-            self.learner.state.best = Some((step, -mean));
-            self.learner.checkpoint().save(&self.out.join(BEST), None)?;
+    fn step(&self) -> usize {
+        self.learner.learner().state().step
+    }
+
+    /// Makes one optimizer step, evaluates where it is due, and reports both.
+    fn learn(&mut self, meter: &mut Meter, control: &mut Control<'_>) -> Result<()> {
+        let Update { metrics, lr, gradient_norm } = self.update()?;
+        meter.window.add(&metrics, gradient_norm);
+        let (done, steps) = (self.step(), self.config.schedule.steps);
+        let elapsed = meter.start.elapsed().as_secs_f64();
+        let clips_per_second = ((done - meter.first_step) * self.config.data.batch_size) as f64 / elapsed;
+        if is_due(self.online.evaluate_every, done, steps) {
+            meter.evaluated_return = Some(self.evaluate()?);
         }
+        let env_steps = self.data.collector.steps as f64;
+        let played_return = meter.played_return.map(|value| ("return", value));
+        let playing = meter.playing / elapsed;
+        let mut shown = metrics;
+        shown.push(("env_steps", env_steps));
+        shown.extend(played_return);
+        shown.extend(meter.evaluated_return.map(|value| ("evaluation_return", value)));
+        shown.extend([("lr", lr), ("gradient_norm", gradient_norm)]);
+        shown.extend([("clips_per_second", clips_per_second), ("data_wait", playing)]);
+        control.progress(Progress { stage: STAGE, done, total: steps, unit: "steps", metrics: &shown });
+        if is_due(self.config.log_every, done, steps) {
+            let (mut line, norm) = meter.window.take();
+            line.extend([("gradient_norm", norm), ("env_steps", env_steps)]);
+            line.extend(played_return);
+            line.extend([("clips_per_second", clips_per_second), ("playing", playing), ("seconds", elapsed)]);
+            self.log.write(done, &line)?;
+        }
+        Ok(())
+    }
+
+    /// Draws a batch from the replay buffer and makes one optimizer step, checked to be finite.
+    fn update(&mut self) -> Result<Update> {
+        let step = self.step() as u64;
+        let batch = self.data.loader.sample(self.key.with("batch").at(step))?;
+        let key = Key::new(self.config.seed).with("step").at(step);
+        let learner = self.learner.learner_mut();
+        let output = learner.loss_and_gradients(&batch, key, true)?;
+        let loss = output.loss();
+        let update = learner.update(output, key);
+        if loss.is_finite() && update.gradient_norm.is_finite() {
+            return Ok(update);
+        }
+        let what = format!("the loss or its gradient at training step {}", step + 1);
+        let values = format!("{}, gradient norm {}", failed_batch::describe(&update.metrics), update.gradient_norm);
+        let fix = "lower optim.lr; the last checkpoint, if any, is kept";
+        Err(failed_batch::error(self.out, &batch, what, &values, fix))
+    }
+
+    /// Evaluates the present weights, saves them if they are the best so far, and returns the mean return.
+    fn evaluate(&mut self) -> Result<f64> {
+        self.learner.publish();
+        let episodes = self.online.evaluate_episodes;
+        let key = self.key.with("evaluation");
+        let returns = evaluation::returns(&mut self.evaluation_pool, &mut *self.evaluated, episodes, key)?;
+        let mean = mean(&returns);
+        let (lowest, highest) =
+            returns.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), &v| (low.min(v), high.max(v)));
+        let line: Metrics = vec![
+            ("evaluation/return", mean),
+            ("evaluation/lowest", lowest),
+            ("evaluation/highest", highest),
+            ("env_steps", self.data.collector.steps as f64),
+        ];
+        self.log.write(self.step(), &line)?;
+        // The state of a run stores a loss, of which lower is better.
+        self.learner.learner_mut().save_if_best(-mean, self.out)?;
         Ok(mean)
     }
 
-    /// Saves what was played, then what was learnt: a checkpoint in place always finds its episodes.
+    /// Saves the replay buffer and the collector, then the checkpoint, so that a checkpoint always has its data. Returns the
+    /// hash of the weights.
     fn save(&mut self) -> Result<String> {
-        let folder = played(self.out, self.learner.state.step);
+        let folder = saved_data(self.out, self.step());
         if folder.exists() {
             std::fs::remove_dir_all(&folder).map_err(|error| Error::io(&folder, "removing an older save", error))?;
         }
         std::fs::create_dir_all(&folder).map_err(|error| Error::io(&folder, "creating a folder", error))?;
-        self.replay.save(folder.join(REPLAY), WriteOptions::default())?;
-        let place = folder.join(PLACE);
-        std::fs::write(&place, json!(self.collector.place()).to_string())
-            .map_err(|error| Error::io(&place, "saving what was played", error))?;
-        let weights = self.learner.save(self.out)?;
+        self.data.replay.save(folder.join(REPLAY), WriteOptions::default())?;
+        let path = folder.join(COLLECTOR);
+        std::fs::write(&path, json!(self.data.collector.state()).to_string())
+            .map_err(|error| Error::io(&path, "saving the state of the episodes", error))?;
+        let weights = self.learner.learner().save(self.out)?;
         let entries = std::fs::read_dir(self.out).map_err(|error| Error::io(self.out, "listing a run", error))?;
         for path in entries.filter_map(|entry| Some(entry.ok()?.path())) {
             let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -307,23 +378,50 @@ impl<'a, M: Agent> Run<'a, M> {
         }
         Ok(weights)
     }
+
+    fn summary(self, weights: String, interrupted: bool, meter: &Meter) -> OnlineSummary {
+        let seconds = meter.start.elapsed().as_secs_f64();
+        let learner = self.learner.learner();
+        OnlineSummary {
+            checkpoint: self.out.to_owned(),
+            weights,
+            steps: learner.state().step,
+            env_steps: self.data.collector.steps,
+            interrupted,
+            evaluated: meter.evaluated_return,
+            best: learner.state().best.map(|(step, loss)| (step, -loss)),
+            parameters: learner.parameter_count(),
+            seconds,
+            playing: if seconds > 0.0 { meter.playing / seconds } else { 0.0 },
+        }
+    }
 }
 
-const PLAYED: &str = "played-";
+impl Meter {
+    fn new(first_step: usize) -> Self {
+        Self {
+            start: Instant::now(),
+            first_step,
+            playing: 0.0,
+            window: MetricWindow::default(),
+            played_return: None,
+            evaluated_return: None,
+        }
+    }
+}
 
-/// Where the episodes and the running worlds of a gradient step are kept.
-fn played(out: &Path, step: usize) -> PathBuf {
+/// The folder with the replay buffer and the running episodes of an optimizer step.
+fn saved_data(out: &Path, step: usize) -> PathBuf {
     out.join(format!("{PLAYED}{step}"))
 }
 
-fn read_place(folder: &Path) -> Result<Place> {
-    let path = folder.join(PLACE);
-    let text = std::fs::read(&path).map_err(|error| Error::io(&path, "reading what was played", error))?;
+fn read_collector(folder: &Path) -> Result<CollectorState> {
+    let path = folder.join(COLLECTOR);
+    let text = std::fs::read(&path).map_err(|error| Error::io(&path, "reading the state of the episodes", error))?;
     serde_json::from_slice(&text)
         .map_err(|error| Error::corrupt(&path, error.to_string(), "train again from the beginning"))
 }
 
-#[allow(clippy::cast_precision_loss)]
-fn mean(numbers: &[f64]) -> f64 {
-    numbers.iter().sum::<f64>() / numbers.len().max(1) as f64
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len().max(1) as f64
 }

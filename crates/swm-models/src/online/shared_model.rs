@@ -1,8 +1,8 @@
-//! [`SharedModel`]: weights that are trained while somebody acts with them.
+//! [`SharedModel`]: weights that a policy acts with while they are trained.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// A model that changes. Cheap to clone; all clones show the same model.
+/// A model whose weights change. All clones share the same weights and are cheap.
 #[derive(Debug)]
 pub struct SharedModel<M>(Arc<Mutex<M>>);
 
@@ -13,17 +13,17 @@ impl<M> Clone for SharedModel<M> {
 }
 
 impl<M: Clone> SharedModel<M> {
-    /// A model that may change.
+    /// Shares a model.
     pub fn new(model: M) -> Self {
         Self(Arc::new(Mutex::new(model)))
     }
 
-    /// The model as it is now. Tensors are shared, not copied.
+    /// Returns the present model. Tensors are shared, not copied.
     pub fn get(&self) -> M {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
-    /// Changes it, for everybody.
+    /// Replaces the model of all clones.
     pub fn set(&self, model: M) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = model;
     }

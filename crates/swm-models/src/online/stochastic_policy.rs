@@ -1,42 +1,50 @@
-//! [`StochasticPolicy`]: acting by a network alone.
+//! [`StochasticPolicy`]: a policy that draws its actions from a network's distribution, without planning.
 
-use super::SharedModel;
-use crate::Checkpoint;
+use super::shared_model::SharedModel;
+use crate::checkpoint::Checkpoint;
 use crate::train::{DatasetInfo, TrainConfig, Trainable};
 use std::time::Instant;
+use swm_core::columns::{ACTION, STEP_IDX};
 use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result, RowRef};
 use swm_plan::ActionScale;
 
-/// A model that knows what to do at a glance.
+/// A model with a distribution over actions.
 pub trait StochasticActor: Trainable {
-    /// The action for what a row shows, in model units from -1 to 1: the one it thinks best, or one drawn by `key`.
+    /// Returns an action for the observation in a row, in model units from -1 to 1: drawn with `key`, or without one the
+    /// most likely action.
+    ///
+    /// # Shapes
+    /// `[action_dim]`.
     ///
     /// # Errors
-    /// When the row lacks what the model sees.
+    /// When the row lacks a column that the model observes.
     fn act(&self, config: &TrainConfig<Self>, row: RowRef<'_>, key: Option<Key>) -> Result<Vec<f32>>;
 }
 
-/// Does what a network says. Every slot is a call of its own, so what is done in one does not depend on the others.
+/// Executes the actions of a network. Every slot is computed separately, so its actions do not depend on the others.
 pub struct StochasticPolicy<M: StochasticActor> {
     config: TrainConfig<M>,
     scale: ActionScale,
+    /// Bounds of an environment action, element by element.
     bounds: Vec<(f32, f32)>,
-    live: SharedModel<M>,
+    model: SharedModel<M>,
     explore: bool,
-    slots: Vec<Key>,
+    /// The key of each slot's episode.
+    keys: Vec<Key>,
+    /// Seconds per decision since they were last taken.
     latencies: Vec<f64>,
 }
 
 impl<M: StochasticActor> StochasticPolicy<M> {
-    /// A policy for `slots` worlds of `spec`; `explore` draws actions instead of taking the best.
+    /// Creates a policy for `slots` environments of `spec`; with `explore` it draws actions, else it takes the most likely
+    /// ones.
     ///
     /// # Errors
     /// When the model was trained for other actions.
-    #[allow(clippy::cast_possible_truncation)]
     pub fn new(
         config: &TrainConfig<M>,
         dataset_info: &DatasetInfo,
-        live: SharedModel<M>,
+        model: SharedModel<M>,
         spec: &EnvSpec,
         slots: usize,
         explore: bool,
@@ -47,48 +55,48 @@ impl<M: StochasticActor> StochasticPolicy<M> {
             config: config.clone(),
             scale: dataset_info.action.clone(),
             bounds: bounds.map(|(low, high)| (low as f32, high as f32)).collect(),
-            live,
+            model,
             explore,
-            slots: vec![Key::new(0); slots],
+            keys: vec![Key::new(0); slots],
             latencies: vec![],
         })
     }
 
-    /// The policy of a checkpoint.
+    /// Creates the policy of a checkpoint, which does not explore.
     ///
     /// # Errors
     /// As [`StochasticPolicy::new`].
     pub fn of(checkpoint: &Checkpoint<M>, spec: &EnvSpec, slots: usize) -> Result<Self> {
-        let live = SharedModel::new(checkpoint.model.clone());
-        Self::new(&checkpoint.config, &checkpoint.dataset_info, live, spec, slots, false)
+        let model = SharedModel::new(checkpoint.model.clone());
+        Self::new(&checkpoint.config, &checkpoint.dataset_info, model, spec, slots, false)
     }
 }
 
 impl<M: StochasticActor> Policy for StochasticPolicy<M> {
     fn begin(&mut self, slot: usize, key: Key) {
-        self.slots[slot] = key.with("reflex");
+        self.keys[slot] = key.with("reflex");
     }
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
-        let column = actions.schema().index("action")?;
-        // Of the episode, not of this policy: who comes in later does the same.
-        let steps = infos.get::<i32>("step_idx")?;
-        let model = self.live.get();
-        let mut action = vec![0.0; self.bounds.len()];
-        for (slot, key) in self.slots.iter().enumerate().filter(|&(slot, _)| active[slot]) {
-            let begun = Instant::now();
+        let column = actions.schema().index(ACTION)?;
+        // Keyed by the step of the episode, not of the policy, so that a policy that takes over in mid-episode draws the same.
+        let steps = infos.get::<i32>(STEP_IDX)?;
+        let model = self.model.get();
+        let mut env_action = vec![0.0; self.bounds.len()];
+        for (slot, key) in self.keys.iter().enumerate().filter(|&(slot, _)| active[slot]) {
+            let start = Instant::now();
             let key = self.explore.then(|| key.at(steps[slot].unsigned_abs().into()));
-            let said = model.act(&self.config, infos.row(slot), key)?;
-            if said.len() != action.len() {
-                let expected = format!("{}, as the world has", action.len());
-                return Err(Error::mismatch("acting", format!("{} numbers an action", said.len()), expected));
+            let action = model.act(&self.config, infos.row(slot), key)?;
+            if action.len() != env_action.len() {
+                let expected = format!("{}, the dimension of the environment's actions", env_action.len());
+                return Err(Error::mismatch("acting", format!("{} elements an action", action.len()), expected));
             }
-            self.scale.to_env(&said, &mut action);
-            for (number, &(low, high)) in action.iter_mut().zip(&self.bounds) {
-                *number = number.clamp(low, high);
+            self.scale.to_env(&action, &mut env_action);
+            for (value, &(low, high)) in env_action.iter_mut().zip(&self.bounds) {
+                *value = value.clamp(low, high);
             }
-            actions.row_mut(slot).set(column, &action);
-            self.latencies.push(begun.elapsed().as_secs_f64());
+            actions.row_mut(slot).set(column, &env_action);
+            self.latencies.push(start.elapsed().as_secs_f64());
         }
         Ok(())
     }
@@ -97,7 +105,7 @@ impl<M: StochasticActor> Policy for StochasticPolicy<M> {
         false
     }
 
-    /// Seconds each decision took.
+    /// Seconds per decision.
     fn take_latencies(&mut self) -> Vec<f64> {
         std::mem::take(&mut self.latencies)
     }

@@ -51,7 +51,7 @@ pub(super) fn fit<M: Module>(
                 fix: "lower its learning rate, or check the checkpoint and the dataset".to_owned(),
             });
         }
-        (model, _) = optimizer.step(model, schedule.share(number), output.gradients, |_| ParameterGroup::default());
+        (model, _) = optimizer.step(model, schedule.lr_factor(number), output.gradients, |_| ParameterGroup::default());
     }
     Ok((model, loss))
 }

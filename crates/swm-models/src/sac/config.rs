@@ -1,6 +1,6 @@
 //! [`SacConfig`] and [`SacLoss`]: the sizes of a SAC and the settings of its loss.
 
-use crate::train::config::at_least;
+use crate::train::at_least;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 

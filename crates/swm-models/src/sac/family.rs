@@ -4,8 +4,8 @@ use super::Sac;
 use crate::checkpoint::Checkpoint;
 use crate::family::{FamilyEntry, ModelFamily, OnlineRun};
 use crate::online::{self, OnlineSummary, train_online};
-use crate::train::{Observer, TrainConfig};
-use std::sync::atomic::AtomicBool;
+use crate::train::{TrainConfig};
+use swm_core::run::Control;
 use swm_core::{EnvSpec, Policy, Result};
 
 /// The registry row of SAC.
@@ -21,9 +21,8 @@ impl ModelFamily for Sac {
     fn train_online(
         config: &TrainConfig<Self>,
         run: OnlineRun<'_>,
-        observer: &mut dyn Observer,
-        stop: &AtomicBool,
+        control: &mut Control<'_>,
     ) -> Option<Result<OnlineSummary>> {
-        Some(train_online(config, run.environments, run.out, &run.options, observer, stop))
+        Some(train_online(config, run.environments, run.out, &run.options, control))
     }
 }

@@ -54,7 +54,7 @@ impl Trainable for Sac {
     }
 
     fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
-        crate::online::has_rewards(schema)?;
+        crate::online::check_rewards(schema)?;
         let columns = config.model.columns.iter().map(String::as_str).chain(["action", "reward", "terminated"]);
         let clip = ClipSpec { num_steps: 2, frameskip: 1, columns: columns.map(str::to_owned).collect() };
         clip.schema(schema)?;

@@ -1,7 +1,7 @@
 //! [`Tdmpc2Config`] and [`LossConfig`]: the sizes of a TD-MPC2 and the settings of its loss.
 
 use crate::nn::Bins;
-use crate::train::config::at_least;
+use crate::train::at_least;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 

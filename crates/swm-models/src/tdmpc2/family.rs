@@ -4,9 +4,9 @@ use super::{Tdmpc2, Tdmpc2Cost, export, import};
 use crate::checkpoint::Checkpoint;
 use crate::family::{FamilyEntry, ModelFamily, OnlineRun};
 use crate::online::{self, OnlineSummary, train_online};
-use crate::train::{DatasetInfo, Observer, TrainConfig};
+use crate::train::{DatasetInfo, TrainConfig};
 use std::path::Path;
-use std::sync::atomic::AtomicBool;
+use swm_core::run::Control;
 use swm_core::{CostModel, EnvSpec, Policy, Result};
 
 /// The registry row of TD-MPC2.
@@ -26,10 +26,9 @@ impl ModelFamily for Tdmpc2 {
     fn train_online(
         config: &TrainConfig<Self>,
         run: OnlineRun<'_>,
-        observer: &mut dyn Observer,
-        stop: &AtomicBool,
+        control: &mut Control<'_>,
     ) -> Option<Result<OnlineSummary>> {
-        Some(train_online(config, run.environments, run.out, &run.options, observer, stop))
+        Some(train_online(config, run.environments, run.out, &run.options, control))
     }
 
     fn import(from: &Path, dataset_info: DatasetInfo) -> Option<Result<Checkpoint<Self>>> {

@@ -53,7 +53,7 @@ impl Trainable for Tdmpc2 {
         if config.model.image_encoding().is_some() {
             pixels::check(config.model.image, schema, PIXELS)?;
         }
-        crate::online::has_rewards(schema)?;
+        crate::online::check_rewards(schema)?;
         let columns = config.model.columns().into_iter().chain(["action", "reward", "terminated"].map(str::to_owned));
         let clip = ClipSpec { num_steps: config.data.num_steps, frameskip: 1, columns: columns.collect() };
         clip.schema(schema)?;

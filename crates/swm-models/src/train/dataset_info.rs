@@ -1,24 +1,24 @@
-//! [`DatasetInfo`]: what a model knows of the data it was trained on.
+//! [`DatasetInfo`]: the statistics of a dataset that a model needs to scale actions and columns.
 
 use crate::nn::parameters::Named;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
-use swm_core::{Batch, ColumnSpec, DType, Error, Result};
+use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Error, Result, Space};
 use swm_data::{Reader, column_stats};
 use swm_plan::ActionScale;
 
-/// What a model knows of the data it was trained on; stored in its checkpoint.
+/// The statistics of the dataset a model was trained on; stored in its checkpoint.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct DatasetInfo {
-    /// Between environment actions and the model's.
+    /// The map between the environment's actions and the model's.
     pub action: ActionScale,
-    /// The other columns of numbers that it sees.
+    /// The other numeric columns that the model observes.
     pub columns: Named<ColumnInfo>,
-    /// The environment the data came from, where the dataset says so.
+    /// The environment the data came from, where the dataset names it.
     pub env: Option<String>,
 }
 
-/// What is known of a column, number by number.
+/// The statistics of a column, element by element of a row.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ColumnInfo {
     /// The shape of a row.
@@ -27,42 +27,43 @@ pub struct ColumnInfo {
     pub mean: Vec<f64>,
     /// The standard deviation.
     pub std: Vec<f64>,
-    /// The smallest number.
+    /// The minimum.
     pub min: Vec<f64>,
-    /// The largest.
+    /// The maximum.
     pub max: Vec<f64>,
 }
 
 impl ColumnInfo {
-    /// Numbers in a row.
+    /// The number of elements of a row.
     pub fn dim(&self) -> usize {
         self.mean.len()
     }
 
-    /// The standard deviation, 1 where a number never changes: it carries nothing, so its scale is left alone.
+    /// The standard deviation, replaced by 1 for elements that are constant, so that it can be divided by.
     pub fn spread(&self) -> Vec<f64> {
         self.std.iter().map(|&std| if std > 1e-6 { std } else { 1.0 }).collect()
+    }
+
+    fn of(reader: &dyn Reader, spec: &ColumnSpec) -> Result<Self> {
+        let stats = column_stats(reader, &spec.name, None)?;
+        Ok(Self { shape: spec.shape.clone(), mean: stats.mean, std: stats.std, min: stats.min, max: stats.max })
+    }
+
+    /// Statistics that leave a column of that shape as it is.
+    fn identity(spec: &ColumnSpec) -> Self {
+        let all = |value: f64| vec![value; spec.len()];
+        Self { shape: spec.shape.clone(), mean: all(0.0), std: all(1.0), min: all(0.0), max: all(0.0) }
     }
 }
 
 impl DatasetInfo {
-    /// The dataset info of a dataset; `columns` are those a model sees. Pictures among them are left out. Actions are scaled to
-    /// mean 0 and spread 1, or, if `bounded`, to lie between -1 and 1.
+    /// Computes the statistics of a dataset. `columns` are those that the model observes; images among them are skipped.
+    /// Actions are standardised, or, if `bounded`, mapped from their range in the data to -1 ..= 1.
     ///
     /// # Errors
     /// When there is no column of continuous actions, a column is missing, or the data are damaged.
     pub fn from_reader(reader: &dyn Reader, columns: &[String], bounded: bool) -> Result<Self> {
         let schema = reader.schema();
-        let dataset_info = |spec: &ColumnSpec| {
-            let stats = column_stats(reader, &spec.name, None)?;
-            Ok::<_, Error>(ColumnInfo {
-                shape: spec.shape.clone(),
-                mean: stats.mean,
-                std: stats.std,
-                min: stats.min,
-                max: stats.max,
-            })
-        };
         let action = schema.column("action")?;
         if action.dtype != DType::Float32 {
             return Err(Error::mismatch(
@@ -71,61 +72,100 @@ impl DatasetInfo {
                 "float32 actions of a continuous action space",
             ));
         }
-        let action = dataset_info(action)?;
-        #[allow(clippy::cast_possible_truncation)]
-        let single = |values: &[f64]| values.iter().map(|&value| value as f32).collect();
-        let mut seen = Named::new();
+        let action = ColumnInfo::of(reader, action)?;
+        let mut observed = Named::new();
         for name in columns.iter().filter(|name| *name != "action") {
             let spec = schema.column(name)?;
             if spec.dtype != DType::U8 {
-                seen.insert(name.clone(), dataset_info(spec)?);
+                observed.insert(name.clone(), ColumnInfo::of(reader, spec)?);
             }
         }
         let env = reader.manifest().and_then(|manifest| Some(manifest.config.get("env")?.as_str()?.to_owned()));
-        let action = if bounded {
-            let of =
-                |low: f64, high: f64| if high > low { [(high + low) / 2.0, (high - low) / 2.0] } else { [low, 1.0] };
-            let both: Vec<[f64; 2]> = action.min.iter().zip(&action.max).map(|(&low, &high)| of(low, high)).collect();
-            let part = |i: usize| single(&both.iter().map(|pair| pair[i]).collect::<Vec<_>>());
-            ActionScale { mean: part(0), std: part(1) }
-        } else {
-            ActionScale { mean: single(&action.mean), std: single(&action.spread()) }
-        };
-        Ok(Self { action, columns: seen, env })
+        let action = if bounded { range_scale(&action) } else { standard_scale(&action) };
+        Ok(Self { action, columns: observed, env })
     }
 
-    /// The dataset info of a column.
+    /// The info of an environment without data: the shapes of `columns`, whose values are not scaled, and actions whose
+    /// bounds are mapped to -1 and 1.
+    ///
+    /// # Errors
+    /// When the action space is not continuous with finite bounds, or the environment does not observe a column.
+    pub fn from_env(spec: &EnvSpec, columns: &[String]) -> Result<Self> {
+        let action = bounds_scale(spec)?;
+        let info = |name: &String| {
+            let column = spec.columns.iter().find(|column| column.name == *name).ok_or_else(|| {
+                let known = spec.columns.iter().map(|column| column.name.as_str());
+                Error::unknown("column of the environment", name, known, format!("{} observes these", spec.id))
+            })?;
+            Ok((name.clone(), ColumnInfo::identity(column)))
+        };
+        // Images are not scaled, and the other three are no observations.
+        let skipped = ["pixels", "action", "reward", "terminated"];
+        let columns = columns.iter().filter(|name| !skipped.contains(&name.as_str())).map(info);
+        Ok(Self { action, columns: columns.collect::<Result<Named<_>>>()?, env: Some(spec.id.clone()) })
+    }
+
+    /// The statistics of a column.
     ///
     /// # Errors
     /// When the model was trained without it.
     pub fn column(&self, name: &str) -> Result<&ColumnInfo> {
         self.columns.get(name).ok_or_else(|| {
-            Error::unknown(
-                "column of the model",
-                name,
-                self.columns.keys().map(String::as_str),
-                "it was trained on these",
-            )
+            let known = self.columns.keys().map(String::as_str);
+            Error::unknown("column of the model", name, known, "it was trained on these")
         })
     }
 
-    /// The actions of a batch of clips, in model units.
+    /// The actions of a batch of clips, in model units. Missing actions (NaN in the last row of an episode) become 0, which
+    /// is the mean.
     ///
     /// # Shapes
-    /// `[clips, steps, frameskip * numbers]`. Actions that are missing (the last of an episode) are 0, their mean.
+    /// `[clips, steps, frameskip * action_dim]`.
     ///
     /// # Errors
-    /// When there is no such column, or it is of another type.
+    /// When there is no column of actions, or it is of another type.
     pub fn actions(&self, batch: &Batch, steps: usize, frameskip: usize, device: &Device) -> Result<Tensor<3>> {
         let dim = self.action.dim();
         let mut actions = batch.get::<f32>("action")?.to_vec();
         let mut scaled = vec![0.0; dim];
-        for one in actions.chunks_exact_mut(dim) {
-            self.action.to_model(one, &mut scaled);
-            for (to, &from) in one.iter_mut().zip(&scaled) {
+        for action in actions.chunks_exact_mut(dim) {
+            self.action.to_model(action, &mut scaled);
+            for (to, &from) in action.iter_mut().zip(&scaled) {
                 *to = if from.is_nan() { 0.0 } else { from };
             }
         }
         Ok(Tensor::from_data(TensorData::new(actions, [batch.rows(), steps, frameskip * dim]), device))
     }
+}
+
+/// Standardises actions to mean 0 and standard deviation 1.
+fn standard_scale(action: &ColumnInfo) -> ActionScale {
+    let single = |values: &[f64]| values.iter().map(|&value| value as f32).collect();
+    ActionScale { mean: single(&action.mean), std: single(&action.spread()) }
+}
+
+/// Maps the range of the actions in the data to -1 ..= 1; an element that is constant keeps its unit.
+fn range_scale(action: &ColumnInfo) -> ActionScale {
+    let range = |(&low, &high): (&f64, &f64)| match high > low {
+        true => (((high + low) / 2.0) as f32, ((high - low) / 2.0) as f32),
+        false => (low as f32, 1.0),
+    };
+    let (mean, std) = action.min.iter().zip(&action.max).map(range).unzip();
+    ActionScale { mean, std }
+}
+
+/// Maps the bounds of the action space to -1 and 1.
+fn bounds_scale(spec: &EnvSpec) -> Result<ActionScale> {
+    let refused = |fix: &str| {
+        let given = format!("its actions are {}", spec.action_space.describe());
+        Err(Error::config(format!("training online in {}", spec.id), given, fix))
+    };
+    let Space::Box { low, high, .. } = &spec.action_space else {
+        return refused("choose an environment with continuous actions (`swm envs` lists them)");
+    };
+    if low.iter().chain(high).any(|bound| !bound.is_finite()) {
+        return refused("choose an environment whose actions have finite bounds");
+    }
+    let half = |sign: f64| low.iter().zip(high).map(|(low, high)| ((high + sign * low) / 2.0) as f32).collect();
+    Ok(ActionScale { mean: half(1.0), std: half(-1.0) })
 }

@@ -1,4 +1,4 @@
-//! What a training run leaves behind to look at: one JSON object a line, and a TensorBoard event file.
+//! The log of a training run: JSON lines (`train.jsonl`) and a TensorBoard event file.
 
 use prost::Message;
 use std::fs::{File, OpenOptions};
@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use std::time::{SystemTime, UNIX_EPOCH};
 use swm_core::{Error, Result};
 
-/// Named numbers of one moment of training.
+/// Named values of one step.
 pub type Scalars<'a> = &'a [(&'a str, f64)];
 
-/// Writes numbers to `train.jsonl` and to an event file.
+/// Writes scalars to `train.jsonl` and to an event file.
 pub struct Log {
     lines: Writer,
     events: Writer,
@@ -34,8 +34,8 @@ impl Writer {
 }
 
 impl Log {
-    /// A log in a folder; `resume` continues the lines of an earlier run. Event files are one a run, as TensorBoard
-    /// expects.
+    /// Opens the log of a folder; `resume` appends to the lines of an earlier run. Each run gets its own event file, as
+    /// TensorBoard expects.
     ///
     /// # Errors
     /// When the folder cannot be written.
@@ -54,11 +54,10 @@ impl Log {
         Ok(log)
     }
 
-    /// Writes the numbers of a step.
+    /// Writes the scalars of a step.
     ///
     /// # Errors
     /// When the disk refuses.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
     pub fn write(&mut self, step: usize, scalars: Scalars<'_>) -> Result<()> {
         let mut object = serde_json::Map::new();
         object.insert("step".to_owned(), step.into());
@@ -111,7 +110,7 @@ struct Value {
     simple_value: Option<f32>,
 }
 
-/// A record of a TFRecord file: length, its checksum, data, their checksum.
+/// A record of a TFRecord file: the length, its checksum, the data, their checksum.
 fn record(data: &[u8]) -> Vec<u8> {
     let length = (data.len() as u64).to_le_bytes();
     let mut out = length.to_vec();
@@ -121,7 +120,7 @@ fn record(data: &[u8]) -> Vec<u8> {
     out
 }
 
-/// The checksum of TFRecord files: CRC-32C, turned and shifted.
+/// The checksum of TFRecord files: CRC-32C, rotated by 15 bits, plus a constant.
 fn masked_crc(data: &[u8]) -> u32 {
     crc32c::crc32c(data).rotate_right(15).wrapping_add(0xa282_ead8)
 }
@@ -131,7 +130,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn events_read_back_and_their_checksums_hold() {
+    fn events_round_trip_with_valid_checksums() {
         let folder = tempfile::tempdir().expect("a folder");
         let mut log = Log::new(folder.path(), false).expect("a log");
         log.write(7, &[("loss", 0.5), ("lr", 1e-3)]).expect("written");
@@ -155,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn the_checksum_is_the_published_one() {
+    fn checksum_matches_tensorflow() {
         // The first twelve bytes of every event file that TensorFlow writes: a length of 24, then its checksum.
         assert_eq!(masked_crc(&24u64.to_le_bytes()), 0x224b_7fa3);
     }

@@ -1,35 +1,33 @@
-//! AdamW (Loshchilov and Hutter 2019) with clipping of the global gradient norm, as PyTorch computes both.
+//! AdamW (Loshchilov and Hutter 2019, algorithm 2) with clipping of the global gradient norm, as PyTorch computes both.
 //!
-//! Burn's own optimizer clips every tensor by itself and keys its state by ids that change from run to run; this
-//! one clips the whole gradient and keys its state by parameter name, so that it can be stored beside the
-//! weights.
+//! Burn's optimizer clips every tensor separately and keys its state by ids that change from run to run. This one clips the
+//! whole gradient and keys its state by parameter name, so that the state can be stored beside the weights.
 
-use super::trainable::ParameterGroup;
 use crate::nn::parameters::{self, HostTensor, IntoF32, Named};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// The optimizer's settings.
+/// The settings of [`AdamW`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OptimConfig {
-    /// The largest learning rate.
+    /// The peak learning rate.
     pub lr: f64,
     /// Decay of the weights per step, times the learning rate.
     pub weight_decay: f64,
-    /// Decay of the running gradient and of its running square.
+    /// Decay of the first moment (running gradient) and of the second (running squared gradient).
     pub betas: [f64; 2],
-    /// Added to the root of the running square.
+    /// Added to the root of the second moment.
     pub epsilon: f64,
-    /// The largest gradient norm (of all parameters, or of each of the model's groups); larger gradients are scaled down to it.
+    /// The largest gradient norm, of all parameters or of each parameter group; larger gradients are scaled down to it.
     pub clip: f64,
     /// Batches whose gradients are averaged for one step.
     #[serde(default = "one")]
     pub accumulate: usize,
-    /// The weights that are used in the end are a running average of those trained: the share of the average that a step
-    /// keeps, such as 0.999; 0 for none.
+    /// Decay of the exponential moving average of the weights, such as 0.999, which are then the weights of the
+    /// checkpoint; 0 for no average.
     #[serde(default)]
     pub ema: f64,
 }
@@ -38,7 +36,22 @@ fn one() -> usize {
     1
 }
 
-/// The running gradient and its running square, flat.
+/// How the optimizer treats a parameter.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ParameterGroup {
+    /// The index of the clipping group: its parameters share one gradient norm.
+    pub clip: usize,
+    /// A factor of the learning rate.
+    pub lr: f64,
+}
+
+impl Default for ParameterGroup {
+    fn default() -> Self {
+        Self { clip: 0, lr: 1.0 }
+    }
+}
+
+/// First and second moment of a parameter's gradient, flattened to one axis.
 #[derive(Clone, Debug)]
 struct Moments {
     first: Tensor<1>,
@@ -53,12 +66,12 @@ pub struct AdamW {
 }
 
 impl AdamW {
-    /// An optimizer that has made no step.
+    /// Creates an optimizer before its first step.
     pub fn new(config: OptimConfig) -> Self {
         Self { config, steps: 0, moments: Named::new() }
     }
 
-    /// The state: `first.NAME` and `second.NAME`.
+    /// The moments by name: `first.NAME` and `second.NAME`, flattened to one axis.
     pub fn state(&self) -> Named<HostTensor> {
         let host = |tensor: &Tensor<1>| {
             let values = tensor.to_data().into_f32_vec();
@@ -70,7 +83,7 @@ impl AdamW {
         self.moments.iter().flat_map(both).collect()
     }
 
-    /// Puts a state back that was taken after `steps` steps.
+    /// Restores a state that was taken after `steps` steps.
     pub fn restore(&mut self, steps: usize, state: Named<HostTensor>, device: &Device) {
         let tensor =
             |host: &HostTensor| Tensor::from_data(TensorData::new(host.values.clone(), [host.values.len()]), device);
@@ -85,35 +98,31 @@ impl AdamW {
             .collect();
     }
 
-    /// One step at a share of the largest learning rate; returns the module and the gradient's norm before clipping.
-    /// `group` says how a parameter is treated.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
+    /// Makes one step at `lr_factor` times the peak learning rate. Returns the module and the gradient norm before
+    /// clipping. `group` returns the group of the parameter of a name.
+    ///
+    /// # Shapes
+    /// `gradients` are flattened to one axis, by parameter name.
     pub fn step<M: Module>(
         &mut self,
         module: M,
-        share: f64,
+        lr_factor: f64,
         mut gradients: Named<Tensor<1>>,
         group: fn(&str) -> ParameterGroup,
     ) -> (M, f64) {
-        // The square of each group's norm, in the order of names.
-        let mut squares: BTreeMap<usize, f64> = BTreeMap::new();
-        for (name, gradient) in &gradients {
-            let square = f64::from(gradient.clone().square().sum().into_scalar::<f32>());
-            *squares.entry(group(name).clip).or_default() += square;
-        }
-        let norm = squares.values().sum::<f64>().sqrt();
+        let (squared_norms, norm) = squared_norms(&gradients, group);
         self.steps += 1;
         let [beta1, beta2] = self.config.betas;
-        let rest = 1.0 - beta1.powi(self.steps as i32);
-        let root = (1.0 - beta2.powi(self.steps as i32)).sqrt();
+        let bias1 = 1.0 - beta1.powi(self.steps as i32);
+        let root_bias2 = (1.0 - beta2.powi(self.steps as i32)).sqrt();
         let moments = &mut self.moments;
         let config = &self.config;
         let module = parameters::map(module, |name, value| {
             let Some(gradient) = gradients.remove(name) else { return value };
             let group = group(name);
-            let lr = config.lr * share * group.lr;
-            // A little more than the norm, as PyTorch does, so that 0 divides nothing.
-            let scale = config.clip / (squares[&group.clip].sqrt() + 1e-6);
+            let lr = config.lr * lr_factor * group.lr;
+            // PyTorch adds 1e-6 to the norm, so that a zero gradient divides by more than 0.
+            let scale = config.clip / (squared_norms[&group.clip].sqrt() + 1e-6);
             let gradient = if scale < 1.0 { gradient * scale } else { gradient };
             let (first, second) = match moments.remove(name) {
                 Some(Moments { first, second }) => (
@@ -122,10 +131,21 @@ impl AdamW {
                 ),
                 None => (gradient.clone() * (1.0 - beta1), gradient.square() * (1.0 - beta2)),
             };
-            let update = first.clone() / (second.clone().sqrt() / root + config.epsilon);
+            let update = first.clone() / (second.clone().sqrt() / root_bias2 + config.epsilon);
             moments.insert(name.to_owned(), Moments { first, second });
-            value * (1.0 - lr * config.weight_decay) - update * (lr / rest)
+            value * (1.0 - lr * config.weight_decay) - update * (lr / bias1)
         });
         (module, norm)
     }
+}
+
+/// The squared gradient norm of every clipping group, and the norm of the whole gradient. Sums run in the order of names.
+fn squared_norms(gradients: &Named<Tensor<1>>, group: fn(&str) -> ParameterGroup) -> (BTreeMap<usize, f64>, f64) {
+    let mut squares: BTreeMap<usize, f64> = BTreeMap::new();
+    for (name, gradient) in gradients {
+        let square = f64::from(gradient.clone().square().sum().into_scalar::<f32>());
+        *squares.entry(group(name).clip).or_default() += square;
+    }
+    let norm = squares.values().sum::<f64>().sqrt();
+    (squares, norm)
 }

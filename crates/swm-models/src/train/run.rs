@@ -1,467 +1,302 @@
-//! The loop.
+//! [`train`]: the training loop on a dataset.
 
-use super::config::TrainConfig;
-use super::trainable::{StepContext, StepOutput, Trainable};
-use super::{AdamW, DatasetInfo, Observer, Progress, TrainOptions, TrainSummary, episodes, failure, log};
-use crate::checkpoint::{Checkpoint, TrainState};
-use crate::nn::parameters::{self, Named};
-use burn::tensor::Tensor;
+use super::config::{LoopConfig, TrainConfig};
+use super::dataset_info::DatasetInfo;
+use super::failed_batch;
+use super::learner::{self, Learn, Learner, Update};
+use super::log::Log;
+use super::metrics::{MetricWindow, Metrics};
+use super::options::{TrainOptions, TrainSummary};
+use super::run_state::is_due;
+use super::split::episodes;
+use super::step_output::StepOutput;
+use super::trainable::Trainable;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
-use swm_core::{Batch, Error, Key, Manifest, Result};
-use swm_data::{Loader, LoaderConfig, Part, Reader};
+use swm_core::run::{Control, Event, Progress, Stage};
+use swm_core::{Batch, Error, Key, Result};
+use swm_data::{Epoch, Loader, LoaderConfig, Part, Reader};
 
-/// The folder, inside a run's, of the checkpoint with the lowest loss on held-out episodes.
-pub const BEST: &str = "best";
+/// The name of the stage in the events of a training run.
+pub(crate) const STAGE: &str = "train";
 
-/// Trains a model on a dataset; the checkpoint and the logs go to `out`.
+/// Trains a model on a dataset; the checkpoint and the logs go to the folder `out`.
 ///
-/// `stop` ends the run after the current step; what was learnt is saved.
+/// `control` is checked before every step. An interrupted run saves its checkpoint and returns a summary with
+/// `interrupted`. The metrics of the progress events are the model's, then `validation_loss` (once there is one), `lr`,
+/// `gradient_norm`, `clips_per_second` and `data_wait`, the fraction of the time spent waiting for data.
 ///
 /// # Errors
-/// When the configuration contradicts itself or the data, `out` holds a run that may not or cannot be continued,
-/// the loss is not finite (the batch is saved), or the disk refuses.
+/// When the configuration contradicts itself or the data, `out` holds a run that cannot be continued, the loss or its
+/// gradient is not finite (the batch is saved), the caller's poll fails (after saving), or the disk refuses.
 pub fn train<M: Trainable>(
     config: &TrainConfig<M>,
     reader: Arc<dyn Reader>,
     out: &Path,
     options: &TrainOptions,
-    observer: &mut dyn Observer,
-    stop: &AtomicBool,
+    control: &mut Control<'_>,
 ) -> Result<TrainSummary> {
     let threads = swm_core::pool::threads(options.threads)?;
-    threads.install(|| Run::new(config, reader, out, options)?.go(observer, stop))
+    threads.install(|| {
+        config.check()?;
+        let loader_config = M::loader_config(config, reader.schema())?;
+        let goals = loader_config.goals.iter().flat_map(|goal| &goal.columns);
+        let columns: Vec<String> = loader_config.clip.columns.iter().chain(goals).cloned().collect();
+        let dataset_info = DatasetInfo::from_reader(&*reader, &columns, M::BOUNDED_ACTIONS)?;
+        let manifest = learner::manifest(config, reader.content_hash()?, &options.device);
+        let mut learner = match Learner::resume(config, &dataset_info, &manifest, out, options)? {
+            Some(learner) => learner,
+            None => Learner::start(config, dataset_info, manifest, out, &options.device)?
+                .with_pretrained_weights(&options.cache)?,
+        };
+        let run = Run::new(config.loop_config(), loader_config, &reader, out, options, &mut learner)?;
+        run.go(M::FAMILY, control)
+    })
 }
 
 /// A run in progress.
-struct Run<'a, M: Trainable> {
-    config: &'a TrainConfig<M>,
+struct Run<'a> {
+    config: LoopConfig,
     out: &'a Path,
-    options: &'a TrainOptions,
-    loader: Loader,
+    learner: &'a mut dyn Learn,
+    batches: Batches,
     validation: Option<Loader>,
-    /// The weights that are trained.
-    model: M,
-    /// Their running average, where one is kept.
-    average: Option<M>,
-    dataset_info: DatasetInfo,
-    manifest: Manifest,
-    optimizer: AdamW,
-    state: RunState,
-    log: log::Log,
+    log: Log,
+    clock: Clock,
 }
 
-/// Named numbers.
-type Metrics = Vec<(&'static str, f64)>;
-
-/// How far a run is: all that its future depends on, beside the tensors.
-#[derive(Clone, Debug, Default, serde::Serialize, serde::Deserialize)]
-pub(crate) struct RunState {
-    /// Steps done.
-    pub step: usize,
-    /// The step and the loss of the best look at held-out episodes.
-    #[serde(default)]
-    pub best: Option<(usize, f64)>,
-    /// Looks since then.
-    #[serde(default)]
-    pub looks: usize,
+/// The batches of a run, epoch after epoch.
+struct Batches {
+    loader: Loader,
+    epoch: Epoch,
+    /// Batches taken since the run first began.
+    taken: usize,
 }
 
-impl<'a, M: Trainable> Run<'a, M> {
+/// Durations and rates of a run.
+struct Clock {
+    start: Instant,
+    /// The step at which the run began or continued.
+    first_step: usize,
+    /// Seconds spent waiting for batches.
+    waited: f64,
+    clips_per_second: f64,
+}
+
+impl<'a> Run<'a> {
     fn new(
-        config: &'a TrainConfig<M>,
-        reader: Arc<dyn Reader>,
+        config: LoopConfig,
+        loader_config: LoaderConfig,
+        reader: &Arc<dyn Reader>,
         out: &'a Path,
-        options: &'a TrainOptions,
+        options: &TrainOptions,
+        learner: &'a mut dyn Learn,
     ) -> Result<Self> {
-        config.check()?;
-        let device = &options.device;
-        let wanted = M::loader_config(config, reader.schema())?;
-        let columns: Vec<String> =
-            wanted.clip.columns.iter().chain(wanted.goals.iter().flat_map(|goal| &goal.columns)).cloned().collect();
-        let dataset_info = DatasetInfo::from_reader(&*reader, &columns, M::BOUNDED_ACTIONS)?;
-        let mut manifest = Manifest::new("train", config.seed, serde_json::to_value(config).unwrap_or_default());
-        manifest.libraries.insert("burn".to_owned(), "0.22.1".to_owned());
-        manifest.hashes.insert("dataset".to_owned(), reader.content_hash()?);
-        manifest.device = crate::device::name(device);
-
-        let mut optimizer = AdamW::new(config.optim.clone());
-        let mut state = RunState::default();
-        let (model, average);
-        if Checkpoint::<M>::exists(out) {
-            if !options.resume {
-                return Err(Error::config(
-                    out.display().to_string(),
-                    "holds a training run already",
-                    "continue it with `resume`, or choose another folder",
-                ));
-            }
-            let (checkpoint, stored) = Checkpoint::<M>::load_to_resume(out, device)?;
-            same_run(out, &checkpoint.manifest, &manifest)?;
-            optimizer.restore(stored.position.step, stored.moments, device);
-            state = stored.position;
-            match stored.raw {
-                Some(raw) => (model, average) = (raw, Some(checkpoint.model)),
-                None => (model, average) = (checkpoint.model, None),
-            }
-        } else {
-            std::fs::create_dir_all(out).map_err(|error| Error::io(out, "creating a folder", error))?;
-            let fresh = M::new(config, &dataset_info, Key::new(config.seed).with("init"), device)?;
-            model = fresh.with_pretrained_weights(config, &options.cache)?;
-            average = (config.optim.ema > 0.0).then(|| model.clone());
-        }
-
-        let loader = |wanted: LoaderConfig, part, shuffle| {
+        let loader = |part| {
             let config = LoaderConfig {
                 batch_size: config.data.batch_size,
-                shuffle,
+                // Validation is shuffled, too: in stored order, its first batches would come from one or two episodes.
+                shuffle: true,
                 seed: config.seed,
                 threads: options.loader_threads,
                 prefetch: options.prefetch,
                 drop_last: true,
-                episodes: episodes(config.data.hold_out, part, &*reader)?,
-                ..wanted
+                episodes: episodes(config.data.hold_out, part, &**reader)?,
+                ..loader_config.clone()
             };
-            Loader::new(Arc::clone(&reader), config)
+            Loader::new(Arc::clone(reader), config)
         };
-        // In shuffled order, too: in stored order, the first batches would come from one or two episodes.
         let validation = match config.validation.every {
             0 => None,
-            _ => Some(loader(wanted.clone(), Part::Validation, true)?),
+            _ => Some(loader(Part::Validation)?),
         };
-        let loader = loader(wanted, Part::Train, true)?;
-        let log = log::Log::new(out, state.step > 0)?;
-        Ok(Self {
-            config,
-            out,
-            options,
-            loader,
-            validation,
-            model,
-            average,
-            dataset_info,
-            manifest,
-            optimizer,
-            state,
-            log,
-        })
+        let first_step = learner.state().step;
+        let batches = Batches::new(loader(Part::Train)?, first_step * config.optim.accumulate);
+        let log = Log::new(out, first_step > 0)?;
+        let clock = Clock { start: Instant::now(), first_step, waited: 0.0, clips_per_second: 0.0 };
+        Ok(Self { config, out, learner, batches, validation, log, clock })
     }
 
-    #[allow(clippy::cast_precision_loss)]
-    fn go(mut self, observer: &mut dyn Observer, stop: &AtomicBool) -> Result<TrainSummary> {
+    fn go(mut self, family: &'static str, control: &mut Control<'_>) -> Result<TrainSummary> {
         let steps = self.config.schedule.steps;
-        let accumulate = self.config.optim.accumulate;
-        let per_epoch = self.loader.batches_per_epoch();
-        let begun = Instant::now();
-        let first = self.state.step;
-        let mut waited = 0.0;
-        let mut window = Window::default();
-        let mut last = vec![];
-        let (mut interrupted, mut stopped_early) = (false, false);
-        let mut clips_per_second = 0.0;
-        let mut validation = None;
-        let mut taken = self.state.step * accumulate;
-        let mut batches = self.loader.epoch((taken / per_epoch) as u64, taken % per_epoch);
-        while self.state.step < steps && !stopped_early {
-            if stop.load(Ordering::Relaxed) {
-                interrupted = true;
+        control.emit(Event::Started(Stage { name: STAGE, subject: &[family], total: steps, unit: "steps" }));
+        self.clock.start = Instant::now();
+        let (mut window, mut last) = (MetricWindow::default(), vec![]);
+        let (mut stop, mut stopped_early, mut validation) = (None, false, None);
+        while self.learner.state().step < steps && !stopped_early {
+            if let Err(error) = control.check() {
+                stop = Some(error);
                 break;
             }
-            let mut learnt = Learnt::default();
-            for _ in 0..accumulate {
-                let asked = Instant::now();
-                let batch = loop {
-                    match batches.next() {
-                        Some(batch) => break batch?,
-                        None => batches = self.loader.epoch((taken / per_epoch) as u64, 0),
-                    }
-                };
-                waited += asked.elapsed().as_secs_f64();
-                self.look(&batch, taken, &mut learnt)?;
-                taken += 1;
-            }
-            let (metrics, lr, gradient_norm) = self.learn(learnt)?;
-            let done = self.state.step;
-
-            let elapsed = begun.elapsed().as_secs_f64();
-            clips_per_second = ((done - first) * accumulate * self.config.data.batch_size) as f64 / elapsed;
-            let data_wait = waited / elapsed;
+            let Update { metrics, lr, gradient_norm } = self.step()?;
+            let done = self.learner.state().step;
+            let elapsed = self.clock.tick(done, &self.config);
             window.add(&metrics, gradient_norm);
-            if due(self.config.validation.every, done, steps) {
-                let (loss, logged) = self.validate()?;
+            if is_due(self.config.validation.every, done, steps) {
+                let loss = self.validate()?;
                 validation = Some(loss);
-                self.log.write(done, &logged.iter().map(|(name, v)| (name.as_str(), *v)).collect::<Vec<_>>())?;
-                stopped_early = self.judge(loss)?;
+                stopped_early = self.is_stalled(loss)?;
             }
-            observer.progress(&Progress {
-                step: done,
-                steps,
-                epoch: (taken / per_epoch) as u64,
-                metrics,
-                validation,
-                lr,
-                gradient_norm,
-                clips_per_second,
-                data_wait,
-            });
-            if due(self.config.log_every, done, steps) || stopped_early {
-                let (metrics, norm) = window.take();
-                last.clone_from(&metrics);
-                let mut line = metrics;
-                line.extend([
-                    ("lr", lr),
-                    ("gradient_norm", norm),
-                    ("clips_per_second", clips_per_second),
-                    ("data_wait", data_wait),
-                    ("seconds", elapsed),
-                ]);
-                self.log.write(done, &line)?;
+            let rates = self.clock.rates(elapsed);
+            let mut shown = metrics;
+            shown.extend(validation.map(|loss| ("validation_loss", loss)));
+            shown.extend([("lr", lr), ("gradient_norm", gradient_norm)]);
+            shown.extend(rates);
+            control.progress(Progress { stage: STAGE, done, total: steps, unit: "steps", metrics: &shown });
+            if is_due(self.config.log_every, done, steps) || stopped_early {
+                let (means, norm) = window.take();
+                last.clone_from(&means);
+                self.log_line(done, means, lr, norm, rates, elapsed)?;
             }
-            let save = self.config.save_every;
-            if save > 0 && done.is_multiple_of(save) && done < steps {
-                self.save()?;
+            let save_every = self.config.save_every;
+            if save_every > 0 && done.is_multiple_of(save_every) && done < steps {
+                self.learner.save(self.out)?;
+                control.emit(Event::Saved(self.out));
             }
         }
-        let weights = self.save()?;
-        let seconds = begun.elapsed().as_secs_f64();
-        Ok(TrainSummary {
-            checkpoint: self.out.to_owned(),
-            weights,
-            steps: self.state.step,
-            interrupted,
-            stopped_early,
-            best: self.state.best,
-            metrics: last.into_iter().map(|(name, value)| (name.to_owned(), value)).collect(),
-            parameters: parameters::trained_count(&self.model),
-            clips_per_second,
-            data_wait: if seconds > 0.0 { waited / seconds } else { 0.0 },
-            seconds,
-        })
-    }
-
-    /// Loss and gradients of one batch, added to those of the step.
-    fn look(&self, batch: &Batch, number: usize, learnt: &mut Learnt) -> Result<()> {
-        let key = Key::new(self.config.seed).with("step").at(number as u64);
-        let output = self.model.step(&self.context(key, true), batch)?;
-        if !output.loss().is_finite() {
-            return Err(self.failed(batch, &output, "the loss"));
-        }
-        if output.gradients.values().any(|g| !g.clone().abs().sum().into_scalar::<f32>().is_finite()) {
-            return Err(self.failed(batch, &output, "the gradient of the loss"));
-        }
-        learnt.add(output);
-        Ok(())
-    }
-
-    /// What is wrong with a batch that gave numbers that are not finite; the batch is saved.
-    fn failed(&self, batch: &Batch, output: &StepOutput, what: &str) -> Error {
-        let numbers: Vec<String> = output.metrics.iter().map(|(name, value)| format!("{name} {value}")).collect();
-        let kept = match failure::save(self.out, batch) {
-            Ok(path) => format!("the batch is in {}", path.display()),
-            Err(error) => format!("the batch could not be saved ({error})"),
+        let weights = self.learner.save(self.out)?;
+        control.emit(Event::Saved(self.out));
+        let interrupted = match stop {
+            None => false,
+            Some(Error::Interrupted) => true,
+            Some(error) => return Err(error),
         };
-        Error::NotFinite {
-            what: format!("{what} at training step {}", self.state.step + 1),
-            given: format!("{} ({kept})", numbers.join(", ")),
-            fix: "lower optim.lr or lengthen schedule.warmup; the last checkpoint, if any, is kept".to_owned(),
+        if !interrupted {
+            control.emit(Event::Finished { stage: STAGE, metrics: &last });
         }
+        Ok(self.summary(weights, interrupted, stopped_early, last))
     }
 
-    fn context(&self, key: Key, training: bool) -> StepContext<'_, M> {
-        StepContext {
-            config: self.config,
-            dataset_info: &self.dataset_info,
-            key,
-            device: &self.options.device,
-            training,
+    /// Averages the gradients of the step's batches and makes one optimizer step.
+    fn step(&mut self) -> Result<Update> {
+        let accumulate = self.config.optim.accumulate;
+        let mut sum = StepOutput::default();
+        for _ in 0..accumulate {
+            let start = Instant::now();
+            let number = self.batches.taken;
+            let batch = self.batches.next()?;
+            self.clock.waited += start.elapsed().as_secs_f64();
+            sum.add(self.loss_and_gradients(&batch, number)?);
         }
+        let mean = if accumulate > 1 { sum.scaled(1.0 / accumulate as f64) } else { sum };
+        let key = Key::new(self.config.seed).with("after").at(self.learner.state().step as u64);
+        Ok(self.learner.update(mean, key))
     }
 
-    /// One step of the optimizer; returns the step's numbers, its learning rate and the gradient's norm.
-    fn learn(&mut self, learnt: Learnt) -> Result<(Metrics, f64, f64)> {
-        let StepOutput { metrics, gradients, buffers } = learnt.mean();
-        let share = self.config.schedule.share(self.state.step);
-        let (model, norm) = self.optimizer.step(self.model.clone(), share, gradients, M::parameter_group);
-        let key = Key::new(self.config.seed).with("after").at(self.state.step as u64);
-        let model = model.after_step(&self.context(key, true), buffers);
-        if let Some(average) = self.average.take() {
-            self.average = Some(parameters::blend(average, &model, self.config.optim.ema));
-        }
-        self.model = model;
-        self.state.step += 1;
-        Ok((metrics, self.config.optim.lr * share, norm))
+    /// Loss and gradients of the batch of that number, checked to be finite.
+    fn loss_and_gradients(&self, batch: &Batch, number: usize) -> Result<StepOutput> {
+        let key = Key::new(self.config.seed).with("step").at(number as u64);
+        let output = self.learner.loss_and_gradients(batch, key, true)?;
+        let not_finite = if !output.loss().is_finite() {
+            "the loss"
+        } else if output.gradients.values().any(|g| !g.clone().abs().sum().into_scalar::<f32>().is_finite()) {
+            "the gradient of the loss"
+        } else {
+            return Ok(output);
+        };
+        let what = format!("{not_finite} at training step {}", self.learner.state().step + 1);
+        let fix = "lower optim.lr or lengthen schedule.warmup; the last checkpoint, if any, is kept";
+        Err(failed_batch::error(self.out, batch, what, &failed_batch::describe(&output.metrics), fix))
     }
 
-    /// The loss on held-out episodes, and every number by the name it is logged under.
-    #[allow(clippy::cast_precision_loss)]
-    fn validate(&self) -> Result<(f64, Vec<(String, f64)>)> {
-        let Some(loader) = &self.validation else { return Ok((f64::NAN, vec![])) };
-        let model = self.average.as_ref().unwrap_or(&self.model);
-        let mut window = Window::default();
+    /// Logs the means of the metrics over the validation batches and returns the loss.
+    fn validate(&mut self) -> Result<f64> {
+        let Some(loader) = &self.validation else { return Ok(f64::NAN) };
+        let mut window = MetricWindow::default();
         for (number, batch) in loader.epoch(0, 0).take(self.config.validation.batches).enumerate() {
             let key = Key::new(self.config.seed).with("validation").at(number as u64);
-            window.add(&model.step(&self.context(key, false), &*batch?)?.metrics, 0.0);
+            window.add(&self.learner.loss_and_gradients(&*batch?, key, false)?.metrics, 0.0);
         }
-        if window.count == 0 {
+        if window.is_empty() {
             return Err(Error::config(
                 "validation.every",
-                format!("the episodes held out have fewer than {} clips, a batch", self.config.data.batch_size),
-                "collect more episodes, lower data.batch_size, or say validation.every=0",
+                format!("the validation episodes have fewer clips than a batch of {}", self.config.data.batch_size),
+                "collect more episodes, lower data.batch_size, or set validation.every=0",
             ));
         }
         let (metrics, _) = window.take();
-        let loss = metrics.first().map_or(f64::NAN, |&(_, loss)| loss);
-        Ok((loss, metrics.into_iter().map(|(name, value)| (format!("validation/{name}"), value)).collect()))
+        let names: Vec<String> = metrics.iter().map(|(name, _)| format!("validation/{name}")).collect();
+        let scalars: Vec<(&str, f64)> = names.iter().map(String::as_str).zip(metrics.iter().map(|m| m.1)).collect();
+        self.log.write(self.learner.state().step, &scalars)?;
+        Ok(metrics.first().map_or(f64::NAN, |&(_, loss)| loss))
     }
 
-    /// Keeps the best weights so far; returns whether it is time to give up.
-    fn judge(&mut self, loss: f64) -> Result<bool> {
-        if self.state.best.is_none_or(|(_, best)| loss < best) {
-            self.state.best = Some((self.state.step, loss));
-            self.state.looks = 0;
-            self.checkpoint().save(&self.out.join(BEST), None)?;
-        } else {
-            self.state.looks += 1;
-        }
+    /// Saves the weights if `loss` is the lowest so far; returns whether training is to stop early.
+    fn is_stalled(&mut self, loss: f64) -> Result<bool> {
+        let is_best = self.learner.save_if_best(loss, self.out)?;
+        let since_best = &mut self.learner.state_mut().validations_since_best;
+        *since_best = if is_best { 0 } else { *since_best + 1 };
         let patience = self.config.validation.patience;
-        Ok(patience > 0 && self.state.looks >= patience)
+        Ok(patience > 0 && *since_best >= patience)
     }
 
-    /// The model as others use it.
-    fn checkpoint(&self) -> Checkpoint<M> {
-        Checkpoint {
-            model: self.average.as_ref().unwrap_or(&self.model).clone(),
-            config: self.config.clone(),
-            dataset_info: self.dataset_info.clone(),
-            manifest: self.manifest.clone(),
+    fn log_line(
+        &mut self,
+        step: usize,
+        mut means: Metrics,
+        lr: f64,
+        gradient_norm: f64,
+        rates: [(&'static str, f64); 2],
+        elapsed: f64,
+    ) -> Result<()> {
+        means.extend([("lr", lr), ("gradient_norm", gradient_norm)]);
+        means.extend(rates);
+        means.push(("seconds", elapsed));
+        self.log.write(step, &means)
+    }
+
+    fn summary(self, weights: String, interrupted: bool, stopped_early: bool, last: Metrics) -> TrainSummary {
+        let seconds = self.clock.start.elapsed().as_secs_f64();
+        let state = self.learner.state();
+        TrainSummary {
+            checkpoint: self.out.to_owned(),
+            weights,
+            steps: state.step,
+            interrupted,
+            stopped_early,
+            best: state.best,
+            metrics: last.into_iter().map(|(name, value)| (name.to_owned(), value)).collect(),
+            parameters: self.learner.parameter_count(),
+            clips_per_second: self.clock.clips_per_second,
+            data_wait: if seconds > 0.0 { self.clock.waited / seconds } else { 0.0 },
+            seconds,
         }
-    }
-
-    fn save(&self) -> Result<String> {
-        let state = TrainState {
-            position: self.state.clone(),
-            moments: self.optimizer.state(),
-            raw: self.average.as_ref().map(|_| self.model.clone()),
-        };
-        self.checkpoint().save(self.out, Some(&state))
     }
 }
 
-/// Whether something that happens every so many steps, and at the end, is due.
-pub(crate) fn due(every: usize, done: usize, steps: usize) -> bool {
-    every > 0 && (done.is_multiple_of(every) || done == steps)
-}
-
-/// What the batches of a step found, added up.
-#[derive(Default)]
-struct Learnt {
-    sum: StepOutput,
-    count: usize,
-}
-
-impl Learnt {
-    fn add(&mut self, output: StepOutput) {
-        self.count += 1;
-        if self.count == 1 {
-            self.sum = output;
-            return;
-        }
-        for (sum, (_, value)) in self.sum.metrics.iter_mut().zip(output.metrics) {
-            sum.1 += value;
-        }
-        add(&mut self.sum.gradients, output.gradients);
-        add(&mut self.sum.buffers, output.buffers);
+impl Batches {
+    /// The batches after the first `taken`.
+    fn new(loader: Loader, taken: usize) -> Self {
+        let per_epoch = loader.batches_per_epoch();
+        let epoch = loader.epoch((taken / per_epoch) as u64, taken % per_epoch);
+        Self { loader, epoch, taken }
     }
 
-    #[allow(clippy::cast_precision_loss)]
-    fn mean(self) -> StepOutput {
-        let Self { mut sum, count } = self;
-        if count > 1 {
-            let share = 1.0 / count as f64;
-            sum.metrics.iter_mut().for_each(|(_, value)| *value *= share);
-            for tensors in [&mut sum.gradients, &mut sum.buffers] {
-                *tensors = std::mem::take(tensors).into_iter().map(|(name, t)| (name, t * share)).collect();
+    /// The next batch, of the next epoch after the last one of an epoch.
+    fn next(&mut self) -> Result<swm_data::Loaded> {
+        loop {
+            match self.epoch.next() {
+                Some(batch) => {
+                    self.taken += 1;
+                    return batch;
+                }
+                None => self.epoch = self.loader.epoch((self.taken / self.loader.batches_per_epoch()) as u64, 0),
             }
         }
-        sum
     }
 }
 
-/// Adds tensors by name.
-pub(super) fn add(sum: &mut Named<Tensor<1>>, more: Named<Tensor<1>>) {
-    for (name, tensor) in more {
-        let tensor = match sum.remove(&name) {
-            Some(sum) => sum + tensor,
-            None => tensor,
-        };
-        sum.insert(name, tensor);
-    }
-}
-
-/// Means of what happened since the last line of the log.
-#[derive(Default)]
-pub(crate) struct Window {
-    metrics: Vec<(&'static str, f64)>,
-    norm: f64,
-    count: usize,
-}
-
-impl Window {
-    pub fn add(&mut self, metrics: &[(&'static str, f64)], norm: f64) {
-        if self.count == 0 {
-            self.metrics = metrics.iter().map(|&(name, _)| (name, 0.0)).collect();
-        }
-        for (sum, (_, value)) in self.metrics.iter_mut().zip(metrics) {
-            sum.1 += value;
-        }
-        self.norm += norm;
-        self.count += 1;
+impl Clock {
+    /// Updates the rates after `done` steps and returns the seconds since the run began or continued.
+    fn tick(&mut self, done: usize, config: &LoopConfig) -> f64 {
+        let elapsed = self.start.elapsed().as_secs_f64();
+        let clips = (done - self.first_step) * config.optim.accumulate * config.data.batch_size;
+        self.clips_per_second = clips as f64 / elapsed;
+        elapsed
     }
 
-    /// The means and the mean gradient norm; begins anew.
-    #[allow(clippy::cast_precision_loss)]
-    pub fn take(&mut self) -> (Vec<(&'static str, f64)>, f64) {
-        let Self { metrics, norm, count } = std::mem::take(self);
-        let count = count.max(1) as f64;
-        (metrics.into_iter().map(|(name, sum)| (name, sum / count)).collect(), norm / count)
-    }
-}
-
-/// Checks that a stored run and the one asked for are the same.
-pub(crate) fn same_run(path: &Path, stored: &Manifest, wanted: &Manifest) -> Result<()> {
-    let problem = if stored.config != wanted.config {
-        let differing = differences("", &stored.config, &wanted.config);
-        format!("the run there has another configuration ({})", differing.join(", "))
-    } else if stored.hashes.get("dataset") != wanted.hashes.get("dataset") {
-        "the run there was trained on other data".to_owned()
-    } else {
-        return Ok(());
-    };
-    Err(Error::config(
-        path.display().to_string(),
-        problem,
-        "continue with what it began with, or choose another folder",
-    ))
-}
-
-/// The keys in which two configurations differ, with both values.
-fn differences(prefix: &str, a: &serde_json::Value, b: &serde_json::Value) -> Vec<String> {
-    match (a, b) {
-        (serde_json::Value::Object(left), serde_json::Value::Object(right)) => {
-            let mut keys: Vec<&String> = left.keys().chain(right.keys()).collect();
-            keys.sort();
-            keys.dedup();
-            let null = serde_json::Value::Null;
-            keys.into_iter()
-                .flat_map(|key| {
-                    let name = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
-                    differences(&name, left.get(key).unwrap_or(&null), right.get(key).unwrap_or(&null))
-                })
-                .collect()
-        }
-        _ if a == b => vec![],
-        _ => vec![format!("{prefix}: {a} there, {b} here")],
+    fn rates(&self, elapsed: f64) -> [(&'static str, f64); 2] {
+        [("clips_per_second", self.clips_per_second), ("data_wait", self.waited / elapsed)]
     }
 }

@@ -1,29 +1,31 @@
-//! The learning rate over time.
+//! The learning rate over time: linear warm-up, then cosine decay (Loshchilov and Hutter 2017, SGDR, without restarts).
 
 use serde::{Deserialize, Serialize};
 
-/// Linear warm-up, then half a cosine down.
+/// Linear warm-up to the peak learning rate, then half a cosine down to a floor.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ScheduleConfig {
     /// Training steps in all.
     pub steps: usize,
-    /// Of which the learning rate grows from 0.
+    /// Steps of the warm-up, which are among `steps`.
     pub warmup: usize,
-    /// The last learning rate, as a share of the largest.
+    /// The last learning rate, as a fraction of the peak.
     pub floor: f64,
 }
 
 impl ScheduleConfig {
-    /// The learning rate of a step as a share of the largest; the first step is 0.
-    #[allow(clippy::cast_precision_loss)]
-    pub fn share(&self, step: usize) -> f64 {
+    /// Returns the learning rate of a step (the first is 0) as a fraction of the peak.
+    ///
+    /// Step `t` has `(t + 1) / warmup` during the warm-up, then `floor + (1 - floor) (1 + cos πp) / 2` with
+    /// `p = (t - warmup) / (steps - warmup)`.
+    pub fn lr_factor(&self, step: usize) -> f64 {
         if step < self.warmup {
             return (step + 1) as f64 / self.warmup as f64;
         }
-        let rest = self.steps.saturating_sub(self.warmup).max(1) as f64;
-        let done = ((step - self.warmup) as f64 / rest).min(1.0);
-        self.floor + (1.0 - self.floor) * 0.5 * (1.0 + (std::f64::consts::PI * done).cos())
+        let decay_steps = self.steps.saturating_sub(self.warmup).max(1) as f64;
+        let progress = ((step - self.warmup) as f64 / decay_steps).min(1.0);
+        self.floor + (1.0 - self.floor) * 0.5 * (1.0 + (std::f64::consts::PI * progress).cos())
     }
 }
 
@@ -32,11 +34,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn it_rises_then_falls_to_the_floor() {
+    fn learning_rate_rises_linearly_then_decays_to_the_floor() {
         let schedule = ScheduleConfig { steps: 110, warmup: 10, floor: 0.1 };
-        assert!((schedule.share(0) - 0.1).abs() < 1e-12);
-        assert!((schedule.share(9) - 1.0).abs() < 1e-12);
-        assert!((schedule.share(60) - 0.55).abs() < 1e-12);
-        assert!((schedule.share(110) - 0.1).abs() < 1e-12);
+        assert!((schedule.lr_factor(0) - 0.1).abs() < 1e-12);
+        assert!((schedule.lr_factor(9) - 1.0).abs() < 1e-12);
+        assert!((schedule.lr_factor(60) - 0.55).abs() < 1e-12);
+        assert!((schedule.lr_factor(110) - 0.1).abs() < 1e-12);
     }
 }

@@ -1,7 +1,10 @@
-//! [`Trainable`]: what a model tells the training loop.
+//! [`Trainable`]: the contract between a model and the training loop.
 
-use super::config::{Preset, TrainConfig};
+use super::config::TrainConfig;
 use super::dataset_info::DatasetInfo;
+use super::optim::ParameterGroup;
+use super::presets::Preset;
+use super::step_output::StepOutput;
 use crate::nn::parameters::Named;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
@@ -16,111 +19,78 @@ use swm_data::LoaderConfig;
 /// Everything a model stores is a parameter of its module, under its published name: target networks and running
 /// statistics are parameters that need no gradient.
 pub trait Trainable: Module + Sync + 'static {
-    /// Its name, such as `lewm`.
+    /// The name of the family, as in `config.json` and on the command line.
     const FAMILY: &'static str;
-    /// What it is, in a sentence.
+    /// What the family is, in a sentence.
     const SUMMARY: &'static str;
-    /// The configurations that come with the program; the first is what is meant when none is named.
+    /// The built-in configurations; the first is the default.
     const PRESETS: &'static [Preset];
-    /// Whether actions lie between -1 and 1 in its units, which stand for the smallest and the largest of the data, instead of
-    /// having mean 0 and spread 1.
+    /// Whether model units map the smallest and the largest action of the data to -1 and 1, instead of standardising
+    /// actions to mean 0 and standard deviation 1.
     const BOUNDED_ACTIONS: bool = false;
-    /// Its sizes: the table `model` of a configuration.
+    /// The sizes of the networks: the table `model` of a configuration.
     type Config: Serialize + DeserializeOwned + Clone + Debug + PartialEq + Send + Sync;
-    /// Weights and settings of its loss: the table `loss`.
+    /// Weights and settings of the loss: the table `loss`.
     type Loss: Serialize + DeserializeOwned + Clone + Debug + PartialEq + Send + Sync;
 
-    /// Checks that the settings fit each other, as far as the family knows; the loop checks its own.
+    /// Checks the settings that only the family understands; the loop checks its own.
     ///
     /// # Errors
-    /// Naming the first that does not.
+    /// Naming the first setting that does not fit the others.
     fn check(config: &TrainConfig<Self>) -> Result<()>;
 
-    /// The side of the square pictures it sees; none for a model without eyes.
+    /// The side of the square images that the model takes, in pixels; `None` for a state-only model.
     fn image_size(config: &Self::Config) -> Option<usize>;
 
-    /// What a batch holds: clip, columns and goals. The loop decides batch size, order, threads and episodes.
+    /// What a batch holds: clip, columns and goals. The loop sets batch size, order, threads and episodes.
     ///
     /// # Errors
     /// When the dataset lacks a column, or it is of another shape.
     fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig>;
 
-    /// A model with initial values decided by `key`.
+    /// Creates a model whose initial values are decided by `key`.
     ///
     /// # Errors
     /// When the data do not fit the configuration.
     fn new(config: &TrainConfig<Self>, dataset_info: &DatasetInfo, key: Key, device: &Device) -> Result<Self>;
 
-    /// Puts weights of others in place, such as a pretrained encoder's; called once, on a model that begins its
-    /// training. `cache` is where downloads are kept.
+    /// Loads pretrained weights, such as an encoder's, into a new model. `cache` is the folder for downloads.
     ///
     /// # Errors
-    /// When they cannot be had or do not fit.
+    /// When the weights cannot be fetched or do not fit.
     fn with_pretrained_weights(self, _config: &TrainConfig<Self>, _cache: &Path) -> Result<Self> {
         Ok(self)
     }
 
-    /// Loss and gradients of one batch.
+    /// Computes loss and gradients of one batch.
     ///
     /// # Errors
-    /// When the batch does not fit.
+    /// When the batch does not fit the model.
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput>;
 
-    /// The model after the optimizer's step: running statistics follow, target networks move.
+    /// Updates running statistics and target networks after the optimizer's step. `buffers` are those of the step's
+    /// output.
     #[must_use]
     fn after_step(self, _context: &StepContext<'_, Self>, _buffers: Named<Tensor<1>>) -> Self {
         self
     }
 
-    /// How the optimizer treats the parameter of a name.
+    /// How the optimizer treats the parameter of that name.
     fn parameter_group(_name: &str) -> ParameterGroup {
         ParameterGroup::default()
     }
 }
 
-/// How the optimizer treats a parameter.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct ParameterGroup {
-    /// Parameters of equal number share one gradient norm, which is clipped.
-    pub clip: usize,
-    /// A factor of the learning rate.
-    pub lr: f64,
-}
-
-impl Default for ParameterGroup {
-    fn default() -> Self {
-        Self { clip: 0, lr: 1.0 }
-    }
-}
-
-/// What a step may look at beside the model and the batch.
+/// What a training step reads beside the model and the batch.
 pub struct StepContext<'a, M: Trainable> {
     /// The run's configuration.
     pub config: &'a TrainConfig<M>,
-    /// What is known of the data.
+    /// Statistics of the dataset.
     pub dataset_info: &'a DatasetInfo,
     /// Decides the random numbers of this step.
     pub key: Key,
-    /// Where tensors live.
+    /// The device that holds the tensors.
     pub device: &'a Device,
-    /// Whether this is training; in validation there is no dropout, and nobody looks at gradients.
+    /// True in training; false in validation, which has no dropout and needs no gradients.
     pub training: bool,
-}
-
-/// What a step found.
-#[derive(Default)]
-pub struct StepOutput {
-    /// Named numbers; the first is the total loss, `loss`.
-    pub metrics: Vec<(&'static str, f64)>,
-    /// Gradients by parameter, flat. A parameter without one keeps its value.
-    pub gradients: Named<Tensor<1>>,
-    /// What [`Trainable::after`] needs.
-    pub buffers: Named<Tensor<1>>,
-}
-
-impl StepOutput {
-    /// The total loss.
-    pub fn loss(&self) -> f64 {
-        self.metrics.first().map_or(f64::NAN, |&(_, loss)| loss)
-    }
 }

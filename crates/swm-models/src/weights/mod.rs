@@ -1,12 +1,12 @@
-//! Weights of others: read from safetensors and PyTorch files and from the Hugging Face hub, written for PyTorch.
+//! Pretrained weights: read from safetensors and PyTorch files and from the Hugging Face hub, and written for PyTorch.
 //!
-//! - [`read`] a file of any of these kinds: `.safetensors`, `.pt`, `.pth`, `.bin`, `.ckpt`.
-//! - [`fetch`] a file of the Hugging Face hub, or [`locate`] the weights of one of its repositories.
-//! - [`torch::write`] a state dict that `torch.load(weights_only=True)` reads.
-//! - [`names`]: what a vision transformer's weights are called by the versions of `transformers`.
-//! - [`fill`] a module, naming whatever does not fit.
+//! - [`read`]: the tensors of a `.safetensors`, `.pt`, `.pth`, `.bin` or `.ckpt` file.
+//! - [`fetch`]: a file of the Hugging Face hub; [`locate`]: a file, or the weights of a repository.
+//! - [`torch::write`]: a state dict that `torch.load(weights_only=True)` reads.
+//! - [`names`]: the names of a vision transformer's weights in the versions of `transformers`.
+//! - [`fill`]: replaces the weights of a module and reports those that do not fit.
 //!
-//! Nothing in a file is ever executed: of pickles, only what describes tensors is understood.
+//! Pickles are never executed: the reader understands only the operations that describe tensors.
 
 pub mod hub;
 pub(crate) mod keys;
@@ -26,19 +26,19 @@ use safetensors::{Dtype, SafeTensors};
 use std::path::Path;
 use swm_core::{Error, Result};
 
-/// The tensors of a file, in single precision; half precision is widened, integers and doubles are converted.
+/// Reads the tensors of a file in single precision; half precision is widened, integers and doubles are converted.
 ///
-/// Of a training checkpoint that keeps weights under `state_dict`, only those are returned.
+/// Of a training checkpoint with weights under `state_dict`, only those are returned.
 ///
 /// # Errors
-/// When the file cannot be read, is of another kind or damaged, or holds what is no tensor of real numbers.
+/// When the file cannot be read, has another format, is damaged, or holds anything but tensors of real values.
 pub fn read(path: &Path) -> Result<Named<HostTensor>> {
     let tensors = match path.extension().and_then(|end| end.to_str()) {
         Some("safetensors") => safetensors(path)?,
         Some("pt" | "pth" | "bin" | "ckpt") => pickled(path)?,
         _ => {
             let fix = "give a .safetensors, .pt, .pth, .bin or .ckpt file";
-            return Err(Error::corrupt(path, "is no file of weights by its name", fix));
+            return Err(Error::corrupt(path, "does not have the extension of a file of weights", fix));
         }
     };
     let nested: Named<HostTensor> = tensors
@@ -54,7 +54,7 @@ fn safetensors(path: &Path) -> Result<Named<HostTensor>> {
     let file = SafeTensors::deserialize(&bytes).map_err(|error| damaged(path, error.to_string()))?;
     file.iter()
         .map(|(name, view)| {
-            let kind = match view.dtype() {
+            let dtype = match view.dtype() {
                 Dtype::F64 => Torch::F64,
                 Dtype::F32 => Torch::F32,
                 Dtype::F16 => Torch::F16,
@@ -67,7 +67,7 @@ fn safetensors(path: &Path) -> Result<Named<HostTensor>> {
                 Dtype::BOOL => Torch::Bool,
                 other => return Err(damaged(path, format!("'{name}' holds {other:?}"))),
             };
-            Ok((name.to_owned(), HostTensor { shape: view.shape().to_vec(), values: widen(kind, view.data()) }))
+            Ok((name.to_owned(), HostTensor { shape: view.shape().to_vec(), values: widen(dtype, view.data()) }))
         })
         .collect()
 }
@@ -90,13 +90,12 @@ fn pickled(path: &Path) -> Result<Named<HostTensor>> {
         .collect()
 }
 
-/// Little-endian numbers of a kind in single precision.
-#[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
-fn widen(kind: Torch, bytes: &[u8]) -> Vec<f32> {
-    fn each<const N: usize>(bytes: &[u8], number: impl Fn([u8; N]) -> f32) -> Vec<f32> {
-        bytes.as_chunks::<N>().0.iter().map(|chunk| number(*chunk)).collect()
+/// Converts little-endian values of a type to single precision.
+fn widen(dtype: Torch, bytes: &[u8]) -> Vec<f32> {
+    fn each<const N: usize>(bytes: &[u8], convert: impl Fn([u8; N]) -> f32) -> Vec<f32> {
+        bytes.as_chunks::<N>().0.iter().map(|chunk| convert(*chunk)).collect()
     }
-    match kind {
+    match dtype {
         Torch::F64 => each(bytes, |b| f64::from_le_bytes(b) as f32),
         Torch::F32 => each(bytes, f32::from_le_bytes),
         Torch::F16 => each(bytes, |b| f16::from_le_bytes(b).to_f32()),
@@ -116,23 +115,27 @@ fn damaged(path: &Path, problem: String) -> Error {
     Error::corrupt(path, problem, "save the state dict again, as safetensors or with torch.save")
 }
 
-/// A module with weights in place of its own: each of its parameters and buffers must be there, in its shape, and
-/// nothing else. `what` says what the module is, such as "the model of config.json".
+/// Replaces the weights of a module: `weights` must hold each of its parameters and buffers in its shape, and nothing
+/// else. `what` names the module in errors, such as "the model of config.json".
 ///
 /// # Errors
-/// Naming the first weight that is missing, of another shape, or not of the module.
+/// Naming the first weight that is missing, of another shape, or not one of the module.
 pub fn fill<M: Module>(module: M, weights: &Named<HostTensor>, path: &Path, what: &str) -> Result<M> {
-    let wanted = parameters::shapes(&module);
-    let wrong = |problem: String| Err(Error::corrupt(path, problem, format!("give the weights of {what}")));
-    for (name, shape) in &wanted {
-        match weights.get(name) {
-            Some(tensor) if &tensor.shape == shape => {}
-            Some(tensor) => return wrong(format!("'{name}' is {:?}, but {what} makes it {shape:?}", tensor.shape)),
-            None => return wrong(format!("'{name}' is missing, which {what} asks for")),
-        }
-    }
-    match weights.keys().find(|name| !wanted.contains_key(*name)) {
-        Some(name) => wrong(format!("'{name}' is no weight of {what}")),
+    match mismatch(&parameters::shapes(&module), weights, what) {
+        Some(problem) => Err(Error::corrupt(path, problem, format!("give the weights of {what}"))),
         None => Ok(parameters::load(module, weights)),
     }
+}
+
+/// The first difference between weights and the shapes that `what` requires, or `None` if they agree.
+pub(crate) fn mismatch(shapes: &Named<Vec<usize>>, weights: &Named<HostTensor>, what: &str) -> Option<String> {
+    for (name, shape) in shapes {
+        match weights.get(name) {
+            Some(tensor) if &tensor.shape == shape => {}
+            Some(tensor) => return Some(format!("'{name}' is {:?}, but {what} makes it {shape:?}", tensor.shape)),
+            None => return Some(format!("'{name}' is missing, which {what} requires")),
+        }
+    }
+    let unknown = weights.keys().find(|name| !shapes.contains_key(*name))?;
+    Some(format!("'{unknown}' is not a weight of {what}"))
 }

@@ -1,4 +1,4 @@
-//! A checkpoint that cannot be used says why.
+//! Errors of checkpoints name what is wrong.
 
 use crate::training::{config, run};
 use burn::tensor::Device;
@@ -13,11 +13,11 @@ fn edit(path: &Path, change: impl FnOnce(&mut serde_json::Value)) {
 }
 
 #[test]
-fn damage_and_mismatches_are_named() {
+fn damaged_checkpoints_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let trained = folder.path().join("run");
     let load = |path: &Path| Checkpoint::<Lewm>::load(path, &Device::flex());
-    let message = |path: &Path| load(path).expect_err("unusable").to_string();
+    let message = |path: &Path| load(path).expect_err("invalid").to_string();
     assert!(message(&trained).contains("no checkpoint"));
 
     run(&config(&["schedule.steps=1"]), &trained, &TrainOptions::default(), 0).expect("trained");
@@ -36,25 +36,25 @@ fn damage_and_mismatches_are_named() {
     assert!(message(&trained).contains("its hash differs"), "{}", message(&trained));
     std::fs::write(&weights, &whole).expect("written");
 
-    let card = inner.join("config.json");
-    let original = std::fs::read(&card).expect("readable");
-    edit(&card, |card| card["config"]["model"]["latent"] = 8.into());
+    let config_file = inner.join("config.json");
+    let original = std::fs::read(&config_file).expect("readable");
+    edit(&config_file, |file| file["config"]["model"]["latent"] = 8.into());
     assert!(message(&trained).contains("config.json makes it"), "{}", message(&trained));
-    std::fs::write(&card, &original).expect("written");
-    edit(&card, |card| card["config"]["model"]["predictor"]["depth"] = 1.into());
-    assert!(message(&trained).contains("is no weight of the model"), "{}", message(&trained));
-    std::fs::write(&card, &original).expect("written");
-    edit(&card, |card| card["family"] = "pldm".into());
+    std::fs::write(&config_file, &original).expect("written");
+    edit(&config_file, |file| file["config"]["model"]["predictor"]["depth"] = 1.into());
+    assert!(message(&trained).contains("is not a weight of config.json"), "{}", message(&trained));
+    std::fs::write(&config_file, &original).expect("written");
+    edit(&config_file, |file| file["family"] = "pldm".into());
     assert!(message(&trained).contains("family 'pldm'"), "{}", message(&trained));
-    std::fs::write(&card, &original).expect("written");
+    std::fs::write(&config_file, &original).expect("written");
 
-    // A process killed between the two renames leaves the old checkpoint, which is found.
+    // A process that was killed between the two renames leaves the old checkpoint.
     std::fs::rename(&inner, trained.join("checkpoint.old")).expect("renamed");
     load(&trained).expect("the old one");
 }
 
 #[test]
-fn resuming_something_else_is_refused() {
+fn resuming_with_another_configuration_is_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     run(&config(&["schedule.steps=1"]), folder.path(), &TrainOptions::default(), 0).expect("trained");
     let resume = TrainOptions { resume: true, ..TrainOptions::default() };

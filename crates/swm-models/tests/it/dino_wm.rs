@@ -1,10 +1,10 @@
-//! DINO-WM: training is exact and learns while its encoder stays as it is; its cost depends on one environment alone.
+//! DINO-WM: training does not depend on threads and keeps the encoder frozen; costs do not depend on other environments.
 
 use crate::dots::{Dots, SIDE, draw};
 use burn::tensor::Device;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use swm_core::run::Control;
 use swm_core::{Batch, Candidates, ColumnSpec, CostModel, DType, Key, Manifest, Result, Schema};
 use swm_models::dino_wm::{DinoWm, DinoWmCost};
 use swm_models::nn::parameters;
@@ -16,10 +16,10 @@ const SAMPLES: usize = 19;
 const HORIZON: usize = 3;
 const DIM: usize = 4;
 
-/// Sees pictures, places and actions.
-const PLACES: &str = "model.columns=[{ name = \"place\", dim = 3 }, { name = \"action\", dim = 5 }]";
-/// Sees pictures and actions.
-const PICTURES: &str = "model.columns=[{ name = \"action\", dim = 5 }]";
+/// Observes images, positions and actions.
+const POSITIONS: &str = "model.columns=[{ name = \"position\", dim = 3 }, { name = \"action\", dim = 5 }]";
+/// Observes images and actions.
+const IMAGES: &str = "model.columns=[{ name = \"action\", dim = 5 }]";
 
 /// A model of a few thousand parameters.
 fn config(words: &[&str]) -> Result<TrainConfig<DinoWm>> {
@@ -46,18 +46,18 @@ fn config(words: &[&str]) -> Result<TrainConfig<DinoWm>> {
 
 fn run(config: &TrainConfig<DinoWm>, out: &Path, threads: usize) -> Result<TrainSummary> {
     let options = TrainOptions { threads, ..TrainOptions::default() };
-    train(config, Arc::new(Dots::new(6, 0)), out, &options, &mut (), &AtomicBool::new(false))
+    train(config, Arc::new(Dots::new(6, 0)), out, &options, &mut Control::new())
 }
 
 fn dataset_info(config: &TrainConfig<DinoWm>) -> DatasetInfo {
     let columns: Vec<String> = config.model.columns.iter().map(|column| column.name.clone()).collect();
-    DatasetInfo::from_reader(&Dots::new(2, 0), &columns, false).expect("facts")
+    DatasetInfo::from_reader(&Dots::new(2, 0), &columns, false).expect("statistics")
 }
 
 #[test]
-fn threads_do_not_change_a_byte_and_the_encoder_is_frozen() {
+fn results_do_not_depend_on_threads_and_the_encoder_is_frozen() {
     let folder = tempfile::tempdir().expect("a folder");
-    let config = config(&[PLACES, "model.decoder=16"]).expect("a configuration");
+    let config = config(&[POSITIONS, "model.decoder=16"]).expect("a configuration");
     let one = run(&config, &folder.path().join("1"), 1).expect("trained");
     let two = run(&config, &folder.path().join("2"), 2).expect("trained");
     assert_eq!(one.weights, two.weights);
@@ -71,10 +71,10 @@ fn threads_do_not_change_a_byte_and_the_encoder_is_frozen() {
 }
 
 #[test]
-fn training_learns_to_predict() {
+fn training_reduces_every_loss() {
     let folder = tempfile::tempdir().expect("a folder");
     let words = [
-        PLACES,
+        POSITIONS,
         "model.decoder=16",
         "schedule.steps=200",
         "log_every=20",
@@ -83,30 +83,30 @@ fn training_learns_to_predict() {
     ];
     run(&config(&words).expect("a configuration"), folder.path(), 2).expect("trained");
     let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
-    let number = |line: Option<&str>, name: &str| {
+    let value = |line: Option<&str>, name: &str| {
         let line: serde_json::Value = serde_json::from_str(line.expect("a line")).expect("JSON");
         line[name].as_f64().unwrap_or_else(|| panic!("{name} in {line}"))
     };
     for name in ["loss", "prediction", "pixels", "reconstruction"] {
-        let (first, last) = (number(lines.lines().next(), name), number(lines.lines().last(), name));
+        let (first, last) = (value(lines.lines().next(), name), value(lines.lines().last(), name));
         assert!(last < 0.5 * first, "{name}: {first} to {last}");
     }
 }
 
 #[test]
-fn what_does_not_fit_is_told() {
-    let message = |words: &[&str]| config(words).expect_err("wrong").to_string();
+fn invalid_settings_and_data_are_refused() {
+    let message = |words: &[&str]| config(words).expect_err("invalid").to_string();
     assert!(message(&["model.columns=[]"]).contains("name = \"action\""));
-    assert!(message(&[PICTURES, "model.encoder.vit.patch=7"]).contains("model.encoder"));
+    assert!(message(&[IMAGES, "model.encoder.vit.patch=7"]).contains("model.encoder"));
     let folder = tempfile::tempdir().expect("a folder");
     let trained = |words: &[&str]| {
         let config = config(words).expect("a configuration");
-        run(&config, &folder.path().join("none"), 1).expect_err("wrong").to_string()
+        run(&config, &folder.path().join("none"), 1).expect_err("invalid").to_string()
     };
     let missing = "model.columns=[{ name = \"velocity\", dim = 3 }, { name = \"action\", dim = 5 }]";
     assert!(trained(&[missing]).contains("velocity"), "{}", trained(&[missing]));
-    assert!(trained(&[PICTURES, "model.image=32"]).contains("[32, 32, 3]"));
-    let weights = trained(&[PICTURES, "model.weights=nowhere.pt"]);
+    assert!(trained(&[IMAGES, "model.image=32"]).contains("[32, 32, 3]"));
+    let weights = trained(&[IMAGES, "model.weights=nowhere.pt"]);
     assert!(weights.contains("nowhere.pt") && weights.contains("facebook/dinov2-small"), "{weights}");
 }
 
@@ -123,7 +123,7 @@ fn infos(more: &[&str]) -> Batch {
         "history.length" => ColumnSpec::new(*name, DType::Int32, []),
         "history.action" => ColumnSpec::new(*name, DType::Float32, [1, DIM]),
         "history.pixels" => ColumnSpec::new(*name, DType::U8, [1, SIDE, SIDE, 3]),
-        place => ColumnSpec::new(place, DType::Float32, [2]),
+        position => ColumnSpec::new(position, DType::Float32, [2]),
     }));
     let mut infos = Batch::zeros(&Schema::new(columns).expect("columns"), ENVS);
     for env in 0..ENVS {
@@ -135,7 +135,7 @@ fn infos(more: &[&str]) -> Batch {
                 "history.length" => row.set(2 + index, &[env as i32 % 2]),
                 "history.action" => row.set(2 + index, &[0.5, -0.5, env as f32, 0.25]),
                 "history.pixels" => draw([2.0 + env as f32, 5.0], row.at::<u8>(2 + index)),
-                "place" => row.set(2 + index, &[3.0 + env as f32, 5.0]),
+                "position" => row.set(2 + index, &[3.0 + env as f32, 5.0]),
                 _ => row.set(2 + index, &[10.0, 3.0 + 2.0 * env as f32]),
             }
         }
@@ -149,7 +149,7 @@ fn candidates() -> Vec<f32> {
     (0..ENVS * SAMPLES * HORIZON * DIM).map(|_| rng.random_range(-1.0..1.0f32)).collect()
 }
 
-/// Costs and their gradients.
+/// Costs `[envs * samples]` and their gradients `[envs * samples, horizon, dim]`.
 fn costs(words: &[&str], infos: &Batch, envs: &[usize], threads: usize) -> (Vec<f32>, Vec<f32>) {
     let (per_env, all) = (SAMPLES * HORIZON * DIM, candidates());
     let actions: Vec<f32> = envs.iter().flat_map(|&env| all[env * per_env..][..per_env].to_vec()).collect();
@@ -171,9 +171,9 @@ fn costs(words: &[&str], infos: &Batch, envs: &[usize], threads: usize) -> (Vec<
 }
 
 #[test]
-fn neighbours_and_threads_do_not_change_a_cost() {
+fn costs_do_not_depend_on_other_environments_or_threads() {
     let history = ["history.length", "history.action", "history.pixels"];
-    for (words, more) in [(PICTURES, &[][..]), (PICTURES, &history), (PLACES, &["place", "goal_place"])] {
+    for (words, more) in [(IMAGES, &[][..]), (IMAGES, &history), (POSITIONS, &["position", "goal_position"])] {
         let infos = infos(more);
         let together = costs(&[words], &infos, &[0, 1, 2], 2);
         assert!(together.0.windows(2).any(|pair| pair[0] != pair[1]), "actions have no effect");
@@ -188,39 +188,39 @@ fn neighbours_and_threads_do_not_change_a_cost() {
 }
 
 #[test]
-fn gradients_are_slopes_of_the_cost() {
-    let (infos, all) = (infos(&["place", "goal_place"]), candidates());
-    let numbers = HORIZON * DIM;
-    let mut model = DinoWmCost::new(&checkpoint(&[PLACES]));
+fn gradients_match_finite_differences() {
+    let (infos, all) = (infos(&["position", "goal_position"]), candidates());
+    let width = HORIZON * DIM;
+    let mut model = DinoWmCost::new(&checkpoint(&[POSITIONS]));
     model.observe(&infos, &[1]).expect("observed");
-    let slopes = costs(&[PLACES], &infos, &[1], 1).1;
-    let mut moved = |i: usize, by: f32| {
-        let mut actions = all[SAMPLES * numbers..][..numbers].to_vec();
+    let slopes = costs(&[POSITIONS], &infos, &[1], 1).1;
+    let mut cost_at = |i: usize, by: f32| {
+        let mut actions = all[SAMPLES * width..][..width].to_vec();
         actions[i] += by;
         let mut cost = [0.0];
         let one = Candidates { actions: &actions, envs: 1, samples: 1, horizon: HORIZON, dim: DIM };
         model.cost(one, &mut cost).expect("a cost");
         cost[0]
     };
-    let largest = slopes[..numbers].iter().fold(0.0f32, |most, slope| slope.abs().max(most));
-    for (i, slope) in slopes[..numbers].iter().enumerate() {
-        let difference = (moved(i, 2e-2) - moved(i, -2e-2)) / 4e-2;
-        assert!((difference - slope).abs() < 0.03 * largest, "number {i}: {slope}, not {difference}");
+    let largest = slopes[..width].iter().fold(0.0f32, |most, slope| slope.abs().max(most));
+    for (i, slope) in slopes[..width].iter().enumerate() {
+        let difference = (cost_at(i, 2e-2) - cost_at(i, -2e-2)) / 4e-2;
+        assert!((difference - slope).abs() < 0.03 * largest, "element {i}: {slope}, not {difference}");
     }
 }
 
 #[test]
-fn pasts_and_goals_of_columns_count_where_there_are_such() {
+fn history_and_column_goals_change_the_cost() {
     let history = ["history.length", "history.action", "history.pixels"];
     let (with, without) =
-        (costs(&[PICTURES], &infos(&history), &[0, 1], 1), costs(&[PICTURES], &infos(&[]), &[0, 1], 1));
-    // Environment 0 has a past of length 0, environment 1 of length 1.
+        (costs(&[IMAGES], &infos(&history), &[0, 1], 1), costs(&[IMAGES], &infos(&[]), &[0, 1], 1));
+    // Environment 0 has a history of length 0, environment 1 of length 1.
     assert_eq!(with.0[..SAMPLES], without.0[..SAMPLES]);
     assert_ne!(with.0[SAMPLES..], without.0[SAMPLES..]);
     let (with, without) =
-        (costs(&[PLACES], &infos(&["place", "goal_place"]), &[0], 1), costs(&[PLACES], &infos(&["place"]), &[0], 1));
-    assert!(with.0.iter().zip(&without.0).all(|(with, without)| with > without), "a distance was added");
-    let mut model = DinoWmCost::new(&checkpoint(&[PLACES]));
-    let message = model.observe(&infos(&[]), &[0]).expect_err("no place").to_string();
-    assert!(message.contains("place"), "{message}");
+        (costs(&[POSITIONS], &infos(&["position", "goal_position"]), &[0], 1), costs(&[POSITIONS], &infos(&["position"]), &[0], 1));
+    assert!(with.0.iter().zip(&without.0).all(|(with, without)| with > without), "the distance of the column is added");
+    let mut model = DinoWmCost::new(&checkpoint(&[POSITIONS]));
+    let message = model.observe(&infos(&[]), &[0]).expect_err("no position").to_string();
+    assert!(message.contains("position"), "{message}");
 }

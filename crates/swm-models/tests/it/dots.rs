@@ -1,4 +1,4 @@
-//! A dataset in memory: a dot that moves as its actions say, on pictures of 16 pixels.
+//! A dataset in memory: a dot that its actions move, on images of 16 pixels.
 
 use swm_core::{Batch, ColumnSpec, DType, Error, Key, Manifest, Result, Schema};
 use swm_data::{Episode, Reader, StepRange};
@@ -6,6 +6,7 @@ use swm_data::{Episode, Reader, StepRange};
 pub const SIDE: usize = 16;
 const LENGTH: usize = 24;
 
+/// Episodes of a moving dot with the columns `pixels`, `action` and `position` (in pixels).
 pub struct Dots {
     rows: Batch,
     episodes: Vec<Episode>,
@@ -18,7 +19,7 @@ impl Dots {
         let schema = Schema::new([
             ColumnSpec::image("pixels", SIDE, SIDE),
             ColumnSpec::new("action", DType::Float32, [2]),
-            ColumnSpec::new("place", DType::Float32, [2]),
+            ColumnSpec::new("position", DType::Float32, [2]),
         ])
         .expect("three columns");
         let mut rows = Batch::zeros(&schema, episodes * LENGTH);
@@ -40,11 +41,12 @@ impl Dots {
     }
 }
 
+/// Draws a dot at a position, in pixels.
 pub fn draw(at: [f32; 2], rgb: &mut [u8]) {
     for (i, pixel) in rgb.chunks_mut(3).enumerate() {
         let (dx, dy) = ((i % SIDE) as f32 - at[0], (i / SIDE) as f32 - at[1]);
-        let light = (-(dx * dx + dy * dy) / 4.0).exp();
-        pixel.fill((light * 255.0) as u8);
+        let value = (-(dx * dx + dy * dy) / 4.0).exp();
+        pixel.fill((value * 255.0) as u8);
     }
 }
 

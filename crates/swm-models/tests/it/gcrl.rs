@@ -1,9 +1,9 @@
-//! Goal-conditioned models learn on a dot that moves, act, and refuse what does not fit; probes read where the dot is.
+//! Goal-conditioned models learn from episodes of a moving dot and act; probes read the position of the dot.
 
 use crate::dots::{Dots, SIDE, draw};
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use swm_core::run::Control;
 use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Key, Policy as _, Result, Schema, Space, VariationSpace};
 use swm_models::feed_forward::FeedForwardPolicy;
 use swm_models::gcrl::{Actor, Gcbc, Gciql, Gcivl, GcrlConfig, GoalConditioned};
@@ -33,7 +33,7 @@ fn config<M: GoalConditioned<Config = GcrlConfig>>(words: &[&str]) -> TrainConfi
 }
 
 fn run<M: Trainable>(config: &TrainConfig<M>, out: &Path, options: &TrainOptions) -> Result<TrainSummary> {
-    train(config, Arc::new(Dots::new(20, 0)), out, options, &mut (), &AtomicBool::new(false))
+    train(config, Arc::new(Dots::new(20, 0)), out, options, &mut Control::new())
 }
 
 fn trained<M: Trainable>(config: &TrainConfig<M>, out: &Path) -> Checkpoint<M> {
@@ -41,7 +41,7 @@ fn trained<M: Trainable>(config: &TrainConfig<M>, out: &Path) -> Checkpoint<M> {
     Checkpoint::load(out, &Device::flex()).expect("a checkpoint")
 }
 
-/// A world of dots; nobody steps it.
+/// An environment with a dot, which is never stepped.
 fn spec(action_space: Space) -> EnvSpec {
     EnvSpec {
         id: "test/Dots-v0".to_owned(),
@@ -58,11 +58,11 @@ fn plane() -> Space {
     Space::uniform_box([2], DType::Float32, -1.0, 1.0)
 }
 
-/// The dot of every environment at a place, and where it shall be.
-fn infos(places: &[([f32; 2], [f32; 2])]) -> Batch {
+/// Frames of the dots at their positions and at their goals.
+fn infos(positions: &[([f32; 2], [f32; 2])]) -> Batch {
     let schema = Schema::new([ColumnSpec::image("pixels", SIDE, SIDE), ColumnSpec::image("goal", SIDE, SIDE)]);
-    let mut infos = Batch::zeros(&schema.expect("columns"), places.len());
-    for (env, &(at, goal)) in places.iter().enumerate() {
+    let mut infos = Batch::zeros(&schema.expect("columns"), positions.len());
+    for (env, &(at, goal)) in positions.iter().enumerate() {
         let mut row = infos.row_mut(env);
         draw(at, row.at::<u8>(0));
         draw(goal, row.at::<u8>(1));
@@ -75,7 +75,7 @@ fn actions(envs: usize) -> Batch {
 }
 
 #[test]
-fn presets_load_and_say_everything() {
+fn presets_load() {
     fn check<M: GoalConditioned<Config = GcrlConfig>>() {
         for preset in M::PRESETS {
             let config = TrainConfig::<M>::load(preset.id, &[]).expect(preset.id);
@@ -90,7 +90,7 @@ fn presets_load_and_say_everything() {
 }
 
 #[test]
-fn threads_do_not_change_a_byte() {
+fn results_do_not_depend_on_threads() {
     fn check<M: GoalConditioned<Config = GcrlConfig>>(words: &[&str]) {
         let folder = tempfile::tempdir().expect("a folder");
         let config = config::<M>(words);
@@ -105,16 +105,16 @@ fn threads_do_not_change_a_byte() {
     check::<Gciql>(&["model.history=2", "data.num_steps=3", "model.head.dropout=0.1"]);
 }
 
-/// A number in the first and the last line of a run's log.
+/// A value in the first and the last line of a run's log.
 fn first_and_last(run: &Path, name: &str) -> (f64, f64) {
     let lines = std::fs::read_to_string(run.join("train.jsonl")).expect("lines");
-    let number =
+    let value =
         |line: &str| serde_json::from_str::<serde_json::Value>(line).expect("JSON")[name].as_f64().expect("a number");
-    (number(lines.lines().next().expect("a line")), number(lines.lines().last().expect("a line")))
+    (value(lines.lines().next().expect("a line")), value(lines.lines().last().expect("a line")))
 }
 
 #[test]
-fn cloning_learns_what_leads_to_a_goal() {
+fn cloning_reduces_the_loss() {
     let folder = tempfile::tempdir().expect("a folder");
     let words = ["schedule.steps=240", "log_every=40", "model.history=2", "data.num_steps=2"];
     trained(&config::<Gcbc>(&words), folder.path());
@@ -123,13 +123,13 @@ fn cloning_learns_what_leads_to_a_goal() {
 }
 
 #[test]
-fn values_learn_that_the_way_is_long() {
+fn values_fall_below_their_start() {
     fn check<M: GoalConditioned<Config = GcrlConfig>>() {
         let folder = tempfile::tempdir().expect("a folder");
         let words = ["schedule.steps=240", "log_every=20", "loss.target=0.9"];
         trained(&config::<M>(&words), folder.path());
         let (first, last) = first_and_last(folder.path(), "value");
-        // A goal is several steps away, each of which costs 1, and none is worth more than 0.
+        // Every step to the goal has reward -1, so values are negative and several steps large.
         assert!(last < first - 0.3 && last > -20.0, "{}: {first} to {last}", M::FAMILY);
     }
     check::<Gcivl>();
@@ -137,7 +137,7 @@ fn values_learn_that_the_way_is_long() {
 }
 
 #[test]
-fn targets_follow_and_frozen_encoders_stay() {
+fn target_networks_follow_and_frozen_encoders_do_not_change() {
     let folder = tempfile::tempdir().expect("a folder");
     let config = config::<Gcivl>(&["loss.target=0.5"]);
     let dataset_info = DatasetInfo { action: ActionScale::identity(2), columns: Default::default(), env: None };
@@ -148,13 +148,14 @@ fn targets_follow_and_frozen_encoders_stay() {
     let name = "out_proj.weight";
     let (student, teacher) =
         (&last[&format!("value_predictor.student.{name}")], &last[&format!("value_predictor.teacher.{name}")]);
-    let begun = &first[&format!("value_predictor.student.{name}")];
-    let away = |a: &parameters::HostTensor, b: &parameters::HostTensor| {
+    let initial = &first[&format!("value_predictor.student.{name}")];
+    let distance = |a: &parameters::HostTensor, b: &parameters::HostTensor| {
         a.values.iter().zip(&b.values).map(|(a, b)| (a - b).abs()).sum::<f32>()
     };
-    assert!(away(student, teacher) > 0.0 && away(student, teacher) < away(student, begun), "it follows, behind");
+    let lag = distance(student, teacher);
+    assert!(lag > 0.0 && lag < distance(student, initial), "the target follows with a lag");
 
-    // An encoder that was trained here, frozen.
+    // The trained encoder, frozen.
     let weights = folder.path().join("checkpoint/weights.safetensors");
     let words = [format!("model.weights={}", weights.display()), "model.frozen=true".to_owned()];
     let words: Vec<&str> = words.iter().map(String::as_str).collect();
@@ -162,74 +163,74 @@ fn targets_follow_and_frozen_encoders_stay() {
     let again = parameters::values(&again);
     let encoders: Vec<_> = again.iter().filter(|(name, _)| name.starts_with("encoder.")).collect();
     assert!(!encoders.is_empty() && encoders.iter().all(|(name, tensor)| &last[*name] == *tensor));
-    let mut drawn = config.clone();
-    drawn.model.frozen = true;
-    let words = drawn.check().expect_err("frozen as it was drawn").to_string();
-    assert!(words.contains("model.weights"), "{words}");
+    let mut untrained = config.clone();
+    untrained.model.frozen = true;
+    let message = untrained.check().expect_err("frozen without weights").to_string();
+    assert!(message.contains("model.weights"), "{message}");
 }
 
 #[test]
-fn a_policy_acts_by_itself_in_chunks_within_bounds() {
+fn policy_acts_in_chunks_within_bounds_independent_of_other_environments() {
     let folder = tempfile::tempdir().expect("a folder");
     let checkpoint = trained(&config::<Gcbc>(&["model.history=2", "data.num_steps=2"]), folder.path());
     let policy = |slots: usize| -> FeedForwardPolicy<Actor> {
         Gcbc::actor(&checkpoint).policy(&spec(plane()), slots).expect("a policy")
     };
     let scene = ([4.0, 5.0], [11.0, 9.0]);
-    // Five steps alone, and beside another that begins later; the dot is seen to move.
-    let seen = |step: usize| ([4.0 + step as f32, 5.0], scene.1);
-    let (mut alone, mut beside) = (policy(1), policy(2));
+    // Five steps alone, and together with another environment that begins later.
+    let observed = |step: usize| ([4.0 + step as f32, 5.0], scene.1);
+    let (mut alone, mut together) = (policy(1), policy(2));
     alone.begin(0, Key::new(0));
-    beside.begin(1, Key::new(0));
+    together.begin(1, Key::new(0));
     let mut taken: Vec<Vec<f32>> = vec![];
     for step in 0..5 {
         let (mut one, mut two) = (actions(1), actions(2));
-        alone.act(&infos(&[seen(step)]), &[true], &mut one).expect("acts");
-        beside.act(&infos(&[([9.0, 9.0], [2.0, 2.0]), seen(step)]), &[step > 1, true], &mut two).expect("acts");
+        alone.act(&infos(&[observed(step)]), &[true], &mut one).expect("acts");
+        together.act(&infos(&[([9.0, 9.0], [2.0, 2.0]), observed(step)]), &[step > 1, true], &mut two).expect("acts");
         let action = one.row(0).at::<f32>(0).to_vec();
         assert_eq!(action, two.row(1).at::<f32>(0));
         assert!(action.iter().all(|v| (-1.0..=1.0).contains(v)), "{action:?}");
         taken.push(action);
     }
-    // A frameskip of 2: a decision every other step.
+    // With a frameskip of 2, there is a decision every other step.
     assert_eq!(alone.take_latencies().len(), 3);
-    assert_ne!(taken[0], taken[2], "another picture, another action");
+    assert_ne!(taken[0], taken[2], "another image, another action");
 }
 
 #[test]
-fn what_does_not_fit_is_refused_in_words() {
+fn invalid_settings_data_and_environments_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
-    let wrong = |words: &[&str]| {
+    let message = |words: &[&str]| {
         let words: Vec<String> = SMALL.iter().chain(words).map(|&word| word.to_owned()).collect();
         TrainConfig::<Gcivl>::load("tiny", &words).expect_err("wrong").to_string()
     };
-    assert!(wrong(&["data.num_steps=1"]).contains("model.history"), "{}", wrong(&["data.num_steps=1"]));
-    assert!(wrong(&["model.head.depth=2"]).contains("looks at the goal"));
-    assert!(wrong(&["loss.expectile=1.5"]).contains("loss.expectile"));
-    assert!(wrong(&["loss.goals.random=0.9"]).contains("add up to 1"));
-    assert!(wrong(&["model.image=20"]).contains("patches"), "{}", wrong(&["model.image=20"]));
+    assert!(message(&["data.num_steps=1"]).contains("model.history"), "{}", message(&["data.num_steps=1"]));
+    assert!(message(&["model.head.depth=2"]).contains("looks at the goal"));
+    assert!(message(&["loss.expectile=1.5"]).contains("loss.expectile"));
+    assert!(message(&["loss.goals.random=0.9"]).contains("add up to 1"));
+    assert!(message(&["model.image=20"]).contains("patches"), "{}", message(&["model.image=20"]));
 
-    // Pictures of another size than the model sees.
+    // Images of another size than the model's.
     let mut large = config::<Gcbc>(&[]);
     large.model.image = 32;
-    let words = run(&large, &folder.path().join("large"), &TrainOptions::default()).expect_err("wrong").to_string();
-    assert!(words.contains("[16, 16, 3]") && words.contains("model.image"), "{words}");
+    let error = run(&large, &folder.path().join("large"), &TrainOptions::default()).expect_err("invalid").to_string();
+    assert!(error.contains("[16, 16, 3]") && error.contains("model.image"), "{error}");
 
     let checkpoint = trained(&config::<Gcbc>(&[]), &folder.path().join("run"));
     let discrete = Gcbc::actor(&checkpoint).policy(&spec(Space::Discrete { n: 3, start: 0 }), 1);
-    let words = discrete.err().expect("discrete actions").to_string();
-    assert!(words.contains("2 means"), "{words}");
+    let error = discrete.err().expect("discrete actions").to_string();
+    assert!(error.contains("2 means"), "{error}");
     let mut policy = Gcbc::actor(&checkpoint).policy(&spec(plane()), 1).expect("a policy");
     policy.begin(0, Key::new(0));
-    let blind = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", SIDE, SIDE)]).expect("a column"), 1);
-    let words = policy.act(&blind, &[true], &mut actions(1)).expect_err("no goal").to_string();
-    assert!(words.contains("'goal'"), "{words}");
+    let without_goal = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", SIDE, SIDE)]).expect("a column"), 1);
+    let error = policy.act(&without_goal, &[true], &mut actions(1)).expect_err("no goal").to_string();
+    assert!(error.contains("'goal'"), "{error}");
     // A checkpoint of another family.
-    let words = Checkpoint::<Gciql>::load(&folder.path().join("run"), &Device::flex()).expect_err("gcbc").to_string();
-    assert!(words.contains("gcbc") && words.contains("gciql"), "{words}");
+    let error = Checkpoint::<Gciql>::load(&folder.path().join("run"), &Device::flex()).expect_err("gcbc").to_string();
+    assert!(error.contains("gcbc") && error.contains("gciql"), "{error}");
 }
 
-/// Sums of light along rows and columns: an encoder that knows where the dot is.
+/// An encoder whose latents are the sums of the pixels along rows and columns, which determine the position of the dot.
 struct Profiles;
 
 impl ImageEncoder for Profiles {
@@ -255,9 +256,9 @@ impl ImageEncoder for Profiles {
 }
 
 #[test]
-fn probes_read_where_the_dot_is_and_draw_it_again() {
+fn probes_read_the_position_and_reconstruct_the_image() {
     let data = Dots::new(40, 1);
-    let mut settings = StateConfig::new(vec!["place".to_owned()]);
+    let mut settings = StateConfig::new(vec!["position".to_owned()]);
     settings.fit.steps = 300;
     let report = probe::read_state(&Profiles, &data, &settings).expect("read");
     assert_eq!((report.latent, report.linear.len(), report.network.len()), (2 * SIDE, 2, 2));
@@ -266,24 +267,24 @@ fn probes_read_where_the_dot_is_and_draw_it_again() {
         assert!(r2 > 0.95, "{score:?}");
         assert!((r2 - (1.0 - (score.rmse / score.spread).powi(2))).abs() < 1e-9);
     }
-    assert_eq!(probe::read_state(&Profiles, &data, &settings).expect("read"), report, "the same again");
-    // An action cannot be read from a picture, and the last of an episode, which is missing, spoils nothing.
+    assert_eq!(probe::read_state(&Profiles, &data, &settings).expect("read"), report, "deterministic");
+    // Actions cannot be read from images. The missing action of the last row of an episode is skipped.
     let actions = StateConfig { columns: vec!["action".to_owned()], ..settings };
     let report = probe::read_state(&Profiles, &data, &actions).expect("read");
     assert!(report.linear.iter().all(|score| score.r2.expect("it changes") < 0.1), "{report:?}");
 
     let mut settings = ReconstructionConfig { channels: vec![16, 8], shown: 6, ..ReconstructionConfig::default() };
     (settings.fit.steps, settings.fit.lr) = (1000, 5e-3);
-    let (report, sheet) = probe::reconstruct_images(&Profiles, &data, &settings).expect("drawn");
+    let (report, sheet) = probe::reconstruct_images(&Profiles, &data, &settings).expect("fitted");
     assert!(report.explained > 0.2 && report.rmse < report.rmse_of_mean, "{report:?}");
     let cell = SIDE * 8 + 2;
     assert_eq!((sheet.width, sheet.height), (6 * cell + 2, 2 * cell + 2));
 
-    let words = |columns: &[&str]| {
+    let error = |columns: &[&str]| {
         let columns = columns.iter().map(|&name| name.to_owned()).collect();
         probe::read_state(&Profiles, &data, &StateConfig::new(columns)).expect_err("wrong").to_string()
     };
-    assert!(words(&["plaice"]).contains("did you mean place"), "{}", words(&["plaice"]));
-    assert!(words(&["pixels"]).contains("holds pictures"));
-    assert!(words(&[]).contains("columns"));
+    assert!(error(&["positoin"]).contains("did you mean position"), "{}", error(&["positoin"]));
+    assert!(error(&["pixels"]).contains("holds images"));
+    assert!(error(&[]).contains("columns"));
 }

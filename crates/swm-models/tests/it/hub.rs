@@ -8,12 +8,12 @@ use swm_models::weights::hub::Hub;
 
 const FILE: &[u8] = b"not very heavy weights";
 
-/// Serves one file, at the path that the hub has for it; counts what it was asked.
+/// Serves one file at the hub's path for it. Returns the address of the server and the number of requests.
 fn serve() -> (String, Arc<AtomicUsize>) {
     let listener = TcpListener::bind("127.0.0.1:0").expect("a port");
     let address = format!("http://{}", listener.local_addr().expect("an address"));
-    let asked = Arc::new(AtomicUsize::new(0));
-    let count = Arc::clone(&asked);
+    let requests = Arc::new(AtomicUsize::new(0));
+    let count = Arc::clone(&requests);
     std::thread::spawn(move || {
         for stream in listener.incoming() {
             let mut stream = stream.expect("a connection");
@@ -43,29 +43,29 @@ fn serve() -> (String, Arc<AtomicUsize>) {
             }
         }
     });
-    (address, asked)
+    (address, requests)
 }
 
 #[test]
 fn files_are_fetched_once() {
     let folder = tempfile::tempdir().expect("a folder");
-    let (address, asked) = serve();
+    let (address, requests) = serve();
     let hub = Hub::at(&address, folder.path());
     let path = hub.fetch("owner/name", "model.safetensors").expect("it is there");
-    assert_eq!(std::fs::read(&path).expect("kept"), FILE);
+    assert_eq!(std::fs::read(&path).expect("cached"), FILE);
     assert!(path.ends_with("models--owner--name/snapshots/main/model.safetensors"), "{}", path.display());
-    let before = asked.load(Ordering::Relaxed);
-    assert_eq!(hub.fetch("owner/name", "model.safetensors").expect("it is here"), path);
-    assert_eq!(asked.load(Ordering::Relaxed), before, "nobody was asked again");
+    let before = requests.load(Ordering::Relaxed);
+    assert_eq!(hub.fetch("owner/name", "model.safetensors").expect("cached"), path);
+    assert_eq!(requests.load(Ordering::Relaxed), before, "no further request");
     let missing = hub.fetch("owner/name", "other.safetensors").expect_err("no such file").to_string();
     assert!(missing.contains("no such object"), "{missing}");
 }
 
 #[test]
-fn without_a_network_the_error_says_what_to_do() {
+fn unreachable_hub_error_names_the_fix() {
     let folder = tempfile::tempdir().expect("a folder");
     // A name that can never be resolved.
     let hub = Hub::at("http://hub.invalid", folder.path());
-    let message = hub.fetch("owner/name", "model.safetensors").expect_err("nobody is there").to_string();
+    let message = hub.fetch("owner/name", "model.safetensors").expect_err("unreachable").to_string();
     assert!(message.contains("is there a network?") && message.contains("give the file's path"), "{message}");
 }

@@ -1,8 +1,9 @@
 //! Integration tests: parity with the published models, training, checkpoints.
 
-#![allow(clippy::print_stdout)] // the measured errors, for `--no-capture`
+#![allow(clippy::print_stdout, reason = "the measured errors, for `--no-capture`")]
 
 mod checkpoints;
+mod config;
 mod dino_wm;
 mod dots;
 mod gcrl;

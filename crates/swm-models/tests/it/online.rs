@@ -1,13 +1,14 @@
-//! Online training is exact: the same bytes with any number of threads, continued or not. It learns.
+//! Online training gives the same bytes with any number of threads, interrupted or not.
 
+use crate::training::stop_after;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use swm_core::run::Control;
 use swm_core::{EnvPool, Result};
 use swm_models::online::{Agent, OnlineSummary, train_online};
 use swm_models::sac::Sac;
 use swm_models::tdmpc2::Tdmpc2;
-use swm_models::{Observer, Progress, TrainConfig, TrainOptions, Trainable, train};
+use swm_models::{TrainConfig, TrainOptions, Trainable, train};
 
 const PENDULUM: &str = "swm/PendulumControl-v1";
 
@@ -44,7 +45,8 @@ fn config<M: Trainable>(words: &[&str]) -> TrainConfig<M> {
     TrainConfig::load("tiny", &words).expect("a configuration")
 }
 
-fn worlds(id: &'static str, steps: Option<usize>) -> impl Fn(usize) -> Result<EnvPool> {
+/// Makes pools of the environment `id`, whose episodes are truncated after `steps` steps.
+fn pools(id: &'static str, steps: Option<usize>) -> impl Fn(usize) -> Result<EnvPool> {
     move |count| {
         let entry = swm_envs::ENVS.get(id)?;
         let envs = (0..count).map(|_| entry.env()).collect::<Result<Vec<_>>>()?;
@@ -52,22 +54,11 @@ fn worlds(id: &'static str, steps: Option<usize>) -> impl Fn(usize) -> Result<En
     }
 }
 
-/// Stops after a gradient step.
-struct StopAt<'a>(usize, &'a AtomicBool);
-
-impl Observer for StopAt<'_> {
-    fn progress(&mut self, progress: &Progress) {
-        self.1.store(progress.step == self.0, Ordering::Relaxed);
-    }
-}
-
 fn run<M: Agent>(config: &TrainConfig<M>, out: &Path, options: &TrainOptions, stop_at: usize) -> Result<OnlineSummary> {
-    let stop = AtomicBool::new(false);
-    let worlds = worlds(PENDULUM, Some(20));
-    train_online(config, &worlds, out, options, &mut StopAt(stop_at, &stop), &stop)
+    train_online(config, &pools(PENDULUM, Some(20)), out, options, &mut stop_after(stop_at))
 }
 
-/// All that is decided by the configuration.
+/// The files that depend on the configuration alone.
 fn files(run: &Path) -> Vec<Vec<u8>> {
     let of = |folder: &str, name: &str| std::fs::read(run.join(folder).join(name)).expect(name);
     let played = std::fs::read_dir(run).expect("a folder").map(|entry| entry.expect("an entry").file_name());
@@ -81,7 +72,7 @@ fn files(run: &Path) -> Vec<Vec<u8>> {
     files
 }
 
-/// The numbers of a log that are decided by the configuration.
+/// The lines of the log without the values that depend on time.
 fn lines(run: &Path) -> Vec<serde_json::Value> {
     let lines = std::fs::read_to_string(run.join("train.jsonl")).expect("lines");
     let fixed = |line: &str| {
@@ -94,7 +85,7 @@ fn lines(run: &Path) -> Vec<serde_json::Value> {
     lines.lines().map(fixed).collect()
 }
 
-fn is_exact<M: Agent>() {
+fn check_threads<M: Agent>() {
     let folder = tempfile::tempdir().expect("a folder");
     let config = config::<M>(&[]);
     let out = |name: &str| folder.path().join(name);
@@ -102,7 +93,7 @@ fn is_exact<M: Agent>() {
         let options = TrainOptions { threads, ..TrainOptions::default() };
         let summary = run(&config, &out(name), &options, 0).expect("trained");
         assert_eq!((summary.steps, summary.interrupted), (24, false));
-        // 60 steps of warm-up, then 12 rounds of 3 worlds.
+        // 60 steps of warm-up, then 12 rounds of 3 environments.
         assert_eq!(summary.env_steps, 60 + 12 * 3);
         assert!(summary.evaluated.is_some() && summary.best.is_some());
     }
@@ -114,13 +105,13 @@ fn is_exact<M: Agent>() {
 }
 
 #[test]
-fn threads_do_not_change_a_byte_of_an_online_run() {
-    is_exact::<Sac>();
-    is_exact::<Tdmpc2>();
+fn online_results_do_not_depend_on_threads() {
+    check_threads::<Sac>();
+    check_threads::<Tdmpc2>();
 }
 
 #[test]
-fn a_continued_online_run_ends_in_the_same_bytes() {
+fn resumed_online_run_gives_the_same_bytes() {
     let folder = tempfile::tempdir().expect("a folder");
     let (whole, halved) = (folder.path().join("whole"), folder.path().join("halved"));
     let config = config::<Sac>(&[]);
@@ -139,12 +130,11 @@ fn a_continued_online_run_ends_in_the_same_bytes() {
 }
 
 #[test]
-fn what_cannot_be_learnt_from_is_refused_in_words() {
+fn invalid_settings_and_data_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let refused = |config: &TrainConfig<Sac>, id: &'static str| {
-        let stop = AtomicBool::new(false);
         let out = folder.path().join("refused");
-        let error = train_online(config, &worlds(id, None), &out, &TrainOptions::default(), &mut (), &stop);
+        let error = train_online(config, &pools(id, None), &out, &TrainOptions::default(), &mut Control::new());
         error.expect_err("refused").to_string()
     };
     let discrete = refused(&config(&[]), "swm/CartPoleControl-v1");
@@ -156,13 +146,13 @@ fn what_cannot_be_learnt_from_is_refused_in_words() {
     let missing = refused(&offline, PENDULUM);
     assert!(missing.contains("online") && missing.contains("--data"), "{missing}");
 
-    let wrong = |word: &str| {
+    let message = |word: &str| {
         let words = [word.to_owned()];
-        TrainConfig::<Tdmpc2>::load("tiny", &words).expect_err("wrong").to_string()
+        TrainConfig::<Tdmpc2>::load("tiny", &words).expect_err("invalid").to_string()
     };
-    assert!(wrong("model.simplex=7").contains("multiple"), "{}", wrong("model.simplex=7"));
-    assert!(wrong("data.frameskip=5").contains("rewards"), "{}", wrong("data.frameskip=5"));
-    assert!(wrong("loss.discount=1.5").contains("loss.discount"));
+    assert!(message("model.simplex=7").contains("multiple"), "{}", message("model.simplex=7"));
+    assert!(message("data.frameskip=5").contains("rewards"), "{}", message("data.frameskip=5"));
+    assert!(message("loss.discount=1.5").contains("loss.discount"));
 
     let rewardless = Arc::new(crate::dots::Dots::new(6, 0));
     let error = train(
@@ -170,8 +160,7 @@ fn what_cannot_be_learnt_from_is_refused_in_words() {
         rewardless,
         &folder.path().join("dots"),
         &TrainOptions::default(),
-        &mut (),
-        &AtomicBool::new(false),
+        &mut Control::new(),
     );
     let error = error.expect_err("no rewards").to_string();
     assert!(error.contains("'reward'") && error.contains("swm collect"), "{error}");

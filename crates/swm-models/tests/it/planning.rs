@@ -1,4 +1,4 @@
-//! The planning cost of an environment depends on that environment alone.
+//! Planning costs and gradients of LeWM do not depend on other environments or threads.
 
 use crate::dots::{SIDE, draw};
 use crate::training::config;
@@ -17,7 +17,7 @@ const DIM: usize = 4;
 fn checkpoint() -> Checkpoint<Lewm> {
     let config = config(&[]);
     let model = Lewm::init(&config.model, DIM, Key::new(3), &Device::flex());
-    // Modulations are zero before training; without them actions have no effect.
+    // Modulations are zero-initialised, so actions have no effect before training.
     let mut values = swm_models::nn::parameters::values(&model);
     for (name, tensor) in &mut values {
         if name.contains("adaLN") {
@@ -75,7 +75,7 @@ fn costs(infos: &Batch, envs: &[usize], threads: usize) -> Vec<f32> {
 }
 
 #[test]
-fn neighbours_and_threads_do_not_change_a_cost() {
+fn costs_do_not_depend_on_other_environments_or_threads() {
     for history in [false, true] {
         let infos = infos(history);
         let together = costs(&infos, &[0, 1, 2], 2);
@@ -89,15 +89,15 @@ fn neighbours_and_threads_do_not_change_a_cost() {
 }
 
 #[test]
-fn the_past_matters_where_there_is_one() {
+fn history_changes_the_cost() {
     let (with, without) = (costs(&infos(true), &[0, 1], 1), costs(&infos(false), &[0, 1], 1));
-    // Environment 0 has a past of length 0, environment 1 of length 1.
+    // Environment 0 has a history of length 0, environment 1 of length 1.
     assert_eq!(with[..SAMPLES], without[..SAMPLES]);
     assert_ne!(with[SAMPLES..], without[SAMPLES..]);
 }
 
 #[test]
-fn what_does_not_fit_is_refused() {
+fn invalid_candidates_and_observations_are_refused() {
     let mut cost = LewmCost::new(&checkpoint());
     cost.observe(&infos(false), &[0]).expect("observed");
     let actions = vec![0.0; 6];
@@ -113,7 +113,7 @@ fn what_does_not_fit_is_refused() {
     assert!(message.contains("[16, 16, 3]"), "{message}");
 }
 
-/// A model that has observed environments 0 and 1, each with its past.
+/// A model after observing environments 0 and 1 with their histories.
 fn observed() -> LewmCost {
     let mut cost = LewmCost::new(&checkpoint());
     cost.observe(&infos(true), &[0, 1]).expect("observed");
@@ -121,7 +121,7 @@ fn observed() -> LewmCost {
 }
 
 #[test]
-fn gradients_are_slopes_of_the_cost() {
+fn gradients_match_finite_differences() {
     let (samples, numbers) = (5, HORIZON * DIM);
     let actions = &candidates()[..2 * samples * numbers];
     fn of(actions: &[f32]) -> Candidates<'_> {
@@ -136,7 +136,7 @@ fn gradients_are_slopes_of_the_cost() {
     for (cost, plain) in costs.iter().zip(&plain) {
         assert!((cost - plain).abs() < 1e-4 * plain.abs(), "{cost}, not {plain}");
     }
-    // Central differences, for some numbers of some candidates.
+    // Central differences for some elements of some candidates.
     let mut moved = |i: usize, by: f32| {
         let mut actions = actions.to_vec();
         actions[i] += by;
@@ -144,16 +144,16 @@ fn gradients_are_slopes_of_the_cost() {
         f64::from(plain[i / numbers])
     };
     let largest = slopes.iter().fold(0.0, |most, slope| slope.abs().max(most));
-    assert!(largest > 1e-4, "slopes are all but zero: {largest}");
+    assert!(largest > 1e-4, "gradients are almost zero: {largest}");
     for i in (0..slopes.len()).step_by(7) {
         let (step, slope) = (2e-2, f64::from(slopes[i]));
         let difference = (moved(i, step) - moved(i, -step)) / (2.0 * f64::from(step));
-        assert!((difference - slope).abs() < 0.02 * f64::from(largest), "number {i}: {slope}, not {difference}");
+        assert!((difference - slope).abs() < 0.02 * f64::from(largest), "element {i}: {slope}, not {difference}");
     }
 }
 
 #[test]
-fn a_gradient_depends_on_its_environment_alone() {
+fn gradients_do_not_depend_on_other_environments_or_threads() {
     let (samples, numbers) = (SAMPLES, HORIZON * DIM);
     let all = candidates();
     let run = |envs: &[usize], threads: usize| {
@@ -175,7 +175,7 @@ fn a_gradient_depends_on_its_environment_alone() {
 }
 
 #[test]
-fn one_step_and_its_products_agree() {
+fn vector_jacobian_products_match_finite_differences() {
     let mut model = observed();
     let latent = model.latent().expect("a LeWM has latents");
     let width = latent.latent_dim();
@@ -185,7 +185,7 @@ fn one_step_and_its_products_agree() {
     let actions = candidates()[..2 * DIM].to_vec();
     let mut next = vec![0.0; 2 * width];
     latent.predict(&start, &actions, &mut next).expect("a step");
-    // Pulled by a random vector, the products are slopes of a scalar function.
+    // The products with a fixed vector are the gradient of a scalar function.
     let pull: Vec<f32> = (0..2 * width).map(|i| ((i * 29 % 17) as f32 - 8.0) / 8.0).collect();
     let (mut by_latent, mut by_action) = (vec![0.0; 2 * width], vec![0.0; 2 * DIM]);
     latent.predict_vjp(&start, &actions, &pull, &mut by_latent, &mut by_action).expect("products");

@@ -1,11 +1,11 @@
-//! PLDM: training is exact and learns, its cost is that of its world model, wrong settings are told.
+//! PLDM: training does not depend on threads and reduces the loss; invalid settings are refused.
 
 use crate::dots::Dots;
 use burn::tensor::Device;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use swm_core::Result;
+use swm_core::run::Control;
 use swm_models::pldm::Pldm;
 use swm_models::{Checkpoint, TrainConfig, TrainOptions, TrainSummary, train};
 
@@ -39,11 +39,11 @@ fn config(words: &[&str]) -> Result<TrainConfig<Pldm>> {
 
 fn run(config: &TrainConfig<Pldm>, out: &Path, threads: usize) -> TrainSummary {
     let options = TrainOptions { threads, ..TrainOptions::default() };
-    train(config, Arc::new(Dots::new(6, 0)), out, &options, &mut (), &AtomicBool::new(false)).expect("trained")
+    train(config, Arc::new(Dots::new(6, 0)), out, &options, &mut Control::new()).expect("trained")
 }
 
 #[test]
-fn threads_do_not_change_a_byte() {
+fn results_do_not_depend_on_threads() {
     let folder = tempfile::tempdir().expect("a folder");
     let config = config(&[]).expect("a configuration");
     let (one, two) = (run(&config, &folder.path().join("1"), 1), run(&config, &folder.path().join("2"), 2));
@@ -53,28 +53,28 @@ fn threads_do_not_change_a_byte() {
 }
 
 #[test]
-fn every_term_is_logged_and_what_is_trained_falls() {
+fn every_term_is_logged_and_trained_terms_fall() {
     let folder = tempfile::tempdir().expect("a folder");
     let words = ["schedule.steps=300", "log_every=20", "model.predictor.dropout=0", "optim.lr=3e-3", "loss.idm=10"];
     run(&config(&words).expect("a configuration"), folder.path(), 2);
     let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
     let line = |line: Option<&str>| serde_json::from_str::<serde_json::Value>(line.expect("a line")).expect("JSON");
     let (first, last) = (line(lines.lines().next()), line(lines.lines().last()));
-    let number =
+    let value =
         |line: &serde_json::Value, name: &str| line[name].as_f64().unwrap_or_else(|| panic!("{name} in {line}"));
     for name in ["prediction", "std", "std_t", "cov", "cov_t", "temp_align", "idm", "temp_straight"] {
-        assert!(number(&last, name).is_finite(), "{name}");
+        assert!(value(&last, name).is_finite(), "{name}");
     }
     for name in ["loss", "idm"] {
-        assert!(number(&last, name) < 0.7 * number(&first, name), "{name}: {first}\n{last}");
+        assert!(value(&last, name) < 0.7 * value(&first, name), "{name}: {first}\n{last}");
     }
-    // Latents that had collapsed would fall short of the spread by all of it.
-    assert!(number(&last, "std") < 0.5, "{last}");
+    // Collapsed latents have a standard deviation of 0, so this term would be 1.
+    assert!(value(&last, "std") < 0.5, "{last}");
 }
 
 #[test]
-fn wrong_settings_say_what_to_change() {
-    let message = |words: &[&str]| config(words).expect_err("wrong").to_string();
+fn invalid_settings_are_refused() {
+    let message = |words: &[&str]| config(words).expect_err("invalid").to_string();
     assert!(message(&["model.latent=1"]).contains("model.latent"), "{}", message(&["model.latent=1"]));
     let short = message(&["data.num_steps=2", "model.predictor.history=1"]);
     assert!(short.contains("loss.temp_straight") && short.contains("data.num_steps of at least 3"), "{short}");
@@ -83,7 +83,7 @@ fn wrong_settings_say_what_to_change() {
     let folder = tempfile::tempdir().expect("a folder");
     let large = config(&["model.image=32"]).expect("a configuration");
     let reader = Arc::new(Dots::new(2, 0));
-    let trained = train(&large, reader, folder.path(), &TrainOptions::default(), &mut (), &AtomicBool::new(false));
-    let message = trained.expect_err("pictures of 16 pixels").to_string();
+    let trained = train(&large, reader, folder.path(), &TrainOptions::default(), &mut Control::new());
+    let message = trained.expect_err("images of 16 pixels").to_string();
     assert!(message.contains("[32, 32, 3]") && message.contains("model.image"), "{message}");
 }

@@ -1,4 +1,4 @@
-//! Checkpoints of the reference implementation load, compute what they did there, and go back.
+//! Checkpoints of the reference implementation load, give the recorded outputs, and are exported again.
 
 use crate::golden::{Golden, check, values};
 use burn::tensor::Tensor;
@@ -18,9 +18,9 @@ fn folder(family: &str) -> PathBuf {
 }
 
 fn dataset_info(action: usize) -> DatasetInfo {
-    let numbers = |value: f64| vec![value; 3];
+    let all = |value: f64| vec![value; 3];
     let proprio =
-        ColumnInfo { shape: vec![3], mean: numbers(0.0), std: numbers(1.0), min: numbers(-1.0), max: numbers(1.0) };
+        ColumnInfo { shape: vec![3], mean: all(0.0), std: all(1.0), min: all(-1.0), max: all(1.0) };
     DatasetInfo {
         action: ActionScale::identity(action),
         columns: BTreeMap::from([("proprio".to_owned(), proprio)]),
@@ -28,12 +28,12 @@ fn dataset_info(action: usize) -> DatasetInfo {
     }
 }
 
-/// What was recorded of a checkpoint.
+/// The recorded inputs and outputs of a checkpoint.
 fn recorded(family: &str) -> Golden {
     Golden::read(&folder("..").join(format!("reference-{family}.safetensors")))
 }
 
-fn world(golden: &Golden, model: &Lewm) {
+fn check_world_model(golden: &Golden, model: &Lewm) {
     let [clips, steps, _] = golden.tensor::<3>("i.action").dims();
     let latents = model.encode(golden.patches("i.pixels"));
     let [_, latent] = latents.dims();
@@ -46,15 +46,15 @@ fn world(golden: &Golden, model: &Lewm) {
 fn lewm_checkpoints_load() {
     let checkpoint = lewm::import::import(&folder("lewm"), dataset_info(2)).expect("it loads");
     assert_eq!((checkpoint.config.data.frameskip, checkpoint.config.model.image), (2, 8));
-    world(&recorded("lewm"), &checkpoint.model);
+    check_world_model(&recorded("lewm"), &checkpoint.model);
 }
 
 #[test]
 fn pldm_checkpoints_load() {
-    // The file itself may be named, too.
+    // The path may also be that of the file.
     let checkpoint = pldm::import::import(&folder("pldm").join("weights.pt"), dataset_info(4)).expect("it loads");
     assert_eq!((checkpoint.config.data.frameskip, checkpoint.config.model.predictor.history), (1, 3));
-    world(&recorded("pldm"), &checkpoint.model.model);
+    check_world_model(&recorded("pldm"), &checkpoint.model.model);
 }
 
 fn dino_wm_checkpoint() -> swm_models::Checkpoint<DinoWm> {
@@ -92,38 +92,38 @@ fn exported_checkpoints_load_again() {
         let again = pldm::import::import(&there, dataset_info(2)).expect("it loads");
         assert_eq!(parameters::values(&again.model), parameters::values(&pldm.model));
     }
-    // What was published under old names comes back as it was, but for counters.
-    let mut theirs = weights::read(&folder("pldm").join("weights.pt")).expect("theirs");
-    let mut ours = weights::read(&out.path().join("pldm-Published/weights.pt")).expect("ours");
-    for all in [&mut theirs, &mut ours] {
-        all.retain(|name, _| !name.ends_with("num_batches_tracked"));
+    // Weights that were published under old names are exported unchanged, except for counters.
+    let mut reference = weights::read(&folder("pldm").join("weights.pt")).expect("the reference");
+    let mut exported = weights::read(&out.path().join("pldm-Published/weights.pt")).expect("exported");
+    for state in [&mut reference, &mut exported] {
+        state.retain(|name, _| !name.ends_with("num_batches_tracked"));
     }
-    assert_eq!(ours, theirs);
+    assert_eq!(exported, reference);
 
-    // The reference makes the encoder from a published one, so a small one has no place in its config.json; the state
-    // dict is theirs.
+    // The reference builds the encoder from a published one, so its config.json cannot describe a smaller one; only the state
+    // dict can be compared.
     let checkpoint = dino_wm_checkpoint();
     let refused = dino_wm::import::export(&checkpoint, &out.path().join("dino"), Naming::Published);
     assert!(refused.expect_err("no published encoder").to_string().contains("DINOv2-small"));
-    let ours = dino_wm::import::state(&checkpoint.model, Naming::Transformers5);
-    let theirs = weights::read(&folder("prejepa").join("weights.pt")).expect("theirs");
-    let theirs: parameters::Named<_> = theirs
+    let exported = dino_wm::import::state(&checkpoint.model, Naming::Transformers5);
+    let reference = weights::read(&folder("prejepa").join("weights.pt")).expect("the reference");
+    let reference: parameters::Named<_> = reference
         .into_iter()
         .map(|(name, tensor)| (name.replacen("backbone.backbone.", "backbone.", 1), tensor))
         .collect();
-    assert_eq!(ours, theirs);
+    assert_eq!(exported, reference);
 }
 
 #[test]
-fn what_does_not_fit_is_told() {
-    let message = |found: swm_core::Result<swm_models::Checkpoint<Lewm>>| found.expect_err("wrong").to_string();
+fn unsuitable_checkpoints_are_refused() {
+    let message = |found: swm_core::Result<swm_models::Checkpoint<Lewm>>| found.expect_err("invalid").to_string();
     let other = message(lewm::import::import(&folder("pldm"), dataset_info(2)));
     assert!(other.contains("PLDM") && other.contains("class LeWM"), "{other}");
     let actions = message(lewm::import::import(&folder("lewm"), dataset_info(3)));
     assert!(actions.contains("3 action elements") && actions.contains("divisor of 4"), "{actions}");
     let none = message(lewm::import::import(Path::new("nowhere"), dataset_info(2)));
     assert!(none.contains("nowhere"), "{none}");
-    // Weights of another size than config.json says.
+    // Weights of another size than in config.json.
     let out = tempfile::tempdir().expect("a folder");
     let text = std::fs::read_to_string(folder("lewm").join("config.json")).expect("there");
     std::fs::write(out.path().join("config.json"), text.replace("\"depth\": 2", "\"depth\": 1")).expect("written");
@@ -132,7 +132,7 @@ fn what_does_not_fit_is_told() {
     assert!(mismatch.contains("layers.1") && mismatch.contains("config.json"), "{mismatch}");
 }
 
-/// With the interpreter that `SWM_TORCH_PYTHON` names, which has the reference, stable-pretraining and transformers 5.
+/// Runs the interpreter in `SWM_TORCH_PYTHON`, which needs the reference, stable-pretraining and transformers 5.
 #[test]
 #[ignore = "needs SWM_TORCH_PYTHON"]
 fn exported_checkpoints_load_in_the_reference() {

@@ -1,12 +1,13 @@
-//! Training is exact: the same bytes with any number of threads, resumed or not.
+//! Training gives the same bytes with any number of threads, interrupted or not.
 
 use crate::dots::Dots;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use swm_core::Result;
+use swm_core::run::{Control, Event};
 use swm_models::lewm::Lewm;
-use swm_models::{Observer, Progress, TrainConfig, TrainOptions, TrainSummary, train};
+use swm_models::{TrainConfig, TrainOptions, TrainSummary, train};
 
 /// A model of a few thousand parameters.
 pub fn config(words: &[&str]) -> TrainConfig<Lewm> {
@@ -34,18 +35,18 @@ pub fn config(words: &[&str]) -> TrainConfig<Lewm> {
     TrainConfig::load("tiny", &words).expect("a configuration")
 }
 
-/// Stops after a step.
-struct StopAt<'a>(usize, &'a AtomicBool);
-
-impl Observer for StopAt<'_> {
-    fn progress(&mut self, progress: &Progress) {
-        self.1.store(progress.step == self.0, Ordering::Relaxed);
-    }
+/// A control that interrupts the run after the step `stop_at`.
+pub fn stop_after(stop_at: usize) -> Control<'static> {
+    let flag = Arc::new(AtomicBool::new(false));
+    Control::new().with_interrupt(Arc::clone(&flag)).with_events(move |event| {
+        if let Event::Progress(progress) = event {
+            flag.store(progress.done == stop_at, Ordering::Relaxed);
+        }
+    })
 }
 
 pub fn run(config: &TrainConfig<Lewm>, out: &Path, options: &TrainOptions, stop_at: usize) -> Result<TrainSummary> {
-    let stop = AtomicBool::new(false);
-    train(config, Arc::new(Dots::new(6, 0)), out, options, &mut StopAt(stop_at, &stop), &stop)
+    train(config, Arc::new(Dots::new(6, 0)), out, options, &mut stop_after(stop_at))
 }
 
 fn files(run: &Path) -> Vec<Vec<u8>> {
@@ -55,7 +56,7 @@ fn files(run: &Path) -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn a_resumed_run_ends_in_the_same_bytes() {
+fn resumed_run_gives_the_same_bytes() {
     let folder = tempfile::tempdir().expect("a folder");
     let (whole, halved) = (folder.path().join("whole"), folder.path().join("halved"));
     // 6 episodes of 17 clips: an epoch ends after the sixth step, so the second half crosses it.
@@ -80,7 +81,7 @@ fn a_resumed_run_ends_in_the_same_bytes() {
 }
 
 #[test]
-fn threads_do_not_change_a_byte() {
+fn results_do_not_depend_on_threads() {
     let folder = tempfile::tempdir().expect("a folder");
     let config = config(&[]);
     let mut all = vec![];
@@ -97,22 +98,22 @@ fn threads_do_not_change_a_byte() {
 }
 
 #[test]
-fn training_learns_to_predict() {
+fn training_reduces_the_loss() {
     let folder = tempfile::tempdir().expect("a folder");
     let words = ["schedule.steps=300", "log_every=20", "model.predictor.dropout=0", "optim.lr=3e-3"];
     run(&config(&words), folder.path(), &TrainOptions::default(), 0).expect("trained");
     let lines = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
-    let numbers = |line: &str, name: &str| {
+    let value = |line: &str, name: &str| {
         serde_json::from_str::<serde_json::Value>(line).expect("JSON")[name].as_f64().expect(name)
     };
     let (first, last) = (lines.lines().next().expect("a line"), lines.lines().last().expect("a line"));
-    assert!(numbers(last, "loss") < 0.5 * numbers(first, "loss"), "{first}\n{last}");
-    // A latent that had collapsed would be predicted perfectly, at a SIGReg of about a tenth of the batch.
-    assert!(numbers(last, "sigreg") < 2.0, "{last}");
+    assert!(value(last, "loss") < 0.5 * value(first, "loss"), "{first}\n{last}");
+    // Collapsed latents are predicted perfectly, but their SIGReg is about a tenth of the batch size.
+    assert!(value(last, "sigreg") < 2.0, "{last}");
 }
 
 #[test]
-fn a_loss_that_is_not_finite_stops_the_run() {
+fn non_finite_loss_stops_the_run() {
     let folder = tempfile::tempdir().expect("a folder");
     let error = run(&config(&["optim.lr=1e30", "optim.clip=1e30"]), folder.path(), &TrainOptions::default(), 0);
     let message = error.expect_err("not finite").to_string();

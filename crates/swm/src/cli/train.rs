@@ -5,9 +5,10 @@ use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use swm::home;
+use swm_core::run::{Control, Event};
 use swm_core::{EnvPool, Error, Result};
 use swm_data::Reader;
-use swm_models::{FAMILIES, Observer, OnlineRun, TrainOptions, TrainRun, TrainSummary, TrainableConfig, device};
+use swm_models::{FAMILIES, OnlineRun, TrainOptions, TrainRun, TrainSummary, TrainableConfig, device};
 
 /// Arguments of `swm train`.
 #[derive(Args)]
@@ -102,9 +103,9 @@ fn train_online(
         format!("{}-{world}", args.model)
     });
     let out = home::checkpoint(&name);
-    let mut bar = Bar(Progress::new("train", config.steps()));
+    let mut bar = Progress::new("train", config.steps());
     let Some(summary) =
-        config.train_online(OnlineRun { environments: &environments, out: &out, options }, &mut bar, &context.stop)
+        config.train_online(OnlineRun { environments: &environments, out: &out, options }, &mut control(context, &mut bar))
     else {
         let problem = format!("{} learns from datasets only", args.model);
         anyhow::bail!(Error::config("--env", problem, "give a dataset with --data, or train tdmpc2 or sac"));
@@ -112,7 +113,7 @@ fn train_online(
     let summary = summary?;
     let evaluated = summary.evaluated.map_or(String::new(), |mean| format!(", mean return {mean:.1}"));
     let best = summary.best.map_or(String::new(), |(step, mean)| format!(", best {mean:.1} after step {step}"));
-    bar.0.done(&format!(
+    bar.done(&format!(
         "{} gradient steps and {} environment steps in {:.0} s{evaluated}{best}, {}",
         summary.steps,
         summary.env_steps,
@@ -148,11 +149,11 @@ impl TrainArgs {
 /// Trains with a progress bar.
 pub fn run(config: &dyn TrainableConfig, on: TrainRun<'_>, context: &Context) -> Result<TrainSummary> {
     let out = on.out.to_owned();
-    let mut bar = Bar(Progress::new("train", config.steps()));
-    let summary = config.train(on, &mut bar, &context.stop)?;
+    let mut bar = Progress::new("train", config.steps());
+    let summary = config.train(on, &mut control(context, &mut bar))?;
     let early = if summary.stopped_early { ", stopped early" } else { "" };
     let best = summary.best.map_or(String::new(), |(step, loss)| format!(", best {loss:.4} after step {step}"));
-    bar.0.done(&format!(
+    bar.done(&format!(
         "{} steps in {:.0} s{early}{best} ({} parameters, {:.0} clips/s, {:.0} % of it waiting for data), {}",
         summary.steps,
         summary.seconds,
@@ -172,24 +173,24 @@ pub fn log_of(checkpoint: &Path) -> PathBuf {
     checkpoint.join("train.jsonl")
 }
 
-struct Bar(Progress);
-
-/// Metrics the bar has room for.
+/// Metrics of the model that the progress bar has room for.
 const SHOWN: usize = 4;
 
-impl Observer for Bar {
-    fn progress(&mut self, at: &swm_models::Progress) {
-        let shown: Vec<String> =
-            at.metrics.iter().take(SHOWN).map(|(name, value)| format!("{name} {value:.4}")).collect();
-        let validation = at.validation.map_or(String::new(), |loss| format!(", held out {loss:.4}"));
-        self.0.at(
-            at.step,
-            format!(
-                "{}{validation}, {:.0} clips/s, waits {:.0} %",
-                shown.join(" "),
-                at.clips_per_second,
-                100.0 * at.data_wait
-            ),
+/// The control of a training run that is shown by a progress bar.
+fn control<'a>(context: &Context, bar: &'a mut Progress) -> Control<'a> {
+    Control::new().with_interrupt(Arc::clone(&context.stop)).with_events(move |event| {
+        let Event::Progress(at) = event else { return };
+        // The loop's own metrics follow the model's.
+        let is_loops = |name: &str| ["validation_loss", "evaluation_return", "lr"].contains(&name);
+        let shown = at.metrics.iter().take_while(|(name, _)| !is_loops(name)).take(SHOWN);
+        let shown: Vec<String> = shown.map(|(name, value)| format!("{name} {value:.4}")).collect();
+        let validation = at.metric("validation_loss").or(at.metric("evaluation_return"));
+        let validation = validation.map_or(String::new(), |value| format!(", held out {value:.4}"));
+        let clips_per_second = at.metric("clips_per_second").unwrap_or_default();
+        let wait = 100.0 * at.metric("data_wait").unwrap_or_default();
+        bar.at(
+            at.done,
+            format!("{}{validation}, {clips_per_second:.0} clips/s, waits {wait:.0} %", shown.join(" ")),
         );
-    }
+    })
 }

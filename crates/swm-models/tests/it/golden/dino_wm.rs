@@ -8,7 +8,7 @@ use swm_models::dino_wm::{ColumnConfig, DinoWm, DinoWmConfig, FramePredictor, Fr
 use swm_models::nn::parameters::{self, HostTensor, Named};
 use swm_models::nn::{BackboneConfig, DinoConfig, DropoutRng, Init};
 
-/// Published weights without the masks of the attention, which are computed here.
+/// Published weights without the attention masks, which are computed here.
 fn without_masks(weights: Named<HostTensor>) -> Named<HostTensor> {
     weights.into_iter().filter(|(name, weight)| !(name.ends_with(".0.bias") && weight.shape.len() == 4)).collect()
 }
@@ -44,7 +44,7 @@ fn golden_predictor() {
 }
 
 impl Golden {
-    /// Names, numbers in a frame and features of the columns.
+    /// Name, elements per frame and embedding dimension of every column.
     fn columns(&self) -> Vec<(String, usize, usize)> {
         serde_json::from_value(self.config["columns"].clone()).expect("columns")
     }
@@ -80,8 +80,8 @@ impl Golden {
     }
 
     fn dino_wm(&self) -> DinoWm {
-        let numbers: Vec<usize> = self.columns().iter().map(|(_, numbers, _)| *numbers).collect();
-        let model = DinoWm::init(&self.dino_wm_config(), &numbers, Key::new(0), &Device::flex());
+        let dims: Vec<usize> = self.columns().iter().map(|(_, dim, _)| *dim).collect();
+        let model = DinoWm::init(&self.dino_wm_config(), &dims, Key::new(0), &Device::flex());
         let weights = without_masks(self.group("w."));
         let published: Named<Vec<usize>> =
             weights.iter().map(|(name, weight)| (name.clone(), weight.shape.clone())).collect();
@@ -127,7 +127,7 @@ fn golden_model() {
         let start = frames.slice([0..1, 0..1, 0..patches, 0..dim]).expand([samples, 1, patches, dim]);
         let rollout = model.rollout(start, golden.tensor("i.candidates"));
         let theirs = golden.get("o.rollout");
-        // Beside the last frame stands no action of meaning; the reference leaves what the predictor put there, as we do.
+        // The action part of the last frame has no meaning; both implementations leave the predictor's output there.
         assert_eq!(theirs.shape, rollout.dims());
         check(&golden, "o.rollout", &values(rollout));
     }

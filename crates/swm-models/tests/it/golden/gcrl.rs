@@ -50,7 +50,7 @@ impl Golden {
         }
     }
 
-    /// The published weights, all of which the module must have.
+    /// Loads the published weights, all of which the module must have.
     fn fill<M: Module>(&self, prefix: &str, module: M) -> M {
         let weights = self.group(prefix);
         let shapes = parameters::shapes(&module);
@@ -73,11 +73,11 @@ impl Golden {
     }
 
     fn value_loss(&self) -> ValueLoss {
-        let number = |name: &str| self.config[name].as_f64().expect(name) as f32;
+        let value = |name: &str| self.config[name].as_f64().expect(name) as f32;
         ValueLoss {
-            discount: number("discount"),
-            expectile: number("expectile"),
-            temperature: number("temperature"),
+            discount: value("discount"),
+            expectile: value("expectile"),
+            temperature: value("temperature"),
             target: 0.995,
             goals: GoalMixture::default(),
             policy_goals: GoalMixture::FUTURE,
@@ -96,8 +96,8 @@ impl Golden {
         let largest = theirs.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));
         for (name, gradient) in &theirs {
             let ours = values(output.gradients.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
-            // A shift that a softmax takes out again has no effect: its gradient is zero but for rounding, and is held
-            // against the others. So is what no head looks at, the class token behind the last layer.
+            // A softmax cancels the bias of the keys, so its gradient is zero up to rounding; its error is relative to the
+            // largest gradient of all.
             let idle = name.ends_with(".key.bias");
             let error = error(&ours, &gradient.values, if idle { largest } else { 1e-6 });
             if error > worst.0 {
@@ -175,7 +175,7 @@ fn golden_gciql() {
 }
 
 #[test]
-fn golden_gcrl_checkpoints_of_the_reference_load_and_go_back() {
+fn golden_gcrl_checkpoints_round_trip() {
     let here = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("tests/golden");
     let dataset_info = DatasetInfo { action: ActionScale::identity(2), columns: Default::default(), env: None };
     let checkpoint = import::import::<Gcivl>(&here.join("reference/gcivl"), dataset_info.clone()).expect("imported");
@@ -186,7 +186,7 @@ fn golden_gcrl_checkpoints_of_the_reference_load_and_go_back() {
     let ours = parameters::values(&checkpoint.model);
     assert_eq!(ours, golden.group("w."));
 
-    // What goes back has the names and the shapes of the reference's class; values without their slow copy.
+    // Exported weights have the names and shapes of the reference's class, without the target networks.
     let folder = tempfile::tempdir().expect("a folder");
     import::export(&checkpoint, folder.path(), Naming::Published).expect("exported");
     let written = weights::read(&folder.path().join("weights.pt")).expect("weights");
@@ -203,7 +203,7 @@ fn golden_gcrl_checkpoints_of_the_reference_load_and_go_back() {
         assert_eq!(weight, &ours[&name.replace(".teacher.", ".student.")], "{name}");
     }
 
-    // A policy is part of it; a critic is not; nor do other actions fit.
+    // It contains a policy but no critic, and does not fit other actions.
     let cloned = import::import::<Gcbc>(folder.path(), dataset_info.clone()).expect("the policy alone");
     assert_eq!(parameters::values(&cloned.model)["log_stds"], ours["log_stds"]);
     let words = import::import::<Gciql>(folder.path(), dataset_info).expect_err("no critic").to_string();

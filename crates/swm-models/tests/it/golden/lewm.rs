@@ -59,11 +59,11 @@ fn golden_evaluation() {
         let dim = golden.size("dim");
         let latents = model.encode(golden.patches("i.pixels")).reshape([clips, steps, dim]);
         check(&golden, "o.eval.emb", &values(latents.clone()));
-        // The fast encoder, a picture at a time.
+        // The CPU encoder, one image at a time.
         let fast = HostEncoder::new(&model, &golden.config()).expect("a transformer");
-        let pictures = golden.patches("i.pixels");
-        let size = pictures.dims()[1] * pictures.dims()[2];
-        let fast: Vec<f32> = values(pictures).chunks(size).flat_map(|patches| fast.encode(patches)).collect();
+        let images = golden.patches("i.pixels");
+        let size = images.dims()[1] * images.dims()[2];
+        let fast: Vec<f32> = values(images).chunks(size).flat_map(|patches| fast.encode(patches)).collect();
         check(&golden, "o.eval.emb", &fast);
         let conditions = model.embed_actions(golden.tensor("i.action"));
         check(&golden, "o.eval.act_emb", &values(conditions.clone()));
@@ -78,7 +78,7 @@ fn golden_evaluation() {
         let candidates = golden.tensor::<4>("i.candidates").reshape([envs * samples, horizon, numbers]);
         let goal = model.encode(golden.patches("i.goal")).reshape([envs, 1, dim]).expand([envs, samples, dim]);
         for history in [1, 3] {
-            // The first frames of the first clips, and the actions taken between them.
+            // The first frames of the first clips, and the actions between them.
             let repeat = |x: Tensor<3>, length: usize, width: usize| {
                 let x: Tensor<4> = x.slice([0..envs, 0..length, 0..width]).unsqueeze_dim(1);
                 x.expand([envs, samples, length, width]).reshape([envs * samples, length, width])
@@ -89,16 +89,16 @@ fn golden_evaluation() {
             }
             let rollout = model.rollout(repeat(latents.clone(), history, dim), actions.clone());
             let [_, length, _] = rollout.dims();
-            // The fast rollout, for each environment from its own present.
+            // The CPU rollout of each environment.
             let fast = Rollout::new(&model);
             let steps = length - 1;
-            let numbers_of = |x: Tensor<3>, env: usize| {
+            let values_of = |x: Tensor<3>, env: usize| {
                 let [_, b, c] = x.dims();
                 values(x.slice([env * samples..(env + 1) * samples, 0..b, 0..c]))
             };
             for env in 0..envs {
                 let start = values(latents.clone().slice([env..env + 1, 0..history, 0..dim]));
-                let all = fast.run(&start, &numbers_of(actions.clone(), env), samples, steps);
+                let all = fast.run(&start, &values_of(actions.clone(), env), samples, steps);
                 let theirs = &golden.get(&format!("o.rollout.h{history}")).values[env * samples * length * dim..];
                 for (time, latents) in all.iter().enumerate() {
                     for (sample, latent) in latents.chunks(dim).enumerate() {

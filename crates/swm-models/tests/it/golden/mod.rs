@@ -1,5 +1,5 @@
-//! Parity with the published models: weights under their published names, outputs, losses and gradients of the
-//! reference implementation. Every test reads each `<model>-*.safetensors` of the folder named by `SWM_GOLDEN_MODELS`, or
+//! Parity with the published models: names of weights, outputs, losses and gradients of the reference implementation. Every
+//! test reads each `<model>-*.safetensors` of the folder named by `SWM_GOLDEN_MODELS`, or
 //! of `tests/golden` (written by the exporters beside them) and of the shared reference.
 
 mod dino_wm;
@@ -18,8 +18,9 @@ use swm_models::nn::parameters::{HostTensor, Named};
 
 const TOLERANCE: f32 = 1e-4;
 
+/// A golden file: tensors by name and the configuration of the model.
 pub struct Golden {
-    /// The metadata `config`, as it is written and as it reads.
+    /// The metadata `config` as text and parsed.
     text: String,
     config: serde_json::Value,
     tensors: BTreeMap<String, HostTensor>,
@@ -63,9 +64,9 @@ impl Golden {
         self.tensors.iter().filter_map(strip).collect()
     }
 
-    /// Compares gradients with all recorded ones. Parameters whose names end as one of `idle` have no effect, because a
-    /// batch normalisation or a softmax takes them out again: their gradients are zero but for rounding, and are held
-    /// against the largest of all.
+    /// Compares gradients with all recorded ones. Parameters whose names end in one of `idle` have no effect, because a
+    /// batch normalisation or a softmax cancels them: their gradients are zero up to rounding, so their errors are relative
+    /// to the largest gradient of all.
     fn check_gradients(&self, ours: &Named<Tensor<1>>, idle: &[&str]) {
         let theirs = self.group("g.");
         let largest = theirs.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));
@@ -84,12 +85,12 @@ impl Golden {
         assert_eq!(names(ours.keys().collect()), names(theirs.keys().collect()), "parameters with gradients");
     }
 
-    /// Pictures of the configured size, already normalised, as patches.
+    /// Normalised images of the configured size as patches.
     pub fn patches(&self, name: &str) -> Tensor<3> {
         self.cut(name, self.size("image"))
     }
 
-    /// Pictures `[…, 3, image, image]`, already normalised, as patches.
+    /// Normalised images `[…, 3, image, image]` as patches `[frames, patches, 3 * patch * patch]`.
     fn cut(&self, name: &str, image: usize) -> Tensor<3> {
         let patch = self.size("patch");
         let (host, grid) = (self.get(name), image / patch);
@@ -104,17 +105,19 @@ impl Golden {
     }
 }
 
-/// The largest difference, relative to the largest number (or to `floor`, where all are tiny).
+/// The largest difference, relative to the largest value, or to `floor` where all are smaller.
 fn error(ours: &[f32], theirs: &[f32], floor: f32) -> f32 {
     assert_eq!(ours.len(), theirs.len());
     let scale = theirs.iter().fold(floor, |m, v| m.max(v.abs()));
     ours.iter().zip(theirs).fold(0.0f32, |m, (a, b)| m.max((a - b).abs())) / scale
 }
 
+/// The values of a tensor in row-major order.
 pub fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
     tensor.into_data().iter::<f32>().collect()
 }
 
+/// Compares values with the tensor `name` of a golden file.
 pub fn check(golden: &Golden, name: &str, ours: &[f32]) {
     let error = error(ours, &golden.get(name).values, 1e-6);
     println!("{name}: {error:.1e}");

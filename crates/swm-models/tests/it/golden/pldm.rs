@@ -31,14 +31,14 @@ fn golden_loss_terms() {
         for (name, term) in terms {
             check(&golden, name, &values(term.clone().inner()));
         }
-        // The recorded gradient is that of the sum of all terms but the inverse dynamics', which does not see `z`.
+        // The recorded gradient is that of the sum of all terms except inverse dynamics, which does not depend on `z`.
         let mut all = (std + std_t + cov + cov_t + temp_align + temp_straight).backward();
         check(&golden, "g.z_of_sum", &values(z.grad_remove(&mut all).expect("a gradient")));
     }
 }
 
 impl Golden {
-    fn world(&self) -> LewmConfig {
+    fn world_model_config(&self) -> LewmConfig {
         LewmConfig {
             image: self.size("image"),
             pixel_mean: [0.0; 3],
@@ -68,7 +68,7 @@ impl Golden {
 
     fn pldm(&self) -> Pldm {
         let (actions, hidden) = (self.size("action_dim"), self.size("idm_hidden"));
-        let model = Pldm::init(&self.world(), actions, hidden, Key::new(0), &Device::flex());
+        let model = Pldm::init(&self.world_model_config(), actions, hidden, Key::new(0), &Device::flex());
         let weights = self.group("w.");
         let published: Named<Vec<usize>> =
             weights.iter().map(|(name, weight)| (name.clone(), weight.shape.clone())).collect();
@@ -98,7 +98,7 @@ fn golden_evaluation() {
         let goal = model.encode(golden.patches("i.goal")).reshape([1, 1, latent]);
         let last = rollout.slice([0..samples, horizon..horizon + 1, 0..latent]);
         check(&golden, "o.cost", &values((last - goal).square().sum_dim(2)));
-        // What plans: the fast rollout.
+        // The CPU rollout, which planning uses.
         let fast = Rollout::new(&model).run(&values(start), &values(candidates), samples, horizon);
         let theirs = &golden.get("o.rollout").values;
         for (time, latents) in fast.iter().enumerate() {

@@ -42,10 +42,10 @@ fn golden_tdmpc2_forward() {
         let critics = Ensemble::of(&model.qs.iter().collect::<Vec<_>>());
         check(&golden, "o.q_logits", &values(critics.forward(input, 0.0, &mut DropoutRng::disabled())));
 
-        let numbers = golden.tensor::<1>("i.values");
-        check(&golden, "o.symlog", &values(two_hot::symlog(numbers.clone())));
-        check(&golden, "o.symexp", &values(two_hot::symexp(numbers.clone() * 0.2)));
-        check(&golden, "o.two_hot", &values(config.bins.two_hot(numbers)));
+        let scalars = golden.tensor::<1>("i.values");
+        check(&golden, "o.symlog", &values(two_hot::symlog(scalars.clone())));
+        check(&golden, "o.symexp", &values(two_hot::symexp(scalars.clone() * 0.2)));
+        check(&golden, "o.two_hot", &values(config.bins.two_hot(scalars)));
 
         let rollouts = Rollouts::new(&model, golden.wm("discount"), golden.wm("uncertainty_penalty"));
         let (latents, actions) = (values(z), values(golden.tensor::<4>("i.candidates")));
@@ -64,7 +64,7 @@ fn golden_tdmpc2_forward() {
 }
 
 #[test]
-fn golden_tdmpc2_goes_to_the_reference_and_back() {
+fn golden_tdmpc2_checkpoints_round_trip() {
     let folder = tempfile::tempdir().expect("a folder");
     for golden in forward_files() {
         let (model, published) = golden.tdmpc2();
@@ -132,8 +132,8 @@ impl Golden {
         terminations: bool,
         shards: usize,
     ) -> Tdmpc2Step {
-        // From clip after clip to step after step.
-        let turned = |name: &str| {
+        // From clip-major to step-major order.
+        let step_major = |name: &str| {
             let [clips, steps, width] = self.tensor::<3>(name).dims();
             self.tensor::<3>(name).swap_dims(0, 1).reshape([steps * clips, width])
         };
@@ -144,9 +144,9 @@ impl Golden {
         let batch = TrainBatch {
             observations: Observation {
                 pixels: None,
-                columns: config.column_encodings().map(|part| turned(&format!("i.{}", part.column))).collect(),
+                columns: config.column_encodings().map(|part| step_major(&format!("i.{}", part.column))).collect(),
             },
-            actions: turned("i.action").narrow(0, 0, horizon * clips).reshape([horizon, clips, width]),
+            actions: step_major("i.action").narrow(0, 0, horizon * clips).reshape([horizon, clips, width]),
             rewards: flat("i.reward"),
             terminated: if terminations { ended } else { ended.zeros_like() },
         };

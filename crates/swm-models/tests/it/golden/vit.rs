@@ -1,4 +1,4 @@
-//! Backbones: tokens of pictures of the size they were made for and of another, and gradients.
+//! Backbones: tokens and gradients, for images of the original size and of another one.
 
 use super::{Golden, check, files, values};
 use burn::module::Module;
@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor};
 use swm_core::Key;
 use swm_models::nn::{Dino, DinoConfig, Init, Vit, VitConfig, parameters};
 
-/// Everything that `tokens` of a module is compared in.
+/// Compares the tokens and gradients of a module with the recorded ones.
 fn compare<M: Module>(golden: &Golden, module: M, tokens: impl Fn(&M, Tensor<3>) -> Tensor<3>) {
     let weights = golden.group("w.");
     let shapes = parameters::shapes(&module);

@@ -1,4 +1,4 @@
-//! Files of weights that PyTorch wrote, and such as it reads.
+//! Files of weights that PyTorch wrote, and state dicts written for PyTorch.
 
 use std::path::{Path, PathBuf};
 use swm_models::nn::parameters::{HostTensor, Named};
@@ -10,15 +10,15 @@ fn file(name: &str) -> PathBuf {
 
 #[test]
 fn golden_files_of_weights() {
-    let wanted = weights::read(&file("weights-single.safetensors")).expect("single precision throughout");
-    assert_eq!(wanted["norm.num_batches_tracked"], HostTensor { shape: vec![], values: vec![7.0] });
+    let expected = weights::read(&file("weights-single.safetensors")).expect("single precision throughout");
+    assert_eq!(expected["norm.num_batches_tracked"], HostTensor { shape: vec![], values: vec![7.0] });
     for name in ["weights-zip.pt", "weights-legacy.pth", "weights-training.ckpt", "weights-same.safetensors"] {
-        assert_eq!(weights::read(&file(name)).expect(name), wanted, "{name}");
+        assert_eq!(weights::read(&file(name)).expect(name), expected, "{name}");
     }
 }
 
 #[test]
-fn state_dicts_go_there_and_back() {
+fn state_dicts_round_trip() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("weights.pt");
     let tensor = |shape: &[usize], first: f32| HostTensor {
@@ -39,7 +39,7 @@ fn state_dicts_go_there_and_back() {
 }
 
 #[test]
-fn files_that_are_no_weights_say_so() {
+fn invalid_files_are_refused() {
     let folder = tempfile::tempdir().expect("a folder");
     let message = |name: &str, bytes: &[u8]| {
         let path = folder.path().join(name);
@@ -49,12 +49,12 @@ fn files_that_are_no_weights_say_so() {
     assert!(message("weights.txt", b"").contains(".safetensors, .pt"));
     assert!(message("weights.pt", b"not a pickle").contains("torch.save"));
     assert!(message("weights.safetensors", b"short").contains("save the state dict again"));
-    // A pickle that would run a program is refused, not run.
+    // A pickle that calls a program is refused, not executed.
     let attack = b"\x80\x02cos\nsystem\nX\x04\x00\x00\x00true\x85R.";
     assert!(message("attack.pt", attack).contains("torch.save"), "{}", message("attack.pt", attack));
     let missing = weights::read(&folder.path().join("none.pt")).expect_err("no file").to_string();
     assert!(missing.contains("reading weights"), "{missing}");
-    // Cut off in the middle.
+    // A truncated file.
     let whole = std::fs::read(file("weights-zip.pt")).expect("the fixture");
     assert!(message("cut.pt", &whole[..whole.len() / 2]).contains("torch.save"));
 }

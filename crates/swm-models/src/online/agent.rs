@@ -1,0 +1,48 @@
+//! [`Agent`]: the contract between a model and the online training loop.
+
+use super::shared_model::SharedModel;
+use crate::checkpoint::Checkpoint;
+use crate::train::{DatasetInfo, TrainConfig, Trainable};
+use swm_core::columns::{REWARD, TERMINATED};
+use swm_core::{EnvSpec, Error, Policy, Result, Schema};
+
+/// A model that learns by interaction.
+pub trait Agent: Trainable {
+    /// Creates a policy for `slots` environments of `spec` that always acts with the present weights of `model`. With
+    /// `explore`, its actions include exploration noise.
+    ///
+    /// # Errors
+    /// When the model does not fit the environment.
+    fn policy(
+        config: &TrainConfig<Self>,
+        dataset_info: &DatasetInfo,
+        model: SharedModel<Self>,
+        spec: &EnvSpec,
+        slots: usize,
+        explore: bool,
+    ) -> Result<Box<dyn Policy>>;
+}
+
+/// Creates the policy of a trained agent, which does not explore.
+///
+/// # Errors
+/// When the model does not fit the environment.
+pub fn policy<M: Agent>(checkpoint: &Checkpoint<M>, spec: &EnvSpec, slots: usize) -> Result<Box<dyn Policy>> {
+    let model = SharedModel::new(checkpoint.model.clone());
+    M::policy(&checkpoint.config, &checkpoint.dataset_info, model, spec, slots, false)
+}
+
+/// Checks that a dataset has rewards to learn from.
+///
+/// # Errors
+/// Naming the column that is missing.
+pub(crate) fn check_rewards(schema: &Schema) -> Result<()> {
+    match [REWARD, TERMINATED].into_iter().find(|name| schema.find(name).is_none()) {
+        None => Ok(()),
+        Some(name) => Err(Error::config(
+            format!("the column '{name}'"),
+            "the dataset does not have it",
+            "train on a dataset with rewards, such as `swm collect` writes",
+        )),
+    }
+}

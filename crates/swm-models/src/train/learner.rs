@@ -1,0 +1,219 @@
+//! [`Learner`]: a model, its optimizer and their progress, as both training loops drive them.
+//!
+//! The loops see a model through the object-safe trait [`Learn`], so they are compiled once and not once per family.
+
+use super::config::TrainConfig;
+use super::dataset_info::DatasetInfo;
+use super::optim::AdamW;
+use super::options::TrainOptions;
+use super::run_state::RunState;
+use super::step_output::StepOutput;
+use super::trainable::{StepContext, Trainable};
+use super::{metrics::Metrics, resume};
+use crate::checkpoint::{Checkpoint, TrainState};
+use crate::nn::parameters;
+use burn::tensor::Device;
+use std::path::Path;
+use swm_core::{Batch, Error, Key, Manifest, Result};
+
+/// The operations of a training loop on a model of any family.
+pub(crate) trait Learn {
+    /// The progress of the run.
+    fn state(&self) -> &RunState;
+
+    /// The progress of the run, to change.
+    fn state_mut(&mut self) -> &mut RunState;
+
+    /// Saves the weights below `out` if `loss` is the lowest so far; returns whether it is.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    fn save_if_best(&mut self, loss: f64, out: &Path) -> Result<bool>;
+
+    /// Loss and gradients of a batch; without `training`, of the averaged weights, where an average is kept.
+    ///
+    /// # Errors
+    /// When the batch does not fit the model.
+    fn loss_and_gradients(&self, batch: &Batch, key: Key, training: bool) -> Result<StepOutput>;
+
+    /// Makes one optimizer step; `key` decides the random numbers of what follows it.
+    fn update(&mut self, output: StepOutput, key: Key) -> Update;
+
+    /// Saves the checkpoint with all that is needed to continue, and returns the hash of its weights.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    fn save(&self, out: &Path) -> Result<String>;
+
+    /// The number of trained scalars.
+    fn parameter_count(&self) -> usize;
+}
+
+/// What an optimizer step reports.
+pub(crate) struct Update {
+    /// The metrics of the step.
+    pub metrics: Metrics,
+    /// Its learning rate.
+    pub lr: f64,
+    /// The norm of the gradient before clipping.
+    pub gradient_norm: f64,
+}
+
+/// The folder, inside a run's, of the checkpoint with the lowest validation loss or the highest mean return.
+const BEST: &str = "best";
+
+/// A model in training.
+pub(crate) struct Learner<'a, M: Trainable> {
+    config: &'a TrainConfig<M>,
+    device: &'a Device,
+    /// The weights that are trained.
+    model: M,
+    /// Their exponential moving average, where one is kept.
+    average: Option<M>,
+    dataset_info: DatasetInfo,
+    manifest: Manifest,
+    optimizer: AdamW,
+    state: RunState,
+}
+
+impl<'a, M: Trainable> Learner<'a, M> {
+    /// Resumes the run in the folder `out`, or returns `None` where there is none.
+    ///
+    /// # Errors
+    /// When there is a run that may not be continued: `options` do not ask for it, or its configuration or data differ.
+    pub fn resume(
+        config: &'a TrainConfig<M>,
+        dataset_info: &DatasetInfo,
+        manifest: &Manifest,
+        out: &Path,
+        options: &'a TrainOptions,
+    ) -> Result<Option<Self>> {
+        if !Checkpoint::<M>::exists(out) {
+            return Ok(None);
+        }
+        if !options.resume {
+            return Err(resume::refuse_existing(out));
+        }
+        let device = &options.device;
+        let (checkpoint, stored) = Checkpoint::<M>::load_to_resume(out, device)?;
+        resume::check_same_run(out, &checkpoint.manifest, manifest)?;
+        let mut optimizer = AdamW::new(config.optim.clone());
+        optimizer.restore(stored.state.step, stored.moments, device);
+        let (model, average) = match stored.raw {
+            Some(raw) => (raw, Some(checkpoint.model)),
+            None => (checkpoint.model, None),
+        };
+        let (dataset_info, manifest) = (dataset_info.clone(), manifest.clone());
+        Ok(Some(Self { config, device, model, average, dataset_info, manifest, optimizer, state: stored.state }))
+    }
+
+    /// A model with initial weights, in a folder that is created.
+    ///
+    /// # Errors
+    /// When the data do not fit the configuration, or the disk refuses.
+    pub fn start(
+        config: &'a TrainConfig<M>,
+        dataset_info: DatasetInfo,
+        manifest: Manifest,
+        out: &Path,
+        device: &'a Device,
+    ) -> Result<Self> {
+        std::fs::create_dir_all(out).map_err(|error| Error::io(out, "creating a folder", error))?;
+        let model = M::new(config, &dataset_info, Key::new(config.seed).with("init"), device)?;
+        let (optimizer, state) = (AdamW::new(config.optim.clone()), RunState::default());
+        Ok(Self { config, device, model, average: None, dataset_info, manifest, optimizer, state })
+    }
+
+    /// Loads pretrained weights, and keeps an average of the weights where the configuration asks for one.
+    ///
+    /// # Errors
+    /// When the weights cannot be fetched or do not fit.
+    pub fn with_pretrained_weights(self, cache: &Path) -> Result<Self> {
+        let model = self.model.with_pretrained_weights(self.config, cache)?;
+        let average = (self.config.optim.ema > 0.0).then(|| model.clone());
+        Ok(Self { model, average, ..self })
+    }
+
+    /// The trained weights.
+    pub fn model(&self) -> &M {
+        &self.model
+    }
+
+    /// Statistics of the data.
+    pub fn dataset_info(&self) -> &DatasetInfo {
+        &self.dataset_info
+    }
+
+    fn context(&self, key: Key, training: bool) -> StepContext<'_, M> {
+        StepContext { config: self.config, dataset_info: &self.dataset_info, key, device: self.device, training }
+    }
+
+    /// The weights to use: the average, where one is kept.
+    fn checkpoint(&self) -> Checkpoint<M> {
+        Checkpoint {
+            model: self.average.as_ref().unwrap_or(&self.model).clone(),
+            config: self.config.clone(),
+            dataset_info: self.dataset_info.clone(),
+            manifest: self.manifest.clone(),
+        }
+    }
+}
+
+impl<M: Trainable> Learn for Learner<'_, M> {
+    fn state(&self) -> &RunState {
+        &self.state
+    }
+
+    fn state_mut(&mut self) -> &mut RunState {
+        &mut self.state
+    }
+
+    fn save_if_best(&mut self, loss: f64, out: &Path) -> Result<bool> {
+        let is_best = self.state.best.is_none_or(|(_, best)| loss < best);
+        if is_best {
+            self.state.best = Some((self.state.step, loss));
+            self.checkpoint().save(&out.join(BEST), None)?;
+        }
+        Ok(is_best)
+    }
+
+    fn loss_and_gradients(&self, batch: &Batch, key: Key, training: bool) -> Result<StepOutput> {
+        let model = if training { &self.model } else { self.average.as_ref().unwrap_or(&self.model) };
+        model.step(&self.context(key, training), batch)
+    }
+
+    fn update(&mut self, output: StepOutput, key: Key) -> Update {
+        let StepOutput { metrics, gradients, buffers } = output;
+        let lr_factor = self.config.schedule.lr_factor(self.state.step);
+        let (model, gradient_norm) = self.optimizer.step(self.model.clone(), lr_factor, gradients, M::parameter_group);
+        let model = model.after_step(&self.context(key, true), buffers);
+        if let Some(average) = self.average.take() {
+            self.average = Some(parameters::blend(average, &model, self.config.optim.ema));
+        }
+        self.model = model;
+        self.state.step += 1;
+        Update { metrics, lr: self.config.optim.lr * lr_factor, gradient_norm }
+    }
+
+    fn save(&self, out: &Path) -> Result<String> {
+        let state = TrainState {
+            state: self.state.clone(),
+            moments: self.optimizer.state(),
+            raw: self.average.as_ref().map(|_| self.model.clone()),
+        };
+        self.checkpoint().save(out, Some(&state))
+    }
+
+    fn parameter_count(&self) -> usize {
+        parameters::trained_count(&self.model)
+    }
+}
+
+/// The manifest of a training run whose data have the hash `dataset`.
+pub(crate) fn manifest<M: Trainable>(config: &TrainConfig<M>, dataset: String, device: &Device) -> Manifest {
+    let mut manifest = Manifest::new("train", config.seed, serde_json::to_value(config).unwrap_or_default());
+    manifest.libraries.insert("burn".to_owned(), "0.22.1".to_owned());
+    manifest.hashes.insert("dataset".to_owned(), dataset);
+    manifest.device = crate::device::name(device);
+    manifest
+}

@@ -1,0 +1,57 @@
+//! [`TrainOptions`] and [`TrainSummary`]: what a run takes and returns beside its configuration, data and model.
+
+use burn::tensor::Device;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+/// Options of a run that do not change its results.
+#[derive(Clone, Debug)]
+pub struct TrainOptions {
+    /// Whether to continue the run in the output folder, if there is one.
+    pub resume: bool,
+    /// The device that holds the tensors.
+    pub device: Device,
+    /// Threads that compute; 0 for all.
+    pub threads: usize,
+    /// Threads that load data.
+    pub loader_threads: usize,
+    /// Batches loaded ahead.
+    pub prefetch: usize,
+    /// The folder in which downloaded pretrained weights are cached.
+    pub cache: PathBuf,
+}
+
+impl Default for TrainOptions {
+    fn default() -> Self {
+        let cache = std::env::temp_dir().join("swm-weights");
+        Self { resume: false, device: Device::flex(), threads: 0, loader_threads: 1, prefetch: 4, cache }
+    }
+}
+
+/// The result of a run.
+#[derive(Clone, Debug, Serialize)]
+pub struct TrainSummary {
+    /// The run folder, which holds the checkpoint.
+    pub checkpoint: PathBuf,
+    /// The hash of the weights.
+    pub weights: String,
+    /// Steps done.
+    pub steps: usize,
+    /// Whether the run was interrupted; training again with `resume` continues it.
+    pub interrupted: bool,
+    /// Whether the run ended early because the validation loss no longer fell.
+    pub stopped_early: bool,
+    /// The step and the loss of the best validation, whose weights are in `best/`.
+    pub best: Option<(usize, f64)>,
+    /// Means of the metrics over the last logged steps, by name.
+    pub metrics: BTreeMap<String, f64>,
+    /// The number of trained scalars.
+    pub parameters: usize,
+    /// Clips trained on per second.
+    pub clips_per_second: f64,
+    /// The fraction of the time spent waiting for data.
+    pub data_wait: f64,
+    /// Duration of the run in seconds.
+    pub seconds: f64,
+}

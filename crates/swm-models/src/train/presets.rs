@@ -1,0 +1,105 @@
+//! Configurations from presets, TOML files and `key=value` words.
+
+use figment::Figment;
+use figment::providers::{Format as _, Serialized, Toml};
+use serde::de::DeserializeOwned;
+use std::path::Path;
+use swm_core::{Error, Result};
+
+/// A named configuration.
+#[derive(Debug)]
+pub struct Preset {
+    /// Its name.
+    pub id: &'static str,
+    /// What it is for, in a sentence.
+    pub summary: &'static str,
+    /// The configuration.
+    pub toml: &'static str,
+}
+
+/// Reads the TOML of a preset, or of the file of that path.
+///
+/// # Errors
+/// When there is neither.
+pub(crate) fn preset_text(presets: &[Preset], preset: &str) -> Result<String> {
+    match presets.iter().find(|row| row.id == preset) {
+        Some(row) => Ok(row.toml.to_owned()),
+        None if Path::new(preset).extension().is_some_and(|end| end == "toml") => {
+            std::fs::read_to_string(preset).map_err(|error| Error::io(preset, "reading a configuration", error))
+        }
+        None => {
+            let hint = "or give the path of a .toml file";
+            Err(Error::unknown("preset", preset, presets.iter().map(|row| row.id), hint))
+        }
+    }
+}
+
+/// Parses a configuration from TOML, overridden by `key=value` words with dotted keys. The valid keys are those of
+/// `presets`.
+///
+/// # Errors
+/// When there is no such key (naming the nearest), or a value does not fit.
+pub(crate) fn parse<C: DeserializeOwned>(text: &str, words: &[String], presets: &[&str]) -> Result<C> {
+    merge(text, words, presets)?.extract().map_err(|error| {
+        let key = if error.path.is_empty() { "configuration".to_owned() } else { error.path.join(".") };
+        Error::config(key, error.kind.to_string(), "give a value that fits (`--print-config` shows them all)")
+    })
+}
+
+/// The TOML and the words merged, with their keys checked.
+fn merge(text: &str, words: &[String], presets: &[&str]) -> Result<Figment> {
+    let known = known_keys(presets);
+    let check = |key: &str| {
+        if known.iter().any(|name| name == key || name.starts_with(&format!("{key}."))) {
+            return Ok(());
+        }
+        let known = known.iter().map(String::as_str);
+        Err(Error::unknown("setting", key, known, "`--print-config` shows them all"))
+    };
+    let table: toml::Table =
+        toml::from_str(text).map_err(|error| Error::config("configuration", error.message(), "correct the file"))?;
+    let mut keys = vec![];
+    flatten("", &toml::Value::Table(table), &mut keys);
+    keys.iter().try_for_each(|key| check(key))?;
+
+    let mut figment = Figment::from(Toml::string(text));
+    for word in words {
+        let Some((key, value)) = word.split_once('=') else {
+            return Err(Error::config(word, "is not a setting", "write key=value, such as optim.lr=3e-4"));
+        };
+        check(key)?;
+        // A word that is no TOML value is a string.
+        let value = toml::from_str::<toml::Table>(&format!("value = {value}"))
+            .ok()
+            .and_then(|mut table| table.remove("value"))
+            .unwrap_or_else(|| toml::Value::String(value.to_owned()));
+        figment = figment.merge(Serialized::default(key, value));
+    }
+    Ok(figment)
+}
+
+/// The dotted keys of all presets.
+fn known_keys(presets: &[&str]) -> Vec<String> {
+    let mut keys = vec![];
+    for preset in presets {
+        if let Ok(table) = toml::from_str(preset) {
+            flatten("", &toml::Value::Table(table), &mut keys);
+        }
+    }
+    keys.sort();
+    keys.dedup();
+    keys
+}
+
+/// Appends the dotted keys of a value to `keys`.
+fn flatten(prefix: &str, value: &toml::Value, keys: &mut Vec<String>) {
+    match value {
+        toml::Value::Table(table) => {
+            for (key, value) in table {
+                let key = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
+                flatten(&key, value, keys);
+            }
+        }
+        _ => keys.push(prefix.to_owned()),
+    }
+}

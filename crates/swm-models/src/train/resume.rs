@@ -1,0 +1,53 @@
+//! Whether a stored run may be continued with a given configuration and dataset.
+
+use serde_json::Value;
+use std::path::Path;
+use swm_core::{Error, Manifest, Result};
+
+/// The error for an output folder that holds a run which is not to be continued.
+pub(crate) fn refuse_existing(out: &Path) -> Error {
+    Error::config(
+        out.display().to_string(),
+        "holds a training run already",
+        "continue it with `resume`, or choose another folder",
+    )
+}
+
+/// Checks that a stored run has the configuration and the data of the requested one.
+///
+/// # Errors
+/// Naming the settings that differ.
+pub(crate) fn check_same_run(path: &Path, stored: &Manifest, requested: &Manifest) -> Result<()> {
+    let problem = if stored.config != requested.config {
+        let differing = differences("", &stored.config, &requested.config);
+        format!("the run there has another configuration ({})", differing.join(", "))
+    } else if stored.hashes.get("dataset") != requested.hashes.get("dataset") {
+        "the run there was trained on other data".to_owned()
+    } else {
+        return Ok(());
+    };
+    Err(Error::config(
+        path.display().to_string(),
+        problem,
+        "continue with the configuration and the data it began with, or choose another folder",
+    ))
+}
+
+/// The keys in which two configurations differ, with both values.
+fn differences(prefix: &str, stored: &Value, requested: &Value) -> Vec<String> {
+    match (stored, requested) {
+        (Value::Object(left), Value::Object(right)) => {
+            let mut keys: Vec<&String> = left.keys().chain(right.keys()).collect();
+            keys.sort();
+            keys.dedup();
+            keys.into_iter()
+                .flat_map(|key| {
+                    let name = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
+                    differences(&name, left.get(key).unwrap_or(&Value::Null), right.get(key).unwrap_or(&Value::Null))
+                })
+                .collect()
+        }
+        _ if stored == requested => vec![],
+        _ => vec![format!("{prefix}: {stored} there, {requested} here")],
+    }
+}

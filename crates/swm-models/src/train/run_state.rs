@@ -1,0 +1,22 @@
+//! [`RunState`]: the progress of a run, stored in its checkpoint as `state.json`.
+
+use serde::{Deserialize, Serialize};
+
+/// The progress of a run: together with the tensors, all that its continuation depends on.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub(crate) struct RunState {
+    /// Optimizer steps done.
+    pub step: usize,
+    /// The step and the loss of the best validation.
+    #[serde(default)]
+    pub best: Option<(usize, f64)>,
+    /// Validations since the best one.
+    #[serde(default, rename = "looks")]
+    pub validations_since_best: usize,
+}
+
+/// Returns whether an action that repeats every `every` steps, and happens after the last step, is due after `done` of
+/// `steps` steps. `every` of 0 disables it.
+pub(crate) fn is_due(every: usize, done: usize, steps: usize) -> bool {
+    every > 0 && (done.is_multiple_of(every) || done == steps)
+}

@@ -4,8 +4,8 @@ use super::contract::{ModelFamily, OnlineRun, TrainRun};
 use crate::online::OnlineSummary;
 use crate::train::{TrainConfig, TrainSummary, train};
 use serde_json::{Value, json};
-use swm_core::run::Control;
 use swm_core::Result;
+use swm_core::run::Control;
 
 /// A complete training configuration of any family.
 pub trait TrainableConfig {
@@ -28,11 +28,7 @@ pub trait TrainableConfig {
     ///
     /// # Errors
     /// As [`crate::online::train_online`].
-    fn train_online(
-        &self,
-        run: OnlineRun<'_>,
-        control: &mut Control<'_>,
-    ) -> Option<Result<OnlineSummary>>;
+    fn train_online(&self, run: OnlineRun<'_>, control: &mut Control<'_>) -> Option<Result<OnlineSummary>>;
 
     /// Trains on a dataset.
     ///
@@ -58,11 +54,7 @@ impl<M: ModelFamily> TrainableConfig for TrainConfig<M> {
         M::image_size(&self.model)
     }
 
-    fn train_online(
-        &self,
-        run: OnlineRun<'_>,
-        control: &mut Control<'_>,
-    ) -> Option<Result<OnlineSummary>> {
+    fn train_online(&self, run: OnlineRun<'_>, control: &mut Control<'_>) -> Option<Result<OnlineSummary>> {
         M::train_online(self, run, control)
     }
 

@@ -55,8 +55,11 @@ impl InverseCheckpoint {
         let config = stored.config;
         let (latent, actions) = (world_model.config.model.latent, world_model.actions());
         let model = Mlp::new(&Init::new(Key::new(0), device), 2 * latent, config.hidden, actions);
-        let model =
-            checkpoint::load_weights(model, &stored.folder.join("weights.safetensors"), stored.manifest.hashes.get("weights"))?;
+        let model = checkpoint::load_weights(
+            model,
+            &stored.folder.join("weights.safetensors"),
+            stored.manifest.hashes.get("weights"),
+        )?;
         Ok(Self { world_model, model, config, manifest: stored.manifest })
     }
 }

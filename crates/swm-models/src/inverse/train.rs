@@ -134,14 +134,14 @@ fn run(
         let (elapsed, lr) = (begun.elapsed().as_secs_f64(), config.optim.lr * factor);
         clips_per_second = (step * config.batch_size) as f64 / elapsed;
         let metrics = [
-                ("loss", loss),
-                ("lr", lr),
-                ("gradient_norm", norm),
-                ("clips_per_second", clips_per_second),
-                ("data_wait", waited / elapsed),
-            ];
-            let total = config.schedule.steps;
-            control.progress(Progress { stage: "train", done: step, total, unit: "steps", metrics: &metrics });
+            ("loss", loss),
+            ("lr", lr),
+            ("gradient_norm", norm),
+            ("clips_per_second", clips_per_second),
+            ("data_wait", waited / elapsed),
+        ];
+        let total = config.schedule.steps;
+        control.progress(Progress { stage: "train", done: step, total, unit: "steps", metrics: &metrics });
         if step.is_multiple_of(config.log_every) || step == config.schedule.steps {
             log.write(step, &[("loss", loss), ("lr", lr), ("gradient_norm", norm)])?;
         }

@@ -16,8 +16,8 @@ mod run;
 mod shared_model;
 mod stochastic_policy;
 
-pub use agent::{Agent, policy};
 pub(crate) use agent::check_rewards;
+pub use agent::{Agent, policy};
 pub use config::OnlineConfig;
 pub use planner_config::PlannerConfig;
 pub use run::{OnlineSummary, train_online};

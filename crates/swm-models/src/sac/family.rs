@@ -4,7 +4,7 @@ use super::Sac;
 use crate::checkpoint::Checkpoint;
 use crate::family::{FamilyEntry, ModelFamily, OnlineRun};
 use crate::online::{self, OnlineSummary, train_online};
-use crate::train::{TrainConfig};
+use crate::train::TrainConfig;
 use swm_core::run::Control;
 use swm_core::{EnvSpec, Policy, Result};
 

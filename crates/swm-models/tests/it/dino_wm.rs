@@ -212,13 +212,14 @@ fn gradients_match_finite_differences() {
 #[test]
 fn history_and_column_goals_change_the_cost() {
     let history = ["history.length", "history.action", "history.pixels"];
-    let (with, without) =
-        (costs(&[IMAGES], &infos(&history), &[0, 1], 1), costs(&[IMAGES], &infos(&[]), &[0, 1], 1));
+    let (with, without) = (costs(&[IMAGES], &infos(&history), &[0, 1], 1), costs(&[IMAGES], &infos(&[]), &[0, 1], 1));
     // Environment 0 has a history of length 0, environment 1 of length 1.
     assert_eq!(with.0[..SAMPLES], without.0[..SAMPLES]);
     assert_ne!(with.0[SAMPLES..], without.0[SAMPLES..]);
-    let (with, without) =
-        (costs(&[POSITIONS], &infos(&["position", "goal_position"]), &[0], 1), costs(&[POSITIONS], &infos(&["position"]), &[0], 1));
+    let (with, without) = (
+        costs(&[POSITIONS], &infos(&["position", "goal_position"]), &[0], 1),
+        costs(&[POSITIONS], &infos(&["position"]), &[0], 1),
+    );
     assert!(with.0.iter().zip(&without.0).all(|(with, without)| with > without), "the distance of the column is added");
     let mut model = DinoWmCost::new(&checkpoint(&[POSITIONS]));
     let message = model.observe(&infos(&[]), &[0]).expect_err("no position").to_string();

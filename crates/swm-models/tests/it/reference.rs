@@ -19,8 +19,7 @@ fn folder(family: &str) -> PathBuf {
 
 fn dataset_info(action: usize) -> DatasetInfo {
     let all = |value: f64| vec![value; 3];
-    let proprio =
-        ColumnInfo { shape: vec![3], mean: all(0.0), std: all(1.0), min: all(-1.0), max: all(1.0) };
+    let proprio = ColumnInfo { shape: vec![3], mean: all(0.0), std: all(1.0), min: all(-1.0), max: all(1.0) };
     DatasetInfo {
         action: ActionScale::identity(action),
         columns: BTreeMap::from([("proprio".to_owned(), proprio)]),

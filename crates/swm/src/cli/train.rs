@@ -104,8 +104,8 @@ fn train_online(
     });
     let out = home::checkpoint(&name);
     let mut bar = Progress::new("train", config.steps());
-    let Some(summary) =
-        config.train_online(OnlineRun { environments: &environments, out: &out, options }, &mut control(context, &mut bar))
+    let Some(summary) = config
+        .train_online(OnlineRun { environments: &environments, out: &out, options }, &mut control(context, &mut bar))
     else {
         let problem = format!("{} learns from datasets only", args.model);
         anyhow::bail!(Error::config("--env", problem, "give a dataset with --data, or train tdmpc2 or sac"));
@@ -188,9 +188,6 @@ fn control<'a>(context: &Context, bar: &'a mut Progress) -> Control<'a> {
         let validation = validation.map_or(String::new(), |value| format!(", held out {value:.4}"));
         let clips_per_second = at.metric("clips_per_second").unwrap_or_default();
         let wait = 100.0 * at.metric("data_wait").unwrap_or_default();
-        bar.at(
-            at.done,
-            format!("{}{validation}, {clips_per_second:.0} clips/s, waits {wait:.0} %", shown.join(" ")),
-        );
+        bar.at(at.done, format!("{}{validation}, {clips_per_second:.0} clips/s, waits {wait:.0} %", shown.join(" ")));
     })
 }

@@ -274,7 +274,7 @@ impl Batches {
     }
 
     /// The next batch, of the next epoch after the last one of an epoch.
-    fn next(&mut self) -> Result<swm_data::Loaded> {
+    fn next(&mut self) -> Result<swm_data::LoadedBatch> {
         loop {
             match self.epoch.next() {
                 Some(batch) => {

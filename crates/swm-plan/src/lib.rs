@@ -1,50 +1,25 @@
 //! Planning: solvers that search for cheap action sequences, and the policy that replans with them.
 //!
-//! A solver is a file; each is the algorithm of its paper on a screen, over the contracts of
-//! [`swm_core::plan`]. [`MpcPolicy`] turns any solver and any [`swm_core::CostModel`] into a
-//! [`swm_core::Policy`].
+//! - [`solvers`]: a file for each algorithm, and [`SOLVERS`], the list of them.
+//! - [`search`]: what solvers share: the population, sampling, the gradient loop, optimizers, checks of problems and settings.
+//! - [`objective`]: terms and constraints that are added to the cost of a model or replace it.
+//! - [`mpc`]: [`MpcPolicy`], which turns any solver and any [`swm_core::CostModel`] into a [`swm_core::Policy`].
+//! - [`simulator`]: the true simulator as a cost model.
+//!
+//! The contracts (`Solver`, `CostModel`, `PlanProblem`, `Plan`) are in [`swm_core::plan`].
 
-pub mod augmented_lagrangian;
-pub mod categorical_cem;
-pub mod cem;
-mod codec;
-mod colour;
-mod gaussian;
-#[cfg(test)]
-mod golden;
-pub mod gradient_descent;
-pub mod grasp;
-mod guard;
-mod history;
-pub mod icem;
+pub mod entry;
 pub mod mpc;
-pub mod mppi;
 pub mod objective;
-pub mod optimizer;
-pub mod penalty;
-pub mod pgd;
-mod population;
-pub mod predictive_sampling;
-pub mod problem;
-pub mod registry;
-mod sampling;
-pub mod scale;
+pub mod search;
 pub mod simulator;
-pub mod topk;
-pub mod trace;
+pub mod solvers;
 
-pub use augmented_lagrangian::AugmentedLagrangian;
-pub use categorical_cem::CategoricalCem;
-pub use cem::Cem;
-pub use gradient_descent::GradientDescent;
-pub use grasp::Grasp;
-pub use icem::ICem;
-pub use mpc::{MpcConfig, MpcPolicy};
-pub use mppi::Mppi;
-pub use penalty::Penalised;
-pub use pgd::Pgd;
-pub use predictive_sampling::PredictiveSampling;
-pub use registry::{SOLVERS, SolverEntry};
-pub use scale::ActionScale;
+pub use entry::{ActionKind, Family, Need, SolverEntry};
+pub use mpc::{ActionScale, MpcConfig, MpcPolicy, PlanRecord, TraceLog};
+pub use objective::Penalised;
 pub use simulator::{Score, SimulatorCost};
-pub use trace::{PlanRecord, TraceLog};
+pub use solvers::{
+    AugmentedLagrangian, CategoricalCem, Cem, GradientDescent, Grasp, ICem, Mppi, Pgd, PredictiveSampling, SOLVERS,
+    pairing,
+};

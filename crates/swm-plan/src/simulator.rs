@@ -1,21 +1,20 @@
-//! [`SimulatorCost`]: the true simulator as the model, so that any solver can be run with perfect dynamics.
+//! [`SimulatorCost`]: the true simulator as a cost model, so that any solver can be run with perfect dynamics.
 //!
-//! It is an upper bound, and a test of solvers without a model's errors: what fails here is the search, its settings or
-//! the cost. The model looks at the world itself ([`CostModel::observe_env`]), so only a [`crate::MpcPolicy`] that is shown the
-//! worlds can use it.
+//! It gives an upper bound on performance and tests solvers without model errors: a failure is due to the search, its
+//! settings or the cost. The model reads the environment itself ([`CostModel::observe_env`]), so it requires a
+//! [`MpcPolicy`](crate::MpcPolicy) that receives the environments.
 //!
-//! Every candidate is played from a snapshot of the world in a simulator of the model's own, with the actions that the
-//! policy would execute. Simulators are made when a thread first needs one and kept. A cost depends on the snapshot and
-//! the candidate alone.
+//! Every candidate is played from a snapshot of the environment in a private simulator, with the actions that the policy would
+//! execute. Simulators are created when a thread first needs one, and reused. A cost depends on the snapshot and the
+//! candidate alone.
 
-use crate::ActionScale;
-use crate::codec::{ActionCodec, Decoded};
+use crate::mpc::{ActionCodec, ActionScale, Decoded};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::sync::{Mutex, PoisonError};
 use swm_core::{Batch, Candidates, CostModel, Env, Error, Result, Snapshot};
 
-/// What a candidate is judged by; distances are [`Env::goal_distance`], in the environment's unit.
+/// The cost of a candidate; distances are [`Env::goal_distance`], in the environment's unit.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Score {
@@ -24,8 +23,8 @@ pub enum Score {
     Terminal,
     /// The sum of the distances after every environment step.
     Running,
-    /// Reaching the goal on the way counts, and the earlier the better: minus the share of the steps that are left then,
-    /// which is never above 0. A candidate that does not reach it costs its distance at the end.
+    /// For a candidate that reaches the goal, minus the fraction of steps that remain then (0 at most); otherwise the
+    /// distance to the goal at the end.
     Reach,
 }
 
@@ -35,26 +34,26 @@ pub struct SimulatorCost {
     id: String,
     codec: ActionCodec,
     score: Score,
-    /// The worlds that were shown since they were last observed, by slot.
-    shown: Vec<Option<Snapshot>>,
-    /// The worlds to plan from.
+    /// Snapshots of the environments passed to `observe_env` since they were last observed, by slot.
+    received: Vec<Option<Snapshot>>,
+    /// Snapshots of the environments to plan from.
     present: Vec<Snapshot>,
-    /// Simulators that no thread uses now.
+    /// Simulators that no thread is using.
     idle: Mutex<Vec<Simulator>>,
 }
 
-/// A world to try actions in.
+/// A private environment in which candidates are played.
 struct Simulator {
     env: Box<dyn Env>,
     action: Decoded,
 }
 
-/// Candidates that one thread plays after another.
+/// The number of candidates that one task plays.
 const GROUP: usize = 8;
 
 impl SimulatorCost {
-    /// A model of the worlds that `make` makes, such as [`swm_core::EnvChoice::env`]. Scale and block are those of the
-    /// policy: a simulator has no units of its own, so [`ActionScale::unscaled`] will do.
+    /// A model of the environments that `make` creates, such as [`swm_core::EnvChoice::env`]. Scale and block are those of the
+    /// policy; [`ActionScale::unscaled`] fits any simulator.
     ///
     /// # Errors
     /// When the scale does not fit the environment, or a model step has no action, and what `make` returns.
@@ -71,21 +70,20 @@ impl SimulatorCost {
         let spec = first.env.spec();
         let (id, codec) = (spec.id.clone(), ActionCodec::new(spec, scale, action_block)?);
         let idle = Mutex::new(vec![first]);
-        Ok(Self { make: Box::new(make), id, codec, score, shown: vec![], present: vec![], idle })
+        Ok(Self { make: Box::new(make), id, codec, score, received: vec![], present: vec![], idle })
     }
 
-    /// A simulator nobody uses; one that fails is not put back, because it may be in any state.
-    fn borrow(&self) -> Result<Simulator> {
+    /// Takes an idle simulator or creates one. A simulator that fails is not returned, because its state is unknown.
+    fn take(&self) -> Result<Simulator> {
         let idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner).pop();
         idle.map_or_else(|| Ok(Simulator { env: (self.make)()?, action: Decoded::default() }), Ok)
     }
 
-    fn put_back(&self, simulator: Simulator) {
+    fn give_back(&self, simulator: Simulator) {
         self.idle.lock().unwrap_or_else(PoisonError::into_inner).push(simulator);
     }
 
-    /// Plays a candidate.
-    #[allow(clippy::cast_precision_loss)]
+    /// Plays a candidate, `[horizon, dim]`; returns its cost.
     fn play(&self, simulator: &mut Simulator, start: &Snapshot, actions: &[f32]) -> Result<f64> {
         let Simulator { env, action } = simulator;
         env.restore(start)?;
@@ -110,27 +108,27 @@ impl SimulatorCost {
 impl CostModel for SimulatorCost {
     fn observe_env(&mut self, slot: usize, env: &dyn Env) -> Result<()> {
         if env.spec().id != self.id {
-            return Err(Error::mismatch("showing a world to a simulator", &env.spec().id, &self.id));
+            return Err(Error::mismatch("the environment of a simulator", &env.spec().id, &self.id));
         }
-        if slot >= self.shown.len() {
-            self.shown.resize(slot + 1, None);
+        if slot >= self.received.len() {
+            self.received.resize(slot + 1, None);
         }
-        self.shown[slot] = Some(env.snapshot());
+        self.received[slot] = Some(env.snapshot());
         Ok(())
     }
 
     fn observe(&mut self, _: &Batch, envs: &[usize]) -> Result<()> {
         self.present.clear();
         for &slot in envs {
-            // Taken, not copied: a world that is not shown again must not be planned from where it was.
-            let Some(world) = self.shown.get_mut(slot).and_then(Option::take) else {
+            // Taken, not copied, so that an outdated snapshot is never planned from.
+            let Some(snapshot) = self.received.get_mut(slot).and_then(Option::take) else {
                 return Err(Error::config(
                     format!("planning in slot {slot} with a simulator"),
-                    "the world was not shown",
-                    "call Policy::observe_envs with the worlds before Policy::act",
+                    "the environment was not passed to the policy",
+                    "call Policy::observe_envs before Policy::act",
                 ));
             };
-            self.present.push(world);
+            self.present.push(snapshot);
         }
         Ok(())
     }
@@ -140,21 +138,19 @@ impl CostModel for SimulatorCost {
         if envs != self.present.len() || dim != self.codec.space().dim() {
             return Err(Error::mismatch(
                 "scoring candidates in a simulator",
-                format!("{envs} environments, {dim} numbers a model step"),
+                format!("{envs} environments, {dim} values per model step"),
                 format!("{} and {}", self.present.len(), self.codec.space().dim()),
             ));
         }
         let (this, len) = (&*self, horizon * dim);
         let groups = actions.par_chunks(GROUP * len).zip(costs.par_chunks_mut(GROUP)).enumerate();
         groups.try_for_each(|(group, (actions, costs))| {
-            let mut simulator = this.borrow()?;
+            let mut simulator = this.take()?;
             for (i, (actions, cost)) in actions.chunks_exact(len).zip(costs).enumerate() {
                 let start = &this.present[(group * GROUP + i) / samples];
-                #[allow(clippy::cast_possible_truncation)]
-                let judged = this.play(&mut simulator, start, actions)? as f32;
-                *cost = judged;
+                *cost = this.play(&mut simulator, start, actions)? as f32;
             }
-            this.put_back(simulator);
+            this.give_back(simulator);
             Ok(())
         })
     }

@@ -11,8 +11,8 @@ use swm_envs::wrappers::{GoalPicture, Stack, WRAPPERS};
 use swm_eval::{Actor, Acts, Choice, EvalRequest, Model, PolicyRequest, Predictor, Resolver, World};
 use swm_models::{CheckpointInfo, Device, load};
 use swm_plan::objective::ObjectiveConfig;
-use swm_plan::problem::pairing;
-use swm_plan::registry::Actions;
+use swm_plan::pairing;
+use swm_plan::ActionKind;
 use swm_plan::{ActionScale, MpcConfig, MpcPolicy, PlanRecord, SOLVERS, Score, SimulatorCost, TraceLog};
 
 /// Knows what is built in and what is at home.
@@ -109,7 +109,7 @@ impl Resolver for Home {
             }
             Acts::Plan { model, solver, mpc, objective } => {
                 let (id, solver) = (&solver.id, (SOLVERS.get(&solver.id)?.make)(&solver.settings)?);
-                let actions = Actions::of(&spec.action_space);
+                let actions = ActionKind::of(&spec.action_space);
                 let wrong = |what: &str, error: serde_json::Error| {
                     Error::config(what, error.to_string(), "`swm eval --help` lists what there is")
                 };

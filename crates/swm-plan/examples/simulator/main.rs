@@ -1,9 +1,8 @@
-//! How often planners with perfect dynamics reach the goal: the upper bound of every model, and what the search itself
-//! misses.
+//! Success rates of planners with perfect dynamics: an upper bound for every model, and a measure of the search alone.
 //!
-//!     cargo run --release -p swm-plan --example simulator [PART OF A WORLD] [SOLVER] [STARTS] [SETTINGS]
+//!     cargo run --release -p swm-plan --example simulator [PART OF AN ENVIRONMENT ID] [SOLVER] [STARTS] [SETTINGS]
 //!
-//! A start that already satisfies its goal is counted apart and not played. SETTINGS is JSON that is laid over those of
+//! A start that is already solved is counted separately and not played. SETTINGS is JSON that overrides the settings in
 //! `rows.rs`, as in `{"solver": {"samples": 100}, "mpc": {"horizon": 3}}`.
 
 mod play;
@@ -13,22 +12,22 @@ use play::{play, starts};
 use serde_json::Value;
 use std::io::Write as _;
 
-/// Starts of each row unless the command line says otherwise.
+/// The default number of starts of each row.
 const STARTS: usize = 100;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let part = |i: usize| arguments.get(i).map_or(String::new(), |part| part.to_lowercase());
-    let (world, solver) = (part(0), part(1));
+    let (env, solver) = (part(0), part(1));
     let n = arguments.get(2).map_or(Ok(STARTS), |number| number.parse())?;
     let changes: Value = arguments.get(3).map_or(Ok(Value::Null), |text| serde_json::from_str(text))?;
     let mut out = std::io::stdout();
     writeln!(
         out,
-        "| world | starts | solver | solved before | success | 95 % | steps, median | a plan, median | all |"
+        "| environment | starts | solver | solved at start | success | 95 % | steps, median | a plan, median | all |"
     )?;
     writeln!(out, "| --- | --- | --- | --- | --- | --- | --- | --- | --- |")?;
-    for task in rows::TASKS.iter().filter(|task| task.entry.id.to_lowercase().contains(&world)) {
+    for task in rows::TASKS.iter().filter(|task| task.entry.id.to_lowercase().contains(&env)) {
         let starts = starts(task.entry, task.protocol, n)?;
         for id in rows::SOLVERS.into_iter().filter(|id| solver.is_empty() || *id == solver) {
             let planner = rows::planner(task, id, &changes)?;
@@ -39,7 +38,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 "| `{}` | {:?} | `{id}` | {} | {} of {} | {:.1}–{:.1} % | {:.0} | {:.2} s | {:.0} s |",
                 task.entry.id,
                 task.protocol,
-                found.solved,
+                found.solved_at_start,
                 success.successes,
                 success.n,
                 100.0 * success.low,

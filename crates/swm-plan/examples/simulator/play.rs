@@ -1,4 +1,4 @@
-//! Plays planners with perfect dynamics and counts strictly: a start that already satisfies its goal is not played.
+//! Plays planners with perfect dynamics. Counting is strict: a start that is already solved is not played.
 
 use rand::seq::index::sample;
 use std::time::Instant;
@@ -7,50 +7,50 @@ use swm_core::results::{Proportion, Summary};
 use swm_core::{Action, Batch, EnvEntry, EnvPool, Key, Policy, ResetOptions, Result, Schema, Space};
 use swm_plan::{ActionScale, MpcConfig, MpcPolicy, SOLVERS, Score, SimulatorCost};
 
-/// From where an episode is played and towards which goal.
+/// The initial state and the goal of an episode.
 pub struct Start {
     seed: u64,
-    /// A start row and a goal row; what the reset chooses for none.
+    /// A start row and a goal row; without them, the reset chooses both.
     rows: Option<Batch>,
 }
 
-/// Where starts come from.
+/// The origin of starts.
 #[derive(Clone, Copy, Debug)]
 pub enum Protocol {
-    /// Start and goal as the environment resets.
+    /// Start and goal from the reset of the environment.
     Episodic,
-    /// Both from an episode of the environment's first expert, so many steps apart.
+    /// Two rows from an episode of the environment's first expert, with this number of steps between them.
     Demonstrated(usize),
 }
 
-/// Who plans, and how.
+/// A solver with its settings.
 #[derive(Clone)]
 pub struct Planner {
     /// The solver's id.
     pub solver: &'static str,
     /// Its settings.
     pub settings: serde_json::Value,
-    /// How far, and how much of it is executed.
+    /// Horizons and action block.
     pub mpc: MpcConfig,
-    /// What a candidate is judged by.
+    /// The cost of a candidate.
     pub score: Score,
 }
 
-/// What came of it.
+/// The result of playing.
 pub struct Outcome {
     /// Starts that were already solved.
-    pub solved: usize,
-    /// How often the goal was reached from the others.
+    pub solved_at_start: usize,
+    /// The success rate of the other starts.
     pub success: Proportion,
-    /// Steps to the goal among successes.
+    /// Steps to the goal in successful episodes.
     pub steps: Option<Summary>,
-    /// Seconds of one plan, while others are planned on the same cores.
+    /// Seconds per plan, while others are planned on the same cores.
     pub plan: Option<Summary>,
-    /// Seconds all together.
+    /// Seconds in total.
     pub seconds: f64,
 }
 
-/// Environments that are played, and planned for, at the same time.
+/// The number of environments that are played and planned for at the same time.
 const SLOTS: usize = 25;
 
 /// The first `n` starts of an environment.
@@ -86,10 +86,10 @@ fn demonstrate(entry: &EnvEntry, seed: u64) -> Result<Batch> {
     env.observe(&mut rows.row_mut(step));
     while step < limit && !env.is_success() {
         expert.act(rows.row(step), &mut action)?;
-        let numbers: Vec<f32> = action.iter().map(|&v| v as f32).collect();
+        let values: Vec<f32> = action.iter().map(|&v| v as f32).collect();
         let integers: Vec<i64> = action.iter().map(|&v| v as i64).collect();
         match env.spec().action_space {
-            Space::Box { .. } => env.step(Action::Continuous(&numbers))?,
+            Space::Box { .. } => env.step(Action::Continuous(&values))?,
             _ => env.step(Action::Discrete(&integers))?,
         };
         step += 1;
@@ -102,7 +102,7 @@ fn demonstrate(entry: &EnvEntry, seed: u64) -> Result<Batch> {
 /// Plays every start once, for at most `budget` steps.
 pub fn play(entry: &EnvEntry, starts: &[Start], planner: &Planner, budget: usize) -> Result<Outcome> {
     let begun = Instant::now();
-    let (mut solved, mut played, mut successes, mut latencies) = (0, 0, vec![], vec![]);
+    let (mut solved_at_start, mut played, mut successes, mut latencies) = (0, 0, vec![], vec![]);
     for starts in starts.chunks(SLOTS) {
         let envs = starts.iter().map(|_| entry.env().expect("an environment")).collect();
         let mut pool = EnvPool::new(envs, None, Some(budget), threads(0)?)?;
@@ -113,7 +113,7 @@ pub fn play(entry: &EnvEntry, starts: &[Start], planner: &Planner, budget: usize
         })?;
         let mut policy = planner.policy(entry, &pool)?;
         let mut active: Vec<bool> = slots.iter().map(|&slot| !pool.env(slot).is_success()).collect();
-        solved += active.iter().filter(|&&active| !active).count();
+        solved_at_start += active.iter().filter(|&&active| !active).count();
         played += active.iter().filter(|&&active| active).count();
         slots.iter().for_each(|&slot| policy.begin(slot, Key::new(starts[slot].seed)));
         let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()])?, pool.len());
@@ -135,7 +135,7 @@ pub fn play(entry: &EnvEntry, starts: &[Start], planner: &Planner, budget: usize
         latencies.extend(policy.take_latencies());
     }
     Ok(Outcome {
-        solved,
+        solved_at_start,
         success: Proportion::wilson(successes.len(), played),
         steps: Summary::of(&successes),
         plan: Summary::of(&latencies),

@@ -1,4 +1,4 @@
-//! What is planned with what.
+//! The tasks of the example and the settings of the planners.
 
 use super::play::{Planner, Protocol};
 use serde_json::{Value, json};
@@ -6,7 +6,7 @@ use swm_core::{EnvEntry, Error, Result};
 use swm_envs::{push_t, two_room};
 use swm_plan::{MpcConfig, Score};
 
-/// A world, where its starts come from, and the steps an episode may take.
+/// An environment, the origin of its starts, and the time limit of an episode.
 pub struct Task {
     pub entry: &'static EnvEntry,
     pub protocol: Protocol,
@@ -21,16 +21,16 @@ pub static TASKS: [Task; 2] = [
 
 pub const SOLVERS: [&str; 3] = ["cem", "icem", "mppi"];
 
-/// Any solver will do: a tenth of the paper's candidates, judged by how soon they get there.
+/// Any solver finds a plan with a third of the paper's candidates, scored by the time to the goal.
 fn two_room(_: &str) -> Value {
     json!({ "score": "reach", "solver": { "samples": 100, "iterations": 10, "elites": 10 } })
 }
 
-/// The horizon is the paper's 25 steps, planned one by one, so that noise can be coloured along them.
+/// The horizon is the paper's 25 steps, planned individually, so that noise can be coloured along them.
 ///
-/// The search is hard because pushing is: most candidates do not touch the block, and those that do rarely push it the
-/// right way. Replanning often helps every solver more than searching long, because CEM's spread collapses around the
-/// first push that is any good. MPPI keeps its spread, and iCEM's coloured noise walks straight instead of trembling.
+/// The search is hard because most candidates do not touch the block, and those that do rarely push it in the right direction.
+/// Frequent replanning helps every solver more than a long search, because the spread of CEM collapses around the first push
+/// with a lower cost. MPPI keeps its spread, and the coloured noise of iCEM moves in straighter lines than white noise.
 fn push_t(solver: &str) -> Value {
     let (solver, receding_horizon) = match solver {
         "cem" => (json!({ "samples": 300, "iterations": 5, "elites": 20, "sigma": 0.7 }), 1),
@@ -41,10 +41,10 @@ fn push_t(solver: &str) -> Value {
     json!({ "score": "reach", "solver": solver, "mpc": mpc })
 }
 
-/// The planner of a row, with these settings laid over its own.
+/// The planner of a row, with `changes` merged into its settings.
 pub fn planner(task: &Task, solver: &'static str, changes: &Value) -> Result<Planner> {
     let mut settings = (task.settings)(solver);
-    lay_over(&mut settings, changes);
+    merge(&mut settings, changes);
     let wrong = |error: serde_json::Error| Error::config("settings", error.to_string(), "see the example's rows");
     let part = |name: &str| settings.get(name).cloned().filter(|value| !value.is_null());
     Ok(Planner {
@@ -55,11 +55,11 @@ pub fn planner(task: &Task, solver: &'static str, changes: &Value) -> Result<Pla
     })
 }
 
-fn lay_over(value: &mut Value, changes: &Value) {
+fn merge(value: &mut Value, changes: &Value) {
     match (value, changes) {
         (Value::Object(value), Value::Object(changes)) => {
             for (key, change) in changes {
-                lay_over(value.entry(key.clone()).or_insert(Value::Null), change);
+                merge(value.entry(key.clone()).or_insert(Value::Null), change);
             }
         }
         (_, Value::Null) => {}

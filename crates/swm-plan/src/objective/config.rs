@@ -1,14 +1,17 @@
-//! [`ObjectiveConfig`]: what a plan is for, as a file says it.
+//! [`ObjectiveConfig`]: an objective and constraints as described in a configuration file.
 
-use super::{ActionNorm, Change, Constraint, Control, Goal, LatentBox, Objective, ObjectiveCost, Regularised, Shape};
-use super::{Slope, Trajectory};
+use super::constraint::{ActionNorm, LatentBox};
+use super::contracts::{Constraint, Objective, Shape, Slope, Trajectory};
+use super::cost::ObjectiveCost;
+use super::regularised::Regularised;
+use super::term::{Change, Control, Goal};
 use serde::{Deserialize, Serialize};
 use swm_core::{CostModel, Result};
 
-/// Terms that are added up, and constraints.
+/// The terms and constraints of a plan.
 ///
-/// Without a goal term, everything is added to the model's own cost. With one, the terms are the whole cost, of the rollout
-/// of the model's latent dynamics; only then can latents be constrained.
+/// Without a goal term, the terms are added to the model's own cost. With one, the terms are the whole cost, computed on a
+/// rollout of the model's latent dynamics; only then can latents be constrained.
 ///
 /// ```
 /// use swm_plan::objective::ObjectiveConfig;
@@ -23,9 +26,9 @@ use swm_core::{CostModel, Result};
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ObjectiveConfig {
-    /// What is added up.
+    /// The terms, which are added up.
     pub terms: Vec<Term>,
-    /// What must hold.
+    /// The constraints.
     pub constraints: Vec<Limit>,
 }
 
@@ -33,11 +36,11 @@ pub struct ObjectiveConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "term", rename_all = "snake_case")]
 pub enum Term {
-    /// The distance to the goal.
+    /// The squared distance to the goal.
     Goal(Goal),
-    /// The effort.
+    /// The squared size of the actions.
     Control(Control),
-    /// The restlessness.
+    /// The squared differences of neighbouring actions.
     Change(Change),
 }
 
@@ -73,9 +76,9 @@ impl Objective for Term {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "constraint", rename_all = "snake_case")]
 pub enum Limit {
-    /// On the length of actions.
+    /// A limit on the norm of actions.
     ActionNorm(ActionNorm),
-    /// On predicted latents.
+    /// Bounds on predicted latents.
     LatentBox(LatentBox),
 }
 
@@ -89,16 +92,16 @@ impl Limit {
 }
 
 impl ObjectiveConfig {
-    /// Whether it leaves a model as it is.
+    /// Whether there are no terms and no constraints.
     pub fn is_empty(&self) -> bool {
         self.terms.is_empty() && self.constraints.is_empty()
     }
 
-    /// A model that plans are made for this with.
+    /// Applies the terms and constraints to a model.
     ///
     /// # Errors
-    /// When there are terms or constraints on latents and the model shows none, constraints on latents without a goal term,
-    /// or the model has constraints of its own.
+    /// When a term or constraint uses latents and the model has none, a constraint uses latents without a goal term, or the
+    /// model has constraints of its own.
     pub fn apply(&self, model: Box<dyn CostModel>) -> Result<Box<dyn CostModel>> {
         if self.is_empty() {
             return Ok(model);

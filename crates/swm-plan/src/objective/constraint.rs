@@ -1,38 +1,18 @@
-//! Inequalities on trajectories: [`ActionNorm`], [`LatentBox`], and what users write themselves.
+//! Inequality constraints on trajectories: [`ActionNorm`], [`LatentBox`], and custom ones.
 
-use super::{Pick, Shape, Slope, Trajectory, check_block, check_latents, check_picks, check_positive, picked};
+use super::contracts::{Constraint, Shape, Slope, Trajectory, check_block, check_latents};
+use super::pick::{Pick, check_picks, picked};
+use crate::search::Settings;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 
-/// Differentiable inequalities; each is satisfied when its value is at most 0.
-pub trait Constraint: Send + Sync {
-    /// Whether it looks at latents.
-    fn needs_latents(&self) -> bool;
-
-    /// Checks the settings, for trajectories of this shape.
-    ///
-    /// # Errors
-    /// When they contradict each other or the shape.
-    fn check(&self, shape: Shape) -> Result<()>;
-
-    /// How many values, for so many model steps and numbers of a latent.
-    fn count(&self, horizon: usize, latent: usize) -> usize;
-
-    /// Writes the values.
-    fn values(&self, trajectory: Trajectory<'_>, values: &mut [f32]);
-
-    /// Adds the gradient of the sum of the values, each times its weight.
-    fn add_gradient(&self, trajectory: Trajectory<'_>, weights: &[f32], slope: &mut Slope<'_>);
-}
-
-/// No action is longer than a limit: `‖a_t‖ - limit ≤ 0`, for every action. Where an action is zero, its slope is taken to
-/// be zero too.
+/// Limits the norm of every action: `‖a_t‖ - limit ≤ 0`. At a zero action, the gradient is taken to be zero.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ActionNorm {
-    /// The greatest norm of an action.
+    /// The largest norm of an action.
     pub limit: f32,
-    /// Actions of the environment in a model step, each with a norm of its own.
+    /// Environment actions in a model step; each has its own norm.
     #[serde(default = "one")]
     pub block: usize,
 }
@@ -51,7 +31,7 @@ impl Constraint for ActionNorm {
     }
 
     fn check(&self, shape: Shape) -> Result<()> {
-        check_positive("action norm", "limit", self.limit)?;
+        Settings("action norm").not_negative("limit", self.limit)?;
         check_block("action norm", self.block, shape.dim)
     }
 
@@ -76,11 +56,11 @@ impl Constraint for ActionNorm {
     }
 }
 
-/// Predicted latents stay between two bounds: `low - z_t,i ≤ 0` and `z_t,i - high ≤ 0` after every step.
+/// Bounds predicted latents: `low - z_t,i ≤ 0` and `z_t,i - high ≤ 0` after every step.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LatentBox {
-    /// Which numbers of a latent; all where none is named.
+    /// The bounded latent dimensions; empty for all.
     pub latents: Vec<Pick>,
     /// The lower bound, if there is one.
     pub low: Option<f32>,
@@ -89,16 +69,16 @@ pub struct LatentBox {
 }
 
 impl LatentBox {
-    /// The sides: how a value rises with a latent, and from what bound.
+    /// The bounds that exist, each with the sign of the constraint's derivative.
     fn sides(&self) -> impl Iterator<Item = (f32, f32)> + Clone {
         self.low.map(|low| (-1.0, low)).into_iter().chain(self.high.map(|high| (1.0, high)))
     }
 
-    /// Every predicted number that is bounded, with its place among the latents.
+    /// Every bounded value of the predicted latents: its index, the sign of the derivative, and the bound.
     fn bounded(&self, latent: usize, latents: usize) -> impl Iterator<Item = (usize, f32, f32)> {
-        let places = (latent..latents).step_by(latent.max(1));
-        let numbers = places.flat_map(move |at| picked(&self.latents, latent).map(move |i| at + i));
-        numbers.flat_map(|place| self.sides().map(move |(sign, bound)| (place, sign, bound)))
+        let steps = (latent..latents).step_by(latent.max(1));
+        let indices = steps.flat_map(move |start| picked(&self.latents, latent).map(move |i| start + i));
+        indices.flat_map(|index| self.sides().map(move |(sign, bound)| (index, sign, bound)))
     }
 }
 
@@ -135,12 +115,12 @@ impl Constraint for LatentBox {
     }
 }
 
-/// A constraint of functions: `values` writes as many numbers as `count` says, and `gradient` adds the gradient of their
-/// weighted sum.
+/// A constraint made of two functions: `values` writes `count` values, and `gradient` adds the gradient of their weighted
+/// sum.
 pub struct CustomConstraint<V, G> {
-    /// How many values, whatever the horizon.
+    /// The number of values, independent of the horizon.
     pub count: usize,
-    /// Whether the functions look at latents.
+    /// Whether the functions use latents.
     pub needs_latents: bool,
     /// See [`Constraint::values`].
     pub values: V,

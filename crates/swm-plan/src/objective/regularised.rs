@@ -1,10 +1,11 @@
-//! [`Regularised`]: the cost of a model, and terms and constraints on the actions alone.
+//! [`Regularised`]: the cost of a model plus terms and constraints on actions.
 
-use super::{Constraint, Objective, Rolled, Shape, check_all, check_room};
+use super::contracts::{Constraint, Objective, Shape};
+use super::trajectories::{Trajectories, check_all, check_len};
 use swm_core::{Batch, Candidates, Constrained, CostModel, DifferentiableCost, Env, Error, LatentDynamics, Result};
 
-/// A model whose plans also pay for their actions, or must keep limits on them. It is differentiable if the model is, and
-/// shows the model's latents.
+/// A model with terms on actions added to its cost, and with constraints on actions. It is differentiable if the model is,
+/// and gives access to the model's latents.
 pub struct Regularised {
     model: Box<dyn CostModel>,
     objective: Box<dyn Objective>,
@@ -12,35 +13,35 @@ pub struct Regularised {
 }
 
 impl Regularised {
-    /// A model with an objective added to its cost, and constraints.
+    /// Adds an objective and constraints to a model.
     ///
     /// # Errors
-    /// When one of them looks at latents, or the model has constraints of its own.
+    /// When one of them uses latents, or the model has constraints of its own.
     pub fn new(
         mut model: Box<dyn CostModel>,
         objective: Box<dyn Objective>,
         constraints: Vec<Box<dyn Constraint>>,
     ) -> Result<Self> {
-        refuse_constraints(&mut *model)?;
+        reject_constraints(&mut *model)?;
         if objective.needs_latents() || constraints.iter().any(|constraint| constraint.needs_latents()) {
             return Err(Error::config(
                 "objective",
-                "a term on latents cannot be added to the cost of a model as it is",
-                "price the whole rollout: name a goal term too",
+                "a term on latents cannot be added to the model's own cost",
+                "replace the cost by terms on the rollout: name a goal term too",
             ));
         }
         Ok(Self { model, objective, constraints })
     }
 
-    fn check<'a>(&self, candidates: Candidates<'a>) -> Result<Rolled<'a>> {
+    fn check<'a>(&self, candidates: Candidates<'a>) -> Result<Trajectories<'a>> {
         let Candidates { horizon, dim, .. } = candidates;
         check_all(Shape { horizon, latent: 0, dim }, &*self.objective, &self.constraints)?;
-        Ok(Rolled { candidates, latents: &[], goals: &[], latent: 0 })
+        Ok(Trajectories { candidates, latents: &[], goals: &[], latent: 0 })
     }
 }
 
-/// Refuses models that have constraints already: a candidate has one list of them.
-pub(super) fn refuse_constraints(model: &mut dyn CostModel) -> Result<()> {
+/// Rejects models that already have constraints: a candidate has one list of them.
+pub(super) fn reject_constraints(model: &mut dyn CostModel) -> Result<()> {
     if model.constrained().is_none() {
         return Ok(());
     }
@@ -57,9 +58,9 @@ impl CostModel for Regularised {
     }
 
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
-        let rolled = self.check(candidates)?;
+        let trajectories = self.check(candidates)?;
         self.model.cost(candidates, costs)?;
-        rolled.add_costs(&*self.objective, costs);
+        trajectories.add_costs(&*self.objective, costs);
         Ok(())
     }
 
@@ -78,15 +79,15 @@ impl CostModel for Regularised {
 
 impl DifferentiableCost for Regularised {
     fn cost_and_gradient(&mut self, candidates: Candidates<'_>, costs: &mut [f32], gradient: &mut [f32]) -> Result<()> {
-        let rolled = self.check(candidates)?;
-        check_room("the gradient of a cost", gradient.len(), candidates.actions.len())?;
+        let trajectories = self.check(candidates)?;
+        check_len("the gradient of a cost", gradient.len(), candidates.actions.len())?;
         let Some(model) = self.model.differentiable() else {
-            let fix = "choose a solver that samples";
+            let fix = "choose a sampling solver";
             return Err(Error::config("objective", "the model it is added to has no gradient", fix));
         };
         model.cost_and_gradient(candidates, costs, gradient)?;
-        rolled.add_costs(&*self.objective, costs);
-        rolled.add_gradients(&*self.objective, &mut [], gradient);
+        trajectories.add_costs(&*self.objective, costs);
+        trajectories.add_gradients(&*self.objective, &mut [], gradient);
         Ok(())
     }
 }
@@ -97,17 +98,17 @@ impl Constrained for Regularised {
     }
 
     fn constrain(&mut self, candidates: Candidates<'_>, values: &mut [f32]) -> Result<()> {
-        let rolled = self.check(candidates)?;
-        check_room("the values of constraints", values.len(), rolled.count(&self.constraints))?;
-        rolled.constrain(&self.constraints, values);
+        let trajectories = self.check(candidates)?;
+        check_len("the values of constraints", values.len(), trajectories.count(&self.constraints))?;
+        trajectories.constrain(&self.constraints, values);
         Ok(())
     }
 
     fn constrain_vjp(&mut self, candidates: Candidates<'_>, weights: &[f32], gradient: &mut [f32]) -> Result<()> {
-        let rolled = self.check(candidates)?;
-        check_room("the weights of constraints", weights.len(), rolled.count(&self.constraints))?;
-        check_room("the gradient of constraints", gradient.len(), candidates.actions.len())?;
-        rolled.add_constraint_gradients(&self.constraints, weights, &mut [], gradient);
+        let trajectories = self.check(candidates)?;
+        check_len("the weights of constraints", weights.len(), trajectories.count(&self.constraints))?;
+        check_len("the gradient of constraints", gradient.len(), candidates.actions.len())?;
+        trajectories.add_constraint_gradients(&self.constraints, weights, &mut [], gradient);
         Ok(())
     }
 }

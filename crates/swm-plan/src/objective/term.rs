@@ -1,12 +1,12 @@
-//! The terms an objective is made of: [`Goal`], [`Control`], [`Change`].
+//! The terms of an objective: [`Goal`], [`Control`], [`Change`].
 
-use super::{
-    Objective, Pick, Shape, Slope, Trajectory, check_block, check_latents, check_picks, check_positive, picked,
-};
+use super::contracts::{Objective, Shape, Slope, Trajectory, check_block, check_latents};
+use super::pick::{Pick, check_picks, picked};
+use crate::search::Settings;
 use serde::{Deserialize, Serialize};
-use swm_core::{Error, Result};
+use swm_core::Result;
 
-/// When a term is due.
+/// The steps at which a term is evaluated.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum When {
@@ -16,18 +16,18 @@ pub enum When {
     Running,
 }
 
-/// The squared distance of latents to those of the goal: `w Σ_t γ^(t-1) Σ_i (z_t,i - g_i)²`, over the last latent or over
-/// all that are predicted. With the defaults, the cost of the reference's models, which add up squared errors.
+/// The squared distance of latents to the goal's latent: `w Σ_t γ^(t-1) Σ_i (z_t,i - g_i)²`, over the last latent or over all
+/// predicted ones. The defaults give the cost of the reference's models.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Goal {
     /// The weight, w.
     pub weight: f32,
-    /// Which latents are compared.
+    /// The latents that are compared.
     pub when: When,
-    /// How much less a later latent weighs, γ, if it is running.
+    /// The discount factor of later latents, γ, for a running term.
     pub discount: f32,
-    /// Which numbers of a latent; all where none is named.
+    /// The compared latent dimensions; empty for all.
     pub latents: Vec<Pick>,
 }
 
@@ -38,16 +38,16 @@ impl Default for Goal {
 }
 
 impl Goal {
-    /// The latents that are due, each with its place and its weight.
-    fn due(&self, trajectory: Trajectory<'_>) -> impl Iterator<Item = (usize, f32)> {
+    /// The compared latents: the index of the first value and the weight of each.
+    fn compared(&self, trajectory: Trajectory<'_>) -> impl Iterator<Item = (usize, f32)> {
         let latent = trajectory.goal.len();
         let last = trajectory.latents.len() / latent - 1;
         let first = if self.when == When::Terminal { last } else { 1 };
         let (mut weight, discount) = (self.weight, self.discount);
         (first..=last).map(move |t| {
-            let due = (t * latent, weight);
+            let compared = (t * latent, weight);
             weight *= discount;
-            due
+            compared
         })
     }
 }
@@ -60,26 +60,29 @@ impl Objective for Goal {
     fn check(&self, shape: Shape) -> Result<()> {
         check_latents("goal term", shape)?;
         check_picks("goal term", &self.latents, shape.latent)?;
-        check_positive("goal term", "weight", self.weight)?;
-        check_positive("goal term", "discount", self.discount)?;
-        #[allow(clippy::float_cmp)]
-        if self.when == When::Terminal && self.discount != 1.0 {
-            let given = format!("{} of a terminal term", self.discount);
-            return Err(Error::config("goal term, discount", given, "make it running, or leave the discount at 1"));
-        }
-        Ok(())
+        let settings = Settings("goal term");
+        settings.not_negative("weight", self.weight)?;
+        settings.not_negative("discount", self.discount)?;
+        #[allow(clippy::float_cmp, reason = "1 is the default, which no arithmetic has changed")]
+        let undiscounted = self.discount == 1.0;
+        settings.check(
+            self.when == When::Running || undiscounted,
+            "discount",
+            format!("{} of a terminal term", self.discount),
+            "make it running, or leave the discount at 1",
+        )
     }
 
     fn cost(&self, trajectory: Trajectory<'_>) -> f32 {
         let Trajectory { latents, goal, .. } = trajectory;
         let distance =
             |at: usize| -> f32 { picked(&self.latents, goal.len()).map(|i| (latents[at + i] - goal[i]).powi(2)).sum() };
-        self.due(trajectory).map(|(at, weight)| weight * distance(at)).sum()
+        self.compared(trajectory).map(|(at, weight)| weight * distance(at)).sum()
     }
 
     fn add_gradient(&self, trajectory: Trajectory<'_>, slope: &mut Slope<'_>) {
         let Trajectory { latents, goal, .. } = trajectory;
-        for (at, weight) in self.due(trajectory) {
+        for (at, weight) in self.compared(trajectory) {
             for i in picked(&self.latents, goal.len()) {
                 slope.latents[at + i] += 2.0 * weight * (latents[at + i] - goal[i]);
             }
@@ -87,7 +90,7 @@ impl Objective for Goal {
     }
 }
 
-/// The effort of a plan: `w Σ_t ‖a_t‖²`.
+/// The squared size of the actions: `w Σ_t ‖a_t‖²`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Control {
@@ -107,7 +110,7 @@ impl Objective for Control {
     }
 
     fn check(&self, _: Shape) -> Result<()> {
-        check_positive("control term", "weight", self.weight)
+        Settings("control term").not_negative("weight", self.weight)
     }
 
     fn cost(&self, trajectory: Trajectory<'_>) -> f32 {
@@ -119,13 +122,13 @@ impl Objective for Control {
     }
 }
 
-/// How restless a plan is: `w Σ_t ‖a_t - a_{t-1}‖²` from its second action on.
+/// The squared differences of neighbouring actions: `w Σ_t ‖a_t - a_{t-1}‖²`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Change {
     /// The weight, w.
     pub weight: f32,
-    /// Actions of the environment in a model step, each compared with the one before.
+    /// Environment actions in a model step; each is compared with the one before.
     pub block: usize,
 }
 
@@ -141,7 +144,7 @@ impl Objective for Change {
     }
 
     fn check(&self, shape: Shape) -> Result<()> {
-        check_positive("change term", "weight", self.weight)?;
+        Settings("change term").not_negative("weight", self.weight)?;
         check_block("change term", self.block, shape.dim)
     }
 
@@ -155,9 +158,9 @@ impl Objective for Change {
         let Trajectory { actions, dim, .. } = trajectory;
         let width = dim / self.block;
         for i in width..actions.len() {
-            let pull = 2.0 * self.weight * (actions[i] - actions[i - width]);
-            slope.actions[i] += pull;
-            slope.actions[i - width] -= pull;
+            let derivative = 2.0 * self.weight * (actions[i] - actions[i - width]);
+            slope.actions[i] += derivative;
+            slope.actions[i - width] -= derivative;
         }
     }
 }

@@ -1,7 +1,7 @@
-//! Published plans stay the same: every iteration of a short search by every solver, as `tests/golden/plans.json` has it.
+//! Golden test: every iteration of a short search by every solver equals `tests/golden/plans.json`.
 //!
-//! Results depend on these numbers; changing them is a breaking change. After one that is meant to be,
-//! `BLESS=1 cargo test --release -p swm-plan golden` writes the file anew.
+//! Published results depend on these values, so changing them is a breaking change. After an intended change, `BLESS=1 cargo
+//! test --release -p swm-plan golden` rewrites the file.
 
 use crate::solvers::{solves, trial};
 use crate::toys::{Model, TOYS, solve};
@@ -9,9 +9,9 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
 use swm_core::Plan;
-use swm_plan::registry::{SOLVERS, SolverEntry};
+use swm_plan::{SOLVERS, SolverEntry};
 
-/// The plan of one environment and how it was found, in six digits.
+/// The plan of one environment and its search, in six digits.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Golden {
     toy: String,
@@ -21,13 +21,13 @@ struct Golden {
     spread: Vec<f64>,
 }
 
-/// The toys that show most of a solver, best first.
-const TELLING: [&str; 4] = ["multi-modal", "discrete", "constrained", "reach-bounded"];
+/// The toys to use, the first that a solver can solve.
+const PREFERRED: [&str; 4] = ["multi-modal", "discrete", "constrained", "reach-bounded"];
 
 const ENV: usize = 4;
 
 fn short_search(row: &SolverEntry) -> Golden {
-    let toys = TELLING.iter().flat_map(|name| TOYS.iter().filter(move |toy| toy.name == *name));
+    let toys = PREFERRED.iter().flat_map(|name| TOYS.iter().filter(move |toy| toy.name == *name));
     let toy = toys.into_iter().find(|toy| solves(row, toy)).expect("a toy");
     let settings = serde_json::from_str(trial(row.id).short).expect("settings");
     let mut solver = (row.make)(&settings).expect("a solver");
@@ -44,7 +44,7 @@ fn short_search(row: &SolverEntry) -> Golden {
 }
 
 #[test]
-fn every_iteration_is_as_published() {
+fn iterations_equal_golden_plans() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden/plans.json");
     let ours: BTreeMap<&str, Golden> = SOLVERS.rows.iter().map(|row| (row.id, short_search(row))).collect();
     if std::env::var_os("BLESS").is_some() {
@@ -63,7 +63,7 @@ fn every_iteration_is_as_published() {
         ] {
             assert_eq!(ours.len(), published.len(), "{solver}: {what}");
             for (i, (ours, published)) in ours.iter().zip(published).enumerate() {
-                // The system's `exp` and `cos`, behind some solvers and toys, may differ in the last bit.
+                // The system's `exp` and `cos`, used by some solvers and toys, may differ in the last bit.
                 let tolerance = 1e-4 * (1.0 + published.abs());
                 assert!((ours - published).abs() < tolerance, "{solver}: {what} {i} is {ours}, was {published}");
             }

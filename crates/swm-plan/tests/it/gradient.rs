@@ -1,4 +1,4 @@
-//! The solvers that follow gradients, beside what torch and the reference compute (`../golden/gradient_solvers.json`).
+//! The gradient solvers, compared with torch and the reference implementation (`../golden/gradient_solvers.json`).
 
 use crate::toys::{Model, toy};
 use serde::Deserialize;
@@ -7,10 +7,10 @@ use swm_core::Solver;
 use swm_core::{
     Batch, Candidates, Constrained, CostModel, DifferentiableCost, Key, Plan, PlanProblem, PlanSpace, Result,
 };
-use swm_plan::optimizer::{Adam, Memory, Optimizer, RmsProp, Sgd};
+use swm_plan::search::{Adam, Memory, Optimizer, RmsProp, Sgd};
 use swm_plan::{AugmentedLagrangian, GradientDescent, Pgd, SOLVERS};
 
-/// What `export_gradient_solvers.py` recorded.
+/// The file that `export_gradient_solvers.py` writes.
 #[derive(Deserialize)]
 struct Golden {
     optimizers: Paths,
@@ -50,7 +50,7 @@ fn golden() -> Golden {
 
 #[track_caller]
 fn assert_near(given: &[f32], expected: &[f32], tolerance: f32) {
-    assert_eq!(given.len(), expected.len(), "numbers");
+    assert_eq!(given.len(), expected.len(), "length");
     let near = given.iter().zip(expected).all(|(a, b)| (a - b).abs() <= tolerance);
     assert!(near, "{given:?}\n{expected:?}");
 }
@@ -59,9 +59,9 @@ fn assert_near(given: &[f32], expected: &[f32], tolerance: f32) {
 struct Bowl {
     scale: &'static [f32],
     target: &'static [f32],
-    /// Writes this instead of one number of the gradient.
+    /// Replaces one value of the gradient: its index and the new value.
     wrong: Option<(usize, f32)>,
-    /// Whether the sum of the numbers of a step is at most a half.
+    /// Whether the sum of the values of a step is constrained to at most a half.
     limited: bool,
 }
 
@@ -134,7 +134,7 @@ fn solve(solver: &mut dyn Solver, model: &mut dyn CostModel, keys: &[Key]) -> Re
 }
 
 #[test]
-fn optimizers_take_the_steps_of_torch() {
+fn optimizers_equal_torch() {
     let golden = golden().optimizers;
     let table = [
         (Optimizer::Sgd(Sgd { step: 0.1, momentum: 0.9 }), golden.sgd),
@@ -153,7 +153,7 @@ fn optimizers_take_the_steps_of_torch() {
 }
 
 #[test]
-fn gradient_descent_takes_the_steps_of_the_reference() {
+fn gradient_descent_equals_the_reference() {
     let golden = golden().gd;
     let optimizer = Optimizer::Sgd(Sgd { step: 0.5, momentum: 0.9 });
     let mut gd =
@@ -161,11 +161,11 @@ fn gradient_descent_takes_the_steps_of_the_reference() {
     let plan = solve(&mut gd, &mut { BOWL }, &[Key::new(0)]).expect("a plan");
     assert_near(&plan.actions, &golden.actions, 1e-5);
     assert_near(&plan.trace[0].best[..4], &golden.costs, 1e-5);
-    assert_eq!(plan.trace[0].best[4..], plan.costs, "the last entry is of the plan");
+    assert_eq!(plan.trace[0].best[4..], plan.costs, "the last entry is that of the plan");
 }
 
 #[test]
-fn projected_gradient_descent_takes_the_steps_of_the_reference() {
+fn projected_gradient_descent_equals_the_reference() {
     let golden = golden().pgd;
     let mut pgd = Pgd { samples: 1, iterations: 4, ..Pgd::default() };
     let start = [0.0, 0.0, 1.0, 1.0, 0.0, 0.0];
@@ -184,7 +184,7 @@ fn projected_gradient_descent_takes_the_steps_of_the_reference() {
 }
 
 #[test]
-fn the_augmented_lagrangian_takes_the_steps_of_the_reference() {
+fn augmented_lagrangian_equals_the_reference() {
     let golden = golden().lagrangian;
     let mut solver = AugmentedLagrangian {
         samples: 1,
@@ -194,25 +194,25 @@ fn the_augmented_lagrangian_takes_the_steps_of_the_reference() {
         ..AugmentedLagrangian::default()
     };
     let plan = solve(&mut solver, &mut Bowl { limited: true, ..BOWL }, &[Key::new(0)]).expect("a plan");
-    // Nine steps of Adam: they only agree if multipliers and penalties do.
+    // Nine steps of Adam, which agree only if the multipliers and penalties agree.
     assert_near(&plan.actions, &golden.actions, 1e-5);
     let trace = &plan.trace[0];
     assert_eq!(trace.best.len(), 10);
-    // The first steps violate nothing, so their loss is their cost.
+    // The first steps violate no constraint, so their loss is their cost.
     assert!(trace.violation[0] < 0.0 && trace.violation[1] < 0.0);
     assert_near(&trace.best[..2], &golden.losses[..2], 1e-5);
 }
 
 #[test]
-fn a_plan_that_breaks_a_constraint_says_so() {
+fn trace_records_the_violation_of_the_plan() {
     // No action within these bounds adds up to at most a half.
     let space = PlanSpace::Continuous { low: &[0.3, 0.4], high: &[9.0, 9.0] };
     let problem = PlanProblem { horizon: 3, space, keys: &[Key::new(0)], init: None, deadline: None };
     let mut solver = AugmentedLagrangian { samples: 8, ..AugmentedLagrangian::default() };
     let plan = solver.solve(&mut Bowl { limited: true, ..BOWL }, problem).expect("a plan");
     let violation = plan.trace[0].violation.last().expect("a violation");
-    assert!((violation - 0.2).abs() < 1e-2, "the least violation there is: {violation}");
-    // Where some candidate keeps the constraints, a cheaper one that does not is passed over.
+    assert!((violation - 0.2).abs() < 1e-2, "the smallest possible violation, not {violation}");
+    // A feasible candidate is preferred to a cheaper infeasible one.
     let plan = solve(&mut solver, &mut Bowl { limited: true, ..BOWL }, &[Key::new(0)]).expect("a plan");
     let steps = plan.actions.chunks_exact(2).map(|step| step.iter().sum::<f32>() - 0.5);
     let violation = steps.fold(f32::NEG_INFINITY, f32::max);
@@ -220,7 +220,7 @@ fn a_plan_that_breaks_a_constraint_says_so() {
     assert!(violation <= solver.tolerance);
 }
 
-/// Small settings with noise wherever a solver can draw some, and a toy for each.
+/// For each gradient solver: a toy, and settings of a short search with all kinds of noise.
 const NOISY: &[(&str, &str, &str)] = &[
     ("gd", "quadratic", r#"{"samples": 5, "iterations": 4, "action_noise": 0.1, "clip": 1.0}"#),
     ("pgd", "discrete", r#"{"samples": 5, "iterations": 4, "action_noise": 0.1}"#),
@@ -229,7 +229,7 @@ const NOISY: &[(&str, &str, &str)] = &[
 ];
 
 #[test]
-fn a_plan_is_the_same_whoever_else_is_planned_and_on_any_number_of_threads() {
+fn noisy_plans_do_not_depend_on_batches_or_threads() {
     for &(solver, name, settings) in NOISY {
         let toy = toy(name);
         let settings = serde_json::from_str(settings).expect("settings");
@@ -242,7 +242,7 @@ fn a_plan_is_the_same_whoever_else_is_planned_and_on_any_number_of_threads() {
                 let plan = plan.expect("a plan");
                 plan.actions.into_iter().chain(plan.costs).map(f32::to_bits).collect::<Vec<_>>()
             };
-            // Actions and costs of one environment after another's.
+            // Actions and costs, environment by environment.
             let mut rows = vec![vec![]; 50];
             for envs in all.chunks(size) {
                 let bits = plan(envs);
@@ -262,9 +262,9 @@ fn a_plan_is_the_same_whoever_else_is_planned_and_on_any_number_of_threads() {
 }
 
 #[test]
-fn published_searches_stay_the_same() {
-    // Results depend on these numbers: changing them is a breaking change. Rounded, because `exp` and `ln` behind the
-    // Gaussians may differ in the last bit between platforms.
+fn noisy_searches_are_pinned() {
+    // Published results depend on these values: changing them is a breaking change. They are rounded, because `exp` and `ln`
+    // may differ in the last bit between platforms.
     for (&(solver, name, settings), expected) in NOISY.iter().zip(PINNED) {
         let toy = toy(name);
         let settings = serde_json::from_str(settings).expect("settings");
@@ -284,9 +284,9 @@ const PINNED: &[&[f32]] = &[
 ];
 
 #[test]
-fn gradients_that_are_not_finite_say_where() {
+fn errors_locate_gradients_that_are_not_finite() {
     for wrong in [f32::NAN, f32::INFINITY] {
-        // Number 3 of candidate 1 of environment 1, of two with two candidates each.
+        // Value 3 of candidate 1 of environment 1, of two environments with two candidates each.
         let mut bowl = Bowl { wrong: Some((3 * 6 + 3, wrong)), ..BOWL };
         let mut gd = GradientDescent { samples: 2, ..GradientDescent::default() };
         let message = solve(&mut gd, &mut bowl, &[Key::new(0), Key::new(1)]).expect_err("wrong").to_string();
@@ -296,17 +296,17 @@ fn gradients_that_are_not_finite_say_where() {
 }
 
 #[test]
-fn a_model_without_a_gradient_is_refused_and_others_are_named() {
+fn gradient_descent_requires_a_gradient() {
     let quadratic = toy("quadratic");
     let mut model = Model::new(quadratic, &[0]).opaque();
     let mut gd = GradientDescent::default();
     let message = crate::toys::solve(&mut gd, &mut model, quadratic, &[0]).expect_err("no gradient").to_string();
     assert!(message.starts_with("solver gd: it needs the gradient of the cost"), "{message}");
-    assert!(message.contains("choose predictive_sampling or cem"), "{message}");
+    assert!(message.contains("choose another solver"), "{message}");
 }
 
 #[test]
-fn a_late_search_returns_what_it_has() {
+fn deadline_ends_the_search() {
     for &(id, name, _) in NOISY {
         let (toy, keys) = (toy(name), [Key::new(0)]);
         let problem =
@@ -314,16 +314,16 @@ fn a_late_search_returns_what_it_has() {
         let mut solver = (SOLVERS.get(id).expect("a solver").make)(&serde_json::json!({})).expect("a solver");
         let late = solver.solve(&mut Model::new(toy, &[0]), problem(Some(Instant::now()))).expect("a plan");
         let whole = solver.solve(&mut Model::new(toy, &[0]), problem(None)).expect("a plan");
-        // The start and one step; of GRASP, whose steps are not rolled out, only the plan.
+        // The start and one step; for GRASP, whose steps are not rolled out, only the plan.
         assert_eq!(late.trace[0].best.len(), if id == "grasp" { 1 } else { 2 }, "{id}");
         assert_eq!(late.trace[0].best.last(), Some(&late.costs[0]), "{id}");
         assert!(late.costs[0].is_finite() && late.actions.len() == whole.actions.len(), "{id}");
-        assert!(late.trace[0].best.len() < whole.trace[0].best.len(), "{id}: the whole search goes on");
+        assert!(late.trace[0].best.len() < whole.trace[0].best.len(), "{id}: the search without a deadline is longer");
     }
 }
 
 #[test]
-fn settings_that_make_no_sense_say_so() {
+fn errors_name_invalid_settings() {
     let message = |gd: GradientDescent| solve(&mut gd.clone(), &mut { BOWL }, &[]).expect_err("wrong").to_string();
     let default = GradientDescent::default;
     assert!(message(GradientDescent { samples: 0, ..default() }).contains("gd samples: 0; ask for at least 1"));
@@ -332,7 +332,7 @@ fn settings_that_make_no_sense_say_so() {
     assert!(message(GradientDescent { action_noise: -1.0, ..default() }).contains("gd action_noise: -1"));
     assert!(message(GradientDescent { clip: Some(0.0), ..default() }).contains("gd clip: 0"));
 
-    // What the others add.
+    // The settings of the other solvers.
     let message = |id: &str, settings: serde_json::Value| {
         let mut solver = match (SOLVERS.get(id).expect("a solver").make)(&settings) {
             Ok(solver) => solver,

@@ -1,12 +1,12 @@
-//! Every draw has a key: the plan of an environment is the same bytes whatever is planned beside it and on any number of
-//! threads.
+//! Every draw has a key: the plan of an environment has the same bytes whichever other environments are planned in the same
+//! call, and on any number of threads.
 
 use crate::solvers::{solves, trial};
 use crate::toys::{Model, TOYS, Toy, solve};
 use swm_core::{Plan, PlanTrace};
-use swm_plan::registry::{SOLVERS, SolverEntry};
+use swm_plan::{SOLVERS, SolverEntry};
 
-/// The bits of everything a plan says of each environment.
+/// The bits of actions, costs and trace of each environment.
 fn bits(plan: &Plan, envs: usize) -> Vec<Vec<u32>> {
     let len = plan.actions.len() / envs;
     let trace = |PlanTrace { best, mean, spread, violation }: &PlanTrace| [&best[..], mean, spread, violation].concat();
@@ -27,7 +27,7 @@ fn toy_for(row: &SolverEntry) -> &'static Toy {
 }
 
 #[test]
-fn batches_and_threads_change_nothing() {
+fn plans_do_not_depend_on_batches_or_threads() {
     let envs: Vec<usize> = (0..50).collect();
     for row in SOLVERS.rows {
         let run = |threads, size| {
@@ -38,12 +38,12 @@ fn batches_and_threads_change_nothing() {
         for (threads, size) in [(2, 1), (1, 7), (2, 7), (1, 50), (2, 50)] {
             assert!(run(threads, size) == alone, "{}: {size} environments on {threads} threads", row.id);
         }
-        assert!(alone[0] != alone[1], "{}: environments have plans of their own", row.id);
+        assert!(alone[0] != alone[1], "{}: different environments have different plans", row.id);
     }
 }
 
 #[test]
-fn neighbours_change_nothing() {
+fn plans_do_not_depend_on_other_environments() {
     for row in SOLVERS.rows {
         let toy = toy_for(row);
         let [first, second] = [[3, 11, 40], [27, 8, 11]].map(|envs| plan(row, toy, &envs));

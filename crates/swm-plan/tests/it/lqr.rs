@@ -1,8 +1,8 @@
-//! The linear-quadratic regulator: the one planning problem whose best plan is a formula.
+//! The linear-quadratic regulator, a planning problem with a closed-form solution.
 //!
-//! A cart on a line, `s = (position, speed)`, is pushed: `s' = A s + B a`. The plan minimises
+//! A force accelerates a cart on a line, `s = (position, speed)`: `s' = A s + B a`. The plan minimises
 //! `Σ_t (sᵗᵀ Q sᵗ + R aᵗ²) + sᴴᵀ Q_H sᴴ`. Bellman's recursion (Riccati's equation) gives the best feedback, and the
-//! best plan is what it does from the start.
+//! best plan is the sequence of its actions from the start.
 
 use crate::toys::{Landscape, draw};
 
@@ -28,7 +28,7 @@ impl Lqr {
         Self { start: [start[0], start[1]] }
     }
 
-    /// The states a plan leads through, the first included.
+    /// The states of a plan, the initial one included.
     fn states(&self, plan: &[f64]) -> Vec<State> {
         let mut states = vec![self.start];
         for (t, a) in plan.iter().enumerate() {
@@ -48,7 +48,7 @@ impl Landscape for Lqr {
     }
 
     fn gradient(&self, plan: &[f64]) -> Vec<f64> {
-        // The adjoint p_t = ∂cost/∂s_t runs backwards.
+        // The adjoint p_t = ∂cost/∂s_t, computed backwards.
         let states = self.states(plan);
         let mut gradient = vec![0.0; plan.len()];
         let mut p = times(LAST, states[plan.len()]).map(|v| 2.0 * v);
@@ -99,7 +99,7 @@ fn product(a: Matrix, b: Matrix) -> Matrix {
 }
 
 #[test]
-fn the_formula_is_where_the_gradient_vanishes() {
+fn gradient_vanishes_at_the_closed_form() {
     for env in 0..3 {
         let lqr = Lqr::new(env);
         let slopes = lqr.gradient(&lqr.optimum());

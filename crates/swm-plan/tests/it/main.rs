@@ -1,5 +1,5 @@
 //! Solvers on problems whose answers are known.
-#![allow(missing_docs, clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+#![allow(missing_docs, reason = "the items of a test program are private")]
 
 mod golden;
 mod gradient;

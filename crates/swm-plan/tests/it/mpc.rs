@@ -1,4 +1,4 @@
-//! The MPC policy: when it plans, what from, what it executes, and what it refuses.
+//! The MPC policy: when it replans, initial guesses, executed actions, history, and errors.
 
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
@@ -8,18 +8,18 @@ use swm_core::{
 };
 use swm_plan::{ActionScale, Cem, MpcConfig, MpcPolicy, TraceLog};
 
-/// One call of the solver: the keys and the first guess.
+/// One call of the solver: the keys and the initial guess.
 type Call = (Vec<Key>, Vec<f32>);
 
-/// Plans `100 * (call + 1) + place of the number`, and notes what it was asked.
-struct Counting {
+/// A solver whose plan is `100 * (call + 1) + index`, and which records its calls.
+struct RecordingSolver {
     calls: Arc<Mutex<Vec<Call>>>,
 }
 
-impl Solver for Counting {
+impl Solver for RecordingSolver {
     fn solve(&mut self, _: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan> {
         let mut calls = self.calls.lock().expect("one thread");
-        calls.push((problem.keys.to_vec(), problem.init.expect("a first guess").to_vec()));
+        calls.push((problem.keys.to_vec(), problem.init.expect("an initial guess").to_vec()));
         let base = 100.0 * calls.len() as f32;
         let len = problem.horizon * problem.space.dim();
         let actions = (0..problem.keys.len() * len).map(|i| base + (i % len) as f32).collect();
@@ -28,10 +28,10 @@ impl Solver for Counting {
     }
 }
 
-/// Notes which slots it was shown, and the past beside them.
+/// A model that records the slots it observes, and their history.
 #[derive(Default)]
-struct Watching {
-    seen: Arc<Mutex<Vec<Vec<usize>>>>,
+struct RecordingModel {
+    observed: Arc<Mutex<Vec<Vec<usize>>>>,
     past: Arc<Mutex<Vec<Past>>>,
 }
 
@@ -42,9 +42,9 @@ struct Past {
     actions: Vec<f32>,
 }
 
-impl CostModel for Watching {
+impl CostModel for RecordingModel {
     fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()> {
-        self.seen.lock().expect("one thread").push(envs.to_vec());
+        self.observed.lock().expect("one thread").push(envs.to_vec());
         if infos.schema().find("history.length").is_some() {
             let row = infos.row(envs[0]);
             self.past.lock().expect("one thread").push(Past {
@@ -76,7 +76,7 @@ fn spec(high: f64) -> EnvSpec {
 struct Rig {
     policy: MpcPolicy,
     calls: Arc<Mutex<Vec<Call>>>,
-    seen: Arc<Mutex<Vec<Vec<usize>>>>,
+    observed: Arc<Mutex<Vec<Vec<usize>>>>,
     past: Arc<Mutex<Vec<Past>>>,
     infos: Batch,
     actions: Batch,
@@ -85,14 +85,21 @@ struct Rig {
 impl Rig {
     fn new(config: MpcConfig, high: f64, slots: usize) -> Self {
         let calls = Arc::default();
-        let cost = Watching::default();
-        let (seen, past) = (Arc::clone(&cost.seen), Arc::clone(&cost.past));
+        let cost = RecordingModel::default();
+        let (observed, past) = (Arc::clone(&cost.observed), Arc::clone(&cost.past));
         let scale = ActionScale { mean: vec![1.0], std: vec![2.0] };
-        let solver = Box::new(Counting { calls: Arc::clone(&calls) });
+        let solver = Box::new(RecordingSolver { calls: Arc::clone(&calls) });
         let policy = MpcPolicy::new(solver, Box::new(cost), config, scale, &spec(high), slots).expect("a policy");
         let infos = Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("schema");
         let actions = Schema::new([spec(high).action_column()]).expect("schema");
-        Self { policy, calls, seen, past, infos: Batch::zeros(&infos, slots), actions: Batch::zeros(&actions, slots) }
+        Self {
+            policy,
+            calls,
+            observed,
+            past,
+            infos: Batch::zeros(&infos, slots),
+            actions: Batch::zeros(&actions, slots),
+        }
     }
 
     fn act(&mut self, active: &[bool]) -> Vec<f32> {
@@ -100,39 +107,39 @@ impl Rig {
         self.actions.get::<f32>("action").expect("actions").to_vec()
     }
 
-    fn seen(&self) -> Vec<Vec<usize>> {
-        self.seen.lock().expect("one thread").clone()
+    fn observed(&self) -> Vec<Vec<usize>> {
+        self.observed.lock().expect("one thread").clone()
     }
 }
 
 #[test]
-fn what_is_due_replans_in_one_call_and_starts_from_the_rest() {
+fn replans_due_slots_in_one_call_with_warm_starts() {
     let config = MpcConfig { horizon: 3, receding_horizon: 2, action_block: 2, ..MpcConfig::default() };
     let mut rig = Rig::new(config, 1e6, 3);
     for slot in 0..3 {
         rig.policy.begin(slot, Key::new(slot as u64));
     }
-    // Two model steps of two environment steps are executed: the plan's first four numbers, times 2 plus 1.
-    for number in 0..4 {
-        assert_eq!(rig.act(&[true, true, false])[..2], [201.0 + 2.0 * number as f32; 2]);
+    // Two model steps of two environment steps are executed: the first four values of the plan, times 2 plus 1.
+    for value in 0..4 {
+        assert_eq!(rig.act(&[true, true, false])[..2], [201.0 + 2.0 * value as f32; 2]);
     }
-    assert_eq!(rig.seen(), [[0, 1]]);
+    assert_eq!(rig.observed(), [[0, 1]]);
     // A new episode in slot 1; slot 2 joins. All are due: one call.
     rig.policy.begin(1, Key::new(7));
     rig.act(&[true, true, true]);
-    assert_eq!(rig.seen(), [vec![0, 1], vec![0, 1, 2]]);
+    assert_eq!(rig.observed(), [vec![0, 1], vec![0, 1, 2]]);
     let calls = rig.calls.lock().expect("one thread");
     let (keys, init) = &calls[1];
     let key = |seed, plan| Key::new(seed).with("plan").at(plan);
     assert_eq!(keys[..], [key(0, 1), key(7, 0), key(2, 0)]);
-    assert_eq!(init[..6], [104.0, 105.0, 0.0, 0.0, 0.0, 0.0], "what was left, moved forward");
+    assert_eq!(init[..6], [104.0, 105.0, 0.0, 0.0, 0.0, 0.0], "the part that was not executed, moved forward");
     assert_eq!(init[6..], [0.0; 12], "new episodes start from zeros");
     assert_eq!(rig.policy.take_latencies().len(), 5);
     assert!(rig.policy.take_latencies().is_empty());
 }
 
 #[test]
-fn cold_starts_begin_at_zero_and_open_loop_executes_everything() {
+fn cold_starts_are_zero_and_open_loop_executes_whole_plans() {
     let config = MpcConfig { horizon: 2, receding_horizon: 2, action_block: 1, ..MpcConfig::default() };
     let mut open = Rig::new(config.clone(), 1e6, 1);
     (0..3).for_each(|_| drop(open.act(&[true])));
@@ -143,13 +150,13 @@ fn cold_starts_begin_at_zero_and_open_loop_executes_everything() {
 }
 
 #[test]
-fn executed_actions_are_in_the_action_space() {
+fn executed_actions_are_clipped_to_the_action_space() {
     let config = MpcConfig { horizon: 1, receding_horizon: 1, action_block: 1, ..MpcConfig::default() };
     assert_eq!(Rig::new(config, 5.0, 1).act(&[true]), [5.0]);
 }
 
 #[test]
-fn the_past_is_shown_to_models_that_want_it() {
+fn history_contains_past_frames_and_actions() {
     let config = MpcConfig {
         horizon: 1,
         receding_horizon: 1,
@@ -178,10 +185,10 @@ fn the_past_is_shown_to_models_that_want_it() {
 }
 
 #[test]
-fn wrong_settings_say_so() {
+fn errors_name_invalid_settings() {
     let make = |config: MpcConfig, scale: ActionScale, spec: &EnvSpec| {
-        let solver = Box::new(Counting { calls: Arc::default() });
-        let made = MpcPolicy::new(solver, Box::new(Watching::default()), config, scale, spec, 1);
+        let solver = Box::new(RecordingSolver { calls: Arc::default() });
+        let made = MpcPolicy::new(solver, Box::new(RecordingModel::default()), config, scale, spec, 1);
         made.err().expect("wrong").to_string()
     };
     let scale = ActionScale::identity(1);
@@ -202,7 +209,7 @@ fn wrong_settings_say_so() {
 
 #[test]
 fn integers_are_planned_as_one_hot_vectors() {
-    /// Plans one option after the other, for every choice.
+    /// A solver that plans these options, one for each choice.
     struct Options(Vec<usize>);
 
     impl Solver for Options {
@@ -222,7 +229,7 @@ fn integers_are_planned_as_one_hot_vectors() {
     let space = Space::MultiDiscrete { nvec: vec![3, 2], start: vec![0, 5] };
     let spec = EnvSpec { action_space: space, ..spec(1.0) };
     let config = MpcConfig { horizon: 2, receding_horizon: 1, action_block: 2, history: 2, ..MpcConfig::default() };
-    let (model, scale) = (Watching::default(), ActionScale::unscaled(&spec));
+    let (model, scale) = (RecordingModel::default(), ActionScale::unscaled(&spec));
     let (past, solver) = (Arc::clone(&model.past), Options(vec![2, 0, 1, 1, 0, 0, 0, 0]));
     let mut policy = MpcPolicy::new(Box::new(solver), Box::new(model), config, scale, &spec, 1).expect("a policy");
     let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("schema"), 1);
@@ -234,18 +241,18 @@ fn integers_are_planned_as_one_hot_vectors() {
     let past = past.lock().expect("one thread");
     assert_eq!(past[1].actions, [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0]);
 
-    // Whoever gives actions of another kind is told so.
-    let mut numbers = Batch::zeros(&Schema::new([ColumnSpec::new("action", DType::Float32, [2])]).expect("schema"), 1);
-    let error = policy.act(&infos, &[true], &mut numbers).expect_err("numbers");
+    // An action column of another type is an error.
+    let mut floats = Batch::zeros(&Schema::new([ColumnSpec::new("action", DType::Float32, [2])]).expect("schema"), 1);
+    let error = policy.act(&infos, &[true], &mut floats).expect_err("floats");
     assert!(error.to_string().contains("Int64"), "{error}");
 }
 
 #[test]
-fn a_latency_budget_is_a_deadline_for_the_solver() {
-    /// Notes until when it may search.
-    struct Hurried(Arc<Mutex<Option<Instant>>>);
+fn latency_budget_sets_the_deadline() {
+    /// A solver that records its deadline.
+    struct DeadlineSolver(Arc<Mutex<Option<Instant>>>);
 
-    impl Solver for Hurried {
+    impl Solver for DeadlineSolver {
         fn solve(&mut self, _: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan> {
             *self.0.lock().expect("one thread") = problem.deadline;
             Ok(Plan { actions: vec![0.0; 25], costs: vec![0.0], ..Plan::default() })
@@ -254,7 +261,7 @@ fn a_latency_budget_is_a_deadline_for_the_solver() {
 
     let deadline = |latency_budget| {
         let deadline = Arc::default();
-        let (solver, model) = (Hurried(Arc::clone(&deadline)), Watching::default());
+        let (solver, model) = (DeadlineSolver(Arc::clone(&deadline)), RecordingModel::default());
         let config = MpcConfig { latency_budget, ..MpcConfig::default() };
         let policy = MpcPolicy::new(Box::new(solver), Box::new(model), config, ActionScale::identity(1), &spec(1.0), 1);
         let infos = Batch::zeros(&Schema::new([ColumnSpec::image("pixels", 1, 1)]).expect("schema"), 1);
@@ -265,12 +272,12 @@ fn a_latency_budget_is_a_deadline_for_the_solver() {
     let (before, budget) = (Instant::now(), Duration::from_secs(5));
     let end = deadline(Some(5.0)).expect("a deadline");
     assert!(end >= before + budget && end <= Instant::now() + budget);
-    assert_eq!(deadline(Some(1e30)), None, "beyond the clock's reach");
+    assert_eq!(deadline(Some(1e30)), None, "beyond the range of the clock");
     assert_eq!(deadline(None), None);
 }
 
 #[test]
-fn plans_are_noted_on_request() {
+fn trace_log_records_plans() {
     let config = MpcConfig { horizon: 2, receding_horizon: 1, action_block: 1, ..MpcConfig::default() };
     let mut rig = Rig::new(config, 1e6, 2);
     let log = TraceLog::default();
@@ -280,21 +287,21 @@ fn plans_are_noted_on_request() {
     rig.act(&[true, false]);
     rig.act(&[true, true]);
     let plans = log.take();
-    let told: Vec<_> =
+    let recorded: Vec<_> =
         plans.iter().map(|p| (p.episode, p.slot, p.replan, p.together, p.cost, p.search.best.clone())).collect();
     let [first, second] = keys.map(|key| key.seed() >> 1);
     let (one, two) = (vec![100.0], vec![200.0]);
-    assert_eq!(told[0], (first, 0, 0, 1, 100.0, one));
-    assert_eq!(told[1..], [(first, 0, 1, 2, 200.0, two.clone()), (second, 1, 0, 2, 200.0, two)]);
+    assert_eq!(recorded[0], (first, 0, 0, 1, 100.0, one));
+    assert_eq!(recorded[1..], [(first, 0, 1, 2, 200.0, two.clone()), (second, 1, 0, 2, 200.0, two)]);
     assert!(plans.iter().all(|plan| plan.seconds >= plan.model_seconds && plan.model_seconds >= 0.0));
-    assert!(log.take().is_empty(), "handed out once");
+    assert!(log.take().is_empty(), "each plan is returned once");
     let json = serde_json::to_value(&plans[0]).expect("JSON");
     assert_eq!((&json["episode"], &json["best"]), (&first.into(), &serde_json::json!([100.0])));
 }
 
 #[test]
-fn what_goes_wrong_in_a_plan_says_who_and_what() {
-    /// Returns a plan, or panics.
+fn errors_name_the_source_of_invalid_plans() {
+    /// A solver that returns an invalid plan, or panics.
     struct Wrong(fn(&mut dyn CostModel, usize) -> Plan);
 
     impl Solver for Wrong {
@@ -303,7 +310,7 @@ fn what_goes_wrong_in_a_plan_says_who_and_what() {
         }
     }
 
-    /// Panics when asked.
+    /// A model whose cost panics.
     struct Panicking;
 
     impl CostModel for Panicking {
@@ -312,7 +319,7 @@ fn what_goes_wrong_in_a_plan_says_who_and_what() {
         }
 
         fn cost(&mut self, _: Candidates<'_>, _: &mut [f32]) -> Result<()> {
-            panic!("the weights are on fire")
+            panic!("broken weights")
         }
     }
 
@@ -324,7 +331,7 @@ fn what_goes_wrong_in_a_plan_says_who_and_what() {
         policy.expect("a policy").act(&infos, &[true], &mut actions).expect_err("wrong").to_string()
     };
     let wrong = |plan| message(Box::new(Wrong(plan)));
-    assert!(wrong(|_, len| Plan { actions: vec![0.0; len - 1], ..Plan::default() }).contains("24 numbers"));
+    assert!(wrong(|_, len| Plan { actions: vec![0.0; len - 1], ..Plan::default() }).contains("24 values"));
     assert!(wrong(|_, len| Plan { actions: vec![0.0; len], ..Plan::default() }).contains("0 costs"));
     let nan = wrong(|_, len| Plan {
         actions: (0..len).map(|i| if i == 7 { f32::NAN } else { 0.0 }).collect(),
@@ -337,5 +344,5 @@ fn what_goes_wrong_in_a_plan_says_who_and_what() {
     let solver = wrong(|_, len| panic!("{len} is too much"));
     assert!(solver.contains("the solver panicked while planning: 25 is too much"), "{solver}");
     let model = message(Box::<Cem>::default());
-    assert!(model.contains("the model panicked while scoring candidates: the weights are on fire"), "{model}");
+    assert!(model.contains("the model panicked while scoring candidates: broken weights"), "{model}");
 }

@@ -1,4 +1,4 @@
-//! Objectives and constraints: what they cost, that their gradients are slopes, and what plans they lead to.
+//! Objectives and constraints: their values, their gradients, and the plans they lead to.
 
 use crate::lqr::{self, Lqr};
 use crate::toys::{Landscape as _, Model, draw, toy};
@@ -7,36 +7,35 @@ use swm_core::{
     Batch, Candidates, Constrained, CostModel, DifferentiableCost, Key, LatentDynamics, Plan, PlanProblem, PlanSpace,
     Result, Schema, Solver,
 };
-use swm_plan::grasp::Fall;
 use swm_plan::objective::{
     ActionNorm, Change, Constraint, Control, CustomConstraint, Goal, LatentBox, Objective, ObjectiveConfig,
     ObjectiveCost, Pick, Regularised, Shape, Slope, Trajectory, When,
 };
-use swm_plan::optimizer::{Adam, Optimizer, Sgd};
-use swm_plan::{AugmentedLagrangian, GradientDescent, Grasp};
+use swm_plan::search::{Adam, Optimizer, Sgd};
+use swm_plan::solvers::{AugmentedLagrangian, GradientDescent, Grasp, LinearSchedule};
 
-/// Latent dynamics `z' = f(M z + B a)`, with one row of `M` and `B` for every number of `z'`. The cost is the squared
-/// distance to the goal after the last step.
+/// Latent dynamics `z' = f(M z + B a)`, where the matrices M and B are lists of rows. The cost is the squared distance to the
+/// goal after the last step.
 struct System {
     mix: Vec<Vec<f32>>,
     push: Vec<Vec<f32>>,
-    /// Whether f is the hyperbolic tangent; otherwise it changes nothing.
-    bent: bool,
+    /// Whether f is the hyperbolic tangent; otherwise it is the identity.
+    nonlinear: bool,
     /// Start and goal of an environment.
-    scene: fn(env: usize) -> (Vec<f32>, Vec<f32>),
+    start_and_goal: fn(env: usize) -> (Vec<f32>, Vec<f32>),
     envs: Vec<usize>,
 }
 
-/// Three latents, two actions of two numbers a model step, nothing linear about it.
-fn bent() -> System {
+/// A nonlinear system with 3 latent dimensions and 2 actions of dimension 2 in a model step.
+fn nonlinear() -> System {
     let mut rng = Key::new(1).rng();
     let mut row = |n: usize| -> Vec<f32> { (0..n).map(|_| rng.random_range(-0.9f32..0.9)).collect() };
     let (mix, push) = ((0..3).map(|_| row(3)).collect(), (0..3).map(|_| row(4)).collect());
-    let scene = |env| {
-        let numbers: Vec<f32> = draw(env, 6, 0.8).iter().map(|&v| v as f32).collect();
-        (numbers[..3].to_vec(), numbers[3..].to_vec())
+    let start_and_goal = |env| {
+        let values: Vec<f32> = draw(env, 6, 0.8).iter().map(|&v| v as f32).collect();
+        (values[..3].to_vec(), values[3..].to_vec())
     };
-    System { mix, push, bent: true, scene, envs: vec![] }
+    System { mix, push, nonlinear: true, start_and_goal, envs: vec![] }
 }
 
 impl System {
@@ -59,7 +58,7 @@ impl CostModel for System {
 
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
         for (i, plan) in candidates.actions.chunks_exact(candidates.horizon * candidates.dim).enumerate() {
-            let (mut z, goal) = (self.scene)(self.envs[i / candidates.samples]);
+            let (mut z, goal) = (self.start_and_goal)(self.envs[i / candidates.samples]);
             for a in plan.chunks_exact(candidates.dim) {
                 let mut next = vec![0.0; z.len()];
                 self.predict(&z, a, &mut next)?;
@@ -81,9 +80,9 @@ impl LatentDynamics for System {
     }
 
     fn encode(&mut self, start: &mut [f32], goal: &mut [f32]) -> Result<()> {
-        let scenes: Vec<_> = self.envs.iter().map(|&env| (self.scene)(env)).collect();
-        start.copy_from_slice(&scenes.iter().flat_map(|scene| scene.0.clone()).collect::<Vec<_>>());
-        goal.copy_from_slice(&scenes.iter().flat_map(|scene| scene.1.clone()).collect::<Vec<_>>());
+        let (starts, goals): (Vec<_>, Vec<_>) = self.envs.iter().map(|&env| (self.start_and_goal)(env)).unzip();
+        start.copy_from_slice(&starts.concat());
+        goal.copy_from_slice(&goals.concat());
         Ok(())
     }
 
@@ -92,7 +91,7 @@ impl LatentDynamics for System {
         let pairs = latents.chunks_exact(latent).zip(actions.chunks_exact(self.dim()));
         for ((z, a), next) in pairs.zip(next.chunks_exact_mut(latent)) {
             let before = self.before(z, a);
-            next.iter_mut().zip(before).for_each(|(next, b)| *next = if self.bent { b.tanh() } else { b });
+            next.iter_mut().zip(before).for_each(|(next, b)| *next = if self.nonlinear { b.tanh() } else { b });
         }
         Ok(())
     }
@@ -110,19 +109,19 @@ impl LatentDynamics for System {
         action_gradient.fill(0.0);
         for (i, (z, a)) in latents.chunks_exact(latent).zip(actions.chunks_exact(dim)).enumerate() {
             for (row, before) in self.before(z, a).into_iter().enumerate() {
-                let slope = if self.bent { 1.0 - before.tanh().powi(2) } else { 1.0 };
-                let pull = next_gradient[i * latent + row] * slope;
-                (0..latent).for_each(|j| latent_gradient[i * latent + j] += pull * self.mix[row][j]);
-                (0..dim).for_each(|j| action_gradient[i * dim + j] += pull * self.push[row][j]);
+                let slope = if self.nonlinear { 1.0 - before.tanh().powi(2) } else { 1.0 };
+                let gradient = next_gradient[i * latent + row] * slope;
+                (0..latent).for_each(|j| latent_gradient[i * latent + j] += gradient * self.mix[row][j]);
+                (0..dim).for_each(|j| action_gradient[i * dim + j] += gradient * self.push[row][j]);
             }
         }
         Ok(())
     }
 }
 
-/// Shows a model some environments; what they look like follows from their numbers.
+/// Lets a model observe environments, which it knows by their indices.
 fn observe(model: &mut dyn CostModel, envs: &[usize]) {
-    model.observe(&Batch::zeros(&Schema::new([]).expect("no columns"), 0), envs).expect("nothing to read");
+    model.observe(&Batch::zeros(&Schema::new([]).expect("no columns"), 0), envs).expect("no columns are read");
 }
 
 const HORIZON: usize = 4;
@@ -139,7 +138,7 @@ fn random(n: usize) -> Vec<f32> {
 }
 
 /// An objective with every kind of term.
-fn everything() -> Vec<Box<dyn Objective>> {
+fn all_terms() -> Vec<Box<dyn Objective>> {
     let running =
         Goal { weight: 0.7, when: When::Running, discount: 0.8, latents: vec![Pick::One(2), Pick::Range([0, 1])] };
     vec![
@@ -150,21 +149,22 @@ fn everything() -> Vec<Box<dyn Objective>> {
     ]
 }
 
-/// Every kind of constraint: 8 norms, 4 latents with two bounds, and the product of the first two actions of all steps.
+/// Every kind of constraint: 8 norms, 4 latents with two bounds, and a custom one on actions and latents.
 fn limits() -> Vec<Box<dyn Constraint>> {
     let product = CustomConstraint {
         count: 1,
         needs_latents: true,
-        values: |way: Trajectory<'_>, values: &mut [f32]| {
-            values[0] = way.actions.chunks_exact(way.dim).map(|a| a[0] * a[1]).sum::<f32>() + way.latents[4].powi(2);
+        values: |trajectory: Trajectory<'_>, values: &mut [f32]| {
+            values[0] = trajectory.actions.chunks_exact(trajectory.dim).map(|a| a[0] * a[1]).sum::<f32>()
+                + trajectory.latents[4].powi(2);
         },
-        gradient: |way: Trajectory<'_>, weights: &[f32], slope: &mut Slope<'_>| {
-            for t in 0..way.actions.len() / way.dim {
-                let at = t * way.dim;
-                slope.actions[at] += weights[0] * way.actions[at + 1];
-                slope.actions[at + 1] += weights[0] * way.actions[at];
+        gradient: |trajectory: Trajectory<'_>, weights: &[f32], slope: &mut Slope<'_>| {
+            for t in 0..trajectory.actions.len() / trajectory.dim {
+                let at = t * trajectory.dim;
+                slope.actions[at] += weights[0] * trajectory.actions[at + 1];
+                slope.actions[at + 1] += weights[0] * trajectory.actions[at];
             }
-            slope.latents[4] += 2.0 * weights[0] * way.latents[4];
+            slope.latents[4] += 2.0 * weights[0] * trajectory.latents[4];
         },
     };
     let bounds = LatentBox { latents: vec![Pick::One(1)], low: Some(-0.2), high: Some(0.3) };
@@ -173,7 +173,7 @@ fn limits() -> Vec<Box<dyn Constraint>> {
 
 /// Checks a gradient against central differences of a sum over all candidates.
 #[track_caller]
-fn assert_slopes(actions: &[f32], gradient: &[f32], mut sum: impl FnMut(&[f32]) -> f64) {
+fn assert_gradient(actions: &[f32], gradient: &[f32], mut sum: impl FnMut(&[f32]) -> f64) {
     const STEP: f32 = 4e-3;
     for j in 0..actions.len() {
         let mut moved = actions.to_vec();
@@ -181,17 +181,17 @@ fn assert_slopes(actions: &[f32], gradient: &[f32], mut sum: impl FnMut(&[f32]) 
         let above = sum(&moved);
         moved[j] = actions[j] - STEP;
         let slope = (above - sum(&moved)) / (2.0 * f64::from(STEP));
-        assert!((slope - f64::from(gradient[j])).abs() < 1e-3, "number {j}: slope {slope}, gradient {}", gradient[j]);
+        assert!((slope - f64::from(gradient[j])).abs() < 1e-3, "value {j}: slope {slope}, gradient {}", gradient[j]);
     }
 }
 
-fn total(numbers: &[f32]) -> f64 {
-    numbers.iter().map(|&v| f64::from(v)).sum()
+fn total(values: &[f32]) -> f64 {
+    values.iter().map(|&v| f64::from(v)).sum()
 }
 
 #[test]
-fn gradients_through_time_are_slopes() {
-    let mut model = ObjectiveCost::new(Box::new(bent()), Box::new(everything()), limits()).expect("a model");
+fn gradients_through_time_equal_finite_differences() {
+    let mut model = ObjectiveCost::new(Box::new(nonlinear()), Box::new(all_terms()), limits()).expect("a model");
     observe(&mut model, &ENVS);
     let actions = random(ENVS.len() * SAMPLES * HORIZON * 4);
     let (mut costs, mut again) = ([f32::NAN; 6], [f32::NAN; 6]);
@@ -199,7 +199,7 @@ fn gradients_through_time_are_slopes() {
     model.cost(candidates(&actions, HORIZON), &mut costs).expect("costs");
     model.cost_and_gradient(candidates(&actions, HORIZON), &mut again, &mut gradient).expect("gradients");
     assert_eq!(costs, again);
-    assert_slopes(&actions, &gradient, |moved| {
+    assert_gradient(&actions, &gradient, |moved| {
         model.cost(candidates(moved, HORIZON), &mut costs).expect("costs");
         total(&costs)
     });
@@ -208,66 +208,66 @@ fn gradients_through_time_are_slopes() {
     assert_eq!(count, 2 * HORIZON + 2 * HORIZON + 1);
     let weights = random(6 * count);
     let mut values = vec![0.0; 6 * count];
-    // Gradients of constraints are added to what is there.
+    // Gradients of constraints are added to the existing values.
     let mut gradient = vec![0.5; actions.len()];
     model.constrain_vjp(candidates(&actions, HORIZON), &weights, &mut gradient).expect("gradients");
     gradient.iter_mut().for_each(|g| *g -= 0.5);
-    assert_slopes(&actions, &gradient, |moved| {
+    assert_gradient(&actions, &gradient, |moved| {
         model.constrain(candidates(moved, HORIZON), &mut values).expect("values");
         values.iter().zip(&weights).map(|(value, weight)| f64::from(value * weight)).sum()
     });
 }
 
 #[test]
-fn terms_and_constraints_cost_what_their_formulas_say() {
-    // Two steps of a latent of two numbers.
-    let way = Trajectory {
+fn values_of_terms_and_constraints_follow_their_formulas() {
+    // Two steps of a latent of dimension 2.
+    let trajectory = Trajectory {
         latents: &[9.0, 9.0, 2.0, 1.0, 4.0, 0.0],
         goal: &[1.0, 3.0],
         actions: &[3.0, 4.0, 0.0, 1.0, 0.0, 1.0, 2.0, 1.0],
         dim: 4,
     };
-    assert_eq!(Goal::default().cost(way), 9.0 + 9.0);
+    assert_eq!(Goal::default().cost(trajectory), 9.0 + 9.0);
     let running = Goal { weight: 2.0, when: When::Running, discount: 0.5, latents: vec![] };
-    assert_eq!(running.cost(way), 2.0 * ((1.0 + 4.0) + 0.5 * (9.0 + 9.0)));
-    assert_eq!(Goal { latents: vec![Pick::One(1)], ..running }.cost(way), 2.0 * (4.0 + 0.5 * 9.0));
-    assert_eq!(Control { weight: 0.5 }.cost(way), 0.5 * (25.0 + 1.0 + 1.0 + 5.0));
+    assert_eq!(running.cost(trajectory), 2.0 * ((1.0 + 4.0) + 0.5 * (9.0 + 9.0)));
+    assert_eq!(Goal { latents: vec![Pick::One(1)], ..running }.cost(trajectory), 2.0 * (4.0 + 0.5 * 9.0));
+    assert_eq!(Control { weight: 0.5 }.cost(trajectory), 0.5 * (25.0 + 1.0 + 1.0 + 5.0));
     // Model steps (3 4 0 1), (0 1 2 1); as two actions each, (3 4), (0 1), (0 1), (2 1).
-    assert_eq!(Change { weight: 1.0, block: 1 }.cost(way), 9.0 + 9.0 + 4.0 + 0.0);
-    assert_eq!(Change { weight: 1.0, block: 2 }.cost(way), (9.0 + 9.0) + 0.0 + 4.0);
+    assert_eq!(Change { weight: 1.0, block: 1 }.cost(trajectory), 9.0 + 9.0 + 4.0 + 0.0);
+    assert_eq!(Change { weight: 1.0, block: 2 }.cost(trajectory), (9.0 + 9.0) + 0.0 + 4.0);
     let values = |constraint: &dyn Constraint| {
         let mut values = vec![f32::NAN; constraint.count(2, 2)];
-        constraint.values(way, &mut values);
+        constraint.values(trajectory, &mut values);
         values
     };
     assert_eq!(values(&ActionNorm { limit: 2.0, block: 2 }), [3.0, -1.0, -1.0, 5f32.sqrt() - 2.0]);
     assert_eq!(values(&LatentBox { high: Some(1.5), ..LatentBox::default() }), [0.5, -0.5, 2.5, -1.5]);
     let one = LatentBox { latents: vec![Pick::Range([0, 1])], low: Some(3.0), high: Some(5.0) };
     assert_eq!(values(&one), [1.0, -3.0, -1.0, -1.0]);
-    let none = Control::default().cost(Trajectory { latents: &[], goal: &[], ..way });
+    let none = Control::default().cost(Trajectory { latents: &[], goal: &[], ..trajectory });
     assert_eq!(none, 32.0, "terms on actions need no latents");
 }
 
 #[test]
-fn a_terminal_goal_is_the_models_own_cost() {
+fn terminal_goal_equals_the_cost_of_the_model() {
     let actions = random(ENVS.len() * SAMPLES * HORIZON * 4);
     let (mut own, mut priced) = ([0.0; 6], [1.0; 6]);
-    let mut model = bent();
+    let mut model = nonlinear();
     observe(&mut model, &ENVS);
     model.cost(candidates(&actions, HORIZON), &mut own).expect("costs");
-    let mut model = ObjectiveCost::new(Box::new(bent()), Box::new(Goal::default()), vec![]).expect("a model");
+    let mut model = ObjectiveCost::new(Box::new(nonlinear()), Box::new(Goal::default()), vec![]).expect("a model");
     observe(&mut model, &ENVS);
     model.cost(candidates(&actions, HORIZON), &mut priced).expect("costs");
     assert_eq!(own, priced);
     assert!(model.constrained().is_none());
-    // The same candidates elsewhere are predicted anew.
+    // The same candidates are predicted again after a new observation.
     observe(&mut model, &[4, 5]);
     model.cost(candidates(&actions, HORIZON), &mut priced).expect("costs");
     assert!(own.iter().zip(priced).all(|(own, other)| *own != other));
 }
 
 #[test]
-fn a_model_can_be_regularised_with_its_gradient_or_without() {
+fn regularised_model_adds_costs_gradients_and_constraints() {
     let quadratic = toy("quadratic");
     let actions = random(ENVS.len() * SAMPLES * 6);
     let config = r#"{
@@ -288,7 +288,7 @@ fn a_model_can_be_regularised_with_its_gradient_or_without() {
     }
     let differentiable = model.differentiable().expect("the toy has a gradient");
     differentiable.cost_and_gradient(candidates(&actions, 3), &mut costs, &mut gradient).expect("gradients");
-    assert_slopes(&actions, &gradient, |moved| {
+    assert_gradient(&actions, &gradient, |moved| {
         model.cost(candidates(moved, 3), &mut costs).expect("costs");
         total(&costs)
     });
@@ -296,7 +296,7 @@ fn a_model_can_be_regularised_with_its_gradient_or_without() {
     let (weights, mut values) = (random(18), vec![0.0; 18]);
     gradient.fill(0.0);
     limits.constrain_vjp(candidates(&actions, 3), &weights, &mut gradient).expect("gradients");
-    assert_slopes(&actions, &gradient, |moved| {
+    assert_gradient(&actions, &gradient, |moved| {
         limits.constrain(candidates(moved, 3), &mut values).expect("values");
         values.iter().zip(&weights).map(|(value, weight)| f64::from(value * weight)).sum()
     });
@@ -326,8 +326,8 @@ fn try_solve(
 }
 
 #[test]
-fn plans_keep_to_an_action_norm_that_the_model_knows_nothing_of() {
-    // A point that is to go farther than three actions of norm 0.1 lead: straight on, at full speed.
+fn plans_satisfy_an_action_norm_constraint() {
+    // The goal is farther away than three actions of norm 0.1 reach, so the best plan is a straight line of maximal actions.
     const LIMIT: f32 = 0.1;
     let limit: Vec<Box<dyn Constraint>> = vec![Box::new(ActionNorm { limit: LIMIT, block: 1 })];
     let envs = [0, 1, 2];
@@ -354,13 +354,12 @@ fn plans_keep_to_an_action_norm_that_the_model_knows_nothing_of() {
     }
 }
 
-/// The cart of [`lqr`], its cost written as an objective. The states' costs before the first action are left out, as no
-/// plan changes them.
+/// The cart of [`lqr`] with its cost as an objective. The cost of the initial state is omitted, because it is constant.
 fn cart() -> ObjectiveCost {
     let narrow = |row: &[f64; 2]| row.map(|v| v as f32).to_vec();
-    let scene = |env| (draw(env, 2, 1.5).iter().map(|&v| v as f32).collect(), vec![0.0; 2]);
+    let start_and_goal = |env| (draw(env, 2, 1.5).iter().map(|&v| v as f32).collect(), vec![0.0; 2]);
     let (mix, push) = (lqr::A.iter().map(narrow).collect(), lqr::B.iter().map(|&b| vec![b as f32]).collect());
-    let system = System { mix, push, bent: false, scene, envs: vec![] };
+    let system = System { mix, push, nonlinear: false, start_and_goal, envs: vec![] };
     let mut terms: Vec<Box<dyn Objective>> = vec![Box::new(Control { weight: lqr::R as f32 })];
     for i in 0..2 {
         let (each, last) = (lqr::Q[i][i] as f32, lqr::LAST[i][i] as f32);
@@ -372,10 +371,10 @@ fn cart() -> ObjectiveCost {
 }
 
 #[test]
-fn the_regulators_plan_is_found_through_the_latent_dynamics() {
+fn gradient_solvers_find_the_plan_of_the_regulator() {
     let envs = [0, 1, 2];
     let gd = GradientDescent { samples: 4, iterations: 400, ..GradientDescent::default() };
-    // The loss of GRASP is not the regulator's: what finds its plan is the synchronisation.
+    // The lifted loss of GRASP is not the regulator's cost, so only the synchronisation finds the plan.
     let sync_optimizer = Optimizer::Adam(Adam { step: 0.05, ..Adam::default() });
     let grasp = Grasp { iterations: 50, sync_iterations: 600, sync_optimizer, ..Grasp::default() };
     let solvers: [Box<dyn Solver>; 2] = [Box::new(gd), Box::new(grasp)];
@@ -391,36 +390,36 @@ fn the_regulators_plan_is_found_through_the_latent_dynamics() {
     }
 }
 
-/// A point in the plane that turns and flees from the origin by the factor `growth` a step, pushed where one likes.
-fn fleeing(growth: f32) -> ObjectiveCost {
-    let scene = |env| {
-        let numbers: Vec<f32> = draw(env, 4, 1.0).iter().map(|&v| v as f32).collect();
-        (numbers[..2].to_vec(), numbers[2..].to_vec())
+/// An unstable linear system in the plane, which turns and grows by the factor `growth` in a step.
+fn unstable(growth: f32) -> ObjectiveCost {
+    let start_and_goal = |env| {
+        let values: Vec<f32> = draw(env, 4, 1.0).iter().map(|&v| v as f32).collect();
+        (values[..2].to_vec(), values[2..].to_vec())
     };
     let mix = vec![vec![growth, 0.2], vec![-0.2, growth]];
     let push = vec![vec![1.0, 0.0], vec![0.0, 1.0]];
-    let system = System { mix, push, bent: false, scene, envs: vec![] };
+    let system = System { mix, push, nonlinear: false, start_and_goal, envs: vec![] };
     ObjectiveCost::new(Box::new(system), Box::new(Goal::default()), vec![]).expect("a model")
 }
 
 #[test]
-fn with_virtual_states_one_step_size_serves_every_horizon() {
-    // What GRASP promises: the curvature of a rollout's cost grows with the horizon, that of the lifted problem does not.
-    // Plain gradient steps show it; Adam, which rescales every number, hides it.
+fn one_step_size_of_grasp_works_for_all_horizons() {
+    // The curvature of a rollout's cost grows with the horizon, that of the lifted problem does not. The test uses plain
+    // gradient steps, because Adam rescales every value and hides the difference.
     let plain = |step| Optimizer::Sgd(Sgd { step, momentum: 0.0 });
-    let still = Fall { from: 0.0, to: 0.0 };
+    let zero = LinearSchedule { from: 0.0, to: 0.0 };
     let mut grasp = Grasp {
         iterations: 100,
         action_optimizer: plain(0.2),
         state_optimizer: plain(0.2),
-        goal_weight: still,
-        state_noise: still,
+        goal_weight: zero,
+        state_noise: zero,
         sync_every: 0,
         ..Grasp::default()
     };
     let envs = [0, 1, 2];
     let worst = |solver: &mut dyn Solver, growth: f32, horizon: usize| -> Result<f32> {
-        let mut model = fleeing(growth);
+        let mut model = unstable(growth);
         observe(&mut model, &envs);
         let plan = try_solve(solver, &mut model, horizon, 2, &envs)?;
         Ok(plan.costs.into_iter().fold(0.0, f32::max))
@@ -431,49 +430,49 @@ fn with_virtual_states_one_step_size_serves_every_horizon() {
     }
     let gd =
         |step| GradientDescent { samples: 1, iterations: 100, optimizer: plain(step), ..GradientDescent::default() };
-    assert!(worst(&mut gd(1e-3), 1.1, 20).expect("a plan") < 1e-6, "the right step for 20 steps");
-    let message = worst(&mut gd(1e-3), 1.1, 40).expect_err("too long a step for 40").to_string();
+    assert!(worst(&mut gd(1e-3), 1.1, 20).expect("a plan") < 1e-6, "a suitable step size for horizon 20");
+    let message = worst(&mut gd(1e-3), 1.1, 40).expect_err("too large a step size for horizon 40").to_string();
     assert!(message.contains("not finite"), "{message}");
-    assert!(worst(&mut gd(1e-5), 1.1, 40).expect("a plan") < 1e-6, "the right step for 40 steps");
-    assert!(worst(&mut gd(1e-5), 1.1, 20).expect("a plan") > 1.0, "too short a step for 20");
+    assert!(worst(&mut gd(1e-5), 1.1, 40).expect("a plan") < 1e-6, "a suitable step size for horizon 40");
+    assert!(worst(&mut gd(1e-5), 1.1, 20).expect("a plan") > 1.0, "too small a step size for horizon 20");
 }
 
 #[test]
-fn what_does_not_fit_says_so() {
+fn errors_name_what_does_not_fit() {
     let shape = Shape { horizon: 2, latent: 3, dim: 4 };
     let message = |objective: &dyn Objective| objective.check(shape).expect_err("wrong").to_string();
     let goal = Goal::default;
     let past = message(&Goal { latents: vec![Pick::Range([2, 4])], ..goal() });
-    assert_eq!(past, "goal term, latents = 2..4 is outside its space: expected numbers of a latent, within 0..3");
+    assert_eq!(past, "goal term latents = 2..4 is outside its space: expected latent dimensions within 0..3");
     assert!(message(&Goal { latents: vec![Pick::One(1), Pick::Range([0, 2])], ..goal() }).contains("1 is named twice"));
     assert!(message(&Goal { discount: 0.9, ..goal() }).contains("0.9 of a terminal term"));
-    assert!(message(&Goal { weight: f32::NAN, ..goal() }).contains("goal term, weight: NaN"));
-    assert!(message(&Control { weight: -1.0 }).contains("control term, weight: -1"));
-    assert!(message(&Change { weight: 1.0, block: 3 }).contains("3 actions in a model step of 4 numbers"));
+    assert!(message(&Goal { weight: f32::NAN, ..goal() }).contains("goal term weight: NaN"));
+    assert!(message(&Control { weight: -1.0 }).contains("control term weight: -1"));
+    assert!(message(&Change { weight: 1.0, block: 3 }).contains("3 actions in a model step of dimension 4"));
     let message = |constraint: &dyn Constraint| constraint.check(shape).expect_err("wrong").to_string();
-    assert!(message(&ActionNorm { limit: -1.0, block: 1 }).contains("action norm, limit: -1"));
+    assert!(message(&ActionNorm { limit: -1.0, block: 1 }).contains("action norm limit: -1"));
     assert!(message(&LatentBox::default()).contains("give a finite lower bound"));
     assert!(message(&LatentBox { low: Some(1.0), high: Some(0.0), ..LatentBox::default() }).contains("Some(1.0)"));
-    let blind = Goal::default().check(Shape { latent: 0, ..shape }).expect_err("no latents").to_string();
-    assert!(blind.contains("this model shows none"), "{blind}");
+    let error = Goal::default().check(Shape { latent: 0, ..shape }).expect_err("no latents").to_string();
+    assert!(error.contains("this model has none"), "{error}");
 
     let read = |json: &str| serde_json::from_str::<ObjectiveConfig>(json);
-    assert!(read(r#"{"terms": [{"term": "goal", "wieght": 1}]}"#).expect_err("a slip").to_string().contains("wieght"));
+    assert!(read(r#"{"terms": [{"term": "goal", "wieght": 1}]}"#).expect_err("a typo").to_string().contains("wieght"));
     assert!(read(r#"{"terms": [{"term": "joy"}]}"#).expect_err("unknown").to_string().contains("joy"));
     let model = |name| Box::new(Model::new(toy(name), &ENVS));
-    let refuse =
+    let reject =
         |json: &str, name| read(json).expect("an objective").apply(model(name)).err().expect("wrong").to_string();
-    let message = refuse(r#"{"terms": [{"term": "goal"}]}"#, "quadratic");
-    assert!(message.contains("it prices latents, and this model shows none"), "{message}");
-    let message = refuse(r#"{"constraints": [{"constraint": "latent_box", "low": 0}]}"#, "reach");
+    let message = reject(r#"{"terms": [{"term": "goal"}]}"#, "quadratic");
+    assert!(message.contains("it uses latents, and this model has none"), "{message}");
+    let message = reject(r#"{"constraints": [{"constraint": "latent_box", "low": 0}]}"#, "reach");
     assert!(message.contains("name a goal term too"), "{message}");
-    let message = refuse(r#"{"terms": [{"term": "control"}]}"#, "constrained");
+    let message = reject(r#"{"terms": [{"term": "control"}]}"#, "constrained");
     assert!(message.contains("the model has constraints of its own"), "{message}");
     assert!(ObjectiveConfig::default().is_empty());
-    assert!(ObjectiveConfig::default().apply(model("constrained")).is_ok(), "nothing to add");
+    assert!(ObjectiveConfig::default().apply(model("constrained")).is_ok(), "an empty objective");
 
-    let mut cost = ObjectiveCost::new(Box::new(bent()), Box::new(goal()), vec![]).expect("a model");
+    let mut cost = ObjectiveCost::new(Box::new(nonlinear()), Box::new(goal()), vec![]).expect("a model");
     let actions = random(ENVS.len() * SAMPLES * HORIZON * 4);
     let message = cost.cost(candidates(&actions, HORIZON), &mut [0.0; 6]).expect_err("nothing observed").to_string();
-    assert!(message.contains("got 2, expected 0, which were observed"), "{message}");
+    assert!(message.contains("got 2, expected 0, the number of observed ones"), "{message}");
 }

@@ -1,7 +1,6 @@
-//! With perfect dynamics, planners reach their goals. The example `simulator` plays the same with more starts.
+//! With perfect dynamics, planners reach their goals. The example `simulator` plays the same tasks from more starts.
 
-// Times are for the example.
-#[allow(dead_code)]
+#[allow(dead_code, reason = "the example prints times, which are not tested")]
 #[path = "../../examples/simulator/play.rs"]
 mod play;
 #[path = "../../examples/simulator/rows.rs"]
@@ -18,7 +17,7 @@ fn run(task: &Task, solver: &'static str, n: usize) -> Outcome {
 }
 
 #[test]
-fn two_room_is_solved() {
+fn solves_two_room() {
     for solver in rows::SOLVERS {
         let found = run(&rows::TASKS[0], solver, 40);
         assert!(found.success.rate >= 0.95, "{solver}: {:?}", found.success);
@@ -26,7 +25,7 @@ fn two_room_is_solved() {
 }
 
 #[test]
-fn push_t_is_solved_from_demonstrations() {
+fn solves_push_t_from_demonstrations() {
     // CEM takes five times as long.
     for solver in ["icem", "mppi"] {
         let found = run(&rows::TASKS[1], solver, 5);

@@ -1,13 +1,13 @@
-//! What the sampling solvers have in common: where they start, when they stop, and what they refuse.
+//! Common behaviour of the sampling solvers: initial guess, deadline, traces, bounds, and errors.
 
 use crate::toys::{Model, Toy, solve, toy};
 use serde_json::{Value, json};
 use std::time::Instant;
 use swm_core::{Key, Plan, PlanProblem, PlanSpace, Solver};
-use swm_plan::registry::{Actions, Family, SOLVERS, SolverEntry};
+use swm_plan::{ActionKind, Family, SOLVERS, SolverEntry};
 
 fn samplers() -> impl Iterator<Item = (&'static SolverEntry, &'static Toy)> {
-    let toy_for = |row: &SolverEntry| toy(if row.actions == Actions::Discrete { "discrete" } else { "quadratic" });
+    let toy_for = |row: &SolverEntry| toy(if row.actions == ActionKind::Discrete { "discrete" } else { "quadratic" });
     SOLVERS.rows.iter().filter(|row| row.family == Family::Sampling).map(move |row| (row, toy_for(row)))
 }
 
@@ -21,7 +21,7 @@ fn plan(id: &str, toy: &'static Toy, init: Option<&[f32]>, deadline: Option<Inst
 }
 
 #[test]
-fn a_first_guess_is_the_first_candidate() {
+fn initial_guess_is_the_first_candidate() {
     for (row, toy) in samplers() {
         let landscape = (toy.landscape)(0);
         let optimum = landscape.optimum();
@@ -35,7 +35,7 @@ fn a_first_guess_is_the_first_candidate() {
 }
 
 #[test]
-fn a_late_search_returns_what_it_has() {
+fn deadline_ends_the_search() {
     for (row, toy) in samplers() {
         let (late, whole) = (plan(row.id, toy, None, Some(Instant::now())), plan(row.id, toy, None, None));
         assert_eq!(late.trace[0].best.len(), 1, "{}", row.id);
@@ -46,7 +46,7 @@ fn a_late_search_returns_what_it_has() {
 }
 
 #[test]
-fn traces_are_what_they_say() {
+fn traces_are_consistent() {
     for (row, toy) in samplers() {
         let trace = &plan(row.id, toy, None, None).trace[0];
         let n = trace.best.len();
@@ -60,25 +60,25 @@ fn traces_are_what_they_say() {
 
 #[test]
 fn candidates_stay_within_bounds() {
-    /// Notes how far candidates reach.
-    struct Watch(f32);
-    impl swm_core::CostModel for Watch {
+    /// Records the largest absolute action.
+    struct LargestAction(f32);
+    impl swm_core::CostModel for LargestAction {
         fn observe(&mut self, _: &swm_core::Batch, _: &[usize]) -> swm_core::Result<()> {
             Ok(())
         }
         fn cost(&mut self, candidates: swm_core::Candidates<'_>, costs: &mut [f32]) -> swm_core::Result<()> {
-            self.0 = candidates.actions.iter().fold(self.0, |far, a| far.max(a.abs()));
+            self.0 = candidates.actions.iter().fold(self.0, |largest, a| largest.max(a.abs()));
             costs.fill(1.0);
             Ok(())
         }
     }
-    for (row, _) in samplers().filter(|(row, _)| row.actions == Actions::Continuous) {
-        let mut watch = Watch(0.0);
+    for (row, _) in samplers().filter(|(row, _)| row.actions == ActionKind::Continuous) {
+        let mut model = LargestAction(0.0);
         let space = PlanSpace::Continuous { low: &[-0.3, -0.5], high: &[0.25, 0.5] };
         let problem = PlanProblem { horizon: 3, space, keys: &[Key::new(0)], init: Some(&[9.0; 6]), deadline: None };
-        let plan = make(row.id, &json!({})).solve(&mut watch, problem).expect("a plan");
-        assert_eq!(watch.0, 0.5, "{}", row.id);
-        // The costs say nothing: the plan must be within bounds all the same.
+        let plan = make(row.id, &json!({})).solve(&mut model, problem).expect("a plan");
+        assert_eq!(model.0, 0.5, "{}", row.id);
+        // All costs are equal; the plan must be within the bounds all the same.
         for step in plan.actions.chunks_exact(2) {
             assert!((-0.3..=0.25).contains(&step[0]) && (-0.5..=0.5).contains(&step[1]), "{}: {step:?}", row.id);
         }
@@ -86,7 +86,7 @@ fn candidates_stay_within_bounds() {
 }
 
 #[test]
-fn no_environments_no_plans() {
+fn no_environments_give_no_plans() {
     for (row, toy) in samplers() {
         let plan = solve(&mut *make(row.id, &json!({})), &mut Model::new(toy, &[]), toy, &[]).expect("nothing");
         assert!(plan.actions.is_empty() && plan.costs.is_empty() && plan.trace.is_empty());
@@ -94,13 +94,13 @@ fn no_environments_no_plans() {
 }
 
 #[test]
-fn wrong_settings_say_so() {
+fn errors_name_invalid_settings() {
     let wrong = [
         ("predictive_sampling", json!({"samples": 0}), "predictive_sampling samples: 0"),
         ("predictive_sampling", json!({"sigma": 0}), "predictive_sampling sigma: 0"),
         ("cem", json!({"iterations": 0}), "cem iterations: 0; ask for at least 1"),
         ("cem", json!({"samples": 64, "elites": 65}), "cem elites: 65 of 64 samples"),
-        ("cem", json!({"elites": 1}), "at least 2 (a spread needs two)"),
+        ("cem", json!({"elites": 1}), "at least 2 (a standard deviation needs two)"),
         ("cem", json!({"sigma": -1}), "cem sigma: -1; choose a finite number above 0"),
         ("icem", json!({"elites": 0}), "icem elites: 0 of 300 samples"),
         ("icem", json!({"momentum": 1.5}), "icem momentum: 1.5; choose a number of at least 0 and below 1"),
@@ -127,7 +127,7 @@ fn wrong_settings_say_so() {
 }
 
 #[test]
-fn wrong_problems_say_so() {
+fn errors_name_invalid_problems() {
     let quadratic = toy("quadratic");
     let message = |id: &str, horizon, space, init: Option<&[f32]>| {
         let keys = [Key::new(0), Key::new(1)];
@@ -137,16 +137,16 @@ fn wrong_problems_say_so() {
     let space = quadratic.space;
     assert!(message("cem", 0, space, None).contains("planning horizon: 0 model steps"));
     let given = message("cem", 3, space, Some(&[0.0; 5]));
-    assert!(given.contains("5 numbers") && given.contains("12 (2 environments x 3 x 2)"), "{given}");
+    assert!(given.contains("5 values") && given.contains("12 (2 environments x 3 x 2)"), "{given}");
     let infinite = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, f32::INFINITY, 0.0, 0.0, 0.0];
     let given = message("cem", 3, space, Some(&infinite));
     assert!(given.contains("planned environment 1") && given.contains("inf at step 1"), "{given}");
     let crossed = PlanSpace::Continuous { low: &[0.0, 1.0], high: &[1.0, 0.5] };
-    assert!(message("cem", 3, crossed, None).contains("bounds of action number 1: 1 ..= 0.5"));
+    assert!(message("cem", 3, crossed, None).contains("bounds of action dimension 1: 1 ..= 0.5"));
     let uneven = PlanSpace::Continuous { low: &[0.0], high: &[1.0, 0.5] };
     assert!(message("cem", 3, uneven, None).contains("1 lower and 2 upper"));
     let none = PlanSpace::Discrete { choices: &[2, 0] };
-    assert!(message("categorical_cem", 3, none, None).contains("choice 1 of a model step: there is nothing"));
+    assert!(message("categorical_cem", 3, none, None).contains("choice 1 of a model step: it has no options"));
     let choices = PlanSpace::Discrete { choices: &[2] };
     let negative = [1.0, -1.0, 0.0, 0.0];
     assert!(message("categorical_cem", 1, choices, Some(&negative)).contains("none below 0"));

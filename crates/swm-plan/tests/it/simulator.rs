@@ -1,4 +1,4 @@
-//! The simulator as a model: its costs are those of the actions that the policy executes.
+//! The simulator as a cost model: its costs are those of the actions that the policy executes.
 
 use rand::Rng as _;
 use swm_core::pool::{Reset, threads};
@@ -17,7 +17,7 @@ fn pool(entry: &EnvEntry, envs: usize) -> EnvPool {
     pool
 }
 
-/// A simulator that was shown these slots.
+/// A simulator that has observed these slots.
 fn simulator(entry: &EnvEntry, pool: &EnvPool, slots: &[usize], score: Score) -> SimulatorCost {
     let mut simulator = SimulatorCost::new(
         {
@@ -29,8 +29,8 @@ fn simulator(entry: &EnvEntry, pool: &EnvPool, slots: &[usize], score: Score) ->
         score,
     )
     .expect("a simulator");
-    slots.iter().for_each(|&slot| simulator.observe_env(slot, pool.env(slot)).expect("its own world"));
-    simulator.observe(pool.infos(), slots).expect("worlds that were shown");
+    slots.iter().for_each(|&slot| simulator.observe_env(slot, pool.env(slot)).expect("an environment of this kind"));
+    simulator.observe(pool.infos(), slots).expect("observed environments");
     simulator
 }
 
@@ -46,7 +46,7 @@ fn actions(rng: &mut Rng, n: usize) -> Vec<f32> {
 }
 
 #[test]
-fn a_cost_is_what_the_world_itself_would_say() {
+fn costs_equal_distances_in_the_environment() {
     for entry in [&two_room::ENTRY, &push_t::ENTRY] {
         let samples = 5;
         let actions = actions(&mut Key::new(1).rng(), samples * HORIZON * BLOCK * 2);
@@ -54,14 +54,14 @@ fn a_cost_is_what_the_world_itself_would_say() {
         for score in [Score::Terminal, Score::Running] {
             let costs = costs(&mut simulator(entry, &pool, &[1], score), &actions, 1, samples);
             for (candidate, cost) in actions.chunks_exact(HORIZON * BLOCK * 2).zip(costs) {
-                let mut world = entry.env().expect("an environment");
-                world.restore(&pool.env(1).snapshot()).expect("a snapshot");
+                let mut environment = entry.env().expect("an environment");
+                environment.restore(&pool.env(1).snapshot()).expect("a snapshot");
                 let distances: Vec<f64> = candidate
                     .chunks_exact(2)
                     .map(|action| {
                         let action = [action[0].clamp(-1.0, 1.0), action[1].clamp(-1.0, 1.0)];
-                        world.step(Action::Continuous(&action)).expect("a step");
-                        world.goal_distance()
+                        environment.step(Action::Continuous(&action)).expect("a step");
+                        environment.goal_distance()
                     })
                     .collect();
                 let wanted = match score {
@@ -91,11 +91,15 @@ fn reaching_the_goal_early_is_cheapest() {
     let walk = |steps: usize| (0..6).flat_map(move |t| [if t < steps { 1.0 } else { 0.0 }, 0.0]);
     let actions: Vec<f32> = walk(3).chain(walk(2)).chain(walk(6)).collect();
     let costs = costs(&mut simulator(entry, &pool, &[0], Score::Reach), &actions, 1, 3);
-    assert_eq!(costs, [-0.5, 20.0, -0.5], "3 of 6 steps are left; 20 pixels are missing; going on changes nothing");
+    assert_eq!(
+        costs,
+        [-0.5, 20.0, -0.5],
+        "3 of 6 steps remain; the goal is 20 pixels away; later steps change nothing"
+    );
 }
 
 #[test]
-fn costs_depend_on_their_own_world_alone() {
+fn costs_do_not_depend_on_other_environments_or_threads() {
     for entry in [&two_room::ENTRY, &push_t::ENTRY, &push_t::discrete::ENTRY] {
         let (envs, samples) = (3, 20);
         let pool = pool(entry, envs);
@@ -117,20 +121,25 @@ fn costs_depend_on_their_own_world_alone() {
         let together = run(1, &[0, 1, 2]);
         assert!(together.iter().all(|costs| costs.iter().any(|&cost| cost != costs[0])), "{}: all alike", entry.id);
         assert_eq!(run(2, &[0, 1, 2]), together, "{}: two threads", entry.id);
-        assert_eq!(run(2, &[2, 0]), [together[2].clone(), together[0].clone()], "{}: other company", entry.id);
+        assert_eq!(
+            run(2, &[2, 0]),
+            [together[2].clone(), together[0].clone()],
+            "{}: other environments in the call",
+            entry.id
+        );
     }
 }
 
 #[test]
-fn a_simulator_refuses_worlds_it_does_not_know() {
+fn rejects_other_environments_and_wrong_shapes() {
     let (room, table) = (pool(&two_room::ENTRY, 1), pool(&push_t::ENTRY, 1));
     let mut simulator = simulator(&two_room::ENTRY, &room, &[0], Score::Terminal);
-    let foreign = simulator.observe_env(0, table.env(0)).expect_err("another world").to_string();
+    let foreign = simulator.observe_env(0, table.env(0)).expect_err("another environment").to_string();
     assert!(foreign.contains(push_t::ENTRY.id) && foreign.contains(two_room::ENTRY.id), "{foreign}");
-    let again = simulator.observe(room.infos(), &[0]).expect_err("shown once, observed twice").to_string();
-    assert!(again.contains("was not shown"), "{again}");
+    let again = simulator.observe(room.infos(), &[0]).expect_err("passed once, observed twice").to_string();
+    assert!(again.contains("was not passed to the policy"), "{again}");
     let wide = Candidates { actions: &[0.0; 6], envs: 1, samples: 1, horizon: 1, dim: 6 };
-    assert!(simulator.cost(wide, &mut [0.0]).expect_err("too wide").to_string().contains("6 numbers"));
+    assert!(simulator.cost(wide, &mut [0.0]).expect_err("too wide").to_string().contains("6 values"));
     let none = SimulatorCost::new(|| two_room::ENTRY.env(), ActionScale::identity(2), 0, Score::Terminal);
     assert!(none.err().expect("no actions").to_string().contains("action block"));
 }

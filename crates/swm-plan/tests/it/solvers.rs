@@ -1,25 +1,24 @@
-//! Every solver on every toy: it comes as near to the optimum as its trial says, or refuses and names who can.
+//! Every solver on every toy: it finds the optimum to the accuracy of its trial, or rejects the toy.
 
 use crate::toys::{Model, TOYS, Toy, solve, toy};
 use swm_core::PlanSpace;
 use swm_core::registry::Named;
-use swm_plan::penalty::Penalised;
-use swm_plan::registry::{Actions, Need, SOLVERS, SolverEntry};
+use swm_plan::{ActionKind, Need, Penalised, SOLVERS, SolverEntry, pairing};
 
-/// What a solver is tried with, and how near it must come.
+/// The settings to try a solver with, and the required accuracy.
 pub struct Trial {
     pub solver: &'static str,
-    /// Its settings, as JSON.
+    /// The settings, as JSON.
     pub settings: &'static str,
-    /// Those of a short search, whose every number is pinned.
+    /// The settings of the short search that golden files record.
     pub short: &'static str,
-    /// For each toy it can solve: by how much the cost may exceed the lowest one, and how far any number of the plan may
-    /// be from the best plan's.
+    /// For each toy it can solve: the allowed excess of the cost over the lowest one, and the allowed distance of any value of
+    /// the plan from the best plan.
     pub near: &'static [(&'static str, f64, f64)],
 }
 
 pub const TRIALS: &[Trial] = &[
-    // One round of guesses: it comes near, no more.
+    // A single round of samples is only approximate.
     Trial {
         solver: "predictive_sampling",
         settings: r#"{"samples": 200000, "sigma": 0.7}"#,
@@ -115,13 +114,13 @@ pub const TRIALS: &[Trial] = &[
     },
 ];
 
-/// What is not tried, and why.
+/// Pairs that are not tried, with the reason.
 const SKIPPED: &[(&str, &str, &str)] = &[];
 
-/// The environments every toy is solved for, together.
+/// The environments that every toy is solved for in one call.
 const ENVS: [usize; 3] = [0, 1, 2];
 
-/// Multipliers of the constrained toy are below 2.
+/// Above the multipliers of the constrained toy, which are below 2.
 const PENALTY: f32 = 4.0;
 
 pub fn trial(solver: &str) -> &'static Trial {
@@ -129,11 +128,11 @@ pub fn trial(solver: &str) -> &'static Trial {
     trial.unwrap_or_else(|| panic!("give {solver} a trial"))
 }
 
-/// Whether a solver can plan a toy's actions with what the toy offers, were it not for constraints.
+/// Whether a solver can plan for a toy, constraints aside.
 fn fits(row: &SolverEntry, toy: &Toy) -> bool {
     let actions = match toy.space {
-        PlanSpace::Continuous { .. } => Actions::Continuous,
-        PlanSpace::Discrete { .. } => Actions::Discrete,
+        PlanSpace::Continuous { .. } => ActionKind::Continuous,
+        PlanSpace::Discrete { .. } => ActionKind::Discrete,
     };
     let offered = |need: &Need| match need {
         Need::Gradient => true,
@@ -143,18 +142,18 @@ fn fits(row: &SolverEntry, toy: &Toy) -> bool {
     row.actions == actions && row.needs.iter().all(offered)
 }
 
-/// Whether it also keeps the toy's constraints.
+/// Whether a solver can plan for a toy and satisfies its constraints.
 pub fn solves(row: &SolverEntry, toy: &Toy) -> bool {
     fits(row, toy) && (!toy.constrained || row.needs.contains(&Need::Constraints))
 }
 
 #[test]
-fn every_solver_finds_the_optimum_of_every_toy_it_can_solve() {
+fn solvers_find_the_optima_of_toys() {
     for row in SOLVERS.rows {
         let trial = trial(row.id);
         let settings = serde_json::from_str(trial.settings).expect("settings");
         for toy in TOYS {
-            // A solver that knows no constraints and needs no gradient is given them as a penalty.
+            // A sampling solver receives constraints as a penalty.
             let penalised = toy.constrained && fits(row, toy) && row.needs.is_empty();
             let skipped = SKIPPED.iter().any(|&(solver, name, _)| (solver, name) == (row.id, toy.name));
             let near = trial.near.iter().find(|near| near.0 == toy.name);
@@ -178,22 +177,29 @@ fn every_solver_finds_the_optimum_of_every_toy_it_can_solve() {
                 let actions: Vec<f64> = actions.iter().map(|&a| f64::from(a)).collect();
                 let best = landscape.optimum();
                 let gap = landscape.cost(&actions) - landscape.cost(&best);
-                let off = actions.iter().zip(&best).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-                let place = format!("{} on {}, environment {env}", row.id, toy.name);
-                assert!(gap.abs() <= excess, "{place}: costs {gap:e} more than the least");
-                assert!(off <= distance || !landscape.is_unique(), "{place}: {actions:?}, best {best:?}");
+                let distance_to_best = actions.iter().zip(&best).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                let subject = format!("{} on {}, environment {env}", row.id, toy.name);
+                assert!(gap.abs() <= excess, "{subject}: costs {gap:e} more than the optimum");
+                assert!(
+                    distance_to_best <= distance || !landscape.is_unique(),
+                    "{subject}: {actions:?}, best {best:?}"
+                );
                 let violation = landscape.constraints(&actions).into_iter().fold(0.0, f64::max);
-                assert!(violation <= 1e-3, "{place}: violates a constraint by {violation:e}");
+                assert!(violation <= 1e-3, "{subject}: violates a constraint by {violation:e}");
             }
         }
     }
 }
 
 #[test]
-fn an_impossible_pairing_names_the_solvers_that_would_work() {
-    let message = |row: &SolverEntry, toy, model: &mut Model| {
+fn pairing_names_the_solvers_that_fit() {
+    let message = |row: &SolverEntry, toy: &Toy, model: &mut Model| {
         let mut solver = (row.make)(&serde_json::json!({})).expect("a solver");
-        solve(&mut *solver, model, toy, &ENVS).expect_err(row.id).to_string()
+        let rejected = solve(&mut *solver, model, toy, &ENVS).expect_err(row.id).to_string();
+        let message = pairing(row.id, model, ActionKind::of_plan(toy.space)).expect_err(row.id).to_string();
+        let obstacle = |message: &str| message.split("; ").next().map(str::to_owned);
+        assert_eq!(obstacle(&rejected), obstacle(&message), "the solver and `pairing` agree");
+        message
     };
     let named = |message: &str, id: &str| message.split(|c: char| !(c.is_alphanumeric() || c == '_')).any(|w| w == id);
     for (row, toy) in SOLVERS.rows.iter().flat_map(|row| TOYS.iter().map(move |toy| (row, toy))) {
@@ -205,9 +211,9 @@ fn an_impossible_pairing_names_the_solvers_that_would_work() {
             assert_eq!(named(&message, other.id), solves(other, toy), "{} on {}: {message}", other.id, toy.name);
         }
     }
-    // Without a gradient, only sampling is left.
+    // Without a gradient, only sampling solvers fit.
     for row in SOLVERS.rows.iter().filter(|row| row.needs.contains(&Need::Gradient)) {
-        let toy = toy(if row.actions == Actions::Discrete { "discrete" } else { "quadratic" });
+        let toy = toy(if row.actions == ActionKind::Discrete { "discrete" } else { "quadratic" });
         let message = message(row, toy, &mut Model::new(toy, &ENVS).opaque());
         for other in SOLVERS.rows.iter().filter(|other| other.id() != row.id()) {
             let able = other.actions == row.actions && other.needs.is_empty();
@@ -217,7 +223,7 @@ fn an_impossible_pairing_names_the_solvers_that_would_work() {
 }
 
 #[test]
-fn skipped_trials_exist_and_say_why() {
+fn skipped_trials_exist_and_have_reasons() {
     for &(solver, name, why) in SKIPPED {
         assert!(SOLVERS.get(solver).is_ok() && TOYS.iter().any(|toy| toy.name == name) && why.len() > 10, "{solver}");
     }
@@ -228,7 +234,7 @@ fn skipped_trials_exist_and_say_why() {
 }
 
 #[test]
-fn a_cost_that_is_missing_or_not_finite_is_named() {
+fn errors_name_costs_that_are_missing_or_not_finite() {
     for row in SOLVERS.rows {
         let toy = TOYS.iter().find(|toy| solves(row, toy)).expect("a toy");
         let message = |cost| {

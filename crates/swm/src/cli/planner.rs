@@ -6,7 +6,7 @@ use serde_json::{Map, Value, json};
 use swm_core::{EnvChoice, Error, Result};
 use swm_eval::{Acts, Choice, Model};
 use swm_plan::objective::ObjectiveConfig;
-use swm_plan::registry::Actions;
+use swm_plan::ActionKind;
 use swm_plan::{MpcConfig, SOLVERS};
 
 /// How a world model plans; the defaults are those of the paper's experiments.
@@ -58,10 +58,10 @@ impl PlannerArgs {
             });
             return choices.collect();
         }
-        let actions = Actions::of(&env.env()?.spec().action_space);
+        let actions = ActionKind::of(&env.env()?.spec().action_space);
         let first = match actions {
-            Actions::Continuous => SOLVERS.get("cem")?,
-            Actions::Discrete => {
+            ActionKind::Continuous => SOLVERS.get("cem")?,
+            ActionKind::Discrete => {
                 SOLVERS.rows.iter().find(|row| row.actions == actions && row.needs.is_empty()).ok_or_else(|| {
                     Error::config("--solver", "none plans discrete actions", "`swm solvers` lists them")
                 })?

@@ -1,0 +1,126 @@
+//! [`SolverEntry`]: the row of a solver in the registry, which states what the solver plans and what it requires of a model.
+//!
+//! Every solver's file defines its row as `pub const ENTRY`; [`SOLVERS`](crate::SOLVERS) lists them.
+
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use swm_core::registry::Named;
+use swm_core::{Error, PlanSpace, Result, Solver, Space};
+
+/// A solver in the registry.
+pub struct SolverEntry {
+    /// The id, such as `cem`.
+    pub id: &'static str,
+    /// One sentence on how it searches.
+    pub summary: &'static str,
+    /// The family of algorithms it belongs to.
+    pub family: Family,
+    /// The actions it plans.
+    pub actions: ActionKind,
+    /// What it requires of a model beyond a cost.
+    pub needs: &'static [Need],
+    /// The publication it follows.
+    pub paper: &'static str,
+    /// Returns the default settings, as JSON.
+    pub defaults: fn() -> serde_json::Value,
+    /// Makes a solver from settings; settings that are not named keep their defaults.
+    pub make: fn(&serde_json::Value) -> Result<Box<dyn Solver>>,
+}
+
+/// How a solver searches.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Family {
+    /// It compares the costs of samples.
+    Sampling,
+    /// It follows the gradient of the cost.
+    Gradient,
+}
+
+/// The kind of actions a solver plans.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ActionKind {
+    /// Real values within bounds.
+    Continuous,
+    /// Choices among finitely many options.
+    Discrete,
+}
+
+/// A capability of a model beyond a cost.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Need {
+    /// The gradient of the cost: [`swm_core::DifferentiableCost`].
+    Gradient,
+    /// Latent dynamics: [`swm_core::LatentDynamics`].
+    Latent,
+    /// Constraints: [`swm_core::Constrained`].
+    Constraints,
+}
+
+impl Named for SolverEntry {
+    fn id(&self) -> &'static str {
+        self.id
+    }
+}
+
+impl SolverEntry {
+    /// Returns why this solver cannot plan such actions with a model that has the capabilities `offers`, if so.
+    pub fn obstacle(&self, actions: ActionKind, offers: &[Need]) -> Option<String> {
+        if self.actions != actions {
+            return Some(match actions {
+                ActionKind::Continuous => "it plans discrete actions; these are continuous".to_owned(),
+                ActionKind::Discrete => "it plans continuous actions; these are discrete".to_owned(),
+            });
+        }
+        if let Some(need) = self.needs.iter().find(|need| !offers.contains(need)) {
+            return Some(need.obstacle());
+        }
+        let ignores_constraints = offers.contains(&Need::Constraints) && !self.needs.contains(&Need::Constraints);
+        ignores_constraints.then(|| "it would ignore the constraints of the model".to_owned())
+    }
+}
+
+impl ActionKind {
+    /// The kind of the actions of an environment.
+    pub fn of(space: &Space) -> Self {
+        if matches!(space, Space::Box { .. }) { Self::Continuous } else { Self::Discrete }
+    }
+
+    /// The kind of the actions of a plan.
+    pub fn of_plan(space: PlanSpace<'_>) -> Self {
+        match space {
+            PlanSpace::Continuous { .. } => Self::Continuous,
+            PlanSpace::Discrete { .. } => Self::Discrete,
+        }
+    }
+}
+
+impl Need {
+    /// The obstacle for a solver that requires this of a model without it.
+    pub fn obstacle(self) -> String {
+        let needed = match self {
+            Self::Gradient => "the gradient of the cost",
+            Self::Latent => "the model's latent state",
+            Self::Constraints => "constraints",
+        };
+        format!("it needs {needed}, which this model does not offer")
+    }
+}
+
+/// The default settings of a solver, as JSON: [`SolverEntry::defaults`].
+pub fn defaults<S: Default + Serialize>() -> serde_json::Value {
+    serde_json::to_value(S::default()).unwrap_or_default()
+}
+
+/// Makes a solver from JSON settings: [`SolverEntry::make`].
+///
+/// # Errors
+/// When a setting is unknown or has the wrong type.
+pub fn make<S: Solver + DeserializeOwned + 'static>(settings: &serde_json::Value) -> Result<Box<dyn Solver>> {
+    match S::deserialize(settings) {
+        Ok(solver) => Ok(Box::new(solver)),
+        Err(error) => Err(Error::config("solver settings", error.to_string(), "`swm solvers` lists the settings")),
+    }
+}

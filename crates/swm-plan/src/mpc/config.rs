@@ -1,0 +1,69 @@
+//! [`MpcConfig`]: how far to plan and how much of a plan to execute.
+
+use crate::search::Settings;
+use serde::{Deserialize, Serialize};
+use std::time::{Duration, Instant};
+use swm_core::{Error, Result};
+
+/// How far to plan and how much of a plan to execute.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct MpcConfig {
+    /// Model steps to plan, H.
+    pub horizon: usize,
+    /// Model steps to execute before planning again; the whole horizon is open loop.
+    pub receding_horizon: usize,
+    /// Environment steps in one model step (the frameskip the model was trained with). Their actions are concatenated in a
+    /// model step's action.
+    pub action_block: usize,
+    /// Whether a plan starts from the part of the last plan that was not executed, moved forward and filled with zeros (the
+    /// mean action in model units; no preference among choices).
+    pub warm_start: bool,
+    /// Model steps the model conditions on, the present one included.
+    pub history: usize,
+    /// Seconds after which solvers stop searching and return the best plan so far. The time counts from the observation of
+    /// the present, for all environments that are planned together; the first iteration is always finished. With a budget,
+    /// results depend on the machine's speed and load.
+    pub latency_budget: Option<f64>,
+}
+
+impl Default for MpcConfig {
+    /// The setting of the paper's planning experiments: 5 model steps of 5 environment steps, open loop.
+    fn default() -> Self {
+        Self { horizon: 5, receding_horizon: 5, action_block: 5, warm_start: true, history: 1, latency_budget: None }
+    }
+}
+
+impl MpcConfig {
+    /// Checks that the settings fit each other.
+    ///
+    /// # Errors
+    /// When a count is 0, more would be executed than planned, or the latency budget is not a positive time.
+    pub fn check(&self) -> Result<()> {
+        let settings = Settings("MPC");
+        settings.at_least_one("horizon", self.horizon)?;
+        settings.at_least_one("receding horizon", self.receding_horizon)?;
+        settings.at_least_one("action block", self.action_block)?;
+        settings.at_least_one("history", self.history)?;
+        settings.check(
+            self.receding_horizon <= self.horizon,
+            "receding horizon",
+            format!("{} model steps to execute, {} planned", self.receding_horizon, self.horizon),
+            "execute at most what is planned",
+        )?;
+        if let Some(seconds) = self.latency_budget.filter(|seconds| !(seconds.is_finite() && *seconds > 0.0)) {
+            return Err(Error::config(
+                "MPC latency budget",
+                format!("{seconds} seconds"),
+                "choose more than 0 seconds, or none for no limit",
+            ));
+        }
+        Ok(())
+    }
+
+    /// The time at which a search that starts now has to stop; none for a budget that exceeds the range of the clock.
+    pub(super) fn deadline(&self, now: Instant) -> Option<Instant> {
+        let budget = Duration::try_from_secs_f64(self.latency_budget?).ok()?;
+        now.checked_add(budget)
+    }
+}

@@ -1,0 +1,150 @@
+//! [`Descent`]: the loop that all gradient solvers share.
+//!
+//! Each step computes costs and gradients, lets the solver adjust the gradient, moves the candidates, adds noise, and projects
+//! the candidates back to what is allowed (action bounds or probability simplices).
+
+use super::optimizer::{Memory, Optimizer};
+use super::population::Population;
+use super::problem::{UNWRITTEN, check_costs, differentiable};
+use swm_core::{CostModel, Error, Plan, PlanProblem, PlanTrace, Result};
+
+/// How one step moves the candidates.
+#[derive(Clone, Copy)]
+pub struct Step<'a> {
+    /// Turns a gradient into a step.
+    pub optimizer: &'a Optimizer,
+    /// The standard deviation of the noise added after the step; 0 for none.
+    pub action_noise: f32,
+}
+
+/// Moves actions to the nearest allowed ones.
+type Projection<'p> = Box<dyn Fn(&mut [f32]) + 'p>;
+
+/// Candidates that descend the gradient of their cost.
+pub struct Descent<'p> {
+    /// The candidates.
+    pub population: Population,
+    /// The gradient of each candidate's cost, `[envs, samples, horizon, dim]`.
+    pub gradient: Vec<f32>,
+    /// The search of every environment, `[envs]`.
+    pub trace: Vec<PlanTrace>,
+    /// Steps done so far.
+    pub steps: usize,
+    solver: &'static str,
+    memory: Memory,
+    problem: PlanProblem<'p>,
+    project: Projection<'p>,
+}
+
+impl<'p> Descent<'p> {
+    /// Starts at `samples` candidates for each environment: the initial guess, and others around it with the standard
+    /// deviation `sigma`. `project` moves actions to the nearest allowed ones, here and after every step.
+    pub fn new(
+        solver: &'static str,
+        problem: &PlanProblem<'p>,
+        samples: usize,
+        sigma: f32,
+        project: impl Fn(&mut [f32]) + 'p,
+    ) -> Self {
+        let mut population = Population::around(solver, problem, samples, sigma);
+        project(&mut population.actions);
+        Self {
+            gradient: vec![0.0; population.actions.len()],
+            trace: vec![PlanTrace::default(); problem.keys.len()],
+            steps: 0,
+            solver,
+            memory: Memory::new(population.actions.len()),
+            population,
+            problem: *problem,
+            project: Box::new(project),
+        }
+    }
+
+    /// Takes up to `steps` steps; returns whether time is left before the deadline.
+    ///
+    /// `prepare` runs once costs and gradients are known: it records the trace and adjusts the gradient.
+    ///
+    /// # Errors
+    /// When the model fails, a cost or a gradient is missing or not finite, and what `prepare` returns.
+    pub fn run(
+        &mut self,
+        cost: &mut dyn CostModel,
+        steps: usize,
+        step: Step<'_>,
+        mut prepare: impl FnMut(&mut Self, &mut dyn CostModel) -> Result<()>,
+    ) -> Result<bool> {
+        for _ in 0..steps {
+            self.differentiate(cost)?;
+            prepare(self, cost)?;
+            self.step(step);
+            if self.problem.is_late() {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    /// Computes the cost and the gradient of every candidate.
+    fn differentiate(&mut self, cost: &mut dyn CostModel) -> Result<()> {
+        let (candidates, costs) = self.population.split();
+        costs.fill(UNWRITTEN);
+        self.gradient.fill(UNWRITTEN);
+        differentiable(self.solver, cost)?.cost_and_gradient(candidates, costs, &mut self.gradient)?;
+        check_costs(&self.population.costs, self.population.samples(), self.steps)?;
+        self.check_gradient()
+    }
+
+    /// Checks that the gradient is finite.
+    ///
+    /// # Errors
+    /// When it is not; the message names the step and the candidate.
+    pub fn check_gradient(&self) -> Result<()> {
+        let Some(i) = self.gradient.iter().position(|g| !g.is_finite()) else {
+            return Ok(());
+        };
+        let (population, iteration) = (&self.population, self.steps);
+        let (step, candidate) = (i / population.dim() % self.problem.horizon, i / population.len());
+        Err(Error::NotFinite {
+            what: "the gradient of a candidate's cost".to_owned(),
+            given: format!(
+                "{} at step {step} for candidate {} of planned environment {} in iteration {iteration}",
+                self.gradient[i],
+                candidate % population.samples(),
+                candidate / population.samples()
+            ),
+            fix: "the gradient explodes over this horizon or was not written: shorten the horizon, clip the gradient, take \
+                  smaller steps, or check the checkpoint"
+                .to_owned(),
+        })
+    }
+
+    /// Moves every candidate once against its gradient, adds noise and projects.
+    pub fn step(&mut self, step: Step<'_>) {
+        step.optimizer.step(&mut self.memory, &mut self.population.actions, &self.gradient);
+        self.population.perturb(step.action_noise, self.steps);
+        (self.project)(&mut self.population.actions);
+        self.steps += 1;
+    }
+
+    /// Clears the memory of the optimizer.
+    pub fn forget(&mut self) {
+        self.memory.clear();
+    }
+
+    /// Records the current costs in the trace; returns the cheapest candidate of every environment.
+    pub fn record(&mut self) -> Vec<usize> {
+        let best = self.population.cheapest();
+        self.population.record(&mut self.trace, &best);
+        best
+    }
+
+    /// Evaluates the candidates where they are now and returns the cheapest as plans.
+    ///
+    /// # Errors
+    /// When the model fails, or a cost is missing or not finite.
+    pub fn finish(mut self, cost: &mut dyn CostModel) -> Result<Plan> {
+        self.population.evaluate(cost, self.steps)?;
+        let best = self.record();
+        Ok(self.population.plan(&best, self.trace))
+    }
+}

@@ -10,9 +10,9 @@ use swm_data::Reader;
 use swm_envs::wrappers::{GoalPicture, Stack, WRAPPERS};
 use swm_eval::{Actor, Acts, Choice, EvalRequest, Model, PolicyRequest, Predictor, Resolver, World};
 use swm_models::{CheckpointInfo, Device, load};
+use swm_plan::ActionKind;
 use swm_plan::objective::ObjectiveConfig;
 use swm_plan::pairing;
-use swm_plan::ActionKind;
 use swm_plan::{ActionScale, MpcConfig, MpcPolicy, PlanRecord, SOLVERS, Score, SimulatorCost, TraceLog};
 
 /// Knows what is built in and what is at home.

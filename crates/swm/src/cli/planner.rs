@@ -5,8 +5,8 @@ use clap::Args;
 use serde_json::{Map, Value, json};
 use swm_core::{EnvChoice, Error, Result};
 use swm_eval::{Acts, Choice, Model};
-use swm_plan::objective::ObjectiveConfig;
 use swm_plan::ActionKind;
+use swm_plan::objective::ObjectiveConfig;
 use swm_plan::{MpcConfig, SOLVERS};
 
 /// How a world model plans; the defaults are those of the paper's experiments.

@@ -92,8 +92,8 @@ impl Actor {
         let model = model(given, &spec, mpc.action_block)?;
         let scale = scale.or(model.scale).unwrap_or_else(|| ActionScale::unscaled(&spec));
         let mut cost = model.cost;
-        let actions = swm::plan::registry::Actions::of(&spec.action_space);
-        swm::plan::problem::pairing(solver, &mut *cost, actions).map_err(raised)?;
+        let actions = swm::plan::ActionKind::of(&spec.action_space);
+        swm::plan::pairing(solver, &mut *cost, actions).map_err(raised)?;
         let log = TraceLog::default();
         let policy = py.detach(|| MpcPolicy::new(made, cost, mpc, scale, &spec, slots)).map_err(raised)?;
         let policy = policy.traced(log.clone());

@@ -260,7 +260,7 @@ fn write(source: &Path, path: &Path, layout: &Layout) -> Result<()> {
         verify: false,
         ..ConvertOptions::default()
     };
-    convert(&open(source)?, &Location::from(path), &options, &mut |_, _, _| true).map(|_| ())
+    convert(&open(source)?, &Location::from(path), &options, &mut Control::new()).map(|_| ())
 }
 
 /// The reference's side of loading.
@@ -349,7 +349,7 @@ fn remote(local: &Path, config: &DataBenchConfig) -> Result<Option<DataBenchRow>
     let Some(place) = &config.remote else { return Ok(None) };
     let target = Location::parse(&format!("{}/bench.lance", place.to_string().trim_end_matches('/')))?;
     let options = ConvertOptions { mode: ConvertMode::Overwrite, codec: JPEG, verify: false, ..Default::default() };
-    convert(&open(local)?, &target, &options, &mut |_, _, _| true)?;
+    convert(&open(local)?, &target, &options, &mut Control::new())?;
     let mut loaders =
         [loader(&open(&target)?, config, CacheConfig::Off)?, loader(&open(local)?, config, CacheConfig::Off)?]
             .map(|loader| Endless { loader, epoch: 0 });
@@ -424,7 +424,7 @@ fn converting(
             ..ConvertOptions::default()
         };
         let begun = Instant::now();
-        convert(&open(source)?, &Location::from(&our_place), &options, &mut |_, _, _| true)?;
+        convert(&open(source)?, &Location::from(&our_place), &options, &mut Control::new())?;
         ours.push(1.0 / begun.elapsed().as_secs_f64());
         if let Some(asked) = &mut reference {
             match asked.convert(source, layout.beside, &their_place) {

@@ -26,6 +26,7 @@ pub mod policy;
 pub mod pool;
 pub mod predictor;
 pub mod registry;
+pub mod requirements;
 pub mod results;
 pub mod run;
 pub mod space;

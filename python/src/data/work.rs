@@ -8,10 +8,12 @@ use pyo3::prelude::*;
 use serde::Deserialize;
 use serde_json::{Value, json as value};
 use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+use swm::core::run::{Control, Event};
 use swm::core::{Error, Named as _};
-use swm::data::convert::Stage;
-use swm::data::doctor::{examine, open_what_is_left, repair};
+use swm::data::doctor::{examine, open_damaged, repair};
 use swm::data::{ConvertMode, ConvertOptions, Converted, Location, Reader, checksum, formats};
+use swm::dataset_requirements::DATASET_REQUIREMENTS;
 use swm::home;
 
 /// How to convert, from JSON.
@@ -52,43 +54,25 @@ impl Wanted {
     }
 }
 
-/// Tells Python how far the work is, lets it see its signals, and remembers what it raised.
-struct Watch {
-    tell: Option<Py<PyAny>>,
-    signals: Box<dyn FnMut() -> swm::core::Result<()> + Send>,
-    raised: Option<Error>,
-}
-
-impl Watch {
-    fn new(tell: Option<Py<PyAny>>) -> Self {
-        Self { tell, signals: Box::new(signals()), raised: None }
-    }
-
-    /// Whether the work goes on.
-    fn at(&mut self, stage: &str, done: usize, total: usize) -> bool {
-        let told = match &self.tell {
-            Some(tell) => Python::attach(|py| tell.call1(py, (stage, done, total)).map(drop)).map_err(foreign),
-            None => Ok(()),
-        };
-        self.raised = told.and_then(|()| (self.signals)()).err();
-        self.raised.is_none()
-    }
-
-    /// The outcome, with what Python raised in place of the interruption that it caused.
-    fn outcome<T>(self, outcome: swm::core::Result<T>) -> PyResult<T> {
-        match self.raised {
-            Some(error) => Err(raised(error)),
-            None => outcome.map_err(raised),
+/// A control that reports progress to Python's `tell(stage, done, total)` and lets Python handle signals. An exception
+/// that either raises stops the run.
+fn control<'a>(tell: Option<Py<PyAny>>) -> Control<'a> {
+    let failed = Arc::new(Mutex::new(None));
+    let raised = Arc::clone(&failed);
+    let mut signals = signals();
+    let control =
+        Control::new().with_poll(move || match failed.lock().unwrap_or_else(PoisonError::into_inner).take() {
+            Some(error) => Err(foreign(error)),
+            None => signals(),
+        });
+    let Some(tell) = tell else { return control };
+    control.with_events(move |event| {
+        let Event::Progress(at) = event else { return };
+        let outcome = Python::attach(|py| tell.call1(py, (at.stage, at.done, at.total)).map(drop));
+        if let Err(error) = outcome {
+            raised.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
         }
-    }
-}
-
-fn stage(stage: Stage) -> &'static str {
-    match stage {
-        Stage::Comparing => "compare",
-        Stage::Writing => "convert",
-        Stage::Verifying => "verify",
-    }
+    })
 }
 
 fn text(found: &impl serde::Serialize) -> PyResult<String> {
@@ -105,13 +89,12 @@ pub fn convert(
     tell: Option<Py<PyAny>>,
 ) -> PyResult<String> {
     let options = json::<Wanted>("conversion", options)?.options()?;
-    let mut watch = Watch::new(tell);
+    let mut control = control(tell);
     let converted = work(py, || {
         let target = home::target(target, options.format.as_deref())?;
-        let mut progress = |at, done, total| watch.at(stage(at), done, total);
-        swm::data::convert(&dataset.reader()?, &target, &options, &mut progress)
+        swm::data::convert(&dataset.reader()?, &target, &options, &mut control)
     });
-    text(&watch.outcome(converted)?)
+    text(&converted.map_err(raised)?)
 }
 
 /// Examines a dataset, and writes what is sound of it to `target` if there is one; returns what was found as JSON.
@@ -124,24 +107,22 @@ pub fn doctor(
     tell: Option<Py<PyAny>>,
 ) -> PyResult<String> {
     let options = json::<Wanted>("repair", options)?.options()?;
-    let mut watch = Watch::new(tell);
+    let mut control = control(tell);
     let found = work(py, || {
-        let (reader, lost) = open_what_is_left(&home::find_dataset(path)?)?;
-        let total = reader.episodes().len();
-        let mut diagnosis = examine(&*reader, &mut |done| watch.at("examine", done, total))?;
-        diagnosis.add_lost(lost);
+        let (reader, lost) = open_damaged(&home::find_dataset(path)?)?;
+        let mut diagnosis = examine(&*reader, &DATASET_REQUIREMENTS, &mut control)?;
+        diagnosis.add_losses(lost);
         let mut repaired: Option<Converted> = None;
         if let Some(target) = target {
             let target: Location = home::target(target, options.format.as_deref())?;
-            let mut progress = |at, done, total| watch.at(stage(at), done, total);
-            repaired = Some(repair(&reader, &diagnosis, &target, &options, &mut progress)?);
+            repaired = Some(repair(&reader, &diagnosis, &target, &options, &mut control)?);
         }
         let mut found = value!(diagnosis);
         found["problems"] = value!(diagnosis.problems());
         found["repaired"] = value!(repaired);
         Ok(found)
     });
-    text(&watch.outcome(found)?)
+    text(&found.map_err(raised)?)
 }
 
 /// What is in a dataset, as JSON. With `summed` everything is read for the checksum of what readers get.

@@ -6,22 +6,23 @@ use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use swm_core::run::{Control, Event};
 use swm_core::{Batch, ColumnSpec, DType, Error, Key, Result, Schema};
-use swm_data::convert::Stage;
 use swm_data::{
     CommitPolicy, ConvertMode, ConvertOptions, Converted, FORMATS, ImageCodec, Location, Reader, WriteMode,
     WriteOptions, checksum, convert, create, open,
 };
 
 fn run(source: &Path, target: &Path, options: &ConvertOptions) -> Result<Converted> {
-    convert(&open(source)?, &Location::from(target), options, &mut |_, _, _| true)
+    convert(&open(source)?, &Location::from(target), options, &mut Control::new())
 }
 
 fn lossless(mode: ConvertMode) -> ConvertOptions {
     ConvertOptions { mode, codec: ImageCodec::Png, ..ConvertOptions::default() }
 }
 
-/// The episodes `0..9`, pictures lossless.
+/// The episodes `0..9`, images lossless.
 fn source(folder: &Path) -> PathBuf {
     let path = folder.join("source.lance");
     let mut writer = create(&path, &schema(), WriteOptions { codec: ImageCodec::Png, ..options(WriteMode::Create) })
@@ -55,8 +56,8 @@ fn every_format_gives_back_what_it_got() {
         check(&*to, 0);
         assert_eq!(to.manifest().map(|manifest| manifest.seed), from.manifest().map(|manifest| manifest.seed));
         for column in &report.columns {
-            let picture = ["pixels", "goal"].contains(&&column.column[..]);
-            let kept = column.exact || column.psnr.is_some_and(|psnr| picture && psnr > 25.0);
+            let is_image = ["pixels", "goal"].contains(&&column.column[..]);
+            let kept = column.exact || column.psnr.is_some_and(|psnr| is_image && psnr > 25.0);
             assert!(kept, "{}: {column:?}", format.id);
         }
         if report.columns.iter().all(|column| column.exact) {
@@ -75,11 +76,8 @@ fn lossy_pictures_are_judged() {
     let path = source(folder.path());
     let jpeg = ConvertOptions { codec: ImageCodec::Jpeg { quality: 95 }, ..ConvertOptions::default() };
     let report = run(&path, &folder.path().join("fine.lance"), &jpeg).expect("near enough");
-    let pictures = report.columns.iter().find(|column| column.column == "pixels").expect("pictures");
-    assert!(
-        !pictures.exact && pictures.max_error >= 1.0 && pictures.psnr.is_some_and(|psnr| psnr > 30.0),
-        "{pictures:?}"
-    );
+    let images = report.columns.iter().find(|column| column.column == "pixels").expect("images");
+    assert!(!images.exact && images.max_error >= 1.0 && images.psnr.is_some_and(|psnr| psnr > 30.0), "{images:?}");
     assert!(report.columns.iter().filter(|column| column.column == "state").all(|column| column.exact));
     let strict = ConvertOptions { least_psnr: 90.0, ..jpeg };
     let error = run(&path, &folder.path().join("strict.lance"), &strict).expect_err("not near enough").to_string();
@@ -90,27 +88,27 @@ fn lossy_pictures_are_judged() {
 }
 
 #[test]
-fn a_stopped_conversion_goes_on_and_other_data_are_refused() {
+fn resumes_a_stopped_conversion_and_rejects_other_targets() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = source(folder.path());
     let target = folder.path().join("target.lance");
     for stop in [1, 4, 9] {
         let mut stages = vec![];
-        let mut progress = |stage, done, _| {
-            stages.push(stage);
-            stage != Stage::Writing || done < stop
-        };
-        let stopped = convert(
-            &open(&path).expect("opens"),
-            &Location::from(&target),
-            &lossless(ConvertMode::Resume),
-            &mut progress,
-        );
+        let flag = Arc::new(AtomicBool::new(false));
+        let mut control = Control::new().with_interrupt(Arc::clone(&flag)).with_events(|event| {
+            if let Event::Progress(at) = event {
+                stages.push(at.stage);
+                flag.store(at.stage == "convert" && at.done >= stop, Ordering::Relaxed);
+            }
+        });
+        let reader = open(&path).expect("opens");
+        let options = lossless(ConvertMode::Resume);
+        let stopped = convert(&reader, &Location::from(&target), &options, &mut control);
+        drop(control);
         assert!(matches!(stopped, Err(Error::Interrupted)), "{stopped:?}");
         assert_eq!(open(&target).expect("opens").episodes().len(), stop, "what was written is kept");
-        assert_eq!(stages.contains(&Stage::Comparing), stop > 1);
+        assert_eq!(stages.contains(&"compare"), stop > 1);
     }
-    // What a killed process leaves may end anywhere, as this does.
     let report = run(&path, &target, &lossless(ConvertMode::Resume)).expect("compares");
     assert_eq!((report.episodes, report.kept, report.rows), (9, 9, 0));
     assert_eq!(
@@ -134,50 +132,51 @@ fn a_stopped_conversion_goes_on_and_other_data_are_refused() {
     check(&*open(&other).expect("opens"), 0);
 }
 
-/// What the child process converts to; only set for it. Its source is beside it.
+/// Environment variable of the child process: the target of the conversion. The source is in the same folder.
 const TARGET: &str = "SWM_TEST_CONVERT_TARGET";
 
-/// Not a test of its own: the process that the test below kills. A line for every episode.
+/// The child process of the next test, which kills it. Prints a line per episode. Without the variable it does nothing.
 #[test]
 fn child_that_converts() {
     let Some(target) = std::env::var_os(TARGET).map(PathBuf::from) else { return };
     let commit = CommitPolicy { episodes: 2, ..CommitPolicy::default() };
     let source = open(target.with_file_name("source.lance")).expect("opens");
     let options = ConvertOptions { commit, ..lossless(ConvertMode::Resume) };
-    let mut progress = |stage, done, _| {
-        println!("{stage:?} {done}");
-        true
-    };
-    let report = convert(&source, &Location::from(&target), &options, &mut progress).expect("converts");
+    let mut control = Control::new().with_events(|event| {
+        if let Event::Progress(at) = event {
+            println!("{} {}", at.stage, at.done);
+        }
+    });
+    let report = convert(&source, &Location::from(&target), &options, &mut control).expect("converts");
     println!("done {}", report.checksum.expect("verified"));
 }
 
 #[test]
-fn a_killed_conversion_goes_on() {
+fn resumes_a_killed_conversion() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("source.lance");
     write(&path, WriteMode::Create, 40, 0..40);
     let expected = checksum(&*open(&path).expect("opens")).expect("a checksum");
     let target = folder.path().join("target.lance");
-    let mut moments = Key::new(7).rng();
+    let mut rng = Key::new(7).rng();
     let (mut kills, mut finished, mut continued) = (0, 0, false);
     while kills < 50 || finished == 0 {
         let mut command = Command::new(std::env::current_exe().expect("this program"));
         command.args(["--exact", "convert::child_that_converts", "--nocapture"]).env(TARGET, &target);
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("starts");
         let mut lines = BufReader::new(child.stdout.take().expect("its output")).lines();
-        // Killed after so many lines, unless it is through before.
-        let kill_after = if kills < 50 { moments.random_range(0..60) } else { usize::MAX };
+        // The child is killed after this many lines, unless it finishes earlier.
+        let kill_after = if kills < 50 { rng.random_range(0..60) } else { usize::MAX };
         let mut done = None;
         for line in lines.by_ref().map(|line| line.expect("text")).take(kill_after) {
-            continued |= line.contains("Comparing");
+            continued |= line.contains("compare");
             done = line.split_once("done ").map(|(_, checksum)| checksum.trim().to_owned()).or(done);
         }
         let _ = child.kill();
         child.wait().expect("gone");
         kills += usize::from(done.is_none());
         if target.exists() {
-            // Whatever it left is whole episodes, in order.
+            // The target always holds complete episodes, in order.
             check(&*open(&target).expect("opens"), 0);
         }
         if let Some(checksum) = done {
@@ -187,7 +186,7 @@ fn a_killed_conversion_goes_on() {
             finished += 1;
         }
     }
-    assert!(continued, "some of the fifty were killed half way");
+    assert!(continued, "at least one of the fifty was killed in the middle and resumed");
 }
 
 /// A foreign dataset whose last rows have actions.
@@ -233,7 +232,7 @@ fn actions_that_lead_nowhere_are_left_out_and_told() {
     let schema = Schema::new([ColumnSpec::new("action", DType::Float32, [1])]).expect("schema");
     let reader: Arc<dyn Reader> = Arc::new(Foreign(schema));
     let report =
-        convert(&reader, &Location::from(&target), &ConvertOptions::default(), &mut |_, _, _| true).expect("converts");
+        convert(&reader, &Location::from(&target), &ConvertOptions::default(), &mut Control::new()).expect("converts");
     assert_eq!((report.episodes, report.last_actions), (2, 2));
     let read = open(&target).expect("opens");
     let batch: Batch = read.read(&["action"], &[swm_data::StepRange::new(0, 0, 3)]).expect("reads");
@@ -250,7 +249,7 @@ fn double_precision_survives_or_its_rounding_is_told() {
     batch.get_mut::<f64>("state").expect("states").copy_from_slice(&[0.1, -1.0 / 3.0, 1e-9, 7.0]);
     let buffer = swm_data::ReplayBuffer::new(&schema, 10).expect("a buffer");
     buffer.add(&batch, &swm_data::Constants::new()).expect("adds");
-    let report = convert(&buffer.snapshot(), &Location::from(&path), &ConvertOptions::default(), &mut |_, _, _| true)
+    let report = convert(&buffer.snapshot(), &Location::from(&path), &ConvertOptions::default(), &mut Control::new())
         .expect("converts");
     let state = &report.columns[0];
     assert!(state.exact || (state.max_error > 0.0 && state.max_error < 1e-7), "{state:?}");

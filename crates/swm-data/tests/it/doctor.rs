@@ -1,19 +1,22 @@
-//! Datasets broken on purpose: each break is found, told, and left out of a repaired dataset.
+//! The doctor finds deliberate defects, reports them, and omits defective episodes from a repaired dataset.
 
 use crate::sample::{episode, rows, schema, write};
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use swm_core::requirements::DatasetRequirements;
+use swm_core::run::Control;
 use swm_core::{Batch, ColumnSpec, Error, Manifest, Result, Schema};
-use swm_data::doctor::{Diagnosis, Finding, Severity, examine, open_what_is_left, repair};
+use swm_data::doctor::{Diagnosis, Finding, Severity, examine, open_damaged, repair};
 use swm_data::{Constants, ConvertOptions, Episode, Irregularity, Location, Reader, StepRange, WriteMode, open};
 
-/// The episodes of the sample, given by whatever has broken them.
+/// A reader of the sample episodes with deliberate defects.
 #[derive(Default)]
 struct Broken {
     schema: Option<Schema>,
     episodes: Vec<Episode>,
     rows: Vec<Batch>,
-    /// Episodes whose pictures cannot be read.
+    /// Positions of episodes whose images cannot be read.
     damaged: Vec<usize>,
     irregular: Vec<Irregularity>,
 }
@@ -46,7 +49,7 @@ impl Reader for Broken {
         let mut at = 0;
         for range in ranges {
             if column == "pixels" && self.damaged.contains(&range.episode) {
-                return Err(Error::external("decoding a picture", "it is cut off"));
+                return Err(Error::external("decoding an image", "it is truncated"));
             }
             let bytes = &self.rows[range.episode].bytes(index)[range.start * n..(range.start + range.length) * n];
             out[at..at + bytes.len()].copy_from_slice(bytes);
@@ -76,11 +79,17 @@ impl Reader for Broken {
     }
 }
 
+/// Requirements of a world model, and of an agent that learns from states and rewards.
+const MODELS: [DatasetRequirements; 2] = [
+    DatasetRequirements { model: "world model", images: true, reward: false, clip_rows: 20 },
+    DatasetRequirements { model: "agent", images: false, reward: true, clip_rows: 4 },
+];
+
 fn diagnose(reader: &dyn Reader) -> Diagnosis {
-    examine(reader, &mut |_| true).expect("examines")
+    examine(reader, &MODELS, &mut Control::new()).expect("examines")
 }
 
-/// The one problem that is there: its words and episodes.
+/// The only problem: its description and episodes.
 fn problem(diagnosis: &Diagnosis) -> (String, Vec<usize>) {
     let problems: Vec<_> = diagnosis.findings.iter().filter(|found| found.severity == Severity::Problem).collect();
     assert_eq!(problems.len(), 1, "{problems:?}");
@@ -88,51 +97,51 @@ fn problem(diagnosis: &Diagnosis) -> (String, Vec<usize>) {
 }
 
 #[test]
-fn what_was_collected_is_clean() {
+fn collected_dataset_has_no_findings() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..8);
     let diagnosis = diagnose(&*open(&path).expect("opens"));
     assert_eq!((diagnosis.problems(), diagnosis.findings.len(), diagnosis.sound.len()), (0, 0, 8), "{diagnosis:?}");
     assert_eq!(diagnosis.rows, (0..8).map(rows).sum::<usize>());
-    // Eleven rows are no clip of 4 frames and frameskip 5.
+    // The longest episode, with eleven rows, is shorter than a clip of the world model.
     let fits: Vec<&str> = diagnosis.models.iter().filter(|fit| fit.fits()).map(|fit| fit.model).collect();
-    assert_eq!(fits, ["TD-MPC2", "GCBC", "GCIVL", "GCIQL"]);
+    assert_eq!(fits, ["agent"]);
     assert!(diagnosis.models[0].missing[0].contains("the longest has 11"), "{:?}", diagnosis.models[0]);
 }
 
 #[test]
-fn a_number_that_stands_for_two_episodes_is_found_in_a_table() {
+fn finds_a_repeated_episode_index_in_a_table() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/broken.lance");
     let reader = open(&path).expect("opens");
     let diagnosis = diagnose(&*reader);
     let problems: Vec<_> = diagnosis.findings.iter().filter(|found| found.severity == Severity::Problem).collect();
     assert!(problems.iter().all(|found| found.episodes == [1]), "{problems:?}");
-    assert!(problems.iter().any(|found| found.what.contains("0 stands in row 2")), "{problems:?}");
+    assert!(problems.iter().any(|found| found.what.contains("row 2 holds 0")), "{problems:?}");
     assert!(problems.iter().any(|found| found.what.contains("no action in a row that is not the last")));
     assert_eq!(diagnosis.sound, [0, 2]);
 }
 
 #[test]
 #[cfg(feature = "hdf5")]
-fn steps_that_restart_and_rows_of_two_episodes_are_found_in_a_file() {
+fn finds_restarting_steps_and_shared_rows_in_an_hdf5_file() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/broken.h5");
     let diagnosis = diagnose(&*open(&path).expect("opens"));
     let of = |episode: usize| {
         let here = |found: &&Finding| found.severity == Severity::Problem && found.episodes.contains(&episode);
         diagnosis.findings.iter().filter(here).map(|found| found.what.clone()).collect::<Vec<_>>()
     };
-    assert_eq!(of(1), ["the stored steps do not count up from 0: 0 stands in row 2"]);
+    assert_eq!(of(1), ["the stored steps do not count up from 0: row 2 holds 0"]);
     assert!(of(3).contains(&"some of its rows are also those of episode 2".to_owned()), "{:?}", of(3));
     assert_eq!(diagnosis.sound, [0, 2]);
 }
 
 #[test]
-fn what_is_left_of_a_table_is_repaired() {
+fn repairs_the_readable_part_of_a_table() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..8);
-    // One of the four data files is cut, so that the table does not open.
+    // One of the four data files is truncated, so the table does not open.
     let data = std::fs::read_dir(path.join("data")).expect("a folder").flatten();
     let mut files: Vec<_> = data.map(|entry| entry.path()).collect();
     files.sort();
@@ -140,32 +149,32 @@ fn what_is_left_of_a_table_is_repaired() {
     std::fs::write(&files[1], &bytes[..bytes.len() / 2]).expect("writes");
     let location = Location::from(&path);
     assert!(open(&location).is_err());
-    let (reader, lost) = open_what_is_left(&location).expect("most is left");
+    let (reader, lost) = open_damaged(&location).expect("most is left");
     assert!(lost.len() == 1 && lost[0].contains("are lost"), "{lost:?}");
     let mut diagnosis = diagnose(&*reader);
     assert_eq!((diagnosis.episodes, diagnosis.problems()), (6, 0));
-    diagnosis.add_lost(lost);
+    diagnosis.add_losses(lost);
     assert_eq!(diagnosis.problems(), 1);
-    let target = Location::from(folder.path().join("mended.lance"));
-    repair(&reader, &diagnosis, &target, &ConvertOptions::default(), &mut |_, _, _| true).expect("repairs");
-    let mended = open(&target).expect("opens");
-    assert_eq!((diagnose(&*mended).problems(), mended.episodes().len()), (0, 6));
-    // Where nothing opens, the error is that of opening.
+    let target = Location::from(folder.path().join("repaired.lance"));
+    repair(&reader, &diagnosis, &target, &ConvertOptions::default(), &mut Control::new()).expect("repairs");
+    let repaired = open(&target).expect("opens");
+    assert_eq!((diagnose(&*repaired).problems(), repaired.episodes().len()), (0, 6));
+    // If no part can be opened, the error is that of opening.
     files.iter().for_each(|file| std::fs::write(file, b"").expect("writes"));
-    assert!(open_what_is_left(&location).map(|(reader, _)| reader.episodes().len()).unwrap_or(0) == 0);
-    assert!(open_what_is_left(&Location::from(folder.path().join("nothing.lance"))).is_err());
+    assert!(open_damaged(&location).map(|(reader, _)| reader.episodes().len()).unwrap_or(0) == 0);
+    assert!(open_damaged(&Location::from(folder.path().join("nothing.lance"))).is_err());
 }
 
 #[test]
-fn every_break_is_found_where_it_is() {
+fn finds_each_defect_in_its_episode() {
     type Breaking = fn(usize, &mut Batch);
     let breaks: [(&str, Breaking); 7] = [
-        ("'reward' has a number that is not finite", |e, rows| {
+        ("'reward' has a value that is not finite", |e, rows| {
             if e == 2 {
                 rows.get_mut::<f32>("reward").expect("rewards")[1] = f32::NAN;
             }
         }),
-        ("'state' has a number that is not finite", |e, rows| {
+        ("'state' has a value that is not finite", |e, rows| {
             if e == 2 {
                 rows.get_mut::<f64>("state").expect("states")[4] = f64::INFINITY;
             }
@@ -180,12 +189,12 @@ fn every_break_is_found_where_it_is() {
                 rows.get_mut::<f32>("action").expect("actions")[3] = f32::NAN;
             }
         }),
-        ("step 1 stands in row 2", |e, rows| {
+        ("row 2 holds step 1", |e, rows| {
             if e == 2 {
                 rows.get_mut::<i64>("step_idx").expect("steps")[2] = 1;
             }
         }),
-        ("step 3 stands in row 0", |e, rows| {
+        ("row 0 holds step 3", |e, rows| {
             if e == 2 {
                 rows.get_mut::<i64>("step_idx").expect("steps").iter_mut().for_each(|step| *step += 3);
             }
@@ -205,12 +214,12 @@ fn every_break_is_found_where_it_is() {
     broken.damaged = vec![1, 3];
     let diagnosis = diagnose(&broken);
     let (what, episodes) = problem(&diagnosis);
-    assert!(what.contains("'pixels' cannot be read") && what.contains("cut off"), "{what}");
+    assert!(what.contains("'pixels' cannot be read") && what.contains("truncated"), "{what}");
     assert_eq!((episodes, diagnosis.sound), (vec![1, 3], vec![0, 2]));
     let mut broken = Broken::new(4, |_, _| {});
     broken.episodes[3].index = 1;
     let (what, episodes) = problem(&diagnose(&broken));
-    assert!(what.contains("the number 1 stands for another episode") && episodes == [3], "{what}");
+    assert!(what.contains("the index 1 is also that of another episode") && episodes == [3], "{what}");
     let mut broken = Broken::new(4, |_, _| {});
     broken.irregular = vec![Irregularity { episode: None, what: "3 rows belong to no episode".to_owned() }];
     let diagnosis = diagnose(&broken);
@@ -223,7 +232,7 @@ fn every_break_is_found_where_it_is() {
 }
 
 #[test]
-fn what_is_odd_and_sound_is_a_note() {
+fn unusual_but_sound_data_gives_a_note() {
     let notes = |broken: Broken| -> Vec<String> {
         let diagnosis = diagnose(&broken);
         assert_eq!(diagnosis.problems(), 0, "{diagnosis:?}");
@@ -238,15 +247,15 @@ fn what_is_odd_and_sound_is_a_note() {
         }
     });
     assert!(notes(single)[0].contains("no step"));
-    let mut silent = Broken::new(3, |_, _| {});
+    let mut without = Broken::new(3, |_, _| {});
     let columns: Vec<ColumnSpec> = schema().columns().iter().filter(|c| c.name != "reward").cloned().collect();
     let schema = Schema::new(columns).expect("schema");
-    silent.rows = silent.rows.iter().map(|rows| without_reward(&schema, rows)).collect();
-    silent.schema = Some(schema);
-    let diagnosis = diagnose(&silent);
+    without.rows = without.rows.iter().map(|rows| without_reward(&schema, rows)).collect();
+    without.schema = Some(schema);
+    let diagnosis = diagnose(&without);
     assert_eq!(diagnosis.findings[0].what, "there is no reward");
-    let tdmpc2 = diagnosis.models.iter().find(|fit| fit.model == "TD-MPC2").expect("listed");
-    assert_eq!(tdmpc2.missing, ["there is no 'reward'"]);
+    let agent = diagnosis.models.iter().find(|fit| fit.model == "agent").expect("listed");
+    assert_eq!(agent.missing, ["there is no 'reward'"]);
 }
 
 fn without_reward(schema: &Schema, rows: &Batch) -> Batch {
@@ -259,15 +268,15 @@ fn without_reward(schema: &Schema, rows: &Batch) -> Batch {
 }
 
 #[test]
-fn what_is_sound_makes_a_new_dataset() {
+fn repair_writes_the_sound_episodes() {
     let folder = tempfile::tempdir().expect("a folder");
-    let target = folder.path().join("mended.lance");
+    let target = folder.path().join("repaired.lance");
     let broken = Broken::new(6, |e, rows| {
         if e == 1 {
             rows.get_mut::<f32>("reward").expect("rewards").fill(f32::NAN);
         }
         if e == 4 {
-            // Rows and more from nowhere, as a writer leaves them that numbered twice.
+            // Repeated step indices, as after two writers used the same episode index.
             rows.get_mut::<i64>("step_idx").expect("steps").fill(0);
         }
     });
@@ -277,23 +286,24 @@ fn what_is_sound_makes_a_new_dataset() {
     let diagnosis = diagnose(&*reader);
     assert_eq!((diagnosis.problems(), &diagnosis.sound[..]), (3, &[0, 3, 5][..]));
     let to = Location::from(&target);
-    let report = repair(&reader, &diagnosis, &to, &ConvertOptions::default(), &mut |_, _, _| true).expect("repairs");
+    let report = repair(&reader, &diagnosis, &to, &ConvertOptions::default(), &mut Control::new()).expect("repairs");
     assert_eq!(report.episodes, 3);
-    let mended = open(&target).expect("opens");
-    assert_eq!(diagnose(&*mended).problems(), 0);
+    let repaired = open(&target).expect("opens");
+    assert_eq!(diagnose(&*repaired).problems(), 0);
     for (position, e) in [0, 3, 5].into_iter().enumerate() {
-        let read = mended.read(&["state"], &[StepRange::new(position, 0, rows(e))]).expect("reads");
+        let read = repaired.read(&["state"], &[StepRange::new(position, 0, rows(e))]).expect("reads");
         assert_eq!(read.bytes(0), episode(e).bytes(2));
     }
     let hopeless: Arc<dyn Reader> = Arc::new(Broken::new(2, |_, rows| rows.resize(0)));
     let diagnosis = diagnose(&*hopeless);
-    let refused = repair(&hopeless, &diagnosis, &to, &ConvertOptions::default(), &mut |_, _, _| true);
+    let refused = repair(&hopeless, &diagnosis, &to, &ConvertOptions::default(), &mut Control::new());
     assert!(refused.expect_err("nothing is left").to_string().contains("none of its 2 episodes"));
-    let stopped = examine(&*mended, &mut |_| false);
+    let mut control = Control::new().with_interrupt(Arc::new(AtomicBool::new(true)));
+    let stopped = examine(&*repaired, &MODELS, &mut control);
     assert!(matches!(stopped, Err(Error::Interrupted)));
 }
 
-/// Without constants, which Lance cannot keep in this build.
+/// Hides the constants of the inner reader.
 struct Plain(Broken);
 
 impl Reader for Plain {

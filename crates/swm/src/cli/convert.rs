@@ -4,11 +4,9 @@ use super::config::CodecArgs;
 use super::datasets::bytes;
 use super::{Context, Progress, emit, emit_json};
 use clap::{Args, ValueEnum};
-use std::cell::RefCell;
-use std::sync::atomic::Ordering;
 use std::time::Instant;
 use swm::home;
-use swm_data::convert::Stage;
+use swm_core::run::{Control, Event};
 use swm_data::{ConvertMode, ConvertOptions, Converted, Location};
 
 /// Arguments of `swm convert`.
@@ -74,7 +72,7 @@ pub fn convert(args: &ConvertArgs, context: &Context) -> anyhow::Result<()> {
     let reader = home::open_dataset(&args.source)?;
     let target = home::target(&args.target, args.target_args.format.as_deref())?;
     let begun = Instant::now();
-    let report = swm_data::convert(&reader, &target, &options, &mut progress(context))?;
+    let report = swm_data::convert(&reader, &target, &options, &mut control(context))?;
     if context.json {
         return emit_json(&report);
     }
@@ -82,24 +80,18 @@ pub fn convert(args: &ConvertArgs, context: &Context) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Shows how far a conversion has come, until Ctrl-C.
-pub fn progress(context: &Context) -> impl FnMut(Stage, usize, usize) -> bool {
-    let bar: RefCell<Option<(Stage, Progress)>> = RefCell::new(None);
-    move |stage, done, total| {
-        let mut bar = bar.borrow_mut();
-        if bar.as_ref().is_none_or(|(shown, _)| *shown != stage) {
-            let name = match stage {
-                Stage::Comparing => "compare",
-                Stage::Writing => "convert",
-                Stage::Verifying => "verify",
-            };
-            *bar = Some((stage, Progress::new(name, total)));
+/// A control that shows the progress of each stage and stops the run on Ctrl-C.
+pub fn control(context: &Context) -> Control<'static> {
+    let mut bar: Option<Progress> = None;
+    Control::new().with_interrupt(context.stop.clone()).with_events(move |event| match event {
+        Event::Started(stage) => bar = Some(Progress::new(stage.name, stage.total)),
+        Event::Progress(at) => {
+            if let Some(bar) = &mut bar {
+                bar.at(at.done, "");
+            }
         }
-        if let Some((_, bar)) = &*bar {
-            bar.at(done, "");
-        }
-        !context.stop.load(Ordering::Relaxed)
-    }
+        _ => {}
+    })
 }
 
 /// What became of it, in words.

@@ -1,14 +1,14 @@
 //! `swm doctor`: what is wrong with a dataset, which models it can train, and a new dataset of what is sound.
 
-use super::convert::{TargetArgs, progress, words};
-use super::{Context, Progress, emit, emit_json, table};
+use super::convert::{TargetArgs, control, words};
+use super::{Context, complain, emit, emit_json, table};
 use clap::Args;
 use serde_json::json;
-use std::sync::atomic::Ordering;
 use std::time::Instant;
+use swm::dataset_requirements::DATASET_REQUIREMENTS;
 use swm::home;
 use swm_data::ConvertMode;
-use swm_data::doctor::{Diagnosis, Finding, Severity, examine, open_what_is_left, repair};
+use swm_data::doctor::{Diagnosis, Finding, Severity, examine, open_damaged, repair};
 
 /// Arguments of `swm doctor`.
 #[derive(Args)]
@@ -25,7 +25,7 @@ pub struct DoctorArgs {
 /// Examines, and repairs on request. Fails when there are problems that are not repaired.
 pub fn doctor(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
     let name = &args.dataset;
-    let (reader, lost) = match home::find_dataset(name).and_then(|location| open_what_is_left(&location)) {
+    let (reader, lost) = match home::find_dataset(name).and_then(|location| open_damaged(&location)) {
         Ok(opened) => opened,
         Err(error) if error.is_usage() => return Err(error.into()),
         Err(error) => {
@@ -38,13 +38,9 @@ pub fn doctor(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
             return Err(anyhow::Error::new(error).context(format!("{name} cannot be opened")));
         }
     };
-    let bar = Progress::new("examine", reader.episodes().len());
-    let mut diagnosis = examine(&*reader, &mut |done| {
-        bar.at(done, "");
-        !context.stop.load(Ordering::Relaxed)
-    })?;
-    diagnosis.add_lost(lost);
-    bar.done(&format!("{} episodes, {} rows", diagnosis.episodes, diagnosis.rows));
+    let mut diagnosis = examine(&*reader, &DATASET_REQUIREMENTS, &mut control(context))?;
+    diagnosis.add_losses(lost);
+    complain(&format!("{:>9}: {} episodes, {} rows\n", "examine", diagnosis.episodes, diagnosis.rows));
     let mut repaired = None;
     if !context.json {
         emit(&report(&diagnosis));
@@ -53,7 +49,7 @@ pub fn doctor(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
         let target = home::target(target, args.target.format.as_deref())?;
         let begun = Instant::now();
         let options = args.target.options(ConvertMode::Resume);
-        let converted = repair(&reader, &diagnosis, &target, &options, &mut progress(context))?;
+        let converted = repair(&reader, &diagnosis, &target, &options, &mut control(context))?;
         if !context.json {
             emit(&words(&converted, &target, begun.elapsed().as_secs_f64()));
         }

@@ -1,137 +1,69 @@
-//! One column: where the chunks of its dataset are, and how the rows that a batch wants are read from them.
+//! One column: its storage layout in the file, and reading of requested rows.
 
+use super::chunks::{Chunk, Grid, Index, read_chunk};
 use super::filters::{Pipeline, Scratch};
 use super::source::Source;
+use super::structure::{catch_panic, scalar_type};
 use crate::dataset::episodes::RowSlot;
 use crate::dataset::objects::Bytes;
-use crate::formats::stored_scalar::{Class, StoredScalar};
-use hdf5_pure::{Dataset, Datatype, DatatypeByteOrder, FloatingPointLayout, Layout};
+use crate::formats::stored_scalar::StoredScalar;
+use hdf5_pure::{Dataset, Layout};
 use rayon::prelude::*;
 use std::cell::RefCell;
 use std::collections::HashMap;
 use std::ops::Range;
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::OnceLock;
 use swm_core::ColumnSpec;
 
-/// Chunks larger than this are refused: nobody writes them, and damaged files promise any size.
+/// Larger chunks are rejected, because only damaged files declare them.
 const MAX_CHUNK_BYTES: u64 = 128 << 20;
 
-/// Bytes of a contiguous dataset that are read at once.
+/// Maximum index of bytes that one read of contiguous rows covers.
 const RUN_BYTES: u64 = 1 << 20;
 
 thread_local! {
     static BUFFERS: RefCell<Buffers> = RefCell::default();
 }
 
-/// Memory of a thread for reading chunks.
+/// Buffers of a thread for reading chunks.
 #[derive(Default)]
 struct Buffers {
     stored: Vec<u8>,
     chunk: Vec<u8>,
-    numbers: Vec<u8>,
+    rows_buffer: Vec<u8>,
     scratch: Scratch,
 }
 
-/// A dataset of rows.
+/// An HDF5 dataset of rows.
 pub(super) struct Column {
     pub spec: ColumnSpec,
-    /// How many rows it has.
+    /// Number of rows.
     pub rows: u64,
     dataset: Dataset,
     stored: StoredScalar,
     storage: Storage,
-    /// Whether we wrote it: then every chunk is there.
+    /// Whether this format's writer wrote it. Then no chunk may be missing.
     pub written_here: bool,
 }
 
 enum Storage {
-    /// One row after another from this byte on, or in the dataset's header.
+    /// Rows are contiguous from this address on, or never written; or they are in the dataset's header.
     Contiguous(Option<u64>),
     Compact,
     Chunked {
         pipeline: Pipeline,
-        /// Rows of a chunk, and its sides within a row.
+        /// Rows per chunk, and its other sides.
         rows: u64,
         sides: Vec<usize>,
         index: OnceLock<Result<Index, String>>,
     },
 }
 
-/// Where the chunks are, by their slot in the grid of chunks.
-struct Index {
-    chunks: Vec<Chunk>,
-    /// The decoded last row of chunks, when its chunks hold several rows: a writer at work moves it.
-    tail: Option<(u64, Vec<u8>)>,
-}
-
-#[derive(Clone, Copy, Debug)]
-struct Chunk {
-    /// Its number in the grid.
-    number: u64,
-    address: u64,
-    size: u32,
-    filter_mask: u32,
-}
-
-/// Runs code of `hdf5-pure`, in which a damaged file may provoke a panic.
-pub(super) fn catch_panic<T, E: std::fmt::Display>(
-    what: &str,
-    code: impl FnOnce() -> Result<T, E>,
-) -> Result<T, String> {
-    match catch_unwind(AssertUnwindSafe(code)) {
-        Ok(result) => result.map_err(|e| format!("{what}: {e}")),
-        Err(_) => Err(format!("{what}: the library that reads HDF5 gave up on it")),
-    }
-}
-
-/// The number type of a dataset; none for text and records.
-fn scalar_type(datatype: &Datatype) -> Option<StoredScalar> {
-    let (class, size, order) = match datatype {
-        Datatype::FixedPoint { size, byte_order, layout } => {
-            if layout.bit_offset != 0 || u32::from(layout.bit_precision) != size * 8 {
-                return None;
-            }
-            (if layout.signed { Class::Signed } else { Class::Unsigned }, *size, *byte_order)
-        }
-        Datatype::FloatingPoint { size, byte_order, layout } => {
-            // IEEE 754, of 16, 32 or 64 bits.
-            let half = FloatingPointLayout {
-                bit_precision: 16,
-                exponent_location: 10,
-                exponent_size: 5,
-                mantissa_size: 10,
-                exponent_bias: 15,
-                ..FloatingPointLayout::IEEE754_BINARY32
-            };
-            let known =
-                [(2, half), (4, FloatingPointLayout::IEEE754_BINARY32), (8, FloatingPointLayout::IEEE754_BINARY64)];
-            if !known.contains(&(*size, *layout)) {
-                return None;
-            }
-            (Class::Float, *size, *byte_order)
-        }
-        // What h5py makes of booleans.
-        Datatype::Enumeration { size: 1, members, .. } if members.len() == 2 => {
-            (Class::Bool, 1, DatatypeByteOrder::LittleEndian)
-        }
-        Datatype::Enumeration { base_type, .. } => return scalar_type(base_type),
-        _ => return None,
-    };
-    let big_endian = match order {
-        DatatypeByteOrder::LittleEndian => false,
-        DatatypeByteOrder::BigEndian => true,
-        DatatypeByteOrder::Vax => return None,
-    };
-    let stored = StoredScalar { class, size: size as usize, big_endian };
-    stored.dtype().map(|_| stored)
-}
-
 impl Column {
-    /// A dataset as a column of its rows; `None` when it holds no numbers.
+    /// Interprets a dataset as a column; `None` if it is not numeric.
     ///
     /// # Errors
-    /// When it is damaged, or stored in a way that is not understood.
+    /// If it is damaged, or its layout or filters are not supported.
     pub fn new(name: &str, dataset: Dataset, file_size: u64) -> Result<Option<Self>, String> {
         let Some(stored) = scalar_type(&catch_panic("its type", || dataset.datatype())?) else { return Ok(None) };
         let Some(dtype) = stored.dtype() else { return Ok(None) };
@@ -170,7 +102,7 @@ impl Column {
                 if chunk_shape.len() != shape.len() || !fits(bytes) || !fits(block) {
                     return Err(format!("its chunks have the shape {chunk_shape:?}, which is too large"));
                 }
-                // A chunk takes some bytes of the file, if only in the list of chunks.
+                // Every chunk takes some bytes of the file, at least in the list of chunks.
                 let least = if pipeline.is_empty() { bytes.unwrap_or(0) } else { 8 };
                 let chunks = shape
                     .iter()
@@ -186,7 +118,7 @@ impl Column {
                     index: OnceLock::new(),
                 }
             }
-            other => return Err(format!("its data are {other}, which is not read")),
+            other => return Err(format!("its data layout {other} is not supported")),
         };
         Ok(Some(Self {
             spec: ColumnSpec::new(name, dtype, sides),
@@ -198,17 +130,17 @@ impl Column {
         }))
     }
 
-    /// Whether numbers are stored as we store them.
+    /// Whether the file stores the column's type.
     pub fn is_plain(&self) -> bool {
         self.stored.is_plain()
     }
 
-    /// Bytes of a stored row.
+    /// Size of a stored row in bytes.
     fn stored_row(&self) -> usize {
         self.spec.len() * self.stored.size
     }
 
-    /// Bytes in the file.
+    /// Size in the file, in bytes.
     pub fn footprint(&self, source: &Source) -> Result<u64, String> {
         match &self.storage {
             Storage::Contiguous(_) | Storage::Compact => Ok(self.rows * self.stored_row() as u64),
@@ -216,10 +148,10 @@ impl Column {
         }
     }
 
-    /// All rows, as the column holds them.
+    /// Reads all rows.
     ///
     /// # Errors
-    /// When they are damaged.
+    /// If they are damaged.
     pub fn read_all(&self, source: &Source) -> Result<Vec<u8>, String> {
         let size = self.spec.row_bytes();
         let mut all = vec![0; self.rows as usize * size];
@@ -229,10 +161,10 @@ impl Column {
         Ok(all)
     }
 
-    /// Reads rows of the table, each to its slot. They are sorted by `row_of` their keys.
+    /// Reads rows into their slots, which are sorted by `row_of` their keys.
     ///
     /// # Errors
-    /// When they are damaged.
+    /// If they are damaged.
     pub fn read(
         &self,
         source: &Source,
@@ -250,7 +182,7 @@ impl Column {
             }
             Storage::Contiguous(Some(address)) => self.read_contiguous(source, *address, slots, &row_of),
             Storage::Chunked { pipeline, rows, sides, .. } => {
-                let grid = Grid::new(*rows, sides, self);
+                let grid = Grid::new(*rows, sides, &self.spec.shape, self.stored.size);
                 self.read_chunks(source, pipeline, &grid, slots, &row_of)
             }
         }
@@ -265,7 +197,7 @@ impl Column {
     ) -> Result<(), String> {
         let size = self.stored_row() as u64;
         let most = (RUN_BYTES / size).max(1);
-        // Runs of rows that follow each other, each read in one go.
+        // Runs of consecutive rows, each read at once.
         let runs: Vec<&mut [RowSlot<'_>]> = {
             let mut runs = vec![];
             let mut rest = slots;
@@ -310,7 +242,7 @@ impl Column {
         })
     }
 
-    /// Copies slots rows from stored ones, the first of which is row `first`.
+    /// Copies rows into their slots. `stored` starts with row `first`.
     fn copy_rows(
         &self,
         stored: &[u8],
@@ -321,7 +253,7 @@ impl Column {
         let size = self.stored_row();
         for (key, slot) in slots {
             let at = (row_of(*key) - first) as usize * size;
-            let row = stored.get(at..at + size).ok_or("its data are cut off")?;
+            let row = stored.get(at..at + size).ok_or("its data is truncated")?;
             self.stored.convert(row, slot)?;
         }
         Ok(())
@@ -337,7 +269,7 @@ impl Column {
     ) -> Result<(), String> {
         let index = self.index(source)?;
         let same_chunks = |a: &RowSlot<'_>, b: &RowSlot<'_>| row_of(a.0) / grid.rows == row_of(b.0) / grid.rows;
-        // From far away, all chunks are fetched at once.
+        // From a remote file, all chunks are fetched at once.
         let mut ranges: Vec<Range<u64>> = vec![];
         if source.is_remote() {
             let rows = slots.chunk_by(same_chunks).map(|group| row_of(group[0].0) / grid.rows);
@@ -355,37 +287,37 @@ impl Column {
                 return self.copy_rows(decoded, row * grid.rows, group, row_of);
             }
             BUFFERS.with_borrow_mut(|buffers| {
-                let Buffers { stored, chunk, numbers, scratch } = buffers;
+                let Buffers { stored, chunk, rows_buffer, scratch } = buffers;
                 let chunks = index.row(row, grid);
-                // The usual case: the chunk is the row, slots once.
+                // The common case: the chunk is one row, requested once.
                 if let ([found], [(_, slot)], true) = (chunks, &mut *group, self.stored.is_plain() && grid.is_row()) {
                     return read_chunk(source, pipeline, found, fetched(found), stored, scratch, slot);
                 }
-                numbers.resize(grid.rows as usize * self.stored_row(), 0);
+                rows_buffer.resize(grid.rows as usize * self.stored_row(), 0);
                 if chunks.len() != grid.per_row() {
-                    // Never written: numbers that nobody set.
-                    numbers.fill(0);
+                    // Chunks that were never written read as 0.
+                    rows_buffer.fill(0);
                 }
                 for found in chunks {
                     if grid.covers_rows() {
-                        read_chunk(source, pipeline, found, fetched(found), stored, scratch, numbers)?;
+                        read_chunk(source, pipeline, found, fetched(found), stored, scratch, rows_buffer)?;
                     } else {
                         chunk.resize(grid.chunk_bytes, 0);
                         read_chunk(source, pipeline, found, fetched(found), stored, scratch, chunk)?;
-                        grid.copy_chunk(found.number, chunk, numbers);
+                        grid.copy_chunk(found.index, chunk, rows_buffer);
                     }
                 }
-                self.copy_rows(numbers, row * grid.rows, group, row_of)
+                self.copy_rows(rows_buffer, row * grid.rows, group, row_of)
             })
         })
     }
 
-    /// Where the chunks are. Read when it is first asked for.
+    /// The index of chunks, read at the first access.
     fn index(&self, source: &Source) -> Result<&Index, String> {
         let Storage::Chunked { pipeline, rows, sides, index } = &self.storage else {
             return Err("it has no chunks".to_owned());
         };
-        let grid = Grid::new(*rows, sides, self);
+        let grid = Grid::new(*rows, sides, &self.spec.shape, self.stored.size);
         let index = index.get_or_init(|| self.read_index(source, pipeline, &grid));
         index.as_ref().map_err(Clone::clone)
     }
@@ -402,23 +334,23 @@ impl Column {
             if !inside {
                 return Err(format!("a chunk lies at byte {}, beyond the end of the file", chunk.address));
             }
-            let number = grid.number(&chunk.offset).ok_or("a chunk lies outside its grid")?;
-            chunks.push(Chunk { number, address: chunk.address, size, filter_mask: chunk.filter_mask });
+            let index = grid.chunk_index(&chunk.offset).ok_or("a chunk lies outside its grid")?;
+            chunks.push(Chunk { index, address: chunk.address, size, filter_mask: chunk.filter_mask });
         }
-        chunks.sort_unstable_by_key(|chunk| chunk.number);
-        if chunks.windows(2).any(|pair| pair[0].number == pair[1].number) {
-            return Err("two chunks are in the same slot".to_owned());
+        chunks.sort_unstable_by_key(|chunk| chunk.index);
+        if chunks.windows(2).any(|pair| pair[0].index == pair[1].index) {
+            return Err("two chunks have the same index".to_owned());
         }
-        // Files of others may be sparse, though more often they are damaged.
+        // Third-party files may be sparse, but are more often damaged.
         let expected = self.rows.div_ceil(grid.rows).saturating_mul(grid.per_row() as u64);
-        let present = chunks.partition_point(|chunk| chunk.number < expected) as u64;
+        let present = chunks.partition_point(|chunk| chunk.index < expected) as u64;
         if present < if self.written_here { expected } else { expected / 2 } {
-            return Err(format!("of its {expected} chunks there are {present}"));
+            return Err(format!("only {present} of its {expected} chunks exist"));
         }
         let mut addresses: Vec<u64> = chunks.iter().map(|chunk| chunk.address).collect();
         addresses.sort_unstable();
         if addresses.windows(2).any(|pair| pair[0] == pair[1]) {
-            return Err("two chunks lie in the same slot of the file".to_owned());
+            return Err("two chunks have the same address".to_owned());
         }
         let mut index = Index { chunks, tail: None };
         if grid.rows > 1
@@ -429,126 +361,8 @@ impl Column {
             let mut decoded = vec![0; grid.chunk_bytes];
             let (mut stored, mut scratch) = (vec![], Scratch::default());
             read_chunk(source, pipeline, last, None, &mut stored, &mut scratch, &mut decoded)?;
-            index.tail = Some((last.number, decoded));
+            index.tail = Some((last.index, decoded));
         }
         Ok(index)
-    }
-}
-
-fn read_chunk(
-    source: &Source,
-    pipeline: &Pipeline,
-    chunk: &Chunk,
-    fetched: Option<&Bytes>,
-    stored: &mut Vec<u8>,
-    scratch: &mut Scratch,
-    out: &mut [u8],
-) -> Result<(), String> {
-    let within = |problem: String| format!("chunk {}: {problem}", chunk.number);
-    if let Some(bytes) = fetched {
-        return pipeline.decode(bytes, chunk.filter_mask, scratch, out).map_err(within);
-    }
-    if pipeline.is_empty() {
-        return source.read(chunk.address, out).map_err(|e| within(e.to_string()));
-    }
-    stored.resize(chunk.size as usize, 0);
-    source.read(chunk.address, stored).map_err(|e| within(e.to_string()))?;
-    pipeline.decode(stored, chunk.filter_mask, scratch, out).map_err(within)
-}
-
-impl Chunk {
-    fn range(&self) -> Range<u64> {
-        self.address..self.address + u64::from(self.size)
-    }
-}
-
-impl Index {
-    /// The chunks of a row of the grid.
-    fn row(&self, row: u64, grid: &Grid) -> &[Chunk] {
-        let per_row = grid.per_row() as u64;
-        let at = |number: u64| self.chunks.partition_point(|chunk| chunk.number < number);
-        &self.chunks[at(row.saturating_mul(per_row))..at((row + 1).saturating_mul(per_row))]
-    }
-}
-
-/// How chunks tile the rows.
-struct Grid<'a> {
-    /// Rows of a chunk.
-    rows: u64,
-    /// Its sides within a row, and the row's.
-    sides: &'a [usize],
-    shape: &'a [usize],
-    /// Chunks along each side.
-    counts: Vec<usize>,
-    size: usize,
-    chunk_bytes: usize,
-}
-
-impl<'a> Grid<'a> {
-    fn new(rows: u64, sides: &'a [usize], column: &'a Column) -> Self {
-        let shape = &column.spec.shape;
-        let counts = shape.iter().zip(sides).map(|(whole, side)| whole.div_ceil(*side)).collect();
-        let size = column.stored.size;
-        let chunk_bytes = sides.iter().product::<usize>() * rows as usize * size;
-        Self { rows, sides, shape, counts, size, chunk_bytes }
-    }
-
-    /// How many chunks a row is cut into.
-    fn per_row(&self) -> usize {
-        self.counts.iter().product()
-    }
-
-    /// Whether a chunk holds whole rows and nothing else.
-    fn covers_rows(&self) -> bool {
-        self.sides == self.shape
-    }
-
-    /// Whether a chunk is a row.
-    fn is_row(&self) -> bool {
-        self.rows == 1 && self.covers_rows()
-    }
-
-    /// The number of the chunk that begins there.
-    fn number(&self, offset: &[u64]) -> Option<u64> {
-        let (&row, offsets) = offset.split_first()?;
-        let mut number = row / self.rows;
-        for ((&offset, &side), &count) in offsets.iter().zip(self.sides).zip(&self.counts) {
-            let at = offset / side as u64;
-            if at >= count as u64 {
-                return None;
-            }
-            number = number.checked_mul(count as u64)?.checked_add(at)?;
-        }
-        Some(number)
-    }
-
-    /// Copies what a chunk holds to its slot in the rows of the grid's row.
-    fn copy_chunk(&self, number: u64, chunk: &[u8], rows: &mut [u8]) {
-        let mut rest = number as usize;
-        let mut begin = vec![0; self.sides.len()];
-        for axis in (0..self.sides.len()).rev() {
-            begin[axis] = rest % self.counts[axis] * self.sides[axis];
-            rest /= self.counts[axis];
-        }
-        // Runs along the last side, one for each combination of the others.
-        let Some((&last, outer)) = self.sides.split_last() else { return };
-        let axis = outer.len();
-        let run = last.min(self.shape[axis] - begin[axis]) * self.size;
-        let row_bytes = self.shape.iter().product::<usize>() * self.size;
-        for (i, source) in chunk.chunks_exact(last * self.size).enumerate() {
-            let (mut rest, mut at, mut stride) = (i, begin[axis] * self.size, self.shape[axis] * self.size);
-            let mut inside = true;
-            for axis in (0..outer.len()).rev() {
-                let position = begin[axis] + rest % self.sides[axis];
-                inside &= position < self.shape[axis];
-                at += position * stride;
-                stride *= self.shape[axis];
-                rest /= self.sides[axis];
-            }
-            if inside {
-                at += rest * row_bytes;
-                rows[at..at + run].copy_from_slice(&source[..run]);
-            }
-        }
     }
 }

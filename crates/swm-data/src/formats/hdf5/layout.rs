@@ -1,49 +1,49 @@
-//! The files we write: the oldest structures of HDF5 (superblock 0, headers 1, B-trees 1), which every version of the
-//! library reads. They carry no checksums of their own, so each change that matters is one number written in its place,
-//! and a file is sound at every moment, also when the writer is killed.
+//! The layout of files written here. It uses the oldest structures of HDF5 (superblock 0, object headers 1, B-trees 1),
+//! which every version of the library reads. They have no checksums, so every commit is a single in-place write of a
+//! number, and the file is valid at any time, even if the writer is killed.
 //!
 //! ```text
 //! superblock                               end of the file
 //! root group                               attribute: a reference to the record
-//! its B-tree, heap, and table of names
+//! its B-tree, heap, and symbol table
 //! headers of the record, of ep_len, of ep_offset, of the columns
-//!                                          rows; where the B-tree of chunks is
-//! chunks and nodes of B-trees, in the order in which they came
+//!                                          number of rows; address of the B-tree of chunks
+//! chunks and nodes of B-trees, in order of writing
 //! ```
 //!
-//! The numbers and names come from the specification of the format (version 3.0, "HDF5 File Format Specification").
+//! Constants and names follow the "HDF5 File Format Specification", version 3.0.
 
 use super::filters::{fletcher32, id};
 use super::source::Source;
 use super::tree::read_u64;
 use swm_core::{ColumnSpec, DType, Error, Result};
 
-/// An address of nothing.
+/// The undefined address.
 pub(super) const UNDEFINED: u64 = u64::MAX;
-/// How every HDF5 file begins.
+/// The signature of HDF5 files.
 pub(super) const SIGNATURE: [u8; 8] = *b"\x89HDF\r\n\x1a\n";
-/// Where the superblock says where the file ends.
+/// Offset of the end-of-file address in the superblock.
 pub(super) const END_AT: u64 = 40;
-/// Where it says where the root's B-tree is.
+/// Offset of the address of the root's B-tree in the superblock.
 const ROOT_TREE_AT: u64 = 80;
-/// The root group's header, and the attribute in it that refers to the record.
+/// Offset of the root group's header, and size of its attribute that refers to the record.
 pub(super) const ROOT: u64 = 96;
 /// See [`ROOT`].
 const ATTRIBUTE: &str = "stable_worldmodel.record";
-/// Room in the root's header, so that other programs which add attributes leave written_here where it is.
-const ROOM: usize = 64;
-/// The least half of a node of a group's B-tree; the library's default.
+/// Spare bytes in the root's header, so that programs that add attributes do not move that attribute.
+const SPARE_BYTES: usize = 64;
+/// Minimum number of entries in a node of a group's B-tree; the library's default.
 const GROUP_K: u16 = 16;
 
-/// Rows of small numbers gather in chunks of about this size.
+/// Chunk size in bytes for small rows.
 const CHUNK_BYTES: usize = 8192;
-/// Rows of at least this size are chunks of their own, and compressed.
+/// Rows of at least this size in bytes are single chunks and are compressed.
 const LARGE_ROW: usize = 1024;
 
 pub(super) const LENGTHS: &str = "ep_len";
 pub(super) const OFFSETS: &str = "ep_offset";
 
-/// Kinds of messages in headers.
+/// Types of header messages.
 mod message {
     pub const NOTHING: u16 = 0;
     pub const DATASPACE: u16 = 1;
@@ -55,17 +55,17 @@ mod message {
     pub const SYMBOL_TABLE: u16 = 17;
 }
 
-/// A dataset as its header says it is.
+/// The header of a dataset.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Table {
     pub spec: ColumnSpec,
-    /// Rows of a chunk.
+    /// Rows per chunk.
     pub chunk_rows: usize,
-    /// Whether chunks are compressed (they are rows then), or only summed.
+    /// Whether chunks are compressed (then each is one row) or only have a checksum.
     pub compressed: bool,
-    /// Where its number of rows is in the file.
+    /// Offset of its number of rows in the file.
     pub rows_at: u64,
-    /// Where the address of its B-tree is.
+    /// Offset of the address of its B-tree.
     pub tree_at: u64,
 }
 
@@ -77,44 +77,44 @@ impl Table {
         Self { spec, chunk_rows, compressed, rows_at: 0, tree_at: 0 }
     }
 
-    /// Its header is there.
+    /// A dataset whose header exists.
     fn is_at(&mut self, at: u64) {
         let before: usize = messages(self)[..3].iter().map(|(_, data)| 8 + data.len()).sum();
         self.rows_at = at + 16 + 8 + 8;
         self.tree_at = at + 16 + before as u64 + 8 + 3;
     }
 
-    /// Bytes of a chunk before it is compressed or summed.
+    /// Chunk size in bytes before compression and checksum.
     pub fn chunk_bytes(&self) -> usize {
         self.chunk_rows * self.spec.row_bytes()
     }
 
-    /// Sides of the dataset and of its numbers, as keys of B-trees count.
+    /// Sides of a chunk and size of an element, as B-tree keys require.
     pub fn sides(&self) -> usize {
         self.spec.shape.len() + 2
     }
 }
 
-/// The beginning of a file: everything that does not grow.
+/// The start of a file: everything that does not grow.
 pub(super) struct Layout {
-    /// The bytes, of a file without episodes.
+    /// The bytes of a file without episodes.
     pub bytes: Vec<u8>,
-    /// The record, the episodes' lengths and beginnings, then the columns.
+    /// The record, lengths and first rows of the episodes, then the columns.
     pub tables: Vec<Table>,
 }
 
 impl Layout {
-    /// The file of these columns.
+    /// The layout for these columns.
     ///
     /// # Errors
-    /// When a name or a shape cannot be stored.
+    /// If a name or a shape cannot be stored.
     pub fn new(columns: &[ColumnSpec]) -> Result<Self> {
         for column in columns {
             let problem = match &*column.name {
-                "" | "." => "is no name in an HDF5 file",
-                LENGTHS | OFFSETS => "is used by the format",
-                name if name.contains(['/', '\0']) => "has letters that a name in an HDF5 file must not have",
-                _ if column.is_empty() => "holds no number",
+                "" | "." => "is not a valid name in an HDF5 file",
+                LENGTHS | OFFSETS => "is reserved by the format",
+                name if name.contains(['/', '\0']) => "contains characters that HDF5 names must not contain",
+                _ if column.is_empty() => "has no elements",
                 _ if column.row_bytes() > 64 << 20 || column.shape.len() > 30 => "has rows that are too large",
                 _ => continue,
             };
@@ -153,7 +153,7 @@ impl Layout {
         let mut at = symbols + 8 + 40 * 2 * leaf_k as u64;
         let mut headers = vec![];
         for table in &mut tables {
-            // A header does not cross a boundary of 512 bytes where it has a number that changes.
+            // A header must not cross a 512-byte boundary where a number changes.
             let bytes = header(&messages(table));
             if at % 512 + bytes.len() as u64 > 512 {
                 at = at.next_multiple_of(512);
@@ -165,7 +165,7 @@ impl Layout {
 
         let mut out = superblock(leaf_k as u16, at, tree, heap_at);
         out.extend(header(&root_messages(tree, heap_at, headers[0].0)));
-        // A B-tree of one child.
+        // A B-tree with one child.
         out.extend(b"TREE\0\0");
         out.extend(1_u16.to_le_bytes());
         for value in [UNDEFINED, UNDEFINED, 0, symbols, last] {
@@ -173,7 +173,7 @@ impl Layout {
         }
         out.resize(heap_at as usize, 0);
         out.extend(b"HEAP\0\0\0\0");
-        // No free list: 1 means none.
+        // 1 means that there is no free list.
         for value in [heap.len() as u64, 1, heap_data] {
             out.extend(value.to_le_bytes());
         }
@@ -192,12 +192,12 @@ impl Layout {
         Self { bytes: out, tables }
     }
 
-    /// Whether a file begins as one of written_here does, but for the numbers that change.
+    /// Whether a file starts with this layout, apart from numbers that change.
     pub fn is_that_of(&self, file: &[u8]) -> bool {
         if file.len() != self.bytes.len() {
             return false;
         }
-        let mut changing = vec![(END_AT, 8), (ROOT, 16), (ROOT + ROOT_BYTES, 8 + ROOM as u64)];
+        let mut changing = vec![(END_AT, 8), (ROOT, 16), (ROOT + ROOT_BYTES, 8 + SPARE_BYTES as u64)];
         changing.extend(self.tables.iter().flat_map(|table| [(table.rows_at, 8), (table.tree_at, 8)]));
         changing.sort_unstable();
         let mut at = 0;
@@ -210,26 +210,26 @@ impl Layout {
     }
 }
 
-/// Bytes of the root's header before its room.
+/// Size of the root's header without spare bytes.
 const ROOT_BYTES: u64 = 16 + 8 + 16 + 8 + 8 + 32 + 8 + 8 + 8;
 
-/// The record of a file that we wrote.
+/// The record of a file that was written here.
 ///
 /// # Errors
-/// When the file is cut off.
+/// If the file is truncated.
 pub(super) fn record(source: &Source) -> Result<Option<Table>, String> {
     let mut root = [0; ROOT_BYTES as usize];
     if source.size() < ROOT + ROOT_BYTES {
         return Ok(None);
     }
     source.read(ROOT, &mut root).map_err(|e| e.to_string())?;
-    let number = |at: usize| u64::from_le_bytes(std::array::from_fn(|i| root[at + i]));
-    let (tree, heap, record) = (number(24), number(32), number(root.len() - 8));
+    let read = |at: usize| u64::from_le_bytes(std::array::from_fn(|i| root[at + i]));
+    let (tree, heap, record) = (read(24), read(32), read(root.len() - 8));
     let expected = header(&root_messages(tree, heap, record));
     if root[16..] != expected[16..root.len()] {
-        // No other program puts the root's B-tree there; the superblock says where it is as well.
-        let place = ROOT + ROOT_BYTES + 8 + ROOM as u64;
-        if tree == place || read_u64(source, ROOT_TREE_AT)? == place {
+        // No other program puts the root's B-tree at this address, which the superblock also contains.
+        let address = ROOT + ROOT_BYTES + 8 + SPARE_BYTES as u64;
+        if tree == address || read_u64(source, ROOT_TREE_AT)? == address {
             return Err("the header of its root is damaged".to_owned());
         }
         return Ok(None);
@@ -246,7 +246,7 @@ fn superblock(leaf_k: u16, end: u64, tree: u64, heap: u64) -> Vec<u8> {
     out.extend(leaf_k.to_le_bytes());
     out.extend(GROUP_K.to_le_bytes());
     out.extend(0_u32.to_le_bytes());
-    // Where addresses begin, free space, the end, drivers; then the root group: its name, its header.
+    // Base address, free space, end of file, drivers; then the root group: its name and header.
     for value in [0, UNDEFINED, end, UNDEFINED, 0, ROOT, 1, tree, heap] {
         out.extend(value.to_le_bytes());
     }
@@ -259,7 +259,7 @@ fn header_size(messages: &[Message]) -> usize {
     messages.iter().map(|(_, data)| 8 + data.len()).sum()
 }
 
-/// A header, version 1.
+/// An object header, version 1.
 fn header(messages: &[Message]) -> Vec<u8> {
     let mut out = vec![1, 0];
     out.extend((messages.len() as u16).to_le_bytes());
@@ -269,7 +269,7 @@ fn header(messages: &[Message]) -> Vec<u8> {
     for (kind, data) in messages {
         out.extend(kind.to_le_bytes());
         out.extend((data.len() as u16).to_le_bytes());
-        // A type never changes.
+        // Type messages are constant.
         out.extend([u8::from(*kind == message::DATATYPE), 0, 0, 0]);
         out.extend(data);
     }
@@ -289,7 +289,7 @@ fn root_messages(tree: u64, heap: u64, record: u64) -> Vec<Message> {
     attribute.extend(reference);
     attribute.extend([1, 0, 0, 0, 0, 0, 0, 0]);
     attribute.extend(record.to_le_bytes());
-    vec![(message::SYMBOL_TABLE, group), (message::ATTRIBUTE, attribute), (message::NOTHING, vec![0; ROOM])]
+    vec![(message::SYMBOL_TABLE, group), (message::ATTRIBUTE, attribute), (message::NOTHING, vec![0; SPARE_BYTES])]
 }
 
 /// The messages of a dataset; the layout is the fourth.
@@ -309,14 +309,15 @@ fn messages(table: &Table) -> Vec<Message> {
 
     let mut filters = vec![1, 1 + u8::from(table.compressed), 0, 0, 0, 0, 0, 0];
     if table.compressed {
-        // Optional: what does not become smaller is stored as it is. Its settings are versions and the chunk's size.
+        // Optional filter: chunks that do not become smaller are stored uncompressed. Its settings are versions and the
+        // chunk size.
         filter(&mut filters, id::LZF, b"lzf\0\0\0\0\0", 1, &[4, 0x105, table.chunk_bytes() as u32]);
     }
     filter(&mut filters, id::FLETCHER32, b"fletcher32\0\0\0\0\0\0", 0, &[]);
     vec![
         (message::DATASPACE, dataspace),
         (message::DATATYPE, datatype(table.spec.dtype)),
-        // Space comes with the chunks, and what was never written reads as 0.
+        // Space is allocated with each chunk; unwritten values read as 0.
         (message::FILL_VALUE, vec![2, 3, 2, 1, 0, 0, 0, 0]),
         (message::LAYOUT, layout),
         (message::FILTERS, filters),
@@ -332,7 +333,7 @@ fn filter(out: &mut Vec<u8>, id: u16, name: &[u8], flags: u16, settings: &[u32])
     out.resize(out.len().next_multiple_of(8), 0);
 }
 
-/// The message of a number type.
+/// The message of a numeric type.
 fn datatype(dtype: DType) -> Vec<u8> {
     let whole = |signed: u8, size: u8| vec![0x10, signed << 3, 0, 0, size, 0, 0, 0, 0, 0, size * 8, 0, 0, 0, 0, 0];
     let real = |size: u8, sign: u8, [exponent, exponent_bits, fraction_bits]: [u8; 3], bias: u32| {
@@ -344,7 +345,7 @@ fn datatype(dtype: DType) -> Vec<u8> {
     };
     match dtype {
         DType::Bool => {
-            // As h5py does it: FALSE and TRUE, over a signed byte.
+            // As h5py stores booleans: FALSE and TRUE over a signed byte.
             let mut out = vec![0x18, 2, 0, 0, 1, 0, 0, 0, 0x10, 8, 0, 0, 1, 0, 0, 0, 0, 0, 8, 0];
             out.extend(b"FALSE\0\0\0TRUE\0\0\0\0\0\x01");
             out.resize(out.len().next_multiple_of(8), 0);
@@ -358,7 +359,7 @@ fn datatype(dtype: DType) -> Vec<u8> {
     }
 }
 
-/// Bytes that a chunk which is not compressed takes.
+/// Stored size of an uncompressed chunk, in bytes.
 pub(super) fn summed_bytes(table: &Table) -> usize {
     table.chunk_bytes() + fletcher32::SIZE
 }

@@ -1,26 +1,28 @@
-//! The format `hdf5`: one file, as the reference's `HDF5Dataset` and every HDF5 library read it.
+//! The format `hdf5`: one file that the reference's `HDF5Dataset` and every HDF5 library read.
 //!
-//! A dataset `[rows, shape…]` for each column, all episodes one after another, and `ep_len` and `ep_offset` with the
-//! rows of every episode and its first row. Types, names and shapes are those of the columns.
+//! Each column is a dataset `[rows, shape…]` with all episodes one after another; `ep_len` and `ep_offset` hold the
+//! length and first row of every episode. Types, names and shapes are those of the columns.
 //!
-//! **Reading.** `hdf5-pure` reads the structure of a file. Chunks we read ourselves: those that a batch wants are planned
-//! together, read once each, and decoded on all threads, mostly straight to their place in the batch. Any layout of
-//! chunks is understood, and the filters that h5py and hdf5plugin are used with (`filters/`). `s3://` and `http://`
-//! locations are read by ranges, all those of a batch at once.
+//! **Reading.** `hdf5-pure` reads the structure of a file; chunks are read here. The chunks of a batch are planned
+//! together, read once each, and decoded on all threads, usually straight into the batch. All chunk layouts and the
+//! usual filters of h5py and hdf5plugin are supported (`filters/`). From `s3://` and `http://` locations, all byte
+//! ranges of a batch are read at once.
 //!
-//! **Writing.** Pictures are chunks of one row, compressed with LZF, which h5py reads without plugins: drawn pictures take
-//! a fiftieth of their space and are read faster than uncompressed ones. A chunk that would not become a third smaller
-//! (noise, photographs) is stored as it is. Numbers gather in chunks of 8 KiB. Every chunk carries Fletcher's checksum, so
-//! that damage is found, by other programs as well (all but words of 0xffff where 0x0000 stood, to which that sum is
-//! blind). The structure is of the oldest kind (see `layout`), because it can be
-//! changed safely in place: chunks are written first, then what refers to them, then the lengths of the columns, and the
-//! length of `ep_len` at last, which commits the episodes. A file is sound at every moment; what a killed writer left
-//! behind is not counted, and overwritten by the next.
+//! **Writing.** Images are chunks of one row with LZF compression, which h5py reads without plugins; rendered frames
+//! shrink to a fiftieth and read faster than uncompressed. A chunk that would shrink by less than a third (noise,
+//! photographs) is stored uncompressed. Other columns have chunks of 8 KiB. Every chunk has a Fletcher checksum, so
+//! that other programs also detect damage (except words 0xffff replacing 0x0000, which this checksum cannot
+//! distinguish).
 //!
-//! A writer holds the lock of the file. h5py asks for a lock to read as well, unless `HDF5_USE_FILE_LOCKING=FALSE`.
+//! The structure is of the oldest kind (see `layout`), because it can be changed safely in place. A commit writes
+//! chunks first, then the B-trees that refer to them, then the lengths of the columns, and the length of `ep_len` last.
+//! The file is valid at any time; data of a killed writer is not counted and is overwritten by the next writer.
 //!
-//! To continue a file that another program laid out, it is first copied to our layout, and then takes its place.
+//! A writer locks the file. h5py also locks it for reading, unless `HDF5_USE_FILE_LOCKING=FALSE`. To append to a file
+//! with another layout, the writer first copies it to this layout and replaces it.
 
+#[cfg(feature = "hdf5")]
+mod chunks;
 #[cfg(feature = "hdf5")]
 mod column;
 #[cfg(feature = "hdf5")]
@@ -33,6 +35,8 @@ mod reader;
 mod record;
 #[cfg(feature = "hdf5")]
 mod source;
+#[cfg(feature = "hdf5")]
+mod structure;
 #[cfg(feature = "hdf5")]
 mod table;
 #[cfg(feature = "hdf5")]
@@ -66,7 +70,7 @@ fn detect(location: &Location) -> bool {
     ENTRY.has_suffix(location) || folder.is_some_and(|path| !files(path).is_empty())
 }
 
-/// The files of a folder that are of this format, by name.
+/// The files in a folder with a suffix of this format, sorted by name.
 fn files(folder: &Path) -> Vec<PathBuf> {
     let entries = folder.read_dir().into_iter().flatten().flatten().map(|entry| entry.path());
     let mut files: Vec<PathBuf> = entries.filter(|path| ENTRY.has_suffix(&path.into())).collect();
@@ -74,8 +78,8 @@ fn files(folder: &Path) -> Vec<PathBuf> {
     files
 }
 
+/// The file of a dataset: the location itself, or the only file in a folder, which the reference also supports.
 #[cfg(feature = "hdf5")]
-/// The file of a dataset: itself, or the only one in a folder, which the reference allows as well.
 fn file(location: &Location) -> Result<Location> {
     let Some(folder) = location.path().filter(|path| path.is_dir()) else { return Ok(location.clone()) };
     match &files(folder)[..] {
@@ -83,7 +87,7 @@ fn file(location: &Location) -> Result<Location> {
         [] => Err(Error::corrupt(folder, "it is a folder without .h5 files", "name the file")),
         many => {
             let problem = format!("it holds {} .h5 files", many.len());
-            Err(Error::corrupt(folder, problem, "name the one you mean"))
+            Err(Error::corrupt(folder, problem, "name one of them"))
         }
     }
 }

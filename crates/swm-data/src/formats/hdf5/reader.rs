@@ -1,9 +1,10 @@
-//! Reading episodes.
+//! Reads episodes.
 
-use super::column::{Column, catch_panic};
+use super::column::Column;
 use super::layout::{self, LENGTHS, OFFSETS};
 use super::record::Record;
 use super::source::Source;
+use super::structure::catch_panic;
 use super::table;
 use crate::dataset::Location;
 use crate::dataset::episodes::{EpisodeRows, content_hash, index_columns};
@@ -12,7 +13,7 @@ use std::sync::Arc;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, DType, Error, Manifest, Result, Schema};
 
-/// Rows that are hashed at once.
+/// Rows hashed at once.
 const ROWS_AT_ONCE: usize = 64;
 
 /// Opens a file.
@@ -26,12 +27,12 @@ pub(super) struct Hdf5Reader {
     schema: Schema,
     columns: Vec<Column>,
     record: Record,
-    /// Datasets that hold no numbers.
+    /// Datasets that are not numeric.
     left_out: Vec<String>,
 }
 
 impl Hdf5Reader {
-    /// Opens a file.
+    /// Opens a local or remote file.
     pub fn open(location: &Location) -> Result<Self> {
         Self::of(Source::open(location)?)
     }
@@ -53,7 +54,7 @@ impl Hdf5Reader {
             Ok(column)
         };
         let counts = |name: &str| -> Result<Vec<i64>> {
-            let missing = || damaged(format!("it has no list of numbers '{name}', which says where episodes are"));
+            let missing = || damaged(format!("it has no list of integers '{name}', which locates the episodes"));
             if !names.iter().any(|known| known == name) {
                 return Err(missing());
             }
@@ -85,25 +86,25 @@ impl Hdf5Reader {
         for written in record.schema.iter().flat_map(Schema::columns) {
             let same = |column: &&Column| column.spec == *written && column.is_plain();
             if !columns.iter().any(|column| same(&column)) {
-                let problem = format!("column '{}' is not as it was written, or missing", written.name);
+                let problem = format!("column '{}' differs from the record, or is missing", written.name);
                 return Err(damaged(problem));
             }
         }
         let known = record.schema.as_ref().map(Schema::columns).unwrap_or_default();
-        let place = |column: &Column| known.iter().position(|k| k.name == column.spec.name).unwrap_or(known.len());
-        columns.sort_by(|a, b| place(a).cmp(&place(b)).then_with(|| a.spec.name.cmp(&b.spec.name)));
+        let position = |column: &Column| known.iter().position(|k| k.name == column.spec.name).unwrap_or(known.len());
+        columns.sort_by(|a, b| position(a).cmp(&position(b)).then_with(|| a.spec.name.cmp(&b.spec.name)));
         let specs: Vec<ColumnSpec> = columns.iter().map(|column| column.spec.clone()).collect();
         let data = specs.iter().filter(|spec| spec.name != EPISODE_IDX && spec.name != STEP_IDX).cloned();
         let schema = Schema::new(index_columns(&specs).into_iter().chain(data).collect::<Vec<_>>())?;
         Ok(Self { source, rows, schema, columns, record, left_out })
     }
 
-    /// Where the episodes are.
+    /// The rows of the episodes.
     pub const fn rows(&self) -> &EpisodeRows {
         &self.rows
     }
 
-    /// What was recorded beside the columns.
+    /// The record stored beside the columns.
     pub const fn record(&self) -> &Record {
         &self.record
     }
@@ -113,7 +114,7 @@ impl Hdf5Reader {
         self.columns.iter().map(|column| column.spec.clone()).collect()
     }
 
-    /// Datasets that hold no numbers.
+    /// Names of datasets that are not numeric.
     pub fn left_out(&self) -> &[String] {
         &self.left_out
     }
@@ -124,7 +125,7 @@ impl Hdf5Reader {
 }
 
 fn damaged(source: &Source, problem: String) -> Error {
-    Error::corrupt(source.label(), problem, "restore it from a copy, or convert what h5py still reads of it")
+    Error::corrupt(source.label(), problem, "restore it from a copy, or convert the part that h5py can read")
 }
 
 impl Reader for Hdf5Reader {
@@ -142,22 +143,22 @@ impl Reader for Hdf5Reader {
             return self.rows.fill_index_column(spec, ranges, out);
         }
         let Some(column) = self.columns.iter().find(|column| column.spec.name == name) else {
-            return Err(self.fail(name, "it is not there"));
+            return Err(self.fail(name, "it does not exist"));
         };
-        let mut wanted = self.rows.row_slots(spec, ranges, out)?;
+        let mut slots = self.rows.row_slots(spec, ranges, out)?;
         let first = self.rows.first_rows();
         if !self.rows.is_contiguous() {
-            wanted.sort_by_key(|&((episode, step), _)| first[episode] + step as u64);
+            slots.sort_by_key(|&((episode, step), _)| first[episode] + step as u64);
         }
         let row_of = |(episode, step): (usize, usize)| first[episode] + step as u64;
-        column.read(&self.source, &mut wanted, row_of).map_err(|problem| self.fail(name, &problem))
+        column.read(&self.source, &mut slots, row_of).map_err(|problem| self.fail(name, &problem))
     }
 
     fn constants(&self, episode: usize) -> Result<Constants> {
         Ok(self.record.constants(episode))
     }
 
-    /// Episodes that share rows, and stored steps that do not count up from 0: here steps are numbered by their places.
+    /// Episodes that share rows, and stored step indices that differ from the positions in the episode.
     fn irregularities(&self) -> Result<Vec<Irregularity>> {
         let mut found = vec![];
         let mut order: Vec<usize> = (0..self.episodes().len()).collect();
@@ -179,12 +180,12 @@ impl Reader for Hdf5Reader {
         for (position, episode) in self.episodes().iter().enumerate() {
             steps.resize(episode.length);
             let range = [StepRange::new(position, 0, episode.length)];
-            let mut wanted = self.rows.row_slots(&column.spec, &range, steps.bytes_mut(0))?;
-            column.read(&self.source, &mut wanted, row_of).map_err(|problem| self.fail(STEP_IDX, &problem))?;
+            let mut slots = self.rows.row_slots(&column.spec, &range, steps.bytes_mut(0))?;
+            column.read(&self.source, &mut slots, row_of).map_err(|problem| self.fail(STEP_IDX, &problem))?;
             if let Some((row, step)) =
                 steps.to_f32(STEP_IDX)?.into_iter().enumerate().find(|&(row, step)| step != row as f32)
             {
-                let what = format!("the stored steps do not count up from 0: {step} stands in row {row}");
+                let what = format!("the stored steps do not count up from 0: row {row} holds {step}");
                 found.push(Irregularity { episode: Some(position), what });
             }
         }

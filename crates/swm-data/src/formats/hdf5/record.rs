@@ -1,8 +1,8 @@
-//! What we record beside the columns: types and shapes as they were, where the data come from, what is constant in an
-//! episode. It is a dataset of bytes without a name, so no program takes it for a column; the root's attribute
-//! `stable_worldmodel.record` refers to it.
+//! The record: metadata that is stored beside the columns (original schema, manifest, constants of episodes). It is an
+//! unnamed byte dataset, so no program treats it as a column; the root's attribute `stable_worldmodel.record` refers to
+//! it.
 //!
-//! Lines of JSON, one after another, which only grows. A constant's line is followed by its bytes.
+//! The record consists of JSON lines and is only appended to. The bytes of a constant follow its line.
 
 use crate::dataset::Constants;
 use serde::{Deserialize, Serialize};
@@ -15,34 +15,35 @@ use swm_core::{Error, Manifest, Result, Schema};
 enum Line {
     /// The columns.
     Schema(Schema),
-    /// The last one counts.
+    /// The manifest; the last such line is valid.
     Manifest(Box<Manifest>),
-    /// A constant of this many bytes, which follow; they are numbered.
+    /// A constant with this many bytes, which follow. Constants are numbered in order.
     Constant(usize),
-    /// A writer ended properly, after so many episodes.
+    /// A writer finished, with this many episodes.
     Closed(usize),
     /// The constants of an episode, by their numbers.
     Episode { number: usize, constants: BTreeMap<String, usize> },
 }
 
-/// A record, read.
+/// A parsed record.
 #[derive(Default)]
 pub(super) struct Record {
     pub schema: Option<Schema>,
     pub manifest: Option<Manifest>,
     bytes: Vec<u8>,
-    /// Where the constants are.
+    /// Byte ranges of the constants.
     constants: Vec<Range<usize>>,
     episodes: HashMap<usize, BTreeMap<String, usize>>,
-    /// How much of it belongs to episodes that are there.
+    /// Length of the part that belongs to committed episodes.
     pub committed: usize,
 }
 
 impl Record {
-    /// Reads a record of a file with so many episodes; what it says of others was never committed.
+    /// Parses the record of a file with `episodes` episodes. Lines of later episodes were never committed and are
+    /// ignored.
     ///
     /// # Errors
-    /// When it makes no sense.
+    /// If it is damaged.
     pub fn parse(bytes: Vec<u8>, episodes: usize) -> Result<Self, String> {
         let mut record = Self::default();
         let mut at = 0;
@@ -53,12 +54,12 @@ impl Record {
                 Line::Schema(schema) => record.schema = Some(schema),
                 Line::Manifest(manifest) => record.manifest = Some(*manifest),
                 Line::Closed(count) if count > episodes => {
-                    return Err(format!("it has {episodes} episodes; {count} were written"));
+                    return Err(format!("it has {episodes} episodes instead of {count}"));
                 }
                 Line::Closed(_) => {}
                 Line::Constant(size) => {
                     let end = at.checked_add(size).filter(|&end| end <= bytes.len());
-                    let end = end.ok_or("its record is cut off in a constant")?;
+                    let end = end.ok_or("its record is truncated in a constant")?;
                     record.constants.push(at..end);
                     at = end;
                 }
@@ -73,7 +74,7 @@ impl Record {
             record.committed = at;
         }
         if record.committed == at && at < bytes.len() {
-            return Err("its record is cut off".to_owned());
+            return Err("its record is truncated".to_owned());
         }
         record.bytes = bytes;
         Ok(record)
@@ -86,7 +87,7 @@ impl Record {
     }
 }
 
-/// Makes the lines of a record.
+/// Produces the lines of a record.
 #[derive(Default)]
 pub(super) struct RecordWriter {
     known: HashMap<blake3::Hash, usize>,
@@ -94,10 +95,10 @@ pub(super) struct RecordWriter {
 }
 
 impl RecordWriter {
-    /// Continues a record, as far as it is committed.
+    /// Continues the committed part of a record.
     pub fn continued(record: &Record) -> Self {
-        let committed = record.constants.iter().take_while(|place| place.end <= record.committed);
-        let hashes: Vec<blake3::Hash> = committed.map(|place| blake3::hash(&record.bytes[place.clone()])).collect();
+        let committed = record.constants.iter().take_while(|range| range.end <= record.committed);
+        let hashes: Vec<blake3::Hash> = committed.map(|range| blake3::hash(&record.bytes[range.clone()])).collect();
         Self { count: hashes.len(), known: hashes.into_iter().zip(0..).collect() }
     }
 
@@ -111,12 +112,12 @@ impl RecordWriter {
         line(&Line::Manifest(Box::new(manifest.clone())))
     }
 
-    /// The line at the end.
+    /// The line that marks the end of a writer.
     pub fn closed(episodes: usize) -> Result<Vec<u8>> {
         line(&Line::Closed(episodes))
     }
 
-    /// The lines of an episode; constants that are there are not stored again.
+    /// The lines of an episode. Constants that are stored already are referred to by number.
     pub fn episode(&mut self, number: usize, constants: &Constants) -> Result<Vec<u8>> {
         if constants.is_empty() {
             return Ok(vec![]);

@@ -1,4 +1,4 @@
-//! Where the bytes of a file come from: this machine or an object store.
+//! Byte access to a local file or an object in a store.
 
 use crate::dataset::Location;
 use crate::dataset::objects::{Bytes, ObjectFile};
@@ -11,24 +11,24 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
 
-/// The structure of a remote file is fetched in pieces of this size,
-const PIECE: u64 = 256 << 10;
-/// of which so many are kept.
-const KEPT: usize = 256;
+/// Block size for reading the structure of a remote file,
+const BLOCK: u64 = 256 << 10;
+/// and number of cached blocks.
+const CACHED_BLOCKS: usize = 256;
 
-/// The bytes of a file. Cheap to clone.
+/// A readable file. Clones share it.
 #[derive(Clone)]
 pub(super) struct Source(Arc<Kind>);
 
 enum Kind {
     Local { file: File, path: PathBuf, len: u64 },
-    Remote { file: ObjectFile, label: PathBuf, pieces: Mutex<ObjectRanges> },
+    Remote { file: ObjectFile, label: PathBuf, blocks: Mutex<Blocks> },
 }
 
-/// ObjectRanges of a remote file, for the many small reads that its structure takes.
+/// Cached blocks of a remote file, for the many small reads of its structure.
 #[derive(Default)]
-struct ObjectRanges {
-    by_number: HashMap<u64, Bytes>,
+struct Blocks {
+    by_index: HashMap<u64, Bytes>,
     /// Oldest first.
     order: VecDeque<u64>,
 }
@@ -37,11 +37,11 @@ impl Source {
     /// Opens a file.
     ///
     /// # Errors
-    /// When there is none, or it cannot be read.
+    /// If it does not exist or cannot be read.
     pub fn open(location: &Location) -> Result<Self> {
         let Some(path) = location.path() else {
             let file = ObjectFile::open(location)?;
-            return Ok(Self(Arc::new(Kind::Remote { file, label: location.label(), pieces: Mutex::default() })));
+            return Ok(Self(Arc::new(Kind::Remote { file, label: location.label(), blocks: Mutex::default() })));
         };
         let file = File::open(path).map_err(|e| match e.kind() {
             std::io::ErrorKind::NotFound => {
@@ -52,13 +52,13 @@ impl Source {
         Self::of(file, path)
     }
 
-    /// The bytes of an open file, as many as it has now.
+    /// An open local file, with its present size.
     pub fn of(file: File, path: &Path) -> Result<Self> {
         let len = file.metadata().map_err(|e| Error::io(path, "reading its size", e))?.len();
         Ok(Self(Arc::new(Kind::Local { file, path: path.to_owned(), len })))
     }
 
-    /// What messages call the file.
+    /// How messages show the file.
     pub fn label(&self) -> &Path {
         match &*self.0 {
             Kind::Local { path, .. } => path,
@@ -66,7 +66,7 @@ impl Source {
         }
     }
 
-    /// How many bytes it has.
+    /// Size in bytes.
     pub fn size(&self) -> u64 {
         match &*self.0 {
             Kind::Local { len, .. } => *len,
@@ -74,15 +74,15 @@ impl Source {
         }
     }
 
-    /// Whether a request takes so long that many should be made at once.
+    /// Whether many requests should run concurrently, because each takes long.
     pub fn is_remote(&self) -> bool {
         matches!(&*self.0, Kind::Remote { .. })
     }
 
-    /// The bytes from `offset` on.
+    /// Reads the bytes from `offset` on.
     ///
     /// # Errors
-    /// When there are not as many, or the disk or the store fails.
+    /// If the file is shorter, or reading fails.
     pub fn read(&self, offset: u64, out: &mut [u8]) -> Result<()> {
         if offset.checked_add(out.len() as u64).is_none_or(|end| end > self.size()) {
             let given = format!("{} bytes from byte {offset}", out.len());
@@ -96,16 +96,16 @@ impl Source {
             Kind::Local { file, path, .. } => {
                 file.read_exact_at(out, offset).map_err(|e| Error::io(path, "reading the file", e))
             }
-            Kind::Remote { file, pieces, .. } => {
+            Kind::Remote { file, blocks, .. } => {
                 let mut at = offset;
                 let mut rest = out;
                 while !rest.is_empty() {
-                    let number = at / PIECE;
-                    let piece = piece(file, pieces, number)?;
-                    let begin = (at - number * PIECE) as usize;
-                    let size = rest.len().min(piece.len() - begin);
+                    let index = at / BLOCK;
+                    let block = block(file, blocks, index)?;
+                    let begin = (at - index * BLOCK) as usize;
+                    let size = rest.len().min(block.len() - begin);
                     let (now, later) = rest.split_at_mut(size);
-                    now.copy_from_slice(&piece[begin..begin + size]);
+                    now.copy_from_slice(&block[begin..begin + size]);
                     (at, rest) = (at + size as u64, later);
                 }
                 Ok(())
@@ -113,7 +113,7 @@ impl Source {
         }
     }
 
-    /// All ranges of a remote file at once, in the given order; of a local one nothing.
+    /// Reads all ranges of a remote file concurrently, returned in the given order. Returns nothing for a local file.
     ///
     /// # Errors
     /// As [`Source::read`].
@@ -125,23 +125,23 @@ impl Source {
     }
 }
 
-fn piece(file: &ObjectFile, pieces: &Mutex<ObjectRanges>, number: u64) -> Result<Bytes> {
-    let lock = || pieces.lock().unwrap_or_else(PoisonError::into_inner);
-    if let Some(piece) = lock().by_number.get(&number) {
-        return Ok(piece.clone());
+fn block(file: &ObjectFile, blocks: &Mutex<Blocks>, index: u64) -> Result<Bytes> {
+    let lock = || blocks.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(block) = lock().by_index.get(&index) {
+        return Ok(block.clone());
     }
-    let range = number * PIECE..((number + 1) * PIECE).min(file.len());
-    let piece = file.read(&[range])?.pop().unwrap_or_default();
-    let mut kept = lock();
-    if kept.by_number.insert(number, piece.clone()).is_none() {
-        kept.order.push_back(number);
-        if kept.order.len() > KEPT
-            && let Some(oldest) = kept.order.pop_front()
+    let range = index * BLOCK..((index + 1) * BLOCK).min(file.len());
+    let block = file.read(&[range])?.pop().unwrap_or_default();
+    let mut cached = lock();
+    if cached.by_index.insert(index, block.clone()).is_none() {
+        cached.order.push_back(index);
+        if cached.order.len() > CACHED_BLOCKS
+            && let Some(oldest) = cached.order.pop_front()
         {
-            kept.by_number.remove(&oldest);
+            cached.by_index.remove(&oldest);
         }
     }
-    Ok(piece)
+    Ok(block)
 }
 
 impl hdf5_pure::Source for Source {

@@ -1,4 +1,4 @@
-//! A dataset that we write: rows become chunks, and commits make them count.
+//! Writes one HDF5 dataset: rows become chunks, and commits make them visible.
 
 use super::filters::{fletcher32, lzf};
 use super::layout::{Table, summed_bytes};
@@ -10,17 +10,17 @@ use std::fs::File;
 use std::io;
 use std::os::unix::fs::FileExt as _;
 
-/// The filter that is left out of a chunk: the first, LZF.
+/// Mask of the filter that is skipped for uncompressed chunks: the first, LZF.
 const NOT_COMPRESSED: u32 = 1;
 
-/// Nodes of B-trees are put next to each other, in pieces of the file of this size.
+/// Nodes of B-trees are allocated together, in regions of this size in bytes.
 const PIECE: u64 = 32 << 10;
 
 thread_local! {
     static ENCODER: RefCell<lzf::Encoder> = RefCell::default();
 }
 
-/// Where what is new is put: at the end of the file.
+/// Allocates space at the end of the file.
 pub(super) struct Space {
     /// The end of the file.
     pub end: u64,
@@ -49,18 +49,18 @@ impl Space {
     }
 }
 
-/// Writes the rows of a dataset.
+/// Appends the rows of a dataset.
 pub(super) struct TableWriter {
     pub table: Table,
     rows: u64,
     tree: Tree,
-    /// Rows of the chunk that is not full, and how many bytes of them are stored.
+    /// Rows of the incomplete chunk, and how many of its bytes are stored.
     open: Vec<u8>,
     stored: usize,
-    /// Places of former versions of chunks that were not full: free now, and free after the next commit.
+    /// Regions of previous versions of incomplete chunks: free now, and free after the next commit.
     free: Vec<u64>,
     freed: Vec<u64>,
-    /// The chunks of an episode, encoded.
+    /// Encoded chunks of an episode.
     encoded: Vec<Vec<u8>>,
     writing: Vec<u8>,
 }
@@ -84,7 +84,7 @@ impl TableWriter {
     /// Continues after the first `rows` rows.
     ///
     /// # Errors
-    /// When they are damaged.
+    /// If they are damaged.
     pub fn load(table: Table, source: &Source, rows: u64) -> Result<Self, String> {
         let tree = Tree::load(&table, source, rows)?;
         let mut writer = Self { rows, tree, ..Self::new(table) };
@@ -98,7 +98,7 @@ impl TableWriter {
         Ok(writer)
     }
 
-    /// Adds rows. Chunks that they fill are written at once.
+    /// Appends rows. Complete chunks are written immediately.
     pub fn append(&mut self, file: &File, space: &mut Space, rows: &[u8]) -> io::Result<()> {
         self.rows += (rows.len() / self.table.spec.row_bytes()) as u64;
         if self.table.compressed {
@@ -153,7 +153,7 @@ impl TableWriter {
         Ok(())
     }
 
-    /// Writes the open chunk, as far as it is filled, beside its former version.
+    /// Writes the incomplete chunk to a new region.
     fn store_open(&mut self, file: &File, space: &mut Space) -> io::Result<()> {
         let size = summed_bytes(&self.table);
         let address = self.free.pop().unwrap_or_else(|| space.take(size));
@@ -173,7 +173,7 @@ impl TableWriter {
         Ok(())
     }
 
-    /// Writes what nothing refers to yet.
+    /// Writes data to which nothing refers yet.
     pub fn write_new(&mut self, file: &File, space: &mut Space) -> io::Result<()> {
         if self.open.len() > self.stored {
             self.store_open(file, space)?;
@@ -181,12 +181,12 @@ impl TableWriter {
         self.tree.write_new(file)
     }
 
-    /// Lets the B-tree refer to it.
+    /// Updates the B-tree.
     pub fn write_changes(&mut self, file: &File) -> io::Result<()> {
         self.tree.write_changes(file)
     }
 
-    /// Lets the rows count.
+    /// Updates the number of rows.
     pub fn write_rows(&mut self, file: &File) -> io::Result<()> {
         file.write_all_at(&self.rows.to_le_bytes(), self.table.rows_at)?;
         self.free.append(&mut self.freed);
@@ -194,25 +194,25 @@ impl TableWriter {
     }
 }
 
-/// All rows of a dataset that we wrote and did not compress.
+/// Reads all rows of an uncompressed dataset that was written here.
 ///
 /// # Errors
-/// When it is damaged.
+/// If it is damaged.
 pub(super) fn read_all(table: &Table, source: &Source) -> Result<Vec<u8>, String> {
     let rows = read_u64(source, table.rows_at)?;
     let size = table.spec.row_bytes();
     let mut all = vec![];
     for entry in Tree::chunks(table, source)? {
         if entry.row != (all.len() / size) as u64 {
-            return Err(format!("a chunk begins in row {} instead of {}", entry.row, all.len() / size));
+            return Err(format!("a chunk starts at row {} instead of {}", entry.row, all.len() / size));
         }
         all.extend(read_chunk(table, source, &entry)?);
     }
-    let wanted = usize::try_from(rows).ok().and_then(|rows| rows.checked_mul(size));
-    let Some(wanted) = wanted.filter(|&wanted| wanted <= all.len()) else {
-        return Err(format!("it has {rows} rows, and chunks for {}", all.len() / size));
+    let expected = usize::try_from(rows).ok().and_then(|rows| rows.checked_mul(size));
+    let Some(expected) = expected.filter(|&expected| expected <= all.len()) else {
+        return Err(format!("it has {rows} rows, but chunks for {}", all.len() / size));
     };
-    all.truncate(wanted);
+    all.truncate(expected);
     Ok(all)
 }
 

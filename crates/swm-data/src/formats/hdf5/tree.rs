@@ -1,8 +1,8 @@
-//! The B-tree (version 1) of a dataset's chunks, which only ever grows at its right edge.
+//! The B-tree (version 1) of a dataset's chunks. It only grows at its right edge.
 //!
-//! A node has room for 64 children. Before each child stands the key of its first chunk (size, filters that were left
-//! out, offset along every side), after the last a key beyond all. A commit writes new nodes first, which nothing refers
-//! to; then, in nodes that are there, children after the last; then the numbers of children, and the root.
+//! A node has room for 64 children. Each child is preceded by the key of its first chunk (size, skipped filters, offset
+//! along every side); a key beyond all chunks follows the last child. A commit first writes new nodes, to which nothing
+//! refers yet; then appends children to existing nodes; then updates child counts and the root.
 
 use super::layout::{Table, UNDEFINED};
 use super::source::Source;
@@ -10,44 +10,44 @@ use std::fs::File;
 use std::io;
 use std::os::unix::fs::FileExt as _;
 
-/// Children that a node has room for: twice the library's default.
+/// Maximum number of children of a node: twice the library's default.
 const FULL: usize = 64;
 
-/// A chunk, or a node one level below, by its first chunk.
+/// An entry of a node: a chunk, or a node one level below, identified by its first chunk.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Entry {
-    /// Stored bytes of the (first) chunk, and the filters left out.
+    /// Stored size of the (first) chunk in bytes, and the mask of skipped filters.
     pub size: u32,
     pub filter_mask: u32,
-    /// Its first row.
+    /// First row of the chunk.
     pub row: u64,
     pub address: u64,
 }
 
-/// A node on the right edge, or left of it since the last commit.
+/// A node on the right edge, or one that was completed since the last commit.
 struct Node {
     address: u64,
     level: u8,
     left: u64,
     right: u64,
     entries: Vec<Entry>,
-    /// The first row beyond it.
+    /// The first row after the node.
     end: u64,
-    /// How many entries the file has; none of a node that is not there yet.
+    /// Number of entries in the file; `None` if the node is not written yet.
     written: Option<usize>,
-    /// Whether the last written entry has another address now.
+    /// Whether the address of the last written entry changed.
     moved: bool,
 }
 
 pub(super) struct Tree {
     sides: usize,
     chunk_rows: u64,
-    /// Where the root's address is in the file, and the address there.
+    /// Offset of the root's address in the file, and the stored address.
     root_at: u64,
     root: u64,
-    /// The right edge, leaf first.
+    /// Nodes of the right edge, leaf first.
     edge: Vec<Node>,
-    /// Nodes that are full since the last commit.
+    /// Nodes that were completed since the last commit.
     full: Vec<Node>,
 }
 
@@ -58,10 +58,10 @@ impl Tree {
         Self { sides: table.sides(), chunk_rows, root_at: table.tree_at, root: UNDEFINED, edge: vec![], full: vec![] }
     }
 
-    /// The right edge of a tree in a file, as far as the chunks before `rows`.
+    /// Loads the right edge of a tree, up to the chunks before row `rows`.
     ///
     /// # Errors
-    /// When it is damaged.
+    /// If it is damaged.
     pub fn load(table: &Table, source: &Source, rows: u64) -> Result<Self, String> {
         let mut tree = Self::new(table);
         tree.root = read_u64(source, tree.root_at)?;
@@ -69,10 +69,10 @@ impl Tree {
         while next != UNDEFINED {
             let mut node = tree.read(source, next)?;
             if tree.edge.last().is_some_and(|above| above.level != node.level + 1) {
-                return Err(format!("a node of level {} is below one that is not next to it", node.level));
+                return Err(format!("a node of level {} does not match the level of its parent", node.level));
             }
             let before = node.entries.iter().take_while(|entry| entry.row < rows).count();
-            // A node that is not a leaf has a child always.
+            // Inner nodes always have a child.
             node.entries.truncate(if node.level > 0 { before.max(1) } else { before });
             node.written = Some(node.entries.len());
             node.right = UNDEFINED;
@@ -93,7 +93,7 @@ impl Tree {
         self.edge.first()?.entries.last().copied()
     }
 
-    /// Adds a chunk after all others. `allocate` gives new nodes their place.
+    /// Appends a chunk. `allocate` returns addresses for new nodes.
     pub fn push(&mut self, entry: Entry, allocate: &mut impl FnMut(usize) -> u64) {
         self.insert(0, entry, allocate);
         let end = entry.row + self.chunk_rows;
@@ -129,7 +129,7 @@ impl Tree {
         self.edge[level].entries.push(entry);
     }
 
-    /// Gives the last chunk another place, and says which it had.
+    /// Changes the address of the last chunk, and returns the previous one.
     pub fn move_last(&mut self, address: u64) -> Option<u64> {
         let node = self.edge.first_mut()?;
         let last = node.entries.len().checked_sub(1)?;
@@ -137,7 +137,7 @@ impl Tree {
         Some(std::mem::replace(&mut node.entries[last].address, address))
     }
 
-    /// Writes the nodes that nothing in the file refers to yet.
+    /// Writes the nodes to which nothing in the file refers yet.
     pub fn write_new(&self, file: &File) -> io::Result<()> {
         for node in self.full.iter().chain(&self.edge).filter(|node| node.written.is_none()) {
             let mut bytes = node.head();
@@ -148,7 +148,7 @@ impl Tree {
         Ok(())
     }
 
-    /// Changes the nodes that are in the file, and the root. What was there before stays in force until each of these
+    /// Updates nodes in the file and the root. The previous state stays valid until each of these small writes.
     /// small writes.
     pub fn write_changes(&mut self, file: &File) -> io::Result<()> {
         for node in self.full.iter().chain(&self.edge) {
@@ -159,7 +159,7 @@ impl Tree {
                 let at = node.address + self.key_at(written - 1) + self.key_bytes();
                 file.write_all_at(&entry.address.to_le_bytes(), at)?;
             }
-            // The number of children and the siblings: within 24 bytes.
+            // The child count and the siblings, within 24 bytes.
             file.write_all_at(&node.head()[6..], node.address + 6)?;
         }
         if let Some(root) = self.edge.last()
@@ -175,10 +175,10 @@ impl Tree {
         Ok(())
     }
 
-    /// Every chunk of a tree in a file.
+    /// All chunks of a tree in a file.
     ///
     /// # Errors
-    /// When it is damaged.
+    /// If it is damaged.
     pub fn chunks(table: &Table, source: &Source) -> Result<Vec<Entry>, String> {
         let tree = Self::new(table);
         let root = read_u64(source, tree.root_at)?;
@@ -187,7 +187,7 @@ impl Tree {
         while let Some((address, above)) = waiting.pop() {
             let node = tree.read(source, address)?;
             if node.level >= above {
-                return Err("its nodes go round in circles".to_owned());
+                return Err("its nodes form a cycle".to_owned());
             }
             if node.level == 0 {
                 chunks.extend(node.entries);
@@ -202,7 +202,7 @@ impl Tree {
         8 + 8 * self.sides as u64
     }
 
-    /// Where a key is in a node.
+    /// Offset of a key within a node.
     const fn key_at(&self, index: usize) -> u64 {
         24 + index as u64 * (self.key_bytes() + 8)
     }
@@ -211,7 +211,7 @@ impl Tree {
         (self.key_at(FULL) + self.key_bytes()) as usize
     }
 
-    /// The bytes of a node from the key of an entry to the key beyond all.
+    /// The bytes of a node, from the key of an entry to the final key.
     fn tail(&self, node: &Node, from: usize) -> Vec<u8> {
         let mut out = vec![];
         let key = |out: &mut Vec<u8>, size: u32, filter_mask: u32, row: u64| {
@@ -236,7 +236,7 @@ impl Tree {
         let u64_at = |at: usize| u64::from_le_bytes(std::array::from_fn(|i| bytes[at + i]));
         let u32_at = |at: usize| u32::from_le_bytes(std::array::from_fn(|i| bytes[at + i]));
         if bytes[..4] != *b"TREE" || kind != 1 || count > FULL || (level > 0 && count == 0) {
-            return Err(format!("at byte {address} there is no node of its B-tree"));
+            return Err(format!("there is no B-tree node at byte {address}"));
         }
         let entry = |i: usize| {
             let at = self.key_at(i) as usize;
@@ -267,7 +267,7 @@ impl Node {
     }
 }
 
-/// A number of a file.
+/// Reads a 64-bit integer of a file.
 pub(super) fn read_u64(source: &Source, at: u64) -> Result<u64, String> {
     let mut bytes = [0; 8];
     source.read(at, &mut bytes).map_err(|e| e.to_string())?;

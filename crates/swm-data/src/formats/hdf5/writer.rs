@@ -1,4 +1,4 @@
-//! Writing episodes: rows go to the end of the file at once, and count when they are committed.
+//! Writes episodes: rows are appended to the file immediately and become visible when they are committed.
 
 use super::layout::{END_AT, Layout, SIGNATURE};
 use super::reader::Hdf5Reader;
@@ -22,7 +22,7 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     let path = location.local("hdf5")?;
     for name in [EPISODE_IDX, STEP_IDX] {
         if schema.column(name).is_ok_and(|column| column.len() != 1) {
-            let problem = format!("column '{name}' numbers rows, and must be one number");
+            let problem = format!("column '{name}' must be a scalar");
             return Err(Error::config("schema", problem, "leave it out"));
         }
     }
@@ -31,14 +31,14 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
         (_, false) => Hdf5Writer::begin(path, lock(path)?, schema, manifest)?,
         (WriteMode::Create, true) => {
             let problem = format!("{} exists already", path.display());
-            let fix = "choose another path, or say whether to append to it or to overwrite it";
+            let fix = "choose another path, append to it, or overwrite it";
             return Err(Error::config("dataset", problem, fix));
         }
         (WriteMode::Overwrite, true) => {
             let _old = lock(path)?;
-            let passing = beside(path);
-            let writer = Hdf5Writer::begin(&passing, lock(&passing)?, schema, manifest)?;
-            take_place(writer, &passing, path)?
+            let temporary = temporary_path(path);
+            let writer = Hdf5Writer::begin(&temporary, lock(&temporary)?, schema, manifest)?;
+            replace_file(writer, &temporary, path)?
         }
         (WriteMode::Append, true) => {
             let old = lock(path)?;
@@ -47,7 +47,7 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
             episodes::check_appendable(&location, schema, reader.schema())?;
             let mut writer = match Hdf5Writer::resume(path, &reader, old)? {
                 Ok(writer) => writer,
-                // Still locked, until its copy is there.
+                // The old file stays locked until its copy replaces it.
                 Err(_old) => copied(path, &reader)?,
             };
             if let Some(manifest) = manifest
@@ -64,13 +64,13 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
     Ok(Box::new(writer))
 }
 
-/// Whether there is a file that was begun properly.
+/// Whether a complete file exists.
 fn is_there(path: &Path) -> Result<bool> {
     let mut start = [0; SIGNATURE.len()];
     match File::open(path) {
         Ok(file) => {
             let size = file.read_at(&mut start, 0).map_err(|e| Error::io(path, "reading the file", e))?;
-            // A file is begun with its signature last.
+            // The signature is written last when a file is created.
             Ok(start[..size] != [0; SIGNATURE.len()][..size])
         }
         Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(false),
@@ -78,7 +78,7 @@ fn is_there(path: &Path) -> Result<bool> {
     }
 }
 
-/// Opens a file, new or not, and locks it against other writers until it is closed or the process ends.
+/// Opens or creates a file and locks it against other writers, until it is closed or the process ends.
 fn lock(path: &Path) -> Result<File> {
     if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
         std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating the folder", e))?;
@@ -90,46 +90,46 @@ fn lock(path: &Path) -> Result<File> {
         Ok(()) => Ok(file),
         Err(TryLockError::WouldBlock) => {
             let problem = format!("another process writes to {}", path.display());
-            Err(Error::config("dataset", problem, "wait until they are done, or choose another path"))
+            Err(Error::config("dataset", problem, "wait until it is done, or choose another path"))
         }
         Err(TryLockError::Error(e)) => Err(Error::io(path, "locking the file", e)),
     }
 }
 
-/// A new name in the same folder.
-fn beside(path: &Path) -> PathBuf {
+/// A temporary name in the same folder.
+fn temporary_path(path: &Path) -> PathBuf {
     let name = format!(".{}.tmp", uuid::Uuid::new_v4().simple());
     path.with_file_name(name)
 }
 
-/// Puts a complete new file in the place of an old one.
-fn take_place(mut writer: Hdf5Writer, passing: &Path, path: &Path) -> Result<Hdf5Writer> {
-    std::fs::rename(passing, path).map_err(|e| Error::io(path, "replacing the file", e))?;
+/// Replaces a file by a complete new one.
+fn replace_file(mut writer: Hdf5Writer, temporary: &Path, path: &Path) -> Result<Hdf5Writer> {
+    std::fs::rename(temporary, path).map_err(|e| Error::io(path, "replacing the file", e))?;
     writer.path = path.to_owned();
     Ok(writer)
 }
 
-/// Copies a file of another layout to one of written_here, which takes its place.
+/// Copies a file with another layout to this layout and replaces it.
 fn copied(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
     if let [name, ..] = reader.left_out() {
-        let problem = format!("its dataset '{name}' holds no numbers, which cannot be continued");
+        let problem = format!("its dataset '{name}' is not numeric and cannot be appended to");
         return Err(Error::corrupt(path, problem, "convert it to a new dataset, without this column"));
     }
     let schema = Schema::new(reader.stored())?;
-    let passing = beside(path);
+    let temporary = temporary_path(path);
     let copy = || {
-        let mut writer = Hdf5Writer::begin(&passing, lock(&passing)?, &schema, reader.manifest().as_ref())?;
+        let mut writer = Hdf5Writer::begin(&temporary, lock(&temporary)?, &schema, reader.manifest().as_ref())?;
         let names: Vec<&str> = schema.columns().iter().map(|column| &*column.name).collect();
         for (position, episode) in reader.episodes().iter().enumerate() {
             let batch = reader.read(&names, &[StepRange::new(position, 0, episode.length)])?;
             writer.append(&batch, &reader.constants(position)?)?;
         }
         writer.commit()?;
-        take_place(writer, &passing, path)
+        replace_file(writer, &temporary, path)
     };
     copy().inspect_err(|_| {
-        // Nothing refers to it.
-        let _ = std::fs::remove_file(&passing);
+        // The file is not referenced yet.
+        let _ = std::fs::remove_file(&temporary);
     })
 }
 
@@ -137,25 +137,25 @@ struct Hdf5Writer {
     path: PathBuf,
     file: File,
     space: Space,
-    /// The record, then lengths and beginnings of episodes, then the columns.
+    /// The record, lengths and first rows of episodes, then the columns.
     tables: Vec<TableWriter>,
-    /// The columns that episodes come with.
+    /// Columns of the episodes that are added.
     schema: Schema,
     policy: CommitPolicy,
     last_commit: Instant,
-    /// The end of the file at the last commit, and the episodes since.
+    /// End of the file at the last commit, and the episodes since then.
     committed_end: u64,
     in_group: usize,
-    /// Whether episodes came since the file was last closed.
+    /// Whether episodes were added since the file was last closed.
     unclosed: bool,
     rows: EpisodeRows,
     record: RecordWriter,
-    /// Whether something failed to be written.
+    /// Whether a write failed.
     failed: bool,
     scratch: Vec<u8>,
 }
 
-/// Places in [`Hdf5Writer::tables`].
+/// Indices in [`Hdf5Writer::tables`].
 const RECORD: usize = 0;
 /// See [`RECORD`].
 const LENGTHS: usize = 1;
@@ -165,10 +165,10 @@ const OFFSETS: usize = 2;
 const COLUMNS: usize = 3;
 
 impl Hdf5Writer {
-    /// Begins a file without episodes.
+    /// Creates a file without episodes.
     fn begin(path: &Path, file: File, schema: &Schema, manifest: Option<&Manifest>) -> Result<Self> {
         let layout = Layout::new(schema.columns())?;
-        let io = |e| Error::io(path, "beginning the file", e);
+        let io = |e| Error::io(path, "creating the file", e);
         let (signature, rest) = layout.bytes.split_at(SIGNATURE.len());
         file.set_len(0).map_err(io)?;
         file.write_all_at(rest, signature.len() as u64).map_err(io)?;
@@ -185,7 +185,7 @@ impl Hdf5Writer {
         Ok(writer)
     }
 
-    /// Continues a file that we laid out; gives back any other.
+    /// Continues a file with this layout; returns any other file unchanged.
     fn resume(path: &Path, reader: &Hdf5Reader, file: File) -> Result<Result<Self, File>> {
         let Some(schema) = &reader.record().schema else { return Ok(Err(file)) };
         let layout = Layout::new(schema.columns())?;
@@ -244,30 +244,30 @@ impl Hdf5Writer {
         self.put(RECORD, lines)
     }
 
-    /// Adds the rows of an episode.
+    /// Appends the rows of an episode.
     fn append(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
-        let number = self.rows.episodes().len();
+        let position = self.rows.episodes().len();
         let first = self.rows.total();
         let too_many = || Error::mismatch("writing an episode", "more than 2^31 - 1 rows", "fewer");
         let length = i32::try_from(episode.rows()).map_err(|_| too_many())?;
-        // True until all of it is written: what is written in part must not count.
+        // Stays set if a write fails, because incomplete data must not be committed.
         self.failed = true;
         self.rows.push(episode.rows());
         for at in COLUMNS..self.tables.len() {
             let spec = self.tables[at].table.spec.clone();
             if spec.name == EPISODE_IDX || spec.name == STEP_IDX {
-                let mut numbers = std::mem::take(&mut self.scratch);
-                numbers.resize(episode.rows() * spec.row_bytes(), 0);
-                self.rows.fill_index_column(&spec, &[StepRange::new(number, 0, episode.rows())], &mut numbers)?;
-                self.put(at, &numbers)?;
-                self.scratch = numbers;
+                let mut indices = std::mem::take(&mut self.scratch);
+                indices.resize(episode.rows() * spec.row_bytes(), 0);
+                self.rows.fill_index_column(&spec, &[StepRange::new(position, 0, episode.rows())], &mut indices)?;
+                self.put(at, &indices)?;
+                self.scratch = indices;
             } else {
                 let column = episode.schema().index(&spec.name)?;
                 let written = self.tables[at].append(&self.file, &mut self.space, episode.bytes(column));
                 written.map_err(|e| Error::io(&self.path, "writing an episode", e))?;
             }
         }
-        let lines = self.record.episode(number, constants)?;
+        let lines = self.record.episode(position, constants)?;
         self.record(&lines)?;
         self.put(OFFSETS, &first.to_le_bytes())?;
         self.put(LENGTHS, &length.to_le_bytes())?;
@@ -277,7 +277,7 @@ impl Hdf5Writer {
         Ok(())
     }
 
-    /// Lets everything that was added count.
+    /// Commits everything that was added.
     fn commit(&mut self) -> Result<()> {
         self.failed = true;
         self.try_commit().map_err(|e| Error::io(&self.path, "committing episodes", e))?;
@@ -298,14 +298,14 @@ impl Hdf5Writer {
             table.write_changes(file)?;
         }
         file.sync_data()?;
-        // The lengths of the episodes last.
+        // Lengths of the episodes last.
         for at in (COLUMNS..tables.len()).chain([RECORD, OFFSETS, LENGTHS]) {
             tables[at].write_rows(file)?;
         }
         file.sync_data()
     }
 
-    /// Commits what is left, and that it is all.
+    /// Commits the rest and marks the file as complete.
     fn close(&mut self) -> Result<()> {
         if self.in_group == 0 && !self.unclosed {
             return Ok(());
@@ -318,7 +318,7 @@ impl Hdf5Writer {
     }
 
     fn lost() -> Error {
-        Error::external("writing an episode", "an earlier one failed to be written; nothing more is kept")
+        Error::external("writing an episode", "an earlier write failed; later episodes are not stored")
     }
 }
 
@@ -352,7 +352,7 @@ impl Drop for Hdf5Writer {
         if !self.failed
             && let Err(error) = self.close()
         {
-            tracing::error!(dataset = %self.path.display(), "the last episodes are lost: {error}");
+            tracing::error!(dataset = %self.path.display(), "the last episodes could not be stored: {error}");
         }
     }
 }

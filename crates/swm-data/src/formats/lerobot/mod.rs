@@ -27,6 +27,10 @@
 //! datasets that browsers should play.
 
 #[cfg(feature = "lerobot")]
+mod episode_files;
+#[cfg(feature = "lerobot")]
+mod features;
+#[cfg(feature = "lerobot")]
 mod info;
 #[cfg(feature = "lerobot")]
 mod reader;

@@ -1,13 +1,13 @@
 //! Reading: numbers from Parquet, kept once they were asked for; frames from videos, by time.
 
+use super::episode_files::EpisodeFiles;
 use super::info::{Column, Info, Kind, damaged};
-use super::{CONSTANTS, TASK, table, values};
+use super::{TASK, table, values};
 use crate::dataset::Location;
 use crate::dataset::episodes::{EpisodeRows, content_hash, index_columns};
 use crate::dataset::{Constants, Episode, Reader, StepRange};
 use arrow_array::Array as _;
 use arrow_array::cast::AsArray as _;
-use arrow_array::types::Float64Type;
 use rayon::prelude::*;
 use serde::Deserialize;
 use std::collections::BTreeMap;
@@ -24,18 +24,6 @@ const ROW_COUNTERS: [&str; 3] = ["timestamp", "index", "task_index"];
 /// Opens a dataset.
 pub(super) fn open(location: &Location) -> Result<Arc<dyn Reader>> {
     Ok(Arc::new(LerobotReader::open(location.local("lerobot")?)?))
-}
-
-/// Where an episode is.
-pub(super) struct EpisodeFiles {
-    tasks: Vec<String>,
-    data: PathBuf,
-    /// For every video feature, its file and when the episode begins there, in seconds.
-    videos: Vec<(PathBuf, f64)>,
-    length: usize,
-    constants: Option<String>,
-    /// The number of its files, counted through all chunks.
-    pub file: usize,
 }
 
 pub(super) struct LerobotReader {
@@ -67,8 +55,7 @@ impl LerobotReader {
         let bookkeeping = |column: &Column| info.stable_worldmodel.is_none() && ROW_COUNTERS.contains(&&*column.native);
         columns.sort_by_key(bookkeeping);
         let visible = 2 + columns.iter().filter(|column| !bookkeeping(column)).count();
-        let files_of_episodes =
-            if info.is_v3() { episode_files_v3(root, &info)? } else { episode_files_v2(root, &info)? };
+        let files_of_episodes = EpisodeFiles::read(root, &info)?;
         let mut rows = EpisodeRows::default();
         files_of_episodes.iter().for_each(|place| rows.push(place.length));
         if info.total_episodes != files_of_episodes.len() || rows.total() != info.total_frames as u64 {
@@ -450,137 +437,4 @@ impl Stored {
             Self::Bytes(bytes) => bytes,
         }
     }
-}
-
-/// The episodes of version 2.1: a line each, and a file each.
-fn episode_files_v2(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
-    #[derive(Deserialize)]
-    struct Line {
-        episode_index: usize,
-        #[serde(default)]
-        tasks: Vec<String>,
-        length: usize,
-    }
-    let path = root.join("meta").join("episodes.jsonl");
-    let text = std::fs::read_to_string(&path).map_err(|e| match e.kind() {
-        std::io::ErrorKind::NotFound => damaged(root, "meta/episodes.jsonl is missing".to_owned()),
-        _ => Error::io(&path, "reading the list of episodes", e),
-    })?;
-    let mut files_of_episodes = vec![];
-    for line in text.lines().filter(|line| !line.trim().is_empty()) {
-        let line: Line =
-            serde_json::from_str(line).map_err(|e| damaged(&path, format!("a line is unreadable: {e}")))?;
-        if line.episode_index != files_of_episodes.len() {
-            let problem = format!("episode {} comes where {} should", line.episode_index, files_of_episodes.len());
-            return Err(damaged(&path, problem));
-        }
-        let numbers =
-            [("episode_chunk", files_of_episodes.len() / info.chunks_size), ("episode_index", files_of_episodes.len())];
-        let videos: Result<Vec<(PathBuf, f64)>> =
-            info.video_keys().into_iter().map(|key| Ok((video_file(root, info, key, &numbers)?, 0.0))).collect();
-        files_of_episodes.push(EpisodeFiles {
-            tasks: line.tasks,
-            data: info.file(root, &info.data_path, "", &numbers)?,
-            videos: videos?,
-            length: line.length,
-            constants: None,
-            file: files_of_episodes.len(),
-        });
-    }
-    Ok(files_of_episodes)
-}
-
-fn video_file(root: &Path, info: &Info, key: &str, numbers: &[(&str, usize)]) -> Result<PathBuf> {
-    let template = info.video_path.as_deref();
-    let template = template.ok_or_else(|| damaged(root, "meta/info.json does not say where videos are".to_owned()))?;
-    info.file(root, template, key, numbers)
-}
-
-/// The episodes of version 3.0: a row each.
-fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
-    let folder = root.join("meta").join("episodes");
-    let mut files = vec![];
-    // None where there is no episode yet.
-    for chunk in std::fs::read_dir(&folder).into_iter().flatten().flatten() {
-        let entries = std::fs::read_dir(chunk.path()).into_iter().flatten().flatten().map(|entry| entry.path());
-        files.extend(entries.filter(|path| path.extension().is_some_and(|suffix| suffix == "parquet")));
-    }
-    files.sort();
-    let keys = info.video_keys();
-    let named = |key: &str, what: &str| format!("videos/{key}/{what}");
-    let mut wanted: Vec<String> =
-        ["episode_index", "tasks", "length", "data/chunk_index", "data/file_index", CONSTANTS]
-            .map(str::to_owned)
-            .to_vec();
-    for key in &keys {
-        wanted.extend(["chunk_index", "file_index", "from_timestamp"].map(|what| named(key, what)));
-    }
-    let wanted: Vec<&str> = wanted.iter().map(String::as_str).collect();
-    let mut files_of_episodes = vec![];
-    for path in &files {
-        let batches = table::read(path, &wanted, None)?;
-        let numbers = |column: &str| -> Result<Vec<usize>> {
-            let sound = |number: i64| usize::try_from(number).ok().filter(|&n| n < 1 << 40);
-            let numbers = table::integers(path, &batches, column)?.into_iter().map(sound);
-            numbers
-                .collect::<Option<_>>()
-                .ok_or_else(|| damaged(path, format!("a number of '{column}' makes no sense")))
-        };
-        let (index, length) = (numbers("episode_index")?, numbers("length")?);
-        let (chunk, file) = (numbers("data/chunk_index")?, numbers("data/file_index")?);
-        let mut videos = vec![];
-        for key in &keys {
-            let mut begins = vec![];
-            for batch in &batches {
-                let column = batch.column_by_name(&named(key, "from_timestamp"));
-                let column = column.and_then(|array| array.as_primitive_opt::<Float64Type>());
-                let column = column.ok_or_else(|| damaged(path, format!("it does not say when '{key}' begins")))?;
-                begins.extend_from_slice(column.values());
-            }
-            videos.push((numbers(&named(key, "chunk_index"))?, numbers(&named(key, "file_index"))?, begins));
-        }
-        let (mut tasks, mut constants) = (vec![], vec![]);
-        for batch in &batches {
-            tasks.extend(texts(batch, "tasks").unwrap_or_else(|| vec![vec![]; batch.num_rows()]));
-            let stored = batch.column_by_name(CONSTANTS).and_then(|array| array.as_string_opt::<i32>());
-            constants.extend((0..batch.num_rows()).map(|row| stored.map(|stored| stored.value(row).to_owned())));
-        }
-        for row in 0..index.len() {
-            // An interrupted writer may have left more than it committed.
-            if files_of_episodes.len() == info.total_episodes {
-                break;
-            }
-            if index[row] != files_of_episodes.len() {
-                let problem = format!("episode {} comes where {} should", index[row], files_of_episodes.len());
-                return Err(damaged(path, problem));
-            }
-            let at = |chunk: usize, file: usize| [("chunk_index", chunk), ("file_index", file)];
-            let files: Result<Vec<(PathBuf, f64)>> = keys
-                .iter()
-                .zip(&videos)
-                .map(|(key, (chunk, file, begin))| {
-                    Ok((video_file(root, info, key, &at(chunk[row], file[row]))?, begin[row]))
-                })
-                .collect();
-            files_of_episodes.push(EpisodeFiles {
-                tasks: std::mem::take(&mut tasks[row]),
-                data: info.file(root, &info.data_path, "", &at(chunk[row], file[row]))?,
-                videos: files?,
-                length: length[row],
-                constants: constants[row].take(),
-                file: chunk[row].saturating_mul(info.chunks_size).saturating_add(file[row]),
-            });
-        }
-    }
-    Ok(files_of_episodes)
-}
-
-/// A column of lists of texts.
-fn texts(batch: &arrow_array::RecordBatch, column: &str) -> Option<Vec<Vec<String>>> {
-    let lists = batch.column_by_name(column)?.as_list_opt::<i32>()?;
-    let text = |list: arrow_array::ArrayRef| -> Option<Vec<String>> {
-        let text = list.as_string_opt::<i32>()?;
-        Some(text.iter().flatten().map(str::to_owned).collect())
-    };
-    (0..lists.len()).map(|row| text(lists.value(row))).collect()
 }

@@ -2,9 +2,8 @@
 //! due; a group becomes one file of numbers, one video a camera, and one file that describes its episodes. All files
 //! appear complete, `meta/info.json` last: it says how many episodes there are, and commits them.
 
-use super::info::{
-    DATA_PATH, EPISODES_PATH, Feature, Features, Info, Recorded, VERSION, VIDEO_PATH, damaged, fill, native_name,
-};
+use super::features::{FRAMES_PER_SECOND, new_info, stored_columns};
+use super::info::{DATA_PATH, EPISODES_PATH, Info, Recorded, VIDEO_PATH, damaged, fill};
 use super::reader::{LerobotReader, Stored};
 use super::stats::{self, Stats};
 use super::table::{self, put};
@@ -22,12 +21,9 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
-use swm_core::columns::{ACTION, EPISODE_IDX, STEP_IDX};
+use swm_core::columns::ACTION;
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
 use swm_video::{Encoder, Encoding};
-
-/// Frames a second: what LeRobot's times count in. Steps of simulated worlds have no common rate.
-const FRAMES_PER_SECOND: u32 = 25;
 
 /// Creates, continues or replaces a dataset.
 pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
@@ -75,7 +71,7 @@ struct PendingEpisode {
 impl LerobotWriter {
     fn create(root: &Path, schema: &Schema, options: WriteOptions) -> Result<Self> {
         options.codec.check()?;
-        let columns = stored(schema)?;
+        let columns = stored_columns(schema)?;
         let exists = root.join("meta").join("info.json").is_file();
         if !exists && root.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
             let problem = format!("{} holds something else", root.display());
@@ -96,7 +92,7 @@ impl LerobotWriter {
             _lock: lock,
             encoding: Encoding::training(options.codec),
             schema: schema.clone(),
-            info: info(schema, &columns, &options),
+            info: new_info(schema, &columns, &options),
             stats: columns.iter().map(|(index, _)| Stats::new(&schema.columns()[*index])).collect(),
             columns,
             tasks: vec![],
@@ -419,80 +415,6 @@ fn record(fields: Vec<Field>, arrays: Vec<ArrayRef>) -> Result<(Arc<ArrowSchema>
     let schema = Arc::new(ArrowSchema::new(fields));
     let batch = RecordBatch::try_new(Arc::clone(&schema), arrays).map_err(|e| Error::external("writing a table", e))?;
     Ok((schema, batch))
-}
-
-/// The columns that are stored, and their features.
-fn stored(schema: &Schema) -> Result<Vec<(usize, String)>> {
-    let mut columns: Vec<(usize, String)> = vec![];
-    for (index, column) in schema.columns().iter().enumerate() {
-        let refuse = |problem: String, fix: &str| Err(Error::config("schema", problem, fix));
-        if column.name == EPISODE_IDX || column.name == STEP_IDX {
-            continue;
-        }
-        if column.is_empty() {
-            return refuse(format!("column '{}' holds no number", column.name), "leave it out");
-        }
-        let native = native_name(column, schema);
-        let reserved = ["timestamp", "frame_index", "episode_index", "index", "task_index", "task"];
-        let unfit = native.contains(['/', '\\', '\0']) || native.starts_with('.');
-        if unfit || reserved.contains(&&*native) || columns.iter().any(|(_, other)| *other == native) {
-            return refuse(format!("LeRobot can have no feature '{native}' of a column's"), "rename the column");
-        }
-        columns.push((index, native));
-    }
-    if columns.is_empty() {
-        return Err(Error::config("schema", "it has no columns", "an episode needs at least one"));
-    }
-    Ok(columns)
-}
-
-fn info(schema: &Schema, columns: &[(usize, String)], options: &WriteOptions) -> Info {
-    let mut features: Vec<(String, Feature)> = columns
-        .iter()
-        .map(|(index, native)| {
-            let column = &schema.columns()[*index];
-            let feature = if column.is_image() {
-                let names = json!(["height", "width", "channels"]);
-                let details = json!({
-                    "video.height": column.shape[0], "video.width": column.shape[1], "video.codec": "h264",
-                    "video.fps": FRAMES_PER_SECOND, "video.channels": 3, "video.is_depth_map": false, "has_audio": false,
-                });
-                Feature { dtype: "video".to_owned(), shape: column.shape.clone(), names, info: Some(details) }
-            } else {
-                // More than one axis would need extensions of Arrow; our own record restores them.
-                let shape = vec![column.len()];
-                Feature { dtype: column.dtype.name().to_owned(), shape, names: Value::Null, info: None }
-            };
-            (native.clone(), feature)
-        })
-        .collect();
-    let mut default = |name: &str, dtype: DType| {
-        let feature = Feature { dtype: dtype.name().to_owned(), shape: vec![1], names: Value::Null, info: None };
-        features.push((name.to_owned(), feature));
-    };
-    default("timestamp", DType::Float32);
-    ["frame_index", "episode_index", "index", "task_index"].iter().for_each(|name| default(name, DType::Int64));
-    let cameras = columns.iter().any(|(index, _)| schema.columns()[*index].is_image());
-    Info {
-        codebase_version: VERSION.to_owned(),
-        robot_type: None,
-        total_episodes: 0,
-        total_frames: 0,
-        total_tasks: 0,
-        chunks_size: 1000,
-        data_files_size_in_mb: 100,
-        video_files_size_in_mb: 200,
-        fps: FRAMES_PER_SECOND.into(),
-        splits: BTreeMap::new(),
-        data_path: DATA_PATH.to_owned(),
-        video_path: cameras.then(|| VIDEO_PATH.to_owned()),
-        features: Features(features),
-        stable_worldmodel: Some(Recorded {
-            schema: schema.clone(),
-            manifest: options.manifest.clone(),
-            last_action_repeats: true,
-        }),
-    }
 }
 
 /// The last row, which holds no action, repeats the one before; where there is none it is 0.

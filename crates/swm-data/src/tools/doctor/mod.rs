@@ -1,78 +1,78 @@
-//! Examining a dataset: what is wrong with it, which models it can train, and a new dataset of what is sound.
+//! Examines a dataset: its defects, the models it can train, and repair, which writes the sound episodes to a new dataset.
 //!
-//! Everything is read the way training reads it, every row of every column, so what passes here is what a loader gives.
-//! What only the format can tell (rows that belong to no episode, stored step numbers, files that nothing refers to) it
-//! tells through [`Reader::irregularities`].
+//! The examination reads every row of every column as training does, so a sound dataset gives a loader no errors. Defects
+//! that only the format can detect come from [`Reader::irregularities`].
 
-mod models;
+mod model_fit;
 
-pub use models::{Fitness, fitness};
+pub use model_fit::ModelFit;
 
-use crate::dataset::Location;
 use crate::dataset::views::subset;
-use crate::dataset::{Reader, StepRange};
+use crate::dataset::{Location, Reader, StepRange};
 use crate::formats::{lance, open};
-use crate::tools::convert::{ConvertOptions, Converted, Stage, convert};
+use crate::tools::convert::{ConvertOptions, Converted, convert};
 use serde::Serialize;
 use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
-use swm_core::columns::{ACTION, EPISODE_IDX, STEP_IDX};
-use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
+use swm_core::columns::{ACTION, EPISODE_IDX, REWARD, STEP_IDX, TERMINATED};
+use swm_core::requirements::DatasetRequirements;
+use swm_core::run::{Control, Event, Progress, Stage};
+use swm_core::{Batch, ColumnSpec, DType, Error, Result};
 
-/// How bad it is.
+/// Severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Severity {
-    /// The data are damaged or contradict themselves.
+    /// The data is damaged or inconsistent.
     Problem,
-    /// Worth knowing, and sound.
+    /// A remark on sound data.
     Note,
 }
 
-/// Something that was found.
+/// Something the examination found.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Finding {
-    /// How bad it is.
+    /// Its severity.
     pub severity: Severity,
-    /// What it is.
+    /// Description for people.
     pub what: String,
-    /// The positions of the episodes it was found in; none if it is about the dataset.
+    /// Positions of the affected episodes; empty if the whole dataset is affected.
     pub episodes: Vec<usize>,
 }
 
-/// What is the matter with a dataset.
+/// The result of an examination.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Diagnosis {
-    /// Episodes.
+    /// Number of episodes.
     pub episodes: usize,
-    /// Rows of all episodes.
+    /// Number of rows of all episodes.
     pub rows: usize,
-    /// What was found, problems first.
+    /// Findings, problems first.
     pub findings: Vec<Finding>,
-    /// The positions of the episodes without a problem.
+    /// Positions of the episodes without a problem.
     pub sound: Vec<usize>,
-    /// Which models the sound episodes can train.
-    pub models: Vec<Fitness>,
+    /// For each model, whether the sound episodes can train it.
+    pub models: Vec<ModelFit>,
 }
 
 impl Diagnosis {
-    /// Adds what was lost before anything was read.
-    pub fn add_lost(&mut self, lost: Vec<String>) {
+    /// Adds the losses that [`open_damaged`] reported.
+    pub fn add_losses(&mut self, lost: Vec<String>) {
         let finding = |what| Finding { severity: Severity::Problem, what, episodes: vec![] };
         self.findings.splice(0..0, lost.into_iter().map(finding));
     }
 
-    /// How many problems there are.
+    /// Number of problems.
     pub fn problems(&self) -> usize {
         self.findings.iter().filter(|finding| finding.severity == Severity::Problem).count()
     }
 }
 
-/// Opens a dataset, or what is left of one that cannot be opened, and says what is lost.
+/// Opens a dataset, or the readable part of a damaged one with descriptions of the losses.
 ///
 /// # Errors
-/// When nothing of it can be opened.
-pub fn open_what_is_left(location: &Location) -> Result<(Arc<dyn Reader>, Vec<String>)> {
+/// If no part of it can be opened.
+pub fn open_damaged(location: &Location) -> Result<(Arc<dyn Reader>, Vec<String>)> {
     open(location).map(|reader| (reader, vec![])).or_else(|error| {
         if !(lance::ENTRY.detect)(location) {
             return Err(error);
@@ -84,11 +84,13 @@ pub fn open_what_is_left(location: &Location) -> Result<(Arc<dyn Reader>, Vec<St
     })
 }
 
-/// Reads everything and says what is wrong. `progress` is told the episodes done, and stops the work by saying `false`.
+/// Examines a dataset, and compares its sound episodes with the requirements of `models`.
 ///
 /// # Errors
-/// When the work is stopped. Damage is no error: it is what is looked for.
-pub fn examine(reader: &dyn Reader, progress: &mut dyn FnMut(usize) -> bool) -> Result<Diagnosis> {
+/// If the run is stopped. Damage is not an error but a finding.
+pub fn examine(reader: &dyn Reader, models: &[DatasetRequirements], control: &mut Control<'_>) -> Result<Diagnosis> {
+    let (stage, total, unit) = ("examine", reader.episodes().len(), "episodes");
+    control.emit(Event::Started(Stage { name: stage, subject: &[], total, unit }));
     let mut found = Findings::default();
     match reader.irregularities() {
         Ok(irregularities) => irregularities.into_iter().for_each(|it| found.problem(it.episode, it.what)),
@@ -100,18 +102,18 @@ pub fn examine(reader: &dyn Reader, progress: &mut dyn FnMut(usize) -> bool) -> 
     }
     let data = |name: &str| name != EPISODE_IDX && name != STEP_IDX;
     let columns: Vec<&ColumnSpec> = reader.schema().columns().iter().filter(|column| data(&column.name)).collect();
-    if !columns.iter().any(|column| column.name == "reward") {
+    if !columns.iter().any(|column| column.name == REWARD) {
         found.note(None, "there is no reward".to_owned());
     }
-    let mut numbers = HashSet::new();
+    let mut indices = HashSet::new();
     let mut sound = vec![];
     for (position, episode) in episodes.iter().enumerate() {
-        if !numbers.insert(episode.index) {
-            found.problem(Some(position), format!("the number {} stands for another episode, too", episode.index));
+        if !indices.insert(episode.index) {
+            found.problem(Some(position), format!("the index {} is also that of another episode", episode.index));
         }
         match episode.length {
             0 => found.problem(Some(position), "it has no rows".to_owned()),
-            1 => found.note(Some(position), "it has one row, and so no step".to_owned()),
+            1 => found.note(Some(position), "it has one row and therefore no step".to_owned()),
             _ => {}
         }
         if let Err(error) = reader.constants(position) {
@@ -126,15 +128,15 @@ pub fn examine(reader: &dyn Reader, progress: &mut dyn FnMut(usize) -> bool) -> 
         if !found.bad.contains(&position) {
             sound.push(position);
         }
-        if !progress(position + 1) {
-            return Err(Error::Interrupted);
-        }
+        control.progress(Progress { stage, done: position + 1, total, unit, metrics: &[] });
+        control.check()?;
     }
+    control.emit(Event::Finished { stage, metrics: &[] });
     let lengths: Vec<usize> = sound.iter().map(|&position| episodes[position].length).collect();
     Ok(Diagnosis {
         episodes: episodes.len(),
         rows: episodes.iter().map(|episode| episode.length).sum(),
-        models: fitness(reader.schema(), &lengths),
+        models: models.iter().map(|required| ModelFit::new(required, reader.schema(), &lengths)).collect(),
         findings: found.sorted(),
         sound,
     })
@@ -143,13 +145,13 @@ pub fn examine(reader: &dyn Reader, progress: &mut dyn FnMut(usize) -> bool) -> 
 /// Writes the episodes without a problem to a new dataset.
 ///
 /// # Errors
-/// When none is sound, or the target cannot be written.
+/// If no episode is sound, or the target cannot be written.
 pub fn repair(
     reader: &Arc<dyn Reader>,
     diagnosis: &Diagnosis,
     target: &Location,
     options: &ConvertOptions,
-    progress: &mut dyn FnMut(Stage, usize, usize) -> bool,
+    control: &mut Control<'_>,
 ) -> Result<Converted> {
     if diagnosis.sound.is_empty() {
         let problem = format!("none of its {} episodes is sound", diagnosis.episodes);
@@ -159,14 +161,14 @@ pub fn repair(
             "collect the data again, or convert them again from their source",
         ));
     }
-    convert(&subset(Arc::clone(reader), diagnosis.sound.clone())?, target, options, progress)
+    convert(&subset(Arc::clone(reader), diagnosis.sound.clone())?, target, options, control)
 }
 
-/// What was found, episodes with the same gathered.
+/// Findings, with all episodes of the same finding grouped.
 #[derive(Default)]
 struct Findings {
     found: BTreeMap<(Severity, String), Vec<usize>>,
-    /// Positions of episodes with a problem.
+    /// Positions of the episodes with a problem.
     bad: HashSet<usize>,
 }
 
@@ -186,7 +188,7 @@ impl Findings {
     }
 }
 
-/// Looks at one column of one episode.
+/// Examines one column of one episode.
 fn examine_column(rows: &Batch, column: &str, position: usize, found: &mut Findings) -> Result<()> {
     let (count, spec) = (rows.rows(), &rows.schema().columns()[0]);
     let last = count.saturating_sub(1);
@@ -194,7 +196,7 @@ fn examine_column(rows: &Batch, column: &str, position: usize, found: &mut Findi
         STEP_IDX => {
             let steps = rows.to_f32(STEP_IDX)?;
             if let Some(row) = (0..count.min(1 << 24)).find(|&row| steps[row] != row as f32) {
-                found.problem(Some(position), format!("step {} stands in row {row}", steps[row]));
+                found.problem(Some(position), format!("row {row} holds step {}", steps[row]));
             }
         }
         ACTION if spec.dtype != DType::U8 && spec.dtype != DType::Bool => {
@@ -205,8 +207,8 @@ fn examine_column(rows: &Batch, column: &str, position: usize, found: &mut Findi
                 let none = action.iter().all(|&v| if float { v.is_nan() } else { v == -1.0 });
                 match row == last {
                     true if !none => {
-                        let what = "the last row has an action, from which nothing follows; it is left out of a repaired or \
-                                    converted dataset";
+                        let what = "the last row has an action, but no observation follows it; a repaired or converted \
+                                    dataset omits it";
                         found.note(Some(position), what.to_owned());
                     }
                     false if none => missing += 1,
@@ -227,21 +229,16 @@ fn examine_column(rows: &Batch, column: &str, position: usize, found: &mut Findi
                 _ => rows.get::<f64>(column)?.iter().all(|v| v.is_finite()),
             };
             if !finite {
-                found.problem(Some(position), format!("'{column}' has a number that is not finite"));
+                found.problem(Some(position), format!("'{column}' has a value that is not finite"));
             }
         }
-        "terminated" => {
+        TERMINATED => {
             let flags = rows.bytes(0);
             if flags.iter().take(last.saturating_sub(1)).any(|&flag| flag != 0) {
-                found.note(Some(position), "it goes on after it terminated".to_owned());
+                found.note(Some(position), "it continues after it terminated".to_owned());
             }
         }
         _ => {}
     }
     Ok(())
-}
-
-/// Whether a column is there and holds pictures.
-fn is_picture(schema: &Schema, name: &str) -> bool {
-    schema.column(name).is_ok_and(ColumnSpec::is_image)
 }

@@ -1,8 +1,9 @@
-//! Bitshuffle: the first bits of all numbers, then their second bits, and so on; in blocks, which may be compressed.
+//! Bitshuffle: stores the first bits of all elements, then their second bits, and so on, in blocks that may be
+//! compressed.
 
 use super::{Input, lz4_block, zstd_frame};
 
-/// What a block is compressed with.
+/// Compression of blocks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Codec {
     None,
@@ -22,12 +23,12 @@ impl Codec {
     }
 }
 
-/// Bytes of a block, of the filter's own choosing.
+/// Block size in bytes, as the filter chooses it.
 fn default_block(size: usize) -> usize {
     (8192 / size / 8 * 8).max(128) * size
 }
 
-/// Decodes what the filter wrote to exactly `out`.
+/// Decodes to exactly `out`.
 pub fn decode(from: &[u8], size: usize, codec: Codec, out: &mut [u8]) -> Result<(), String> {
     let mut input = Input(from);
     let block = if codec == Codec::None {
@@ -35,14 +36,11 @@ pub fn decode(from: &[u8], size: usize, codec: Codec, out: &mut [u8]) -> Result<
     } else {
         let (total, block) = (input.u64_be()?, input.u32_be()? as usize);
         if total != out.len() as u64 || block == 0 {
-            return Err(format!(
-                "bitshuffle: it says it holds {total} bytes in blocks of {block}; they are {}",
-                out.len()
-            ));
+            return Err(format!("bitshuffle: it declares {total} bytes in blocks of {block} instead of {}", out.len()));
         }
         block
     };
-    // Bits of eight numbers share a byte; what is left over is stored as it is.
+    // Eight elements share a byte for each bit; the remaining elements are stored unshuffled.
     let eight = 8 * size;
     let block = (block / eight * eight).max(eight);
     let whole = out.len() / eight * eight;
@@ -64,9 +62,9 @@ pub fn decode(from: &[u8], size: usize, codec: Codec, out: &mut [u8]) -> Result<
     Ok(())
 }
 
-/// Puts shuffled bits of a multiple of eight numbers back in their order.
+/// Unshuffles the bits of a multiple of eight elements.
 pub fn undo(from: &[u8], size: usize, out: &mut [u8]) {
-    // One row a bit: the bits of that place of all numbers, the first in the lowest bit.
+    // One row per bit: that bit of all elements, the first in the lowest bit.
     let row = out.len() / size / 8;
     for byte in 0..size {
         let rows: [&[u8]; 8] = std::array::from_fn(|bit| &from[(byte * 8 + bit) * row..(byte * 8 + bit + 1) * row]);
@@ -79,7 +77,7 @@ pub fn undo(from: &[u8], size: usize, out: &mut [u8]) {
     }
 }
 
-/// Transposes eight rows of eight bits (Hacker's Delight, 7-3).
+/// Transposes an 8 x 8 bit matrix (Hacker's Delight, 7-3).
 fn transpose(mut x: u64) -> u64 {
     let mut swap = |mask: u64, shift: u32| {
         let t = (x ^ x >> shift) & mask;

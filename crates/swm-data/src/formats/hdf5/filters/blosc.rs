@@ -1,8 +1,8 @@
-//! Blosc (version 1): blocks, shuffled and compressed with one of several codecs.
+//! Blosc (version 1): shuffled blocks, compressed with one of several codecs.
 //!
-//! A header of 16 bytes (versions, flags, the size of a number, lengths of all, of a block, and of the chunk), the
-//! beginning of every block, then the blocks. A block is one stream, or one for each byte of a number; each has its
-//! length before it, and is stored when that is what it holds.
+//! A chunk is a header of 16 bytes (versions, flags, element size, total length, block length, chunk length), the
+//! offset of every block, then the blocks. A block is one stream, or one stream per byte of an element. Each stream has
+//! a length prefix and is stored uncompressed if that length equals its content.
 
 use super::{Input, bitshuffle, copy_match, inflate, lz4_block, shuffle, zstd_frame};
 
@@ -30,7 +30,7 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
         ));
     }
     if flags & flag::STORED != 0 {
-        let bytes = from.get(HEADER..HEADER + total).ok_or("Blosc: it is cut off")?;
+        let bytes = from.get(HEADER..HEADER + total).ok_or("Blosc: it is truncated")?;
         out.copy_from_slice(bytes);
         return Ok(());
     }
@@ -40,7 +40,7 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     for (place, start) in out.chunks_mut(block).zip(starts.as_chunks::<4>().0) {
         let start = u32::from_le_bytes(*start) as usize;
         let mut input = Input(from.get(start..).ok_or("Blosc: a block is outside the chunk")?);
-        // The last block is one stream when it is shorter.
+        // The last block is one stream if it is shorter.
         let streams = if flags & flag::ONE_STREAM != 0 || place.len() < block { 1 } else { size };
         let shuffled = (flags & flag::SHUFFLE != 0 && size > 1) || flags & flag::BITSHUFFLE != 0;
         scratch.resize(place.len(), 0);
@@ -61,11 +61,11 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
                 1 => lz4_block(bytes, stream)?,
                 3 => inflate(bytes, stream)?,
                 4 => zstd_frame(bytes, stream)?,
-                codec => return Err(format!("Blosc: codec {codec} (Snappy is 2) is not understood")),
+                codec => return Err(format!("Blosc: codec {codec} (Snappy is 2) is not supported")),
             }
         }
         if flags & flag::BITSHUFFLE != 0 {
-            // Only whole groups of eight numbers are shuffled, or nothing.
+            // Only whole groups of eight elements are shuffled, or none.
             if place.len().is_multiple_of(8 * size) {
                 bitshuffle::undo(&scratch, size, place);
             } else {
@@ -78,13 +78,13 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     Ok(())
 }
 
-/// BloscLZ, a descendant of FastLZ: as LZF, but a long length has any number of bytes, and the largest distance is
-/// followed by two bytes of what it is beyond that.
+/// BloscLZ, a descendant of FastLZ: like LZF, but lengths have any number of bytes, and two more bytes follow the
+/// largest distance.
 fn blosclz(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     const FAR: usize = 8191;
     let mut input = Input(from);
     let mut at = 0;
-    // The first instruction is literals, whatever its upper bits say.
+    // The first instruction is always literals.
     let mut control = usize::from(input.array::<1>()?[0] & 31);
     loop {
         if control < 32 {
@@ -97,7 +97,7 @@ fn blosclz(from: &[u8], out: &mut [u8]) -> Result<(), String> {
             if length == 7 + 2 {
                 loop {
                     let [more] = input.array()?;
-                    length = length.checked_add(usize::from(more)).ok_or("BloscLZ: a length is too large")?;
+                    length = length.checked_add(usize::from(more)).ok_or("BloscLZ: a length overflows")?;
                     if more != 255 {
                         break;
                     }

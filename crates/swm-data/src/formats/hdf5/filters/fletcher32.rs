@@ -1,18 +1,18 @@
-//! Fletcher's checksum of 32 bits over big-endian words of 16, as HDF5 defines it, stored after the bytes it sums.
+//! The 32-bit Fletcher checksum over big-endian 16-bit words, as HDF5 defines it. It is stored after the data.
 
-/// Bytes of a checksum.
+/// Size of a checksum in bytes.
 pub const SIZE: usize = 4;
 
 /// Words summed between two reductions: the weighted sum of so many stays below 2^32.
 const BLOCK: usize = 256;
 
-/// The checksum of some bytes.
+/// The checksum of `bytes`.
 pub fn sum(bytes: &[u8]) -> u32 {
     const MODULUS: u64 = 65_535;
     let (mut plain, mut weighted) = (0_u64, 0_u64);
     let (words, odd) = bytes.as_chunks::<2>();
     for block in words.chunks(BLOCK) {
-        // Over a block of n words the plain sum enters the weighted one n times, and word i of it n - i times.
+        // Over a block of n words, the plain sum enters the weighted one n times, and word i of the block n - i times.
         let n = block.len() as u32;
         let (mut sum, mut sums) = (0_u32, 0_u32);
         for (&word, weight) in block.iter().zip((1..=n).rev()) {
@@ -27,14 +27,14 @@ pub fn sum(bytes: &[u8]) -> u32 {
         plain = (plain + (u64::from(*last) << 8)) % MODULUS;
         weighted = (weighted + plain) % MODULUS;
     }
-    // HDF5 folds carries instead of dividing, which leaves the modulus where division leaves 0, unless all was 0.
+    // HDF5 folds carries instead of dividing, so the result is the modulus instead of 0, unless all words are 0.
     let fold = |sum: u64, any: bool| if sum == 0 && any { MODULUS } else { sum };
     let any = bytes.iter().any(|&byte| byte != 0);
     let folded = (fold(weighted, any) << 16 | fold(plain, any)) as u32;
     folded
 }
 
-/// Checks the sum at the end of some bytes, and gives how many it sums.
+/// Verifies the checksum at the end of `bytes`, and returns the length of the data.
 pub fn check(bytes: &[u8]) -> Result<usize, String> {
     let Some((summed, stored)) = bytes.split_last_chunk::<SIZE>() else {
         return Err("a chunk is too short for its checksum".to_owned());
@@ -50,7 +50,7 @@ pub fn check(bytes: &[u8]) -> Result<usize, String> {
 mod tests {
     use super::*;
 
-    /// As HDF5's documentation describes it, word by word.
+    /// The definition in HDF5's documentation, word by word.
     fn slow(bytes: &[u8]) -> u32 {
         let (mut a, mut b) = (0_u32, 0_u32);
         let fold = |sum: u32| (sum & 0xffff) + (sum >> 16);

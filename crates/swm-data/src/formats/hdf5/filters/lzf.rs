@@ -1,22 +1,22 @@
-//! LZF, Marc Lehmann's fast codec, which h5py brings along: every h5py reads it without plugins.
+//! LZF, Marc Lehmann's fast codec. It is part of h5py, so every h5py reads it without plugins.
 //!
-//! A stream of instructions. A byte below 32 is followed by one literal more than it says. Any other begins a match: its
-//! upper three bits are the length less 2, where 7 is followed by a byte to add; its lower five and the next byte are the
-//! distance less 1.
+//! The format is a stream of instructions. A byte `n` below 32 is followed by `n + 1` literals. Any other byte starts a
+//! match: its upper three bits are the length less 2 (7 means that another byte is added), and its lower five bits with
+//! the next byte are the distance less 1.
 
 use super::copy_match;
 
 const MAX_LITERALS: usize = 32;
 const MAX_DISTANCE: usize = 1 << 13;
 const MAX_LENGTH: usize = 264;
-/// Matches up to this length are copied in one go.
+/// Matches up to this length are copied at once.
 const SHORT: usize = 16;
-/// Positions that are remembered, by a hash of the three bytes there.
+/// Number of remembered positions, addressed by a hash of the three bytes there.
 const TABLE_BITS: u32 = 14;
 
 /// Decodes to exactly `out`.
 pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
-    let cut = || "LZF: it is cut off".to_owned();
+    let cut = || "LZF: it is truncated".to_owned();
     let (mut i, mut at) = (0, 0);
     while let Some(&control) = from.get(i) {
         let control = usize::from(control);
@@ -25,9 +25,9 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
             let length = control + 1;
             let literals = from.get(i..i + length).ok_or_else(cut)?;
             if length > out.len() - at {
-                return Err("LZF: it holds too much".to_owned());
+                return Err("LZF: it exceeds the chunk".to_owned());
             }
-            // Where there is room, the longest run is copied always, which takes two moves instead of a call.
+            // If there is space, always copies the maximum length, which takes two moves instead of a call.
             match (from[i..].first_chunk::<MAX_LITERALS>(), out[at..].first_chunk_mut::<MAX_LITERALS>()) {
                 (Some(literals), Some(place)) => *place = *literals,
                 _ => out[at..at + length].copy_from_slice(literals),
@@ -57,7 +57,7 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     if at == out.len() { Ok(()) } else { Err(format!("LZF: it ends after {at} of {} bytes", out.len())) }
 }
 
-/// What an encoder remembers; kept to be used again.
+/// The state of an encoder, reused between chunks.
 pub struct Encoder(Box<[u32; 1 << TABLE_BITS]>);
 
 impl Default for Encoder {
@@ -67,8 +67,8 @@ impl Default for Encoder {
 }
 
 impl Encoder {
-    /// Appends the encoded bytes to `out`, and says whether that saves a third. Where not, nothing is appended: bytes as
-    /// they are take less time to read.
+    /// Appends the encoded bytes to `out` if that saves a third, and returns whether it does. Otherwise appends
+    /// nothing, because uncompressed bytes read faster.
     pub fn encode(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> bool {
         let begin = out.len();
         let most = bytes.len() / 3 * 2;
@@ -77,7 +77,7 @@ impl Encoder {
         while at + 2 < bytes.len() {
             let key = [bytes[at], bytes[at + 1], bytes[at + 2]];
             let hash = (u32::from_le_bytes([key[0], key[1], key[2], 0]).wrapping_mul(0x9e37_79b1)) >> (32 - TABLE_BITS);
-            // Positions are stored one higher, as 0 means none.
+            // Positions are stored plus one, because 0 means none.
             let slot = &mut self.0[hash as usize];
             let before = (*slot as usize).checked_sub(1);
             {
@@ -107,7 +107,7 @@ impl Encoder {
     }
 }
 
-/// How many bytes are equal, eight at a time.
+/// Length of the common prefix, compared eight bytes at a time.
 fn common(a: &[u8], b: &[u8]) -> usize {
     let words = a.as_chunks::<8>().0.iter().zip(b.as_chunks::<8>().0);
     for (i, (x, y)) in words.enumerate() {

@@ -1,7 +1,7 @@
-//! The filters of HDF5: what a chunk went through when it was written, undone.
+//! Decoders for HDF5 filters.
 //!
-//! Those of the library itself (deflate, shuffle, Fletcher's checksum), LZF, which comes with h5py, and of the package
-//! hdf5plugin LZ4, Zstandard, bitshuffle and Blosc with all its codecs but Snappy.
+//! Supported are the filters of the HDF5 library (deflate, shuffle, Fletcher's checksum), h5py's LZF, and LZ4,
+//! Zstandard, bitshuffle and Blosc (with all codecs except Snappy) of the package hdf5plugin.
 
 mod bitshuffle;
 mod blosc;
@@ -11,7 +11,7 @@ mod shuffle;
 
 use std::mem;
 
-/// Their numbers in the registry of HDF5 filters.
+/// Ids in the registry of HDF5 filters.
 pub(super) mod id {
     pub const DEFLATE: u16 = 1;
     pub const SHUFFLE: u16 = 2;
@@ -39,7 +39,7 @@ enum Filter {
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Pipeline(Vec<Filter>);
 
-/// Memory for what is between two filters, used again for every chunk.
+/// Buffers for data between two filters, reused for every chunk.
 #[derive(Default)]
 pub(super) struct Scratch {
     from: Vec<u8>,
@@ -47,10 +47,10 @@ pub(super) struct Scratch {
 }
 
 impl Pipeline {
-    /// The filters of a dataset whose numbers have `size` bytes.
+    /// The filters of a dataset whose elements have `size` bytes.
     ///
     /// # Errors
-    /// When there is one that is not understood; names it.
+    /// If a filter is not supported; names it.
     pub fn new(filters: &[hdf5_pure::Filter], size: usize) -> Result<Self, String> {
         let understood = |filter: &hdf5_pure::Filter| {
             let value = |at: usize| filter.client_data.get(at).copied().unwrap_or(0);
@@ -66,26 +66,29 @@ impl Pipeline {
                 id::BITSHUFFLE => Filter::Bitshuffle { size: element(2), codec: bitshuffle::Codec::new(value(4))? },
                 unknown => {
                     let name = filter.name.as_deref().map(str::trim).filter(|name| !name.is_empty());
-                    return Err(format!("its chunks went through filter {unknown} ({})", name.unwrap_or("no name")));
+                    return Err(format!(
+                        "its chunks use the unsupported filter {unknown} ({})",
+                        name.unwrap_or("no name")
+                    ));
                 }
             })
         };
         filters.iter().map(understood).collect::<Result<_, _>>().map(Self)
     }
 
-    /// Whether chunks are stored as they are.
+    /// Whether chunks are stored without filters.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// Undoes the filters, but for those whose bit is set in `skipped`. `out` is as long as the chunk.
+    /// Reverses all filters except those whose bit is set in `skipped`. `out` is as long as the decoded chunk.
     ///
     /// # Errors
-    /// When the chunk is damaged.
+    /// If the chunk is damaged.
     pub fn decode(&self, stored: &[u8], skipped: u32, scratch: &mut Scratch, out: &mut [u8]) -> Result<(), String> {
         let applied = |at: usize| at >= 32 || skipped & 1 << at == 0;
         let Scratch { from, to } = scratch;
-        // What is left to undo is `stored` at first, then `from`.
+        // The remaining data is in `stored` at first, then in `from`.
         let mut first = true;
         let mut end = stored.len();
         for at in (0..self.0.len()).rev().filter(|&at| applied(at)) {
@@ -115,7 +118,7 @@ impl Pipeline {
 }
 
 impl Filter {
-    /// Undoes it. What comes out is exactly as long as `out`.
+    /// Reverses the filter. The result is exactly as long as `out`.
     fn undo(self, from: &[u8], out: &mut [u8]) -> Result<(), String> {
         match self {
             Self::Deflate => inflate(from, out),
@@ -125,13 +128,13 @@ impl Filter {
             Self::Zstd => zstd_frame(from, out),
             Self::Blosc => blosc::decode(from, out),
             Self::Bitshuffle { size, codec } => bitshuffle::decode(from, size, codec, out),
-            // A checksum is not in the way of what it sums.
+            // The data in front of a checksum needs no conversion.
             Self::Fletcher32 => Ok(()),
         }
     }
 }
 
-/// A stream of zlib.
+/// Decodes a zlib stream.
 fn inflate(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     use flate2::{Decompress, FlushDecompress, Status};
     let mut state = Decompress::new(true);
@@ -142,25 +145,25 @@ fn inflate(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     Err(format!("deflate: it ends after {} of {} bytes", state.total_out(), out.len()))
 }
 
-/// A block of LZ4.
+/// Decodes an LZ4 block.
 fn lz4_block(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     let size = lz4_flex::block::decompress_into(from, out).map_err(|e| format!("LZ4: {e}"))?;
     if size == out.len() { Ok(()) } else { Err(format!("LZ4: it ends after {size} of {} bytes", out.len())) }
 }
 
-/// A frame of Zstandard.
+/// Decodes a Zstandard frame.
 fn zstd_frame(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     let size = zstd::bulk::decompress_to_buffer(from, out).map_err(|e| format!("Zstandard: {e}"))?;
     if size == out.len() { Ok(()) } else { Err(format!("Zstandard: it ends after {size} of {} bytes", out.len())) }
 }
 
-/// What the LZ4 filter writes: the length of all, that of a block, then blocks with the length of each before it. A
-/// block that is not smaller than what it holds is stored.
+/// Decodes the output of the LZ4 filter: total length, block length, then blocks with length prefixes. A block that is
+/// not smaller than its content is stored uncompressed.
 fn lz4_blocks(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     let mut input = Input(from);
     let (total, block) = (input.u64_be()?, input.u32_be()? as usize);
     if total != out.len() as u64 || block == 0 {
-        return Err(format!("LZ4: it says it holds {total} bytes in blocks of {block}; they are {}", out.len()));
+        return Err(format!("LZ4: it declares {total} bytes in blocks of {block} instead of {}", out.len()));
     }
     for place in out.chunks_mut(block) {
         let size = input.u32_be()? as usize;
@@ -170,7 +173,7 @@ fn lz4_blocks(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     Ok(())
 }
 
-/// Bytes taken one after another.
+/// A reader of consecutive bytes.
 struct Input<'a>(&'a [u8]);
 
 impl<'a> Input<'a> {
@@ -198,7 +201,7 @@ impl<'a> Input<'a> {
     }
 }
 
-/// Copies `length` bytes from `distance` before `at` to `at`; they may overlap, which repeats them.
+/// Copies `length` bytes from `distance` before `at` to `at`. Overlapping ranges repeat the bytes.
 fn copy_match(out: &mut [u8], at: usize, distance: usize, length: usize) -> Result<(), String> {
     if distance > at || distance == 0 || length > out.len() - at {
         return Err(format!("a chunk refers to {distance} bytes before byte {at}, for {length} bytes"));

@@ -1,6 +1,6 @@
-//! Shuffle: the first bytes of all numbers, then their second bytes, and so on.
+//! Shuffle: stores the first bytes of all elements, then their second bytes, and so on.
 
-/// Puts shuffled bytes back in their order. Bytes after the last whole number are where they were.
+/// Unshuffles bytes. Bytes after the last whole element are not shuffled.
 pub fn undo(from: &[u8], size: usize, out: &mut [u8]) -> Result<(), String> {
     if from.len() != out.len() {
         return Err(format!("a chunk has {} bytes instead of {}", from.len(), out.len()));

@@ -1,0 +1,58 @@
+//! Calls of `hdf5-pure`, which reads the structure of a file.
+
+use crate::formats::stored_scalar::{Class, StoredScalar};
+use hdf5_pure::{Datatype, DatatypeByteOrder, FloatingPointLayout};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+/// Calls `hdf5-pure`, which may panic on damaged files.
+pub(super) fn catch_panic<T, E: std::fmt::Display>(
+    what: &str,
+    code: impl FnOnce() -> Result<T, E>,
+) -> Result<T, String> {
+    match catch_unwind(AssertUnwindSafe(code)) {
+        Ok(result) => result.map_err(|e| format!("{what}: {e}")),
+        Err(_) => Err(format!("{what}: the HDF5 library panicked")),
+    }
+}
+
+/// The numeric type of a dataset; `None` for text and compound types.
+pub(super) fn scalar_type(datatype: &Datatype) -> Option<StoredScalar> {
+    let (class, size, order) = match datatype {
+        Datatype::FixedPoint { size, byte_order, layout } => {
+            if layout.bit_offset != 0 || u32::from(layout.bit_precision) != size * 8 {
+                return None;
+            }
+            (if layout.signed { Class::Signed } else { Class::Unsigned }, *size, *byte_order)
+        }
+        Datatype::FloatingPoint { size, byte_order, layout } => {
+            // IEEE 754 with 16, 32 or 64 bits.
+            let half = FloatingPointLayout {
+                bit_precision: 16,
+                exponent_location: 10,
+                exponent_size: 5,
+                mantissa_size: 10,
+                exponent_bias: 15,
+                ..FloatingPointLayout::IEEE754_BINARY32
+            };
+            let known =
+                [(2, half), (4, FloatingPointLayout::IEEE754_BINARY32), (8, FloatingPointLayout::IEEE754_BINARY64)];
+            if !known.contains(&(*size, *layout)) {
+                return None;
+            }
+            (Class::Float, *size, *byte_order)
+        }
+        // The type that h5py stores booleans as.
+        Datatype::Enumeration { size: 1, members, .. } if members.len() == 2 => {
+            (Class::Bool, 1, DatatypeByteOrder::LittleEndian)
+        }
+        Datatype::Enumeration { base_type, .. } => return scalar_type(base_type),
+        _ => return None,
+    };
+    let big_endian = match order {
+        DatatypeByteOrder::LittleEndian => false,
+        DatatypeByteOrder::BigEndian => true,
+        DatatypeByteOrder::Vax => return None,
+    };
+    let stored = StoredScalar { class, size: size as usize, big_endian };
+    stored.dtype().map(|_| stored)
+}

@@ -1,0 +1,86 @@
+//! The features of new datasets: how columns are named and described in `meta/info.json`.
+
+use super::info::{DATA_PATH, Feature, Features, Info, Recorded, VERSION, VIDEO_PATH, native_name};
+use crate::dataset::WriteOptions;
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use swm_core::columns::{EPISODE_IDX, STEP_IDX};
+use swm_core::{DType, Error, Result, Schema};
+
+/// Frames per second in timestamps. Steps of simulated environments have no common rate.
+pub const FRAMES_PER_SECOND: u32 = 25;
+
+/// The columns that are stored, and their features.
+pub fn stored_columns(schema: &Schema) -> Result<Vec<(usize, String)>> {
+    let mut columns: Vec<(usize, String)> = vec![];
+    for (index, column) in schema.columns().iter().enumerate() {
+        let refuse = |problem: String, fix: &str| Err(Error::config("schema", problem, fix));
+        if column.name == EPISODE_IDX || column.name == STEP_IDX {
+            continue;
+        }
+        if column.is_empty() {
+            return refuse(format!("column '{}' holds no number", column.name), "leave it out");
+        }
+        let native = native_name(column, schema);
+        let reserved = ["timestamp", "frame_index", "episode_index", "index", "task_index", "task"];
+        let unfit = native.contains(['/', '\\', '\0']) || native.starts_with('.');
+        if unfit || reserved.contains(&&*native) || columns.iter().any(|(_, other)| *other == native) {
+            return refuse(format!("LeRobot can have no feature '{native}' of a column's"), "rename the column");
+        }
+        columns.push((index, native));
+    }
+    if columns.is_empty() {
+        return Err(Error::config("schema", "it has no columns", "an episode needs at least one"));
+    }
+    Ok(columns)
+}
+
+/// The description of a new dataset.
+pub fn new_info(schema: &Schema, columns: &[(usize, String)], options: &WriteOptions) -> Info {
+    let mut features: Vec<(String, Feature)> = columns
+        .iter()
+        .map(|(index, native)| {
+            let column = &schema.columns()[*index];
+            let feature = if column.is_image() {
+                let names = json!(["height", "width", "channels"]);
+                let details = json!({
+                    "video.height": column.shape[0], "video.width": column.shape[1], "video.codec": "h264",
+                    "video.fps": FRAMES_PER_SECOND, "video.channels": 3, "video.is_depth_map": false, "has_audio": false,
+                });
+                Feature { dtype: "video".to_owned(), shape: column.shape.clone(), names, info: Some(details) }
+            } else {
+                // More than one axis would need extensions of Arrow; our own record restores them.
+                let shape = vec![column.len()];
+                Feature { dtype: column.dtype.name().to_owned(), shape, names: Value::Null, info: None }
+            };
+            (native.clone(), feature)
+        })
+        .collect();
+    let mut default = |name: &str, dtype: DType| {
+        let feature = Feature { dtype: dtype.name().to_owned(), shape: vec![1], names: Value::Null, info: None };
+        features.push((name.to_owned(), feature));
+    };
+    default("timestamp", DType::Float32);
+    ["frame_index", "episode_index", "index", "task_index"].iter().for_each(|name| default(name, DType::Int64));
+    let cameras = columns.iter().any(|(index, _)| schema.columns()[*index].is_image());
+    Info {
+        codebase_version: VERSION.to_owned(),
+        robot_type: None,
+        total_episodes: 0,
+        total_frames: 0,
+        total_tasks: 0,
+        chunks_size: 1000,
+        data_files_size_in_mb: 100,
+        video_files_size_in_mb: 200,
+        fps: FRAMES_PER_SECOND.into(),
+        splits: BTreeMap::new(),
+        data_path: DATA_PATH.to_owned(),
+        video_path: cameras.then(|| VIDEO_PATH.to_owned()),
+        features: Features(features),
+        stable_worldmodel: Some(Recorded {
+            schema: schema.clone(),
+            manifest: options.manifest.clone(),
+            last_action_repeats: true,
+        }),
+    }
+}

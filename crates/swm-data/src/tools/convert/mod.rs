@@ -1,0 +1,402 @@
+//! Converts datasets between formats: resumes interrupted conversions, and verifies the result against the source.
+//!
+//! The verification compares decoded content: images as pixels, other columns as values. A lossless target must
+//! reproduce every byte; a lossy one every numeric value, and images with a minimum peak signal-to-noise ratio.
+
+mod comparison;
+
+pub use comparison::ColumnComparison;
+
+use crate::dataset::episodes::describe_columns;
+use crate::dataset::{CommitPolicy, Constants, Location, Reader, StepRange, WriteMode, WriteOptions};
+use crate::formats::{FORMATS, FormatEntry, create, open};
+use comparison::{data_columns, dataset_hash, episode_hash};
+use serde::Serialize;
+use std::ops::Range;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
+use std::thread::scope;
+use swm_core::columns::ACTION;
+use swm_core::run::{Control, Event, Progress, Stage};
+use swm_core::{Batch, DType, Error, Result, Schema};
+use swm_image::ImageCodec;
+
+/// The unit of progress.
+const UNIT: &str = "episodes";
+
+/// What happens when the target already exists.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ConvertMode {
+    /// Continue it after its last episode, if its content is the beginning of the source.
+    #[default]
+    Resume,
+    /// Fail.
+    Create,
+    /// Replace it.
+    Overwrite,
+    /// Append all episodes of the source.
+    Append,
+}
+
+/// Settings of a conversion.
+#[derive(Clone, Debug)]
+pub struct ConvertOptions {
+    /// The target's format; for `None` the target's suffix determines it.
+    pub format: Option<String>,
+    /// What happens when the target already exists.
+    pub mode: ConvertMode,
+    /// How the target encodes images, if its format supports several codecs.
+    pub codec: ImageCodec,
+    /// Whether the target is read back and compared with the source.
+    pub verify: bool,
+    /// Minimum peak signal-to-noise ratio of an image column, in decibels.
+    pub least_psnr: f64,
+    /// When written episodes are committed. A killed conversion rewrites uncommitted episodes.
+    pub commit: CommitPolicy,
+}
+
+impl Default for ConvertOptions {
+    fn default() -> Self {
+        Self {
+            format: None,
+            mode: ConvertMode::default(),
+            codec: ImageCodec::default(),
+            verify: true,
+            least_psnr: 25.0,
+            commit: CommitPolicy::default(),
+        }
+    }
+}
+
+/// The result of a conversion.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Converted {
+    /// Number of episodes in the target.
+    pub episodes: usize,
+    /// Number of episodes that an earlier conversion had written.
+    pub kept: usize,
+    /// Number of written rows.
+    pub rows: usize,
+    /// Number of episodes whose last row had an action. It was omitted, because no observation follows it.
+    pub last_actions: usize,
+    /// The [`checksum`] of the compared episodes of the source; `None` without verification.
+    pub checksum: Option<String>,
+    /// Comparison of each verified column.
+    pub columns: Vec<ColumnComparison>,
+}
+
+/// The BLAKE3 hash of decoded content: names and types of the columns, and every row. Datasets in any format and codec
+/// have the same checksum if, and only if, readers return the same bytes.
+///
+/// # Errors
+/// If the data is damaged.
+pub fn checksum(reader: &dyn Reader) -> Result<String> {
+    let source = Source::new(reader);
+    let mut batch = Batch::zeros(&source.schema, 0);
+    let mut hashes = vec![];
+    for episode in 0..reader.episodes().len() {
+        source.read(episode, &mut batch)?;
+        hashes.push(episode_hash(&batch));
+    }
+    Ok(dataset_hash(&source.schema, &hashes))
+}
+
+/// Writes a dataset to another location. If the run is stopped, another call continues it.
+///
+/// # Errors
+/// If the source is damaged, the target cannot be written or differs from the source, or the run is stopped
+/// ([`Error::Interrupted`]).
+pub fn convert(
+    reader: &Arc<dyn Reader>,
+    target: &Location,
+    options: &ConvertOptions,
+    control: &mut Control<'_>,
+) -> Result<Converted> {
+    let source = Source::new(&**reader);
+    let format = options.format.as_deref().map(|id| FORMATS.get(id)).transpose()?;
+    let all = reader.episodes().len();
+    let mut report = Converted {
+        episodes: all,
+        kept: 0,
+        rows: 0,
+        last_actions: 0,
+        checksum: None,
+        columns: data_columns(&source.schema).map(|(_, column)| ColumnComparison::new(column)).collect(),
+    };
+    let existing = match options.mode {
+        ConvertMode::Resume | ConvertMode::Append => open_existing(target, format)?,
+        ConvertMode::Create | ConvertMode::Overwrite => None,
+    };
+    let mut hashes = vec![None; all];
+    // Position of the source's first episode in the target, and of the first episode that is not in the target.
+    let (mut base, mut first) = (0, 0);
+    if let Some(existing) = &existing {
+        let episodes = existing.episodes().len();
+        match options.mode {
+            ConvertMode::Append => base = episodes,
+            _ if episodes > all => {
+                return Err(not_a_prefix(target, format!("{episodes} episodes, more than the source's {all}")));
+            }
+            _ => first = episodes,
+        }
+        report.kept = first;
+        let compared = source.compare("compare", &**existing, 0..first, 0, &mut hashes, &mut report.columns, control);
+        compared.map_err(|error| match error {
+            Error::Mismatch { operation, given, expected } => {
+                not_a_prefix(target, format!("{operation}: {given}, expected {expected}"))
+            }
+            other => other,
+        })?;
+        check_psnr(&report.columns, options).map_err(|error| not_a_prefix(target, error.to_string()))?;
+    }
+    drop(existing);
+    if first < all || all == 0 {
+        let mode = match options.mode {
+            ConvertMode::Resume | ConvertMode::Append => WriteMode::Append,
+            ConvertMode::Create => WriteMode::Create,
+            ConvertMode::Overwrite => WriteMode::Overwrite,
+        };
+        let write = WriteOptions { mode, codec: options.codec, manifest: reader.manifest(), commit: options.commit };
+        let hashed = options.verify.then_some(&mut hashes[..]);
+        source.copy(target, format, write, first..all, hashed, &mut report, control)?;
+    }
+    report.episodes = base + all;
+    if options.verify {
+        let written = reopen(target, format)?;
+        if written.episodes().len() != base + all {
+            return Err(Error::mismatch(
+                format!("reading {target} again"),
+                format!("{} episodes", written.episodes().len()),
+                (base + all).to_string(),
+            ));
+        }
+        source.compare("verify", &*written, first..all, base, &mut hashes, &mut report.columns, control)?;
+        check_psnr(&report.columns, options)?;
+        let hashes: Vec<[u8; 32]> = hashes.into_iter().flatten().collect();
+        report.checksum = Some(dataset_hash(&source.schema, &hashes));
+    } else {
+        report.columns.retain(|column| column.values > 0);
+    }
+    Ok(report)
+}
+
+/// Opens the target if it exists.
+fn open_existing(target: &Location, format: Option<&FormatEntry>) -> Result<Option<Arc<dyn Reader>>> {
+    let Some(path) = target.path() else { return Ok(reopen(target, format).ok()) };
+    let empty = path.is_dir() && path.read_dir().is_ok_and(|mut entries| entries.next().is_none());
+    if empty || !path.exists() {
+        return Ok(None);
+    }
+    reopen(target, format).map(Some)
+}
+
+fn reopen(target: &Location, format: Option<&FormatEntry>) -> Result<Arc<dyn Reader>> {
+    format.map_or_else(|| open(target), |format| format.open(target))
+}
+
+/// The error for a target whose content is not the beginning of the source.
+fn not_a_prefix(target: &Location, problem: String) -> Error {
+    let fix = "convert to another location, replace the target (overwrite), or append to it";
+    Error::config(format!("continuing {target}"), format!("it is not the beginning of the source: {problem}"), fix)
+}
+
+/// The dataset to convert. Its episodes are renumbered by position.
+struct Source<'a> {
+    reader: &'a dyn Reader,
+    schema: Schema,
+}
+
+/// An episode on the way to the writer.
+struct SourceEpisode {
+    rows: Batch,
+    constants: Constants,
+    hash: Option<[u8; 32]>,
+    /// Whether its last action was omitted.
+    cut: bool,
+}
+
+impl<'a> Source<'a> {
+    fn new(reader: &'a dyn Reader) -> Self {
+        Self { reader, schema: reader.schema().clone() }
+    }
+
+    /// Reads an episode and removes its last action. Returns whether there was one.
+    fn read(&self, episode: usize, rows: &mut Batch) -> Result<bool> {
+        let length = self.reader.episodes()[episode].length;
+        read(self.reader, &self.schema, episode, length, rows)?;
+        Ok(cut_last_action(rows))
+    }
+
+    /// Copies episodes while a thread reads ahead of the writer. Stores their hashes in `hashes`, if given.
+    #[allow(clippy::too_many_arguments, reason = "a part of `convert`, which has all of these")]
+    fn copy(
+        &self,
+        target: &Location,
+        format: Option<&FormatEntry>,
+        options: WriteOptions,
+        episodes: Range<usize>,
+        mut hashes: Option<&mut [Option<[u8; 32]>]>,
+        report: &mut Converted,
+        control: &mut Control<'_>,
+    ) -> Result<()> {
+        let mut writer = match format {
+            Some(format) => format.create(target, &self.schema, options)?,
+            None => create(target, &self.schema, options)?,
+        };
+        let (first, all) = (episodes.start, self.reader.episodes().len());
+        start(control, "convert", all);
+        let hashed = hashes.is_some();
+        let outcome = scope(|scope| {
+            let (to_writer, from_reader) = sync_channel(1);
+            let (back, empty) = channel();
+            scope.spawn(move || self.send(episodes, &to_writer, &empty, hashed));
+            for (done, episode) in from_reader.into_iter().enumerate() {
+                let SourceEpisode { rows, constants, hash, cut } = episode?;
+                writer.write_episode_with(&rows, &constants)?;
+                if let Some(hashes) = &mut hashes {
+                    hashes[first + done] = hash;
+                }
+                report.rows += rows.rows();
+                report.last_actions += usize::from(cut);
+                // Fails if the reading thread has finished.
+                let _ = back.send(rows);
+                advance(control, "convert", first + done + 1, all)?;
+            }
+            Ok(())
+        });
+        // Complete episodes are kept, even after an error.
+        let finished = writer.finish();
+        outcome.and(finished)?;
+        control.emit(Event::Finished { stage: "convert", metrics: &[] });
+        Ok(())
+    }
+
+    /// Reads episodes and sends them, until the receiver is gone.
+    fn send(
+        &self,
+        episodes: Range<usize>,
+        to_writer: &SyncSender<Result<SourceEpisode>>,
+        empty: &Receiver<Batch>,
+        hashed: bool,
+    ) {
+        for episode in episodes {
+            let mut rows = empty.try_recv().unwrap_or_else(|_| Batch::zeros(&self.schema, 0));
+            let read = self.read(episode, &mut rows).and_then(|cut| {
+                let constants = self.reader.constants(episode)?;
+                let hash = hashed.then(|| episode_hash(&rows));
+                Ok(SourceEpisode { rows, constants, hash, cut })
+            });
+            let failed = read.is_err();
+            if to_writer.send(read).is_err() || failed {
+                return;
+            }
+        }
+    }
+
+    /// Compares episodes with those of a copy, `base` positions later there, and stores their hashes.
+    #[allow(clippy::too_many_arguments, reason = "a part of `convert`, which has all of these")]
+    fn compare(
+        &self,
+        stage: &'static str,
+        copy: &dyn Reader,
+        episodes: Range<usize>,
+        base: usize,
+        hashes: &mut [Option<[u8; 32]>],
+        columns: &mut [ColumnComparison],
+        control: &mut Control<'_>,
+    ) -> Result<()> {
+        let total = episodes.len();
+        start(control, stage, total);
+        for (_, column) in data_columns(&self.schema) {
+            let theirs = copy.schema().column(&column.name)?;
+            if theirs.dtype != column.dtype || theirs.len() != column.len() {
+                let [given, expected] = [theirs, column].map(|column| describe_columns(std::slice::from_ref(column)));
+                return Err(Error::mismatch(format!("column '{}'", column.name), given, expected));
+            }
+        }
+        let (mut ours, mut theirs) = (Batch::zeros(&self.schema, 0), Batch::zeros(&self.schema, 0));
+        for (done, episode) in episodes.enumerate() {
+            let (length, found) = (self.reader.episodes()[episode].length, copy.episodes()[base + episode].length);
+            if found != length {
+                return Err(Error::mismatch(format!("episode {episode}"), format!("{found} rows"), length.to_string()));
+            }
+            read(copy, &self.schema, base + episode, length, &mut theirs)?;
+            let known = hashes[episode];
+            if known.is_some_and(|known| known == episode_hash(&theirs)) {
+                for (column, (_, spec)) in columns.iter_mut().zip(data_columns(&self.schema)) {
+                    column.values += (length * spec.len()) as u64;
+                }
+            } else {
+                self.read(episode, &mut ours)?;
+                hashes[episode] = Some(episode_hash(&ours));
+                for (column, (i, spec)) in columns.iter_mut().zip(data_columns(&self.schema)) {
+                    column.add(spec, ours.bytes(i), theirs.bytes(i)).map_err(|(given, expected)| {
+                        Error::mismatch(format!("column '{}' of episode {episode}", spec.name), given, expected)
+                    })?;
+                }
+            }
+            if self.reader.constants(episode)? != copy.constants(base + episode)? {
+                return Err(Error::mismatch(
+                    format!("constants of episode {episode}"),
+                    "different values",
+                    "those of the source",
+                ));
+            }
+            advance(control, stage, done + 1, total)?;
+        }
+        control.emit(Event::Finished { stage, metrics: &[] });
+        Ok(())
+    }
+}
+
+/// Reports that a stage starts.
+fn start(control: &mut Control<'_>, name: &'static str, total: usize) {
+    control.emit(Event::Started(Stage { name, subject: &[], total, unit: UNIT }));
+}
+
+/// Reports progress. Fails if the run is to stop.
+fn advance(control: &mut Control<'_>, stage: &'static str, done: usize, total: usize) -> Result<()> {
+    control.progress(Progress { stage, done, total, unit: UNIT, metrics: &[] });
+    control.check()
+}
+
+/// Checks the signal-to-noise ratio of image columns.
+fn check_psnr(columns: &[ColumnComparison], options: &ConvertOptions) -> Result<()> {
+    let bad = columns.iter().find(|column| column.psnr.is_some_and(|psnr| psnr < options.least_psnr));
+    bad.map_or(Ok(()), |column| {
+        Err(Error::mismatch(
+            format!("images of column '{}'", column.column),
+            format!("a signal-to-noise ratio of {:.1} dB", column.psnr.unwrap_or_default()),
+            format!("at least {} dB; choose a codec with higher quality", options.least_psnr),
+        ))
+    })
+}
+
+/// Reads all columns of an episode except index columns.
+fn read(reader: &dyn Reader, schema: &Schema, episode: usize, length: usize, rows: &mut Batch) -> Result<()> {
+    rows.resize(length);
+    let range = [StepRange::new(episode, 0, length)];
+    for (i, column) in data_columns(schema) {
+        reader.read_column(&column.name, &range, rows.bytes_mut(i))?;
+    }
+    Ok(())
+}
+
+/// Removes the last action. Returns whether there was one: third-party datasets may have it, but no observation follows.
+fn cut_last_action(rows: &mut Batch) -> bool {
+    let Some(index) = rows.schema().find(ACTION) else { return false };
+    let Some(last) = rows.rows().checked_sub(1) else { return false };
+    let mut row = rows.row_mut(last);
+    fn cut<T: PartialEq + Copy>(action: &mut [T], missing: T, is_missing: impl Fn(&T) -> bool) -> bool {
+        let there = !action.iter().all(is_missing);
+        action.fill(missing);
+        there
+    }
+    match row.schema().columns()[index].dtype {
+        DType::Float32 => cut(row.at::<f32>(index), f32::NAN, |v| v.is_nan()),
+        DType::Float64 => cut(row.at::<f64>(index), f64::NAN, |v| v.is_nan()),
+        DType::Int32 => cut(row.at::<i32>(index), -1, |&v| v == -1),
+        DType::Int64 => cut(row.at::<i64>(index), -1, |&v| v == -1),
+        DType::Bool | DType::U8 => false,
+    }
+}

@@ -1,0 +1,85 @@
+//! Compares a dataset with the requirements of models.
+
+use serde::Serialize;
+use swm_core::columns::{ACTION, PIXELS, REWARD, STATE};
+use swm_core::requirements::DatasetRequirements;
+use swm_core::{ColumnSpec, DType, Schema};
+
+/// The observation of environments that do not name their columns.
+const OBSERVATION: &str = "observation";
+
+/// Whether a dataset can train a model.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct ModelFit {
+    /// The model.
+    pub model: &'static str,
+    /// The unmet requirements; empty if the dataset can train the model.
+    pub missing: Vec<String>,
+    /// Number of episodes that are long enough for a training clip.
+    pub episodes: usize,
+}
+
+impl ModelFit {
+    /// Compares a dataset with these columns, and with episodes of these lengths in rows, with the requirements.
+    pub fn new(required: &DatasetRequirements, schema: &Schema, lengths: &[usize]) -> Self {
+        let mut missing = vec![];
+        let images = schema.column(PIXELS).is_ok_and(ColumnSpec::is_image);
+        let has = |name| schema.find(name).is_some();
+        match (images, required.images) {
+            (true, _) => {}
+            (false, true) if has(PIXELS) => missing.push(format!("'{PIXELS}' holds no RGB images")),
+            (false, true) => missing.push(format!("there are no images ('{PIXELS}')")),
+            (false, false) if has(STATE) || has(OBSERVATION) => {}
+            (false, false) => missing.push(format!("there are neither images ('{PIXELS}') nor a state")),
+        }
+        match schema.column(ACTION).map(|column| column.dtype) {
+            Err(_) => missing.push(format!("there are no actions ('{ACTION}')")),
+            Ok(DType::Float32 | DType::Float64) => {}
+            Ok(other) => missing.push(format!("actions are discrete ({})", other.name())),
+        }
+        if required.reward && !has(REWARD) {
+            missing.push(format!("there is no '{REWARD}'"));
+        }
+        let rows = required.clip_rows;
+        let episodes = lengths.iter().filter(|&&length| length >= rows).count();
+        if episodes == 0 {
+            let longest = lengths.iter().max().copied().unwrap_or(0);
+            missing.push(format!("no sound episode has the {rows} rows of a clip; the longest has {longest}"));
+        }
+        Self { model: required.model, missing, episodes }
+    }
+
+    /// Whether the dataset can train the model.
+    pub fn fits(&self) -> bool {
+        self.missing.is_empty()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lists_unmet_requirements() {
+        let world_model = DatasetRequirements { model: "world model", images: true, reward: false, clip_rows: 20 };
+        let from_rewards = DatasetRequirements { model: "from rewards", images: false, reward: true, clip_rows: 4 };
+        let pixels = ColumnSpec::image(PIXELS, 8, 8);
+        let action = |dtype| ColumnSpec::new(ACTION, dtype, [2]);
+        let reward = ColumnSpec::new(REWARD, DType::Float32, []);
+        let missing = |columns: &[ColumnSpec], lengths: &[usize]| -> Vec<usize> {
+            let schema = Schema::new(columns.to_vec()).expect("schema");
+            [world_model, from_rewards]
+                .iter()
+                .map(|required| ModelFit::new(required, &schema, lengths).missing.len())
+                .collect()
+        };
+        let all = [pixels.clone(), action(DType::Float32), reward.clone()];
+        assert_eq!(missing(&all, &[30, 3]), [0, 0]);
+        assert_eq!(missing(&all[..2], &[19]), [1, 1]);
+        let states = [ColumnSpec::new(STATE, DType::Float64, [4]), action(DType::Float32), reward.clone()];
+        assert_eq!(missing(&states, &[30]), [1, 0]);
+        assert_eq!(missing(&[pixels, action(DType::Int64), reward], &[30]), [1, 1]);
+        let schema = Schema::new(states.to_vec()).expect("schema");
+        assert_eq!(ModelFit::new(&world_model, &schema, &[30]).missing, ["there are no images ('pixels')"]);
+    }
+}

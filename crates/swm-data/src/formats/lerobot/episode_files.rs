@@ -2,9 +2,9 @@
 
 use super::info::{Info, damaged};
 use super::{CONSTANTS, table};
+use arrow_array::Array as _;
 use arrow_array::cast::AsArray as _;
 use arrow_array::types::Float64Type;
-use arrow_array::Array as _;
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Result};

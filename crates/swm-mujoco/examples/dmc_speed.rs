@@ -1,6 +1,6 @@
-//! How fast worlds of the suite step, beside MuJoCo's `mj_step` alone on the same states and controls; then four of them in a pool
-//! on two threads. `cargo run --release -p swm-mujoco --example dmc_speed`
-#![allow(clippy::print_stdout, reason = "a program")]
+//! Speed of DeepMind Control environments compared with MuJoCo's `mj_step` alone on the same states and controls, and of four
+//! environments in a pool on two threads: `cargo run --release -p swm-mujoco --example dmc_speed`.
+#![allow(clippy::print_stdout, reason = "a command-line program")]
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -10,18 +10,18 @@ use swm_core::{Action, Batch, Key, ResetOptions, Schema};
 use swm_mujoco::physics::{Physics, compile_file};
 use swm_mujoco::{ENVS, assets};
 
-/// Rounds: the fastest of each side counts, as other work only ever slows.
+/// Rounds; the fastest of each side counts, because other load only slows them.
 const ROUNDS: usize = 15;
 
-/// How long this thread has been running: on a busy machine, the time that counts.
-fn busy() -> std::io::Result<Duration> {
+/// The CPU time of this thread, which does not include time spent waiting for other processes.
+fn cpu_time() -> std::io::Result<Duration> {
     let text = std::fs::read_to_string("/proc/thread-self/schedstat")?;
     Ok(Duration::from_nanos(text.split(' ').next().and_then(|first| first.parse().ok()).unwrap_or(0)))
 }
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let suite = assets::path("dm_control")?.join("dm_control/suite");
-    // Steps of an environment in a round, and time steps of the physics in one of them.
+    // Id, model file, steps per round, and physics time steps per step.
     for (id, file, steps, substeps) in [
         ("swm/CheetahDMControl-v0", "cheetah.xml", 10_000u32, 2),
         ("swm/HumanoidDMControl-v0", "humanoid.xml", 400, 10),
@@ -35,31 +35,31 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone())?, 1);
         env.reset(0, &ResetOptions::default())?;
         env.observe(&mut row.row_mut(0));
-        let (start, begun) = (env.snapshot(), row.row(0).to_f64("state")?);
+        let (start, start_state) = (env.snapshot(), row.row(0).to_f64("state")?);
 
         let mut physics = Physics::new(Arc::new(compile_file(&suite.join(file))?))?;
         let [mut whole, mut raw] = [Duration::MAX; 2];
         for _ in 0..ROUNDS {
             env.restore(&start)?;
-            let clock = busy()?;
+            let clock = cpu_time()?;
             for action in &actions {
                 env.step(Action::Continuous(action))?;
                 env.observe(&mut row.row_mut(0));
             }
-            whole = whole.min(busy()? - clock);
+            whole = whole.min(cpu_time()? - clock);
 
-            physics.set_state(&begun[..physics.state_len()])?;
-            let clock = busy()?;
+            physics.set_state(&start_state[..physics.state_len()])?;
+            let clock = cpu_time()?;
             for action in &actions {
                 let data = physics.data_mut();
                 data.ctrl_mut().iter_mut().zip(action).for_each(|(control, &action)| *control = f64::from(action));
                 (0..substeps).for_each(|_| data.step());
             }
-            raw = raw.min(busy()? - clock);
+            raw = raw.min(cpu_time()? - clock);
         }
         let rate = |time: Duration| f64::from(steps) / time.as_secs_f64();
-        let more = (whole.as_secs_f64() / raw.as_secs_f64() - 1.0) * 100.0;
-        println!("{id}: {:.0} steps/s, mj_step alone {:.0}; {more:.1} % more time", rate(whole), rate(raw));
+        let overhead = (whole.as_secs_f64() / raw.as_secs_f64() - 1.0) * 100.0;
+        println!("{id}: {:.0} steps/s, mj_step alone {:.0}; {overhead:.1} % overhead", rate(whole), rate(raw));
 
         let envs = (0..4).map(|_| entry.env()).collect::<Result<Vec<_>, _>>()?;
         let mut pool = EnvPool::new(envs, None, Some(usize::MAX), threads(2)?)?;

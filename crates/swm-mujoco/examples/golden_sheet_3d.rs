@@ -1,11 +1,12 @@
-//! Pictures of the Python reference beside ours: `docs/worlds-3d.png`, and the table of `docs/worlds-3d.md`.
+//! Compares frames of the Python reference with those of the CPU renderer: writes `docs/worlds-3d.png` and the table of
+//! `docs/worlds-3d.md`.
 //!
 //! ```text
-//! SWM_GOLDEN_PICTURES=DIR cargo nextest run --release -p swm-mujoco golden follow
+//! SWM_GOLDEN_IMAGES=DIR cargo nextest run --release -p swm-mujoco golden
 //! cargo run --release -p swm-mujoco --example golden_sheet_3d DIR
 //! ```
-//! The golden tests leave triptychs in a folder: the recorded picture, that of our own renderer, and their difference.
-#![allow(clippy::print_stdout, reason = "a program")]
+//! The golden tests write triptychs to the folder: the recorded frame, that of the CPU renderer, and their difference.
+#![allow(clippy::print_stdout, reason = "a command-line program")]
 
 use std::fmt::Write as _;
 use std::fs::File;
@@ -13,19 +14,20 @@ use std::io::{BufReader, BufWriter};
 use std::path::Path;
 use swm_mujoco::ENVS;
 
-/// Pixels of a cell's side, and of the gap between the cells of two pictures.
+/// Side of a cell, in pixels.
 const CELL: usize = 66;
+/// Gap between the cells of two triptychs, in pixels.
 const GAP: usize = 4;
 
 type Failure = Box<dyn std::error::Error>;
 
-/// An RGB picture.
-struct Picture {
+/// An RGB image.
+struct Image {
     width: usize,
     rgb: Vec<u8>,
 }
 
-impl Picture {
+impl Image {
     fn read(path: &Path) -> Result<Self, Failure> {
         let mut reader = png::Decoder::new(BufReader::new(File::open(path)?)).read_info()?;
         let mut rgb = vec![0; reader.output_buffer_size().ok_or("no size")?];
@@ -33,7 +35,7 @@ impl Picture {
         Ok(Self { width, rgb })
     }
 
-    /// The mean absolute difference of the first two pictures of a triptych, of 255.
+    /// The mean absolute difference of the first two frames of a triptych, of 255.
     fn difference(&self) -> f64 {
         let third = self.width;
         let rows = self.rgb.chunks_exact(3 * self.width).map(|row| row[..third].iter().zip(&row[third..2 * third]));
@@ -41,7 +43,7 @@ impl Picture {
         3.0 * total / self.rgb.len() as f64
     }
 
-    /// The same in three cells: the mean of the pixels that each of theirs stands for.
+    /// Shrinks a triptych to three cells by averaging pixels.
     fn shrunk(&self) -> Self {
         let (third, height) = (self.width / 3, self.rgb.len() / 3 / self.width);
         let mut rgb = vec![];
@@ -51,12 +53,12 @@ impl Picture {
                 for channel in 0..3 {
                     let rows = y * height / CELL..(y + 1) * height / CELL;
                     let columns = panel * third + x * third / CELL..panel * third + (x + 1) * third / CELL;
-                    let places = rows.len() * columns.len();
+                    let pixels = rows.len() * columns.len();
                     let row = |y: usize| {
                         columns.clone().map(move |x| usize::from(self.rgb[3 * (y * self.width + x) + channel]))
                     };
                     let sum: usize = rows.flat_map(row).sum();
-                    rgb.push(u8::try_from(sum / places).unwrap_or(u8::MAX));
+                    rgb.push(u8::try_from(sum / pixels).unwrap_or(u8::MAX));
                 }
             }
         }
@@ -65,21 +67,21 @@ impl Picture {
 }
 
 fn main() -> Result<(), Failure> {
-    let folder = std::env::args().nth(1).ok_or("which folder? see the head of this program")?;
+    let folder = std::env::args().nth(1).ok_or("give the folder of the triptychs (see the head of this program)")?;
     let read = |id: &str, kind: &str, frame: &str| {
-        Picture::read(&Path::new(&folder).join(format!("{}-{kind}-0-frame_{frame}.png", id.replace('/', "_"))))
+        Image::read(&Path::new(&folder).join(format!("{}-{kind}-0-frame_{frame}.png", id.replace('/', "_"))))
     };
     let mut table = String::from(
-        "| world | default factors: first frame | last frame | all varied: first frame | last frame |\n\
+        "| environment | default factors: first frame | last frame | all varied: first frame | last frame |\n\
          | --- | --- | --- | --- | --- |\n",
     );
     let (mut sheet, width) = (vec![], 6 * CELL + GAP);
     for id in ENVS.rows.iter().map(|row| row.id) {
-        // Worlds that differ in their rewards alone were recorded once.
+        // Environments that differ only in their rewards were recorded once.
         let Ok(first) = read(id, "default", "first") else { continue };
         let last = read(id, "all", "last")?;
         let between = [read(id, "default", "last")?.difference(), read(id, "all", "first")?.difference()];
-        let [a, d] = [&first, &last].map(Picture::difference);
+        let [a, d] = [&first, &last].map(Image::difference);
         writeln!(table, "| `{id}` | {a:.2} | {:.2} | {:.2} | {d:.2} |", between[0], between[1])?;
         let [left, right] = [first.shrunk(), last.shrunk()];
         for (left, right) in left.rgb.chunks_exact(3 * left.width).zip(right.rgb.chunks_exact(3 * right.width)) {
@@ -96,8 +98,10 @@ fn main() -> Result<(), Failure> {
     encoder.write_header()?.write_image_data(&sheet)?;
     let page = docs.join("worlds-3d.md");
     let text = std::fs::read_to_string(&page)?;
-    let words = text.split_once("| world |").map_or(text.as_str(), |(words, _)| words);
-    std::fs::write(&page, format!("{words}{table}"))?;
+    // The table starts with its header, in its present or its former words.
+    let head = ["| environment |", "| world |"].into_iter().find_map(|head| text.split_once(head));
+    let prose = head.map_or(text.as_str(), |(prose, _)| prose);
+    std::fs::write(&page, format!("{prose}{table}"))?;
     print!("{table}");
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! Installs every asset that is not there: what `swm assets install` does.
+//! Installs every asset that is not installed, as `swm assets install` does.
 #![allow(clippy::print_stdout, reason = "a command-line program")]
 
 use swm_mujoco::assets::{self, Status};

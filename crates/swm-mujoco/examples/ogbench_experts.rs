@@ -1,11 +1,12 @@
-//! How often the experts of OGBench's worlds reach their goals: `ogbench_experts [ID …]`, 200 seeds with the default factors and 200
-//! with all varied, towards the goals of resets and towards sampled ones.
+//! Success rates of OGBench's experts: `ogbench_experts [SEEDS] [ID …]` runs 200 seeds with default factors and 200 with all varied,
+//! towards the goals of resets and towards sampled ones.
 #![allow(clippy::print_stdout, reason = "a command-line program")]
 
 use swm_core::{Action, Batch, Key, ResetOptions, Result, Schema, VariationRequest};
 use swm_mujoco::ENVS;
 
-const USUAL: [&str; 7] = [
+/// The environments if none are given.
+const DEFAULT_IDS: [&str; 7] = [
     "swm/OGBCube-v0",
     "swm/OGBCube-v0,env_type=double",
     "swm/OGBCube-v0,env_type=triple",
@@ -15,7 +16,7 @@ const USUAL: [&str; 7] = [
     "swm/OGBMaze-v0",
 ];
 
-/// Steps until the goal is reached, of those episodes that reach it.
+/// Steps to the goal of the episodes that reach it, sorted.
 fn trial(id: &str, varied: bool, sampled: bool, seeds: u64) -> Result<Vec<usize>> {
     let choice = ENVS.choose(id)?;
     let (mut env, mut expert) = (choice.env()?, (choice.entry.experts[0].make)());
@@ -33,8 +34,8 @@ fn trial(id: &str, varied: bool, sampled: bool, seeds: u64) -> Result<Vec<usize>
         for step in 1..=env.spec().max_episode_steps {
             env.observe(&mut row.row_mut(0));
             expert.act(row.row(0), &mut action)?;
-            let numbers: Vec<f32> = action.iter().map(|&number| number as f32).collect();
-            env.step(Action::Continuous(&numbers))?;
+            let action: Vec<f32> = action.iter().map(|&value| value as f32).collect();
+            env.step(Action::Continuous(&action))?;
             if env.is_success() {
                 steps.push(step);
                 break;
@@ -46,18 +47,18 @@ fn trial(id: &str, varied: bool, sampled: bool, seeds: u64) -> Result<Vec<usize>
 }
 
 fn main() -> Result<()> {
-    let mut asked: Vec<String> = std::env::args().skip(1).collect();
-    let seeds = match asked.first().and_then(|first| first.parse().ok()) {
+    let mut ids: Vec<String> = std::env::args().skip(1).collect();
+    let seeds = match ids.first().and_then(|first| first.parse().ok()) {
         Some(seeds) => {
-            asked.remove(0);
+            ids.remove(0);
             seeds
         }
         None => 200,
     };
-    if asked.is_empty() {
-        asked = USUAL.map(str::to_owned).to_vec();
+    if ids.is_empty() {
+        ids = DEFAULT_IDS.map(str::to_owned).to_vec();
     }
-    for id in asked {
+    for id in ids {
         for (varied, sampled) in [(false, false), (true, false), (false, true), (true, true)] {
             let steps = trial(&id, varied, sampled, seeds)?;
             let median = steps.get(steps.len() / 2).copied().unwrap_or(0);

@@ -1,5 +1,5 @@
-//! Steps every world with all factors varied, reset after reset, and watches memory: `soak [STEPS]` (a million by default),
-//! a share for each world in parallel pools.
+//! Steps every environment with all factors varied, reset after reset, and reports memory use: `soak [STEPS]`. The steps (a
+//! million by default) are divided among the environments, which run in parallel pools.
 #![allow(clippy::print_stdout, reason = "a command-line program")]
 
 use swm_core::policy::{Policy as _, RandomPolicy};
@@ -7,14 +7,15 @@ use swm_core::pool::{Reset, threads};
 use swm_core::{Batch, EnvPool, Key, ResetOptions, Result, Schema, VariationRequest};
 use swm_mujoco::ENVS;
 
-/// Steps of an episode; each begins with other factors.
+/// Steps of an episode; each starts with new factors.
 const EPISODE: usize = 25;
+/// Environments in a pool.
 const SLOTS: usize = 8;
 
 fn main() -> Result<()> {
-    let wanted: usize = std::env::args().nth(1).and_then(|text| text.parse().ok()).unwrap_or(1_000_000);
+    let requested: usize = std::env::args().nth(1).and_then(|text| text.parse().ok()).unwrap_or(1_000_000);
     let workers = threads(std::thread::available_parallelism().map_or(1, usize::from))?;
-    let share = wanted.div_ceil(ENVS.rows.len());
+    let steps_per_env = requested.div_ceil(ENVS.rows.len());
     let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
     let mut total = 0;
     for entry in ENVS.rows {
@@ -23,7 +24,7 @@ fn main() -> Result<()> {
         let mut policy = RandomPolicy::new(pool.spec(), SLOTS);
         let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()])?, SLOTS);
         let (mut steps, mut episode, mut unstable, mut early) = (0, 0, 0, 0);
-        while steps < share {
+        while steps < steps_per_env {
             let resets: Vec<Reset> = (0..SLOTS)
                 .map(|slot| {
                     let options = ResetOptions { variation: variation.clone(), ..ResetOptions::default() };
@@ -68,7 +69,7 @@ fn main() -> Result<()> {
     Ok(())
 }
 
-/// Megabytes this process holds, where the system tells.
+/// The resident memory of this process, in megabytes; 0 where the system does not report it.
 fn resident() -> usize {
     let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));

@@ -1,17 +1,16 @@
-//! Steps a world and observes it, for a profiler: how many instructions a step takes beyond those of MuJoCo does not depend on what
-//! else the machine does.
+//! Steps and observes an environment, to profile it: counts of instructions do not depend on the load of the machine.
 //!
 //! ```text
 //! cargo build --release -p swm-mujoco --example steps
 //! valgrind --tool=callgrind --toggle-collect='*play*' --callgrind-out-file=OUT target/release/examples/steps swm/CheetahDMControl-v0 200
 //! callgrind_annotate --inclusive=yes OUT
 //! ```
-#![allow(clippy::print_stdout, reason = "a program")]
+#![allow(clippy::print_stdout, reason = "a command-line program")]
 
 use swm_core::{Action, Batch, Env, Key, ResetOptions, Result, Schema};
 use swm_mujoco::ENVS;
 
-/// What is measured.
+/// The profiled function.
 #[inline(never)]
 fn play(env: &mut dyn Env, actions: &[Vec<f32>], row: &mut Batch) -> Result<f64> {
     let mut total = 0.0;

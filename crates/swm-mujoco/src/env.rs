@@ -16,7 +16,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use swm_core::{
     Action, CameraView, ColumnSpec, DType, Env, EnvSpec, Error, FactorValues, FrameMut, Key, Modality, ResetOptions,
-    Result, RowMut, RowRef, Snapshot, Transition, VariationRequest, factors,
+    Result, RowMut, RowRef, Snapshot, Transition, VariationRequest, columns, factors,
 };
 
 /// An environment that runs a [`Task`] in MuJoCo.
@@ -45,7 +45,8 @@ impl<T: Task> MujocoEnv<T> {
         let factors = spec.variation_space.resolve(&none, Key::new(0))?;
         task.apply_factors(&mut physics, &factors)?;
         let state = physics.state_len() + task.task_state_len(physics.model());
-        let shared = [ColumnSpec::new("state", DType::Float64, [state]), ColumnSpec::new("unstable", DType::Bool, [])];
+        let shared =
+            [ColumnSpec::new(columns::STATE, DType::Float64, [state]), ColumnSpec::new("unstable", DType::Bool, [])];
         spec.columns.splice(..0, shared);
         let cameras = cameras(physics.model(), task.camera());
         spec.cameras = cameras.iter().map(|(name, _)| name.clone()).collect();
@@ -270,7 +271,7 @@ impl<T: Task> Env for MujocoEnv<T> {
     }
 
     fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()> {
-        let (state, goal) = (start.to_f64("state")?, goal.to_f64("state")?);
+        let (state, goal) = (start.to_f64(columns::STATE)?, goal.to_f64(columns::STATE)?);
         self.apply_factors(factors::from_row(&self.spec.variation_space, &self.factors, start)?)?;
         self.set_state(&state)?;
         self.set_goal(&goal)

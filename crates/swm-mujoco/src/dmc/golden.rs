@@ -165,7 +165,7 @@ fn replay_one<D: Domain>(file: &Path) -> Worst {
 #[allow(clippy::print_stderr, reason = "a table for `--nocapture`")]
 fn replay_all<D: Domain>() {
     let files = golden::files(env!("CARGO_MANIFEST_DIR"), &format!("{}-", D::ID.replace('/', "_")));
-    assert!(!files.is_empty(), "the files beside the tests are always there");
+    assert!(!files.is_empty(), "`tests/golden` has files of every domain");
     let mut wrong = vec![];
     for file in files {
         let worst = replay_one::<D>(&file);

@@ -17,7 +17,7 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 use swm_core::{
     ColumnSpec, DType, Env, EnvChoice, EnvEntry, EnvOption, EnvSpec, Error, ExpertEntry, FactorValues, Key, Result,
-    Rng, RowMut, Space, VariationRequest, VariationSpace,
+    Rng, RowMut, Space, VariationRequest, VariationSpace, columns,
 };
 
 /// Control steps per action (the reference's action repeat).
@@ -100,7 +100,7 @@ pub(super) fn parts<D: Domain>(choice: &EnvChoice) -> Result<(EnvSpec, Arc<MjMod
     let (nq, nv) = (physics.data().qpos().len(), physics.data().qvel().len());
     let control_ranges = model.actuator_ctrlrange().to_vec();
     let mut columns = vec![
-        ColumnSpec::new("goal_state", DType::Float64, [nq + nv]),
+        ColumnSpec::new(columns::GOAL_STATE, DType::Float64, [nq + nv]),
         ColumnSpec::new("observation", DType::Float32, [observed]),
         ColumnSpec::new("qpos", DType::Float64, [nq]),
         ColumnSpec::new("qvel", DType::Float64, [nv]),

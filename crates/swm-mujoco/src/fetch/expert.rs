@@ -2,7 +2,7 @@
 
 use super::task::proprio_len;
 use swm_core::policy::Expert;
-use swm_core::{Error, ExpertEntry, Key, Result, RowRef};
+use swm_core::{Error, ExpertEntry, Key, Result, RowRef, columns};
 
 macro_rules! expert {
     ($act:ident, $summary:literal) => {
@@ -39,7 +39,7 @@ impl Expert for Controller {
     fn begin(&mut self, _key: Key) {}
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
-        let (proprio, goal) = (row.get::<f64>("proprio")?, row.get::<f64>("desired_goal")?);
+        let (proprio, goal) = (row.get::<f64>(columns::PROPRIO)?, row.get::<f64>("desired_goal")?);
         let at = |index: usize| [proprio[index], proprio[index + 1], proprio[index + 2]];
         let goal = [goal[0], goal[1], goal[2]];
         let inputs = match proprio.len() {

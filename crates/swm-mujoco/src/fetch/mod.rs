@@ -8,7 +8,7 @@ mod task;
 
 use crate::env::MujocoEnv;
 use config::{PICK_AND_PLACE, PUSH, REACH, SLIDE, TaskConfig};
-use swm_core::{ColumnSpec, DType, Env, EnvChoice, EnvEntry, EnvSpec, Result, Space};
+use swm_core::{ColumnSpec, DType, Env, EnvChoice, EnvEntry, EnvSpec, Result, Space, columns};
 use task::{Fetch, ObservationKind, Reward, proprio_len};
 
 macro_rules! entry {
@@ -52,8 +52,8 @@ fn make(
     let proprio = proprio_len(config.has_object());
     let unbounded = |n: usize, dtype| Space::uniform_box([n], dtype, f64::NEG_INFINITY, f64::INFINITY);
     let mut columns = vec![
-        ColumnSpec::new("proprio", DType::Float64, [proprio]),
-        ColumnSpec::new("goal_state", DType::Float64, [setup.qpos.len() + setup.qvel.len()]),
+        ColumnSpec::new(columns::PROPRIO, DType::Float64, [proprio]),
+        ColumnSpec::new(columns::GOAL_STATE, DType::Float64, [setup.qpos.len() + setup.qvel.len()]),
         ColumnSpec::new("achieved_goal", DType::Float64, [3]),
         ColumnSpec::new("desired_goal", DType::Float64, [3]),
     ];

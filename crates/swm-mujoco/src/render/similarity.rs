@@ -58,13 +58,13 @@ impl ImageSimilarity {
         Self { difference, ssim: sum / count }
     }
 
-    /// Compares an image of the CPU renderer with a recorded one and prints the result. If `SWM_GOLDEN_PICTURES` names a folder,
+    /// Compares an image of the CPU renderer with a recorded one and prints the result. If `SWM_GOLDEN_IMAGES` names a folder,
     /// writes `NAME.png` there: the recorded image, the rendered one, and four times their difference, side by side.
     #[allow(clippy::print_stderr, reason = "a table for `--no-capture`")]
     pub fn report(name: &str, rendered: &[u8], recorded: &[u8], width: usize) -> Self {
         let similarity = Self::of(rendered, recorded, width);
         eprintln!("cpu {name}: {:.2} of 255, SSIM {:.3}", similarity.difference, similarity.ssim);
-        if let Some(folder) = std::env::var_os("SWM_GOLDEN_PICTURES") {
+        if let Some(folder) = std::env::var_os("SWM_GOLDEN_IMAGES") {
             let difference: Vec<u8> =
                 rendered.iter().zip(recorded).map(|(a, b)| a.abs_diff(*b).saturating_mul(4)).collect();
             let rows = recorded.chunks(3 * width).zip(rendered.chunks(3 * width)).zip(difference.chunks(3 * width));

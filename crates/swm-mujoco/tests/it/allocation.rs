@@ -1,5 +1,5 @@
-//! Nothing is allocated in a step, an observation or a picture, once a world is warm. What MuJoCo takes from its own allocator, and what a
-//! driver of OpenGL does, is not counted.
+//! A warm environment allocates no memory in a step, an observation or a rendering. Allocations by MuJoCo's own allocator and by
+//! OpenGL drivers are not counted.
 
 use swm_conformance::allocation::{self, Counting};
 use swm_core::{Action, Env, FrameMut, Key, ResetOptions, VariationRequest, thread_budget};
@@ -10,36 +10,36 @@ use swm_mujoco::render::{self, Choice};
 static ALLOCATOR: Counting = Counting;
 
 #[test]
-fn the_counter_counts() {
+fn counter_counts_allocations() {
     allocation::the_counter_counts();
 }
 
 #[test]
-fn steps_allocate_nothing() {
+fn steps_allocate_no_memory() {
     allocation::steps_and_frames_allocate_nothing(ENVS.rows, &[]);
 }
 
-/// Worlds with default factors, and with all varied.
-fn worlds() -> Vec<Box<dyn Env>> {
+/// Environments with default factors, and with all varied.
+fn environments() -> Vec<Box<dyn Env>> {
     let names = ["swm/CheetahDMControl-v0", "swm/HumanoidDMControl-v0", "swm/OGBCube-v0", "swm/FetchReach-v3"];
     let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
     names
         .iter()
         .flat_map(|name| [VariationRequest::default(), variation.clone()].map(|variation| (name, variation)))
         .map(|(name, variation)| {
-            let mut world = ENVS.choose(name).and_then(|entry| entry.env()).expect("a world");
-            world.reset(0, &ResetOptions { variation, ..ResetOptions::default() }).expect("a reset");
-            world
+            let mut env = ENVS.choose(name).and_then(|entry| entry.env()).expect("an environment");
+            env.reset(0, &ResetOptions { variation, ..ResetOptions::default() }).expect("a reset");
+            env
         })
         .collect()
 }
 
-/// Draws all worlds, again and again: what is allocated once all have been in each place where something is kept of a few.
-fn drawn(side: usize, worlds: &mut [Box<dyn Env>]) -> usize {
+/// The allocations of rendering all environments once, after enough rounds to fill every cache that holds several models.
+fn allocations_of_rendering(side: usize, envs: &mut [Box<dyn Env>]) -> usize {
     let mut rgb = vec![0; side * side * 3];
     let mut draw = || {
-        for world in &mut *worlds {
-            world.render(FrameMut::new(side, side, &mut rgb)).expect("a picture");
+        for env in &mut *envs {
+            env.render(FrameMut::new(side, side, &mut rgb)).expect("a frame");
         }
     };
     render::with(Choice::Cpu, || {
@@ -49,30 +49,30 @@ fn drawn(side: usize, worlds: &mut [Box<dyn Env>]) -> usize {
 }
 
 #[test]
-fn a_thread_that_draws_worlds_in_turn_allocates_nothing() {
-    assert_eq!(drawn(64, &mut worlds()), 0);
+fn rendering_environments_in_turn_allocates_no_memory() {
+    assert_eq!(allocations_of_rendering(64, &mut environments()), 0);
 }
 
 #[test]
-fn pictures_of_moving_worlds_allocate_nothing_once_warm() {
+fn rendering_after_steps_allocates_no_memory_once_warm() {
     let mut rgb = vec![0; 64 * 64 * 3];
-    for mut world in worlds() {
-        let space = world.spec().action_space.clone();
+    for mut env in environments() {
+        let space = env.spec().action_space.clone();
         let mut allocated = vec![];
         for step in 0..120 {
             let action: Vec<f32> = space.sample(&mut Key::new(7).at(step).rng()).iter().map(|&x| x as f32).collect();
-            world.step(Action::Continuous(&action)).expect("a step");
-            let mut draw = || world.render(FrameMut::new(64, 64, &mut rgb)).expect("a picture");
+            env.step(Action::Continuous(&action)).expect("a step");
+            let mut draw = || env.render(FrameMut::new(64, 64, &mut rgb)).expect("a frame");
             allocated.push(allocation::allocations(|| render::with(Choice::Cpu, &mut draw)));
         }
-        assert!(allocated[60..].iter().all(|&count| count == 0), "{}: {allocated:?}", world.spec().id);
+        assert!(allocated[60..].iter().all(|&count| count == 0), "{}: {allocated:?}", env.spec().id);
     }
 }
 
 #[test]
-fn a_picture_that_threads_share_allocates_nothing() {
-    // Counted on the thread that asks, which is one of the pool's.
+fn rendering_on_several_threads_allocates_no_memory() {
+    // Counted on the calling thread, which belongs to the pool.
     let pool = swm_core::pool::threads(3).expect("threads");
-    let mut worlds = worlds();
-    pool.install(|| thread_budget::all(|| assert_eq!(drawn(160, &mut worlds), 0)));
+    let mut envs = environments();
+    pool.install(|| thread_budget::all(|| assert_eq!(allocations_of_rendering(160, &mut envs), 0)));
 }

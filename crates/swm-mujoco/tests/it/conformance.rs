@@ -1,86 +1,84 @@
-//! What every environment must keep. Pictures take tens of milliseconds here, so everything is looked at less often than
-//! in worlds of two dimensions.
+//! The conformance suite over every environment of this crate. Rendering takes tens of milliseconds here, so the checks run
+//! with fewer repetitions than for 2-D environments.
 
 use swm_conformance::Worlds;
 use swm_mujoco::ENVS;
 
-/// What the reference announces and never applies.
-const ANNOUNCED: &str = "the reference never applies it";
-/// What has a mass needs no density.
-const MASS: &str = "its mass is given";
-/// Sites of groups that are not drawn.
-const HIDDEN: &str = "it is in a group that is not drawn";
-/// A planar world along whose y-axis nothing moves.
+/// The reference declares the factor and never applies it.
+const NEVER_APPLIED: &str = "the reference never applies it";
+/// A density has no effect on a geom with an explicit mass.
+const EXPLICIT_MASS: &str = "the geom has an explicit mass";
+/// Sites of hidden groups are not rendered.
+const HIDDEN_GROUP: &str = "it is in a group that is not rendered";
+/// Planar environments do not move along y.
 const PLANAR: &str = "nothing moves along y";
-
-/// What shows later than a few steps from the start.
-const UNTOUCHED: &str = "nothing touches it so early";
-
-/// Fetch's default picture is of a free camera, and the factor turns the model's.
-const ANOTHER_CAMERA: &str = "the default camera is none of the model's";
-/// What tasks decide unless data are collected.
-const BY_TASK: &str = "the task says so";
-/// What is of pictures for an agent that sees.
-const SEEING: &str = "it matters with ob_type=pixels alone";
-/// Reaching is done with nothing on the table.
+/// The effect appears only after more steps than the check takes.
+const NO_EARLY_CONTACT: &str = "there is no contact with it in the first steps";
+/// The default camera of Fetch is a free one, and the factor rotates those of the model.
+const FREE_CAMERA: &str = "the default camera is not one of the model's";
+/// The factor applies with `mode=data_collection` only.
+const SET_BY_TASK: &str = "the task sets it";
+/// The factor applies with `ob_type=pixels` only.
+const PIXELS_ONLY: &str = "it applies with ob_type=pixels only";
+/// Reach has no object.
 const NO_OBJECT: &str = "there is no object";
 
-/// Factors that change nothing, in the reference as here, or not so early.
+/// Factors without effect in these environments, or without effect in the first steps.
 const IDLE: &[(&str, &str, &str)] = &[
-    ("swm/AcrobotDMControl-v0", "agent.lower_arm_density", MASS),
-    ("swm/AcrobotDMControl-v0", "agent.upper_arm_density", MASS),
-    ("swm/AcrobotDMControl-v0", "agent.upper_arm_locked", ANNOUNCED),
+    ("swm/AcrobotDMControl-v0", "agent.lower_arm_density", EXPLICIT_MASS),
+    ("swm/AcrobotDMControl-v0", "agent.upper_arm_density", EXPLICIT_MASS),
+    ("swm/AcrobotDMControl-v0", "agent.upper_arm_locked", NEVER_APPLIED),
     ("swm/AcrobotDMControl-v0", "gravity.y", PLANAR),
-    ("swm/AcrobotDMControl-v0", "target.color", HIDDEN),
-    ("swm/AcrobotDMControl-v0", "target.shape", HIDDEN),
-    ("swm/BallInCupDMControl-v0", "ball.color", ANNOUNCED),
-    ("swm/BallInCupDMControl-v0", "rendering.render_target", HIDDEN),
-    ("swm/BallInCupDMControl-v0", "target.color", HIDDEN),
-    ("swm/BallInCupDMControl-v0", "target.shape", HIDDEN),
-    ("swm/CartpoleDMControl-v0", "agent.cart_shape", ANNOUNCED),
-    ("swm/CartpoleDMControl-v0", "agent.pole_density", MASS),
+    ("swm/AcrobotDMControl-v0", "target.color", HIDDEN_GROUP),
+    ("swm/AcrobotDMControl-v0", "target.shape", HIDDEN_GROUP),
+    ("swm/BallInCupDMControl-v0", "ball.color", NEVER_APPLIED),
+    ("swm/BallInCupDMControl-v0", "rendering.render_target", HIDDEN_GROUP),
+    ("swm/BallInCupDMControl-v0", "target.color", HIDDEN_GROUP),
+    ("swm/BallInCupDMControl-v0", "target.shape", HIDDEN_GROUP),
+    ("swm/CartpoleDMControl-v0", "agent.cart_shape", NEVER_APPLIED),
+    ("swm/CartpoleDMControl-v0", "agent.pole_density", EXPLICIT_MASS),
     ("swm/CartpoleDMControl-v0", "gravity.y", PLANAR),
-    ("swm/CheetahDMControl-v0", "agent.back_foot_locked", ANNOUNCED),
+    ("swm/CheetahDMControl-v0", "agent.back_foot_locked", NEVER_APPLIED),
     ("swm/CheetahDMControl-v0", "gravity.y", PLANAR),
-    ("swm/FetchPickAndPlace-v3", "camera.angle_delta", ANOTHER_CAMERA),
-    ("swm/FetchPickAndPlaceDense-v3", "camera.angle_delta", ANOTHER_CAMERA),
-    ("swm/FetchPickAndPlaceDict-v3", "camera.angle_delta", ANOTHER_CAMERA),
-    ("swm/FetchPush-v3", "camera.angle_delta", ANOTHER_CAMERA),
-    ("swm/FetchPushDense-v3", "camera.angle_delta", ANOTHER_CAMERA),
-    ("swm/FetchPushDict-v3", "camera.angle_delta", ANOTHER_CAMERA),
-    ("swm/FetchReach-v3", "camera.angle_delta", ANOTHER_CAMERA),
+    ("swm/FetchPickAndPlace-v3", "camera.angle_delta", FREE_CAMERA),
+    ("swm/FetchPickAndPlaceDense-v3", "camera.angle_delta", FREE_CAMERA),
+    ("swm/FetchPickAndPlaceDict-v3", "camera.angle_delta", FREE_CAMERA),
+    ("swm/FetchPush-v3", "camera.angle_delta", FREE_CAMERA),
+    ("swm/FetchPushDense-v3", "camera.angle_delta", FREE_CAMERA),
+    ("swm/FetchPushDict-v3", "camera.angle_delta", FREE_CAMERA),
+    ("swm/FetchReach-v3", "camera.angle_delta", FREE_CAMERA),
     ("swm/FetchReach-v3", "object.color", NO_OBJECT),
-    ("swm/FetchReachDense-v3", "camera.angle_delta", ANOTHER_CAMERA),
+    ("swm/FetchReachDense-v3", "camera.angle_delta", FREE_CAMERA),
     ("swm/FetchReachDense-v3", "object.color", NO_OBJECT),
-    ("swm/FetchReachDict-v3", "camera.angle_delta", ANOTHER_CAMERA),
+    ("swm/FetchReachDict-v3", "camera.angle_delta", FREE_CAMERA),
     ("swm/FetchReachDict-v3", "object.color", NO_OBJECT),
-    ("swm/FetchSlide-v3", "camera.angle_delta", ANOTHER_CAMERA),
-    ("swm/FetchSlideDense-v3", "camera.angle_delta", ANOTHER_CAMERA),
-    ("swm/FetchSlideDict-v3", "camera.angle_delta", ANOTHER_CAMERA),
-    ("swm/FingerDMControl-v0", "spinner.density", UNTOUCHED),
-    ("swm/FingerDMControl-v0", "spinner.friction", UNTOUCHED),
-    ("swm/HopperDMControl-v0", "agent.foot_locked", ANNOUNCED),
-    ("swm/HopperDMControl-v0", "floor.friction", UNTOUCHED),
+    ("swm/FetchSlide-v3", "camera.angle_delta", FREE_CAMERA),
+    ("swm/FetchSlideDense-v3", "camera.angle_delta", FREE_CAMERA),
+    ("swm/FetchSlideDict-v3", "camera.angle_delta", FREE_CAMERA),
+    ("swm/FingerDMControl-v0", "spinner.density", NO_EARLY_CONTACT),
+    ("swm/FingerDMControl-v0", "spinner.friction", NO_EARLY_CONTACT),
+    ("swm/HopperDMControl-v0", "agent.foot_locked", NEVER_APPLIED),
+    ("swm/HopperDMControl-v0", "floor.friction", NO_EARLY_CONTACT),
     ("swm/HopperDMControl-v0", "gravity.y", PLANAR),
-    ("swm/HumanoidDMControl-v0", "agent.left_knee_locked", ANNOUNCED),
-    ("swm/ManipulatorDMControl-v0", "agent.upper_arm_length", ANNOUNCED),
-    ("swm/OGBCube-v0", "cube.goal_position", BY_TASK),
-    ("swm/OGBCube-v0", "cube.goal_yaw", BY_TASK),
-    ("swm/OGBCube-v0", "cube.start_position", BY_TASK),
-    ("swm/OGBCube-v0", "cube.start_yaw", BY_TASK),
-    ("swm/OGBMaze-v0", "floor.pixel_encoding", SEEING),
-    ("swm/OGBScene-v0", "cube.goal_position", BY_TASK),
-    ("swm/OGBScene-v0", "cube.goal_yaw", BY_TASK),
-    ("swm/OGBScene-v0", "cube.start_position", BY_TASK),
-    ("swm/OGBScene-v0", "cube.start_yaw", BY_TASK),
-    ("swm/PendulumDMControl-v0", "agent.mass_density", MASS),
-    ("swm/PendulumDMControl-v0", "agent.mass_shape", ANNOUNCED),
-    ("swm/PendulumDMControl-v0", "agent.pole_density", MASS),
+    ("swm/HumanoidDMControl-v0", "agent.left_knee_locked", NEVER_APPLIED),
+    ("swm/ManipulatorDMControl-v0", "agent.upper_arm_length", NEVER_APPLIED),
+    ("swm/OGBCube-v0", "cube.goal_position", SET_BY_TASK),
+    ("swm/OGBCube-v0", "cube.goal_yaw", SET_BY_TASK),
+    ("swm/OGBCube-v0", "cube.start_position", SET_BY_TASK),
+    ("swm/OGBCube-v0", "cube.start_yaw", SET_BY_TASK),
+    ("swm/OGBMaze-v0", "floor.pixel_encoding", PIXELS_ONLY),
+    ("swm/OGBScene-v0", "cube.goal_position", SET_BY_TASK),
+    ("swm/OGBScene-v0", "cube.goal_yaw", SET_BY_TASK),
+    ("swm/OGBScene-v0", "cube.start_position", SET_BY_TASK),
+    ("swm/OGBScene-v0", "cube.start_yaw", SET_BY_TASK),
+    ("swm/PendulumDMControl-v0", "agent.mass_density", EXPLICIT_MASS),
+    ("swm/PendulumDMControl-v0", "agent.mass_shape", NEVER_APPLIED),
+    ("swm/PendulumDMControl-v0", "agent.pole_density", EXPLICIT_MASS),
     ("swm/PendulumDMControl-v0", "gravity.y", PLANAR),
-    ("swm/QuadrupedDMControl-v0", "agent.knee_back_left_locked", ANNOUNCED),
-    ("swm/QuadrupedDMControl-v0", "floor.friction", UNTOUCHED),
-    ("swm/ReacherDMControl-v0", "agent.finger_locked", ANNOUNCED),
-    ("swm/WalkerDMControl-v0", "agent.right_knee_locked", ANNOUNCED),
+    ("swm/QuadrupedDMControl-v0", "agent.knee_back_left_locked", NEVER_APPLIED),
+    ("swm/QuadrupedDMControl-v0", "floor.friction", NO_EARLY_CONTACT),
+    ("swm/ReacherDMControl-v0", "agent.finger_locked", NEVER_APPLIED),
+    ("swm/WalkerDMControl-v0", "agent.right_knee_locked", NEVER_APPLIED),
     ("swm/WalkerDMControl-v0", "gravity.y", PLANAR),
 ];
 

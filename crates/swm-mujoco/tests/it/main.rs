@@ -1,4 +1,4 @@
-//! Integration tests: golden rollouts of the Python reference, and what every environment must keep. They need the assets.
+//! Integration tests: golden rollouts of the Python reference, and the conformance suite. They need the installed assets.
 
 mod allocation;
 mod conformance;

@@ -1,4 +1,4 @@
-//! Every camera of every world, in colours, distances and geoms; and what draws them.
+//! Every camera of every environment, in RGB, depth and segmentation, with both renderers.
 
 use swm_core::{
     Action, Batch, CameraView, Env, FrameMut, Key, Modality, ResetOptions, Result, Schema, VariationRequest,
@@ -10,18 +10,18 @@ use swm_mujoco::render::{self, Choice};
 const HEIGHT: usize = 24;
 const WIDTH: usize = 32;
 
-fn see(env: &mut dyn Env, view: &CameraView) -> Result<Vec<f64>> {
+fn render_view(env: &mut dyn Env, view: &CameraView) -> Result<Vec<f64>> {
     let mut row = Batch::zeros(&Schema::new([view.column(HEIGHT, WIDTH)])?, 1);
     env.render_view(view, HEIGHT, WIDTH, row.row_mut(0).bytes(0))?;
     row.row(0).to_f64(&view.to_string())
 }
 
 #[test]
-fn views_show_what_they_say() {
-    render::with(Choice::Cpu, || views_of_all("cpu ("));
+fn camera_views_have_valid_values() {
+    render::with(Choice::Cpu, || check_all_views("cpu ("));
 }
 
-fn views_of_all(renderer: &str) {
+fn check_all_views(renderer: &str) {
     for entry in ENVS.rows {
         let mut env = entry.env().unwrap_or_else(|error| panic!("{}: {error}", entry.id));
         env.reset(0, &ResetOptions::default()).expect("a reset");
@@ -31,20 +31,21 @@ fn views_of_all(renderer: &str) {
         for (i, camera) in cameras.into_iter().enumerate() {
             for modality in [Modality::Rgb, Modality::Depth, Modality::Segmentation] {
                 let view = CameraView { camera: Some(camera.clone()), modality };
-                let seen = see(&mut *env, &view).unwrap_or_else(|error| panic!("{}: {error}", entry.id));
-                let fine = match modality {
+                let values = render_view(&mut *env, &view).unwrap_or_else(|error| panic!("{}: {error}", entry.id));
+                let valid = match modality {
                     // The first camera is the default one.
-                    Modality::Rgb => i > 0 || seen.iter().zip(&rgb).all(|(seen, byte)| *seen == f64::from(*byte)),
-                    Modality::Depth => seen.iter().all(|&metres| metres > 0.0 && metres.is_finite()),
-                    Modality::Segmentation => seen.iter().all(|&geom| geom >= -1.0),
+                    Modality::Rgb => i > 0 || values.iter().zip(&rgb).all(|(value, byte)| *value == f64::from(*byte)),
+                    Modality::Depth => values.iter().all(|&metres| metres > 0.0 && metres.is_finite()),
+                    Modality::Segmentation => values.iter().all(|&geom| geom >= -1.0),
                 };
-                assert!(fine, "{}: {view}: {seen:?}", entry.id);
+                assert!(valid, "{}: {view}: {values:?}", entry.id);
             }
         }
-        let geoms = see(&mut *env, &CameraView { camera: None, modality: Modality::Segmentation }).expect("geoms");
-        assert!(geoms.iter().any(|&geom| geom >= 0.0), "{}: something is to be seen", entry.id);
+        let geoms =
+            render_view(&mut *env, &CameraView { camera: None, modality: Modality::Segmentation }).expect("geoms");
+        assert!(geoms.iter().any(|&geom| geom >= 0.0), "{}: a geom is visible", entry.id);
         let unknown = CameraView { camera: Some("nowhere".to_owned()), modality: Modality::Rgb };
-        assert!(see(&mut *env, &unknown).is_err(), "{}", entry.id);
+        assert!(render_view(&mut *env, &unknown).is_err(), "{}", entry.id);
         let libraries = env.libraries();
         assert_eq!(libraries.get("mujoco").map(String::as_str), Some(swm_mujoco::link::VERSION));
         assert!(libraries["renderer"].starts_with(renderer), "{libraries:?}");
@@ -52,7 +53,7 @@ fn views_of_all(renderer: &str) {
 }
 
 #[test]
-fn threads_that_share_a_picture_draw_what_one_draws() {
+fn frames_do_not_depend_on_the_number_of_threads() {
     let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
     let pools = [2, 3, 7].map(|threads| swm_core::pool::threads(threads).expect("threads"));
     let (mut one, mut many) = (vec![0; 200 * 144 * 3], vec![0; 200 * 144 * 3]);
@@ -60,26 +61,26 @@ fn threads_that_share_a_picture_draw_what_one_draws() {
         for entry in ENVS.rows {
             let mut env = entry.env().unwrap_or_else(|error| panic!("{}: {error}", entry.id));
             env.reset(3, &ResetOptions { variation: variation.clone(), ..ResetOptions::default() }).expect("a reset");
-            env.render(FrameMut::new(144, 200, &mut one)).expect("a picture");
+            env.render(FrameMut::new(144, 200, &mut one)).expect("a frame");
             for pool in &pools {
                 let draw = || render::with(Choice::Cpu, || env.render(FrameMut::new(144, 200, &mut many)));
-                pool.install(|| thread_budget::all(draw)).expect("a picture");
+                pool.install(|| thread_budget::all(draw)).expect("a frame");
                 assert!(one == many, "{}: {} threads", entry.id, pool.current_num_threads());
             }
         }
     });
 }
 
-/// Draws on a thread that has drawn nothing before, and so keeps nothing.
-fn afresh(env: &mut dyn Env, (width, height): (usize, usize)) -> Vec<u8> {
+/// Renders on a new thread, whose caches are empty.
+fn render_without_caches(env: &mut dyn Env, (width, height): (usize, usize)) -> Vec<u8> {
     let mut rgb = vec![0; width * height * 3];
     let draw = || render::with(Choice::Cpu, || env.render(FrameMut::new(width, height, &mut rgb)));
-    std::thread::scope(|scope| scope.spawn(draw).join()).expect("a thread").expect("a picture");
+    std::thread::scope(|scope| scope.spawn(draw).join()).expect("a thread").expect("a frame");
     rgb
 }
 
 #[test]
-fn what_is_kept_between_pictures_does_not_show() {
+fn cached_geometry_does_not_change_frames() {
     let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
     for entry in ENVS.rows {
         let mut env = entry.env().unwrap_or_else(|error| panic!("{}: {error}", entry.id));
@@ -87,12 +88,12 @@ fn what_is_kept_between_pictures_does_not_show() {
         for step in 0..18 {
             let size = if step < 12 { (64, 48) } else { (40, 56) };
             match step {
-                // Episodes begin, the second and third with other colours, lights, cameras and sizes.
+                // Resets; the second and third change colours, lights, cameras and sizes.
                 0 => env.reset(0, &ResetOptions::default()).expect("a reset"),
                 6 | 9 => env
                     .reset(step, &ResetOptions { variation: variation.clone(), ..ResetOptions::default() })
                     .expect("a reset"),
-                // Some pictures show the same twice.
+                // Some frames show the same state twice.
                 3 | 7 | 14 => {}
                 _ => {
                     let action = space.sample(&mut Key::new(5).at(step).rng());
@@ -101,33 +102,33 @@ fn what_is_kept_between_pictures_does_not_show() {
                 }
             }
             let mut rgb = vec![0; size.0 * size.1 * 3];
-            render::with(Choice::Cpu, || env.render(FrameMut::new(size.0, size.1, &mut rgb))).expect("a picture");
-            assert!(rgb == afresh(&mut *env, size), "{}, step {step}", entry.id);
+            render::with(Choice::Cpu, || env.render(FrameMut::new(size.0, size.1, &mut rgb))).expect("a frame");
+            assert!(rgb == render_without_caches(&mut *env, size), "{}, step {step}", entry.id);
         }
     }
 }
 
-/// The side of pictures in which both renderers are compared.
+/// The side of the frames in which the renderers are compared.
 const SIDE: usize = 96;
 
 #[test]
-#[allow(clippy::print_stderr, reason = "the table for whoever runs it with --no-capture")]
-fn both_renderers_see_the_same_geoms_at_the_same_distances() {
+#[allow(clippy::print_stderr, reason = "a table for `--no-capture`")]
+fn both_renderers_agree_on_geoms_and_distances() {
     let mut problems = vec![];
     for entry in ENVS.rows.iter().filter(|entry| !entry.id.contains("Dense") && !entry.id.contains("Dict")) {
         let mut env = entry.env().unwrap_or_else(|error| panic!("{}: {error}", entry.id));
         env.reset(1, &ResetOptions::default()).expect("a reset");
-        let mut see = |choice, modality| {
+        let mut view_of = |choice, modality| {
             let view = CameraView { camera: None, modality };
             let mut row = Batch::zeros(&Schema::new([view.column(SIDE, SIDE)]).expect("a schema"), 1);
             render::with(choice, || env.render_view(&view, SIDE, SIDE, row.row_mut(0).bytes(0)))
                 .unwrap_or_else(|error| panic!("{}: {error}", entry.id));
-            row.row(0).to_f64(&view.to_string()).expect("numbers")
+            row.row(0).to_f64(&view.to_string()).expect("values")
         };
-        let [ours, theirs] = [Choice::Cpu, Choice::Egl].map(|choice| see(choice, Modality::Segmentation));
-        let [near, known] = [Choice::Cpu, Choice::Egl].map(|choice| see(choice, Modality::Depth));
+        let [ours, theirs] = [Choice::Cpu, Choice::Egl].map(|choice| view_of(choice, Modality::Segmentation));
+        let [near, known] = [Choice::Cpu, Choice::Egl].map(|choice| view_of(choice, Modality::Depth));
         let equal = ours.iter().zip(&theirs).filter(|(a, b)| a == b).count() as f64 / ours.len() as f64;
-        // At rims, one may see another surface of the same geom.
+        // At silhouettes, the renderers may hit different surfaces of the same geom.
         let both: Vec<(f64, f64)> =
             (0..ours.len()).filter(|&i| ours[i] == theirs[i] && ours[i] >= 0.0).map(|i| (near[i], known[i])).collect();
         let close = both.iter().filter(|(a, b)| (a - b).abs() <= 0.01 * b).count() as f64 / both.len().max(1) as f64;

@@ -2,7 +2,7 @@
 
 use std::f64::consts::PI;
 use swm_core::policy::Expert;
-use swm_core::{Error, ExpertEntry, Key, Result, RowRef};
+use swm_core::{Error, ExpertEntry, Key, Result, RowRef, columns};
 
 /// The experts of the reacher.
 pub const EXPERTS: &[ExpertEntry] = &[ExpertEntry {
@@ -22,7 +22,7 @@ impl Expert for Controller {
     fn begin(&mut self, _key: Key) {}
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
-        let [angles, speeds, goal] = [row.to_f64("qpos")?, row.to_f64("qvel")?, row.to_f64("goal_state")?];
+        let [angles, speeds, goal] = [row.to_f64("qpos")?, row.to_f64("qvel")?, row.to_f64(columns::GOAL_STATE)?];
         let (&[shoulder, wrist], &[goal_shoulder, goal_wrist, ..]) = (&angles[..], &goal[..]) else {
             let given = format!("{} angles and {} goal values", angles.len(), goal.len());
             return Err(Error::mismatch("controlling a reacher", given, "2 and at least 2"));

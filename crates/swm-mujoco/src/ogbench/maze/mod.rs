@@ -16,7 +16,7 @@ use map::{MAPS, Map};
 use mujoco_rs::wrappers::MjModel;
 use std::sync::Arc;
 use swm_core::registry::EnvOption;
-use swm_core::{ColumnSpec, DType, Env, EnvChoice, EnvSpec, Error, Factor, Result, Space, VariationSpace};
+use swm_core::{ColumnSpec, DType, Env, EnvChoice, EnvSpec, Error, Factor, Result, Space, VariationSpace, columns};
 use task::{Maze, Settings, TASK_STATE_HEAD};
 
 /// Steps after which an episode is truncated.
@@ -90,7 +90,7 @@ fn spec(choice: &EnvChoice, agent: Agent, pixels: bool, model: &MjModel) -> EnvS
         action_space: Space::uniform_box([actions], DType::Float32, -1.0, 1.0),
         columns: vec![
             float("observation", observation),
-            float("goal_state", physics::state_len(model) + TASK_STATE_HEAD + nq + nv),
+            float(columns::GOAL_STATE, physics::state_len(model) + TASK_STATE_HEAD + nq + nv),
             float("xy", 2),
             float("prev_qpos", nq),
             float("prev_qvel", nv),

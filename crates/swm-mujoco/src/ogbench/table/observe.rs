@@ -10,6 +10,7 @@ use crate::ogbench::arm::pose::{Vec3, yaw, yaw_of_matrix};
 use crate::physics::state_len;
 use crate::task::{FIRST_TASK_COLUMN, Task as _};
 use mujoco_rs::wrappers::MjModel;
+use swm_core::columns::GOAL_STATE;
 use swm_core::{ColumnSpec, DType, RowMut};
 
 /// The origin of positions in an observation, in metres.
@@ -69,7 +70,7 @@ impl Table {
         let mut columns = vec![];
         let mut float = |name: &str, n: usize| columns.push(ColumnSpec::new(name, DType::Float64, [n]));
         float("observation", observation);
-        float("goal_state", state);
+        float(GOAL_STATE, state);
         float("proprio/joint_pos", JOINTS);
         float("proprio/joint_vel", JOINTS);
         float("proprio/effector_pos", 3);

@@ -301,7 +301,7 @@ impl Task for Table {
             position.copy_from_slice(&values[..3]);
             rotation.copy_from_slice(&values[3..]);
         }
-        // Planning restores thousands of states of one episode, all with the same goal: its observation is kept.
+        // Planning restores thousands of states of one episode, all with the same goal, so its observation is cached.
         if self.goal.pose != pose || self.goal.contact != head[5] {
             self.goal.pose.copy_from_slice(pose);
             self.goal.contact = head[5];

@@ -51,17 +51,17 @@ impl BoxContacts {
 
     /// Removes points that are outside one box and not well inside the other.
     fn remove_outside(&mut self, a: &OrientedBox, b: &OrientedBox, margin: f64) {
-        let mut kept = 0;
+        let mut count = 0;
         for i in 0..self.count {
             let (point, _) = self.points[i];
             let depths = [a, b].map(|solid| solid.relative_depth(point, margin));
             let bad = |one: f64, other: f64| one > 1.0 + SLACK && other >= 1.0 - SLACK;
             if !bad(depths[0], depths[1]) && !bad(depths[1], depths[0]) {
-                self.points[kept] = self.points[i];
-                kept += 1;
+                self.points[count] = self.points[i];
+                count += 1;
             }
         }
-        self.count = kept;
+        self.count = count;
     }
 
     fn add(&mut self, point: Vector, distance: f64) {

@@ -5,7 +5,6 @@
 //! restored exactly.
 
 use crate::describe::head;
-use crate::picture::Scaler;
 use crate::recorded::{self, Goal};
 use crate::{Description, Failure, Form, Request, Transport};
 use std::collections::BTreeMap;
@@ -14,6 +13,7 @@ use swm_core::{
     Action, Callable, DatasetStart, DatasetStartEnv, DispatchEnv, Env, EnvSpec, Error, FactorValues, FrameMut, Key,
     PendingCall, ResetOptions, Result, RowMut, RowRef, Schema, Snapshot, Transition, VariationRequest,
 };
+use swm_image::resize::{PillowFilter, PillowResizer};
 
 /// How many lines of a traceback an error shows: the end, which names what was raised.
 const LINES: usize = 12;
@@ -34,7 +34,7 @@ pub struct GymEnv {
     drawn: bool,
     /// Whether somebody looks: then a step brings its picture along.
     looked_at: bool,
-    scaler: Scaler,
+    resizer: PillowResizer,
 }
 
 /// How far the environment behind the transport is.
@@ -99,7 +99,7 @@ impl GymEnv {
         let nothing = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
         Ok(Self {
             factors: form.spec.variation_space.resolve(&nothing, Key::new(0))?,
-            scaler: Scaler::new(form.pixel_art()),
+            resizer: PillowResizer::new(if form.pixel_art() { PillowFilter::Nearest } else { PillowFilter::Triangle }),
             transport,
             form,
             restarts,
@@ -445,7 +445,12 @@ impl Env for GymEnv {
             }
             self.ask(Ask::Render)?;
         }
-        self.scaler.draw(picture.size, &self.transport.memory()[picture.range()], frame);
+        self.resizer.resize(
+            &self.transport.memory()[picture.range()],
+            (picture.size[0], picture.size[1]),
+            frame.rgb,
+            (frame.height, frame.width),
+        );
         Ok(())
     }
 
@@ -454,9 +459,16 @@ impl Env for GymEnv {
     fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()> {
         self.settle()?;
         match (self.form.goal(), &self.episode) {
-            (_, Some(Episode { goal: Some(goal), .. })) => self.scaler.draw(goal.size, &goal.rgb, frame),
+            (_, Some(Episode { goal: Some(goal), .. })) => {
+                self.resizer.resize(&goal.rgb, (goal.size[0], goal.size[1]), frame.rgb, (frame.height, frame.width))
+            }
             (Some(goal), Some(_)) => {
-                self.scaler.draw(goal.size, &self.transport.memory()[goal.range()], frame);
+                self.resizer.resize(
+                    &self.transport.memory()[goal.range()],
+                    (goal.size[0], goal.size[1]),
+                    frame.rgb,
+                    (frame.height, frame.width),
+                );
             }
             _ => frame.rgb.fill(0),
         }

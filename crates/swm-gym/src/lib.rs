@@ -12,7 +12,6 @@ mod choose;
 mod config;
 mod describe;
 mod env;
-mod picture;
 mod recorded;
 mod transport;
 mod worker;

@@ -3,6 +3,7 @@
 //! - [`ImageCodec`], [`decode`], [`image_size`]: the codecs that datasets store frames with. A stored image names its
 //!   own format in its first bytes.
 //! - [`read_png`], [`write_png`]: PNG files.
+//! - [`resize`]: one resizer per semantics (Pillow's and OpenCV's filters).
 //!
 //! Videos are in `swm-video`. Images are `[height, width, 3]` RGB bytes, row-major, unless stated otherwise.
 
@@ -10,6 +11,7 @@ mod codec;
 mod jpeg;
 mod png_file;
 mod qoi;
+pub mod resize;
 mod rgb_image;
 
 pub use codec::{ImageCodec, decode, image_size};

@@ -3,8 +3,9 @@
 //! A frame copies the resized background, draws the moving shapes at the original size, and resizes only the pixels they
 //! touch.
 
-use super::{Area, BySize, Pixels, Tent};
+use super::{Area, BySize, Pixels};
 use swm_core::FrameMut;
+use swm_image::resize::TriangleResizer;
 
 /// A square background image with resized copies, and a canvas to draw moving shapes over it.
 pub struct Background {
@@ -18,7 +19,7 @@ pub struct Background {
 
 /// The background at one frame size.
 struct Resized {
-    tent: Tent,
+    resizer: TriangleResizer,
     /// `[height, width, 3]`.
     rgb: Vec<u8>,
 }
@@ -40,14 +41,14 @@ impl Background {
     }
 
     /// Fills a frame with the background. Returns the filter it was resized with, or `None` at the original size.
-    pub fn copy_to(&mut self, frame: &mut FrameMut<'_>) -> Option<&Tent> {
+    pub fn copy_to(&mut self, frame: &mut FrameMut<'_>) -> Option<&TriangleResizer> {
         if (frame.width, frame.height) == (self.side, self.side) {
             frame.rgb.copy_from_slice(&self.image);
             return None;
         }
         let resized = self.resized(frame.width, frame.height);
         frame.rgb.copy_from_slice(&resized.rgb);
-        Some(&resized.tent)
+        Some(&resized.resizer)
     }
 
     /// Fills a frame with the background and, over it, what `draw` draws. `draw` returns the area it may have changed.
@@ -59,8 +60,9 @@ impl Background {
         }
         let mut canvas = self.canvas.take().unwrap_or_else(|| self.image.clone());
         let area = draw(&mut Pixels::new(side, &mut canvas));
-        self.resized(frame.width, frame.height).tent.draw(&canvas, area, frame.rgb);
         let (columns, rows) = area.within(side);
+        let resizer = &mut self.resized(frame.width, frame.height).resizer;
+        resizer.resize_part(&canvas, columns.clone(), rows.clone(), frame.rgb);
         for y in rows {
             let row = 3 * (y * side + columns.start)..3 * (y * side + columns.end.max(columns.start));
             canvas[row.clone()].copy_from_slice(&self.image[row]);
@@ -71,8 +73,9 @@ impl Background {
     /// Returns the background at a frame size.
     fn resized(&mut self, width: usize, height: usize) -> &mut Resized {
         let (side, image) = (self.side, &self.image);
-        let create = || Resized { tent: Tent::new(side, width, height), rgb: vec![0; width * height * 3] };
-        let update = |resized: &mut Resized| resized.tent.draw(image, Area::square(side), &mut resized.rgb);
+        let create =
+            || Resized { resizer: TriangleResizer::new(side, width, height), rgb: vec![0; width * height * 3] };
+        let update = |resized: &mut Resized| resized.resizer.resize_part(image, 0..side, 0..side, &mut resized.rgb);
         let slot = self.resized.slot(width, height, create, update);
         &mut self.resized[slot]
     }
@@ -101,7 +104,7 @@ mod tests {
                 draw(&mut Pixels::new(30, &mut full));
                 Pixels::new(30, &mut full).fill(dot(x), [255, 10, 30]);
                 let mut expected = vec![0; width * height * 3];
-                Tent::new(30, width, height).draw(&full, Area::square(30), &mut expected);
+                TriangleResizer::new(30, width, height).resize_part(&full, 0..30, 0..30, &mut expected);
                 assert!(frame == expected, "{width} x {height}, {x}");
             }
         }

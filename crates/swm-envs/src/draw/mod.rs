@@ -3,7 +3,7 @@
 //! A [`Canvas`] holds one byte per pixel, an index into a [`Palette`]; its shapes cover the same pixels as those of
 //! pygame 2.6, and a [`Resampler`] converts it to RGB of any size with the arithmetic of OpenCV's bilinear resize.
 //! [`Pixels`] is an RGB image for shapes with anti-aliased edges as matplotlib draws them, and a [`Background`] caches
-//! the static part of such images and resizes with a [`Tent`], the filter of Pillow. A [`Brush`] blends soft discs at
+//! the static part of such images and resizes with Pillow's triangle filter. A [`Brush`] blends soft discs at
 //! any size.
 
 mod background;
@@ -12,7 +12,6 @@ mod canvas;
 mod pixels;
 mod resample;
 mod soft_disc;
-mod tent;
 
 pub use background::Background;
 pub use by_size::BySize;
@@ -20,4 +19,3 @@ pub use canvas::{Area, Canvas, Palette, Point, WIDTH};
 pub use pixels::{Pixels, Rgb, rect};
 pub use resample::Resampler;
 pub use soft_disc::{Brush, SoftDisc};
-pub use tent::Tent;

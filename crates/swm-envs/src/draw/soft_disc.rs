@@ -2,7 +2,8 @@
 //!
 //! Two-Room and Piecewise draw agent and target with them.
 
-use super::{Rgb, Tent};
+use super::Rgb;
+use swm_image::resize::TriangleResizer;
 
 /// Side of the frame in which positions are given, in pixels.
 const NATIVE: f64 = 224.0;
@@ -51,10 +52,10 @@ impl Brush {
 
     /// Blends one disc into an image, `[height, width, 3]`, that a filter made of a 224-pixel frame. Where the image has
     /// one colour, this equals blending before resizing.
-    pub fn blend_resized(&mut self, disc: &SoftDisc, tent: &Tent, rgb: &mut [u8]) {
+    pub fn blend_resized(&mut self, disc: &SoftDisc, resizer: &TriangleResizer, rgb: &mut [u8]) {
         let mut start = [0; 2];
-        self.clear(tent.size().0, tent.size().1);
-        for (axis, resized) in tent.axes().into_iter().enumerate() {
+        self.clear(resizer.size().0, resizer.size().1);
+        for (axis, resized) in resizer.axes().into_iter().enumerate() {
             let profile = Profile::new(disc, axis, NATIVE as usize);
             self.profile.clear();
             self.profile.reserve(NATIVE as usize);
@@ -69,7 +70,7 @@ impl Brush {
                 self.down.extend(opacities);
             }
         }
-        self.blend_profiles(disc.color, tent.size().0, start, rgb);
+        self.blend_profiles(disc.color, resizer.size().0, start, rgb);
     }
 
     /// Empties the scratch memory and reserves enough for discs as large as the image.
@@ -136,7 +137,6 @@ impl Profile {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::draw::Area;
 
     #[test]
     fn disc_is_opaque_at_its_centre_and_clipped_to_the_image() {
@@ -157,11 +157,11 @@ mod tests {
         let mut native = vec![120; 224 * 224 * 3];
         Brush::default().blend(&disc, 224, 224, &mut native);
         for (w, h) in [(64, 64), (100, 37), (300, 224), (5, 3)] {
-            let mut tent = Tent::new(224, w, h);
+            let mut resizer = TriangleResizer::new(224, w, h);
             let mut expected = vec![0; w * h * 3];
-            tent.draw(&native, Area::square(224), &mut expected);
+            resizer.resize_part(&native, 0..224, 0..224, &mut expected);
             let mut rgb = vec![120; w * h * 3];
-            Brush::default().blend_resized(&disc, &tent, &mut rgb);
+            Brush::default().blend_resized(&disc, &resizer, &mut rgb);
             let apart = rgb.iter().zip(&expected).map(|(a, b)| a.abs_diff(*b)).max();
             assert!(apart <= Some(1), "{w} x {h}: {apart:?}");
         }

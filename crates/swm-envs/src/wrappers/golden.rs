@@ -3,7 +3,7 @@
 
 use super::chroma_key::ChromaKey;
 use super::color_jitter::ColorJitter;
-use super::media::{Media, Picture};
+use super::media::Media;
 use super::moving_patch::Moving;
 use super::patch::{Patch, Rect};
 use super::random_conv::RandomConv;
@@ -13,14 +13,15 @@ use serde_json::{Map, Value};
 use std::fs::File;
 use std::io::BufReader;
 use swm_core::FrameMut;
+use swm_image::RgbImage;
 
 struct Golden(NpzArchive<BufReader<File>>);
 
 impl Golden {
-    fn picture(&mut self, name: &str) -> Picture {
+    fn picture(&mut self, name: &str) -> RgbImage {
         let array = self.0.by_name(name).expect("a readable archive").expect("an array of this name");
         let [height, width] = [0, 1].map(|axis| usize::try_from(array.shape()[axis]).expect("a size"));
-        Picture { width, height, rgb: array.into_vec().expect("bytes") }
+        RgbImage { width, height, rgb: array.into_vec().expect("bytes") }
     }
 
     fn cases(&mut self) -> Vec<Map<String, Value>> {
@@ -59,7 +60,7 @@ fn wrappers_do_what_the_reference_does() {
         let id = case.remove("wrapper").expect("a wrapper").as_str().expect("a name").to_owned();
         let drawn = case.remove("drawn").filter(|drawn| !drawn.is_null()).map(|drawn| floats(&drawn));
         let step = case.remove("step").and_then(|step| step.as_u64()).expect("a step");
-        let Picture { width, height, mut rgb } = Picture { rgb: original.rgb.clone(), ..original };
+        let RgbImage { width, height, mut rgb } = RgbImage { rgb: original.rgb.clone(), ..original };
         let mut frame = FrameMut::new(width, height, &mut rgb);
         match (id.as_str(), drawn) {
             ("chroma-key", _) => {

@@ -3,27 +3,20 @@
 //! A PNG file or a folder of them is read here; any other file (MP4, GIF, JPEG, …) by the `ffmpeg` program, once. What
 //! was read, and what it looks like in the sizes it was asked for, is shared by everybody who shows it.
 
-use super::resize::Resizer;
 use std::ffi::OsString;
-use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use swm_core::{Error, Result};
+use swm_image::resize::AreaResizer;
+use swm_image::{RgbImage, read_png};
 
 /// Bytes that the frames of one video may take in memory.
 const LIMIT: usize = 1 << 30;
 
-/// One frame: `[height, width, 3]` bytes, none of the sides 0.
-pub struct Picture {
-    pub width: usize,
-    pub height: usize,
-    pub rgb: Vec<u8>,
-}
-
 /// One frame or several, shown one after the other.
 pub struct Media {
-    frames: Vec<Picture>,
+    frames: Vec<RgbImage>,
     /// The sizes that somebody asked for.
     sizes: Mutex<Vec<Arc<Sized>>>,
 }
@@ -36,7 +29,7 @@ pub struct Sized {
 
 impl Media {
     /// These frames, at least one.
-    pub fn new(frames: Vec<Picture>) -> Self {
+    pub fn new(frames: Vec<RgbImage>) -> Self {
         Self { frames, sizes: Mutex::default() }
     }
 
@@ -69,9 +62,9 @@ impl Media {
     pub fn frame<'a>(&self, sized: &'a Sized, step: u64) -> &'a [u8] {
         let index = (step % self.frames.len() as u64) as usize;
         sized.frames[index].get_or_init(|| {
-            let Picture { width, height, rgb } = &self.frames[index];
+            let RgbImage { width, height, rgb } = &self.frames[index];
             let mut resized = vec![0; 3 * sized.size[0] * sized.size[1]];
-            Resizer::new([*width, *height], sized.size).run(rgb, &mut resized);
+            AreaResizer::new([*width, *height], sized.size).resize(rgb, &mut resized);
             resized
         })
     }
@@ -84,7 +77,7 @@ impl Sized {
     }
 }
 
-fn read_folder(path: &Path) -> Result<Vec<Picture>> {
+fn read_folder(path: &Path) -> Result<Vec<RgbImage>> {
     let fail = |source| Error::io(path, "listing pictures", source);
     let mut files: Vec<PathBuf> = vec![];
     for entry in std::fs::read_dir(path).map_err(fail)? {
@@ -100,33 +93,13 @@ fn read_folder(path: &Path) -> Result<Vec<Picture>> {
     files.iter().map(|file| read_png(file)).collect()
 }
 
-/// Reads a PNG of any kind: grey is repeated, 16 bits become 8, transparency is dropped.
-fn read_png(path: &Path) -> Result<Picture> {
-    let damaged = |error: png::DecodingError| Error::corrupt(path, error.to_string(), "give a PNG file that opens");
-    let file = std::fs::File::open(path).map_err(|source| Error::io(path, "opening a picture", source))?;
-    let mut decoder = png::Decoder::new(BufReader::new(file));
-    decoder.set_transformations(png::Transformations::EXPAND | png::Transformations::STRIP_16);
-    let mut reader = decoder.read_info().map_err(damaged)?;
-    let (width, height) = (reader.info().width as usize, reader.info().height as usize);
-    let bytes = reader.output_buffer_size().filter(|&bytes| bytes <= LIMIT);
-    let Some(bytes) = bytes else { return Err(too_large(path)) };
-    let mut pixels = vec![0; bytes];
-    reader.next_frame(&mut pixels).map_err(damaged)?;
-    let channels = reader.output_color_type().0.samples();
-    let rgb = pixels
-        .chunks_exact(channels)
-        .flat_map(|pixel| if channels < 3 { [pixel[0]; 3] } else { [pixel[0], pixel[1], pixel[2]] })
-        .collect();
-    Ok(Picture { width, height, rgb })
-}
-
 fn too_large(path: &Path) -> Error {
     let problem = format!("its frames take more than {} MiB in memory", LIMIT >> 20);
     Error::corrupt(path, problem, "shorten or shrink it: ffmpeg -i IN -t 10 -vf scale=256:-2 OUT.mp4")
 }
 
 /// Decodes all frames of a file. They come as PPM pictures, which say their own size.
-fn read_video(program: &Path, path: &Path, limit: usize) -> Result<Vec<Picture>> {
+fn read_video(program: &Path, path: &Path, limit: usize) -> Result<Vec<RgbImage>> {
     if let Err(source) = std::fs::metadata(path) {
         return Err(Error::io(path, "opening a picture or video", source));
     }
@@ -165,11 +138,11 @@ fn read_video(program: &Path, path: &Path, limit: usize) -> Result<Vec<Picture>>
 }
 
 /// The pictures of a stream of binary PPM files, up to the first that is not whole.
-fn read_ppm(mut stream: &[u8]) -> Vec<Picture> {
+fn read_ppm(mut stream: &[u8]) -> Vec<RgbImage> {
     let mut frames = vec![];
     while let Some((width, height, rest)) = ppm_header(stream) {
         let Some((rgb, rest)) = rest.split_at_checked(3 * width * height) else { break };
-        frames.push(Picture { width, height, rgb: rgb.to_vec() });
+        frames.push(RgbImage { width, height, rgb: rgb.to_vec() });
         stream = rest;
     }
     frames
@@ -216,7 +189,7 @@ mod tests {
 
     #[test]
     fn a_media_is_resized_once_a_size_and_repeats() {
-        let frame = |v| Picture { width: 2, height: 1, rgb: vec![v; 6] };
+        let frame = |v| RgbImage { width: 2, height: 1, rgb: vec![v; 6] };
         let media = Media::new(vec![frame(1), frame(2)]);
         let sized = media.sized([3, 3]);
         assert!(Arc::ptr_eq(&sized, &media.sized([3, 3])));

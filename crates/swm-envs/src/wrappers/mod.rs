@@ -23,7 +23,6 @@ mod occlusion;
 mod patch;
 mod random_conv;
 mod random_shift;
-mod resize;
 mod resolution;
 mod settings;
 mod wrapped;

@@ -7,11 +7,11 @@
 //! Source: `ResolutionWrapper` of the reference (area interpolation down, nearest neighbour up). Deviation: no
 //! `scale` above 1, which changes nothing but time.
 
-use super::resize::Resizer;
 use super::settings::{Domain, Parameter};
 use super::{View, VisualWrapper, WrapperEntry, typed};
 use serde::Deserialize;
 use swm_core::FrameMut;
+use swm_image::resize::AreaResizer;
 
 /// The registry row.
 pub const ENTRY: WrapperEntry = WrapperEntry {
@@ -38,7 +38,7 @@ struct Settings {
 #[derive(Clone)]
 struct Resolution {
     scale: f64,
-    resizer: Option<Resizer>,
+    resizer: Option<AreaResizer>,
     /// For every column of the picture, the one of the small picture that it shows.
     columns: Vec<usize>,
     small: Vec<u8>,
@@ -60,11 +60,11 @@ impl VisualWrapper for Resolution {
             Some(resizer) if resizer.is_for(from, to) => resizer,
             other => {
                 self.columns = (0..from[0]).map(|x| x * to[0] / from[0]).collect();
-                other.insert(Resizer::new(from, to))
+                other.insert(AreaResizer::new(from, to))
             }
         };
         self.small.resize(3 * to[0] * to[1], 0);
-        resizer.run(frame.rgb, &mut self.small);
+        resizer.resize(frame.rgb, &mut self.small);
         let small = self.small.as_chunks::<3>().0;
         let stride = 3 * from[0];
         let mut drawn = None;

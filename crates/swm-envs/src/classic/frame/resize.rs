@@ -8,57 +8,35 @@
 
 use super::surface::{Color, NONE, Surface};
 use std::ops::Range;
-
-/// Binary digits of a weight.
-const DIGITS: u32 = 22;
-/// What rounds to the nearest.
-const HALF: i32 = 1 << (DIGITS - 1);
+use swm_image::resize::{FilterAxis, WEIGHT_HALF, weighted_byte};
 
 /// One direction of the filter.
 #[derive(Clone)]
 struct Axis {
-    taps: Vec<Tap>,
-    /// For every tap, the weights of its pixels, and the sums of those before each (one more than pixels).
-    weights: Vec<i32>,
+    filter: FilterAxis<i32>,
+    /// By pixel of the frame: where its partial sums of weights begin.
+    sums_start: Vec<usize>,
+    /// For every pixel of the frame, the sums of the weights before each pixel of the surface (one more than pixels).
     sums: Vec<i32>,
-    /// For every pixel of the surface, the taps it is in.
+    /// By pixel of the surface: the pixels of the frame that depend on it.
     reach: Vec<Range<usize>>,
 }
 
-/// The pixels of the surface that a pixel of the picture is made of.
-#[derive(Clone)]
-struct Tap {
-    pixels: Range<usize>,
-    /// Where its weights begin, and its sums.
-    weights: usize,
-    sums: usize,
-}
-
 impl Axis {
-    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    fn new(surface: usize, picture: usize) -> Self {
-        let scale = surface as f64 / picture as f64;
-        let support = scale.max(1.0);
-        let mut axis = Self { taps: vec![], weights: vec![], sums: vec![], reach: vec![NONE; surface] };
-        for i in 0..picture {
-            let centre = (i as f64 + 0.5) * scale;
-            let first = (centre - support + 0.5).max(0.0) as usize;
-            let pixels = first..((centre + support + 0.5) as usize).min(surface);
-            let height = |x: usize| (1.0 - ((x as f64 - centre + 0.5) / support).abs()).max(0.0);
-            let total: f64 = pixels.clone().map(height).sum();
-            let tap = Tap { pixels: pixels.clone(), weights: axis.weights.len(), sums: axis.sums.len() };
-            axis.sums.push(0);
+    fn new(surface: usize, frame: usize) -> Self {
+        let filter = FilterAxis::<i32>::triangle(surface, frame);
+        let (mut sums_start, mut sums, mut reach) = (vec![], vec![], vec![NONE; surface]);
+        for i in 0..frame {
+            sums_start.push(sums.len());
+            sums.push(0);
             let mut sum = 0;
-            for x in pixels {
-                let weight = (height(x) / total * f64::from(1 << DIGITS) + 0.5) as i32;
+            for (x, weight) in filter.source(i).zip(filter.weights(i)) {
                 sum += weight;
-                axis.weights.push(weight);
-                axis.sums.push(sum);
-                axis.reach[x] = axis.reach[x].start.min(i)..i + 1;
+                sums.push(sum);
+                reach[x] = reach[x].start.min(i)..i + 1;
             }
-            axis.taps.push(tap);
         }
-        axis
+        Self { filter, sums_start, sums, reach }
     }
 
     /// The taps that some of these pixels are in.
@@ -134,18 +112,18 @@ impl Resize {
             }
             let taps = self.columns.reached(&drawn);
             let sums = &mut self.sums[3 * taps.start..3 * taps.end];
-            sums.fill(HALF);
+            sums.fill(WEIGHT_HALF);
             let row = surface.row(from_below);
-            let end = self.columns.taps[taps.end - 1].pixels.end;
-            let mut x = self.columns.taps[taps.start].pixels.start;
+            let end = self.columns.filter.source(taps.end - 1).end;
+            let mut x = self.columns.filter.source(taps.start).start;
             while x < end {
                 let run = x..x + row[x..end].iter().take_while(|&&color| color == row[x]).count();
                 let color = swaps.iter().fold(row[x], |color, &(from, to)| if color == from { to } else { color });
                 let color = color.rgb().map(i32::from);
                 let reached = self.columns.reached(&run);
                 for tap in reached.start.max(taps.start)..reached.end.min(taps.end) {
-                    let Tap { pixels, sums: place, .. } = &self.columns.taps[tap];
-                    let before = |x: usize| self.columns.sums[place + x.clamp(pixels.start, pixels.end) - pixels.start];
+                    let (pixels, start) = (self.columns.filter.source(tap), self.columns.sums_start[tap]);
+                    let before = |x: usize| self.columns.sums[start + x.clamp(pixels.start, pixels.end) - pixels.start];
                     let weight = before(run.end) - before(run.start);
                     let sum = &mut sums[3 * (tap - taps.start)..][..3];
                     (0..3).for_each(|i| sum[i] += color[i] * weight);
@@ -160,15 +138,16 @@ impl Resize {
     /// Averages along y.
     fn average_lines(&mut self, rgb: &mut [u8]) {
         let bytes = self.sums.len();
-        for (y, tap) in self.rows.taps.iter().enumerate() {
-            let changed = self.changed[tap.pixels.clone()].iter().filter(|columns| !columns.is_empty());
+        for y in 0..self.rows.filter.len() {
+            let lines = self.rows.filter.source(y);
+            let changed = self.changed[lines.clone()].iter().filter(|columns| !columns.is_empty());
             let columns = changed.fold(NONE, |all, one| all.start.min(one.start)..all.end.max(one.end));
             if columns.is_empty() {
                 continue;
             }
             let sums = &mut self.sums[columns.clone()];
-            sums.fill(HALF);
-            for (line, &weight) in tap.pixels.clone().zip(&self.rows.weights[tap.weights..]) {
+            sums.fill(WEIGHT_HALF);
+            for (line, &weight) in lines.zip(self.rows.filter.weights(y)) {
                 let line = &self.lines[line * bytes..][columns.clone()];
                 sums.iter_mut().zip(line).for_each(|(sum, &byte)| *sum += i32::from(byte) * weight);
             }
@@ -178,10 +157,8 @@ impl Resize {
 }
 
 /// Sums of weighted bytes as bytes.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn finish(sums: &[i32], bytes: &mut [u8]) {
-    // Weights may add up to a little more than 1.
-    bytes.iter_mut().zip(sums).for_each(|(byte, &sum)| *byte = (sum >> DIGITS).min(255) as u8);
+    bytes.iter_mut().zip(sums).for_each(|(byte, &sum)| *byte = weighted_byte(sum));
 }
 
 #[cfg(test)]

@@ -1,18 +1,18 @@
-//! Pictures in another size, every pixel the mean of what it covers (OpenCV's area interpolation).
+//! [`AreaResizer`]: OpenCV's area interpolation (`INTER_AREA`), in which every pixel is the mean of the area it covers.
 
-/// What the pixels of a line of the result take from a line of the source.
+/// For each pixel along one side of the result, the pixels of the source and their weights.
 #[derive(Clone)]
 struct Taps {
-    /// How many pixels of the source each of them takes, at most.
+    /// Pixels of the source per pixel of the result, at most.
     span: usize,
-    /// The first of those pixels; all lie in the line.
+    /// By pixel of the result: its first pixel of the source.
     first: Vec<usize>,
-    /// Their weights, `span` for each pixel of the result, that add up to 1.
+    /// The weights, `span` per pixel of the result, which sum to 1.
     weights: Vec<f32>,
 }
 
 impl Taps {
-    /// From the first pixel and the weights for each pixel of the result; `from` pixels are in the source.
+    /// Builds the taps from the first pixel and the weights of each pixel of the result. The source has `from` pixels.
     fn new(from: usize, taps: &[(usize, Vec<f32>)]) -> Self {
         let span = taps.iter().map(|(_, weights)| weights.len()).max().unwrap_or(1);
         let first: Vec<usize> = taps.iter().map(|(first, _)| (*first).min(from - span)).collect();
@@ -23,40 +23,39 @@ impl Taps {
         Self { span, first, weights: padded }
     }
 
-    /// For each pixel of the result, the first pixel of the source and the weights.
+    /// Iterates over the pixels of the result: the first pixel of the source and the weights.
     fn iter(&self) -> impl Iterator<Item = (usize, &[f32])> {
         self.first.iter().copied().zip(self.weights.chunks_exact(self.span))
     }
 }
 
-/// How a picture of one size becomes one of another size. Shrinking takes the mean of the covered area. Growing along
-/// a side blends the two pixels that a pixel of the result touches, by how far it reaches into them.
+/// Resizes images of one size to another size. Shrinking averages the covered area. Enlarging blends the two pixels that
+/// a pixel of the result overlaps, weighted by the overlap.
 #[derive(Clone)]
-pub struct Resizer {
+pub struct AreaResizer {
     from: [usize; 2],
     to: [usize; 2],
     columns: Taps,
     rows: Taps,
-    /// One row of the result before its pixels are taken together: as wide as the source.
+    /// One row of the result before it is resized along x.
     line: Vec<f32>,
 }
 
-impl Resizer {
-    /// Between two sizes, `[width, height]`, none of them 0.
+impl AreaResizer {
+    /// Makes a resizer between two sizes, `[width, height]`, none of them 0.
     pub fn new(from: [usize; 2], to: [usize; 2]) -> Self {
         let taps = if (0..2).all(|side| from[side] >= to[side]) { shrinking } else { growing };
         let [columns, rows] = [0, 1].map(|side| Taps::new(from[side], &taps(from[side], to[side])));
         Self { from, to, columns, rows, line: vec![0.0; 3 * from[0]] }
     }
 
-    /// Whether it is for these sizes.
+    /// Whether the resizer is for these sizes.
     pub fn is_for(&self, from: [usize; 2], to: [usize; 2]) -> bool {
         self.from == from && self.to == to
     }
 
-    /// Resizes RGB bytes.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    pub fn run(&mut self, source: &[u8], result: &mut [u8]) {
+    /// Resizes an RGB image.
+    pub fn resize(&mut self, source: &[u8], result: &mut [u8]) {
         let stride = self.line.len();
         for ((first, weights), result) in self.rows.iter().zip(result.chunks_exact_mut(3 * self.to[0])) {
             self.line.fill(0.0);
@@ -79,13 +78,12 @@ impl Resizer {
     }
 }
 
-#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn shrinking(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     let scale = from as f64 / to as f64;
     let tap = |i: usize| {
         let (start, end) = (i as f64 * scale, ((i + 1) as f64 * scale).min(from as f64));
         let first = start as usize;
-        // Slivers that rounding leaves of a neighbour would be noise.
+        // A sliver of a neighbour that is due to rounding does not count.
         let last = ((end - 1e-3).ceil() as usize).clamp(first + 1, from);
         let covered = |pixel: usize| (end.min((pixel + 1) as f64) - start.max(pixel as f64)) / (end - start);
         (first, (first..last).map(|pixel| covered(pixel) as f32).collect())
@@ -93,7 +91,6 @@ fn shrinking(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     (0..to).map(tap).collect()
 }
 
-#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn growing(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     let scale = from as f64 / to as f64;
     let tap = |i: usize| {
@@ -112,19 +109,19 @@ mod tests {
     fn resized(red: &[u8], from: [usize; 2], to: [usize; 2]) -> Vec<u8> {
         let source: Vec<u8> = red.iter().flat_map(|&v| [v, 0, 9]).collect();
         let mut result = vec![0; 3 * to[0] * to[1]];
-        Resizer::new(from, to).run(&source, &mut result);
+        AreaResizer::new(from, to).resize(&source, &mut result);
         result.as_chunks::<3>().0.iter().map(|&[r, _, b]| if b == 9 { r } else { panic!("mixed channels") }).collect()
     }
 
     #[test]
-    fn shrinking_is_the_mean_of_what_is_covered() {
+    fn shrinking_averages_the_covered_area() {
         assert_eq!(resized(&[0, 100, 200, 40], [4, 1], [2, 1]), [50, 120]);
         assert_eq!(resized(&[0, 90, 240], [3, 1], [2, 1]), [30, 190]);
         assert_eq!(resized(&[10, 30, 50, 110], [2, 2], [1, 1]), [50]);
     }
 
     #[test]
-    fn growing_keeps_the_values() {
+    fn enlarging_by_integers_repeats_pixels() {
         assert_eq!(resized(&[7, 9], [1, 2], [3, 2]), [7, 7, 7, 9, 9, 9]);
         assert_eq!(resized(&[0, 200], [2, 1], [4, 1]), [0, 0, 200, 200]);
     }

@@ -2,10 +2,9 @@
 //!
 //! A tensor library allocates and reads memory once per operation. Here weights are laid out once ([`Panels`]), scratch
 //! memory is reused ([`ScratchPool`]), and every row is computed on its own, so that no byte of a result depends on the
-//! number of threads or on the other rows. The crate knows neither tensors nor model families: `swm-models` converts
+//! number of threads or on the other rows. The crate depends neither on tensors nor on model families: `swm-models` converts
 //! its layers to [`Affine`], [`Norm`], [`Panels`] and [`VitParameters`].
 
-// Loops over constant numbers of lanes are what compilers turn into vectors.
 #![allow(clippy::needless_range_loop, reason = "indexed loops over constant lane counts are vectorised")]
 
 mod affine;

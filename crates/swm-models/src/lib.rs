@@ -1,18 +1,20 @@
-//! World models, goal-conditioned policies and their training.
+//! World models, policies and their training.
 //!
-//! - [`nn`]: building blocks, under PyTorch's parameter names; [`pixels`]: from bytes to normalised tensors.
-//! - [`train`](mod@train): the training loop for every [`Trainable`] model, presets, logs.
-//! - [`online`]: training by interaction with an environment.
-//! - [`lewm`]: the LeWM family: model, loss, planning cost.
-//! - [`pldm`]: the PLDM family: LeWM's model with VICReg losses, temporal alignment and inverse dynamics.
-//! - [`dino_wm`]: the DINO-WM family: a frozen patch encoder and a predictor of the patches of the next frame.
-//! - [`tdmpc2`]: TD-MPC2, a world model of rewards and values; [`sac`]: soft actor-critic.
-//! - [`gcrl`]: goal-conditioned cloning, values and Q-learning; [`feed_forward`]: policies that do not plan.
-//! - [`inverse`]: an inverse-dynamics policy on a frozen encoder, the baseline without planning.
-//! - [`weights`]: pretrained weights, from files and the Hugging Face hub, and for PyTorch.
+//! Contracts:
+//! - [`train`](mod@train): the training loop for every [`Trainable`] model, its configuration and logs.
+//! - [`family`]: [`ModelFamily`], the uses of a trained model; [`registry`]: the families of this build.
+//! - [`online`]: training by acting in environments; [`feed_forward`]: policies without planning.
 //! - [`probe`]: how much of the state of an environment the latents contain.
-//! - [`checkpoint`]: trained models on disk.
-//! - [`device`]: the devices models compute on.
+//! - [`checkpoint`]: trained models on disk; [`weights`]: pretrained weights, and files for PyTorch.
+//!
+//! Building blocks: [`nn`], with PyTorch's parameter names; [`pixels`], the normalisation of images; [`device`].
+//!
+//! Families, a folder each:
+//! - [`lewm`] (LeWM) and [`pldm`] (PLDM): world models with a latent per frame.
+//! - [`dino_wm`] (DINO-WM): a world model in the patches of a frozen encoder.
+//! - [`tdmpc2`] (TD-MPC2): a world model of rewards and values; [`sac`]: soft actor-critic.
+//! - [`gcrl`] (GCBC, GCIVL, GCIQL): goal-conditioned policies from offline data.
+//! - [`inverse`]: an inverse-dynamics policy on the encoder of another checkpoint.
 
 pub mod checkpoint;
 mod checks;

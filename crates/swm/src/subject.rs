@@ -1,5 +1,5 @@
-//! [`LewmSubject`]: the LeWM that `swm bench plan` and `swm bench train` measure, of the published size, with weights
-//! that were drawn, not trained: how fast it is does not depend on them.
+//! [`LewmSubject`]: the LeWM that `swm bench plan` and `swm bench train` measure. It has the published size and random
+//! weights, on which its speed does not depend.
 
 use rand::Rng as _;
 use std::path::Path;
@@ -16,10 +16,10 @@ use swm_plan::{ActionScale, Cem};
 
 /// Model steps of a plan.
 const HORIZON: usize = 5;
-/// Numbers of an environment's action.
-const NUMBERS: usize = 2;
+/// Elements of an environment's action.
+const ACTION_DIM: usize = 2;
 
-/// A LeWM, what it plans for, and what it is trained on.
+/// A LeWM with inputs for planning and training.
 pub struct LewmSubject {
     config: TrainConfig<Lewm>,
     device: Device,
@@ -28,13 +28,13 @@ pub struct LewmSubject {
     cem: Cem,
     /// `pixels` and `goal` of one environment.
     infos: Batch,
-    /// `[samples, HORIZON, numbers]`.
+    /// `[samples, HORIZON, frameskip * ACTION_DIM]`.
     candidates: Vec<f32>,
-    training: Option<Training>,
+    training: Option<TrainingRun>,
 }
 
-/// What a training run holds.
-struct Training {
+/// The state of a training run.
+struct TrainingRun {
     model: Lewm,
     optimizer: AdamW,
     dataset_info: DatasetInfo,
@@ -43,15 +43,15 @@ struct Training {
 }
 
 impl LewmSubject {
-    /// The published model with a CEM of so many iterations, and training batches of so many clips.
+    /// The published model with a CEM of `iterations` iterations and training batches of `clips` clips.
     ///
     /// # Errors
     /// When the preset does not load.
     pub fn new(iterations: usize, clips: usize, device: &Device) -> Result<Self> {
-        let words = [format!("data.batch_size={clips}"), format!("shards={}", rayon::current_num_threads())];
-        let config = TrainConfig::<Lewm>::load("paper", &words)?;
-        let actions = config.data.frameskip * NUMBERS;
-        let model = stirred(Lewm::init(&config.model, actions, Key::new(0), device));
+        let settings = [format!("data.batch_size={clips}"), format!("shards={}", rayon::current_num_threads())];
+        let config = TrainConfig::<Lewm>::load("paper", &settings)?;
+        let actions = config.data.frameskip * ACTION_DIM;
+        let model = with_modulations(Lewm::init(&config.model, actions, Key::new(0), device));
         let mut cost = LewmCost::of(&model, &config.model, actions);
         let side = config.model.image;
         let columns = [ColumnSpec::image("pixels", side, side), ColumnSpec::image("goal", side, side)];
@@ -66,7 +66,7 @@ impl LewmSubject {
         Ok(Self { config, device: device.clone(), model, cost, cem, infos, candidates, training: None })
     }
 
-    /// The sizes as the reference's process reads them.
+    /// Returns the sizes as the process of the reference implementation reads them.
     pub fn sizes(&self) -> serde_json::Value {
         let (model, predictor) = (&self.config.model, &self.config.model.predictor);
         let EncoderConfig::Vit(vit) = &model.encoder else { return serde_json::Value::Null };
@@ -81,10 +81,11 @@ impl LewmSubject {
         })
     }
 
-    /// Writes weights and inputs for the reference's process: `w.NAME` and `i.NAME`, pictures normalised.
+    /// Writes weights (`w.NAME`) and inputs (`i.NAME`, with normalised images) for the process of the reference
+    /// implementation.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// When the file cannot be written.
     pub fn write(&self, path: &Path) -> Result<()> {
         let weights = parameters::values(&self.model).into_iter();
         let mut tensors: Named<HostTensor> = weights.map(|(name, tensor)| (format!("w.{name}"), tensor)).collect();
@@ -100,7 +101,7 @@ impl LewmSubject {
     }
 
     fn actions(&self) -> usize {
-        self.config.data.frameskip * NUMBERS
+        self.config.data.frameskip * ACTION_DIM
     }
 
     fn costs(&mut self) -> Result<Vec<f32>> {
@@ -123,25 +124,25 @@ impl LewmSubject {
         let (config, device) = (&self.config, &self.device);
         let mut training = match self.training.take() {
             Some(training) => training,
-            None => Training::new(config, &self.model)?,
+            None => TrainingRun::new(config, &self.model)?,
         };
         let key = Key::new(0).at(training.steps);
         let context = StepContext { config, dataset_info: &training.dataset_info, key, device, training: true };
-        let found = training.model.step(&context, &training.batch)?;
-        let (model, _) = training.optimizer.step(training.model, 1.0, found.gradients, Lewm::parameter_group);
-        training.model = model.after_step(&context, found.buffers);
+        let output = training.model.step(&context, &training.batch)?;
+        let (model, _) = training.optimizer.step(training.model, 1.0, output.gradients, Lewm::parameter_group);
+        training.model = model.after_step(&context, output.buffers);
         training.steps += 1;
         self.training = Some(training);
         Ok(())
     }
 }
 
-impl Training {
+impl TrainingRun {
     fn new(config: &TrainConfig<Lewm>, model: &Lewm) -> Result<Self> {
         let (steps, side) = (config.data.num_steps, config.model.image);
         let columns = [
             ColumnSpec::new("pixels", DType::U8, [steps, side, side, 3]),
-            ColumnSpec::new("action", DType::Float32, [steps, config.data.frameskip * NUMBERS]),
+            ColumnSpec::new("action", DType::Float32, [steps, config.data.frameskip * ACTION_DIM]),
         ];
         let mut batch = Batch::zeros(&Schema::new(columns)?, config.data.batch_size);
         let mut rng = Key::new(0).with("batch").rng();
@@ -150,7 +151,7 @@ impl Training {
             rng.fill(row.at::<u8>(0));
             row.at::<f32>(1).iter_mut().for_each(|action| *action = rng.random_range(-1.0..1.0));
         }
-        let dataset_info = DatasetInfo { action: ActionScale::identity(NUMBERS), columns: Named::new(), env: None };
+        let dataset_info = DatasetInfo { action: ActionScale::identity(ACTION_DIM), columns: Named::new(), env: None };
         Ok(Self { model: model.clone(), optimizer: AdamW::new(config.optim.clone()), dataset_info, batch, steps: 0 })
     }
 }
@@ -167,8 +168,8 @@ impl Subject for LewmSubject {
     }
 }
 
-/// Modulations are zero before training; without them actions have no effect.
-fn stirred(model: Lewm) -> Lewm {
+/// Replaces the zero-initialised modulations by random ones; without them actions have no effect.
+fn with_modulations(model: Lewm) -> Lewm {
     let mut values = parameters::values(&model);
     let mut rng = Key::new(0).with("modulations").rng();
     for (_, tensor) in values.iter_mut().filter(|(name, _)| name.contains("adaLN")) {

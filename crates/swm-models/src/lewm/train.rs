@@ -11,8 +11,7 @@ use swm_data::{ClipSpec, LoaderConfig};
 
 impl Trainable for Lewm {
     const FAMILY: &'static str = "lewm";
-    const SUMMARY: &'static str =
-        "LeWorldModel: encoder and predictor trained end to end, kept from collapsing by SIGReg";
+    const SUMMARY: &'static str = "LeWorldModel: encoder and predictor trained end to end, regularised by SIGReg";
     const PRESETS: &'static [Preset] = &[
         Preset {
             id: "tiny",

@@ -1,5 +1,5 @@
-//! PLDM checkpoints of the reference implementation, both ways. They hold the world model; the inverse dynamics, which
-//! its training keeps apart, begin anew where training goes on.
+//! Import and export of PLDM checkpoints of the reference implementation. They hold the world model only; the inverse
+//! dynamics are initialised randomly if training continues.
 
 use super::model::{Idm, Pldm};
 use crate::checkpoint::Checkpoint;

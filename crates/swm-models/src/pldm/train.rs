@@ -13,7 +13,7 @@ use swm_data::LoaderConfig;
 impl Trainable for Pldm {
     const FAMILY: &'static str = "pldm";
     const SUMMARY: &'static str =
-        "PLDM: a LeWM's model, kept from collapsing by variance, covariance, temporal alignment and inverse dynamics";
+        "PLDM: the networks of a LeWM, regularised by variance, covariance, temporal alignment and inverse dynamics";
     const PRESETS: &'static [Preset] = &[
         Preset {
             id: "tiny",

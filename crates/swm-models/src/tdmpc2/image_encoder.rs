@@ -20,7 +20,6 @@ pub struct Convolution {
 }
 
 impl Convolution {
-    #[allow(clippy::cast_precision_loss)]
     fn new(init: &Init, inputs: usize, side: usize) -> Self {
         let bound = 1.0 / ((inputs * side * side) as f32).sqrt();
         Self {

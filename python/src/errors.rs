@@ -9,7 +9,7 @@ use swm::core::Error;
 pub fn raised(error: Error) -> PyErr {
     let message = error.to_string();
     match error {
-        Error::Foreign(inner) => match inner.downcast::<PyErr>() {
+        Error::Embedder(inner) => match inner.downcast::<PyErr>() {
             Ok(original) => *original,
             Err(_) => PyRuntimeError::new_err(message),
         },
@@ -27,7 +27,7 @@ pub fn raised(error: Error) -> PyErr {
 
 /// An exception on its way through the engine.
 pub fn foreign(error: PyErr) -> Error {
-    Error::Foreign(Box::new(error))
+    Error::Embedder(Box::new(error))
 }
 
 /// A poll for long loops: lets Python handle its signals, so that Ctrl-C raises `KeyboardInterrupt`, at most every twenty

@@ -1,17 +1,17 @@
-//! [`CameraView`]: which camera looks at a world, and what it sees: colours, distances, or which thing is where.
+//! [`CameraView`]: a camera of an environment and the modality it renders: colour, depth or segmentation.
 
 use crate::{ColumnSpec, DType, EnvSpec, Error, Result, columns};
 use std::fmt;
 
-/// What a camera sees.
+/// The kind of image a camera renders.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 pub enum Modality {
-    /// Colours: `[height, width, 3]` bytes.
+    /// Colour: `[height, width, 3]` bytes.
     #[default]
     Rgb,
-    /// Distances from the camera's plane: `[height, width]` of `Float32`, in metres.
+    /// Distance from the camera plane: `[height, width]` of `Float32`, in metres.
     Depth,
-    /// Which thing is seen: `[height, width]` of `Int32`, its number in the world's model, -1 for none.
+    /// The index of the visible geometry in the simulator's model: `[height, width]` of `Int32`, -1 for none.
     Segmentation,
 }
 
@@ -19,26 +19,26 @@ impl Modality {
     const ALL: [(Self, &'static str); 3] =
         [(Self::Rgb, columns::PIXELS), (Self::Depth, columns::DEPTH), (Self::Segmentation, columns::SEGMENTATION)];
 
-    /// What columns of it are called.
+    /// The name of its columns: `pixels`, `depth` or `segmentation`.
     pub fn name(self) -> &'static str {
         Self::ALL[self as usize].1
     }
 }
 
-/// A camera and what it sees; by default the colours that the world's default camera sees.
+/// A camera and its modality; by default, colour from the default camera.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
 pub struct CameraView {
-    /// The camera's name, one of [`EnvSpec::cameras`]; the default one for `None`.
+    /// The camera's name, one of [`EnvSpec::cameras`]; `None` for the default camera.
     pub camera: Option<String>,
-    /// What it sees.
+    /// The kind of image.
     pub modality: Modality,
 }
 
 impl CameraView {
-    /// Reads `MODALITY`, `CAMERA` or `CAMERA:MODALITY`, where a modality is `pixels`, `depth` or `segmentation`.
+    /// Parses `MODALITY`, `CAMERA` or `CAMERA:MODALITY`, where a modality is `pixels`, `depth` or `segmentation`.
     ///
     /// # Errors
-    /// When the text behind the colon is no modality.
+    /// When the text after the colon is not a modality.
     pub fn parse(text: &str) -> Result<Self> {
         let modality =
             |name: &str| Modality::ALL.iter().find(|(_, known)| *known == name).map(|(modality, _)| *modality);
@@ -51,13 +51,13 @@ impl CameraView {
                 Some(modality) => Ok(Self { camera: Some(camera.to_owned()), modality }),
                 None => {
                     let known = Modality::ALL.iter().map(|(_, name)| *name);
-                    Err(Error::unknown("modality of a view", name, known, "write CAMERA:MODALITY"))
+                    Err(Error::unknown("modality of a camera view", name, known, "write CAMERA:MODALITY"))
                 }
             },
         }
     }
 
-    /// The column that holds it: `pixels`, `depth.CAMERA`, `segmentation`.
+    /// The column that stores it, named `pixels`, `depth.CAMERA`, `segmentation`, …
     pub fn column(&self, height: usize, width: usize) -> ColumnSpec {
         let name = self.to_string();
         match self.modality {
@@ -67,17 +67,18 @@ impl CameraView {
         }
     }
 
-    /// The error of a world that does not know this view.
+    /// The error of an environment that cannot render this view.
     pub fn unknown(&self, spec: &EnvSpec) -> Error {
         let id = &spec.id;
         match (&self.camera, spec.cameras.is_empty()) {
             (Some(camera), false) => {
-                Error::unknown("camera", camera, spec.cameras.iter().map(String::as_str), format!("those of {id}"))
+                let known = spec.cameras.iter().map(String::as_str);
+                Error::unknown("camera", camera, known, format!("{id} has {}", spec.cameras.join(", ")))
             }
             _ => Error::config(
-                "view",
-                format!("{id} knows no {self}: it has one camera and colours only"),
-                "leave it out",
+                "camera view",
+                format!("{id} cannot render {self}: it has one camera and renders colour only"),
+                "leave the view out",
             ),
         }
     }
@@ -94,13 +95,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_view_is_a_camera_a_modality_or_both() -> Result<()> {
+    fn parses_camera_modality_or_both() -> Result<()> {
         assert_eq!(CameraView::parse("pixels")?, CameraView::default());
         assert_eq!(CameraView::parse("depth")?, CameraView { camera: None, modality: Modality::Depth });
-        assert_eq!(
-            CameraView::parse("wrist")?,
-            CameraView { camera: Some("wrist".to_owned()), modality: Modality::Rgb }
-        );
+        let wrist = CameraView { camera: Some("wrist".to_owned()), modality: Modality::Rgb };
+        assert_eq!(CameraView::parse("wrist")?, wrist);
         let both = CameraView::parse("top:segmentation")?;
         assert_eq!((both.to_string().as_str(), both.modality), ("segmentation.top", Modality::Segmentation));
         assert_eq!(both.column(4, 6), ColumnSpec::new("segmentation.top", DType::Int32, [4, 6]));

@@ -1,9 +1,9 @@
-//! [`Env`]: one world, its actions, its observations, and its picture.
+//! [`Env`]: one environment, with its actions, observations, goals and frames.
 //!
-//! An environment declares its observation columns up front ([`EnvSpec`]) and writes them into a [`crate::Batch`]
-//! row in place. It owns all its randomness: the same seed and the same actions give the same bytes. Its
-//! full state can be taken and put back ([`Env::snapshot`]), it can start from a row of a dataset
-//! ([`Env::restore_from`]), and it can always make a reachable goal ([`Env::sample_goal`]).
+//! An environment declares its observation columns up front ([`EnvSpec`]) and writes them into a [`crate::Batch`] row in
+//! place. It owns all its randomness: the same seed and the same actions give the same bytes. Its full state can be saved
+//! and restored ([`Env::snapshot`]), it can start from a row of a dataset ([`Env::restore_from`]), and it can always
+//! sample a reachable goal ([`Env::sample_goal`]).
 
 use crate::batch::{ColumnSpec, RowMut, RowRef};
 use crate::camera_view::CameraView;
@@ -13,29 +13,29 @@ use crate::dispatch::DispatchEnv;
 use crate::{Error, FactorValues, Key, Result, Space, VariationRequest, VariationSpace};
 use std::collections::BTreeMap;
 
-/// What never changes about an environment.
+/// The constant properties of an environment.
 #[derive(Clone)]
 pub struct EnvSpec {
     /// Its registered id with the options that differ from their defaults, such as `swm/PushT-v1` or
     /// `swm/OGBCube-v0,env_type=double` ([`crate::EnvChoice::id`]).
     pub id: String,
-    /// The actions it takes: a `Float32` box, a discrete space or a multi-discrete one.
+    /// The action space: a `Float32` box, a discrete space or a multi-discrete one.
     pub action_space: Space,
     /// The columns [`Env::observe`] writes, in order; `state` is always among them.
     pub columns: Vec<ColumnSpec>,
-    /// What an agent observes: columns, and between which bounds they usually lie. Worlds may leave them, as the
-    /// reference's do. A single one is the observation itself.
+    /// The columns an agent observes, with their usual bounds. As in the reference implementation, values may exceed the
+    /// bounds. A single column is the observation itself, several are a dictionary.
     pub observation_space: Vec<(&'static str, Space)>,
-    /// Its factors of variation.
+    /// The factors of variation.
     pub variation_space: VariationSpace,
-    /// Steps after which an episode is truncated, unless the caller says otherwise.
+    /// The default time limit: steps after which an episode is truncated.
     pub max_episode_steps: usize,
-    /// The names of its cameras, the default first; none where there is only one way to look at it.
+    /// The names of its cameras, the default one first; empty for an environment with a single unnamed view.
     pub cameras: Vec<String>,
 }
 
 impl EnvSpec {
-    /// Numbers in one action.
+    /// The dimension of an action.
     pub fn action_dim(&self) -> usize {
         self.action_space.len()
     }
@@ -55,26 +55,26 @@ impl EnvSpec {
 pub struct ResetOptions {
     /// Factors to sample and to pin.
     pub variation: VariationRequest,
-    /// The start, in the layout of the `state` column; `None` follows the factors.
+    /// The initial state, in the layout of the `state` column; by default the factors and the seed decide it.
     pub state: Option<Vec<f64>>,
-    /// The goal, in the layout of the `state` column; `None` lets the environment choose.
+    /// The goal state, in the layout of the `state` column; by default the environment samples it.
     pub goal_state: Option<Vec<f64>>,
 }
 
 /// One action.
 #[derive(Clone, Copy, Debug)]
 pub enum Action<'a> {
-    /// A point of a box.
+    /// A point of a box, `[dim]`.
     Continuous(&'a [f32]),
-    /// One of a discrete set, or one of each of several.
+    /// One integer of a discrete space, or one for each dimension of a multi-discrete space.
     Discrete(&'a [i64]),
 }
 
 impl<'a> Action<'a> {
-    /// The numbers of a continuous action.
+    /// The elements of a continuous action of dimension `dim`.
     ///
     /// # Errors
-    /// When it is discrete, has another length than `dim`, or a number is not finite.
+    /// When the action is discrete, has another dimension, or an element is not finite.
     pub fn continuous(self, dim: usize) -> Result<&'a [f32]> {
         match self {
             Self::Continuous(values) if values.len() == dim => match values.iter().find(|v| !v.is_finite()) {
@@ -85,21 +85,24 @@ impl<'a> Action<'a> {
                     fix: "check the policy or the model that produced it".to_owned(),
                 }),
             },
-            Self::Continuous(values) => {
-                Err(Error::mismatch("stepping", format!("an action of {} numbers", values.len()), format!("{dim}")))
-            }
-            Self::Discrete(choice) => {
-                Err(Error::mismatch("stepping", format!("discrete action {choice:?}"), format!("{dim} numbers")))
-            }
+            Self::Continuous(values) => Err(Error::mismatch(
+                "stepping",
+                format!("an action of dimension {}", values.len()),
+                format!("dimension {dim}"),
+            )),
+            Self::Discrete(choice) => Err(Error::mismatch(
+                "stepping",
+                format!("discrete action {choice:?}"),
+                format!("a continuous action of dimension {dim}"),
+            )),
         }
     }
 
-    /// The integers of an action of a discrete space: one, or as many as a multi-discrete space has.
+    /// The integers of an action of a discrete or multi-discrete space.
     ///
     /// # Errors
-    /// When it is continuous, has another length than the space, or is out of range.
+    /// When the action is continuous, has another dimension than the space, or is out of range.
     pub fn discrete(self, space: &Space) -> Result<&'a [i64]> {
-        #[allow(clippy::cast_possible_truncation)]
         let bounds = |i| {
             let (low, high) = space.bounds(i);
             low as i64..=high as i64
@@ -120,35 +123,38 @@ impl<'a> Action<'a> {
     }
 }
 
-/// What a step brought, apart from the observation.
+/// The outcome of a step, apart from the observation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Transition {
     /// The reward.
     pub reward: f64,
-    /// The episode is over because of where the world is: the goal is reached, or cannot be any more. Which of the two,
-    /// [`Env::is_success`] says.
+    /// Whether a terminal state ended the episode: the goal is reached, or cannot be reached any more.
+    /// [`Env::is_success`] tells the two apart.
     pub terminated: bool,
-    /// The episode is over because of the clock.
+    /// Whether the time limit ended the episode.
     pub truncated: bool,
 }
 
-/// An RGB picture to draw into: rows of `width` pixels of 3 bytes.
+/// An RGB frame to render into.
+///
+/// # Shapes
+/// `rgb` is `[height, width, 3]` bytes, row-major.
 pub struct FrameMut<'a> {
     /// Pixels in a row.
     pub width: usize,
     /// Rows.
     pub height: usize,
-    /// `height * width * 3` bytes.
+    /// The pixels.
     pub rgb: &'a mut [u8],
 }
 
 impl<'a> FrameMut<'a> {
-    /// A picture over these bytes.
+    /// A frame over these bytes, `[height, width, 3]`.
     ///
     /// # Panics
-    /// When there are not `height * width * 3` of them.
+    /// When the size of `rgb` differs from `height * width * 3`.
     pub fn new(width: usize, height: usize, rgb: &'a mut [u8]) -> Self {
-        assert_eq!(rgb.len(), width * height * 3, "a {width} x {height} RGB picture");
+        assert_eq!(rgb.len(), width * height * 3, "a {width} x {height} RGB frame");
         Self { width, height, rgb }
     }
 }
@@ -157,49 +163,44 @@ impl<'a> FrameMut<'a> {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Snapshot(pub Vec<u8>);
 
-/// One world.
+/// One environment.
 pub trait Env: Send {
-    /// What never changes about it.
+    /// The constant properties.
     fn spec(&self) -> &EnvSpec;
 
-    /// Starts an episode: samples factors, start and goal from `seed` alone.
+    /// Starts an episode: samples factors, initial state and goal from `seed` alone.
     ///
     /// # Errors
-    /// When the request names unknown factors or impossible values.
+    /// When the request names unknown factors or invalid values.
     fn reset(&mut self, seed: u64, options: &ResetOptions) -> Result<()>;
 
-    /// Applies one action. Continuous actions outside the action space are clipped to it or not, as the
-    /// environment's README says; non-finite ones are errors.
+    /// Applies one action. Each environment's README documents whether continuous actions outside the action space are
+    /// clipped.
     ///
     /// # Errors
-    /// When the action is of the wrong kind, length or range, or not finite.
+    /// When the action has the wrong kind, dimension or range, or is not finite.
     fn step(&mut self, action: Action<'_>) -> Result<Transition>;
 
-    /// The environment as one whose calls can be dispatched early, if it runs in another process.
-    fn as_dispatch(&mut self) -> Option<&mut dyn DispatchEnv> {
-        None
-    }
-
-    /// Writes the columns of [`EnvSpec::columns`] into the first places of a row.
+    /// Writes the columns of [`EnvSpec::columns`] into the first columns of a row.
     fn observe(&self, row: &mut RowMut<'_>);
 
-    /// Draws the world as it is.
+    /// Renders the present state with the default camera.
     ///
     /// # Errors
-    /// When there is nothing to draw with: a renderer that is missing, or refuses.
+    /// When the renderer is missing or fails.
     fn render(&mut self, frame: FrameMut<'_>) -> Result<()>;
 
-    /// Draws the world as it would look at the goal.
+    /// Renders the goal state with the default camera.
     ///
     /// # Errors
     /// As [`Env::render`].
     fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()>;
 
-    /// Writes what a view of the world shows, in the form of its [`CameraView::column`]. Worlds with one camera know no view
-    /// but that of [`Env::render`].
+    /// Renders a camera view of the present state into `out`, the bytes of a row of [`CameraView::column`]. By default an
+    /// environment has the view of [`Env::render`] only.
     ///
     /// # Errors
-    /// When there is no such camera, or no such modality; and as [`Env::render`].
+    /// When there is no such camera or modality; and as [`Env::render`].
     fn render_view(&mut self, view: &CameraView, height: usize, width: usize, out: &mut [u8]) -> Result<()> {
         if *view == CameraView::default() {
             return self.render(FrameMut::new(width, height, out));
@@ -207,13 +208,14 @@ pub trait Env: Send {
         Err(view.unknown(self.spec()))
     }
 
-    /// The libraries that decide its numbers and pictures, such as `mujoco` or `renderer`, with their versions: what
-    /// datasets and results made with it record.
+    /// The versions of the libraries that affect values and frames, such as `mujoco` or `renderer`. Datasets and results
+    /// record them.
     fn libraries(&self) -> BTreeMap<String, String> {
         BTreeMap::new()
     }
 
-    /// What is the same in every step of this episode and no number, such as the XML of its scene: stored once with it.
+    /// Data that is constant over the episode and not a column, such as the XML of its scene. Datasets store it once per
+    /// episode.
     fn constants(&self) -> BTreeMap<String, Vec<u8>> {
         BTreeMap::new()
     }
@@ -224,21 +226,41 @@ pub trait Env: Send {
     /// The full state, randomness included.
     fn snapshot(&self) -> Snapshot;
 
-    /// Puts a state back; what follows equals what followed the snapshot, bit for bit.
+    /// Restores a snapshot. The following steps equal those that followed the snapshot, bit for bit.
     ///
     /// # Errors
     /// When the snapshot is of another environment.
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()>;
 
-    /// Continues from a dataset row (its `state` column, and factor columns where it has them) towards the
-    /// state of another row.
+    /// Continues from a dataset row (its `state` column, and factor columns where it has them), with the state of another
+    /// row as the goal.
     ///
     /// # Errors
-    /// When a row lacks what the environment needs.
+    /// When a row lacks a required column.
     fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()>;
 
-    /// The environment's own way to start at rows of a dataset, where it cannot restore its state from a row.
-    /// [`crate::dataset_start`] holds the functions that callers use.
+    /// Samples a new reachable goal that is not reached yet. The state of the environment does not change.
+    ///
+    /// # Errors
+    /// When no goal is found within a bounded number of tries.
+    fn sample_goal(&mut self, key: Key) -> Result<()>;
+
+    /// Whether the present state satisfies the goal.
+    fn is_success(&self) -> bool;
+
+    /// The distance from the present state to the goal, in the unit that the environment's README names.
+    ///
+    /// It is 0 at the goal, never negative, and falls along a good path there (around walls, not through them). A
+    /// simulator that serves as a cost model minimises it.
+    fn goal_distance(&self) -> f64;
+
+    /// This environment as one whose calls can be dispatched early, if it runs in another process.
+    fn as_dispatch(&mut self) -> Option<&mut dyn DispatchEnv> {
+        None
+    }
+
+    /// This environment's own way to start at dataset rows, if [`Env::restore_from`] is not it. Callers use the functions
+    /// of [`crate::dataset_start`].
     fn dataset_start(&self) -> Option<&dyn DatasetStartEnv> {
         None
     }
@@ -247,18 +269,4 @@ pub trait Env: Send {
     fn dataset_start_mut(&mut self) -> Option<&mut dyn DatasetStartEnv> {
         None
     }
-
-    /// Chooses a new reachable goal that is not already reached, without moving the world.
-    ///
-    /// # Errors
-    /// When none is found in bounded tries.
-    fn sample_goal(&mut self, key: Key) -> Result<()>;
-
-    /// Whether the goal is reached now.
-    fn is_success(&self) -> bool;
-
-    /// How far the world is from its goal, in the unit its README names: 0 at the goal, never negative, falling
-    /// along a good way there (around walls, not through them). A simulator that serves as a cost model
-    /// minimises it.
-    fn goal_distance(&self) -> f64;
 }

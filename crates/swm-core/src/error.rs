@@ -1,51 +1,51 @@
-//! What can go wrong, grouped by who can mend it: the user's words, the data, or the code.
+//! [`Error`]: the one error type, its variants grouped by cause: user input, data, or the run.
 //!
-//! Every message says what was given, what was wanted, and the next step. Front ends map variants to exit
-//! codes and Python exceptions in one place each.
+//! Every message states what was given, what was expected, and what to do. The command line maps variants to exit codes
+//! in one place, the Python package to exceptions in another.
 
 use std::path::PathBuf;
 
-/// The result of everything in this workspace that can fail.
+/// The result of every fallible function of the workspace.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// An error of the platform.
+/// An error.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    // ---- the user's words ----
-    /// A name that no registry row, column, factor or key carries.
+    // ---- user input ----
+    /// A name that matches no registry row, column, factor or setting.
     #[error("unknown {kind} '{given}'{}; {hint}", nearest_clause(.nearest))]
     UnknownName {
-        /// What kind of name: "environment", "column", "factor of variation".
+        /// The kind of name: "environment", "column", "factor of variation".
         kind: &'static str,
         /// The name as given.
         given: String,
-        /// The nearest right names, best first.
+        /// The most similar valid names, best first.
         nearest: Vec<String>,
-        /// What lists the right names.
+        /// Where the valid names are listed.
         hint: String,
     },
-    /// A value outside what its space allows.
+    /// A value outside its space.
     #[error("{what} = {given} is outside its space: expected {expected}")]
     OutOfSpace {
         /// The value's name.
         what: String,
-        /// The value given.
+        /// The value.
         given: String,
         /// The space, in words.
         expected: String,
     },
-    /// A setting that contradicts another one or makes no sense.
+    /// An invalid setting, or one that contradicts another.
     #[error("{what}: {problem}; {fix}")]
     Config {
         /// The setting.
         what: String,
-        /// What is wrong with it.
+        /// Why it is invalid.
         problem: String,
-        /// What to do.
+        /// How to fix it.
         fix: String,
     },
-    /// No value satisfied a constraint within the bounded number of tries.
+    /// No sample satisfied a constraint within the bounded number of tries.
     #[error(
         "no value of '{factor}' satisfied its constraint ({constraint}) in {tries} tries; pin the factors it depends on to compatible values, or vary fewer of them"
     )]
@@ -58,64 +58,64 @@ pub enum Error {
         tries: usize,
     },
 
-    // ---- the data ----
-    /// Two shapes, sizes or types that should agree and do not.
+    // ---- data ----
+    /// Two shapes, sizes or types that must agree and do not.
     #[error("{operation}: got {given}, expected {expected}")]
     Mismatch {
-        /// The operation that found it.
+        /// The operation that failed.
         operation: String,
-        /// What came.
+        /// What was given.
         given: String,
         /// What was expected.
         expected: String,
     },
-    /// A file, dataset or checkpoint that is damaged or of another kind.
+    /// A file, dataset or checkpoint that is damaged or of another format.
     #[error("{}: {problem}; {fix}", .path.display())]
     Corrupt {
         /// The file or folder.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The damage.
         problem: String,
-        /// What to do.
+        /// How to fix it.
         fix: String,
     },
-    /// The operating system refused.
+    /// The operating system refused a file operation.
     #[error("{}: {action}: {source}{}", .path.display(), disk_hint(.source))]
     Io {
         /// The file or folder.
         path: PathBuf,
-        /// What was being done.
+        /// The operation, such as "creating the folder".
         action: String,
         /// The system's reason.
         source: std::io::Error,
     },
-    /// A number that must be finite is not.
+    /// A value that must be finite is not.
     #[error("{what} is not finite: {given}; {fix}")]
     NotFinite {
-        /// What the number is.
+        /// The value's name.
         what: String,
-        /// The number and where it stood.
+        /// The value and its position.
         given: String,
-        /// What to do.
+        /// How to fix it.
         fix: String,
     },
 
     // ---- the run ----
-    /// The user pressed Ctrl-C; what was finished before is kept.
+    /// The user interrupted the run; finished work is kept.
     #[error("interrupted; everything finished before is kept")]
     Interrupted,
-    /// A library underneath failed in a way it explains itself.
+    /// A third-party library failed.
     #[error("{context}: {message}")]
     External {
-        /// What was being done, with which library.
+        /// The operation and the library.
         context: String,
         /// The library's message.
         message: String,
     },
-    /// An error of the program that embeds the platform, raised in something it lent (a policy, a model, an
-    /// environment), and handed back to it as it was.
+    /// An error of the embedding program, raised by a policy, model or environment of its own and returned to it
+    /// unchanged, such as a Python exception.
     #[error("{0}")]
-    Foreign(Box<dyn std::error::Error + Send + Sync>),
+    Embedder(Box<dyn std::error::Error + Send + Sync>),
 }
 
 impl Error {
@@ -144,7 +144,7 @@ impl Error {
         Self::External { context: context.into(), message: message.to_string() }
     }
 
-    /// An [`Error::UnknownName`] with the nearest of `known` filled in.
+    /// An [`Error::UnknownName`] that suggests the most similar names of `known`.
     pub fn unknown<'a>(
         kind: &'static str,
         given: &str,
@@ -154,13 +154,13 @@ impl Error {
         Self::UnknownName { kind, given: given.to_owned(), nearest: nearest(given, known), hint: hint.into() }
     }
 
-    /// Whether the user's words (not the data, not the machine) are at fault: exit code 2.
+    /// Whether user input caused the error, which is exit code 2 of the command line.
     pub fn is_usage(&self) -> bool {
         matches!(self, Self::UnknownName { .. } | Self::OutOfSpace { .. } | Self::Config { .. })
     }
 }
 
-/// The names most like `given`, best first, at most three.
+/// The names most similar to `given`, best first, at most three.
 pub fn nearest<'a>(given: &str, known: impl IntoIterator<Item = &'a str>) -> Vec<String> {
     let fold = |s: &str| s.to_lowercase().replace(['-', '_', '.', '/'], "");
     let wanted = fold(given);
@@ -170,12 +170,11 @@ pub fn nearest<'a>(given: &str, known: impl IntoIterator<Item = &'a str>) -> Vec
             let folded = fold(name);
             let contains = folded.contains(&wanted) || wanted.contains(&folded);
             let (short, long) = (wanted.len().min(folded.len()), wanted.len().max(folded.len()).max(1));
-            // A part of a name is nearer the more of the name it covers.
-            #[allow(clippy::cast_precision_loss)]
+            // A substring scores higher the more of the name it covers.
             let bonus = if contains { 0.15 * short as f64 / long as f64 } else { 0.0 };
-            // Two letters swapped, or one wrong, say little about a name of three to the other measure.
-            let slip = if strsim::osa_distance(&wanted, &folded) == 1 { 0.9 } else { 0.0 };
-            ((strsim::jaro_winkler(&wanted, &folded) + bonus).max(slip), name)
+            // Jaro-Winkler scores one typing error in a very short name too low.
+            let typo = if strsim::osa_distance(&wanted, &folded) == 1 { 0.9 } else { 0.0 };
+            ((strsim::jaro_winkler(&wanted, &folded) + bonus).max(typo), name)
         })
         .filter(|(score, _)| *score > 0.75)
         .collect();
@@ -204,7 +203,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn wrong_names_get_the_nearest_right_ones() {
+    fn unknown_names_suggest_similar_ones() {
         let known = ["swm/PushT-v1", "swm/TwoRoom-v1"];
         assert_eq!(nearest("pusht", known), ["swm/PushT-v1"]);
         assert_eq!(nearest("swm/TowRoom-v1", known)[0], "swm/TwoRoom-v1");

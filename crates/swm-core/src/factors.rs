@@ -1,12 +1,12 @@
-//! Factor values as bytes, and out of dataset rows: what every environment's `snapshot`, `restore` and
-//! `restore_from` need.
+//! Factor values as bytes and from dataset rows, as every environment's `snapshot`, `restore` and `restore_from` use
+//! them.
 
 use crate::{Error, FactorValues, Key, Result, RowRef, Snapshot, VariationRequest, VariationSpace, columns};
 
 /// A request that resolves to exactly these values.
 ///
-/// Only what differs from its default is pinned: constraints are checked on pinned factors, and defaults that
-/// nobody touched are trusted, at the reset as well as here.
+/// Only values that differ from their defaults are pinned, because [`VariationSpace::resolve`] checks constraints on
+/// pinned factors and trusts untouched defaults.
 pub fn pin(values: &FactorValues) -> VariationRequest {
     let changed = values.factors().iter().zip(values.iter()).filter(|(factor, (_, value))| factor.init_value != *value);
     VariationRequest {
@@ -15,7 +15,7 @@ pub fn pin(values: &FactorValues) -> VariationRequest {
     }
 }
 
-/// The factors of a dataset row: those it has a column for, and `current` for the others.
+/// The factor values of a dataset row; `current` values where it has no column.
 ///
 /// # Errors
 /// When a column holds a value outside its factor's space.
@@ -25,7 +25,7 @@ pub fn from_row(space: &VariationSpace, current: &FactorValues, row: RowRef<'_>)
         let name = columns::flat_factor(&factor.key);
         if row.schema().find(&name).is_some() {
             let value: Vec<f64> =
-                row.to_f64(&name)?.iter().enumerate().map(|(i, &v)| snapped(v, factor.space.bounds(i))).collect();
+                row.to_f64(&name)?.iter().enumerate().map(|(i, &v)| clamp_rounded(v, factor.space.bounds(i))).collect();
             if value == factor.init_value {
                 request.variation_values.remove(&factor.key);
             } else {
@@ -36,10 +36,10 @@ pub fn from_row(space: &VariationSpace, current: &FactorValues, row: RowRef<'_>)
     space.resolve(&request, Key::new(0))
 }
 
-/// A value on its way through single precision may end a hair outside its bounds.
-fn snapped(value: f64, (low, high): (f64, f64)) -> f64 {
-    let hair = f64::from(f32::EPSILON) * low.abs().max(high.abs());
-    if value >= low - hair && value <= high + hair { value.clamp(low, high) } else { value }
+/// Clamps a value that rounding to single precision moved just outside its bounds.
+fn clamp_rounded(value: f64, (low, high): (f64, f64)) -> f64 {
+    let tolerance = f64::from(f32::EPSILON) * low.abs().max(high.abs());
+    if value >= low - tolerance && value <= high + tolerance { value.clamp(low, high) } else { value }
 }
 
 /// Appends every value, in sampling order, to `bytes`.
@@ -49,12 +49,12 @@ fn write(values: &FactorValues, bytes: &mut Vec<u8>) {
     }
 }
 
-/// Bytes that [`write`] appends for a space.
+/// The number of bytes that [`write`] appends.
 fn byte_len(space: &VariationSpace) -> usize {
     space.factors().iter().map(|factor| factor.space.len() * size_of::<f64>()).sum()
 }
 
-/// A snapshot: the environment's id, its factors, and whatever bytes its state is.
+/// A snapshot of an environment's id, factor values, and state bytes.
 pub fn snapshot(id: &str, values: &FactorValues, state: impl IntoIterator<Item = u8>) -> Snapshot {
     let mut bytes = id.as_bytes().to_vec();
     write(values, &mut bytes);
@@ -62,11 +62,11 @@ pub fn snapshot(id: &str, values: &FactorValues, state: impl IntoIterator<Item =
     Snapshot(bytes)
 }
 
-/// The factors of a [`snapshot`], `None` where they are the `current` ones, and the bytes of its state.
+/// Parses a [`snapshot`] into its factor values, `None` if they equal `current`, and its state bytes.
 ///
 /// # Errors
-/// When it is of another environment, too short, or holds impossible values.
-pub fn restored<'a>(
+/// When it is of another environment, too short, or holds invalid values.
+pub fn parse_snapshot<'a>(
     id: &str,
     space: &VariationSpace,
     current: &FactorValues,
@@ -74,17 +74,17 @@ pub fn restored<'a>(
 ) -> Result<(Option<FactorValues>, &'a [u8])> {
     match snapshot.0.strip_prefix(id.as_bytes()) {
         Some(body) => read_changed(space, current, body),
-        None => Err(foreign(id, "a snapshot of another environment")),
+        None => Err(wrong_snapshot(id, "a snapshot of another environment")),
     }
 }
 
-/// A snapshot that is none of this environment.
-pub fn foreign(id: &str, given: impl Into<String>) -> Error {
+/// The error of a snapshot that is not of this environment.
+pub fn wrong_snapshot(id: &str, given: impl Into<String>) -> Error {
     Error::mismatch("restoring a snapshot", given, format!("one of {id}"))
 }
 
-/// As [`read`], but `None` for the values of `current`. Whoever plans in a simulator restores one episode's states
-/// thousands of times: its factors are told apart by their bytes, and neither resolved nor arranged again.
+/// As [`read`], but returns `None` if the values equal `current`. A planner in a simulator restores states of one episode
+/// thousands of times, and comparing bytes is much faster than resolving the factors again.
 ///
 /// # Errors
 /// As [`read`].
@@ -93,20 +93,20 @@ fn read_changed<'a>(
     current: &FactorValues,
     bytes: &'a [u8],
 ) -> Result<(Option<FactorValues>, &'a [u8])> {
-    let numbers = current.iter().flat_map(|(_, value)| value);
-    let known = bytes
+    let elements = current.iter().flat_map(|(_, value)| value);
+    let unchanged = bytes
         .split_at_checked(byte_len(space))
-        .filter(|(head, _)| head.as_chunks().0.iter().copied().eq(numbers.map(|number| number.to_le_bytes())));
-    match known {
+        .filter(|(head, _)| head.as_chunks().0.iter().copied().eq(elements.map(|element| element.to_le_bytes())));
+    match unchanged {
         Some((_, rest)) => Ok((None, rest)),
         None => read(space, bytes).map(|(values, rest)| (Some(values), rest)),
     }
 }
 
-/// The values [`write`] wrote, and the bytes behind them.
+/// Parses the values that [`write`] wrote; also returns the bytes after them.
 ///
 /// # Errors
-/// When there are too few bytes or they hold impossible values.
+/// When there are too few bytes or they hold invalid values.
 fn read<'a>(space: &VariationSpace, bytes: &'a [u8]) -> Result<(FactorValues, &'a [u8])> {
     let Some((mut head, rest)) = bytes.split_at_checked(byte_len(space)) else {
         let (given, expected) = (format!("{} bytes", bytes.len()), format!("at least {}", byte_len(space)));
@@ -115,8 +115,7 @@ fn read<'a>(space: &VariationSpace, bytes: &'a [u8]) -> Result<(FactorValues, &'
     let mut request = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
     for factor in space.factors() {
         let (own, next) = head.split_at(factor.space.len() * size_of::<f64>());
-        let numbers = own.as_chunks().0.iter();
-        let value: Vec<f64> = numbers.map(|&number| f64::from_le_bytes(number)).collect();
+        let value: Vec<f64> = own.as_chunks().0.iter().map(|&bytes| f64::from_le_bytes(bytes)).collect();
         if value != factor.init_value {
             request.variation_values.insert(factor.key.clone(), value);
         }

@@ -1,8 +1,8 @@
-//! Where every random number comes from: a counter-based generator keyed by what the number is for.
+//! [`Key`]: keyed random streams, the only source of randomness.
 //!
-//! A [`Key`] names a purpose, such as `(seed, "env", episode 7, "factor", "agent.color")`. Two different
-//! purposes never share a stream and no stream depends on how often another one was drawn from, so results
-//! do not depend on threads, batch sizes, or the order of work.
+//! A [`Key`] names a purpose, such as `(seed, "env", episode 7, "factor", "agent.color")`, and seeds a counter-based
+//! generator of its own. Streams of different purposes are independent, so results do not depend on threads, batch
+//! sizes, or the order of work.
 //!
 //! ```
 //! use rand::Rng as _;
@@ -22,7 +22,7 @@ pub type Rng = rand_chacha::ChaCha8Rng;
 pub struct Key([u8; 32]);
 
 impl Key {
-    /// The root of everything a seed decides.
+    /// The root key of a seed.
     pub fn new(seed: u64) -> Self {
         Self([0; 32]).mix(b's', &seed.to_le_bytes())
     }
@@ -39,12 +39,12 @@ impl Key {
         self.mix(b'i', &index.to_le_bytes())
     }
 
-    /// The stream of this key, from its beginning.
+    /// The random stream of this key, from its start.
     pub fn rng(self) -> Rng {
         Rng::from_seed(self.0)
     }
 
-    /// A seed for code that wants a `u64`, such as [`crate::Env::reset`].
+    /// The key as a `u64` seed, as [`crate::Env::reset`] takes it.
     pub fn seed(self) -> u64 {
         u64::from_le_bytes(std::array::from_fn(|i| self.0[i]))
     }
@@ -80,8 +80,8 @@ mod tests {
     }
 
     #[test]
-    fn the_stream_of_a_key_is_pinned() {
-        // Published results depend on this stream: changing it is a breaking change.
+    fn keys_are_pinned() {
+        // Published results depend on these streams: changing them is a breaking change.
         assert_eq!(Key::new(42).with("env").at(7).seed(), PINNED);
     }
 

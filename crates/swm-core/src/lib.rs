@@ -1,14 +1,15 @@
-//! The vocabulary of stable-worldmodel.
+//! The contracts of stable-worldmodel: what every other crate of the workspace implements or uses.
 //!
-//! Read the modules in this order and you know the system:
+//! Read the modules in this order:
 //!
-//! 1. [`batch`] and [`columns`]: named typed columns, the only thing that flows between the parts, and their names.
-//! 2. [`space`] and [`variation`]: what an action, an observation and a factor of variation may be.
-//! 3. [`key`]: where every random number comes from.
-//! 4. [`env`], [`camera_view`], [`dispatch`], [`dataset_start`]: one environment; [`pool`], [`thread_budget`]: many of them at
-//!    once; [`policy`]: what acts in them.
+//! 1. [`batch`] and [`columns`]: named typed arrays, which all parts of the system exchange, and the names of their columns.
+//! 2. [`space`] and [`variation`]: the values of actions, observations and factors of variation.
+//! 3. [`key`]: keyed random streams, the only source of randomness.
+//! 4. [`env`], [`camera_view`], [`dispatch`], [`dataset_start`]: one environment. [`pool`], [`thread_budget`]: many
+//!    environments on a fixed set of threads. [`policy`]: policies and experts.
 //! 5. [`plan`]: costs of candidate action sequences, and the solvers that minimise them.
-//! 6. [`run`], [`registry`], [`manifest`], [`results`], [`error`]: long commands, names, provenance, findings, and what goes wrong.
+//! 6. [`run`]: progress and interruption of long commands. [`registry`], [`manifest`], [`results`], [`error`]: names,
+//!    provenance, evaluation results and errors.
 
 pub mod batch;
 pub mod camera_view;

@@ -1,29 +1,29 @@
-//! [`Manifest`]: where a dataset, a checkpoint or a result came from, so that it can be made again.
+//! [`Manifest`]: the provenance of a dataset, a checkpoint or a result, sufficient to make it again.
 
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Provenance. Everything in it is decided by what was asked, so two equal runs have equal manifests.
+/// The provenance of an artifact. It holds no times, so two equal runs have equal manifests.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
-    /// What made it: `collect`, `train`, `evaluate`.
+    /// The command that made it: `collect`, `train`, `evaluate`.
     pub kind: String,
     /// The version of stable-worldmodel.
     pub swm_version: String,
-    /// Versions of the libraries that decide the numbers.
+    /// Versions of the libraries that affect values.
     pub libraries: BTreeMap<String, String>,
     /// The seed.
     pub seed: u64,
     /// The complete configuration.
     pub config: serde_json::Value,
-    /// BLAKE3 hashes of what went in: `dataset`, `weights`, `starts`.
+    /// BLAKE3 hashes of the inputs: `dataset`, `weights`, `starts`.
     pub hashes: BTreeMap<String, String>,
-    /// Where the numbers were computed, such as `cpu (flex)`.
+    /// The device of the computation, such as `cpu (flex)`.
     pub device: String,
 }
 
 impl Manifest {
-    /// A manifest of this build.
+    /// A manifest of this version of stable-worldmodel.
     pub fn new(kind: &str, seed: u64, config: serde_json::Value) -> Self {
         Self {
             kind: kind.to_owned(),

@@ -1,8 +1,7 @@
-//! Planning: what a candidate action sequence costs, and who finds a cheap one.
+//! Planning: a [`CostModel`] scores candidate action sequences, a [`Solver`] minimises the cost and returns a [`Plan`].
 //!
-//! A [`CostModel`] scores candidates; a [`Solver`] asks it repeatedly and returns a [`Plan`]. Plain host arrays
-//! cross this border, so solvers know no deep-learning framework. All environments that replan at a step
-//! go in one call, yet the plan of each depends on its own cost and key only.
+//! Model and solver exchange plain host slices, so solvers depend on no deep-learning framework. All environments that
+//! replan at a step share one call, yet the plan of each depends on its own cost and key only.
 
 use crate::{Batch, Env, Key, Result};
 use serde::Serialize;
@@ -14,29 +13,31 @@ use std::time::Instant;
 /// `actions` is `[envs, samples, horizon, dim]`, row-major.
 #[derive(Clone, Copy, Debug)]
 pub struct Candidates<'a> {
-    /// The numbers.
+    /// The action sequences.
     pub actions: &'a [f32],
-    /// Environments that replan.
+    /// The number of environments that replan.
     pub envs: usize,
-    /// Candidates for each.
+    /// Candidates of each environment.
     pub samples: usize,
     /// Model steps of a candidate.
     pub horizon: usize,
-    /// Numbers of one model step: action dimension times action block.
+    /// The dimension of one model step: action dimension times action block.
     pub dim: usize,
 }
 
-/// Scores candidate action sequences from the present of each environment.
+/// Scores candidate action sequences from the present observation of each environment.
 pub trait CostModel: Send {
-    /// Takes note of the present and the goal: rows `envs` of `infos`. What a plan needs only once (encoding
-    /// the start and the goal) happens here.
+    /// Reads the present observation and the goal of each environment: rows `envs` of `infos`. Work that a plan needs only
+    /// once, such as encoding both, happens here.
     ///
     /// # Errors
-    /// When `infos` lacks a column the model reads.
+    /// When `infos` lacks a column that the model reads.
     fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()>;
 
-    /// Writes the cost of every candidate, `[envs, samples]`, environments in the order of the last
-    /// [`CostModel::observe`].
+    /// Writes the cost of every candidate, environments in the order of the last [`CostModel::observe`].
+    ///
+    /// # Shapes
+    /// `costs` is `[envs, samples]`.
     ///
     /// # Errors
     /// When the candidates do not fit the model.
@@ -51,17 +52,17 @@ pub trait CostModel: Send {
         Ok(())
     }
 
-    /// This model with its gradient, if it has one.
+    /// This model as one with a gradient, if it has one.
     fn differentiable(&mut self) -> Option<&mut dyn DifferentiableCost> {
         None
     }
 
-    /// This model with its latent state, if it shows one.
+    /// This model as one with a latent state, if it exposes one.
     fn latent(&mut self) -> Option<&mut dyn LatentDynamics> {
         None
     }
 
-    /// This model with its constraints, if it has any.
+    /// This model as one with constraints, if it has any.
     fn constrained(&mut self) -> Option<&mut dyn Constrained> {
         None
     }
@@ -69,7 +70,10 @@ pub trait CostModel: Send {
 
 /// A cost with a gradient.
 pub trait DifferentiableCost: CostModel {
-    /// Costs `[envs, samples]` and the gradient of each with respect to its candidate, of the candidates' shape.
+    /// Writes the cost of every candidate and the gradient of each cost with respect to its candidate.
+    ///
+    /// # Shapes
+    /// `costs` is `[envs, samples]`, `gradient` is `[envs, samples, horizon, dim]`.
     ///
     /// # Errors
     /// As [`CostModel::cost`].
@@ -78,23 +82,32 @@ pub trait DifferentiableCost: CostModel {
 
 /// A model with a latent state, for solvers that optimise states and actions together.
 pub trait LatentDynamics: CostModel {
-    /// Numbers in one latent state.
+    /// The dimension of a latent state.
     fn latent_dim(&self) -> usize;
 
-    /// The latent state of every observed environment and of its goal, `[envs, latent]` each.
+    /// Writes the latent state of every observed environment and of its goal.
+    ///
+    /// # Shapes
+    /// `start` and `goal` are `[envs, latent]`.
     ///
     /// # Errors
-    /// When nothing was observed.
+    /// Before the first [`CostModel::observe`].
     fn encode(&mut self, start: &mut [f32], goal: &mut [f32]) -> Result<()>;
 
-    /// One step for `n` pairs: `next[n, latent]` from `latents[n, latent]` and `actions[n, dim]`. Every observed
-    /// environment has equally many pairs, one environment's after another's.
+    /// Predicts one model step for `n` pairs of latent state and action. The pairs are grouped by observed environment, the
+    /// same number for each.
+    ///
+    /// # Shapes
+    /// `latents` and `next` are `[n, latent]`, `actions` is `[n, dim]`.
     ///
     /// # Errors
     /// When shapes do not fit the model.
     fn predict(&mut self, latents: &[f32], actions: &[f32], next: &mut [f32]) -> Result<()>;
 
     /// The vector-Jacobian product of [`LatentDynamics::predict`]: writes the gradients with respect to latents and actions.
+    ///
+    /// # Shapes
+    /// `next_gradient` and `latent_gradient` are `[n, latent]`, `action_gradient` is `[n, dim]`.
     ///
     /// # Errors
     /// As [`LatentDynamics::predict`].
@@ -110,42 +123,48 @@ pub trait LatentDynamics: CostModel {
 
 /// Differentiable inequality constraints on candidates.
 pub trait Constrained: CostModel {
-    /// How many, for a candidate of `horizon` model steps: a limit on every step counts once a step.
+    /// The number of constraints of a candidate of `horizon` model steps; a limit on every step counts once per step.
     fn constraints(&self, horizon: usize) -> usize;
 
-    /// Writes `[envs, samples, constraints]`; a constraint is satisfied when its value is at most 0.
+    /// Writes the value of every constraint; a constraint is satisfied when its value is at most 0.
+    ///
+    /// # Shapes
+    /// `values` is `[envs, samples, constraints]`.
     ///
     /// # Errors
     /// As [`CostModel::cost`].
     fn constrain(&mut self, candidates: Candidates<'_>, values: &mut [f32]) -> Result<()>;
 
     /// The vector-Jacobian product of [`Constrained::constrain`]: adds `Σ_c weights_c ∂value_c / ∂candidate` to
-    /// `gradient`, of the candidates' shape; `weights` is `[envs, samples, constraints]`.
+    /// `gradient`.
+    ///
+    /// # Shapes
+    /// `weights` is `[envs, samples, constraints]`, `gradient` is `[envs, samples, horizon, dim]`.
     ///
     /// # Errors
     /// As [`CostModel::cost`].
     fn constrain_vjp(&mut self, candidates: Candidates<'_>, weights: &[f32], gradient: &mut [f32]) -> Result<()>;
 }
 
-/// What one model step of a plan may be.
+/// The action space of one model step of a plan.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum PlanSpace<'a> {
-    /// Numbers within bounds, in the model's (normalised) action units; infinite bounds bound nothing.
+    /// A point within bounds, in the model's (normalised) action units; bounds may be infinite.
     Continuous {
-        /// The lower bound of each of the `dim` numbers.
+        /// The lower bounds, `[dim]`.
         low: &'a [f32],
-        /// The upper bound of each.
+        /// The upper bounds, `[dim]`.
         high: &'a [f32],
     },
-    /// Several choices, one after another in a model step, each as a one-hot vector.
+    /// Several choices, concatenated in a model step, each as a one-hot vector.
     Discrete {
-        /// Among how many each choice is made; they add up to `dim`.
+        /// The number of options of each choice; the sum is `dim`.
         choices: &'a [usize],
     },
 }
 
 impl PlanSpace<'_> {
-    /// Numbers of one model step.
+    /// The dimension of one model step.
     pub fn dim(&self) -> usize {
         match self {
             Self::Continuous { low, .. } => low.len(),
@@ -154,61 +173,61 @@ impl PlanSpace<'_> {
     }
 }
 
-/// What a solver is asked.
+/// A planning problem: everything a solver needs besides the cost.
 #[derive(Clone, Copy, Debug)]
 pub struct PlanProblem<'a> {
-    /// Model steps to plan.
+    /// The number of model steps to plan.
     pub horizon: usize,
-    /// What a model step may be.
+    /// The action space of a model step.
     pub space: PlanSpace<'a>,
-    /// The key of each environment's plan, one an environment: `(seed, episode, replan)`.
+    /// The key of each environment's plan, `[envs]`: `(seed, episode, replan)`.
     pub keys: &'a [Key],
-    /// Where to start: `[envs, horizon, dim]`; `None` for zeros, or for every choice equally likely.
+    /// The initial action sequences, `[envs, horizon, dim]`; `None` for zeros, or for uniform choices.
     pub init: Option<&'a [f32]>,
-    /// When to stop searching and return the best plan so far: solvers look between iterations, after the first. A plan
-    /// that was cut short depends on the machine's speed.
+    /// When to stop and return the best plan so far. Solvers check it between iterations, after the first. A plan that
+    /// stopped early depends on the machine's speed.
     pub deadline: Option<Instant>,
 }
 
 impl PlanProblem<'_> {
-    /// Whether the search is to stop now.
+    /// Whether the deadline has passed.
     pub fn is_late(&self) -> bool {
         self.deadline.is_some_and(|deadline| Instant::now() >= deadline)
     }
 }
 
-/// What a solver found.
+/// The plans of a solver.
 #[derive(Clone, Debug, Default)]
 pub struct Plan {
-    /// The action sequences, `[envs, horizon, dim]`; of discrete actions, one-hot vectors.
+    /// The action sequences, `[envs, horizon, dim]`; discrete actions are one-hot vectors.
     pub actions: Vec<f32>,
-    /// The cost of each, `[envs]`: what the model said of the best candidate of the last iteration.
+    /// The cost of each, `[envs]`: the model's cost of the best candidate of the last iteration.
     pub costs: Vec<f32>,
-    /// How the search went, `[envs][iterations]`.
+    /// The trace of each search, one per environment.
     pub trace: Vec<PlanTrace>,
 }
 
-/// How the search of one environment's plan went, one number an iteration.
+/// The trace of one environment's search: one value per iteration.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct PlanTrace {
     /// The lowest cost of the iteration.
     pub best: Vec<f32>,
-    /// The mean cost of the elites (or of all candidates, where a solver has none).
+    /// The mean cost of the elites, or of all candidates if the solver has no elites.
     pub mean: Vec<f32>,
-    /// The mean spread of the sampling distribution after the iteration (or of the candidates, where a solver has none).
+    /// The mean spread of the sampling distribution after the iteration, or of the candidates if the solver has none.
     pub spread: Vec<f32>,
-    /// The largest value of a constraint of the best candidate, where the model has constraints and the solver keeps them:
+    /// The largest constraint value of the best candidate, if the model has constraints and the solver enforces them. It is
     /// at most 0, or the solver's tolerance, when all are satisfied.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub violation: Vec<f32>,
 }
 
-/// Finds cheap action sequences.
+/// Searches for action sequences of low cost.
 pub trait Solver: Send {
-    /// Solves one problem for every environment `cost` observed.
+    /// Solves one problem for every environment that `cost` observed.
     ///
     /// # Errors
-    /// When the settings contradict each other or do not fit the action space or the model, or the model fails or returns
+    /// When the solver's settings are invalid or do not fit the action space or the model, or the model fails or returns
     /// costs that are not finite.
     fn solve(&mut self, cost: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan>;
 }

@@ -1,22 +1,22 @@
-//! [`Policy`]: who acts. A policy sees the infos of all environments at once and fills one action row for each.
+//! [`Policy`]: reads the infos of all environments of a pool at once and fills one action row for each.
 //!
-//! Randomness of a policy is keyed by the episode a slot plays, not by the slot, so the same episode is
-//! played the same way wherever it runs.
+//! A policy's randomness is keyed by the episode that a slot plays, not by the slot, so an episode has the same actions in
+//! every slot.
 
 use crate::batch::{Batch, DType, RowMut, RowRef};
 use crate::parallelism::Parallelism;
 use crate::{EnvPool, EnvSpec, Error, Key, Result, Rng, columns};
 use std::time::Instant;
 
-/// Who acts.
+/// Chooses the actions of the environments of a pool.
 pub trait Policy: Send {
-    /// A new episode begins in `slot`; `key` is the episode's.
+    /// Starts an episode in `slot`; `key` is that of the episode.
     fn begin(&mut self, slot: usize, key: Key);
 
     /// Fills the `action` rows of the active slots.
     ///
     /// # Errors
-    /// When the infos lack what the policy needs, or its model fails.
+    /// When the infos lack a column that the policy reads, or its model fails.
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()>;
 
     /// Reads the environments themselves, before [`Policy::act`]. Only a policy with privileged information, such as one that
@@ -28,18 +28,18 @@ pub trait Policy: Send {
         Ok(())
     }
 
-    /// Whether [`Policy::act`] works on several threads; one that does not is called on the caller's.
+    /// Whether [`Policy::act`] uses several threads. If not, it runs on the thread of the caller.
     fn uses_threads(&self) -> bool {
         true
     }
 
-    /// Seconds each plan took since the last call, for policies that plan.
+    /// The duration of each plan since the last call, in seconds, for policies that plan.
     fn take_latencies(&mut self) -> Vec<f64> {
         vec![]
     }
 }
 
-/// Acts uniformly at random in the action space.
+/// Samples actions uniformly from the action space.
 pub struct RandomPolicy {
     spec: EnvSpec,
     rngs: Vec<Rng>,
@@ -71,24 +71,25 @@ impl Policy for RandomPolicy {
     }
 }
 
-/// One environment's expert: reads the infos row, writes the action.
+/// A scripted policy of one environment: reads its infos row, writes its action.
 pub trait Expert: Send {
-    /// A new episode begins.
+    /// Starts an episode.
     fn begin(&mut self, key: Key);
 
-    /// The action for what the row shows.
+    /// Writes the action for an infos row, `[dim]`.
     ///
     /// # Errors
-    /// When the row lacks what the expert needs.
+    /// When the row lacks a column that the expert reads.
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()>;
 }
 
-/// One [`Expert`] a slot.
+/// A policy of one [`Expert`] per slot.
 pub struct ExpertPolicy {
     slots: Vec<ExpertSlot>,
     parallelism: Parallelism,
 }
 
+/// The expert of one slot, its last action, `[dim]`, and its error.
 struct ExpertSlot {
     expert: Box<dyn Expert>,
     action: Vec<f64>,
@@ -96,7 +97,7 @@ struct ExpertSlot {
 }
 
 impl ExpertPolicy {
-    /// A policy of these experts, one a slot.
+    /// A policy of these experts, one per slot.
     pub fn new(spec: &EnvSpec, experts: Vec<Box<dyn Expert>>) -> Self {
         let slot_expert = |expert| ExpertSlot { expert, action: vec![0.0; spec.action_dim()], failed: None };
         Self { slots: experts.into_iter().map(slot_expert).collect(), parallelism: Parallelism::default() }
@@ -116,17 +117,17 @@ impl Policy for ExpertPolicy {
                 write_action(&mut row, column, &slot_expert.action);
             }
         };
-        let begun = Instant::now();
-        let alone = !self.uses_threads();
-        if alone {
+        let start = Instant::now();
+        let serial = !self.uses_threads();
+        if serial {
             for (slot, slot_expert) in self.slots.iter_mut().enumerate() {
                 work(slot, actions.row_mut(slot), slot_expert);
             }
         } else {
             actions.par_zip_mut(&mut self.slots, work);
         }
-        let workers = if alone { 1 } else { rayon::current_num_threads() };
-        self.parallelism.record(begun, workers, self.slots.len());
+        let workers = if serial { 1 } else { rayon::current_num_threads() };
+        self.parallelism.record(start, workers, self.slots.len());
         self.slots.iter_mut().find_map(|slot_expert| slot_expert.failed.take()).map_or(Ok(()), Err)
     }
 
@@ -135,8 +136,7 @@ impl Policy for ExpertPolicy {
     }
 }
 
-/// Writes an action in the type of its column.
-#[allow(clippy::cast_possible_truncation)]
+/// Writes an action, `[dim]`, in the type of its column.
 pub fn write_action(row: &mut RowMut<'_>, column: usize, action: &[f64]) {
     match row.schema().columns()[column].dtype {
         DType::Float32 => {

@@ -1,9 +1,8 @@
-//! [`EnvPool`]: many environments of one kind, stepped and drawn on a fixed set of threads.
+//! [`EnvPool`]: many environments of one kind, stepped and rendered on a fixed set of threads.
 //!
-//! Everything the environments produce lands in one [`Batch`], `infos`, written in place: the environment's own
-//! columns, then `reward`, `terminated`, `truncated`, `success`, `step_idx`, and, where pictures are asked for,
-//! `pixels`, `goal` and other views. What an environment produces depends on its seed and its actions only, never on the
-//! number of threads or of neighbours.
+//! All output is written in place into one [`Batch`], the infos: the environment's own columns, then `reward`,
+//! `terminated`, `truncated`, `success`, `step_idx`, and, if the pool renders, `pixels`, `goal` and further camera views.
+//! The output of an environment depends on its seed and its actions only, not on the number of threads or environments.
 
 use crate::batch::{Batch, ColumnSpec, DType, RowMut, Schema};
 use crate::columns::{self, ColumnIndices};
@@ -13,14 +12,14 @@ use crate::{Action, CameraView, Env, EnvSpec, Error, FrameMut, PendingCall, Rese
 use std::sync::Arc;
 use std::time::Instant;
 
-/// One slot of a pool to reset.
+/// The reset of one slot.
 #[derive(Clone)]
 pub struct Reset {
-    /// Which slot.
+    /// The slot.
     pub slot: usize,
     /// The seed of its episode.
     pub seed: u64,
-    /// Factors, start and goal.
+    /// Factors, initial state and goal.
     pub options: ResetOptions,
 }
 
@@ -96,20 +95,21 @@ struct Slot {
     failed: Option<Error>,
 }
 
-/// A pool of worker threads: `n` of them, or as many as the machine offers for 0.
+/// Starts a pool of `n` worker threads; 0 means one per core.
 ///
 /// # Errors
-/// When the system refuses to start them.
+/// When the operating system cannot start them.
 pub fn threads(n: usize) -> Result<Arc<rayon::ThreadPool>> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(n).thread_name(|i| format!("swm-{i}")).build();
     pool.map(Arc::new).map_err(|error| Error::external("starting worker threads", error))
 }
 
 impl EnvPool {
-    /// A pool of these environments. `image` is the `(height, width)` of `pixels` and `goal`, if wanted.
+    /// A pool of these environments. `image` is the `(height, width)` of frames; without it, the pool renders nothing.
+    /// `max_episode_steps` replaces the environment's own time limit.
     ///
     /// # Errors
-    /// When there is no environment.
+    /// When `envs` is empty.
     pub fn new(
         envs: Vec<Box<dyn Env>>,
         image: Option<(usize, usize)>,
@@ -119,10 +119,10 @@ impl EnvPool {
         Self::with_views(envs, image, vec![], max_episode_steps, threads)
     }
 
-    /// As [`EnvPool::new`], with further views of the worlds, each in its own [`CameraView::column`] behind `goal`.
+    /// As [`EnvPool::new`], with further camera views, each in its own [`CameraView::column`] after `goal`.
     ///
     /// # Errors
-    /// As [`EnvPool::new`], and when views are asked for without a picture's size, or one of them twice.
+    /// As [`EnvPool::new`], and when there are views without an `image` size, or a view occurs twice.
     pub fn with_views(
         envs: Vec<Box<dyn Env>>,
         image: Option<(usize, usize)>,
@@ -131,10 +131,10 @@ impl EnvPool {
         threads: Arc<rayon::ThreadPool>,
     ) -> Result<Self> {
         if image.is_none() && !views.is_empty() {
-            return Err(Error::config("views", "asked for without a size", "give the size of the pictures"));
+            return Err(Error::config("camera views", "they need a frame size", "set the frame size"));
         }
         let Some(first) = envs.first() else {
-            return Err(Error::config("number of environments", "0", "ask for at least 1"));
+            return Err(Error::config("number of environments", "it is 0", "choose at least 1"));
         };
         let spec = first.spec();
         let (schema, columns) = PoolColumns::add(spec.columns.clone(), image, views)?;
@@ -149,32 +149,32 @@ impl EnvPool {
         })
     }
 
-    /// How many environments.
+    /// The number of environments.
     pub fn len(&self) -> usize {
         self.slots.len()
     }
 
-    /// Whether there is none (never).
+    /// Whether the pool is empty; always false.
     pub fn is_empty(&self) -> bool {
         self.slots.is_empty()
     }
 
-    /// What never changes about the environments.
+    /// The constant properties of the environments.
     pub fn spec(&self) -> &EnvSpec {
         self.slots[0].env.spec()
     }
 
-    /// What the last reset or step of every slot produced.
+    /// The output of the last reset or step of every slot, one row per slot.
     pub fn infos(&self) -> &Batch {
         &self.infos
     }
 
-    /// The `(height, width)` of the pictures, if there are any.
+    /// The `(height, width)` of frames in pixels, if the pool renders.
     pub fn image(&self) -> Option<(usize, usize)> {
         self.columns.frames.map(|frames| (frames.height, frames.width))
     }
 
-    /// What is drawn besides `pixels` and `goal`.
+    /// The camera views rendered besides `pixels` and `goal`.
     pub fn views(&self) -> &[CameraView] {
         &self.columns.views
     }
@@ -184,12 +184,12 @@ impl EnvPool {
         &self.threads
     }
 
-    /// One environment.
+    /// The environment of a slot.
     pub fn env(&self, slot: usize) -> &dyn Env {
         &*self.slots[slot].env
     }
 
-    /// Steps after which an episode is truncated.
+    /// The time limit: steps after which an episode is truncated.
     pub fn max_episode_steps(&self) -> usize {
         self.max_episode_steps
     }
@@ -197,28 +197,28 @@ impl EnvPool {
     /// Starts episodes in some slots.
     ///
     /// # Errors
-    /// When an environment refuses its options.
+    /// As [`Env::reset`].
     pub fn reset(&mut self, resets: &[Reset]) -> Result<()> {
-        let mut wanted: Vec<Option<&Reset>> = vec![None; self.slots.len()];
+        let mut by_slot: Vec<Option<&Reset>> = vec![None; self.slots.len()];
         for reset in resets {
-            wanted[reset.slot] = Some(reset);
+            by_slot[reset.slot] = Some(reset);
         }
-        for (slot, reset) in self.slots.iter_mut().zip(&wanted) {
+        for (slot, reset) in self.slots.iter_mut().zip(&by_slot) {
             if let Some(reset) = reset {
                 slot.dispatch(PendingCall::Reset(reset.seed, &reset.options));
             }
         }
         self.each(Some(resets.len()), |i, slot, columns, row| {
-            let Some(reset) = wanted[i] else { return Ok(()) };
+            let Some(reset) = by_slot[i] else { return Ok(()) };
             slot.env.reset(reset.seed, &reset.options)?;
             slot.start(columns, row)
         })
     }
 
-    /// Changes environments in place (a restore, a new goal), then observes and draws them as after a reset.
+    /// Changes environments in place (a restore, a new goal), then observes and renders them as after a reset.
     ///
     /// # Errors
-    /// What `change` returns.
+    /// Those of `change`, and as [`Env::render`].
     pub fn restart(
         &mut self,
         slots: &[usize],
@@ -233,11 +233,11 @@ impl EnvPool {
         })
     }
 
-    /// Steps the slots whose `active` is true with their row of `actions` (the column of
-    /// [`EnvSpec::action_column`]); the others keep their infos.
+    /// Steps the slots whose `active` is true with their row of `actions`, a batch with the column
+    /// [`EnvSpec::action_column`]; the other slots keep their infos.
     ///
     /// # Errors
-    /// When `actions` is not of that form, or an environment refuses an action.
+    /// When `actions` has another form, and as [`Env::step`] and [`Env::render`].
     pub fn step(&mut self, actions: &Batch, active: &[bool]) -> Result<()> {
         if actions.rows() != self.len() || active.len() != self.len() {
             return Err(Error::mismatch(
@@ -248,16 +248,16 @@ impl EnvPool {
         }
         let column = actions.schema().index(columns::ACTION)?;
         let dtype = actions.schema().columns()[column].dtype;
-        let wanted = self.spec().action_column();
-        if actions.schema().columns()[column] != wanted {
+        let expected = self.spec().action_column();
+        if actions.schema().columns()[column] != expected {
             return Err(Error::mismatch(
                 "stepping a pool",
                 format!("actions {} {:?}", dtype.name(), actions.schema().columns()[column].shape),
-                format!("{} {:?}", wanted.dtype.name(), wanted.shape),
+                format!("{} {:?}", expected.dtype.name(), expected.shape),
             ));
         }
         let limit = self.max_episode_steps;
-        let begun = Instant::now();
+        let start = Instant::now();
         let stepping = active.iter().filter(|&&active| active).count();
         let action = |i| match dtype {
             DType::Float32 => Action::Continuous(actions.row(i).at::<f32>(column)),
@@ -276,18 +276,17 @@ impl EnvPool {
             let mut transition = slot.env.step(action(i))?;
             slot.steps += 1;
             transition.truncated |= slot.steps >= limit && !transition.terminated;
-            #[allow(clippy::cast_possible_truncation)]
             row.set(columns.at.reward, &[transition.reward as f32]);
             row.set(columns.at.terminated, &[u8::from(transition.terminated)]);
             row.set(columns.at.truncated, &[u8::from(transition.truncated)]);
             slot.observe(columns, row)
         });
-        self.parallelism.record(begun, if serial { 1 } else { self.threads.current_num_threads() }, stepping);
+        self.parallelism.record(start, if serial { 1 } else { self.threads.current_num_threads() }, stepping);
         stepped
     }
 
-    /// Runs `work` on every slot; the first slot's error wins, whatever finished first. In parallel where it is said how many of them
-    /// have something to do, which share the threads; on this thread otherwise.
+    /// Runs `work` on every slot and returns the error of the lowest slot that failed. `busy` is the number of slots that
+    /// have work and divide the threads among them; `None` runs everything on the calling thread.
     fn each(
         &mut self,
         busy: Option<usize>,
@@ -325,7 +324,7 @@ impl Slot {
         self.env.as_dispatch().is_some_and(|env| env.dispatch(call))
     }
 
-    /// Fills a row after a reset.
+    /// Fills the row of an episode's first observation.
     fn start(&mut self, columns: &PoolColumns, row: &mut RowMut<'_>) -> Result<()> {
         self.steps = 0;
         row.set(columns.at.reward, &[0.0f32]);
@@ -340,11 +339,10 @@ impl Slot {
         }
     }
 
-    /// Fills the parts of a row that follow the world.
+    /// Fills the columns of a row that follow from the present state.
     fn observe(&mut self, columns: &PoolColumns, row: &mut RowMut<'_>) -> Result<()> {
         self.env.observe(row);
         row.set(columns.at.success, &[u8::from(self.env.is_success())]);
-        #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
         row.set(columns.step_idx, &[self.steps as i32]);
         if let Some(FrameColumns { pixels, first_view, height, width, .. }) = columns.frames {
             self.env.render(FrameMut::new(width, height, row.at::<u8>(pixels)))?;

@@ -1,21 +1,21 @@
-//! [`Registry`]: one visible list of what there is of a kind. A row holds the id, the constructor and the
-//! defaults together, so a family member is added in one place.
+//! [`Registry`]: a list of everything of one kind, such as environments or solvers. A row holds the id, the constructor
+//! and the defaults together, so a new member is added in one place.
 
 use crate::policy::Expert;
 use crate::{Env, Error, Result};
 
 /// A row of a registry.
 pub trait Named {
-    /// The id users type.
+    /// The id that users write.
     fn id(&self) -> &'static str;
 }
 
 /// A list of rows with unique ids.
 #[derive(Clone, Copy)]
 pub struct Registry<T: 'static> {
-    /// What the rows are, for messages: "environment".
+    /// The kind of the rows, for errors: "environment".
     pub kind: &'static str,
-    /// What lists them, for messages: "`swm envs` lists them".
+    /// Where they are listed, for errors: "`swm envs` lists them".
     pub hint: &'static str,
     /// The rows.
     pub rows: &'static [T],
@@ -25,7 +25,7 @@ impl<T: Named> Registry<T> {
     /// The row of an id.
     ///
     /// # Errors
-    /// When there is none; names the nearest.
+    /// When no row has that id; the error suggests similar ids.
     pub fn get(&self, id: &str) -> Result<&'static T> {
         self.rows
             .iter()
@@ -34,9 +34,12 @@ impl<T: Named> Registry<T> {
     }
 }
 
-/// Two lists as one, for registries that several crates fill.
-pub const fn join<T: Copy, const N: usize>(first: &[T], second: &[T]) -> [T; N] {
-    assert!(first.len() + second.len() == N && !first.is_empty(), "as long as both together");
+/// Concatenates two lists, for registries that several crates fill.
+///
+/// # Panics
+/// When `N` differs from the total length, or the first list is empty.
+pub const fn concat<T: Copy, const N: usize>(first: &[T], second: &[T]) -> [T; N] {
+    assert!(first.len() + second.len() == N && !first.is_empty(), "N is the length of both lists");
     let mut all = [first[0]; N];
     let mut i = 0;
     while i < N {
@@ -46,23 +49,23 @@ pub const fn join<T: Copy, const N: usize>(first: &[T], second: &[T]) -> [T; N] 
     all
 }
 
-/// Something about an environment that is chosen when it is made, such as its task.
+/// An option of an environment, chosen when it is made, such as its task.
 #[derive(Clone, Copy, Debug)]
 pub struct EnvOption {
     /// Its name, such as `task`.
     pub key: &'static str,
-    /// What it decides, in a sentence.
+    /// Its effect, in a sentence.
     pub summary: &'static str,
-    /// What it may be; the first is the default.
+    /// Its possible values; the first is the default.
     pub values: &'static [&'static str],
 }
 
-/// A value for each of an environment's options.
+/// The value of each of an environment's options.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Choices(Vec<(&'static str, &'static str)>);
 
 impl Choices {
-    /// What was chosen for an option.
+    /// The value of an option.
     ///
     /// # Panics
     /// When the environment has no such option.
@@ -72,18 +75,18 @@ impl Choices {
     }
 }
 
-/// An environment that can be made.
+/// A row of the registry of environments.
 #[derive(Clone, Copy)]
 pub struct EnvEntry {
     /// Its id, such as `swm/PushT-v1`.
     pub id: &'static str,
-    /// What one does there, in a sentence.
+    /// Its task, in a sentence.
     pub summary: &'static str,
-    /// What can be chosen when it is made.
+    /// Its options.
     pub options: &'static [EnvOption],
-    /// Makes one. Its [`crate::EnvSpec::id`] is that of [`EnvChoice::id`].
+    /// The constructor. The [`crate::EnvSpec::id`] of the environment is [`EnvChoice::id`].
     pub make: fn(&EnvChoice) -> Result<Box<dyn Env>>,
-    /// Who can demonstrate it; the first is the default expert.
+    /// Its experts; the first is the default.
     pub experts: &'static [ExpertEntry],
 }
 
@@ -94,16 +97,16 @@ impl Named for EnvEntry {
 }
 
 impl EnvEntry {
-    /// One with the default of every option.
+    /// Makes the environment with the default of every option.
     ///
     /// # Errors
-    /// When something it needs is missing on this machine.
+    /// When a library or asset is missing on this machine.
     pub fn env(&self) -> Result<Box<dyn Env>> {
         EnvChoice::from(self).env()
     }
 }
 
-/// A row of the registry of environments, and what was chosen of its options.
+/// A row of the registry of environments and the values of its options.
 #[derive(Clone)]
 pub struct EnvChoice {
     /// The row.
@@ -133,20 +136,20 @@ impl EnvChoice {
         id
     }
 
-    /// Makes one.
+    /// Makes the environment.
     ///
     /// # Errors
-    /// When something it needs is missing on this machine.
+    /// When a library or asset is missing on this machine.
     pub fn env(&self) -> Result<Box<dyn Env>> {
         (self.entry.make)(self)
     }
 }
 
 impl Registry<EnvEntry> {
-    /// Reads `ID` or `ID,option=value,…`.
+    /// Parses `ID` or `ID,option=value,…`.
     ///
     /// # Errors
-    /// When there is no such environment, option or value; names the nearest.
+    /// When there is no such environment, option or value; the error suggests similar ones.
     pub fn choose(&self, text: &str) -> Result<EnvChoice> {
         let mut parts = text.split(',');
         let mut chosen = EnvChoice::from(self.get(parts.next().unwrap_or_default())?);
@@ -154,11 +157,11 @@ impl Registry<EnvEntry> {
             let (key, value) = part.split_once('=').unwrap_or((part, ""));
             let options = chosen.entry.options;
             let keys = || options.iter().map(|option| option.key);
-            let place = keys().position(|known| known == key).ok_or_else(|| {
+            let index = keys().position(|known| known == key).ok_or_else(|| {
                 let hint = if options.is_empty() { "it has none" } else { "write ID,option=value" };
                 Error::unknown("option of the environment", key, keys(), format!("{}: {hint}", chosen.entry.id))
             })?;
-            let values = options[place].values;
+            let values = options[index].values;
             let value = values.iter().find(|known| **known == value).ok_or_else(|| {
                 Error::unknown(
                     "value of the option",
@@ -167,20 +170,20 @@ impl Registry<EnvEntry> {
                     format!("{key} of {}", chosen.entry.id),
                 )
             })?;
-            chosen.choices.0[place].1 = value;
+            chosen.choices.0[index].1 = value;
         }
         Ok(chosen)
     }
 }
 
-/// A scripted policy that can be made.
+/// A row of an environment's experts.
 #[derive(Clone, Copy)]
 pub struct ExpertEntry {
     /// Its name, such as `expert` or `weak`.
     pub id: &'static str,
-    /// How it acts, in a sentence.
+    /// Its behaviour, in a sentence.
     pub summary: &'static str,
-    /// Makes one, for one environment.
+    /// The constructor of an expert for one environment.
     pub make: fn() -> Box<dyn Expert>,
 }
 

@@ -1,7 +1,6 @@
-//! [`Results`]: what an evaluation found, as written to `results.json` and read by reports.
+//! [`Results`]: the results of an evaluation, as written to `results.json` and read by reports.
 //!
-//! Everything but [`Run::timing`] is decided by the manifest: two equal evaluations write equal results,
-//! latencies aside.
+//! The manifest determines everything except [`Run::timing`]: two equal evaluations write equal results, times aside.
 
 mod counting;
 mod paired;
@@ -21,86 +20,85 @@ use serde::{Deserialize, Serialize};
 /// The content of a `results.json`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Results {
-    /// Where the numbers came from.
+    /// The provenance.
     pub manifest: Manifest,
-    /// The environment.
+    /// The environment's id.
     pub env: String,
     /// The protocol: `episodic` or `dataset`.
     pub protocol: String,
-    /// Which episodes count, and as what.
+    /// Which episodes count, and what counts as a success.
     #[serde(default)]
     pub counting: Counting,
-    /// One entry a policy and condition.
+    /// One entry per policy and condition.
     pub runs: Vec<Run>,
-    /// Every pair of policies that played the same starts under the same condition.
+    /// Paired comparisons of policies that played the same starts under the same condition.
     #[serde(default)]
     pub comparisons: Vec<Comparison>,
 }
 
-/// One policy under one condition.
+/// The results of one policy under one condition.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Run {
-    /// The condition: `in distribution`, or what was shifted.
+    /// The condition: `in distribution`, or the shifted factors.
     pub condition: String,
-    /// Who acted: `random` (the floor), `expert`, or a checkpoint's name.
+    /// The policy: `random` (the random-policy floor), `expert`, or a checkpoint's name.
     pub policy: String,
     /// Every episode, in order.
     pub episodes: Vec<EpisodeResult>,
-    /// Starts that already satisfied the goal.
+    /// The number of episodes that were solved at start.
     pub solved_at_start: usize,
     /// The success rate of the episodes that count.
     pub success: Proportion,
-    /// What the strict counting says of the same episodes, where they were counted otherwise and one run tells both.
+    /// The success rate of the same episodes by strict counting, where they were counted otherwise and one run gives both.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub strict: Option<Proportion>,
-    /// Steps to the goal among successes.
+    /// The time to goal of successful episodes, in environment steps.
     pub time_to_goal: Option<Summary>,
-    /// How the searches behind its plans went, where that was traced.
+    /// Search traces of the planner, if recorded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub searches: Option<Searches>,
-    /// How well its model predicts the trajectories the starts were taken from, where that was asked for.
+    /// Prediction errors of the model on the trajectories that the starts come from, if requested.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prediction: Option<Prediction>,
-    /// How long it took: the only part that differs between equal runs.
+    /// Durations, the only part that differs between equal runs.
     pub timing: Timing,
-    /// Videos, as paths relative to the results file.
+    /// Paths of videos, relative to the results file.
     #[serde(default)]
     pub videos: Vec<String>,
 }
 
-/// One episode.
+/// The result of one episode.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct EpisodeResult {
-    /// Its seed.
+    /// The reset seed.
     pub seed: u64,
     /// Whether it succeeded.
     pub success: bool,
-    /// Whether the start already satisfied the goal.
+    /// Whether the episode was solved at start.
     pub solved_at_start: bool,
-    /// Steps played.
+    /// The number of steps played.
     pub steps: usize,
-    /// The step that reached the goal, where it then had to be held and the episode went on.
+    /// The first step that satisfied the goal, if the goal then had to be held for more steps.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reached: Option<usize>,
     /// The sum of rewards.
     pub total_reward: f64,
-    /// Where it started in a dataset, if it did: `[episode, step]`.
+    /// The dataset row of its start, if it started from one: `[episode, step]`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start: Option<[usize; 2]>,
 }
 
-/// How long it took.
+/// Durations of a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Timing {
-    /// Seconds one plan took, over all plans; none for policies that do not plan.
+    /// The duration of a plan over all plans, in seconds; none for policies that do not plan.
     pub plan_seconds: Option<Summary>,
-    /// Seconds the whole run took.
+    /// The duration of the run, in seconds.
     pub wall_seconds: f64,
 }
 
 impl Run {
-    /// A run of these episodes, counted.
-    #[allow(clippy::cast_precision_loss)]
+    /// A run of these episodes, with their success rate and time to goal.
     pub fn new(
         condition: &str,
         policy: &str,
@@ -127,12 +125,12 @@ impl Run {
 }
 
 impl EpisodeResult {
-    /// An episode that is still to be played.
+    /// The result of an episode before its first step.
     pub fn new(seed: u64) -> Self {
         Self { seed, ..Self::default() }
     }
 
-    /// Steps to the goal, if it succeeded.
+    /// The time to goal in environment steps, if the episode succeeded.
     pub fn time_to_goal(&self) -> Option<usize> {
         self.success.then(|| self.reached.unwrap_or(self.steps))
     }

@@ -1,7 +1,7 @@
-//! What an action, an observation or a factor of variation may be.
+//! [`Space`]: the set of values of an action, an observation or a factor of variation.
 //!
-//! A value of any space is held as `f64`s (exact for every type here); the space says how many, of which
-//! type, and within which bounds. The JSON form is the one `swm fovs --json` prints.
+//! A value of any space is a slice of `f64` (exact for every type here). The space gives its shape, element type and
+//! bounds. Its JSON form is that of `swm fovs --json`.
 
 use crate::batch::DType;
 use crate::{Error, Result, Rng};
@@ -12,29 +12,29 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "type")]
 pub enum Space {
-    /// Numbers between bounds, `shape` of them.
+    /// An array within bounds.
     Box {
         /// The shape; empty for a scalar.
         shape: Vec<usize>,
-        /// The type of the numbers.
+        /// The type of the elements.
         dtype: DType,
-        /// Lower bounds, one for each number, included.
+        /// The lower bound of each element, inclusive.
         low: Vec<f64>,
-        /// Upper bounds, one for each number, included.
+        /// The upper bound of each element, inclusive.
         high: Vec<f64>,
     },
-    /// One of `n` integers, `start` being the first.
+    /// One of `n` consecutive integers.
     Discrete {
-        /// How many.
+        /// The number of integers.
         n: i64,
-        /// The first.
+        /// The first integer.
         start: i64,
     },
-    /// Several integers, the i-th one of `nvec[i]`, `start[i]` being the first.
+    /// Several integers, each from its own range.
     MultiDiscrete {
-        /// How many values each has.
+        /// The number of integers in each range.
         nvec: Vec<i64>,
-        /// The first of each.
+        /// The first integer of each range.
         start: Vec<i64>,
     },
     /// A colour: red, green and blue from 0 to 255.
@@ -43,14 +43,14 @@ pub enum Space {
 }
 
 impl Space {
-    /// A box with the same bounds for every number.
+    /// A box with the same bounds for every element.
     pub fn uniform_box(shape: impl Into<Vec<usize>>, dtype: DType, low: f64, high: f64) -> Self {
         let shape = shape.into();
         let n = shape.iter().product();
         Self::Box { shape, dtype, low: vec![low; n], high: vec![high; n] }
     }
 
-    /// Numbers in one value.
+    /// Elements of one value.
     pub fn len(&self) -> usize {
         match self {
             Self::Box { low, .. } => low.len(),
@@ -60,7 +60,7 @@ impl Space {
         }
     }
 
-    /// Whether a value holds no number.
+    /// Whether a value has no elements.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -75,7 +75,7 @@ impl Space {
         }
     }
 
-    /// The type of its numbers.
+    /// The type of its elements.
     pub fn dtype(&self) -> DType {
         match self {
             Self::Box { dtype, .. } => *dtype,
@@ -84,9 +84,8 @@ impl Space {
         }
     }
 
-    /// The bounds of number `i` of a value, both included.
+    /// The bounds of element `i` of a value, both inclusive.
     pub fn bounds(&self, i: usize) -> (f64, f64) {
-        #[allow(clippy::cast_precision_loss)]
         match self {
             Self::Box { low, high, .. } => (low[i], high[i]),
             Self::Discrete { n, start } => (*start as f64, (*start + *n - 1) as f64),
@@ -102,16 +101,14 @@ impl Space {
                 let (low, high) = self.bounds(i);
                 match self.dtype() {
                     DType::Float32 | DType::Float64 => self.round(low + (high - low) * rng.random::<f64>()),
-                    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
                     _ => rng.random_range(low as i64..=high as i64) as f64,
                 }
             })
             .collect()
     }
 
-    /// The nearest number this space's type can hold.
+    /// Rounds to the nearest value that the element type can represent.
     pub fn round(&self, value: f64) -> f64 {
-        #[allow(clippy::cast_possible_truncation)]
         match self.dtype() {
             DType::Float32 => f64::from(value as f32),
             _ => value,
@@ -121,29 +118,30 @@ impl Space {
     /// Checks that `value` is in the space.
     ///
     /// # Errors
-    /// When it has another length, a number is out of bounds or not finite, or not whole where it must be.
+    /// When it has another number of elements, or an element is out of bounds, not finite, or not an integer where the
+    /// space holds integers.
     pub fn check(&self, name: &str, value: &[f64]) -> Result<()> {
-        let whole = !matches!(self.dtype(), DType::Float32 | DType::Float64);
-        let fine = value.len() == self.len()
+        let integer = !matches!(self.dtype(), DType::Float32 | DType::Float64);
+        let valid = value.len() == self.len()
             && value.iter().enumerate().all(|(i, &v)| {
                 let (low, high) = self.bounds(i);
-                v.is_finite() && v >= low && v <= high && (!whole || v.fract() == 0.0)
+                v.is_finite() && v >= low && v <= high && (!integer || v.fract() == 0.0)
             });
-        if fine {
+        if valid {
             return Ok(());
         }
         Err(Error::OutOfSpace { what: name.to_owned(), given: format!("{value:?}"), expected: self.describe() })
     }
 
-    /// The space in a few words.
+    /// The space in words, for errors.
     pub fn describe(&self) -> String {
         match self {
             Self::Box { shape, dtype, low, high } => {
                 let same = |v: &[f64]| v.windows(2).all(|w| w[0] == w[1]);
                 let (low, high) = if !low.is_empty() && same(low) && same(high) {
-                    (self.written(&low[..1]), self.written(&high[..1]))
+                    (self.format_values(&low[..1]), self.format_values(&high[..1]))
                 } else {
-                    (format!("[{}]", self.written(low)), format!("[{}]", self.written(high)))
+                    (format!("[{}]", self.format_values(low)), format!("[{}]", self.format_values(high)))
                 };
                 let shape = if shape.is_empty() { "one".to_owned() } else { format!("{shape:?}") };
                 format!("{shape} {} in {low} ..= {high}", dtype.name())
@@ -158,14 +156,13 @@ impl Space {
         }
     }
 
-    /// Numbers of this space as people write them: single precision without the digits it does not have.
-    #[allow(clippy::cast_possible_truncation)]
-    pub fn written(&self, numbers: &[f64]) -> String {
-        let write = |&number: &f64| match self.dtype() {
-            DType::Float32 => (number as f32).to_string(),
-            _ => number.to_string(),
+    /// Values of this space as text with no more digits than the element type holds.
+    pub fn format_values(&self, values: &[f64]) -> String {
+        let format = |&value: &f64| match self.dtype() {
+            DType::Float32 => (value as f32).to_string(),
+            _ => value.to_string(),
         };
-        numbers.iter().map(write).collect::<Vec<_>>().join(", ")
+        values.iter().map(format).collect::<Vec<_>>().join(", ")
     }
 }
 

@@ -1,9 +1,9 @@
-//! Factors of variation: what may differ between two episodes of one environment, by dot key.
+//! Factors of variation: named properties that may differ between two episodes of one environment.
 //!
-//! A [`VariationSpace`] lists every factor of an environment with its space and default. A
-//! [`VariationRequest`] says which to sample (`"agent.color"`, a group such as `"agent"`, or `"all"`) and which
-//! to pin. [`VariationSpace::resolve`] turns a request and a key into [`FactorValues`], constant for the
-//! episode. Every factor draws from its own stream, so varying one never changes another's draw.
+//! A [`VariationSpace`] lists the factors of an environment, each with its space and default. A [`VariationRequest`]
+//! names the factors to sample (`"agent.color"`, a group such as `"agent"`, or `"all"`) and the values to pin.
+//! [`VariationSpace::resolve`] turns a request and a key into [`FactorValues`], constant over the episode. Every factor
+//! draws from its own stream, so varying one never changes the sample of another.
 
 use crate::{Error, Key, Result, Space};
 use serde::{Deserialize, Serialize};
@@ -13,24 +13,24 @@ use std::sync::Arc;
 /// One factor of variation.
 #[derive(Clone, Debug, Serialize)]
 pub struct Factor {
-    /// Its dot key, such as `agent.color`.
+    /// Its key, such as `agent.color`.
     #[serde(skip)]
     pub key: String,
-    /// The values it may take.
+    /// Its possible values.
     #[serde(flatten)]
     pub space: Space,
-    /// Its value where nobody varies it.
+    /// Its value unless it is sampled or pinned.
     pub init_value: Vec<f64>,
 }
 
 impl Factor {
-    /// A factor.
+    /// A factor of that key, space and default.
     pub fn new(key: &str, space: Space, init_value: impl Into<Vec<f64>>) -> Self {
         Self { key: key.to_owned(), space, init_value: init_value.into() }
     }
 }
 
-/// A condition on a factor's value given the factors sampled before it.
+/// A condition on a factor's value, given the factors sampled before it.
 #[derive(Clone)]
 struct Constraint {
     factor: usize,
@@ -43,19 +43,19 @@ struct Constraint {
 pub struct VariationSpace {
     factors: Arc<[Factor]>,
     constraints: Vec<Constraint>,
-    /// What is sampled at a reset that asks for nothing.
+    /// Keys of the factors sampled by default.
     defaults: Vec<String>,
 }
 
-/// How often a constrained factor is sampled before giving up.
+/// Samples of a constrained factor before [`VariationSpace::resolve`] fails.
 const TRIES: usize = 10_000;
 
 impl VariationSpace {
-    /// A space of these factors, sampled in this order; `defaults` are sampled when a reset asks for nothing.
+    /// A space of these factors, sampled in this order; `defaults` are sampled unless a request names other factors.
     ///
     /// # Panics
-    /// When a default value is outside its own space or a default key does not exist: that is a bug of the
-    /// environment, found by its first test.
+    /// When a default value is outside its own space or a default key does not exist, which is a bug of the
+    /// environment.
     pub fn new(factors: Vec<Factor>, defaults: &[&str]) -> Self {
         for factor in &factors {
             if let Err(error) = factor.space.check(&factor.key, &factor.init_value) {
@@ -68,19 +68,19 @@ impl VariationSpace {
             defaults: defaults.iter().map(|&key| key.to_owned()).collect(),
         };
         for key in &space.defaults {
-            assert!(space.find(key).is_some(), "default variation '{key}' is no factor");
+            assert!(space.find(key).is_some(), "default variation '{key}' is not a factor");
         }
         space
     }
 
-    /// Adds a constraint: after `factor` is sampled, `holds` must be true, else it is sampled again. `holds`
-    /// sees that factor's value, those of factors earlier in the sampling order, and pinned values.
+    /// Adds a constraint: `factor` is sampled again until `holds` returns true. `holds` may read that factor's value,
+    /// those of factors earlier in the sampling order, and pinned values. `words` states the constraint in errors.
     ///
     /// # Panics
     /// When there is no such factor.
     #[must_use]
     pub fn constrain(mut self, factor: &str, words: &'static str, holds: fn(&FactorValues) -> bool) -> Self {
-        let factor = self.find(factor).unwrap_or_else(|| panic!("constraint on '{factor}', which is no factor"));
+        let factor = self.find(factor).unwrap_or_else(|| panic!("constraint on '{factor}', which is not a factor"));
         self.constraints.push(Constraint { factor, words, holds });
         self
     }
@@ -90,20 +90,20 @@ impl VariationSpace {
         &self.factors
     }
 
-    /// What is sampled at a reset that asks for nothing.
+    /// Keys of the factors sampled by default.
     pub fn defaults(&self) -> &[String] {
         &self.defaults
     }
 
-    /// The place of a factor.
+    /// The index of a factor.
     pub fn find(&self, key: &str) -> Option<usize> {
         self.factors.iter().position(|factor| factor.key == key)
     }
 
-    /// The places of all factors a key names: one, a group, or all.
+    /// The indices of all factors that a key names: one, a group, or all.
     ///
     /// # Errors
-    /// When the key names none.
+    /// When the key names no factor.
     pub fn select(&self, key: &str) -> Result<Vec<usize>> {
         let group = format!("{key}.");
         let chosen: Vec<usize> = (0..self.factors.len())
@@ -124,11 +124,11 @@ impl VariationSpace {
         Ok(chosen)
     }
 
-    /// The values of an episode: defaults, then pinned values, then samples of what varies.
+    /// The factor values of an episode: defaults, replaced by pinned values, replaced by samples of the varied factors.
     ///
     /// # Errors
-    /// Unknown keys, pinned values out of bounds, pinned values that violate a constraint, and constraints
-    /// that no sample satisfies.
+    /// When a key is unknown, a pinned value is out of bounds or violates a constraint, or no sample satisfies a
+    /// constraint.
     pub fn resolve(&self, request: &VariationRequest, key: Key) -> Result<FactorValues> {
         let mut varied = vec![false; self.factors.len()];
         for name in request.variation.as_ref().unwrap_or(&self.defaults) {
@@ -170,7 +170,7 @@ impl VariationSpace {
                 }
             }
         }
-        // What somebody pinned must fit the final values; defaults that nobody touched are trusted.
+        // Pinned values must satisfy their constraints given the final values; untouched defaults are trusted.
         for constraint in &self.constraints {
             if pinned[constraint.factor] && !(constraint.holds)(&values) {
                 let factor = &self.factors[constraint.factor];
@@ -185,18 +185,18 @@ impl VariationSpace {
     }
 }
 
-/// Which factors to sample and which to pin at a reset.
+/// The factors to sample and to pin at a reset.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct VariationRequest {
     /// Keys to sample: factors, groups, or `all`. `None` means the environment's defaults.
     #[serde(default)]
     pub variation: Option<Vec<String>>,
-    /// Factors held at a value.
+    /// Values of pinned factors, by key.
     #[serde(default)]
     pub variation_values: BTreeMap<String, Vec<f64>>,
 }
 
-/// The value of every factor, constant for an episode.
+/// The value of every factor, constant over an episode.
 #[derive(Clone, Debug)]
 pub struct FactorValues {
     factors: Arc<[Factor]>,
@@ -212,10 +212,10 @@ impl FactorValues {
     /// The value of a factor.
     ///
     /// # Panics
-    /// When the environment asks for a factor it did not declare.
+    /// When the environment did not declare the factor.
     pub fn get(&self, key: &str) -> &[f64] {
         let i = self.factors.iter().position(|factor| factor.key == key);
-        &self.values[i.unwrap_or_else(|| panic!("'{key}' is no factor"))]
+        &self.values[i.unwrap_or_else(|| panic!("'{key}' is not a factor"))]
     }
 
     /// The value of a scalar factor.
@@ -230,7 +230,6 @@ impl FactorValues {
     ///
     /// # Panics
     /// As [`FactorValues::get`].
-    #[allow(clippy::cast_possible_truncation)]
     pub fn integer(&self, key: &str) -> i64 {
         self.scalar(key) as i64
     }
@@ -239,7 +238,6 @@ impl FactorValues {
     ///
     /// # Panics
     /// As [`FactorValues::get`].
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     pub fn rgb(&self, key: &str) -> [u8; 3] {
         let value = self.get(key);
         [value[0] as u8, value[1] as u8, value[2] as u8]
@@ -276,7 +274,7 @@ mod tests {
     }
 
     #[test]
-    fn varying_one_factor_leaves_the_others() {
+    fn varying_one_factor_leaves_the_others_unchanged() {
         let space = space();
         let key = Key::new(5);
         let none = space.resolve(&request(&[]), key).expect("nothing");
@@ -293,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_requests_say_what_is_wrong() {
+    fn invalid_requests_are_errors() {
         let space = space();
         let pin = |key: &str, value: &[f64]| VariationRequest {
             variation: None,

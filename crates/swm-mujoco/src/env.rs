@@ -249,13 +249,14 @@ impl<T: Task> Env for MujocoEnv<T> {
     }
 
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let (changed, bytes) = factors::restored(&self.spec.id, &self.spec.variation_space, &self.factors, snapshot)?;
+        let (changed, bytes) =
+            factors::parse_snapshot(&self.spec.id, &self.spec.variation_space, &self.factors, snapshot)?;
         let saved = self.physics.saved_len();
         let (values, rest) = bytes.as_chunks();
         let task_state = self.state_len() - self.physics.state_len();
         let expected = saved + task_state + self.task.goal_len();
         if values.len() != expected || !rest.is_empty() {
-            return Err(factors::foreign(&self.spec.id, format!("{} bytes of state", bytes.len())));
+            return Err(factors::wrong_snapshot(&self.spec.id, format!("{} bytes of state", bytes.len())));
         }
         self.scratch.clear();
         self.scratch.extend(values.iter().map(|&value| f64::from_le_bytes(value)));

@@ -20,7 +20,7 @@ mod task;
 
 pub use physics::Physics;
 
-use swm_core::registry::join;
+use swm_core::registry::concat;
 use swm_core::{EnvEntry, Registry};
 
 const DMC_AND_FETCH: usize = dmc::ENTRIES.len() + fetch::ENTRIES.len();
@@ -30,5 +30,5 @@ const ALL: usize = DMC_AND_FETCH + ogbench::ENTRIES.len();
 pub static ENVS: Registry<EnvEntry> = Registry {
     kind: "environment",
     hint: "`swm envs` lists them",
-    rows: &join::<_, ALL>(&join::<_, DMC_AND_FETCH>(&dmc::ENTRIES, &fetch::ENTRIES), &ogbench::ENTRIES),
+    rows: &concat::<_, ALL>(&concat::<_, DMC_AND_FETCH>(&dmc::ENTRIES, &fetch::ENTRIES), &ogbench::ENTRIES),
 };

@@ -8,22 +8,22 @@ use std::fmt;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Counting {
-    /// A start that already satisfies the goal is not played and not counted. An episode succeeds when its
-    /// observations satisfy the goal (the column `success`) for `hold` steps in a row, within its budget.
+    /// An episode that is solved at start is neither played nor counted. An episode succeeds when its observations satisfy
+    /// the goal (the column `success`) for `hold` consecutive steps within its budget.
     Strict {
-        /// Steps in a row that must satisfy the goal; 1 succeeds at the first. With more, the episode goes on after the
-        /// first success until the goal was held or the budget is spent.
+        /// Consecutive steps that must satisfy the goal. With more than 1, the episode continues after the first success
+        /// until the goal is held or the budget is spent.
         hold: usize,
     },
-    /// The counting of the Python package `stable-worldmodel` 0.1.1, to compare with its figures: every start is
-    /// played and counts, solved or not, and an episode succeeds when the world *terminates* within its budget, whatever
-    /// the reason. Where a world terminates by failing (a pole that falls), that is counted as a success.
+    /// The counting of the Python package `stable-worldmodel` 0.1.1, for comparison with its figures. Every start is
+    /// played and counts, solved at start or not, and an episode succeeds when the environment *terminates* within its
+    /// budget for any reason. A termination by failure (a pole that falls) counts as a success.
     ///
-    /// Its episodic protocol counts the first episodes that finish among `envs` that are played side by side and begin
-    /// anew as they finish. Long episodes, which mostly fail, are thus counted less often, and the rate depends on
+    /// Its episodic protocol plays `envs` environments at a time, resets each as it finishes, and counts the first
+    /// episodes that finish. Long episodes, which mostly fail, therefore count less often, and the rate depends on
     /// `envs`.
     Compat {
-        /// Environments played side by side.
+        /// Environments played at the same time.
         envs: usize,
     },
 }
@@ -49,7 +49,7 @@ impl Counting {
         Proportion::wilson(counted().filter(|episode| episode.success).count(), counted().count())
     }
 
-    /// Its name: `strict` or `compat`.
+    /// The name of the rule: `strict` or `compat`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Strict { .. } => "strict",

@@ -1,47 +1,47 @@
-//! [`Comparison`]: two policies on the same starts. Starts differ in how hard they are, so what tells policies apart
-//! is the starts that one solves and the other does not.
+//! [`Comparison`]: two policies on the same starts. Starts differ in difficulty, so a paired comparison uses the starts that
+//! only one of the policies solves.
 
 use super::{Counting, Proportion, Run};
 use serde::{Deserialize, Serialize};
 
-/// Two policies under one condition, start by start.
+/// A paired comparison of two policies under one condition.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Comparison {
     /// The condition.
     pub condition: String,
-    /// One policy.
+    /// The first policy.
     pub a: String,
-    /// The other.
+    /// The second policy.
     pub b: String,
-    /// What came of every start that counts.
+    /// The outcomes of all starts that count.
     #[serde(flatten)]
     pub table: Paired,
 }
 
-/// Outcomes of pairs, and what they say about the difference.
+/// Counts of paired outcomes, a test and an interval of their difference.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Paired {
-    /// Starts both solved.
+    /// Starts that both policies solved.
     pub both: usize,
-    /// Starts only the first solved.
+    /// Starts that only the first policy solved.
     pub only_a: usize,
-    /// Starts only the second solved.
+    /// Starts that only the second policy solved.
     pub only_b: usize,
-    /// Starts neither solved.
+    /// Starts that neither policy solved.
     pub neither: usize,
-    /// The two-sided p-value of McNemar's exact test: how likely so uneven a split of the starts that only one solved
-    /// is, were both policies equally good.
+    /// The two-sided p-value of McNemar's exact test: the probability, if both policies were equally good, of a split of the
+    /// starts that only one solved that is at least as uneven.
     pub p: f64,
-    /// The first's success rate less the second's.
+    /// The success rate of the first policy minus that of the second.
     pub difference: f64,
-    /// The lower end of the difference's 95 % interval.
+    /// The lower end of the 95 % interval of the difference.
     pub low: f64,
-    /// The upper end.
+    /// The upper end of the interval.
     pub high: f64,
 }
 
 impl Comparison {
-    /// Compares two runs of one condition, or says nothing where they did not play the same starts.
+    /// Compares two runs of one condition; `None` if they did not play the same starts.
     pub fn of(a: &Run, b: &Run, counting: Counting) -> Option<Self> {
         let pairs = || a.episodes.iter().zip(&b.episodes);
         let same = a.condition == b.condition
@@ -60,8 +60,8 @@ impl Comparison {
         })
     }
 
-    /// Compares every policy with those before it, condition by condition: a learned policy with the floor comes out as
-    /// `learned` less `random`.
+    /// Compares every policy with those before it, condition by condition, so that a learned policy is compared with the
+    /// random-policy floor as `learned` minus `random`.
     pub fn all(runs: &[Run], counting: Counting) -> Vec<Self> {
         let later = runs.iter().enumerate();
         later.flat_map(|(i, run)| runs[..i].iter().filter_map(move |other| Self::of(run, other, counting))).collect()
@@ -69,24 +69,23 @@ impl Comparison {
 }
 
 impl Paired {
-    /// What a table of paired outcomes says.
+    /// The statistics of a table of paired outcomes.
     ///
     /// The test is the exact, conditional one (McNemar, "Note on the sampling error of the difference between
     /// correlated proportions or percentages", 1947): two-sided binomial, with chance one half. The interval of the
     /// difference is Newcombe's square-and-add ("Improved confidence intervals for the difference between
-    /// binomial proportions based on paired data", 1998, method 10): Wilson intervals of both rates, joined with regard
-    /// to their correlation.
-    #[allow(clippy::cast_precision_loss)]
+    /// binomial proportions based on paired data", 1998, method 10): Wilson intervals of both rates, combined by
+    /// their correlation.
     pub fn of(both: usize, only_a: usize, only_b: usize, neither: usize) -> Self {
         let n = both + only_a + only_b + neither;
         let (a, b) = (Proportion::wilson(both + only_a, n), Proportion::wilson(both + only_b, n));
         let [w, x, y, z] = [both, only_a, only_b, neither].map(|count| count as f64);
         let margins = (w + x) * (y + z) * (w + y) * (x + z);
         let excess = w * z - x * y;
-        // Newcombe's continuity correction, which applies to positive correlation alone.
+        // Newcombe's continuity correction, which applies to positive correlations only.
         let corrected = if excess > 0.0 { (excess - n as f64 / 2.0).max(0.0) } else { excess };
         let phi = if margins > 0.0 { corrected / margins.sqrt() } else { 0.0 };
-        let joined = |a: f64, b: f64| (a * a - 2.0 * phi * a * b + b * b).max(0.0).sqrt();
+        let combined = |a: f64, b: f64| (a * a - 2.0 * phi * a * b + b * b).max(0.0).sqrt();
         let difference = a.rate - b.rate;
         Self {
             both,
@@ -95,22 +94,21 @@ impl Paired {
             neither,
             p: mcnemar(only_a, only_b),
             difference,
-            low: (difference - joined(a.rate - a.low, b.high - b.rate)).max(-1.0),
-            high: (difference + joined(a.high - a.rate, b.rate - b.low)).min(1.0),
+            low: (difference - combined(a.rate - a.low, b.high - b.rate)).max(-1.0),
+            high: (difference + combined(a.high - a.rate, b.rate - b.low)).min(1.0),
         }
     }
 
-    /// Pairs.
+    /// The number of pairs.
     pub fn n(&self) -> usize {
         self.both + self.only_a + self.only_b + self.neither
     }
 }
 
-/// The chance of a split of `b + c` fair coins at least as uneven as `b` to `c`, either way.
-#[allow(clippy::cast_precision_loss)]
+/// The probability that `b + c` fair coins split at least as unevenly as `b` to `c`, in either direction.
 fn mcnemar(b: usize, c: usize) -> f64 {
     let (n, fewer) = (b + c, b.min(c));
-    // The logarithm of the chance of `k` heads, which thousands of coins do not underflow.
+    // Logarithms of the binomial probabilities, which do not underflow for thousands of coins.
     let mut term = n as f64 * 0.5f64.ln();
     let mut tail = 0.0;
     for k in 0..=fewer {
@@ -148,7 +146,7 @@ mod tests {
     }
 
     #[test]
-    fn intervals_are_newcombes() {
+    fn intervals_match_published_values() {
         // Newcombe 1998, table of examples: (36, 12, 2, 0) gives 0.0569 to 0.3404. Altman et al., "Statistics with
         // confidence", table 6.2: (14, 5, 0, 22) gives 0.011 to 0.226. Fagerland, Lydersen and Laake 2014:
         // (1, 1, 7, 12) gives -0.507 to -0.026, and p = 0.0703.
@@ -175,7 +173,7 @@ mod tests {
     }
 
     #[test]
-    fn runs_are_compared_on_starts_that_count_and_are_the_same() {
+    fn runs_are_compared_on_equal_counted_starts() {
         let floor = run("random", &[(1, false, false), (2, true, false), (3, false, true), (4, false, false)]);
         let model = run("model", &[(1, true, false), (2, true, false), (3, false, true), (4, false, false)]);
         let found = Comparison::all(&[floor.clone(), model.clone()], Counting::default());

@@ -1,47 +1,47 @@
-//! [`Prediction`]: how well a model predicted recorded trajectories, beside whether its plans succeeded there.
+//! [`Prediction`]: a model's prediction errors on recorded trajectories, grouped by the success of its plans there.
 
 use super::Summary;
 use serde::{Deserialize, Serialize};
 
-/// How well a model predicted recorded trajectories, open loop: from the latent of their first observation and their
-/// recorded actions alone.
+/// A model's open-loop prediction errors on recorded trajectories: it predicts from the latent of the first observation
+/// and the recorded actions.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Prediction {
-    /// Environment steps in one model step.
+    /// Environment steps per model step.
     pub frameskip: usize,
-    /// The variance of the latents of all observations that were to be predicted, averaged over a latent's numbers. Errors
-    /// are told in it: always predicting the mean latent has an error of 1.
+    /// The variance of the latents of all predicted observations, averaged over latent dimensions. It is the unit of errors:
+    /// always predicting the mean latent has an error of 1.
     pub variance: f64,
-    /// Every trajectory.
+    /// The errors of every trajectory.
     pub trajectories: Vec<Trajectory>,
-    /// All trajectories, then those of successes and those of failures, where that is known.
+    /// All trajectories, then those of successes and those of failures, where known.
     pub groups: Vec<Group>,
 }
 
-/// One trajectory.
+/// The prediction errors of one trajectory.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Trajectory {
-    /// Where it starts: `[episode, step]`.
+    /// The dataset row of its start: `[episode, step]`.
     pub start: [usize; 2],
-    /// Whether its episode succeeded, where that is known.
+    /// Whether its episode succeeded, if known.
     pub success: Option<bool>,
     /// The mean squared error of each model step's latent, in units of [`Prediction::variance`].
     pub errors: Vec<f64>,
 }
 
-/// Some of the trajectories.
+/// The prediction errors of some of the trajectories.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Group {
-    /// Successes, failures, or all of them for `None`.
+    /// Successes, failures, or all trajectories for `None`.
     pub success: Option<bool>,
-    /// The errors of whole trajectories, each the mean over its steps.
+    /// The trajectories' mean errors over their steps.
     pub trajectory: Summary,
     /// The errors of each model step.
     pub steps: Vec<Summary>,
 }
 
 impl Prediction {
-    /// Puts trajectories of equally many steps into groups. A group without trajectories is left out.
+    /// Groups trajectories of equal length. Empty groups are omitted.
     pub fn new(frameskip: usize, variance: f64, trajectories: Vec<Trajectory>) -> Self {
         let groups =
             [None, Some(true), Some(false)].into_iter().filter_map(|success| Group::of(success, &trajectories));
@@ -50,8 +50,7 @@ impl Prediction {
 }
 
 impl Trajectory {
-    /// Its error as a whole: the mean over its steps.
-    #[allow(clippy::cast_precision_loss)]
+    /// The mean error over its steps.
     pub fn error(&self) -> f64 {
         self.errors.iter().sum::<f64>() / self.errors.len() as f64
     }
@@ -59,13 +58,13 @@ impl Trajectory {
 
 impl Group {
     fn of(success: Option<bool>, trajectories: &[Trajectory]) -> Option<Self> {
-        let mine = || trajectories.iter().filter(|trajectory| success.is_none() || trajectory.success == success);
-        let horizon = mine().next()?.errors.len();
+        let members = || trajectories.iter().filter(|trajectory| success.is_none() || trajectory.success == success);
+        let horizon = members().next()?.errors.len();
         let at =
-            |step: usize| mine().filter_map(|trajectory| trajectory.errors.get(step).copied()).collect::<Vec<f64>>();
+            |step: usize| members().filter_map(|trajectory| trajectory.errors.get(step).copied()).collect::<Vec<f64>>();
         Some(Self {
             success,
-            trajectory: Summary::of(&mine().map(Trajectory::error).collect::<Vec<f64>>())?,
+            trajectory: Summary::of(&members().map(Trajectory::error).collect::<Vec<f64>>())?,
             steps: (0..horizon).filter_map(|step| Summary::of(&at(step))).collect(),
         })
     }
@@ -76,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn errors_are_told_apart_by_success() {
+    fn errors_are_grouped_by_success() {
         let trajectory = |success, errors: &[f64]| Trajectory { start: [0, 0], success, errors: errors.to_vec() };
         let found = Prediction::new(
             5,

@@ -1,39 +1,39 @@
-//! [`Searches`]: how the searches behind a run's plans went, iteration by iteration.
+//! [`Searches`]: the search traces of a run's plans, aggregated per iteration.
 
 use crate::PlanTrace;
 use serde::{Deserialize, Serialize};
 
-/// How the searches behind many plans went.
+/// The search traces of many plans, aggregated per iteration.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Searches {
-    /// Plans.
+    /// The number of plans.
     pub plans: usize,
     /// The lowest cost of each iteration.
     pub best: Vec<Band>,
-    /// The mean cost of each iteration's elites.
+    /// The mean cost of the elites of each iteration.
     pub mean: Vec<Band>,
     /// The spread of the sampling distribution after each iteration.
     pub spread: Vec<Band>,
 }
 
-/// Where most of many numbers lie.
+/// The 10th percentile, the median and the 90th percentile of many values.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Band {
-    /// A tenth of them are below (nearest rank).
+    /// The 10th percentile (nearest rank).
     pub low: f32,
-    /// Half of them are below.
+    /// The median.
     pub median: f32,
-    /// A tenth of them are above.
+    /// The 90th percentile (nearest rank).
     pub high: f32,
 }
 
 impl Searches {
-    /// What these traces come to, whatever their order; none where there are none. An iteration that only some plans came
-    /// to is told of those.
+    /// Aggregates traces, in any order; `None` if there are none. An iteration that only some plans reached aggregates
+    /// those plans.
     pub fn of(traces: &[PlanTrace]) -> Option<Self> {
-        let bands = |of: fn(&PlanTrace) -> &[f32]| {
-            let iterations = traces.iter().map(|trace| of(trace).len()).max().unwrap_or(0);
-            let at = |i: usize| traces.iter().filter_map(|trace| of(trace).get(i).copied()).collect();
+        let bands = |column: fn(&PlanTrace) -> &[f32]| {
+            let iterations = traces.iter().map(|trace| column(trace).len()).max().unwrap_or(0);
+            let at = |i: usize| traces.iter().filter_map(|trace| column(trace).get(i).copied()).collect();
             (0..iterations).map(|i| Band::of(at(i))).collect::<Vec<Band>>()
         };
         let [best, mean, spread] = [bands(|t| &t.best), bands(|t| &t.mean), bands(|t| &t.spread)];
@@ -42,7 +42,7 @@ impl Searches {
 }
 
 impl Band {
-    /// The band of at least one number.
+    /// The band of at least one value.
     fn of(mut values: Vec<f32>) -> Self {
         values.sort_by(f32::total_cmp);
         let rank = |tenths: usize| values[(values.len() * tenths).div_ceil(10).saturating_sub(1)];
@@ -65,10 +65,10 @@ mod tests {
         traces.push(trace(&[10.0]));
         let found = Searches::of(&traces).expect("traces");
         assert_eq!(found.best[0], Band { low: 1.0, median: 5.0, high: 9.0 });
-        assert_eq!(found.best[1], Band { low: 0.5, median: 0.5, high: 0.5 }, "of the ten that came so far");
+        assert_eq!(found.best[1], Band { low: 0.5, median: 0.5, high: 0.5 }, "of the ten plans that reached it");
         assert_eq!((found.plans, found.mean.len(), found.spread.len()), (11, 1, 0));
         traces.reverse();
         assert_eq!(Searches::of(&traces), Some(found));
-        assert_eq!(Searches::of(&[PlanTrace::default()]), None, "nothing was traced");
+        assert_eq!(Searches::of(&[PlanTrace::default()]), None, "an empty trace");
     }
 }

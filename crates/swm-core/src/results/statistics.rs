@@ -1,18 +1,18 @@
-//! The few statistics findings are told in: shares with intervals, and summaries of many numbers.
+//! Statistics of results: proportions with confidence intervals, and summaries of many values.
 
 use serde::{Deserialize, Serialize};
 
-/// The 97.5th percentile of the standard normal distribution: both tails together leave out 5 %.
+/// The 97.5th percentile of the standard normal distribution, for two-sided 95 % intervals.
 const Z: f64 = 1.959_963_984_540_054;
 
-/// A share of successes with its 95 % Wilson score interval.
+/// A success rate with its 95 % Wilson score interval.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Proportion {
-    /// Successes.
+    /// The number of successes.
     pub successes: usize,
-    /// Tries.
+    /// The number of trials.
     pub n: usize,
-    /// `successes / n`; 0 where nothing was tried.
+    /// `successes / n`; 0 without trials.
     pub rate: f64,
     /// The lower end of the interval.
     pub low: f64,
@@ -21,9 +21,8 @@ pub struct Proportion {
 }
 
 impl Proportion {
-    /// The share of `successes` in `n` tries (Wilson, "Probable inference, the law of succession, and
+    /// The proportion of `successes` in `n` trials (Wilson, "Probable inference, the law of succession, and
     /// statistical inference", 1927, with z = 1.96).
-    #[allow(clippy::cast_precision_loss)]
     pub fn wilson(successes: usize, n: usize) -> Self {
         if n == 0 {
             return Self { successes, n, rate: 0.0, low: 0.0, high: 1.0 };
@@ -36,22 +35,21 @@ impl Proportion {
     }
 }
 
-/// A few numbers about many.
+/// Summary statistics of many values.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
-    /// How many.
+    /// The number of values.
     pub n: usize,
-    /// Their mean.
+    /// The mean.
     pub mean: f64,
-    /// Their median.
+    /// The median.
     pub median: f64,
-    /// Their 95th percentile (nearest rank).
+    /// The 95th percentile (nearest rank).
     pub p95: f64,
 }
 
 impl Summary {
-    /// A summary of these numbers, or none where there are none.
-    #[allow(clippy::cast_precision_loss)]
+    /// The summary of these values; `None` if there are none.
     pub fn of(values: &[f64]) -> Option<Self> {
         let n = values.len();
         if n == 0 {
@@ -84,7 +82,7 @@ mod tests {
     }
 
     #[test]
-    fn summaries_take_the_middle() {
+    fn summary_of_an_even_number_of_values() {
         let summary = Summary::of(&[3.0, 1.0, 2.0, 10.0]).expect("some");
         assert_eq!((summary.mean, summary.median, summary.p95), (4.0, 2.5, 10.0));
         assert!(Summary::of(&[]).is_none());

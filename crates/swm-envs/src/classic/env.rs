@@ -5,7 +5,7 @@ use super::frame::FrameRenderer;
 use super::task::ControlTask;
 use rand::Rng as _;
 use rand::seq::IndexedRandom as _;
-use swm_core::factors::{foreign, from_row, restored, snapshot};
+use swm_core::factors::{wrong_snapshot, from_row, parse_snapshot, snapshot};
 use swm_core::{
     Action, ColumnSpec, DType, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, Rng, RowMut,
     RowRef, Snapshot, Space, Transition, VariationRequest,
@@ -181,12 +181,12 @@ impl<T: ControlTask> Env for ClassicEnv<T> {
     }
 
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let (factors, bytes) = restored(T::ID, &self.spec.variation_space, &self.factors, snapshot)?;
+        let (factors, bytes) = parse_snapshot(T::ID, &self.spec.variation_space, &self.factors, snapshot)?;
         let (mut state, mut goal) = (T::State::default(), T::State::default());
         let values = state.as_mut().iter_mut().chain(goal.as_mut());
         let (chunks, tail) = bytes.as_chunks();
         if chunks.len() != values.size_hint().0 || !tail.is_empty() {
-            return Err(foreign(T::ID, format!("{} bytes of state and goal", bytes.len())));
+            return Err(wrong_snapshot(T::ID, format!("{} bytes of state and goal", bytes.len())));
         }
         values.zip(chunks).for_each(|(value, &bytes)| *value = f64::from_le_bytes(bytes));
         match factors {

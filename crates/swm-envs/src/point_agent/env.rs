@@ -3,7 +3,7 @@
 
 use super::position::{Position, position};
 use super::task::PointTask;
-use swm_core::factors::{foreign, from_row, restored, snapshot};
+use swm_core::factors::{from_row, parse_snapshot, snapshot, wrong_snapshot};
 use swm_core::{
     Action, DType, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, RowMut, RowRef, Snapshot,
     Space, Transition, VariationRequest,
@@ -54,7 +54,7 @@ fn checked<T: PointTask>(what: &str, value: &[f64]) -> Result<Position> {
 fn read_positions(id: &str, bytes: &[u8]) -> Result<[Position; 2]> {
     match bytes.as_chunks() {
         (&[ax, ay, gx, gy], []) => Ok([[ax, ay], [gx, gy]].map(|position| position.map(f32::from_le_bytes))),
-        _ => Err(foreign(id, format!("{} bytes of positions", bytes.len()))),
+        _ => Err(wrong_snapshot(id, format!("{} bytes of positions", bytes.len()))),
     }
 }
 
@@ -106,7 +106,7 @@ impl<T: PointTask> Env for PointAgentEnv<T> {
     }
 
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let (factors, bytes) = restored(T::ID, &self.spec.variation_space, &self.factors, snapshot)?;
+        let (factors, bytes) = parse_snapshot(T::ID, &self.spec.variation_space, &self.factors, snapshot)?;
         let [agent, goal] = read_positions(T::ID, bytes)?;
         match factors {
             Some(factors) => self.begin(factors, agent, goal),

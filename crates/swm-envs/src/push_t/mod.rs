@@ -14,7 +14,7 @@ use physics::{AGENT, BLOCK, Simulation, put, take_array};
 use render::{DrawnState, TableRenderer};
 use state::{State, checked, goal_distance, is_reached, set_state, settled, start_state, state_distance, state_of};
 use std::f64::consts::TAU;
-use swm_core::factors::{foreign, from_row, restored, snapshot};
+use swm_core::factors::{wrong_snapshot, from_row, parse_snapshot, snapshot};
 use swm_core::{
     Action, DType, Env, EnvEntry, EnvSpec, Error, ExpertEntry, FactorValues, FrameMut, Key, ResetOptions, Result,
     RowMut, RowRef, Snapshot, Space, Transition, VariationRequest,
@@ -213,7 +213,7 @@ impl Env for PushT {
 
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
         let invalid = || foreign(&self.spec.id, "other bytes");
-        let (factors, mut bytes) = restored(&self.spec.id, &self.spec.variation_space, &self.factors, snapshot)?;
+        let (factors, mut bytes) = parse_snapshot(&self.spec.id, &self.spec.variation_space, &self.factors, snapshot)?;
         let goal = take_array::<f64, 7>(&mut bytes).ok_or_else(invalid)?;
         let [contacts] = take_array::<u64, 1>(&mut bytes).ok_or_else(invalid)?;
         let goal = checked(&goal, "goal of a snapshot")?;
@@ -224,7 +224,7 @@ impl Env for PushT {
         if self.simulation.load(&mut bytes).is_none() || !bytes.is_empty() {
             // A partly read state is invalid: the episode starts anew at its goal.
             self.begin(self.factors.clone(), goal);
-            return Err(foreign(&self.spec.id, "other bytes"));
+            return Err(wrong_snapshot(&self.spec.id, "other bytes"));
         }
         self.contacts = contacts;
         Ok(())

@@ -112,7 +112,7 @@ pub fn fovs(args: &FovsArgs, as_json: bool) -> anyhow::Result<()> {
         vec![
             factor.key.clone(),
             factor.space.describe(),
-            factor.space.written(&factor.init_value),
+            factor.space.format_values(&factor.init_value),
             if space.defaults().contains(&factor.key) { "sampled".to_owned() } else { String::new() },
         ]
     });

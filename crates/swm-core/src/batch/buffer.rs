@@ -1,0 +1,38 @@
+//! [`Buffer`]: bytes at a 64-byte aligned address, as SIMD code and array views require.
+
+/// 64 bytes at an address that is a multiple of 64.
+#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
+#[repr(C, align(64))]
+struct Line([u8; 64]);
+
+/// Bytes at a 64-byte aligned address.
+#[derive(Clone, Default)]
+pub(super) struct Buffer {
+    lines: Vec<Line>,
+    len: usize,
+}
+
+impl Buffer {
+    /// Bytes held.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Changes the number of bytes; new bytes are zero. Memory stays allocated.
+    pub fn resize(&mut self, len: usize) {
+        if len < self.len {
+            // A later resize to a larger size must read zeros here.
+            self.bytes_mut()[len..].fill(0);
+        }
+        self.lines.resize(len.div_ceil(64), Line([0; 64]));
+        self.len = len;
+    }
+
+    pub fn bytes(&self) -> &[u8] {
+        &bytemuck::cast_slice(&self.lines)[..self.len]
+    }
+
+    pub fn bytes_mut(&mut self) -> &mut [u8] {
+        &mut bytemuck::cast_slice_mut(&mut self.lines)[..self.len]
+    }
+}

@@ -1,0 +1,241 @@
+//! [`Batch`]: named, typed, row-major arrays with a common number of rows.
+//!
+//! Environments, writers, loaders, policies and models exchange nothing else: environments write their observations
+//! into a batch in place, writers store batches, loaders return them, models read them. A [`Schema`] lists the columns.
+//! Column data is contiguous and aligned to 64 bytes, so a tensor or an array view needs no copy.
+
+mod buffer;
+mod rows;
+mod schema;
+
+pub use rows::{RowMut, RowRef};
+pub use schema::{ColumnSpec, DType, Element, Schema};
+
+use crate::{Error, Result};
+use buffer::Buffer;
+use rows::{RowsMut, Start};
+
+/// Named, typed, row-major arrays with a common number of rows.
+///
+/// # Shapes
+/// A column of rows of shape `[shape…]` is one array `[rows, shape…]`.
+#[derive(Clone)]
+pub struct Batch {
+    schema: Schema,
+    rows: usize,
+    data: Vec<Buffer>,
+    /// The address of each column; refreshed whenever mutable rows are handed out, so that this allocates nothing.
+    starts: Vec<Start>,
+}
+
+impl Batch {
+    /// A batch of `rows` rows, all zero.
+    pub fn zeros(schema: &Schema, rows: usize) -> Self {
+        let mut batch = Self {
+            schema: schema.clone(),
+            rows: 0,
+            data: schema.columns().iter().map(|_| Buffer::default()).collect(),
+            starts: vec![Start::default(); schema.columns().len()],
+        };
+        batch.resize(rows);
+        batch
+    }
+
+    /// The columns.
+    pub fn schema(&self) -> &Schema {
+        &self.schema
+    }
+
+    /// The number of rows.
+    pub fn rows(&self) -> usize {
+        self.rows
+    }
+
+    /// Bytes held.
+    pub fn byte_len(&self) -> usize {
+        self.data.iter().map(Buffer::len).sum()
+    }
+
+    /// Changes the number of rows; new rows are zero. Memory stays allocated, so growing again costs nothing.
+    pub fn resize(&mut self, rows: usize) {
+        for (buffer, column) in self.data.iter_mut().zip(self.schema.columns()) {
+            buffer.resize(rows * column.row_bytes());
+        }
+        self.rows = rows;
+    }
+
+    /// The raw bytes of a column, row after row.
+    pub fn bytes(&self, column: usize) -> &[u8] {
+        self.data[column].bytes()
+    }
+
+    /// The raw bytes of a column, row after row, for writing.
+    pub fn bytes_mut(&mut self, column: usize) -> &mut [u8] {
+        self.data[column].bytes_mut()
+    }
+
+    /// All elements of a column, `[rows, shape…]`.
+    ///
+    /// # Errors
+    /// When there is no such column, or it holds another type.
+    pub fn get<T: Element>(&self, name: &str) -> Result<&[T]> {
+        let index = self.schema.index(name)?;
+        self.check::<T>(index)?;
+        Ok(bytemuck::cast_slice(self.bytes(index)))
+    }
+
+    /// All elements of a column, `[rows, shape…]`, for writing.
+    ///
+    /// # Errors
+    /// As [`Batch::get`].
+    pub fn get_mut<T: Element>(&mut self, name: &str) -> Result<&mut [T]> {
+        let index = self.schema.index(name)?;
+        self.check::<T>(index)?;
+        Ok(bytemuck::cast_slice_mut(self.bytes_mut(index)))
+    }
+
+    /// A column converted to `f32`, whatever its type: `[rows, shape…]`.
+    ///
+    /// # Errors
+    /// When there is no such column.
+    pub fn to_f32(&self, name: &str) -> Result<Vec<f32>> {
+        let index = self.schema.index(name)?;
+        let bytes = self.bytes(index);
+        Ok(match self.schema.columns()[index].dtype {
+            DType::Bool | DType::U8 => bytes.iter().map(|&v| f32::from(v)).collect(),
+            DType::Int32 => bytemuck::cast_slice::<u8, i32>(bytes).iter().map(|&v| v as f32).collect(),
+            DType::Int64 => bytemuck::cast_slice::<u8, i64>(bytes).iter().map(|&v| v as f32).collect(),
+            DType::Float32 => bytemuck::cast_slice(bytes).to_vec(),
+            DType::Float64 => bytemuck::cast_slice::<u8, f64>(bytes).iter().map(|&v| v as f32).collect(),
+        })
+    }
+
+    /// One row.
+    ///
+    /// # Panics
+    /// When there is no such row.
+    pub fn row(&self, row: usize) -> RowRef<'_> {
+        assert!(row < self.rows, "row {row} of a batch of {} rows", self.rows);
+        RowRef::new(self, row)
+    }
+
+    /// One row, for writing.
+    ///
+    /// # Panics
+    /// When there is no such row.
+    pub fn row_mut(&mut self, row: usize) -> RowMut<'_> {
+        self.rows_mut().row(row)
+    }
+
+    /// Calls `f(row index, row)` for every row on the threads of the current rayon pool.
+    pub fn par_rows_mut(&mut self, f: impl Fn(usize, RowMut<'_>) + Sync) {
+        use rayon::prelude::*;
+        let rows = self.rows;
+        let shared = self.rows_mut();
+        (0..rows).into_par_iter().with_max_len(1).for_each(|row| f(row, shared.row(row)));
+    }
+
+    /// Calls `f(row index, row, item)` for every row and the item of the same index, on the threads of the
+    /// current rayon pool.
+    ///
+    /// # Panics
+    /// Unless there is one item per row.
+    pub fn par_zip_mut<T: Send>(&mut self, items: &mut [T], f: impl Fn(usize, RowMut<'_>, &mut T) + Sync) {
+        use rayon::prelude::*;
+        assert_eq!(items.len(), self.rows, "one item per row");
+        let shared = self.rows_mut();
+        items.par_iter_mut().with_max_len(1).enumerate().for_each(|(row, item)| f(row, shared.row(row), item));
+    }
+
+    /// Copies a row of another batch of the same schema.
+    ///
+    /// # Errors
+    /// When the schemas differ.
+    pub fn copy_row(&mut self, to: usize, from: &Batch, row: usize) -> Result<()> {
+        if self.schema != from.schema {
+            return Err(Error::mismatch("copying a row", from.schema.describe(), self.schema.describe()));
+        }
+        for (index, column) in self.schema.columns().iter().enumerate() {
+            let n = column.row_bytes();
+            self.data[index].bytes_mut()[to * n..(to + 1) * n]
+                .copy_from_slice(&from.bytes(index)[row * n..(row + 1) * n]);
+        }
+        Ok(())
+    }
+
+    /// Appends a row of another batch of the same schema.
+    ///
+    /// # Errors
+    /// When the schemas differ.
+    pub fn push_row(&mut self, from: &Batch, row: usize) -> Result<()> {
+        let to = self.rows;
+        self.resize(to + 1);
+        self.copy_row(to, from, row)
+    }
+
+    /// Checks that a column holds `T`.
+    fn check<T: Element>(&self, index: usize) -> Result<()> {
+        let column = &self.schema.columns()[index];
+        if T::is(column.dtype) {
+            return Ok(());
+        }
+        Err(Error::mismatch(
+            format!("reading column '{}'", column.name),
+            std::any::type_name::<T>(),
+            column.dtype.name(),
+        ))
+    }
+
+    fn rows_mut(&mut self) -> RowsMut<'_> {
+        for (start, buffer) in self.starts.iter_mut().zip(&mut self.data) {
+            start.0 = buffer.bytes_mut().as_mut_ptr();
+        }
+        RowsMut { schema: &self.schema, rows: self.rows, starts: &self.starts }
+    }
+}
+
+impl std::fmt::Debug for Batch {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "Batch({} rows: {})", self.rows, self.schema.describe())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn schema() -> Schema {
+        Schema::new([ColumnSpec::new("state", DType::Float64, [3]), ColumnSpec::image("pixels", 2, 2)]).expect("schema")
+    }
+
+    #[test]
+    fn threads_write_rows_in_place() {
+        let mut batch = Batch::zeros(&schema(), 100);
+        batch.par_rows_mut(|i, mut row| {
+            row.set(0, &[i as f64, 0.5, -1.0]);
+            row.at::<u8>(1).fill(i as u8);
+        });
+        assert_eq!(batch.row(7).at::<f64>(0), [7.0, 0.5, -1.0]);
+        assert_eq!(batch.row(99).get::<u8>("pixels").expect("pixels"), [99; 12]);
+        assert_eq!(batch.get::<f64>("state").expect("state").len(), 300);
+        assert_eq!(batch.bytes(1).as_ptr() as usize % 64, 0);
+    }
+
+    #[test]
+    fn rows_grown_after_shrinking_are_zero() {
+        let mut batch = Batch::zeros(&schema(), 2);
+        batch.get_mut::<f64>("state").expect("state").fill(1.0);
+        batch.resize(1);
+        batch.resize(2);
+        assert_eq!(batch.get::<f64>("state").expect("state"), [1.0, 1.0, 1.0, 0.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn wrong_column_and_wrong_type_are_errors() {
+        let batch = Batch::zeros(&schema(), 1);
+        let missing = batch.get::<f64>("stat").expect_err("no such column").to_string();
+        assert!(missing.contains("did you mean state?"), "{missing}");
+        let wrong = batch.get::<f32>("state").expect_err("wrong type").to_string();
+        assert!(wrong.contains("f32") && wrong.contains("float64"), "{wrong}");
+    }
+}

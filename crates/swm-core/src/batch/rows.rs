@@ -1,0 +1,143 @@
+//! Single rows of a batch: [`RowRef`] reads one, [`RowMut`] writes one. Several threads write disjoint rows at once.
+
+use super::{Batch, DType, Element, Schema};
+use crate::Result;
+
+/// One row of a [`Batch`].
+#[derive(Clone, Copy)]
+pub struct RowRef<'a> {
+    batch: &'a Batch,
+    row: usize,
+}
+
+impl<'a> RowRef<'a> {
+    /// The row of that index, which must exist.
+    pub(super) fn new(batch: &'a Batch, row: usize) -> Self {
+        Self { batch, row }
+    }
+
+    /// The elements of column `index`, `[shape…]`.
+    ///
+    /// # Panics
+    /// When the column holds another type: indices come from a schema, so that is a bug of the caller.
+    pub fn at<T: Element>(self, index: usize) -> &'a [T] {
+        let column = &self.schema().columns()[index];
+        assert!(T::is(column.dtype), "column '{}' holds {}", column.name, column.dtype.name());
+        let n = column.row_bytes();
+        bytemuck::cast_slice(&self.batch.bytes(index)[self.row * n..(self.row + 1) * n])
+    }
+
+    /// The elements of a column, `[shape…]`.
+    ///
+    /// # Errors
+    /// When there is no such column, or it holds another type.
+    pub fn get<T: Element>(self, name: &str) -> Result<&'a [T]> {
+        let index = self.schema().index(name)?;
+        self.batch.check::<T>(index)?;
+        Ok(self.at(index))
+    }
+
+    /// The elements of a column as `f64`, whatever its type: `[shape…]`.
+    ///
+    /// # Errors
+    /// When there is no such column.
+    pub fn to_f64(self, name: &str) -> Result<Vec<f64>> {
+        let index = self.schema().index(name)?;
+        Ok(match self.schema().columns()[index].dtype {
+            DType::Bool | DType::U8 => self.at::<u8>(index).iter().map(|&v| f64::from(v)).collect(),
+            DType::Int32 => self.at::<i32>(index).iter().map(|&v| f64::from(v)).collect(),
+            DType::Int64 => self.at::<i64>(index).iter().map(|&v| v as f64).collect(),
+            DType::Float32 => self.at::<f32>(index).iter().map(|&v| f64::from(v)).collect(),
+            DType::Float64 => self.at::<f64>(index).to_vec(),
+        })
+    }
+
+    /// The bytes of column `index`, whatever its type.
+    pub fn bytes(self, index: usize) -> &'a [u8] {
+        let n = self.schema().columns()[index].row_bytes();
+        &self.batch.bytes(index)[self.row * n..][..n]
+    }
+
+    /// The columns of the row.
+    pub fn schema(self) -> &'a Schema {
+        self.batch.schema()
+    }
+}
+
+pub use shared::RowMut;
+pub(super) use shared::{RowsMut, Start};
+
+/// Disjoint rows of one batch, written by several threads at once.
+#[allow(unsafe_code, reason = "threads write disjoint rows of one buffer, which safe slices cannot express by column")]
+mod shared {
+    use super::{Element, Schema};
+
+    /// The address of a column's first byte.
+    #[derive(Clone, Copy)]
+    pub(in crate::batch) struct Start(pub *mut u8);
+
+    impl Default for Start {
+        fn default() -> Self {
+            Self(std::ptr::null_mut())
+        }
+    }
+
+    // SAFETY: a `Start` is only read through `RowsMut`, which borrows the batch mutably and refreshes it.
+    unsafe impl Send for Start {}
+    // SAFETY: as above.
+    unsafe impl Sync for Start {}
+
+    /// All rows of a mutably borrowed batch. The batch hands out each row at most once at a time.
+    pub(in crate::batch) struct RowsMut<'a> {
+        pub schema: &'a Schema,
+        pub rows: usize,
+        pub starts: &'a [Start],
+    }
+
+    impl<'a> RowsMut<'a> {
+        pub fn row(&self, row: usize) -> RowMut<'a> {
+            assert!(row < self.rows, "row {row} of a batch of {} rows", self.rows);
+            RowMut { schema: self.schema, starts: self.starts, row }
+        }
+    }
+
+    /// One row of a batch, for writing.
+    pub struct RowMut<'a> {
+        schema: &'a Schema,
+        starts: &'a [Start],
+        row: usize,
+    }
+
+    impl RowMut<'_> {
+        /// The columns of the row.
+        pub fn schema(&self) -> &Schema {
+            self.schema
+        }
+
+        /// The elements of column `index`, `[shape…]`, for writing.
+        ///
+        /// # Panics
+        /// When the column holds another type: indices come from a schema, so that is a bug of the caller.
+        pub fn at<T: Element>(&mut self, index: usize) -> &mut [T] {
+            let column = &self.schema.columns()[index];
+            assert!(T::is(column.dtype), "column '{}' holds {}", column.name, column.dtype.name());
+            bytemuck::cast_slice_mut(self.bytes(index))
+        }
+
+        /// The bytes of column `index`, for writing.
+        pub fn bytes(&mut self, index: usize) -> &mut [u8] {
+            let n = self.schema.columns()[index].row_bytes();
+            // SAFETY: the batch is mutably borrowed while rows exist, so its buffers neither move nor are
+            // reached otherwise; each holds `rows * n` bytes, and rows are disjoint ranges of them.
+            unsafe { std::slice::from_raw_parts_mut(self.starts[index].0.add(self.row * n), n) }
+        }
+
+        /// Writes the elements of column `index`, `[shape…]`.
+        ///
+        /// # Panics
+        /// When the column holds another type or number of elements.
+        pub fn set<T: Element>(&mut self, index: usize, values: &[T]) {
+            self.at::<T>(index).copy_from_slice(values);
+        }
+    }
+}

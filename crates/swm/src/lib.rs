@@ -25,14 +25,14 @@ pub mod home;
 pub mod resolver;
 pub mod subject;
 
-use swm_core::registry::{Registry, join};
+use swm_core::registry::{Registry, concat};
 use swm_core::{EnvChoice, EnvEntry, Result};
 
 /// Every environment of this build: those of two dimensions, then those on MuJoCo.
 pub static ENVS: Registry<EnvEntry> = Registry { rows: &ROWS, ..swm_envs::ENVS };
 
 const ROWS: [EnvEntry; swm_envs::ENVS.rows.len() + swm_mujoco::ENVS.rows.len()] =
-    join(swm_envs::ENVS.rows, swm_mujoco::ENVS.rows);
+    concat(swm_envs::ENVS.rows, swm_mujoco::ENVS.rows);
 
 /// The environment that a text names, `ID` or `ID,option=value,…`: one of [`ENVS`], or else any that Gymnasium knows
 /// (`docs/gymnasium.md`).

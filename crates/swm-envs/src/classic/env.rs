@@ -5,7 +5,7 @@ use super::frame::FrameRenderer;
 use super::task::ControlTask;
 use rand::Rng as _;
 use rand::seq::IndexedRandom as _;
-use swm_core::factors::{wrong_snapshot, from_row, parse_snapshot, snapshot};
+use swm_core::factors::{from_row, parse_snapshot, snapshot, wrong_snapshot};
 use swm_core::{
     Action, ColumnSpec, DType, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, Rng, RowMut,
     RowRef, Snapshot, Space, Transition, VariationRequest,

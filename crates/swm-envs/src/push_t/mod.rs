@@ -14,7 +14,7 @@ use physics::{AGENT, BLOCK, Simulation, put, take_array};
 use render::{DrawnState, TableRenderer};
 use state::{State, checked, goal_distance, is_reached, set_state, settled, start_state, state_distance, state_of};
 use std::f64::consts::TAU;
-use swm_core::factors::{wrong_snapshot, from_row, parse_snapshot, snapshot};
+use swm_core::factors::{from_row, parse_snapshot, snapshot, wrong_snapshot};
 use swm_core::{
     Action, DType, Env, EnvEntry, EnvSpec, Error, ExpertEntry, FactorValues, FrameMut, Key, ResetOptions, Result,
     RowMut, RowRef, Snapshot, Space, Transition, VariationRequest,
@@ -212,7 +212,7 @@ impl Env for PushT {
     }
 
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let invalid = || foreign(&self.spec.id, "other bytes");
+        let invalid = || wrong_snapshot(&self.spec.id, "other bytes");
         let (factors, mut bytes) = parse_snapshot(&self.spec.id, &self.spec.variation_space, &self.factors, snapshot)?;
         let goal = take_array::<f64, 7>(&mut bytes).ok_or_else(invalid)?;
         let [contacts] = take_array::<u64, 1>(&mut bytes).ok_or_else(invalid)?;

@@ -64,6 +64,7 @@ impl Column {
     ///
     /// # Errors
     /// If it is damaged, or its layout or filters are not supported.
+    #[allow(clippy::too_many_lines, reason = "one case per storage layout")]
     pub fn new(name: &str, dataset: Dataset, file_size: u64) -> Result<Option<Self>, String> {
         let Some(stored) = scalar_type(&catch_panic("its type", || dataset.datatype())?) else { return Ok(None) };
         let Some(dtype) = stored.dtype() else { return Ok(None) };

@@ -168,6 +168,7 @@ pub fn codec(lance: &LanceSchema) -> Option<ImageCodec> {
 ///
 /// # Errors
 /// If the table has no index columns, or its columns contradict the recorded schema.
+#[allow(clippy::too_many_lines, reason = "one case per kind of stored column")]
 pub fn columns_to_read(
     folder: &Path,
     lance: &LanceSchema,

@@ -13,11 +13,11 @@ use swm_core::{Error, Result};
 pub(super) struct EpisodeFiles {
     pub tasks: Vec<String>,
     pub data: PathBuf,
-    /// For every video feature, its file and when the episode begins there, in seconds.
+    /// For every video feature, its file and the episode's start time in it, in seconds.
     pub videos: Vec<(PathBuf, f64)>,
     pub length: usize,
     pub constants: Option<String>,
-    /// The number of its files, counted through all chunks.
+    /// Index of its files, counted over all chunks.
     pub file: usize,
 }
 
@@ -31,7 +31,7 @@ impl EpisodeFiles {
     }
 }
 
-/// The episodes of version 2.1: a line each, and a file each.
+/// The episodes of version 2.1, which has one line and one file per episode.
 fn episode_files_v2(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     #[derive(Deserialize)]
     struct Line {
@@ -50,16 +50,16 @@ fn episode_files_v2(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
         let line: Line =
             serde_json::from_str(line).map_err(|e| damaged(&path, format!("a line is unreadable: {e}")))?;
         if line.episode_index != files_of_episodes.len() {
-            let problem = format!("episode {} comes where {} should", line.episode_index, files_of_episodes.len());
+            let problem = format!("found episode {} instead of {}", line.episode_index, files_of_episodes.len());
             return Err(damaged(&path, problem));
         }
-        let numbers =
+        let fields =
             [("episode_chunk", files_of_episodes.len() / info.chunks_size), ("episode_index", files_of_episodes.len())];
         let videos: Result<Vec<(PathBuf, f64)>> =
-            info.video_keys().into_iter().map(|key| Ok((video_file(root, info, key, &numbers)?, 0.0))).collect();
+            info.video_keys().into_iter().map(|key| Ok((video_file(root, info, key, &fields)?, 0.0))).collect();
         files_of_episodes.push(EpisodeFiles {
             tasks: line.tasks,
-            data: info.file(root, &info.data_path, "", &numbers)?,
+            data: info.file(root, &info.data_path, "", &fields)?,
             videos: videos?,
             length: line.length,
             constants: None,
@@ -71,15 +71,16 @@ fn episode_files_v2(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
 
 fn video_file(root: &Path, info: &Info, key: &str, numbers: &[(&str, usize)]) -> Result<PathBuf> {
     let template = info.video_path.as_deref();
-    let template = template.ok_or_else(|| damaged(root, "meta/info.json does not say where videos are".to_owned()))?;
+    let template = template.ok_or_else(|| damaged(root, "meta/info.json has no video_path".to_owned()))?;
     info.file(root, template, key, numbers)
 }
 
-/// The episodes of version 3.0: a row each.
+/// The episodes of version 3.0, which has one row per episode.
+#[allow(clippy::too_many_lines, reason = "one block per column of the table")]
 fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     let folder = root.join("meta").join("episodes");
     let mut files = vec![];
-    // None where there is no episode yet.
+    // The folder is empty if there are no episodes yet.
     for chunk in std::fs::read_dir(&folder).into_iter().flatten().flatten() {
         let entries = std::fs::read_dir(chunk.path()).into_iter().flatten().flatten().map(|entry| entry.path());
         files.extend(entries.filter(|path| path.extension().is_some_and(|suffix| suffix == "parquet")));
@@ -87,36 +88,38 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     files.sort();
     let keys = info.video_keys();
     let named = |key: &str, what: &str| format!("videos/{key}/{what}");
-    let mut wanted: Vec<String> =
+    let mut columns: Vec<String> =
         ["episode_index", "tasks", "length", "data/chunk_index", "data/file_index", CONSTANTS]
             .map(str::to_owned)
             .to_vec();
     for key in &keys {
-        wanted.extend(["chunk_index", "file_index", "from_timestamp"].map(|what| named(key, what)));
+        columns.extend(["chunk_index", "file_index", "from_timestamp"].map(|what| named(key, what)));
     }
-    let wanted: Vec<&str> = wanted.iter().map(String::as_str).collect();
+    let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
     let mut files_of_episodes = vec![];
     for path in &files {
-        let batches = table::read(path, &wanted, None)?;
-        let numbers = |column: &str| -> Result<Vec<usize>> {
-            let sound = |number: i64| usize::try_from(number).ok().filter(|&n| n < 1 << 40);
-            let numbers = table::integers(path, &batches, column)?.into_iter().map(sound);
-            numbers
-                .collect::<Option<_>>()
-                .ok_or_else(|| damaged(path, format!("a number of '{column}' makes no sense")))
+        let batches = table::read(path, &columns, None)?;
+        let column_values = |column: &str| -> Result<Vec<usize>> {
+            let valid = |value: i64| usize::try_from(value).ok().filter(|&n| n < 1 << 40);
+            let values = table::integers(path, &batches, column)?.into_iter().map(valid);
+            values.collect::<Option<_>>().ok_or_else(|| damaged(path, format!("a value of '{column}' is invalid")))
         };
-        let (index, length) = (numbers("episode_index")?, numbers("length")?);
-        let (chunk, file) = (numbers("data/chunk_index")?, numbers("data/file_index")?);
+        let (index, length) = (column_values("episode_index")?, column_values("length")?);
+        let (chunk, file) = (column_values("data/chunk_index")?, column_values("data/file_index")?);
         let mut videos = vec![];
         for key in &keys {
             let mut begins = vec![];
             for batch in &batches {
                 let column = batch.column_by_name(&named(key, "from_timestamp"));
                 let column = column.and_then(|array| array.as_primitive_opt::<Float64Type>());
-                let column = column.ok_or_else(|| damaged(path, format!("it does not say when '{key}' begins")))?;
+                let column = column.ok_or_else(|| damaged(path, format!("it has no start times of '{key}'")))?;
                 begins.extend_from_slice(column.values());
             }
-            videos.push((numbers(&named(key, "chunk_index"))?, numbers(&named(key, "file_index"))?, begins));
+            videos.push((
+                column_values(&named(key, "chunk_index"))?,
+                column_values(&named(key, "file_index"))?,
+                begins,
+            ));
         }
         let (mut tasks, mut constants) = (vec![], vec![]);
         for batch in &batches {
@@ -125,12 +128,12 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
             constants.extend((0..batch.num_rows()).map(|row| stored.map(|stored| stored.value(row).to_owned())));
         }
         for row in 0..index.len() {
-            // An interrupted writer may have left more than it committed.
+            // Ignores uncommitted episodes of an interrupted writer.
             if files_of_episodes.len() == info.total_episodes {
                 break;
             }
             if index[row] != files_of_episodes.len() {
-                let problem = format!("episode {} comes where {} should", index[row], files_of_episodes.len());
+                let problem = format!("found episode {} instead of {}", index[row], files_of_episodes.len());
                 return Err(damaged(path, problem));
             }
             let at = |chunk: usize, file: usize| [("chunk_index", chunk), ("file_index", file)];
@@ -154,7 +157,7 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     Ok(files_of_episodes)
 }
 
-/// A column of lists of texts.
+/// A column of lists of strings.
 fn texts(batch: &arrow_array::RecordBatch, column: &str) -> Option<Vec<Vec<String>>> {
     let lists = batch.column_by_name(column)?.as_list_opt::<i32>()?;
     let text = |list: arrow_array::ArrayRef| -> Option<Vec<String>> {

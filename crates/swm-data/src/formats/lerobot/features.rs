@@ -10,7 +10,7 @@ use swm_core::{DType, Error, Result, Schema};
 /// Frames per second in timestamps. Steps of simulated environments have no common rate.
 pub const FRAMES_PER_SECOND: u32 = 25;
 
-/// The columns that are stored, and their features.
+/// Indices of the columns to store, with the names of their features.
 pub fn stored_columns(schema: &Schema) -> Result<Vec<(usize, String)>> {
     let mut columns: Vec<(usize, String)> = vec![];
     for (index, column) in schema.columns().iter().enumerate() {
@@ -19,13 +19,13 @@ pub fn stored_columns(schema: &Schema) -> Result<Vec<(usize, String)>> {
             continue;
         }
         if column.is_empty() {
-            return refuse(format!("column '{}' holds no number", column.name), "leave it out");
+            return refuse(format!("column '{}' has no elements", column.name), "leave it out");
         }
         let native = native_name(column, schema);
         let reserved = ["timestamp", "frame_index", "episode_index", "index", "task_index", "task"];
         let unfit = native.contains(['/', '\\', '\0']) || native.starts_with('.');
         if unfit || reserved.contains(&&*native) || columns.iter().any(|(_, other)| *other == native) {
-            return refuse(format!("LeRobot can have no feature '{native}' of a column's"), "rename the column");
+            return refuse(format!("'{native}' is not a valid LeRobot feature name"), "rename the column");
         }
         columns.push((index, native));
     }
@@ -35,7 +35,7 @@ pub fn stored_columns(schema: &Schema) -> Result<Vec<(usize, String)>> {
     Ok(columns)
 }
 
-/// The description of a new dataset.
+/// The description of a dataset without episodes.
 pub fn new_info(schema: &Schema, columns: &[(usize, String)], options: &WriteOptions) -> Info {
     let mut features: Vec<(String, Feature)> = columns
         .iter()
@@ -49,7 +49,7 @@ pub fn new_info(schema: &Schema, columns: &[(usize, String)], options: &WriteOpt
                 });
                 Feature { dtype: "video".to_owned(), shape: column.shape.clone(), names, info: Some(details) }
             } else {
-                // More than one axis would need extensions of Arrow; our own record restores them.
+                // More than one axis would need Arrow extensions; the recorded schema restores the shape.
                 let shape = vec![column.len()];
                 Feature { dtype: column.dtype.name().to_owned(), shape, names: Value::Null, info: None }
             };

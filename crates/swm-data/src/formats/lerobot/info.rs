@@ -1,4 +1,4 @@
-//! `meta/info.json`: what a dataset holds and how its files are named.
+//! `meta/info.json`: the features of a dataset and the templates of its file names.
 
 use serde::de::{MapAccess, Visitor};
 use serde::ser::SerializeMap as _;
@@ -11,7 +11,7 @@ use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema};
 /// The version that is written.
 pub const VERSION: &str = "v3.0";
 
-/// Where files of version 3.0 are.
+/// Path templates of version 3.0.
 pub const DATA_PATH: &str = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet";
 /// See [`DATA_PATH`].
 pub const VIDEO_PATH: &str = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4";
@@ -41,7 +41,7 @@ pub struct Info {
     #[serde(default)]
     pub video_path: Option<String>,
     pub features: Features,
-    /// What we record for ourselves.
+    /// Metadata of this format's writer.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stable_worldmodel: Option<Recorded>,
 }
@@ -54,16 +54,16 @@ fn hundred() -> usize {
     100
 }
 
-/// What we record for ourselves.
+/// Metadata of this format's writer.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Recorded {
     pub schema: Schema,
     pub manifest: Option<Manifest>,
-    /// The last action of an episode repeats the one before, and stands for none.
+    /// Whether the last action of an episode is a copy of the previous one and stands for a missing action.
     pub last_action_repeats: bool,
 }
 
-/// Features by name, in the order of the file: the first camera is the main one.
+/// Features by name, in file order. The first camera is the main one.
 #[derive(Clone, Debug, Default)]
 pub struct Features(pub Vec<(String, Feature)>);
 
@@ -115,17 +115,17 @@ impl<'de> Deserialize<'de> for Features {
 pub enum Kind {
     /// In the data files.
     Values,
-    /// As encoded pictures in the data files.
+    /// As encoded images in the data files.
     Images,
-    /// In videos; the place among the features that are.
+    /// In videos, with the index among video features.
     Video(usize),
 }
 
-/// A column as readers see it.
+/// A column as readers return it.
 #[derive(Clone, Debug)]
 pub struct Column {
     pub spec: ColumnSpec,
-    /// The feature's name.
+    /// Name of the feature.
     pub native: String,
     pub kind: Kind,
 }
@@ -134,7 +134,7 @@ impl Info {
     /// Reads the file of a dataset.
     ///
     /// # Errors
-    /// When it is missing, is no such file, or is of a version that is not read.
+    /// If it is missing or damaged, or its version is not supported.
     pub fn read(root: &Path) -> Result<Self> {
         let path = root.join("meta").join("info.json");
         let bytes = std::fs::read(&path).map_err(|e| match e.kind() {
@@ -146,11 +146,11 @@ impl Info {
         })?;
         let info: Self = serde_json::from_slice(&bytes).map_err(|e| damaged(&path, format!("is unreadable: {e}")))?;
         if !info.is_v3() && info.codebase_version != "v2.1" && info.codebase_version != "v2.0" {
-            let problem = format!("LeRobot's version {} is not read", info.codebase_version);
+            let problem = format!("LeRobot's version {} is not supported", info.codebase_version);
             return Err(Error::corrupt(&path, problem, "convert it with LeRobot's own tools to v2.1 or v3.0"));
         }
         if info.chunks_size == 0 || info.fps().is_none() {
-            return Err(damaged(&path, "its chunks or frames a second are none".to_owned()));
+            return Err(damaged(&path, "chunks_size or fps is invalid".to_owned()));
         }
         Ok(info)
     }
@@ -159,20 +159,20 @@ impl Info {
         self.codebase_version == VERSION
     }
 
-    /// Frames a second, if that is a rate.
+    /// Frames per second, if valid.
     pub fn fps(&self) -> Option<f64> {
         self.fps.as_f64().filter(|fps| fps.is_finite() && *fps > 0.0)
     }
 
-    /// Names of the features that are stored as videos.
+    /// Names of the video features.
     pub fn video_keys(&self) -> Vec<&str> {
         self.features.0.iter().filter(|(_, feature)| feature.dtype == "video").map(|(name, _)| name.as_str()).collect()
     }
 
-    /// The columns. Text, and what has a shape that we have no column for, is left out.
+    /// The columns. Features with text or with unsupported shapes are skipped.
     ///
     /// # Errors
-    /// When the shape of a camera makes no sense.
+    /// If the shape of a camera is invalid.
     pub fn columns(&self, root: &Path) -> Result<Vec<Column>> {
         let (mut columns, mut videos, mut primary) = (vec![], 0, true);
         for (native, feature) in &self.features.0 {
@@ -183,7 +183,7 @@ impl Info {
             let camera = feature.dtype == "video" || feature.dtype == "image";
             let (spec, kind) = if camera {
                 let (height, width) = feature.size().ok_or_else(|| {
-                    damaged(root, format!("the camera '{native}' has pictures of {:?}", feature.shape))
+                    damaged(root, format!("the camera '{native}' has images of shape {:?}", feature.shape))
                 })?;
                 let name = if std::mem::take(&mut primary) { "pixels" } else { native };
                 let kind = if feature.dtype == "video" { Kind::Video(videos) } else { Kind::Images };
@@ -197,7 +197,7 @@ impl Info {
             };
             let spec = match recorded {
                 Some(known) if known.len() == spec.len() && known.is_image() == camera => known.clone(),
-                // Ours have a few more, which the writer was not given.
+                // Our writer adds features, which are not in the schema passed to it.
                 _ if self.stable_worldmodel.is_some() => continue,
                 _ => spec,
             };
@@ -218,19 +218,19 @@ impl Info {
         Ok(columns)
     }
 
-    /// A file of the dataset: its template with the numbers filled in.
+    /// The path of a file: its template with the values filled in.
     ///
     /// # Errors
-    /// When the template leads out of the dataset.
+    /// If the path leaves the dataset's folder.
     pub fn file(&self, root: &Path, template: &str, key: &str, numbers: &[(&str, usize)]) -> Result<PathBuf> {
         let name = fill(template, key, numbers);
         let inside = Path::new(&name).components().all(|part| matches!(part, std::path::Component::Normal(_)));
-        if inside { Ok(root.join(name)) } else { Err(damaged(root, format!("'{name}' is no file within it"))) }
+        if inside { Ok(root.join(name)) } else { Err(damaged(root, format!("'{name}' is outside of it"))) }
     }
 }
 
 impl Feature {
-    /// Height and width of a camera's pictures: the names say in which order, else the place of the colours.
+    /// Height and width of a camera's images: as named, otherwise by the position of the colour axis.
     fn size(&self) -> Option<(usize, usize)> {
         let [a, b, c] = self.shape[..] else { return None };
         let named = |name: &str| self.names.as_array()?.iter().position(|found| found.as_str() == Some(name));
@@ -243,7 +243,7 @@ impl Feature {
         (sides.0 > 0 && sides.1 > 0 && sides.0 < 1 << 16 && sides.1 < 1 << 16).then_some(sides)
     }
 
-    /// The type of column that holds its numbers without loss.
+    /// The column type that holds the feature's values without loss.
     fn number(&self) -> Option<DType> {
         Some(match self.dtype.as_str() {
             "bool" => DType::Bool,
@@ -257,7 +257,7 @@ impl Feature {
     }
 }
 
-/// The feature that a column of ours is stored as.
+/// Name of the feature that stores a column.
 pub fn native_name(column: &ColumnSpec, schema: &Schema) -> String {
     let state = if schema.find("proprio").is_some() { "proprio" } else { "state" };
     match &*column.name {
@@ -267,12 +267,12 @@ pub fn native_name(column: &ColumnSpec, schema: &Schema) -> String {
     }
 }
 
-/// The error of a dataset that contradicts itself.
+/// The error for an inconsistent dataset.
 pub fn damaged(path: &Path, problem: String) -> Error {
     Error::corrupt(path, problem, "restore it from a copy, or rebuild the dataset")
 }
 
-/// A template in Python's notation, with the numbers and the key filled in.
+/// Fills the key and values into a template in Python's notation.
 pub fn fill(template: &str, key: &str, numbers: &[(&str, usize)]) -> String {
     let mut filled = String::new();
     let mut rest = template;
@@ -283,7 +283,7 @@ pub fn fill(template: &str, key: &str, numbers: &[(&str, usize)]) -> String {
         if name == "video_key" || name == "image_key" {
             filled.push_str(key);
         } else if let Some((_, number)) = numbers.iter().find(|(known, _)| *known == name) {
-            // Such as `03d`.
+            // A format such as `03d`.
             let width = form.trim_end_matches('d').trim_start_matches('0').parse::<usize>().unwrap_or(0).min(20);
             filled.push_str(&format!("{number:0width$}"));
         }

@@ -2,29 +2,28 @@
 //!
 //! ```text
 //! NAME.lerobot/
-//!   meta/info.json                                   features, names of files, how many episodes; the commit
-//!   meta/episodes/chunk-000/file-000.parquet         where the rows and frames of each episode are
+//!   meta/info.json                                   features, path templates, number of episodes; commits
+//!   meta/episodes/chunk-000/file-000.parquet         position of the rows and frames of each episode
 //!   meta/tasks.parquet, meta/stats.json
-//!   data/chunk-000/file-000.parquet                  numbers, a row a step, several episodes in a file
+//!   data/chunk-000/file-000.parquet                  numeric columns, one row per step, several episodes per file
 //!   videos/KEY/chunk-000/file-000.mp4                frames of the same episodes
 //! ```
 //!
-//! **Names.** As in the reference's adapter, `observation.state` is called `proprio`, and the first camera of
-//! `info.json` is called `pixels`; `action` keeps its name, and so does everything else. Reading by the native name works
-//! as well. What was written here comes back under the names it was given: pictures are stored as
-//! `observation.images.NAME`, `proprio` (or `state`, where there is none) as `observation.state`. `episode_index` and
-//! `frame_index` are our `episode_idx` and `step_idx`; `timestamp`, `index` and `task_index` are read by name, but are no
-//! columns, as every writer counts anew. Text is not read, but for the task, which is the episode's
-//! constant `task`.
+//! **Names.** As in the reference's adapter, `observation.state` becomes `proprio`, and the first camera in `info.json`
+//! becomes `pixels`; all other names, such as `action`, are unchanged. Columns can also be read by their LeRobot names.
+//! Datasets written here are read with their original names: images are stored as `observation.images.NAME`, and
+//! `proprio` (or `state`, if there is none) as `observation.state`. `episode_index` and `frame_index` become
+//! `episode_idx` and `step_idx`. `timestamp`, `index` and `task_index` can be read by name but are not columns, because
+//! writers compute them. The only text that is read is the task, as the constant `task` of the episode.
 //!
-//! **Time.** LeRobot's last row has an action, ours has none. Foreign datasets are read as they are. In ours the action
-//! before is repeated in the file, so that whoever trains on it meets no NaN; reading it here gives NaN (or -1) again.
+//! **Time.** LeRobot's last row has an action. Third-party datasets are read unchanged. Datasets written here repeat
+//! the previous action in the last row, so that other programs get no NaN; reading them here restores NaN (or -1).
 //!
-//! **Frames** are found by time: that of the row after that of the episode's beginning in the file. A frame further away
-//! than a quarter of a frame is an error.
+//! **Frames** are located by time: the start time of the episode in the file plus the timestamp of the row. It is an
+//! error if the nearest frame is further away than a quarter of a frame.
 //!
-//! How pictures are stored follows from [`ImageCodec`](swm_image::ImageCodec) as in the format `video`; choose JPEG for
-//! datasets that browsers should play.
+//! [`ImageCodec`](swm_image::ImageCodec) determines the encoding of frames as in the format `video`; use JPEG for
+//! datasets that browsers must play.
 
 #[cfg(feature = "lerobot")]
 mod episode_files;
@@ -69,9 +68,9 @@ fn detect(location: &Location) -> bool {
 /// The constant that holds an episode's task.
 #[cfg(feature = "lerobot")]
 const TASK: &str = "task";
-/// What an episode without a task is filed under.
+/// The stored task of an episode without a task.
 #[cfg(feature = "lerobot")]
 const NO_TASK: &str = "unspecified";
-/// The column of `meta/episodes` that holds our constants, as JSON.
+/// The column of `meta/episodes` that holds the constants, as JSON.
 #[cfg(feature = "lerobot")]
 const CONSTANTS: &str = "stable_worldmodel/constants";

@@ -1,4 +1,5 @@
-//! Reading: numbers from Parquet, kept once they were asked for; frames from videos, by time.
+//! Reads numeric columns from Parquet files, which stay in memory after the first access, and frames from videos, by
+//! time.
 
 use super::episode_files::EpisodeFiles;
 use super::info::{Column, Info, Kind, damaged};
@@ -18,7 +19,7 @@ use swm_core::columns::ACTION;
 use swm_core::{Batch, ColumnSpec, DType, Error, Manifest, Result, Schema};
 use swm_video::{Source, Video, VideoCache};
 
-/// Features that count rows, in every dataset.
+/// Features with row counters, which every dataset has.
 const ROW_COUNTERS: [&str; 3] = ["timestamp", "index", "task_index"];
 
 /// Opens a dataset.
@@ -31,17 +32,17 @@ pub(super) struct LerobotReader {
     pub info: Info,
     fps: f64,
     schema: Schema,
-    /// Those of the schema after the index_columns, then LeRobot's bookkeeping, which is read by name only.
+    /// The columns of the schema after the index columns, then LeRobot's row counters, which are only read by name.
     columns: Vec<Column>,
-    /// The numbering and all of `columns`.
+    /// Specs of the index columns and of `columns`.
     specs: Vec<ColumnSpec>,
     rows: EpisodeRows,
     pub files_of_episodes: Vec<EpisodeFiles>,
     /// Data files, and the positions of the episodes in each.
     files: Vec<(PathBuf, Range<usize>)>,
-    /// The numbers of each column.
+    /// The values of each numeric column.
     data: Vec<OnceLock<Vec<u8>>>,
-    /// When each row is, where that is stored.
+    /// The timestamp of each row, if stored.
     timestamps: OnceLock<Option<Vec<f32>>>,
     videos: VideoCache<PathBuf>,
 }
@@ -51,16 +52,16 @@ impl LerobotReader {
         let info = Info::read(root)?;
         let fps = info.fps().unwrap_or(1.0);
         let mut columns = info.columns(root)?;
-        // Our own datasets may have columns of these names.
+        // Datasets written here may have columns with these names.
         let bookkeeping = |column: &Column| info.stable_worldmodel.is_none() && ROW_COUNTERS.contains(&&*column.native);
         columns.sort_by_key(bookkeeping);
         let visible = 2 + columns.iter().filter(|column| !bookkeeping(column)).count();
         let files_of_episodes = EpisodeFiles::read(root, &info)?;
         let mut rows = EpisodeRows::default();
-        files_of_episodes.iter().for_each(|place| rows.push(place.length));
+        files_of_episodes.iter().for_each(|files| rows.push(files.length));
         if info.total_episodes != files_of_episodes.len() || rows.total() != info.total_frames as u64 {
             let problem = format!(
-                "meta/info.json promises {} episodes of {} rows, {} of {} are described",
+                "meta/info.json declares {} episodes with {} rows in total, but {} with {} are described",
                 info.total_episodes,
                 info.total_frames,
                 files_of_episodes.len(),
@@ -69,26 +70,26 @@ impl LerobotReader {
             return Err(damaged(root, problem));
         }
         let mut files: Vec<(PathBuf, Range<usize>)> = vec![];
-        for (position, place) in files_of_episodes.iter().enumerate() {
+        for (position, episode) in files_of_episodes.iter().enumerate() {
             match files.last_mut() {
-                Some((path, episodes)) if *path == place.data => episodes.end = position + 1,
-                _ => files.push((place.data.clone(), position..position + 1)),
+                Some((path, episodes)) if *path == episode.data => episodes.end = position + 1,
+                _ => files.push((episode.data.clone(), position..position + 1)),
             }
         }
         let recorded = info.stable_worldmodel.as_ref().map(|recorded| recorded.schema.columns()).unwrap_or_default();
         let specs: Vec<ColumnSpec> =
             index_columns(recorded).into_iter().chain(columns.iter().map(|column| column.spec.clone())).collect();
-        // Room is made for pictures of the promised size.
+        // Checks the declared frame size before memory for it is allocated.
         let videos = VideoCache::default();
         for column in &columns {
-            if let (Kind::Video(feature), Some(place)) =
-                (column.kind, files_of_episodes.iter().find(|place| place.length > 0))
+            if let (Kind::Video(feature), Some(episode)) =
+                (column.kind, files_of_episodes.iter().find(|episode| episode.length > 0))
             {
-                let path = &place.videos[feature].0;
+                let path = &episode.videos[feature].0;
                 let size = videos.frame_size(path, || Ok(Source::File(path.clone())))?;
                 if [size.0, size.1] != column.spec.shape[..2] {
                     let problem =
-                        format!("camera '{}' has pictures of {size:?}, not {:?}", column.native, column.spec.shape);
+                        format!("camera '{}' has frames of {size:?} instead of {:?}", column.native, column.spec.shape);
                     return Err(damaged(root, problem));
                 }
             }
@@ -109,38 +110,38 @@ impl LerobotReader {
         })
     }
 
-    /// The place of a column in the schema, by our name or by its own.
+    /// The index of a column in `specs`, by its name or its LeRobot name.
     fn index(&self, name: &str) -> Result<usize> {
         match name {
             "episode_index" => Ok(0),
             "frame_index" => Ok(1),
             _ => match self.columns.iter().position(|column| column.native == name) {
-                Some(place) if self.schema.find(name).is_none() => Ok(place + 2),
+                Some(index) if self.schema.find(name).is_none() => Ok(index + 2),
                 _ => self.schema.index(name),
             },
         }
     }
 
-    /// All rows of a column of numbers.
-    fn data(&self, place: usize) -> Result<&[u8]> {
-        if let Some(data) = self.data[place].get() {
+    /// All rows of a numeric column.
+    fn data(&self, index: usize) -> Result<&[u8]> {
+        if let Some(data) = self.data[index].get() {
             return Ok(data);
         }
-        let column = &self.columns[place];
+        let column = &self.columns[index];
         let mut data = self.read_values(&column.native, &column.spec)?;
         let repeats = self.info.stable_worldmodel.as_ref().is_some_and(|recorded| recorded.last_action_repeats);
         if repeats && column.spec.name == ACTION {
             let size = column.spec.row_bytes();
             for (&first, episode) in self.rows.first_rows().iter().zip(self.rows.episodes()) {
-                // The rows are in memory.
+                // The offset fits, because all rows are in memory.
                 let last = (first as usize + episode.length) * size;
                 missing(column.spec.dtype, &mut data[last - size..last]);
             }
         }
-        Ok(self.data[place].get_or_init(|| data))
+        Ok(self.data[index].get_or_init(|| data))
     }
 
-    /// All rows of a feature of numbers, from all files.
+    /// All rows of a numeric feature, from all files.
     fn read_values(&self, native: &str, spec: &ColumnSpec) -> Result<Vec<u8>> {
         let parts: Result<Vec<Vec<u8>>> = self
             .files
@@ -162,7 +163,7 @@ impl LerobotReader {
         Ok(parts?.concat())
     }
 
-    /// Checks that a file holds the rows of its episodes, and no others.
+    /// Checks that a file holds exactly the rows of its episodes.
     fn check_rows(&self, path: &Path, episodes: &Range<usize>, found: &[i64]) -> Result<()> {
         let expected = episodes
             .clone()
@@ -170,10 +171,10 @@ impl LerobotReader {
         if expected.eq(found.iter().copied()) {
             return Ok(());
         }
-        Err(damaged(path, "its rows are not those of the episodes that should be in it".to_owned()))
+        Err(damaged(path, "its rows do not belong to the episodes that it should contain".to_owned()))
     }
 
-    /// When each row of the dataset is, counted from its episode's first.
+    /// The timestamp of each row, relative to the start of its episode.
     fn timestamps(&self) -> Result<Option<&[f32]>> {
         if let Some(known) = self.timestamps.get() {
             return Ok(known.as_deref());
@@ -190,23 +191,23 @@ impl LerobotReader {
 
     fn read_video(&self, column: &ColumnSpec, feature: usize, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let times = self.timestamps()?;
-        let wanted = self.rows.row_slots(column, ranges, out)?;
-        let mut frames = Vec::with_capacity(wanted.len());
-        for ((episode, step), place) in wanted {
+        let slots = self.rows.row_slots(column, ranges, out)?;
+        let mut frames = Vec::with_capacity(slots.len());
+        for ((episode, step), slot) in slots {
             let (path, begin) = &self.files_of_episodes[episode].videos[feature];
-            frames.push((path.clone(), begin + self.time(times, episode, step), place));
+            frames.push((path.clone(), begin + self.time(times, episode, step), slot));
         }
         let source = |path: &PathBuf| Ok(Source::File(path.clone()));
         self.videos.read(frames, source, |video, &time| self.frame(video, time))
     }
 
-    /// Seconds from the episode's beginning to a row.
+    /// Time from the start of the episode to a row, in seconds.
     fn time(&self, times: Option<&[f32]>, episode: usize, step: usize) -> f64 {
         let row = self.rows.first_rows()[episode] as usize + step;
         times.and_then(|times| times.get(row)).map_or(step as f64 / self.fps, |&time| f64::from(time))
     }
 
-    /// The frame that is shown at a time.
+    /// The frame at a time.
     fn frame(&self, video: &Video, time: f64) -> Result<usize> {
         match video.frame_at(time) {
             Some((frame, away)) if away <= 0.25 / self.fps => Ok(frame),
@@ -214,7 +215,7 @@ impl LerobotReader {
         }
     }
 
-    /// Encoded pictures of rows of one episode, each given to `each` with its place among the rows.
+    /// Calls `each` with the encoded images of some rows of a file, and their positions in the list of rows.
     fn each_encoded_image(
         &self,
         native: &str,
@@ -227,11 +228,12 @@ impl LerobotReader {
         for batch in table::read(path, &[native], Some(rows))? {
             let stored = batch.column_by_name(native).and_then(|array| array.as_struct_opt());
             let bytes = stored.and_then(|stored| stored.column_by_name("bytes")?.as_binary_opt::<i32>());
-            let bytes = bytes.ok_or_else(|| damaged(path, format!("column '{native}' holds no pictures")))?;
+            let bytes = bytes.ok_or_else(|| damaged(path, format!("column '{native}' holds no images")))?;
             for row in 0..bytes.len() {
                 if bytes.is_null(row) {
-                    let problem = format!("a picture of column '{native}' lies outside of it, which is not read");
-                    return Err(Error::corrupt(path, problem, "embed the pictures with LeRobot's own tools"));
+                    let problem =
+                        format!("an image of column '{native}' is in a separate file, which is not supported");
+                    return Err(Error::corrupt(path, problem, "embed the images with LeRobot's own tools"));
                 }
                 each(at, bytes.value(row))?;
                 at += 1;
@@ -242,9 +244,9 @@ impl LerobotReader {
 
     fn read_images(&self, column: &Column, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let (height, width) = (column.spec.shape[0], column.spec.shape[1]);
-        let mut wanted = self.rows.row_slots(&column.spec, ranges, out)?;
+        let mut slots = self.rows.row_slots(&column.spec, ranges, out)?;
         let file_of = |episode: usize| self.files.partition_point(|(_, episodes)| episodes.end <= episode);
-        let jobs: Vec<_> = wanted.chunk_by_mut(|a, b| file_of(a.0.0) == file_of(b.0.0)).collect();
+        let jobs: Vec<_> = slots.chunk_by_mut(|a, b| file_of(a.0.0) == file_of(b.0.0)).collect();
         jobs.into_par_iter().with_max_len(1).try_for_each(|group| {
             let Some(file) = group.first().map(|((episode, _), _)| file_of(*episode)) else { return Ok(()) };
             let first = self.rows.first_rows()[self.files[file].1.start];
@@ -255,21 +257,21 @@ impl LerobotReader {
                 .map(|files_of_episodes| row(files_of_episodes[0].0)..row(files_of_episodes[0].0) + 1)
                 .collect();
             self.each_encoded_image(&column.native, file, rows, |at, bytes| {
-                let Some(((_, place), others)) =
+                let Some(((_, first), others)) =
                     groups.get_mut(at).and_then(|files_of_episodes| files_of_episodes.split_first_mut())
                 else {
                     return Ok(());
                 };
-                swm_image::decode(bytes, height, width, place)
+                swm_image::decode(bytes, height, width, first)
                     .map_err(|e| damaged(&self.files[file].0, format!("column '{}': {e}", column.native)))?;
-                others.iter_mut().for_each(|(_, other)| other.copy_from_slice(place));
+                others.iter_mut().for_each(|(_, other)| other.copy_from_slice(first));
                 Ok(())
             })
         })
     }
 }
 
-/// Writes that there is no action.
+/// Fills values that stand for a missing action.
 fn missing(dtype: DType, bytes: &mut [u8]) {
     match dtype {
         DType::Float32 => bytes.as_chunks_mut::<4>().0.fill(f32::NAN.to_ne_bytes()),
@@ -292,14 +294,14 @@ impl Reader for LerobotReader {
     fn read_column(&self, name: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let index = self.index(name)?;
         let spec = &self.specs[index];
-        let Some(place) = index.checked_sub(2) else { return self.rows.fill_index_column(spec, ranges, out) };
-        let column = &self.columns[place];
+        let Some(index) = index.checked_sub(2) else { return self.rows.fill_index_column(spec, ranges, out) };
+        let column = &self.columns[index];
         match column.kind {
             Kind::Video(feature) => self.read_video(spec, feature, ranges, out),
             Kind::Images => self.read_images(column, ranges, out),
             Kind::Values => {
                 EpisodeRows::check_output(spec, ranges, out)?;
-                let (data, size) = (self.data(place)?, spec.row_bytes());
+                let (data, size) = (self.data(index)?, spec.row_bytes());
                 let mut rest = out;
                 for range in ranges {
                     let rows = self.rows.range(range)?;
@@ -313,13 +315,13 @@ impl Reader for LerobotReader {
     }
 
     fn read(&self, columns: &[&str], ranges: &[StepRange]) -> Result<Batch> {
-        // As the trait's own, but native names are known as well.
+        // As the default implementation, but LeRobot names are valid, too.
         let spec = |name: &&str| -> Result<ColumnSpec> {
             let index = self.index(name)?;
             let known = &self.specs[index];
-            // Nothing is made room for before the files have it.
-            if let Some(place) = index.checked_sub(2).filter(|&place| self.columns[place].kind == Kind::Values) {
-                self.data(place)?;
+            // Reads the files before memory for the batch is allocated, because they may be shorter than declared.
+            if let Some(index) = index.checked_sub(2).filter(|&index| self.columns[index].kind == Kind::Values) {
+                self.data(index)?;
             }
             Ok(ColumnSpec::new(*name, known.dtype, known.shape.clone()))
         };
@@ -332,8 +334,8 @@ impl Reader for LerobotReader {
     }
 
     fn constants(&self, episode: usize) -> Result<Constants> {
-        let Some(place) = self.files_of_episodes.get(episode) else {
-            let given = format!("the episode in position {episode}");
+        let Some(files) = self.files_of_episodes.get(episode) else {
+            let given = format!("episode position {episode}");
             return Err(Error::mismatch(
                 "reading constants",
                 given,
@@ -341,12 +343,12 @@ impl Reader for LerobotReader {
             ));
         };
         let mut constants = Constants::new();
-        if let Some(stored) = &place.constants {
+        if let Some(stored) = &files.constants {
             let stored: BTreeMap<String, Stored> = serde_json::from_str(stored)
                 .map_err(|e| damaged(&self.root, format!("the constants of episode {episode} are unreadable: {e}")))?;
             constants.extend(stored.into_iter().map(|(name, value)| (name, value.into_bytes())));
-        } else if !place.tasks.is_empty() {
-            constants.insert(TASK.to_owned(), place.tasks.join("\n").into_bytes());
+        } else if !files.tasks.is_empty() {
+            constants.insert(TASK.to_owned(), files.tasks.join("\n").into_bytes());
         }
         Ok(constants)
     }
@@ -387,12 +389,12 @@ impl Reader for LerobotReader {
     fn content_hash(&self) -> Result<String> {
         let times = self.timestamps()?;
         content_hash(&self.rows, &self.schema.columns()[2..], |spec, add| {
-            let place = self.schema.index(&spec.name)? - 2;
-            let column = &self.columns[place];
+            let index = self.schema.index(&spec.name)? - 2;
+            let column = &self.columns[index];
             for (position, episode) in self.rows.episodes().iter().enumerate() {
                 match column.kind {
                     Kind::Values => {
-                        let (data, size) = (self.data(place)?, spec.row_bytes());
+                        let (data, size) = (self.data(index)?, spec.row_bytes());
                         let rows = self.rows.range(&StepRange::new(position, 0, episode.length))?;
                         data[rows.start as usize * size..rows.end as usize * size]
                             .chunks_exact(size)
@@ -422,7 +424,7 @@ impl Reader for LerobotReader {
     }
 }
 
-/// A constant in JSON: text, or bytes that are none.
+/// A constant in JSON: a string, or bytes that are not UTF-8.
 #[derive(Deserialize, serde::Serialize)]
 #[serde(untagged)]
 pub(super) enum Stored {

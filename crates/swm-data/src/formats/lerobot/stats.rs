@@ -1,15 +1,15 @@
-//! `meta/stats.json`: minimum, maximum, mean and deviation of every feature, which LeRobot's policies normalise with.
-//! They grow with the dataset: what is stored and what comes are merged, not computed anew. Quantiles are left out.
+//! `meta/stats.json`: minimum, maximum, mean and standard deviation of every feature, which LeRobot's policies use for
+//! normalisation. Statistics of new episodes are merged with the stored ones. Quantiles are not written.
 
 use serde_json::{Value, json};
 use swm_core::{ColumnSpec, Result};
 
-/// What is known of one feature.
+/// Statistics of one feature.
 #[derive(Clone, Debug)]
 pub struct Stats {
-    /// Rows, or frames.
+    /// Number of rows or frames.
     count: f64,
-    /// For every number of a row, or every colour.
+    /// Per element of a row, or per colour channel.
     dims: Vec<Dim>,
     camera: bool,
 }
@@ -19,7 +19,7 @@ struct Dim {
     min: f64,
     max: f64,
     mean: f64,
-    /// Sum of squared distances from the mean.
+    /// Sum of squared deviations from the mean.
     spread: f64,
 }
 
@@ -31,7 +31,7 @@ impl Stats {
         Self { count: 0.0, dims: vec![NOTHING; if camera { 3 } else { column.len() }], camera }
     }
 
-    /// Adds rows of numbers, `f64` values row after row; of a camera, its pixels.
+    /// Adds rows of values, row-major; of a camera, its pixels.
     pub fn add(&mut self, values: impl Iterator<Item = f64> + Clone, rows: usize) {
         let width = self.dims.len();
         let mut added = vec![NOTHING; width];
@@ -40,7 +40,7 @@ impl Stats {
             let (dim, sum) = (&mut added[i % width], &mut sums[i % width]);
             dim.min = dim.min.min(value);
             dim.max = dim.max.max(value);
-            // Welford's update, exact enough for any number of pixels.
+            // Welford's algorithm.
             sum.0 += 1.0;
             let from = value - sum.1;
             sum.1 += from / sum.0;
@@ -48,7 +48,7 @@ impl Stats {
         }
         for (dim, (n, mean, spread)) in added.iter_mut().zip(&sums) {
             dim.mean = *mean;
-            // Per row: a camera has many values in one.
+            // Images have many values per channel and row.
             dim.spread = if *n > 0.0 { spread / n * rows as f64 } else { 0.0 };
         }
         self.merge(&added, rows as f64);
@@ -69,7 +69,7 @@ impl Stats {
         self.count = total;
     }
 
-    /// As LeRobot stores it: pictures from 0 to 1, as `[3, 1, 1]`.
+    /// The JSON object that LeRobot stores. Statistics of images are in `[0, 1]`, with shape `[3, 1, 1]`.
     pub fn to_json(&self) -> Value {
         let scale = if self.camera { 255.0 } else { 1.0 };
         let list = |value: &dyn Fn(&Dim) -> f64| -> Value {
@@ -85,7 +85,7 @@ impl Stats {
         })
     }
 
-    /// Takes over what is stored, if it is of this feature.
+    /// Loads stored statistics, if they are of this feature.
     pub fn continue_from(&mut self, stored: &Value) -> Option<()> {
         let scale = if self.camera { 255.0 } else { 1.0 };
         let list = |name: &str| -> Option<Vec<f64>> {
@@ -105,10 +105,10 @@ impl Stats {
     }
 }
 
-/// All statistics, as a file.
+/// The content of the file.
 ///
 /// # Errors
-/// When they cannot be written as JSON.
+/// If it cannot be serialised.
 pub fn file<'a>(features: impl Iterator<Item = (&'a str, &'a Stats)>) -> Result<Vec<u8>> {
     let all: serde_json::Map<String, Value> =
         features.map(|(name, stats)| (name.to_owned(), stats.to_json())).collect();

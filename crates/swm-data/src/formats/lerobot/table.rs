@@ -1,4 +1,4 @@
-//! Parquet files: columns out of them, and columns into them.
+//! Reads and writes Parquet files.
 
 use super::info::damaged;
 use arrow_array::cast::AsArray as _;
@@ -16,13 +16,13 @@ use std::path::Path;
 use std::sync::Arc;
 use swm_core::{Error, Result};
 
-/// Rows that are decoded at a time.
+/// Rows per decoded batch.
 const ROWS: usize = 4096;
 
-/// Reads columns of a file; rows of some rising ranges, or all of them. `None` for a column that is not there.
+/// Reads columns of a file: all rows, or some ascending ranges. Columns that do not exist are missing from the result.
 ///
 /// # Errors
-/// When the file cannot be read or is damaged, and also when that makes the videos panic.
+/// If the file cannot be read or is damaged, including when the Parquet library panics.
 pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> Result<Vec<RecordBatch>> {
     let file = File::open(path).map_err(|e| match e.kind() {
         std::io::ErrorKind::NotFound => damaged(path, "the file is missing".to_owned()),
@@ -30,8 +30,7 @@ pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> R
     })?;
     let failed = |e: &dyn std::fmt::Display| damaged(path, format!("the table is damaged: {e}"));
     let work = || -> Result<Vec<RecordBatch>> {
-        // Without the Arrow schema that other programs put into the file: what Parquet says is enough, and what it
-        // adds is a second thing to be damaged.
+        // Ignores the Arrow schema that other programs embed, because it is redundant and could be damaged.
         let options = ArrowReaderOptions::new().with_skip_arrow_metadata(true);
         let builder = ParquetRecordBatchReaderBuilder::try_new_with_options(file, options).map_err(|e| failed(&e))?;
         let total = usize::try_from(builder.metadata().file_metadata().num_rows()).map_err(|e| failed(&e))?;
@@ -49,32 +48,32 @@ pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> R
         let reader = builder.build().map_err(|e| failed(&e))?;
         reader.map(|batch| batch.map_err(|e| failed(&e))).collect()
     };
-    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| Err(failed(&"its content makes no sense")))
+    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| Err(failed(&"its content is invalid")))
 }
 
-/// Whole numbers of a column.
+/// An integer column.
 ///
 /// # Errors
-/// When there is no such column, or it holds something else.
+/// If there is no such column, or it has another type.
 pub fn integers(path: &Path, batches: &[RecordBatch], column: &str) -> Result<Vec<i64>> {
     let mut numbers = vec![];
     for batch in batches {
         let values = batch.column_by_name(column).and_then(|array| {
             array.as_primitive_opt::<arrow_array::types::Int64Type>().filter(|array| array.null_count() == 0)
         });
-        let values = values.ok_or_else(|| damaged(path, format!("it has no whole numbers '{column}'")))?;
+        let values = values.ok_or_else(|| damaged(path, format!("it has no integer column '{column}'")))?;
         numbers.extend_from_slice(values.values());
     }
     Ok(numbers)
 }
 
-/// Writes a file under a passing name, then gives it its own.
+/// Writes a file atomically.
 ///
 /// # Errors
-/// When the disk refuses.
+/// If writing fails.
 pub fn write(path: &Path, schema: &Arc<ArrowSchema>, batch: &RecordBatch) -> Result<()> {
     let failed = |e: parquet::errors::ParquetError| Error::external(format!("writing {}", path.display()), e);
-    // Readers other than Arrow's look for the schema's metadata here.
+    // Other readers expect the schema's metadata here.
     let metadata = schema.metadata().iter().map(|(key, value)| KeyValue::new(key.clone(), value.clone())).collect();
     let properties =
         WriterProperties::builder().set_compression(Compression::SNAPPY).set_key_value_metadata(Some(metadata)).build();
@@ -85,10 +84,10 @@ pub fn write(path: &Path, schema: &Arc<ArrowSchema>, batch: &RecordBatch) -> Res
     put(path, &bytes)
 }
 
-/// Writes a file beside its place, then moves it there.
+/// Writes a file atomically: to a temporary file that is then renamed.
 ///
 /// # Errors
-/// When the disk refuses.
+/// If writing fails.
 pub fn put(path: &Path, bytes: &[u8]) -> Result<()> {
     let io = |e| Error::io(path, "writing a file of the dataset", e);
     if let Some(folder) = path.parent() {

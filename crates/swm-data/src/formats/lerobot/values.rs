@@ -1,4 +1,4 @@
-//! Between Arrow's arrays and the bytes of our columns.
+//! Conversions between Arrow arrays and the bytes of columns.
 
 use arrow_array::cast::AsArray as _;
 use arrow_array::types::{
@@ -11,10 +11,10 @@ use arrow_schema::{DataType, Field};
 use std::sync::Arc;
 use swm_core::{ColumnSpec, DType, Error, Result};
 
-/// Appends the numbers of an array, `column.len()` of them in every row, as bytes of the column's type.
+/// Appends an array with `column.len()` values per row as bytes of the column's type.
 ///
 /// # Errors
-/// When rows have more or fewer numbers, some are missing, or it holds something else; in words.
+/// If a row has another number of values, values are missing, or they are not numeric.
 pub fn append(array: &dyn Array, column: &ColumnSpec, out: &mut Vec<u8>) -> Result<(), String> {
     let expected = array.len() * column.len();
     let mut leaf: ArrayRef = arrow_array::make_array(array.to_data());
@@ -34,7 +34,7 @@ pub fn append(array: &dyn Array, column: &ColumnSpec, out: &mut Vec<u8>) -> Resu
         };
     }
     if leaf.len() != expected {
-        return Err(format!("it has {} numbers instead of {expected}", leaf.len()));
+        return Err(format!("it has {} values instead of {expected}", leaf.len()));
     }
     match leaf.data_type() {
         DataType::Boolean => {
@@ -56,12 +56,12 @@ pub fn append(array: &dyn Array, column: &ColumnSpec, out: &mut Vec<u8>) -> Resu
             real(leaf.as_primitive::<Float32Type>().values().iter().map(|v| f64::from(*v)), column, out)
         }
         DataType::Float64 => real(leaf.as_primitive::<Float64Type>().values().iter().copied(), column, out),
-        other => return Err(format!("it holds {other}, which are no numbers")),
+        other => return Err(format!("it holds {other}, which is not numeric")),
     }
     Ok(())
 }
 
-/// Damaged files could promise lists that end before they begin.
+/// Checks that all lists have the same length. Damaged files may declare invalid offsets.
 fn check_offsets(offsets: &[i32]) -> Result<(), String> {
     let steady = offsets.windows(2).all(|pair| pair[1] - pair[0] == offsets[1] - offsets[0]);
     if steady { Ok(()) } else { Err("its rows have different lengths".to_owned()) }
@@ -71,7 +71,7 @@ fn whole<T: ArrowPrimitiveType>(leaf: &ArrayRef, column: &ColumnSpec, out: &mut 
 where
     T::Native: ArrowNativeType + TryInto<i64>,
 {
-    // Of unsigned numbers of 64 bits, those below 2^63 keep their value.
+    // Unsigned 64-bit values from 2^63 on are clamped.
     let values = leaf.as_primitive::<T>().values().iter().map(|&v| v.try_into().unwrap_or(i64::MAX));
     put(values, column.dtype, out, |v| v, |v| v as f64);
 }
@@ -97,10 +97,10 @@ fn put<V: Copy>(
     }
 }
 
-/// The array of a column's bytes, and its field.
+/// Converts the bytes of a column to an array with its field.
 ///
 /// # Errors
-/// When a row has more numbers than Arrow counts.
+/// If a row has more values than Arrow supports.
 pub fn array(name: &str, column: &ColumnSpec, bytes: &[u8]) -> Result<(Field, ArrayRef)> {
     let flat: ArrayRef = match column.dtype {
         DType::Bool => Arc::new(BooleanArray::from(bytes.iter().map(|&v| v != 0).collect::<Vec<bool>>())),

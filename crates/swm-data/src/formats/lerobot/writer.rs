@@ -1,6 +1,6 @@
-//! Writing version 3.0. Finished episodes gather until the [`CommitPolicy`](crate::CommitPolicy) says that the group is
-//! due; a group becomes one file of numbers, one video a camera, and one file that describes its episodes. All files
-//! appear complete, `meta/info.json` last: it says how many episodes there are, and commits them.
+//! Writes version 3.0. Finished episodes accumulate until the [`CommitPolicy`](crate::CommitPolicy) requires a commit.
+//! They then become one data file, one video per camera, and one file that describes the episodes. All files are
+//! written atomically; `meta/info.json`, the last, declares the number of episodes and thereby commits them.
 
 use super::features::{FRAMES_PER_SECOND, new_info, stored_columns};
 use super::info::{DATA_PATH, EPISODES_PATH, Info, Recorded, VIDEO_PATH, damaged, fill};
@@ -32,31 +32,31 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
 
 struct LerobotWriter {
     root: PathBuf,
-    /// Locked, so that nobody else writes there.
+    /// Holds the lock of the folder against other writers.
     _lock: std::fs::File,
     options: WriteOptions,
     encoding: Encoding,
     schema: Schema,
     info: Info,
-    /// Each column that is stored, and its feature.
+    /// Indices of the stored columns, with the names of their features.
     columns: Vec<(usize, String)>,
     stats: Vec<Stats>,
     tasks: Vec<String>,
-    /// The number of the next files, counted through all chunks.
+    /// Index of the next files, counted over all chunks.
     file: usize,
     group: Group,
     last_commit: Instant,
-    /// Whether something failed half-way.
+    /// Whether a write failed.
     failed: bool,
 }
 
-/// Episodes that are not committed.
+/// Uncommitted episodes.
 #[derive(Default)]
 struct Group {
     episodes: Vec<PendingEpisode>,
-    /// The bytes of each stored column of numbers.
+    /// The bytes of each numeric column.
     numbers: Vec<Vec<u8>>,
-    /// The video of each stored column of pictures.
+    /// The video encoder of each image column.
     encoders: Vec<Option<Encoder>>,
     rows: usize,
     bytes: usize,
@@ -74,12 +74,12 @@ impl LerobotWriter {
         let columns = stored_columns(schema)?;
         let exists = root.join("meta").join("info.json").is_file();
         if !exists && root.read_dir().is_ok_and(|mut entries| entries.next().is_some()) {
-            let problem = format!("{} holds something else", root.display());
+            let problem = format!("{} holds other files", root.display());
             return Err(Error::config("dataset", problem, "choose another path"));
         }
         if exists && options.mode == WriteMode::Create {
             let problem = format!("{} exists already", root.display());
-            let fix = "choose another path, or say whether to append to it or to overwrite it";
+            let fix = "choose another path, append to it, or overwrite it";
             return Err(Error::config("dataset", problem, fix));
         }
         if exists && options.mode == WriteMode::Overwrite {
@@ -110,11 +110,11 @@ impl LerobotWriter {
         Ok(writer)
     }
 
-    /// Takes over what is there, and removes what an interrupted writer did not commit.
+    /// Loads the state of the existing dataset, and removes uncommitted files of an interrupted writer.
     fn continue_from(&mut self) -> Result<()> {
         let old = LerobotReader::open(&self.root)?;
         let Some(recorded) = old.info.stable_worldmodel.clone() else {
-            let problem = "another program wrote it, and LeRobot's datasets do not say enough to be continued";
+            let problem = "another program wrote it, and its metadata is not sufficient for appending";
             return Err(Error::corrupt(&self.root, problem, "convert it to a new dataset first"));
         };
         episodes::check_appendable(&self.root.display(), &self.schema, old.schema())?;
@@ -134,14 +134,14 @@ impl LerobotWriter {
             for batch in table::read(&path, &[INDEX], None)? {
                 use arrow_array::cast::AsArray as _;
                 let texts = batch.column_by_name(INDEX).and_then(|array| array.as_string_opt::<i32>());
-                let texts = texts.ok_or_else(|| damaged(&path, "it holds no texts".to_owned()))?;
+                let texts = texts.ok_or_else(|| damaged(&path, "it holds no strings".to_owned()))?;
                 self.tasks.extend(texts.iter().flatten().map(str::to_owned));
             }
         }
         self.remove_uncommitted()
     }
 
-    /// Removes files that are numbered higher than those in use.
+    /// Removes files with higher indices than the committed ones.
     fn remove_uncommitted(&self) -> Result<()> {
         let mut todo = vec![self.root.clone()];
         while let Some(folder) = todo.pop() {
@@ -242,7 +242,7 @@ impl LerobotWriter {
         self.describe()
     }
 
-    /// The rows of a group, with the features that LeRobot wants of every dataset.
+    /// The rows of a group, with the features that LeRobot requires of every dataset.
     fn data(&self, episodes: &[PendingEpisode], bytes: &[Vec<u8>]) -> Result<(Arc<ArrowSchema>, RecordBatch)> {
         let (mut fields, mut arrays): (Vec<Field>, Vec<ArrayRef>) = (vec![], vec![]);
         for ((index, native), bytes) in self.columns.iter().zip(bytes) {
@@ -271,7 +271,7 @@ impl LerobotWriter {
         record(fields, arrays)
     }
 
-    /// What describes the episodes of a group.
+    /// The descriptions of a group's episodes.
     fn episodes(&self, episodes: &[PendingEpisode], place: [usize; 2]) -> Result<(Arc<ArrowSchema>, RecordBatch)> {
         let (mut fields, mut arrays): (Vec<Field>, Vec<ArrayRef>) = (vec![], vec![]);
         let mut tasks = ListBuilder::new(StringBuilder::new());
@@ -320,7 +320,7 @@ impl LerobotWriter {
         record(fields, arrays)
     }
 
-    /// Writes what describes the whole dataset; `meta/info.json` commits.
+    /// Writes the files that describe the whole dataset. `meta/info.json` commits.
     fn describe(&mut self) -> Result<()> {
         let meta = self.root.join("meta");
         if self.info.total_episodes > 0 {
@@ -344,7 +344,10 @@ impl LerobotWriter {
 
     fn complete(&mut self) -> Result<()> {
         if std::mem::replace(&mut self.failed, true) {
-            return Err(Error::external("writing an episode", "an earlier commit failed; nothing more is kept"));
+            return Err(Error::external(
+                "writing an episode",
+                "an earlier commit failed; later episodes are not stored",
+            ));
         }
         self.commit()?;
         self.failed = false;
@@ -356,7 +359,10 @@ impl Writer for LerobotWriter {
     fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
         episodes::check_episode(episode, &self.schema)?;
         if std::mem::replace(&mut self.failed, true) {
-            return Err(Error::external("writing an episode", "an earlier commit failed; nothing more is kept"));
+            return Err(Error::external(
+                "writing an episode",
+                "an earlier commit failed; later episodes are not stored",
+            ));
         }
         self.add(episode, constants)?;
         let (group, policy) = (&self.group, &self.options.commit);
@@ -384,15 +390,15 @@ impl Drop for LerobotWriter {
         if !self.failed
             && let Err(error) = self.complete()
         {
-            tracing::error!(dataset = %self.root.display(), "the last episodes are lost: {error}");
+            tracing::error!(dataset = %self.root.display(), "the last episodes could not be stored: {error}");
         }
     }
 }
 
-/// The column of `meta/tasks.parquet` that pandas takes for the index.
+/// The column of `meta/tasks.parquet` that pandas uses as the index.
 const INDEX: &str = "__index_level_0__";
 
-/// What makes pandas take it so.
+/// Metadata that makes pandas use it as the index.
 fn pandas() -> String {
     let column = |name: Value, field: &str, kind: &str, numpy: &str| json!({"name": name, "field_name": field, "pandas_type": kind, "numpy_type": numpy, "metadata": null});
     json!({
@@ -417,7 +423,7 @@ fn record(fields: Vec<Field>, arrays: Vec<ArrayRef>) -> Result<(Arc<ArrowSchema>
     Ok((schema, batch))
 }
 
-/// The last row, which holds no action, repeats the one before; where there is none it is 0.
+/// Copies the previous action into the last row, which has none; 0 if there is no previous row.
 fn repeat_last(bytes: &mut [u8], row: usize) {
     let last = bytes.len() - row;
     match last.checked_sub(row) {
@@ -426,7 +432,7 @@ fn repeat_last(bytes: &mut [u8], row: usize) {
     }
 }
 
-/// The numbers of a column.
+/// The values of a column.
 fn read_values(column: &ColumnSpec, bytes: &[u8]) -> Vec<f64> {
     match column.dtype {
         DType::Bool | DType::U8 => bytes.iter().map(|&v| f64::from(v)).collect(),

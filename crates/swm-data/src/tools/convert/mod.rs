@@ -106,6 +106,7 @@ pub fn checksum(reader: &dyn Reader) -> Result<String> {
 /// # Errors
 /// If the source is damaged, the target cannot be written or differs from the source, or the run is stopped
 /// ([`Error::Interrupted`]).
+#[allow(clippy::too_many_lines, reason = "compare, copy and verify share the report")]
 pub fn convert(
     reader: &Arc<dyn Reader>,
     target: &Location,

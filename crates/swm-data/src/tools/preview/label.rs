@@ -1,9 +1,9 @@
-//! Letters on pictures: small ones, of 3 by 5 points, for numbers of episodes and names of columns.
+//! Draws text on images, with letters of 3 by 5 points, for episode indices and column names.
 
-/// Points across and down.
+/// Width and height of a letter in points.
 const SIZE: (usize, usize) = (3, 5);
 
-/// The rows of a letter, from the top; the bits of a row, from the left.
+/// The rows of a letter from the top; bits from the left.
 fn glyph(letter: char) -> [u8; 5] {
     match letter.to_ascii_lowercase() {
         '0' => [7, 5, 5, 5, 7],
@@ -51,18 +51,18 @@ fn glyph(letter: char) -> [u8; 5] {
     }
 }
 
-/// Pixels that a line of text takes from top to bottom, with points of `scale` pixels.
+/// Height of a line of text in pixels. A point has `scale` pixels.
 pub(super) const fn height(scale: usize) -> usize {
     (SIZE.1 + 2) * scale
 }
 
-/// Pixels that a text takes from left to right.
+/// Width of a text in pixels.
 pub(super) fn width(text: &str, scale: usize) -> usize {
     (text.chars().count() * (SIZE.0 + 1) + 1) * scale
 }
 
-/// Writes a text in white on a picture `wide` pixels wide, its upper left corner at `(left, top)`; what does not fit is
-/// cut off at `right`.
+/// Draws white text on an image that is `wide` pixels wide, with its upper left corner at `(left, top)`. Letters beyond
+/// `right` are omitted.
 pub(super) fn draw(rgb: &mut [u8], wide: usize, (left, top): (usize, usize), right: usize, scale: usize, text: &str) {
     for (i, letter) in text.chars().enumerate() {
         let (x, y) = (left + (i * (SIZE.0 + 1) + 1) * scale, top + scale);

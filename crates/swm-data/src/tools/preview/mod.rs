@@ -1,5 +1,5 @@
-//! What a dataset or a world looks like, for people: videos of sampled episodes and a contact sheet of them, all
-//! cameras side by side and labelled; and the parts they are made of.
+//! Previews for people: videos of sampled episodes and a contact sheet of them, with all cameras side by side and
+//! labelled; and functions to write such videos and sheets.
 
 mod label;
 mod sheet;
@@ -14,14 +14,14 @@ use std::path::{Path, PathBuf};
 use swm_core::{Batch, ColumnSpec, Error, Result};
 use swm_image::write_png;
 
-/// What to show of a dataset.
+/// Settings of a preview.
 #[derive(Clone, Debug)]
 pub struct PreviewOptions {
-    /// How many episodes, spread over the dataset.
+    /// Number of episodes, spread over the dataset.
     pub episodes: usize,
-    /// The columns of pictures; all of them when there is none.
+    /// The image columns to show; all if empty.
     pub columns: Vec<String>,
-    /// Frames in a second of video.
+    /// Frames per second.
     pub fps: u32,
 }
 
@@ -34,17 +34,17 @@ impl Default for PreviewOptions {
 /// Frames of an episode on the contact sheet.
 const SHEET_COLUMNS: usize = 8;
 
-/// The side small pictures are enlarged towards, in pixels.
+/// Target side of enlarged images, in pixels.
 const WATCHABLE: usize = 256;
 
-/// Rows that are decoded at a time, which bounds the memory.
+/// Rows decoded at once, which bounds the memory.
 const ROWS: usize = 32;
 
-/// Writes `episode_N.mp4` for some episodes and `contact_sheet.png` of all of these into a folder, and returns their
-/// paths. `progress` is told how many episodes are done.
+/// Writes `episode_N.mp4` for some episodes and `contact_sheet.png` of all of them into a folder, and returns the
+/// paths. Calls `progress` with the number of finished episodes.
 ///
 /// # Errors
-/// When the dataset has no pictures or no such column, is damaged, or the folder cannot be written.
+/// If the dataset has no images or no such column, is damaged, or the folder cannot be written.
 pub fn preview(
     reader: &dyn Reader,
     folder: &Path,
@@ -67,25 +67,25 @@ pub fn preview(
             let rows = ROWS.min(length - start);
             let batch = reader.read(&strip.names(), &[StepRange::new(episode, start, rows)])?;
             for row in 0..rows {
-                let picture = strip.draw(&batch, row, &format!("episode {index} step {}", start + row));
-                video.add(&picture)?;
-                // A short episode shows a frame more than once.
+                let image = strip.draw(&batch, row, &format!("episode {index} step {}", start + row));
+                video.add(&image)?;
+                // Short episodes repeat frames on the sheet.
                 let times = on_sheet.iter().filter(|&&step| step == start + row).count();
-                sheet.extend(std::iter::repeat_n(picture, times));
+                sheet.extend(std::iter::repeat_n(image, times));
             }
         }
         video.finish()?;
         written.push(path);
         progress(done + 1);
     }
-    let picture = contact_sheet(strip.width, strip.height, &sheet, SHEET_COLUMNS, 1)?;
+    let image = contact_sheet(strip.width, strip.height, &sheet, SHEET_COLUMNS, 1)?;
     let path = folder.join("contact_sheet.png");
-    write_png(&path, picture.width, picture.height, &picture.rgb)?;
+    write_png(&path, image.width, image.height, &image.rgb)?;
     written.push(path);
     Ok(written)
 }
 
-/// Positions of episodes spread over the dataset.
+/// Positions of episodes spread evenly over the dataset.
 fn chosen(reader: &dyn Reader, count: usize) -> Result<Vec<usize>> {
     let all: Vec<usize> = (0..reader.episodes().len()).filter(|&i| reader.episodes()[i].length > 0).collect();
     let count = count.min(all.len());
@@ -95,12 +95,12 @@ fn chosen(reader: &dyn Reader, count: usize) -> Result<Vec<usize>> {
     Ok((0..count).map(|i| all[i * all.len() / count]).collect())
 }
 
-/// The cameras of a row side by side, below a line of text each.
+/// Layout of a row: cameras side by side below their labels.
 struct Strip {
     cameras: Vec<ColumnSpec>,
     width: usize,
     height: usize,
-    /// Pixels of a letter's point.
+    /// Size of a letter's point in pixels.
     point: usize,
 }
 
@@ -119,17 +119,17 @@ impl Strip {
             return Err(Error::mismatch(
                 format!("previewing column '{}'", column.name),
                 format!("{} {:?}", column.dtype.name(), column.shape),
-                "pictures: uint8 [height, width, 3]",
+                "images: uint8 [height, width, 3]",
             ));
         }
         let tallest = cameras.iter().map(|camera| camera.shape[0]).max();
         let Some(tallest) = tallest else {
-            return Err(Error::config("preview", "the dataset has no pictures", "collect it with a picture size"));
+            return Err(Error::config("preview", "the dataset has no images", "collect it with an image size"));
         };
         let point = (tallest / 112).max(1);
         let lines = 1 + usize::from(cameras.len() > 1);
         let wide: usize = cameras.iter().map(|camera| camera.shape[1]).sum::<usize>() + GAP * (cameras.len() - 1);
-        // The first line must fit, however small the pictures are.
+        // The title must fit, even if images are small.
         let width = wide.max(label::width("episode 0000 step 0000", point));
         Ok(Self { width, height: tallest + lines * label::height(point), point, cameras })
     }
@@ -148,8 +148,8 @@ impl Strip {
             if self.cameras.len() > 1 {
                 label::draw(&mut rgb, self.width, (left, line), left + width, self.point, &camera.name);
             }
-            let picture = &batch.bytes(index)[row * camera.row_bytes()..][..camera.row_bytes()];
-            for (y, pixels) in picture.chunks_exact(width * 3).enumerate() {
+            let image = &batch.bytes(index)[row * camera.row_bytes()..][..camera.row_bytes()];
+            for (y, pixels) in image.chunks_exact(width * 3).enumerate() {
                 let at = ((top + y) * self.width + left) * 3;
                 rgb[at..at + pixels.len()].copy_from_slice(pixels);
             }

@@ -3,16 +3,16 @@
 use swm_core::{Error, Result};
 use swm_image::RgbImage;
 
-/// Pixels between the frames of a contact sheet and around them.
+/// Pixels between and around the frames of a contact sheet.
 const GAP: usize = 2;
-/// The grey between the frames: neither the white nor the black that worlds are drawn on.
+/// Grey level between frames; environments are drawn on white or black.
 const BACKGROUND: u8 = 128;
 
-/// Lays out `frames` (each `height * width * 3` bytes, RGB) in a grid of `columns`, in reading order, every
-/// pixel drawn as a square of `scale` by `scale`.
+/// Arranges `frames` (each `[height, width, 3]` RGB bytes) in a grid with `columns` columns, in reading order. Every
+/// pixel becomes a square with side `scale`.
 ///
 /// # Errors
-/// When there is no frame, a frame has another size, or `columns`, `scale` or a side is 0.
+/// If there is no frame, a frame has another size, or `columns`, `scale` or a side is 0.
 pub fn contact_sheet<F: AsRef<[u8]>>(
     width: usize,
     height: usize,

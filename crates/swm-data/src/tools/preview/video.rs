@@ -1,16 +1,16 @@
-//! Videos for people to watch: H.264 in MP4, as browsers play it.
+//! Videos for people: H.264 in MP4, which browsers play.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Result};
 
-/// Writes `frames` (each `height * width * 3` bytes, RGB, row after row) as an MP4 that browsers play.
-/// Odd sizes gain a black row or column, which H.264's halved colour planes need. The file appears under its
-/// name only when complete. Equal frames give equal bytes with the same FFmpeg.
+/// Writes `frames` (each `[height, width, 3]` RGB bytes) as an MP4 that browsers play. Odd sizes get an additional
+/// black row or column, because H.264 halves the colour planes. The file is written atomically. Equal frames give equal
+/// bytes with the same FFmpeg version.
 ///
 /// # Errors
-/// When this build has no videos, FFmpeg has no H.264 encoder, a frame has another size, there is no frame, or the disk
-/// refuses.
+/// If this build lacks the feature `ffmpeg`, FFmpeg has no H.264 encoder, a frame has another size, there is no frame,
+/// or writing fails.
 pub fn write_mp4<I>(path: &Path, width: usize, height: usize, fps: u32, frames: I) -> Result<()>
 where
     I: IntoIterator,
@@ -19,11 +19,11 @@ where
     write_mp4_scaled(path, width, height, fps, 1, frames)
 }
 
-/// As [`write_mp4`], every pixel drawn as a square of `scale` by `scale`, so that a 64-pixel world is
-/// watchable and its pixels stay crisp.
+/// As [`write_mp4`], with every pixel enlarged to a square with side `scale`, so that small frames are visible and stay
+/// sharp.
 ///
 /// # Errors
-/// As [`write_mp4`], and when `scale` is 0.
+/// As [`write_mp4`], and if `scale` is 0.
 pub fn write_mp4_scaled<I>(path: &Path, width: usize, height: usize, fps: u32, scale: usize, frames: I) -> Result<()>
 where
     I: IntoIterator,
@@ -36,25 +36,25 @@ where
     video.finish()
 }
 
-/// The factor that brings a picture's longer side nearest to, but not over, `target` pixels; at least 1.
+/// The integer factor that enlarges an image's longer side to at most `target` pixels; at least 1.
 pub fn integer_scale(width: usize, height: usize, target: usize) -> usize {
     (target / width.max(height).max(1)).max(1)
 }
 
-/// A video that is being written, frame by frame.
+/// A video file that is being written.
 pub(crate) struct VideoFile {
     path: PathBuf,
     width: usize,
     height: usize,
     scale: usize,
     frames: i64,
-    /// The enlarged frame, of even sides.
+    /// The enlarged frame, with even sides.
     large: Vec<u8>,
     inner: encoder::Encoder,
 }
 
 impl VideoFile {
-    /// A video of frames of `width * scale` by `height * scale` pixels.
+    /// Starts a video with frames of `width * scale` by `height * scale` pixels.
     pub fn begin(path: &Path, width: usize, height: usize, fps: u32, scale: usize) -> Result<Self> {
         if width == 0 || height == 0 || fps == 0 || scale == 0 {
             return Err(Error::config(
@@ -75,7 +75,7 @@ impl VideoFile {
         })
     }
 
-    /// Adds a frame, `height * width * 3` bytes.
+    /// Adds a frame, `[height, width, 3]` RGB bytes.
     pub fn add(&mut self, rgb: &[u8]) -> Result<()> {
         let (width, height, scale) = (self.width, self.height, self.scale);
         if rgb.len() != width * height * 3 {
@@ -97,7 +97,7 @@ impl VideoFile {
         Ok(())
     }
 
-    /// Completes the file and gives it its name.
+    /// Completes the file.
     pub fn finish(self) -> Result<()> {
         if self.frames == 0 {
             let what = format!("video {}", self.path.display());
@@ -108,14 +108,14 @@ impl VideoFile {
             let problem = format!("'{}' names no file", self.path.display());
             return Err(Error::config("video path", problem, "end it in .mp4"));
         };
-        // Two processes that write the same video must not share it.
+        // The process id separates processes that write the same video.
         let mut hidden = OsString::from(".");
         hidden.push(name);
         hidden.push(format!(".{}.partial", std::process::id()));
         let passing = self.path.with_file_name(hidden);
         let written = std::fs::write(&passing, bytes).and_then(|()| std::fs::rename(&passing, &self.path));
         written.map_err(|source| {
-            // Where it was not even created there is nothing to remove.
+            // Removing fails if the file was never created.
             let _ = std::fs::remove_file(&passing);
             Error::io(&self.path, "writing the video", source)
         })
@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn every_frame_is_there_and_equal_frames_give_equal_bytes() {
+    fn writes_all_frames_reproducibly() {
         let folder = tempfile::tempdir().expect("folder");
         let [a, b] = ["a.mp4", "b: 2.mp4"].map(|name| folder.path().join(name));
         let twice = |width, height| {
@@ -209,7 +209,7 @@ mod tests {
     }
 
     #[test]
-    fn failures_say_why_and_leave_nothing() {
+    fn failed_writes_leave_no_files() {
         let folder = tempfile::tempdir().expect("folder");
         let path = folder.path().join("a.mp4");
         let message = |scale, frames: &[Vec<u8>]| {
@@ -227,7 +227,7 @@ mod tests {
     }
 
     #[test]
-    fn small_worlds_are_enlarged_by_whole_factors() {
+    fn integer_scale_enlarges_small_frames() {
         assert_eq!(
             [(64, 64, 256), (224, 224, 256), (512, 64, 256), (60, 30, 256)].map(|(w, h, t)| integer_scale(w, h, t)),
             [4, 1, 1, 4]

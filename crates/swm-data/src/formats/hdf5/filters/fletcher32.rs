@@ -30,8 +30,7 @@ pub fn sum(bytes: &[u8]) -> u32 {
     // HDF5 folds carries instead of dividing, so the result is the modulus instead of 0, unless all words are 0.
     let fold = |sum: u64, any: bool| if sum == 0 && any { MODULUS } else { sum };
     let any = bytes.iter().any(|&byte| byte != 0);
-    let folded = (fold(weighted, any) << 16 | fold(plain, any)) as u32;
-    folded
+    (fold(weighted, any) << 16 | fold(plain, any)) as u32
 }
 
 /// Verifies the checksum at the end of `bytes`, and returns the length of the data.

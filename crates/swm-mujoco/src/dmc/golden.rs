@@ -13,7 +13,7 @@ use crate::task::Task as _;
 use std::path::Path;
 use std::sync::Arc;
 use swm_conformance::golden::{self, Golden};
-use swm_core::{Batch, ColumnSpec, DType, EnvChoice, Key, Registry, Schema};
+use swm_core::{Batch, ColumnSpec, DType, EnvChoice, Key, Registry, Schema, columns};
 
 /// The largest allowed difference of values.
 const TOLERANCE: f64 = 1e-6;
@@ -129,11 +129,12 @@ fn replay_one<D: Domain>(file: &Path) -> Worst {
 
     // The columns as in an environment: two of its own, then the task's.
     let own = [ColumnSpec::new("state", DType::Float64, [1]), ColumnSpec::new("unstable", DType::Bool, [])];
-    let columns: Vec<ColumnSpec> = own.into_iter().chain(spec.columns.clone()).collect();
-    let row = Batch::zeros(&Schema::new(columns).expect("columns"), 1);
+    let specs: Vec<ColumnSpec> = own.into_iter().chain(spec.columns.clone()).collect();
+    let row = Batch::zeros(&Schema::new(specs).expect("columns"), 1);
     let mut replay = Replay { physics, task, scene: None, row };
 
-    let (actions, rewards, ends) = (golden.values("action"), golden.values("reward"), golden.values("terminated"));
+    let (actions, rewards, ends) =
+        (golden.values("action"), golden.values("reward"), golden.values(columns::TERMINATED));
     let (states, observations) = (golden.values("qpos_qvel"), golden.values("obs"));
     let infos: Vec<(&str, Vec<f64>)> =
         D::INFO.iter().map(|info| (info.name, golden.values(&format!("info.{}", info.name)))).collect();

@@ -2,6 +2,7 @@
 mod arm;
 mod floor;
 mod maze;
+mod options;
 mod table;
 
 use mujoco_rs::wrappers::MjModel;

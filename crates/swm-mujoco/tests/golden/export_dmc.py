@@ -1,12 +1,12 @@
-"""Records rollouts of the reference's DeepMind Control worlds, for `src/dmc/golden.rs`.
+"""Records rollouts of the reference's DeepMind Control environments for `src/dmc/golden.rs`.
 
     python export_dmc.py OUT [--seeds 1 2 3] [--steps 40] [--tasks hop walk …] [--domains Hopper …] [--no-frames]
 
 Needs `stable-worldmodel` 0.1.1 with `mujoco` 3.17.0 and `dm_control` 1.0.50. The layout is that of the shared golden files;
-beside it, a file says which task was played (`task`) and where its target was (`start.target`).
+each file also contains the name of the task (`task`) and the position of its target (`start.target`).
 
-The reference's worlds have their own tasks, and those of the suite that it offers. Tasks of the suite that it does not offer are
-put into its worlds here: same factors, same action repeat.
+The reference's environments have their own tasks and some of the suite's. The suite's other tasks are added to its environments
+here, with the same factors and the same action repeat.
 """
 
 import argparse
@@ -18,7 +18,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 
 import gymnasium as gym
 import numpy as np
-import stable_worldmodel  # noqa: F401  registers the worlds
+import stable_worldmodel  # noqa: F401  registers the environments
 from dm_control import mjcf
 from dm_control.suite import acrobot, cartpole, humanoid, manipulator, quadruped
 
@@ -37,7 +37,7 @@ TASKS = {
     "Reacher": ["hard", "easy", "qpos_match"],
     "Walker": ["walk", "stand", "run", "walk-backward", "arabesque", "lie_down", "legs_up", "flip"],
 }
-# Tasks of the suite that the reference's worlds lack.
+# Tasks of the suite that the reference's environments lack.
 ADDED = {
     ("Acrobot", "swingup"): lambda: acrobot.Balance(sparse=False),
     ("Cartpole", "swingup"): lambda: cartpole.Balance(swing_up=True, sparse=False),
@@ -49,19 +49,19 @@ ADDED = {
     ("Manipulator", "insert_peg"): lambda: manipulator.Bring(use_peg=True, insert=True, fully_observable=True),
     ("Quadruped", "fetch"): lambda: quadruped.Fetch(),
 }
-# Worlds of the reference that take no task: theirs is the first one above.
+# Environments of the reference without a `task` argument: their task is the first one above.
 ALONE = ["Acrobot", "BallInCup", "Cartpole", "Manipulator", "Pendulum"]
 START = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart", "eq_active", "time")
 
 
-def numbers(value):
+def to_lists(value):
     if isinstance(value, dict):
-        return {key: numbers(inner) for key, inner in value.items()}
+        return {key: to_lists(inner) for key, inner in value.items()}
     return np.asarray(value).tolist()
 
 
 def own_model(domain, task):
-    """The model of a task that needs another one than the reference's."""
+    """The model of a task that cannot use the reference's model."""
     if domain == "Manipulator":
         xml, assets = manipulator.make_model(use_peg="peg" in task, insert="insert" in task)
     else:
@@ -84,7 +84,7 @@ def make(domain, task):
     if task in ("bring_peg", "insert_ball", "insert_peg", "fetch"):
         env._mjcf_model = own_model(domain, task)
         if "peg" in task:
-            # The reference edits the ball's target, which is not there: the peg's stands in for it, unchanged.
+            # The reference edits the ball's target, which this model lacks: a dummy receives the edit.
             edit = env.modify_mjcf_model
 
             class WithBall:
@@ -139,7 +139,7 @@ def record(domain, task, varied, seed, steps, frames):
     out |= {key: np.array(value, dtype=np.float64) for key, value in rows.items()}
     out |= {f"info.{key}": np.array(value, dtype=np.float64) for key, value in infos.items()}
     out |= {"action": np.array(actions), "reward": np.array(rewards, dtype=np.float64), "terminated": np.array(ends)}
-    out["variation"] = np.array(json.dumps(numbers(env.variation_space.value)))
+    out["variation"] = np.array(json.dumps(to_lists(env.variation_space.value)))
     out["task"] = np.array(task)
     env.close()
     return out

@@ -1,9 +1,9 @@
-"""Records rollouts of the reference's Fetch worlds, in the layout of the shared golden files.
+"""Records rollouts of the reference's Fetch environments in the layout of the shared golden files.
 
     python export_fetch.py FOLDER [SEED ...] [--steps N] [--factors KEY,KEY] [--no-frames]
 
-Needs stable-worldmodel, gymnasium-robotics 1.4.2 and mujoco 3.3.2. `--factors` names factors one by one: asked for `all`, the
-reference samples every factor but applies none except `block.mass`.
+Needs stable-worldmodel, gymnasium-robotics 1.4.2 and mujoco 3.3.2. `--factors` lists factors by name: for `all`, the
+reference samples every factor but applies only `block.mass`.
 """
 
 import argparse
@@ -33,7 +33,7 @@ def leaves(space, prefix=""):
 
 def record(task, seed, steps, wanted, frames):
     env = gym.make(f"swm/{task}", render_mode="rgb_array" if frames else None)
-    world, data = env.unwrapped, env.unwrapped.data
+    data = env.unwrapped.data
     space = env.get_wrapper_attr("variation_space")
     options = None if wanted is None else {"variation": list(leaves(space)) if wanted == ["each"] else wanted}
     obs, info = env.reset(seed=seed, options=options)
@@ -45,7 +45,7 @@ def record(task, seed, steps, wanted, frames):
     pose = lambda: np.concatenate([data.qpos, data.qvel])
     rows = {"obs": [obs], "qpos_qvel": [pose()], "action": [], "reward": [], "terminated": []}
     infos = {key: [np.array(info[key])] for key in ["proprio", "state", "goal_state"]}
-    pictures = {"frame_first": env.render()} if frames else {}
+    images = {"frame_first": env.render()} if frames else {}
     draw = np.random.default_rng(seed)
     for _ in range(steps):
         action = draw.uniform(-1, 1, 4).astype(np.float32)
@@ -56,12 +56,12 @@ def record(task, seed, steps, wanted, frames):
         for key, values in infos.items():
             values.append(np.array(info[key]))
     if frames:
-        pictures["frame_last"] = env.render()
+        images["frame_last"] = env.render()
     return {
         **{key: np.array(values) for key, values in rows.items()},
         **{f"info.{key}": np.array(values) for key, values in infos.items()},
         **{f"start.{key}": value for key, value in start.items()},
-        **pictures,
+        **images,
         "variation": np.array(json.dumps(factors(space))),
     }
 

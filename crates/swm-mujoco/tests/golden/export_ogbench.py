@@ -1,9 +1,9 @@
-"""Records rollouts of the reference's OGBench worlds, for `tests/it/golden.rs`.
+"""Records rollouts of the reference's OGBench environments for `tests/it/golden.rs`.
 
-    python export_ogbench.py OUT [--worlds cube scene maze] [--seeds 1 2] [--steps 40] [--no-frames]
+    python export_ogbench.py OUT [--envs cube scene maze] [--seeds 1 2] [--steps 40] [--no-frames]
 
 Needs `stable-worldmodel` 0.1.1 with `mujoco` 3.17.0, `dm_control` 1.0.50 and `ogbench` 1.2.2. The layout is that of the shared
-golden files; options stand in the name (`swm_OGBCube-v0,env_type=double-all-1.npz`), and of mazes the goal is recorded too
+golden files; options are part of the name (`swm_OGBCube-v0,env_type=double-all-1.npz`), and files of mazes contain the goal
 (`goal.xy`). Actions of odd seeds are random, those of even seeds are held for eight steps.
 """
 
@@ -15,7 +15,7 @@ os.environ.setdefault("MUJOCO_GL", "egl")
 
 import gymnasium as gym
 import numpy as np
-import stable_worldmodel  # noqa: F401  registers the worlds
+import stable_worldmodel  # noqa: F401  registers the environments
 
 CUBES = [dict(env_type=kind) for kind in ("single", "double", "triple", "quadruple", "octuple")]
 MAZES = [
@@ -23,7 +23,7 @@ MAZES = [
     for agent in ("point", "ant")
     for maze in ("arena", "medium", "large", "giant", "teleport")
 ]
-WORLDS = {"cube": ("swm/OGBCube-v0", CUBES), "scene": ("swm/OGBScene-v0", [{}]), "maze": ("swm/OGBMaze-v0", MAZES)}
+ENVS = {"cube": ("swm/OGBCube-v0", CUBES), "scene": ("swm/OGBScene-v0", [{}]), "maze": ("swm/OGBMaze-v0", MAZES)}
 
 
 def values(space):
@@ -48,14 +48,14 @@ def start(model, data):
     return {f"start.{name}": np.array(part, np.float64) for name, part in parts.items()}
 
 
-def record(world, options, varied, seed, steps, frames):
+def record(env_id, options, varied, seed, steps, frames):
     np.random.seed(seed)
-    env = gym.make(world, disable_env_checker=True, **options)
+    env = gym.make(env_id, disable_env_checker=True, **options)
     observation, info = env.reset(seed=seed, options={"variation": ["all"]} if varied else {})
     inner = env.unwrapped
     model, data = inner.model, inner.data
     arrays = start(model, data) | {"variation": np.array(factors(env))}
-    if "Maze" in world:
+    if "Maze" in env_id:
         arrays["goal.xy"] = np.array(inner.cur_goal_xy, np.float64)
     if frames:
         arrays["frame_first"] = env.render()
@@ -84,18 +84,18 @@ def record(world, options, varied, seed, steps, frames):
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("out")
-    parser.add_argument("--worlds", nargs="+", default=list(WORLDS))
+    parser.add_argument("--envs", nargs="+", default=list(ENVS))
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2])
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--no-frames", action="store_true")
     asked = parser.parse_args()
     os.makedirs(asked.out, exist_ok=True)
-    for world, options in ((WORLDS[name][0], options) for name in asked.worlds for options in WORLDS[name][1]):
+    for env_id, options in ((ENVS[name][0], options) for name in asked.envs for options in ENVS[name][1]):
         for varied in (False, True):
             for seed in asked.seeds:
-                name = "".join([world.replace("/", "_")] + [f",{key}={value}" for key, value in options.items()])
+                name = "".join([env_id.replace("/", "_")] + [f",{key}={value}" for key, value in options.items()])
                 file = f"{name}-{'all' if varied else 'default'}-{seed}.npz"
-                arrays = record(world, options, varied, seed, asked.steps, not asked.no_frames)
+                arrays = record(env_id, options, varied, seed, asked.steps, not asked.no_frames)
                 np.savez_compressed(os.path.join(asked.out, file), **arrays)
                 print(file)
 

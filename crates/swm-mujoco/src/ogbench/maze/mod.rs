@@ -10,6 +10,7 @@ pub use expert::EXPERTS;
 
 use crate::env::MujocoEnv;
 use crate::ogbench::floor;
+use crate::ogbench::options::{PIXELS, TERMINATE_AT_GOAL};
 use crate::physics::{self, shared_model};
 use agent::Agent;
 use map::{MAPS, Map};
@@ -29,18 +30,14 @@ pub const OPTIONS: &[EnvOption] = &[
     EnvOption {
         key: "ob_type",
         summary: "states: frames show the goal; pixels: frames hide it, and the floor may encode the position",
-        values: &["states", "pixels"],
+        values: &["states", PIXELS],
     },
     EnvOption {
         key: "reward_task_id",
         summary: "a fixed task (0: the default one) with reward -1 until success; none: a random task",
         values: &["none", "0", "1", "2", "3", "4", "5"],
     },
-    EnvOption {
-        key: "terminate_at_goal",
-        summary: "whether an episode terminates at its goal",
-        values: &["true", "false"],
-    },
+    TERMINATE_AT_GOAL,
     EnvOption {
         key: "add_noise_to_goal",
         summary: "whether goals differ from the centres of cells",
@@ -56,7 +53,7 @@ pub fn make(choice: &EnvChoice) -> Result<Box<dyn Env>> {
     let chosen = |key| choice.choices.get(key);
     let agent = if chosen("loco_env_type") == "ant" { Agent::Ant } else { Agent::Point };
     let map = MAPS.iter().find(|map| map.name == chosen("maze_type")).unwrap_or(&MAPS[0]);
-    let pixels = chosen("ob_type") == "pixels";
+    let pixels = chosen("ob_type") == PIXELS;
     let fixed_task = match chosen("reward_task_id").parse::<usize>() {
         Err(_) => None,
         Ok(task) if task <= map.tasks.len() => Some(task.max(1) - 1),

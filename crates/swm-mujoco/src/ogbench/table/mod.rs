@@ -15,6 +15,7 @@ pub use expert::EXPERTS;
 
 use super::arm::ACTION;
 use crate::env::MujocoEnv;
+use crate::ogbench::options::{PIXELS, TERMINATE_AT_GOAL};
 use crate::physics::shared_model;
 use arena::ArmRendering;
 use config::{CUBES, SCENE, TableConfig, observation_len};
@@ -42,18 +43,14 @@ macro_rules! options {
             EnvOption {
                 key: "ob_type",
                 summary: "states: the arm is opaque; pixels: it is transparent and does not hide the cubes",
-                values: &["states", "pixels"],
+                values: &["states", PIXELS],
             },
             EnvOption {
                 key: "permute_blocks",
                 summary: "whether the cubes of a task are shuffled",
                 values: &["true", "false"],
             },
-            EnvOption {
-                key: "terminate_at_goal",
-                summary: "whether an episode terminates at its goal",
-                values: &["true", "false"],
-            },
+            TERMINATE_AT_GOAL,
             EnvOption {
                 key: "multiview",
                 summary: "whether the camera at the side varies too",
@@ -106,7 +103,7 @@ pub fn models() -> impl Iterator<Item = (String, Result<Arc<MjModel>>)> {
 
 fn make(config: &'static TableConfig, choice: &EnvChoice) -> Result<Box<dyn Env>> {
     let chosen = |key| choice.choices.get(key);
-    let arm_rendering = if chosen("ob_type") == "pixels" { ArmRendering::Transparent } else { ArmRendering::Opaque };
+    let arm_rendering = if chosen("ob_type") == PIXELS { ArmRendering::Transparent } else { ArmRendering::Opaque };
     let model = model(config, arm_rendering)?;
     let mode = match (chosen("mode"), chosen("reward_task_id").parse()) {
         ("data_collection", _) => Mode::DataCollection,

@@ -25,7 +25,7 @@ const IN_CLOSED_DRAWER: Vec3 = [0.33, -0.356, 0.065986];
 const P_STACK: f64 = 0.5;
 /// Probability that a goal puts the cube into the drawer.
 const P_DRAWER: f64 = 0.3;
-/// Weight of a locked drawer or window among the subjects of `mode=data_collection`; the weight of others is 1.
+/// Weight of a locked drawer or window among the subjects of `mode=data_collection`; all other weights are 1.
 const LOCKED_WEIGHT: f64 = 0.25;
 /// Probability that a sampled goal stacks a cube.
 const P_GOAL_STACK: f64 = 0.3;

@@ -39,13 +39,13 @@ pub(super) fn fill(scene: &mut Scene, from: &mjvScene, model: &MjModel, (width, 
     scene.geoms.extend(geoms.iter().filter_map(|from| geom(from, model)));
 }
 
-/// The camera midway between MuJoCo's two eyes, with the aspect ratio of the frame.
-fn camera(eyes: &[mjvGLCamera; 2], width: usize, height: usize) -> Camera {
+/// The camera midway between MuJoCo's stereo pair, with the aspect ratio of the frame.
+fn camera(pair: &[mjvGLCamera; 2], width: usize, height: usize) -> Camera {
     let mean = |of: fn(&mjvGLCamera) -> V3| -> V3 {
-        let [a, b] = [of(&eyes[0]), of(&eyes[1])];
+        let [a, b] = [of(&pair[0]), of(&pair[1])];
         std::array::from_fn(|k| 0.5 * (a[k] + b[k]))
     };
-    let middle = |of: fn(&mjvGLCamera) -> f32| 0.5 * (of(&eyes[0]) + of(&eyes[1]));
+    let middle = |of: fn(&mjvGLCamera) -> f32| 0.5 * (of(&pair[0]) + of(&pair[1]));
     let unit = |a: V3| {
         let length = a.iter().map(|x| x * x).sum::<f32>().sqrt();
         a.map(|x| x / length)
@@ -65,7 +65,7 @@ fn camera(eyes: &[mjvGLCamera; 2], width: usize, height: usize) -> Camera {
         frustum: [centre - half, centre + half, bottom, top],
         near: middle(|eye| eye.frustum_near),
         far: middle(|eye| eye.frustum_far),
-        orthographic: eyes[0].orthographic != 0,
+        orthographic: pair[0].orthographic != 0,
     }
 }
 

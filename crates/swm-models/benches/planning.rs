@@ -1,6 +1,7 @@
-//! One CEM iteration of a LeWM of the published size (300 candidates of 5 model steps, one environment): the
-//! rollout that plans with, beside the model's own on the same threads. Prints milliseconds and the ratio.
-#![allow(clippy::print_stdout)]
+//! Times one iteration of the cross-entropy method in a LeWM of the published size (300 candidates of 5 model steps, one
+//! environment): the CPU rollout of planning against the model's own rollout, on the same threads. Prints milliseconds and the
+//! ratio.
+#![allow(clippy::print_stdout, reason = "a benchmark prints its result")]
 
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
@@ -11,13 +12,13 @@ use swm_models::lewm::{Lewm, Rollout};
 
 const SAMPLES: usize = 300;
 const HORIZON: usize = 5;
-const NUMBERS: usize = 10;
+const ACTION_DIM: usize = 10;
 const ROUNDS: usize = 5;
 
 fn milliseconds(work: impl FnOnce()) -> f64 {
-    let begun = Instant::now();
+    let start = Instant::now();
     work();
-    begun.elapsed().as_secs_f64() * 1e3
+    start.elapsed().as_secs_f64() * 1e3
 }
 
 fn median(mut times: Vec<f64>) -> f64 {
@@ -28,26 +29,26 @@ fn median(mut times: Vec<f64>) -> f64 {
 fn main() {
     let config = TrainConfig::<Lewm>::load("paper", &[]).expect("a preset");
     let latent = config.model.latent;
-    let model = Lewm::init(&config.model, NUMBERS, Key::new(0), &Device::flex());
+    let model = Lewm::init(&config.model, ACTION_DIM, Key::new(0), &Device::flex());
     let rollout = Rollout::new(&model);
     let start = vec![0.1; latent];
-    let actions: Vec<f32> = (0..SAMPLES * HORIZON * NUMBERS).map(|i| (i * 37 % 101) as f32 / 101.0 - 0.5).collect();
-    let chunks = || actions.par_chunks(Rollout::part(SAMPLES) * HORIZON * NUMBERS);
+    let actions: Vec<f32> = (0..SAMPLES * HORIZON * ACTION_DIM).map(|i| (i * 37 % 101) as f32 / 101.0 - 0.5).collect();
+    let chunks = || actions.par_chunks(Rollout::part(SAMPLES) * HORIZON * ACTION_DIM);
     let (mut fast, mut plain) = (vec![], vec![]);
     for _ in 0..ROUNDS {
         fast.push(milliseconds(|| {
             chunks().for_each(|chunk| {
-                let samples = chunk.len() / (HORIZON * NUMBERS);
+                let samples = chunk.len() / (HORIZON * ACTION_DIM);
                 assert_eq!(rollout.run(&start, chunk, samples, HORIZON).len(), HORIZON + 1);
             });
         }));
         plain.push(milliseconds(|| {
             chunks().for_each(|chunk| {
-                let samples = chunk.len() / (HORIZON * NUMBERS);
+                let samples = chunk.len() / (HORIZON * ACTION_DIM);
                 let tensor = |values: Vec<f32>, shape: [usize; 3]| {
                     Tensor::<3>::from_data(TensorData::new(values, shape), &Device::flex())
                 };
-                let actions = tensor(chunk.to_vec(), [samples, HORIZON, NUMBERS]);
+                let actions = tensor(chunk.to_vec(), [samples, HORIZON, ACTION_DIM]);
                 let latents = model.rollout(tensor(start.repeat(samples), [samples, 1, latent]), actions);
                 assert_eq!(latents.dims(), [samples, HORIZON + 1, latent]);
             });

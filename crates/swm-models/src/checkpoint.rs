@@ -160,7 +160,7 @@ pub fn family(run: &Path) -> Option<String> {
     Some(file.get("family")?.as_str()?.to_owned())
 }
 
-/// The files of a checkpoint beside its weights, of any family.
+/// The files of a checkpoint other than its weights, of any family.
 pub(crate) struct StoredCheckpoint<C> {
     /// The checkpoint's folder.
     pub folder: PathBuf,

@@ -3,7 +3,7 @@
 use super::{DinoWm, DinoWmCost, import};
 use crate::checkpoint::Checkpoint;
 use crate::family::{FamilyEntry, ModelFamily};
-use crate::nn::kernels::host;
+use crate::nn::parameters::host;
 use crate::probe::ImageEncoder;
 use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::Naming;

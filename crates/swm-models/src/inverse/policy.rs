@@ -3,7 +3,7 @@
 use super::InverseCheckpoint;
 use crate::feed_forward::{ActionNetwork, FeedForwardPolicy};
 use crate::lewm::{encode, pixels};
-use crate::nn::kernels::host;
+use crate::nn::parameters::host;
 use burn::tensor::{Device, Tensor, TensorData};
 use swm_core::{Result, RowRef, Schema};
 use swm_plan::ActionScale;

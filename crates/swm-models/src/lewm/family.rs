@@ -4,7 +4,7 @@ use super::predictor::LewmPredictor;
 use super::{Lewm, LewmConfig, LewmCost, import, pixels};
 use crate::checkpoint::Checkpoint;
 use crate::family::{FamilyEntry, ModelFamily};
-use crate::nn::kernels::host;
+use crate::nn::parameters::host;
 use crate::probe::ImageEncoder;
 use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::Naming;

@@ -1,7 +1,7 @@
 //! [`LewmPredictor`]: predictions of a LeWM for comparison with recorded trajectories.
 
 use super::{Lewm, LewmConfig, Rollout, pixels};
-use crate::nn::kernels::host;
+use crate::nn::parameters::host;
 use burn::tensor::Device;
 use rayon::prelude::*;
 use swm_core::{Batch, Error, Predictor, Result};

@@ -18,7 +18,8 @@
 
 use super::model::Lewm;
 use crate::nn::Linear;
-use crate::nn::kernels::{host, norm, output_panels, panels, projector_panels};
+use crate::nn::kernels::{norm, output_panels, panels, projector_panels};
+use crate::nn::parameters::host;
 use crate::nn::predictor::{Block, MODULATED_EPSILON};
 use burn::module::Param;
 use swm_kernels::functions::{gelu, silu};

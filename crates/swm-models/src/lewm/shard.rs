@@ -3,7 +3,8 @@
 //! On the CPU, [`VitGradient`] differentiates vision transformers; Burn differentiates all other encoders.
 
 use super::model::Encoder;
-use crate::nn::kernels::{host, named_vit_gradients, vit_gradient};
+use crate::nn::kernels::{named_vit_gradients, vit_gradient};
+use crate::nn::parameters::host;
 use crate::nn::parameters::{self, Named};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};

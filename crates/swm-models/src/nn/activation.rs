@@ -1,27 +1,30 @@
-//! Activations and dropout.
+//! Activation functions and dropout.
 
-use super::kernels::host;
+use super::parameters::host;
 use burn::tensor::{DType, Device, Tensor, TensorData, activation};
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 use swm_core::Rng;
 use swm_kernels::functions;
 
-/// A nonlinearity.
+/// An activation function.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Activation {
     /// `max(x, 0)`.
     #[default]
     Relu,
-    /// `x Φ(x)`, with the error function, not its approximation by tanh.
+    /// `x Φ(x)` (Hendrycks and Gimpel 2016), with the error function and not its approximation by tanh.
     Gelu,
-    /// `x / (1 + exp(-x))`.
+    /// `x / (1 + exp(-x))`, also called swish.
     Silu,
 }
 
 impl Activation {
-    /// Applies it to every number.
+    /// Applies the function to every element.
+    ///
+    /// # Shapes
+    /// `[…]` to the same.
     pub fn forward<const D: usize>(self, x: Tensor<D>) -> Tensor<D> {
         match self {
             Self::Relu => activation::relu(x),
@@ -31,7 +34,7 @@ impl Activation {
     }
 }
 
-/// `x Φ(x)`. On the CPU by our own kernel: Burn's computes the error function number by number, twice in training.
+/// `x Φ(x)`. The CPU uses our vectorised kernel: Burn computes the error function one element at a time, twice in training.
 fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     let device = x.device();
     if device.clone().inner() != Device::flex() || x.dtype() != DType::F32 {
@@ -44,29 +47,33 @@ fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
         functions::gelu(&mut values);
         return tensor(values);
     }
-    // A line through every number that has the value and the slope of the curve there: that is all backward asks for.
+    // The tangent at every element has the value and the derivative of the function there, which is all that the backward pass
+    // needs.
     let mut offsets = host(x.clone().inner());
     let mut slopes = vec![0.0; offsets.len()];
     functions::gelu_tangent(&mut offsets, &mut slopes);
     x * tensor(slopes) + tensor(offsets)
 }
 
-/// Dropout noise of one training pass; none when evaluating.
+/// The random generator of dropout in one training pass; `None` in evaluation.
 pub struct DropoutRng<'a>(pub Option<&'a mut Rng>);
 
 impl DropoutRng<'_> {
-    /// No noise: evaluation.
+    /// Disables dropout, for evaluation.
     pub fn disabled() -> Self {
         DropoutRng(None)
     }
 
-    /// Sets numbers to zero with probability `rate` and scales the others by `1 / (1 - rate)`.
+    /// Sets elements to zero with probability `rate` and scales the others by `1 / (1 - rate)` (Srivastava et al. 2014).
+    ///
+    /// # Shapes
+    /// `[…]` to the same.
     pub fn dropout<const D: usize>(&mut self, x: Tensor<D>, rate: f32) -> Tensor<D> {
         let Some(rng) = self.0.as_deref_mut().filter(|_| rate > 0.0) else { return x };
-        let keep = 1.0 / (1.0 - rate);
+        let scale = 1.0 / (1.0 - rate);
         let shape = x.dims();
         let mask: Vec<f32> =
-            (0..shape.iter().product()).map(|_| if rng.random::<f32>() < rate { 0.0 } else { keep }).collect();
+            (0..shape.iter().product()).map(|_| if rng.random::<f32>() < rate { 0.0 } else { scale }).collect();
         let mask = Tensor::from_data(TensorData::new(mask, shape), &x.device());
         x * mask
     }

@@ -5,7 +5,7 @@ use super::{Activation, DropoutRng, Init, LayerNorm, Linear};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
-/// Number added to the variance by the normalisations of these blocks.
+/// Added to the variance by the normalisations of these blocks.
 const EPSILON: f64 = 1e-5;
 
 /// Computes scaled dot-product attention with `heads` heads, `softmax(Q Kᵀ / √d + mask) V` (Vaswani et al. 2017,
@@ -56,7 +56,7 @@ pub struct SelfAttention {
     dropout: f32,
 }
 
-/// The output projection of an attention block. A field `_0` is number 0 of a sequence.
+/// The output projection of an attention block. A field `_0` is element 0 of a sequence.
 #[derive(Module, Debug)]
 pub struct AttentionOutput {
     /// The layer.

@@ -1,4 +1,4 @@
-//! [`Backbone`]: any of the picture encoders, behind one door.
+//! [`Backbone`]: any of the image encoders.
 
 use super::{Dino, DinoConfig, Init, PatchCnn, PatchCnnConfig, Vit, VitConfig};
 use burn::module::Module;
@@ -6,7 +6,7 @@ use burn::tensor::Tensor;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Result};
 
-/// Which picture encoder, and its size.
+/// The kind and the size of an image encoder.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum BackboneConfig {
@@ -14,43 +14,46 @@ pub enum BackboneConfig {
     Vit(VitConfig),
     /// DINOv2.
     Dinov2(DinoConfig),
-    /// Convolutions of disjoint patches: small and fast.
+    /// Convolutions over disjoint patches: small and fast.
     #[serde(rename = "pyramid")]
     PatchCnn(PatchCnnConfig),
 }
 
-/// A picture encoder.
+/// An image encoder.
 #[derive(Module, Debug)]
-#[allow(clippy::large_enum_variant)]
+#[allow(
+    clippy::large_enum_variant,
+    reason = "a model has one encoder, so the size of the smaller variants does not matter"
+)]
 pub enum Backbone {
     /// A vision transformer.
     Vit(Vit),
     /// DINOv2.
     Dinov2(Dino),
-    /// Convolutions of disjoint patches.
+    /// Convolutions over disjoint patches.
     PatchCnn(PatchCnn),
 }
 
 impl BackboneConfig {
-    /// Side of the patches the picture is cut into.
+    /// The side of the patches that an image is cut into, in pixels.
     pub fn patch(&self) -> usize {
         match self {
             Self::Vit(vit) => vit.patch,
             Self::Dinov2(dino) => dino.patch,
-            Self::PatchCnn(pyramid) => pyramid.stages.first().map_or(0, |stage| stage.patch),
+            Self::PatchCnn(cnn) => cnn.stages.first().map_or(0, |stage| stage.patch),
         }
     }
 
-    /// Features of a picture, or of a patch.
+    /// The number of features of an image, or of a patch.
     pub fn dim(&self) -> usize {
         match self {
             Self::Vit(vit) => vit.dim,
             Self::Dinov2(dino) => dino.dim,
-            Self::PatchCnn(pyramid) => pyramid.dim,
+            Self::PatchCnn(cnn) => cnn.dim,
         }
     }
 
-    /// How many [`Backbone::patches`] a square picture of `image` pixels has.
+    /// The number of [`Backbone::patches`] of an image with a side of `image` pixels.
     pub fn patches(&self, image: usize) -> usize {
         match self {
             Self::Vit(_) | Self::Dinov2(_) => (image / self.patch().max(1)).pow(2),
@@ -58,19 +61,19 @@ impl BackboneConfig {
         }
     }
 
-    /// Checks that the sizes fit each other and square pictures of `image` pixels. `at` is where the settings stand.
+    /// Checks that the sizes fit each other and images with a side of `image` pixels. `at` is the path of the settings.
     ///
     /// # Errors
-    /// Naming the first that does not.
+    /// Naming the first size that does not fit.
     pub fn check(&self, at: &str, image: usize) -> Result<()> {
-        let wrong = |what: &str, problem: String, fix: &str| Err(Error::config(format!("{at}.{what}"), problem, fix));
+        let invalid = |what: &str, problem: String, fix: &str| Err(Error::config(format!("{at}.{what}"), problem, fix));
         let transformer = |name: &str, sizes: [(&str, usize); 5], dim: usize, heads: usize| {
             if let Some((what, _)) = sizes.iter().find(|(_, size)| *size == 0) {
-                return wrong(&format!("{name}.{what}"), "0".to_owned(), "give at least 1");
+                return invalid(&format!("{name}.{what}"), "0".to_owned(), "give at least 1");
             }
             if !dim.is_multiple_of(heads) {
                 let problem = format!("{dim} features do not split into {heads} heads");
-                return wrong(&format!("{name}.heads"), problem, "choose a divisor of `dim`");
+                return invalid(&format!("{name}.heads"), problem, "choose a divisor of `dim`");
             }
             Ok(())
         };
@@ -84,43 +87,43 @@ impl BackboneConfig {
                 let sizes = [("patch", *patch), ("dim", *dim), ("depth", *depth), ("heads", *heads), ("mlp", *mlp)];
                 transformer("dinov2", sizes, *dim, *heads)?;
                 if *grid == 0 {
-                    return wrong("dinov2.grid", "0".to_owned(), "give at least 1");
+                    return invalid("dinov2.grid", "0".to_owned(), "give at least 1");
                 }
                 vec![*patch]
             }
-            Self::PatchCnn(pyramid) => {
-                if pyramid.hidden == 0 || pyramid.dim == 0 || pyramid.stages.iter().any(|stage| stage.channels == 0) {
-                    return wrong("pyramid", "a size is 0".to_owned(), "give at least 1");
+            Self::PatchCnn(cnn) => {
+                if cnn.hidden == 0 || cnn.dim == 0 || cnn.stages.iter().any(|stage| stage.channels == 0) {
+                    return invalid("pyramid", "a size is 0".to_owned(), "give at least 1");
                 }
-                if pyramid.stages.is_empty() {
-                    return wrong("pyramid.stages", "none".to_owned(), "give at least one");
+                if cnn.stages.is_empty() {
+                    return invalid("pyramid.stages", "none".to_owned(), "give at least one");
                 }
-                pyramid.stages.iter().map(|stage| stage.patch).collect()
+                cnn.stages.iter().map(|stage| stage.patch).collect()
             }
         };
         let mut side = image;
         for patch in patches {
             if patch == 0 || !side.is_multiple_of(patch) || side == 0 {
-                let problem = format!("a side of {side} does not split into patches of {patch}");
-                return Err(Error::config(at, problem, "choose patches whose product divides the picture's side"));
+                let problem = format!("a side of {side} pixels does not split into patches of {patch}");
+                return Err(Error::config(at, problem, "choose patches whose product divides the image's side"));
             }
             side /= patch;
         }
         Ok(())
     }
 
-    /// The encoder, for square pictures of `image` pixels.
+    /// Creates the encoder for images with a side of `image` pixels.
     pub fn init(&self, init: &Init, image: usize) -> Backbone {
         match self {
             Self::Vit(vit) => Backbone::Vit(vit.init(init, image)),
             Self::Dinov2(dino) => Backbone::Dinov2(dino.init(init)),
-            Self::PatchCnn(pyramid) => Backbone::PatchCnn(pyramid.init(init, image)),
+            Self::PatchCnn(cnn) => Backbone::PatchCnn(cnn.init(init, image)),
         }
     }
 }
 
 impl Backbone {
-    /// The features of pictures: the class token of a transformer.
+    /// Computes the features of images: the class token of a transformer.
     ///
     /// # Shapes
     /// `[frames, patches, 3 * patch * patch]` to `[frames, dim]`.
@@ -128,11 +131,11 @@ impl Backbone {
         match self {
             Self::Vit(vit) => vit.forward(patches),
             Self::Dinov2(dino) => dino.forward(patches),
-            Self::PatchCnn(pyramid) => pyramid.forward(patches),
+            Self::PatchCnn(cnn) => cnn.forward(patches),
         }
     }
 
-    /// The features of every patch; a pyramid has those of the picture alone, as one patch.
+    /// Computes the features of every patch; a [`PatchCnn`] returns those of the image as one patch.
     ///
     /// # Shapes
     /// `[frames, patches, 3 * patch * patch]` to `[frames, patches, dim]`.
@@ -145,7 +148,7 @@ impl Backbone {
                 tokens.slice([0..frames, all - count..all, 0..dim])
             }
             Self::Dinov2(dino) => dino.patches(patches),
-            Self::PatchCnn(pyramid) => pyramid.forward(patches).unsqueeze_dim(1),
+            Self::PatchCnn(cnn) => cnn.forward(patches).unsqueeze_dim(1),
         }
     }
 }

@@ -1,12 +1,15 @@
-//! [`with_derivative`]: a function whose derivative is written down.
+//! [`with_derivative`]: a function with an explicit derivative.
 
 use burn::tensor::Tensor;
 
-/// `value` as a function of `x` whose derivative, number by number, is `slope`; both are outside of any graph.
+/// Returns `value` as a function of `x` whose elementwise derivative is `derivative`; both are outside of any graph.
 ///
-/// What is added to the value is 0, exactly; its gradient is the slope times the gradient that comes. A graph holds one
-/// product then, whatever the function.
-pub fn with_derivative<const D: usize>(x: Tensor<D>, value: Tensor<D>, slope: Tensor<D>) -> Tensor<D> {
-    let away = x.clone() - x.inner().autodiff();
-    away * slope.autodiff() + value.autodiff()
+/// The difference that is added to the value is exactly 0, and its gradient is the derivative times the incoming gradient. The
+/// graph then holds one product, whatever the function.
+///
+/// # Shapes
+/// All tensors have the same shape.
+pub fn with_derivative<const D: usize>(x: Tensor<D>, value: Tensor<D>, derivative: Tensor<D>) -> Tensor<D> {
+    let zero = x.clone() - x.inner().autodiff();
+    zero * derivative.autodiff() + value.autodiff()
 }

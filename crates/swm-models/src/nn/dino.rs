@@ -1,5 +1,6 @@
-//! DINOv2 (Oquab et al. 2023), with or without registers (Darcet et al. 2023): a vision transformer whose parts are
-//! scaled channel by channel before they are added, named as the published checkpoints name it.
+//! DINOv2 (Oquab et al. 2023), with or without registers (Darcet et al. 2023): a vision transformer whose branches are scaled
+//! channel by channel before they are added (LayerScale, Touvron et al. 2021). Parameters have the names of the published
+//! checkpoints.
 
 use super::positions::Resampling;
 use super::vit::{Attention, Patches, Projection, STD, embed, leading};
@@ -14,17 +15,17 @@ use serde::{Deserialize, Serialize};
 pub struct DinoConfig {
     /// Side of a patch, in pixels.
     pub patch: usize,
-    /// Features of a token.
+    /// The number of features of a token.
     pub dim: usize,
-    /// Layers.
+    /// The number of layers.
     pub depth: usize,
-    /// Attention heads.
+    /// The number of attention heads.
     pub heads: usize,
-    /// Hidden features of the feed-forward part.
+    /// The number of hidden features of the feed-forward block.
     pub mlp: usize,
-    /// Side of the grid of patches that positions were learnt for.
+    /// Side of the grid of patches that the position embeddings were trained for.
     pub grid: usize,
-    /// Tokens that stand for nothing.
+    /// The number of register tokens, which represent no patch.
     #[serde(default)]
     pub registers: usize,
 }
@@ -32,7 +33,7 @@ pub struct DinoConfig {
 /// A DINOv2 encoder.
 #[derive(Module, Debug)]
 pub struct Dino {
-    /// Patches, tokens of their own, positions.
+    /// Patch, class, register and position embeddings.
     pub embeddings: Embeddings,
     /// The layers.
     pub encoder: Layers,
@@ -40,46 +41,46 @@ pub struct Dino {
     pub layernorm: LayerNorm,
 }
 
-/// Patches, tokens of their own, positions.
+/// Patch, class, register and position embeddings.
 #[derive(Module, Debug)]
 pub struct Embeddings {
     /// `[1, 1, dim]`.
     pub cls_token: Param<Tensor<3>>,
-    /// `[1, dim]`: in place of hidden patches while it was trained; not used here.
+    /// `[1, dim]`: replaces masked patches in pretraining; not used here.
     pub mask_token: Param<Tensor<2>>,
     /// `[1, 1 + grid * grid, dim]`.
     pub position_embeddings: Param<Tensor<3>>,
     /// `[1, registers, dim]`.
     pub register_tokens: Option<Param<Tensor<3>>>,
-    /// From pixels to tokens.
+    /// The projection of patches to tokens.
     pub patch_embeddings: Patches,
 }
 
 /// The layers of a [`Dino`].
 #[derive(Module, Debug)]
 pub struct Layers {
-    /// In order.
+    /// The layers, first to last.
     pub layer: Vec<Layer>,
 }
 
-/// One layer: attention, then feed-forward, each on normalised tokens, scaled and added to them.
+/// One layer: attention, then feed-forward, each computed from normalised tokens, scaled and added to the tokens.
 #[derive(Module, Debug)]
 pub struct Layer {
-    /// Before the attention.
+    /// The normalisation before the attention.
     pub norm1: LayerNorm,
     /// Self-attention.
     pub attention: Attention,
-    /// Scales what it returns.
+    /// The scale of the attention branch.
     pub layer_scale1: Scale,
-    /// Before the feed-forward part.
+    /// The normalisation before the feed-forward block.
     pub norm2: LayerNorm,
-    /// The feed-forward part.
+    /// The feed-forward block.
     pub mlp: FeedForward,
-    /// Scales what it returns.
+    /// The scale of the feed-forward branch.
     pub layer_scale2: Scale,
 }
 
-/// A factor a channel.
+/// A factor for every channel.
 #[derive(Module, Debug)]
 pub struct Scale {
     /// `[dim]`.
@@ -89,32 +90,32 @@ pub struct Scale {
 /// Linear, GELU, linear.
 #[derive(Module, Debug)]
 pub struct FeedForward {
-    /// Into the hidden features.
+    /// The layer to the hidden features.
     pub fc1: Linear,
-    /// Out of them.
+    /// The layer from the hidden features.
     pub fc2: Linear,
 }
 
-/// What the layer normalisations add to the variance.
+/// Added to the variance by the layer normalisations.
 const EPSILON: f64 = 1e-6;
 
 impl DinoConfig {
-    /// The published sizes: patches of 14 pixels, trained on pictures of 518.
+    /// The published sizes: patches of 14 pixels, trained on images of 518.
     const fn sized(dim: usize, heads: usize) -> Self {
         Self { patch: 14, dim, depth: 12, heads, mlp: 4 * dim, grid: 37, registers: 0 }
     }
 
-    /// `facebook/dinov2-small`.
+    /// The size of `facebook/dinov2-small`.
     pub const fn small() -> Self {
         Self::sized(384, 6)
     }
 
-    /// `facebook/dinov2-base`.
+    /// The size of `facebook/dinov2-base`.
     pub const fn base() -> Self {
         Self::sized(768, 12)
     }
 
-    /// The encoder.
+    /// Creates the encoder.
     pub fn init(&self, init: &Init) -> Dino {
         let dim = self.dim;
         let layer = |index| {
@@ -147,7 +148,7 @@ impl DinoConfig {
 }
 
 impl Dino {
-    /// The class token.
+    /// Computes the class token.
     ///
     /// # Shapes
     /// `[frames, patches, 3 * patch * patch]` to `[frames, dim]`.
@@ -157,7 +158,7 @@ impl Dino {
         class.reshape([frames, dim])
     }
 
-    /// All tokens: the class token, the registers, one a patch.
+    /// Computes all tokens: the class token, the registers, one for every patch.
     ///
     /// # Shapes
     /// `[frames, patches, 3 * patch * patch]` to `[frames, 1 + registers + patches, dim]`.
@@ -165,7 +166,7 @@ impl Dino {
         self.run(patches, None)
     }
 
-    /// One token a patch.
+    /// Computes one token for every patch.
     ///
     /// # Shapes
     /// `[frames, patches, 3 * patch * patch]` to `[frames, patches, dim]`.
@@ -176,8 +177,8 @@ impl Dino {
         tokens.slice([0..frames, all - count..all, 0..dim])
     }
 
-    /// The first `asked` tokens, or all.
-    fn run(&self, patches: Tensor<3>, asked: Option<usize>) -> Tensor<3> {
+    /// Computes the first `outputs` tokens, or all of them.
+    fn run(&self, patches: Tensor<3>, outputs: Option<usize>) -> Tensor<3> {
         let parts = &self.embeddings;
         let resampling = match parts.register_tokens {
             Some(_) => Resampling::Antialiased,
@@ -192,23 +193,26 @@ impl Dino {
             tokens = Tensor::cat(vec![leading(tokens, 1), registers.val().expand([frames, more, dim]), rest], 1);
         }
         for (index, layer) in self.encoder.layer.iter().enumerate() {
-            tokens = layer.forward(tokens, asked.filter(|_| index + 1 == self.encoder.layer.len()));
+            tokens = layer.forward(tokens, outputs.filter(|_| index + 1 == self.encoder.layer.len()));
         }
-        self.layernorm.forward(match asked {
-            Some(asked) => leading(tokens, asked),
+        self.layernorm.forward(match outputs {
+            Some(outputs) => leading(tokens, outputs),
             None => tokens,
         })
     }
 }
 
 impl Layer {
-    /// All tokens, or the first `asked`.
-    fn forward(&self, x: Tensor<3>, asked: Option<usize>) -> Tensor<3> {
-        let mixed = self.attention.forward(self.norm1.forward(x.clone()), asked);
-        let x = match asked {
-            Some(asked) => leading(x, asked),
+    /// Computes all tokens, or the first `outputs`.
+    ///
+    /// # Shapes
+    /// `[frames, tokens, dim]` to `[frames, outputs, dim]`.
+    fn forward(&self, x: Tensor<3>, outputs: Option<usize>) -> Tensor<3> {
+        let attended = self.attention.forward(self.norm1.forward(x.clone()), outputs);
+        let x = match outputs {
+            Some(outputs) => leading(x, outputs),
             None => x,
-        } + self.layer_scale1.forward(mixed);
+        } + self.layer_scale1.forward(attended);
         let hidden = Activation::Gelu.forward(self.mlp.fc1.forward(self.norm2.forward(x.clone())));
         x + self.layer_scale2.forward(self.mlp.fc2.forward(hidden))
     }

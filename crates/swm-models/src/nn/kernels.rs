@@ -1,17 +1,11 @@
 //! Layers in the form that the CPU kernels of `swm-kernels` read.
 
 use super::norm::BatchNorm;
-use super::parameters::{IntoF32, Named};
+use super::parameters::{Named, host};
 use super::positions::{Resampling, positions};
 use super::vit::{Layer, Projection};
 use super::{LayerNorm, Linear, Projector, Vit};
-use burn::tensor::Tensor;
 use swm_kernels::{Affine, Norm, Panels, VitEncoder, VitGradient, VitLayerParameters, VitParameters};
-
-/// Copies the elements of a tensor to the host, row-major.
-pub(crate) fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().into_f32_vec()
-}
 
 /// Lays out a linear layer.
 pub(crate) fn panels(layer: &Linear) -> Panels {
@@ -134,7 +128,7 @@ fn linear_parameters(layer: &Linear) -> Affine {
 mod tests {
     use super::*;
     use crate::nn::{Init, VitConfig};
-    use burn::tensor::{Device, TensorData};
+    use burn::tensor::{Device, Tensor, TensorData};
     use swm_core::Key;
 
     #[test]

@@ -14,8 +14,7 @@ pub struct Linear {
 }
 
 impl Linear {
-    /// A layer drawn as PyTorch draws it by default: uniform within `1 / sqrt(inputs)`.
-    #[allow(clippy::cast_precision_loss)]
+    /// Creates a layer with PyTorch's default initialisation: uniform within `1 / sqrt(inputs)`.
     pub fn new(init: &Init, inputs: usize, outputs: usize) -> Self {
         let bound = 1.0 / (inputs as f32).sqrt();
         Self {
@@ -24,23 +23,25 @@ impl Linear {
         }
     }
 
-    /// A layer without bias.
+    /// Creates a layer without bias.
     pub fn without_bias(init: &Init, inputs: usize, outputs: usize) -> Self {
         Self { bias: None, ..Self::new(init, inputs, outputs) }
     }
 
-    /// A layer that returns 0 until trained.
+    /// Creates a zero-initialised layer.
     pub fn zeros(init: &Init, inputs: usize, outputs: usize) -> Self {
         Self { weight: init.constant([outputs, inputs], 0.0), bias: Some(init.constant([outputs], 0.0)) }
     }
 
-    /// A layer drawn from a normal distribution, with bias 0.
+    /// Creates a layer with normally distributed weights (standard deviation `std`) and bias 0.
     pub fn normal(init: &Init, inputs: usize, outputs: usize, std: f32) -> Self {
         Self { weight: init.normal("weight", [outputs, inputs], std), bias: Some(init.constant([outputs], 0.0)) }
     }
 
+    /// Applies the layer; all leading axes are rows of one matrix product.
+    ///
     /// # Shapes
-    /// `[…, inputs]` to `[…, outputs]`. All leading axes go into one matrix product.
+    /// `[…, inputs]` to `[…, outputs]`.
     pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
         let [outputs, inputs] = self.weight.dims();
         let mut shape = x.dims();

@@ -1,11 +1,11 @@
-//! Small networks around the encoder and the predictor.
+//! Multi-layer perceptrons: projector, action embedder, read-out.
 
 use super::{Activation, BatchNorm, BatchStatistics, Init, Linear};
 use burn::module::Module;
 use burn::tensor::Tensor;
 
-/// Linear, batch normalisation, GELU, linear. Its parts carry the published names `net.0`, `net.1`, `net.3`: a
-/// field `_3` is number 3 of a sequence.
+/// Linear, batch normalisation, GELU, linear. Its layers have the published names `net.0`, `net.1`, `net.3`: a field `_3` is
+/// element 3 of a sequence.
 #[derive(Module, Debug)]
 pub struct Projector {
     /// The sequence.
@@ -15,16 +15,16 @@ pub struct Projector {
 /// The sequence of a [`Projector`].
 #[derive(Module, Debug)]
 pub struct ProjectorNet {
-    /// Into the hidden features.
+    /// The layer to the hidden features.
     pub _0: Linear,
-    /// Normalises them.
+    /// Their normalisation.
     pub _1: BatchNorm,
-    /// Out of them.
+    /// The layer from the hidden features.
     pub _3: Linear,
 }
 
 impl Projector {
-    /// A projector.
+    /// Creates a projector.
     pub fn new(init: &Init, inputs: usize, hidden: usize, outputs: usize) -> Self {
         Self {
             net: ProjectorNet {
@@ -35,6 +35,8 @@ impl Projector {
         }
     }
 
+    /// Normalises with the running statistics, for evaluation.
+    ///
     /// # Shapes
     /// `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
@@ -42,19 +44,22 @@ impl Projector {
         self.net._3.forward(Activation::Gelu.forward(hidden))
     }
 
-    /// As [`Projector::forward`], with the statistics of the batch.
+    /// Normalises with the statistics of the batch, which it also returns, for training.
+    ///
+    /// # Shapes
+    /// `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward_train(&self, x: Tensor<2>) -> (Tensor<2>, BatchStatistics) {
         let (hidden, statistics) = self.net._1.forward_train(self.net._0.forward(x));
         (self.net._3.forward(Activation::Gelu.forward(hidden)), statistics)
     }
 
-    /// Moves the running statistics towards those of a batch.
+    /// Updates the running statistics with those of a batch.
     pub fn track(&mut self, batch: BatchStatistics) {
         self.net._1.track(batch);
     }
 }
 
-/// The action encoder: a convolution over time with one tap (a linear map), then a network of one hidden layer.
+/// The action encoder: a convolution over time with a kernel of 1, then a network with one hidden layer.
 #[derive(Module, Debug)]
 pub struct Embedder {
     /// The convolution.
@@ -63,7 +68,7 @@ pub struct Embedder {
     pub embed: EmbedderNet,
 }
 
-/// A convolution with one tap.
+/// A convolution with a kernel of 1, which is a linear layer.
 #[derive(Module, Debug)]
 pub struct PointwiseConv {
     /// `[outputs, inputs, 1]`.
@@ -75,21 +80,21 @@ pub struct PointwiseConv {
 /// The network of an [`Embedder`].
 #[derive(Module, Debug)]
 pub struct EmbedderNet {
-    /// Into the hidden features.
+    /// The layer to the hidden features.
     pub _0: Linear,
-    /// Out of them.
+    /// The layer from the hidden features.
     pub _2: Linear,
 }
 
 impl Embedder {
-    /// An embedder of `inputs` numbers, of which the convolution makes `smoothed`, with `4 outputs` hidden features.
-    #[allow(clippy::cast_precision_loss)]
+    /// Creates an embedder of vectors with `inputs` elements, whose convolution has `smoothed` outputs and whose network has
+    /// `4 * outputs` hidden features.
     pub fn new(init: &Init, inputs: usize, smoothed: usize, outputs: usize) -> Self {
-        let (tap, bound) = (init.of("patch_embed"), 1.0 / (inputs as f32).sqrt());
+        let (conv, bound) = (init.of("patch_embed"), 1.0 / (inputs as f32).sqrt());
         Self {
             patch_embed: PointwiseConv {
-                weight: tap.uniform("weight", [smoothed, inputs, 1], bound),
-                bias: tap.uniform("bias", [smoothed], bound),
+                weight: conv.uniform("weight", [smoothed, inputs, 1], bound),
+                bias: conv.uniform("bias", [smoothed], bound),
             },
             embed: EmbedderNet {
                 _0: Linear::new(&init.of("0"), smoothed, 4 * outputs),
@@ -98,28 +103,30 @@ impl Embedder {
         }
     }
 
+    /// Embeds actions.
+    ///
     /// # Shapes
     /// `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
-        let tap: Tensor<2> = self.patch_embed.weight.val().squeeze_dim(2);
-        let x = x.matmul(tap.transpose()) + self.patch_embed.bias.val().unsqueeze();
+        let weight: Tensor<2> = self.patch_embed.weight.val().squeeze_dim(2);
+        let x = x.matmul(weight.transpose()) + self.patch_embed.bias.val().unsqueeze();
         self.embed._2.forward(Activation::Silu.forward(self.embed._0.forward(x)))
     }
 }
 
-/// Two hidden layers with GELU. A field `_2` is number 2 of a sequence, as in PyTorch.
+/// Two hidden layers with GELU. A field `_2` is element 2 of a sequence, as in PyTorch.
 #[derive(Module, Debug)]
 pub struct Mlp {
     /// Into hidden features.
     pub _0: Linear,
-    /// From hidden features to hidden features.
+    /// The layer between the hidden features.
     pub _2: Linear,
-    /// Out of them.
+    /// The layer from the hidden features.
     pub _4: Linear,
 }
 
 impl Mlp {
-    /// A network.
+    /// Creates a network.
     pub fn new(init: &Init, inputs: usize, hidden: usize, outputs: usize) -> Self {
         Self {
             _0: Linear::new(&init.of("0"), inputs, hidden),
@@ -128,6 +135,8 @@ impl Mlp {
         }
     }
 
+    /// Applies the network.
+    ///
     /// # Shapes
     /// `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {

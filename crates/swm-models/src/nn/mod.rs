@@ -1,6 +1,5 @@
-//! Building blocks, with the parameter names and layouts PyTorch checkpoints use, so that weights move both ways
-//! without renaming. Every initial value comes from a [`Key`] and the parameter's name, never from a global
-//! generator.
+//! Building blocks with the parameter names and layouts of PyTorch checkpoints, so that weights are exchanged without
+//! renaming. A [`Key`] and the name of a parameter decide its initial values; there is no global generator.
 
 pub mod activation;
 pub mod attention;
@@ -41,7 +40,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use rand_distr::{Distribution as _, StandardNormal};
 use swm_core::Key;
 
-/// Where initial values come from: a key that narrows with the path of the parameter.
+/// A source of initial values: a key derived along the path of the parameter.
 #[derive(Clone)]
 pub struct Init {
     key: Key,
@@ -49,31 +48,31 @@ pub struct Init {
 }
 
 impl Init {
-    /// Initial values decided by `key`, on `device`.
+    /// Creates a source of values on `device` that `key` decides.
     pub fn new(key: Key, device: &Device) -> Self {
         Self { key, device: device.clone() }
     }
 
-    /// Initial values of a part.
+    /// The source for the part of that name.
     #[must_use]
     pub fn of(&self, part: &str) -> Self {
         Self { key: self.key.with(part), device: self.device.clone() }
     }
 
-    /// Initial values of the `index`th part.
+    /// The source for the part of that index.
     #[must_use]
     pub fn at(&self, index: usize) -> Self {
         Self { key: self.key.at(index as u64), device: self.device.clone() }
     }
 
-    /// A parameter drawn uniformly from `-bound ..= bound`.
+    /// Draws a parameter uniformly from `-bound ..= bound`.
     pub fn uniform<const D: usize>(&self, name: &str, shape: [usize; D], bound: f32) -> Param<Tensor<D>> {
         use rand::Rng as _;
         let mut rng = self.key.with(name).rng();
         self.draw(shape, || rng.random_range(-bound..=bound))
     }
 
-    /// A parameter drawn from a normal distribution of mean 0, cut off at two standard deviations.
+    /// Draws a parameter from a normal distribution of mean 0 and standard deviation `std`, truncated at `2 * std`.
     pub fn normal<const D: usize>(&self, name: &str, shape: [usize; D], std: f32) -> Param<Tensor<D>> {
         let mut rng = self.key.with(name).rng();
         self.draw(shape, || {
@@ -86,12 +85,12 @@ impl Init {
         })
     }
 
-    /// A parameter of equal numbers.
+    /// Creates a parameter whose elements are all `value`.
     pub fn constant<const D: usize>(&self, shape: [usize; D], value: f32) -> Param<Tensor<D>> {
         self.draw(shape, || value)
     }
 
-    /// A tensor that is stored with the weights but not trained.
+    /// Creates a constant tensor that is stored with the weights but not trained.
     pub fn buffer<const D: usize>(&self, shape: [usize; D], value: f32) -> Param<Tensor<D>> {
         self.constant(shape, value).set_require_grad(false)
     }
@@ -102,7 +101,10 @@ impl Init {
     }
 }
 
-/// Standard normal numbers, `[keys, width]`, each row decided by its key.
+/// Draws standard normal values, each row with its key.
+///
+/// # Shapes
+/// `[keys, width]`.
 pub fn normal(keys: &[Key], width: usize) -> Vec<f32> {
     let row = |key: &Key| {
         let mut rng = key.rng();

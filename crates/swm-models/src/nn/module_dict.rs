@@ -1,21 +1,21 @@
-//! [`ModuleDict`]: modules under names that are data, such as a column's.
+//! [`ModuleDict`]: modules under names that are data, such as the names of columns.
 
 use burn::module::{Content, Devices, Module, ModuleDisplay, ModuleDisplayDefault, ModuleMapper, ModuleVisitor};
 use burn::tensor::Device;
 use std::fmt::Debug;
 
-/// Modules under names that are only known when the model is made, in a fixed order. A parameter's path goes through the
-/// name, as in a `ModuleDict` of PyTorch.
+/// Modules under names that are known only when the model is created, in a fixed order. The path of a parameter contains the
+/// name, as in PyTorch's `ModuleDict`.
 #[derive(Clone, Debug)]
 pub struct ModuleDict<M>(pub Vec<(String, M)>);
 
 impl<M> ModuleDict<M> {
-    /// Names and modules.
+    /// Iterates over names and modules.
     pub fn iter(&self) -> impl Iterator<Item = (&str, &M)> {
         self.0.iter().map(|(name, module)| (name.as_str(), module))
     }
 
-    fn each(self, change: impl Fn(M) -> M) -> Self {
+    fn map_modules(self, change: impl Fn(M) -> M) -> Self {
         Self(self.0.into_iter().map(|(name, module)| (name, change(module))).collect())
     }
 }
@@ -28,11 +28,11 @@ impl<M: Module> Module for ModuleDict<M> {
     }
 
     fn fork(self, device: &Device) -> Self {
-        self.each(|module| module.fork(device))
+        self.map_modules(|module| module.fork(device))
     }
 
     fn to_device(self, device: &Device) -> Self {
-        self.each(|module| module.to_device(device))
+        self.map_modules(|module| module.to_device(device))
     }
 
     fn num_params(&self) -> usize {
@@ -62,11 +62,11 @@ impl<M: Module> Module for ModuleDict<M> {
     }
 
     fn train(self) -> Self {
-        self.each(Module::train)
+        self.map_modules(Module::train)
     }
 
     fn materialize(self) -> Self {
-        self.each(Module::materialize)
+        self.map_modules(Module::materialize)
     }
 }
 

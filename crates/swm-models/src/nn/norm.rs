@@ -4,7 +4,7 @@ use super::{Init, Named};
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor, module};
 
-/// Layer normalisation over the last axis.
+/// Layer normalisation over the last axis (Ba et al. 2016).
 #[derive(Module, Debug)]
 pub struct LayerNorm {
     /// Scale, `[features]`.
@@ -15,16 +15,18 @@ pub struct LayerNorm {
 }
 
 impl LayerNorm {
-    /// Scale 1, shift 0.
+    /// Creates a layer with scale 1 and shift 0.
     pub fn new(init: &Init, features: usize, epsilon: f64) -> Self {
         Self { weight: init.constant([features], 1.0), bias: init.constant([features], 0.0), epsilon }
     }
 
-    /// The number added to the variance.
+    /// The value added to the variance.
     pub fn epsilon(&self) -> f64 {
         self.epsilon
     }
 
+    /// Applies the layer.
+    ///
     /// # Shapes
     /// `[…, features]` to the same.
     pub fn forward<const D: usize>(&self, x: Tensor<D>) -> Tensor<D> {
@@ -32,7 +34,10 @@ impl LayerNorm {
     }
 }
 
-/// Layer normalisation over the last axis, without scale and shift.
+/// Normalises the last axis to mean 0 and variance 1, without scale and shift.
+///
+/// # Shapes
+/// `[…, features]` to the same.
 pub fn standardize<const D: usize>(x: Tensor<D>, epsilon: f64) -> Tensor<D> {
     let mean = x.clone().mean_dim(D - 1);
     let centred = x - mean;
@@ -40,7 +45,7 @@ pub fn standardize<const D: usize>(x: Tensor<D>, epsilon: f64) -> Tensor<D> {
     centred / (variance + epsilon).sqrt()
 }
 
-/// Batch normalisation of `[rows, features]`.
+/// Batch normalisation of `[rows, features]` (Ioffe and Szegedy 2015).
 #[derive(Module, Debug)]
 pub struct BatchNorm {
     /// Scale, `[features]`.
@@ -61,13 +66,13 @@ pub struct BatchStatistics {
 }
 
 impl BatchStatistics {
-    /// Puts them among other tensors, under `name`.
+    /// Inserts the statistics into other tensors, under `name`.
     pub fn store(self, name: &str, tensors: &mut Named<Tensor<1>>) {
         tensors.insert(format!("{name}.mean"), self.mean);
         tensors.insert(format!("{name}.variance"), self.variance);
     }
 
-    /// Takes out again what [`BatchStatistics::store`] put there.
+    /// Removes the statistics that [`BatchStatistics::store`] inserted.
     pub fn take(name: &str, tensors: &mut Named<Tensor<1>>) -> Option<Self> {
         let mut tensor = |part: &str| tensors.remove(&format!("{name}.{part}"));
         Some(Self { mean: tensor("mean")?, variance: tensor("variance")? })
@@ -75,12 +80,12 @@ impl BatchStatistics {
 }
 
 impl BatchNorm {
-    /// The number added to the variance.
+    /// The value added to the variance.
     pub const EPSILON: f64 = 1e-5;
-    /// The share of a batch in the running statistics.
+    /// The weight of a batch in the running statistics.
     const MOMENTUM: f64 = 0.1;
 
-    /// Scale 1, shift 0, running statistics of a standard normal distribution.
+    /// Creates a layer with scale 1, shift 0 and the running statistics of a standard normal distribution.
     pub fn new(init: &Init, features: usize) -> Self {
         Self {
             weight: init.constant([features], 1.0),
@@ -104,7 +109,6 @@ impl BatchNorm {
     ///
     /// # Shapes
     /// `[rows, features]` to the same.
-    #[allow(clippy::cast_precision_loss)]
     pub fn forward_train(&self, x: Tensor<2>) -> (Tensor<2>, BatchStatistics) {
         let [rows, _] = x.dims();
         let mean = x.clone().mean_dim(0);
@@ -119,14 +123,14 @@ impl BatchNorm {
         (normal * self.weight.val().unsqueeze() + self.bias.val().unsqueeze(), statistics)
     }
 
-    /// Moves the running statistics towards those of a batch.
+    /// Updates the running statistics with those of a batch.
     pub fn track(&mut self, batch: BatchStatistics) {
-        let blend = |running: &mut Param<Tensor<1>>, value: Tensor<1>| {
+        let update = |running: &mut Param<Tensor<1>>, value: Tensor<1>| {
             let next = running.val().inner() * (1.0 - Self::MOMENTUM) + value * Self::MOMENTUM;
             *running = Param::from_tensor(next).set_require_grad(false);
         };
-        blend(&mut self.running_mean, batch.mean);
-        blend(&mut self.running_var, batch.variance);
+        update(&mut self.running_mean, batch.mean);
+        update(&mut self.running_var, batch.variance);
     }
 
     /// The device of the layer.

@@ -1,4 +1,5 @@
-//! The networks of TD-MPC2 (Hansen, Su and Wang 2024, arXiv 2310.16828): every hidden layer is linear, normalised, and goes
+//! Multi-layer perceptrons with normalised hidden layers (Hansen, Su and Wang 2024, arXiv 2310.16828): every hidden layer is
+//! linear, normalised, and goes
 //! through Mish; latents are simplices.
 
 use super::norm::standardize;
@@ -6,12 +7,12 @@ use super::{DropoutRng, Init, LayerNorm, Linear, with_derivative};
 use burn::module::{Module, Param};
 use burn::tensor::{Tensor, activation};
 
-/// The number added to the variance.
+/// Added to the variance by the normalisations.
 const EPSILON: f64 = 1e-5;
-/// The standard deviation of initial weights, cut off at two of them.
+/// The standard deviation of initial weights, which are truncated at twice that.
 const STD: f32 = 0.02;
 
-/// A linear layer and the normalisation behind it.
+/// A linear layer followed by layer normalisation.
 #[derive(Module, Debug)]
 pub struct NormalizedLinear {
     /// `[outputs, inputs]`.
@@ -23,7 +24,7 @@ pub struct NormalizedLinear {
 }
 
 impl NormalizedLinear {
-    /// A layer.
+    /// Creates a layer.
     pub fn new(init: &Init, inputs: usize, outputs: usize) -> Self {
         Self {
             weight: init.normal("weight", [outputs, inputs], STD),
@@ -32,25 +33,28 @@ impl NormalizedLinear {
         }
     }
 
-    /// What goes into the nonlinearity: `[rows, inputs]` to `[rows, outputs]`.
+    /// Computes the input of the activation function.
+    ///
+    /// # Shapes
+    /// `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
         self.ln.forward(x.matmul(self.weight.val().transpose()) + self.bias.val().unsqueeze())
     }
 }
 
-/// Two hidden layers and a linear read-out. A field `_2` is number 2 of a sequence, as in PyTorch.
+/// Two hidden layers and a linear output layer. A field `_2` is element 2 of a sequence, as in PyTorch.
 #[derive(Module, Debug)]
 pub struct Head {
-    /// Into hidden features.
+    /// The layer to the hidden features.
     pub _0: NormalizedLinear,
-    /// From hidden features to hidden features.
+    /// The layer between the hidden features.
     pub _1: NormalizedLinear,
-    /// Out of them.
+    /// The output layer.
     pub _2: Linear,
 }
 
 impl Head {
-    /// A head.
+    /// Creates a head.
     pub fn new(init: &Init, inputs: usize, hidden: usize, outputs: usize) -> Self {
         Self {
             _0: NormalizedLinear::new(&init.of("0"), inputs, hidden),
@@ -59,32 +63,35 @@ impl Head {
         }
     }
 
-    /// A head whose read-out is 0 until trained.
+    /// Creates a head with a zero-initialised output layer.
     pub fn zero_initialized(init: &Init, inputs: usize, hidden: usize, outputs: usize) -> Self {
         let mut head = Self::new(init, inputs, hidden, outputs);
         head._2 = Linear::zeros(init, hidden, outputs);
         head
     }
 
+    /// Applies the network.
+    ///
+    /// # Shapes
     /// `[rows, inputs]` to `[rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
         self._2.forward(mish(self._1.forward(mish(self._0.forward(x)))))
     }
 }
 
-/// Two hidden layers and a third that ends in a latent.
+/// Two hidden layers and an output layer whose output is a latent on simplices.
 #[derive(Module, Debug)]
 pub struct Dynamics {
-    /// Into hidden features.
+    /// The layer to the hidden features.
     pub _0: NormalizedLinear,
-    /// From hidden features to hidden features.
+    /// The layer between the hidden features.
     pub _1: NormalizedLinear,
-    /// To what becomes a latent.
+    /// The output layer.
     pub _2: NormalizedLinear,
 }
 
 impl Dynamics {
-    /// Dynamics.
+    /// Creates the network.
     pub fn new(init: &Init, inputs: usize, hidden: usize, latent: usize) -> Self {
         Self {
             _0: NormalizedLinear::new(&init.of("0"), inputs, hidden),
@@ -93,19 +100,22 @@ impl Dynamics {
         }
     }
 
-    /// `[rows, inputs]` to `[rows, latent]`; `simplex` numbers of a latent add up to 1.
+    /// Computes latents, every `simplex` elements of which add up to 1.
+    ///
+    /// # Shapes
+    /// `[rows, inputs]` to `[rows, latent]`.
     pub fn forward(&self, x: Tensor<2>, simplex: usize) -> Tensor<2> {
         let hidden = mish(self._1.forward(mish(self._0.forward(x))));
         sim_norm(self._2.forward(hidden), simplex)
     }
 }
 
-/// Several heads of equal sizes side by side: a matrix product is one for all of them.
+/// Several heads of equal sizes, computed together: one batched matrix product per layer.
 pub struct Ensemble {
     layers: [Layer; 3],
 }
 
-/// The same layer of every head: `[heads, inputs, outputs]` and rows of `[heads, 1, outputs]`.
+/// The same layer of every head: weights `[heads, inputs, outputs]`; bias, scale and shift `[heads, 1, outputs]`.
 struct Layer {
     weight: Tensor<3>,
     bias: Option<Tensor<3>>,
@@ -113,7 +123,7 @@ struct Layer {
 }
 
 impl Ensemble {
-    /// These heads; gradients flow back to them.
+    /// Combines heads; gradients flow back to them.
     pub fn of(heads: &[&Head]) -> Self {
         let hidden = |get: fn(&Head) -> &NormalizedLinear| Layer {
             weight: matrices(heads.iter().map(|head| &get(head).weight)),
@@ -130,18 +140,21 @@ impl Ensemble {
         Self { layers: [hidden(|head| &head._0), hidden(|head| &head._1), last] }
     }
 
-    /// The same heads as constants of a graph: gradients flow through them, not to them.
+    /// Returns the heads as constants of a graph: gradients flow through them to the input, but not to the heads.
     #[must_use]
     pub fn frozen(mut self) -> Self {
-        let still = |tensor: &mut Tensor<3>| *tensor = tensor.clone().inner().autodiff();
+        let freeze = |tensor: &mut Tensor<3>| *tensor = tensor.clone().inner().autodiff();
         for Layer { weight, bias, norm } in &mut self.layers {
-            still(weight);
-            bias.iter_mut().chain(norm.iter_mut().flatten()).for_each(still);
+            freeze(weight);
+            bias.iter_mut().chain(norm.iter_mut().flatten()).for_each(freeze);
         }
         self
     }
 
-    /// `[rows, inputs]` to `[heads, rows, outputs]`; `dropout` is the rate behind the first product.
+    /// Applies all heads; `dropout` is the rate after the first matrix product.
+    ///
+    /// # Shapes
+    /// `[rows, inputs]` to `[heads, rows, outputs]`.
     pub fn forward(&self, x: Tensor<2>, dropout: f32, noise: &mut DropoutRng<'_>) -> Tensor<3> {
         let [first, second, last] = &self.layers;
         let [heads, _, _] = first.weight.dims();
@@ -154,12 +167,18 @@ impl Ensemble {
     }
 }
 
-/// The matrices of several heads, `[heads, inputs, outputs]`.
+/// Stacks the matrices of several heads.
+///
+/// # Shapes
+/// `[outputs, inputs]` each, to `[heads, inputs, outputs]`.
 fn matrices<'a>(parameters: impl Iterator<Item = &'a Param<Tensor<2>>>) -> Tensor<3> {
     Tensor::stack::<3>(parameters.map(Param::val).collect(), 0).swap_dims(1, 2)
 }
 
-/// The vectors of several heads, `[heads, 1, outputs]`, where they have them.
+/// Stacks the vectors of several heads, or returns `None` if one is missing.
+///
+/// # Shapes
+/// `[outputs]` each, to `[heads, 1, outputs]`.
 fn rows<'a>(parameters: impl Iterator<Item = Option<&'a Param<Tensor<1>>>>) -> Option<Tensor<3>> {
     let all: Option<Vec<Tensor<1>>> = parameters.map(|parameter| parameter.map(Param::val)).collect();
     Some(Tensor::stack::<2>(all?, 0).unsqueeze_dim(1))
@@ -182,11 +201,14 @@ impl Layer {
     }
 }
 
-/// `x tanh(ln(1 + exp x))`, by one exponential: with `n = exp x (exp x + 2)` it is `x n / (n + 2)`. Its derivative is written
-/// down, so that a graph holds one product and not six functions.
+/// Mish (Misra 2019), `x tanh(ln(1 + exp x))`, with one exponential: for `n = exp x (exp x + 2)` it is `x n / (n + 2)`. Its
+/// derivative is explicit, so that a graph holds one product and not six functions.
+///
+/// # Shapes
+/// `[…]` to the same.
 pub fn mish<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     let inner = x.clone().inner();
-    // Above 20 it is x in single precision, and the square of the exponential still a number.
+    // Above 20 the function equals x in single precision; the bound keeps the square of the exponential finite.
     let exponential = inner.clone().clamp_max(20.0).exp();
     let n = exponential.clone() * (exponential.clone() + 2.0);
     let tanh = n.clone() / (n + 2.0);
@@ -195,11 +217,14 @@ pub fn mish<const D: usize>(x: Tensor<D>) -> Tensor<D> {
         return value;
     }
     let sigmoid = exponential.clone() / (exponential + 1.0);
-    let slope = tanh.clone() + inner * sigmoid * (tanh.square().neg() + 1.0);
-    with_derivative(x, value, slope)
+    let derivative = tanh.clone() + inner * sigmoid * (tanh.square().neg() + 1.0);
+    with_derivative(x, value, derivative)
 }
 
-/// Every `simplex` numbers of a row become weights that add up to 1 (SimNorm).
+/// SimNorm (Lavoie et al. 2023): a softmax over every `simplex` elements of a row.
+///
+/// # Shapes
+/// `[rows, width]` to the same.
 pub fn sim_norm(x: Tensor<2>, simplex: usize) -> Tensor<2> {
     let [rows, width] = x.dims();
     activation::softmax(x.reshape([rows, width / simplex, simplex]), 2).reshape([rows, width])

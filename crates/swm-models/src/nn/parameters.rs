@@ -1,28 +1,28 @@
-//! The parameters of a module by their published names.
+//! Access to the parameters of a module by their published names.
 
 use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor, TensorData};
 use std::collections::BTreeMap;
 
-/// A tensor on the host: its shape and its numbers.
+/// A tensor on the host.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HostTensor {
     /// The shape.
     pub shape: Vec<usize>,
-    /// The numbers, row-major.
+    /// The values, row-major.
     pub values: Vec<f32>,
 }
 
-/// Something by parameter name, in the order of names.
+/// Values by parameter name, in the order of names.
 pub type Named<T> = BTreeMap<String, T>;
 
-/// Follows the path of a traversal.
+/// The path of a traversal.
 #[derive(Default)]
 struct Path(Vec<String>);
 
 impl Path {
     fn enter(&mut self, name: &str, container: &str) {
-        // The variant of an enum is no part of the name; a field `_3` is number 3 of a sequence.
+        // The variant of an enum is not part of the name; a field `_3` is element 3 of a sequence.
         if container.starts_with("Enum:") {
             self.0.push(String::new());
         } else {
@@ -39,7 +39,7 @@ impl Path {
     }
 }
 
-/// Every parameter and buffer of a module.
+/// Copies every parameter and buffer of a module to the host.
 pub fn values<M: Module>(module: &M) -> Named<HostTensor> {
     struct Visitor(Path, Named<HostTensor>);
     impl ModuleVisitor for Visitor {
@@ -61,7 +61,7 @@ pub fn values<M: Module>(module: &M) -> Named<HostTensor> {
     visitor.1
 }
 
-/// Names and shapes of every parameter and buffer of a module.
+/// Returns names and shapes of every parameter and buffer of a module.
 pub fn shapes<M: Module>(module: &M) -> Named<Vec<usize>> {
     struct Visitor(Path, Named<Vec<usize>>);
     impl ModuleVisitor for Visitor {
@@ -80,7 +80,8 @@ pub fn shapes<M: Module>(module: &M) -> Named<Vec<usize>> {
     visitor.1
 }
 
-/// The gradients of a module's parameters, flat; parameters that the loss does not reach are left out.
+/// Returns the gradients of a module's parameters, flattened to one axis, without those of parameters that the loss does not
+/// depend on.
 pub fn gradients<M: Module>(module: &M, gradients: &Gradients) -> Named<Tensor<1>> {
     struct Visitor<'a>(Path, &'a Gradients, Named<Tensor<1>>);
     impl ModuleVisitor for Visitor<'_> {
@@ -92,8 +93,8 @@ pub fn gradients<M: Module>(module: &M, gradients: &Gradients) -> Named<Tensor<1
         }
         fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
             if let Some(gradient) = param.val().grad(self.1) {
-                let numbers = gradient.dims().iter().product::<usize>();
-                self.2.insert(self.0.name(), gradient.reshape([numbers]));
+                let count = gradient.dims().iter().product::<usize>();
+                self.2.insert(self.0.name(), gradient.reshape([count]));
             }
         }
     }
@@ -102,7 +103,7 @@ pub fn gradients<M: Module>(module: &M, gradients: &Gradients) -> Named<Tensor<1
     visitor.2
 }
 
-/// Replaces parameters: `change(name, value)` gets and returns them flat.
+/// Replaces every parameter by the result of `change(name, value)`; values are flattened to one axis.
 pub fn map<M: Module>(module: M, change: impl FnMut(&str, Tensor<1>) -> Tensor<1>) -> M {
     struct Mapper<F>(Path, F);
     impl<F: FnMut(&str, Tensor<1>) -> Tensor<1>> ModuleMapper for Mapper<F> {
@@ -117,15 +118,15 @@ pub fn map<M: Module>(module: M, change: impl FnMut(&str, Tensor<1>) -> Tensor<1
             let change = &mut self.1;
             param.map(|tensor| {
                 let shape = tensor.dims();
-                let numbers = shape.iter().product::<usize>();
-                change(&name, tensor.reshape([numbers])).reshape(shape)
+                let count = shape.iter().product::<usize>();
+                change(&name, tensor.reshape([count])).reshape(shape)
             })
         }
     }
     module.map(&mut Mapper(Path::default(), change))
 }
 
-/// Replaces every parameter whose name is in `values`, which must have the right number of numbers.
+/// Replaces every parameter whose name is in `values`; the numbers of elements must agree.
 pub fn load<M: Module>(module: M, values: &Named<HostTensor>) -> M {
     map(module, |name, old| match values.get(name) {
         None => old,
@@ -133,21 +134,21 @@ pub fn load<M: Module>(module: M, values: &Named<HostTensor>) -> M {
     })
 }
 
-/// Moves every parameter and buffer of `average` towards those of `module`: `keep` of the one, the rest of the other.
+/// Updates an exponential moving average: every parameter and buffer becomes `keep * average + (1 - keep) * module`.
 pub fn blend<M: Module>(average: M, module: &M, keep: f64) -> M {
-    let mut news = Named::new();
-    // Collects the tensors of the module, flat, as they are.
+    let mut values = Named::new();
+    // Collects the tensors of the module without copying them.
     let _ = map(module.clone(), |name, value| {
-        news.insert(name.to_owned(), value.clone());
+        values.insert(name.to_owned(), value.clone());
         value
     });
-    map(average, |name, old| match news.remove(name) {
+    map(average, |name, old| match values.remove(name) {
         Some(new) => old * keep + new * (1.0 - keep),
         None => old,
     })
 }
 
-/// How many numbers of a module are trained: those of parameters that need a gradient.
+/// Counts the trained scalars of a module: the elements of parameters that need a gradient.
 pub fn trained_count<M: Module>(module: &M) -> usize {
     struct Visitor(usize);
     impl ModuleVisitor for Visitor {
@@ -159,14 +160,19 @@ pub fn trained_count<M: Module>(module: &M) -> usize {
         }
     }
     let mut visitor = Visitor(0);
-    // Only a module in training knows.
+    // Only modules in training mark the parameters that need a gradient.
     module.clone().train().visit(&mut visitor);
     visitor.0
 }
 
-/// Reads numbers that are known to be single precision.
+/// Copies the elements of a tensor to the host, row-major.
+pub(crate) fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
+    tensor.into_data().into_f32_vec()
+}
+
+/// Conversion of tensor data to single precision.
 pub(crate) trait IntoF32 {
-    /// The numbers.
+    /// The values, row-major.
     fn into_f32_vec(self) -> Vec<f32>;
 }
 

@@ -1,5 +1,5 @@
-//! A small convolutional encoder whose kernels equal their strides, so that every layer is one matrix product:
-//! the fastest kind of convolution on a CPU.
+//! [`PatchCnn`]: a small convolutional encoder whose kernels equal their strides, so that every layer is one matrix product,
+//! which is the fastest kind of convolution on a CPU.
 
 use super::vit::Projection;
 use super::{Activation, Init, Linear};
@@ -11,13 +11,13 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PatchCnnConfig {
-    /// The convolutions, from pixels up.
+    /// The convolutions, first to last.
     pub stages: Vec<Stage>,
-    /// Hidden features after the last convolution.
+    /// The number of hidden features after the last convolution.
     pub hidden: usize,
-    /// Features it returns.
+    /// The number of output features.
     pub dim: usize,
-    /// The nonlinearity between layers.
+    /// The activation function between layers.
     pub activation: Activation,
 }
 
@@ -25,35 +25,34 @@ pub struct PatchCnnConfig {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Stage {
-    /// Kernel and stride.
+    /// Kernel size and stride.
     pub patch: usize,
     /// Output channels.
     pub channels: usize,
 }
 
-/// Convolutions of disjoint patches, then two linear layers.
+/// Convolutions over disjoint patches, then two linear layers.
 #[derive(Module, Debug)]
 pub struct PatchCnn {
-    /// From pixels.
+    /// The first convolution.
     pub stem: Projection,
     /// The later convolutions.
     pub stages: Vec<Linear>,
-    /// Into the hidden features.
+    /// The layer to the hidden features.
     pub hidden: Linear,
-    /// Out of them.
+    /// The output layer.
     pub out: Linear,
     #[module(skip)]
     config: PatchCnnConfig,
 }
 
 impl PatchCnnConfig {
-    /// Side of the feature map after the last convolution, for pictures of `image` pixels.
+    /// The side of the feature map after the last convolution, for images with a side of `image` pixels.
     fn side(&self, image: usize) -> usize {
         self.stages.iter().fold(image, |side, stage| side / stage.patch)
     }
 
-    /// An encoder for square pictures of `image` pixels.
-    #[allow(clippy::cast_precision_loss)]
+    /// Creates an encoder for images with a side of `image` pixels. Weights have the variance of He et al. 2015.
     pub fn init(&self, init: &Init, image: usize) -> PatchCnn {
         let first = self.stages[0];
         let stages = self.stages.windows(2).enumerate().map(|(index, pair)| {
@@ -61,9 +60,9 @@ impl PatchCnnConfig {
             Linear::normal(&init.of("stage").at(index), inputs, pair[1].channels, (2.0 / inputs as f32).sqrt())
         });
         let features = self.side(image).pow(2) * self.stages[self.stages.len() - 1].channels;
-        let spread = (2.0 / (3 * first.patch.pow(2)) as f32).sqrt();
+        let std = (2.0 / (3 * first.patch.pow(2)) as f32).sqrt();
         PatchCnn {
-            stem: Projection::new(&init.of("stem"), 3, first.patch, first.channels, spread),
+            stem: Projection::new(&init.of("stem"), 3, first.patch, first.channels, std),
             stages: stages.collect(),
             hidden: Linear::normal(&init.of("hidden"), features, self.hidden, (2.0 / features as f32).sqrt()),
             out: Linear::new(&init.of("out"), self.hidden, self.dim),
@@ -73,13 +72,15 @@ impl PatchCnnConfig {
 }
 
 impl PatchCnn {
+    /// Computes the features of images.
+    ///
     /// # Shapes
-    /// `[frames, patches, 3 * patch * patch]`, patches in rows, to `[frames, dim]`.
+    /// `[frames, patches, 3 * patch * patch]`, patches in row-major order of the image, to `[frames, dim]`.
     pub fn forward(&self, patches: Tensor<3>) -> Tensor<2> {
-        let [frames, count, numbers] = patches.dims();
+        let [frames, count, width] = patches.dims();
         let activation = self.config.activation;
         let mut side = count.isqrt();
-        let mut x = activation.forward(self.stem.forward(patches.reshape([frames * count, numbers])));
+        let mut x = activation.forward(self.stem.forward(patches.reshape([frames * count, width])));
         for (layer, stage) in self.stages.iter().zip(&self.config.stages[1..]) {
             let ([_, channels], patch) = (x.dims(), stage.patch);
             side /= patch;

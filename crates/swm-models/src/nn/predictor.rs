@@ -1,7 +1,7 @@
-//! The predictor: a causal transformer over latents whose layers are modulated by the actions (AdaLN, Peebles and
-//! Xie 2023).
+//! [`Predictor`]: a causal transformer over latents whose layers are modulated by the actions (AdaLN-Zero, Peebles and Xie
+//! 2023, section 3.2).
 
-#![allow(non_snake_case)] // published parameter names
+#![allow(non_snake_case, reason = "parameters have their published names")]
 
 use super::attention::{FeedForward, SelfAttention, causal_mask};
 use super::norm::standardize;
@@ -14,25 +14,25 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PredictorConfig {
-    /// Latents it sees: the present one and those before it.
+    /// The number of latents in a window: the present one and those before it.
     pub history: usize,
-    /// Features of a token inside.
+    /// The number of features of a token.
     pub dim: usize,
-    /// Layers.
+    /// The number of layers.
     pub depth: usize,
-    /// Attention heads.
+    /// The number of attention heads.
     pub heads: usize,
-    /// Features of a head.
+    /// The number of features of a head.
     pub dim_head: usize,
-    /// Hidden features of the feed-forward part.
+    /// The number of hidden features of the feed-forward block.
     pub mlp: usize,
-    /// Dropout inside the layers.
+    /// The dropout rate inside the layers.
     pub dropout: f32,
-    /// Dropout of the latents that go in.
+    /// The dropout rate of the input latents.
     pub emb_dropout: f32,
 }
 
-/// Predicts the next latent after each of a window of latents, given the action taken from each.
+/// Predicts the latent after each latent of a window, given the action taken from it.
 #[derive(Module, Debug)]
 pub struct Predictor {
     /// `[1, history, latent]`.
@@ -43,18 +43,18 @@ pub struct Predictor {
     config: PredictorConfig,
 }
 
-/// The layers of a [`Predictor`]; projections are there only where the sizes differ.
+/// The layers of a [`Predictor`]; it has projections only where sizes differ.
 #[derive(Module, Debug)]
 pub struct Transformer {
     /// The last normalisation.
     pub norm: LayerNorm,
-    /// From latents to tokens.
+    /// The projection of latents to tokens.
     pub input_proj: Option<Linear>,
-    /// From embedded actions to conditions.
+    /// The projection of embedded actions to conditions.
     pub cond_proj: Option<Linear>,
-    /// From tokens to latents.
+    /// The projection of tokens to latents.
     pub output_proj: Option<Linear>,
-    /// In order.
+    /// The layers, first to last.
     pub layers: Vec<Block>,
 }
 
@@ -63,27 +63,27 @@ pub struct Transformer {
 pub struct Block {
     /// Self-attention.
     pub attn: SelfAttention,
-    /// The feed-forward part.
+    /// The feed-forward block.
     pub mlp: FeedForward,
-    /// From the condition to shifts, scales and gates.
+    /// The map of the condition to shifts, scales and gates.
     pub adaLN_modulation: Modulation,
 }
 
 /// SiLU, then linear: `[rows, dim]` to `[rows, 6 * dim]`, the shift, scale and gate of the attention, then those of
-/// the feed-forward part. All zero before training.
+/// the feed-forward block. Zero-initialised.
 #[derive(Module, Debug)]
 pub struct Modulation {
     /// The layer.
     pub _1: Linear,
 }
 
-/// What the normalisations before a modulation add to the variance.
+/// Added to the variance by the normalisations before a modulation.
 pub(crate) const MODULATED_EPSILON: f64 = 1e-6;
-/// What the other normalisations add.
+/// Added to the variance by the other normalisations.
 const EPSILON: f64 = 1e-5;
 
 impl PredictorConfig {
-    /// A predictor of `latent` numbers.
+    /// Creates a predictor of latents with `latent` elements.
     pub fn init(&self, init: &Init, latent: usize) -> Predictor {
         let dim = self.dim;
         let bridge =
@@ -111,11 +111,13 @@ impl PredictorConfig {
 }
 
 impl Predictor {
-    /// The size.
+    /// The sizes of the predictor.
     pub fn config(&self) -> &PredictorConfig {
         &self.config
     }
 
+    /// Predicts the next latents.
+    ///
     /// # Shapes
     /// Latents `[windows, steps, latent]` and embedded actions of the same shape, `steps` at most the history, to
     /// predictions of the same shape.

@@ -1,5 +1,5 @@
-//! A vision transformer (Dosovitskiy et al. 2021, pre-norm, class token, learned positions), named as the
-//! published checkpoints name it. Pictures of other sizes than it was made for get interpolated positions.
+//! A vision transformer (Dosovitskiy et al. 2021: pre-norm, class token, trained position embeddings). Parameters have the
+//! names of the published checkpoints. Position embeddings are interpolated for images of other sizes.
 
 use super::attention::attend;
 use super::positions::{Resampling, positions};
@@ -14,20 +14,20 @@ use serde::{Deserialize, Serialize};
 pub struct VitConfig {
     /// Side of a patch, in pixels.
     pub patch: usize,
-    /// Features of a token.
+    /// The number of features of a token.
     pub dim: usize,
-    /// Layers.
+    /// The number of layers.
     pub depth: usize,
-    /// Attention heads.
+    /// The number of attention heads.
     pub heads: usize,
-    /// Hidden features of the feed-forward part.
+    /// The number of hidden features of the feed-forward block.
     pub mlp: usize,
 }
 
 /// A vision transformer.
 #[derive(Module, Debug)]
 pub struct Vit {
-    /// Patches, class token and positions.
+    /// Patch, class and position embeddings.
     pub embeddings: Embeddings,
     /// The layers.
     pub encoder: Layers,
@@ -35,25 +35,25 @@ pub struct Vit {
     pub layernorm: LayerNorm,
 }
 
-/// Patches, class token and positions.
+/// Patch, class and position embeddings.
 #[derive(Module, Debug)]
 pub struct Embeddings {
     /// `[1, 1, dim]`.
     pub cls_token: Param<Tensor<3>>,
     /// `[1, 1 + patches, dim]`.
     pub position_embeddings: Param<Tensor<3>>,
-    /// From pixels to tokens.
+    /// The projection of patches to tokens.
     pub patch_embeddings: Patches,
 }
 
-/// From pixels to tokens.
+/// The projection of patches to tokens.
 #[derive(Module, Debug)]
 pub struct Patches {
-    /// A convolution whose stride is its kernel.
+    /// A convolution whose stride equals its kernel size.
     pub projection: Projection,
 }
 
-/// A convolution whose stride is its kernel: one matrix product over patches.
+/// A convolution whose stride equals its kernel size: one matrix product over patches.
 #[derive(Module, Debug)]
 pub struct Projection {
     /// `[dim, 3, patch, patch]`.
@@ -63,11 +63,13 @@ pub struct Projection {
 }
 
 impl Projection {
-    /// A projection drawn from a normal distribution.
+    /// Creates a projection with normally distributed weights (standard deviation `std`) and bias 0.
     pub fn new(init: &Init, channels: usize, patch: usize, dim: usize, std: f32) -> Self {
         Self { weight: init.normal("weight", [dim, channels, patch, patch], std), bias: init.constant([dim], 0.0) }
     }
 
+    /// Projects patches.
+    ///
     /// # Shapes
     /// `[rows, channels * patch * patch]` (channel, then row, then column) to `[rows, dim]`.
     pub fn forward(&self, patches: Tensor<2>) -> Tensor<2> {
@@ -80,22 +82,22 @@ impl Projection {
 /// The layers of a [`Vit`].
 #[derive(Module, Debug)]
 pub struct Layers {
-    /// In order.
+    /// The layers, first to last.
     pub layer: Vec<Layer>,
 }
 
-/// One layer: attention, then feed-forward, each on normalised tokens and added to them.
+/// One layer: attention, then feed-forward, each computed from normalised tokens and added to the tokens.
 #[derive(Module, Debug)]
 pub struct Layer {
-    /// Before the attention.
+    /// The normalisation before the attention.
     pub layernorm_before: LayerNorm,
     /// Self-attention.
     pub attention: Attention,
-    /// Before the feed-forward part.
+    /// The normalisation before the feed-forward block.
     pub layernorm_after: LayerNorm,
-    /// Into the hidden features.
+    /// The layer to the hidden features.
     pub intermediate: Dense,
-    /// Out of them.
+    /// The layer from the hidden features.
     pub output: Dense,
 }
 
@@ -104,7 +106,7 @@ pub struct Layer {
 pub struct Attention {
     /// Queries, keys and values.
     pub attention: Qkv,
-    /// What comes out.
+    /// The output projection.
     pub output: Dense,
     heads: usize,
 }
@@ -127,43 +129,43 @@ pub struct Dense {
     pub dense: Linear,
 }
 
-/// The spread of initial weights.
+/// The standard deviation of initial weights.
 pub(super) const STD: f32 = 0.02;
-/// What the layer normalisations add to the variance.
+/// Added to the variance by the layer normalisations.
 const EPSILON: f64 = 1e-12;
 
 impl VitConfig {
-    /// The published sizes, by features of a token; the feed-forward part is four times as wide.
+    /// A published size; the feed-forward block has four times the features of a token.
     const fn sized(patch: usize, dim: usize, depth: usize, heads: usize) -> Self {
         Self { patch, dim, depth, heads, mlp: 4 * dim }
     }
 
-    /// ViT-tiny.
+    /// The size of ViT-tiny.
     pub const fn tiny(patch: usize) -> Self {
         Self::sized(patch, 192, 12, 3)
     }
 
-    /// ViT-small.
+    /// The size of ViT-small.
     pub const fn small(patch: usize) -> Self {
         Self::sized(patch, 384, 12, 6)
     }
 
-    /// ViT-base.
+    /// The size of ViT-base.
     pub const fn base(patch: usize) -> Self {
         Self::sized(patch, 768, 12, 12)
     }
 
-    /// ViT-large.
+    /// The size of ViT-large.
     pub const fn large(patch: usize) -> Self {
         Self::sized(patch, 1024, 24, 16)
     }
 
-    /// ViT-huge.
+    /// The size of ViT-huge.
     pub const fn huge(patch: usize) -> Self {
         Self::sized(patch, 1280, 32, 16)
     }
 
-    /// A transformer for square pictures of `image` pixels.
+    /// Creates a transformer for images with a side of `image` pixels.
     pub fn init(&self, init: &Init, image: usize) -> Vit {
         let (dim, tokens) = (self.dim, (image / self.patch).pow(2));
         let dense =
@@ -191,7 +193,7 @@ impl VitConfig {
 }
 
 impl Vit {
-    /// The class token.
+    /// Computes the class token.
     ///
     /// # Shapes
     /// `[frames, patches, 3 * patch * patch]` to `[frames, dim]`.
@@ -201,7 +203,7 @@ impl Vit {
         class.reshape([frames, dim])
     }
 
-    /// All tokens: the class token, then one a patch.
+    /// Computes all tokens: the class token, then one for every patch.
     ///
     /// # Shapes
     /// `[frames, patches, 3 * patch * patch]` to `[frames, 1 + patches, dim]`.
@@ -209,28 +211,35 @@ impl Vit {
         self.run(patches, None)
     }
 
-    /// The first `asked` tokens, or all. Others are not computed where nothing asked for depends on them.
-    fn run(&self, patches: Tensor<3>, asked: Option<usize>) -> Tensor<3> {
+    /// Computes the first `outputs` tokens, or all of them. The last layer skips the others.
+    ///
+    /// # Shapes
+    /// `[frames, patches, 3 * patch * patch]` to `[frames, outputs, dim]`.
+    fn run(&self, patches: Tensor<3>, outputs: Option<usize>) -> Tensor<3> {
         let Embeddings { cls_token, position_embeddings, patch_embeddings } = &self.embeddings;
         let projection = &patch_embeddings.projection;
         let mut tokens = embed(patches, projection, cls_token, position_embeddings, Resampling::Bicubic);
         for (index, layer) in self.encoder.layer.iter().enumerate() {
-            tokens = layer.forward(tokens, asked.filter(|_| index + 1 == self.encoder.layer.len()));
+            tokens = layer.forward(tokens, outputs.filter(|_| index + 1 == self.encoder.layer.len()));
         }
-        self.layernorm.forward(match asked {
-            Some(asked) => leading(tokens, asked),
+        self.layernorm.forward(match outputs {
+            Some(outputs) => leading(tokens, outputs),
             None => tokens,
         })
     }
 }
 
-/// The first tokens.
+/// Returns the first `count` tokens.
+///
+/// # Shapes
+/// `[frames, tokens, dim]` to `[frames, count, dim]`.
 pub(super) fn leading(tokens: Tensor<3>, count: usize) -> Tensor<3> {
     let [frames, _, dim] = tokens.dims();
     tokens.slice([0..frames, 0..count, 0..dim])
 }
 
-/// Patches as tokens behind a class token, with positions (of learnt ones, resampled to the patches' grid).
+/// Computes the input tokens: the class token and the projected patches, plus position embeddings, which are resampled to the
+/// grid of the patches.
 ///
 /// # Shapes
 /// `[frames, patches, 3 * patch * patch]` to `[frames, 1 + patches, dim]`.
@@ -238,21 +247,24 @@ pub(super) fn embed(
     patches: Tensor<3>,
     projection: &Projection,
     class: &Param<Tensor<3>>,
-    learnt: &Param<Tensor<3>>,
+    trained: &Param<Tensor<3>>,
     resampling: Resampling,
 ) -> Tensor<3> {
-    let [frames, count, numbers] = patches.dims();
+    let [frames, count, width] = patches.dims();
     let [_, _, dim] = class.dims();
-    let tokens = projection.forward(patches.reshape([frames * count, numbers])).reshape([frames, count, dim]);
-    Tensor::cat(vec![class.val().expand([frames, 1, dim]), tokens], 1) + positions(learnt.val(), count, resampling)
+    let tokens = projection.forward(patches.reshape([frames * count, width])).reshape([frames, count, dim]);
+    Tensor::cat(vec![class.val().expand([frames, 1, dim]), tokens], 1) + positions(trained.val(), count, resampling)
 }
 
 impl Layer {
-    /// All tokens, or the first `asked`.
-    fn forward(&self, x: Tensor<3>, asked: Option<usize>) -> Tensor<3> {
-        let mixed = self.attention.forward(self.layernorm_before.forward(x.clone()), asked);
-        let x = match asked {
-            Some(asked) => leading(x, asked),
+    /// Computes all tokens, or the first `outputs`.
+    ///
+    /// # Shapes
+    /// `[frames, tokens, dim]` to `[frames, outputs, dim]`.
+    fn forward(&self, x: Tensor<3>, outputs: Option<usize>) -> Tensor<3> {
+        let mixed = self.attention.forward(self.layernorm_before.forward(x.clone()), outputs);
+        let x = match outputs {
+            Some(outputs) => leading(x, outputs),
             None => x,
         } + mixed;
         let hidden = self.intermediate.dense.forward(self.layernorm_after.forward(x.clone()));
@@ -261,7 +273,7 @@ impl Layer {
 }
 
 impl Attention {
-    /// Attention of `heads` heads, drawn as its layers are.
+    /// Creates an attention block with `heads` heads.
     pub(super) fn new(init: &Init, dim: usize, heads: usize) -> Self {
         let part = |name| Linear::normal(&init.of(name), dim, dim, STD);
         Self {
@@ -271,16 +283,19 @@ impl Attention {
         }
     }
 
-    /// How many heads there are.
+    /// The number of heads.
     pub(crate) fn heads(&self) -> usize {
         self.heads
     }
 
-    /// What all tokens, or the first `asked`, attend to.
-    pub(super) fn forward(&self, x: Tensor<3>, asked: Option<usize>) -> Tensor<3> {
+    /// Computes the attention of all tokens, or of the first `outputs`, to all tokens.
+    ///
+    /// # Shapes
+    /// `[frames, tokens, dim]` to `[frames, outputs, dim]`.
+    pub(super) fn forward(&self, x: Tensor<3>, outputs: Option<usize>) -> Tensor<3> {
         let [_, tokens, _] = x.dims();
         let parts = &self.attention;
-        let query = parts.query.forward(leading(x.clone(), asked.unwrap_or(tokens)));
+        let query = parts.query.forward(leading(x.clone(), outputs.unwrap_or(tokens)));
         let (key, value) = (parts.key.forward(x.clone()), parts.value.forward(x));
         self.output.dense.forward(attend([query, key, value], self.heads, None, 0.0, &mut DropoutRng::disabled()))
     }

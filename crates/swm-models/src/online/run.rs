@@ -5,7 +5,6 @@ use super::collector::{Collector, CollectorState};
 use super::config::OnlineConfig;
 use super::evaluation;
 use super::shared_model::SharedModel;
-use crate::checkpoint::Checkpoint;
 use crate::train::config::LoopConfig;
 use crate::train::learner::{self, Learn, Learner, Update};
 use crate::train::metrics::{MetricWindow, Metrics};
@@ -46,7 +45,7 @@ pub struct OnlineSummary {
 }
 
 /// Trains a model by interaction with environments; the checkpoint, the best checkpoint so far and the logs go to the
-/// folder `out`. `make_pool` makes a pool of as many environments as it is asked for.
+/// folder `out`. `make_pool` creates a pool of the given number of environments.
 ///
 /// `control` is checked before every round. An interrupted run saves its weights and its replay buffer and returns a summary
 /// with `interrupted`; `options.resume` continues it. The metrics of the progress events are the model's, then `env_steps`,

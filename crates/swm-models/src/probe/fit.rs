@@ -1,4 +1,4 @@
-//! Fitting a small network: AdamW, warm-up and cosine, batches drawn by key.
+//! Training of the small networks of probes: AdamW, warm-up and cosine decay, batches drawn with a key.
 
 use crate::train::{AdamW, OptimConfig, ParameterGroup, ScheduleConfig, StepOutput};
 use burn::module::Module;
@@ -7,19 +7,23 @@ use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 use swm_core::{Error, Key, Result};
 
-/// How a network is fitted.
+/// The settings of training a network.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FitConfig {
-    /// Steps of the optimizer.
+    /// Optimizer steps.
     pub steps: usize,
-    /// Frames in a batch, drawn with repetition.
+    /// Frames of a batch, drawn with replacement.
     pub batch_size: usize,
-    /// The largest learning rate.
+    /// The peak learning rate.
     pub lr: f64,
 }
 
-/// Fits `model`: `step` gives loss and gradients for the samples at some places. Returns it and its last loss.
+/// Trains `model`; `step` computes loss and gradients of the samples with the given indices. Returns the model and its last
+/// loss.
+///
+/// # Errors
+/// When a step fails or its loss is not finite.
 pub(super) fn fit<M: Module>(
     mut model: M,
     config: FitConfig,
@@ -41,8 +45,8 @@ pub(super) fn fit<M: Module>(
     let mut loss = f64::NAN;
     for number in 0..config.steps {
         let mut rng = key.at(number as u64).rng();
-        let places: Vec<usize> = (0..config.batch_size).map(|_| rng.random_range(0..samples)).collect();
-        let output = step(&model, &places)?;
+        let indices: Vec<usize> = (0..config.batch_size).map(|_| rng.random_range(0..samples)).collect();
+        let output = step(&model, &indices)?;
         loss = output.loss();
         if !loss.is_finite() {
             return Err(Error::NotFinite {
@@ -56,9 +60,12 @@ pub(super) fn fit<M: Module>(
     Ok((model, loss))
 }
 
-/// Some rows of a table, `[rows, width]`, as a tensor.
-pub(super) fn rows(table: &[f32], width: usize, places: &[usize]) -> Tensor<2> {
-    let numbers: Vec<f32> =
-        places.iter().flat_map(|&place| &table[place * width..(place + 1) * width]).copied().collect();
-    Tensor::from_data(TensorData::new(numbers, [places.len(), width]), &Device::flex())
+/// Gathers rows of a table as a tensor.
+///
+/// # Shapes
+/// `[rows, width]` to `[indices, width]`.
+pub(super) fn rows(table: &[f32], width: usize, indices: &[usize]) -> Tensor<2> {
+    let values: Vec<f32> =
+        indices.iter().flat_map(|&index| &table[index * width..(index + 1) * width]).copied().collect();
+    Tensor::from_data(TensorData::new(values, [indices.len(), width]), &Device::flex())
 }

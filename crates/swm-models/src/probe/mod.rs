@@ -1,11 +1,11 @@
-//! Probes: what a frozen encoder's latents say about the world.
+//! Probes: how much of the state of an environment a frozen encoder's latents contain.
 //!
-//! - [`state`](mod@state): read-outs of the columns of a dataset from latents, [linear](ridge) and by a small network, judged
-//!   on episodes that they were not fitted on.
-//! - [`reconstruction`]: the pictures themselves, drawn again from latents.
+//! - [`state`]: regression of the columns of a dataset on latents, [linear](ridge) and with a small network, scored on held-out
+//!   episodes.
+//! - [`reconstruction`]: the images, reconstructed from latents.
 //!
-//! A latent that knows where things are lets a linear map say so; one that a network alone can read holds it folded; what
-//! neither reads is lost, and no planner can use it.
+//! A state that a linear map reads is represented linearly; one that only the network reads, nonlinearly. A planner cannot use
+//! what neither reads.
 
 mod fit;
 pub mod reconstruction;
@@ -19,20 +19,20 @@ pub use state::{Score, StateConfig, StateReport, read_state};
 
 use swm_core::Result;
 
-/// An encoder from pictures to latents.
+/// An encoder of images.
 pub trait ImageEncoder: Send + Sync {
-    /// The side of the square pictures it sees, in pixels.
+    /// The side of its square images, in pixels.
     fn image_size(&self) -> usize;
 
-    /// Numbers in a latent: all patches, where it has patches.
+    /// The dimension of a latent; for an encoder of patches, that of all patches together.
     fn latent_dim(&self) -> usize;
 
-    /// The latents of pictures.
+    /// Encodes images.
     ///
     /// # Shapes
-    /// `[frames, image, image, 3]` bytes to `[frames, latent]`.
+    /// `[frames, image_size, image_size, 3]` bytes to `[frames, latent_dim]`.
     ///
     /// # Errors
-    /// When the bytes are not whole pictures.
+    /// When the bytes are not whole images.
     fn encode(&self, rgb: &[u8]) -> Result<Vec<f32>>;
 }

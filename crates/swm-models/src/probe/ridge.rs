@@ -1,16 +1,16 @@
-//! Linear read-outs in closed form: ridge regression with an intercept.
+//! Ridge regression with an intercept, in closed form (Hoerl and Kennard 1970).
 //!
-//! With features `X` and targets `Y` centred, the map is `W = (XᵀX + λnI)⁻¹ XᵀY = Xᵀ (XXᵀ + λnI)⁻¹ Y`: solved where the
-//! matrix is smaller, by Cholesky's factorisation, in double precision. Features are scaled to unit spread first, so that λ
-//! means the same for every encoder.
+//! For centred features `X` and targets `Y`, the weights are `W = (XᵀX + λnI)⁻¹ XᵀY = Xᵀ (XXᵀ + λnI)⁻¹ Y`. The smaller of the two
+//! systems is solved by Cholesky factorisation in double precision. Features are standardised first, so that λ has the same
+//! meaning for every encoder.
 
 use rayon::prelude::*;
 use swm_core::{Error, Result};
 
-/// `y = W x + b`.
+/// The linear map `y = W x + b`.
 #[derive(Clone, Debug)]
 pub struct Ridge {
-    /// `[targets, features]`, for features as they come.
+    /// `[targets, features]`, for features in their own units.
     weights: Vec<f64>,
     /// `[targets]`.
     intercept: Vec<f64>,
@@ -18,30 +18,29 @@ pub struct Ridge {
 }
 
 impl Ridge {
-    /// The map that fits best.
+    /// Fits the map.
     ///
     /// # Shapes
     /// `x` is `[rows, features]`, `y` is `[rows, targets]`.
     ///
     /// # Errors
-    /// When λ is not above 0, or the features are not finite.
-    #[allow(clippy::cast_precision_loss)]
+    /// When λ is not positive, or a feature or target is not finite.
     pub fn fit(x: &[f32], y: &[f32], rows: usize, lambda: f64) -> Result<Self> {
         if !(lambda.is_finite() && lambda > 0.0) {
-            return Err(Error::config("ridge", lambda.to_string(), "give a number above 0"));
+            return Err(Error::config("ridge", lambda.to_string(), "give a positive number"));
         }
         let (features, targets) = (x.len() / rows, y.len() / rows);
-        let (mean_x, spread) = moments(x, rows);
-        let (mean_y, _) = moments(y, rows);
-        // A feature that never changes says nothing, whatever its scale.
-        let scale: Vec<f64> = spread.iter().map(|&s| if s > 1e-12 { 1.0 / s } else { 0.0 }).collect();
+        let (mean_x, std) = mean_and_std(x, rows);
+        let (mean_y, _) = mean_and_std(y, rows);
+        // A constant feature gets no weight.
+        let scale: Vec<f64> = std.iter().map(|&s| if s > 1e-12 { 1.0 / s } else { 0.0 }).collect();
         let x: Vec<f64> =
             x.iter().enumerate().map(|(i, &v)| (f64::from(v) - mean_x[i % features]) * scale[i % features]).collect();
         let y: Vec<f64> = y.iter().enumerate().map(|(i, &v)| f64::from(v) - mean_y[i % targets]).collect();
         if !x.iter().chain(&y).all(|v| v.is_finite()) {
             return Err(Error::NotFinite {
-                what: "the latents that a probe reads, or what it reads from them".to_owned(),
-                given: "numbers that are not finite".to_owned(),
+                what: "the latents of a probe or its targets".to_owned(),
+                given: "values that are not finite".to_owned(),
                 fix: "check the checkpoint and the dataset".to_owned(),
             });
         }
@@ -68,9 +67,10 @@ impl Ridge {
         Ok(Self { weights, intercept, features })
     }
 
+    /// Predicts targets.
+    ///
     /// # Shapes
     /// `[rows, features]` to `[rows, targets]`.
-    #[allow(clippy::cast_possible_truncation)]
     pub fn predict(&self, x: &[f32]) -> Vec<f32> {
         x.par_chunks_exact(self.features)
             .flat_map_iter(|x| {
@@ -82,9 +82,11 @@ impl Ridge {
     }
 }
 
-/// Mean and standard deviation of every column.
-#[allow(clippy::cast_precision_loss)]
-pub(super) fn moments(x: &[f32], rows: usize) -> (Vec<f64>, Vec<f64>) {
+/// Computes mean and standard deviation of every column.
+///
+/// # Shapes
+/// `x` is `[rows, width]`; returns `[width]` twice.
+pub(super) fn mean_and_std(x: &[f32], rows: usize) -> (Vec<f64>, Vec<f64>) {
     let width = x.len() / rows;
     let mut mean = vec![0.0f64; width];
     for row in x.chunks_exact(width) {
@@ -98,23 +100,31 @@ pub(super) fn moments(x: &[f32], rows: usize) -> (Vec<f64>, Vec<f64>) {
     (mean, square.into_iter().map(|sum| (sum / rows as f64).sqrt()).collect())
 }
 
+/// Transposes a matrix.
+///
+/// # Shapes
 /// `[rows, columns]` to `[columns, rows]`.
 fn transpose(x: &[f64], rows: usize, columns: usize) -> Vec<f64> {
     (0..rows * columns).map(|i| x[i % rows * columns + i / rows]).collect()
 }
 
-/// The inner products of all rows of `a` with all rows of `b`, `width` numbers each.
+/// Computes `a bᵀ`, the inner products of all rows.
+///
+/// # Shapes
+/// `a` is `[m, width]`, `b` is `[n, width]`; returns `[m, n]`.
 fn products(a: &[f64], b: &[f64], width: usize) -> Vec<f64> {
     a.par_chunks_exact(width)
         .flat_map_iter(|a| b.chunks_exact(width).map(move |b| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>()))
         .collect()
 }
 
-/// Solves `(gram + penalty I) S = right`, `right` and `S` being `[size, targets]`, for a gram that has no negative
-/// eigenvalue and a positive penalty.
+/// Solves `(gram + penalty I) S = right` for a positive semidefinite `gram` and a positive penalty.
+///
+/// # Shapes
+/// `gram` is `[size, size]`, `right` and the result are `[size, targets]`.
 fn solve(mut gram: Vec<f64>, mut right: Vec<f64>, targets: usize, penalty: f64) -> Vec<f64> {
     let size = right.len() / targets;
-    // Cholesky's factor takes the place of the lower triangle, row after row of what is left.
+    // The Cholesky factor overwrites the lower triangle.
     for i in 0..size {
         gram[i * size + i] += penalty;
     }
@@ -164,7 +174,7 @@ mod tests {
     }
 
     #[test]
-    fn a_linear_map_is_found_again() {
+    fn linear_map_is_recovered() {
         let (rows, features) = (200, 7);
         let x = noise(rows * features, "x");
         let truth = noise(2 * features, "w");
@@ -178,20 +188,20 @@ mod tests {
     }
 
     #[test]
-    fn both_ways_to_solve_agree() {
-        // The same problem, once with more rows than features; then some features twice, so that there are more of them.
+    fn primal_and_dual_solutions_agree() {
+        // The same problem with more rows than features, then with every feature twice, so that there are more features.
         let (rows, features) = (12, 9);
         let (x, y) = (noise(rows * features, "x"), noise(rows * 3, "y"));
         let primal = Ridge::fit(&x, &y, rows, 0.1).expect("fitted").predict(&x);
         let twice: Vec<f32> = x.chunks(features).flat_map(|x| [x, x].concat()).collect();
-        // Every feature twice with twice the penalty is the same map, its weights shared out.
+        // Every feature twice with twice the penalty gives the same map, with each weight split in two.
         let dual = Ridge::fit(&twice, &y, rows, 0.2).expect("fitted").predict(&twice);
         let worst = primal.iter().zip(&dual).fold(0.0f32, |m, (a, b)| m.max((a - b).abs()));
         assert!(worst < 1e-5, "{worst}");
     }
 
     #[test]
-    fn a_penalty_of_nothing_and_numbers_that_are_none_are_refused() {
+    fn zero_penalty_and_non_finite_values_are_refused() {
         assert!(Ridge::fit(&[1.0, 2.0], &[1.0, 2.0], 2, 0.0).is_err());
         assert!(Ridge::fit(&[1.0, f32::NAN], &[1.0, 2.0], 2, 0.1).is_err());
     }

@@ -1,67 +1,71 @@
-//! Frames drawn from a dataset, their latents, and columns beside them.
+//! Frames sampled from a dataset, their latents, and the columns to predict.
 
 use super::ImageEncoder;
 use crate::pixels;
 use rand::Rng as _;
 use rayon::prelude::*;
+use swm_core::columns::PIXELS;
 use swm_core::{Batch, Error, Key, Result};
 use swm_data::{Part, Reader, Split, StepRange};
 
-/// Frames and what belongs to them.
+/// Sampled frames.
 pub(super) struct Samples {
-    /// Frames.
+    /// The number of frames.
     pub count: usize,
-    /// `[count, latent]`.
+    /// `[count, latent_dim]`.
     pub latents: Vec<f32>,
-    /// `[count, image, image, 3]`, where they were asked for.
-    pub pictures: Vec<u8>,
-    /// `[count, numbers]`: the numbers of all columns, beside each other.
+    /// `[count, image_size, image_size, 3]`, or empty if images are not kept.
+    pub images: Vec<u8>,
+    /// `[count, targets]`: the elements of all columns, concatenated.
     pub targets: Vec<f32>,
 }
 
-/// Frames read and encoded at once: a fixed number, so that latents do not depend on the number of threads.
+/// Frames that are read and encoded together: a constant, so that latents do not depend on the number of threads.
 const FRAMES: usize = 64;
 
-/// Numbers of latents kept at once, at most: 1 GB of them in double precision.
-const NUMBERS: usize = 1 << 27;
+/// The largest number of latent elements held in memory: 1 GB in double precision.
+const MAX_ELEMENTS: usize = 1 << 27;
 
-/// Draws up to `count` frames of a part of a dataset (fewer where latents are very large), without repetition, in stored
-/// order. Frames at which a column holds something that is not finite are left out.
-pub(super) fn draw(
+/// Samples up to `count` frames of a part of a dataset (fewer if latents are very large) without replacement, in stored order.
+/// Frames whose columns are not finite are skipped.
+///
+/// # Errors
+/// When a column is missing, images have another size than the encoder's, or fewer than two frames are left.
+pub(super) fn sample(
     encoder: &dyn ImageEncoder,
     reader: &dyn Reader,
     part: Part,
     columns: &[String],
-    keep_pictures: bool,
+    keep_images: bool,
     (count, key): (usize, Key),
 ) -> Result<Samples> {
-    pixels::check(encoder.image_size(), reader.schema(), "pixels")?;
+    pixels::check(encoder.image_size(), reader.schema(), PIXELS)?;
     let rows: Vec<StepRange> = Split::default()
         .episodes(reader, part)?
         .into_iter()
         .flat_map(|episode| (0..reader.episodes()[episode].length).map(move |row| StepRange::new(episode, row, 1)))
         .collect();
-    let rows = choose(rows, count.min(NUMBERS / encoder.latent_dim()), key.with(&part.to_string()));
-    let names: Vec<&str> = std::iter::once("pixels").chain(columns.iter().map(String::as_str)).collect();
-    let mut samples = Samples { count: 0, latents: vec![], pictures: vec![], targets: vec![] };
-    // A few blocks at a time, each encoded by itself.
+    let rows = choose(rows, count.min(MAX_ELEMENTS / encoder.latent_dim()), key.with(&part.to_string()));
+    let names: Vec<&str> = std::iter::once(PIXELS).chain(columns.iter().map(String::as_str)).collect();
+    let mut samples = Samples { count: 0, latents: vec![], images: vec![], targets: vec![] };
+    // Some blocks at a time, encoded in parallel.
     for blocks in rows.chunks(FRAMES * 16) {
         let parts: Result<Vec<(Vec<f32>, Batch)>> = blocks
             .par_chunks(FRAMES)
             .map(|rows| {
                 let batch = reader.read(&names, rows)?;
-                Ok((encoder.encode(batch.get::<u8>("pixels")?)?, batch))
+                Ok((encoder.encode(batch.get::<u8>(PIXELS)?)?, batch))
             })
             .collect();
         for (latents, batch) in parts? {
-            samples.add(encoder, columns, keep_pictures, &latents, &batch)?;
+            samples.add(encoder, columns, keep_images, &latents, &batch)?;
         }
     }
     if samples.count < 2 {
         return Err(Error::config(
             format!("the {part} split"),
-            format!("{} frames with finite numbers in {}", samples.count, columns.join(", ")),
-            "choose columns that hold finite numbers, or a larger dataset",
+            format!("{} frames with finite values in {}", samples.count, columns.join(", ")),
+            "choose columns with finite values, or a larger dataset",
         ));
     }
     Ok(samples)
@@ -72,26 +76,26 @@ impl Samples {
         &mut self,
         encoder: &dyn ImageEncoder,
         columns: &[String],
-        keep_pictures: bool,
+        keep_images: bool,
         latents: &[f32],
         batch: &Batch,
     ) -> Result<()> {
         let columns: Result<Vec<Vec<f32>>> = columns.iter().map(|name| batch.to_f32(name)).collect();
         let (columns, rows) = (columns?, batch.rows());
-        let pictures = batch.get::<u8>("pixels")?;
+        let images = batch.get::<u8>(PIXELS)?;
         for row in 0..rows {
-            let numbers = columns.iter().flat_map(|column| {
+            let targets = columns.iter().flat_map(|column| {
                 let width = column.len() / rows;
                 &column[row * width..(row + 1) * width]
             });
-            if !numbers.clone().all(|number| number.is_finite()) {
+            if !targets.clone().all(|value| value.is_finite()) {
                 continue;
             }
-            self.targets.extend(numbers);
+            self.targets.extend(targets);
             self.latents.extend_from_slice(&latents[row * encoder.latent_dim()..][..encoder.latent_dim()]);
-            if keep_pictures {
-                let bytes = pictures.len() / rows;
-                self.pictures.extend_from_slice(&pictures[row * bytes..][..bytes]);
+            if keep_images {
+                let bytes = images.len() / rows;
+                self.images.extend_from_slice(&images[row * bytes..][..bytes]);
             }
             self.count += 1;
         }
@@ -99,7 +103,7 @@ impl Samples {
     }
 }
 
-/// `count` of the rows, in order: Floyd's choice without repetition.
+/// Samples `count` of the rows without replacement, in order (Floyd's algorithm).
 fn choose(rows: Vec<StepRange>, count: usize, key: Key) -> Vec<StepRange> {
     if count >= rows.len() {
         return rows;
@@ -107,10 +111,10 @@ fn choose(rows: Vec<StepRange>, count: usize, key: Key) -> Vec<StepRange> {
     let mut rng = key.rng();
     let mut chosen = std::collections::BTreeSet::new();
     for last in rows.len() - count..rows.len() {
-        let place = usize::try_from(rng.random_range(0..=last as u64)).unwrap_or(last);
-        if !chosen.insert(place) {
+        let index = usize::try_from(rng.random_range(0..=last as u64)).unwrap_or(last);
+        if !chosen.insert(index) {
             chosen.insert(last);
         }
     }
-    chosen.into_iter().map(|place| rows[place]).collect()
+    chosen.into_iter().map(|index| rows[index]).collect()
 }

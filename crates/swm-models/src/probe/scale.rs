@@ -1,39 +1,43 @@
-//! [`Scale`]: columns of mean 0 and spread 1, which networks are fitted on.
+//! [`Scale`]: standardisation of columns to mean 0 and standard deviation 1, for the networks of probes.
 
-use super::ridge::moments;
+use super::ridge::mean_and_std;
 
-/// The mean and the spread of every column of a table.
+/// The mean and the standard deviation of every column of a table.
 pub(super) struct Scale {
     mean: Vec<f64>,
-    spread: Vec<f64>,
+    std: Vec<f64>,
 }
 
 impl Scale {
-    /// Those of a table; a column that never changes keeps its scale.
+    /// Computes the scale of a table `[rows, width]`; a constant column keeps its unit.
     pub fn of(table: &[f32], rows: usize) -> Self {
-        let (mean, spread) = moments(table, rows);
-        Self { mean, spread: spread.into_iter().map(|s| if s > 1e-12 { s } else { 1.0 }).collect() }
+        let (mean, std) = mean_and_std(table, rows);
+        Self { mean, std: std.into_iter().map(|s| if s > 1e-12 { s } else { 1.0 }).collect() }
     }
 
-    /// Columns.
+    /// The number of columns.
     pub fn width(&self) -> usize {
         self.mean.len()
     }
 
-    /// The table, scaled.
-    #[allow(clippy::cast_possible_truncation)]
+    /// Standardises a table.
+    ///
+    /// # Shapes
+    /// `[rows, width]` to the same.
     pub fn apply(&self, table: &[f32]) -> Vec<f32> {
         let width = self.width();
-        let scaled = |(i, &v): (usize, &f32)| ((f64::from(v) - self.mean[i % width]) / self.spread[i % width]) as f32;
+        let scaled = |(i, &v): (usize, &f32)| ((f64::from(v) - self.mean[i % width]) / self.std[i % width]) as f32;
         table.iter().enumerate().map(scaled).collect()
     }
 
-    /// A scaled table in its own units again.
-    #[allow(clippy::cast_possible_truncation)]
+    /// Converts a standardised table back to its units.
+    ///
+    /// # Shapes
+    /// `[rows, width]` to the same.
     pub fn undo(&self, table: &mut [f32]) {
         let width = self.width();
         for (i, v) in table.iter_mut().enumerate() {
-            *v = (f64::from(*v) * self.spread[i % width] + self.mean[i % width]) as f32;
+            *v = (f64::from(*v) * self.std[i % width] + self.mean[i % width]) as f32;
         }
     }
 }

@@ -1,7 +1,7 @@
-//! Reading columns of numbers from latents.
+//! Regression of numeric columns on latents.
 
 use super::fit::{FitConfig, fit, rows};
-use super::ridge::{Ridge, moments};
+use super::ridge::{Ridge, mean_and_std};
 use super::scale::Scale;
 use super::{ImageEncoder, samples};
 use crate::nn::parameters::{self, IntoF32};
@@ -14,72 +14,71 @@ use serde::{Deserialize, Serialize};
 use swm_core::{Error, Key, Result};
 use swm_data::{Part, Reader};
 
-/// What to read, and how.
+/// The columns to predict, and how.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct StateConfig {
-    /// Decides which frames are drawn, initial weights and batches.
+    /// The seed of sampled frames, initial weights and batches.
     pub seed: u64,
-    /// The columns to read.
+    /// The columns to predict.
     pub columns: Vec<String>,
-    /// Frames to fit on, at most; from episodes that models are trained on.
+    /// The largest number of frames to fit on, from the training episodes.
     pub frames: usize,
-    /// Frames to judge on, at most; from episodes held out for validation.
+    /// The largest number of frames to score on, from the validation episodes.
     pub held_out: usize,
-    /// λ of the linear read-out.
+    /// λ of the ridge regression.
     pub ridge: f64,
-    /// Hidden features of the network.
+    /// The number of hidden features of the network.
     pub hidden: usize,
-    /// How the network is fitted.
+    /// The training of the network.
     pub fit: FitConfig,
 }
 
 impl StateConfig {
-    /// The settings that are used unless something else is said.
+    /// The default settings for these columns.
     pub fn new(columns: Vec<String>) -> Self {
         let fit = FitConfig { steps: 1500, batch_size: 128, lr: 2e-3 };
         Self { seed: 0, columns, frames: 6000, held_out: 2000, ridge: 1e-4, hidden: 128, fit }
     }
 }
 
-/// How well one number is read on episodes that nothing was fitted on.
+/// How well one element of a column is predicted on held-out episodes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Score {
     /// The column.
     pub column: String,
-    /// The place of the number in a row of it.
+    /// The index of the element in a row of the column.
     pub index: usize,
-    /// The number's standard deviation, in its units.
+    /// The standard deviation of the element, in its units.
     pub spread: f64,
-    /// The share of its variance that is read: 1 is all, 0 what its mean says, less is worse than that. None for a number
-    /// that never changes.
+    /// The coefficient of determination: 1 for perfect predictions, 0 for those of the mean. `None` for a constant element.
     pub r2: Option<f64>,
-    /// The root of the mean squared error, in its units.
+    /// The root mean squared error, in its units.
     pub rmse: f64,
     /// The mean absolute error, in its units.
     pub mae: f64,
 }
 
-/// What two read-outs found.
+/// The scores of both regressions.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct StateReport {
-    /// Numbers in a latent.
+    /// The dimension of a latent.
     pub latent: usize,
-    /// Frames fitted on.
+    /// Frames that were fitted on.
     pub frames: usize,
-    /// Frames judged on.
+    /// Frames that were scored on.
     pub held_out: usize,
-    /// The linear read-out, number by number.
+    /// The scores of the ridge regression, element by element.
     pub linear: Vec<Score>,
-    /// The network with two hidden layers.
+    /// The scores of the network with two hidden layers, element by element.
     pub network: Vec<Score>,
 }
 
-/// Fits a linear and a nonlinear read-out of columns from an encoder's latents, and judges both on held-out episodes.
+/// Fits a linear and a nonlinear regression of columns on an encoder's latents, and scores both on held-out episodes.
 ///
 /// # Errors
-/// When a column is missing or holds pictures, the pictures have another size than the encoder sees, no episode is held
-/// out, or a setting makes no sense.
+/// When a column is missing or holds images, the images have another size than the encoder's, no episode is held out, or a
+/// setting is out of range.
 pub fn read_state(encoder: &dyn ImageEncoder, reader: &dyn Reader, config: &StateConfig) -> Result<StateReport> {
     at_least(&[
         ("columns", config.columns.len(), 1),
@@ -93,29 +92,30 @@ pub fn read_state(encoder: &dyn ImageEncoder, reader: &dyn Reader, config: &Stat
     for name in &config.columns {
         let column = reader.schema().column(name)?;
         if column.is_image() {
-            let fix = "name columns of numbers; pictures are drawn again by the picture probe";
-            return Err(Error::config(name, "holds pictures", fix));
+            let fix = "name numeric columns; the image probe reconstructs images";
+            return Err(Error::config(name, "holds images", fix));
         }
         names.extend((0..column.len()).map(|index| (name.clone(), index)));
     }
     let key = Key::new(config.seed).with("probe");
-    let draw = |part, count| samples::draw(encoder, reader, part, &config.columns, false, (count, key.with("frames")));
-    let train = draw(Part::Train, config.frames)?;
-    let held_out = draw(Part::Validation, config.held_out)?;
+    let sample =
+        |part, count| samples::sample(encoder, reader, part, &config.columns, false, (count, key.with("frames")));
+    let train = sample(Part::Train, config.frames)?;
+    let held_out = sample(Part::Validation, config.held_out)?;
 
     let ridge = Ridge::fit(&train.latents, &train.targets, train.count, config.ridge)?;
     let network = Network::fit(&train, config, key)?;
-    let judge = |said: &[f32]| scores(&names, said, &held_out.targets);
+    let score = |predictions: &[f32]| scores(&names, predictions, &held_out.targets);
     Ok(StateReport {
         latent: encoder.latent_dim(),
         frames: train.count,
         held_out: held_out.count,
-        linear: judge(&ridge.predict(&held_out.latents)),
-        network: judge(&network.predict(&held_out.latents)),
+        linear: score(&ridge.predict(&held_out.latents)),
+        network: score(&network.predict(&held_out.latents)),
     })
 }
 
-/// The nonlinear read-out.
+/// The nonlinear regression.
 struct Network {
     model: Mlp,
     latents: Scale,
@@ -128,9 +128,9 @@ impl Network {
         let (x, y) = (latents.apply(&train.latents), targets.apply(&train.targets));
         let (inputs, outputs) = (latents.width(), targets.width());
         let model = Mlp::new(&Init::new(key.with("init"), &Device::flex()), inputs, config.hidden, outputs);
-        let step = |model: &Mlp, places: &[usize]| {
+        let step = |model: &Mlp, indices: &[usize]| {
             let trained = model.clone().train();
-            let error = trained.forward(rows(&x, inputs, places).autodiff()) - rows(&y, outputs, places).autodiff();
+            let error = trained.forward(rows(&x, inputs, indices).autodiff()) - rows(&y, outputs, indices).autodiff();
             let loss = error.square().mean();
             let metrics = vec![("loss", f64::from(loss.clone().inner().into_scalar::<f32>()))];
             let gradients = parameters::gradients(&trained, &loss.backward());
@@ -150,20 +150,23 @@ impl Network {
                 self.model.forward(Tensor::from_data(x, &Device::flex())).into_data().into_f32_vec()
             })
             .collect();
-        let mut said = parts.concat();
-        self.targets.undo(&mut said);
-        said
+        let mut predictions = parts.concat();
+        self.targets.undo(&mut predictions);
+        predictions
     }
 }
 
-#[allow(clippy::cast_precision_loss)]
-fn scores(names: &[(String, usize)], said: &[f32], truth: &[f32]) -> Vec<Score> {
-    let (width, count) = (names.len(), (truth.len() / names.len()) as f64);
-    let (_, spread) = moments(truth, truth.len() / width);
-    let score = |(place, (column, index)): (usize, &(String, usize))| {
-        let errors = || said.iter().zip(truth).skip(place).step_by(width).map(|(a, b)| f64::from(a - b));
+/// Scores predictions of the elements `names`.
+///
+/// # Shapes
+/// `predictions` and `targets` are `[rows, names]`.
+fn scores(names: &[(String, usize)], predictions: &[f32], targets: &[f32]) -> Vec<Score> {
+    let (width, count) = (names.len(), (targets.len() / names.len()) as f64);
+    let (_, spread) = mean_and_std(targets, targets.len() / width);
+    let score = |(i, (column, index)): (usize, &(String, usize))| {
+        let errors = || predictions.iter().zip(targets).skip(i).step_by(width).map(|(a, b)| f64::from(a - b));
         let square = errors().map(|e| e * e).sum::<f64>() / count;
-        let (column, index, spread) = (column.clone(), *index, spread[place]);
+        let (column, index, spread) = (column.clone(), *index, spread[i]);
         let r2 = (spread > 1e-9).then(|| 1.0 - square / spread.powi(2));
         Score { column, index, spread, r2, rmse: square.sqrt(), mae: errors().map(f64::abs).sum::<f64>() / count }
     };
@@ -175,10 +178,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn scores_are_in_units_and_a_constant_has_no_r2() {
+    fn scores_have_units_and_constants_have_no_r2() {
         let names = vec![("x".to_owned(), 0), ("x".to_owned(), 1)];
-        let (said, truth) = ([1.0, 5.0, 2.0, 5.0, 6.0, 5.0], [0.0, 5.0, 3.0, 5.0, 6.0, 5.0]);
-        let scores = scores(&names, &said, &truth);
+        let (predictions, targets) = ([1.0, 5.0, 2.0, 5.0, 6.0, 5.0], [0.0, 5.0, 3.0, 5.0, 6.0, 5.0]);
+        let scores = scores(&names, &predictions, &targets);
         assert!((scores[0].mae - 2.0 / 3.0).abs() < 1e-9 && (scores[0].rmse - (2.0f64 / 3.0).sqrt()).abs() < 1e-9);
         // The variance of 0, 3, 6 is 6.
         assert!((scores[0].r2.expect("it changes") - (1.0 - 2.0 / 3.0 / 6.0)).abs() < 1e-9);

@@ -36,7 +36,7 @@ pub(crate) trait Learn {
     /// When the batch does not fit the model.
     fn loss_and_gradients(&self, batch: &Batch, key: Key, training: bool) -> Result<StepOutput>;
 
-    /// Makes one optimizer step; `key` decides the random numbers of what follows it.
+    /// Makes one optimizer step, then [`Trainable::after_step`] with `key`.
     fn update(&mut self, output: StepOutput, key: Key) -> Update;
 
     /// Saves the checkpoint with all that is needed to continue, and returns the hash of its weights.
@@ -49,7 +49,7 @@ pub(crate) trait Learn {
     fn parameter_count(&self) -> usize;
 }
 
-/// What an optimizer step reports.
+/// The result of an optimizer step.
 pub(crate) struct Update {
     /// The metrics of the step.
     pub metrics: Metrics,

@@ -1,4 +1,4 @@
-//! [`TrainOptions`] and [`TrainSummary`]: what a run takes and returns beside its configuration, data and model.
+//! [`TrainOptions`] and [`TrainSummary`]: the options of a run that do not change its results, and its summary.
 
 use burn::tensor::Device;
 use serde::Serialize;

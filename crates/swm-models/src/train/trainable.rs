@@ -81,7 +81,7 @@ pub trait Trainable: Module + Sync + 'static {
     }
 }
 
-/// What a training step reads beside the model and the batch.
+/// The inputs of a training step besides the model and the batch.
 pub struct StepContext<'a, M: Trainable> {
     /// The run's configuration.
     pub config: &'a TrainConfig<M>,

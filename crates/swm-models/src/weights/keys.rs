@@ -1,16 +1,16 @@
-//! The keys of JSON objects in the order of the file, which a parsed object no longer tells: the reference's modules are
-//! applied in that order.
+//! The keys of JSON objects in the order of the file, which parsed objects lose. The reference applies its modules in that
+//! order.
 
 use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde::ser::{Serialize, SerializeMap as _, Serializer};
 use std::fmt;
 
-/// The keys of an object, each with those of its value.
+/// The keys of an object in order, each with the keys of its value.
 #[derive(Debug, Default, PartialEq)]
 pub(crate) struct Keys(pub Vec<(String, Keys)>);
 
 impl Keys {
-    /// Those of the object at a path with dots.
+    /// The keys of the object at a dotted path.
     pub fn at(&self, path: &str) -> Option<&Self> {
         path.split('.').try_fold(self, |keys, key| keys.0.iter().find(|(name, _)| name == key).map(|(_, keys)| keys))
     }
@@ -59,7 +59,7 @@ impl<'de> Deserialize<'de> for Keys {
     }
 }
 
-/// An object whose keys are written in this order.
+/// An object that is serialised with its keys in this order.
 pub(crate) struct InOrder<T>(pub Vec<(String, T)>);
 
 impl<T: Serialize> Serialize for InOrder<T> {
@@ -77,7 +77,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_order_of_the_file_is_kept() {
+    fn keys_keep_the_order_of_the_file() {
         let text = r#"{"z": {"second": 1, "first": [{"x": 2}], "null": null}, "a": "text"}"#;
         let keys: Keys = serde_json::from_str(text).expect("JSON");
         let names = |keys: &Keys| keys.0.iter().map(|(name, _)| name.clone()).collect::<Vec<_>>();

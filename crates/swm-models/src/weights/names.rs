@@ -1,11 +1,11 @@
-//! What the weights of a vision transformer are called.
+//! The names of the weights of a vision transformer.
 //!
-//! Published files, and models of `transformers` up to version 4, use the names of our modules. Version 5 renames
-//! them when it loads a file, so a state dict that was saved from a live model has its newer names.
+//! Published files and `transformers` up to version 4 use the names of our modules. Version 5 renames weights when it loads a
+//! file, so a state dict that it saved has the newer names.
 
 use crate::nn::parameters::Named;
 
-/// Who is to load a state dict.
+/// The names in a state dict.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Naming {
     /// `transformers` up to version 4, and published files.
@@ -15,7 +15,7 @@ pub enum Naming {
     Transformers5,
 }
 
-/// Parts of names: published, and of version 5. Those of a ViT, which has no `mlp` in published names.
+/// Parts of names in a ViT: published, and in version 5.
 const VIT: &[(&str, &str)] = &[
     ("encoder.layer.", "layers."),
     (".attention.attention.query.", ".attention.q_proj."),
@@ -26,7 +26,7 @@ const VIT: &[(&str, &str)] = &[
     (".output.dense.", ".mlp.fc2."),
 ];
 
-/// Those of a DINOv2.
+/// Parts of names in a DINOv2: published, and in version 5.
 const DINO: &[(&str, &str)] = &[
     (".attention.attention.query.", ".attention.q_proj."),
     (".attention.attention.key.", ".attention.k_proj."),
@@ -34,13 +34,13 @@ const DINO: &[(&str, &str)] = &[
     (".attention.output.dense.", ".attention.o_proj."),
 ];
 
-/// The table of a transformer, which one can tell from its names: a DINOv2 has scales.
+/// The table of a transformer; only a DINOv2 has weights of LayerScale.
 fn table<T>(weights: &Named<T>, prefix: &str) -> &'static [(&'static str, &'static str)] {
     let scaled = weights.keys().any(|name| name.starts_with(prefix) && name.contains(".layer_scale1."));
     if scaled { DINO } else { VIT }
 }
 
-/// Gives the weights of the transformer below `prefix` (such as `encoder.`) their published names, whichever they have.
+/// Renames the weights of the transformer below `prefix` (such as `encoder.`) to their published names, whichever they have.
 pub fn to_published<T>(weights: Named<T>, prefix: &str) -> Named<T> {
     let table = table(&weights, prefix);
     let is_newer = |name: &String| name.starts_with(prefix) && name.contains(".attention.q_proj.");
@@ -50,7 +50,7 @@ pub fn to_published<T>(weights: Named<T>, prefix: &str) -> Named<T> {
     rename(weights, prefix, |name, (old, new)| name.replacen(new, old, 1), table)
 }
 
-/// Gives the weights of the transformer below `prefix`, which have their published names, those of `naming`.
+/// Renames the weights of the transformer below `prefix` from their published names to those of `naming`.
 pub fn to_naming<T>(weights: Named<T>, prefix: &str, naming: Naming) -> Named<T> {
     let table = table(&weights, prefix);
     match naming {
@@ -86,7 +86,7 @@ mod tests {
     }
 
     #[test]
-    fn names_go_there_and_back() {
+    fn names_round_trip() {
         let families = [
             (
                 ["e.encoder.layer.0.attention.attention.query.bias", "e.encoder.layer.0.attention.output.dense.bias"],
@@ -102,7 +102,7 @@ mod tests {
             ),
         ];
         for (a, b, c, d) in families {
-            // What lies outside the transformer keeps its name.
+            // Weights outside of the transformer keep their names.
             let old = set(&[&a[..], &b[..], &["predictor.mlp.fc1.weight"]].concat());
             let new = set(&[&c[..], &d[..], &["predictor.mlp.fc1.weight"]].concat());
             assert_eq!(to_naming(old.clone(), "e.", Naming::Transformers5), new);

@@ -1,5 +1,5 @@
-//! Checkpoints of the reference implementation: a state dict (`weights.pt`) beside a `config.json`, which is a tree of
-//! classes (`_target_`) and the sizes they are made with.
+//! Checkpoints of the reference implementation: a state dict (`weights.pt`) and a `config.json`, which is a tree of classes
+//! (`_target_`) and their arguments.
 
 use super::keys::Keys;
 use super::{BATCHES_TRACKED, names, read, torch};
@@ -10,7 +10,7 @@ use serde_json::Value;
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Result};
 
-/// A checkpoint of the reference, read.
+/// A checkpoint of the reference.
 pub(crate) struct Reference {
     /// The file of weights.
     pub path: PathBuf,
@@ -26,80 +26,91 @@ const CONFIG: &str = "config.json";
 const TARGET: &str = "_target_";
 
 impl Reference {
-    /// Reads a folder with a `config.json` and one file of weights, or such a file beside a `config.json`, of a model
-    /// whose class is called `class`.
+    /// Reads a checkpoint of the class `class`: a folder with a `config.json` and one file of weights, or the path of that file.
     ///
     /// # Errors
-    /// When a file is missing or damaged, there are several files of weights, or it is another model.
+    /// When a file is missing or damaged, there are several files of weights, or the class is another one.
     pub fn open(from: &Path, class: &str) -> Result<Self> {
         if !from.exists() {
             let fix = "give the folder of a checkpoint, or its file of weights";
-            return Err(Error::corrupt(from, "there is nothing", fix));
+            return Err(Error::corrupt(from, "does not exist", fix));
         }
         let folder = if from.is_dir() { from } else { from.parent().unwrap_or(Path::new("")) };
         let path = if from.is_dir() { only_weights(folder)? } else { from.to_owned() };
-        let beside = folder.join(CONFIG);
-        let text = std::fs::read(&beside).map_err(|error| Error::io(&beside, "reading a checkpoint", error))?;
-        let wrong = |problem: String| {
-            Error::corrupt(&beside, problem, format!("give a checkpoint of the reference's class {class}"))
+        let config_path = folder.join(CONFIG);
+        let text =
+            std::fs::read(&config_path).map_err(|error| Error::io(&config_path, "reading a checkpoint", error))?;
+        let invalid = |problem: String| {
+            Error::corrupt(&config_path, problem, format!("give a checkpoint of the reference's class {class}"))
         };
-        let mut config: Value = serde_json::from_slice(&text).map_err(|error| wrong(error.to_string()))?;
-        let mut keys: Keys = serde_json::from_slice(&text).map_err(|error| wrong(error.to_string()))?;
-        // Early versions stored the whole configuration of the run.
+        let mut config: Value = serde_json::from_slice(&text).map_err(|error| invalid(error.to_string()))?;
+        let mut keys: Keys = serde_json::from_slice(&text).map_err(|error| invalid(error.to_string()))?;
+        // Early versions stored the configuration of the whole run.
         if config.get(TARGET).is_none() && config["model"].get(TARGET).is_some() {
             config = config["model"].take();
             keys = keys.0.into_iter().find_map(|(name, keys)| (name == "model").then_some(keys)).unwrap_or_default();
         }
         let found = config[TARGET].as_str().unwrap_or("nothing with a _target_").to_owned();
         if found.rsplit('.').next() != Some(class) {
-            return Err(wrong(format!("it describes {found}")));
+            return Err(invalid(format!("it describes {found}")));
         }
         let mut weights = read(&path)?;
         weights.retain(|name, _| !name.ends_with(BATCHES_TRACKED));
         Ok(Self { path, config, keys, weights })
     }
 
-    /// The size at a path with dots, such as `predictor.depth`.
+    /// Returns the size at a dotted path, such as `predictor.depth`.
+    ///
+    /// # Errors
+    /// When there is none.
     pub fn size(&self, at: &str) -> Result<usize> {
         self.size_or(at, None)
     }
 
-    /// As [`Reference::size`], with the value that is meant where there is none.
+    /// Returns the size at a dotted path, or `default` where there is none.
+    ///
+    /// # Errors
+    /// When there is neither.
     pub fn size_or(&self, at: &str, default: Option<usize>) -> Result<usize> {
         let found = self.at(at).and_then(Value::as_u64).and_then(|size| usize::try_from(size).ok());
-        found.or(default).ok_or_else(|| self.wrong(format!("{CONFIG} says no number for {at}")))
+        found.or(default).ok_or_else(|| self.wrong(format!("{CONFIG} has no number at {at}")))
     }
 
-    /// The rate at a path with dots; 0 where there is none.
-    #[allow(clippy::cast_possible_truncation)]
+    /// Returns the rate at a dotted path, or 0 where there is none.
     pub fn rate(&self, at: &str) -> f32 {
         self.at(at).and_then(Value::as_f64).unwrap_or(0.0) as f32
     }
 
-    /// What stands at a path with dots.
+    /// Returns the value at a dotted path.
     pub fn at(&self, path: &str) -> Option<&Value> {
         path.split('.').try_fold(&self.config, |value, key| value.get(key)).filter(|value| !value.is_null())
     }
 
-    /// The class at a path with dots, without its module.
+    /// Returns the class at a dotted path, without its module.
     pub fn class(&self, at: &str) -> &str {
         let target = self.at(at).and_then(|value| value[TARGET].as_str()).unwrap_or("");
         target.rsplit('.').next().unwrap_or_default()
     }
 
-    /// Something about the checkpoint that this program cannot use.
+    /// The error for a checkpoint that this program cannot use.
     pub fn wrong(&self, problem: String) -> Error {
         Error::corrupt(&self.path, problem, "give a checkpoint that the reference's own training wrote")
     }
 
-    /// The shape of a weight.
+    /// Returns the shape of a weight.
+    ///
+    /// # Errors
+    /// When it is missing.
     pub fn shape(&self, name: &str) -> Result<&[usize]> {
         let found = self.weights.get(name).map(|weight| weight.shape.as_slice());
         found.ok_or_else(|| self.wrong(format!("'{name}' is missing")))
     }
 
-    /// The size and the picture's side of the vision transformer at a path with dots; its weights get their published
-    /// names.
+    /// Returns the sizes and the image size of the vision transformer at a dotted path, and renames its weights to their
+    /// published names.
+    ///
+    /// # Errors
+    /// When there is another encoder, or its size is unknown.
     pub fn vit(&mut self, at: &str) -> Result<(VitConfig, usize)> {
         if self.class(at) != "vit_hf" {
             return Err(self.wrong(format!("its encoder is '{}', not the vision transformer 'vit_hf'", self.class(at))));
@@ -125,12 +136,15 @@ impl Reference {
         let prefix = format!("{at}.");
         let weights = std::mem::take(&mut self.weights);
         self.weights = names::to_published(weights, &prefix);
-        // Of use while masked pictures are learnt from, and not there otherwise.
+        // Used in pretraining with masked images only.
         self.weights.remove(&format!("{prefix}embeddings.mask_token"));
         Ok((config, image))
     }
 
-    /// The size of the DINOv2 whose weights begin with `prefix`, which get their published names.
+    /// Returns the sizes of the DINOv2 below `prefix`, and renames its weights to their published names.
+    ///
+    /// # Errors
+    /// When a weight is missing.
     pub fn dinov2(&mut self, prefix: &str) -> Result<DinoConfig> {
         let weights = std::mem::take(&mut self.weights);
         self.weights = names::to_published(weights, prefix);
@@ -144,14 +158,14 @@ impl Reference {
         let registers = of("embeddings.register_tokens").map_or(0, |shape| shape.get(1).copied().unwrap_or(0));
         let layer = |name: &String| name.strip_prefix(prefix).is_some_and(|name| name.ends_with(".norm1.weight"));
         let depth = self.weights.keys().filter(|name| layer(name)).count();
-        // All that were published have heads of 64 features.
+        // All published sizes have heads of 64 features.
         Ok(DinoConfig { patch, dim, depth, heads: (dim / 64).max(1), mlp, grid, registers })
     }
 }
 
-/// The one file of weights in a folder.
+/// Returns the only file of weights in a folder.
 fn only_weights(folder: &Path) -> Result<PathBuf> {
-    let entries = std::fs::read_dir(folder).map_err(|error| Error::io(folder, "looking for weights", error))?;
+    let entries = std::fs::read_dir(folder).map_err(|error| Error::io(folder, "listing weights", error))?;
     let weights = |path: &PathBuf| path.extension().is_some_and(|end| end == "pt" || end == "safetensors");
     let mut files: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).filter(weights).collect();
     files.sort();
@@ -160,7 +174,7 @@ fn only_weights(folder: &Path) -> Result<PathBuf> {
         [] => {
             Err(Error::corrupt(folder, "there is no .pt file", "give the folder of a checkpoint, or the file itself"))
         }
-        _ => Err(Error::corrupt(folder, "there are several files of weights", "name the one you mean")),
+        _ => Err(Error::corrupt(folder, "there are several files of weights", "give the path of one of them")),
     }
 }
 

@@ -1,4 +1,4 @@
-//! State dicts as PyTorch writes them: a zip archive with a pickle that describes the tensors, and their numbers.
+//! State dicts in PyTorch's format: a zip archive with a pickle that describes the tensors, and their values.
 
 use crate::nn::parameters::{HostTensor, Named};
 use std::io::{Seek, Write};
@@ -7,11 +7,11 @@ use swm_core::{Error, Result};
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipWriter};
 
-/// How many batches a normalisation has seen: the one integer in a state dict, `[]`.
+/// The batch counter of a batch normalisation, `[]`: the only integer in a state dict.
 pub const BATCHES_TRACKED: &str = "num_batches_tracked";
 
-/// Writes a state dict that `torch.load(path, weights_only=True)` reads: single precision throughout, but for the
-/// counters of batch normalisations ([`BATCHES_TRACKED`]), which PyTorch keeps as integers.
+/// Writes a state dict that `torch.load(path, weights_only=True)` reads: single precision, except for the counters of batch
+/// normalisations ([`BATCHES_TRACKED`]), which are integers in PyTorch.
 ///
 /// # Errors
 /// When the disk refuses.
@@ -25,7 +25,7 @@ pub fn write(path: &Path, tensors: &Named<HostTensor>) -> Result<()> {
 
 fn archive(file: impl Write + Seek, tensors: &Named<HostTensor>) -> zip::result::ZipResult<()> {
     let mut zip = ZipWriter::new(file);
-    // PyTorch maps the numbers into memory where they start on a multiple of 64 bytes.
+    // PyTorch maps values into memory if they are aligned to 64 bytes.
     let options = SimpleFileOptions::default().compression_method(CompressionMethod::Stored).with_alignment(64);
     let mut entry = |name: &str, bytes: &[u8]| {
         zip.start_file(format!("weights/{name}"), options)?;
@@ -34,7 +34,6 @@ fn archive(file: impl Write + Seek, tensors: &Named<HostTensor>) -> zip::result:
     entry("data.pkl", &pickle(tensors))?;
     entry("byteorder", b"little")?;
     for (index, (name, tensor)) in tensors.iter().enumerate() {
-        #[allow(clippy::cast_possible_truncation)]
         let bytes: Vec<u8> = if is_counter(name) {
             tensor.values.iter().flat_map(|value| (*value as i64).to_le_bytes()).collect()
         } else {
@@ -51,7 +50,7 @@ fn is_counter(name: &str) -> bool {
     name.ends_with(BATCHES_TRACKED)
 }
 
-/// The pickle (protocol 2) of an ordered dictionary of tensors, the `i`th of which lies in `data/i`.
+/// The pickle (protocol 2) of an ordered dictionary of tensors, whose values are in `data/0`, `data/1` and so on.
 fn pickle(tensors: &Named<HostTensor>) -> Vec<u8> {
     let mut out = vec![0x80, 2];
     empty_dict(&mut out);
@@ -60,7 +59,7 @@ fn pickle(tensors: &Named<HostTensor>) -> Vec<u8> {
         text(&mut out, name);
         global(&mut out, "torch._utils", "_rebuild_tensor_v2");
         out.push(b'(');
-        // Where its numbers are: ("storage", type, key, device, count), as a persistent id.
+        // The storage as a persistent id: ("storage", type, key, device, count).
         out.push(b'(');
         text(&mut out, "storage");
         global(&mut out, "torch", if is_counter(name) { "LongStorage" } else { "FloatStorage" });
@@ -68,7 +67,7 @@ fn pickle(tensors: &Named<HostTensor>) -> Vec<u8> {
         text(&mut out, "cpu");
         integer(&mut out, tensor.values.len());
         out.extend(b"tQ");
-        // Offset, shape, strides, no gradient, no hooks.
+        // Offset, shape, strides, requires_grad, hooks.
         integer(&mut out, 0);
         tuple(&mut out, &tensor.shape);
         tuple(&mut out, &strides(&tensor.shape));
@@ -90,14 +89,13 @@ fn global(out: &mut Vec<u8>, module: &str, name: &str) {
     out.extend(format!("c{module}\n{name}\n").bytes());
 }
 
-#[allow(clippy::cast_possible_truncation)] // names of parameters
 fn text(out: &mut Vec<u8>, text: &str) {
     out.push(b'X');
     out.extend((text.len() as u32).to_le_bytes());
     out.extend(text.bytes());
 }
 
-/// A whole number, as a long of eight bytes, which has no limit that matters.
+/// An integer, as a long of eight bytes.
 fn integer(out: &mut Vec<u8>, value: usize) {
     out.extend([0x8a, 8]);
     out.extend((value as u64).to_le_bytes());
@@ -109,7 +107,7 @@ fn tuple(out: &mut Vec<u8>, values: &[usize]) {
     out.push(b't');
 }
 
-/// How far apart neighbours along each axis are, row-major.
+/// The row-major strides of a shape, in elements.
 fn strides(shape: &[usize]) -> Vec<usize> {
     (0..shape.len()).map(|axis| shape[axis + 1..].iter().product()).collect()
 }

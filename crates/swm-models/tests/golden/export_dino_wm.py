@@ -5,7 +5,7 @@ Run with an interpreter that has torch, transformers and the reference package:
     python export_dino_wm.py dino-wm-model-small.safetensors
 
 Encoding, prediction, rollout and cost are the reference's (`PreJEPA`); the loss follows its training script: everything
-is predicted but the actions. The encoder is a tiny DINOv2 whose positions were made for larger pictures.
+is predicted except the actions. The encoder is a tiny DINOv2 whose position embeddings are for larger images.
 """
 
 import json
@@ -41,7 +41,7 @@ def main(path):
         ),
         extra_encoders=nn.ModuleDict({k: Embedder(in_chans=n, emb_dim=dim) for k, n, dim in c["columns"]}),
         history_size=c["history"],
-        interpolate_pos_encoding=False,  # DINOv2 always does, and takes no such argument
+        interpolate_pos_encoding=False,  # DINOv2 always interpolates and has no such argument
     )  # fmt: skip
     with torch.no_grad():
         for value in model.parameters():
@@ -62,7 +62,7 @@ def main(path):
     predicted = model.predict(embedding)
     target = info["emb"][:, 1:].detach()
     out |= {"o.emb": info["emb"], "o.pred": predicted}
-    # Actions come last here.
+    # Actions are the last column.
     free = info["emb"].shape[-1] - c["columns"][-1][2]
     loss = (predicted - target)[..., :free].square().mean()
     loss.backward()

@@ -1,5 +1,5 @@
 """Writes gcbc-small.safetensors, gcivl-small.safetensors and gciql-small.safetensors: numerics of goal-conditioned models at
-a very small size; and reference/gcivl, a checkpoint as the published training script leaves it.
+a very small size; and reference/gcivl, a checkpoint in the form of the published training script.
 
 Run with an interpreter that has torch and the reference package (`pip install stable-worldmodel torch`):
 
@@ -7,9 +7,9 @@ Run with an interpreter that has torch and the reference package (`pip install s
 
 Model, heads and expectile loss are the reference's (`wm/gcrl`). The package holds no training code, so the losses are
 transcribed here from the algorithms of the paper's appendix (GCBC, GCIVL and GCIQL training), with what the published
-training scripts add: an action's weight is at most 100, the policy is a normal distribution with one learnt spread a
-number, values are pooled by the mean. Values and policy are learnt at once: nothing of the policy's loss reaches
-encoder and values, so its gradients are those of the paper's two phases.
+training scripts add: the weight of an action is at most 100, the policy is a normal distribution with one trained standard
+deviation per element, values are pooled by the mean. Values and policy are trained together: the policy's loss has no
+gradient to encoder and values, so the gradients are those of the paper's two phases.
 """
 
 import json
@@ -30,7 +30,7 @@ CONFIG = dict(
 
 
 class TeacherStudent(nn.Module):
-    """A network and its slow copy, under the names of the published training scripts."""
+    """A network and its target network, under the names of the published training scripts."""
 
     def __init__(self, make):
         super().__init__()
@@ -43,7 +43,7 @@ def flat(embedding):
 
 
 def save(model, folder):
-    """The state dict, beside the settings of the script that trained it."""
+    """The state dict and the settings of the script that trained it."""
     c = CONFIG
     sizes = dict(depth=c["depth"], heads=c["heads"], mlp_dim=c["mlp"], dim_head=c["dim_head"], dropout=0.0)
     settings = dict(
@@ -73,7 +73,7 @@ def main(family, path):
             )
         )
     model = GCRL(encoder=Vit(c), action_predictor=Predictor(out_dim=c["action_dim"], **size), **parts)
-    # Nothing may be left at a value that hides mistakes.
+    # Parameters at their initial values could hide errors.
     with torch.no_grad():
         for value in model.state_dict().values():
             if value.is_floating_point():
@@ -84,7 +84,7 @@ def main(family, path):
     pixels = torch.randn(clips, steps, 3, c["image"], c["image"])
     action = torch.randn(clips, steps, c["action_dim"])
     goal = torch.randn(clips, 1, 3, c["image"], c["image"])
-    goal[0, 0] = pixels[0, history - 1]  # one clip is where it shall be
+    goal[0, 0] = pixels[0, history - 1]  # one clip has reached its goal
     actor_goal = torch.randn_like(goal)
     out = {"i.pixels": pixels, "i.action": action, "i.goal": goal}
     out |= {f"w.{name}": value.clone() for name, value in model.state_dict().items()}

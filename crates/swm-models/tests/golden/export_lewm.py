@@ -5,7 +5,7 @@ Run with an interpreter that has torch and the reference package (`pip install s
     python export_lewm.py lewm-small.safetensors
 
 Model, rollout, cost and SIGReg are the reference's. Its encoder comes from another package, so the vision
-transformer is spelled out here, under the names that package gives its weights.
+transformer is implemented here, with that package's names of weights.
 """
 
 import json
@@ -24,7 +24,7 @@ CONFIG = dict(
 
 
 def tree(**parts):
-    """A module that is nothing but its named parts."""
+    """A module that consists of its named parts."""
     module = nn.Module()
     for name, part in parts.items():
         setattr(module, name, part)
@@ -95,7 +95,7 @@ def main(path):
         projector=MLP(c["dim"], c["proj_hidden"], c["dim"], norm),
         pred_proj=MLP(c["dim"], c["proj_hidden"], c["dim"], norm),
     )
-    # Nothing may be left at a value that hides mistakes: zero modulations, unit scales, default statistics.
+    # Initial values could hide errors: zero modulations, unit scales, default statistics.
     with torch.no_grad():
         for name, value in model.state_dict().items():
             if name.endswith("running_var"):

@@ -4,8 +4,8 @@ Run with an interpreter that has torch, transformers and the reference package:
 
     python export_pldm.py pldm-model-small.safetensors
 
-Model, rollout, cost and loss terms are the reference's; how they are put together follows its training script: the
-inverse dynamics see the next latent, then the present one. Weights have their published names below `model.` and
+Model, rollout, cost and loss terms are the reference's; their combination follows its training script: the input of the
+inverse dynamics is the next latent, then the present one. Weights have their published names below `model.` and
 `idm.`.
 """
 
@@ -52,7 +52,7 @@ def main(path):
     torch.manual_seed(0)
     c = CONFIG
     parts = build(c)
-    # Nothing may stay at the zeros it is initialised with.
+    # Zero-initialised parameters could hide errors.
     with torch.no_grad():
         for value in parts.parameters():
             value.add_(0.2 * torch.randn_like(value))

@@ -1,10 +1,10 @@
-"""Writes reference/{lewm,pldm,prejepa}, checkpoints that the reference wrote, and reference-*.safetensors, what they compute.
+"""Writes reference/{lewm,pldm,prejepa}, checkpoints that the reference wrote, and reference-*.safetensors, their outputs.
 
 Run with an interpreter that has the reference package, stable-pretraining, hydra, torch and transformers:
 
     python export_reference.py FOLDER/reference
 
-Models are made by hydra from the `config.json` that is stored and saved by the reference's `save_pretrained`. The state
+Hydra builds the models from the `config.json` that is stored with them; the reference's `save_pretrained` saves them. The state
 dict of `lewm` has the names of transformers 5, that of `pldm` those of version 4 and of published files, and that of
 `prejepa` the prefix of a wrapped encoder.
 """

@@ -4,10 +4,9 @@ Run with an interpreter that has torch and the reference package (`pip install s
 
     python export_tdmpc2.py tdmpc2-train.safetensors
 
-Model and loss are the reference's (`wm/tdmpc2`). What it draws at random, noise and pairs of Q functions, is recorded; dropout
-is off. Beyond the reference, which bootstraps behind terminations, `o.terminated.*` has the loss of a batch some of whose
-steps terminate: there the value of the next frame is multiplied by 0, as the publication of SAC and the later official
-TD-MPC2 do.
+Model and loss are the reference's (`wm/tdmpc2`). Its random draws, noise and pairs of Q functions, are recorded; dropout is
+off. The reference bootstraps after terminations, so `o.terminated.*` additionally has the loss of a batch with terminations:
+there the value of the next frame is multiplied by 0, as in the publication of SAC and the later official TD-MPC2.
 """
 
 import json
@@ -39,7 +38,7 @@ class Config(dict):
 
 
 def record(model, config, batch, out, prefix):
-    """Losses and gradients; what is drawn goes to `out` as well."""
+    """Losses and gradients; the random draws are added to `out`."""
     noise, pairs, scalars = [], [], {}
     draw, choose = torch.randn_like, random.sample
     reference.torch.randn_like = lambda x: noise.append(draw(x)) or noise[-1]
@@ -49,7 +48,7 @@ def record(model, config, batch, out, prefix):
     loss = reference.tdmpc2_forward(context, batch, "validate", config)["loss"]
     loss.backward()
     reference.torch.randn_like, reference.random.sample = draw, choose
-    # Of every step, first the target's, then the policy's.
+    # For every step, the draws of the target, then those of the policy.
     pairs = torch.tensor(pairs, dtype=torch.float32)
     out[f"{prefix}.target_noise"], out[f"{prefix}.policy_noise"] = torch.stack(noise[::2]), torch.stack(noise[1::2])
     out[f"{prefix}.target_critics"], out[f"{prefix}.policy_critics"] = pairs[::2], pairs[1::2]
@@ -61,7 +60,7 @@ def terminated(model, config, batch, done, out):
     """The value loss where some steps terminate: the reference's targets with the next value masked."""
     original = reference.two_hot_inv
     step = SimpleNamespace(call=0)
-    # In every step it asks for two values of the next frame, which are masked, then for one of every Q function.
+    # Every step calls two values of the next frame, which are masked, then every Q function once.
     per_step = 2 + config.wm.num_q
 
     def masked(logits, cfg):
@@ -81,7 +80,7 @@ def main(path):
     random.seed(0)
     config = Config(CONFIG)
     model = reference.TDMPC2(config)
-    # Nothing may be left at a value that hides mistakes: zero read-outs, unit scales, equal targets.
+    # Initial values could hide errors: zero output layers, unit scales, equal targets.
     with torch.no_grad():
         for value in model.state_dict().values():
             value.add_(0.2 * torch.randn_like(value))

@@ -4,9 +4,9 @@ Run with an interpreter that has torch and transformers:
 
     python export_vit.py FOLDER
 
-Weights are written under the names published checkpoints have (transformers 4; version 5 renames them when it loads).
-Each file has pictures of the size the model was made for (`i.pixels`) and of another (`i.other`), the tokens of both,
-and the gradients of the tokens' mean square for the other.
+Weights are written under the names of published checkpoints (transformers 4; version 5 renames them when it loads).
+Each file has images of the model's size (`i.pixels`) and of another size (`i.other`), the tokens of both, and the gradients
+of the mean square of the tokens of the latter.
 """
 
 import json
@@ -56,7 +56,7 @@ def write(path, model, dino, config):
     rename = lambda name: published(name, dino)
     tensors = {"i.pixels": pixels, "i.other": other, "o.tokens": tokens, "o.other": resized}
     tensors |= {f"w.{rename(name)}": value for name, value in model.state_dict().items()}
-    # The mask token takes part in nothing.
+    # The mask token is not used.
     grads = {name: value.grad for name, value in model.named_parameters() if value.grad is not None}
     tensors |= {f"g.{rename(name)}": value for name, value in grads.items()}
     tensors = {name: value.detach().contiguous().clone() for name, value in tensors.items()}

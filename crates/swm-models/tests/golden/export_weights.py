@@ -1,4 +1,4 @@
-"""Writes files of weights as torch.save writes them, and what they hold: weights-*.
+"""Writes weights-*: files of weights in the formats of torch.save, and their content as safetensors.
 
 Run with an interpreter that has torch and safetensors:
 
@@ -19,7 +19,7 @@ def main(folder):
     state = OrderedDict(
         {
             "single.weight": base,
-            "single.column": base[:, 1],  # a view of the same numbers, with strides
+            "single.column": base[:, 1],  # a view of the same values, with strides
             "single.transposed": base.t(),
             "half.weight": torch.randn(3, 2).half(),
             "brain.weight": torch.randn(5).bfloat16(),

@@ -1,4 +1,4 @@
-"""Loads an exported checkpoint with the reference's `load_pretrained` and compares what it computes with a recording.
+"""Loads an exported checkpoint with the reference's `load_pretrained` and compares its outputs with recorded ones.
 
     python load_reference.py CHECKPOINT reference-lewm.safetensors
 """

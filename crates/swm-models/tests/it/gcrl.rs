@@ -205,7 +205,7 @@ fn invalid_settings_data_and_environments_are_refused() {
         TrainConfig::<Gcivl>::load("tiny", &words).expect_err("wrong").to_string()
     };
     assert!(message(&["data.num_steps=1"]).contains("model.history"), "{}", message(&["data.num_steps=1"]));
-    assert!(message(&["model.head.depth=2"]).contains("looks at the goal"));
+    assert!(message(&["model.head.depth=2"]).contains("attends to the goal"));
     assert!(message(&["loss.expectile=1.5"]).contains("loss.expectile"));
     assert!(message(&["loss.goals.random=0.9"]).contains("add up to 1"));
     assert!(message(&["model.image=20"]).contains("patches"), "{}", message(&["model.image=20"]));

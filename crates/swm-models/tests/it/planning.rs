@@ -102,7 +102,7 @@ fn invalid_candidates_and_observations_are_refused() {
     cost.observe(&infos(false), &[0]).expect("observed");
     let actions = vec![0.0; 6];
     let wrong = Candidates { actions: &actions, envs: 1, samples: 1, horizon: 2, dim: 3 };
-    let message = cost.cost(wrong, &mut [0.0]).expect_err("three numbers").to_string();
+    let message = cost.cost(wrong, &mut [0.0]).expect_err("three elements").to_string();
     assert!(message.contains("4 action elements a model step"), "{message}");
     let schema = Schema::new([ColumnSpec::image("pixels", SIDE, SIDE)]).expect("a column");
     let message = cost.observe(&Batch::zeros(&schema, 1), &[0]).expect_err("no goal").to_string();
@@ -122,8 +122,8 @@ fn observed() -> LewmCost {
 
 #[test]
 fn gradients_match_finite_differences() {
-    let (samples, numbers) = (5, HORIZON * DIM);
-    let actions = &candidates()[..2 * samples * numbers];
+    let (samples, width) = (5, HORIZON * DIM);
+    let actions = &candidates()[..2 * samples * width];
     fn of(actions: &[f32]) -> Candidates<'_> {
         Candidates { actions, envs: 2, samples: 5, horizon: HORIZON, dim: DIM }
     }
@@ -141,7 +141,7 @@ fn gradients_match_finite_differences() {
         let mut actions = actions.to_vec();
         actions[i] += by;
         model.cost(of(&actions), &mut plain).expect("costs");
-        f64::from(plain[i / numbers])
+        f64::from(plain[i / width])
     };
     let largest = slopes.iter().fold(0.0, |most, slope| slope.abs().max(most));
     assert!(largest > 1e-4, "gradients are almost zero: {largest}");
@@ -154,11 +154,11 @@ fn gradients_match_finite_differences() {
 
 #[test]
 fn gradients_do_not_depend_on_other_environments_or_threads() {
-    let (samples, numbers) = (SAMPLES, HORIZON * DIM);
+    let (samples, width) = (SAMPLES, HORIZON * DIM);
     let all = candidates();
     let run = |envs: &[usize], threads: usize| {
         let actions: Vec<f32> =
-            envs.iter().flat_map(|&env| all[env * samples * numbers..][..samples * numbers].to_vec()).collect();
+            envs.iter().flat_map(|&env| all[env * samples * width..][..samples * width].to_vec()).collect();
         let mut model = LewmCost::new(&checkpoint());
         let (mut costs, mut slopes) = (vec![0.0; envs.len() * samples], vec![0.0; actions.len()]);
         swm_core::pool::threads(threads).expect("threads").install(|| {
@@ -171,7 +171,7 @@ fn gradients_do_not_depend_on_other_environments_or_threads() {
     };
     let together = run(&[0, 1, 2], 2);
     assert_eq!(together, run(&[0, 1, 2], 1));
-    assert_eq!(together[samples * numbers..2 * samples * numbers], run(&[1], 2)[..]);
+    assert_eq!(together[samples * width..2 * samples * width], run(&[1], 2)[..]);
 }
 
 #[test]
@@ -194,10 +194,10 @@ fn vector_jacobian_products_match_finite_differences() {
         next.iter().zip(&pull).map(|(a, b)| f64::from(a * b)).sum::<f64>()
     };
     let step = 2e-2f32;
-    for (numbers, slopes, is_action) in [(&start, &by_latent, false), (&actions, &by_action, true)] {
-        for i in (0..numbers.len()).step_by(3) {
+    for (values, slopes, is_action) in [(&start, &by_latent, false), (&actions, &by_action, true)] {
+        for i in (0..values.len()).step_by(3) {
             let mut at = |by: f32| {
-                let mut moved = numbers.clone();
+                let mut moved = values.clone();
                 moved[i] += by;
                 if is_action { value(&start, &moved) } else { value(&moved, &actions) }
             };

@@ -63,8 +63,8 @@ impl Golden {
 
     fn clips(&self) -> Clips {
         let actions: Tensor<3> = self.tensor("i.action");
-        let [clips, _, numbers] = actions.dims();
-        let actions = actions.slice([0..clips, 0..self.size("history"), 0..numbers]);
+        let [clips, _, dim] = actions.dims();
+        let actions = actions.slice([0..clips, 0..self.size("history"), 0..dim]);
         Clips { frames: self.patches("i.pixels"), goal: self.patches("i.goal"), actions }
     }
 

@@ -55,7 +55,7 @@ fn golden_evaluation() {
         println!("{}", file.display());
         let golden = Golden::read(&file);
         let model = golden.model();
-        let [clips, steps, numbers] = golden.tensor::<3>("i.action").dims();
+        let [clips, steps, action_dim] = golden.tensor::<3>("i.action").dims();
         let dim = golden.size("dim");
         let latents = model.encode(golden.patches("i.pixels")).reshape([clips, steps, dim]);
         check(&golden, "o.eval.emb", &values(latents.clone()));
@@ -75,7 +75,7 @@ fn golden_evaluation() {
         );
 
         let [envs, samples, horizon, _] = golden.tensor::<4>("i.candidates").dims();
-        let candidates = golden.tensor::<4>("i.candidates").reshape([envs * samples, horizon, numbers]);
+        let candidates = golden.tensor::<4>("i.candidates").reshape([envs * samples, horizon, action_dim]);
         let goal = model.encode(golden.patches("i.goal")).reshape([envs, 1, dim]).expand([envs, samples, dim]);
         for history in [1, 3] {
             // The first frames of the first clips, and the actions between them.
@@ -85,7 +85,7 @@ fn golden_evaluation() {
             };
             let mut actions = candidates.clone();
             if history > 1 {
-                actions = Tensor::cat(vec![repeat(golden.tensor("i.action"), history - 1, numbers), actions], 1);
+                actions = Tensor::cat(vec![repeat(golden.tensor("i.action"), history - 1, action_dim), actions], 1);
             }
             let rollout = model.rollout(repeat(latents.clone(), history, dim), actions.clone());
             let [_, length, _] = rollout.dims();

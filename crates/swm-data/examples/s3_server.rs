@@ -1,4 +1,4 @@
-//! An S3 server on loopback whose buckets are the folders of a folder, for measuring:
+//! An S3 server on loopback for benchmarks. It serves the subfolders of a folder as buckets:
 //!
 //! ```sh
 //! mkdir -p /tmp/buckets/bench && cargo run --release --workspace --example s3_server -- /tmp/buckets &
@@ -6,17 +6,17 @@
 //! swm bench data --formats lance --load-only --remote s3://bench/data
 //! ```
 
-#![allow(clippy::print_stdout)]
+#![allow(clippy::print_stdout, reason = "prints its address")]
 
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use s3s::service::S3ServiceBuilder;
 use std::error::Error;
 
-/// Where it listens.
+/// The address it listens on.
 const ADDRESS: &str = "127.0.0.1:9753";
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let root = std::env::args().nth(1).ok_or("which folder holds the buckets?")?;
+    let root = std::env::args().nth(1).ok_or("name the folder that holds the buckets")?;
     let files = s3s_fs::FileSystem::new(&root).map_err(|error| format!("{root}: {error:?}"))?;
     let service = S3ServiceBuilder::new(files).build();
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build()?;

@@ -1,4 +1,4 @@
-//! Decoded rows that are kept: the same bytes, fewer decoded, and never those of other data.
+//! Caches of decoded rows: the same bytes, fewer decodes, and never rows of other data.
 
 use crate::sample::write;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use swm_core::{Manifest, Result, Schema};
 use swm_data::{CacheConfig, Episode, Reader, StepRange, WriteMode, open};
 
-/// A dataset that counts the rows of pictures it is asked for.
+/// A reader that counts the image rows it decodes.
 struct Counting {
     inner: Arc<dyn Reader>,
     rows: AtomicUsize,
@@ -52,13 +52,13 @@ impl Reader for Counting {
     }
 }
 
-const PICTURE: usize = 16 * 24 * 3;
+const IMAGE: usize = 16 * 24 * 3;
 
 fn over(reader: &Arc<Counting>, cache: &CacheConfig) -> Arc<dyn Reader> {
     cache.over(Arc::clone(reader) as Arc<dyn Reader>, &["pixels", "state"]).expect("a cache")
 }
 
-/// Every picture and state, single rows in a mixed order.
+/// Every image and state, as single rows in a mixed order.
 fn all(reader: &dyn Reader) -> (Vec<u8>, Vec<u8>) {
     let rows = |e: usize| (0..reader.episodes()[e].length).map(move |t| StepRange::new(e, t, 1));
     let mut ranges: Vec<StepRange> = (0..reader.episodes().len()).rev().flat_map(rows).collect();
@@ -74,7 +74,7 @@ fn dataset(folder: &Path) -> (PathBuf, usize) {
 }
 
 #[test]
-fn rows_are_decoded_once_and_only_as_many_kept_as_fit() {
+fn decodes_cached_rows_once_within_the_limit() {
     let folder = tempfile::tempdir().expect("a folder");
     let (path, rows) = dataset(folder.path());
     let reader = Counting::open(&path);
@@ -83,14 +83,14 @@ fn rows_are_decoded_once_and_only_as_many_kept_as_fit() {
     let states = rows * 24;
     for (room, kept) in [(0, 0), (10, 10), (1000, rows)] {
         for cache in [
-            CacheConfig::Memory { bytes: states + room * PICTURE },
-            CacheConfig::Disk { folder: folder.path().join(format!("cache-{room}")), bytes: states + room * PICTURE },
+            CacheConfig::Memory { bytes: states + room * IMAGE },
+            CacheConfig::Disk { folder: folder.path().join(format!("cache-{room}")), bytes: states + room * IMAGE },
         ] {
             let cached = over(&reader, &cache);
             assert!(all(&*cached) == expected, "{cache:?}");
             assert_eq!(reader.decoded(), rows + 3, "the first time {cache:?}");
             assert!(all(&*cached) == expected, "{cache:?}");
-            // The three rows that are asked for twice are among the kept ones only where all are.
+            // The three rows that are read twice are cached only if all rows are.
             let decoded = reader.decoded();
             let again = if kept == rows { 0..=0 } else { rows - kept..=rows + 3 - kept };
             assert!(again.contains(&decoded), "{decoded} of {rows} with {cache:?}");
@@ -102,7 +102,7 @@ fn rows_are_decoded_once_and_only_as_many_kept_as_fit() {
 }
 
 #[test]
-fn a_cache_on_disk_serves_the_next_run_and_other_processes() {
+fn disk_cache_serves_later_runs_and_other_processes() {
     let folder = tempfile::tempdir().expect("a folder");
     let (path, _) = dataset(folder.path());
     let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
@@ -111,12 +111,12 @@ fn a_cache_on_disk_serves_the_next_run_and_other_processes() {
     reader.decoded();
     let first = over(&reader, &cache);
     assert!(all(&*first) == expected && reader.decoded() == 0, "a new run finds it");
-    // A second one at the same time holds no lock, and reads what is there all the same.
+    // A second cache at the same time has no lock, but reads the existing rows.
     let second = over(&reader, &cache);
     assert!(all(&*second) == expected && reader.decoded() == 0);
     drop((first, second));
 
-    // Other content, under the same path: nothing of the old is used.
+    // Other content at the same path does not use the old cache.
     write(&path, WriteMode::Overwrite, 3, 1..7);
     let changed = Counting::open(&path);
     let fresh = all(&*changed);
@@ -125,7 +125,7 @@ fn a_cache_on_disk_serves_the_next_run_and_other_processes() {
 }
 
 #[test]
-fn a_cache_that_was_damaged_is_decoded_again() {
+fn damaged_cache_is_decoded_again() {
     let folder = tempfile::tempdir().expect("a folder");
     let (path, rows) = dataset(folder.path());
     let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
@@ -140,14 +140,14 @@ fn a_cache_that_was_damaged_is_decoded_again() {
         found
     };
     let rows_file = files().into_iter().find(|file| file.extension().is_some_and(|end| end == "rows")).expect("rows");
-    // A byte of the third row flips.
+    // A bit of the third row flips.
     let mut bytes = std::fs::read(&rows_file).expect("reads");
-    bytes[2 * PICTURE + 7] ^= 1;
+    bytes[2 * IMAGE + 7] ^= 1;
     std::fs::write(&rows_file, &bytes).expect("writes");
     assert!(all(&*over(&reader, &cache)) == expected);
     assert_eq!(reader.decoded(), 1);
     assert!(all(&*over(&reader, &cache)) == expected && reader.decoded() == 0, "it is mended");
-    // Both files are cut.
+    // Both files are truncated.
     for file in files() {
         std::fs::write(&file, b"").expect("writes");
     }

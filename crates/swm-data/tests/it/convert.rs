@@ -1,4 +1,4 @@
-//! From any format to any other: resumed, verified, and refused where the target holds something else.
+//! Conversion between all formats: resumed, verified, and rejected if the target holds other data.
 
 use crate::sample::{check, episode, options, schema, write};
 use rand::Rng as _;
@@ -22,7 +22,7 @@ fn lossless(mode: ConvertMode) -> ConvertOptions {
     ConvertOptions { mode, codec: ImageCodec::Png, ..ConvertOptions::default() }
 }
 
-/// The episodes `0..9`, images lossless.
+/// The episodes `0..9` with lossless images.
 fn source(folder: &Path) -> PathBuf {
     let path = folder.join("source.lance");
     let mut writer = create(&path, &schema(), WriteOptions { codec: ImageCodec::Png, ..options(WriteMode::Create) })
@@ -32,7 +32,7 @@ fn source(folder: &Path) -> PathBuf {
     path
 }
 
-/// A place whose name every format accepts as its own.
+/// A path that every format accepts.
 fn place(folder: &Path, format: &str) -> PathBuf {
     folder.join(match format {
         "hdf5" => "to.h5".to_owned(),
@@ -41,7 +41,7 @@ fn place(folder: &Path, format: &str) -> PathBuf {
 }
 
 #[test]
-fn every_format_gives_back_what_it_got() {
+fn every_format_preserves_the_content() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = source(folder.path());
     let from = open(&path).expect("opens");
@@ -63,7 +63,7 @@ fn every_format_gives_back_what_it_got() {
         if report.columns.iter().all(|column| column.exact) {
             assert_eq!(checksum(&*to).expect("a checksum"), sum, "{}", format.id);
         }
-        // There and back again.
+        // Back to the source's format.
         let back = folder.path().join(format!("back-{}.lance", format.id));
         run(&target, &back, &lossless(ConvertMode::Create)).unwrap_or_else(|error| panic!("{}: {error}", format.id));
         check(&*open(&back).expect("opens"), 0);
@@ -71,7 +71,7 @@ fn every_format_gives_back_what_it_got() {
 }
 
 #[test]
-fn lossy_pictures_are_judged() {
+fn lossy_images_must_reach_the_minimum_psnr() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = source(folder.path());
     let jpeg = ConvertOptions { codec: ImageCodec::Jpeg { quality: 95 }, ..ConvertOptions::default() };
@@ -189,10 +189,10 @@ fn resumes_a_killed_conversion() {
     assert!(continued, "at least one of the fifty was killed in the middle and resumed");
 }
 
-/// A foreign dataset whose last rows have actions.
-struct Foreign(Schema);
+/// A third-party dataset whose last rows have actions.
+struct ThirdParty(Schema);
 
-impl Reader for Foreign {
+impl Reader for ThirdParty {
     fn schema(&self) -> &Schema {
         &self.0
     }
@@ -226,11 +226,11 @@ impl Reader for Foreign {
 }
 
 #[test]
-fn actions_that_lead_nowhere_are_left_out_and_told() {
+fn omits_and_counts_actions_of_last_rows() {
     let folder = tempfile::tempdir().expect("a folder");
     let target = folder.path().join("target.lance");
     let schema = Schema::new([ColumnSpec::new("action", DType::Float32, [1])]).expect("schema");
-    let reader: Arc<dyn Reader> = Arc::new(Foreign(schema));
+    let reader: Arc<dyn Reader> = Arc::new(ThirdParty(schema));
     let report =
         convert(&reader, &Location::from(&target), &ConvertOptions::default(), &mut Control::new()).expect("converts");
     assert_eq!((report.episodes, report.last_actions), (2, 2));
@@ -241,7 +241,7 @@ fn actions_that_lead_nowhere_are_left_out_and_told() {
 }
 
 #[test]
-fn double_precision_survives_or_its_rounding_is_told() {
+fn preserves_doubles_or_reports_rounding() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("fine.lance");
     let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [1])]).expect("schema");

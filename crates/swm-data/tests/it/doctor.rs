@@ -166,6 +166,7 @@ fn repairs_the_readable_part_of_a_table() {
 }
 
 #[test]
+#[allow(clippy::too_many_lines, reason = "a table of defects")]
 fn finds_each_defect_in_its_episode() {
     type Breaking = fn(usize, &mut Batch);
     let breaks: [(&str, Breaking); 7] = [

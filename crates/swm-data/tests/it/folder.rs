@@ -1,4 +1,4 @@
-//! The format `folder`. The long runs:
+//! The format `folder`. Run the long tests with:
 //!
 //! ```text
 //! cargo test --release --workspace --test it -- --ignored folder::
@@ -12,12 +12,12 @@ use swm_core::{Batch, Schema};
 use swm_data::{StepRange, WriteMode, WriteOptions, create, open};
 
 #[test]
-fn it_does_what_formats_do() {
+fn passes_the_format_suite() {
     format_suite::all("d.folder");
 }
 
 #[test]
-fn a_killed_writer_keeps_committed_episodes() {
+fn killed_writer_keeps_committed_episodes() {
     format_suite::killed("d.folder", 4);
 }
 
@@ -32,14 +32,14 @@ fn damaged(cases: u64) {
     let path = folder.path().join("d.folder");
     format_suite::write(&path, WriteMode::Create, 0..3);
     let report = fuzz::dataset("folder", &path, cases, fuzz::read_everything);
-    // A picture in the place of another is one that nothing tells apart.
+    // Exchanged image files cannot be detected.
     let changed: Vec<&String> = report.changed.iter().filter(|change| !change.contains("replaced by")).collect();
     assert!(changed.is_empty(), "{changed:?}");
     assert!(report.refused as u64 > cases / 2, "{report:?}");
 }
 
 #[test]
-fn damaged_folders_are_refused() {
+fn rejects_damaged_folders() {
     damaged(400);
 }
 
@@ -50,7 +50,7 @@ fn folders_damaged_in_10000_ways_are_refused() {
 }
 
 #[test]
-fn what_an_interrupted_writer_left_may_be_damaged() {
+fn rejects_damaged_leftovers_of_an_interrupted_writer() {
     // A journal, and column files that are still empty.
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.folder");
@@ -81,7 +81,7 @@ fn interop(name: &str) -> PathBuf {
 }
 
 #[test]
-fn a_folder_of_the_reference_opens_here_and_is_refused_to_be_continued() {
+fn reads_but_does_not_append_to_a_folder_of_the_reference() {
     let path = interop("folder-reference");
     let reader = open(&path).expect("opens");
     let lengths: Vec<usize> = reader.episodes().iter().map(|episode| episode.length).collect();
@@ -92,18 +92,18 @@ fn a_folder_of_the_reference_opens_here_and_is_refused_to_be_continued() {
     let read = reader.read(&names, &all).expect("reads");
     for t in 0..5 {
         let row = read.row(t);
-        let numbers = |name: &str| row.to_f64(name).expect("numbers");
+        let numbers = |name: &str| row.to_f64(name).expect("values");
         let last = t == 1 || t == 4;
         assert!(if last { numbers("action")[0].is_nan() } else { numbers("action") == [t as f64 / 4.0, -(t as f64)] });
         assert_eq!(numbers("reward"), [t as f64 * 0.5]);
         assert_eq!(numbers("small"), [t as f64 - 3.0]);
         assert_eq!(numbers("variation.agent"), [t as f64; 3]);
         let mut off = 0.0;
-        for (i, rgb) in row.get::<u8>("pixels").expect("pictures").chunks(3).enumerate() {
+        for (i, rgb) in row.get::<u8>("pixels").expect("images").chunks(3).enumerate() {
             let expected = [(8 * (i / 24) + t) as u8, (4 * (i % 24) + 7 * t) as u8, 90];
             off += rgb.iter().zip(expected).map(|(&a, b)| f64::from(a.abs_diff(b))).sum::<f64>();
         }
-        // The first is a PNG.
+        // The first image is a PNG.
         assert!(if t == 0 { off == 0.0 } else { off / 1152.0 < 6.0 }, "row {t}: {off}");
     }
     assert!(reader.manifest().is_none() && reader.constants(1).expect("none").is_empty());
@@ -133,7 +133,7 @@ fn a_folder_of_the_reference_opens_here_and_is_refused_to_be_continued() {
 }
 
 #[test]
-fn our_folders_open_in_the_reference() {
+fn the_reference_opens_our_folders() {
     let Some(python) = std::env::var_os("SWM_REFERENCE_PYTHON") else {
         println!("SKIPPED: set SWM_REFERENCE_PYTHON to a Python with stable-worldmodel");
         return;
@@ -156,7 +156,7 @@ fn our_folders_open_in_the_reference() {
     assert_eq!(seen["state"], serde_json::json!([[7.0, first as f64, -0.5], [7.0, first as f64 + 2.0, -0.5]]));
     let last = sample::episode(7);
     for step in 0..2 {
-        let frame = last.row(first + 2 * step).get::<u8>("pixels").expect("pictures");
+        let frame = last.row(first + 2 * step).get::<u8>("pixels").expect("images");
         let mean = frame.iter().map(|&value| f64::from(value)).sum::<f64>() / frame.len() as f64;
         let theirs = seen["pixels"][step].as_f64().expect("a mean");
         assert!((mean - theirs).abs() < 1e-9, "lossless: {mean} {theirs}");

@@ -1,5 +1,5 @@
-//! What every format that stores columns as they are must do, whatever its files: the modes, the time convention,
-//! constants, one writer at a time, and episodes that stay when the writer is killed.
+//! Tests that every lossless format must pass: write modes, the time convention, constants, exclusive writers, and
+//! recovery of killed writers.
 
 use crate::sample::{self, episode, manifest, schema};
 use rand::Rng as _;
@@ -12,7 +12,7 @@ use swm_data::{
     CommitPolicy, Constants, ImageCodec, Location, Reader, StepRange, WriteMode, WriteOptions, Writer, create, open,
 };
 
-/// How often a group of episodes is committed here.
+/// Episodes per commit.
 const GROUP: usize = 2;
 
 pub fn writer(location: impl Into<Location>, mode: WriteMode) -> Result<Box<dyn Writer>> {
@@ -20,7 +20,7 @@ pub fn writer(location: impl Into<Location>, mode: WriteMode) -> Result<Box<dyn 
     create(location, &schema(), WriteOptions { mode, codec: ImageCodec::Png, manifest: Some(manifest(3)), commit })
 }
 
-/// A scene that every third episode shares, and a note of its own.
+/// A scene that every third episode shares, and a unique note.
 fn constants(e: usize) -> Constants {
     let scene = format!("<mujoco model='{}'/>", e % 3);
     Constants::from([("scene.xml".to_owned(), scene.into_bytes()), ("note".to_owned(), vec![e as u8; e])])
@@ -53,7 +53,7 @@ fn check_constants(reader: &dyn Reader, first: usize) {
     }
 }
 
-/// Everything below but what kills processes.
+/// Runs all tests except those that kill processes.
 pub fn all(name: &str) {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join(name);
@@ -127,7 +127,7 @@ fn rows_in_any_order(path: &Path) {
             let (a, b) = (read.row(row).get::<u8>(name), expected.row(t).get::<u8>(name));
             assert!(a.expect("bytes") == b.expect("bytes"), "{name} of row {row}");
         }
-        assert_eq!(read.row(row).get::<f64>("state").expect("numbers"), [e as f64, t as f64, -0.5]);
+        assert_eq!(read.row(row).get::<f64>("state").expect("values"), [e as f64, t as f64, -0.5]);
         assert_eq!(read.row(row).get::<i32>("episode_idx").expect("a number"), [e as i32]);
         assert_eq!(read.row(row).get::<i64>("step_idx").expect("a number"), [t as i64]);
     }
@@ -205,7 +205,7 @@ fn numbers_of_every_type(path: &Path) {
     (0..names.len()).for_each(|column| assert!(read.bytes(column) == batch.bytes(column), "{}", names[column]));
 }
 
-/// Kills a writer at moments that a key decides; every time, all that was committed is there, and the next continues.
+/// Kills a writer at keyed random moments. All committed episodes must be readable, and the next writer continues.
 pub fn killed(name: &str, moments: u64) {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join(name);
@@ -219,7 +219,7 @@ pub fn killed(name: &str, moments: u64) {
             let line = lines.next().expect("more lines").expect("text");
             last = line.rsplit_once("episode ").map(|(_, e)| e.parse::<usize>().expect("a number")).or(last);
         }
-        // Somewhere in what follows.
+        // At a random moment.
         let until = Instant::now() + Duration::from_micros(rng.random_range(0..8000));
         while Instant::now() < until {
             std::hint::spin_loop();
@@ -228,7 +228,7 @@ pub fn killed(name: &str, moments: u64) {
         child.wait().expect("gone");
         let now = match open(&path) {
             Ok(reader) => {
-                // Loosely: the child stores JPEG where the format encodes pictures.
+                // With a tolerance, because the child stores JPEG in formats that encode images.
                 sample::check(&*reader, 0);
                 reader.episodes().len()
             }
@@ -237,7 +237,7 @@ pub fn killed(name: &str, moments: u64) {
                 0
             }
         };
-        // Three episodes make a group.
+        // A commit has three episodes.
         let said = last.map_or(0, |last| last + 1);
         assert!(now >= stored && now + 3 > said, "moment {moment}: {now} episodes after {stored}; {said} were written");
         stored = now;

@@ -1,6 +1,5 @@
-//! Damaged inputs, for the tests of every format: a sound dataset is damaged in ways that a key decides, and reading
-//! each copy must end in an error that says something or in data, never in a panic, a hang, or a request for absurd
-//! memory.
+//! Fuzzing with damaged inputs, for the tests of every format. A valid dataset is damaged in keyed random ways; reading
+//! each copy must return data or a useful error, without a panic, a hang, or an excessive allocation.
 //!
 //! ```ignore
 //! let report = fuzz::dataset("lance", &path, 300, fuzz::read_everything);
@@ -8,8 +7,8 @@
 //! assert!(report.refused > 200, "{report:?}");
 //! ```
 //!
-//! A format's suite runs a few hundred cases; a test with `#[ignore]` runs 10,000 or more and says in its module's
-//! documentation how. A failure names its case, and [`only`] repeats that one.
+//! The suite of a format runs a few hundred cases; tests with `#[ignore]` run 10,000 or more, as the head of their
+//! module describes. A failure names its case, and [`only`] repeats that case.
 
 use rand::Rng as _;
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -23,30 +22,30 @@ use std::time::Duration;
 use swm_core::{Key, Result, Rng};
 use swm_data::{StepRange, open};
 
-/// Nothing here needs a piece of memory of this size: who asks for it trusts a damaged length.
+/// Larger allocations are failures: they trust a damaged length.
 const ABSURD_MEMORY: usize = 256 << 20;
 
-/// What reading one case takes at most; more is a hang.
+/// Time limit per case; a longer run counts as a hang.
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// What became of the damaged copies.
+/// Results of reading the damaged copies.
 #[derive(Debug, Default)]
 pub struct Report {
-    /// How many were refused.
+    /// Number of rejected copies.
     pub refused: usize,
-    /// How many gave what the sound one gives.
+    /// Number of copies that gave the same data as the original.
     pub same: usize,
-    /// Those that gave something else, in words.
+    /// Descriptions of the copies that gave other data.
     pub changed: Vec<String>,
 }
 
-/// The one case to run, where `SWM_FUZZ_CASE` names it.
+/// The only case to run, if `SWM_FUZZ_CASE` names one.
 fn only() -> Option<u64> {
     std::env::var("SWM_FUZZ_CASE").ok().map(|case| case.parse().expect("SWM_FUZZ_CASE is the number of a case"))
 }
 
-/// Damages copies of a dataset, a file or a folder: in each case one of its files. Every kind of file (by folder and
-/// suffix) gets its share. `read` opens a dataset and gives what it holds, such as [`read_everything`].
+/// Damages one file of a copy of a dataset (a file or a folder) per case. Every kind of file (by folder and suffix)
+/// gets an equal number of cases. `read` opens a dataset and returns its content, as [`read_everything`] does.
 pub fn dataset<T: PartialEq>(name: &str, sound: &Path, cases: u64, read: impl Fn(&Path) -> Result<T>) -> Report {
     let folder = tempfile::tempdir().expect("a folder");
     let copy = folder.path().join(sound.file_name().expect("a name"));
@@ -80,7 +79,7 @@ pub fn dataset<T: PartialEq>(name: &str, sound: &Path, cases: u64, read: impl Fn
     })
 }
 
-/// Damages copies of some bytes, such as an encoded picture.
+/// Damages copies of a byte string, such as an encoded image.
 pub fn bytes<T: PartialEq>(name: &str, sound: &[u8], cases: u64, read: impl Fn(&[u8]) -> Result<T>) -> Report {
     let expected = read(sound).expect("the sound bytes are read");
     run(name, cases, &expected, |_, rng| {
@@ -90,7 +89,7 @@ pub fn bytes<T: PartialEq>(name: &str, sound: &[u8], cases: u64, read: impl Fn(&
     })
 }
 
-/// Opens a dataset and reads all there is: a hash of everything.
+/// Opens a dataset and returns a hash of all its content.
 pub fn read_everything(path: &Path) -> Result<String> {
     let reader = open(path)?;
     let ranges: Vec<StepRange> =
@@ -110,7 +109,8 @@ pub fn read_everything(path: &Path) -> Result<String> {
     Ok(hasher.finalize().to_hex().to_string())
 }
 
-/// A damaged copy, and what was done to it. The ends, where formats keep their structure, are hit more often.
+/// A damaged copy and a description of the damage. Start and end, where formats keep their structure, are hit more
+/// often.
 pub fn damage(rng: &mut Rng, sound: &[u8]) -> (Vec<u8>, String) {
     let mut bytes = sound.to_vec();
     if bytes.is_empty() {
@@ -133,7 +133,7 @@ pub fn damage(rng: &mut Rng, sound: &[u8]) -> (Vec<u8>, String) {
             format!("bits flipped in {flips:?}")
         }
         4..=5 => {
-            // A length, a count, an offset or a version that is not what it should be.
+            // Replaces a length, a count, an offset or a version.
             let value =
                 [0, 1, u64::MAX, i64::MAX as u64, u32::MAX.into(), i32::MAX as u64, sound.len() as u64 + 1, 1 << 40]
                     [rng.random_range(0..8)];
@@ -169,14 +169,14 @@ fn place(rng: &mut Rng, len: usize) -> usize {
     }
 }
 
-/// Runs the cases that `prepare` makes: what is wrong in words, how to read it, how to restore it.
+/// Runs the cases that `prepare` returns: a description, how to read the copy, how to restore it.
 fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
     name: &str,
     cases: u64,
     expected: &T,
     prepare: impl Fn(u64, &mut Rng) -> (String, R, C),
 ) -> Report {
-    // One at a time: requests for memory are watched on all threads.
+    // One at a time, because allocations are recorded for all threads.
     static ONE: Mutex<()> = Mutex::new(());
     let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
     let mut report = Report::default();
@@ -205,7 +205,7 @@ fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
     report
 }
 
-/// Ends the program, naming the case, when one takes too long: a hanging thread cannot be ended otherwise.
+/// Aborts the process and names the case if it takes too long, because a hanging thread cannot be stopped.
 fn watch(cases: &Receiver<String>) {
     let mut current = String::new();
     loop {
@@ -220,7 +220,7 @@ fn watch(cases: &Receiver<String>) {
     }
 }
 
-/// The files of a dataset, those of one folder and suffix together.
+/// The files of a dataset, grouped by folder and suffix.
 fn kinds(path: &Path) -> Vec<Vec<PathBuf>> {
     let mut kinds = std::collections::BTreeMap::<_, Vec<PathBuf>>::new();
     for file in files(path) {
@@ -230,7 +230,7 @@ fn kinds(path: &Path) -> Vec<Vec<PathBuf>> {
     kinds.into_values().collect()
 }
 
-/// All files below a folder, or the file itself, by name.
+/// All files below a folder, or the file itself, sorted by name.
 pub fn files(path: &Path) -> Vec<PathBuf> {
     if path.is_file() {
         return vec![path.to_owned()];
@@ -241,7 +241,7 @@ pub fn files(path: &Path) -> Vec<PathBuf> {
     found
 }
 
-/// Copies a file, or a folder with all that is in it.
+/// Copies a file, or a folder with its content.
 pub fn copy_all(from: &Path, to: &Path) {
     for file in files(from) {
         let target = match file.strip_prefix(from) {
@@ -253,41 +253,45 @@ pub fn copy_all(from: &Path, to: &Path) {
     }
 }
 
-/// The largest piece of memory that was asked for since this was last 0, on any thread: readers have threads of their
-/// own, and no other test of this program needs as much as is absurd here.
+/// Size of the largest allocation since this was last 0, on any thread, because readers use threads of their own. No
+/// other test of this program allocates as much.
 static LARGEST: AtomicUsize = AtomicUsize::new(0);
 
-/// The system's allocator, which remembers the largest request.
-struct Watching;
+/// The system allocator, which records the largest allocation.
+struct RecordingAllocator;
 
-// Sound: every call goes to the system's allocator as it came; the number touches neither memory nor arguments.
-#[allow(unsafe_code)]
-unsafe impl GlobalAlloc for Watching {
+#[allow(unsafe_code, reason = "recording allocations")]
+// SAFETY: every call is forwarded unchanged to the system allocator; recording a size accesses no allocated memory.
+unsafe impl GlobalAlloc for RecordingAllocator {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         LARGEST.fetch_max(layout.size(), Ordering::Relaxed);
+        // SAFETY: the caller upholds the contract of this function, which is that of the system allocator.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         LARGEST.fetch_max(layout.size(), Ordering::Relaxed);
+        // SAFETY: the caller upholds the contract of this function, which is that of the system allocator.
         unsafe { System.alloc_zeroed(layout) }
     }
 
     unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
         LARGEST.fetch_max(size, Ordering::Relaxed);
+        // SAFETY: the caller upholds the contract of this function, which is that of the system allocator.
         unsafe { System.realloc(pointer, layout, size) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: the caller upholds the contract of this function, which is that of the system allocator.
         unsafe { System.dealloc(pointer, layout) }
     }
 }
 
 #[global_allocator]
-static ALLOCATOR: Watching = Watching;
+static ALLOCATOR: RecordingAllocator = RecordingAllocator;
 
 #[test]
-fn damage_is_repeatable_and_does_damage() {
+fn damage_is_reproducible_and_effective() {
     let sound: Vec<u8> = (0..200).collect();
     let mut same = 0;
     for case in 0..500 {
@@ -300,7 +304,7 @@ fn damage_is_repeatable_and_does_damage() {
 }
 
 #[test]
-fn panics_and_absurd_requests_are_found() {
+fn detects_panics_and_excessive_allocations() {
     let found = |read: fn(&[u8]) -> Result<usize>| {
         let run = || bytes("the harness", &[7; 100], 200, read);
         let panic = catch_unwind(run).expect_err("found");

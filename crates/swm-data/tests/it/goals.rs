@@ -1,4 +1,4 @@
-//! Goals: drawn with every clip, the same for whoever asks again.
+//! Goals are drawn with every clip and are reproducible.
 
 use crate::sample::{rows, write};
 use std::sync::Arc;
@@ -27,14 +27,14 @@ fn config(goals: &[(&str, GoalMixture)]) -> LoaderConfig {
 }
 
 #[test]
-fn goals_are_rows_of_the_dataset_and_tell_how_far_they_are() {
+fn goals_are_rows_of_the_dataset_with_offsets() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..9);
     let reader = open(&path).expect("opens");
     let wanted = [("goal", GoalMixture::default()), ("end", GoalMixture::LAST), ("later", GoalMixture::FUTURE)];
     let batches = load(&reader, config(&wanted), 0, 0);
-    // Two steps of two rows, and one more row: what a goal behind the second step needs.
+    // Two steps of two rows, and one more row for a goal after the second step.
     let expected: usize = (0..9).map(|e| (rows(e) + 1).saturating_sub(5)).sum();
     assert_eq!(batches.iter().map(Batch::rows).sum::<usize>(), expected);
     let shapes: Vec<&[usize]> = batches[0].schema().columns()[2..5].iter().map(|c| &c.shape[..]).collect();
@@ -51,9 +51,9 @@ fn goals_are_rows_of_the_dataset_and_tell_how_far_they_are() {
                 } else {
                     assert!(name == "goal" && (goal[0] != e || goal[1] < now));
                 }
-                let pixel = f64::from(row.get::<u8>(&format!("{name}_pixels")).expect("a picture")[0]);
+                let pixel = f64::from(row.get::<u8>(&format!("{name}_pixels")).expect("an image")[0]);
                 let drawn = (3.0 * goal[1] + 20.0 * goal[0]) % 256.0;
-                assert!((pixel - drawn).abs() < 40.0, "the picture of another row: {pixel} {drawn}");
+                assert!((pixel - drawn).abs() < 40.0, "the image of another row: {pixel} {drawn}");
                 match name {
                     "end" => assert_eq!(goal[1] as usize + 1, rows(e as usize)),
                     "later" => assert!(offset > 0 && offset % 2 == 0),
@@ -65,7 +65,7 @@ fn goals_are_rows_of_the_dataset_and_tell_how_far_they_are() {
 }
 
 #[test]
-fn the_same_goals_come_again_and_other_epochs_have_others() {
+fn goals_are_reproducible_and_differ_between_epochs() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..9);
@@ -80,7 +80,7 @@ fn the_same_goals_come_again_and_other_epochs_have_others() {
     assert_eq!(states(other, 4, 0), base, "neither threads nor the batch size matter");
     assert_eq!(states(config(&goals), 4, 2), base[2 * 5 * 3..], "resumed");
     assert_ne!(states(config(&goals), 5, 0), base);
-    // Goals of one episode alone stay in it.
+    // Goals drawn from one episode stay in it.
     let held = LoaderConfig { episodes: Some(vec![6]), ..config(&[("goal", GoalMixture::RANDOM)]) };
     assert!(states(held, 0, 0).chunks(3).all(|state| state[0] == 6.0));
     let refused = Loader::new(reader, config(&[("goal", GoalMixture { last: 0.5, ..GoalMixture::RANDOM })]));

@@ -1,4 +1,4 @@
-//! The format `hdf5`. The long runs:
+//! The format `hdf5`. Run the long tests with:
 //!
 //! ```text
 //! cargo test --release --workspace --test it -- --ignored hdf5::
@@ -12,12 +12,12 @@ use swm_core::{Batch, ColumnSpec, DType, Schema};
 use swm_data::{CommitPolicy, Reader, StepRange, WriteMode, WriteOptions, create, open};
 
 #[test]
-fn it_does_what_formats_do() {
+fn passes_the_format_suite() {
     format_suite::all("d.h5");
 }
 
 #[test]
-fn a_killed_writer_keeps_committed_episodes() {
+fn killed_writer_keeps_committed_episodes() {
     format_suite::killed("d.h5", 4);
 }
 
@@ -32,7 +32,7 @@ fn damaged(cases: u64) {
     let path = folder.path().join("d.h5");
     format_suite::write(&path, WriteMode::Create, 0..3);
     let report = fuzz::dataset("hdf5", &path, cases, fuzz::read_everything);
-    // Fletcher's sum is modulo 65535: it does not tell words of 0xffff from those of 0x0000.
+    // Fletcher's checksum is modulo 65535, so it does not distinguish words 0xffff and 0x0000.
     let blind = |change: &&String| change.contains("[ff, ff] written") || change.contains("[ff, ff, ff, ff] written");
     let (unseen, changed): (Vec<&String>, Vec<&String>) = report.changed.iter().partition(blind);
     assert!(changed.is_empty() && unseen.len() as u64 <= 1 + cases / 2000, "{changed:#?} {unseen:#?}");
@@ -40,7 +40,7 @@ fn damaged(cases: u64) {
 }
 
 #[test]
-fn damaged_files_are_refused() {
+fn rejects_damaged_files() {
     damaged(400);
 }
 
@@ -51,8 +51,8 @@ fn files_damaged_in_10000_ways_are_refused() {
 }
 
 #[test]
-fn many_chunks_need_trees_of_several_levels() {
-    // 64 chunks a leaf, 4096 below a node of the second level: three levels, in groups that end anywhere.
+fn many_chunks_make_trees_of_several_levels() {
+    // 64 chunks per leaf, 4096 per node of the second level: three levels, with commits at any position.
     let schema = Schema::new([ColumnSpec::new("large", DType::U8, [2048]), ColumnSpec::new("small", DType::Int64, [])]);
     let schema = schema.expect("schema");
     let folder = tempfile::tempdir().expect("a folder");
@@ -92,10 +92,10 @@ fn interop(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop").join(name)
 }
 
-/// Episodes of the files that `hdf5_export.py` writes, and their pictures and numbers in row `t` of the file.
+/// Episodes of the files that `hdf5_export.py` writes, with their images and values in row `t` of the file.
 const LENGTHS: [usize; 3] = [6, 7, 8];
 
-fn picture(t: usize) -> Vec<u8> {
+fn image(t: usize) -> Vec<u8> {
     let mut rgb = vec![];
     for y in 0..6 {
         for x in 0..8 {
@@ -110,7 +110,7 @@ fn numbers(t: usize) -> [i64; 5] {
     std::array::from_fn(|k| (t * 100 + k * k) as i64)
 }
 
-/// Reads a column whole, and checks that it is read the same row by row, in any order.
+/// Reads a whole column, and checks that reading single rows in any order gives the same.
 fn column(reader: &dyn Reader, name: &str) -> Batch {
     let all: Vec<StepRange> = LENGTHS.iter().enumerate().map(|(e, &length)| StepRange::new(e, 0, length)).collect();
     let whole = reader.read(&[name], &all).unwrap_or_else(|e| panic!("{name}: {e}"));
@@ -125,24 +125,24 @@ fn column(reader: &dyn Reader, name: &str) -> Batch {
     whole
 }
 
-fn has_pictures(reader: &dyn Reader, name: &str) {
+fn has_images(reader: &dyn Reader, name: &str) {
     let read = column(reader, name);
-    (0..21).for_each(|t| assert_eq!(read.row(t).get::<u8>(name).expect("pictures"), picture(t), "{name}, row {t}"));
+    (0..21).for_each(|t| assert_eq!(read.row(t).get::<u8>(name).expect("images"), image(t), "{name}, row {t}"));
 }
 
-fn has_numbers(reader: &dyn Reader, name: &str) {
+fn has_values(reader: &dyn Reader, name: &str) {
     let read = column(reader, name);
     for t in 0..21 {
         let expected = numbers(t).map(|number| number as f64);
-        assert_eq!(read.row(t).to_f64(name).expect("numbers"), expected, "{name}, row {t}");
+        assert_eq!(read.row(t).to_f64(name).expect("values"), expected, "{name}, row {t}");
     }
 }
 
 #[test]
-fn a_file_of_the_reference_opens_here() {
+fn reads_a_file_of_the_reference() {
     let reader = open(interop("hdf5-reference.h5")).expect("opens");
     assert_eq!(reader.episodes().iter().map(|episode| episode.length).collect::<Vec<_>>(), LENGTHS);
-    has_pictures(&*reader, "pixels");
+    has_images(&*reader, "pixels");
     let types =
         [("pixels", DType::U8), ("action", DType::Float32), ("reward", DType::Float64), ("step_idx", DType::Int64)];
     for (name, dtype) in types {
@@ -151,7 +151,7 @@ fn a_file_of_the_reference_opens_here() {
     let ends = [5, 12, 20];
     let (action, reward, step) = (column(&*reader, "action"), column(&*reader, "reward"), column(&*reader, "step_idx"));
     for t in 0..21 {
-        let given = action.row(t).to_f64("action").expect("numbers");
+        let given = action.row(t).to_f64("action").expect("values");
         if ends.contains(&t) {
             assert!(given.iter().all(|value| value.is_nan()));
         } else {
@@ -180,43 +180,42 @@ fn every_filter_of_h5py_and_hdf5plugin_is_undone() {
     let names: Vec<String> = reader.schema().columns()[2..].iter().map(|column| column.name.clone()).collect();
     assert_eq!(names.len(), 2 * 26);
     for name in names {
-        if name.starts_with("pictures") { has_pictures(&*reader, &name) } else { has_numbers(&*reader, &name) }
+        if name.starts_with("pictures") { has_images(&*reader, &name) } else { has_values(&*reader, &name) }
     }
 }
 
 #[test]
-fn every_layout_is_read() {
+fn reads_every_layout() {
     let reader = open(interop("hdf5-layouts.h5")).expect("opens");
     for name in ["contiguous", "one chunk", "fixed", "growing", "growing blocks"] {
-        has_pictures(&*reader, name);
+        has_images(&*reader, name);
     }
     for dtype in ["u2", "i2", ">i4", "u4", "u8", ">f8"] {
-        has_numbers(&*reader, &format!("numbers {dtype}"));
+        has_values(&*reader, &format!("numbers {dtype}"));
     }
     let read = column(&*reader, "numbers i1");
-    (0..21).for_each(|t| {
-        assert_eq!(read.row(t).get::<i32>("numbers i1").expect("numbers")[3], numbers(t)[3] as i32 % 100)
-    });
+    (0..21)
+        .for_each(|t| assert_eq!(read.row(t).get::<i32>("numbers i1").expect("values")[3], numbers(t)[3] as i32 % 100));
     let read = column(&*reader, "numbers f2");
-    // 11 bits of precision, and even above 2048.
-    (0..20).for_each(|t| assert_eq!(read.row(t).get::<f32>("numbers f2").expect("numbers")[0], (t * 100) as f32));
+    // Half precision has 11 bits, so values above 2048 must be even.
+    (0..20).for_each(|t| assert_eq!(read.row(t).get::<f32>("numbers f2").expect("values")[0], (t * 100) as f32));
     let read = column(&*reader, "truth");
     (0..21).for_each(|t| assert_eq!(read.row(t).get::<u8>("truth").expect("a truth"), [u8::from(t % 3 == 0)]));
     assert!(reader.schema().column("text").is_err(), "text is left out");
 
     let reader = open(interop("hdf5-trees.h5")).expect("opens");
-    has_pictures(&*reader, "growing");
-    has_pictures(&*reader, "blocks");
+    has_images(&*reader, "growing");
+    has_images(&*reader, "blocks");
     let read = column(&*reader, "partly written");
     for t in 0..21 {
         let expected = if t < 16 { numbers(t).map(|number| number as f64) } else { [0.0; 5] };
-        assert_eq!(read.row(t).to_f64("partly written").expect("numbers"), expected, "row {t}");
+        assert_eq!(read.row(t).to_f64("partly written").expect("values"), expected, "row {t}");
     }
 }
 
 #[test]
-fn damaged_files_of_others_are_refused_or_read() {
-    // They have no checksums: what is changed is not always noticed, but never harms.
+fn rejects_or_reads_damaged_third_party_files() {
+    // These files have no checksums: changes are not always detected, but never do harm.
     for name in ["hdf5-reference.h5", "hdf5-filters.h5", "hdf5-layouts.h5", "hdf5-trees.h5"] {
         let report = fuzz::dataset(name, &interop(name), 150, fuzz::read_everything);
         assert!(report.refused > 20, "{name}: {report:?}");
@@ -233,7 +232,7 @@ fn files_of_others_damaged_in_10000_ways_are_refused_or_read() {
     }
 }
 
-/// The columns of `hdf5-reference.h5`, and an episode of them.
+/// The columns of `hdf5-reference.h5`, and one of its episodes.
 fn theirs() -> Batch {
     let reader = open(interop("hdf5-reference.h5")).expect("opens");
     let columns: Vec<ColumnSpec> = reader.schema().columns()[1..].to_vec();
@@ -242,7 +241,7 @@ fn theirs() -> Batch {
 }
 
 #[test]
-fn a_file_of_the_reference_is_continued_here() {
+fn appends_to_a_file_of_the_reference() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("continued.h5");
     std::fs::copy(interop("hdf5-reference.h5"), &path).expect("copies");
@@ -254,14 +253,14 @@ fn a_file_of_the_reference_is_continued_here() {
         writer.finish().expect("finishes");
         let reader = open(&path).expect("opens");
         assert_eq!(reader.episodes().len(), 3 + round);
-        has_pictures(&*reader, "pixels");
+        has_images(&*reader, "pixels");
         let names: Vec<&str> = episode.schema().columns().iter().map(|column| &*column.name).collect();
         let read = reader.read(&names, &[StepRange::new(2 + round, 0, LENGTHS[1])]).expect("reads");
         (0..names.len()).for_each(|at| assert!(read.bytes(at) == episode.bytes(at), "{}", names[at]));
     }
 }
 
-/// Runs `hdf5_check.py`, if there is a Python for it.
+/// Runs `hdf5_check.py` if Python with h5py is available.
 fn check(mode: &str, path: &Path) -> Option<Value> {
     let Some(python) = std::env::var_os("SWM_LANCE_PYTHON").or_else(|| std::env::var_os("SWM_REFERENCE_PYTHON")) else {
         println!("SKIPPED: set SWM_LANCE_PYTHON to a Python with numpy and h5py");
@@ -278,7 +277,7 @@ fn check(mode: &str, path: &Path) -> Option<Value> {
     Some(serde_json::from_slice(&output.stdout).expect("JSON"))
 }
 
-/// Checks what h5py says of the columns against ours.
+/// Compares the columns that h5py reads with ours.
 fn agrees(path: &Path, seen: &Value) {
     let reader = open(path).expect("opens");
     let all: Vec<StepRange> =
@@ -292,7 +291,7 @@ fn agrees(path: &Path, seen: &Value) {
         let (mut sum, mut weighted) = (0.0, 0.0);
         for t in 0..read.rows() {
             let row: f64 =
-                read.row(t).to_f64(&column.name).expect("numbers").iter().filter(|value| !value.is_nan()).sum();
+                read.row(t).to_f64(&column.name).expect("values").iter().filter(|value| !value.is_nan()).sum();
             sum += row;
             weighted += row * (t % 1000 + 1) as f64;
         }
@@ -315,7 +314,7 @@ fn our_files_open_in_h5py_and_what_it_appends_opens_here() {
     let Some(seen) = check("append", &path) else { return };
     assert_eq!(open(&path).expect("opens").episodes().len(), 78);
     agrees(&path, &seen);
-    // And we continue it after h5py did.
+    // Appends after h5py did.
     let mut writer = format_suite::writer(&path, WriteMode::Append).expect("continues");
     writer.write_episode(&crate::sample::episode(0)).expect("writes");
     writer.finish().expect("finishes");

@@ -1,10 +1,10 @@
-//! HDF5 files in object stores, read by ranges of bytes.
+//! HDF5 files in object stores, read by byte ranges.
 
 use crate::{format_suite, objects};
 use swm_data::{Location, StepRange, WriteMode, open};
 
 #[test]
-fn a_file_in_a_bucket_and_on_a_web_server_is_read() {
+fn reads_files_in_a_bucket_and_on_a_web_server() {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::create_dir(folder.path().join("bucket")).expect("a bucket");
     let path = folder.path().join("bucket/d.h5");
@@ -18,7 +18,7 @@ fn a_file_in_a_bucket_and_on_a_web_server_is_read() {
     let here = open(&path).expect("opens");
     assert_eq!(reader.content_hash().expect("hashes"), here.content_hash().expect("hashes"));
     assert_eq!(reader.constants(7).expect("reads"), here.constants(7).expect("reads"));
-    // A batch in random order, some rows twice.
+    // A batch in random order, with some rows twice.
     let ranges: Vec<StepRange> = (0..60).map(|i| StepRange::new(i * 7 % 30, i % 4, 2)).collect();
     let names = ["pixels", "action", "state"];
     let (near, far) = (here.read(&names, &ranges).expect("reads"), reader.read(&names, &ranges).expect("reads"));
@@ -34,7 +34,7 @@ fn a_file_in_a_bucket_and_on_a_web_server_is_read() {
 }
 
 #[test]
-fn nothing_is_written_to_a_web_server() {
+fn does_not_write_to_a_web_server() {
     let location = Location::parse("http://127.0.0.1:9/d.h5").expect("a location");
     let error = format_suite::writer(&location, WriteMode::Create).err().expect("refused").to_string();
     assert!(error.contains("hdf5") && error.contains("copy it"), "{error}");

@@ -1,4 +1,4 @@
-//! Writers that are killed, or run out of space: what was committed stays, and nothing is half there.
+//! Writers that are killed or run out of disk space keep committed episodes and leave no partial ones.
 
 use crate::sample::{check, episode, options, schema, write};
 use std::io::{BufRead as _, BufReader};
@@ -7,11 +7,10 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 use swm_data::{CommitPolicy, WriteMode, WriteOptions, create, open};
 
-/// Where the child process writes; only set for it.
+/// Environment variable of child processes: the path to write to.
 const TARGET: &str = "SWM_TEST_CHILD_TARGET";
 
-/// Not a test of its own: the process that the tests below kill or starve. Writes episodes for ever, a line
-/// each; stops at an error, and prints it.
+/// A child process of the tests below. Writes episodes forever and prints a line for each; prints an error and stops.
 #[test]
 fn child_that_writes() {
     let Some(path) = std::env::var_os(TARGET).map(PathBuf::from) else { return };
@@ -27,7 +26,7 @@ fn child_that_writes() {
     }
 }
 
-/// The command that runs a child test, after `shell` has set its limits.
+/// The command that runs a child test after `shell` has set its limits.
 fn run_child(test: &str, path: &Path, shell: &str) -> Command {
     let mut command = Command::new("sh");
     let program = std::env::current_exe().expect("this program");
@@ -36,7 +35,7 @@ fn run_child(test: &str, path: &Path, shell: &str) -> Command {
     command
 }
 
-/// Not a test of its own: opens the dataset in a process with few file descriptors.
+/// A child process that opens the dataset with few file descriptors.
 #[test]
 fn child_that_reads() {
     let Some(path) = std::env::var_os(TARGET).map(PathBuf::from) else { return };
@@ -46,7 +45,7 @@ fn child_that_reads() {
 }
 
 #[test]
-fn many_fragments_need_few_file_descriptors() {
+fn opens_many_fragments_with_few_file_descriptors() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 1, 0..170);
@@ -56,7 +55,7 @@ fn many_fragments_need_few_file_descriptors() {
 }
 
 #[test]
-fn a_killed_writer_keeps_finished_episodes() {
+fn killed_writer_keeps_committed_episodes() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     let mut stored = 0;
@@ -71,7 +70,7 @@ fn a_killed_writer_keeps_finished_episodes() {
         child.kill().expect("killed");
         child.wait().expect("gone");
         let reader = open(&path).expect("still opens");
-        // Three episodes make a group; two more may wait for the committing thread, three be on their way.
+        // A commit has three episodes; two more may wait for the committing thread, and three may be in progress.
         let now = reader.episodes().len();
         assert!(now + 9 > stored + written, "{now} episodes of {}", stored + written);
         check(&*reader, 0);
@@ -83,7 +82,7 @@ fn a_killed_writer_keeps_finished_episodes() {
     check(&*reader, 0);
 }
 
-/// Runs the child until it fails, and checks what it says and leaves.
+/// Runs the child until it fails, and checks its error and the dataset.
 fn starve(path: &Path, shell: &str, words: &str) {
     let output = run_child("child_that_writes", path, shell).output().expect("runs");
     let text = String::from_utf8_lossy(&output.stdout);
@@ -96,17 +95,17 @@ fn starve(path: &Path, shell: &str, words: &str) {
 }
 
 #[test]
-fn files_that_may_not_grow_keep_finished_episodes() {
+fn file_size_limit_keeps_committed_episodes() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 1, 0..4);
-    // A fragment of three episodes is larger than 8 blocks; the existing manifests are not.
+    // A fragment of three episodes is larger than 8 blocks; the existing manifests are smaller.
     starve(&path, "trap '' XFSZ; ulimit -f 8;", "File too large");
     assert_eq!(open(&path).expect("opens").episodes().len(), 4);
 }
 
 #[test]
-fn a_full_disk_keeps_finished_episodes() {
+fn full_disk_keeps_committed_episodes() {
     let folder = tempfile::tempdir().expect("a folder");
     let mount = Command::new("mount").args(["-t", "tmpfs", "-o", "size=1m", "tmpfs"]).arg(folder.path()).output();
     if !mount.is_ok_and(|output| output.status.success()) {

@@ -1,7 +1,8 @@
-//! A process that writes is killed (SIGKILL) at random moments: every committed episode is readable, the next run
-//! continues, and what is left behind disturbs nobody.
+//! A writing process is killed (SIGKILL) at random moments: committed episodes must be readable, the next writer must
+//! continue, and leftovers must not matter.
 //!
-//! The suite kills a few times; `cargo test --release -p swm-data --test it kill -- --ignored` at fifty moments of each
+//! The suite kills a few times; `cargo test --release -p swm-data --test it kill -- --ignored` fifty times per kind of
+//! writing.
 //! kind of writing.
 
 use crate::sample::{check, episode, options, schema};
@@ -14,16 +15,16 @@ use swm_core::Key;
 use swm_data::lance::{Shard, commit_shards, create_shard};
 use swm_data::{CommitPolicy, Constants, Location, WriteMode, WriteOptions, Writer, create, open};
 
-/// Where the child process writes; only set for it.
+/// Environment variable of child processes: the path to write to.
 const TARGET: &str = "SWM_TEST_KILLED";
 
-/// A child, and its output, which must stay open as long as it prints.
+/// A child process and its output, which must stay open while it prints.
 struct Running {
     child: Child,
     _output: Lines<BufReader<ChildStdout>>,
 }
 
-/// Starts one of the children below, and waits until it is at work.
+/// Starts a child test below and waits until it is writing.
 fn start(test: &str, path: &Path) -> Running {
     let mut command = Command::new(std::env::current_exe().expect("this program"));
     command.args(["--exact", &format!("kill::{test}"), "--nocapture"]).env(TARGET, path);
@@ -34,9 +35,9 @@ fn start(test: &str, path: &Path) -> Running {
     Running { child, _output: output }
 }
 
-/// Kills a child after a moment that the key decides; gives whether it was still at work.
+/// Kills a child after a keyed random time; returns whether it was still running.
 fn kill(mut running: Running, key: Key, longest: Duration) -> bool {
-    // The moment itself is what is tested, so it passes without a sleep that the scheduler may stretch.
+    // Busy waiting, because the scheduler may extend a sleep.
     let end = Instant::now() + longest.mul_f64(key.rng().random());
     while Instant::now() < end {
         std::hint::spin_loop();
@@ -62,7 +63,7 @@ fn write_on(mut writer: Box<dyn Writer>, until: usize) {
     writer.finish().expect("finishes");
 }
 
-/// Not a test of its own: makes or continues a dataset, without an end.
+/// A child process: creates or continues a dataset forever.
 #[test]
 fn child_that_appends() {
     let Some(path) = target() else { return };
@@ -70,7 +71,7 @@ fn child_that_appends() {
     write_on(create(&path, &schema(), options).expect("continues"), 1_000_000);
 }
 
-/// Not a test of its own: replaces a dataset by ten episodes, again and again.
+/// A child process: replaces a dataset with ten episodes, again and again.
 #[test]
 fn child_that_replaces() {
     let Some(path) = target() else { return };
@@ -80,7 +81,7 @@ fn child_that_replaces() {
     }
 }
 
-/// Not a test of its own: writes one part of two, continues what another process began of the other, and commits them.
+/// A child process: writes one of two shards, continues the other, and commits both.
 #[test]
 fn child_that_writes_parts() {
     let Some(path) = target() else { return };
@@ -97,7 +98,7 @@ fn child_that_writes_parts() {
     commit_shards(&Location::from(&path)).expect("commits");
 }
 
-/// Everything is readable, and episodes are numbered without a gap.
+/// Checks that everything is readable and that episode indices have no gap.
 fn check_all(path: &Path, constants: bool) -> usize {
     let reader = open(path).expect("opens");
     check(&*reader, 0);
@@ -123,7 +124,7 @@ fn killed_appends(moments: u64) {
         stored = now;
     }
     assert!(stored > 0);
-    // The next run continues, and what was left behind stays unseen.
+    // The next writer continues and ignores leftovers.
     let mut writer = create(&path, &schema(), options(WriteMode::Append)).expect("continues");
     let constants = Constants::from([("number".to_owned(), stored.to_string().into_bytes())]);
     writer.write_episode_with(&episode(stored), &constants).expect("writes");
@@ -147,7 +148,7 @@ fn killed_parts(moments: u64) {
         let path = folder.path().join(format!("{moment}.lance"));
         let child = start("child_that_writes_parts", &path);
         if kill(child, Key::new(0).with("parts").at(moment), Duration::from_millis(60)) {
-            // Another run ends what this one began; unless it was killed between the commit and its end.
+            // Another run completes the commit, unless this one was killed between the commit and its cleanup.
             let committed = open(&path).is_ok();
             if committed {
                 assert_eq!(check_all(&path, false), 12, "all or nothing");
@@ -163,34 +164,34 @@ fn killed_parts(moments: u64) {
 }
 
 #[test]
-fn a_killed_append_keeps_what_was_committed() {
+fn killed_append_keeps_committed_episodes() {
     killed_appends(4);
 }
 
 #[test]
-fn a_killed_replacement_leaves_one_of_both() {
+fn killed_replacement_leaves_the_old_or_new_dataset() {
     killed_replacements(4);
 }
 
 #[test]
-fn a_killed_part_is_continued() {
+fn killed_shard_is_continued() {
     killed_parts(4);
 }
 
 #[test]
 #[ignore = "takes a minute"]
-fn fifty_killed_appends_keep_what_was_committed() {
+fn fifty_killed_appends_keep_committed_episodes() {
     killed_appends(50);
 }
 
 #[test]
 #[ignore = "takes a minute"]
-fn fifty_killed_replacements_leave_one_of_both() {
+fn fifty_killed_replacements_leave_the_old_or_new_dataset() {
     killed_replacements(50);
 }
 
 #[test]
 #[ignore = "takes a minute"]
-fn fifty_killed_parts_are_continued() {
+fn fifty_killed_shards_are_continued() {
     killed_parts(50);
 }

@@ -1,4 +1,4 @@
-//! The Lance format: what was written is what is read.
+//! The format `lance`.
 
 use crate::sample::{COLUMNS, check, episode, manifest, options, rows, schema, write};
 use rand::Rng as _;
@@ -14,7 +14,7 @@ fn failure(path: &Path, schema: &Schema, mode: WriteMode) -> String {
 }
 
 #[test]
-fn what_is_written_is_read() {
+fn reads_what_was_written() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("with space ü%20.lance");
     write(&path, WriteMode::Create, 2, 0..9);
@@ -22,18 +22,18 @@ fn what_is_written_is_read() {
     assert_eq!(reader.episodes().len(), 9);
     check(&*reader, 0);
     assert_eq!(reader.manifest(), Some(manifest(3)));
-    // Names and types are those that were written, the numbering first.
+    // Names and types are unchanged, with index columns first.
     let mut expected = vec![ColumnSpec::new("episode_idx", DType::Int32, []), schema().columns()[5].clone()];
     expected.extend(schema().columns().iter().filter(|c| c.name != "step_idx").cloned());
     assert_eq!(reader.schema().columns(), expected);
-    // A folder that holds one table names it.
+    // A folder that contains one table can be opened, too.
     assert_eq!(open(folder.path()).expect("opens").episodes(), reader.episodes());
     let on_disk: u64 = reader.footprint().expect("a footprint").iter().map(|(_, bytes)| bytes).sum();
     assert!(on_disk > 5_000, "{on_disk}");
 }
 
 #[test]
-fn any_ranges_are_read_in_the_order_asked() {
+fn reads_ranges_in_the_requested_order() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..12);
@@ -65,7 +65,7 @@ fn any_ranges_are_read_in_the_order_asked() {
 }
 
 #[test]
-fn wrong_columns_and_rows_say_what_is_right() {
+fn invalid_columns_and_rows_are_explained() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..2);
@@ -83,7 +83,7 @@ fn wrong_columns_and_rows_say_what_is_right() {
 }
 
 #[test]
-fn modes_keep_refuse_or_replace() {
+fn follows_the_write_mode() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Append, 100, 0..3);
@@ -93,7 +93,7 @@ fn modes_keep_refuse_or_replace() {
     assert_eq!(writer.episodes(), 3);
     writer.write_episode(&episode(3)).expect("writes");
     assert_eq!(writer.episodes(), 4);
-    drop(writer); // as good as `finish`, but cannot say that it failed
+    drop(writer); // commits as `finish` does, but cannot report errors
     let reader = open(&path).expect("opens");
     check(&*reader, 0);
     assert_eq!(reader.episodes().iter().map(|e| e.index).collect::<Vec<_>>(), [0, 1, 2, 3]);
@@ -111,7 +111,7 @@ fn modes_keep_refuse_or_replace() {
 }
 
 #[test]
-fn an_empty_dataset_opens() {
+fn opens_an_empty_dataset() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 1, 0..0);
@@ -124,7 +124,7 @@ fn an_empty_dataset_opens() {
 }
 
 #[test]
-fn another_schema_is_not_appended() {
+fn does_not_append_another_schema() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 100, 0..2);
@@ -138,7 +138,7 @@ fn another_schema_is_not_appended() {
     assert!(with(&|columns| columns[3].dtype = DType::Float64).contains("reward float32"));
     assert!(with(&|columns| columns.truncate(4)).contains("the columns it has"));
     assert!(with(&|columns| columns.push(ColumnSpec::new("more", DType::U8, []))).contains("more"));
-    // Columns in another order are the same columns.
+    // The order of columns does not matter.
     let mut columns = schema().columns().to_vec();
     columns.reverse();
     let turned = Schema::new(columns).expect("schema");
@@ -154,7 +154,7 @@ fn another_schema_is_not_appended() {
 }
 
 #[test]
-fn episodes_that_break_the_convention_are_refused() {
+fn rejects_episodes_that_break_the_time_convention() {
     let folder = tempfile::tempdir().expect("a folder");
     let mut writer = create(folder.path().join("d.lance"), &schema(), options(WriteMode::Create)).expect("creates");
     let mut refuse = |change: &dyn Fn(&mut Batch), words: &str| {
@@ -182,7 +182,7 @@ fn episodes_that_break_the_convention_are_refused() {
 }
 
 #[test]
-fn the_content_hash_knows_content_not_files() {
+fn content_hash_does_not_depend_on_files() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = |name: &str| folder.path().join(name);
     write(&path("a.lance"), WriteMode::Create, 1, 0..5);
@@ -195,7 +195,7 @@ fn the_content_hash_knows_content_not_files() {
 }
 
 #[test]
-fn pictures_can_be_lossless() {
+fn stores_lossless_images() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     for (number, codec) in [ImageCodec::Png, ImageCodec::Qoi].into_iter().enumerate() {
@@ -213,7 +213,7 @@ fn pictures_can_be_lossless() {
 }
 
 #[test]
-fn many_threads_read_at_once() {
+fn several_threads_read_at_once() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..12);
@@ -230,7 +230,7 @@ fn many_threads_read_at_once() {
 }
 
 #[test]
-fn writers_that_append_at_once_both_survive() {
+fn concurrent_writers_both_append() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     let threads = 4;
@@ -252,7 +252,7 @@ fn writers_that_append_at_once_both_survive() {
     let reader = open(&path).expect("opens");
     let numbers: Vec<i64> = reader.episodes().iter().map(|episode| episode.index).collect();
     assert_eq!(numbers, (0..(threads * each) as i64).collect::<Vec<_>>());
-    // Which episode each is, by its state.
+    // The state identifies the episode.
     let firsts: Vec<StepRange> = (0..threads * each).map(|at| StepRange::new(at, 0, 1)).collect();
     let read = reader.read(&["state"], &firsts).expect("reads");
     let mut found: Vec<usize> = read.get::<f64>("state").expect("states").chunks(3).map(|s| s[0] as usize).collect();
@@ -266,7 +266,7 @@ fn writers_that_append_at_once_both_survive() {
 }
 
 #[test]
-fn a_writer_whose_dataset_was_replaced_fails_cleanly() {
+fn writer_of_a_replaced_dataset_fails() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     let mut first = create(&path, &schema(), options(WriteMode::Append)).expect("creates");
@@ -279,7 +279,7 @@ fn a_writer_whose_dataset_was_replaced_fails_cleanly() {
 }
 
 #[test]
-fn doubles_are_exact_and_older_tables_stay_single() {
+fn stores_doubles_exactly_but_keeps_the_precision_of_older_tables() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     let schema = Schema::new([ColumnSpec::new("state", DType::Float64, [2])]).expect("schema");
@@ -295,7 +295,7 @@ fn doubles_are_exact_and_older_tables_stay_single() {
         read.get::<f64>("state").expect("states").iter().map(|v| v.to_bits()).collect()
     };
     assert_eq!(bits(&*open(&path).expect("opens")), values.map(f64::to_bits));
-    // A table of the first version, which held all numbers in single precision, is continued as it is.
+    // A table of the first version stored all numeric columns in single precision; appending keeps it.
     let old = folder.path().join("old.lance");
     crate::fuzz::copy_all(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/single.lance"), &old);
     let there = open(&old).expect("opens").episodes().len();
@@ -306,7 +306,7 @@ fn doubles_are_exact_and_older_tables_stay_single() {
 }
 
 #[test]
-fn constants_come_back() {
+fn reads_constants() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     let scene = |e: usize| {
@@ -327,7 +327,7 @@ fn constants_come_back() {
         assert_eq!(reader.constants(e).expect("reads"), expected, "episode {e}");
     }
     assert!(reader.constants(10).is_err());
-    // They are part of the content.
+    // They are part of the content hash.
     let plain = folder.path().join("plain.lance");
     write(&plain, WriteMode::Create, 4, 0..10);
     let plain = open(&plain).expect("opens");
@@ -336,7 +336,7 @@ fn constants_come_back() {
 }
 
 #[test]
-fn old_versions_do_not_pile_up() {
+fn old_versions_are_removed() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 1, 0..30);
@@ -346,17 +346,17 @@ fn old_versions_do_not_pile_up() {
 }
 
 #[test]
-fn places_that_cannot_be_written_say_why() {
+fn unwritable_locations_are_explained() {
     let folder = tempfile::tempdir().expect("a folder");
     let file = folder.path().join("file");
     std::fs::write(&file, "not a folder").expect("writes");
     let error = failure(&file.join("d.lance"), &schema(), WriteMode::Create);
     assert!(error.contains("Not a directory"), "{error}");
     assert!(failure(&folder.path().join("name"), &schema(), WriteMode::Create).contains("end it in .lance"));
-    // Not even the administrator may write here.
+    // Not even root may write here.
     let error = create(Path::new("/proc/d.lance"), &schema(), options(WriteMode::Create)).err().expect("refused");
     assert!(matches!(error, Error::Io { .. }), "{error}");
-    // Somebody else's folder is left alone.
+    // A folder with other files is left unchanged.
     let other = folder.path().join("other.lance");
     std::fs::create_dir(&other).expect("a folder");
     std::fs::write(other.join("thesis.tex"), "years of work").expect("writes");
@@ -367,7 +367,7 @@ fn places_that_cannot_be_written_say_why() {
 }
 
 #[test]
-fn statistics_leave_missing_numbers_out() {
+fn statistics_ignore_missing_values() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..4);

@@ -1,4 +1,4 @@
-//! Datasets that several machines write together.
+//! Datasets that several machines write as shards.
 
 use crate::sample::{check, episode, options, schema, write};
 use std::path::Path;
@@ -6,13 +6,13 @@ use swm_core::{ColumnSpec, DType, Schema};
 use swm_data::lance::{Shard, commit_shards, create_shard};
 use swm_data::{CommitPolicy, Constants, Location, WriteMode, WriteOptions, Writer, open};
 
-fn part(path: &Path, mode: WriteMode, index: usize, count: usize) -> swm_core::Result<Box<dyn Writer>> {
+fn shard_writer(path: &Path, mode: WriteMode, index: usize, count: usize) -> swm_core::Result<Box<dyn Writer>> {
     let commit = CommitPolicy { episodes: 2, ..CommitPolicy::default() };
     create_shard(&Location::from(path), &schema(), WriteOptions { commit, ..options(mode) }, Shard { index, count })
 }
 
-fn write_part(path: &Path, index: usize, count: usize, episodes: std::ops::Range<usize>) {
-    let mut writer = part(path, WriteMode::Create, index, count).expect("begins");
+fn write_shard(path: &Path, index: usize, count: usize, episodes: std::ops::Range<usize>) {
+    let mut writer = shard_writer(path, WriteMode::Create, index, count).expect("begins");
     for e in episodes {
         let constants = Constants::from([("number".to_owned(), e.to_string().into_bytes())]);
         writer.write_episode_with(&episode(e), &constants).expect("writes");
@@ -25,18 +25,18 @@ fn failure(path: &Path) -> String {
 }
 
 #[test]
-fn parts_become_one_version() {
+fn commits_all_shards_as_one_version() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     assert!(failure(&path).contains("no shards to commit"));
-    // In any order, and on several threads as on several machines.
+    // In any order; threads stand for machines.
     std::thread::scope(|scope| {
-        scope.spawn(|| write_part(&path, 2, 3, 7..12));
-        scope.spawn(|| write_part(&path, 0, 3, 0..5));
+        scope.spawn(|| write_shard(&path, 2, 3, 7..12));
+        scope.spawn(|| write_shard(&path, 0, 3, 0..5));
     });
     assert!(failure(&path).contains("shard 1 of 3 is missing"));
     assert!(open(&path).is_err(), "nothing is seen before the commit");
-    write_part(&path, 1, 3, 5..7);
+    write_shard(&path, 1, 3, 5..7);
     assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 12);
 
     let reader = open(&path).expect("opens");
@@ -46,7 +46,7 @@ fn parts_become_one_version() {
         assert_eq!(reader.constants(e).expect("reads")["number"], e.to_string().into_bytes());
     }
     assert!(failure(&path).contains("no shards to commit"), "the log is gone");
-    // The content is that of one writer's.
+    // The content equals that of a single writer.
     let whole = folder.path().join("whole.lance");
     write(&whole, WriteMode::Create, 100, 0..12);
     let columns = ["pixels", "state", "episode_idx", "step_idx"];
@@ -55,9 +55,9 @@ fn parts_become_one_version() {
     let (parts, one) = (read(&*reader), read(&*open(&whole).expect("opens")));
     assert!((0..columns.len()).all(|column| parts.bytes(column) == one.bytes(column)));
 
-    // More parts, after those that are there; then an ordinary writer after them.
-    write_part(&path, 0, 2, 12..14);
-    write_part(&path, 1, 2, 14..16);
+    // More shards, after the existing episodes; then an ordinary writer.
+    write_shard(&path, 0, 2, 12..14);
+    write_shard(&path, 1, 2, 14..16);
     assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 4);
     write(&path, WriteMode::Append, 1, 16..18);
     let reader = open(&path).expect("opens");
@@ -66,18 +66,20 @@ fn parts_become_one_version() {
 }
 
 #[test]
-fn a_part_that_was_interrupted_is_continued_or_begun_again() {
+fn interrupted_shard_is_continued_or_restarted() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
-    write_part(&path, 1, 2, 4..6);
-    let mut writer = part(&path, WriteMode::Create, 0, 2).expect("begins");
+    write_shard(&path, 1, 2, 4..6);
+    let mut writer = shard_writer(&path, WriteMode::Create, 0, 2).expect("begins");
     for e in 0..2 {
         writer.write_episode(&episode(e)).expect("writes");
     }
     drop(writer);
     assert!(failure(&path).contains("shard 0 of 2 is not finished"));
-    assert!(part(&path, WriteMode::Create, 0, 2).err().expect("refused").to_string().contains("already exists"));
-    let mut writer = part(&path, WriteMode::Append, 0, 2).expect("continues");
+    assert!(
+        shard_writer(&path, WriteMode::Create, 0, 2).err().expect("refused").to_string().contains("already exists")
+    );
+    let mut writer = shard_writer(&path, WriteMode::Append, 0, 2).expect("continues");
     assert_eq!(writer.episodes(), 2);
     for e in 2..4 {
         writer.write_episode(&episode(e)).expect("writes");
@@ -86,8 +88,8 @@ fn a_part_that_was_interrupted_is_continued_or_begun_again() {
     commit_shards(&Location::from(&path)).expect("commits");
     check(&*open(&path).expect("opens"), 0);
 
-    write_part(&path, 0, 1, 0..3);
-    let mut writer = part(&path, WriteMode::Overwrite, 0, 1).expect("begins again");
+    write_shard(&path, 0, 1, 0..3);
+    let mut writer = shard_writer(&path, WriteMode::Overwrite, 0, 1).expect("begins again");
     writer.write_episode(&episode(6)).expect("writes");
     writer.finish().expect("finishes");
     assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 1);
@@ -95,10 +97,10 @@ fn a_part_that_was_interrupted_is_continued_or_begun_again() {
 }
 
 #[test]
-fn a_commit_that_was_killed_before_it_cleaned_up_is_not_repeated() {
+fn commit_killed_before_cleanup_is_not_repeated() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
-    write_part(&path, 0, 1, 0..3);
+    write_shard(&path, 0, 1, 0..3);
     crate::fuzz::copy_all(&path.join("_shards"), &folder.path().join("kept"));
     assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 3);
     crate::fuzz::copy_all(&folder.path().join("kept"), &path.join("_shards"));
@@ -108,15 +110,17 @@ fn a_commit_that_was_killed_before_it_cleaned_up_is_not_repeated() {
 }
 
 #[test]
-fn parts_that_do_not_fit_are_refused() {
+fn rejects_inconsistent_shards() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     let location = Location::from(&path);
-    assert!(part(&path, WriteMode::Create, 3, 3).err().expect("refused").to_string().contains("no shard 3 of 3"));
-    write_part(&path, 0, 2, 0..2);
-    write_part(&path, 0, 3, 0..2);
+    assert!(
+        shard_writer(&path, WriteMode::Create, 3, 3).err().expect("refused").to_string().contains("no shard 3 of 3")
+    );
+    write_shard(&path, 0, 2, 0..2);
+    write_shard(&path, 0, 3, 0..2);
     assert!(failure(&path).contains("there are shards of"));
-    drop(part(&path, WriteMode::Overwrite, 0, 3).expect("begins again"));
+    drop(shard_writer(&path, WriteMode::Overwrite, 0, 3).expect("begins again"));
     std::fs::remove_dir_all(path.join("_shards/0-of-3")).expect("removes");
     let other = Schema::new([ColumnSpec::new("other", DType::Float32, [])]).expect("schema");
     let shard = Shard { index: 1, count: 2 };

@@ -1,4 +1,4 @@
-//! The format `lance-video`. The long runs:
+//! The format `lance-video`. Run the long tests with:
 //!
 //! ```text
 //! cargo test --release --workspace --test it -- --ignored lance_video::
@@ -23,7 +23,7 @@ fn write(path: &std::path::Path, mode: WriteMode, codec: ImageCodec, episodes: s
 }
 
 #[test]
-fn episodes_come_back_with_their_pictures() {
+fn reads_episodes_with_their_images() {
     let folder = tempfile::tempdir().expect("a folder");
     for (name, codec) in [("a", ImageCodec::Png), ("b", ImageCodec::Jpeg { quality: 95 })] {
         let path = folder.path().join(format!("{name}.lance-video"));
@@ -54,13 +54,13 @@ fn episodes_come_back_with_their_pictures() {
         assert!(create(&path, &few, options).is_err(), "other columns");
     }
     assert!(open(folder.path().join("none.lance-video")).is_err(), "there is none");
-    let pictures = Schema::new(schema().columns()[..1].to_vec()).expect("schema");
+    let images = Schema::new(schema().columns()[..1].to_vec()).expect("schema");
     let path = folder.path().join("pictures.lance-video");
-    let error = create(&path, &pictures, WriteOptions::default()).err().expect("no numbers").to_string();
+    let error = create(&path, &images, WriteOptions::default()).err().expect("no numbers").to_string();
     assert!(error.contains("format video"), "{error}");
 }
 
-/// Kills a writer after some episodes; what it committed is there, and the next one continues.
+/// Kills a writer after some episodes. Committed episodes must be readable, and the next writer continues.
 fn killed(moments: usize) {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance-video");
@@ -80,7 +80,7 @@ fn killed(moments: usize) {
         child.wait().expect("gone");
         let reader = open(&path).expect("still opens");
         check(&*reader, 0);
-        // Three episodes make a group; more may wait for the committing thread.
+        // A commit has three episodes; more may wait for the committing thread.
         let now = reader.episodes().len();
         assert!(now >= stored && now + 9 > stored + seen, "{now} episodes after {stored} and {seen}");
         stored = now;
@@ -92,7 +92,7 @@ fn killed(moments: usize) {
 }
 
 #[test]
-fn a_killed_writer_keeps_committed_episodes() {
+fn killed_writer_keeps_committed_episodes() {
     killed(3);
 }
 
@@ -111,7 +111,7 @@ fn damaged(cases: u64) {
 }
 
 #[test]
-fn damaged_tables_are_refused() {
+fn rejects_damaged_tables() {
     damaged(300);
 }
 

@@ -1,5 +1,6 @@
-//! The format `lerobot`, on datasets that LeRobot's own package wrote (`tests/interop/lerobot_export.py`), and ours in
-//! its hands. The long runs:
+//! The format `lerobot`: datasets that LeRobot's own package wrote (`tests/interop/lerobot_export.py`), and that
+//! package
+//! reading ours. Run the long tests with:
 //!
 //! ```text
 //! cargo test --release --workspace --test it -- --ignored lerobot::
@@ -12,12 +13,12 @@ use swm_core::{ColumnSpec, DType};
 use swm_data::{CommitPolicy, Constants, ImageCodec, StepRange, WriteMode, WriteOptions, create, open};
 
 #[test]
-fn it_does_what_formats_do() {
+fn passes_the_format_suite() {
     format_suite::all("d.lerobot");
 }
 
 #[test]
-fn a_killed_writer_keeps_committed_episodes() {
+fn killed_writer_keeps_committed_episodes() {
     format_suite::killed("d.lerobot", 4);
 }
 
@@ -28,7 +29,7 @@ fn a_writer_killed_at_50_moments_keeps_committed_episodes() {
 }
 
 #[test]
-fn datasets_of_lerobot_open_here() {
+fn reads_datasets_of_lerobot() {
     for name in ["lerobot-v30-h264", "lerobot-v30-av1", "lerobot-v21"] {
         let reader = open(interop().join(name)).expect("opens");
         assert_eq!(reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), THEIR_LENGTHS, "{name}");
@@ -44,8 +45,8 @@ fn datasets_of_lerobot_open_here() {
             let read = reader.read(&names, &[StepRange::new(e, 0, length)]).expect("reads");
             for t in 0..length {
                 let (row, time) = (read.row(t), t as f32);
-                assert_eq!(row.get::<f32>("observation.state").expect("numbers"), [e as f32, time, -0.5]);
-                assert_eq!(row.get::<f32>("action").expect("numbers"), [e as f32 + time / 4.0, -time]);
+                assert_eq!(row.get::<f32>("observation.state").expect("values"), [e as f32, time, -0.5]);
+                assert_eq!(row.get::<f32>("action").expect("values"), [e as f32 + time / 4.0, -time]);
                 assert_eq!(row.get::<f32>("next.reward").expect("a number"), [time / 2.0]);
                 assert_eq!(row.get::<u8>("next.done").expect("a flag"), [u8::from(t + 1 == length)]);
                 assert_eq!(row.get::<i64>("task_index").expect("a number"), [(e % 2) as i64]);
@@ -66,13 +67,13 @@ fn datasets_of_lerobot_open_here() {
 }
 
 #[test]
-fn pictures_in_tables_are_read() {
+fn reads_images_in_tables() {
     let reader = open(interop().join("lerobot-v30-h264")).expect("opens");
     let name = "observation.images.still";
     let ranges = [StepRange::new(2, 3, 2), StepRange::new(0, 10, 1), StepRange::new(2, 3, 1)];
     let read = reader.read(&[name], &ranges).expect("reads");
     for (row, (e, t)) in [(2, 3), (2, 4), (0, 10), (2, 3)].into_iter().enumerate() {
-        let frame = read.row(row).get::<u8>(name).expect("a picture").to_vec();
+        let frame = read.row(row).get::<u8>(name).expect("an image").to_vec();
         for y in 0..24 {
             for x in 0..32 {
                 let block = (4 + t..12 + t).contains(&y) && (8 + 2 * t..20 + 2 * t).contains(&x);
@@ -90,7 +91,7 @@ fn damaged(name: &str, cases: u64) {
 }
 
 #[test]
-fn damaged_datasets_are_survived() {
+fn survives_damaged_datasets() {
     ["lerobot-v30-h264", "lerobot-v21"].iter().for_each(|name| damaged(name, 200));
 }
 
@@ -101,7 +102,7 @@ fn datasets_damaged_in_10000_ways_are_survived() {
 }
 
 #[test]
-fn our_datasets_open_in_lerobot() {
+fn lerobot_opens_our_datasets() {
     let Some(python) = std::env::var_os("SWM_LEROBOT_PYTHON") else {
         println!("SKIPPED: set SWM_LEROBOT_PYTHON to a Python with lerobot 0.4");
         return;
@@ -139,7 +140,7 @@ fn our_datasets_open_in_lerobot() {
                 assert_eq!(row["task"], format!("task {}", e % 2));
                 assert_eq!((&row["episode_index"], &row["frame_index"]), (&e.into(), &t.into()));
                 for column in ["pixels", "goal"] {
-                    let ours = episode.row(t).get::<u8>(column).expect("pictures").to_vec();
+                    let ours = episode.row(t).get::<u8>(column).expect("images").to_vec();
                     let theirs = row[column].as_array().expect("bytes");
                     assert_eq!(theirs.len(), ours.len());
                     let off: f64 = theirs

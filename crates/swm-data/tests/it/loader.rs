@@ -1,4 +1,4 @@
-//! The loader: every clip once an epoch, in an order that the seed decides, whatever the threads.
+//! The loader yields every clip once per epoch, in an order that depends only on the seed and the epoch.
 
 use crate::sample::{rows, write};
 use std::path::PathBuf;
@@ -33,7 +33,7 @@ fn load(reader: &Arc<dyn Reader>, config: LoaderConfig, epoch: u64, first: usize
     batches
 }
 
-/// `(episode, first row)` of every clip, from its states.
+/// `(episode, first row)` of every clip, decoded from its states.
 fn clips(batches: &[Batch]) -> Vec<(usize, usize)> {
     let mut found = vec![];
     for batch in batches {
@@ -50,7 +50,7 @@ fn bytes(batches: &[Batch]) -> Vec<Vec<u8>> {
 }
 
 #[test]
-fn every_clip_comes_once_and_holds_its_rows() {
+fn yields_every_clip_once_with_its_rows() {
     let (_folder, path) = dataset(2);
     let reader = open(&path).expect("opens");
     let (steps, skip) = (2, 3);
@@ -69,12 +69,12 @@ fn every_clip_comes_once_and_holds_its_rows() {
             let (e, start) = (state[0] as usize, state[1] as usize);
             for k in 0..steps {
                 assert_eq!(state[3 * k..3 * k + 2], [e as f64, (start + k * skip) as f64]);
-                let frame = batch.row(row).get::<u8>("pixels").expect("pictures");
+                let frame = batch.row(row).get::<u8>("pixels").expect("images");
                 let frame = &frame[k * 16 * 24 * 3..(k + 1) * 16 * 24 * 3];
                 let first = ((3 * (start + k * skip) + 20 * e) % 256) as u8;
                 assert!(frame[0].abs_diff(first) < 40, "{} {first}", frame[0]);
             }
-            // Actions of the skipped rows, in order; only that of an episode's last row is missing.
+            // Actions of skipped rows are included, in order; only that of an episode's last row is missing.
             let action = batch.row(row).get::<f32>("action").expect("actions");
             for (i, pair) in action.chunks_exact(2).enumerate() {
                 if start + i + 1 == rows(e) {
@@ -88,7 +88,7 @@ fn every_clip_comes_once_and_holds_its_rows() {
 }
 
 #[test]
-fn the_order_depends_on_seed_and_epoch_alone() {
+fn order_depends_only_on_seed_and_epoch() {
     let (_folder, path) = dataset(2);
     let (_other_folder, other_path) = dataset(100);
     let reader = open(&path).expect("opens");
@@ -113,7 +113,7 @@ fn the_order_depends_on_seed_and_epoch_alone() {
 }
 
 #[test]
-fn episodes_batches_and_cache_are_as_configured() {
+fn follows_the_configuration_of_episodes_batches_and_cache() {
     let (_folder, path) = dataset(2);
     let reader = open(&path).expect("opens");
     let cache = CacheConfig::Memory { bytes: 1 << 30 };
@@ -126,7 +126,7 @@ fn episodes_batches_and_cache_are_as_configured() {
     assert_eq!(episodes, [2, 7]);
     let full = load(&reader, LoaderConfig { drop_last: true, ..some }, 0, 0);
     assert!(full.iter().all(|batch| batch.rows() == 4));
-    // An epoch may be left early, and one past the end is empty.
+    // An epoch may be dropped early, and an epoch that starts after its end is empty.
     let loader = Loader::new(Arc::clone(&reader), config(1, 1)).expect("a loader");
     assert_eq!(loader.epoch(0, 0).take(2).count(), 2);
     assert_eq!(loader.epoch(0, loader.batches_per_epoch()).count(), 0);
@@ -135,7 +135,7 @@ fn episodes_batches_and_cache_are_as_configured() {
 }
 
 #[test]
-fn memory_is_reused_and_two_epochs_can_be_read_at_once() {
+fn reuses_memory_and_reads_two_epochs_at_once() {
     let (_folder, path) = dataset(2);
     let reader = open(&path).expect("opens");
     let loader = Loader::new(Arc::clone(&reader), config(1, 1)).expect("a loader");
@@ -143,7 +143,7 @@ fn memory_is_reused_and_two_epochs_can_be_read_at_once() {
         loader.epoch(epoch, 0).map(|batch| batch.expect("a batch").into_batch()).collect()
     };
     let (first, second) = (read(1), read(2));
-    // Batches that were dropped are filled anew, with as many rows as the next one has.
+    // Dropped batches are refilled, with as many rows as the next batch has.
     let addresses = || -> Vec<(usize, Vec<u8>)> {
         let look = |batch: LoadedBatch| (batch.bytes(0).as_ptr() as usize, batch.bytes(0).to_vec());
         loader.epoch(1, 0).map(|batch| look(batch.expect("a batch"))).collect()
@@ -163,20 +163,20 @@ fn memory_is_reused_and_two_epochs_can_be_read_at_once() {
 }
 
 #[test]
-fn what_is_loaded_ahead_fits_its_budget() {
+fn prefetching_respects_its_budget() {
     let (_folder, path) = dataset(2);
     let reader = open(&path).expect("opens");
     let ahead = |prefetch_bytes| {
         let config = LoaderConfig { prefetch: 8, prefetch_bytes, ..config(2, 1) };
         Loader::new(Arc::clone(&reader), config).expect("a loader").prefetch()
     };
-    // Four clips of two pictures, actions and states.
+    // Four clips of two images, actions and states.
     let batch = 4 * 2 * (16 * 24 * 3 + 8 + 24);
     assert_eq!([0, batch, 3 * batch - 1, 1 << 30].map(ahead), [1, 1, 2, 8]);
 }
 
 #[test]
-fn wrong_wishes_say_what_is_right() {
+fn invalid_settings_are_explained() {
     let (_folder, path) = dataset(100);
     let reader = open(&path).expect("opens");
     let wrong = |config| Loader::new(Arc::clone(&reader), config).err().expect("refused").to_string();
@@ -189,7 +189,7 @@ fn wrong_wishes_say_what_is_right() {
 }
 
 #[test]
-fn a_damaged_dataset_ends_the_epoch_with_an_error() {
+fn damaged_dataset_ends_the_epoch_with_an_error() {
     let (_folder, path) = dataset(2);
     let reader = open(&path).expect("opens");
     for entry in std::fs::read_dir(path.join("data")).expect("a folder") {

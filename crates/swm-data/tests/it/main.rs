@@ -1,14 +1,13 @@
-//! Datasets on disk, in one test binary.
+//! Tests of datasets on disk, in one test binary.
 
-// Tests say on standard output why they are skipped; the child process of one of them reports there.
-#![allow(clippy::print_stdout)]
+// Tests print why they are skipped, and a child process prints its results, to standard output.
+#![allow(clippy::print_stdout, reason = "reports of skipped tests and of child processes")]
 
 mod cache;
 mod convert;
 mod damage;
 mod doctor;
 mod folder;
-mod foreign;
 mod format_suite;
 mod fuzz;
 mod goals;
@@ -25,6 +24,7 @@ mod lerobot;
 mod loader;
 mod objects;
 mod preview;
+mod reference;
 mod replay;
 mod sample;
 mod video;

@@ -1,5 +1,5 @@
-//! Datasets in object stores, against a real S3 server on loopback. A store's address and credentials are in the
-//! environment, so what uses it runs in processes of its own.
+//! Datasets in object stores, against an S3 server on loopback. Address and credentials of a store are environment
+//! variables, so tests that use one run in child processes.
 
 use crate::sample::{check, episode, options, schema, write};
 use hyper_util::rt::{TokioExecutor, TokioIo};
@@ -12,13 +12,12 @@ use swm_data::lance::{Shard, commit_shards, create_shard};
 use swm_data::objects::ObjectFile;
 use swm_data::{CommitPolicy, Constants, Location, StepRange, WriteMode, WriteOptions, create, open};
 
-/// Where a child process finds its dataset; only set for it.
+/// Environment variable of child processes: the location of the dataset.
 const TARGET: &str = "SWM_TEST_OBJECTS";
 const KEYS: [&str; 2] = ["AKEXAMPLE", "secret/example"];
 
-/// Serves the folders of a folder as buckets, to anybody or to those with the keys; gives its address. It ends with
-/// the program. This server looks whether an object is there and then writes it, which S3 does in one step: so what is
-/// written is written one after the other.
+/// Serves the subfolders of `root` as buckets, to everyone or to holders of the keys, until the process ends. Returns
+/// its address. Unlike S3, this server checks for an existing object and writes in two steps, so writes are serialised.
 pub fn serve(root: &Path, keys: bool) -> String {
     let mut service = S3ServiceBuilder::new(s3s_fs::FileSystem::new(root).expect("a root"));
     if keys {
@@ -53,7 +52,7 @@ pub fn serve(root: &Path, keys: bool) -> String {
     format!("http://{address}")
 }
 
-/// A process that runs one of the children below.
+/// A process that runs one of the child tests below.
 pub fn child(test: &str, endpoint: &str, target: &str) -> Command {
     let mut command = Command::new(std::env::current_exe().expect("this program"));
     command.args(["--exact", &format!("objects::{test}"), "--nocapture"]).env(TARGET, target);
@@ -83,7 +82,7 @@ fn write_to(location: &Location, mode: WriteMode, episodes: std::ops::Range<usiz
     writer.finish().expect("finishes");
 }
 
-/// Not a test of its own: writes, appends, replaces and reads a dataset.
+/// A child process of other tests: writes, appends to, replaces and reads a dataset.
 #[test]
 fn child_that_writes_and_reads() {
     let Some(location) = target() else { return };
@@ -116,13 +115,13 @@ fn child_that_writes_and_reads() {
 }
 
 #[test]
-fn a_bucket_holds_datasets() {
+fn stores_datasets_in_a_bucket() {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::create_dir(folder.path().join("bucket")).expect("a bucket");
     let endpoint = serve(folder.path(), true);
     let output = child("child_that_writes_and_reads", &endpoint, "s3://bucket/runs/d.lance").output().expect("runs");
     let text = finished(&output);
-    // What is in the bucket is the dataset as it would be on this machine.
+    // The objects in the bucket equal the files of a local dataset.
     let reader = open(folder.path().join("bucket/runs/d.lance")).expect("opens");
     check(&*reader, 2);
     assert!(text.contains(&reader.content_hash().expect("a hash")), "{text}");
@@ -136,7 +135,7 @@ fn a_bucket_holds_datasets() {
     assert!(text.contains("it holds no Lance table"), "{text}");
 }
 
-/// Not a test of its own: opens a dataset, and says how that went.
+/// A child process of other tests: opens a dataset and prints the result.
 #[test]
 fn child_that_reads() {
     let Some(location) = target() else { return };
@@ -149,7 +148,7 @@ fn child_that_reads() {
     }
 }
 
-/// Not a test of its own: appends one episode at a time.
+/// A child process of other tests: appends one episode at a time.
 #[test]
 fn child_that_appends() {
     let Some(location) = target() else { return };
@@ -163,7 +162,7 @@ fn child_that_appends() {
 }
 
 #[test]
-fn processes_that_append_to_a_bucket_at_once_all_survive() {
+fn concurrent_processes_append_to_a_bucket() {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::create_dir(folder.path().join("bucket")).expect("a bucket");
     let endpoint = serve(folder.path(), true);
@@ -184,7 +183,7 @@ fn processes_that_append_to_a_bucket_at_once_all_survive() {
 }
 
 #[test]
-fn a_web_server_is_read_and_not_written() {
+fn reads_from_but_does_not_write_to_a_web_server() {
     let folder = tempfile::tempdir().expect("a folder");
     write(&folder.path().join("bucket/d.lance"), WriteMode::Create, 2, 0..5);
     let endpoint = serve(folder.path(), false);
@@ -208,7 +207,7 @@ fn a_web_server_is_read_and_not_written() {
 }
 
 #[test]
-fn a_store_that_does_not_answer_is_no_damage() {
+fn unreachable_store_is_not_reported_as_damage() {
     let nobody = std::net::TcpListener::bind("127.0.0.1:0").expect("a port").local_addr().expect("an address");
     let location = Location::parse(&format!("http://{nobody}/d.lance")).expect("a location");
     let error = open(&location).err().expect("nobody is there").to_string();

@@ -1,11 +1,11 @@
-//! Videos and contact sheets of datasets, whatever their format.
+//! Videos and contact sheets of datasets in any format.
 
 use crate::sample::{options, schema};
 use crate::{fuzz, sample};
 use swm_data::{PreviewOptions, WriteMode, create, open, preview};
 
 #[test]
-fn every_camera_of_some_episodes_is_shown() {
+fn previews_show_every_camera() {
     let folder = tempfile::tempdir().expect("a folder");
     for name in ["d.lance", "d.video", "d.lance-video"] {
         let path = folder.path().join(name);
@@ -22,8 +22,8 @@ fn every_camera_of_some_episodes_is_shown() {
         assert_eq!(told, [1, 2, 3]);
         assert_eq!(fuzz::files(&out).len(), 4, "nothing else is left");
         let png = std::io::BufReader::new(std::fs::File::open(&written[3]).expect("opens"));
-        let png = png::Decoder::new(png).read_info().expect("a picture");
-        // Eight strips of two cameras of 24 pixels, or of a line of text if that is wider; two lines of text above.
+        let png = png::Decoder::new(png).read_info().expect("an image");
+        // Eight strips of two 24-pixel cameras (or of a wider line of text), below two lines of text.
         let strip = (22 * 4 + 1, 16 + 2 * 7);
         assert_eq!((png.info().width, png.info().height), (8 * (strip.0 + 2) + 2, 3 * (strip.1 + 2) + 2));
         let one = PreviewOptions { columns: vec!["goal".to_owned()], ..options };

@@ -1,4 +1,4 @@
-//! The replay buffer: it forgets the oldest, is read while it is filled, and can be put away.
+//! The replay buffer evicts the oldest episodes, is read while it grows, and can be saved and restored.
 
 use crate::sample::{check, episode, rows, schema};
 use swm_core::{Batch, Key};
@@ -21,13 +21,13 @@ fn filled(episodes: std::ops::Range<usize>, capacity: usize) -> ReplayBuffer {
 }
 
 /// Episode and row of every first step.
-fn places(batch: &Batch) -> Vec<(usize, usize)> {
+fn first_rows(batch: &Batch) -> Vec<(usize, usize)> {
     let state = |row| batch.row(row).get::<f64>("state").expect("states").to_vec();
     (0..batch.rows()).map(|row| (state(row)[0] as usize, state(row)[1] as usize)).collect()
 }
 
 #[test]
-fn the_oldest_episodes_leave_and_snapshots_stay() {
+fn evicts_the_oldest_episodes_but_keeps_snapshots() {
     let buffer = filled(0..6, 30);
     // Episodes have 5, 6, 7, 8, 9 and 10 rows.
     assert_eq!((buffer.rows(), buffer.episodes(), buffer.added()), (27, 3, 6));
@@ -50,35 +50,35 @@ fn the_oldest_episodes_leave_and_snapshots_stay() {
 }
 
 #[test]
-fn windows_are_equally_likely_and_a_key_draws_the_same_again() {
+fn samples_windows_uniformly_and_reproducibly() {
     let buffer = filled(0..6, 100);
     let loader = buffer.loader(ReplayConfig { batch_size: 9000, ..config(3) }).expect("a loader");
     let batch = loader.sample(Key::new(1)).expect("samples");
-    assert_eq!(places(&batch), places(&loader.sample(Key::new(1)).expect("samples")));
+    assert_eq!(first_rows(&batch), first_rows(&loader.sample(Key::new(1)).expect("samples")));
     let mut count = vec![[0_i32; 10]; 6];
-    for (e, start) in places(&batch) {
+    for (e, start) in first_rows(&batch) {
         assert!(start + 3 <= rows(e), "over the end of an episode");
         count[e][start] += 1;
     }
-    // 33 windows: five standard deviations of 9000 draws at 1 of 33.
+    // 33 windows: five standard deviations of 9000 draws with probability 1/33.
     let counts = count.iter().flatten().filter(|&&n| n > 0);
     assert_eq!(counts.clone().count(), 33);
     assert!(counts.clone().all(|n| n.abs_diff(273) < 82), "{count:?}");
     // The latest twelve rows are those of the last two episodes.
     let recent = buffer.loader(ReplayConfig { recent: Some(12), ..config(1) }).expect("a loader");
-    assert!(places(&recent.sample(Key::new(2)).expect("samples")).iter().all(|&(e, _)| e >= 4));
+    assert!(first_rows(&recent.sample(Key::new(2)).expect("samples")).iter().all(|&(e, _)| e >= 4));
     let goal =
         GoalSpec { name: "goal".into(), columns: vec!["state".into()], anchor: None, mixture: GoalMixture::LAST };
     let goals = buffer.loader(ReplayConfig { goals: vec![goal], ..config(1) }).expect("a loader");
     let batch = goals.sample(Key::new(0)).expect("samples");
-    for (row, (e, _)) in places(&batch).into_iter().enumerate() {
+    for (row, (e, _)) in first_rows(&batch).into_iter().enumerate() {
         let goal = batch.row(row).get::<f64>("goal_state").expect("goals");
         assert_eq!((goal[0] as usize, goal[1] as usize + 1), (e, rows(e)));
     }
 }
 
 #[test]
-fn it_is_read_while_it_grows() {
+fn reads_while_it_grows() {
     let buffer = filled(0..2, 200);
     let loader = buffer.loader(ReplayConfig { threads: 2, ..config(2) }).expect("a loader");
     let writer = buffer.clone();
@@ -90,12 +90,12 @@ fn it_is_read_while_it_grows() {
     let mut latest = 0;
     for batch in loader.batches(0) {
         let batch = batch.expect("a batch");
-        let places = places(&batch);
-        // Every window is whole, whatever was forgotten meanwhile.
+        let places = first_rows(&batch);
+        // Every window is complete, even if episodes are evicted in the meantime.
         for (row, &(e, start)) in places.iter().enumerate() {
             let state = batch.row(row).get::<f64>("state").expect("states");
             assert_eq!([state[3], state[4]], [e as f64, start as f64 + 1.0]);
-            let pixel = batch.row(row).get::<u8>("pixels").expect("pictures")[0];
+            let pixel = batch.row(row).get::<u8>("pixels").expect("images")[0];
             assert_eq!(usize::from(pixel), (3 * start + 20 * e) % 256);
         }
         let oldest = places.iter().map(|place| place.0).min().unwrap_or(0);
@@ -106,14 +106,14 @@ fn it_is_read_while_it_grows() {
     }
     assert!(latest > 250, "it sees what came");
     writing.join().expect("the writer ends");
-    // One that holds no window says so, and its stream ends.
+    // Without a window, sampling fails and the stream ends.
     let empty = ReplayBuffer::new(&schema(), 10).expect("a buffer").loader(config(1)).expect("a loader");
     let mut batches = empty.batches(0);
     assert!(batches.next().is_some_and(|batch| batch.is_err()) && batches.next().is_none());
 }
 
 #[test]
-fn it_is_put_away_and_taken_out() {
+fn saves_and_restores() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("buffer.lance");
     let buffer = filled(0..6, 30);

@@ -1,4 +1,4 @@
-//! Episodes whose every number says where it belongs.
+//! Sample episodes in which every value depends on its episode and row.
 
 use std::path::Path;
 use swm_core::{Batch, ColumnSpec, DType, Manifest, Schema};
@@ -21,12 +21,12 @@ pub fn schema() -> Schema {
     .expect("schema")
 }
 
-/// Rows of episode `e`.
+/// Number of rows of episode `e`.
 pub fn rows(e: usize) -> usize {
     5 + e % 7
 }
 
-/// Episode `e`: a smooth moving picture, a constant goal, numbers made of `e` and the row.
+/// Episode `e`: a smooth moving image, a constant goal, and values computed from `e` and the row.
 pub fn episode(e: usize) -> Batch {
     let rows = rows(e);
     let mut batch = Batch::zeros(&schema(), rows);
@@ -55,7 +55,7 @@ pub fn options(mode: WriteMode) -> WriteOptions {
     WriteOptions { mode, codec, manifest: Some(manifest(3)), ..WriteOptions::default() }
 }
 
-/// Writes episodes, a commit after every `group` of them.
+/// Writes episodes with a commit after every `group` of them.
 pub fn write(path: &Path, mode: WriteMode, group: usize, episodes: std::ops::Range<usize>) {
     let commit = CommitPolicy { episodes: group, ..CommitPolicy::default() };
     let mut writer = create(path, &schema(), WriteOptions { commit, ..options(mode) }).expect("creates");

@@ -1,4 +1,4 @@
-//! The format `video`. The long runs:
+//! The format `video`. Run the long tests with:
 //!
 //! ```text
 //! cargo test --release --workspace --test it -- --ignored video::
@@ -10,12 +10,12 @@ use std::process::Command;
 use swm_data::{ImageCodec, Reader, StepRange, WriteMode, WriteOptions, create, open};
 
 #[test]
-fn it_does_what_formats_do() {
+fn passes_the_format_suite() {
     format_suite::all("d.video");
 }
 
 #[test]
-fn a_killed_writer_keeps_committed_episodes() {
+fn killed_writer_keeps_committed_episodes() {
     format_suite::killed("d.video", 4);
 }
 
@@ -30,14 +30,14 @@ fn damaged(cases: u64) {
     let path = folder.path().join("d.video");
     format_suite::write(&path, WriteMode::Create, 0..3);
     let report = fuzz::dataset("video", &path, cases, fuzz::read_everything);
-    // A video in the place of another is one that nothing tells apart.
+    // Exchanged videos cannot be detected.
     let changed: Vec<&String> = report.changed.iter().filter(|change| !change.contains("replaced by")).collect();
     assert!(changed.is_empty(), "{changed:?}");
     assert!(report.refused as u64 > cases / 2, "{report:?}");
 }
 
 #[test]
-fn damaged_folders_are_refused() {
+fn rejects_damaged_folders() {
     damaged(400);
 }
 
@@ -47,25 +47,25 @@ fn folders_damaged_in_10000_ways_are_refused() {
     damaged(10_000);
 }
 
-/// Videos without our checksums: the decoder sees what is damaged.
-fn foreign_damaged(cases: u64) {
+/// Videos without our checksums: damage reaches the decoder.
+fn damaged_third_party(cases: u64) {
     let report = fuzz::dataset("reference-video", &interop().join("reference-video"), cases, fuzz::read_everything);
     assert!(report.refused as u64 > cases / 2, "{report:?}");
 }
 
 #[test]
-fn damaged_foreign_videos_are_survived() {
-    foreign_damaged(400);
+fn survives_damaged_third_party_videos() {
+    damaged_third_party(400);
 }
 
 #[test]
 #[ignore = "minutes"]
 fn foreign_videos_damaged_in_10000_ways_are_survived() {
-    foreign_damaged(10_000);
+    damaged_third_party(10_000);
 }
 
 #[test]
-fn videos_of_other_lengths_are_told() {
+fn reports_videos_of_other_lengths() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.video");
     format_suite::write(&path, WriteMode::Create, 0..4);
@@ -85,16 +85,16 @@ pub fn interop() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop")
 }
 
-/// The lengths of the episodes in the datasets that other programs wrote.
+/// Lengths of the episodes in the datasets of other programs.
 pub const THEIR_LENGTHS: [usize; 3] = [11, 14, 9];
 
-/// Compares the first, third and last frame of every episode with what another program decoded, which is stored as a
-/// PNG of them one below the other.
+/// Compares the first, third and last frame of every episode with those that another program decoded, stored below each
+/// other in a PNG.
 pub fn check_frames(reader: &dyn Reader, column: &str, png: &str, tolerance: u8) {
     let file = std::io::BufReader::new(std::fs::File::open(interop().join(png)).expect("opens"));
     let mut decoder = png::Decoder::new(file).read_info().expect("a PNG");
     let mut expected = vec![0; decoder.output_buffer_size().expect("a size")];
-    decoder.next_frame(&mut expected).expect("a picture");
+    decoder.next_frame(&mut expected).expect("an image");
     let ranges: Vec<StepRange> = THEIR_LENGTHS
         .iter()
         .enumerate()
@@ -115,15 +115,15 @@ pub fn check_frames(reader: &dyn Reader, column: &str, png: &str, tolerance: u8)
 }
 
 #[test]
-fn the_reference_s_videos_open_here() {
+fn reads_videos_of_the_reference() {
     let reader = open(interop().join("reference-video")).expect("opens");
     assert_eq!(reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>(), THEIR_LENGTHS);
     check_frames(&*reader, "pixels", "reference-video-pixels.png", 0);
     for (e, &length) in THEIR_LENGTHS.iter().enumerate() {
         let read = reader.read(&["state", "action", "success"], &[StepRange::new(e, 0, length)]).expect("reads");
         for t in 0..length {
-            assert_eq!(read.row(t).get::<f64>("state").expect("numbers"), [e as f64, t as f64, -0.5]);
-            let action = read.row(t).get::<f32>("action").expect("numbers").to_vec();
+            assert_eq!(read.row(t).get::<f64>("state").expect("values"), [e as f64, t as f64, -0.5]);
+            let action = read.row(t).get::<f32>("action").expect("values").to_vec();
             assert!(if t + 1 == length { action[0].is_nan() } else { action == [e as f32, t as f32 / 4.0] });
             assert_eq!(read.row(t).get::<u8>("success").expect("a flag"), [u8::from(t % 3 == 0)]);
         }
@@ -131,7 +131,7 @@ fn the_reference_s_videos_open_here() {
 }
 
 #[test]
-fn a_video_of_the_reference_is_continued_here() {
+fn appends_to_a_dataset_of_the_reference() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("reference-video");
     fuzz::copy_all(&interop().join("reference-video"), &path);
@@ -151,7 +151,7 @@ fn a_video_of_the_reference_is_continued_here() {
 }
 
 #[test]
-fn our_videos_open_in_the_reference() {
+fn the_reference_opens_our_videos() {
     let Some(python) = std::env::var_os("SWM_VIDEO_PYTHON") else {
         println!("SKIPPED: set SWM_VIDEO_PYTHON to a Python with stable-worldmodel and decord");
         return;

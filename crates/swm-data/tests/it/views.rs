@@ -1,4 +1,4 @@
-//! Datasets made of datasets.
+//! Views of datasets.
 
 use crate::sample::{COLUMNS, check, episode, rows, schema, write};
 use std::path::Path;
@@ -13,7 +13,7 @@ fn dataset(path: &Path, episodes: std::ops::Range<usize>) -> Arc<dyn Reader> {
 }
 
 #[test]
-fn datasets_one_after_another_read_as_one() {
+fn concatenation_reads_like_one_dataset() {
     let folder = tempfile::tempdir().expect("a folder");
     let parts =
         [(0, 3), (3, 4), (4, 9)].map(|(from, to)| dataset(&folder.path().join(format!("{from}.lance")), from..to));
@@ -26,7 +26,7 @@ fn datasets_one_after_another_read_as_one() {
         ranges.iter().flat_map(|r| (r.start..r.start + r.length).map(|t| [r.episode as f64, t as f64])).collect();
     let states = read.get::<f64>("state").expect("states").chunks(3);
     assert!(states.map(|state| [state[0], state[1]]).eq(expected.iter().copied()));
-    assert!(read.to_f32("episode_idx").expect("numbers").iter().zip(&expected).all(|(&a, b)| f64::from(a) == b[0]));
+    assert!(read.to_f32("episode_idx").expect("values").iter().zip(&expected).all(|(&a, b)| f64::from(a) == b[0]));
     assert!(all.read(&["state"], &[StepRange::new(9, 0, 1)]).is_err() && all.read(&["stat"], &ranges).is_err());
     assert_eq!(all.manifest(), parts[0].manifest(), "they agree");
     assert_ne!(all.content_hash().expect("a hash"), parts[0].content_hash().expect("a hash"));
@@ -38,7 +38,7 @@ fn datasets_one_after_another_read_as_one() {
 }
 
 #[test]
-fn columns_of_another_dataset_stand_beside() {
+fn merge_adds_columns_of_another_dataset() {
     let folder = tempfile::tempdir().expect("a folder");
     let base = dataset(&folder.path().join("base.lance"), 0..5);
     let extra = Schema::new([ColumnSpec::new("embedding", DType::Float32, [2])]).expect("schema");
@@ -47,7 +47,7 @@ fn columns_of_another_dataset_stand_beside() {
         let mut writer = create(&path, &extra, WriteOptions::default()).expect("creates");
         for e in 0..5 {
             let mut batch = Batch::zeros(&extra, rows(e) + longer * (e / 4));
-            let values = batch.get_mut::<f32>("embedding").expect("numbers").iter_mut().enumerate();
+            let values = batch.get_mut::<f32>("embedding").expect("values").iter_mut().enumerate();
             values.for_each(|(i, value)| *value = (100 * e + i) as f32);
             writer.write_episode(&batch).expect("writes");
         }
@@ -58,8 +58,8 @@ fn columns_of_another_dataset_stand_beside() {
     let both = merge(Arc::clone(&base), Arc::clone(&other), &["embedding"]).expect("fits");
     check(&*both, 0);
     let read = both.read(&["embedding", "state"], &[StepRange::new(3, 1, 2)]).expect("reads");
-    assert_eq!(read.get::<f32>("embedding").expect("numbers"), [302.0, 303.0, 304.0, 305.0]);
-    assert_eq!(read.get::<f64>("state").expect("numbers")[..2], [3.0, 1.0]);
+    assert_eq!(read.get::<f32>("embedding").expect("values"), [302.0, 303.0, 304.0, 305.0]);
+    assert_eq!(read.get::<f64>("state").expect("values")[..2], [3.0, 1.0]);
     assert!(both.footprint().expect("sizes").iter().any(|(name, _)| name == "embedding"));
 
     let error = |other, columns: &[&str]| merge(Arc::clone(&base), other, columns).err().expect("refused").to_string();
@@ -69,7 +69,7 @@ fn columns_of_another_dataset_stand_beside() {
 }
 
 #[test]
-fn parts_keep_the_numbers_of_their_episodes() {
+fn splits_keep_episode_indices() {
     let folder = tempfile::tempdir().expect("a folder");
     let all = dataset(&folder.path().join("d.lance"), 0..40);
     let parts = [Part::Train, Part::Validation, Part::Test].map(|part| {

@@ -1,5 +1,5 @@
-//! Datasets of the published `stable-worldmodel`, and ours in its hands. `tests/interop` holds a dataset that
-//! its writer wrote, the script that made it, and the script that opens ours there.
+//! Interoperability with the published `stable-worldmodel`. `tests/interop` holds a dataset of its writer, the script
+//! that wrote it, and the script that opens our datasets with it.
 
 use crate::sample::{episode, options, rows, schema, write};
 use serde_json::Value;
@@ -14,7 +14,7 @@ fn interop() -> PathBuf {
 }
 
 /// The columns that `export.py` writes.
-fn their_schema() -> Schema {
+fn reference_schema() -> Schema {
     Schema::new([
         ColumnSpec::image("pixels", 24, 32),
         ColumnSpec::new("action", DType::Float32, [2]),
@@ -24,10 +24,10 @@ fn their_schema() -> Schema {
     .expect("schema")
 }
 
-/// Episode `e` of `export.py`; its third one ends with action 0.
-fn their_episode(e: usize) -> Batch {
+/// Episode `e` of `export.py`. The third one ends with action 0.
+fn reference_episode(e: usize) -> Batch {
     let rows = 6 + e;
-    let mut batch = Batch::zeros(&their_schema(), rows);
+    let mut batch = Batch::zeros(&reference_schema(), rows);
     batch.par_rows_mut(|t, mut row| {
         for (i, rgb) in row.at::<u8>(0).chunks_exact_mut(3).enumerate() {
             rgb.copy_from_slice(&[(4 * (i / 32) + 10 * e) as u8, (4 * (i % 32) + t) as u8, 90]);
@@ -40,12 +40,12 @@ fn their_episode(e: usize) -> Batch {
     batch
 }
 
-fn check_theirs(path: &Path, episodes: usize) {
+fn check_reference(path: &Path, episodes: usize) {
     let reader = open(path).expect("opens");
-    assert_eq!(reader.schema().columns()[2..], *their_schema().columns());
+    assert_eq!(reader.schema().columns()[2..], *reference_schema().columns());
     assert_eq!(reader.episodes().len(), episodes);
     for e in 0..episodes {
-        let expected = their_episode(e);
+        let expected = reference_episode(e);
         let read = reader
             .read(
                 &["pixels", "action", "reward", "variation_agent_color"],
@@ -54,7 +54,7 @@ fn check_theirs(path: &Path, episodes: usize) {
             .expect("reads");
         assert_eq!(read.rows(), expected.rows());
         for column in 1..4 {
-            // Compared as text, in which NaN equals NaN.
+            // Compared as text, so that NaN equals NaN.
             let text = |b: &Batch| format!("{:?}", floats(b.bytes(column)));
             assert_eq!(text(&read), text(&expected), "column {column} of episode {e}");
         }
@@ -68,8 +68,8 @@ fn floats(bytes: &[u8]) -> Vec<f32> {
 }
 
 #[test]
-fn a_dataset_of_the_reference_opens_here() {
-    check_theirs(&interop().join("reference.lance"), 3);
+fn reads_a_dataset_of_the_reference() {
+    check_reference(&interop().join("reference.lance"), 3);
     let text = open(interop().join("reference-text.lance")).expect("opens");
     let names: Vec<&str> = text.schema().columns().iter().map(|c| c.name.as_str()).collect();
     assert_eq!(names, ["episode_idx", "step_idx", "state"], "text is left out");
@@ -88,26 +88,27 @@ fn copy(from: &Path, to: &Path) {
     }
 }
 
-/// Continues a copy of the reference's dataset with two episodes of ours.
+/// Appends two episodes to a copy of the reference's dataset.
 fn continued(folder: &Path) -> PathBuf {
     let path = folder.join("continued.lance");
     copy(&interop().join("reference.lance"), &path);
-    let mut writer = create(&path, &their_schema(), options(WriteMode::Append)).expect("continues");
+    let mut writer = create(&path, &reference_schema(), options(WriteMode::Append)).expect("continues");
     assert_eq!(writer.episodes(), 3);
-    writer.write_episode(&their_episode(3)).expect("writes");
-    writer.write_episode(&their_episode(4)).expect("writes");
+    writer.write_episode(&reference_episode(3)).expect("writes");
+    writer.write_episode(&reference_episode(4)).expect("writes");
     writer.finish().expect("finishes");
     path
 }
 
 #[test]
-fn a_dataset_of_the_reference_is_continued_here() {
+fn appends_to_a_dataset_of_the_reference() {
     let folder = tempfile::tempdir().expect("a folder");
-    check_theirs(&continued(folder.path()), 5);
+    check_reference(&continued(folder.path()), 5);
 }
 
 #[test]
-fn our_datasets_open_in_the_reference() {
+#[allow(clippy::too_many_lines, reason = "one dataset per codec and kind of writer, checked by one Python process")]
+fn the_reference_opens_our_datasets() {
     let Some(python) = std::env::var_os("SWM_REFERENCE_PYTHON") else {
         println!("SKIPPED: set SWM_REFERENCE_PYTHON to a Python with stable-worldmodel and pylance");
         return;
@@ -126,7 +127,7 @@ fn our_datasets_open_in_the_reference() {
         writer.finish().expect("finishes");
         path
     });
-    // What two machines wrote, and one committed.
+    // Two shards, committed together.
     let parts = folder.path().join("parts.lance");
     for index in 0..2 {
         let shard = Shard { index, count: 2 };
@@ -156,7 +157,7 @@ fn our_datasets_open_in_the_reference() {
         let batch = episode(e);
         for t in 0..rows(e) {
             expected.push((e as i64, t as i64));
-            let frame = batch.row(t).get::<u8>("pixels").expect("pictures");
+            let frame = batch.row(t).get::<u8>("pixels").expect("images");
             means.push(frame.iter().map(|&v| f64::from(v)).sum::<f64>() / frame.len() as f64);
         }
     }
@@ -180,7 +181,7 @@ fn our_datasets_open_in_the_reference() {
         }
     }
     assert_eq!(seen[4], seen[0], "parts are as good as one");
-    // Both see the same clips: 2 steps with frameskip 2 take 4 rows.
+    // Both read the same clips: 2 steps with frameskip 2 take 4 rows.
     let clips: usize = (0..8).map(|e| rows(e) - 3).sum();
     assert_eq!(seen[0]["clips"], clips);
     assert_eq!(seen[0]["clip_action_shape"], serde_json::json!([2, 4]));

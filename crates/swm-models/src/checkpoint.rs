@@ -8,8 +8,8 @@
 //! | `raw.safetensors` | the trained weights, where `weights.safetensors` holds their moving average |
 //! | `manifest.json` | provenance, and the hashes of the files above |
 //!
-//! A new checkpoint is written to a second folder, which then replaces the old one by renaming, so that a killed process
-//! leaves a complete checkpoint.
+//! A new checkpoint is written to a second folder, which then replaces the old one by renaming, so that a killed
+//! process leaves a complete checkpoint.
 
 use crate::nn::parameters::{self, HostTensor, Named};
 use crate::train::run_state::RunState;

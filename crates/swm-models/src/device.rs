@@ -7,8 +7,8 @@ use swm_core::{Error, Result};
 const BACKENDS: [(&str, bool); 3] =
     [("cpu", true), ("vulkan", cfg!(feature = "vulkan")), ("cuda", cfg!(feature = "cuda"))];
 
-/// Parses the name of a device: `cpu`, `vulkan` or `cuda` (followed by `:1` for the second such GPU), or `auto`, which is a
-/// GPU backend that was built in, or else the CPU.
+/// Parses the name of a device: `cpu`, `vulkan` or `cuda` (followed by `:1` for the second such GPU), or `auto`, which
+/// is a GPU backend that was built in, or else the CPU.
 ///
 /// # Errors
 /// When there is no such device, or this program was built without it.

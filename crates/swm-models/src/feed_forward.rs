@@ -29,8 +29,8 @@ pub trait ActionNetwork: Send + Sync {
     fn next_actions(&self, state: &mut Self::EpisodeState, row: RowRef<'_>) -> Result<Vec<f32>>;
 }
 
-/// Executes the actions of a network, one model step at a time. Every environment is computed separately, so its actions
-/// depend neither on the other environments nor on the number of threads.
+/// Executes the actions of a network, one model step at a time. Every environment is computed separately, so its
+/// actions depend neither on the other environments nor on the number of threads.
 pub struct FeedForwardPolicy<N: ActionNetwork> {
     network: N,
     /// Bounds of an environment action, element by element.

@@ -57,7 +57,8 @@ pub fn check(side: usize, schema: &Schema, column: &str) -> Result<()> {
     ))
 }
 
-/// Cuts images into normalised patches, row by row; the values of a patch are ordered by channel, then row, then column.
+/// Cuts images into normalised patches, row by row; the values of a patch are ordered by channel, then row, then
+/// column.
 ///
 /// # Shapes
 /// `[frames, side, side, 3]` bytes to `[frames, patches, 3 * patch * patch]`.

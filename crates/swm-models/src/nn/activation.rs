@@ -34,7 +34,8 @@ impl Activation {
     }
 }
 
-/// `x Φ(x)`. The CPU uses our vectorised kernel: Burn computes the error function one element at a time, twice in training.
+/// `x Φ(x)`. The CPU uses our vectorised kernel: Burn computes the error function one element at a time, twice in
+/// training.
 fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     let device = x.device();
     if device.clone().inner() != Device::flex() || x.dtype() != DType::F32 {
@@ -47,8 +48,8 @@ fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
         functions::gelu(&mut values);
         return tensor(values);
     }
-    // The tangent at every element has the value and the derivative of the function there, which is all that the backward pass
-    // needs.
+    // The tangent at every element has the value and the derivative of the function there, which is all that the
+    // backward pass needs.
     let mut offsets = host(x.clone().inner());
     let mut slopes = vec![0.0; offsets.len()];
     functions::gelu_tangent(&mut offsets, &mut slopes);
@@ -64,7 +65,8 @@ impl DropoutRng<'_> {
         DropoutRng(None)
     }
 
-    /// Sets elements to zero with probability `rate` and scales the others by `1 / (1 - rate)` (Srivastava et al. 2014).
+    /// Sets elements to zero with probability `rate` and scales the others by `1 / (1 - rate)` (Srivastava et al.
+    /// 2014).
     ///
     /// # Shapes
     /// `[…]` to the same.

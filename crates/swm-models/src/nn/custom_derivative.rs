@@ -4,8 +4,8 @@ use burn::tensor::Tensor;
 
 /// Returns `value` as a function of `x` whose elementwise derivative is `derivative`; both are outside of any graph.
 ///
-/// The difference that is added to the value is exactly 0, and its gradient is the derivative times the incoming gradient. The
-/// graph then holds one product, whatever the function.
+/// The difference that is added to the value is exactly 0, and its gradient is the derivative times the incoming
+/// gradient. The graph then holds one product, whatever the function.
 ///
 /// # Shapes
 /// All tensors have the same shape.

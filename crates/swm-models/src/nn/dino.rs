@@ -1,6 +1,6 @@
-//! DINOv2 (Oquab et al. 2023), with or without registers (Darcet et al. 2023): a vision transformer whose branches are scaled
-//! channel by channel before they are added (LayerScale, Touvron et al. 2021). Parameters have the names of the published
-//! checkpoints.
+//! DINOv2 (Oquab et al. 2023), with or without registers (Darcet et al. 2023): a vision transformer whose branches are
+//! scaled channel by channel before they are added (LayerScale, Touvron et al. 2021). Parameters have the names of the
+//! published checkpoints.
 
 use super::positions::Resampling;
 use super::vit::{Attention, Patches, Projection, STD, embed, leading};

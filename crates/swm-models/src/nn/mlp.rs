@@ -4,8 +4,8 @@ use super::{Activation, BatchNorm, BatchStatistics, Init, Linear};
 use burn::module::Module;
 use burn::tensor::Tensor;
 
-/// Linear, batch normalisation, GELU, linear. Its layers have the published names `net.0`, `net.1`, `net.3`: a field `_3` is
-/// element 3 of a sequence.
+/// Linear, batch normalisation, GELU, linear. Its layers have the published names `net.0`, `net.1`, `net.3`: a field
+/// `_3` is element 3 of a sequence.
 #[derive(Module, Debug)]
 pub struct Projector {
     /// The sequence.
@@ -87,8 +87,8 @@ pub struct EmbedderNet {
 }
 
 impl Embedder {
-    /// Creates an embedder of vectors with `inputs` elements, whose convolution has `smoothed` outputs and whose network has
-    /// `4 * outputs` hidden features.
+    /// Creates an embedder of vectors with `inputs` elements, whose convolution has `smoothed` outputs and whose
+    /// network has `4 * outputs` hidden features.
     pub fn new(init: &Init, inputs: usize, smoothed: usize, outputs: usize) -> Self {
         let (conv, bound) = (init.of("patch_embed"), 1.0 / (inputs as f32).sqrt());
         Self {

@@ -4,8 +4,8 @@ use burn::module::{Content, Devices, Module, ModuleDisplay, ModuleDisplayDefault
 use burn::tensor::Device;
 use std::fmt::Debug;
 
-/// Modules under names that are known only when the model is created, in a fixed order. The path of a parameter contains the
-/// name, as in PyTorch's `ModuleDict`.
+/// Modules under names that are known only when the model is created, in a fixed order. The path of a parameter
+/// contains the name, as in PyTorch's `ModuleDict`.
 #[derive(Clone, Debug)]
 pub struct ModuleDict<M>(pub Vec<(String, M)>);
 

@@ -1,6 +1,5 @@
-//! Multi-layer perceptrons with normalised hidden layers (Hansen, Su and Wang 2024, arXiv 2310.16828): every hidden layer is
-//! linear, normalised, and goes
-//! through Mish; latents are simplices.
+//! Multi-layer perceptrons with normalised hidden layers (Hansen, Su and Wang 2024, arXiv 2310.16828): every hidden
+//! layer is linear, normalised, and goes through Mish; latents are simplices.
 
 use super::norm::standardize;
 use super::{DropoutRng, Init, LayerNorm, Linear, with_derivative};
@@ -201,8 +200,8 @@ impl Layer {
     }
 }
 
-/// Mish (Misra 2019), `x tanh(ln(1 + exp x))`, with one exponential: for `n = exp x (exp x + 2)` it is `x n / (n + 2)`. Its
-/// derivative is explicit, so that a graph holds one product and not six functions.
+/// Mish (Misra 2019), `x tanh(ln(1 + exp x))`, with one exponential: for `n = exp x (exp x + 2)` it is `x n / (n + 2)`.
+/// Its derivative is explicit, so that a graph holds one product and not six functions.
 ///
 /// # Shapes
 /// `[…]` to the same.

@@ -80,8 +80,8 @@ pub fn shapes<M: Module>(module: &M) -> Named<Vec<usize>> {
     visitor.1
 }
 
-/// Returns the gradients of a module's parameters, flattened to one axis, without those of parameters that the loss does not
-/// depend on.
+/// Returns the gradients of a module's parameters, flattened to one axis, without those of parameters that the loss
+/// does not depend on.
 pub fn gradients<M: Module>(module: &M, gradients: &Gradients) -> Named<Tensor<1>> {
     struct Visitor<'a>(Path, &'a Gradients, Named<Tensor<1>>);
     impl ModuleVisitor for Visitor<'_> {

@@ -1,5 +1,5 @@
-//! [`PatchCnn`]: a small convolutional encoder whose kernels equal their strides, so that every layer is one matrix product,
-//! which is the fastest kind of convolution on a CPU.
+//! [`PatchCnn`]: a small convolutional encoder whose kernels equal their strides, so that every layer is one matrix
+//! product, which is the fastest kind of convolution on a CPU.
 
 use super::vit::Projection;
 use super::{Activation, Init, Linear};

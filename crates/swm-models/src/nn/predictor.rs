@@ -1,5 +1,5 @@
-//! [`Predictor`]: a causal transformer over latents whose layers are modulated by the actions (AdaLN-Zero, Peebles and Xie
-//! 2023, section 3.2).
+//! [`Predictor`]: a causal transformer over latents whose layers are modulated by the actions (AdaLN-Zero, Peebles and
+//! Xie 2023, section 3.2).
 
 #![allow(non_snake_case, reason = "parameters have their published names")]
 

@@ -1,5 +1,5 @@
-//! Scalars as distributions over bins (Bellemare et al. 2017; Hafner et al. 2023, section "Critic learning"): the two-hot
-//! encoding puts weight on the two bins next to a scalar, on a logarithmic axis.
+//! Scalars as distributions over bins (Bellemare et al. 2017; Hafner et al. 2023, section "Critic learning"): the
+//! two-hot encoding puts weight on the two bins next to a scalar, on a logarithmic axis.
 
 use super::with_derivative;
 use burn::tensor::{Device, Tensor, TensorData, activation};

@@ -1,5 +1,5 @@
-//! A vision transformer (Dosovitskiy et al. 2021: pre-norm, class token, trained position embeddings). Parameters have the
-//! names of the published checkpoints. Position embeddings are interpolated for images of other sizes.
+//! A vision transformer (Dosovitskiy et al. 2021: pre-norm, class token, trained position embeddings). Parameters have
+//! the names of the published checkpoints. Position embeddings are interpolated for images of other sizes.
 
 use super::attention::attend;
 use super::positions::{Resampling, positions};
@@ -238,8 +238,8 @@ pub(super) fn leading(tokens: Tensor<3>, count: usize) -> Tensor<3> {
     tokens.slice([0..frames, 0..count, 0..dim])
 }
 
-/// Computes the input tokens: the class token and the projected patches, plus position embeddings, which are resampled to the
-/// grid of the patches.
+/// Computes the input tokens: the class token and the projected patches, plus position embeddings, which are resampled
+/// to the grid of the patches.
 ///
 /// # Shapes
 /// `[frames, patches, 3 * patch * patch]` to `[frames, 1 + patches, dim]`.

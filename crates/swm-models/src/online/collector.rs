@@ -1,7 +1,7 @@
 //! [`Collector`]: steps environments with a policy and adds their transitions to the replay buffer, segment by segment.
 //!
-//! A segment ends with the observation that the next one begins with, so that no transition is lost; only clips of several
-//! steps across the border of two segments are.
+//! A segment ends with the observation that the next one begins with, so that no transition is lost; only clips of
+//! several steps across the border of two segments are.
 
 use serde::{Deserialize, Serialize};
 use swm_core::columns::{ACTION, REWARD, TERMINATED, TRUNCATED};
@@ -122,8 +122,8 @@ impl Collector {
         Ok(())
     }
 
-    /// Executes the actions in the active slots and returns the slots whose episode ended. With `record`, complete segments
-    /// go to the replay buffer.
+    /// Executes the actions in the active slots and returns the slots whose episode ended. With `record`, complete
+    /// segments go to the replay buffer.
     fn advance(&mut self, record: bool) -> Result<Vec<usize>> {
         let Self { pool, running, observed, actions, active, .. } = self;
         for (slot, running) in running.iter_mut().enumerate().filter(|&(slot, _)| active[slot]) {

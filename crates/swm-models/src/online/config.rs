@@ -18,8 +18,8 @@ pub struct OnlineConfig {
     pub warmup: usize,
     /// Rows of the replay buffer; the oldest episodes are dropped first.
     pub capacity: usize,
-    /// Steps of a segment, after which the rows of a running episode go to the replay buffer. Clips of several steps that
-    /// would span two segments are lost.
+    /// Steps of a segment, after which the rows of a running episode go to the replay buffer. Clips of several steps
+    /// that would span two segments are lost.
     #[serde(rename = "part")]
     pub segment: usize,
     /// Optimizer steps between two evaluations; 0 for none.

@@ -47,14 +47,14 @@ pub struct OnlineSummary {
 /// Trains a model by interaction with environments; the checkpoint, the best checkpoint so far and the logs go to the
 /// folder `out`. `make_pool` creates a pool of the given number of environments.
 ///
-/// `control` is checked before every round. An interrupted run saves its weights and its replay buffer and returns a summary
-/// with `interrupted`; `options.resume` continues it. The metrics of the progress events are the model's, then `env_steps`,
-/// `return` (of the last episodes), `evaluation_return`, `lr`, `gradient_norm`, `clips_per_second` and `data_wait`, the
-/// fraction of the time spent on interaction.
+/// `control` is checked before every round. An interrupted run saves its weights and its replay buffer and returns a
+/// summary with `interrupted`; `options.resume` continues it. The metrics of the progress events are the model's, then
+/// `env_steps`, `return` (of the last episodes), `evaluation_return`, `lr`, `gradient_norm`, `clips_per_second` and
+/// `data_wait`, the fraction of the time spent on interaction.
 ///
 /// # Errors
-/// When the configuration contradicts itself or the environments, `out` holds a run that cannot be continued, a loss is not
-/// finite, an environment fails, the caller's poll fails (after saving), or the disk refuses.
+/// When the configuration contradicts itself or the environments, `out` holds a run that cannot be continued, a loss is
+/// not finite, an environment fails, the caller's poll fails (after saving), or the disk refuses.
 pub fn train_online<M: Agent>(
     config: &TrainConfig<M>,
     make_pool: &dyn Fn(usize) -> Result<EnvPool>,
@@ -355,8 +355,8 @@ impl Run<'_> {
         Ok(mean)
     }
 
-    /// Saves the replay buffer and the collector, then the checkpoint, so that a checkpoint always has its data. Returns the
-    /// hash of the weights.
+    /// Saves the replay buffer and the collector, then the checkpoint, so that a checkpoint always has its data.
+    /// Returns the hash of the weights.
     fn save(&mut self) -> Result<String> {
         let folder = saved_data(self.out, self.step());
         if folder.exists() {

@@ -10,8 +10,8 @@ use swm_plan::ActionScale;
 
 /// A model with a distribution over actions.
 pub trait StochasticActor: Trainable {
-    /// Returns an action for the observation in a row, in model units from -1 to 1: drawn with `key`, or without one the
-    /// most likely action.
+    /// Returns an action for the observation in a row, in model units from -1 to 1: drawn with `key`, or without one
+    /// the most likely action.
     ///
     /// # Shapes
     /// `[action_dim]`.
@@ -36,8 +36,8 @@ pub struct StochasticPolicy<M: StochasticActor> {
 }
 
 impl<M: StochasticActor> StochasticPolicy<M> {
-    /// Creates a policy for `slots` environments of `spec`; with `explore` it draws actions, else it takes the most likely
-    /// ones.
+    /// Creates a policy for `slots` environments of `spec`; with `explore` it draws actions, else it takes the most
+    /// likely ones.
     ///
     /// # Errors
     /// When the model was trained for other actions.
@@ -79,7 +79,8 @@ impl<M: StochasticActor> Policy for StochasticPolicy<M> {
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
         let column = actions.schema().index(ACTION)?;
-        // Keyed by the step of the episode, not of the policy, so that a policy that takes over in mid-episode draws the same.
+        // Keyed by the step of the episode, not of the policy, so that a policy that takes over in mid-episode draws
+        // the same.
         let steps = infos.get::<i32>(STEP_IDX)?;
         let model = self.model.get();
         let mut env_action = vec![0.0; self.bounds.len()];

@@ -19,8 +19,8 @@ pub struct FitConfig {
     pub lr: f64,
 }
 
-/// Trains `model`; `step` computes loss and gradients of the samples with the given indices. Returns the model and its last
-/// loss.
+/// Trains `model`; `step` computes loss and gradients of the samples with the given indices. Returns the model and its
+/// last loss.
 ///
 /// # Errors
 /// When a step fails or its loss is not finite.

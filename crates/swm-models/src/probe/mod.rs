@@ -1,11 +1,11 @@
 //! Probes: how much of the state of an environment a frozen encoder's latents contain.
 //!
-//! - [`state`]: regression of the columns of a dataset on latents, [linear](ridge) and with a small network, scored on held-out
-//!   episodes.
+//! - [`state`]: regression of the columns of a dataset on latents, [linear](ridge) and with a small network, scored on
+//!   held-out episodes.
 //! - [`reconstruction`]: the images, reconstructed from latents.
 //!
-//! A state that a linear map reads is represented linearly; one that only the network reads, nonlinearly. A planner cannot use
-//! what neither reads.
+//! A state that a linear map reads is represented linearly; one that only the network reads, nonlinearly. A planner
+//! cannot use what neither reads.
 
 mod fit;
 pub mod reconstruction;

@@ -63,8 +63,9 @@ pub struct ReconstructionReport {
 /// The side of the blocks of pixels that the last layer returns, in pixels.
 const BLOCK: usize = 4;
 
-/// A decoder of latents: a small network computes a feature map, then transposed convolutions whose strides equal their kernel
-/// sizes, each one matrix product, enlarge it; the last returns blocks of pixels. The result is the difference to the mean image.
+/// A decoder of latents: a small network computes a feature map, then transposed convolutions whose strides equal their
+/// kernel sizes, each one matrix product, enlarge it; the last returns blocks of pixels. The result is the difference
+/// to the mean image.
 #[derive(Module, Debug)]
 struct Decoder {
     hidden: Linear,
@@ -126,12 +127,12 @@ impl Decoder {
     }
 }
 
-/// Fits a decoder of an encoder's latents. The contact sheet shows held-out images in pairs of rows: the originals and their
-/// reconstructions.
+/// Fits a decoder of an encoder's latents. The contact sheet shows held-out images in pairs of rows: the originals and
+/// their reconstructions.
 ///
 /// # Errors
-/// When the images have another size than the encoder's or one that the blocks do not fill, no episode is held out, or a
-/// setting is out of range.
+/// When the images have another size than the encoder's or one that the blocks do not fill, no episode is held out, or
+/// a setting is out of range.
 pub fn reconstruct_images(
     encoder: &dyn ImageEncoder,
     reader: &dyn Reader,

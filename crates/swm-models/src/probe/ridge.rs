@@ -1,8 +1,8 @@
 //! Ridge regression with an intercept, in closed form (Hoerl and Kennard 1970).
 //!
-//! For centred features `X` and targets `Y`, the weights are `W = (XᵀX + λnI)⁻¹ XᵀY = Xᵀ (XXᵀ + λnI)⁻¹ Y`. The smaller of the two
-//! systems is solved by Cholesky factorisation in double precision. Features are standardised first, so that λ has the same
-//! meaning for every encoder.
+//! For centred features `X` and targets `Y`, the weights are `W = (XᵀX + λnI)⁻¹ XᵀY = Xᵀ (XXᵀ + λnI)⁻¹ Y`. The smaller
+//! of the two systems is solved by Cholesky factorisation in double precision. Features are standardised first, so that
+//! λ has the same meaning for every encoder.
 
 use rayon::prelude::*;
 use swm_core::{Error, Result};
@@ -189,7 +189,8 @@ mod tests {
 
     #[test]
     fn primal_and_dual_solutions_agree() {
-        // The same problem with more rows than features, then with every feature twice, so that there are more features.
+        // The same problem with more rows than features, then with every feature twice, so that there are more
+        // features.
         let (rows, features) = (12, 9);
         let (x, y) = (noise(rows * features, "x"), noise(rows * 3, "y"));
         let primal = Ridge::fit(&x, &y, rows, 0.1).expect("fitted").predict(&x);

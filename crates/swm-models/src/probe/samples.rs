@@ -26,8 +26,8 @@ const FRAMES: usize = 64;
 /// The largest number of latent elements held in memory: 1 GB in double precision.
 const MAX_ELEMENTS: usize = 1 << 27;
 
-/// Samples up to `count` frames of a part of a dataset (fewer if latents are very large) without replacement, in stored order.
-/// Frames whose columns are not finite are skipped.
+/// Samples up to `count` frames of a part of a dataset (fewer if latents are very large) without replacement, in stored
+/// order. Frames whose columns are not finite are skipped.
 ///
 /// # Errors
 /// When a column is missing, images have another size than the encoder's, or fewer than two frames are left.

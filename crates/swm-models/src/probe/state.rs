@@ -51,7 +51,8 @@ pub struct Score {
     pub index: usize,
     /// The standard deviation of the element, in its units.
     pub spread: f64,
-    /// The coefficient of determination: 1 for perfect predictions, 0 for those of the mean. `None` for a constant element.
+    /// The coefficient of determination: 1 for perfect predictions, 0 for those of the mean. `None` for a constant
+    /// element.
     pub r2: Option<f64>,
     /// The root mean squared error, in its units.
     pub rmse: f64,
@@ -77,8 +78,8 @@ pub struct StateReport {
 /// Fits a linear and a nonlinear regression of columns on an encoder's latents, and scores both on held-out episodes.
 ///
 /// # Errors
-/// When a column is missing or holds images, the images have another size than the encoder's, no episode is held out, or a
-/// setting is out of range.
+/// When a column is missing or holds images, the images have another size than the encoder's, no episode is held out,
+/// or a setting is out of range.
 pub fn read_state(encoder: &dyn ImageEncoder, reader: &dyn Reader, config: &StateConfig) -> Result<StateReport> {
     at_least(&[
         ("columns", config.columns.len(), 1),

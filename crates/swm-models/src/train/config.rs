@@ -74,8 +74,9 @@ pub struct DataConfig {
     pub frameskip: usize,
     /// Clips of a batch.
     pub batch_size: usize,
-    /// Whether the episodes that [`swm_data::Split::default`] holds out, a tenth for validation and a tenth for testing,
-    /// are left out of the training data, so that `swm eval --split test` starts from episodes no model was trained on.
+    /// Whether the episodes that [`swm_data::Split::default`] holds out, a tenth for validation and a tenth for
+    /// testing, are left out of the training data, so that `swm eval --split test` starts from episodes no model was
+    /// trained on.
     #[serde(default)]
     pub hold_out: bool,
 }

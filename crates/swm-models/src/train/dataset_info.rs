@@ -57,8 +57,8 @@ impl ColumnInfo {
 }
 
 impl DatasetInfo {
-    /// Computes the statistics of a dataset. `columns` are those that the model observes; images among them are skipped.
-    /// Actions are standardised, or, if `bounded`, mapped from their range in the data to -1 ..= 1.
+    /// Computes the statistics of a dataset. `columns` are those that the model observes; images among them are
+    /// skipped. Actions are standardised, or, if `bounded`, mapped from their range in the data to -1 ..= 1.
     ///
     /// # Errors
     /// When there is no column of continuous actions, a column is missing, or the data are damaged.
@@ -116,8 +116,8 @@ impl DatasetInfo {
         })
     }
 
-    /// The actions of a batch of clips, in model units. Missing actions (NaN in the last row of an episode) become 0, which
-    /// is the mean.
+    /// The actions of a batch of clips, in model units. Missing actions (NaN in the last row of an episode) become 0,
+    /// which is the mean.
     ///
     /// # Shapes
     /// `[clips, steps, frameskip * action_dim]`.

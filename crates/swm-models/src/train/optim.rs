@@ -1,7 +1,7 @@
 //! AdamW (Loshchilov and Hutter 2019, algorithm 2) with clipping of the global gradient norm, as PyTorch computes both.
 //!
-//! Burn's optimizer clips every tensor separately and keys its state by ids that change from run to run. This one clips the
-//! whole gradient and keys its state by parameter name, so that the state can be stored beside the weights.
+//! Burn's optimizer clips every tensor separately and keys its state by ids that change from run to run. This one clips
+//! the whole gradient and keys its state by parameter name, so that the state can be stored beside the weights.
 
 use crate::nn::parameters::{self, HostTensor, IntoF32, Named};
 use burn::module::Module;
@@ -139,7 +139,8 @@ impl AdamW {
     }
 }
 
-/// The squared gradient norm of every clipping group, and the norm of the whole gradient. Sums run in the order of names.
+/// The squared gradient norm of every clipping group, and the norm of the whole gradient. Sums run in the order of
+/// names.
 fn squared_norms(gradients: &Named<Tensor<1>>, group: fn(&str) -> ParameterGroup) -> (BTreeMap<usize, f64>, f64) {
     let mut squares: BTreeMap<usize, f64> = BTreeMap::new();
     for (name, gradient) in gradients {

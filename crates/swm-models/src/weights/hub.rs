@@ -1,8 +1,8 @@
 //! Files of the Hugging Face hub, downloaded once and cached.
 //!
-//! The cache has the layout of the hub's own libraries (`models--OWNER--NAME/snapshots/REVISION/FILE`), and files in their cache
-//! (`$HF_HOME`, by default `~/.cache/huggingface`) are used, too. Downloads go through our object stores, because the hub's
-//! client would add a second HTTP stack.
+//! The cache has the layout of the hub's own libraries (`models--OWNER--NAME/snapshots/REVISION/FILE`), and files in
+//! their cache (`$HF_HOME`, by default `~/.cache/huggingface`) are used, too. Downloads go through our object stores,
+//! because the hub's client would add a second HTTP stack.
 
 use hf_hub::{Cache, Repo, RepoType};
 use std::io::Write as _;
@@ -23,7 +23,8 @@ pub struct Hub {
 }
 
 impl Hub {
-    /// The hub at the address in `HF_ENDPOINT` (by default `https://huggingface.co`); its files are cached in the folder `cache`.
+    /// The hub at the address in `HF_ENDPOINT` (by default `https://huggingface.co`); its files are cached in the
+    /// folder `cache`.
     pub fn new(cache: &Path) -> Self {
         let variable = |name| std::env::var(name).ok().filter(|value| !value.is_empty());
         let endpoint = variable("HF_ENDPOINT").unwrap_or_else(|| "https://huggingface.co".to_owned());
@@ -38,8 +39,8 @@ impl Hub {
         Self { endpoint: endpoint.to_owned(), cache: cache.to_owned(), library_cache: None }
     }
 
-    /// Returns the path of a file of a repository (`OWNER/NAME`, or `OWNER/NAME@REVISION`), which is downloaded unless it is
-    /// cached.
+    /// Returns the path of a file of a repository (`OWNER/NAME`, or `OWNER/NAME@REVISION`), which is downloaded unless
+    /// it is cached.
     ///
     /// # Errors
     /// When it is not cached and the hub has no such file or cannot be reached.
@@ -87,8 +88,8 @@ impl Hub {
     }
 }
 
-/// Returns the path of a file of a Hugging Face repository, such as `model.safetensors` of `facebook/dinov2-small`; downloads
-/// are cached in the folder `cache`.
+/// Returns the path of a file of a Hugging Face repository, such as `model.safetensors` of `facebook/dinov2-small`;
+/// downloads are cached in the folder `cache`.
 ///
 /// # Errors
 /// As [`Hub::fetch`].
@@ -96,8 +97,8 @@ pub fn fetch(repo: &str, file: &str, cache: &Path) -> Result<PathBuf> {
     Hub::new(cache).fetch(repo, file)
 }
 
-/// Returns the path of the weights `from`: a local file, or a Hugging Face repository (`OWNER/NAME`), whose files are cached in
-/// the folder `cache`.
+/// Returns the path of the weights `from`: a local file, or a Hugging Face repository (`OWNER/NAME`), whose files are
+/// cached in the folder `cache`.
 ///
 /// # Errors
 /// When there is neither, or the hub cannot be reached.

@@ -1,5 +1,5 @@
-//! The keys of JSON objects in the order of the file, which parsed objects lose. The reference applies its modules in that
-//! order.
+//! The keys of JSON objects in the order of the file, which parsed objects lose. The reference applies its modules in
+//! that order.
 
 use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde::ser::{Serialize, SerializeMap as _, Serializer};

@@ -1,7 +1,7 @@
 //! The names of the weights of a vision transformer.
 //!
-//! Published files and `transformers` up to version 4 use the names of our modules. Version 5 renames weights when it loads a
-//! file, so a state dict that it saved has the newer names.
+//! Published files and `transformers` up to version 4 use the names of our modules. Version 5 renames weights when it
+//! loads a file, so a state dict that it saved has the newer names.
 
 use crate::nn::parameters::Named;
 
@@ -40,7 +40,8 @@ fn table<T>(weights: &Named<T>, prefix: &str) -> &'static [(&'static str, &'stat
     if scaled { DINO } else { VIT }
 }
 
-/// Renames the weights of the transformer below `prefix` (such as `encoder.`) to their published names, whichever they have.
+/// Renames the weights of the transformer below `prefix` (such as `encoder.`) to their published names, whichever they
+/// have.
 pub fn to_published<T>(weights: Named<T>, prefix: &str) -> Named<T> {
     let table = table(&weights, prefix);
     let is_newer = |name: &String| name.starts_with(prefix) && name.contains(".attention.q_proj.");

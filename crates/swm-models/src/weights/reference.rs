@@ -1,5 +1,5 @@
-//! Checkpoints of the reference implementation: a state dict (`weights.pt`) and a `config.json`, which is a tree of classes
-//! (`_target_`) and their arguments.
+//! Checkpoints of the reference implementation: a state dict (`weights.pt`) and a `config.json`, which is a tree of
+//! classes (`_target_`) and their arguments.
 
 use super::keys::Keys;
 use super::{BATCHES_TRACKED, names, read, torch};
@@ -26,7 +26,8 @@ const CONFIG: &str = "config.json";
 const TARGET: &str = "_target_";
 
 impl Reference {
-    /// Reads a checkpoint of the class `class`: a folder with a `config.json` and one file of weights, or the path of that file.
+    /// Reads a checkpoint of the class `class`: a folder with a `config.json` and one file of weights, or the path of
+    /// that file.
     ///
     /// # Errors
     /// When a file is missing or damaged, there are several files of weights, or the class is another one.
@@ -106,8 +107,8 @@ impl Reference {
         found.ok_or_else(|| self.wrong(format!("'{name}' is missing")))
     }
 
-    /// Returns the sizes and the image size of the vision transformer at a dotted path, and renames its weights to their
-    /// published names.
+    /// Returns the sizes and the image size of the vision transformer at a dotted path, and renames its weights to
+    /// their published names.
     ///
     /// # Errors
     /// When there is another encoder, or its size is unknown.

@@ -10,8 +10,8 @@ use zip::{CompressionMethod, ZipWriter};
 /// The batch counter of a batch normalisation, `[]`: the only integer in a state dict.
 pub const BATCHES_TRACKED: &str = "num_batches_tracked";
 
-/// Writes a state dict that `torch.load(path, weights_only=True)` reads: single precision, except for the counters of batch
-/// normalisations ([`BATCHES_TRACKED`]), which are integers in PyTorch.
+/// Writes a state dict that `torch.load(path, weights_only=True)` reads: single precision, except for the counters of
+/// batch normalisations ([`BATCHES_TRACKED`]), which are integers in PyTorch.
 ///
 /// # Errors
 /// When the disk refuses.

@@ -1,4 +1,5 @@
-//! DINO-WM: training does not depend on threads and keeps the encoder frozen; costs do not depend on other environments.
+//! DINO-WM: training does not depend on threads and keeps the encoder frozen; costs do not depend on other
+//! environments.
 
 use crate::dots::{Dots, SIDE, draw};
 use burn::tensor::Device;

@@ -99,8 +99,8 @@ fn exported_checkpoints_load_again() {
     }
     assert_eq!(exported, reference);
 
-    // The reference builds the encoder from a published one, so its config.json cannot describe a smaller one; only the state
-    // dict can be compared.
+    // The reference builds the encoder from a published one, so its config.json cannot describe a smaller one; only the
+    // state dict can be compared.
     let checkpoint = dino_wm_checkpoint();
     let refused = dino_wm::import::export(&checkpoint, &out.path().join("dino"), Naming::Published);
     assert!(refused.expect_err("no published encoder").to_string().contains("DINOv2-small"));

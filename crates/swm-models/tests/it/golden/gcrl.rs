@@ -1,5 +1,5 @@
-//! Goal-conditioned models: heads of the published package (`gcrl-*`), and losses with all gradients (`gcbc-*`, `gcivl-*`,
-//! `gciql-*`).
+//! Goal-conditioned models: heads of the published package (`gcrl-*`), and losses with all gradients (`gcbc-*`,
+//! `gcivl-*`, `gciql-*`).
 
 use super::{Golden, TOLERANCE, check, error, files, values};
 use burn::module::Module;
@@ -96,8 +96,8 @@ impl Golden {
         let largest = theirs.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));
         for (name, gradient) in &theirs {
             let ours = values(output.gradients.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
-            // A softmax cancels the bias of the keys, so its gradient is zero up to rounding; its error is relative to the
-            // largest gradient of all.
+            // A softmax cancels the bias of the keys, so its gradient is zero up to rounding; its error is relative to
+            // the largest gradient of all.
             let idle = name.ends_with(".key.bias");
             let error = error(&ours, &gradient.values, if idle { largest } else { 1e-6 });
             if error > worst.0 {

@@ -1,6 +1,6 @@
-//! Parity with the published models: names of weights, outputs, losses and gradients of the reference implementation. Every
-//! test reads each `<model>-*.safetensors` of the folder named by `SWM_GOLDEN_MODELS`, or
-//! of `tests/golden` (written by the exporters beside them) and of the shared reference.
+//! Parity with the published models: names of weights, outputs, losses and gradients of the reference implementation.
+//! Every test reads each `<model>-*.safetensors` of the folder named by `SWM_GOLDEN_MODELS`, or of `tests/golden`
+//! (written by the exporters beside them) and of the shared reference.
 
 mod dino_wm;
 mod gcrl;
@@ -65,8 +65,8 @@ impl Golden {
     }
 
     /// Compares gradients with all recorded ones. Parameters whose names end in one of `idle` have no effect, because a
-    /// batch normalisation or a softmax cancels them: their gradients are zero up to rounding, so their errors are relative
-    /// to the largest gradient of all.
+    /// batch normalisation or a softmax cancels them: their gradients are zero up to rounding, so their errors are
+    /// relative to the largest gradient of all.
     fn check_gradients(&self, ours: &Named<Tensor<1>>, idle: &[&str]) {
         let theirs = self.group("g.");
         let largest = theirs.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));

@@ -18,8 +18,7 @@ use swm::core::run::{Control, Event};
 use swm::core::{Callable, CameraView, Env, Error, Key, ResetOptions, Snapshot, VariationRequest};
 use swm::data::{ImageCodec, WriteMode, WriteOptions};
 use swm::envs::wrappers::{GoalPicture, Stack, WRAPPERS};
-use swm::eval::world::{episode_key, reset_seed};
-use swm::eval::{CollectConfig, EvalConfig, Starts, Videos, WorldConfig};
+use swm::eval::{CollectConfig, EvalConfig, Starts, Videos, WorldConfig, episode_key, reset_seed};
 use swm::gym::GymEnv;
 
 /// Many environments of one kind.
@@ -163,7 +162,7 @@ impl World {
     fn ask(&self, py: Python<'_>, actor: &Actor, active: Vec<bool>) -> PyResult<()> {
         let (mut world, mut policy) = (self.lock()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
-        py.detach(|| world.ask(policy, &active)).map_err(raised)
+        py.detach(|| world.act(policy, &active)).map_err(raised)
     }
 
     /// Steps the active slots with the actions that were written.
@@ -200,7 +199,7 @@ impl World {
                     *active = flags.iter().all(|&flag| infos.bytes(flag)[slot] == 0);
                 }
                 if active.contains(&true) {
-                    world.ask(policy, &active)?;
+                    world.act(policy, &active)?;
                     world.advance(&active)?;
                 }
                 if active.contains(&false) {
@@ -241,7 +240,7 @@ impl World {
         let mut world = self.lock()?;
         let world = &mut *world;
         let snapshot = Snapshot(state);
-        py.detach(|| world.change(&[slot], |_, env| env.restore(&snapshot))).map_err(raised)
+        py.detach(|| world.modify(&[slot], |_, env| env.restore(&snapshot))).map_err(raised)
     }
 
     /// Plays episodes into a dataset at `path`, or into `writer`, an object with `write_episode`; returns `(episodes, added,

@@ -1,8 +1,7 @@
-//! How fast clips are loaded and datasets converted, beside the reference where it is installed.
+//! `bench data`: clips loaded per second and datasets converted per second.
 //!
-//! One collection of a world is the content of every dataset: ours are written by our writers, the reference's by its
-//! own. As in [`bench`](mod@crate::envs), turns alternate and the median of the ratios of neighbouring turns counts. The
-//! reference loads in its own process or with worker processes, whichever a first turn of each finds to be faster.
+//! All datasets have the same content, collected once; each side writes its own. The reference loads in its own process or with
+//! worker processes, whichever is faster in a first turn.
 
 use crate::reference::{Reference, not_compared, reference_python};
 use serde::Serialize;
@@ -19,14 +18,14 @@ use swm_data::{
 };
 use swm_eval::{CollectConfig, World, WorldConfig};
 
-/// What to measure.
+/// Settings of the benchmark.
 #[derive(Clone, Debug)]
 pub struct DataBenchConfig {
     /// Episodes of the datasets.
     pub episodes: usize,
     /// Steps of an episode.
     pub steps: usize,
-    /// The side of the square pictures, in pixels.
+    /// The side length of the square frames, in pixels.
     pub size: usize,
     /// The clips that are loaded.
     pub clip: ClipSpec,
@@ -34,26 +33,26 @@ pub struct DataBenchConfig {
     pub batch_size: usize,
     /// Threads of our loader.
     pub threads: usize,
-    /// Numbers of worker processes that the reference is tried with.
+    /// The numbers of worker processes to try with the reference.
     pub workers: Vec<usize>,
     /// Pairs of turns, ours and the reference's.
     pub pairs: usize,
     /// Seconds of a turn of loading.
     pub seconds: f64,
-    /// Names of the formats to load from; all there are for none.
+    /// The names of the formats to load from; empty for all.
     pub formats: Vec<String>,
     /// Whether conversions are measured.
     pub convert: bool,
-    /// Epochs over which the use of memory is watched; 0 leaves it out.
+    /// Epochs over which memory use is measured; 0 to skip.
     pub epochs: usize,
-    /// A folder of an object store to load from beside this machine's disk, if there is one.
+    /// A folder of an object store to compare with the local disk, if any.
     pub remote: Option<Location>,
-    /// A Python with the reference, if there is one.
+    /// A Python with the reference implementation, if any.
     pub python: Option<PathBuf>,
 }
 
 impl Default for DataBenchConfig {
-    /// The setting of the reference's own figures: clips of 4 frames, 5 steps apart, at 224 pixels, 64 in a batch.
+    /// The settings of the reference's published rates: clips of 4 frames, 5 steps apart, at 224 pixels, 64 in a batch.
     fn default() -> Self {
         let columns = ["pixels", "action"].map(str::to_owned).to_vec();
         Self {
@@ -75,61 +74,62 @@ impl Default for DataBenchConfig {
     }
 }
 
-/// What was measured.
+/// The result of the benchmark.
 #[derive(Clone, Debug, Serialize)]
 pub struct DataBenchReport {
-    /// The environment whose pictures are loaded.
+    /// The environment whose frames are loaded.
     pub env: String,
-    /// Episodes and rows of the datasets.
+    /// Episodes of the datasets.
     pub episodes: usize,
     /// Rows of all episodes.
     pub rows: usize,
-    /// Frames of a clip, rows between them, clips of a batch.
+    /// Frames of a clip, rows between them, and clips of a batch.
     pub clip: [usize; 3],
     /// Threads of our loader.
     pub threads: usize,
-    /// The reference's version, or why it is not compared.
+    /// The version of the reference, or the reason why it is not compared.
     pub reference: String,
-    /// One entry for everything that was measured.
+    /// One entry for each measurement.
     pub rates: Vec<DataBenchRow>,
-    /// Bytes this process held in memory after every epoch of loading from Lance.
+    /// Memory of this process after every epoch of loading from Lance, in bytes.
     pub resident: Vec<u64>,
 }
 
-/// One thing beside the reference's way of doing it.
+/// One measurement.
 #[derive(Clone, Debug, Serialize)]
 pub struct DataBenchRow {
-    /// What was done: `load` or `convert`.
+    /// The kind of work: `load` or `convert`.
     pub work: &'static str,
-    /// With which format and codec.
+    /// The format and codec.
     pub what: String,
-    /// What the reference did beside it, or why it did nothing.
+    /// What the reference did for comparison, or the reason why it is not compared.
     pub beside: String,
-    /// Clips or conversions a second in each of our turns.
+    /// Clips or conversions per second in each of our turns.
     pub ours: Vec<f64>,
-    /// The same in each of the reference's turns; empty without it.
+    /// The same in each turn of the reference; empty without it.
     pub reference: Vec<f64>,
     /// The median of our turns.
     pub rate: f64,
-    /// The median ratio of neighbouring turns: how many times faster ours is.
+    /// The median ratio of neighbouring turns: our rate divided by that of the reference.
     pub ratio: Option<f64>,
 }
 
-/// A dataset of ours to load, and the reference's format beside it.
+/// A dataset of ours to load, and the reference's format to compare with.
 struct Layout {
     name: &'static str,
     format: &'static str,
     codec: ImageCodec,
-    /// The name its folder or file has.
-    place: &'static str,
-    beside: &'static str,
-    their_place: &'static str,
+    /// The name of its folder or file.
+    file: &'static str,
+    /// The format of the reference.
+    reference_format: &'static str,
+    /// The name of the reference's folder or file.
+    reference_file: &'static str,
 }
 
 const JPEG: ImageCodec = ImageCodec::Jpeg { quality: 95 };
 
-/// Every format that the reference has, and those of ours it has none of beside its Lance. The reference's Lance holds
-/// JPEG, whatever ours does.
+/// Every format. Formats that the reference lacks are compared with its Lance format, which always stores JPEG.
 const LAYOUTS: [Layout; 6] = [
     layout("lance, jpeg", "lance", JPEG, "jpeg.lance", "lance", "theirs.lance"),
     layout("lance, lossless", "lance", LOSSLESS, "lossless.lance", "lance", "theirs.lance"),
@@ -139,33 +139,34 @@ const LAYOUTS: [Layout; 6] = [
     layout("folder", "folder", JPEG, "ours.folder", "folder", "their-folder"),
 ];
 
-/// What pictures are stored as unless somebody asks for something else.
+/// The default codec of frames.
 const LOSSLESS: ImageCodec = ImageCodec::Qoi;
 
 const fn layout(
     name: &'static str,
     format: &'static str,
     codec: ImageCodec,
-    place: &'static str,
-    beside: &'static str,
-    their_place: &'static str,
+    file: &'static str,
+    reference_format: &'static str,
+    reference_file: &'static str,
 ) -> Layout {
-    Layout { name, format, codec, place, beside, their_place }
+    Layout { name, format, codec, file, reference_format, reference_file }
 }
 
-/// Measures loading from every format, converting, and what the process holds in memory over some epochs.
+/// Measures loading from every format, converting, and memory use over some epochs.
 ///
 /// # Errors
-/// When a number makes no sense, the world or a writer fails, or the reference stops answering. What the reference cannot
-/// do is no error: the row says so.
+/// When a setting is invalid, the world or a writer fails, or the reference stops answering. Work that the reference cannot do is
+/// not an error: the row contains the reason.
+#[allow(clippy::too_many_lines, reason = "the list of all measurements, in order")]
 pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBenchReport> {
     if config.pairs == 0 || !(config.seconds > 0.0 && config.seconds.is_finite()) {
         let given = format!("{} pairs of turns of {} seconds", config.pairs, config.seconds);
         return Err(Error::config("benchmark", given, "ask for at least 1 pair of more than 0 seconds"));
     }
-    let folder = tempfile::tempdir().map_err(|e| Error::io("a temporary folder", "making it for datasets", e))?;
+    let folder = tempfile::tempdir().map_err(|e| Error::io("a temporary folder", "creating it for datasets", e))?;
     let at = |name: &str| folder.path().join(name);
-    // PNG is what both sides read without loss.
+    // Both sides read PNG without loss.
     let source = at("source.lance");
     let rows = collect(env, config, &source)?;
     let mut report = DataBenchReport {
@@ -193,13 +194,13 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
         known && (config.formats.is_empty() || config.formats.iter().any(|name| name == layout.format))
     };
     for layout in LAYOUTS.iter().filter(wanted) {
-        let path = at(layout.place);
+        let path = at(layout.file);
         write(&source, &path, layout)?;
-        let mut theirs = match &mut reference {
-            Some(reference) => Theirs::new(reference, config, &source, layout, &at(layout.their_place)),
+        let mut reference_side = match &mut reference {
+            Some(reference) => ReferenceDataset::new(reference, config, &source, layout, &at(layout.reference_file)),
             None => Err("no reference".to_owned()),
         };
-        report.rates.push(load(layout.name, &path, config, CacheConfig::Off, theirs.as_mut())?);
+        report.rates.push(load(layout.name, &path, config, CacheConfig::Off, reference_side.as_mut())?);
         if layout.name == "lance, jpeg" {
             let decoded = rows * config.size * config.size * 3;
             let kept = [
@@ -209,7 +210,7 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
             ];
             for (what, cache) in kept {
                 let what = format!("{}, {what}", layout.name);
-                report.rates.push(load(&what, &path, config, cache, theirs.as_mut())?);
+                report.rates.push(load(&what, &path, config, cache, reference_side.as_mut())?);
             }
             report.rates.extend(remote(&path, config)?);
             for _ in 0..config.epochs {
@@ -225,15 +226,15 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
             for (what, verify) in [("", false), (", verified", true)] {
                 let what = format!("lance to {}{what}", layout.name);
                 let source = jpeg.as_deref().unwrap_or(&source);
-                let place = at("converted");
-                report.rates.push(converting(&what, verify, source, layout, &place, config, reference.as_mut())?);
+                let folder = at("converted");
+                report.rates.push(converting(&what, verify, source, layout, &folder, config, reference.as_mut())?);
             }
         }
     }
     Ok(report)
 }
 
-/// Collects the content of all datasets: how many rows it has.
+/// Collects the content of all datasets; returns its number of rows.
 fn collect(env: &EnvChoice, config: &DataBenchConfig, path: &Path) -> Result<usize> {
     let image = Some((config.size, config.size));
     let world = WorldConfig { image, max_episode_steps: Some(config.steps), ..WorldConfig::default() };
@@ -251,7 +252,7 @@ fn collect(env: &EnvChoice, config: &DataBenchConfig, path: &Path) -> Result<usi
     Ok(open(path)?.episodes().iter().map(|episode| episode.length).sum())
 }
 
-/// Writes the content in a layout.
+/// Writes the content in the format of a layout.
 fn write(source: &Path, path: &Path, layout: &Layout) -> Result<()> {
     let options = ConvertOptions {
         format: Some(layout.format.to_owned()),
@@ -263,16 +264,16 @@ fn write(source: &Path, path: &Path, layout: &Layout) -> Result<()> {
     convert(&open(source)?, &Location::from(path), &options, &mut Control::new()).map(|_| ())
 }
 
-/// The reference's side of loading.
-struct Theirs<'r> {
+/// A dataset that the reference loads.
+struct ReferenceDataset<'r> {
     reference: &'r mut Reference,
     format: &'static str,
     path: PathBuf,
     workers: usize,
 }
 
-impl<'r> Theirs<'r> {
-    /// Writes its dataset and finds out how it loads fastest; says why if it cannot.
+impl<'r> ReferenceDataset<'r> {
+    /// Writes the dataset and finds the fastest number of workers; returns the error message of the reference on failure.
     fn new(
         reference: &'r mut Reference,
         config: &DataBenchConfig,
@@ -281,18 +282,18 @@ impl<'r> Theirs<'r> {
         path: &Path,
     ) -> std::result::Result<Self, String> {
         if !path.exists() {
-            reference.convert(source, layout.beside, path).map_err(|error| error.to_string())?;
+            reference.convert(source, layout.reference_format, path).map_err(|error| error.to_string())?;
         }
-        let mut theirs = Self { reference, format: layout.beside, path: path.to_owned(), workers: 0 };
+        let mut dataset = Self { reference, format: layout.reference_format, path: path.to_owned(), workers: 0 };
         let mut best = 0.0;
         for &workers in &config.workers {
-            let tried = Self::load(theirs.reference, theirs.format, path, workers, config);
+            let tried = Self::load(dataset.reference, dataset.format, path, workers, config);
             let rate = tried.map_err(|error| error.to_string())?;
             if rate > best {
-                (best, theirs.workers) = (rate, workers);
+                (best, dataset.workers) = (rate, workers);
             }
         }
-        Ok(theirs)
+        Ok(dataset)
     }
 
     fn load(
@@ -322,57 +323,62 @@ fn load(
     path: &Path,
     config: &DataBenchConfig,
     cache: CacheConfig,
-    theirs: std::result::Result<&mut Theirs<'_>, &mut String>,
+    dataset: std::result::Result<&mut ReferenceDataset<'_>, &mut String>,
 ) -> Result<DataBenchRow> {
     let mut endless = Endless { loader: loader(&open(path)?, config, cache)?, epoch: 0 };
-    // Once through everything: what can be kept is kept, buffers are there.
+    // One epoch as a warm-up, which fills caches and buffers.
     for batch in endless.loader.epoch(0, 0) {
         batch?;
     }
-    let beside = match &theirs {
-        Ok(theirs) => format!("{}, {} workers", theirs.format, theirs.workers),
+    let beside = match &dataset {
+        Ok(dataset) => format!("{}, {} workers", dataset.format, dataset.workers),
         Err(why) => format!("not compared: {why}"),
     };
-    let mut theirs = theirs.ok();
+    let mut dataset = dataset.ok();
     let (mut ours, mut reference) = (vec![], vec![]);
     for _ in 0..config.pairs {
         ours.push(endless.turn(config)?);
-        if let Some(theirs) = &mut theirs {
-            reference.push(theirs.turn(config)?);
+        if let Some(dataset) = &mut dataset {
+            reference.push(dataset.turn(config)?);
         }
     }
     Ok(DataBenchRow::new("load", what.to_owned(), beside, ours, reference))
 }
 
-/// Alternates turns of loading from the object store and from this machine's disk.
+/// Alternates turns of loading from the object store and from the local disk.
 fn remote(local: &Path, config: &DataBenchConfig) -> Result<Option<DataBenchRow>> {
-    let Some(place) = &config.remote else { return Ok(None) };
-    let target = Location::parse(&format!("{}/bench.lance", place.to_string().trim_end_matches('/')))?;
+    let Some(folder) = &config.remote else { return Ok(None) };
+    let target = Location::parse(&format!("{}/bench.lance", folder.to_string().trim_end_matches('/')))?;
     let options = ConvertOptions { mode: ConvertMode::Overwrite, codec: JPEG, verify: false, ..Default::default() };
     convert(&open(local)?, &target, &options, &mut Control::new())?;
     let mut loaders =
         [loader(&open(&target)?, config, CacheConfig::Off)?, loader(&open(local)?, config, CacheConfig::Off)?]
             .map(|loader| Endless { loader, epoch: 0 });
-    let (mut there, mut here) = (vec![], vec![]);
+    let (mut remote, mut local) = (vec![], vec![]);
     for _ in 0..=config.pairs {
-        there.push(loaders[0].turn(config)?);
-        here.push(loaders[1].turn(config)?);
+        remote.push(loaders[0].turn(config)?);
+        local.push(loaders[1].turn(config)?);
     }
-    // The first turn of each warms up.
-    let beside = "this machine's disk".to_owned();
-    let row =
-        DataBenchRow::new("load", format!("lance, jpeg, from {place}"), beside, there.split_off(1), here.split_off(1));
+    // The first turn of each is a warm-up.
+    let beside = "the local disk".to_owned();
+    let row = DataBenchRow::new(
+        "load",
+        format!("lance, jpeg, from {folder}"),
+        beside,
+        remote.split_off(1),
+        local.split_off(1),
+    );
     Ok(Some(row))
 }
 
-/// A loader that begins anew where an epoch ends.
+/// A loader that repeats epochs.
 struct Endless {
     loader: Loader,
     epoch: u64,
 }
 
 impl Endless {
-    /// Loads for about so long, after one batch that is not counted: clips a second.
+    /// Loads for about `config.seconds`, after one batch that is not counted; returns clips per second.
     fn turn(&mut self, config: &DataBenchConfig) -> Result<f64> {
         self.epoch += 1;
         let mut batches = (self.epoch..).flat_map(|epoch| self.loader.epoch(epoch, 0));
@@ -386,7 +392,7 @@ impl Endless {
     }
 }
 
-/// One whole epoch.
+/// Loads one epoch.
 fn epoch(reader: &Arc<dyn Reader>, config: &DataBenchConfig, epoch: u64) -> Result<()> {
     for batch in loader(reader, config, CacheConfig::Off)?.epoch(epoch, 0) {
         batch?;
@@ -394,7 +400,7 @@ fn epoch(reader: &Arc<dyn Reader>, config: &DataBenchConfig, epoch: u64) -> Resu
     Ok(())
 }
 
-/// Bytes of memory this process holds, where the system tells.
+/// The resident memory of this process in bytes, on systems that report it.
 fn resident() -> Option<u64> {
     let status = std::fs::read_to_string("/proc/self/status").ok()?;
     let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;
@@ -407,14 +413,14 @@ fn converting(
     verify: bool,
     source: &Path,
     layout: &Layout,
-    place: &Path,
+    folder: &Path,
     config: &DataBenchConfig,
     mut reference: Option<&mut Reference>,
 ) -> Result<DataBenchRow> {
     let (mut ours, mut theirs) = (vec![], vec![]);
-    let mut beside = if reference.is_some() { layout.beside.to_owned() } else { "not compared".to_owned() };
-    std::fs::create_dir_all(place).map_err(|e| Error::io(place, "making a folder", e))?;
-    let (our_place, their_place) = (place.join(layout.place), place.join(layout.their_place));
+    let mut beside = if reference.is_some() { layout.reference_format.to_owned() } else { "not compared".to_owned() };
+    std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating a folder", e))?;
+    let (our_path, reference_path) = (folder.join(layout.file), folder.join(layout.reference_file));
     for _ in 0..config.pairs {
         let options = ConvertOptions {
             format: Some(layout.format.to_owned()),
@@ -424,10 +430,10 @@ fn converting(
             ..ConvertOptions::default()
         };
         let begun = Instant::now();
-        convert(&open(source)?, &Location::from(&our_place), &options, &mut Control::new())?;
+        convert(&open(source)?, &Location::from(&our_path), &options, &mut Control::new())?;
         ours.push(1.0 / begun.elapsed().as_secs_f64());
-        if let Some(asked) = &mut reference {
-            match asked.convert(source, layout.beside, &their_place) {
+        if let Some(process) = &mut reference {
+            match process.convert(source, layout.reference_format, &reference_path) {
                 Ok(rate) => theirs.push(rate),
                 Err(error) => {
                     beside = format!("not compared: {error}");

@@ -1,10 +1,6 @@
-//! How fast worlds are, beside the reference implementation where it is installed.
-//!
-//! Ours and the reference's turns alternate within one run, so that both meet the same machine, and what is
-//! reported is the median of the ratios of neighbouring turns. Absolute figures mean little on a shared machine;
-//! ratios hold.
+//! `bench envs`: environment steps per second, with and without rendering, and while collecting.
 
-use crate::reference::{REFERENCE_PYTHON, Reference, Size, not_compared, reference_python};
+use crate::reference::{Reference, Size, not_compared, reference_python};
 use serde::Serialize;
 use std::fmt;
 use std::path::{Path, PathBuf};
@@ -16,19 +12,18 @@ use swm_core::{
     Action, ColumnIndices, EnvChoice, Error, Key, RandomPolicy, ResetOptions, Result, Space, VariationRequest,
 };
 use swm_data::{ImageCodec, WriteOptions, create};
-use swm_eval::world::{episode_key, reset_seed};
-use swm_eval::{CollectConfig, World, WorldConfig};
+use swm_eval::{CollectConfig, World, WorldConfig, episode_key, reset_seed};
 
-/// What to measure.
+/// Settings of the benchmark.
 #[derive(Clone, Debug)]
 pub struct BenchConfig {
     /// Environments of a world.
     pub envs: usize,
-    /// Sides of the square pictures, in pixels.
+    /// The side lengths of the square frames, in pixels.
     pub sizes: Vec<usize>,
-    /// Whether to measure without pictures, too.
+    /// Whether to measure stepping without frames, too.
     pub bare: bool,
-    /// Worker threads; as many as the machine offers for 0. The reference steps on one thread.
+    /// Worker threads; as many as the machine has cores for 0. The reference steps on one thread.
     pub threads: usize,
     /// Pairs of turns, ours and the reference's.
     pub pairs: usize,
@@ -36,19 +31,19 @@ pub struct BenchConfig {
     pub seconds: f64,
     /// Steps of an episode.
     pub episode_steps: usize,
-    /// Episodes the reference collects in a turn, none to leave collecting out. Ours collects `OURS_MORE` times
-    /// as many, so that both turns are long enough to measure.
+    /// Episodes the reference collects in a turn; 0 skips collecting. Our side collects `EPISODE_FACTOR` times as many, so that
+    /// both turns are long enough to measure.
     pub episodes: usize,
-    /// A Python with the reference, if there is one.
+    /// A Python with the reference implementation, if any.
     pub python: Option<PathBuf>,
 }
 
-/// How many times more episodes ours collects in a turn than the reference, so that both turns last about as long.
-const OURS_MORE: usize = 32;
+/// The number of episodes our side collects for each one of the reference, so that both turns take about as long.
+const EPISODE_FACTOR: usize = 32;
 
 impl Default for BenchConfig {
-    /// The setting of the reference's own figures: 8 environments at 224 pixels. The reference is the one of
-    /// [`REFERENCE_PYTHON`].
+    /// The settings of the reference's published rates: 8 environments at 224 pixels. The reference is that of
+    /// [`REFERENCE_PYTHON`](crate::REFERENCE_PYTHON).
     fn default() -> Self {
         Self {
             envs: 8,
@@ -64,45 +59,46 @@ impl Default for BenchConfig {
     }
 }
 
-/// What was measured.
+/// The result of the benchmark.
 #[derive(Clone, Debug, Serialize)]
 pub struct BenchReport {
     /// Environments of a world.
     pub envs: usize,
-    /// Worker threads of ours.
+    /// Worker threads of our side.
     pub threads: usize,
-    /// The reference's version, or why it is not compared.
+    /// The version of the reference, or the reason why it is not compared.
     pub reference: String,
-    /// One entry an environment, size and activity.
+    /// One entry for each environment, frame size and kind of work.
     pub rows: Vec<BenchRow>,
 }
 
-/// One environment at one size doing one thing.
+/// The rate of one environment at one frame size and one kind of work.
 #[derive(Clone, Debug, Serialize)]
 pub struct BenchRow {
     /// The environment.
     pub env: String,
-    /// What was done: `step + render`, `collect` into Lance with a codec, `step` without pictures, or `step` on one
-    /// thread without a world around it.
+    /// The kind of work: `step + render`, `collect` to Lance with a codec, `step` without frames, or `step` of a single
+    /// environment on one thread.
     pub what: &'static str,
-    /// The side of the pictures, in pixels; none where nothing is drawn.
+    /// The side length of the frames, in pixels; none without frames.
     pub size: Option<usize>,
-    /// Environment steps a second in each of our turns.
+    /// Environment steps per second in each of our turns.
     pub ours: Vec<f64>,
-    /// Environment steps a second in each of the reference's turns; empty without it.
+    /// Environment steps per second in each turn of the reference; empty without it.
     pub reference: Vec<f64>,
     /// The median of our turns.
     pub steps_per_second: f64,
-    /// The median ratio of neighbouring turns: how many times faster ours is.
+    /// The median ratio of neighbouring turns: our rate divided by that of the reference.
     pub ratio: Option<f64>,
 }
 
-/// Measures stepping with rendering and collecting into Lance for every environment and size, and stepping without
-/// pictures for every environment.
+/// Measures stepping with rendering and collecting to Lance for every environment and size, and stepping without frames for every
+/// environment.
 ///
 /// # Errors
-/// When a number makes no sense, a world fails, or the reference fails after it had started. A reference that does
-/// not start is no error: [`BenchReport::reference`] says why.
+/// When a setting is invalid, a world fails, or the reference fails after its start. A reference that does not start is not an
+/// error: [`BenchReport::reference`] contains the reason.
+#[allow(clippy::too_many_lines, reason = "the list of all measurements, in order")]
 pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchReport> {
     if config.pairs == 0 || !(config.seconds > 0.0 && config.seconds.is_finite()) {
         let given = format!("{} pairs of turns of {} seconds", config.pairs, config.seconds);
@@ -116,7 +112,7 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
     };
     for env in choices {
         if config.bare {
-            let mut reference = report.start(env, 64, config);
+            let mut reference = report.start_reference(env, 64, config);
             let mut ours = Ours::new(env, None, config)?;
             ours.step(config.seconds / 4.0)?;
             report.rows.push(BenchRow::measure(
@@ -132,14 +128,14 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
                 None,
                 "step, one thread",
                 config.pairs,
-                |turn| alone(env, turn as u64, config),
+                |turn| single(env, turn as u64, config),
                 reference.as_mut().map(|reference| |_| reference.bare(config.seconds)),
             )?);
         }
         for &size in &config.sizes {
-            let mut reference = report.start(env, size, config);
+            let mut reference = report.start_reference(env, size, config);
             let mut ours = Ours::new(env, Some(size), config)?;
-            // The first turn of each warms up and is not counted.
+            // The first turn of each side is a warm-up and is not counted.
             ours.step(config.seconds / 4.0)?;
             reference.as_mut().map(|reference| reference.step(config.seconds / 4.0)).transpose()?;
             report.rows.push(BenchRow::measure(
@@ -154,14 +150,14 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
                 continue;
             }
             let folder =
-                tempfile::tempdir().map_err(|e| Error::io("a temporary folder", "making it for datasets", e))?;
-            let path = |who: &str, turn: usize| folder.path().join(format!("{who}-{turn}.lance"));
-            let more = CollectConfig {
-                episodes: config.episodes * OURS_MORE,
+                tempfile::tempdir().map_err(|e| Error::io("a temporary folder", "creating it for datasets", e))?;
+            let path = |side: &str, turn: usize| folder.path().join(format!("{side}-{turn}.lance"));
+            let collect = CollectConfig {
+                episodes: config.episodes * EPISODE_FACTOR,
                 policy: "random".to_owned(),
                 ..CollectConfig::default()
             };
-            // The reference stores JPEG of quality 95; ours does by default what is lossless, or the same on request.
+            // The reference stores JPEG of quality 95; our default codec is lossless.
             let codecs =
                 [("qoi", "collect, qoi", ImageCodec::Qoi), ("jpeg", "collect, jpeg", ImageCodec::Jpeg { quality: 95 })];
             for (name, what, codec) in codecs {
@@ -171,7 +167,7 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
                     what,
                     config.pairs,
                     |turn| {
-                        let config = CollectConfig { seed: turn as u64, ..more.clone() };
+                        let config = CollectConfig { seed: turn as u64, ..collect.clone() };
                         ours.collect(&path(&format!("ours-{name}"), turn), codec, config)
                     },
                     reference.as_mut().map(|reference| {
@@ -187,7 +183,7 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
     Ok(report)
 }
 
-/// Our side: a world and a random policy.
+/// Our side of the benchmark: a world and a random policy.
 struct Ours {
     world: World,
     policy: RandomPolicy,
@@ -214,7 +210,7 @@ impl Ours {
         Ok(Self { world, policy, active: vec![true; config.envs], episodes: config.envs, done: vec![] })
     }
 
-    /// Steps with random actions for about so long: environment steps a second.
+    /// Steps with random actions for about `seconds`; returns environment steps per second.
     fn step(&mut self, seconds: f64) -> Result<f64> {
         let columns = ColumnIndices::of(self.world.pool().infos().schema())?;
         let ended = [columns.terminated, columns.truncated];
@@ -243,7 +239,7 @@ impl Ours {
         Ok(steps as f64 / elapsed)
     }
 
-    /// Collects into a Lance dataset: environment steps a second, everything committed.
+    /// Collects a Lance dataset, including the commit; returns environment steps per second.
     fn collect(&mut self, path: &Path, codec: ImageCodec, config: CollectConfig) -> Result<f64> {
         let begun = Instant::now();
         let manifest = Some(self.world.collect_manifest(&config));
@@ -251,15 +247,15 @@ impl Ours {
         let writer = create(path, &self.world.collect_schema(false)?, options)?;
         let collected = self.world.collect(&mut self.policy, writer, &config, &mut Control::default())?;
         let rate = collected.steps as f64 / begun.elapsed().as_secs_f64();
-        // What comes next steps on from running episodes, as it did before.
+        // The next turn of stepping starts from running episodes.
         self.world.reset(0, &VariationRequest::default())?;
         Ok(rate)
     }
 }
 
 impl BenchReport {
-    /// The reference with a world of this size, where there is one; says why where there is not.
-    fn start(&mut self, env: &EnvChoice, size: usize, config: &BenchConfig) -> Option<Reference> {
+    /// Starts the reference with a world of this size, if possible; otherwise stores the reason.
+    fn start_reference(&mut self, env: &EnvChoice, size: usize, config: &BenchConfig) -> Option<Reference> {
         let wanted =
             Size { env: &env.id(), envs: config.envs, image: (size, size), episode_steps: config.episode_steps };
         match Reference::start(config.python.as_ref()?, wanted) {
@@ -275,18 +271,16 @@ impl BenchReport {
     }
 }
 
-/// Environment steps a second of one environment on this thread, nothing observed, random actions drawn beforehand.
-fn alone(env: &EnvChoice, seed: u64, config: &BenchConfig) -> Result<f64> {
+/// Environment steps per second of a single environment on this thread, without observations, with precomputed random actions.
+fn single(env: &EnvChoice, seed: u64, config: &BenchConfig) -> Result<f64> {
     const ACTIONS: usize = 4096;
-    /// Steps between two looks at the clock.
+    /// Steps between two readings of the clock.
     const ROUND: usize = 1000;
     let mut env = env.env()?;
     let space = env.spec().action_space.clone();
     let mut rng = Key::new(seed).with("bench").rng();
     let drawn: Vec<Vec<f64>> = (0..ACTIONS).map(|_| space.sample(&mut rng)).collect();
-    #[allow(clippy::cast_possible_truncation)]
-    let numbers: Vec<Vec<f32>> = drawn.iter().map(|action| action.iter().map(|&v| v as f32).collect()).collect();
-    #[allow(clippy::cast_possible_truncation)]
+    let values: Vec<Vec<f32>> = drawn.iter().map(|action| action.iter().map(|&v| v as f32).collect()).collect();
     let choices: Vec<Vec<i64>> = drawn.iter().map(|action| action.iter().map(|&v| v as i64).collect()).collect();
     let continuous = matches!(space, Space::Box { .. });
     let (mut steps, mut episode, mut in_episode) = (0, 0, 0);
@@ -295,7 +289,7 @@ fn alone(env: &EnvChoice, seed: u64, config: &BenchConfig) -> Result<f64> {
     loop {
         for i in 0..ROUND {
             let i = (steps + i) % ACTIONS;
-            let action = if continuous { Action::Continuous(&numbers[i]) } else { Action::Discrete(&choices[i]) };
+            let action = if continuous { Action::Continuous(&values[i]) } else { Action::Discrete(&choices[i]) };
             in_episode += 1;
             if env.step(action)?.terminated || in_episode == config.episode_steps {
                 episode += 1;
@@ -312,7 +306,7 @@ fn alone(env: &EnvChoice, seed: u64, config: &BenchConfig) -> Result<f64> {
 }
 
 impl BenchRow {
-    /// Alternates turns of ours and, where there is one, of the reference. A turn is given its number.
+    /// Alternates turns of both sides; `ours` and `reference` receive the index of the turn.
     fn measure(
         env: &EnvChoice,
         size: Option<usize>,

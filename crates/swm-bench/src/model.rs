@@ -1,9 +1,7 @@
-//! How fast a LeWM is, beside the reference's with the same weights: a plan, the costs of one iteration, encoding a picture,
-//! a training step.
+//! `bench plan` and `bench train`: the time of a LeWM for planning, evaluating candidates, encoding, and a training step.
 //!
-//! As in [`bench`](mod@crate::envs), turns of ours and of the reference's alternate, and the figure that counts is the
-//! median of the ratios of neighbouring turns; here it is the share of the reference's time that ours takes. Where both
-//! come to numbers, those are compared.
+//! The reference runs with the same weights. The reported ratio is our time divided by that of the reference. Outputs of both
+//! sides are compared where they are deterministic.
 
 use crate::reference::{Reference, not_compared};
 use serde::Serialize;
@@ -13,22 +11,22 @@ use std::time::Instant;
 use swm_core::results::Summary;
 use swm_core::{Error, Result};
 
-/// Something a model does.
+/// The work of a model that is measured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Work {
-    /// A whole plan: start and goal are encoded, then all iterations.
+    /// A whole plan: encoding start and goal, then all iterations.
     Plan,
     /// The costs of the candidates of one iteration.
     Cost,
-    /// One picture to its latent.
+    /// Encoding one frame.
     Encode,
-    /// One step of training with its optimizer.
+    /// One training step, including the optimizer.
     Train,
 }
 
 impl Work {
-    /// What the reference's process calls it.
+    /// The name in the protocol of the reference's process.
     pub fn name(self) -> &'static str {
         match self {
             Self::Plan => "plan",
@@ -38,65 +36,65 @@ impl Work {
         }
     }
 
-    /// Whether both sides come to the same numbers.
+    /// Whether the outputs of both sides are compared.
     fn is_compared(self) -> bool {
         matches!(self, Self::Cost | Self::Encode)
     }
 }
 
-/// A model of ours that is measured.
+/// A model to measure.
 pub trait Subject {
-    /// Does a work once; returns the numbers it comes to, or none where they depend on draws.
+    /// Does a work once; returns its outputs, or an empty list if they are random.
     ///
     /// # Errors
     /// When the model fails.
     fn run(&mut self, work: Work) -> Result<Vec<f32>>;
 }
 
-/// What to measure.
+/// Settings of the benchmark.
 #[derive(Clone, Debug)]
 pub struct ModelBenchConfig {
-    /// Works and how often each is done in a turn.
+    /// The works, each with the number of repetitions in a turn.
     pub works: Vec<(Work, usize)>,
     /// Pairs of turns, ours and the reference's.
     pub pairs: usize,
-    /// The sizes of the model as the reference's process reads them.
+    /// The sizes of the model, in the form that the reference's process reads.
     pub sizes: serde_json::Value,
-    /// A Python with the reference, if there is one.
+    /// A Python with the reference implementation, if any.
     pub python: Option<PathBuf>,
 }
 
-/// What was measured.
+/// The result of the benchmark.
 #[derive(Clone, Debug, Serialize)]
 pub struct ModelBenchReport {
-    /// The reference's version, or why it is not compared.
+    /// The version of the reference, or the reason why it is not compared.
     pub reference: String,
-    /// One entry a work.
+    /// One entry for each work.
     pub rows: Vec<ModelBenchRow>,
 }
 
-/// One work.
+/// The measurements of one work.
 #[derive(Clone, Debug, Serialize)]
 pub struct ModelBenchRow {
-    /// Which.
+    /// The work.
     pub work: Work,
-    /// Seconds in each of our turns, for the work done once.
+    /// Seconds per repetition in each of our turns.
     pub ours: Vec<f64>,
-    /// The same of the reference's turns; empty without it.
+    /// The same in each turn of the reference; empty without it.
     pub reference: Vec<f64>,
     /// The median of our turns.
     pub seconds: f64,
-    /// The median share of neighbouring turns: what ours takes of the reference's time.
+    /// The median ratio of neighbouring turns: our time divided by that of the reference.
     pub share: Option<f64>,
-    /// The largest difference of the numbers both come to, relative to the largest of them.
+    /// The largest difference between the outputs of both sides, relative to the largest output.
     pub difference: Option<f32>,
 }
 
-/// Measures a model; `weights` is a file with its weights and inputs, which the reference's process reads.
+/// Measures a model; `weights` is a file with its weights and inputs for the reference's process.
 ///
 /// # Errors
-/// When there is no turn, a work fails, or the reference fails after it had started. A reference that does not start is no
-/// error: [`ModelBenchReport::reference`] says why.
+/// When there are no turns, a work fails, or the reference fails after its start. A reference that does not start is not an error:
+/// [`ModelBenchReport::reference`] contains the reason.
 pub fn bench_model(config: &ModelBenchConfig, weights: &Path, subject: &mut dyn Subject) -> Result<ModelBenchReport> {
     if config.pairs == 0 || config.works.iter().any(|(_, count)| *count == 0) {
         return Err(Error::config("turns of a benchmark", "0", "ask for at least 1"));
@@ -113,10 +111,10 @@ pub fn bench_model(config: &ModelBenchConfig, weights: &Path, subject: &mut dyn 
         }
     }
     for &(work, count) in &config.works {
-        // The first time warms up and is not counted; where numbers come out, they are compared.
-        let numbers = subject.run(work)?;
+        // The first repetition is a warm-up and is not counted.
+        let outputs = subject.run(work)?;
         let difference = match &mut reference {
-            Some(reference) if work.is_compared() => Some(difference(&numbers, &reference.numbers(work.name())?)?),
+            Some(reference) if work.is_compared() => Some(difference(&outputs, &reference.outputs(work.name())?)?),
             Some(reference) => {
                 reference.run(work.name(), 1)?;
                 None
@@ -147,14 +145,14 @@ pub fn bench_model(config: &ModelBenchConfig, weights: &Path, subject: &mut dyn 
     Ok(report)
 }
 
-/// The largest difference, relative to the largest number.
+/// The largest difference, relative to the largest output of the reference.
 fn difference(ours: &[f32], theirs: &[f32]) -> Result<f32> {
     if ours.len() != theirs.len() {
-        let (given, expected) = (format!("{} numbers", ours.len()), format!("the reference's {}", theirs.len()));
+        let (given, expected) = (format!("{} values", ours.len()), format!("{}, as the reference", theirs.len()));
         return Err(Error::mismatch("comparing with the reference", given, expected));
     }
-    let largest = theirs.iter().fold(f32::MIN_POSITIVE, |most, number| number.abs().max(most));
-    // `max` would pass over a number that is none.
+    let largest = theirs.iter().fold(f32::MIN_POSITIVE, |most, value| value.abs().max(most));
+    // `max` would discard NaN.
     let apart = ours.iter().zip(theirs).map(|(a, b)| (a - b).abs());
     Ok(apart.fold(0.0, |most, apart| if apart > most || apart.is_nan() { apart } else { most }) / largest)
 }
@@ -169,7 +167,7 @@ impl fmt::Display for ModelBenchReport {
                 write!(f, ", {share:.2} x the reference's {:.1} ms (median of {turns})", 1e3 * theirs.median)?;
             }
             if let Some(difference) = row.difference {
-                write!(f, ", numbers differ by {difference:.1e}")?;
+                write!(f, ", outputs differ by {difference:.1e}")?;
             }
             writeln!(f)?;
         }
@@ -182,7 +180,7 @@ mod tests {
     use super::*;
     use crate::REFERENCE_PYTHON;
 
-    /// Comes to 1 and 2.
+    /// A subject with the outputs 1 and 2.
     struct Constant;
 
     impl Subject for Constant {
@@ -201,7 +199,7 @@ mod tests {
     }
 
     #[test]
-    fn without_the_reference_it_says_so() {
+    fn report_states_that_the_reference_is_missing() {
         let report = bench_model(&config(None), Path::new("none"), &mut Constant).expect("a report");
         assert!(report.to_string().contains(REFERENCE_PYTHON));
         assert_eq!(report.rows.len(), 2);
@@ -212,12 +210,11 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn times_and_numbers_are_compared() {
+    fn times_and_outputs_are_compared() {
         use std::os::unix::fs::PermissionsExt as _;
         let folder = tempfile::tempdir().expect("a folder");
         let python = folder.path().join("python");
-        // Stands in for Python with the reference: two works in a second, and numbers of which one is off by a tenth of
-        // the largest.
+        // A fake reference: two repetitions per second, and an output that differs by a fifth of the largest.
         let script = "#!/bin/sh\necho SWM ready 1.2.3\nwhile read what rest; do\n\
             if [ $what = run ]; then echo SWM 2 1.0; else echo SWM 1.0 2.5; fi; done\n";
         std::fs::write(&python, script).expect("a file");
@@ -230,11 +227,11 @@ mod tests {
             let shares: Vec<f64> = row.ours.iter().map(|seconds| seconds / 0.5).collect();
             assert_eq!(row.share, Summary::of(&shares).map(|shares| shares.median));
         }
-        assert!(report.to_string().contains("numbers differ by 2.0e-1"), "{report}");
+        assert!(report.to_string().contains("outputs differ by 2.0e-1"), "{report}");
     }
 
     #[test]
-    fn what_is_no_number_is_a_difference() {
+    fn nan_is_a_difference() {
         assert!(difference(&[f32::NAN, 1.0], &[1.0, 1.0]).expect("two").is_nan());
         assert!(difference(&[1.0], &[1.0, 1.0]).is_err());
     }

@@ -1,9 +1,6 @@
-//! How fast planning is: the sampling and update step of CEM beside the reference's where it is installed, and what a
-//! planner takes beside its model.
+//! `bench plan`: iterations of CEM per second, without the time of a model.
 //!
-//! As in [`bench`](mod@crate::envs), turns of ours and of the reference's alternate, and the figure that counts is the
-//! median of the ratios of neighbouring turns. The model of both is free: it answers with costs that were drawn before,
-//! so that nothing but the planner is measured.
+//! The model of both sides returns precomputed random costs, so that only sampling and updates are measured.
 
 use crate::reference::{Reference, not_compared, reference_python};
 use rand::Rng as _;
@@ -16,33 +13,33 @@ use swm_core::results::Summary;
 use swm_core::{Batch, Candidates, CostModel, Error, Key, PlanProblem, PlanSpace, Result, Solver};
 use swm_plan::Cem;
 
-/// What to measure.
+/// Settings of the benchmark.
 #[derive(Clone, Debug)]
 pub struct PlanBenchConfig {
-    /// Environments planned in one call, one row each.
+    /// The numbers of environments planned in one call; one row each.
     pub envs: Vec<usize>,
     /// Candidates, iterations, elites.
     pub cem: Cem,
     /// Model steps of a plan.
     pub horizon: usize,
-    /// Numbers of a model step.
+    /// The dimension of a model step.
     pub dim: usize,
-    /// Seconds a model takes for the candidates of one environment in one iteration, beside which the planner's own time
-    /// is told.
+    /// The time of a model for the candidates of one environment in one iteration, in seconds, which the planner's time is
+    /// compared with.
     pub model_seconds: f64,
-    /// Worker threads; as many as the machine offers for 0. The reference uses as many as torch chooses.
+    /// Worker threads; as many as the machine has cores for 0. The reference uses torch's default.
     pub threads: usize,
     /// Pairs of turns, ours and the reference's.
     pub pairs: usize,
     /// Seconds of a turn.
     pub seconds: f64,
-    /// A Python with the reference, if there is one.
+    /// A Python with the reference implementation, if any.
     pub python: Option<PathBuf>,
 }
 
 impl Default for PlanBenchConfig {
-    /// The paper's setting: 300 candidates, 30 iterations, 5 model steps of 5 actions of 2 numbers; for one environment
-    /// and for 16. The model takes as long as the fastest LeWM we aim at, on two cores.
+    /// The paper's settings: 300 candidates, 30 iterations, 5 model steps of 5 actions of dimension 2; for 1 and for 16
+    /// environments. The model time is that of the fastest LeWM we aim at, on two cores.
     fn default() -> Self {
         Self {
             envs: vec![1, 16],
@@ -58,47 +55,47 @@ impl Default for PlanBenchConfig {
     }
 }
 
-/// What was measured.
+/// The result of the benchmark.
 #[derive(Clone, Debug, Serialize)]
 pub struct PlanBenchReport {
-    /// Candidates an iteration.
+    /// Candidates per iteration.
     pub samples: usize,
     /// Iterations of a plan.
     pub iterations: usize,
     /// Model steps of a plan.
     pub horizon: usize,
-    /// Numbers of a model step.
+    /// The dimension of a model step.
     pub dim: usize,
-    /// Worker threads of ours.
+    /// Worker threads of our side.
     pub threads: usize,
-    /// The reference's version, or why it is not compared.
+    /// The version of the reference, or the reason why it is not compared.
     pub reference: String,
-    /// One entry a number of environments.
+    /// One entry for each number of environments.
     pub rows: Vec<PlanBenchRow>,
 }
 
-/// Planning for some environments in one call.
+/// The rate of planning for a number of environments in one call.
 #[derive(Clone, Debug, Serialize)]
 pub struct PlanBenchRow {
     /// Environments planned in one call.
     pub envs: usize,
-    /// Iterations a second in each of our turns.
+    /// Iterations per second in each of our turns.
     pub ours: Vec<f64>,
-    /// Iterations a second in each of the reference's turns; empty without it.
+    /// Iterations per second in each turn of the reference; empty without it.
     pub reference: Vec<f64>,
     /// The median of our turns.
     pub iterations_per_second: f64,
-    /// The median ratio of neighbouring turns: how many times faster ours is.
+    /// The median ratio of neighbouring turns: our rate divided by that of the reference.
     pub ratio: Option<f64>,
-    /// The planner's own time as a share of the model's, with a model of [`PlanBenchConfig::model_seconds`].
+    /// The planner's time divided by [`PlanBenchConfig::model_seconds`].
     pub overhead: f64,
 }
 
-/// Measures CEM with a model that costs nothing.
+/// Measures CEM with a model that takes no time.
 ///
 /// # Errors
-/// When a number makes no sense, or the reference fails after it had started. A reference that does not start is no
-/// error: [`PlanBenchReport::reference`] says why.
+/// When a setting is invalid, or the reference fails after its start. A reference that does not start is not an error:
+/// [`PlanBenchReport::reference`] contains the reason.
 pub fn bench_plan(config: &PlanBenchConfig) -> Result<PlanBenchReport> {
     let positive = |seconds: f64| seconds > 0.0 && seconds.is_finite();
     if config.pairs == 0 || !positive(config.seconds) || !positive(config.model_seconds) {
@@ -135,7 +132,7 @@ pub fn bench_plan(config: &PlanBenchConfig) -> Result<PlanBenchReport> {
             }
         }
         let mut planning = Planning::new(config, envs);
-        // The first turn of each warms up and is not counted.
+        // The first turn of each side is a warm-up and is not counted.
         workers.install(|| planning.solve(config.seconds / 4.0))?;
         reference.as_mut().map(|reference| reference.solve(config.seconds / 4.0)).transpose()?;
         let (mut ours, mut theirs) = (vec![], vec![]);
@@ -159,11 +156,11 @@ pub fn bench_plan(config: &PlanBenchConfig) -> Result<PlanBenchReport> {
     Ok(report)
 }
 
-/// CEM and a free model.
+/// CEM with a model of precomputed costs.
 struct Planning<'a> {
     config: &'a PlanBenchConfig,
     cem: Cem,
-    model: Free,
+    model: PrecomputedCosts,
     keys: Vec<Key>,
     low: Vec<f32>,
     high: Vec<f32>,
@@ -177,15 +174,15 @@ impl<'a> Planning<'a> {
         let costs = (0..config.cem.iterations)
             .map(|_| (0..envs * config.cem.samples).map(|_| rng.random()).collect())
             .collect();
-        // The reference clips nothing; ours is given bounds, as every environment gives them.
+        // Our side clips to bounds, because every environment has bounds; the reference does not clip.
         let (low, high) = (vec![-1.0; config.dim], vec![1.0; config.dim]);
         let keys = (0..envs).map(|env| Key::new(env as u64)).collect();
-        Self { config, cem: config.cem.clone(), model: Free { costs, asked: 0 }, keys, low, high, plans: 0 }
+        Self { config, cem: config.cem.clone(), model: PrecomputedCosts { costs, calls: 0 }, keys, low, high, plans: 0 }
     }
 
-    /// Plans for about so long: iterations a second.
+    /// Plans for about `seconds`; returns iterations per second.
     fn solve(&mut self, seconds: f64) -> Result<f64> {
-        self.model.asked = 0;
+        self.model.calls = 0;
         let begun = Instant::now();
         let elapsed = loop {
             let keys: Vec<Key> = self.keys.iter().map(|key| key.at(self.plans)).collect();
@@ -199,25 +196,25 @@ impl<'a> Planning<'a> {
                 break elapsed;
             }
         };
-        Ok(self.model.asked as f64 / elapsed)
+        Ok(self.model.calls as f64 / elapsed)
     }
 }
 
-/// A model whose costs are drawn once; asking for them takes no time.
-struct Free {
-    /// The costs of each iteration.
+/// A model with precomputed random costs.
+struct PrecomputedCosts {
+    /// The costs of each iteration, `[iterations][envs * samples]`.
     costs: Vec<Vec<f32>>,
-    asked: usize,
+    calls: usize,
 }
 
-impl CostModel for Free {
+impl CostModel for PrecomputedCosts {
     fn observe(&mut self, _: &Batch, _: &[usize]) -> Result<()> {
         Ok(())
     }
 
     fn cost(&mut self, _: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
-        costs.copy_from_slice(&self.costs[self.asked % self.costs.len()]);
-        self.asked += 1;
+        costs.copy_from_slice(&self.costs[self.calls % self.costs.len()]);
+        self.calls += 1;
         Ok(())
     }
 }
@@ -226,7 +223,7 @@ impl fmt::Display for PlanBenchReport {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(
             f,
-            "CEM, {} candidates x {} iterations x {} steps of {} numbers, {} threads; reference: {}",
+            "CEM, {} candidates x {} iterations x {} steps of dimension {}, {} threads; reference: {}",
             self.samples, self.iterations, self.horizon, self.dim, self.threads, self.reference
         )?;
         for row in &self.rows {
@@ -259,7 +256,7 @@ mod tests {
     }
 
     #[test]
-    fn without_the_reference_it_says_so() {
+    fn report_states_that_the_reference_is_missing() {
         let report = bench_plan(&config()).expect("a report");
         assert!(report.reference.contains(REFERENCE_PYTHON));
         assert_eq!(report.rows.iter().map(|row| row.envs).collect::<Vec<_>>(), [1, 3]);
@@ -274,11 +271,11 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn ratios_are_those_of_neighbouring_turns() {
+    fn ratio_is_the_median_of_neighbouring_turns() {
         use std::os::unix::fs::PermissionsExt as _;
         let folder = tempfile::tempdir().expect("a folder");
         let python = folder.path().join("python");
-        // Stands in for Python with the reference: chats, then answers 10 iterations in 2 seconds to everything.
+        // A fake reference: prints other text, then answers every request with 10 iterations in 2 seconds.
         let script = "#!/bin/sh\necho hello\necho SWM ready 1.2.3\nwhile read line; do echo SWM 10 2.0; done\n";
         std::fs::write(&python, script).expect("a file");
         std::fs::set_permissions(&python, std::fs::Permissions::from_mode(0o755)).expect("executable");
@@ -292,7 +289,7 @@ mod tests {
     }
 
     #[test]
-    fn a_benchmark_of_nothing_is_refused() {
+    fn invalid_settings_are_errors() {
         assert!(bench_plan(&PlanBenchConfig { pairs: 0, ..config() }).is_err());
         assert!(bench_plan(&PlanBenchConfig { seconds: f64::NAN, ..config() }).is_err());
         assert!(bench_plan(&PlanBenchConfig { model_seconds: 0.0, ..config() }).is_err());

@@ -1,25 +1,24 @@
-//! How many pictures a second worlds draw, by environment, size and renderer.
+//! `bench render`: frames per second of one environment, by environment, size and renderer.
 //!
-//! One environment, on one thread unless more are asked for: what a core draws, or what one gets where there is but one environment.
-//! Renderers take turns within one run, so that all meet the same machine, and
-//! the median of the turns counts. The world takes a step between two pictures, whose time is not counted.
+//! Renderers take turns within one run; the median of the turns is reported. The environment steps between two frames; the time
+//! of the step is not counted.
 
 use serde::Serialize;
 use std::time::{Duration, Instant};
 use swm_core::results::Summary;
 use swm_core::{Action, Env, EnvChoice, FrameMut, Key, ResetOptions, Result, Space, thread_budget};
-use swm_eval::world::episode_key;
+use swm_eval::episode_key;
 
-/// What to measure.
+/// Settings of the benchmark.
 #[derive(Clone, Debug)]
 pub struct RenderBenchConfig {
-    /// Sides of the square pictures, in pixels.
+    /// The side lengths of the square frames, in pixels.
     pub sizes: Vec<usize>,
     /// Turns of every renderer.
     pub turns: usize,
     /// Seconds of a turn.
     pub seconds: f64,
-    /// Threads that a picture may be drawn on.
+    /// Threads that may render a frame together.
     pub threads: usize,
 }
 
@@ -29,28 +28,29 @@ impl Default for RenderBenchConfig {
     }
 }
 
-/// A way to draw: runs what it is given so that pictures are drawn in this way.
+/// A renderer: calls its argument so that frames are rendered with it.
 pub type Drawing<'a> = dyn Fn(&mut dyn FnMut() -> Result<()>) -> Result<()> + 'a;
 
-/// Pictures a second.
+/// The rate of one renderer.
 #[derive(Clone, Debug, Serialize)]
 pub struct RenderRow {
     /// The environment.
     pub env: String,
-    /// The side of the pictures.
+    /// The side length of the frames, in pixels.
     pub size: usize,
-    /// What drew them.
+    /// The renderer.
     pub renderer: String,
-    /// On so many threads.
+    /// Threads that may render a frame together.
     pub threads: usize,
     /// The median of the turns.
-    pub pictures_per_second: f64,
+    #[serde(rename = "pictures_per_second")]
+    pub frames_per_second: f64,
 }
 
 /// Measures environments with every renderer.
 ///
 /// # Errors
-/// When an environment cannot be made, fails, or draws no pictures.
+/// When an environment cannot be created, fails, or does not render.
 pub fn bench_render(
     envs: &[EnvChoice],
     renderers: &[(String, &Drawing<'_>)],
@@ -67,23 +67,23 @@ pub fn bench_render(
                 for ((_, draw), speeds) in renderers.iter().zip(&mut speeds) {
                     let seed = episode_key(0, turn).seed() >> 1;
                     env.reset(seed, &ResetOptions::default())?;
-                    let (mut spent, mut pictures, mut step) = (Duration::ZERO, 0u32, 0);
-                    // The first picture prepares what is kept.
-                    let mut picture = |env: &mut dyn Env| {
-                        let mut drawn = || env.render(FrameMut::new(size, size, &mut rgb));
-                        thread_budget::with(config.threads, || draw(&mut drawn))
+                    let (mut spent, mut frames, mut step) = (Duration::ZERO, 0u32, 0);
+                    // The first frame, which fills caches, is not counted.
+                    let mut render = |env: &mut dyn Env| {
+                        let mut frame = || env.render(FrameMut::new(size, size, &mut rgb));
+                        thread_budget::with(config.threads, || draw(&mut frame))
                     };
-                    picture(&mut *env)?;
+                    render(&mut *env)?;
                     let begun = Instant::now();
                     while begun.elapsed().as_secs_f64() < config.seconds {
                         act(&mut *env, &space, step)?;
                         step += 1;
                         let before = Instant::now();
-                        picture(&mut *env)?;
+                        render(&mut *env)?;
                         spent += before.elapsed();
-                        pictures += 1;
+                        frames += 1;
                     }
-                    speeds.push(f64::from(pictures) / spent.as_secs_f64().max(1e-9));
+                    speeds.push(f64::from(frames) / spent.as_secs_f64().max(1e-9));
                 }
             }
             for ((renderer, _), speeds) in renderers.iter().zip(&speeds) {
@@ -93,7 +93,7 @@ pub fn bench_render(
                     size,
                     renderer: renderer.clone(),
                     threads: config.threads,
-                    pictures_per_second: median,
+                    frames_per_second: median,
                 });
             }
         }
@@ -101,14 +101,13 @@ pub fn bench_render(
     Ok(rows)
 }
 
-/// Takes a random step; begins again where an episode ends.
-#[allow(clippy::cast_possible_truncation)]
+/// Takes a random step, and resets at the end of an episode.
 fn act(env: &mut dyn Env, space: &Space, step: u64) -> Result<()> {
     let drawn = space.sample(&mut Key::new(1).at(step).rng());
-    let numbers: Vec<f32> = drawn.iter().map(|&x| x as f32).collect();
+    let values: Vec<f32> = drawn.iter().map(|&x| x as f32).collect();
     let choices: Vec<i64> = drawn.iter().map(|&x| x as i64).collect();
     let continuous = matches!(space, Space::Box { .. });
-    let taken = env.step(if continuous { Action::Continuous(&numbers) } else { Action::Discrete(&choices) })?;
+    let taken = env.step(if continuous { Action::Continuous(&values) } else { Action::Discrete(&choices) })?;
     if taken.terminated {
         env.reset(step, &ResetOptions::default())?;
     }

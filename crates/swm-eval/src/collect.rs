@@ -1,27 +1,28 @@
-//! Collecting: every episode a policy plays goes to a dataset.
+//! Collecting: writes every episode that a policy plays to a dataset.
 //!
-//! Episodes are numbered, and an episode's number decides everything in it: its seed is
-//! `Key::new(seed).with("episode").at(number).seed()` without the highest bit, and the policy draws from the same
-//! key. They are handed to the writer in the order of their numbers, whichever slot finishes first, so the
-//! dataset is the same bytes for any number of environments and threads, interrupted and resumed or not.
+//! An episode is determined by its number: its reset seed is `Key::new(seed).with("episode").at(number).seed()` without the
+//! highest bit, and the policy draws from the same key. The writer receives episodes in the order of their numbers, whichever
+//! slot finishes first, so the dataset has the same bytes for any number of environments and threads, and after any
+//! interruption.
 //!
 //! # Rows
-//! Row `t` holds the observation at `t`, the action taken from it, and the reward and flags of that step. The
-//! last row holds the final observation: its action is NaN (-1 where actions are integers), its reward and
-//! flags are 0. `success` says whether the goal is reached in the observation of its own row.
+//! Row `t` holds the observation at `t`, the action taken from it, and the reward and flags of that step. The last row holds
+//! the final observation: its action is NaN (-1 for integer actions), its reward and flags are 0. `success` states whether the
+//! observation of the same row satisfies the goal.
 //!
 //! | column | |
 //! | --- | --- |
-//! | those of the environment | the observation; a `/` in a name becomes `.`, because most formats cannot hold it |
-//! | `pixels` (and `goal`, if asked for) | pictures, in worlds that draw |
+//! | those of the environment | the observation; a `/` in a name becomes `.`, because most formats cannot store it |
+//! | `pixels` (and `goal`, if requested) | frames, in worlds that render |
 //! | `action`, `reward`, `terminated`, `truncated`, `success` | the step |
 //! | `variation.<key>` | every factor of variation, constant over the episode |
-//! | `episode_seed` | what the environment was reset with, constant over the episode: three `int32` of 21 bits each, the lowest first |
+//! | `episode_seed` | the reset seed, constant over the episode: three `int32` of 21 bits each, the lowest first |
 //!
-//! The seed is split because datasets store numbers as `float32`, which holds whole numbers up to 2^24; and it is
-//! not called `seed` because the reference resets environments with a column of that name.
+//! The seed is split because datasets store values as `float32`, which represents integers up to 2^24. It is not called `seed`,
+//! because the reference implementation resets environments with a column of that name.
 
-use crate::world::{Play, World, episode_key, reset, reset_seed};
+use crate::seeding::{episode_key, reset, reset_seed};
+use crate::world::{Play, World};
 use serde::Serialize;
 use serde_json::json;
 use std::collections::VecDeque;
@@ -35,53 +36,53 @@ use swm_core::{
 };
 use swm_data::{Constants, Writer};
 
-/// What to collect.
+/// Settings of a collection.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct CollectConfig {
-    /// Episodes the dataset shall have in the end; those it has already are not played again.
+    /// The number of episodes the dataset has in the end; existing ones are not played again.
     pub episodes: usize,
-    /// What decides every episode, together with its number.
+    /// The seed; together with its number, it determines every episode.
     pub seed: u64,
-    /// Factors to sample and to pin.
+    /// The factors that are sampled and pinned.
     pub variation: VariationRequest,
-    /// Who acts, for the manifest.
+    /// The name of the policy, for the manifest.
     pub policy: String,
-    /// Whether to store the picture of the goal in every row.
+    /// Whether to store the frame of the goal in every row.
     pub goal: bool,
-    /// The number of the first episode: above 0 where several machines collect a part each.
+    /// The number of the first episode; above 0 if several machines collect one part each.
     pub first: usize,
 }
 
-/// What was collected.
+/// The result of a collection.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Collected {
-    /// Episodes in the dataset now.
+    /// Episodes in the dataset.
     pub episodes: usize,
     /// Episodes added.
     pub added: usize,
-    /// Environment steps in what was added.
+    /// Environment steps in the added episodes.
     pub steps: usize,
 }
 
-/// Episodes finished ahead of an unfinished earlier one wait in memory, at most this many for each slot.
+/// The number of episodes per slot that may wait in memory for an earlier, unfinished one.
 const AHEAD: usize = 2;
 
-/// Episodes on their way to the writer.
-const UNDERWAY: usize = 2;
+/// The capacity of the queue to the writer, in episodes.
+const QUEUE: usize = 2;
 
 impl World {
-    /// The columns of a dataset collected here.
+    /// The columns of a dataset collected in this world.
     ///
     /// # Errors
-    /// When the environment names a column as a collected one is named.
+    /// When a column of the environment has the name of a collected one.
     pub fn collect_schema(&self, goal: bool) -> Result<Schema> {
         Layout::of(&self.pool().infos().schema().clone(), self.spec(), goal).map(|layout| layout.schema)
     }
 
-    /// Where a dataset collected here comes from.
+    /// The manifest of a dataset collected in this world.
     pub fn collect_manifest(&self, config: &CollectConfig) -> Manifest {
         let image = self.pool().image().map(|(height, width)| [height, width]);
-        let what = json!({
+        let settings = json!({
             "env": self.spec().id,
             "policy": config.policy,
             "episodes": config.episodes,
@@ -91,17 +92,15 @@ impl World {
             "views": self.pool().views().iter().map(ToString::to_string).collect::<Vec<_>>(),
             "goal": config.goal,
         });
-        Manifest { libraries: self.libraries(), ..Manifest::new("collect", config.seed, what) }
+        Manifest { libraries: self.libraries(), ..Manifest::new("collect", config.seed, settings) }
     }
 
-    /// Plays episodes until the dataset behind `writer` has `config.episodes`. The writer must have the columns
-    /// of [`World::collect_schema`]; the episodes it holds already are taken for the first ones of the same
-    /// collection.
+    /// Plays episodes until the dataset behind `writer` has `config.episodes`. The writer must have the columns of
+    /// [`World::collect_schema`]; its existing episodes are assumed to be the first ones of the same collection.
     ///
     /// # Errors
-    /// When the policy, an environment or the writer fails, or the run is stopped ([`Error::Interrupted`]). In
-    /// all cases the finished episodes are kept, up to the first unfinished one; resuming plays that one
-    /// and what follows it again, to the same bytes.
+    /// When the policy, an environment or the writer fails, or the run is stopped ([`Error::Interrupted`]). The episodes up
+    /// to the first unfinished one stay in the dataset; a resumed collection plays the rest again, to the same bytes.
     pub fn collect(
         &mut self,
         policy: &mut dyn Policy,
@@ -113,40 +112,40 @@ impl World {
         let first = writer.episodes();
         let threads = self.pool().threads().clone();
         scope(|scope| {
-            let (to_writer, from_world) = sync_channel::<Finished>(UNDERWAY);
+            let (to_writer, from_world) = sync_channel::<Finished>(QUEUE);
             let (back, written) = channel();
             let writing = scope.spawn(move || write_all(writer, &from_world, &back, &threads));
-            let mut collecting = Collecting {
+            let mut collection = Collection {
                 layout,
                 config,
                 first,
                 next: first,
                 recordings: (0..self.pool().len()).map(|_| None).collect(),
                 finished: VecDeque::new(),
-                handed: first,
+                sent: first,
                 stored: first,
                 steps: 0,
                 to_writer,
                 written,
                 spare: vec![],
             };
-            let played = self.play(policy, &mut collecting, control);
-            collecting.close(writing, control).and_then(|collected| played.map(|()| collected))
+            let played = self.play(policy, &mut collection, control);
+            collection.close(writing, control).and_then(|collected| played.map(|()| collected))
         })
     }
 }
 
-/// Checks that a collection may be continued: its dataset comes from the same environment, policy, seed and
-/// request, whatever number of episodes was wanted then.
+/// Checks that a collection may be continued: environment, policy, seed and settings must be the same; the number of episodes
+/// may differ.
 ///
 /// # Errors
-/// When something differs; names it.
+/// When something differs; the message names it.
 pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
     let differs = |what: &str, stored: String, wanted: String| {
         Err(Error::config(
             format!("continuing a collection with {what} {wanted}"),
             format!("its episodes were collected with {stored}"),
-            "ask for the same again, or collect into another dataset",
+            "use the same settings, or collect into another dataset",
         ))
     };
     if stored.seed != wanted.seed {
@@ -161,8 +160,8 @@ pub fn check_continues(stored: &Manifest, wanted: &Manifest) -> Result<()> {
     Ok(())
 }
 
-/// The writer's side: stores what comes and sends the batches back. Works on the world's threads, so
-/// that its setting bounds the encoding of pictures as well.
+/// Writes the episodes it receives and returns their batches. Encoding runs on the world's threads, so that one setting limits
+/// all threads.
 fn write_all(
     mut writer: Box<dyn Writer>,
     episodes: &Receiver<Finished>,
@@ -171,24 +170,24 @@ fn write_all(
 ) -> Result<()> {
     for Finished { rows: episode, constants } in episodes {
         threads.install(|| writer.write_episode_with(&episode, &constants))?;
-        // Nobody listens any more when the world failed; what it finished is stored nevertheless.
+        // The receiver is gone if the world failed; its finished episodes are stored all the same.
         let _ = back.send(episode);
     }
     writer.finish()
 }
 
-/// Where the columns of an episode come from.
+/// The columns of an episode and their sources.
 struct Layout {
     schema: Schema,
-    /// `(place in the infos, place in the episode)` of what is copied.
+    /// The copied columns: `(index in the infos, index in the episode)`.
     observed: Vec<(usize, usize)>,
-    /// The standard columns of the episode.
+    /// The indices of the standard columns in the episode.
     columns: ColumnIndices,
     action: usize,
-    /// The first factor column; one for each factor follows.
+    /// The index of the first factor column; the other factors follow.
     factors: usize,
     episode_seed: usize,
-    /// The standard columns of the infos.
+    /// The indices of the standard columns in the infos.
     infos: ColumnIndices,
 }
 
@@ -221,7 +220,7 @@ impl Layout {
         Ok(Self { schema, observed, columns, action, factors, episode_seed, infos })
     }
 
-    /// Writes what a slot shows into a row, the first one behind those there are at most.
+    /// Copies the observation of a slot to a row, which may be one past the last.
     fn observe(&self, episode: &mut Batch, row: usize, infos: &Batch, slot: usize) {
         if row == episode.rows() {
             episode.resize(row + 1);
@@ -232,7 +231,7 @@ impl Layout {
         }
     }
 
-    /// Writes what is constant over an episode into all its rows.
+    /// Writes the columns that are constant over an episode to all its rows.
     fn fill_constants(&self, episode: &mut Batch, pool: &EnvPool, slot: usize, seed: u64) {
         let factors = pool.env(slot).factors();
         for (i, (_, value)) in factors.iter().enumerate() {
@@ -245,9 +244,8 @@ impl Layout {
     }
 }
 
-/// Writes a value into all rows of a column, in the column's type.
+/// Writes a value to all rows of a column, converted to the column's type.
 fn fill(batch: &mut Batch, column: usize, value: &[f64]) {
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     fn put<T: bytemuck::Pod>(bytes: &mut [u8], value: &[f64], convert: impl Fn(f64) -> T) {
         let size = size_of::<T>();
         for (to, &from) in bytes.chunks_exact_mut(size).zip(value.iter().cycle()) {
@@ -256,7 +254,6 @@ fn fill(batch: &mut Batch, column: usize, value: &[f64]) {
     }
     let dtype = batch.schema().columns()[column].dtype;
     let bytes = batch.bytes_mut(column);
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
     match dtype {
         DType::Bool | DType::U8 => put(bytes, value, |v| v as u8),
         DType::Int32 => put(bytes, value, |v| v as i32),
@@ -266,62 +263,63 @@ fn fill(batch: &mut Batch, column: usize, value: &[f64]) {
     }
 }
 
-/// One episode being played. Batches come back from the writer with the rows of an older episode, which are
-/// overwritten one by one: clearing them first would cost as much as recording them.
+/// An episode being played. Its batch may hold rows of an older episode, which are overwritten one by one: clearing them would
+/// cost as much as recording.
 struct Recording {
     number: usize,
-    /// Rows recorded; the batch may have more until the episode is finished.
+    /// The number of recorded rows; the batch may have more until the episode is finished.
     length: usize,
     rows: Batch,
 }
 
-/// An episode on its way to the writer.
+/// A finished episode, to be written.
 struct Finished {
     rows: Batch,
     constants: Constants,
 }
 
-struct Collecting<'a> {
+/// A collection in progress.
+struct Collection<'a> {
     layout: Layout,
     config: &'a CollectConfig,
-    /// Episodes that were there before.
+    /// The number of episodes in the dataset before this run.
     first: usize,
-    /// The next episode to start.
+    /// The number of the next episode to start.
     next: usize,
     recordings: Vec<Option<Recording>>,
-    /// Episodes `handed ..`, those that are finished.
+    /// The episodes from `sent` on; none for unfinished ones.
     finished: VecDeque<Option<Finished>>,
-    /// Episodes given to the writer.
-    handed: usize,
-    /// Episodes the writer has stored.
+    /// The number of episodes sent to the writer.
+    sent: usize,
+    /// The number of episodes the writer has stored.
     stored: usize,
     steps: usize,
     to_writer: SyncSender<Finished>,
     written: Receiver<Batch>,
-    /// Batches to record into, whatever they hold.
+    /// Unused batches, with arbitrary content.
     spare: Vec<Batch>,
 }
 
-impl Collecting<'_> {
+impl Collection<'_> {
     fn finish(&mut self, Recording { number, rows, .. }: Recording, constants: Constants) -> Result<()> {
-        let place = number - self.handed;
-        if self.finished.len() <= place {
-            self.finished.resize_with(place + 1, || None);
+        let index = number - self.sent;
+        if self.finished.len() <= index {
+            self.finished.resize_with(index + 1, || None);
         }
-        self.finished[place] = Some(Finished { rows, constants });
+        self.finished[index] = Some(Finished { rows, constants });
         while let Some(Some(_)) = self.finished.front() {
             let episode = self.finished.pop_front().flatten();
-            // The writer hangs up only when it failed, and then its own error is the one to tell.
-            let sent = episode.is_none_or(|episode| self.to_writer.send(episode).is_ok());
-            if !sent {
+            // The channel closes only if the writer failed; `close` then returns the writer's error instead of this one.
+            let received = episode.is_none_or(|episode| self.to_writer.send(episode).is_ok());
+            if !received {
                 return Err(Error::Interrupted);
             }
-            self.handed += 1;
+            self.sent += 1;
         }
         Ok(())
     }
 
-    fn note_stored(&mut self, rows: Batch, control: &mut Control<'_>) {
+    fn count_stored(&mut self, rows: Batch, control: &mut Control<'_>) {
         self.spare.push(rows);
         self.stored += 1;
         control.progress(Progress {
@@ -333,12 +331,12 @@ impl Collecting<'_> {
         });
     }
 
-    /// Waits for the writer. Its error, if it has one, is the cause of every other.
+    /// Waits for the writer. An error of the writer is returned first, because it causes the others.
     fn close(mut self, writing: ScopedJoinHandle<'_, Result<()>>, control: &mut Control<'_>) -> Result<Collected> {
         let (closed, _) = sync_channel(0);
         drop(std::mem::replace(&mut self.to_writer, closed));
         while let Ok(rows) = self.written.recv() {
-            self.note_stored(rows, control);
+            self.count_stored(rows, control);
         }
         match writing.join() {
             Ok(outcome) => outcome?,
@@ -348,7 +346,7 @@ impl Collecting<'_> {
     }
 }
 
-impl Play for Collecting<'_> {
+impl Play for Collection<'_> {
     fn next(&mut self) -> Option<usize> {
         if !self.more() {
             return None;
@@ -358,7 +356,7 @@ impl Play for Collecting<'_> {
     }
 
     fn more(&self) -> bool {
-        self.next < self.config.episodes && self.next < self.handed + AHEAD * self.recordings.len()
+        self.next < self.config.episodes && self.next < self.sent + AHEAD * self.recordings.len()
     }
 
     fn key(&self, episode: usize) -> Key {
@@ -391,14 +389,14 @@ impl Play for Collecting<'_> {
 
     fn stepped(&mut self, slot: usize, pool: &EnvPool, control: &mut Control<'_>) -> Result<bool> {
         while let Ok(rows) = self.written.try_recv() {
-            self.note_stored(rows, control);
+            self.count_stored(rows, control);
         }
         let Some(mut recording) = self.recordings[slot].take() else { return Ok(false) };
-        let (layout, seen, infos) = (&self.layout, self.layout.infos, pool.infos());
+        let (layout, indices, infos) = (&self.layout, self.layout.infos, pool.infos());
         let last = infos.row(slot);
-        let (terminated, truncated) = (last.at::<u8>(seen.terminated)[0], last.at::<u8>(seen.truncated)[0]);
+        let (terminated, truncated) = (last.at::<u8>(indices.terminated)[0], last.at::<u8>(indices.truncated)[0]);
         let mut row = recording.rows.row_mut(recording.length - 1);
-        row.set(layout.columns.reward, last.at::<f32>(seen.reward));
+        row.set(layout.columns.reward, last.at::<f32>(indices.reward));
         row.set(layout.columns.terminated, &[terminated]);
         row.set(layout.columns.truncated, &[truncated]);
         self.steps += 1;

@@ -1,14 +1,14 @@
-//! Evaluating: how often a policy reaches the goal from given starts, and how long it takes.
+//! Evaluation: the success rate of a policy from given starts, and its time to goal.
 //!
-//! What counts is [`Counting`]'s business, and [`judge`](crate::judge) applies it. Strict counting, the default, finds
-//! a start that already satisfies the goal right after the reset, does not play it, and counts it apart from the success
-//! rate, which comes with its 95 % Wilson interval.
+//! [`Counting`] defines the episodes that count and the success criterion. Strict counting, the default, does not play a start
+//! that is solved right after the reset and counts it separately from the success rate, which has a 95 % Wilson confidence
+//! interval.
 //!
-//! A factor-shifted evaluation is the same with starts whose variation request samples or pins factors.
+//! An evaluation under a shift is an evaluation whose starts sample or pin factors of variation.
 
-use crate::Starts;
-use crate::filming::{Filming, Videos};
-use crate::judge::{Judge, Seen};
+use crate::starts::Starts;
+use crate::success_criterion::{StepOutcome, SuccessCriterion};
+use crate::video_recording::{VideoRecording, Videos};
 use crate::world::{Play, World};
 use serde::Serialize;
 use std::time::Instant;
@@ -16,32 +16,32 @@ use swm_core::results::{Counting, EpisodeResult, Proportion, Run, Summary, Timin
 use swm_core::run::{Control, Progress};
 use swm_core::{Batch, ColumnIndices, EnvPool, Error, Key, Policy, Result};
 
-/// How to evaluate.
+/// Settings of an evaluation.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct EvalConfig {
-    /// Who acts: `random`, `expert`, or a checkpoint's name.
+    /// The name of the policy: `random`, `expert`, or a checkpoint's name.
     pub policy: String,
-    /// The condition: `in distribution`, or what is shifted.
+    /// The condition: `in distribution`, or a description of the shift.
     pub condition: String,
-    /// Steps an episode may take; all the world allows for `None`.
+    /// The time limit of an episode, in steps; that of the world for `None`.
     pub budget: Option<usize>,
-    /// Which episodes count, and as what.
+    /// The episodes that count, and the success criterion.
     pub counting: Counting,
-    /// Videos of the first episodes, if wanted.
+    /// Videos of the first episodes, if any.
     #[serde(skip)]
     pub videos: Option<Videos>,
 }
 
 impl World {
-    /// Plays every start once and judges it. Each slot takes the next start when it is free; what an episode
-    /// brings depends on the start alone.
+    /// Plays every start once. Each slot takes the next start when it is free; the result of an episode depends on its start
+    /// alone.
     ///
-    /// Compat counting of episodic starts goes on beyond the last start until as many episodes as there are starts have
-    /// finished, as the implementation it follows does.
+    /// Compat counting of episodic starts continues beyond the last start until as many episodes as there are starts have
+    /// finished, like the reference implementation.
     ///
     /// # Errors
-    /// When the budget exceeds what the world plays, the counting contradicts itself or the world, videos are wanted of a
-    /// world without pictures, the policy or an environment fails, or the run is stopped.
+    /// When the budget exceeds the world's time limit, the counting contradicts itself or the world, videos are requested of a
+    /// world without frames, the policy or an environment fails, or the run is stopped.
     pub fn evaluate(
         &mut self,
         policy: &mut dyn Policy,
@@ -55,18 +55,18 @@ impl World {
             return Err(Error::config(
                 "evaluation budget",
                 format!("{budget} steps in a world that truncates episodes after {limit}"),
-                "choose at least 1 and at most that, or raise the world's max_episode_steps",
+                "choose at least 1 and at most the time limit, or raise the world's max_episode_steps",
             ));
         }
         let episodic = starts.goal_offset().is_none();
         check_counting(config.counting, budget, episodic.then_some(self.pool().len()))?;
         let videos =
-            config.videos.as_ref().map(|videos| Filming::new(videos, self.pool(), starts.len())).transpose()?;
-        let mut judging = Judging {
+            config.videos.as_ref().map(|videos| VideoRecording::new(videos, self.pool(), starts.len())).transpose()?;
+        let mut evaluation = Evaluation {
             starts,
             first_to_finish: episodic && matches!(config.counting, Counting::Compat { .. }),
             columns: ColumnIndices::of(self.pool().infos().schema())?,
-            slots: vec![(0, Judge::new(config.counting, budget)); self.pool().len()],
+            slots: vec![(0, SuccessCriterion::new(config.counting, budget)); self.pool().len()],
             episodes: vec![],
             finished: vec![],
             satisfied: 0,
@@ -75,22 +75,22 @@ impl World {
         };
         policy.take_latencies();
         let begun = Instant::now();
-        self.play(policy, &mut judging, control)?;
+        self.play(policy, &mut evaluation, control)?;
         let timing =
             Timing { plan_seconds: Summary::of(&policy.take_latencies()), wall_seconds: begun.elapsed().as_secs_f64() };
-        let Judging { mut episodes, mut finished, satisfied, videos, .. } = judging;
+        let Evaluation { mut episodes, mut finished, satisfied, videos, .. } = evaluation;
         finished.sort_unstable();
         let videos = videos.map(|videos| videos.write(&finished)).unwrap_or_default();
         let episodes: Vec<EpisodeResult> = finished.iter().map(|&i| std::mem::take(&mut episodes[i])).collect();
         let run = Run::new(&config.condition, &config.policy, config.counting, episodes, timing);
-        // Episodic compat counts a selection that strict counting would not have made.
+        // Episodic compat counting selects episodes that strict counting would not have selected.
         let both = matches!(config.counting, Counting::Compat { .. }) && !episodic;
         let strict = both.then(|| Proportion::wilson(satisfied, run.episodes.len() - run.solved_at_start));
         Ok(Run { strict, videos, ..run })
     }
 }
 
-/// Refuses a counting that contradicts itself, the budget, or the world; `slots` are those of an episodic evaluation.
+/// Rejects a counting that contradicts itself, the budget, or the world; `slots` is given for episodic evaluations.
 fn check_counting(counting: Counting, budget: usize, slots: Option<usize>) -> Result<()> {
     match (counting, slots) {
         (Counting::Strict { hold }, _) if hold == 0 || hold > budget => Err(Error::config(
@@ -101,34 +101,35 @@ fn check_counting(counting: Counting, budget: usize, slots: Option<usize>) -> Re
         (Counting::Compat { envs }, Some(slots)) if envs != slots => Err(Error::config(
             "compat counting",
             format!("it counts the first to finish among {envs} environments, and the world has {slots}"),
-            "give the world as many, or count strictly, which depends on no such number",
+            "give the world as many environments, or count strictly, which does not depend on their number",
         )),
         _ => Ok(()),
     }
 }
 
-struct Judging<'a> {
+/// An evaluation in progress.
+struct Evaluation<'a> {
     starts: &'a Starts,
-    /// Whether episodes begin until enough have finished, instead of one a start.
+    /// Whether episodes start until enough have finished, instead of one for each start.
     first_to_finish: bool,
     columns: ColumnIndices,
-    /// The episode each slot plays, and its judge.
-    slots: Vec<(usize, Judge)>,
-    /// Every episode begun.
+    /// The episode of each slot, and its success criterion.
+    slots: Vec<(usize, SuccessCriterion)>,
+    /// Every started episode.
     episodes: Vec<EpisodeResult>,
-    /// Those that are done, as they finished.
+    /// The finished episodes, in the order in which they finished.
     finished: Vec<usize>,
-    /// Episodes with an unsolved start and a step that satisfied the goal.
+    /// The number of episodes that were not solved at the start and satisfied the goal at some step.
     satisfied: usize,
     steps: usize,
-    videos: Option<Filming>,
+    videos: Option<VideoRecording>,
 }
 
-impl Judging<'_> {
+impl Evaluation<'_> {
     fn finish(&mut self, slot: usize, control: &mut Control<'_>) {
-        let (episode, judge) = self.slots[slot];
+        let (episode, criterion) = self.slots[slot];
         self.finished.push(episode);
-        self.satisfied += usize::from(judge.satisfied() && !self.episodes[episode].solved_at_start);
+        self.satisfied += usize::from(criterion.satisfied() && !self.episodes[episode].solved_at_start);
         control.progress(Progress {
             stage: "evaluate",
             done: self.finished.len(),
@@ -138,14 +139,14 @@ impl Judging<'_> {
         });
     }
 
-    fn film(&mut self, slot: usize, pool: &EnvPool) {
+    fn record_frame(&mut self, slot: usize, pool: &EnvPool) {
         if let Some(videos) = &mut self.videos {
-            videos.frame(self.slots[slot].0, slot, pool);
+            videos.push(self.slots[slot].0, slot, pool);
         }
     }
 }
 
-impl Play for Judging<'_> {
+impl Play for Evaluation<'_> {
     fn next(&mut self) -> Option<usize> {
         if !self.more() {
             return None;
@@ -172,17 +173,17 @@ impl Play for Judging<'_> {
     fn start(&mut self, pool: &mut EnvPool, starting: &[(usize, usize)]) -> Result<()> {
         for &(slot, episode) in starting {
             self.slots[slot].0 = episode;
-            self.slots[slot].1.begin();
+            self.slots[slot].1.reset();
         }
         self.starts.start(pool, starting)
     }
 
     fn started(&mut self, slot: usize, pool: &EnvPool, control: &mut Control<'_>) -> Result<bool> {
-        self.film(slot, pool);
+        self.record_frame(slot, pool);
         let solved = pool.infos().row(slot).at::<u8>(self.columns.success)[0] != 0;
-        let (episode, judge) = self.slots[slot];
+        let (episode, criterion) = self.slots[slot];
         self.episodes[episode].solved_at_start = solved;
-        let plays = judge.plays(solved);
+        let plays = criterion.plays(solved);
         if !plays {
             self.finish(slot, control);
         }
@@ -192,25 +193,25 @@ impl Play for Judging<'_> {
     fn acted(&mut self, _: usize, _: &EnvPool, _: &Batch) {}
 
     fn stepped(&mut self, slot: usize, pool: &EnvPool, control: &mut Control<'_>) -> Result<bool> {
-        // Enough have finished, in this very step and in slots before this one.
+        // Lower slots may have finished the evaluation in this step.
         if self.over() {
             return Ok(false);
         }
-        self.film(slot, pool);
+        self.record_frame(slot, pool);
         self.steps += 1;
         let row = pool.infos().row(slot);
-        let flag = |place| row.at::<u8>(place)[0] != 0;
-        let seen = Seen {
+        let flag = |column| row.at::<u8>(column)[0] != 0;
+        let outcome = StepOutcome {
             reward: row.at::<f32>(self.columns.reward)[0],
             success: flag(self.columns.success),
             terminated: flag(self.columns.terminated),
             truncated: flag(self.columns.truncated),
         };
-        let (episode, judge) = &mut self.slots[slot];
-        let goes_on = judge.step(&mut self.episodes[*episode], seen);
-        if !goes_on {
+        let (episode, criterion) = &mut self.slots[slot];
+        let continues = criterion.step(&mut self.episodes[*episode], outcome);
+        if !continues {
             self.finish(slot, control);
         }
-        Ok(goes_on)
+        Ok(continues)
     }
 }

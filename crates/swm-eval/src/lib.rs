@@ -1,33 +1,35 @@
-//! Policies in worlds: [`World`] plays episodes, and what is done with them has a file each.
+//! Collecting episodes with policies and evaluating policies.
 //!
-//! - [`world`]: many environments, one policy, and the loop both uses below share.
-//! - [`collect`]: every episode goes to a dataset, in the order of its number.
-//! - [`starts`] and [`evaluate`]: from where to play and towards which goal, and how often it is reached.
-//! - [`request`], [`runner`] and [`reproduce`]: all that decides an evaluation as one value, running it for several
-//!   policies on the same starts, and running it again.
-//! - [`prediction`]: how well a model predicts what was recorded, beside whether its plans succeeded.
+//! - [`world`]: [`World`], many environments of one kind and the loop that plays a policy in them.
+//! - [`collect`]: writes every episode to a dataset.
+//! - [`starts`] and [`evaluate`]: initial states and goals, and the success rate of a policy from them.
+//! - [`request`], [`runner`] and [`reproduce`]: all settings of an evaluation as one value, running it for several policies on
+//!   the same starts, and repeating it from its results.
+//! - [`prediction`]: the prediction errors of a model on recorded trajectories.
 //!
-//! An episode is decided by its own key. Neither the number of environments, nor that of threads, nor what
-//! was played before in the same slot changes a byte of it.
+//! An episode depends on its key alone: not on the number of environments or threads, nor on what was played before in the
+//! same slot.
 
 pub mod collect;
 pub mod evaluate;
-mod filming;
-mod judge;
 pub mod prediction;
 pub mod reproduce;
 pub mod request;
 pub mod runner;
+mod seeding;
 pub mod starts;
-mod witness;
+mod starts_hash;
+mod success_criterion;
+mod video_recording;
 pub mod world;
 
 pub use collect::{CollectConfig, Collected};
 pub use evaluate::EvalConfig;
-pub use filming::Videos;
 pub use prediction::Predictor;
 pub use reproduce::{Difference, Reproduction, reproduce};
-pub use request::{Acts, Choice, Condition, EvalRequest, HeldOut, Model, PolicyRequest, StartsRequest};
-pub use runner::{Actor, Means, Moment, Resolver};
+pub use request::{Choice, Condition, EvalRequest, HeldOut, Model, PolicyKind, PolicyRequest, StartsRequest};
+pub use runner::{ResolvedPolicy, Resolver, RunOptions};
+pub use seeding::{episode_key, reset_seed};
 pub use starts::Starts;
+pub use video_recording::Videos;
 pub use world::{World, WorldConfig};

@@ -1,25 +1,26 @@
-//! How well a model predicts recorded trajectories: from the latent of a first observation and the actions that were
-//! recorded, open loop, step by step beside the latents of what was observed.
+//! Prediction errors of a model on recorded trajectories.
 //!
-//! Prediction errors and success are looked at together, because one does not follow from the other: the
-//! trajectories of an evaluation are grouped by whether its policy solved them, those of a split of a dataset by whether
-//! their recorded episode succeeded.
+//! From the latent of the first observation and the recorded actions, the model predicts open loop; each predicted latent is
+//! compared with that of the recorded observation. Trajectories are grouped by success, because a low prediction error does
+//! not imply success: those of an evaluation by whether the policy solved them, those of a dataset split by whether the
+//! recorded episode succeeded.
 
-use crate::Starts;
+use crate::starts::Starts;
+use swm_core::columns::{ACTION, SUCCESS};
 use swm_core::results::{Prediction, Run, Trajectory};
 use swm_core::{Batch, DType, Error, Result};
 use swm_data::{Reader, StepRange};
 
 pub use swm_core::Predictor;
 
-/// Trajectories that are read and predicted at once.
-const AT_ONCE: usize = 16;
+/// The number of trajectories that are read and predicted at once.
+const CHUNK: usize = 16;
 
-/// Predicts the trajectories that begin at these picks, `[episode, step]`, `horizon` model steps far. `success` tells
-/// what came of each pick, where that is known.
+/// Predicts `horizon` model steps from each pick `[episode, step]`. `success` returns the outcome of a pick, where it is
+/// known.
 ///
 /// # Errors
-/// When there is no pick, a trajectory reaches beyond its episode, the dataset lacks a column the model encodes, a
+/// When there are no picks, a trajectory reaches beyond its episode, the dataset lacks a column the model encodes, a
 /// prediction is not finite, or all observations have the same latent.
 pub fn predict(
     predictor: &mut dyn Predictor,
@@ -36,8 +37,8 @@ pub fn predict(
     let mut spread = Spread::new(predictor.latent_dim());
     let mut trajectories = Vec::with_capacity(picks.len());
     let (mut latents, mut predicted, mut starts) = (vec![], vec![], vec![]);
-    for first in (0..picks.len()).step_by(AT_ONCE) {
-        let part = first..picks.len().min(first + AT_ONCE);
+    for first in (0..picks.len()).step_by(CHUNK) {
+        let part = first..picks.len().min(first + CHUNK);
         let (rows, actions) = read(predictor, reader, &picks[part.clone()], horizon)?;
         let dim = predictor.latent_dim();
         latents.resize(part.len() * frames * dim, 0.0);
@@ -47,12 +48,12 @@ pub fn predict(
         predicted.resize(part.len() * horizon * dim, 0.0);
         predictor.rollout(&starts, &actions, horizon, &mut predicted)?;
         let both = latents.chunks_exact(frames * dim).zip(predicted.chunks_exact(horizon * dim));
-        for (i, (seen, predicted)) in part.zip(both) {
-            let steps = seen[dim..].chunks_exact(dim).zip(predicted.chunks_exact(dim));
+        for (i, (recorded, predicted)) in part.zip(both) {
+            let steps = recorded[dim..].chunks_exact(dim).zip(predicted.chunks_exact(dim));
             let errors: Vec<f64> = steps
-                .map(|(seen, predicted)| {
-                    spread.note(seen);
-                    squared_error(predicted, seen)
+                .map(|(recorded, predicted)| {
+                    spread.add(recorded);
+                    squared_error(predicted, recorded)
                 })
                 .collect();
             if let Some(step) = errors.iter().position(|error| !error.is_finite()) {
@@ -69,17 +70,17 @@ pub fn predict(
     if variance <= 0.0 {
         return Err(Error::config(
             "prediction errors",
-            "all observations have the same latent: the model has collapsed, or nothing moves in these trajectories",
-            "look at another model, or at other trajectories",
+            "all observations have the same latent: the model has collapsed, or these trajectories are constant",
+            "use another model, or other trajectories",
         ));
     }
     trajectories.iter_mut().flat_map(|trajectory| &mut trajectory.errors).for_each(|error| *error /= variance);
     Ok(Prediction::new(predictor.frameskip(), variance, trajectories))
 }
 
-/// Predicts trajectories of some episodes of a dataset, such as those of a held-out [`swm_data::Split`]: `n` of them,
-/// drawn as [`Starts::choose_among`] draws. An episode succeeded when its column `success` says so in any of its rows;
-/// without that column it is not known.
+/// Predicts `n` trajectories of some episodes of a dataset, such as those of a held-out [`swm_data::Split`], chosen by
+/// [`Starts::choose_among`]. An episode succeeded if its column `success` is set in any row; without that column the outcome is
+/// unknown.
 ///
 /// # Errors
 /// As [`predict`], and when the episodes have fewer than `n` trajectories.
@@ -92,18 +93,18 @@ pub fn predict_recorded(
     seed: u64,
 ) -> Result<Prediction> {
     let picks = Starts::choose_among(reader, episodes, n, horizon * predictor.frameskip(), seed)?;
-    let known = reader.schema().find("success").is_some();
+    let known = reader.schema().find(SUCCESS).is_some();
     let outcome = |&[episode, _]: &[usize; 2]| -> Result<Option<bool>> {
         let length = reader.episodes()[episode].length;
-        let rows = known.then(|| reader.read(&["success"], &[StepRange::new(episode, 0, length)])).transpose()?;
+        let rows = known.then(|| reader.read(&[SUCCESS], &[StepRange::new(episode, 0, length)])).transpose()?;
         Ok(rows.map(|rows| rows.bytes(0).iter().any(|&flag| flag != 0)))
     };
     let outcomes: Vec<Option<bool>> = picks.iter().map(outcome).collect::<Result<_>>()?;
     predict(predictor, reader, &picks, horizon, |i| outcomes[i])
 }
 
-/// Predicts the trajectories that a run's starts were taken from, and tells them apart by what came of them there. What
-/// strict counting left out has no outcome.
+/// Predicts the recorded trajectories that a run's starts were taken from, grouped by the outcome of the run. Episodes that
+/// strict counting did not play have no outcome.
 ///
 /// # Errors
 /// As [`predict`], and when the run's starts were not taken from a dataset.
@@ -117,7 +118,7 @@ pub fn predict_run(
     let Some(picks) = picks else {
         return Err(Error::config(
             "prediction errors",
-            "the starts were drawn by the environment, so nothing was recorded there",
+            "the environment drew the starts, so there are no recorded trajectories",
             "take starts from a dataset",
         ));
     };
@@ -127,7 +128,7 @@ pub fn predict_run(
     })
 }
 
-/// The observations at every model step of some trajectories, `[trajectories, horizon + 1]` rows, and the actions
+/// Reads the observations at every model step of some trajectories, `[trajectories, horizon + 1]` rows, and the actions
 /// between them, `[trajectories, horizon, frameskip * action]`.
 fn read(
     predictor: &dyn Predictor,
@@ -152,24 +153,22 @@ fn read(
     }
     let names: Vec<&str> = columns.iter().map(String::as_str).collect();
     let rows = reader.read(&names, &frames)?;
-    let actions = reader.read(&["action"], &between)?;
-    #[allow(clippy::cast_precision_loss)]
+    let actions = reader.read(&[ACTION], &between)?;
     let actions = match actions.schema().columns()[0].dtype {
-        DType::Float32 => actions.get::<f32>("action")?.to_vec(),
-        // Choices are small integers, which float32 holds.
-        _ => actions.get::<i64>("action")?.iter().map(|&choice| choice as f32).collect(),
+        DType::Float32 => actions.get::<f32>(ACTION)?.to_vec(),
+        // Choices are small integers, which float32 represents exactly.
+        _ => actions.get::<i64>(ACTION)?.iter().map(|&choice| choice as f32).collect(),
     };
     Ok((rows, actions))
 }
 
-/// The mean squared error of a prediction.
-#[allow(clippy::cast_precision_loss)]
-fn squared_error(predicted: &[f32], seen: &[f32]) -> f64 {
-    let squares = predicted.iter().zip(seen).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2));
-    squares.sum::<f64>() / seen.len() as f64
+/// The mean squared error of a predicted latent, both `[latent]`.
+fn squared_error(predicted: &[f32], recorded: &[f32]) -> f64 {
+    let squares = predicted.iter().zip(recorded).map(|(&a, &b)| (f64::from(a) - f64::from(b)).powi(2));
+    squares.sum::<f64>() / recorded.len() as f64
 }
 
-/// The variance of latents, number by number, by Welford's update.
+/// The variance of every latent dimension, by Welford's algorithm.
 struct Spread {
     count: f64,
     mean: Vec<f64>,
@@ -181,7 +180,7 @@ impl Spread {
         Self { count: 0.0, mean: vec![0.0; dim], squares: vec![0.0; dim] }
     }
 
-    fn note(&mut self, latent: &[f32]) {
+    fn add(&mut self, latent: &[f32]) {
         self.count += 1.0;
         for ((mean, squares), &value) in self.mean.iter_mut().zip(&mut self.squares).zip(latent) {
             let delta = f64::from(value) - *mean;
@@ -190,8 +189,7 @@ impl Spread {
         }
     }
 
-    /// The mean over a latent's numbers of their variances.
-    #[allow(clippy::cast_precision_loss)]
+    /// The mean of the variances over the latent dimensions.
     fn variance(&self) -> f64 {
         self.squares.iter().sum::<f64>() / self.count / self.mean.len() as f64
     }

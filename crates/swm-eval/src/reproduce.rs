@@ -1,54 +1,55 @@
-//! Running an evaluation again from its results, and saying exactly what differs.
+//! [`reproduce`]: repeats an evaluation from its results and lists all differences.
 
-use crate::World;
 use crate::prediction::Predictor;
 use crate::request::{EvalRequest, PolicyRequest};
-use crate::runner::{Actor, Means, Moment, Resolver};
+use crate::runner::{ResolvedPolicy, Resolver, RunOptions};
+use crate::world::World;
 use serde::Serialize;
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::sync::Arc;
 use swm_core::results::Run;
+use swm_core::run::Control;
 use swm_core::{Env, Error, Manifest, Result, Results};
 use swm_data::Reader;
 
-/// An evaluation that was run again.
+/// A repeated evaluation.
 #[derive(Clone, Debug, Serialize)]
 pub struct Reproduction {
-    /// What it found this time.
+    /// The new results.
     pub results: Results,
-    /// What differs from the first time, times and videos aside.
+    /// The differences from the old results, times and videos aside.
     pub differences: Vec<Difference>,
 }
 
-/// One thing that differs.
+/// A difference between two results.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Difference {
-    /// What kind of thing it is.
+    /// The kind of difference.
     pub kind: Kind,
-    /// What it is, such as `episode 7 of lewm, in distribution`.
+    /// What differs, such as `episode 7 of lewm, in distribution`.
     pub what: String,
-    /// How it was.
+    /// The old value.
     pub was: String,
-    /// How it is now.
+    /// The new value.
     pub is: String,
 }
 
-/// What kind of thing differs.
+/// The kind of a difference.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Kind {
-    /// A version or a device: it explains differences, and alone is none.
+    /// A version or a device, which may explain differences but does not count as one.
     Version,
-    /// What went in: the request, the hash of starts, goals, data or weights.
+    /// An input: the request, or the hash of starts, goals, data or weights.
     Input,
-    /// What came out.
+    /// A result.
     Finding,
 }
 
 impl Reproduction {
-    /// Whether the same went in and the same came out.
+    /// Whether all inputs and results are the same.
     pub fn holds(&self) -> bool {
         self.differences.iter().all(|difference| difference.kind == Kind::Version)
     }
@@ -60,23 +61,23 @@ impl fmt::Display for Difference {
     }
 }
 
-/// Runs the evaluation behind some results again and compares.
+/// Repeats the evaluation behind some results and compares.
 ///
 /// # Errors
-/// When the results hold no request that this version reads, a dataset or a checkpoint has another hash than the first
-/// time, and as [`EvalRequest::run`].
+/// When the results contain no request that this version reads, a dataset or a checkpoint has a different hash, and as
+/// [`EvalRequest::run`].
 pub fn reproduce(
     old: &Results,
     resolver: &dyn Resolver,
-    means: &Means,
-    watch: &mut (dyn FnMut(Moment<'_>) + Send),
+    options: &RunOptions,
+    control: &mut Control<'_>,
 ) -> Result<Reproduction> {
     let request = EvalRequest::of(&old.manifest)?;
-    let results = request.run(&Checked { resolver, manifest: &old.manifest }, means, watch)?;
+    let results = request.run(&Checked { resolver, manifest: &old.manifest }, options, control)?;
     Ok(Reproduction { differences: differences(old, &results), results })
 }
 
-/// A resolver that refuses other data and weights than the first time, before anything is played.
+/// A resolver that rejects data and weights with other hashes than in the old results.
 struct Checked<'a> {
     resolver: &'a dyn Resolver,
     manifest: &'a Manifest,
@@ -87,8 +88,8 @@ impl Checked<'_> {
         match keys.iter().find_map(|&key| self.manifest.hashes.get(key)) {
             Some(first) if first != hash => Err(Error::config(
                 what,
-                format!("its hash is {hash}, the results were made with {first}"),
-                "give what the results were made with under the same name",
+                format!("its hash is {hash}; the results were made with {first}"),
+                "restore the data or weights that the results were made with",
             )),
             _ => Ok(()),
         }
@@ -106,13 +107,13 @@ impl Resolver for Checked<'_> {
         Ok(reader)
     }
 
-    fn policy(&self, request: &PolicyRequest, world: &World) -> Result<Actor> {
-        let actor = self.resolver.policy(request, world)?;
-        if let Some(weights) = &actor.weights {
-            let own = format!("weights of {}", request.name);
-            self.check(weights, own.clone(), &[&own, "weights"])?;
+    fn policy(&self, request: &PolicyRequest, world: &World) -> Result<ResolvedPolicy> {
+        let policy = self.resolver.policy(request, world)?;
+        if let Some(weights) = &policy.weights {
+            let key = format!("weights of {}", request.name);
+            self.check(weights, key.clone(), &[&key, "weights"])?;
         }
-        Ok(actor)
+        Ok(policy)
     }
 
     fn predictor(&self, request: &PolicyRequest) -> Result<Option<Box<dyn Predictor>>> {
@@ -120,22 +121,22 @@ impl Resolver for Checked<'_> {
     }
 }
 
-/// What differs between two results, times and videos aside.
+/// The differences between two results, times and videos aside.
 pub fn differences(old: &Results, new: &Results) -> Vec<Difference> {
     let mut found = vec![];
     let (then, now) = (&old.manifest, &new.manifest);
-    let mut note = |kind, what: &str, was: &str, is: &str| {
+    let mut compare = |kind, what: &str, was: &str, is: &str| {
         if was != is {
             found.push(Difference { kind, what: what.to_owned(), was: was.to_owned(), is: is.to_owned() });
         }
     };
-    note(Kind::Version, "stable-worldmodel", &then.swm_version, &now.swm_version);
-    note(Kind::Version, "device", &then.device, &now.device);
+    compare(Kind::Version, "stable-worldmodel", &then.swm_version, &now.swm_version);
+    compare(Kind::Version, "device", &then.device, &now.device);
     for (what, was, is) in both(&then.libraries, &now.libraries) {
-        note(Kind::Version, what, was, is);
+        compare(Kind::Version, what, was, is);
     }
     for (what, was, is) in both(&then.hashes, &now.hashes) {
-        note(Kind::Input, &format!("hash of {what}"), was, is);
+        compare(Kind::Input, &format!("hash of {what}"), was, is);
     }
     let [was, is] = [then, now].map(|manifest| {
         let mut leaves = BTreeMap::new();
@@ -143,18 +144,18 @@ pub fn differences(old: &Results, new: &Results) -> Vec<Difference> {
         leaves
     });
     for (what, was, is) in both(&was, &is) {
-        note(Kind::Input, &format!("request, {what}"), was, is);
+        compare(Kind::Input, &format!("request, {what}"), was, is);
     }
     for ((run, episode), was, is) in both(&outcomes(old), &outcomes(new)) {
-        note(Kind::Finding, &format!("episode {episode} of {run}"), was, is);
+        compare(Kind::Finding, &format!("episode {episode} of {run}"), was, is);
     }
     for (run, was, is) in both(&rest(old), &rest(new)) {
-        note(Kind::Finding, run, was, is);
+        compare(Kind::Finding, run, was, is);
     }
     found
 }
 
-/// What is on either side, under the same key; what is missing is `nothing`.
+/// The values of both maps for every key; a missing value is `nothing`.
 fn both<'a, K: Ord>(
     was: &'a BTreeMap<K, String>,
     is: &'a BTreeMap<K, String>,
@@ -168,23 +169,23 @@ fn name(run: &Run) -> String {
     format!("{}, {}", run.policy, run.condition)
 }
 
-/// Every episode, by its run and its place.
+/// Every episode as JSON, by its run and index.
 fn outcomes(results: &Results) -> BTreeMap<(String, usize), String> {
     let episodes = results.runs.iter().flat_map(|run| run.episodes.iter().enumerate().map(move |(i, e)| (run, i, e)));
     episodes.map(|(run, i, episode)| ((name(run), i), json(episode))).collect()
 }
 
-/// What a run says beyond its episodes and what follows from them. How searches went is told only where it was traced.
+/// The other results of every run, as JSON. Searches are left out, because tracing them is optional.
 fn rest(results: &Results) -> BTreeMap<String, String> {
     results.runs.iter().map(|run| (name(run), json(&(run.success, run.strict, &run.prediction)))).collect()
 }
 
 fn json(value: &impl Serialize) -> String {
-    // Numbers, words and lists can always be written.
+    // These types always serialise.
     serde_json::to_string(value).unwrap_or_default()
 }
 
-/// The leaves of a JSON value, by their path.
+/// Collects the leaves of a JSON value by their path.
 fn flatten(path: &str, value: &Value, leaves: &mut BTreeMap<String, String>) {
     let below = |key: &str| if path.is_empty() { key.to_owned() } else { format!("{path}.{key}") };
     match value {

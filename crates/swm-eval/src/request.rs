@@ -1,5 +1,7 @@
-//! [`EvalRequest`]: everything that decides what an evaluation finds, as it is written into its manifest and read
-//! again to reproduce it. It names things (a world, a dataset, a checkpoint); a [`Resolver`](crate::Resolver) knows them.
+//! [`EvalRequest`]: all settings that determine the results of an evaluation.
+//!
+//! The request is written to the manifest of the results and read again to reproduce them. It refers to environments, datasets
+//! and checkpoints by name; a [`Resolver`](crate::Resolver) loads them.
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -7,55 +9,56 @@ use swm_core::results::Counting;
 use swm_core::{Error, Manifest, Result, VariationRequest};
 use swm_data::{Part, Split};
 
-/// An evaluation: who acts, in which world, from which starts, and how it is counted.
+/// An evaluation: policies, environment, starts, and counting.
 ///
-/// What does not change a result (threads, environments played side by side in strict counting, videos) is not in it.
+/// Options that do not change a result (threads, parallel environments in strict counting, videos) are in
+/// [`RunOptions`](crate::RunOptions).
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct EvalRequest {
-    /// The layout of this request: [`EvalRequest::VERSION`].
+    /// The version of this layout: [`EvalRequest::VERSION`].
     pub version: u32,
     /// The environment's id.
     pub env: String,
-    /// What is done to its pictures, in order.
+    /// The visual wrappers of its frames, in order.
     pub wrappers: Vec<Choice>,
-    /// Whether the picture of the goal passes through the wrappers, too.
+    /// Whether the wrappers apply to the frame of the goal, too.
     #[serde(default)]
     pub wrap_goal: bool,
-    /// The `[height, width]` of its pictures, if any are drawn.
+    /// The `[height, width]` of its frames, in pixels; none for no frames.
     pub image: Option<[usize; 2]>,
-    /// Who acts. The random floor is played whether it is among them or not.
+    /// The policies. The random-policy floor is always evaluated, even if it is not listed.
     pub policies: Vec<PolicyRequest>,
-    /// From where and towards which goals.
+    /// The origin of starts and goals.
     pub starts: StartsRequest,
-    /// How many episodes.
+    /// The number of episodes.
     pub episodes: usize,
-    /// Decides starts, goals, factors, and everything a policy draws.
+    /// The seed of starts, goals, factors, and all draws of policies.
     pub seed: u64,
-    /// Steps an episode may take; the environment's own number for `None`.
+    /// The time limit of an episode, in steps; that of the environment for `None`.
     pub budget: Option<usize>,
-    /// Which episodes count, and as what.
+    /// The episodes that count, and the success criterion.
     pub counting: Counting,
-    /// What is varied, one evaluation each.
+    /// The conditions, one evaluation each.
     pub conditions: Vec<Condition>,
-    /// How many model steps far the models' predictions are compared with the recorded trajectories that the starts were
-    /// taken from, if they are.
+    /// The horizon, in model steps, of prediction errors on the recorded trajectories that the starts are taken from; none to
+    /// omit them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub prediction: Option<usize>,
 }
 
-/// A named thing with settings: a solver, a wrapper.
+/// A solver or a wrapper, with settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Choice {
-    /// Its id in its registry.
+    /// The id in the registry.
     pub id: String,
-    /// Its settings, as the row of the registry reads them.
+    /// The settings, as its registry entry reads them.
     #[serde(default)]
     pub settings: Value,
 }
 
-/// Where starts and goals come from.
+/// The origin of starts and goals.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum StartsRequest {
@@ -63,96 +66,97 @@ pub enum StartsRequest {
     Episodic,
     /// Rows of a dataset.
     Dataset {
-        /// Its name or path.
+        /// The name or path of the dataset.
         dataset: String,
         /// Steps from a start to its goal.
         goal_offset: usize,
-        /// The held-out part whose episodes are used; all of them for `None`.
+        /// The held-out part whose episodes are used; all episodes for `None`.
         held_out: Option<HeldOut>,
     },
 }
 
-/// A part of a split.
+/// A part of a dataset split.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HeldOut {
     /// The part.
     pub part: Part,
-    /// How the dataset is split.
+    /// The split.
     pub split: Split,
 }
 
-/// Who acts.
+/// A policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PolicyRequest {
-    /// What results call it.
+    /// The name in results.
     pub name: String,
-    /// How it acts.
-    pub acts: Acts,
+    /// The kind of policy.
+    #[serde(rename = "acts")]
+    pub kind: PolicyKind,
 }
 
-/// How a policy acts.
+/// The kind of a policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
-pub enum Acts {
-    /// Uniformly at random: the floor.
+pub enum PolicyKind {
+    /// Uniformly random actions: the floor.
     Random,
-    /// As one of the environment's experts.
+    /// An expert of the environment.
     Expert {
-        /// Its id.
+        /// The id of the expert.
         id: String,
     },
-    /// By planning in a model.
+    /// Planning in a model.
     Plan {
-        /// What predicts.
+        /// The model.
         model: Model,
-        /// What searches.
+        /// The solver.
         solver: Choice,
-        /// The settings of the policy that replans.
+        /// The settings of model-predictive control.
         mpc: Value,
-        /// The objective, where it is not the model's own.
+        /// The objective, if it differs from the model's own cost.
         #[serde(default, skip_serializing_if = "Value::is_null")]
         objective: Value,
     },
-    /// As a trained policy says, without planning.
+    /// A trained policy, without planning.
     Direct {
         /// The checkpoint's name or path.
         checkpoint: String,
-        /// Its settings.
+        /// The settings of the policy.
         #[serde(default, skip_serializing_if = "Value::is_null")]
         settings: Value,
     },
 }
 
-/// What predicts.
+/// A model to plan in.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Model {
     /// A trained world model: its name or path.
     Checkpoint(String),
-    /// The world itself, restored and stepped: an upper bound for every model.
+    /// The environment itself, restored and stepped: an upper bound for every model.
     Simulator {
-        /// What it judges a plan by, by the name the planner knows it by.
+        /// The name of the score of a plan, as the simulator model defines it.
         score: String,
     },
 }
 
-/// What is varied, under a name.
+/// A named condition.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Condition {
-    /// Its name in results: `in distribution`, or what is shifted.
+    /// The name in results: `in distribution`, or a description of the shift.
     pub name: String,
-    /// Factors that are sampled and pinned.
+    /// The factors that are sampled and pinned.
     pub variation: VariationRequest,
 }
 
 impl EvalRequest {
-    /// The layout this version writes and reads.
+    /// The layout that this version writes and reads.
     pub const VERSION: u32 = 1;
 
-    /// The protocol's name: `episodic` or `dataset`.
+    /// The name of the protocol: `episodic` or `dataset`.
     pub fn protocol(&self) -> &'static str {
         match self.starts {
             StartsRequest::Episodic => "episodic",
@@ -163,37 +167,37 @@ impl EvalRequest {
     /// The request behind some results.
     ///
     /// # Errors
-    /// When the manifest is of something else, or holds no request of this layout.
+    /// When the manifest is not that of an evaluation, or contains no request of this layout.
     pub fn of(manifest: &Manifest) -> Result<Self> {
         let again = "evaluate again with this version (`swm eval`)";
-        let refuse = |problem: String| Error::config("the results' manifest", problem, again);
+        let invalid = |problem: String| Error::config("the results' manifest", problem, again);
         if manifest.kind != "evaluate" {
-            return Err(refuse(format!("it tells of '{}', not of an evaluation", manifest.kind)));
+            return Err(invalid(format!("its kind is '{}', expected 'evaluate'", manifest.kind)));
         }
         match manifest.config.get("version").map(Value::as_u64) {
-            Some(Some(version)) if version == u64::from(Self::VERSION) => {
-                Self::deserialize(&manifest.config).map_err(|error| refuse(format!("its request is damaged ({error})")))
-            }
+            Some(Some(version)) if version == u64::from(Self::VERSION) => Self::deserialize(&manifest.config)
+                .map_err(|error| invalid(format!("its request is damaged ({error})"))),
             Some(version) => {
-                let theirs = version.map_or("?".to_owned(), |version| version.to_string());
-                Err(refuse(format!("its request has layout {theirs}, this version reads {}", Self::VERSION)))
+                let given = version.map_or("?".to_owned(), |version| version.to_string());
+                Err(invalid(format!("its request has layout {given}; this version reads {}", Self::VERSION)))
             }
-            None => Err(refuse("it was written before requests were kept, and cannot be run from".to_owned())),
+            None => Err(invalid("it contains no request, because an older version wrote it".to_owned())),
         }
     }
 
-    /// Checks what can be checked before anything is opened.
+    /// Checks the request before anything is loaded.
     ///
     /// # Errors
-    /// When there is no condition, two policies or conditions share a name, or predictions are to be compared with nothing.
+    /// When there is no condition, two policies or conditions share a name, or prediction errors are requested without a
+    /// dataset.
     pub fn check(&self) -> Result<()> {
         if self.conditions.is_empty() {
-            return Err(Error::config("conditions of an evaluation", "there is none", "name at least one"));
+            return Err(Error::config("conditions of an evaluation", "there are none", "name at least one"));
         }
         if self.prediction.is_some() && self.starts == StartsRequest::Episodic {
             return Err(Error::config(
                 "prediction errors",
-                "they are those of recorded trajectories, and the environment draws the starts",
+                "they require recorded trajectories, and the environment draws the starts",
                 "take starts from a dataset",
             ));
         }
@@ -208,8 +212,8 @@ fn unique<'a>(what: &str, names: impl Iterator<Item = &'a str>) -> Result<()> {
         if seen.contains(&name) {
             return Err(Error::config(
                 format!("{what} '{name}'"),
-                "the name stands for two",
-                "give each a name of its own, results go by it",
+                "the name is used twice",
+                "give each a different name, because results are listed by name",
             ));
         }
         seen.push(name);

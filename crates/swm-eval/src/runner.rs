@@ -1,42 +1,47 @@
-//! Running an [`EvalRequest`]: every policy, the random floor first, on the same starts, condition by condition.
+//! Runs an [`EvalRequest`]: condition by condition, every policy on the same starts, the random-policy floor first.
 
+use crate::evaluate::EvalConfig;
 use crate::prediction::{Predictor, predict_run};
-use crate::request::{Acts, EvalRequest, HeldOut, PolicyRequest, StartsRequest};
-use crate::witness::Witness;
-use crate::{EvalConfig, Starts, Videos, World, WorldConfig};
+use crate::request::{Condition, EvalRequest, HeldOut, PolicyKind, PolicyRequest, StartsRequest};
+use crate::starts::Starts;
+use crate::starts_hash::StartsHash;
+use crate::video_recording::Videos;
+use crate::world::{World, WorldConfig};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 use swm_core::results::{Comparison, Counting, Run, Searches};
-use swm_core::run::{Control, Event, Progress};
+use swm_core::run::{Control, Event, Stage};
 use swm_core::{Env, Error, Manifest, PlanTrace, Policy, RandomPolicy, Result, Results, VariationRequest};
 use swm_data::Reader;
 
-/// What the floor is called in results.
+/// The name of the random-policy floor in results.
 const FLOOR: &str = "random";
 
-/// Knows the things that a request names.
+/// The name of the stage that evaluates one policy under one condition.
+const STAGE: &str = "evaluate";
+
+/// Loads the environments, datasets and policies that a request names.
 pub trait Resolver {
-    /// One environment of the request, its wrappers around it.
+    /// Makes an environment of the request, with its wrappers.
     ///
     /// # Errors
     /// When there is no such environment or wrapper.
     fn env(&self, request: &EvalRequest) -> Result<Box<dyn Env>>;
 
-    /// A dataset by its name or path.
+    /// Opens a dataset by its name or path.
     ///
     /// # Errors
-    /// When there is none, or it is damaged.
+    /// When it does not exist or is damaged.
     fn dataset(&self, name: &str) -> Result<Arc<dyn Reader>>;
 
-    /// A policy for all environments of a world. The random floor is made without asking.
+    /// Makes a policy for all environments of a world. It is not called for the random-policy floor.
     ///
     /// # Errors
-    /// When what it names is not there or does not fit the world.
-    fn policy(&self, request: &PolicyRequest, world: &World) -> Result<Actor>;
+    /// When a checkpoint, an expert or a solver does not exist or does not fit the world.
+    fn policy(&self, request: &PolicyRequest, world: &World) -> Result<ResolvedPolicy>;
 
-    /// The model of a policy, to look at its predictions; none where it has no model or shows none.
+    /// Returns the model of a policy for prediction errors; none where it has no model or offers no predictions.
     ///
     /// # Errors
     /// As [`Resolver::policy`].
@@ -45,79 +50,61 @@ pub trait Resolver {
     }
 }
 
-/// A policy, and where it came from.
-pub struct Actor {
+/// A policy with its provenance.
+pub struct ResolvedPolicy {
     /// The policy.
     pub policy: Box<dyn Policy>,
     /// The hash of its weights, if it has any.
     pub weights: Option<String>,
-    /// Versions of the libraries that decide its actions.
+    /// The versions of the libraries that determine its actions.
     pub libraries: BTreeMap<String, String>,
-    /// Where it computes, such as `cpu (flex)`, if not like everything else.
+    /// The device it computes on, such as `cpu (flex)`, if it differs from the default.
     pub device: Option<String>,
-    /// Gives the searches of all plans since it was last called, where they are traced.
-    #[allow(clippy::type_complexity)]
-    pub searches: Option<Box<dyn FnMut() -> Vec<PlanTrace>>>,
+    /// Returns the searches of all plans since the last call, where they are traced.
+    pub searches: Option<TakeSearches>,
 }
 
-impl From<Box<dyn Policy>> for Actor {
+/// Returns the searches of all plans since the last call.
+pub type TakeSearches = Box<dyn FnMut() -> Vec<PlanTrace>>;
+
+impl From<Box<dyn Policy>> for ResolvedPolicy {
     fn from(policy: Box<dyn Policy>) -> Self {
         Self { policy, weights: None, libraries: BTreeMap::new(), device: None, searches: None }
     }
 }
 
-/// What an evaluation runs on, and what is wanted of it besides results: nothing that decides a number.
+/// Options of a run that do not change its results.
 #[derive(Clone, Debug, Default)]
-pub struct Means {
-    /// Environments played, and planned for, at the same time. Compat counting of episodic starts names its own number.
+pub struct RunOptions {
+    /// Environments played and planned for at the same time. Compat counting of episodic starts overrides it.
     pub envs: usize,
-    /// Worker threads; as many as the machine offers for 0.
+    /// Worker threads; as many as the machine has cores for 0.
     pub threads: usize,
-    /// Films of the first episodes of every run: the folder of the results file, and how many.
+    /// Videos of the first episodes of every run: the folder of the results file, and the number of episodes.
     pub videos: Option<(PathBuf, usize)>,
-    /// Set by somebody (Ctrl-C) to stop.
-    pub stop: Option<Arc<AtomicBool>>,
-}
-
-/// How far an evaluation is.
-#[derive(Debug)]
-pub enum Moment<'a> {
-    /// A policy begins under a condition.
-    Begins {
-        /// The policy.
-        policy: &'a str,
-        /// The condition.
-        condition: &'a str,
-    },
-    /// Another episode is done.
-    Progress(Progress<'a>),
-    /// All are.
-    Ends(&'a Run),
 }
 
 impl EvalRequest {
-    /// Evaluates every policy, and the random floor, from the same starts under every condition. `watch` is told how far
-    /// it is.
+    /// Evaluates every policy, and the random-policy floor, from the same starts under every condition.
+    ///
+    /// Each policy and condition is a stage `evaluate` with the subject `[policy, condition]`; its metrics are `success_rate`,
+    /// `successes` and `episodes` (those that count).
     ///
     /// # Errors
-    /// When the request contradicts itself or names what is not there, a policy or an environment fails, or the run is
+    /// When the request contradicts itself or names something unknown, a policy or an environment fails, or the run is
     /// stopped.
-    pub fn run(
-        &self,
-        resolver: &dyn Resolver,
-        means: &Means,
-        watch: &mut (dyn FnMut(Moment<'_>) + Send),
-    ) -> Result<Results> {
+    #[allow(clippy::too_many_lines, reason = "one loop over conditions and policies, which share all state")]
+    pub fn run(&self, resolver: &dyn Resolver, options: &RunOptions, control: &mut Control<'_>) -> Result<Results> {
         self.check()?;
         let request = self.with_floor()?;
         let mut world = World::of(
             || resolver.env(&request),
             WorldConfig {
-                envs: request.side_by_side(means),
+                envs: request.parallel_envs(options),
                 image: request.image.map(|[height, width]| (height, width)),
                 views: vec![],
                 max_episode_steps: request.budget,
-                threads: means.threads,
+                threads: options.threads,
             },
         )?;
         let request = Self { budget: Some(world.pool().max_episode_steps()), ..request };
@@ -130,55 +117,40 @@ impl EvalRequest {
         if let Some(reader) = &dataset {
             manifest.hashes.insert("dataset".to_owned(), reader.content_hash()?);
         }
-        // What is not there or does not fit is found before anything is played.
-        for policy in request.policies.iter().filter(|policy| policy.acts != Acts::Random) {
+        // Policies that do not exist or do not fit fail before the first episode.
+        for policy in request.policies.iter().filter(|policy| policy.kind != PolicyKind::Random) {
             resolver.policy(policy, &world)?;
         }
-        let (mut witness, mut runs) = (Witness::default(), vec![]);
+        let (mut starts_hash, mut runs) = (StartsHash::default(), vec![]);
         for condition in &request.conditions {
             let starts = request.starts(dataset.as_deref(), world.pool().env(0), condition.variation.clone())?;
-            witness.note(&mut world, &starts)?;
+            starts_hash.add(&mut world, &starts)?;
             for policy in &request.policies {
-                let mut actor = match policy.acts {
-                    Acts::Random => Actor::from(floor(&world)),
+                let mut resolved = match policy.kind {
+                    PolicyKind::Random => ResolvedPolicy::from(floor(&world)),
                     _ => resolver.policy(policy, &world)?,
                 };
-                request.credit(&mut manifest, policy, &actor);
-                watch(Moment::Begins { policy: &policy.name, condition: &condition.name });
-                let config = EvalConfig {
-                    policy: policy.name.clone(),
-                    condition: condition.name.clone(),
-                    budget: request.budget,
-                    counting: request.counting,
-                    videos: means.videos.as_ref().map(|(root, count)| Videos {
-                        root: root.clone(),
-                        prefix: format!("videos/{}-{}", slug(&policy.name), slug(&condition.name)),
-                        count: *count,
-                        fps: 15,
-                    }),
-                };
-                let mut control = Control::new().with_events(|event| {
-                    if let Event::Progress(at) = event {
-                        watch(Moment::Progress(at));
-                    }
-                });
-                if let Some(stop) = &means.stop {
-                    control = control.with_interrupt(Arc::clone(stop));
-                }
-                let mut run = world.evaluate(&mut *actor.policy, &starts, &config, &mut control)?;
-                drop(control);
+                request.record_provenance(&mut manifest, policy, &resolved);
+                control.emit(Event::Started(Stage {
+                    name: STAGE,
+                    subject: &[&policy.name, &condition.name],
+                    total: starts.len(),
+                    unit: "episodes",
+                }));
+                let config = request.config(policy, condition, options);
+                let mut run = world.evaluate(&mut *resolved.policy, &starts, &config, control)?;
                 if let Some((horizon, reader)) = request.prediction.zip(dataset.as_deref())
                     && let Some(mut predictor) = resolver.predictor(policy)?
                 {
                     let threads = world.pool().threads();
                     run.prediction = Some(threads.install(|| predict_run(&mut *predictor, reader, &run, horizon))?);
                 }
-                run.searches = actor.searches.as_mut().and_then(|traces| Searches::of(&traces()));
-                watch(Moment::Ends(&run));
+                run.searches = resolved.searches.as_mut().and_then(|take| Searches::of(&take()));
+                control.emit(Event::Finished { stage: STAGE, metrics: &metrics(&run) });
                 runs.push(run);
             }
         }
-        manifest.hashes.extend(witness.hashes());
+        manifest.hashes.extend(starts_hash.hashes());
         Ok(Results {
             manifest,
             env: request.env.clone(),
@@ -189,35 +161,51 @@ impl EvalRequest {
         })
     }
 
-    /// The same with the floor first.
+    /// The settings of one evaluation.
+    fn config(&self, policy: &PolicyRequest, condition: &Condition, options: &RunOptions) -> EvalConfig {
+        EvalConfig {
+            policy: policy.name.clone(),
+            condition: condition.name.clone(),
+            budget: self.budget,
+            counting: self.counting,
+            videos: options.videos.as_ref().map(|(root, count)| Videos {
+                root: root.clone(),
+                prefix: format!("videos/{}-{}", slug(&policy.name), slug(&condition.name)),
+                count: *count,
+                fps: 15,
+            }),
+        }
+    }
+
+    /// This request with the random-policy floor first.
     fn with_floor(&self) -> Result<Self> {
         let mut request = self.clone();
-        match self.policies.iter().position(|policy| policy.acts == Acts::Random) {
-            Some(place) => {
-                let floor = request.policies.remove(place);
+        match self.policies.iter().position(|policy| policy.kind == PolicyKind::Random) {
+            Some(index) => {
+                let floor = request.policies.remove(index);
                 request.policies.insert(0, floor);
             }
             None if self.policies.iter().any(|policy| policy.name == FLOOR) => {
                 return Err(Error::config(
                     format!("policy '{FLOOR}'"),
-                    "it does not act at random, and the random floor goes by that name",
-                    "name it otherwise",
+                    "it is not the random policy, for which this name is reserved",
+                    "choose another name",
                 ));
             }
-            None => request.policies.insert(0, PolicyRequest { name: FLOOR.to_owned(), acts: Acts::Random }),
+            None => request.policies.insert(0, PolicyRequest { name: FLOOR.to_owned(), kind: PolicyKind::Random }),
         }
         Ok(request)
     }
 
-    /// Environments of the world.
-    fn side_by_side(&self, means: &Means) -> usize {
+    /// The number of environments of the world.
+    fn parallel_envs(&self, options: &RunOptions) -> usize {
         match (self.counting, &self.starts) {
             (Counting::Compat { envs }, StartsRequest::Episodic) => envs,
-            _ => means.envs.min(self.episodes).max(1),
+            _ => options.envs.min(self.episodes).max(1),
         }
     }
 
-    /// From where to play under a condition.
+    /// The starts under a condition.
     fn starts(&self, dataset: Option<&dyn Reader>, env: &dyn Env, variation: VariationRequest) -> Result<Starts> {
         let Some((reader, StartsRequest::Dataset { goal_offset, held_out, .. })) = dataset.zip(Some(&self.starts))
         else {
@@ -241,26 +229,32 @@ impl EvalRequest {
         Ok(Manifest::new("evaluate", self.seed, config))
     }
 
-    /// Notes where a policy came from.
-    fn credit(&self, manifest: &mut Manifest, policy: &PolicyRequest, actor: &Actor) {
-        if let Some(weights) = &actor.weights {
-            // The floor is one of them.
-            let alone = self.policies.len() <= 2;
-            let what = if alone { "weights".to_owned() } else { format!("weights of {}", policy.name) };
-            manifest.hashes.insert(what, weights.clone());
+    /// Adds the provenance of a policy to the manifest.
+    fn record_provenance(&self, manifest: &mut Manifest, policy: &PolicyRequest, resolved: &ResolvedPolicy) {
+        if let Some(weights) = &resolved.weights {
+            // The floor and one other policy.
+            let single = self.policies.len() <= 2;
+            let key = if single { "weights".to_owned() } else { format!("weights of {}", policy.name) };
+            manifest.hashes.insert(key, weights.clone());
         }
-        manifest.libraries.extend(actor.libraries.clone());
-        if let Some(device) = &actor.device {
+        manifest.libraries.extend(resolved.libraries.clone());
+        if let Some(device) = &resolved.device {
             manifest.device.clone_from(device);
         }
     }
+}
+
+/// The summary of a run, for [`Event::Finished`].
+fn metrics(run: &Run) -> [(&'static str, f64); 3] {
+    let success = &run.success;
+    [("success_rate", success.rate), ("successes", success.successes as f64), ("episodes", success.n as f64)]
 }
 
 fn floor(world: &World) -> Box<dyn Policy> {
     Box::new(RandomPolicy::new(world.spec(), world.pool().len()))
 }
 
-/// A name as part of a file name.
+/// A name in the form of a file name: lower-case words joined by hyphens.
 fn slug(name: &str) -> String {
     let words: Vec<&str> = name.split(|c: char| !c.is_ascii_alphanumeric()).filter(|word| !word.is_empty()).collect();
     words.join("-").to_lowercase()

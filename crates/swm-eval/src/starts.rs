@@ -1,7 +1,8 @@
-//! [`Starts`]: from where episodes are played and towards which goal. Every policy of a comparison, the random
-//! floor included, is given the same starts.
+//! [`Starts`]: the initial states and goals of an evaluation's episodes.
+//!
+//! Every policy of a comparison, the random-policy floor included, is evaluated on the same starts.
 
-use crate::world::{episode_key, reset_seed};
+use crate::seeding::{episode_key, reset_seed};
 use rand::Rng as _;
 use std::collections::HashSet;
 use swm_core::columns::{flat, flat_factor};
@@ -12,35 +13,35 @@ use swm_core::{
 };
 use swm_data::{Reader, StepRange};
 
-/// Starts and goals, decided by what was asked and nothing else.
+/// Initial states and goals, determined by the request alone.
 #[derive(Clone, Debug)]
 pub struct Starts {
     seed: u64,
     n: usize,
-    /// Whether reset seeds count up from the seed instead of being drawn from it.
+    /// Whether the reset seeds are consecutive numbers instead of derived from keys.
     sequential: bool,
     variation: VariationRequest,
     dataset: Option<Rows>,
 }
 
-/// Starts and goals out of a dataset.
+/// Starts and goals from a dataset.
 #[derive(Clone, Debug)]
 struct Rows {
     /// `[episode, step]` of every start.
     picks: Vec<[usize; 2]>,
     goal_offset: usize,
-    /// The start and the goal of every pick, one after the other.
+    /// The start row and the goal row of every pick, alternating.
     rows: Batch,
-    /// How a world that does not know states by itself is put into them.
+    /// The methods that put an environment into a state which it cannot restore from columns.
     calls: Vec<Callable>,
 }
 
 impl Starts {
-    /// The episodic protocol: `n` episodes, start and goal chosen by the environment from the episode's seed.
-    /// Factors named in `variation` are sampled or pinned as it says.
+    /// The episodic protocol: `n` episodes, whose start and goal the environment draws from the episode's seed. `variation`
+    /// samples or pins factors.
     ///
     /// # Errors
-    /// When there is no episode.
+    /// When `n` is 0.
     pub fn episodic(n: usize, seed: u64, variation: VariationRequest) -> Result<Self> {
         check_count(n)?;
         Ok(Self { seed, n, sequential: false, variation, dataset: None })
@@ -55,18 +56,18 @@ impl Starts {
         Ok(Self { sequential: true, ..Self::episodic(n, seed, variation)? })
     }
 
-    /// The dataset-driven protocol (as of DINO-WM and LeWM): each pick `[episode, step]` of a dataset is a start,
-    /// and what the same episode showed `goal_offset` steps later is its goal, so it is reachable.
+    /// The dataset protocol (of DINO-WM and LeWM): each pick `[episode, step]` of a dataset is a start, and the observation
+    /// `goal_offset` steps later in the same episode is its goal, which is therefore reachable.
     ///
-    /// Factors are those of the recorded episode, except the ones `variation` names: these are sampled or
-    /// pinned as it says, which is how a shift is applied to recorded starts.
+    /// Factors are those of the recorded episode, except those that `variation` samples or pins, which applies a shift to
+    /// recorded starts.
     ///
-    /// `env` is one of the environments to be played, and `calls` says how it is put into a state if it does not know that
-    /// by itself.
+    /// `env` is one of the environments to be played; `calls` are the methods that put it into a state which it cannot restore
+    /// from columns.
     ///
     /// # Errors
     /// When there is no pick, a pick or its goal lies outside its episode, the dataset lacks columns that the environment
-    /// needs ([`dataset_start::required_columns`]), or `variation` names what is no factor.
+    /// needs ([`dataset_start::required_columns`]), or `variation` names an unknown factor.
     pub fn from_dataset(
         reader: &dyn Reader,
         env: &dyn Env,
@@ -102,7 +103,8 @@ impl Starts {
         })
     }
 
-    /// Chooses `n` different starts of a dataset, uniformly among all whose goal lies in the same episode.
+    /// Chooses `n` different starts of a dataset, uniformly among all whose goal lies in the same episode: `[n]` picks
+    /// `[episode, step]`.
     ///
     /// # Errors
     /// When there are fewer than `n` of them.
@@ -111,7 +113,7 @@ impl Starts {
         Self::choose_among(reader, &all, n, goal_offset, seed)
     }
 
-    /// As [`Starts::choose`], in these episodes only: those of a held-out [`swm_data::Split`].
+    /// As [`Starts::choose`], among these episodes only, such as those of a held-out [`swm_data::Split`].
     ///
     /// # Errors
     /// When they have fewer than `n` starts, or one of them does not exist.
@@ -122,7 +124,7 @@ impl Starts {
         goal_offset: usize,
         seed: u64,
     ) -> Result<Vec<[usize; 2]>> {
-        // Starts are numbered episode after episode; `ends[e]` is the number after the last of the `e`th.
+        // Candidate starts are numbered episode by episode; `ends[e]` is one past the last number of the `e`-th episode.
         let mut total = 0;
         let mut ends = Vec::with_capacity(episodes.len());
         for &episode in episodes {
@@ -134,7 +136,7 @@ impl Starts {
             return Err(Error::config(
                 "number of evaluation starts",
                 format!(
-                    "{n}, but the dataset's {} episodes have {total} steps with another {goal_offset} steps behind them",
+                    "{n}, but the dataset's {} episodes have {total} steps that are followed by {goal_offset} others",
                     episodes.len()
                 ),
                 "ask for fewer, lower the goal offset, or collect more episodes",
@@ -154,37 +156,37 @@ impl Starts {
         Ok(picks)
     }
 
-    /// How many.
+    /// The number of starts.
     pub fn len(&self) -> usize {
         self.n
     }
 
-    /// Whether there is none (never).
+    /// Whether there are no starts, which is never the case.
     pub fn is_empty(&self) -> bool {
         self.n == 0
     }
 
-    /// The seed behind them.
+    /// The seed of the starts.
     pub fn seed(&self) -> u64 {
         self.seed
     }
 
-    /// Factors sampled and pinned.
+    /// The factors that are sampled and pinned.
     pub fn variation(&self) -> &VariationRequest {
         &self.variation
     }
 
-    /// The protocol's name: `episodic` or `dataset`.
+    /// The name of the protocol: `episodic` or `dataset`.
     pub fn protocol(&self) -> &'static str {
         if self.dataset.is_some() { "dataset" } else { "episodic" }
     }
 
-    /// Steps between a start and its goal, where they come from a dataset.
+    /// Steps between a start and its goal, for starts from a dataset.
     pub fn goal_offset(&self) -> Option<usize> {
         self.dataset.as_ref().map(|dataset| dataset.goal_offset)
     }
 
-    /// `[episode, step]` of a start, where they come from a dataset.
+    /// The pick `[episode, step]` of a start, for starts from a dataset.
     pub fn pick(&self, episode: usize) -> Option<[usize; 2]> {
         self.dataset.as_ref().map(|dataset| dataset.picks[episode])
     }
@@ -195,7 +197,7 @@ impl Starts {
 
     pub(crate) fn reset_seed(&self, episode: usize) -> u64 {
         if self.sequential {
-            // Without the highest bit, as all reset seeds are.
+            // At most 63 bits, like all reset seeds.
             self.seed.wrapping_add(episode as u64) & (u64::MAX >> 1)
         } else {
             reset_seed(self.key(episode))
@@ -233,7 +235,7 @@ fn check_count(n: usize) -> Result<()> {
     Err(Error::config("number of evaluation episodes", "0", "ask for at least 1"))
 }
 
-/// These columns without the factors that are to be shifted.
+/// Removes the columns of factors that are sampled or pinned.
 fn unshifted(columns: Vec<String>, env: &dyn Env, variation: &VariationRequest) -> Result<Vec<String>> {
     let space = &env.spec().variation_space;
     let mut shifted = HashSet::new();
@@ -245,7 +247,7 @@ fn unshifted(columns: Vec<String>, env: &dyn Env, variation: &VariationRequest) 
     Ok(columns.into_iter().filter(|name| !shifted.contains(&flat(name))).collect())
 }
 
-/// The same rows under flat names, so that environments find columns whatever format they come from.
+/// Renames columns to their flat names, which environments expect for every format.
 fn renamed(rows: Batch) -> Result<Batch> {
     let columns: Vec<ColumnSpec> =
         rows.schema().columns().iter().map(|c| ColumnSpec { name: flat(&c.name), ..c.clone() }).collect();

@@ -1,31 +1,32 @@
 //! [`World`]: a pool of environments of one kind and the loop that plays a policy in them.
+//!
+//! Collecting and evaluating implement [`Play`], which selects the episodes and consumes their steps.
 
-use crate::Starts;
+use crate::seeding::{episode_key, reset};
 use std::collections::BTreeMap;
 use swm_core::pool::{Reset, threads};
 use swm_core::run::Control;
 use swm_core::{
-    Batch, CameraView, Env, EnvChoice, EnvPool, EnvSpec, Error, Key, Policy, ResetOptions, Result, Schema,
-    VariationRequest,
+    Batch, CameraView, Env, EnvChoice, EnvPool, EnvSpec, Error, Key, Policy, Result, Schema, VariationRequest,
 };
 
-/// How big a world is and what it draws.
+/// The size of a world and the frames it renders.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct WorldConfig {
     /// Environments played at the same time.
     pub envs: usize,
-    /// The `(height, width)` of pictures, if any are drawn.
+    /// The `(height, width)` of frames, in pixels; none for no frames.
     pub image: Option<(usize, usize)>,
-    /// What is drawn besides the default camera's colours, at the same size.
+    /// Camera views to render besides the default camera's colours, at the same size.
     pub views: Vec<CameraView>,
-    /// Steps after which an episode is truncated; the environment's own number for `None`.
+    /// The time limit of an episode, in steps; that of the environment for `None`.
     pub max_episode_steps: Option<usize>,
-    /// Worker threads; as many as the machine offers for 0.
+    /// Worker threads; as many as the machine has cores for 0.
     pub threads: usize,
 }
 
 impl Default for WorldConfig {
-    /// Eight environments at the paper's picture size, on all cores.
+    /// Eight environments at the paper's frame size, on all cores.
     fn default() -> Self {
         Self { envs: 8, image: Some((224, 224)), views: vec![], max_episode_steps: None, threads: 0 }
     }
@@ -34,7 +35,7 @@ impl Default for WorldConfig {
 /// Many environments of one kind.
 pub struct World {
     pool: EnvPool,
-    /// One action row a slot.
+    /// One row of actions for each slot.
     actions: Batch,
 }
 
@@ -42,14 +43,13 @@ impl World {
     /// A world of `config.envs` environments.
     ///
     /// # Errors
-    /// When no environment is asked for, pictures have no pixels, episodes have no steps, or threads cannot
-    /// be started.
+    /// When there are no environments, frames have no pixels, episodes have no steps, or threads cannot be started.
     pub fn new(env: impl Into<EnvChoice>, config: WorldConfig) -> Result<Self> {
         let env = env.into();
         Self::of(|| env.env(), config)
     }
 
-    /// As [`World::new`], of environments that `make` makes: with wrappers around them, or of none of the registry.
+    /// As [`World::new`], with environments that `make` creates: wrapped ones, or ones that are not in the registry.
     ///
     /// # Errors
     /// As [`World::new`], and what `make` returns.
@@ -58,7 +58,11 @@ impl World {
             && (height == 0 || width == 0)
         {
             let given = format!("{height} x {width}");
-            return Err(Error::config("picture size", given, "ask for at least one pixel each way, or no pictures"));
+            return Err(Error::config(
+                "frame size",
+                given,
+                "ask for at least one pixel in each dimension, or for no frames",
+            ));
         }
         if config.max_episode_steps == Some(0) {
             return Err(Error::config("steps of an episode", "0", "ask for at least 1"));
@@ -75,12 +79,12 @@ impl World {
         &self.pool
     }
 
-    /// What never changes about the environments.
+    /// The specification of the environments.
     pub fn spec(&self) -> &EnvSpec {
         self.pool.spec()
     }
 
-    /// What decides its numbers and pictures, with versions; a renderer where there are pictures.
+    /// The versions of the libraries that determine results; the renderer's only where frames are rendered.
     pub fn libraries(&self) -> BTreeMap<String, String> {
         let mut libraries = self.pool.env(0).libraries();
         if self.pool.image().is_none() && self.pool.views().is_empty() {
@@ -89,19 +93,17 @@ impl World {
         libraries
     }
 
-    /// Starts an episode in every slot, keyed by the slot, for loops of one's own.
+    /// Starts an episode in every slot, keyed by the slot, for custom loops.
     ///
     /// # Errors
-    /// When an environment refuses the request.
+    /// When an environment rejects the request.
     pub fn reset(&mut self, seed: u64, variation: &VariationRequest) -> Result<()> {
         let resets: Vec<Reset> =
             (0..self.pool.len()).map(|slot| reset(slot, episode_key(seed, slot), variation)).collect();
         self.pool.reset(&resets)
     }
 
-    /// Lets the policy act in the active slots and steps them.
-    ///
-    /// The policy runs on the pool's threads, so one setting bounds the threads of everything.
+    /// Computes the policy's actions for the active slots and steps them.
     ///
     /// # Errors
     /// When the policy or an environment fails.
@@ -110,7 +112,7 @@ impl World {
         self.pool.step(&self.actions, active)
     }
 
-    /// The action of every slot, for loops of one's own: filled before [`World::advance`].
+    /// The actions of all slots, for custom loops, which fill them before [`World::advance`].
     pub fn actions_mut(&mut self) -> &mut Batch {
         &mut self.actions
     }
@@ -123,36 +125,34 @@ impl World {
         self.pool.step(&self.actions, active)
     }
 
-    /// Lets the policy fill the active slots of [`World::actions_mut`], without stepping.
-    ///
-    /// # Errors
-    /// When the policy fails.
-    pub fn ask(&mut self, policy: &mut dyn Policy, active: &[bool]) -> Result<()> {
-        self.act(policy, active)
-    }
-
-    /// Starts some of these episodes in slots: `(slot, episode)`.
-    pub(crate) fn start(&mut self, starts: &Starts, starting: &[(usize, usize)]) -> Result<()> {
-        starts.start(&mut self.pool, starting)
+    /// The environments, for changes between steps.
+    pub(crate) fn pool_mut(&mut self) -> &mut EnvPool {
+        &mut self.pool
     }
 
     /// Starts new episodes in some slots.
     ///
     /// # Errors
-    /// When an environment refuses its options.
+    /// When an environment rejects its options.
     pub fn restart(&mut self, resets: &[Reset]) -> Result<()> {
         self.pool.reset(resets)
     }
 
-    /// Changes environments in place, then shows them as after a reset.
+    /// Modifies environments in place, then observes them as after a reset.
     ///
     /// # Errors
-    /// What `change` returns.
-    pub fn change(&mut self, slots: &[usize], change: impl Fn(usize, &mut dyn Env) -> Result<()> + Sync) -> Result<()> {
-        self.pool.restart(slots, change)
+    /// What `modify` returns.
+    pub fn modify(&mut self, slots: &[usize], modify: impl Fn(usize, &mut dyn Env) -> Result<()> + Sync) -> Result<()> {
+        self.pool.restart(slots, modify)
     }
 
-    fn act(&mut self, policy: &mut dyn Policy, active: &[bool]) -> Result<()> {
+    /// Computes the policy's actions for the active slots into [`World::actions_mut`], without stepping.
+    ///
+    /// The policy runs on the pool's threads, so that one setting limits all threads.
+    ///
+    /// # Errors
+    /// When the policy fails.
+    pub fn act(&mut self, policy: &mut dyn Policy, active: &[bool]) -> Result<()> {
         policy.observe_envs(&self.pool, active)?;
         let (infos, actions) = (self.pool.infos(), &mut self.actions);
         if policy.uses_threads() {
@@ -162,7 +162,7 @@ impl World {
         }
     }
 
-    /// Plays episodes until `play` has no more, each slot taking the next one when it is free.
+    /// Plays the episodes of `play`. Each slot starts the next episode when it is free.
     pub(crate) fn play(
         &mut self,
         policy: &mut dyn Policy,
@@ -214,15 +214,15 @@ impl World {
     }
 }
 
-/// What is done with the episodes a world plays.
+/// Selects the episodes that a world plays and consumes their steps.
 pub(crate) trait Play {
-    /// The next episode to start; none when there is none, or none yet.
+    /// Returns the next episode to start; none if there is none, or none yet.
     fn next(&mut self) -> Option<usize>;
 
-    /// Whether [`Play::next`] would name an episode now.
+    /// Whether [`Play::next`] would return an episode now.
     fn more(&self) -> bool;
 
-    /// Whether nothing more needs to be played, whatever is still running.
+    /// Whether playing can stop, even if episodes are still running.
     fn over(&self) -> bool {
         false
     }
@@ -233,29 +233,12 @@ pub(crate) trait Play {
     /// Starts episodes in slots: `(slot, episode)`.
     fn start(&mut self, pool: &mut EnvPool, starting: &[(usize, usize)]) -> Result<()>;
 
-    /// The slot shows its first observation; whether the episode is to be played.
+    /// Consumes the first observation of a slot; returns whether to play the episode.
     fn started(&mut self, slot: usize, pool: &EnvPool, control: &mut Control<'_>) -> Result<bool>;
 
-    /// The policy acted on what the slot shows; the step comes next.
+    /// Consumes the observation and the action of a slot, before the step.
     fn acted(&mut self, slot: usize, pool: &EnvPool, actions: &Batch);
 
-    /// The slot was stepped; whether the episode goes on.
+    /// Consumes the result of a step; returns whether the episode continues.
     fn stepped(&mut self, slot: usize, pool: &EnvPool, control: &mut Control<'_>) -> Result<bool>;
-}
-
-/// The key of an episode: all its randomness, the policy's included.
-pub fn episode_key(seed: u64, episode: usize) -> Key {
-    Key::new(seed).with("episode").at(episode as u64)
-}
-
-/// The seed an environment is reset with. The highest bit is left out so that signed integers hold it: it is
-/// written to results and datasets, and Gymnasium takes no negative seeds.
-pub fn reset_seed(key: Key) -> u64 {
-    key.seed() >> 1
-}
-
-/// A reset of a slot to the start of an episode.
-pub(crate) fn reset(slot: usize, key: Key, variation: &VariationRequest) -> Reset {
-    let options = ResetOptions { variation: variation.clone(), ..ResetOptions::default() };
-    Reset { slot, seed: reset_seed(key), options }
 }

@@ -1,15 +1,14 @@
-//! Which runs belong side by side: those of one environment, protocol and counting, by condition, whatever file they
-//! come from.
+//! [`Group`]: the runs of one environment, protocol and counting, by condition, from all files.
 
 use crate::text::escape;
 use std::path::PathBuf;
 use swm_core::Results;
 use swm_core::results::{Comparison, Counting, Paired, Run};
 
-/// How many policies get a colour of their own before colours repeat.
+/// The number of different colours of policies.
 const COLOURS: usize = 6;
 
-/// Everything measured in one environment under one protocol, counted one way.
+/// All runs in one environment with the same protocol and counting.
 pub(crate) struct Group<'a> {
     pub env: &'a str,
     pub protocol: &'a str,
@@ -17,24 +16,25 @@ pub(crate) struct Group<'a> {
     pub conditions: Vec<Condition<'a>>,
 }
 
-/// Everything measured under one condition.
+/// All runs under one condition.
 pub(crate) struct Condition<'a> {
     pub name: &'a str,
     pub rows: Vec<Row<'a>>,
 }
 
-/// One run, and how it is drawn.
+/// One run with its label and colour.
 pub(crate) struct Row<'a> {
     pub run: &'a Run,
-    /// The place of its results file.
+    /// The index of its results file.
     pub file: usize,
-    /// The policy's name, with the number of its file where several runs would look alike.
+    /// The name of the policy, with the number of its file if several runs have the same name.
     pub label: String,
-    /// The class that colours it: `floor`, `expert`, or `c0` and so on.
+    /// The CSS class of its colour: `floor`, `expert`, or `c0` and so on.
     pub class: String,
 }
 
 impl Row<'_> {
+    /// Whether this is the random-policy floor.
     pub(crate) fn is_floor(&self) -> bool {
         self.class == "floor"
     }
@@ -48,12 +48,12 @@ impl<'a> Group<'a> {
         for (file, (_, result)) in results.iter().enumerate() {
             let counting = result.counting;
             let same = |g: &Self| (g.env, g.protocol, g.counting) == (&*result.env, &*result.protocol, counting);
-            let place = groups.iter().position(same).unwrap_or_else(|| {
+            let index = groups.iter().position(same).unwrap_or_else(|| {
                 let (env, protocol) = (&*result.env, &*result.protocol);
                 groups.push(Self { env, protocol, counting, conditions: vec![] });
                 groups.len() - 1
             });
-            let conditions = &mut groups[place].conditions;
+            let conditions = &mut groups[index].conditions;
             for run in &result.runs {
                 let at = conditions.iter().position(|c| c.name == run.condition).unwrap_or_else(|| {
                     conditions.push(Condition { name: &run.condition, rows: vec![] });
@@ -71,7 +71,7 @@ impl<'a> Group<'a> {
                     }
                 };
                 let rows = &mut conditions[at].rows;
-                // Evaluations of several models over the same starts all measured the same floor.
+                // Evaluations of several models on the same starts contain the same floor.
                 if class == "floor" && rows.iter().any(|row| row.is_floor() && row.run.episodes == run.episodes) {
                     continue;
                 }
@@ -89,28 +89,30 @@ impl<'a> Group<'a> {
         groups
     }
 
+    /// All runs, by condition.
     pub(crate) fn rows(&self) -> impl Iterator<Item = &Row<'a>> {
         self.conditions.iter().flat_map(|condition| &condition.rows)
     }
 
-    /// The name of the group, escaped.
+    /// The heading of the group, escaped.
     pub(crate) fn title(&self) -> String {
         format!("{} · {}, {}", escape(self.env), escape(self.protocol), escape(&self.counting.to_string()))
     }
 }
 
 impl<'a> Condition<'a> {
-    /// The random floor of the condition, if it was measured.
+    /// The random-policy floor of the condition, if it was measured.
     pub(crate) fn floor(&self) -> Option<&Row<'a>> {
         self.rows.iter().find(|row| row.is_floor())
     }
 
-    /// The floor to hold a run against: that of its own file, else that of the condition.
+    /// The floor to compare a run with: that of its file, or else that of the condition.
     pub(crate) fn floor_of(&self, run: &Row<'_>) -> Option<&Row<'a>> {
         self.rows.iter().find(|row| row.is_floor() && row.file == run.file).or_else(|| self.floor())
     }
 
-    /// Every pair of policies that played the same starts, the later one first: a model, then its floor.
+    /// Every pair of policies that played the same starts; the first of a pair is the later one, usually a model, the second
+    /// its floor.
     pub(crate) fn pairs(&self, counting: Counting) -> Vec<(&Row<'a>, &Row<'a>, Paired)> {
         let later = self.rows.iter().enumerate();
         let pairs = later.flat_map(|(i, row)| self.rows[..i].iter().map(move |other| (row, other)));

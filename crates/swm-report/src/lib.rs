@@ -1,22 +1,17 @@
-//! One self-contained HTML page from result files: tables, plots, videos and provenance.
+//! One self-contained HTML page from result files: tables, charts, videos and provenance.
 //!
-//! [`read_results`] reads what an evaluation wrote, [`write_report`] turns any number of such files into a page
-//! that needs no network, no script and no other file, so it can be mailed, archived and printed. The page
-//! is decided by its inputs: equal results give equal bytes.
+//! [`read_results`] reads a results file of an evaluation, [`write_report`] turns any number of them into a page without
+//! scripts, network access or other files, so it can be mailed, archived and printed. Equal results give equal bytes.
 //!
-//! - `page` puts the sections together, by the groups of `group`; `plots` draws on the primitives of `chart`, and so do
-//!   `paired` (policies on the same starts), `searches` (how plans came about) and `prediction` (how well models predict).
-//! - `films` embeds videos; `read` reads files; `text` writes numbers and escapes words.
+//! - `page` writes the page; `sections` has a file for each section; `charts` has a file for each chart, drawn with the SVG
+//!   primitives of `charts/svg.rs`; `style.css` is the style sheet.
+//! - `group` groups runs by environment, protocol and counting; `read` reads files; `text` formats numbers and escapes text.
 
-mod chart;
-mod films;
+mod charts;
 mod group;
 mod page;
-mod paired;
-mod plots;
-mod prediction;
 mod read;
-mod searches;
+mod sections;
 mod text;
 
 pub use page::{ReportOptions, render, write_report, write_report_with};

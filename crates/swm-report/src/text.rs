@@ -1,8 +1,8 @@
-//! Words and numbers as the page shows them.
+//! Formatting of numbers and texts.
 
 use swm_core::results::EpisodeResult;
 
-/// Words made safe for HTML text and quoted attributes. Control characters, which XML forbids, become spaces.
+/// Escapes a text for HTML and quoted attributes. Control characters, which XML forbids, become spaces.
 pub(crate) fn escape(words: &str) -> String {
     let mut safe = String::with_capacity(words.len());
     for c in words.chars() {
@@ -20,9 +20,9 @@ pub(crate) fn escape(words: &str) -> String {
     safe
 }
 
-/// What came of an episode: the class that colours it, and words.
+/// The outcome of an episode: its CSS class and a description.
 pub(crate) fn outcome(episode: &EpisodeResult) -> (&'static str, String) {
-    let also = if episode.solved_at_start { ", from a start that was solved already" } else { "" };
+    let also = if episode.solved_at_start { ", solved at the start" } else { "" };
     match episode.time_to_goal() {
         _ if episode.solved_at_start && episode.steps == 0 => ("start", "solved at the start, not counted".to_owned()),
         Some(steps) => ("solved", format!("solved in {steps} steps{also}")),
@@ -30,7 +30,7 @@ pub(crate) fn outcome(episode: &EpisodeResult) -> (&'static str, String) {
     }
 }
 
-/// Words cut to `most` characters, with an ellipsis where something is missing.
+/// Truncates a text to `most` characters, with an ellipsis.
 pub(crate) fn shorten(words: &str, most: usize) -> String {
     if words.chars().count() <= most {
         return words.to_owned();
@@ -40,12 +40,12 @@ pub(crate) fn shorten(words: &str, most: usize) -> String {
     short
 }
 
-/// A share as a percentage with one decimal: `92.5 %`, which no line break parts.
+/// A fraction as a percentage with one decimal and a non-breaking space: `92.5 %`.
 pub(crate) fn percent(rate: f64) -> String {
     format!("{:.1}\u{a0}%", rate * 100.0)
 }
 
-/// A difference of shares in percentage points, with its sign: `+34.0`.
+/// A difference of fractions in percentage points, with its sign: `+34.0`.
 pub(crate) fn points(difference: f64) -> String {
     format!("{:+.1}", difference * 100.0).replace('-', "\u{2212}")
 }
@@ -101,13 +101,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn words_cannot_become_markup() {
+    fn text_is_escaped_and_truncated() {
         assert_eq!(escape("<b a=\"1\" c='2'>&\u{1}é"), "&lt;b a=&quot;1&quot; c=&#39;2&#39;&gt;&amp; é");
         assert_eq!((shorten("éclair", 6), shorten("éclairs", 6)), ("éclair".to_owned(), "éclai…".to_owned()));
     }
 
     #[test]
-    fn numbers_are_short() {
+    fn numbers_are_formatted() {
         let numbers = [0.0, 1.0, -2.5, 0.123_456, 12_345.6, 1e-9, 150.0, f64::NAN].map(number);
         assert_eq!(numbers, ["0", "1", "-2.5", "0.1235", "12346", "1.00e-9", "150", "–"]);
         let times = [0.000_84, 0.012, 0.9996, 1.417, 59.96, 200.0, 7500.0, -1.0].map(duration);

@@ -8,7 +8,7 @@ use swm_core::policy::ExpertPolicy;
 use swm_core::{Env, EnvEntry, EnvSpec, Error, Named as _, Policy, RandomPolicy, Result};
 use swm_data::Reader;
 use swm_envs::wrappers::{GoalPicture, Stack, WRAPPERS};
-use swm_eval::{Actor, Acts, Choice, EvalRequest, Model, PolicyRequest, Predictor, Resolver, World};
+use swm_eval::{Choice, EvalRequest, Model, PolicyKind, PolicyRequest, Predictor, ResolvedPolicy, Resolver, World};
 use swm_models::{CheckpointInfo, Device, load};
 use swm_plan::ActionKind;
 use swm_plan::objective::ObjectiveConfig;
@@ -67,8 +67,8 @@ impl Home {
     }
 
     /// A policy that plans; its plans are traced where that was asked for.
-    fn planning(&self, name: &str, policy: MpcPolicy) -> Actor {
-        let Some(traces) = &self.traces else { return Actor::from(Box::new(policy) as Box<dyn Policy>) };
+    fn planning(&self, name: &str, policy: MpcPolicy) -> ResolvedPolicy {
+        let Some(traces) = &self.traces else { return ResolvedPolicy::from(Box::new(policy) as Box<dyn Policy>) };
         let (log, traces, name) = (TraceLog::default(), Arc::clone(traces), name.to_owned());
         let policy: Box<dyn Policy> = Box::new(policy.traced(log.clone()));
         let searches = move || {
@@ -78,7 +78,7 @@ impl Home {
             traces.lock().unwrap_or_else(PoisonError::into_inner).extend(named);
             searches
         };
-        Actor { searches: Some(Box::new(searches)), ..Actor::from(policy) }
+        ResolvedPolicy { searches: Some(Box::new(searches)), ..ResolvedPolicy::from(policy) }
     }
 }
 
@@ -92,22 +92,22 @@ impl Resolver for Home {
         home::open_dataset(name)
     }
 
-    fn policy(&self, request: &PolicyRequest, world: &World) -> Result<Actor> {
+    fn policy(&self, request: &PolicyRequest, world: &World) -> Result<ResolvedPolicy> {
         let (spec, slots) = (world.spec(), world.pool().len());
         let env = crate::env(&spec.id)?;
-        match &request.acts {
-            Acts::Random => Ok(Actor::from(Box::new(RandomPolicy::new(spec, slots)) as Box<dyn Policy>)),
-            Acts::Expert { id } => scripted(&env.entry, id, world).map(Actor::from),
-            Acts::Direct { checkpoint: given, .. } => {
+        match &request.kind {
+            PolicyKind::Random => Ok(ResolvedPolicy::from(Box::new(RandomPolicy::new(spec, slots)) as Box<dyn Policy>)),
+            PolicyKind::Expert { id } => scripted(&env.entry, id, world).map(ResolvedPolicy::from),
+            PolicyKind::Direct { checkpoint: given, .. } => {
                 let (policy, info) = direct(given, spec, slots)?;
-                Ok(Actor {
+                Ok(ResolvedPolicy {
                     weights: Some(info.weights),
                     libraries: info.manifest.libraries,
                     device: Some(info.manifest.device),
-                    ..Actor::from(policy)
+                    ..ResolvedPolicy::from(policy)
                 })
             }
-            Acts::Plan { model, solver, mpc, objective } => {
+            PolicyKind::Plan { model, solver, mpc, objective } => {
                 let (id, solver) = (&solver.id, (SOLVERS.get(&solver.id)?.make)(&solver.settings)?);
                 let actions = ActionKind::of(&spec.action_space);
                 let wrong = |what: &str, error: serde_json::Error| {
@@ -144,7 +144,7 @@ impl Resolver for Home {
                         let (mut cost, scale) = (objective.apply(cost)?, info.dataset_info.action);
                         pairing(id, &mut *cost, actions)?;
                         let policy = MpcPolicy::new(solver, cost, mpc, scale, spec, slots)?;
-                        Ok(Actor {
+                        Ok(ResolvedPolicy {
                             weights: Some(info.weights),
                             libraries: info.manifest.libraries,
                             device: Some(info.manifest.device),
@@ -157,7 +157,7 @@ impl Resolver for Home {
     }
 
     fn predictor(&self, request: &PolicyRequest) -> Result<Option<Box<dyn Predictor>>> {
-        let Acts::Plan { model: Model::Checkpoint(given), .. } = &request.acts else { return Ok(None) };
+        let PolicyKind::Plan { model: Model::Checkpoint(given), .. } = &request.kind else { return Ok(None) };
         Ok(load(&home::find_checkpoint(given)?, &Device::flex())?.predictor())
     }
 }

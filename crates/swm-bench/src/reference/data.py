@@ -1,7 +1,7 @@
-"""Measures how the reference implementation loads and converts datasets, on request, line by line:
-`load FORMAT PATH WORKERS STEPS FRAMESKIP BATCH SECONDS` or `convert SOURCE FORMAT PATH`.
+"""Measures loading and converting of datasets by the reference implementation.
 
-Answers are lines that begin with `SWM `: a count and seconds, or `error` and why; whatever else it prints is not ours.
+Requests, one per line: `load FORMAT PATH WORKERS STEPS FRAMESKIP BATCH SECONDS` or `convert SOURCE FORMAT PATH`. Answers are
+lines that start with `SWM `: a count and seconds, or `error` and a message; other output of the reference is ignored.
 """
 
 import shutil
@@ -58,5 +58,5 @@ if __name__ == "__main__":
         command, *arguments = line.rstrip("\n").split("\t")
         try:
             answer(*(load if command == "load" else convert)(*arguments))
-        except Exception as error:  # whatever it is, ours says that it was
+        except Exception as error:  # every error is an answer
             answer("error", f"{type(error).__name__}: {error}".replace("\n", " "))

@@ -1,7 +1,7 @@
-"""Measures the reference implementation, on request, line by line: `step SECONDS`, `bare SECONDS` (its environments
-without pictures, outside its world) or `collect PATH EPISODES SEED`.
+"""Measures stepping and collecting of the reference implementation.
 
-Answers are lines that begin with `SWM `; whatever else the reference prints is not ours.
+Requests, one per line: `step SECONDS`, `bare SECONDS` (environments without frames and without a world) or
+`collect PATH EPISODES SEED`. Answers are lines that start with `SWM `; other output of the reference is ignored.
 """
 
 import sys

@@ -1,4 +1,6 @@
-//! The reference implementation as a process to be measured beside ours.
+//! [`Reference`]: the reference implementation in a Python process.
+//!
+//! The scripts in this folder read requests from standard input, one per line, and answer with lines that start with `SWM `.
 
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _, Seek as _, Write as _};
@@ -25,17 +27,17 @@ pub(crate) fn not_compared() -> String {
     format!("not compared: set {REFERENCE_PYTHON} to a Python that has stable-worldmodel")
 }
 
-/// A Python process that holds one world, one solver, one model, or the datasets of the reference.
+/// A Python process with a world, a solver, a model, or the datasets of the reference.
 pub(crate) struct Reference {
     process: Child,
-    ask: ChildStdin,
+    requests: ChildStdin,
     answers: BufReader<ChildStdout>,
     log: File,
-    /// Which version it is.
+    /// The version of the reference.
     pub version: String,
 }
 
-/// The world to make: id, environments, `(height, width)`, steps of an episode.
+/// The size of a world.
 #[derive(Clone, Copy)]
 pub(crate) struct Size<'a> {
     pub env: &'a str,
@@ -45,25 +47,25 @@ pub(crate) struct Size<'a> {
 }
 
 impl Reference {
-    /// Starts it and waits until its world stands.
+    /// Starts a process with a world and waits until it is ready.
     ///
     /// # Errors
-    /// When Python cannot be started or the reference is not usable there; with its last words.
+    /// When Python cannot be started, or the reference cannot be imported; the message contains the last line of its output.
     pub fn start(python: &Path, size: Size<'_>) -> Result<Self> {
-        let numbers = [size.envs, size.image.0, size.image.1, size.episode_steps].map(|n| n.to_string());
-        Self::spawn(python, SCRIPT, &[&[size.env.to_owned()][..], &numbers].concat())
+        let counts = [size.envs, size.image.0, size.image.1, size.episode_steps].map(|n| n.to_string());
+        Self::spawn(python, SCRIPT, &[&[size.env.to_owned()][..], &counts].concat())
     }
 
-    /// Starts it with a CEM solver and a model that costs nothing: environments, samples, iterations, elites, horizon,
-    /// numbers of a model step.
+    /// Starts a process with a CEM solver and a model of precomputed costs: environments, samples, iterations, elites, horizon,
+    /// and the dimension of a model step.
     ///
     /// # Errors
     /// As [`Reference::start`].
-    pub fn start_solver(python: &Path, numbers: [usize; 6]) -> Result<Self> {
-        Self::spawn(python, PLAN_SCRIPT, &numbers.map(|n| n.to_string()))
+    pub fn start_solver(python: &Path, sizes: [usize; 6]) -> Result<Self> {
+        Self::spawn(python, PLAN_SCRIPT, &sizes.map(|n| n.to_string()))
     }
 
-    /// Starts it with a LeWM of some sizes; its weights and inputs are in a file.
+    /// Starts a process with a LeWM; a file contains its weights and inputs.
     ///
     /// # Errors
     /// As [`Reference::start`].
@@ -71,7 +73,7 @@ impl Reference {
         Self::spawn(python, MODEL_SCRIPT, &[sizes.to_string(), weights.display().to_string()])
     }
 
-    /// Starts it to load and convert datasets.
+    /// Starts a process that loads and converts datasets.
     ///
     /// # Errors
     /// As [`Reference::start`].
@@ -80,7 +82,7 @@ impl Reference {
     }
 
     fn spawn(python: &Path, script: &str, arguments: &[String]) -> Result<Self> {
-        let log = tempfile::tempfile().map_err(|e| Error::io("a temporary file", "making it", e))?;
+        let log = tempfile::tempfile().map_err(|e| Error::io("a temporary file", "creating it", e))?;
         let errors = log.try_clone().map_err(|e| Error::io("a temporary file", "sharing it", e))?;
         let mut process = Command::new(python)
             .args(["-u", "-c", script])
@@ -90,47 +92,47 @@ impl Reference {
             .stderr(errors)
             .spawn()
             .map_err(|e| Error::io(python, "starting the reference's Python", e))?;
-        let (Some(ask), Some(answers)) = (process.stdin.take(), process.stdout.take()) else {
+        let (Some(requests), Some(answers)) = (process.stdin.take(), process.stdout.take()) else {
             return Err(Error::external("starting the reference", "its pipes are missing"));
         };
-        let mut reference = Self { process, ask, answers: BufReader::new(answers), log, version: String::new() };
+        let mut reference = Self { process, requests, answers: BufReader::new(answers), log, version: String::new() };
         reference.version = reference.answer()?.split_off(1).join(" ");
         Ok(reference)
     }
 
-    /// Steps with random actions for about so long: environment steps a second.
+    /// Steps with random actions for about `seconds`; returns environment steps per second.
     pub fn step(&mut self, seconds: f64) -> Result<f64> {
         self.rate(&format!("step\t{seconds}"))
     }
 
-    /// Steps its environments without pictures, outside its world: environment steps a second.
+    /// Steps environments without frames and without a world; returns environment steps per second.
     pub fn bare(&mut self, seconds: f64) -> Result<f64> {
         self.rate(&format!("bare\t{seconds}"))
     }
 
-    /// Collects into a Lance dataset: environment steps a second.
+    /// Collects a Lance dataset; returns environment steps per second.
     pub fn collect(&mut self, path: &Path, episodes: usize, seed: u64) -> Result<f64> {
         self.rate(&format!("collect\t{}\t{episodes}\t{seed}", path.display()))
     }
 
-    /// Plans for about so long: iterations of the solver a second.
+    /// Plans for about `seconds`; returns iterations of the solver per second.
     pub fn solve(&mut self, seconds: f64) -> Result<f64> {
         self.rate(&format!("solve\t{seconds}"))
     }
 
-    /// Does a work of its model so often: times a second.
+    /// Does a work of the model `count` times; returns repetitions per second.
     pub fn run(&mut self, work: &str, count: usize) -> Result<f64> {
         self.rate(&format!("run\t{work}\t{count}"))
     }
 
-    /// The numbers that a work of its model comes to.
-    pub fn numbers(&mut self, work: &str) -> Result<Vec<f32>> {
-        let words = self.ask(&format!("numbers\t{work}"))?;
-        let numbers = words.iter().map(|word| word.parse());
-        numbers.collect::<std::result::Result<_, _>>().map_err(|error| Error::external("reading the reference", error))
+    /// The outputs of a work of the model.
+    pub fn outputs(&mut self, work: &str) -> Result<Vec<f32>> {
+        let words = self.request(&format!("outputs\t{work}"))?;
+        let outputs = words.iter().map(|word| word.parse());
+        outputs.collect::<std::result::Result<_, _>>().map_err(|error| Error::external("reading the reference", error))
     }
 
-    /// Loads shuffled batches of clips with the columns `pixels` and `action` for about so long: clips a second.
+    /// Loads shuffled batches of clips with the columns `pixels` and `action` for about `seconds`; returns clips per second.
     pub fn load(
         &mut self,
         format: &str,
@@ -144,38 +146,39 @@ impl Reference {
         self.rate(&format!("load\t{format}\t{path}\t{workers}\t{steps}\t{skip}\t{batch}\t{seconds}"))
     }
 
-    /// Converts a dataset: conversions a second.
+    /// Converts a dataset; returns conversions per second.
     pub fn convert(&mut self, source: &Path, format: &str, target: &Path) -> Result<f64> {
         self.rate(&format!("convert\t{}\t{format}\t{}", source.display(), target.display()))
     }
 
+    /// Sends a request whose answer is a count and seconds; returns their quotient.
     fn rate(&mut self, request: &str) -> Result<f64> {
-        let words = self.ask(request)?;
+        let words = self.request(request)?;
         if let Some(("error", why)) = words.split_first().map(|(first, why)| (first.as_str(), why)) {
             return Err(Error::external("the reference", why.join(" ")));
         }
-        let numbers: Vec<f64> = words.iter().filter_map(|word| word.parse().ok()).collect();
-        match numbers[..] {
+        let values: Vec<f64> = words.iter().filter_map(|word| word.parse().ok()).collect();
+        match values[..] {
             [count, seconds] if seconds > 0.0 => Ok(count / seconds),
-            _ => Err(Error::external("asking the reference", format!("it answered {words:?}"))),
+            _ => Err(Error::external("a request to the reference", format!("it answered {words:?}"))),
         }
     }
 
-    /// The words it answers to a request.
-    fn ask(&mut self, request: &str) -> Result<Vec<String>> {
-        let lost = |error| Error::external("asking the reference", error);
-        writeln!(self.ask, "{request}").and_then(|()| self.ask.flush()).map_err(lost)?;
+    /// Sends a request and returns the words of its answer.
+    fn request(&mut self, request: &str) -> Result<Vec<String>> {
+        let lost = |error| Error::external("sending a request to the reference", error);
+        writeln!(self.requests, "{request}").and_then(|()| self.requests.flush()).map_err(lost)?;
         self.answer()
     }
 
-    /// The words of its next answer.
+    /// Reads the words of the next answer.
     fn answer(&mut self) -> Result<Vec<String>> {
         let mut line = String::new();
         loop {
             line.clear();
             let read = self.answers.read_line(&mut line).map_err(|e| Error::external("reading the reference", e))?;
             if read == 0 {
-                return Err(Error::external("running the reference", self.last_words()));
+                return Err(Error::external("running the reference", self.last_line()));
             }
             if let Some(words) = line.strip_prefix("SWM ") {
                 return Ok(words.split_whitespace().map(str::to_owned).collect());
@@ -183,19 +186,20 @@ impl Reference {
         }
     }
 
-    fn last_words(&mut self) -> String {
+    /// The last line that the process wrote to standard error.
+    fn last_line(&mut self) -> String {
         let mut log = vec![];
-        // What it said is an explanation only; without it the error stands all the same.
+        // The log only explains the error, so a failure to read it is ignored.
         let _ = self.log.rewind().and_then(|()| self.log.read_to_end(&mut log));
         let text = String::from_utf8_lossy(&log);
         let last = text.lines().map(str::trim).rfind(|line| !line.is_empty());
-        last.unwrap_or("it ended without a word").to_owned()
+        last.unwrap_or("it ended without output").to_owned()
     }
 }
 
 impl Drop for Reference {
     fn drop(&mut self) {
-        // It may have ended already; either way nothing of it is left behind.
+        // Both calls fail if the process has already ended.
         let _ = self.process.kill();
         let _ = self.process.wait();
     }

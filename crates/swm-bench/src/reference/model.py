@@ -1,10 +1,11 @@
-"""Measures the reference's LeWM with given weights, on request, line by line: `run WORK COUNT`, `numbers WORK`.
+"""Measures the LeWM of the reference implementation with given weights.
 
-Arguments: the sizes as JSON, a file of weights and inputs. Works are `cost` (of the given candidates, the encodings of
-start and goal known), `plan` (both encoded, then CEM), `encode` (one picture) and `train` (one step, optimizer included).
-Answers are lines that begin with `SWM `; whatever else the reference prints is not ours.
+Arguments: the sizes as JSON, and a file of weights and inputs. Requests, one per line: `run WORK COUNT` or `outputs WORK`.
+Works are `cost` (of the given candidates, with start and goal already encoded), `plan` (encoding, then CEM), `encode` (one
+frame) and `train` (one step, including the optimizer). Answers are lines that start with `SWM `; other output of the reference is
+ignored.
 
-The reference's encoder comes from another package, so the vision transformer is spelled out here, with fused attention.
+The encoder of the reference is from another package, so this file contains a vision transformer with fused attention.
 """
 
 import json
@@ -28,7 +29,7 @@ device = torch.device(c["device"])
 
 
 def tree(**parts):
-    """A module that is nothing but its named parts."""
+    """A module with named parts."""
     module = nn.Module()
     for name, part in parts.items():
         setattr(module, name, part)
@@ -101,9 +102,9 @@ solver = CEMSolver(
 )
 space = gym.spaces.Box(-1.0, 1.0, shape=(1, actions), dtype=np.float32)
 solver.configure(action_space=space, n_envs=1, config=PlanConfig(horizon=horizon, receding_horizon=horizon))
-scene = lambda: {"pixels": pixels[None, None], "goal": goal[None, None], "action": torch.zeros(1, 1, actions)}
+observation = lambda: {"pixels": pixels[None, None], "goal": goal[None, None], "action": torch.zeros(1, 1, actions)}
 expand = lambda x: x.to(device)[:, None].expand(1, samples, *x.shape[1:])
-known = {name: expand(value) for name, value in scene().items()}
+known = {name: expand(value) for name, value in observation().items()}
 
 
 @torch.inference_mode()
@@ -117,7 +118,7 @@ def encode():
 
 
 class Training:
-    """One step as published: prediction error and SIGReg, gradients clipped, AdamW."""
+    """One training step as published: prediction error and SIGReg, clipped gradients, AdamW."""
 
     def __init__(self):
         self.model = lewm().train()
@@ -139,7 +140,7 @@ class Training:
         return loss.item()
 
 
-works = {"cost": cost, "encode": encode, "plan": lambda: solver.solve(scene())}
+works = {"cost": cost, "encode": encode, "plan": lambda: solver.solve(observation())}
 
 
 def run(work, count):

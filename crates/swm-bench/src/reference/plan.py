@@ -1,6 +1,6 @@
-"""Measures the reference's CEM with a model whose costs are known beforehand, on request: `solve SECONDS`, line by line.
+"""Measures the CEM of the reference implementation with a model of precomputed costs.
 
-Answers are lines that begin with `SWM `; whatever else the reference prints is not ours.
+Requests, one per line: `solve SECONDS`. Answers are lines that start with `SWM `; other output of the reference is ignored.
 """
 
 import sys
@@ -16,21 +16,21 @@ from stable_worldmodel.solver import CEMSolver
 envs, samples, iterations, elites, horizon, dim = map(int, sys.argv[1:7])
 
 
-class Free:
-    """Costs are drawn once; asking for them takes no time."""
+class PrecomputedCosts:
+    """A model with random costs that are drawn once."""
 
     def __init__(self):
         generator = torch.Generator().manual_seed(0)
         self.costs = [torch.rand(envs, samples, generator=generator) for _ in range(iterations)]
-        self.asked = 0
+        self.calls = 0
 
     def get_cost(self, infos, candidates):
-        self.asked += 1
-        return self.costs[self.asked % iterations]
+        self.calls += 1
+        return self.costs[self.calls % iterations]
 
 
-model = Free()
-# All environments in one batch, which is the reference's fastest way.
+model = PrecomputedCosts()
+# All environments in one batch, which is the fastest setting of the reference.
 solver = CEMSolver(model, batch_size=envs, num_samples=samples, n_steps=iterations, topk=elites)
 actions = gym.spaces.Box(-1.0, 1.0, shape=(envs, dim), dtype=np.float32)
 solver.configure(action_space=actions, n_envs=envs, config=PlanConfig(horizon=horizon, receding_horizon=horizon))
@@ -38,11 +38,11 @@ infos = {"state": torch.zeros(envs, 1)}
 
 
 def solve(seconds):
-    model.asked = 0
+    model.calls = 0
     begun = time.perf_counter()
     while (elapsed := time.perf_counter() - begun) < seconds:
         solver.solve(infos)
-    return model.asked, elapsed
+    return model.calls, elapsed
 
 
 def answer(*words):

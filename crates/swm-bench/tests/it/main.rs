@@ -1,4 +1,4 @@
-//! That what is measured is reported, with and without a reference. Times themselves are not tested.
+//! Tests of reports, with and without a fake reference. Times are not tested.
 
 use std::io::Write as _;
 use swm_bench::{BenchConfig, bench_envs};
@@ -25,7 +25,7 @@ fn config() -> BenchConfig {
 }
 
 #[test]
-fn without_the_reference_it_says_so() {
+fn report_states_that_the_reference_is_missing() {
     let report = bench_envs(&[env()], &config()).expect("a report");
     assert!(report.reference.contains("SWM_REFERENCE_PYTHON"));
     let what: Vec<_> = report.rows.iter().map(|row| (row.what, row.size)).collect();
@@ -41,11 +41,11 @@ fn without_the_reference_it_says_so() {
 
 #[cfg(unix)]
 #[test]
-fn ratios_are_those_of_neighbouring_turns() {
+fn ratio_is_the_median_of_neighbouring_turns() {
     use std::os::unix::fs::PermissionsExt as _;
     let folder = tempfile::tempdir().expect("a folder");
     let python = folder.path().join("python");
-    // Stands in for Python with the reference: chats, then answers 10 steps in 2 seconds to everything.
+    // A fake reference: prints other text, then answers every request with 10 steps in 2 seconds.
     let script = "#!/bin/sh\necho hello\necho SWM ready 1.2.3\nwhile read line; do echo SWM 10 2.0; done\n";
     let mut file = std::fs::File::create(&python).expect("a file");
     file.write_all(script.as_bytes()).expect("written");
@@ -61,7 +61,7 @@ fn ratios_are_those_of_neighbouring_turns() {
 }
 
 #[test]
-fn a_benchmark_of_nothing_is_refused() {
+fn invalid_settings_are_errors() {
     assert!(bench_envs(&[env()], &BenchConfig { pairs: 0, ..config() }).is_err());
     assert!(bench_envs(&[env()], &BenchConfig { seconds: f64::NAN, ..config() }).is_err());
 }

@@ -1,4 +1,4 @@
-//! What lands in a dataset, and that nothing but the seed decides it.
+//! The content of collected datasets, and its independence of environments, threads and interruptions.
 
 use crate::line::{ENTRY, Walker};
 use crate::memory::Memory;
@@ -32,14 +32,14 @@ fn collect(envs: usize, threads: usize, episodes: usize, memory: &Memory) -> Res
 }
 
 #[test]
-fn datasets_are_the_same_bytes_for_any_number_of_environments_and_threads() {
+fn datasets_do_not_depend_on_environments_or_threads() {
     let alone = Memory::default();
     let collected = collect(1, 1, 23, &alone).expect("collected");
     assert_eq!((collected.episodes, collected.added), (23, 23));
     let rows: usize = alone.episodes.lock().expect("lock").iter().map(Batch::rows).sum();
     assert_eq!(collected.steps, rows - 23);
     let lengths: Vec<usize> = alone.episodes.lock().expect("lock").iter().map(Batch::rows).collect();
-    assert!(lengths.iter().any(|&n| n < 13), "some episodes end early, so slots finish out of order: {lengths:?}");
+    assert!(lengths.iter().any(|&n| n < 13), "some episodes end early, so that slots finish out of order: {lengths:?}");
     for (envs, threads) in [(1, 2), (5, 1), (5, 2), (23, 2), (40, 3)] {
         let memory = Memory::default();
         collect(envs, threads, 23, &memory).expect("collected");
@@ -72,13 +72,13 @@ fn rows_follow_the_time_convention() {
         assert!(action[last].is_nan());
         assert_eq!((reward[last], terminated[last]), (0.0, 0));
         let seed = Key::new(11).with("episode").at(number as u64).seed() >> 1;
-        for digits in episode.get::<i32>("episode_seed").expect("seed").chunks_exact(3) {
-            let together = digits.iter().rev().fold(0u64, |high, &digit| high << 21 | digit as u64);
+        for elements in episode.get::<i32>("episode_seed").expect("seed").chunks_exact(3) {
+            let together = elements.iter().rev().fold(0u64, |high, &element| high << 21 | element as u64);
             assert_eq!(together, seed);
-            assert!(digits.iter().all(|&digit| digit as f32 as i32 == digit), "datasets store float32");
+            assert!(elements.iter().all(|&element| element as f32 as i32 == element), "datasets store float32");
         }
         let start = episode.get::<f32>("variation.agent.x").expect("factor");
-        assert!(start.iter().all(|&x| f64::from(x) == state[0]), "constant, and where the agent began");
+        assert!(start.iter().all(|&x| f64::from(x) == state[0]), "constant, and equal to the initial position");
         let color = episode.get::<u8>("variation.agent.color").expect("factor");
         assert_eq!(color[..2], episode.get::<u8>("pixels").expect("pixels")[..2]);
     }
@@ -88,7 +88,7 @@ fn rows_follow_the_time_convention() {
 }
 
 #[test]
-fn resuming_equals_never_stopping() {
+fn resumed_collection_equals_uninterrupted_one() {
     let whole = Memory::default();
     collect(4, 2, 15, &whole).expect("collected");
     let parts = Memory::default();
@@ -96,56 +96,56 @@ fn resuming_equals_never_stopping() {
     let second = collect(2, 2, 15, &parts).expect("the rest");
     assert_eq!((second.episodes, second.added), (15, 11));
     assert!(parts.bytes() == whole.bytes());
-    assert_eq!(collect(2, 2, 15, &parts).expect("nothing to do").added, 0);
+    assert_eq!(collect(2, 2, 15, &parts).expect("no episodes to add").added, 0);
     assert_eq!(parts.len(), 15);
 }
 
 #[test]
-fn an_interruption_keeps_what_is_finished() {
+fn interruption_keeps_finished_episodes() {
     let (whole, part) = (Memory::default(), Memory::default());
     collect(4, 1, 30, &whole).expect("collected");
     let stop = Arc::new(AtomicBool::new(false));
     let mut world = world(4, 1);
     let mut policy = RandomPolicy::new(world.spec(), 4);
-    let mut told = 0;
+    let mut reported = 0;
     let mut control = Control::new().with_interrupt(Arc::clone(&stop)).with_events(|event| {
         if let Event::Progress(progress) = event {
-            told = progress.done;
+            reported = progress.done;
             stop.store(progress.done >= 6, Ordering::Relaxed);
         }
     });
     let outcome = world.collect(&mut policy, part.writer(), &config(30), &mut control);
     drop(control);
     assert!(matches!(outcome, Err(Error::Interrupted)), "{outcome:?}");
-    assert_eq!(*part.finished.lock().expect("lock"), 1, "the writer was finished");
-    assert_eq!(told, part.len(), "what was told is what is stored");
+    assert_eq!(*part.finished.lock().expect("lock"), 1, "`finish` was called");
+    assert_eq!(reported, part.len(), "the reported episodes are stored");
     assert!((6..30).contains(&part.len()));
     assert!(whole.bytes().starts_with(&part.bytes()));
     collect(2, 1, 30, &part).expect("resumed");
     assert!(part.bytes() == whole.bytes());
 }
 
-/// Fails after some steps.
-struct Broken {
+/// A policy that fails after `left` steps.
+struct Failing {
     walker: Walker,
     left: usize,
 }
 
-impl Policy for Broken {
+impl Policy for Failing {
     fn begin(&mut self, _: usize, _: Key) {}
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
-        self.left = self.left.checked_sub(1).ok_or(Error::external("acting", "out of ideas"))?;
+        self.left = self.left.checked_sub(1).ok_or(Error::external("acting", "no more actions"))?;
         self.walker.act(infos, active, actions)
     }
 }
 
 #[test]
-fn a_failing_policy_and_a_full_disk_keep_what_is_finished() {
+fn failures_keep_finished_episodes() {
     let memory = Memory::default();
-    let mut broken = Broken { walker: Walker, left: 20 };
-    let error = world(3, 1).collect(&mut broken, memory.writer(), &config(50), &mut Control::default());
-    assert!(error.expect_err("the policy fails").to_string().contains("out of ideas"));
+    let mut failing = Failing { walker: Walker, left: 20 };
+    let error = world(3, 1).collect(&mut failing, memory.writer(), &config(50), &mut Control::default());
+    assert!(error.expect_err("the policy fails").to_string().contains("no more actions"));
     assert!(memory.len() > 0);
     assert_eq!(*memory.finished.lock().expect("lock"), 1);
 
@@ -156,7 +156,7 @@ fn a_failing_policy_and_a_full_disk_keep_what_is_finished() {
 }
 
 #[test]
-fn wrong_requests_say_so() {
+fn errors_name_invalid_requests() {
     let made = |config| World::new(&ENTRY, config).err().expect("wrong").to_string();
     assert!(made(WorldConfig { envs: 0, ..WorldConfig::default() }).contains("at least 1"));
     assert!(made(WorldConfig { image: Some((0, 3)), ..WorldConfig::default() }).contains("0 x 3"));
@@ -168,7 +168,7 @@ fn wrong_requests_say_so() {
 }
 
 #[test]
-fn the_manifest_says_what_was_asked_and_not_how_it_ran() {
+fn manifest_contains_settings_but_no_run_options() {
     let manifest = world(3, 1).collect_manifest(&config(9));
     assert_eq!(manifest, world(1, 2).collect_manifest(&config(9)));
     assert_eq!((manifest.kind.as_str(), manifest.seed), ("collect", 11));

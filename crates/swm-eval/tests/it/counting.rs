@@ -1,4 +1,4 @@
-//! Which episodes count, and as what: strict and compat, on a line where every outcome can be told beforehand.
+//! Strict and compat counting, on a line where every outcome is known.
 
 use crate::evaluating::{pinned, recorded, run_counted, world};
 use crate::line::Walker;
@@ -8,10 +8,10 @@ use swm_core::run::Control;
 use swm_core::{Batch, Key, Policy, RandomPolicy, Result, VariationRequest};
 use swm_eval::{EvalConfig, Starts};
 
-/// Always pushes to the right, through the goal and past it.
-struct Passing;
+/// A policy that always moves to the right, past the goal.
+struct MoveRight;
 
-impl Policy for Passing {
+impl Policy for MoveRight {
     fn begin(&mut self, _: usize, _: Key) {}
 
     fn act(&mut self, _: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
@@ -21,7 +21,7 @@ impl Policy for Passing {
 }
 
 #[test]
-fn a_goal_that_is_passed_is_not_held() {
+fn passing_the_goal_is_not_holding_it() {
     // From -2 to 2 in steps of 1: at the goal after 4 steps, beyond it after 5.
     let starts = Starts::episodic(2, 0, pinned(&[("agent.x", -2.0), ("goal.x", 2.0)])).expect("starts");
     let play = |policy: &mut dyn Policy, hold| {
@@ -30,13 +30,13 @@ fn a_goal_that_is_passed_is_not_held() {
         (found.success.successes, first.steps, first.time_to_goal())
     };
     assert_eq!(play(&mut Walker, 1), (2, 4, Some(4)));
-    assert_eq!(play(&mut Walker, 3), (2, 6, Some(4)), "held on from the fourth step");
-    assert_eq!(play(&mut Passing, 1), (2, 4, Some(4)));
-    assert_eq!(play(&mut Passing, 2), (0, 12, None), "played to the end of its budget");
+    assert_eq!(play(&mut Walker, 3), (2, 6, Some(4)), "held from the fourth step on");
+    assert_eq!(play(&mut MoveRight, 1), (2, 4, Some(4)));
+    assert_eq!(play(&mut MoveRight, 2), (0, 12, None), "plays until the budget ends");
 }
 
 #[test]
-fn holding_for_longer_than_the_budget_is_refused() {
+fn hold_beyond_the_budget_is_an_error() {
     let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("starts");
     for hold in [0, 13] {
         let config = EvalConfig { counting: Counting::Strict { hold }, ..EvalConfig::default() };
@@ -46,7 +46,7 @@ fn holding_for_longer_than_the_budget_is_refused() {
 }
 
 #[test]
-fn compat_plays_and_counts_solved_starts_and_tells_the_strict_rate_too() {
+fn compat_counting_plays_solved_starts_and_reports_the_strict_rate() {
     let reader = recorded(12);
     let spec = world(1, 1).spec().clone();
     let picks = Starts::choose(&reader, 40, 1, 3).expect("picks");
@@ -58,37 +58,38 @@ fn compat_plays_and_counts_solved_starts_and_tells_the_strict_rate_too() {
     let compat = run_counted(&mut world(5, 2), &mut random, &starts, Counting::Compat { envs: 40 });
     assert!(strict.solved_at_start > 0 && strict.solved_at_start == compat.solved_at_start);
     assert_eq!(compat.success.n, 40, "every start counts");
-    assert_eq!(compat.strict, Some(strict.success), "one run tells both");
+    assert_eq!(compat.strict, Some(strict.success), "one run gives both rates");
     assert_eq!(strict.strict, None);
     for (strict, compat) in strict.episodes.iter().zip(&compat.episodes) {
         assert!(compat.steps > 0, "every start is played");
         assert!(strict.solved_at_start || strict == compat);
     }
-    let flattered = compat.episodes.iter().filter(|episode| episode.solved_at_start && episode.success).count();
-    assert_eq!(compat.success.successes, strict.success.successes + flattered);
-    assert!(flattered > 0);
+    let solved_and_counted =
+        compat.episodes.iter().filter(|episode| episode.solved_at_start && episode.success).count();
+    assert_eq!(compat.success.successes, strict.success.successes + solved_and_counted);
+    assert!(solved_and_counted > 0);
 }
 
 #[test]
-fn episodic_compat_counts_the_first_to_finish() {
+fn episodic_compat_counting_counts_the_first_to_finish() {
     let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
     let play = |envs, threads| -> Run {
         let starts = Starts::sequential(20, 100, all.clone()).expect("starts");
-        run_counted(&mut world(envs, threads), &mut Passing, &starts, Counting::Compat { envs })
+        run_counted(&mut world(envs, threads), &mut MoveRight, &starts, Counting::Compat { envs })
     };
-    // What `World.evaluate(episodes=20, seed=100)` of stable-worldmodel 0.1.1 counted, given environments whose episodes of
-    // each seed last as long and end as these do: beyond seed 118, the seed counted and the successes.
+    // The expected values were computed by `World.evaluate(episodes=20, seed=100)` of stable-worldmodel 0.1.1, for
+    // environments with the same episode lengths and outcomes: the last counted seed and the number of successes.
     for (envs, last, successes) in [(1, 119, 7), (3, 119, 7), (8, 122, 8), (20, 122, 8)] {
         let found = play(envs, 2);
         let seeds: Vec<u64> = found.episodes.iter().map(|episode| episode.seed).collect();
         let expected: Vec<u64> = (100..=118).chain([last]).collect();
         assert_eq!(seeds, expected, "{envs} environments");
         assert_eq!((found.success.successes, found.success.n), (successes, 20));
-        assert_eq!(found.episodes, play(envs, 1).episodes, "whatever the threads");
-        assert_eq!(found.strict, None, "another selection than strict counting makes");
+        assert_eq!(found.episodes, play(envs, 1).episodes, "independent of threads");
+        assert_eq!(found.strict, None, "strict counting selects other episodes");
     }
     let starts = Starts::sequential(2, 0, all).expect("starts");
     let config = EvalConfig { counting: Counting::Compat { envs: 2 }, ..EvalConfig::default() };
-    let error = world(3, 1).evaluate(&mut Passing, &starts, &config, &mut Control::default()).expect_err("refused");
+    let error = world(3, 1).evaluate(&mut MoveRight, &starts, &config, &mut Control::default()).expect_err("rejected");
     assert!(error.to_string().contains("among 2 environments, and the world has 3"), "{error}");
 }

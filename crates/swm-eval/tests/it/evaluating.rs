@@ -1,4 +1,4 @@
-//! What counts as a success, from which starts, and that nothing but the starts decides it.
+//! Evaluation: starts, success, and independence of environments and threads.
 
 use crate::line::{ENTRY, Walker};
 use crate::memory::{Memory, MemoryReader};
@@ -30,20 +30,20 @@ pub fn run_counted(world: &mut World, policy: &mut dyn Policy, starts: &Starts, 
     world.evaluate(policy, starts, &config, &mut Control::default()).expect("a run")
 }
 
-/// Everything but how long it took.
+/// The run without its timing, as JSON.
 fn timeless(run: &Run) -> String {
     serde_json::to_string(&Run { timing: Default::default(), ..run.clone() }).expect("JSON")
 }
 
 #[test]
-fn solved_starts_are_counted_apart() {
-    // The agent starts within the goal's reach in some episodes: the goal is at 2, the start anywhere in -4 ..= 4.
+fn solved_starts_are_counted_separately() {
+    // Some episodes are solved at the start: the goal is at 2, the start anywhere in -4 ..= 4.
     let variation = VariationRequest { variation: Some(vec!["agent.x".to_owned()]), ..pinned(&[("goal.x", 2.0)]) };
     let starts = Starts::episodic(200, 3, variation).expect("starts");
     let found = run(&mut world(16, 2), &mut Walker, &starts, None);
     assert!(found.solved_at_start > 0, "some starts are solved");
     assert_eq!(found.success.n + found.solved_at_start, 200);
-    assert_eq!(found.success.successes, found.success.n, "a straight walk of at most 6 steps");
+    assert_eq!(found.success.successes, found.success.n, "at most 6 steps in a straight line");
     for episode in &found.episodes {
         assert_eq!(episode.solved_at_start, episode.steps == 0);
         assert!(!(episode.solved_at_start && episode.success));
@@ -53,7 +53,7 @@ fn solved_starts_are_counted_apart() {
 }
 
 #[test]
-fn the_budget_ends_an_episode() {
+fn budget_ends_an_episode() {
     let starts = Starts::episodic(3, 0, pinned(&[("agent.x", -3.0), ("goal.x", 3.0)])).expect("starts");
     let steps = |budget| {
         let found = run(&mut world(2, 1), &mut Walker, &starts, budget);
@@ -65,13 +65,13 @@ fn the_budget_ends_an_episode() {
     assert!(error.expect_err("too long").to_string().contains("truncates episodes after 12"));
 }
 
-/// Costs of a model that knows the world: the distance to the goal after the last action.
+/// A perfect model: the cost is the distance to the goal after the last action.
 #[derive(Default)]
-struct Knowing {
+struct PerfectModel {
     present: Vec<(f64, f64)>,
 }
 
-impl CostModel for Knowing {
+impl CostModel for PerfectModel {
     fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()> {
         self.present.clear();
         for &env in envs {
@@ -95,18 +95,19 @@ fn planner(world: &World) -> MpcPolicy {
     let cem = Cem { samples: 32, iterations: 4, elites: 6, sigma: 1.0 };
     let config = MpcConfig { horizon: 3, receding_horizon: 2, action_block: 2, ..MpcConfig::default() };
     let (scale, slots) = (ActionScale::identity(1), world.pool().len());
-    MpcPolicy::new(Box::new(cem), Box::new(Knowing::default()), config, scale, world.spec(), slots).expect("a policy")
+    MpcPolicy::new(Box::new(cem), Box::new(PerfectModel::default()), config, scale, world.spec(), slots)
+        .expect("a policy")
 }
 
 #[test]
-fn planned_or_random_results_do_not_depend_on_who_is_played_beside() {
+fn results_do_not_depend_on_environments_or_threads() {
     let starts = Starts::episodic(20, 5, VariationRequest::default()).expect("starts");
     let mut alone = world(1, 1);
     let mut policy = planner(&alone);
     let planned = run(&mut alone, &mut policy, &starts, None);
     let mut policy = RandomPolicy::new(alone.spec(), 1);
     let random = run(&mut alone, &mut policy, &starts, None);
-    assert!(planned.success.low > random.success.high, "{:?} beside {:?}", planned.success, random.success);
+    assert!(planned.success.low > random.success.high, "{:?} and {:?}", planned.success, random.success);
     assert!(planned.timing.plan_seconds.is_some_and(|plans| plans.n >= 20) && random.timing.plan_seconds.is_none());
     for (envs, threads) in [(7, 1), (20, 1), (20, 2), (32, 2)] {
         let mut world = world(envs, threads);
@@ -127,15 +128,15 @@ pub fn recorded(episodes: usize) -> MemoryReader {
     memory.reader()
 }
 
-/// Repeats the recorded actions of the start its episode was given.
-struct Oracle<'a> {
+/// A policy that repeats the recorded actions from the start of its episode.
+struct Replay<'a> {
     reader: &'a MemoryReader,
     starts: &'a Starts,
     keys: Vec<(Key, usize)>,
     playing: Vec<[usize; 2]>,
 }
 
-impl Policy for Oracle<'_> {
+impl Policy for Replay<'_> {
     fn begin(&mut self, slot: usize, key: Key) {
         let episode = self.keys.iter().find(|(known, _)| *known == key).expect("a key of these starts").1;
         self.playing[slot] = self.starts.pick(episode).expect("starts of a dataset");
@@ -154,17 +155,17 @@ impl Policy for Oracle<'_> {
 }
 
 #[test]
-fn repeating_what_was_recorded_reaches_the_recorded_goal() {
+fn replaying_actions_reaches_the_recorded_goal() {
     let reader = recorded(12);
     let picks = Starts::choose(&reader, 30, 4, 8).expect("picks");
-    assert_eq!(picks, Starts::choose(&reader, 30, 4, 8).expect("picks"), "decided by the seed");
+    assert_eq!(picks, Starts::choose(&reader, 30, 4, 8).expect("picks"), "determined by the seed");
     assert_ne!(picks, Starts::choose(&reader, 30, 4, 9).expect("picks"));
     let starts =
         Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks, 4, 8, VariationRequest::default(), &[])
             .expect("starts");
     let keys = (0..30).map(|i| (Key::new(8).with("episode").at(i as u64), i)).collect();
-    let mut oracle = Oracle { reader: &reader, starts: &starts, keys, playing: vec![[0; 2]; 5] };
-    let found = run(&mut world(5, 2), &mut oracle, &starts, Some(4));
+    let mut replay = Replay { reader: &reader, starts: &starts, keys, playing: vec![[0; 2]; 5] };
+    let found = run(&mut world(5, 2), &mut replay, &starts, Some(4));
     assert!(found.success.n > 0);
     assert_eq!(found.success.rate, 1.0, "{found:?}");
     assert!(found.episodes.iter().all(|episode| episode.start.is_some() && episode.steps <= 4));
@@ -172,6 +173,7 @@ fn repeating_what_was_recorded_reaches_the_recorded_goal() {
     assert_eq!((still.success.successes, still.solved_at_start), (0, found.solved_at_start));
 }
 
+/// A policy whose actions are zero.
 struct Still;
 
 impl Policy for Still {
@@ -183,13 +185,13 @@ impl Policy for Still {
     }
 }
 
-/// Notes the first colour it sees.
+/// A policy that records the first colour it observes, and whose actions are zero.
 #[derive(Default)]
-struct Seeing {
+struct FirstColor {
     color: Vec<u8>,
 }
 
-impl Policy for Seeing {
+impl Policy for FirstColor {
     fn begin(&mut self, _: usize, _: Key) {}
 
     fn act(&mut self, infos: &Batch, _: &[bool], actions: &mut Batch) -> Result<()> {
@@ -201,15 +203,15 @@ impl Policy for Seeing {
 }
 
 #[test]
-fn recorded_factors_hold_unless_they_are_shifted() {
+fn recorded_factors_apply_unless_they_are_shifted() {
     let reader = recorded(12);
     let picks = Starts::choose(&reader, 1, 6, 0).expect("picks");
     let color = |variation: VariationRequest| {
         let starts = Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks.clone(), 6, 0, variation, &[])
             .expect("starts");
-        let mut seeing = Seeing::default();
-        run(&mut world(1, 1), &mut seeing, &starts, None);
-        seeing.color
+        let mut policy = FirstColor::default();
+        run(&mut world(1, 1), &mut policy, &starts, None);
+        policy.color
     };
     let range = swm_data::StepRange { episode: picks[0][0], start: 0, length: 1 };
     let row = reader.read(&["variation.agent.color"], &[range]).expect("a row");
@@ -222,7 +224,7 @@ fn recorded_factors_hold_unless_they_are_shifted() {
 }
 
 #[test]
-fn wrong_requests_say_so() {
+fn errors_name_invalid_requests() {
     let reader = recorded(3);
     let starts = |picks, offset, variation| {
         Starts::from_dataset(&reader, world(1, 1).pool().env(0), picks, offset, 0, variation, &[])
@@ -235,17 +237,17 @@ fn wrong_requests_say_so() {
     assert!(starts(vec![[0, 0]], 1, pinned(&[("agent.y", 1.0)])).contains("agent.x"));
     let error = Starts::choose(&reader, 1000, 2, 0).expect_err("too many").to_string();
     assert!(error.contains("1000") && error.contains("collect more"), "{error}");
-    let blind = WorldConfig { envs: 1, image: None, views: vec![], max_episode_steps: None, threads: 1 };
+    let no_frames = WorldConfig { envs: 1, image: None, views: vec![], max_episode_steps: None, threads: 1 };
     let videos = Videos { root: "nowhere".into(), prefix: "v".to_owned(), count: 1, fps: 10 };
     let config = EvalConfig { videos: Some(videos), ..EvalConfig::default() };
     let starts = Starts::episodic(1, 0, VariationRequest::default()).expect("starts");
-    let mut world = World::new(&ENTRY, blind).expect("a world");
-    let error = world.evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect_err("no pictures");
+    let mut world = World::new(&ENTRY, no_frames).expect("a world");
+    let error = world.evaluate(&mut Walker, &starts, &config, &mut Control::default()).expect_err("no frames");
     assert!(matches!(error, Error::Config { .. }), "{error}");
 }
 
 #[test]
-fn the_first_episodes_are_filmed_beside_their_goal() {
+fn videos_of_the_first_episodes_are_written() {
     let folder = tempfile::tempdir().expect("a folder");
     let videos = Videos { root: folder.path().to_owned(), prefix: "videos/walker".to_owned(), count: 2, fps: 10 };
     let config = EvalConfig { videos: Some(videos), ..EvalConfig::default() };

@@ -1,4 +1,4 @@
-//! A real world, a real dataset on disk, and back: what was collected is what is evaluated.
+//! Collecting to and evaluating from a Lance dataset on disk, with a native environment.
 
 use std::path::Path;
 use swm_core::policy::ExpertPolicy;
@@ -31,7 +31,7 @@ fn collect(path: &Path, mode: WriteMode, envs: usize, episodes: usize) -> Collec
 }
 
 #[test]
-fn resumed_collections_have_the_content_of_uninterrupted_ones() {
+fn resumed_dataset_has_the_same_content() {
     let folder = tempfile::tempdir().expect("a folder");
     let [whole, parts] = ["whole.lance", "parts.lance"].map(|name| folder.path().join(name));
     collect(&whole, WriteMode::Create, 8, 12);
@@ -45,7 +45,7 @@ fn resumed_collections_have_the_content_of_uninterrupted_ones() {
 }
 
 #[test]
-fn recorded_goals_are_within_the_experts_reach() {
+fn expert_reaches_recorded_goals() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("rooms.lance");
     collect(&path, WriteMode::Create, 4, 10);
@@ -68,14 +68,14 @@ fn recorded_goals_are_within_the_experts_reach() {
     let expert = evaluate(&mut world, false, VariationRequest::default());
     let random = evaluate(&mut world, true, VariationRequest::default());
     assert!(expert.success.rate > 0.8, "{:?}", expert.success);
-    assert!(expert.success.low > random.success.high, "{:?} beside {:?}", expert.success, random.success);
+    assert!(expert.success.low > random.success.high, "{:?} and {:?}", expert.success, random.success);
     assert_eq!(expert.solved_at_start, random.solved_at_start, "the same starts");
     let color = VariationRequest { variation: Some(vec!["agent.color".to_owned()]), ..VariationRequest::default() };
-    assert_eq!(evaluate(&mut world, false, color).success, expert.success, "a colour changes nothing for the expert");
+    assert_eq!(evaluate(&mut world, false, color).success, expert.success, "the expert does not depend on colours");
 }
 
 #[test]
-fn a_dataset_of_another_world_is_refused() {
+fn dataset_of_another_environment_is_an_error() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("line.lance");
     let line = WorldConfig { envs: 1, image: None, views: vec![], max_episode_steps: None, threads: 1 };
@@ -87,6 +87,6 @@ fn a_dataset_of_another_world_is_refused() {
     let reader = swm_data::open(&path).expect("a dataset");
     let starts =
         Starts::from_dataset(&*reader, world(1, 1).pool().env(0), vec![[0, 0]], 1, 0, VariationRequest::default(), &[]);
-    let error = starts.expect_err("another world");
+    let error = starts.expect_err("another environment");
     assert!(matches!(error, Error::Mismatch { .. }) && error.to_string().contains("swm/TwoRoom-v1"), "{error}");
 }

@@ -1,4 +1,4 @@
-//! A point on a line that must reach a goal: a world small enough to compute by hand.
+//! An environment small enough to compute by hand: a point on a line that has to reach a goal.
 
 use rand::Rng as _;
 use swm_core::policy::write_action;
@@ -15,7 +15,7 @@ pub const ENTRY: EnvEntry = EnvEntry {
     experts: &[],
 };
 
-/// Nearer than this is there.
+/// The largest distance at which the goal counts as reached.
 pub const NEAR: f64 = 0.25;
 
 pub struct Line {
@@ -23,7 +23,7 @@ pub struct Line {
     factors: FactorValues,
     x: f64,
     goal: f64,
-    /// A number the world draws at every step: shows whether randomness follows the episode.
+    /// A random value drawn at every step, to test that randomness depends on the episode alone.
     noise: f64,
     rng: Rng,
 }
@@ -55,7 +55,7 @@ impl Line {
         Self { spec, factors, x: 0.0, goal: 0.0, noise: 0.0, rng: Key::new(0).rng() }
     }
 
-    fn paint(&self, x: f64, frame: FrameMut<'_>) {
+    fn draw(&self, x: f64, frame: FrameMut<'_>) {
         let [r, g, b] = self.factors.rgb("agent.color");
         for pixel in frame.rgb.chunks_exact_mut(3) {
             pixel.copy_from_slice(&[r, g, b.wrapping_add((x * 16.0) as i32 as u8)]);
@@ -92,12 +92,12 @@ impl Env for Line {
     }
 
     fn render(&mut self, frame: FrameMut<'_>) -> Result<()> {
-        self.paint(self.x, frame);
+        self.draw(self.x, frame);
         Ok(())
     }
 
     fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()> {
-        self.paint(self.goal, frame);
+        self.draw(self.goal, frame);
         Ok(())
     }
 
@@ -110,7 +110,7 @@ impl Env for Line {
     }
 
     fn restore(&mut self, _: &Snapshot) -> Result<()> {
-        Err(Error::external("restoring", "not needed here"))
+        Err(Error::external("restoring", "this environment has no snapshots"))
     }
 
     fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()> {
@@ -141,7 +141,7 @@ impl Env for Line {
     }
 }
 
-/// Walks straight to the goal.
+/// A policy that moves straight to the goal.
 pub struct Walker;
 
 impl Policy for Walker {
@@ -150,8 +150,8 @@ impl Policy for Walker {
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
         for slot in (0..active.len()).filter(|&slot| active[slot]) {
             let row = infos.row(slot);
-            let way = row.get::<f64>("goal_state")?[0] - row.get::<f64>("state")?[0];
-            write_action(&mut actions.row_mut(slot), 0, &[way.clamp(-1.0, 1.0)]);
+            let offset = row.get::<f64>("goal_state")?[0] - row.get::<f64>("state")?[0];
+            write_action(&mut actions.row_mut(slot), 0, &[offset.clamp(-1.0, 1.0)]);
         }
         Ok(())
     }

@@ -1,4 +1,4 @@
-//! Worlds of a tiny environment, so that what is tested is the world and nothing else.
+//! Tests of worlds, mostly with a minimal environment on a line.
 
 mod collecting;
 mod counting;

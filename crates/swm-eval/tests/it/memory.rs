@@ -1,4 +1,4 @@
-//! A dataset in memory, to compare byte by byte.
+//! A dataset in memory, for comparisons byte by byte.
 
 use std::sync::{Arc, Mutex};
 use swm_core::{Batch, ColumnSpec, DType, Error, Manifest, Result, Schema};
@@ -7,7 +7,7 @@ use swm_data::{Constants, Episode, Reader, StepRange, Writer};
 #[derive(Clone, Default)]
 pub struct Memory {
     pub episodes: Arc<Mutex<Vec<Batch>>>,
-    /// Refuses the episode of this number.
+    /// The number of episodes after which writing fails.
     pub full_at: Option<usize>,
     pub finished: Arc<Mutex<usize>>,
 }
@@ -21,7 +21,7 @@ impl Memory {
         self.episodes.lock().expect("no panic").len()
     }
 
-    /// Everything that is stored.
+    /// The content of all episodes.
     pub fn bytes(&self) -> Vec<u8> {
         let mut all = vec![];
         for episode in self.episodes.lock().expect("no panic").iter() {

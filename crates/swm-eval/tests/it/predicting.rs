@@ -1,4 +1,4 @@
-//! Prediction errors of a model whose error can be written down: it knows the line and drifts off it.
+//! Prediction errors of models whose errors are known in closed form.
 
 use crate::evaluating::recorded;
 use crate::memory::MemoryReader;
@@ -8,7 +8,7 @@ use swm_data::{Reader as _, StepRange};
 use swm_eval::Starts;
 use swm_eval::prediction::{Predictor, predict, predict_recorded};
 
-/// Latents are `(x, 7)`. It moves as the line does, and is `drift` further off after every model step.
+/// A model with latents `(x, 7)` and the dynamics of the line, whose error grows by `drift` in every model step.
 pub struct Drifting {
     pub drift: f32,
 }
@@ -47,8 +47,8 @@ impl Predictor for Drifting {
     }
 }
 
-/// Where the line is after `k` model steps from every pick, and the variance of that.
-fn seen(reader: &MemoryReader, picks: &[[usize; 2]], horizon: usize) -> (Vec<f64>, f64) {
+/// The recorded positions after each model step from every pick, and their variance.
+fn recorded_positions(reader: &MemoryReader, picks: &[[usize; 2]], horizon: usize) -> (Vec<f64>, f64) {
     let ranges: Vec<StepRange> = picks
         .iter()
         .flat_map(|&[episode, start]| (1..=horizon).map(move |k| StepRange::new(episode, start + 2 * k, 1)))
@@ -61,28 +61,28 @@ fn seen(reader: &MemoryReader, picks: &[[usize; 2]], horizon: usize) -> (Vec<f64
 }
 
 #[test]
-fn errors_are_what_they_are_known_to_be() {
+fn errors_equal_the_closed_form() {
     let reader = recorded(40);
     let picks = Starts::choose(&reader, 50, 6, 2).expect("picks");
-    let (_, variance) = seen(&reader, &picks, 3);
+    let (_, variance) = recorded_positions(&reader, &picks, 3);
     let found = predict(&mut Drifting { drift: 0.5 }, &reader, &picks, 3, |i| Some(i % 3 == 0)).expect("errors");
-    // One of two numbers is off by 0.5 k; the other one is constant.
+    // One of two latent dimensions has the error 0.5 k; the other is constant.
     assert!((found.variance - variance / 2.0).abs() < 1e-5 * variance, "{} {variance}", found.variance);
     for (trajectory, pick) in found.trajectories.iter().zip(&picks) {
         assert_eq!(trajectory.start, *pick);
         for (k, error) in trajectory.errors.iter().enumerate() {
             let known = (0.5 * (k + 1) as f64).powi(2) / variance;
-            assert!((error - known).abs() < 1e-5 * known, "step {k}: {error}, not {known}");
+            assert!((error - known).abs() < 1e-5 * known, "step {k}: {error}, expected {known}");
         }
     }
     let sizes: Vec<(Option<bool>, usize)> = found.groups.iter().map(|g| (g.success, g.trajectory.n)).collect();
     assert_eq!(sizes, [(None, 50), (Some(true), 17), (Some(false), 33)]);
     let exact = predict(&mut Drifting { drift: 0.0 }, &reader, &picks, 3, |_| None).expect("errors");
     assert!(exact.groups[0].trajectory.p95 < 1e-12, "{:?}", exact.groups[0]);
-    assert_eq!(exact.groups.len(), 1, "nothing is known of their success");
+    assert_eq!(exact.groups.len(), 1, "their outcomes are unknown");
 }
 
-/// Always predicts the same.
+/// A model with a constant prediction.
 struct Constant(f32);
 
 impl Predictor for Constant {
@@ -109,48 +109,48 @@ impl Predictor for Constant {
 }
 
 #[test]
-fn predicting_the_mean_has_an_error_of_one() {
+fn predicting_the_mean_has_the_error_one() {
     let reader = recorded(40);
     let picks = Starts::choose(&reader, 33, 4, 0).expect("picks");
-    let (x, _) = seen(&reader, &picks, 2);
+    let (x, _) = recorded_positions(&reader, &picks, 2);
     let mean = x.iter().sum::<f64>() / x.len() as f64;
     let found = predict(&mut Constant(mean as f32), &reader, &picks, 2, |_| None).expect("errors");
     assert!((found.groups[0].trajectory.mean - 1.0).abs() < 1e-6, "{:?}", found.groups[0]);
 }
 
 #[test]
-fn recorded_success_tells_trajectories_apart() {
+fn trajectories_are_grouped_by_recorded_success() {
     let reader = recorded(60);
     let episodes: Vec<usize> = (10..60).collect();
-    let look = || -> Prediction {
+    let predict = || -> Prediction {
         predict_recorded(&mut Drifting { drift: 0.1 }, &reader, &episodes, 40, 2, 9).expect("errors")
     };
-    let found = look();
-    assert_eq!(found, look(), "decided by the seed");
-    let ends_well = |episode: usize| {
+    let found = predict();
+    assert_eq!(found, predict(), "determined by the seed");
+    let succeeded = |episode: usize| {
         let length = reader.episodes()[episode].length;
         let rows = reader.read(&["success"], &[StepRange::new(episode, 0, length)]).expect("rows");
         rows.bytes(0).contains(&1)
     };
     for trajectory in &found.trajectories {
         assert!(trajectory.start[0] >= 10, "of the chosen episodes");
-        assert_eq!(trajectory.success, Some(ends_well(trajectory.start[0])));
+        assert_eq!(trajectory.success, Some(succeeded(trajectory.start[0])));
     }
-    assert_eq!(found.groups.len(), 3, "some reached their goal and some did not");
+    assert_eq!(found.groups.len(), 3, "all, successful and failed trajectories");
 }
 
 #[test]
-fn what_cannot_be_predicted_is_refused_in_words() {
+fn errors_name_what_cannot_be_predicted() {
     let reader = recorded(10);
-    let refused = |drift: f32, picks: &[[usize; 2]], horizon| -> Error {
-        predict(&mut Drifting { drift }, &reader, picks, horizon, |_| None).expect_err("refused")
+    let rejected = |drift: f32, picks: &[[usize; 2]], horizon| -> Error {
+        predict(&mut Drifting { drift }, &reader, picks, horizon, |_| None).expect_err("rejected")
     };
-    let [none, far] = [refused(0.0, &[], 2), refused(0.0, &[[3, 4]], 50)].map(|error| error.to_string());
+    let [none, far] = [rejected(0.0, &[], 2), rejected(0.0, &[[3, 4]], 50)].map(|error| error.to_string());
     assert!(none.contains("0 trajectories of 2 model steps"), "{none}");
     assert!(far.contains("50 model steps of 2 from step 4 of episode 3") && far.contains("more than 104"), "{far}");
     let picks = Starts::choose(&reader, 5, 4, 0).expect("picks");
-    let error = refused(f32::NAN, &picks, 2).to_string();
+    let error = rejected(f32::NAN, &picks, 2).to_string();
     assert!(error.contains(&format!("model step 1 from step {} of episode {}", picks[0][1], picks[0][0])), "{error}");
-    let error = refused(0.0, &picks[..1], 1).to_string();
-    assert!(error.contains("collapsed"), "one observation alone has no variance: {error}");
+    let error = rejected(0.0, &picks[..1], 1).to_string();
+    assert!(error.contains("collapsed"), "a single observation has no variance: {error}");
 }

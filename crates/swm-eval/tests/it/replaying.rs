@@ -1,4 +1,4 @@
-//! The online regime: a world collects into a replay buffer, a learner reads what is there.
+//! Online learning: a world collects into a replay buffer while a learner reads from it.
 
 use crate::line::ENTRY;
 use crate::memory::Memory;
@@ -19,7 +19,7 @@ fn config(episodes: usize) -> CollectConfig {
 }
 
 #[test]
-fn a_world_collects_while_a_learner_reads_and_goes_on_later() {
+fn collecting_and_reading_run_concurrently() {
     let mut world = world();
     let mut policy = RandomPolicy::new(world.spec(), 3);
     let buffer = ReplayBuffer::new(&world.collect_schema(false).expect("schema"), 120).expect("a buffer");
@@ -32,14 +32,14 @@ fn a_world_collects_while_a_learner_reads_and_goes_on_later() {
     let loader = buffer.loader(ReplayConfig { clip, batch_size: 16, ..ReplayConfig::default() }).expect("a loader");
     scope(|scope| {
         let reading = scope.spawn(|| {
-            // Until episodes that were collected meanwhile have pushed out the first ones.
+            // Until new episodes have replaced the first ones.
             loader.batches(0).take(100_000).take_while(|batch| batch.is_ok() && buffer.added() < 60).count()
         });
         let collected = into(&mut world, &mut policy, 60);
-        assert_eq!((collected.episodes, collected.added), (60, 55), "it goes on behind the first five");
+        assert_eq!((collected.episodes, collected.added), (60, 55), "continues after the first five");
         assert!(reading.join().is_ok());
     });
-    // What is kept are the last episodes of the same collection into a dataset.
+    // The buffer holds the last episodes of the same collection into a dataset.
     let memory = Memory::default();
     let mut again = self::world();
     let mut policy = RandomPolicy::new(again.spec(), 3);

@@ -1,4 +1,4 @@
-//! Evaluations as requests: run, written down, read again, run again, compared.
+//! Evaluation requests: running, serialising, reproducing and comparing them.
 
 use crate::evaluating::recorded;
 use crate::line::{Line, Walker};
@@ -7,27 +7,28 @@ use crate::predicting::Drifting;
 use serde_json::json;
 use std::sync::Arc;
 use swm_core::results::{Counting, Run};
+use swm_core::run::{Control, Event};
 use swm_core::{Env, Error, Policy, Result, Results, VariationRequest};
 use swm_data::{Part, Reader, Split};
 use swm_eval::reproduce::{Kind, differences};
 use swm_eval::{
-    Actor, Acts, Condition, EvalRequest, HeldOut, Means, Moment, PolicyRequest, Predictor, Resolver, StartsRequest,
-    World, reproduce,
+    Condition, EvalRequest, HeldOut, PolicyKind, PolicyRequest, Predictor, ResolvedPolicy, Resolver, RunOptions,
+    StartsRequest, World, reproduce,
 };
 
-/// Knows the line, one dataset, and a walker with weights.
-struct Known {
+/// A resolver of the line environment, one dataset, and a walker with weights.
+struct TestResolver {
     data: Arc<MemoryReader>,
     weights: String,
 }
 
-impl Known {
+impl TestResolver {
     fn new() -> Self {
         Self { data: Arc::new(recorded(60)), weights: "w0".to_owned() }
     }
 }
 
-impl Resolver for Known {
+impl Resolver for TestResolver {
     fn env(&self, request: &EvalRequest) -> Result<Box<dyn Env>> {
         match request.env.as_str() {
             "test/Line-v0" => Ok(Box::new(Line::new())),
@@ -39,14 +40,14 @@ impl Resolver for Known {
         Ok(Arc::clone(&self.data) as Arc<dyn Reader>)
     }
 
-    fn policy(&self, _: &PolicyRequest, _: &World) -> Result<Actor> {
+    fn policy(&self, _: &PolicyRequest, _: &World) -> Result<ResolvedPolicy> {
         let walker: Box<dyn Policy> = Box::new(Walker);
-        Ok(Actor { weights: Some(self.weights.clone()), ..Actor::from(walker) })
+        Ok(ResolvedPolicy { weights: Some(self.weights.clone()), ..ResolvedPolicy::from(walker) })
     }
 
     fn predictor(&self, request: &PolicyRequest) -> Result<Option<Box<dyn Predictor>>> {
-        let shows = request.acts != Acts::Random;
-        Ok(shows.then(|| Box::new(Drifting { drift: 0.1 }) as Box<dyn Predictor>))
+        let has_model = request.kind != PolicyKind::Random;
+        Ok(has_model.then(|| Box::new(Drifting { drift: 0.1 }) as Box<dyn Predictor>))
     }
 }
 
@@ -57,7 +58,10 @@ fn request() -> EvalRequest {
         wrappers: vec![],
         wrap_goal: false,
         image: None,
-        policies: vec![PolicyRequest { name: "walker".to_owned(), acts: Acts::Expert { id: "walker".to_owned() } }],
+        policies: vec![PolicyRequest {
+            name: "walker".to_owned(),
+            kind: PolicyKind::Expert { id: "walker".to_owned() },
+        }],
         starts: StartsRequest::Episodic,
         episodes: 24,
         seed: 5,
@@ -83,16 +87,16 @@ fn held_out(part: Part) -> StartsRequest {
 }
 
 fn run(request: &EvalRequest, envs: usize, threads: usize) -> Results {
-    let means = Means { envs, threads, ..Means::default() };
-    request.run(&Known::new(), &means, &mut |_| {}).expect("results")
+    let options = RunOptions { envs, threads, ..RunOptions::default() };
+    request.run(&TestResolver::new(), &options, &mut Control::new()).expect("results")
 }
 
-fn again(old: &Results, known: &Known) -> Result<swm_eval::Reproduction> {
-    reproduce(old, known, &Means { envs: 3, threads: 2, ..Means::default() }, &mut |_| {})
+fn again(old: &Results, known: &TestResolver) -> Result<swm_eval::Reproduction> {
+    reproduce(old, known, &RunOptions { envs: 3, threads: 2, ..RunOptions::default() }, &mut Control::new())
 }
 
-/// As JSON, and back: what a file holds.
-fn filed(results: &Results) -> Results {
+/// Serialises results to JSON and back.
+fn round_trip(results: &Results) -> Results {
     serde_json::from_str(&serde_json::to_string_pretty(results).expect("JSON")).expect("results")
 }
 
@@ -102,7 +106,7 @@ fn timeless(mut results: Results) -> String {
 }
 
 #[test]
-fn the_floor_is_always_played_and_everybody_is_compared_with_it() {
+fn policies_are_compared_with_the_random_floor() {
     let found = run(&request(), 4, 1);
     let names: Vec<(&str, &str)> = found.runs.iter().map(|run| (&*run.condition, &*run.policy)).collect();
     let expected = [
@@ -112,7 +116,7 @@ fn the_floor_is_always_played_and_everybody_is_compared_with_it() {
         ("goal near", "walker"),
     ];
     assert_eq!(names, expected);
-    assert_eq!(found.comparisons.len(), 2, "one a condition");
+    assert_eq!(found.comparisons.len(), 2, "one for each condition");
     for (comparison, runs) in found.comparisons.iter().zip(found.runs.chunks(2)) {
         assert_eq!((&*comparison.a, &*comparison.b), ("walker", "random"));
         assert_eq!(comparison.table.n(), runs[0].success.n);
@@ -122,15 +126,35 @@ fn the_floor_is_always_played_and_everybody_is_compared_with_it() {
     assert_eq!(found.manifest.hashes["weights"], "w0");
     let mut named = request();
     named.policies[0].name = "random".to_owned();
-    let error = named.run(&Known::new(), &Means::default(), &mut |_| {}).expect_err("no floor by another's name");
-    assert!(error.to_string().contains("does not act at random"), "{error}");
+    let error =
+        named.run(&TestResolver::new(), &RunOptions::default(), &mut Control::new()).expect_err("a reserved name");
+    assert!(error.to_string().contains("it is not the random policy"), "{error}");
     named.policies = vec![request().policies[0].clone(); 2];
-    let error = named.run(&Known::new(), &Means::default(), &mut |_| {}).expect_err("two of a name");
+    let error =
+        named.run(&TestResolver::new(), &RunOptions::default(), &mut Control::new()).expect_err("a name used twice");
     assert!(error.to_string().contains("'walker'") && error.is_usage(), "{error}");
 }
 
 #[test]
-fn results_do_not_depend_on_what_they_are_computed_with() {
+fn every_policy_and_condition_is_a_stage() {
+    let mut stages = vec![];
+    let mut control = Control::new().with_events(|event| match event {
+        Event::Started(stage) => stages.push(format!("{} {}", stage.subject.join(", "), stage.total)),
+        Event::Finished { metrics, .. } => stages.push(format!("{} {}", metrics[0].0, metrics[0].1 > 0.0)),
+        _ => {}
+    });
+    let options = RunOptions { envs: 4, threads: 1, ..RunOptions::default() };
+    request().run(&TestResolver::new(), &options, &mut control).expect("results");
+    drop(control);
+    assert_eq!(
+        stages[..4],
+        ["random, in distribution 24", "success_rate true", "walker, in distribution 24", "success_rate true"]
+    );
+    assert_eq!(stages.len(), 8);
+}
+
+#[test]
+fn results_do_not_depend_on_run_options() {
     let mut requests = vec![request(); 3];
     requests[1].starts = held_out(Part::Test);
     requests[1].counting = Counting::Strict { hold: 2 };
@@ -146,8 +170,8 @@ fn results_do_not_depend_on_what_they_are_computed_with() {
 
 #[test]
 fn held_out_starts_come_from_held_out_episodes() {
-    let known = Known::new();
-    let mut seen = vec![];
+    let known = TestResolver::new();
+    let mut hashes = vec![];
     for part in [Part::Train, Part::Validation, Part::Test] {
         let request = EvalRequest { starts: held_out(part), ..request() };
         let found = run(&request, 4, 1);
@@ -158,28 +182,29 @@ fn held_out_starts_come_from_held_out_episodes() {
             let [position, _] = episode.start.expect("a start");
             assert_eq!(split.part(known.data.episodes()[position].index), part);
         }
-        seen.push(found.manifest.hashes["starts"].clone());
+        hashes.push(found.manifest.hashes["starts"].clone());
     }
-    seen.sort();
-    seen.dedup();
-    assert_eq!(seen.len(), 3);
+    hashes.sort();
+    hashes.dedup();
+    assert_eq!(hashes.len(), 3);
     let nothing = HeldOut { part: Part::Test, split: Split { test: 0.0, ..Split::default() } };
     let starts = StartsRequest::Dataset { dataset: "line".to_owned(), goal_offset: 3, held_out: Some(nothing) };
-    let error = EvalRequest { starts, ..request() }.run(&known, &Means::default(), &mut |_| {}).expect_err("none");
+    let error =
+        EvalRequest { starts, ..request() }.run(&known, &RunOptions::default(), &mut Control::new()).expect_err("none");
     assert!(error.to_string().contains("the test split") && error.to_string().contains("60 episodes"), "{error}");
 }
 
 #[test]
-fn results_can_be_made_again() {
-    let known = Known::new();
+fn results_can_be_reproduced() {
+    let known = TestResolver::new();
     let mut requests = vec![request(); 2];
     requests[1].starts = held_out(Part::Test);
     requests[1].counting = Counting::Compat { envs: 2 };
     for request in requests {
-        let first = filed(&run(&request, 4, 1));
-        let mut asked = request.clone();
-        asked.policies.insert(0, PolicyRequest { name: "random".to_owned(), acts: Acts::Random });
-        assert_eq!(EvalRequest::of(&first.manifest).expect("a request"), asked, "as it was asked, and the floor");
+        let first = round_trip(&run(&request, 4, 1));
+        let mut expected = request.clone();
+        expected.policies.insert(0, PolicyRequest { name: "random".to_owned(), kind: PolicyKind::Random });
+        assert_eq!(EvalRequest::of(&first.manifest).expect("a request"), expected, "the request with the floor");
         let second = again(&first, &known).expect("again");
         assert_eq!(second.differences, []);
         assert!(second.holds());
@@ -187,39 +212,44 @@ fn results_can_be_made_again() {
 }
 
 #[test]
-fn predictions_are_told_apart_by_what_came_of_the_start() {
-    let asked = EvalRequest { starts: held_out(Part::Train), prediction: Some(2), budget: Some(4), ..request() };
-    let found = run(&asked, 4, 1);
+fn prediction_errors_are_grouped_by_the_outcome_of_the_episode() {
+    let request_with_prediction =
+        EvalRequest { starts: held_out(Part::Train), prediction: Some(2), budget: Some(4), ..request() };
+    let found = run(&request_with_prediction, 4, 1);
     assert_eq!((&found.runs[0].prediction, &found.runs[2].prediction), (&None, &None), "the floor has no model");
     for run in [&found.runs[1], &found.runs[3]] {
-        let prediction = run.prediction.as_ref().expect("asked for");
+        let prediction = run.prediction.as_ref().expect("a prediction");
         for (trajectory, episode) in prediction.trajectories.iter().zip(&run.episodes) {
             assert_eq!(Some(trajectory.start), episode.start);
             assert_eq!(trajectory.success, (!episode.solved_at_start).then_some(episode.success));
         }
-        let told: usize = prediction.groups[1..].iter().map(|group| group.trajectory.n).sum();
-        assert_eq!((prediction.groups[0].trajectory.n, told), (24, run.success.n));
+        let grouped: usize = prediction.groups[1..].iter().map(|group| group.trajectory.n).sum();
+        assert_eq!((prediction.groups[0].trajectory.n, grouped), (24, run.success.n));
     }
-    assert_eq!(again(&filed(&found), &Known::new()).expect("again").differences, []);
-    let error = EvalRequest { prediction: Some(2), ..request() }.run(&Known::new(), &Means::default(), &mut |_| {});
-    assert!(error.expect_err("nothing recorded").to_string().contains("take starts from a dataset"));
+    assert_eq!(again(&round_trip(&found), &TestResolver::new()).expect("again").differences, []);
+    let error = EvalRequest { prediction: Some(2), ..request() }.run(
+        &TestResolver::new(),
+        &RunOptions::default(),
+        &mut Control::new(),
+    );
+    assert!(error.expect_err("no recorded trajectories").to_string().contains("take starts from a dataset"));
 }
 
 #[test]
-fn what_differs_is_named() {
-    let known = Known::new();
-    let mut first = filed(&run(&request(), 4, 1));
+fn differences_are_listed() {
+    let known = TestResolver::new();
+    let mut first = round_trip(&run(&request(), 4, 1));
     first.runs[3].episodes[7].steps += 1;
     first.manifest.swm_version = "0.0.9".to_owned();
     first.manifest.hashes.insert("goals".to_owned(), "other".to_owned());
     let second = again(&first, &known).expect("again");
-    let told: Vec<(Kind, &str)> = second.differences.iter().map(|d| (d.kind, d.what.as_str())).collect();
+    let listed: Vec<(Kind, &str)> = second.differences.iter().map(|d| (d.kind, d.what.as_str())).collect();
     let expected = [
         (Kind::Version, "stable-worldmodel"),
         (Kind::Input, "hash of goals"),
         (Kind::Finding, "episode 7 of walker, goal near"),
     ];
-    assert_eq!(told, expected);
+    assert_eq!(listed, expected);
     assert!(!second.holds());
     let sentence = second.differences[0].to_string();
     assert!(sentence.starts_with("stable-worldmodel: was 0.0.9, is "), "{sentence}");
@@ -227,40 +257,40 @@ fn what_differs_is_named() {
     let mut fewer = second.results.clone();
     fewer.runs.remove(0);
     fewer.manifest.config["seed"] = json!(6);
-    let told = differences(&second.results, &fewer);
-    assert_eq!((told[0].what.as_str(), told[0].was.as_str(), told[0].is.as_str()), ("request, seed", "5", "6"));
-    assert_eq!(told.iter().filter(|d| d.is == "nothing").count(), 24 + 1, "24 episodes, and their counts");
+    let listed = differences(&second.results, &fewer);
+    assert_eq!((listed[0].what.as_str(), listed[0].was.as_str(), listed[0].is.as_str()), ("request, seed", "5", "6"));
+    assert_eq!(listed.iter().filter(|d| d.is == "nothing").count(), 24 + 1, "24 episodes and the success rate");
 }
 
 #[test]
-fn other_weights_are_refused_before_anything_is_played() {
+fn other_weights_are_rejected_before_the_first_episode() {
     let first = run(&request(), 4, 1);
-    let other = Known { weights: "w1".to_owned(), ..Known::new() };
-    let mut played = 0;
-    let means = Means { envs: 2, ..Means::default() };
-    let error = reproduce(&first, &other, &means, &mut |moment| {
-        played += usize::from(matches!(moment, Moment::Begins { policy: "walker", .. }));
-    });
+    let other = TestResolver { weights: "w1".to_owned(), ..TestResolver::new() };
+    let mut stages = 0;
+    let options = RunOptions { envs: 2, ..RunOptions::default() };
+    let mut control = Control::new().with_events(|event| stages += usize::from(matches!(event, Event::Started(_))));
+    let error = reproduce(&first, &other, &options, &mut control);
+    drop(control);
     let error = error.expect_err("other weights").to_string();
     assert!(error.contains("w1") && error.contains("made with w0"), "{error}");
-    assert_eq!(played, 0);
+    assert_eq!(stages, 0);
 }
 
 #[test]
-fn requests_are_read_strictly() {
-    let known = Known::new();
+fn malformed_requests_are_errors() {
+    let known = TestResolver::new();
     let first = run(&request(), 4, 1);
-    let refused = |change: &dyn Fn(&mut Results)| {
+    let rejected = |change: &dyn Fn(&mut Results)| {
         let mut old = first.clone();
         change(&mut old);
-        again(&old, &known).map(|_| ()).expect_err("refused").to_string()
+        again(&old, &known).map(|_| ()).expect_err("rejected").to_string()
     };
-    let message = refused(&|old| old.manifest.config["version"] = json!(99));
-    assert!(message.contains("layout 99, this version reads 1"), "{message}");
-    let message = refused(&|old| old.manifest.config["hold"] = json!(2));
+    let message = rejected(&|old| old.manifest.config["version"] = json!(99));
+    assert!(message.contains("layout 99; this version reads 1"), "{message}");
+    let message = rejected(&|old| old.manifest.config["hold"] = json!(2));
     assert!(message.contains("unknown field `hold`"), "{message}");
-    let message = refused(&|old| old.manifest.config = json!({"command": "swm eval lewm"}));
-    assert!(message.contains("before requests were kept"), "{message}");
-    let message = refused(&|old| old.manifest.kind = "train".to_owned());
+    let message = rejected(&|old| old.manifest.config = json!({"command": "swm eval lewm"}));
+    assert!(message.contains("it contains no request"), "{message}");
+    let message = rejected(&|old| old.manifest.kind = "train".to_owned());
     assert!(message.contains("'train'"), "{message}");
 }

@@ -1,4 +1,4 @@
-//! The whole page, from synthetic results whose numbers are known.
+//! Tests of the whole page, from synthetic results.
 
 use std::path::{Path, PathBuf};
 use swm_core::results::{Comparison, Counting, EpisodeResult, Prediction, Run, Searches, Summary, Timing, Trajectory};
@@ -91,8 +91,8 @@ fn page(results: &[(PathBuf, Results)], folder: &Path) -> String {
     page.replace('\u{a0}', " ")
 }
 
-/// Checks that elements nest, attributes are quoted, and ampersands begin entities: the page is valid XML
-/// apart from its doctype.
+/// Checks that elements nest, attributes are quoted, and ampersands start entities, so that the page is valid XML apart from its
+/// doctype.
 fn well_formed(page: &str) {
     let mut open: Vec<&str> = vec![];
     let mut rest = page.strip_prefix("<!DOCTYPE html>").expect("a doctype");
@@ -115,11 +115,11 @@ fn well_formed(page: &str) {
         }
         rest = &rest[end + 1..];
     }
-    assert!(open.is_empty(), "never closed: {open:?}");
+    assert!(open.is_empty(), "unclosed elements: {open:?}");
 }
 
 #[test]
-fn the_page_shows_the_numbers() {
+fn page_contains_the_results() {
     let folder = tempfile::tempdir().expect("folder");
     let results = [(PathBuf::from("runs/demo/results.json"), results())];
     let page = page(&results, folder.path());
@@ -130,8 +130,8 @@ fn the_page_shows_the_numbers() {
         "1.4 – 16.5 %",
         "2.7 – 20.3 %",
         "92.5 % (37/40)",
-        "above the random floor of 5.0 %",
-        "not told apart from the random floor of 5.0 %",
+        "above the random-policy floor of 5.0 %",
+        "not significantly different from the random-policy floor of 5.0 %",
         "26 (43)",
         "38 ms (58 ms)",
         "1 min 23 s",
@@ -145,7 +145,6 @@ fn the_page_shows_the_numbers() {
     ] {
         assert!(page.contains(words), "the page lacks: {words}");
     }
-    // Curves begin at nothing and rise by one episode each: 37 of 40 solved from step 8 to 44.
     assert!(!page.contains("<script") && !page.contains("src=\"http") && !page.contains("@import"));
     assert!(!page.contains("NaN") && !page.contains("inf\""));
 }
@@ -154,13 +153,13 @@ fn the_page_shows_the_numbers() {
 fn policies_are_compared_on_the_same_starts() {
     let folder = tempfile::tempdir().expect("folder");
     let page = page(&[(PathBuf::from("runs/all/results.json"), everything())], folder.path());
-    // 37 of 40 against 2 of 40, none solved by the floor alone: 2 × 0.5^35. 25 of 40 against 37 of 40: 25 both, 12 only
-    // the first, 0 only the other.
+    // 37 of 40 against 2 of 40, none solved by the floor alone: p = 2 × 0.5^35. 25 of 40 against 37 of 40: 25 both, 12 only
+    // one policy, 0 only the other.
     for words in [
         "dataset protocol · counting: strict, held for 5 steps",
         "once the goal was satisfied for 5 steps in a row",
-        "One start was solved already; it was not played and does not count",
-        "above the random floor of 5.0 % (p &lt; 0.001)",
+        "One episode was solved at the start; it was not played and does not count",
+        "above the random-policy floor of 5.0 % (p &lt; 0.001)",
         "lewm-tiny \u{2212} random",
         "pldm \u{2212} lewm-tiny",
         "\u{2212}30.0 [\u{2212}",
@@ -175,12 +174,12 @@ fn policies_are_compared_on_the_same_starts() {
         assert!(page.contains(words), "the page lacks: {words}");
     }
     assert!(!page.contains("agent.color shifted: cost") && !page.contains("pldm, in distribution: cost"));
-    // The shifted run counts a start less than its floor: they did not play the same starts, and intervals decide.
-    assert!(page.contains("not told apart from the random floor of 5.0 %<"));
+    // The shifted run counts one start fewer than its floor, so they are compared by their confidence intervals.
+    assert!(page.contains("not significantly different from the random-policy floor of 5.0 %<"));
 }
 
 #[test]
-fn compat_counting_says_so_and_what_strict_makes_of_it() {
+fn compat_counting_is_described_with_the_strict_rate() {
     let folder = tempfile::tempdir().expect("folder");
     let mut results = results();
     results.counting = Counting::Compat { envs: 8 };
@@ -193,14 +192,14 @@ fn compat_counting_says_so_and_what_strict_makes_of_it() {
     results.comparisons = Comparison::all(&results.runs, results.counting);
     let file = folder.path().join("results.json");
     std::fs::write(&file, serde_json::to_string(&results).expect("JSON")).expect("file");
-    let results = read_results(&file).expect("compat results agree with themselves");
+    let results = read_results(&file).expect("consistent results");
     let page = page(&[(file, results)], &folder.path().join("report"));
     for words in [
-        "every start counts, solved already or not (1 were)",
-        "The first to finish of 8 environments",
+        "every episode counts, solved at the start or not (1 were)",
+        "The first episodes to finish in 8 parallel environments",
         "92.5 % (37/40)",
         "strict 94.9 %",
-        "from a start that was solved already",
+        ", solved at the start",
     ] {
         assert!(page.contains(words), "the page lacks: {words}");
     }
@@ -215,7 +214,7 @@ fn equal_results_give_equal_bytes() {
 }
 
 #[test]
-fn words_of_others_cannot_become_markup() {
+fn external_text_is_escaped() {
     let folder = tempfile::tempdir().expect("folder");
     let mut results = results();
     let evil = "<img src=x onerror=\"alert('1')\">&";
@@ -234,7 +233,7 @@ fn words_of_others_cannot_become_markup() {
 }
 
 #[test]
-fn nothing_measured_is_said_so() {
+fn empty_results_are_described() {
     let folder = tempfile::tempdir().expect("folder");
     let mut empty = results();
     empty.runs.clear();
@@ -243,21 +242,23 @@ fn nothing_measured_is_said_so() {
     unsolved.runs = vec![run("in distribution", "lewm", 0, 0, None)];
     unsolved.manifest = Manifest::default();
     let page = page(&[(PathBuf::from("results.json"), empty), (PathBuf::from("b.json"), unsolved)], folder.path());
-    assert!(page.contains("These results hold no run.") && page.contains("no random floor was measured"));
+    assert!(
+        page.contains("These results contain no runs.") && page.contains("the random-policy floor was not measured")
+    );
     assert!(!page.contains("NaN"));
     let none = write_report(&[], folder.path()).expect_err("nothing to report");
     assert!(none.is_usage() && none.to_string().contains("at least one results.json"));
 }
 
 #[test]
-fn several_files_of_one_world_stand_side_by_side() {
+fn files_of_one_environment_share_a_section() {
     let folder = tempfile::tempdir().expect("folder");
     let files = ["a.json", "b.json"].map(|name| (PathBuf::from(name), results()));
     let page = page(&files, folder.path());
     assert_eq!(page.matches("<h2>Success</h2>").count(), 1);
     assert!(page.contains("lewm-tiny [1]") && page.contains("lewm-tiny [2]") && page.contains("[2] <code>b.json"));
 
-    assert!(!page.contains("random ["), "one floor, measured twice, is shown once");
+    assert!(!page.contains("random ["), "equal floors are shown once");
 
     // Runs that differ by condition or policy need no number.
     let mut shifted = results();
@@ -269,20 +270,20 @@ fn several_files_of_one_world_stand_side_by_side() {
 }
 
 #[test]
-fn other_worlds_and_countings_stand_apart() {
+fn environments_and_countings_have_separate_sections() {
     let folder = tempfile::tempdir().expect("folder");
     let (first, other) = (results(), Results { env: "swm/PushT-v1".to_owned(), ..results() });
     let compat = Results { counting: Counting::Compat { envs: 8 }, ..results() };
     let files = [first, other, compat].map(|results| (PathBuf::from("results.json"), results));
     let page = page(&files, folder.path());
-    assert!(page.contains("<h1>Evaluation in swm/TwoRoom-v1, swm/PushT-v1</h1>"), "each world is named once");
+    assert!(page.contains("<h1>Evaluation in swm/TwoRoom-v1, swm/PushT-v1</h1>"), "each environment is named once");
     for heading in ["swm/TwoRoom-v1 · episodic, strict", "swm/TwoRoom-v1 · episodic, compat with 8 environments"] {
         assert!(page.contains(&format!("<h2>{heading}</h2>")), "{heading}");
     }
 }
 
 #[test]
-fn videos_are_carried_and_missing_ones_named() {
+fn videos_are_embedded_and_missing_ones_named() {
     let folder = tempfile::tempdir().expect("folder");
     std::fs::create_dir_all(folder.path().join("videos")).expect("folder");
     std::fs::write(folder.path().join("videos/lewm-2.mp4"), b"not really a video").expect("file");
@@ -295,13 +296,13 @@ fn videos_are_carried_and_missing_ones_named() {
     assert!(page.contains("data:video/mp4;base64,bm90IHJlYWxseSBhIHZpZGVv"));
     assert!(page.contains("episode 2 <span class=\"mark solved\">solved in 10 steps</span>"));
     assert!(page.contains("episode 39 <span class=\"mark unsolved\">not solved in 60 steps</span>"));
-    for words in ["has 8.0 MiB", "was not found beside its results file", "is neither MP4 nor WebM"] {
+    for words in ["has 8.0 MiB", "was not found in the folder of its results file", "is neither MP4 nor WebM"] {
         assert!(page.contains(words), "the page lacks: {words}");
     }
 }
 
 #[test]
-fn training_logs_become_curves() {
+fn training_metrics_become_charts() {
     let folder = tempfile::tempdir().expect("folder");
     let log = folder.path().join("train.jsonl");
     let lines: String = (0..900)
@@ -313,7 +314,7 @@ fn training_logs_become_curves() {
         })
         .collect();
     std::fs::write(&log, format!("{lines}{{\"step\": 900, \"lo")).expect("log");
-    let metrics = read_metrics(&log).expect("a torn last line is what a killed training leaves");
+    let metrics = read_metrics(&log).expect("an incomplete last line is ignored");
     assert_eq!(metrics.over, "step");
     assert_eq!(metrics.series.iter().map(|s| s.name.as_str()).collect::<Vec<_>>(), ["loss", "optimizer/lr", "seconds"]);
     assert_eq!(metrics.series[0].points[1], (1.0, 0.5));
@@ -323,14 +324,14 @@ fn training_logs_become_curves() {
     let page = std::fs::read_to_string(path).expect("page");
     well_formed(&page);
     assert!(page.contains("loss over step, ending at 0.001111") && page.contains("optimizer/lr"));
-    assert!(!page.contains("seconds over step"), "a page is about how well, not how fast");
+    assert!(!page.contains("seconds over step"), "metrics of speed are left out");
 
     std::fs::write(&log, "{\"step\": 1}\nloss = 3\n{\"step\": 2}\n").expect("log");
-    assert!(read_metrics(&log).expect_err("no JSON").to_string().contains("line 2 is no JSON object"));
+    assert!(read_metrics(&log).expect_err("no JSON").to_string().contains("line 2 is not a JSON object"));
 }
 
 #[test]
-fn results_are_read_back_and_wrong_files_say_what_is_wrong() {
+fn results_are_read_and_errors_name_the_problem() {
     let folder = tempfile::tempdir().expect("folder");
     let path = folder.path().join("results.json");
     let good = serde_json::to_value(results()).expect("json");
@@ -346,14 +347,14 @@ fn results_are_read_back_and_wrong_files_say_what_is_wrong() {
     let newer = wrong(&|v| v["manifest"]["swm_version"] = "0.9.2".into());
     assert!(newer.contains("written by stable-worldmodel 0.9.2") && newer.contains("swm eval"), "{newer}");
     let lacking = wrong(&|v| v["runs"][0].as_object_mut().map(|run| run.remove("success")).map_or((), drop));
-    assert!(lacking.contains("another layout") && lacking.contains("success"), "{lacking}");
+    assert!(lacking.contains("a layout that this version does not read") && lacking.contains("success"), "{lacking}");
     let doctored = wrong(&|v| v["runs"][0]["success"]["successes"] = 39.into());
-    assert!(doctored.contains("claims 39 successes in 40, its episodes show 2 in 40"), "{doctored}");
+    assert!(doctored.contains("states 39 successes in 40, its episodes have 2 in 40"), "{doctored}");
     let doctored = wrong(&|v| v["comparisons"][1]["only_a"] = 36.into());
-    assert!(doctored.contains("its episodes do not show what it says of lewm-tiny and random"), "{doctored}");
-    assert!(wrong(&|v| *v = serde_json::json!({"loss": 1})).contains("no result file"));
+    assert!(doctored.contains("the comparison of lewm-tiny and random does not match the episodes"), "{doctored}");
+    assert!(wrong(&|v| *v = serde_json::json!({"loss": 1})).contains("not a results file"));
 
-    // What was written before countings and comparisons were is read as what it was.
+    // Files from before countings and comparisons existed are read with their defaults.
     let mut older = good.clone();
     let fields = older.as_object_mut().expect("an object");
     fields.remove("counting").and(fields.remove("comparisons")).expect("both were there");
@@ -362,7 +363,7 @@ fn results_are_read_back_and_wrong_files_say_what_is_wrong() {
     assert_eq!((older.counting, older.runs, older.comparisons), (Counting::default(), results().runs, vec![]));
 
     std::fs::write(&path, "{\"manifest\": ").expect("file");
-    assert!(read_results(&path).expect_err("torn").to_string().contains("no JSON document"));
+    assert!(read_results(&path).expect_err("incomplete").to_string().contains("not a JSON document"));
     let missing = read_results(&folder.path().join("lost.json")).expect_err("missing").to_string();
     assert!(missing.contains("reading results"), "{missing}");
 }

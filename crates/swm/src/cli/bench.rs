@@ -71,7 +71,7 @@ fn render(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
         return emit_json(&rows);
     }
     let rows = rows.iter().map(|row| {
-        let speed = format!("{:.0}", row.pictures_per_second);
+        let speed = format!("{:.0}", row.frames_per_second);
         vec![row.env.clone(), format!("{} px", row.size), row.renderer.clone(), speed]
     });
     emit(&table(&["environment", "pictures", "renderer", "pictures/s"], rows));

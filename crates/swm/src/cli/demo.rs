@@ -13,7 +13,9 @@ use swm_core::VariationRequest;
 use swm_core::results::Counting;
 use swm_data::Location;
 use swm_data::{ImageCodec, WriteMode};
-use swm_eval::{Acts, Choice, CollectConfig, Condition, EvalRequest, Model, PolicyRequest, StartsRequest, WorldConfig};
+use swm_eval::{
+    Choice, CollectConfig, Condition, EvalRequest, Model, PolicyKind, PolicyRequest, StartsRequest, WorldConfig,
+};
 use swm_models::lewm::Lewm;
 use swm_models::{Checkpoint, Device, TrainConfig, TrainOptions};
 use swm_plan::{Cem, MpcConfig};
@@ -112,7 +114,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
         history: checkpoint.config.model.predictor.history,
         ..MpcConfig::default()
     };
-    let acts = Acts::Plan {
+    let kind = PolicyKind::Plan {
         model: Model::Checkpoint(model.to_string_lossy().into_owned()),
         solver: Choice { id: "cem".to_owned(), settings: json!(SEARCH) },
         mpc: json!(mpc),
@@ -124,7 +126,7 @@ pub fn demo(args: &DemoArgs, context: &Context) -> anyhow::Result<()> {
         wrappers: vec![],
         wrap_goal: false,
         image: Some(image.into()),
-        policies: vec![PolicyRequest { name: "lewm".to_owned(), acts }],
+        policies: vec![PolicyRequest { name: "lewm".to_owned(), kind }],
         starts: StartsRequest::Episodic,
         episodes: args.eval_episodes,
         seed: args.seed + 1,

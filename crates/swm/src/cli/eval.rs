@@ -11,10 +11,11 @@ use std::path::{Path, PathBuf};
 use swm::home;
 use swm::resolver::{Home, parse_score};
 use swm_core::results::{Counting, Proportion, Run};
+use swm_core::run::{Control, Event};
 use swm_core::{EnvChoice, Error, Result, Results};
 use swm_data::{Part, Split};
 use swm_eval::reproduce::{Reproduction, reproduce as run_again};
-use swm_eval::{Acts, Condition, EvalRequest, HeldOut, Means, Model, Moment, PolicyRequest, StartsRequest};
+use swm_eval::{Condition, EvalRequest, HeldOut, Model, PolicyKind, PolicyRequest, RunOptions, StartsRequest};
 use swm_models::Device;
 
 /// Arguments of `swm eval`.
@@ -172,9 +173,9 @@ impl EvalArgs {
         let Found { name, kind, image, .. } = found;
         let image = image.map(|side| [side, side]);
         let (model, block, history) = match kind {
-            Kind::Acts(acts) => return Ok(vec![(PolicyRequest { name, acts }, image)]),
+            Kind::Acts(acts) => return Ok(vec![(PolicyRequest { name, kind: acts }, image)]),
             Kind::Plans { acts: Some(acts), .. } if self.planner.solvers.is_empty() => {
-                return Ok(vec![(PolicyRequest { name, acts }, image)]);
+                return Ok(vec![(PolicyRequest { name, kind: acts }, image)]);
             }
             Kind::Plans { model: None, .. } => {
                 parse_score(&self.planner.score)?;
@@ -188,7 +189,7 @@ impl EvalArgs {
         let policies = solvers.into_iter().enumerate().map(|(i, solver)| {
             let name = if words.len() > 1 { format!("{name} ({})", words[i]) } else { name.clone() };
             let acts = self.planner.plan(model.clone(), solver, block, history)?;
-            Ok((PolicyRequest { name, acts }, image))
+            Ok((PolicyRequest { name, kind: acts }, image))
         });
         policies.collect()
     }
@@ -206,9 +207,9 @@ struct Found {
 
 enum Kind {
     /// A policy that does not plan.
-    Acts(Acts),
+    Acts(PolicyKind),
     /// A model to plan in, the simulator for none; one that knows how to act does so unless a solver is named.
-    Plans { model: Option<String>, block: usize, history: usize, acts: Option<Acts> },
+    Plans { model: Option<String>, block: usize, history: usize, acts: Option<PolicyKind> },
 }
 
 /// Finds out what a word stands for.
@@ -216,10 +217,10 @@ fn find(given: &str, env: Option<&str>) -> Result<Found> {
     let scripted = |acts| Found { name: given.to_owned(), kind: Kind::Acts(acts), env: None, image: None };
     let env = env.map(swm::env).transpose()?;
     if given == "random" {
-        return Ok(scripted(Acts::Random));
+        return Ok(scripted(PolicyKind::Random));
     }
     if given == "expert" || env.is_some_and(|env| env.entry.experts.iter().any(|expert| expert.id == given)) {
-        return Ok(scripted(Acts::Expert { id: given.to_owned() }));
+        return Ok(scripted(PolicyKind::Expert { id: given.to_owned() }));
     }
     if given == "simulator" {
         let kind = Kind::Plans { model: None, block: 1, history: 1, acts: None };
@@ -229,7 +230,7 @@ fn find(given: &str, env: Option<&str>) -> Result<Found> {
     let name = Path::new(given).file_name().map_or(given.to_owned(), |name| name.to_string_lossy().into_owned());
     let found = swm_models::load(&path, &Device::flex())?;
     let info = found.info()?;
-    let direct = Acts::Direct { checkpoint: given.to_owned(), settings: Value::Null };
+    let direct = PolicyKind::Direct { checkpoint: given.to_owned(), settings: Value::Null };
     let kind = match found.cost() {
         Some(_) => Kind::Plans {
             model: Some(given.to_owned()),
@@ -252,19 +253,14 @@ pub fn run(
 ) -> Result<(Results, PathBuf)> {
     folder(output)?;
     let mut bar = Bar::new(request.episodes);
-    let results = request.run(home, &means(envs, (output, films), context), &mut |moment| bar.watch(&moment))?;
+    let results = request.run(home, &run_options(envs, (output, films), context), &mut bar.control(context))?;
     let file = output.join("results.json");
     write_json(&file, &results)?;
     Ok((results, file))
 }
 
-fn means(envs: usize, (output, films): (&Path, usize), context: &Context) -> Means {
-    Means {
-        envs,
-        threads: context.threads,
-        videos: (films > 0).then(|| (output.to_owned(), films)),
-        stop: Some(context.stop.clone()),
-    }
+fn run_options(envs: usize, (output, films): (&Path, usize), context: &Context) -> RunOptions {
+    RunOptions { envs, threads: context.threads, videos: (films > 0).then(|| (output.to_owned(), films)) }
 }
 
 fn write_json(file: &Path, value: &impl serde::Serialize) -> Result<()> {
@@ -294,22 +290,30 @@ impl Bar {
         Self { episodes, progress: None, doing: String::new() }
     }
 
-    fn watch(&mut self, moment: &Moment<'_>) {
-        match moment {
-            Moment::Begins { policy, condition } => {
+    /// The control of a run that shows its progress and stops at Ctrl-C.
+    fn control(&mut self, context: &Context) -> Control<'_> {
+        Control::new().with_interrupt(context.stop.clone()).with_events(|event| self.show(event))
+    }
+
+    fn show(&mut self, event: Event<'_>) {
+        match event {
+            Event::Started(stage) => {
                 self.progress = Some(Progress::new("evaluate", self.episodes));
-                self.doing = format!("{policy}, {condition}");
+                self.doing = stage.subject.join(", ");
             }
-            Moment::Progress(at) => {
+            Event::Progress(at) => {
                 if let Some(progress) = &self.progress {
                     progress.at(at.done, self.doing.clone());
                 }
             }
-            Moment::Ends(run) => {
+            Event::Finished { metrics, .. } => {
+                let metric = |name| metrics.iter().find(|(known, _)| *known == name).map_or(0.0, |(_, value)| *value);
+                let success = Proportion::wilson(metric("successes") as usize, metric("episodes") as usize);
                 if let Some(progress) = self.progress.take() {
-                    progress.done(&format!("{}: {}", self.doing, percent(&run.success)));
+                    progress.done(&format!("{}: {}", self.doing, percent(&success)));
                 }
             }
+            _ => {}
         }
     }
 }
@@ -333,8 +337,8 @@ pub fn reproduce(args: &ReproduceArgs, context: &Context) -> anyhow::Result<()> 
     let old = swm_report::read_results(&file)?;
     let episodes = EvalRequest::of(&old.manifest)?.episodes;
     let mut bar = Bar::new(episodes);
-    let means = means(args.envs, (Path::new("."), 0), context);
-    let again: Reproduction = run_again(&old, &Home::default(), &means, &mut |moment| bar.watch(&moment))?;
+    let options = run_options(args.envs, (Path::new("."), 0), context);
+    let again: Reproduction = run_again(&old, &Home::default(), &options, &mut bar.control(context))?;
     if let Some(output) = &args.output {
         write_json(&folder(output)?.join("results.json"), &again.results)?;
     }

@@ -4,7 +4,7 @@ use super::solvers;
 use clap::Args;
 use serde_json::{Map, Value, json};
 use swm_core::{EnvChoice, Error, Result};
-use swm_eval::{Acts, Choice, Model};
+use swm_eval::{Choice, Model, PolicyKind};
 use swm_plan::ActionKind;
 use swm_plan::objective::ObjectiveConfig;
 use swm_plan::{MpcConfig, SOLVERS};
@@ -74,7 +74,7 @@ impl PlannerArgs {
     ///
     /// # Errors
     /// When the objective is none.
-    pub fn plan(&self, model: Model, solver: Choice, block: usize, history: usize) -> Result<Acts> {
+    pub fn plan(&self, model: Model, solver: Choice, block: usize, history: usize) -> Result<PolicyKind> {
         let mpc = MpcConfig {
             horizon: self.horizon,
             receding_horizon: self.receding_horizon.min(self.horizon),
@@ -86,7 +86,7 @@ impl PlannerArgs {
         mpc.check()?;
         let objective = self.objective()?;
         let objective = if objective.is_empty() { Value::Null } else { json!(objective) };
-        Ok(Acts::Plan { model, solver, mpc: json!(mpc), objective })
+        Ok(PolicyKind::Plan { model, solver, mpc: json!(mpc), objective })
     }
 
     fn objective(&self) -> Result<ObjectiveConfig> {

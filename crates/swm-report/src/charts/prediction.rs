@@ -1,17 +1,15 @@
-//! How well models predict recorded trajectories, apart for those their plans solved and those they did not.
+//! The charts of prediction errors, grouped by success.
 
-use crate::chart::{Scale, Svg};
+use super::svg::{HALF, Scale, Svg};
 use crate::group::{Condition, Row};
 use crate::text::{number, shorten};
 use swm_core::results::{Group, Prediction};
 
-/// Width of a plot, of which two stand side by side.
-const HALF: f64 = 440.0;
-
-/// The plots of every run of a condition whose model was looked at.
-pub(crate) fn plots(condition: &Condition<'_>) -> String {
-    let told = condition.rows.iter().filter_map(|row| Some((row, row.run.prediction.as_ref()?)));
-    told.filter(|(_, prediction)| !prediction.groups.is_empty())
+/// The charts of all runs of a condition with prediction errors.
+pub(crate) fn charts(condition: &Condition<'_>) -> String {
+    let evaluated = condition.rows.iter().filter_map(|row| Some((row, row.run.prediction.as_ref()?)));
+    evaluated
+        .filter(|(_, prediction)| !prediction.groups.is_empty())
         .map(|(row, prediction)| {
             let title = format!("{}, {}", row.label, condition.name);
             steps(row, prediction, &title) + &trajectories(row, prediction, &title)
@@ -19,8 +17,8 @@ pub(crate) fn plots(condition: &Condition<'_>) -> String {
         .collect()
 }
 
-/// What a group is called, and the classes that draw it.
-fn look(group: &Group) -> (&'static str, &'static str) {
+/// The label of a group and its CSS class.
+fn label(group: &Group) -> (&'static str, &'static str) {
     match group.success {
         None => ("all", "dashed"),
         Some(true) => ("solved", "good"),
@@ -28,8 +26,7 @@ fn look(group: &Group) -> (&'static str, &'static str) {
     }
 }
 
-/// The mean error of each model step, a curve a group.
-#[allow(clippy::cast_precision_loss)]
+/// The mean error of each model step, one curve for each group.
 fn steps(row: &Row<'_>, prediction: &Prediction, title: &str) -> String {
     let [left, top, bottom] = [56.0, 46.0, 200.0];
     let right = HALF - 12.0;
@@ -46,10 +43,10 @@ fn steps(row: &Row<'_>, prediction: &Prediction, title: &str) -> String {
     let unit = format!("model steps of {} environment steps", prediction.frameskip);
     svg.text("tick middle", [(left + right) / 2.0, bottom + 36.0], &unit);
     for (i, group) in prediction.groups.iter().enumerate() {
-        let (name, class) = look(group);
+        let (name, class) = label(group);
         let class = format!("curve {class} {}", row.class);
         let points = group.steps.iter().enumerate().map(|(i, step)| [x.at((i + 1) as f64), y.at(step.mean)]);
-        // Nothing is predicted yet at step 0, so nothing is wrong.
+        // The error at step 0, before any prediction, is 0.
         svg.path(&class, std::iter::once([x.at(0.0), y.at(0.0)]).chain(points));
         let key = left + 125.0 * i as f64;
         svg.path(&class, [[key, 32.0], [key + 26.0, 32.0]]);
@@ -58,8 +55,7 @@ fn steps(row: &Row<'_>, prediction: &Prediction, title: &str) -> String {
     svg.finish(&format!("{title}: mean prediction error by model step"))
 }
 
-/// The error of every trajectory, a line of strokes a group.
-#[allow(clippy::cast_precision_loss)]
+/// The error of every trajectory, one row of strokes for each group.
 fn trajectories(row: &Row<'_>, prediction: &Prediction, title: &str) -> String {
     const LINE: f64 = 46.0;
     let [left, top] = [96.0, 30.0];
@@ -70,13 +66,17 @@ fn trajectories(row: &Row<'_>, prediction: &Prediction, title: &str) -> String {
     let mut svg = Svg::new(HALF, bottom + 42.0);
     svg.text("head", [0.0, 16.0], &shorten(&format!("{title}: error of each trajectory"), 58));
     svg.x_axis(x, &ticks, [top, bottom], "");
-    svg.text("tick middle", [(left + right) / 2.0, bottom + 36.0], "mean over its steps, in the latents' variance");
+    svg.text(
+        "tick middle",
+        [(left + right) / 2.0, bottom + 36.0],
+        "mean over its steps, in units of the latents' variance",
+    );
     for (i, group) in prediction.groups.iter().enumerate() {
-        let (name, class) = look(group);
+        let (name, class) = label(group);
         let y = top + (i as f64 + 0.5) * LINE;
         svg.text("label end", [left - 12.0, y + 4.5], name);
-        let mine = prediction.trajectories.iter().filter(|t| group.success.is_none() || t.success == group.success);
-        for trajectory in mine {
+        let members = prediction.trajectories.iter().filter(|t| group.success.is_none() || t.success == group.success);
+        for trajectory in members {
             let at = x.at(trajectory.error());
             svg.line(&format!("stroke {class} {}", row.class), [at, y - 11.0], [at, y + 11.0]);
         }

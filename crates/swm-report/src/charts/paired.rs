@@ -1,26 +1,22 @@
-//! Policies against each other on the same starts: a plot of the differences, and the counts behind it.
+//! Paired comparisons of policies on the same starts: the chart of the differences and the table of counts.
 
-use crate::chart::{Scale, Svg};
+use super::svg::{ROW, Scale, Svg, WIDE};
 use crate::group::{Group, Row};
 use crate::text::{escape, p_value, points, shorten};
 use std::fmt::Write as _;
 use swm_core::results::Paired;
 
-/// Width of the plot.
-const WIDE: f64 = 920.0;
-/// Where the whiskers begin, right of the names.
+/// The left edge of the plot area, right of the names, in pixels.
 const LABELS: f64 = 340.0;
-/// Height of a row, and of a condition's name.
-const ROW: f64 = 30.0;
 
-/// Differences of success rates with their intervals, one row a pair. None where nobody played the same starts.
-pub(crate) fn plot(group: &Group<'_>) -> Option<String> {
+/// Differences of success rates with their confidence intervals, one row for each pair; none if no policies played the same
+/// starts.
+pub(crate) fn chart(group: &Group<'_>) -> Option<String> {
     let pairs = all(group);
     let rows: usize = pairs.iter().map(|(_, pairs)| pairs.len()).sum();
     if rows == 0 {
         return None;
     }
-    #[allow(clippy::cast_precision_loss)]
     let bottom = 8.0 + (pairs.len() + rows) as f64 * ROW;
     let right = WIDE - 250.0;
     let ends = || pairs.iter().flat_map(|(_, pairs)| pairs).flat_map(|(_, _, t)| [t.low * 100.0, t.high * 100.0]);
@@ -38,7 +34,7 @@ pub(crate) fn plot(group: &Group<'_>) -> Option<String> {
             let middle = y + ROW / 2.0;
             let names = format!("{} \u{2212} {}", shorten(&a.label, 22), shorten(&b.label, 22));
             svg.text("label end", [LABELS - 14.0, middle + 4.5], &names);
-            let [low, high, at] = [table.low, table.high, table.difference].map(|share| scale.at(share * 100.0));
+            let [low, high, at] = [table.low, table.high, table.difference].map(|fraction| scale.at(fraction * 100.0));
             let whisker = format!("whisker {}", a.class);
             svg.line(&whisker, [low, middle], [high, middle]);
             for x in [low, high] {
@@ -51,18 +47,18 @@ pub(crate) fn plot(group: &Group<'_>) -> Option<String> {
             y += ROW;
         }
     }
-    let told = pairs.iter().flat_map(|(_, pairs)| pairs).map(|(a, b, table)| words(a, b, table));
-    Some(svg.finish(&format!("Differences on the same starts: {}", told.collect::<Vec<_>>().join("; "))))
+    let descriptions = pairs.iter().flat_map(|(_, pairs)| pairs).map(|(a, b, table)| words(a, b, table));
+    Some(svg.finish(&format!("Differences on the same starts: {}", descriptions.collect::<Vec<_>>().join("; "))))
 }
 
-/// The counts behind the differences.
+/// The table of the counts behind the differences.
 pub(crate) fn table(group: &Group<'_>) -> String {
     let mut html = "<div class=\"wide\" role=\"region\" aria-label=\"Paired comparisons\" tabindex=\"0\">\n<table>\n\
-         <caption>Starts by who solved them. Only those that one solved and the other did not tell two policies \
-         apart.</caption>\n<thead>\n<tr>\
-         <th scope=\"col\">Condition</th><th scope=\"col\">First</th><th scope=\"col\">Second</th>\
-         <th scope=\"col\" class=\"n\">Both</th><th scope=\"col\" class=\"n\">Only the first</th>\
-         <th scope=\"col\" class=\"n\">Only the second</th><th scope=\"col\" class=\"n\">Neither</th>\
+         <caption>Starts by the policies that solved them. Only starts that exactly one of the two solved distinguish \
+         them.</caption>\n<thead>\n<tr>\
+         <th scope=\"col\">Condition</th><th scope=\"col\">Policy A</th><th scope=\"col\">Policy B</th>\
+         <th scope=\"col\" class=\"n\">Both</th><th scope=\"col\" class=\"n\">Only A</th>\
+         <th scope=\"col\" class=\"n\">Only B</th><th scope=\"col\" class=\"n\">Neither</th>\
          <th scope=\"col\" class=\"n\">McNemar’s p</th></tr>\n</thead>\n"
         .to_owned();
     for (condition, pairs) in all(group) {
@@ -92,18 +88,19 @@ pub(crate) fn table(group: &Group<'_>) -> String {
     html
 }
 
-/// A condition's name and its pairs.
+/// The name of a condition and its pairs.
 type Pairs<'g, 'a> = (&'a str, Vec<(&'g Row<'a>, &'g Row<'a>, Paired)>);
 
-/// Every pair, by condition; conditions without any are left out.
+/// Every pair, by condition; conditions without pairs are left out.
 fn all<'g, 'a>(group: &'g Group<'a>) -> Vec<Pairs<'g, 'a>> {
     let pairs = group.conditions.iter().map(|condition| (condition.name, condition.pairs(group.counting)));
     pairs.filter(|(_, pairs)| !pairs.is_empty()).collect()
 }
 
+/// A comparison as a sentence.
 fn words(a: &Row<'_>, b: &Row<'_>, table: &Paired) -> String {
     format!(
-        "{} less {}: {} points, 95 % interval {} to {}, {}",
+        "{} minus {}: {} percentage points, 95 % confidence interval {} to {}, {}",
         a.label,
         b.label,
         points(table.difference),

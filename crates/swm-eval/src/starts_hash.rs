@@ -1,31 +1,35 @@
-//! [`Witness`]: hashes of the worlds that episodes begin in. Seeds and picks say what was asked for; these say what it
-//! came to, so that a change in how a world resets does not pass as the same start.
+//! [`StartsHash`]: hashes of the initial states and goals of an evaluation.
+//!
+//! Seeds and dataset rows determine the starts as requested; these hashes cover the actual states, so that a changed reset of
+//! an environment is detected.
 
-use crate::{Starts, World};
+use crate::starts::Starts;
+use crate::world::World;
 use std::collections::BTreeMap;
+use swm_core::columns::STATE;
 use swm_core::{Result, manifest};
 
-/// What the starts of some evaluations came to.
+/// The bytes of all initial states and goals.
 #[derive(Clone, Debug, Default)]
-pub struct Witness {
+pub struct StartsHash {
     starts: Vec<u8>,
     goals: Vec<u8>,
 }
 
-impl Witness {
-    /// Resets the world to every start and notes what it shows: the column `state` and the factors of variation as the
-    /// start, the columns whose name begins with `goal` as the goal.
+impl StartsHash {
+    /// Resets the world to every start and adds its state: the column `state` and the factors of variation to the starts, the
+    /// columns whose name starts with `goal` to the goals.
     ///
     /// # Errors
-    /// When an environment refuses a start.
-    pub fn note(&mut self, world: &mut World, starts: &Starts) -> Result<()> {
+    /// When an environment rejects a start.
+    pub fn add(&mut self, world: &mut World, starts: &Starts) -> Result<()> {
         let slots = world.pool().len();
         let columns = &world.spec().columns;
-        let state = columns.iter().position(|column| column.name == "state");
+        let state = columns.iter().position(|column| column.name == STATE);
         let goals: Vec<usize> = (0..columns.len()).filter(|&i| columns[i].name.starts_with("goal")).collect();
         for first in (0..starts.len()).step_by(slots) {
             let starting: Vec<(usize, usize)> = (0..slots.min(starts.len() - first)).map(|i| (i, first + i)).collect();
-            world.start(starts, &starting)?;
+            starts.start(world.pool_mut(), &starting)?;
             for &(slot, _) in &starting {
                 let infos = world.pool().infos();
                 let bytes = |column: usize| {
@@ -43,10 +47,10 @@ impl Witness {
         Ok(())
     }
 
-    /// BLAKE3 hashes of all that was noted, for a manifest: `starts`, and `goals` where the world has columns of them.
+    /// The BLAKE3 hashes for a manifest: `starts`, and `goals` where the environment has goal columns.
     pub fn hashes(&self) -> BTreeMap<String, String> {
         let both = [("starts", &self.starts), ("goals", &self.goals)];
-        let noted = both.into_iter().filter(|(_, bytes)| !bytes.is_empty());
-        noted.map(|(what, bytes)| (what.to_owned(), manifest::hash(bytes))).collect()
+        let present = both.into_iter().filter(|(_, bytes)| !bytes.is_empty());
+        present.map(|(name, bytes)| (name.to_owned(), manifest::hash(bytes))).collect()
     }
 }

@@ -1,9 +1,20 @@
-//! The few primitives all plots are drawn with.
+//! SVG primitives and scales, which all charts use.
 
 use crate::text::{escape, number};
 use std::fmt::Write as _;
 
-/// A linear scale from numbers to pixels.
+/// The width of charts that fill the page, in pixels.
+pub(crate) const WIDE: f64 = 920.0;
+/// The width of charts that stand in pairs, in pixels.
+pub(crate) const HALF: f64 = 440.0;
+/// The left edge of the plot area in charts with labelled rows, in pixels.
+pub(crate) const LABELS: f64 = 200.0;
+/// The number of characters that fit into a row label.
+pub(crate) const NAME: usize = 23;
+/// The height of a labelled row, in pixels.
+pub(crate) const ROW: f64 = 30.0;
+
+/// A linear scale from values to pixels.
 #[derive(Clone, Copy)]
 pub(crate) struct Scale {
     pub low: f64,
@@ -16,23 +27,21 @@ impl Scale {
     /// A scale over `low..=high`, widened to round numbers, with its ticks.
     pub(crate) fn nice(low: f64, high: f64, from: f64, to: f64, ticks: usize) -> (Self, Vec<f64>) {
         let span = if high > low { high - low } else { high.abs().max(1.0) };
-        #[allow(clippy::cast_precision_loss)]
         let rough = span / ticks.max(1) as f64;
         let power = 10f64.powf(rough.log10().floor());
         let step = [1.0, 2.0, 5.0, 10.0].map(|m| m * power).into_iter().find(|s| *s >= rough * 0.999).unwrap_or(rough);
         let (first, last) = ((low / step).floor(), ((low + span) / step - 1e-9).ceil());
-        #[allow(clippy::cast_possible_truncation)]
         let ticks = (first as i64..=last as i64).map(|i| i as f64 * step).collect();
         (Self { low: first * step, high: last * step, from, to }, ticks)
     }
 
-    /// The pixel of a number.
+    /// The pixel of a value.
     pub(crate) fn at(self, value: f64) -> f64 {
         self.from + (value - self.low) / (self.high - self.low) * (self.to - self.from)
     }
 }
 
-/// An SVG picture in the making.
+/// A builder of an SVG image.
 pub(crate) struct Svg {
     body: String,
     width: f64,
@@ -80,17 +89,17 @@ impl Svg {
         self.body.push_str("\"/>\n");
     }
 
-    /// A surface within points.
+    /// A filled polygon.
     pub(crate) fn area(&mut self, class: &str, points: impl IntoIterator<Item = [f64; 2]>) {
         self.outline("polygon", class, points);
     }
 
-    /// Words; `class` says how they are anchored and coloured.
+    /// A text; `class` defines its anchor and colour.
     pub(crate) fn text(&mut self, class: &str, [x, y]: [f64; 2], words: &str) {
         let _ = writeln!(self.body, r#"<text class="{class}" x="{x:.1}" y="{y:.1}">{}</text>"#, escape(words));
     }
 
-    /// Vertical grid lines with numbers below them.
+    /// Vertical grid lines with tick labels below.
     pub(crate) fn x_axis(&mut self, scale: Scale, ticks: &[f64], [top, bottom]: [f64; 2], unit: &str) {
         for &tick in ticks {
             let x = scale.at(tick);
@@ -99,7 +108,7 @@ impl Svg {
         }
     }
 
-    /// Horizontal grid lines with numbers to their left.
+    /// Horizontal grid lines with tick labels to the left.
     pub(crate) fn y_axis(&mut self, scale: Scale, ticks: &[f64], [left, right]: [f64; 2], unit: &str) {
         for &tick in ticks {
             let y = scale.at(tick);
@@ -108,7 +117,7 @@ impl Svg {
         }
     }
 
-    /// The picture; `description` is what a screen reader says.
+    /// The SVG element; `description` is the text for screen readers.
     pub(crate) fn finish(self, description: &str) -> String {
         format!(
             "<svg role=\"img\" aria-label=\"{}\" viewBox=\"0 0 {:.0} {:.0}\" style=\"max-width:{:.0}px\" \
@@ -122,7 +131,7 @@ impl Svg {
     }
 }
 
-/// The end of an element, around a tooltip where there is one.
+/// The end of an element, with a tooltip if `tip` is not empty.
 fn closing(element: &str, tip: &str) -> String {
     if tip.is_empty() { "/>".to_owned() } else { format!("><title>{}</title></{element}>", escape(tip)) }
 }

@@ -1,15 +1,12 @@
-//! How the searches behind plans went: costs and spread, iteration by iteration.
+//! The charts of searches: costs and spread over iterations.
 
-use crate::chart::{Scale, Svg};
+use super::svg::{HALF, Scale, Svg};
 use crate::group::{Condition, Row};
 use crate::text::shorten;
 use swm_core::results::{Band, Searches};
 
-/// Width of a plot, of which two stand side by side.
-const HALF: f64 = 440.0;
-
-/// The plots of every run of a condition that was traced and searched in more than one iteration.
-pub(crate) fn plots(condition: &Condition<'_>) -> String {
+/// The charts of all traced runs of a condition with more than one iteration.
+pub(crate) fn charts(condition: &Condition<'_>) -> String {
     let traced = condition.rows.iter().filter_map(|row| Some((row, row.run.searches.as_ref()?)));
     traced
         .filter(|(_, searches)| searches.best.len() > 1)
@@ -28,7 +25,6 @@ pub(crate) fn plots(condition: &Condition<'_>) -> String {
 }
 
 /// Medians as lines, with a band from the tenth to the ninetieth percentile, over iterations.
-#[allow(clippy::cast_precision_loss)]
 fn bands(row: &Row<'_>, title: &str, curves: &[(&str, &Vec<Band>)], searches: &Searches) -> String {
     let [left, top, bottom] = [56.0, 46.0, 200.0];
     let right = HALF - 12.0;
@@ -39,7 +35,7 @@ fn bands(row: &Row<'_>, title: &str, curves: &[(&str, &Vec<Band>)], searches: &S
         return String::new();
     }
     let longest = curves.iter().map(|(_, bands)| bands.len()).max().unwrap_or(1);
-    // Costs that are all positive are shown from zero: how far they fall is what matters.
+    // The axis of positive costs starts at zero, to show their relative decrease.
     let (y, levels) = Scale::nice(low.min(0.0), high, bottom, top, 4);
     let (nice, ticks) = Scale::nice(1.0, longest.max(2) as f64, left, right, 5);
     let x = Scale { low: 1.0, high: longest.max(2) as f64, ..nice };
@@ -51,13 +47,13 @@ fn bands(row: &Row<'_>, title: &str, curves: &[(&str, &Vec<Band>)], searches: &S
     svg.x_axis(x, &ticks, [top, bottom], "");
     svg.text("tick middle", [(left + right) / 2.0, bottom + 36.0], "iteration");
     for (i, (name, bands)) in curves.iter().enumerate() {
-        let place = |i: usize, value: f32| [x.at((i + 1) as f64), y.at(f64::from(value))];
-        let upper = bands.iter().enumerate().map(|(i, band)| place(i, band.high));
-        let lower = bands.iter().enumerate().rev().map(|(i, band)| place(i, band.low));
+        let point = |i: usize, value: f32| [x.at((i + 1) as f64), y.at(f64::from(value))];
+        let upper = bands.iter().enumerate().map(|(i, band)| point(i, band.high));
+        let lower = bands.iter().enumerate().rev().map(|(i, band)| point(i, band.low));
         svg.area(&format!("spread {}", row.class), upper.chain(lower));
-        // The last of several curves is the one that matters; the others are dashed.
+        // All curves but the last are dashed.
         let class = if i + 1 == curves.len() { "curve" } else { "curve dashed" };
-        svg.path(&format!("{class} {}", row.class), bands.iter().enumerate().map(|(i, band)| place(i, band.median)));
+        svg.path(&format!("{class} {}", row.class), bands.iter().enumerate().map(|(i, band)| point(i, band.median)));
         let key = left + 150.0 * i as f64;
         if curves.len() > 1 {
             svg.path(&format!("{class} {}", row.class), [[key, 32.0], [key + 26.0, 32.0]]);

@@ -1,68 +1,74 @@
-//! [`Videos`]: films of the first episodes of an evaluation.
+//! [`VideoRecording`]: videos of the first episodes of an evaluation.
 
 use std::path::{Path, PathBuf};
+use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{EnvPool, Error, Result};
 
-/// Videos of the first episodes: the agent on the left, its goal on the right.
+/// Options of the videos of the first episodes: the agent on the left, its goal on the right.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Videos {
     /// The folder of the results file; paths in results are relative to it.
     pub root: PathBuf,
-    /// The file names' beginning, below `root`: `videos/random` gives `videos/random-0.mp4`.
+    /// The prefix of the file names, below `root`: `videos/random` gives `videos/random-0.mp4`.
     pub prefix: String,
-    /// How many episodes.
+    /// The number of episodes.
     pub count: usize,
-    /// Frames a second, one a step.
+    /// Frames per second; there is one frame for each step.
     pub fps: u32,
 }
 
-/// The side small pictures are enlarged towards, in pixels.
-const WATCHABLE: usize = 256;
+/// The side length that small frames are enlarged to, in pixels.
+const MIN_SIDE: usize = 256;
 
-/// Keeps the pictures of the first episodes and writes them as videos in the end.
-pub(crate) struct Filming {
+/// Collects the frames of the first episodes and writes them as videos in the end.
+pub(crate) struct VideoRecording {
     videos: Videos,
-    /// `(height, width)` of one picture.
+    /// The `(height, width)` of a frame, in pixels.
     size: (usize, usize),
-    /// Places of `pixels` and `goal` in the infos.
-    places: [usize; 2],
-    /// The frames of every filmed episode.
+    /// The indices of `pixels` and `goal` among the info columns.
+    columns: [usize; 2],
+    /// The frames of every recorded episode.
     frames: Vec<Vec<Vec<u8>>>,
 }
 
-impl Filming {
+impl VideoRecording {
+    /// Prepares the recording of up to `videos.count` of the `episodes`.
+    ///
+    /// # Errors
+    /// When the pool renders no frames.
     pub fn new(videos: &Videos, pool: &EnvPool, episodes: usize) -> Result<Self> {
         let Some(size) = pool.image() else {
             return Err(Error::config(
                 "videos",
-                "the world draws no pictures",
-                "give the world a picture size or ask for no videos",
+                "the world renders no frames",
+                "give the world a frame size or ask for no videos",
             ));
         };
         let schema = pool.infos().schema();
         Ok(Self {
             videos: videos.clone(),
             size,
-            places: [schema.index("pixels")?, schema.index("goal")?],
+            columns: [schema.index(PIXELS)?, schema.index(GOAL)?],
             frames: vec![vec![]; videos.count.min(episodes)],
         })
     }
 
-    pub fn frame(&mut self, episode: usize, slot: usize, pool: &EnvPool) {
+    /// Appends the current frame of a slot to its episode.
+    pub fn push(&mut self, episode: usize, slot: usize, pool: &EnvPool) {
         let Some(frames) = self.frames.get_mut(episode) else { return };
         let row = pool.infos().row(slot);
-        let [agent, goal] = self.places.map(|place| row.at::<u8>(place));
+        let [agent, goal] = self.columns.map(|column| row.at::<u8>(column));
         let line = self.size.1 * 3;
         let pairs = agent.chunks_exact(line).zip(goal.chunks_exact(line));
         frames.push(pairs.flat_map(|(agent, goal)| agent.iter().chain(goal).copied()).collect());
     }
 
-    /// Writes the videos of those of the `counted` episodes that were filmed, named by their place among these, and
-    /// returns their paths, relative to the root. A video that cannot be written (this build
-    /// has no videos, the disk is full) costs a warning: the figures stand without it.
+    /// Writes the videos of the recorded ones of the `counted` episodes, numbered by their index among these. Returns the
+    /// paths relative to the root. A video that cannot be written (no encoder in this build, a full disk) only causes a
+    /// warning, because the results do not depend on it.
     pub fn write(self, counted: &[usize]) -> Vec<String> {
         let (height, width) = self.size;
-        let scale = swm_data::integer_scale(width, height, WATCHABLE);
+        let scale = swm_data::integer_scale(width, height, MIN_SIDE);
         let mut written = vec![];
         for (i, &episode) in counted.iter().enumerate() {
             let Some(frames) = self.frames.get(episode) else { continue };

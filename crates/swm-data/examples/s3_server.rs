@@ -27,7 +27,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             let (socket, _) = listener.accept().await?;
             let service = service.clone();
             tokio::spawn(async move {
-                // A client that goes away is no concern of the others.
+                // A failed connection does not affect other clients.
                 let server = hyper_util::server::conn::auto::Builder::new(TokioExecutor::new());
                 let _ = server.serve_connection(TokioIo::new(socket), service).await;
             });

@@ -105,7 +105,7 @@ impl Clips {
                     spec.num_steps,
                     spec.frameskip
                 ),
-                "ask for fewer steps or a smaller frameskip, or collect longer episodes",
+                "use fewer steps or a smaller frameskip, or collect longer episodes",
             ));
         }
         Ok(clips)

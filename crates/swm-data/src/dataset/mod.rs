@@ -1,7 +1,7 @@
 //! Datasets of episodes, independent of their format on disk.
 //!
 //! The contracts are [`Reader`] and [`Writer`]. Everything else builds on them: clips and goals, the loader and its
-//! cache, the replay buffer, splits, statistics and views. No file in this folder knows a format.
+//! cache, the replay buffer, splits, statistics and views. No file in this folder depends on a format.
 
 pub mod cache;
 pub mod clips;

@@ -13,12 +13,12 @@ use swm_core::{Error, Manifest, Result, Schema};
 /// If the episodes differ, a column does not exist, or `base` already has a column of that name.
 pub fn merge(base: Arc<dyn Reader>, other: Arc<dyn Reader>, columns: &[&str]) -> Result<Arc<dyn Reader>> {
     let lengths = |reader: &Arc<dyn Reader>| reader.episodes().iter().map(|e| e.length).collect::<Vec<_>>();
-    let (ours, theirs) = (lengths(&base), lengths(&other));
-    if ours != theirs {
-        let differs = ours.iter().zip(&theirs).position(|(a, b)| a != b);
+    let (expected, given) = (lengths(&base), lengths(&other));
+    if expected != given {
+        let differs = expected.iter().zip(&given).position(|(a, b)| a != b);
         let (given, expected) = match differs {
-            Some(i) => (format!("{} rows in episode {i}", theirs[i]), ours[i].to_string()),
-            None => (format!("{} episodes", theirs.len()), ours.len().to_string()),
+            Some(i) => (format!("{} rows in episode {i}", given[i]), expected[i].to_string()),
+            None => (format!("{} episodes", given.len()), expected.len().to_string()),
         };
         return Err(Error::mismatch("merging columns of another dataset", given, expected));
     }

@@ -118,7 +118,7 @@ impl LerobotWriter {
             return Err(Error::corrupt(&self.root, problem, "convert it to a new dataset first"));
         };
         episodes::check_appendable(&self.root.display(), &self.schema, old.schema())?;
-        self.file = old.files_of_episodes.last().map_or(0, |place| place.file + 1);
+        self.file = old.files_of_episodes.last().map_or(0, |files| files.file + 1);
         let manifest = self.options.manifest.clone().or(recorded.manifest);
         self.info = Info { stable_worldmodel: Some(Recorded { manifest, ..recorded }), ..old.info };
         let path = self.root.join("meta").join("stats.json");
@@ -224,17 +224,17 @@ impl LerobotWriter {
             return Ok(());
         }
         let group = std::mem::take(&mut self.group);
-        let place =
+        let indices =
             [("chunk_index", self.file / self.info.chunks_size), ("file_index", self.file % self.info.chunks_size)];
         for ((_, native), encoder) in self.columns.iter().zip(group.encoders) {
             if let Some(encoder) = encoder {
-                put(&self.root.join(fill(VIDEO_PATH, native, &place)), &encoder.finish()?)?;
+                put(&self.root.join(fill(VIDEO_PATH, native, &indices)), &encoder.finish()?)?;
             }
         }
         let (schema, batch) = self.data(&group.episodes, &group.numbers)?;
-        table::write(&self.root.join(fill(DATA_PATH, "", &place)), &schema, &batch)?;
-        let (schema, batch) = self.episodes(&group.episodes, place.map(|(_, number)| number))?;
-        table::write(&self.root.join(fill(EPISODES_PATH, "", &place)), &schema, &batch)?;
+        table::write(&self.root.join(fill(DATA_PATH, "", &indices)), &schema, &batch)?;
+        let (schema, batch) = self.episodes(&group.episodes, indices.map(|(_, number)| number))?;
+        table::write(&self.root.join(fill(EPISODES_PATH, "", &indices)), &schema, &batch)?;
         self.info.total_episodes += group.episodes.len();
         self.info.total_frames += group.rows;
         self.file += 1;
@@ -272,7 +272,7 @@ impl LerobotWriter {
     }
 
     /// The descriptions of a group's episodes.
-    fn episodes(&self, episodes: &[PendingEpisode], place: [usize; 2]) -> Result<(Arc<ArrowSchema>, RecordBatch)> {
+    fn episodes(&self, episodes: &[PendingEpisode], indices: [usize; 2]) -> Result<(Arc<ArrowSchema>, RecordBatch)> {
         let (mut fields, mut arrays): (Vec<Field>, Vec<ArrayRef>) = (vec![], vec![]);
         let mut tasks = ListBuilder::new(StringBuilder::new());
         episodes.iter().for_each(|episode| tasks.append_value([Some(&episode.task)]));
@@ -292,7 +292,7 @@ impl LerobotWriter {
             arrays.push(Arc::new(values.into_iter().map(|value| value as i64).collect::<Int64Array>()));
         };
         let same = |value: usize| vec![value; episodes.len()];
-        let [chunk, file] = place;
+        let [chunk, file] = indices;
         whole("episode_index".to_owned(), (0..episodes.len()).map(|e| self.info.total_episodes + e).collect());
         whole("length".to_owned(), episodes.iter().map(|episode| episode.rows).collect());
         for folder in ["data", "meta/episodes"] {

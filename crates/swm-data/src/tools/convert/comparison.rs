@@ -35,7 +35,8 @@ impl ColumnComparison {
         Self { column: spec.name.clone(), exact: true, max_error: 0.0, psnr: None, squares: 0.0, values: 0 }
     }
 
-    /// Adds the values of an episode; says what is wrong if values are not what they were.
+    /// Adds the values of an episode. Fails with `(given, expected)` if a numeric value differs by more than rounding to
+    /// single precision.
     pub(super) fn add(&mut self, spec: &ColumnSpec, ours: &[u8], theirs: &[u8]) -> Result<(), (String, String)> {
         self.values += (ours.len() / spec.dtype.size()) as u64;
         if ours == theirs {

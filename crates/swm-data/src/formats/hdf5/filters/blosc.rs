@@ -89,7 +89,7 @@ fn blosclz(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     loop {
         if control < 32 {
             let literals = input.take(control + 1)?;
-            let place = out.get_mut(at..at + literals.len()).ok_or("BloscLZ: it holds too much")?;
+            let place = out.get_mut(at..at + literals.len()).ok_or("BloscLZ: it exceeds the chunk")?;
             place.copy_from_slice(literals);
             at += literals.len();
         } else {

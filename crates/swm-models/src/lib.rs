@@ -39,5 +39,5 @@ pub mod weights;
 pub use burn::tensor::Device;
 pub use checkpoint::Checkpoint;
 pub use family::{CheckpointInfo, FamilyEntry, LoadedModel, ModelFamily, OnlineRun, TrainRun, TrainableConfig};
-pub use registry::{FAMILIES, load, load_from};
+pub use registry::{FAMILIES, dataset_requirements, load, load_from};
 pub use train::{TrainConfig, TrainOptions, TrainSummary, Trainable, train};

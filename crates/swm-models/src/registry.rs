@@ -4,6 +4,7 @@ use crate::family::{FamilyEntry, LoadedModel};
 use crate::{checkpoint, dino_wm, gcrl, inverse, lewm, pldm, sac, tdmpc2};
 use burn::tensor::Device;
 use std::path::Path;
+use swm_core::requirements::DatasetRequirements;
 use swm_core::{Error, Registry, Result};
 
 /// The families, in the order of listings.
@@ -22,6 +23,14 @@ pub static FAMILIES: Registry<FamilyEntry> = Registry {
         inverse::ENTRY,
     ],
 };
+
+/// Returns what a dataset must contain to train each family that trains on datasets alone.
+///
+/// # Errors
+/// Never for the presets of this build.
+pub fn dataset_requirements() -> Result<Vec<DatasetRequirements>> {
+    FAMILIES.rows.iter().filter_map(|family| (family.requirements)().transpose()).collect()
+}
 
 /// Loads the checkpoint of a run folder, of any family in [`FAMILIES`].
 ///

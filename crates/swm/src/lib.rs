@@ -19,7 +19,6 @@ pub use swm_report as report;
 
 pub mod cli;
 pub mod collect;
-pub mod dataset_requirements;
 pub mod describe;
 pub mod home;
 pub mod resolver;

@@ -13,7 +13,6 @@ use swm::core::run::{Control, Event};
 use swm::core::{Error, Named as _};
 use swm::data::doctor::{examine, open_damaged, repair};
 use swm::data::{ConvertMode, ConvertOptions, Converted, Location, Reader, checksum, formats};
-use swm::dataset_requirements::DATASET_REQUIREMENTS;
 use swm::home;
 
 /// How to convert, from JSON.
@@ -110,7 +109,7 @@ pub fn doctor(
     let mut control = control(tell);
     let found = work(py, || {
         let (reader, lost) = open_damaged(&home::find_dataset(path)?)?;
-        let mut diagnosis = examine(&*reader, &DATASET_REQUIREMENTS, &mut control)?;
+        let mut diagnosis = examine(&*reader, &swm::models::dataset_requirements()?, &mut control)?;
         diagnosis.add_losses(lost);
         let mut repaired: Option<Converted> = None;
         if let Some(target) = target {

@@ -15,5 +15,5 @@ pub mod registry;
 mod stored_scalar;
 mod video;
 
-pub use entry::FormatEntry;
+pub use entry::{Backend, FormatEntry};
 pub use registry::{FORMATS, create, detect, open};

@@ -4,7 +4,7 @@ use crate::sample::{episode, rows, schema, write};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use swm_core::requirements::DatasetRequirements;
+use swm_core::requirements::{DatasetRequirements, RequiredObservations};
 use swm_core::run::Control;
 use swm_core::{Batch, ColumnSpec, Error, Manifest, Result, Schema};
 use swm_data::doctor::{Diagnosis, Finding, Severity, examine, open_damaged, repair};
@@ -81,8 +81,18 @@ impl Reader for Broken {
 
 /// Requirements of a world model, and of an agent that learns from states and rewards.
 const MODELS: [DatasetRequirements; 2] = [
-    DatasetRequirements { model: "world model", images: true, reward: false, clip_rows: 20 },
-    DatasetRequirements { model: "agent", images: false, reward: true, clip_rows: 4 },
+    DatasetRequirements {
+        model: "world model",
+        observations: RequiredObservations::Images,
+        reward: false,
+        clip_rows: 20,
+    },
+    DatasetRequirements {
+        model: "agent",
+        observations: RequiredObservations::ImagesOrState,
+        reward: true,
+        clip_rows: 4,
+    },
 ];
 
 fn diagnose(reader: &dyn Reader) -> Diagnosis {

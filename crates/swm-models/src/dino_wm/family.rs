@@ -9,12 +9,22 @@ use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::Naming;
 use burn::tensor::Device;
 use std::path::Path;
+use swm_core::requirements::{DatasetRequirements, RequiredObservations};
 use swm_core::{CostModel, Result};
 
 /// The registry row of DINO-WM.
 pub const ENTRY: FamilyEntry = FamilyEntry::of::<DinoWm>();
 
 impl ModelFamily for DinoWm {
+    fn requirements(config: &TrainConfig<Self>) -> DatasetRequirements {
+        DatasetRequirements {
+            model: "DINO-WM",
+            observations: RequiredObservations::Images,
+            reward: false,
+            clip_rows: config.data.num_steps * config.data.frameskip,
+        }
+    }
+
     fn history(config: &TrainConfig<Self>) -> usize {
         config.model.predictor.history
     }

@@ -6,6 +6,7 @@ use crate::probe::ImageEncoder;
 use crate::train::{DatasetInfo, TrainConfig, TrainOptions, Trainable};
 use std::path::Path;
 use std::sync::Arc;
+use swm_core::requirements::DatasetRequirements;
 use swm_core::run::Control;
 use swm_core::{CostModel, EnvPool, EnvSpec, Policy, Predictor, Result};
 use swm_data::Reader;
@@ -14,6 +15,9 @@ use swm_data::Reader;
 pub trait ModelFamily: Trainable {
     /// Whether a trained model acts without a solver.
     const ACTS: bool = false;
+
+    /// Returns what a dataset must contain to train with `config`, the default preset.
+    fn requirements(config: &TrainConfig<Self>) -> DatasetRequirements;
 
     /// Returns the number of frames a prediction or decision reads.
     fn history(_config: &TrainConfig<Self>) -> usize {

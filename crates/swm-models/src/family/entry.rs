@@ -7,6 +7,7 @@ use crate::checkpoint::Checkpoint;
 use crate::train::{DatasetInfo, Preset, TrainConfig};
 use burn::tensor::Device;
 use std::path::Path;
+use swm_core::requirements::DatasetRequirements;
 use swm_core::{Named, Result};
 use swm_data::Reader;
 
@@ -23,6 +24,9 @@ pub struct FamilyEntry {
     pub borrows_encoder: bool,
     /// Loads a configuration from a preset (its name or the path of a TOML file) and `key=value` settings.
     pub config: fn(&str, &[String]) -> Result<Box<dyn TrainableConfig>>,
+    /// Returns what a dataset must contain to train the default preset; `None` for a family that also requires another
+    /// checkpoint.
+    pub requirements: fn() -> Result<Option<DatasetRequirements>>,
     /// Loads the checkpoint of a run folder.
     pub load: fn(&Path, &Device) -> Result<Box<dyn LoadedModel>>,
     /// Converts a checkpoint of the reference implementation (`weights.pt` and `config.json` in the first folder), which
@@ -40,6 +44,7 @@ impl FamilyEntry {
             presets: M::PRESETS,
             borrows_encoder: false,
             config: |preset, settings| Ok(Box::new(TrainConfig::<M>::load(preset, settings)?)),
+            requirements: || Ok(Some(M::requirements(&TrainConfig::<M>::load(M::PRESETS[0].id, &[])?))),
             load: |run, device| Ok(Box::new(Checkpoint::<M>::load(run, device)?)),
             import: import::<M>,
         }

@@ -7,6 +7,7 @@ use crate::probe::ImageEncoder;
 use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::Naming;
 use std::path::Path;
+use swm_core::requirements::{DatasetRequirements, RequiredObservations};
 use swm_core::{EnvSpec, Policy, Result};
 
 /// The registry row of GCBC.
@@ -17,9 +18,19 @@ pub const GCIVL: FamilyEntry = FamilyEntry::of::<Gcivl>();
 pub const GCIQL: FamilyEntry = FamilyEntry::of::<Gciql>();
 
 macro_rules! goal_conditioned_family {
-    ($($model:ty),*) => {
+    ($($model:ty, $name:literal);*) => {
         $(impl ModelFamily for $model {
             const ACTS: bool = true;
+
+            fn requirements(config: &TrainConfig<Self>) -> DatasetRequirements {
+                DatasetRequirements {
+                    model: $name,
+                    observations: RequiredObservations::Images,
+                    reward: false,
+                    // A goal is a row after the present one.
+                    clip_rows: (config.data.num_steps * config.data.frameskip).max(2),
+                }
+            }
 
             fn history(config: &TrainConfig<Self>) -> usize {
                 config.model.history
@@ -44,4 +55,4 @@ macro_rules! goal_conditioned_family {
         })*
     };
 }
-goal_conditioned_family!(Gcbc, Gcivl, Gciql);
+goal_conditioned_family!(Gcbc, "GCBC"; Gcivl, "GCIVL"; Gciql, "GCIQL");

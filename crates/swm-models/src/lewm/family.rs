@@ -10,12 +10,22 @@ use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::Naming;
 use burn::tensor::Device;
 use std::path::Path;
+use swm_core::requirements::{DatasetRequirements, RequiredObservations};
 use swm_core::{CostModel, Predictor, Result};
 
 /// The registry row of LeWM.
 pub const ENTRY: FamilyEntry = FamilyEntry::of::<Lewm>();
 
 impl ModelFamily for Lewm {
+    fn requirements(config: &TrainConfig<Self>) -> DatasetRequirements {
+        DatasetRequirements {
+            model: "LeWM",
+            observations: RequiredObservations::Images,
+            reward: false,
+            clip_rows: config.data.num_steps * config.data.frameskip,
+        }
+    }
+
     fn history(config: &TrainConfig<Self>) -> usize {
         config.model.predictor.history
     }

@@ -8,12 +8,22 @@ use crate::probe::ImageEncoder;
 use crate::train::{DatasetInfo, TrainConfig};
 use crate::weights::Naming;
 use std::path::Path;
+use swm_core::requirements::{DatasetRequirements, RequiredObservations};
 use swm_core::{CostModel, Predictor, Result};
 
 /// The registry row of PLDM.
 pub const ENTRY: FamilyEntry = FamilyEntry::of::<Pldm>();
 
 impl ModelFamily for Pldm {
+    fn requirements(config: &TrainConfig<Self>) -> DatasetRequirements {
+        DatasetRequirements {
+            model: "PLDM",
+            observations: RequiredObservations::Images,
+            reward: false,
+            clip_rows: config.data.num_steps * config.data.frameskip,
+        }
+    }
+
     fn history(config: &TrainConfig<Self>) -> usize {
         config.model.predictor.history
     }

@@ -6,6 +6,7 @@ use crate::family::{FamilyEntry, ModelFamily, OnlineRun};
 use crate::online::{self, OnlineSummary, train_online};
 use crate::train::{DatasetInfo, TrainConfig};
 use std::path::Path;
+use swm_core::requirements::{DatasetRequirements, RequiredObservations};
 use swm_core::run::Control;
 use swm_core::{CostModel, EnvSpec, Policy, Result};
 
@@ -14,6 +15,15 @@ pub const ENTRY: FamilyEntry = FamilyEntry::of::<Tdmpc2>();
 
 impl ModelFamily for Tdmpc2 {
     const ACTS: bool = true;
+
+    fn requirements(config: &TrainConfig<Self>) -> DatasetRequirements {
+        DatasetRequirements {
+            model: "TD-MPC2",
+            observations: RequiredObservations::ImagesOrState,
+            reward: true,
+            clip_rows: config.data.num_steps * config.data.frameskip,
+        }
+    }
 
     fn cost(checkpoint: &Checkpoint<Self>) -> Option<Box<dyn CostModel>> {
         Some(Box::new(Tdmpc2Cost::new(checkpoint)))

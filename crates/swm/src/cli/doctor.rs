@@ -5,7 +5,6 @@ use super::{Context, complain, emit, emit_json, table};
 use clap::Args;
 use serde_json::json;
 use std::time::Instant;
-use swm::dataset_requirements::DATASET_REQUIREMENTS;
 use swm::home;
 use swm_data::ConvertMode;
 use swm_data::doctor::{Diagnosis, Finding, Severity, examine, open_damaged, repair};
@@ -38,7 +37,7 @@ pub fn doctor(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
             return Err(anyhow::Error::new(error).context(format!("{name} cannot be opened")));
         }
     };
-    let mut diagnosis = examine(&*reader, &DATASET_REQUIREMENTS, &mut control(context))?;
+    let mut diagnosis = examine(&*reader, &swm_models::dataset_requirements()?, &mut control(context))?;
     diagnosis.add_losses(lost);
     complain(&format!("{:>9}: {} episodes, {} rows\n", "examine", diagnosis.episodes, diagnosis.rows));
     let mut repaired = None;

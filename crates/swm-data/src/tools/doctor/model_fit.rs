@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 use swm_core::columns::{ACTION, PIXELS, REWARD, STATE};
-use swm_core::requirements::DatasetRequirements;
+use swm_core::requirements::{DatasetRequirements, RequiredObservations};
 use swm_core::{ColumnSpec, DType, Schema};
 
 /// The observation of environments that do not name their columns.
@@ -25,12 +25,17 @@ impl ModelFit {
         let mut missing = vec![];
         let images = schema.column(PIXELS).is_ok_and(ColumnSpec::is_image);
         let has = |name| schema.find(name).is_some();
-        match (images, required.images) {
-            (true, _) => {}
-            (false, true) if has(PIXELS) => missing.push(format!("'{PIXELS}' holds no RGB images")),
-            (false, true) => missing.push(format!("there are no images ('{PIXELS}')")),
-            (false, false) if has(STATE) || has(OBSERVATION) => {}
-            (false, false) => missing.push(format!("there are neither images ('{PIXELS}') nor a state")),
+        let state = has(STATE) || has(OBSERVATION);
+        match required.observations {
+            RequiredObservations::Images if images => {}
+            RequiredObservations::Images if has(PIXELS) => missing.push(format!("'{PIXELS}' holds no RGB images")),
+            RequiredObservations::Images => missing.push(format!("there are no images ('{PIXELS}')")),
+            RequiredObservations::ImagesOrState if images || state => {}
+            RequiredObservations::ImagesOrState => {
+                missing.push(format!("there are neither images ('{PIXELS}') nor a state"));
+            }
+            RequiredObservations::State if state => {}
+            RequiredObservations::State => missing.push(format!("there is no state ('{STATE}' or '{OBSERVATION}')")),
         }
         match schema.column(ACTION).map(|column| column.dtype) {
             Err(_) => missing.push(format!("there are no actions ('{ACTION}')")),
@@ -61,8 +66,18 @@ mod tests {
 
     #[test]
     fn lists_unmet_requirements() {
-        let world_model = DatasetRequirements { model: "world model", images: true, reward: false, clip_rows: 20 };
-        let from_rewards = DatasetRequirements { model: "from rewards", images: false, reward: true, clip_rows: 4 };
+        let world_model = DatasetRequirements {
+            model: "world model",
+            observations: RequiredObservations::Images,
+            reward: false,
+            clip_rows: 20,
+        };
+        let from_rewards = DatasetRequirements {
+            model: "from rewards",
+            observations: RequiredObservations::ImagesOrState,
+            reward: true,
+            clip_rows: 4,
+        };
         let pixels = ColumnSpec::image(PIXELS, 8, 8);
         let action = |dtype| ColumnSpec::new(ACTION, dtype, [2]);
         let reward = ColumnSpec::new(REWARD, DType::Float32, []);

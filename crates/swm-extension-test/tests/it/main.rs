@@ -7,7 +7,7 @@ mod format;
 mod solver;
 
 use std::sync::Arc;
-use swm::core::registry::{Registry, join};
+use swm::core::registry::{Registry, concat};
 use swm::core::run::Control;
 use swm::core::{EnvEntry, RandomPolicy, VariationRequest};
 use swm::data::{FormatEntry, WriteOptions};
@@ -17,7 +17,7 @@ use swm::plan::{MpcConfig, MpcPolicy, SolverEntry};
 
 /// The environments of the facade and the one of this test, in one registry.
 static ENVS: Registry<EnvEntry> = Registry { rows: &ENV_ROWS, ..swm::envs::ENVS };
-const ENV_ROWS: [EnvEntry; swm::envs::ENVS.rows.len() + 1] = join(swm::envs::ENVS.rows, &[env::ENTRY]);
+const ENV_ROWS: [EnvEntry; swm::envs::ENVS.rows.len() + 1] = concat(swm::envs::ENVS.rows, &[env::ENTRY]);
 static FORMATS: Registry<FormatEntry> = Registry { kind: "dataset format", hint: "", rows: &[format::ENTRY] };
 static SOLVERS: Registry<SolverEntry> = Registry { kind: "solver", hint: "", rows: &[solver::ENTRY] };
 static FAMILIES: Registry<FamilyEntry> = Registry { kind: "model", hint: "", rows: &[family::ENTRY] };

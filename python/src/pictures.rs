@@ -7,7 +7,7 @@ use pyo3::prelude::*;
 use serde_json::{Map, Value};
 use std::sync::{Mutex, PoisonError};
 use swm::core::{DType, FrameMut, Key};
-use swm::envs::wrappers::{View, VisualWrapper, WRAPPERS};
+use swm::envs::wrappers::{EpisodeFrame, VisualWrapper, WRAPPERS};
 
 /// Wrappers in the order in which they are applied.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
@@ -44,7 +44,7 @@ impl Pictures {
         let wrappers = &mut *wrappers;
         py.detach(|| {
             let mut frame = FrameMut::new(width, height, &mut rgb);
-            wrappers.iter_mut().for_each(|wrapper| wrapper.apply(&mut frame, View::Step(step)));
+            wrappers.iter_mut().for_each(|wrapper| wrapper.apply(&mut frame, EpisodeFrame::Step(step)));
         });
         arrays::array(py, DType::U8, &[height, width, 3], &rgb)
     }

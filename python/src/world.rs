@@ -17,7 +17,7 @@ use swm::core::results::Counting;
 use swm::core::run::{Control, Event};
 use swm::core::{Callable, CameraView, Env, Error, Key, ResetOptions, Snapshot, VariationRequest};
 use swm::data::{ImageCodec, WriteMode, WriteOptions};
-use swm::envs::wrappers::{GoalPicture, Stack, WRAPPERS};
+use swm::envs::wrappers::{GoalFrame, Stack, WRAPPERS};
 use swm::eval::{CollectConfig, EvalConfig, Starts, Videos, WorldConfig, episode_key, reset_seed};
 use swm::gym::GymEnv;
 
@@ -29,11 +29,11 @@ pub struct World {
 }
 
 /// Visual wrappers by id and settings, one stack for all environments.
-pub fn stack(wrappers: &str, wrap_goal: bool) -> PyResult<(Arc<Stack>, GoalPicture)> {
+pub fn stack(wrappers: &str, wrap_goal: bool) -> PyResult<(Arc<Stack>, GoalFrame)> {
     let choices: Vec<(String, Map<String, Value>)> = json("wrappers", wrappers)?;
     let made: swm::core::Result<_> =
         choices.into_iter().map(|(id, settings)| WRAPPERS.get(&id)?.make(&settings.into_iter().collect())).collect();
-    let goal = if wrap_goal { GoalPicture::Wrapped } else { GoalPicture::Clean };
+    let goal = if wrap_goal { GoalFrame::Wrapped } else { GoalFrame::Clean };
     Ok((Arc::new(Stack::new(made.map_err(raised)?)), goal))
 }
 

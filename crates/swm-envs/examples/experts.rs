@@ -1,9 +1,9 @@
-//! How often each expert of each environment reaches its goal, as the table the READMEs quote.
+//! Success counts of every expert of every environment, as a table; the READMEs quote it.
 //!
 //!     cargo run --release -p swm-envs --example experts [PART OF AN ID] [EPISODES]
 //!
-//! Episode k starts from `reset(k)`, with the default variations and with all factors varied, and lasts as long as the
-//! environment's own limit says. Episodes whose start is already a success are counted apart.
+//! Episode k starts from `reset(k)`, with the default variation and with all factors varied, and is truncated at the time
+//! limit of the environment. Episodes that are solved at the start are counted separately.
 
 use std::io::Write as _;
 use std::time::{Duration, Instant};
@@ -11,7 +11,7 @@ use swm_core::policy::Expert;
 use swm_core::{Action, Batch, Env, EnvEntry, ExpertEntry, Key, ResetOptions, Result, Schema, Space, VariationRequest};
 use swm_envs::ENVS;
 
-/// Episodes of each row unless the command line says otherwise.
+/// Episodes per row, unless the command line gives another number.
 const EPISODES: u64 = 200;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -21,7 +21,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut out = std::io::stdout();
     writeln!(
         out,
-        "| environment | expert | factors varied | success | steps, median | already solved | steps/s of a core |"
+        "| environment | expert | factors varied | success | steps, median | solved at start | steps/s of a core |"
     )?;
     writeln!(out, "| --- | --- | --- | --- | --- | --- | --- |")?;
     for entry in ENVS.rows.iter().filter(|entry| entry.id.to_lowercase().contains(&part)) {
@@ -36,12 +36,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     Ok(())
 }
 
-/// What came of some episodes.
+/// The results of some episodes.
 #[derive(Default)]
 struct Tally {
     episodes: usize,
     solved_before: usize,
-    /// Steps of every successful episode.
+    /// The number of steps of every successful episode.
     successes: Vec<usize>,
     steps: usize,
     time: Duration,
@@ -52,7 +52,6 @@ impl std::fmt::Display for Tally {
         let mut successes = self.successes.clone();
         successes.sort_unstable();
         let median = successes.get(successes.len() / 2).map_or("–".to_owned(), ToString::to_string);
-        #[allow(clippy::cast_precision_loss)]
         let speed = self.steps as f64 / self.time.as_secs_f64();
         let tried = self.episodes - self.solved_before;
         write!(f, "{} of {tried} | {median} | {} | {speed:.0}", successes.len(), self.solved_before)
@@ -84,7 +83,7 @@ fn play(entry: &EnvEntry, expert: &ExpertEntry, options: &ResetOptions, episodes
     }))
 }
 
-/// An environment, who acts in it, and what came of it.
+/// An environment, its expert, and the results so far.
 struct Player {
     env: Box<dyn Env>,
     expert: Box<dyn Expert>,
@@ -122,7 +121,6 @@ impl Player {
         Ok(())
     }
 
-    #[allow(clippy::cast_possible_truncation)]
     fn step(&mut self) -> Result<bool> {
         let mut action = vec![0.0; self.env.spec().action_dim()];
         self.env.observe(&mut self.row.row_mut(0));

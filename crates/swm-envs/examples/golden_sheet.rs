@@ -1,36 +1,35 @@
-//! Pictures of the Python reference beside ours: `docs/worlds.png`, and the table of `docs/worlds.md`.
+//! Compares frames of the Python reference with ours: `docs/environments.png`, and the table of `docs/environments.md`.
 //!
 //!     cargo run --release -p swm-envs --example golden_sheet
 //!
-//! Reads the recorded rollouts the golden tests read (`SWM_GOLDEN`, by default `../shared/reference/golden`): for each
-//! world the first one with default factors and the first one with all of them varied.
+//! It reads the recorded rollouts of the golden tests (`SWM_GOLDEN`, by default `../shared/reference/golden`): for each
+//! environment the first one with default factors and the first one with all of them varied.
 
-#[path = "../tests/it/golden.rs"]
-mod golden;
-
-use golden::{Golden, picture_difference};
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::Write as _;
 use std::path::Path;
+use swm_conformance::golden::{self, Golden, image_difference};
 use swm_core::{Action, Env, EnvEntry, FrameMut, ResetOptions, Result, Space};
 use swm_envs::ENVS;
 
-/// Pixels of a cell, of the gap between two, and of the line of labels above a row.
+/// Side of a cell, in pixels.
 const CELL: usize = 150;
+/// Gap between cells, in pixels.
 const GAP: usize = 6;
+/// Height of the line of labels above a row, in pixels.
 const LABELS: usize = 18;
-/// Golden, ours and their difference, for the first and the last frame.
+/// Cells of a row: the recorded frame, ours and their difference, for the first and the last frame.
 const COLUMNS: usize = 6;
-/// Differences are drawn so many times as strong.
-const STRONGER: u8 = 8;
+/// Factor by which differences are amplified.
+const AMPLIFICATION: u8 = 8;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let docs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs");
     let mut pairs = vec![];
     for entry in ENVS.rows {
         for kind in ["default", "all"] {
-            let files = golden::files(&format!("{}-{kind}-", entry.id.replace('/', "_")));
+            let files = golden::files(env!("CARGO_MANIFEST_DIR"), &format!("{}-{kind}-", entry.id.replace('/', "_")));
             if let Some(file) = files.first() {
                 pairs.push((format!("{} {kind}", entry.id), compare(entry, Golden::open(file))?));
             }
@@ -38,23 +37,23 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     }
     let width = COLUMNS * (CELL + GAP) + GAP;
     let mut sheet = Sheet { width, rgb: vec![] };
-    let mut table = String::from("| world | factors | first frame | last frame |\n| --- | --- | --- | --- |\n");
+    let mut table = String::from("| environment | factors | first frame | last frame |\n| --- | --- | --- | --- |\n");
     for (name, frames) in &pairs {
-        let differences = frames.each_ref().map(|frame| picture_difference(&frame.golden, &frame.ours));
+        let differences = frames.each_ref().map(|frame| image_difference(&frame.golden, &frame.ours));
         sheet.row(name, frames, &differences);
         let (id, kind) = name.split_once(' ').unwrap_or((name, ""));
         writeln!(table, "| `{id}` | {kind} | {:.3} | {:.3} |", differences[0], differences[1])?;
     }
-    sheet.save(&docs.join("worlds.png"))?;
-    let page = docs.join("worlds.md");
+    sheet.save(&docs.join("environments.png"))?;
+    let page = docs.join("environments.md");
     let text = std::fs::read_to_string(&page)?;
-    let words = text.split_once("| world |").map_or(text.as_str(), |(words, _)| words);
+    let words = text.split_once("| environment |").map_or(text.as_str(), |(words, _)| words);
     std::fs::write(&page, format!("{words}{table}"))?;
     std::io::stdout().write_all(table.as_bytes())?;
     Ok(())
 }
 
-/// The same frame, twice.
+/// A recorded frame and ours.
 struct Frames {
     height: usize,
     width: usize,
@@ -62,7 +61,7 @@ struct Frames {
     ours: Vec<u8>,
 }
 
-/// The first and the last frame of a rollout.
+/// Replays a rollout and returns its first and last frame.
 fn compare(entry: &EnvEntry, mut golden: Golden) -> Result<[Frames; 2]> {
     let mut env = entry.env().expect("an environment");
     env.reset(0, &start(entry, &*env, &mut golden))?;
@@ -76,7 +75,7 @@ fn compare(entry: &EnvEntry, mut golden: Golden) -> Result<[Frames; 2]> {
     Ok([first, frames(&mut *env, &mut golden, "frame_last")])
 }
 
-/// How a recorded rollout began.
+/// Returns the reset options of a recorded rollout.
 fn start(entry: &EnvEntry, env: &dyn Env, golden: &mut Golden) -> ResetOptions {
     let names = golden.names();
     let has = |name: &&&str| names.iter().any(|known| known == **name);
@@ -85,9 +84,9 @@ fn start(entry: &EnvEntry, env: &dyn Env, golden: &mut Golden) -> ResetOptions {
     let mut read = |choices: &[&str]| choices.iter().find(has).map(|name| golden.read::<f64>(name)[..n].to_vec());
     let goal_state = read(&["info.goal_state", "goal_state"]);
     let state = match entry.id {
-        // Its factors say where everything starts; what is recorded is the state one physics step later.
+        // The factors contain the start; the recorded state is one physics step later.
         id if id.starts_with("swm/PushT") => None,
-        // It keeps the agent's place in this factor, as it was when the factors were recorded.
+        // The reference moves this factor with the agent, so the recorded value is not the start position.
         "swm/SimplePointMaze-v0" => {
             variation.variation_values.extend(read(&["obs"]).map(|place| ("agent.position".to_owned(), place)));
             None
@@ -98,40 +97,44 @@ fn start(entry: &EnvEntry, env: &dyn Env, golden: &mut Golden) -> ResetOptions {
 }
 
 fn frames(env: &mut dyn Env, golden: &mut Golden, name: &str) -> Frames {
-    let (height, width, golden) = golden.picture(name);
+    let (height, width, golden) = golden.image(name);
     let mut ours = vec![0; golden.len()];
-    env.render(FrameMut::new(width, height, &mut ours)).expect("a picture");
+    env.render(FrameMut::new(width, height, &mut ours)).expect("a frame");
     Frames { height, width, golden, ours }
 }
 
-/// A white sheet that grows downwards.
+/// A white image that grows downwards.
 struct Sheet {
     width: usize,
     rgb: Vec<u8>,
 }
 
 impl Sheet {
-    /// Adds the frames of one rollout, side by side, under a line that says what they are.
+    /// Adds the frames of one rollout side by side, below a line of labels.
     fn row(&mut self, name: &str, frames: &[Frames; 2], differences: &[f64; 2]) {
         let top = self.rgb.len() / 3 / self.width;
         let height = frames.iter().map(|frame| CELL * frame.height / frame.width).max().unwrap_or(0);
         self.rgb.resize((top + LABELS + height + GAP) * self.width * 3, 255);
         for (i, (frame, difference)) in frames.iter().zip(differences).enumerate() {
             let left = GAP + 3 * i * (CELL + GAP);
-            // The name takes the room of two pictures.
+            // The name is as wide as two cells.
             let label = if i == 0 { name.trim_start_matches("swm/") } else { "last frame" };
             self.words(label, left, top + 5);
             self.words(&format!("difference {difference:.3}"), left + 2 * (CELL + GAP), top + 5);
-            let apart: Vec<u8> =
-                frame.golden.iter().zip(&frame.ours).map(|(a, b)| a.abs_diff(*b).saturating_mul(STRONGER)).collect();
+            let apart: Vec<u8> = frame
+                .golden
+                .iter()
+                .zip(&frame.ours)
+                .map(|(a, b)| a.abs_diff(*b).saturating_mul(AMPLIFICATION))
+                .collect();
             for (k, rgb) in [&frame.golden, &frame.ours, &apart].into_iter().enumerate() {
-                self.picture(frame, rgb, left + k * (CELL + GAP), top + LABELS);
+                self.image(frame, rgb, left + k * (CELL + GAP), top + LABELS);
             }
         }
     }
 
-    /// Draws a picture, shrunk to a cell: every pixel is the mean of those it covers.
-    fn picture(&mut self, Frames { height, width, .. }: &Frames, rgb: &[u8], left: usize, top: usize) {
+    /// Draws a frame, shrunk to a cell: every pixel is the mean of those it covers.
+    fn image(&mut self, Frames { height, width, .. }: &Frames, rgb: &[u8], left: usize, top: usize) {
         let rows = CELL * height / width;
         for (y, x) in (0..rows).flat_map(|y| (0..CELL).map(move |x| (y, x))) {
             let (ys, xs) = (y * height / rows..(y + 1) * height / rows, x * width / CELL..(x + 1) * width / CELL);
@@ -139,14 +142,13 @@ impl Sheet {
             for c in 0..3 {
                 let sum: usize =
                     ys.clone().flat_map(|v| xs.clone().map(move |u| usize::from(rgb[(v * width + u) * 3 + c]))).sum();
-                #[allow(clippy::cast_possible_truncation)]
                 let mean = (sum / (ys.len() * xs.len()).max(1)) as u8;
                 self.rgb[to + c] = mean;
             }
         }
     }
 
-    /// Writes words in letters of 3 x 5 dots, two pixels wide each.
+    /// Writes text in letters of 3 x 5 dots, each two pixels wide.
     fn words(&mut self, words: &str, left: usize, top: usize) {
         for (i, letter) in words.to_uppercase().chars().enumerate() {
             let dots = FONT.iter().find(|(known, _)| *known == letter).map_or(0, |(_, dots)| *dots);
@@ -159,7 +161,6 @@ impl Sheet {
         }
     }
 
-    #[allow(clippy::cast_possible_truncation)]
     fn save(&self, path: &Path) -> Result<(), Box<dyn std::error::Error>> {
         let height = self.rgb.len() / 3 / self.width;
         let mut encoder = png::Encoder::new(File::create(path)?, self.width as u32, height as u32);
@@ -170,7 +171,7 @@ impl Sheet {
     }
 }
 
-/// Letters of five rows, an octal digit each.
+/// Letters of five rows, one octal digit per row.
 #[rustfmt::skip]
 const FONT: &[(char, u16)] = &[
     ('A', 0o25755), ('B', 0o65656), ('C', 0o34443), ('D', 0o65556), ('E', 0o74647), ('F', 0o74644), ('G', 0o34553),

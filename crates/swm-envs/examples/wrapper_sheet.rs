@@ -1,16 +1,18 @@
-//! A contact sheet of all wrappers, `docs/wrappers.png`: one wrapper a row, the first row without any; Push-T on the
-//! left and Two-Room on the right, each at steps 0 and 10 of an episode and at step 0 of another one.
+//! Draws a contact sheet of all wrappers, `docs/wrappers.png`: one row per wrapper, the first one without any; Push-T on
+//! the left and Two-Room on the right, each at steps 0 and 10 of an episode and at step 0 of another one.
 //!
 //!     cargo run --release -p swm-envs --example wrapper_sheet [OUT.png]
 
 use std::path::{Path, PathBuf};
 use swm_core::{Action, Env, FrameMut, Key, ResetOptions, Result};
-use swm_envs::wrappers::{GoalPicture, Stack};
+use swm_envs::wrappers::{GoalFrame, Stack};
 use swm_envs::{push_t, two_room};
 
-/// Pixels of one picture, and between two of them.
+/// Side of a frame, in pixels.
 const SIDE: usize = 96;
+/// Gap between frames, in pixels.
 const GAP: usize = 4;
+/// Frames per row.
 const COLUMNS: usize = 6;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -37,13 +39,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut sheet = vec![200; 3 * width * height];
     for (row, texts) in rows.iter().enumerate() {
         let stack = Stack::parse(texts)?;
-        for (world, entry) in [push_t::ENTRY, two_room::ENTRY].iter().enumerate() {
-            let mut env = stack.wrap(entry.env().expect("an environment"), GoalPicture::Clean);
+        for (half, entry) in [push_t::ENTRY, two_room::ENTRY].iter().enumerate() {
+            let mut env = stack.wrap(entry.env().expect("an environment"), GoalFrame::Clean);
             for (column, (seed, steps)) in [(1, 0), (1, 10), (2, 0)].into_iter().enumerate() {
                 play(&mut *env, seed, steps)?;
                 let mut rgb = vec![0; 3 * SIDE * SIDE];
-                env.render(FrameMut::new(SIDE, SIDE, &mut rgb)).expect("a picture");
-                let left = (3 * world + column) * (SIDE + GAP);
+                env.render(FrameMut::new(SIDE, SIDE, &mut rgb)).expect("a frame");
+                let left = (3 * half + column) * (SIDE + GAP);
                 for (y, line) in rgb.chunks_exact(3 * SIDE).enumerate() {
                     let start = 3 * ((row * (SIDE + GAP) + y) * width + left);
                     sheet[start..start + 3 * SIDE].copy_from_slice(line);
@@ -55,8 +57,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     write_png(&out, width, height, &sheet)
 }
 
-/// Random actions from the reset of a seed.
-#[allow(clippy::cast_possible_truncation)]
+/// Resets the environment and takes random actions.
 fn play(env: &mut dyn Env, seed: u64, steps: u64) -> Result<()> {
     env.reset(seed, &ResetOptions::default())?;
     let space = env.spec().action_space.clone();
@@ -67,8 +68,7 @@ fn play(env: &mut dyn Env, seed: u64, steps: u64) -> Result<()> {
     Ok(())
 }
 
-/// A background: a sun over the sea.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+/// Draws the background: a sun over the sea.
 fn sunset() -> Vec<u8> {
     let pixel = |x: usize, y: usize| -> [u8; 3] {
         let (x, y) = (x as f64, y as f64);
@@ -81,7 +81,6 @@ fn sunset() -> Vec<u8> {
     (0..256).flat_map(|y| (0..256).flat_map(move |x| pixel(x, y))).collect()
 }
 
-#[allow(clippy::cast_possible_truncation)]
 fn write_png(path: &Path, width: usize, height: usize, rgb: &[u8]) -> Result<(), Box<dyn std::error::Error>> {
     let mut encoder = png::Encoder::new(std::fs::File::create(path)?, width as u32, height as u32);
     encoder.set_color(png::ColorType::Rgb);

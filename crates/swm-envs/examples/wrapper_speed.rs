@@ -1,4 +1,4 @@
-//! Pictures a second of every wrapper on one core, on Push-T, as the table of `docs/wrappers.md`.
+//! Measures frames per second of every wrapper on one core, with frames of Push-T; the table of `docs/wrappers.md`.
 //!
 //!     cargo run --release -p swm-envs --example wrapper_speed
 
@@ -7,10 +7,10 @@ use std::io::Write as _;
 use std::time::{Duration, Instant};
 use swm_core::{FrameMut, Key, ResetOptions, Result};
 use swm_envs::push_t;
-use swm_envs::wrappers::{View, VisualWrapper, WRAPPERS, parse};
+use swm_envs::wrappers::{EpisodeFrame, VisualWrapper, WRAPPERS, parse};
 
-/// Pictures of which the one in the middle counts.
-const PICTURES: u64 = 101;
+/// Frames per measurement, of which the median counts.
+const FRAMES: u64 = 101;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let background = std::env::temp_dir().join("swm-wrapper-speed.png");
@@ -21,7 +21,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     texts[0].push_str(&format!(",key_color=255/255/255,media={}", background.display()));
     texts.insert(2, "noise,kind=salt-pepper".to_owned());
     let mut out = std::io::stdout();
-    writeln!(out, "| wrapper | 64 px, pictures/s | 224 px, pictures/s | 224 px, after noise |")?;
+    writeln!(out, "| wrapper | 64 px, frames/s | 224 px, frames/s | 224 px, after noise |")?;
     writeln!(out, "| --- | --- | --- | --- |")?;
     for text in texts {
         let mut wrapper = parse(&text)?;
@@ -34,22 +34,22 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     Ok(())
 }
 
-/// Pictures a second, without drawing and copying them.
+/// Returns frames per second, without the time to draw and copy them.
 fn rate(wrapper: &mut dyn VisualWrapper, side: usize, noisy: bool) -> Result<f64> {
     let mut env = push_t::ENTRY.env().expect("an environment");
     env.reset(0, &ResetOptions::default())?;
     let mut original = vec![0; 3 * side * side];
-    env.render(FrameMut::new(side, side, &mut original)).expect("a picture");
+    env.render(FrameMut::new(side, side, &mut original)).expect("a frame");
     if noisy {
-        parse("noise")?.apply(&mut FrameMut::new(side, side, &mut original), View::Step(0));
+        parse("noise")?.apply(&mut FrameMut::new(side, side, &mut original), EpisodeFrame::Step(0));
     }
     let mut rgb = original.clone();
     wrapper.reset(Key::new(0));
-    let mut times: Vec<Duration> = (0..PICTURES)
+    let mut times: Vec<Duration> = (0..FRAMES)
         .map(|step| {
             rgb.copy_from_slice(&original);
             let start = Instant::now();
-            wrapper.apply(&mut FrameMut::new(side, side, black_box(&mut rgb)), View::Step(step));
+            wrapper.apply(&mut FrameMut::new(side, side, black_box(&mut rgb)), EpisodeFrame::Step(step));
             start.elapsed()
         })
         .collect();

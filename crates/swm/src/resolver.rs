@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::policy::ExpertPolicy;
 use swm_core::{Env, EnvEntry, EnvSpec, Error, Named as _, Policy, RandomPolicy, Result};
 use swm_data::Reader;
-use swm_envs::wrappers::{GoalPicture, Stack, WRAPPERS};
+use swm_envs::wrappers::{GoalFrame, Stack, WRAPPERS};
 use swm_eval::{Choice, EvalRequest, Model, PolicyKind, PolicyRequest, Predictor, ResolvedPolicy, Resolver, World};
 use swm_models::{CheckpointInfo, Device, load};
 use swm_plan::ActionKind;
@@ -30,7 +30,7 @@ pub struct Home {
 struct Wrapping {
     choices: Vec<Choice>,
     stack: Arc<Stack>,
-    goal: GoalPicture,
+    goal: GoalFrame,
 }
 
 /// Plans and who made them.
@@ -49,7 +49,7 @@ impl Home {
     }
 
     fn wrapping(&self, request: &EvalRequest) -> Result<Wrapping> {
-        let goal = if request.wrap_goal { GoalPicture::Wrapped } else { GoalPicture::Clean };
+        let goal = if request.wrap_goal { GoalFrame::Wrapped } else { GoalFrame::Clean };
         if let Some(known) = &*self.stack.borrow()
             && known.choices == request.wrappers
             && known.goal == goal

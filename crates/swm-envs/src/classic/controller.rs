@@ -2,6 +2,7 @@
 
 use super::task::ControlTask;
 use std::marker::PhantomData;
+use swm_core::columns::{GOAL_STATE, STATE};
 use swm_core::policy::Expert;
 use swm_core::{Key, Result, RowRef};
 
@@ -20,8 +21,8 @@ impl<T: ControlTask> Expert for Controller<T> {
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
         let task = T::new(row.get::<f32>("physics")?);
-        let state = T::parse_state("state", &row.to_f64("state")?)?;
-        let goal = T::parse_state("goal_state", &row.to_f64("goal_state")?)?;
+        let state = T::parse_state(STATE, &row.to_f64(STATE)?)?;
+        let goal = T::parse_state(GOAL_STATE, &row.to_f64(GOAL_STATE)?)?;
         action[0] = task.control(&state, &goal);
         Ok(())
     }

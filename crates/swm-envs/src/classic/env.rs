@@ -5,6 +5,7 @@ use super::frame::FrameRenderer;
 use super::task::ControlTask;
 use rand::Rng as _;
 use rand::seq::IndexedRandom as _;
+use swm_core::columns::{GOAL_STATE, STATE};
 use swm_core::factors::{from_row, parse_snapshot, snapshot, wrong_snapshot};
 use swm_core::{
     Action, ColumnSpec, DType, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, Rng, RowMut,
@@ -58,11 +59,11 @@ impl<T: ControlTask> ClassicEnv<T> {
             id: T::ID.to_owned(),
             action_space: T::action_space(),
             columns: vec![
-                ColumnSpec::new("state", DType::Float32, [state_len]),
-                ColumnSpec::new("goal_state", DType::Float32, [state_len]),
+                ColumnSpec::new(STATE, DType::Float32, [state_len]),
+                ColumnSpec::new(GOAL_STATE, DType::Float32, [state_len]),
                 ColumnSpec::new("physics", DType::Float32, [T::PHYSICS_FACTORS.len()]),
             ],
-            observation_space: vec![("state", observation_space::<T>())],
+            observation_space: vec![(STATE, observation_space::<T>())],
             variation_space: variation_space::<T>(),
             max_episode_steps: T::MAX_EPISODE_STEPS,
             cameras: vec![],
@@ -136,11 +137,11 @@ impl<T: ControlTask> Env for ClassicEnv<T> {
         let key = Key::new(seed);
         let factors = self.spec.variation_space.resolve(&options.variation, key)?;
         let state = match &options.state {
-            Some(state) => T::parse_state("state", state)?,
+            Some(state) => T::parse_state(STATE, state)?,
             None => T::sample_start(&mut key.with("start").rng()),
         };
         let goal = match &options.goal_state {
-            Some(goal) => T::parse_state("goal_state", goal)?,
+            Some(goal) => T::parse_state(GOAL_STATE, goal)?,
             None => T::sample_task_goal(&mut key.with("task").rng()),
         };
         self.begin(factors, state, goal);
@@ -197,8 +198,8 @@ impl<T: ControlTask> Env for ClassicEnv<T> {
     }
 
     fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()> {
-        let state = T::parse_state("state", &start.to_f64("state")?)?;
-        let goal = T::parse_state("goal state", &goal.to_f64("state")?)?;
+        let state = T::parse_state(STATE, &start.to_f64(STATE)?)?;
+        let goal = T::parse_state("goal state", &goal.to_f64(STATE)?)?;
         let factors = from_row(&self.spec.variation_space, &self.factors, start)?;
         self.begin(factors, state, goal);
         Ok(())

@@ -7,6 +7,7 @@ use super::physics::Dynamics;
 use crate::point_agent::room::{BORDER, SIZE, distance};
 use crate::point_agent::{Explorer, Leg, Position, RandomWalk, position, widen};
 use rand::Rng as _;
+use swm_core::columns::{GOAL_STATE, STATE};
 use swm_core::policy::Expert;
 use swm_core::{ExpertEntry, Key, Result, Rng, RowRef};
 
@@ -44,7 +45,7 @@ impl Expert for SteeringExpert {
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
         let dynamics = Dynamics::from_row(&row.to_f64("dynamics")?);
-        let (at, to) = (position(&row.to_f64("state")?), position(&row.to_f64("goal_state")?));
+        let (at, to) = (position(&row.to_f64(STATE)?), position(&row.to_f64(GOAL_STATE)?));
         let known = self.plan.take().filter(|plan| plan.dynamics == dynamics && plan.to == to);
         let plan = self.plan.insert(known.unwrap_or_else(|| {
             let is_straight = steer_to(&dynamics, at, to).1.is_some();
@@ -72,7 +73,7 @@ impl RandomWalk for ZoneWalk {
     type Observed = (Dynamics, Position);
 
     fn read(row: RowRef<'_>) -> Result<Self::Observed> {
-        Ok((Dynamics::from_row(&row.to_f64("dynamics")?), position(&row.to_f64("state")?)))
+        Ok((Dynamics::from_row(&row.to_f64("dynamics")?), position(&row.to_f64(STATE)?)))
     }
 
     fn draw_leg(rng: &mut Rng) -> Leg {

@@ -3,6 +3,7 @@
 
 use super::position::{Position, position};
 use super::task::PointTask;
+use swm_core::columns::{GOAL_STATE, STATE};
 use swm_core::factors::{from_row, parse_snapshot, snapshot, wrong_snapshot};
 use swm_core::{
     Action, DType, Env, EnvSpec, Error, FactorValues, FrameMut, Key, ResetOptions, Result, RowMut, RowRef, Snapshot,
@@ -69,8 +70,8 @@ impl<T: PointTask> Env for PointAgentEnv<T> {
             Some(value) => checked::<T>(what, value),
             None => Ok(position(factors.get(factor))),
         };
-        let agent = start("state", &options.state, "agent.position")?;
-        let goal = start("goal_state", &options.goal_state, T::GOAL_FACTOR)?;
+        let agent = start(STATE, &options.state, "agent.position")?;
+        let goal = start(GOAL_STATE, &options.goal_state, T::GOAL_FACTOR)?;
         self.begin(factors, agent, goal);
         Ok(())
     }
@@ -119,8 +120,8 @@ impl<T: PointTask> Env for PointAgentEnv<T> {
     }
 
     fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()> {
-        let agent = checked::<T>("state", &start.to_f64("state")?)?;
-        let goal = checked::<T>("goal state", &goal.to_f64("state")?)?;
+        let agent = checked::<T>(STATE, &start.to_f64(STATE)?)?;
+        let goal = checked::<T>("goal state", &goal.to_f64(STATE)?)?;
         let factors = from_row(&self.spec.variation_space, &self.factors, start)?;
         self.begin(factors, agent, goal);
         Ok(())

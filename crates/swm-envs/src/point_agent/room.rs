@@ -5,6 +5,7 @@
 
 use super::position::{Position, position};
 use crate::draw::SoftDisc;
+use swm_core::columns::{GOAL_STATE, PROPRIO, STATE};
 use swm_core::{ColumnSpec, DType, EnvSpec, Factor, FactorValues, RowMut, Space, VariationSpace};
 
 /// Side of the square environment, in pixels.
@@ -36,9 +37,9 @@ pub fn spec(id: &str, observation_len: usize, privileged: (&str, usize), variati
         id: id.to_owned(),
         action_space: Space::uniform_box([2], DType::Float32, -1.0, 1.0),
         columns: vec![
-            column("state", 2),
-            column("proprio", 2),
-            column("goal_state", 2),
+            column(STATE, 2),
+            column(PROPRIO, 2),
+            column(GOAL_STATE, 2),
             ColumnSpec::new("distance_to_target", DType::Float32, []),
             column("observation", observation_len),
             column(privileged.0, privileged.1),

@@ -6,6 +6,7 @@ use super::paths::{ShortestPaths, VisibilityGraph};
 use super::physics::{Layout, MAX_ACTION, SIZE};
 use crate::point_agent::{Explorer, Leg, Position64, RandomWalk, distance64, read_position};
 use rand::Rng as _;
+use swm_core::columns::{GOAL_STATE, STATE};
 use swm_core::policy::Expert;
 use swm_core::{ExpertEntry, Key, Result, Rng, RowRef};
 
@@ -71,8 +72,8 @@ impl Expert for ShortestPathExpert {
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
         let layout = Layout::from_row(&row.to_f64("layout")?);
-        let planner = Planner::new(self.planner.take(), &layout, read_position(row, "goal_state")?);
-        let step = planner.step(read_position(row, "state")?);
+        let planner = Planner::new(self.planner.take(), &layout, read_position(row, GOAL_STATE)?);
+        let step = planner.step(read_position(row, STATE)?);
         action.copy_from_slice(&step.map(|v| v * f64::from(MAX_ACTION)));
         self.planner = Some(planner);
         Ok(())
@@ -97,7 +98,7 @@ impl RandomWalk for MazeWalk {
     type Observed = (Layout, Position64);
 
     fn read(row: RowRef<'_>) -> Result<Self::Observed> {
-        Ok((Layout::from_row(&row.to_f64("layout")?), read_position(row, "state")?))
+        Ok((Layout::from_row(&row.to_f64("layout")?), read_position(row, STATE)?))
     }
 
     fn draw_leg(rng: &mut Rng) -> Leg {

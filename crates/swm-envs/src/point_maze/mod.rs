@@ -12,6 +12,7 @@ use paths::{ShortestPaths, VisibilityGraph};
 use physics::{Layout, MAX_ACTION, SIZE, distance};
 use render::{Disc, MazeAppearance, MazeRenderer};
 use std::cell::OnceCell;
+use swm_core::columns::{GOAL_STATE, STATE};
 use swm_core::{
     ColumnSpec, DType, EnvEntry, EnvSpec, Error, FactorValues, FrameMut, Key, Result, Rng, RowMut, Space,
     VariationRequest, VariationSpace,
@@ -74,8 +75,8 @@ impl PointTask for PointMaze {
             id: Self::ID.to_owned(),
             action_space: Space::uniform_box([2], DType::Float32, -limit, limit),
             columns: vec![
-                column("state", 2),
-                column("goal_state", 2),
+                column(STATE, 2),
+                column(GOAL_STATE, 2),
                 column("observation", 2),
                 column("layout", Layout::LEN),
             ],

@@ -3,6 +3,7 @@
 use super::TABLE;
 use super::shapes::BodyShape;
 use std::f64::consts::{PI, TAU};
+use swm_core::columns::{GOAL_PROPRIO, GOAL_STATE, PROPRIO, STATE};
 use swm_core::{ColumnSpec, DType, Factor, FactorValues, Space, VariationSpace};
 
 /// Every factor, in the reference's sampling order.
@@ -53,14 +54,14 @@ pub mod index {
 pub fn columns() -> Vec<ColumnSpec> {
     let column = |name: &str, len: usize| ColumnSpec::new(name, DType::Float64, [len]);
     vec![
-        column("state", 7),
-        column("proprio", 4),
+        column(STATE, 7),
+        column(PROPRIO, 4),
         column("pos_agent", 2),
         column("vel_agent", 2),
         column("block_pose", 3),
         column("goal_pose", 3),
-        column("goal_state", 7),
-        column("goal_proprio", 4),
+        column(GOAL_STATE, 7),
+        column(GOAL_PROPRIO, 4),
         ColumnSpec::new("n_contacts", DType::Int64, []),
         column("shapes", 4),
         column("agent_pose", 3),
@@ -77,8 +78,8 @@ pub fn observation_space() -> Vec<(&'static str, Space)> {
         high: high.to_vec(),
     };
     vec![
-        ("proprio", space(&[0.0, 0.0, -speed, -speed], &[side, side, speed, speed])),
-        ("state", space(&[0.0, 0.0, 0.0, 0.0, 0.0, -speed, -speed], &[side, side, side, side, TAU, speed, speed])),
+        (PROPRIO, space(&[0.0, 0.0, -speed, -speed], &[side, side, speed, speed])),
+        (STATE, space(&[0.0, 0.0, 0.0, 0.0, 0.0, -speed, -speed], &[side, side, side, side, TAU, speed, speed])),
     ]
 }
 

@@ -14,6 +14,7 @@ use physics::{AGENT, BLOCK, Simulation, put, take_array};
 use render::{DrawnState, TableRenderer};
 use state::{State, checked, goal_distance, is_reached, set_state, settled, start_state, state_distance, state_of};
 use std::f64::consts::TAU;
+use swm_core::columns::{GOAL_STATE, STATE};
 use swm_core::factors::{from_row, parse_snapshot, snapshot, wrong_snapshot};
 use swm_core::{
     Action, DType, Env, EnvEntry, EnvSpec, Error, ExpertEntry, FactorValues, FrameMut, Key, ResetOptions, Result,
@@ -142,11 +143,11 @@ impl Env for PushT {
         let key = Key::new(seed);
         let factors = self.spec.variation_space.resolve(&options.variation, key)?;
         let start = match &options.state {
-            Some(state) => checked(state, "state")?,
+            Some(state) => checked(state, STATE)?,
             None => start_state(&factors),
         };
         let goal = match &options.goal_state {
-            Some(state) => checked(state, "goal_state")?,
+            Some(state) => checked(state, GOAL_STATE)?,
             None => find_goal(&factors, &start, key.with("goal"))?,
         };
         self.begin(factors, goal);
@@ -232,8 +233,8 @@ impl Env for PushT {
 
     fn restore_from(&mut self, start: RowRef<'_>, goal: RowRef<'_>) -> Result<()> {
         let factors = from_row(&self.spec.variation_space, &self.factors, start)?;
-        let start = checked(&start.to_f64("state")?, "state of the start row")?;
-        let goal = checked(&goal.to_f64("state")?, "state of the goal row")?;
+        let start = checked(&start.to_f64(STATE)?, "state of the start row")?;
+        let goal = checked(&goal.to_f64(STATE)?, "state of the goal row")?;
         self.begin(factors, goal);
         // A new simulation without contacts, so that the state equals that of the row to the last bit.
         self.simulation = table::simulation(&self.factors);

@@ -7,6 +7,7 @@ use super::physics::Layout;
 use crate::point_agent::room::{BORDER, SIZE};
 use crate::point_agent::{Explorer, Leg, Position64, RandomWalk, distance64, read_position};
 use rand::Rng as _;
+use swm_core::columns::{GOAL_STATE, STATE};
 use swm_core::policy::Expert;
 use swm_core::{ExpertEntry, Key, Result, Rng, RowRef};
 
@@ -32,7 +33,7 @@ impl Expert for ShortestPath {
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
         let layout = Layout::from_row(&row.to_f64("layout")?);
-        let (at, goal) = (read_position(row, "state")?, read_position(row, "goal_state")?);
+        let (at, goal) = (read_position(row, STATE)?, read_position(row, GOAL_STATE)?);
         let next = paths::waypoint(&layout, at, goal);
         let [dx, dy] = [next[0] - at[0], next[1] - at[1]];
         // Full speed, but not beyond the waypoint.
@@ -58,7 +59,7 @@ impl RandomWalk for RoomWalk {
     type Observed = (Layout, Position64);
 
     fn read(row: RowRef<'_>) -> Result<Self::Observed> {
-        Ok((Layout::from_row(&row.to_f64("layout")?), read_position(row, "state")?))
+        Ok((Layout::from_row(&row.to_f64("layout")?), read_position(row, STATE)?))
     }
 
     fn draw_leg(rng: &mut Rng) -> Leg {

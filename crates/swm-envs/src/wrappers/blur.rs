@@ -1,16 +1,16 @@
-//! Gaussian blur: a separable window of `kernel` pixels, mirrored at the edges of the picture.
+//! Gaussian blur: a separable window of `kernel` pixels, mirrored at the edges of the frame.
 //!
 //! | parameter | unit | default | range |
 //! | --- | --- | --- | --- |
-//! | `kernel` | pixels; even numbers mean the next odd one | 5 | 1 to 99 |
+//! | `kernel` | pixels; even values mean the next odd one | 5 | 1 to 99 |
 //! | `sigma` | pixels; 0: `0.3 (kernel - 1) / 2 + 0.5` | 0 | 0 to 100 |
 //!
-//! Source: `BlurWrapper` of the reference, which is OpenCV's blur; followed bit for bit, its window in 2⁻⁸ included
-//! (up to 7 pixels without a `sigma` it is a binomial one).
+//! Source: `BlurWrapper` of the reference, which calls OpenCV. The result is equal bit for bit, including the window in
+//! units of 2⁻⁸ (up to 7 pixels without a `sigma` it is binomial).
 
 use super::border::mirror;
 use super::settings::{Domain, Parameter};
-use super::{View, VisualWrapper, WrapperEntry, typed};
+use super::{EpisodeFrame, VisualWrapper, WrapperEntry, typed};
 use serde::Deserialize;
 use swm_core::FrameMut;
 
@@ -21,7 +21,7 @@ pub const ENTRY: WrapperEntry = WrapperEntry {
     parameters: &[
         Parameter {
             name: "kernel",
-            summary: "side of the window, pixels; even numbers mean the next odd one",
+            summary: "side of the window, pixels; even values mean the next odd one",
             domain: Domain::Integer { low: 1, high: 99 },
             default: Some("5"),
         },
@@ -45,8 +45,7 @@ struct Settings {
     sigma: f64,
 }
 
-/// Weights that add up to 256. What rounding a weight loses is made up for by its inner neighbour.
-#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+/// Returns weights with the sum 256, `[kernel]`. The rounding error of a weight is added to its inner neighbour.
 fn window(kernel: usize, sigma: f64) -> Vec<u16> {
     match (kernel, sigma > 0.0) {
         (1, _) => return vec![256],
@@ -74,11 +73,11 @@ fn window(kernel: usize, sigma: f64) -> Vec<u16> {
 #[derive(Clone, Default)]
 struct Blur {
     weights: Vec<u16>,
-    /// A row of the picture with its mirrored surroundings.
+    /// A row of the frame with its mirrored surroundings.
     line: Vec<u8>,
-    /// The picture blurred along its rows, in 2⁻⁸.
+    /// The frame blurred along its rows, in units of 2⁻⁸.
     across: Vec<u16>,
-    /// One row of the result, in 2⁻¹⁶.
+    /// One row of the result, in units of 2⁻¹⁶.
     sum: Vec<u32>,
 }
 
@@ -87,8 +86,7 @@ impl VisualWrapper for Blur {
         ENTRY.id
     }
 
-    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
-    fn apply(&mut self, frame: &mut FrameMut<'_>, _view: View) {
+    fn apply(&mut self, frame: &mut FrameMut<'_>, _which: EpisodeFrame) {
         let (width, height, radius) = (frame.width, frame.height, self.weights.len() / 2);
         if frame.rgb.is_empty() || radius == 0 {
             return;

@@ -1,8 +1,7 @@
-//! What filters see beyond the edge of a picture.
+//! The mirrored border that filters read beyond the edge of a frame.
 
-/// The pixel in a line of `n`, at least 1, that stands for place `i`, inside or not: the line mirrored at its last pixels, which
-/// are not repeated (OpenCV's default border).
-#[allow(clippy::cast_possible_wrap, clippy::cast_sign_loss)]
+/// Returns the pixel, in a line of `n` ≥ 1 pixels, for a position `i` inside or outside the line. The line is mirrored at
+/// its last pixels, which are not repeated (OpenCV's default border).
 pub fn mirror(i: isize, n: usize) -> usize {
     let inside = i as usize;
     if inside < n {
@@ -16,9 +15,9 @@ pub fn mirror(i: isize, n: usize) -> usize {
 #[cfg(test)]
 mod tests {
     #[test]
-    fn lines_are_mirrored_however_far_one_looks() {
-        let seen = |n| (-5..6).map(|i| super::mirror(i, n)).collect::<Vec<_>>();
-        assert_eq!(seen(3), [1, 0, 1, 2, 1, 0, 1, 2, 1, 0, 1]);
-        assert_eq!(seen(1), [0; 11]);
+    fn lines_are_mirrored_at_any_distance() {
+        let mirrored = |n| (-5..6).map(|i| super::mirror(i, n)).collect::<Vec<_>>();
+        assert_eq!(mirrored(3), [1, 0, 1, 2, 1, 0, 1, 2, 1, 0, 1]);
+        assert_eq!(mirrored(1), [0; 11]);
     }
 }

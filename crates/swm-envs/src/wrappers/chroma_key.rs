@@ -1,8 +1,8 @@
-//! Green screen: pixels near a colour show a background picture or video instead.
+//! Chroma key: pixels near a key colour are replaced by a background image or video.
 //!
-//! A pixel is replaced when its Euclidean distance to one of the key colours is at most `tolerance`. The background
-//! has the size of the picture (area interpolation). A video shows its first frame at step 0, another one every step,
-//! and begins again after its last.
+//! A pixel is replaced when its Euclidean distance to one of the key colours is at most `tolerance`. The background is
+//! resized to the frame (area interpolation). A video starts with its first frame at step 0, advances one frame per step
+//! and repeats.
 //!
 //! | parameter | unit | default | range |
 //! | --- | --- | --- | --- |
@@ -11,11 +11,11 @@
 //! | `tolerance` | levels of 255, distance in RGB | 0 | 0 to 442 |
 //!
 //! Source: `ChromaKeyWrapper` of the reference. Deviation: a video follows the steps of the episode, where the
-//! reference's advances with every picture drawn and never goes back to its beginning.
+//! reference's advances with every frame drawn and is never restarted.
 
-use super::media::{Media, Sized};
+use super::media::{Media, SizedMedia};
 use super::settings::{Domain, Parameter};
-use super::{View, VisualWrapper, WrapperEntry, typed};
+use super::{EpisodeFrame, VisualWrapper, WrapperEntry, typed};
 use serde::Deserialize;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -24,18 +24,18 @@ use swm_core::FrameMut;
 /// The registry row.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "chroma-key",
-    summary: "replaces colours by a picture or a video",
+    summary: "replaces colours by an image or a video",
     parameters: &[
-        Parameter { name: "key_color", summary: "what is replaced", domain: Domain::Colors, default: None },
+        Parameter { name: "key_color", summary: "colours that are replaced", domain: Domain::Colors, default: None },
         Parameter {
             name: "media",
-            summary: "a PNG file, a folder of them, or a picture or video that ffmpeg decodes",
+            summary: "a PNG file, a folder of them, or an image or video that ffmpeg decodes",
             domain: Domain::Path,
             default: None,
         },
         Parameter {
             name: "tolerance",
-            summary: "how far from the key colour, levels of 255 in RGB",
+            summary: "greatest distance from a key colour, levels of 255 in RGB",
             domain: Domain::Number { low: 0.0, high: 442.0 },
             default: Some("0"),
         },
@@ -57,23 +57,25 @@ struct Settings {
 #[derive(Clone)]
 pub(super) struct ChromaKey {
     keys: Vec<[i32; 3]>,
-    /// The greatest squared distance that is near.
-    near: i32,
+    /// The greatest squared distance at which a pixel is replaced.
+    max_distance_squared: i32,
     media: Arc<Media>,
-    sized: Option<Arc<Sized>>,
+    sized: Option<Arc<SizedMedia>>,
 }
 
 impl ChromaKey {
-    #[allow(clippy::cast_possible_truncation)]
     pub fn new(keys: &[u8], media: Media, tolerance: f64) -> Self {
         let keys = keys.as_chunks::<3>().0.iter().map(|key| key.map(i32::from)).collect();
-        // Rounding must not lose a distance that is the tolerance itself.
-        Self { keys, near: (tolerance * tolerance + 1e-6) as i32, media: Arc::new(media), sized: None }
+        // The margin keeps a distance equal to the tolerance despite rounding.
+        let max_distance_squared = (tolerance * tolerance + 1e-6) as i32;
+        Self { keys, max_distance_squared, media: Arc::new(media), sized: None }
     }
 
-    fn is_near(&self, pixel: [u8; 3]) -> bool {
+    /// Returns whether a pixel is replaced.
+    fn is_key(&self, pixel: [u8; 3]) -> bool {
         let [r, g, b] = pixel.map(i32::from);
-        self.keys.iter().any(|key| (r - key[0]).pow(2) + (g - key[1]).pow(2) + (b - key[2]).pow(2) <= self.near)
+        let distance_squared = |key: &[i32; 3]| (r - key[0]).pow(2) + (g - key[1]).pow(2) + (b - key[2]).pow(2);
+        self.keys.iter().any(|key| distance_squared(key) <= self.max_distance_squared)
     }
 }
 
@@ -82,21 +84,21 @@ impl VisualWrapper for ChromaKey {
         ENTRY.id
     }
 
-    fn apply(&mut self, frame: &mut FrameMut<'_>, view: View) {
+    fn apply(&mut self, frame: &mut FrameMut<'_>, which: EpisodeFrame) {
         if frame.rgb.is_empty() {
             return;
         }
         let size = [frame.width, frame.height];
         let sized = match self.sized.take() {
-            Some(sized) if sized.is_for(size) => sized,
+            Some(sized) if sized.has_size(size) => sized,
             _ => self.media.sized(size),
         };
-        let background = self.media.frame(&sized, view.step()).as_chunks::<3>().0;
-        // Most pixels of a drawn world look like their neighbour.
-        let mut last = ([0; 3], self.is_near([0; 3]));
+        let background = self.media.frame(&sized, which.step()).as_chunks::<3>().0;
+        // Most pixels of a drawn frame have the colour of their neighbour.
+        let mut last = ([0; 3], self.is_key([0; 3]));
         for (pixel, background) in frame.rgb.as_chunks_mut::<3>().0.iter_mut().zip(background) {
             if *pixel != last.0 {
-                last = (*pixel, self.is_near(*pixel));
+                last = (*pixel, self.is_key(*pixel));
             }
             if last.1 {
                 *pixel = *background;

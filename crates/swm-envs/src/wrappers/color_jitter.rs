@@ -1,7 +1,7 @@
-//! Brightness, contrast, saturation and hue, changed by amounts drawn at the beginning of an episode.
+//! Changes of brightness, contrast, saturation and hue, sampled once per episode.
 //!
-//! In this order: every channel is multiplied by a brightness factor; its distance from the mean of the channel over
-//! the picture is multiplied by a contrast factor; the result is clipped to 0 ..= 255; in HSV, hue is turned and
+//! In this order: every channel is multiplied by a brightness factor; its difference from the mean of the channel over
+//! the frame is multiplied by a contrast factor; the result is clipped to 0 ..= 255; in HSV, hue is shifted and
 //! saturation multiplied.
 //!
 //! | parameter | unit | default | range |
@@ -11,11 +11,11 @@
 //! | `saturation` | likewise | 0.2 | 0 to 10 |
 //! | `hue` | turns of the colour circle: from ± this, or between low/high | 0.05 | -0.5 to 0.5 |
 //!
-//! All four are drawn uniformly. Source: `ColorJitterWrapper` of the reference, whose HSV is OpenCV's of 8 bits (hue in
-//! 180 steps); followed with its rounding. Addition: ranges, and with them fixed factors (`brightness=1.3/1.3`).
+//! All four are drawn uniformly. Source: `ColorJitterWrapper` of the reference, with the rounding of OpenCV's 8-bit HSV
+//! (hue in 180 steps). Addition: ranges, and with them fixed factors (`brightness=1.3/1.3`).
 
 use super::settings::{Domain, Ends, Parameter};
-use super::{View, VisualWrapper, WrapperEntry, typed};
+use super::{EpisodeFrame, VisualWrapper, WrapperEntry, typed};
 use rand::Rng as _;
 use serde::Deserialize;
 use swm_core::{FrameMut, Key};
@@ -25,7 +25,7 @@ const FACTOR: Domain = Domain::Spread { around: 1.0, low: 0.0, high: 10.0 };
 /// The registry row.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "color-jitter",
-    summary: "changes brightness, contrast, saturation and hue, by the same amounts for an episode",
+    summary: "changes brightness, contrast, saturation and hue, by the same amounts throughout an episode",
     parameters: &[
         Parameter { name: "brightness", summary: "factor of all channels", domain: FACTOR, default: Some("0.2") },
         Parameter {
@@ -64,9 +64,9 @@ pub(super) struct ColorJitter {
     ranges: [[f64; 2]; 4],
     brightness: f32,
     contrast: f32,
-    /// What saturation becomes.
+    /// The new saturation of every saturation.
     saturation: [u8; 256],
-    /// What hue becomes, of 180 steps.
+    /// The new hue of every hue, in 180 steps.
     hue: [u8; 180],
 }
 
@@ -77,9 +77,8 @@ impl ColorJitter {
         jitter
     }
 
-    /// What every channel becomes before hue and saturation do.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-    fn channels(&self, pixels: &[[u8; 3]]) -> [[u8; 256]; 3] {
+    /// Returns the new level of every level of the three channels, by brightness and contrast.
+    fn channel_tables(&self, pixels: &[[u8; 3]]) -> [[u8; 256]; 3] {
         let mut sums = [0u64; 3];
         for pixel in pixels {
             for (sum, &channel) in sums.iter_mut().zip(pixel) {
@@ -93,42 +92,42 @@ impl ColorJitter {
     }
 }
 
-/// `of / whole` for every `whole`, in 2⁻¹²: products with them stand for divisions, as in OpenCV.
-const fn shares(of: u32) -> [u32; 256] {
-    let mut shares = [0; 256];
-    let mut whole = 1;
-    while whole < 256 {
-        shares[whole as usize] = ((of << 13) + whole) / (2 * whole);
-        whole += 1;
+/// Returns `numerator / divisor` for every divisor, in units of 2⁻¹². As in OpenCV, multiplication by them replaces
+/// division.
+const fn quotients(numerator: u32) -> [u32; 256] {
+    let mut quotients = [0; 256];
+    let mut divisor = 1;
+    while divisor < 256 {
+        quotients[divisor as usize] = ((numerator << 13) + divisor) / (2 * divisor);
+        divisor += 1;
     }
-    shares
+    quotients
 }
 
-/// Of the six sectors of the circle, 30 steps each.
-static HUE: [u32; 256] = shares(30);
-static SATURATION: [u32; 256] = shares(255);
+/// Quotients for the hue, whose six sectors have 30 steps each.
+static HUE: [u32; 256] = quotients(30);
+/// Quotients for the saturation.
+static SATURATION: [u32; 256] = quotients(255);
 
-/// Hue in 180 steps, saturation and value in 256, of a colour.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_possible_wrap)]
+/// Converts RGB to hue in 180 steps, saturation and value in 256.
 fn to_hsv([r, g, b]: [u8; 3]) -> [u8; 3] {
     let (value, least) = (r.max(g).max(b), r.min(g).min(b));
     let range = value - least;
     let round = |product: i32| (product + (1 << 11)) >> 12;
     let [red, green, blue] = [r, g, b].map(i32::from);
-    let turned = if value == r {
+    let offset = if value == r {
         green - blue
     } else if value == g {
         blue - red + 2 * i32::from(range)
     } else {
         red - green + 4 * i32::from(range)
     };
-    let hue = round(turned * HUE[range as usize] as i32);
+    let hue = round(offset * HUE[range as usize] as i32);
     let saturation = round(i32::from(range) * SATURATION[value as usize] as i32);
     [if hue < 0 { hue + 180 } else { hue } as u8, saturation as u8, value]
 }
 
-/// The colour of hue in 180 steps, saturation and value in 256; rounded down, as in OpenCV.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+/// Converts hue in 180 steps, saturation and value in 256 to RGB; rounded down, as in OpenCV.
 fn to_rgb([hue, saturation, value]: [u8; 3]) -> [u8; 3] {
     let sector = hue / 30;
     let part = f32::from(hue) * (6.0 / 180.0) - f32::from(sector);
@@ -151,7 +150,6 @@ impl VisualWrapper for ColorJitter {
         ENTRY.id
     }
 
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
     fn reset(&mut self, episode: Key) {
         let mut rng = episode.rng();
         let [brightness, contrast, saturation, hue] =
@@ -161,15 +159,15 @@ impl VisualWrapper for ColorJitter {
         self.hue = std::array::from_fn(|step| (step as f32 + hue * 180.0).rem_euclid(180.0) as u8 % 180);
     }
 
-    fn apply(&mut self, frame: &mut FrameMut<'_>, _view: View) {
+    fn apply(&mut self, frame: &mut FrameMut<'_>, _which: EpisodeFrame) {
         let pixels = frame.rgb.as_chunks_mut::<3>().0;
-        let channels = self.channels(pixels);
+        let channels = self.channel_tables(pixels);
         let jitter = |[r, g, b]: [u8; 3]| {
             let [hue, saturation, value] =
                 to_hsv([channels[0][r as usize], channels[1][g as usize], channels[2][b as usize]]);
             to_rgb([self.hue[hue as usize], self.saturation[saturation as usize], value])
         };
-        // Most pixels of a drawn world look like their neighbour.
+        // Most pixels of a drawn frame have the colour of their neighbour.
         let mut last = ([0; 3], jitter([0; 3]));
         for pixel in pixels {
             if *pixel != last.0 {

@@ -1,38 +1,38 @@
-//! Rectangles that hide parts of the picture, elsewhere in every picture.
+//! Rectangles that hide parts of the frame, at new positions in every step.
 //!
 //! | parameter | unit | default | range |
 //! | --- | --- | --- | --- |
 //! | `num` | rectangles | 1 | 0 to 256 |
-//! | `size` | height, and independently width, as a part of the picture's; drawn uniformly | 0.1/0.2 | 0 to 1 |
-//! | `color` | red/green/blue, or one number for all | 0 | 0 to 255 |
+//! | `size` | height, and independently width, as a share of the frame's; drawn uniformly | 0.1/0.2 | 0 to 1 |
+//! | `color` | red/green/blue, or one value for all | 0 | 0 to 255 |
 //!
-//! Rectangles lie within the picture, every place equally likely. Source: `CutoutWrapper` of the reference.
-//! Deviation: redrawn with every step instead of with every call, so that drawing a step again shows the same.
+//! Rectangles lie within the frame; all positions are equally likely. Source: `CutoutWrapper` of the reference.
+//! Deviation: sampled per step instead of per call, so that drawing a step twice gives equal frames.
 
 use super::patch::Patch;
 use super::settings::{Color, Domain, Ends, Parameter};
-use super::{View, VisualWrapper, WrapperEntry, typed};
+use super::{EpisodeFrame, VisualWrapper, WrapperEntry, typed};
 use serde::Deserialize;
 use swm_core::{FrameMut, Key};
 
 /// The registry row.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "cutout",
-    summary: "masks rectangles, elsewhere in every picture",
+    summary: "masks rectangles, at new positions in every step",
     parameters: &[
         Parameter {
             name: "num",
-            summary: "how many rectangles",
+            summary: "number of rectangles",
             domain: Domain::Integer { low: 0, high: 256 },
             default: Some("1"),
         },
         Parameter {
             name: "size",
-            summary: "height and width, as parts of the picture's",
+            summary: "height and width, as shares of the frame's",
             domain: Domain::Range { low: 0.0, high: 1.0 },
             default: Some("0.1/0.2"),
         },
-        Parameter { name: "color", summary: "what they show", domain: Domain::Color, default: Some("0") },
+        Parameter { name: "color", summary: "colour of the rectangles", domain: Domain::Color, default: Some("0") },
     ],
     build: |settings| {
         let Settings { num, size, color } = typed(ENTRY.id, settings)?;
@@ -65,8 +65,8 @@ impl VisualWrapper for Cutout {
         self.episode = episode;
     }
 
-    fn apply(&mut self, frame: &mut FrameMut<'_>, view: View) {
-        let mut rng = view.key(self.episode).rng();
+    fn apply(&mut self, frame: &mut FrameMut<'_>, which: EpisodeFrame) {
+        let mut rng = which.key(self.episode).rng();
         for _ in 0..self.num {
             Patch::draw(self.size, &mut rng).rect(frame).fill(self.color, frame);
         }

@@ -1,7 +1,6 @@
-//! The standard normal distribution.
+//! Quantiles of the standard normal distribution.
 
-/// Where the distribution function reaches `p`, for `0 < p < 1`: Acklam's rational approximation, relative error
-/// below 1.2e-9.
+/// Returns the quantile of `p`, for `0 < p < 1`, by Acklam's rational approximation (relative error below 1.2e-9).
 pub fn quantile(p: f64) -> f64 {
     const A: [f64; 6] = [
         -3.969683028665376e1,
@@ -48,7 +47,7 @@ mod tests {
     use super::quantile;
 
     #[test]
-    fn quantiles_are_those_of_the_tables() {
+    fn quantiles_equal_tabulated_values() {
         let known = [(0.5, 0.0), (0.975, 1.959963984540054), (0.1, -1.2815515655446004), (0.001, -3.090232306167813)];
         for (p, z) in known {
             assert!((quantile(p) - z).abs() < 1e-8, "quantile({p}) = {}, not {z}", quantile(p));

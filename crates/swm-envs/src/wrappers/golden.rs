@@ -1,5 +1,5 @@
-//! Every wrapper against the Python reference on one picture, `tests/golden/wrappers.npz`; what the reference drew at
-//! random is set here.
+//! Every wrapper compared with the Python reference on one image, `tests/golden/wrappers.npz`. The random draws of the
+//! reference are part of the file.
 
 use super::chroma_key::ChromaKey;
 use super::color_jitter::ColorJitter;
@@ -7,7 +7,7 @@ use super::media::Media;
 use super::moving_patch::Moving;
 use super::patch::{Patch, Rect};
 use super::random_conv::RandomConv;
-use super::{View, VisualWrapper, WRAPPERS};
+use super::{EpisodeFrame, VisualWrapper, WRAPPERS};
 use npyz::npz::NpzArchive;
 use serde_json::{Map, Value};
 use std::fs::File;
@@ -18,7 +18,7 @@ use swm_image::RgbImage;
 struct Golden(NpzArchive<BufReader<File>>);
 
 impl Golden {
-    fn picture(&mut self, name: &str) -> RgbImage {
+    fn image(&mut self, name: &str) -> RgbImage {
         let array = self.0.by_name(name).expect("a readable archive").expect("an array of this name");
         let [height, width] = [0, 1].map(|axis| usize::try_from(array.shape()[axis]).expect("a size"));
         RgbImage { width, height, rgb: array.into_vec().expect("bytes") }
@@ -37,25 +37,26 @@ fn floats(value: &Value) -> Vec<f64> {
     }
 }
 
-/// The largest mean and the largest single difference from the reference that a wrapper may show, of 255.
+/// The tolerated mean and maximal difference of a wrapper from the reference, of 255.
 fn tolerance(id: &str) -> (f64, u8) {
     match id {
-        // Rounding of means that end in a half.
+        // Rounding of means whose fraction is one half.
         "resolution" | "chroma-key" => (0.03, 1),
-        // Products that come out just below a whole number with one way of multiplying and on it with another.
+        // Products that are an integer, or just below it, depending on the order of multiplication.
         "color-jitter" => (0.001, 1),
         _ => (0.0, 0),
     }
 }
 
 #[test]
-fn wrappers_do_what_the_reference_does() {
+#[allow(clippy::too_many_lines, reason = "one match over the wrappers of the golden file")]
+fn wrappers_equal_the_reference() {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/golden/wrappers.npz");
     let mut golden = Golden(NpzArchive::open(path).expect("the golden file"));
-    let original = golden.picture("frame");
-    let (mut seen, mut wrong) = (std::collections::BTreeSet::new(), vec![]);
+    let original = golden.image("frame");
+    let (mut compared, mut wrong) = (std::collections::BTreeSet::new(), vec![]);
     for (i, mut case) in golden.cases().into_iter().enumerate() {
-        let wanted = golden.picture(&format!("out_{i}"));
+        let expected = golden.image(&format!("out_{i}"));
         let what = format!("case {i}, {case:?}");
         let id = case.remove("wrapper").expect("a wrapper").as_str().expect("a name").to_owned();
         let drawn = case.remove("drawn").filter(|drawn| !drawn.is_null()).map(|drawn| floats(&drawn));
@@ -64,52 +65,53 @@ fn wrappers_do_what_the_reference_does() {
         let mut frame = FrameMut::new(width, height, &mut rgb);
         match (id.as_str(), drawn) {
             ("chroma-key", _) => {
-                let media = golden.picture(&format!("background_{}", case["media"].as_str().expect("a name")));
+                let media = golden.image(&format!("background_{}", case["media"].as_str().expect("a name")));
                 let key: Vec<u8> = serde_json::from_value(case["key_color"].clone()).expect("a colour");
                 let tolerance = case["tolerance"].as_f64().expect("a number");
-                ChromaKey::new(&key, Media::new(vec![media]), tolerance).apply(&mut frame, View::Step(step));
+                ChromaKey::new(&key, Media::new(vec![media]), tolerance).apply(&mut frame, EpisodeFrame::Step(step));
             }
             ("color-jitter", Some(drawn)) => {
                 let fixed: Vec<[f64; 2]> = drawn.iter().map(|&value| [value; 2]).collect();
                 let ranges = fixed.try_into().expect("four factors");
-                ColorJitter::new(ranges).apply(&mut frame, View::Step(step));
+                ColorJitter::new(ranges).apply(&mut frame, EpisodeFrame::Step(step));
             }
             ("random-conv", Some(weights)) => {
                 let side = usize::try_from(case["kernel_size"].as_u64().expect("a size")).expect("a size");
                 let mut conv = RandomConv::new(side);
-                #[allow(clippy::cast_possible_truncation)]
                 conv.set(weights.iter().map(|&weight| weight as f32));
-                conv.apply(&mut frame, View::Step(step));
+                conv.apply(&mut frame, EpisodeFrame::Step(step));
             }
             ("occlusion", Some(patches)) => {
                 let color: [u8; 3] = serde_json::from_value(case["color"].clone()).expect("a colour");
                 for patch in patches.as_chunks::<4>().0 {
-                    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
                     let [y, x, height, width] = patch.map(|v| v as usize);
                     Rect { x, y, width, height }.fill(color, &mut frame);
                 }
             }
             ("moving-patch", Some(patches)) => {
                 for &[y, x, h, w, down, right] in patches.as_chunks::<6>().0 {
-                    let parts = [h / height as f64, w / width as f64];
-                    let place = [y / (height as f64 - h), x / (width as f64 - w)];
-                    let moving = Moving { patch: Patch { size: parts, place }, velocity: [down, right] };
+                    let shares = [h / height as f64, w / width as f64];
+                    let position = [y / (height as f64 - h), x / (width as f64 - w)];
+                    let moving = Moving { patch: Patch { size: shares, position }, velocity: [down, right] };
                     moving.rect(&frame, step).fill([255; 3], &mut frame);
                 }
             }
             (id, _) => {
                 let mut wrapper = WRAPPERS.get(id).expect("a wrapper").make(&case).expect("settings");
-                wrapper.apply(&mut frame, View::Step(step));
+                wrapper.apply(&mut frame, EpisodeFrame::Step(step));
             }
         }
-        let apart: Vec<u8> = rgb.iter().zip(&wanted.rgb).map(|(a, b)| a.abs_diff(*b)).collect();
-        let (mean, most) = (apart.iter().map(|&d| f64::from(d)).sum::<f64>() / apart.len() as f64, apart.iter().max());
+        let differences: Vec<u8> = rgb.iter().zip(&expected.rgb).map(|(a, b)| a.abs_diff(*b)).collect();
+        let (mean, most) = (
+            differences.iter().map(|&d| f64::from(d)).sum::<f64>() / differences.len() as f64,
+            differences.iter().max(),
+        );
         let (mean_allowed, most_allowed) = tolerance(&id);
         if mean > mean_allowed || most > Some(&most_allowed) {
             wrong.push(format!("{what}: mean {mean:.4}, most {most:?} of 255"));
         }
-        seen.insert(id);
+        compared.insert(id);
     }
     assert!(wrong.is_empty(), "{wrong:#?}");
-    assert_eq!(seen.len(), 8, "all but noise, cutout and random-shift are compared: {seen:?}");
+    assert_eq!(compared.len(), 8, "all but noise, cutout and random-shift are compared: {compared:?}");
 }

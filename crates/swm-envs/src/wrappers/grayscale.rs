@@ -1,9 +1,9 @@
 //! Luma in all three channels: `Y = 0.299 R + 0.587 G + 0.114 B`.
 //!
-//! No parameters. Source: `GrayscaleWrapper` of the reference, whose arithmetic (OpenCV's, weights in 2⁻¹⁵) is
-//! followed bit for bit. Deviation: pictures always have three channels, so there is no `keep_channels`.
+//! No parameters. Source: `GrayscaleWrapper` of the reference, which calls OpenCV; the result is equal bit for bit (weights
+//! in units of 2⁻¹⁵). Deviation: frames always have three channels, so there is no `keep_channels`.
 
-use super::{View, VisualWrapper, WrapperEntry};
+use super::{EpisodeFrame, VisualWrapper, WrapperEntry};
 use swm_core::FrameMut;
 
 /// The registry row.
@@ -21,8 +21,7 @@ impl VisualWrapper for Grayscale {
         ENTRY.id
     }
 
-    #[allow(clippy::cast_possible_truncation)]
-    fn apply(&mut self, frame: &mut FrameMut<'_>, _view: View) {
+    fn apply(&mut self, frame: &mut FrameMut<'_>, _which: EpisodeFrame) {
         for pixel in frame.rgb.as_chunks_mut::<3>().0 {
             let [r, g, b] = pixel.map(u32::from);
             *pixel = [((r * 9798 + g * 19235 + b * 3735 + (1 << 14)) >> 15) as u8; 3];

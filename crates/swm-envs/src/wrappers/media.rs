@@ -1,7 +1,7 @@
-//! Pictures and videos that stand in for a background.
+//! [`Media`]: background images and videos of the chroma-key wrapper.
 //!
-//! A PNG file or a folder of them is read here; any other file (MP4, GIF, JPEG, …) by the `ffmpeg` program, once. What
-//! was read, and what it looks like in the sizes it was asked for, is shared by everybody who shows it.
+//! A PNG file or a folder of them is read here; any other file (MP4, GIF, JPEG, …) is decoded once by the `ffmpeg` program.
+//! The frames, and their resized copies, are shared by all environments.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -11,29 +11,32 @@ use swm_core::{Error, Result};
 use swm_image::resize::AreaResizer;
 use swm_image::{RgbImage, read_png};
 
-/// Bytes that the frames of one video may take in memory.
+/// The maximal memory of the frames of one video, in bytes.
 const LIMIT: usize = 1 << 30;
 
-/// One frame or several, shown one after the other.
+/// An image or the frames of a video.
 pub struct Media {
     frames: Vec<RgbImage>,
-    /// The sizes that somebody asked for.
-    sizes: Mutex<Vec<Arc<Sized>>>,
+    /// The frames at the sizes in use.
+    sizes: Mutex<Vec<Arc<SizedMedia>>>,
 }
 
-/// The frames of a [`Media`] in one size, each resized when it is first shown.
-pub struct Sized {
+/// The frames of a [`Media`] at one size, each resized at its first use.
+pub struct SizedMedia {
     size: [usize; 2],
     frames: Vec<OnceLock<Vec<u8>>>,
 }
 
 impl Media {
-    /// These frames, at least one.
+    /// Makes a media of frames, at least one.
     pub fn new(frames: Vec<RgbImage>) -> Self {
         Self { frames, sizes: Mutex::default() }
     }
 
-    /// Reads a picture, a folder of pictures in the order of their names, or a video.
+    /// Reads an image, a folder of images in the order of their names, or a video.
+    ///
+    /// # Errors
+    /// When the file is missing, damaged or too large, or `ffmpeg` is needed and missing.
     pub fn read(path: &Path) -> Result<Self> {
         let frames = if path.is_dir() {
             read_folder(path)?
@@ -45,21 +48,20 @@ impl Media {
         Ok(Self::new(frames))
     }
 
-    /// The frames for pictures of a size, `[width, height]`.
-    pub fn sized(&self, size: [usize; 2]) -> Arc<Sized> {
-        // Whoever panicked while it held the lock left a list that is still right.
+    /// Returns the frames at a size, `[width, height]`.
+    pub fn sized(&self, size: [usize; 2]) -> Arc<SizedMedia> {
+        // The list stays valid if a thread panics while it holds the lock.
         let mut sizes = self.sizes.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(known) = sizes.iter().find(|known| known.size == size) {
             return known.clone();
         }
-        let new = Arc::new(Sized { size, frames: self.frames.iter().map(|_| OnceLock::new()).collect() });
+        let new = Arc::new(SizedMedia { size, frames: self.frames.iter().map(|_| OnceLock::new()).collect() });
         sizes.push(new.clone());
         new
     }
 
-    /// The frame at a step, in the size of `sized`: the first at step 0, and again after the last.
-    #[allow(clippy::cast_possible_truncation)]
-    pub fn frame<'a>(&self, sized: &'a Sized, step: u64) -> &'a [u8] {
+    /// Returns the frame at a step, at the size of `sized`; the frames repeat after the last.
+    pub fn frame<'a>(&self, sized: &'a SizedMedia, step: u64) -> &'a [u8] {
         let index = (step % self.frames.len() as u64) as usize;
         sized.frames[index].get_or_init(|| {
             let RgbImage { width, height, rgb } = &self.frames[index];
@@ -70,15 +72,15 @@ impl Media {
     }
 }
 
-impl Sized {
-    /// Whether it is for pictures of this size, `[width, height]`.
-    pub fn is_for(&self, size: [usize; 2]) -> bool {
+impl SizedMedia {
+    /// Returns whether the frames have this size, `[width, height]`.
+    pub fn has_size(&self, size: [usize; 2]) -> bool {
         self.size == size
     }
 }
 
 fn read_folder(path: &Path) -> Result<Vec<RgbImage>> {
-    let fail = |source| Error::io(path, "listing pictures", source);
+    let fail = |source| Error::io(path, "listing images", source);
     let mut files: Vec<PathBuf> = vec![];
     for entry in std::fs::read_dir(path).map_err(fail)? {
         let file = entry.map_err(fail)?.path();
@@ -98,10 +100,10 @@ fn too_large(path: &Path) -> Error {
     Error::corrupt(path, problem, "shorten or shrink it: ffmpeg -i IN -t 10 -vf scale=256:-2 OUT.mp4")
 }
 
-/// Decodes all frames of a file. They come as PPM pictures, which say their own size.
+/// Decodes all frames of a file. `ffmpeg` writes them as PPM images, which contain their size.
 fn read_video(program: &Path, path: &Path, limit: usize) -> Result<Vec<RgbImage>> {
     if let Err(source) = std::fs::metadata(path) {
-        return Err(Error::io(path, "opening a picture or video", source));
+        return Err(Error::io(path, "opening an image or video", source));
     }
     // `file:` keeps a name with a colon from being read as a protocol.
     let mut input = OsString::from("file:");
@@ -109,7 +111,7 @@ fn read_video(program: &Path, path: &Path, limit: usize) -> Result<Vec<RgbImage>
     let output = Command::new(program)
         .args(["-nostdin", "-hide_banner", "-loglevel", "error", "-i"])
         .arg(input)
-        // Every frame once, however long it is to be shown.
+        // Every frame once, regardless of its duration.
         .args(["-an", "-vf", "settb=1/25,setpts=N", "-r", "25", "-fs", &limit.to_string()])
         .args(["-f", "image2pipe", "-c:v", "ppm", "-pix_fmt", "rgb24", "pipe:1"])
         .stdin(Stdio::null())
@@ -131,13 +133,13 @@ fn read_video(program: &Path, path: &Path, limit: usize) -> Result<Vec<RgbImage>
     let frames = read_ppm(&output.stdout);
     if !output.status.success() || frames.is_empty() {
         let log = String::from_utf8_lossy(&output.stderr);
-        let problem = log.lines().rfind(|line| !line.trim().is_empty()).unwrap_or("it shows no frame").to_owned();
-        return Err(Error::corrupt(path, problem, "give a picture or a video that ffmpeg can decode"));
+        let problem = log.lines().rfind(|line| !line.trim().is_empty()).unwrap_or("it has no frame").to_owned();
+        return Err(Error::corrupt(path, problem, "give an image or a video that ffmpeg can decode"));
     }
     Ok(frames)
 }
 
-/// The pictures of a stream of binary PPM files, up to the first that is not whole.
+/// Reads the images of a stream of binary PPM files, up to the first incomplete one.
 fn read_ppm(mut stream: &[u8]) -> Vec<RgbImage> {
     let mut frames = vec![];
     while let Some((width, height, rest)) = ppm_header(stream) {
@@ -148,7 +150,7 @@ fn read_ppm(mut stream: &[u8]) -> Vec<RgbImage> {
     frames
 }
 
-/// Width, height and what follows the header `P6 WIDTH HEIGHT 255`.
+/// Reads the header `P6 WIDTH HEIGHT 255`. Returns width, height and the rest of the stream.
 fn ppm_header(stream: &[u8]) -> Option<(usize, usize, &[u8])> {
     let mut rest = stream;
     let mut word = || {
@@ -169,7 +171,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn frames_follow_each_other_in_a_stream() {
+    fn reads_all_complete_images_of_a_stream() {
         let frames = read_ppm(b"P6\n1 2\n255\nabcdefP6\n2 1\n255\nABCDEFP6\n9 9\n255\ncut off");
         let found: Vec<_> = frames.iter().map(|f| (f.width, f.height, &f.rgb[..])).collect();
         assert_eq!(found, [(1, 2, &b"abcdef"[..]), (2, 1, b"ABCDEF")]);
@@ -177,10 +179,10 @@ mod tests {
     }
 
     #[test]
-    fn a_video_without_ffmpeg_or_without_end_is_refused_in_words() {
+    fn missing_ffmpeg_and_oversized_videos_are_errors() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("a.mp4");
-        let message = |program: &str| read_video(Path::new(program), &path, LIMIT).err().expect("fails").to_string();
+        let message = |program: &str| read_video(Path::new(program), &path, LIMIT).expect_err("fails").to_string();
         assert!(message("ffmpeg").contains("a.mp4"));
         std::fs::write(&path, b"no video").expect("a file");
         assert!(message("no-such-ffmpeg").contains("install FFmpeg"), "{}", message("no-such-ffmpeg"));
@@ -188,7 +190,7 @@ mod tests {
     }
 
     #[test]
-    fn a_media_is_resized_once_a_size_and_repeats() {
+    fn frames_are_resized_once_per_size_and_repeat() {
         let frame = |v| RgbImage { width: 2, height: 1, rgb: vec![v; 6] };
         let media = Media::new(vec![frame(1), frame(2)]);
         let sized = media.sized([3, 3]);

@@ -1,13 +1,12 @@
-//! Visual wrappers: what is done to the pictures of any environment, without touching its world.
+//! Visual wrappers: changes to the frames of any environment that leave its dynamics untouched.
 //!
-//! A [`VisualWrapper`] changes a picture in place. [`Wrapped`] is an environment whose pictures pass through an
-//! ordered stack of them. What a wrapper draws at random is a function of the episode's seed, its place in the
-//! stack and the step, never of how often a picture was asked for: drawing twice gives equal bytes, and a restored
-//! snapshot continues bit for bit.
+//! A [`VisualWrapper`] changes a frame in place. [`Wrapped`] is an environment whose frames pass through an ordered stack
+//! of them. Random draws of a wrapper depend on the episode's seed, its index in the stack and the step, never on how
+//! often a frame was drawn: drawing twice gives equal bytes, and a restored snapshot continues bit for bit.
 //!
 //! Wrappers, their parameters, defaults and meanings are those of the Python package `stable-worldmodel` 0.1.1
-//! (`wrapper/visual.py`) and of the paper's table of visual wrappers; every file names its deviations.
-//! `docs/wrappers.md` shows them.
+//! (`wrapper/visual.py`) and of the paper's table of visual wrappers; every file lists its deviations, and
+//! `docs/wrappers.md` has example frames.
 
 mod blur;
 mod border;
@@ -31,7 +30,7 @@ mod wrapped;
 mod golden;
 
 pub use settings::{Domain, Formula, Parameter, Schedule, Settings};
-pub use wrapped::{GoalPicture, Stack, Wrapped};
+pub use wrapped::{GoalFrame, Stack, Wrapped};
 
 use serde_json::{Value, json};
 use swm_core::{Error, FrameMut, Key, Named, Registry, Result};
@@ -55,17 +54,17 @@ pub static WRAPPERS: Registry<WrapperEntry> = Registry {
     ],
 };
 
-/// Which picture of an episode a wrapper is shown.
+/// The frame of an episode that a wrapper changes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum View {
-    /// The world after that many steps.
+pub enum EpisodeFrame {
+    /// The frame after that many steps.
     Step(u64),
-    /// The goal; what moves stands where it stood at step 0.
+    /// The goal frame; moving wrappers are as at step 0.
     Goal,
 }
 
-impl View {
-    /// The step whose place and strength things have in this picture.
+impl EpisodeFrame {
+    /// Returns the step that decides positions and schedules in this frame.
     pub fn step(self) -> u64 {
         match self {
             Self::Step(step) => step,
@@ -73,7 +72,7 @@ impl View {
         }
     }
 
-    /// Where the randomness of this picture alone comes from.
+    /// Returns the key of random draws for this frame alone.
     #[must_use]
     pub fn key(self, episode: Key) -> Key {
         match self {
@@ -83,33 +82,33 @@ impl View {
     }
 }
 
-/// Something done to pictures.
+/// A change to frames.
 pub trait VisualWrapper: Send + Sync {
     /// The id of its registry row.
     fn id(&self) -> &'static str;
 
-    /// Begins an episode: what is drawn once for all its pictures, and what is drawn for each of them, comes from
-    /// this key. Wrappers without randomness ignore it.
+    /// Starts an episode. All random draws, per episode and per frame, derive from this key. Wrappers without randomness
+    /// ignore it.
     fn reset(&mut self, episode: Key) {
         let _ = episode;
     }
 
-    /// Changes a picture, of any size, in place.
-    fn apply(&mut self, frame: &mut FrameMut<'_>, view: View);
+    /// Changes a frame of any size in place.
+    fn apply(&mut self, frame: &mut FrameMut<'_>, which: EpisodeFrame);
 
-    /// Another one with the same settings, for another environment; what is large (a video) is shared.
+    /// Makes another wrapper with the same settings, for another environment. Large data, such as a video, is shared.
     fn fork(&self) -> Box<dyn VisualWrapper>;
 }
 
-/// A wrapper that can be made.
+/// A row of the registry of wrappers.
 pub struct WrapperEntry {
     /// Its id, such as `noise`.
     pub id: &'static str,
-    /// What it does to a picture, in a sentence.
+    /// What it does to a frame, in one sentence.
     pub summary: &'static str,
-    /// What can be set.
+    /// Its parameters.
     pub parameters: &'static [Parameter],
-    /// Makes one from values of all parameters that were found to be allowed.
+    /// Makes a wrapper from checked values of all parameters.
     build: fn(Value) -> Result<Box<dyn VisualWrapper>>,
 }
 
@@ -120,7 +119,7 @@ impl Named for WrapperEntry {
 }
 
 impl WrapperEntry {
-    /// Makes one; parameters that `settings` does not name have their defaults.
+    /// Makes a wrapper; parameters that `settings` lacks have their defaults.
     ///
     /// # Errors
     /// When a parameter is unknown, missing or not allowed, or a file it names cannot be read.
@@ -128,15 +127,15 @@ impl WrapperEntry {
         (self.build)(settings::complete(self.id, self.parameters, settings)?.into())
     }
 
-    /// Summary and parameters, with what they may be and their defaults (null: must be given), as JSON.
+    /// Returns summary and parameters as JSON: allowed values and defaults (null: required).
     pub fn describe(&self) -> Value {
         let parameters: Settings = self
             .parameters
             .iter()
             .map(|p| {
-                let about =
+                let description =
                     json!({"summary": p.summary, "allowed": p.domain.to_string(), "default": p.default_value()});
-                (p.name.to_owned(), about)
+                (p.name.to_owned(), description)
             })
             .collect();
         json!({"summary": self.summary, "parameters": parameters})
@@ -152,17 +151,17 @@ pub fn parse(text: &str) -> Result<Box<dyn VisualWrapper>> {
     entry.make(&settings)
 }
 
-/// The wrapper and the settings that its form on the command line names.
+/// Reads wrapper and settings in the form of the command line.
 ///
 /// # Errors
-/// When the wrapper or a parameter is unknown, or a value is not of the parameter's kind.
+/// When the wrapper or a parameter is unknown, or a setting is malformed.
 pub fn read(text: &str) -> Result<(&'static WrapperEntry, Settings)> {
     let (id, settings) = text.split_once(',').unwrap_or((text, ""));
     let entry = WRAPPERS.get(id)?;
     Ok((entry, settings::read(entry.id, entry.parameters, settings)?))
 }
 
-/// The typed settings of a wrapper, from checked values.
+/// Converts checked values to the typed settings of a wrapper.
 fn typed<T: serde::de::DeserializeOwned>(wrapper: &str, settings: Value) -> Result<T> {
     serde_json::from_value(settings).map_err(|error| {
         Error::config(format!("wrapper '{wrapper}'"), error.to_string(), "`swm wrappers` lists what it takes")

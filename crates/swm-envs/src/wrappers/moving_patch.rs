@@ -1,19 +1,19 @@
-//! Rectangles that drift over the picture and bounce off its edges.
+//! Rectangles that move over the frame and bounce off its edges.
 //!
 //! | parameter | unit | default | range |
 //! | --- | --- | --- | --- |
 //! | `num_patches` | rectangles | 1 | 0 to 256 |
-//! | `size` | height, and independently width, as a part of the picture's; drawn uniformly | 0.1/0.2 | 0 to 1 |
-//! | `color` | red/green/blue, or one number for all | 255 | 0 to 255 |
+//! | `size` | height, and independently width, as a share of the frame's; drawn uniformly | 0.1/0.2 | 0 to 1 |
+//! | `color` | red/green/blue, or one value for all | 255 | 0 to 255 |
 //! | `speed` | pixels a step | 2 | 0 to 1000 |
 //!
-//! Place and direction are drawn at the beginning of an episode, uniformly. In the picture of the goal the rectangles
-//! stand where they began. Source: `MovingPatchWrapper` of the reference, whose bouncing step by step is here a formula
-//! of the step: the same way as long as `speed` is below the room a rectangle has.
+//! Position and direction are drawn uniformly at the start of an episode. In the goal frame the rectangles are at their
+//! start positions. Source: `MovingPatchWrapper` of the reference. It moves the rectangles step by step; here the position
+//! is a function of the step, which gives the same path while `speed` is below the free length of a rectangle's path.
 
 use super::patch::{Patch, Rect};
 use super::settings::{Color, Domain, Ends, Parameter};
-use super::{View, VisualWrapper, WrapperEntry, typed};
+use super::{EpisodeFrame, VisualWrapper, WrapperEntry, typed};
 use rand::Rng as _;
 use serde::Deserialize;
 use swm_core::{FrameMut, Key};
@@ -21,21 +21,21 @@ use swm_core::{FrameMut, Key};
 /// The registry row.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "moving-patch",
-    summary: "lays rectangles over the picture that drift and bounce off its edges",
+    summary: "draws rectangles that move over the frame and bounce off its edges",
     parameters: &[
         Parameter {
             name: "num_patches",
-            summary: "how many rectangles",
+            summary: "number of rectangles",
             domain: Domain::Integer { low: 0, high: 256 },
             default: Some("1"),
         },
         Parameter {
             name: "size",
-            summary: "height and width, as parts of the picture's",
+            summary: "height and width, as shares of the frame's",
             domain: Domain::Range { low: 0.0, high: 1.0 },
             default: Some("0.1/0.2"),
         },
-        Parameter { name: "color", summary: "what they show", domain: Domain::Color, default: Some("255") },
+        Parameter { name: "color", summary: "colour of the rectangles", domain: Domain::Color, default: Some("255") },
         Parameter {
             name: "speed",
             summary: "pixels a step",
@@ -67,7 +67,7 @@ struct MovingPatch {
     patches: Vec<Moving>,
 }
 
-/// A patch and its velocity, downwards and to the right, in pixels a step.
+/// A patch and its velocity, downwards and to the right, in pixels per step.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Moving {
     pub patch: Patch,
@@ -75,26 +75,25 @@ pub(super) struct Moving {
 }
 
 impl Moving {
-    /// Where it lies after some steps.
-    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    /// Returns the rectangle after some steps.
     pub fn rect(&self, frame: &FrameMut<'_>, step: u64) -> Rect {
         let [height, width] = self.patch.pixels(frame);
         let free = [frame.height.saturating_sub(height) as f64, frame.width.saturating_sub(width) as f64];
         let along = |side: usize| {
-            let way = self.patch.place[side] * free[side] + self.velocity[side] * step as f64;
-            bounce(way, free[side]) as usize
+            let path = self.patch.position[side] * free[side] + self.velocity[side] * step as f64;
+            bounce(path, free[side]) as usize
         };
         Rect { x: along(1), y: along(0), width, height }
     }
 }
 
-/// Where somebody who walked `way` from 0 is who turns around at 0 and at `end`.
-fn bounce(way: f64, end: f64) -> f64 {
+/// Returns the position after a path of a length from 0, reflected at 0 and at `end`.
+fn bounce(path: f64, end: f64) -> f64 {
     if end <= 0.0 {
         return 0.0;
     }
-    let way = way.rem_euclid(2.0 * end);
-    if way > end { 2.0 * end - way } else { way }
+    let path = path.rem_euclid(2.0 * end);
+    if path > end { 2.0 * end - path } else { path }
 }
 
 impl VisualWrapper for MovingPatch {
@@ -112,9 +111,9 @@ impl VisualWrapper for MovingPatch {
         }));
     }
 
-    fn apply(&mut self, frame: &mut FrameMut<'_>, view: View) {
+    fn apply(&mut self, frame: &mut FrameMut<'_>, which: EpisodeFrame) {
         for patch in &self.patches {
-            patch.rect(frame, view.step()).fill(self.color, frame);
+            patch.rect(frame, which.step()).fill(self.color, frame);
         }
     }
 

@@ -1,21 +1,21 @@
-//! Pixel noise, drawn anew for every picture.
+//! Pixel noise, sampled for every frame.
 //!
-//! **Gaussian**: every channel of every pixel gains a draw from N(0, `std`²), is clipped to 0 ..= 255 and rounded
-//! down. **Salt and pepper**: a part `amount` of the pixels becomes white or black, with equal chance.
+//! **Gaussian**: a draw from N(0, `std`²) is added to every channel of every pixel; the sum is clipped to 0 ..= 255 and
+//! rounded down. **Salt and pepper**: a share `amount` of the pixels becomes white or black, with equal probability.
 //!
 //! | parameter | unit | default | range |
 //! | --- | --- | --- | --- |
 //! | `kind` | | `gaussian` | `gaussian`, `salt-pepper` |
-//! | `std` | levels of 255; number or schedule | 10 | 0 to 255 |
-//! | `amount` | part of the pixels; number or schedule | 0.05 | 0 to 1 |
+//! | `std` | levels of 255; value or schedule | 10 | 0 to 255 |
+//! | `amount` | share of the pixels; value or schedule | 0.05 | 0 to 1 |
 //!
 //! Source: `NoiseWrapper` of the reference (Gaussian with a schedule); the paper's table adds salt and pepper, for
 //! which `amount` is the usual measure. Deviations: a schedule counts the steps of the episode, where the reference
-//! counts all steps since the wrapper was made; Gaussian draws are the centres of 8192 equally likely slices, so
+//! counts all steps since the wrapper was made; Gaussian draws are the centres of 8192 intervals of equal probability, so
 //! none lies beyond 3.8 standard deviations.
 
 use super::settings::{Domain, Parameter, Schedule};
-use super::{View, VisualWrapper, WrapperEntry, gaussian, typed};
+use super::{EpisodeFrame, VisualWrapper, WrapperEntry, gaussian, typed};
 use serde::Deserialize;
 use std::sync::LazyLock;
 use swm_core::{FrameMut, Key};
@@ -23,11 +23,11 @@ use swm_core::{FrameMut, Key};
 /// The registry row.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "noise",
-    summary: "adds Gaussian or salt-and-pepper noise, anew in every picture",
+    summary: "adds Gaussian or salt-and-pepper noise, sampled in every step",
     parameters: &[
         Parameter {
             name: "kind",
-            summary: "the noise",
+            summary: "kind of noise",
             domain: Domain::Choice(&["gaussian", "salt-pepper"]),
             default: Some("gaussian"),
         },
@@ -39,14 +39,14 @@ pub const ENTRY: WrapperEntry = WrapperEntry {
         },
         Parameter {
             name: "amount",
-            summary: "part of the pixels that salt and pepper replace",
+            summary: "share of the pixels that salt and pepper replaces",
             domain: Domain::Schedule { low: 0.0, high: 1.0 },
             default: Some("0.05"),
         },
     ],
     build: |settings| {
         let settings: Settings = typed(ENTRY.id, settings)?;
-        Ok(Box::new(Noise { settings, episode: Key::new(0), table: vec![], of: f64::NAN }))
+        Ok(Box::new(Noise { settings, episode: Key::new(0), table: vec![], table_std: f64::NAN }))
     },
 };
 
@@ -65,15 +65,14 @@ enum Kind {
     SaltPepper,
 }
 
-/// Slices of the normal distribution; a power of 2.
-const SLICES: usize = 8192;
+/// The number of intervals of the normal distribution; a power of 2.
+const INTERVALS: usize = 8192;
 
-/// The centres of the slices, scaled to a variance of 1 (slicing loses 0.1 %).
+/// The centres of the intervals, scaled to a variance of 1 (the intervals lose 0.1 %).
 static STANDARD: LazyLock<Vec<f64>> = LazyLock::new(|| {
-    #[allow(clippy::cast_precision_loss)]
-    let mut centres: Vec<f64> = (0..SLICES).map(|i| gaussian::quantile((i as f64 + 0.5) / SLICES as f64)).collect();
-    #[allow(clippy::cast_precision_loss)]
-    let deviation = (centres.iter().map(|z| z * z).sum::<f64>() / SLICES as f64).sqrt();
+    let mut centres: Vec<f64> =
+        (0..INTERVALS).map(|i| gaussian::quantile((i as f64 + 0.5) / INTERVALS as f64)).collect();
+    let deviation = (centres.iter().map(|z| z * z).sum::<f64>() / INTERVALS as f64).sqrt();
     centres.iter_mut().for_each(|z| *z /= deviation);
     centres
 });
@@ -82,13 +81,13 @@ static STANDARD: LazyLock<Vec<f64>> = LazyLock::new(|| {
 struct Noise {
     settings: Settings,
     episode: Key,
-    /// What the slices add to a channel, for one standard deviation.
+    /// The value that each interval adds to a channel, for one standard deviation.
     table: Vec<i16>,
-    /// The standard deviation the table is for.
-    of: f64,
+    /// The standard deviation of the table.
+    table_std: f64,
 }
 
-/// A generator whose state is a counter (SplitMix64): a picture takes tens of thousands of draws.
+/// A fast generator (SplitMix64), because a frame needs tens of thousands of draws.
 struct Counter(u64);
 
 impl Counter {
@@ -101,23 +100,22 @@ impl Counter {
 }
 
 impl Noise {
-    /// Rounding down after adding is adding what is rounded down, because channels are whole numbers.
-    #[allow(clippy::cast_possible_truncation)]
+    /// Adds Gaussian noise. The noise is rounded down before it is added, which is the same, because channels are integers.
     fn gaussian(&mut self, rgb: &mut [u8], std: f64, mut random: Counter) {
         if std <= 0.0 {
             return;
         }
-        if self.of.to_bits() != std.to_bits() {
+        if self.table_std.to_bits() != std.to_bits() {
             self.table.clear();
             self.table.extend(STANDARD.iter().map(|z| (z * std).floor() as i16));
-            self.of = std;
+            self.table_std = std;
         }
-        // A table of known length needs no check of its indices.
-        let Some(table) = self.table.first_chunk::<SLICES>() else { return };
+        // A table of constant length needs no bounds checks.
+        let Some(table) = self.table.first_chunk::<INTERVALS>() else { return };
         let mut add = |channels: &mut [u8]| {
             let bits = random.next();
             for (i, channel) in channels.iter_mut().enumerate() {
-                let noise = table[(bits >> (16 * i)) as usize % SLICES];
+                let noise = table[(bits >> (16 * i)) as usize % INTERVALS];
                 *channel = (i16::from(*channel) + noise).clamp(0, 255) as u8;
             }
         };
@@ -127,8 +125,8 @@ impl Noise {
     }
 }
 
-/// A pixel is hit when a uniform number of 32 bits is below the amount; which colour it gets is the half it hit.
-#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+/// Replaces a pixel when a uniform draw of 32 bits is below the amount: by black in the lower half of that range, by white
+/// in the upper half.
 fn salt_pepper(rgb: &mut [u8], amount: f64, mut random: Counter) {
     let below = (amount * 2f64.powi(32)).round() as u64;
     for pixels in rgb.chunks_mut(6) {
@@ -152,11 +150,11 @@ impl VisualWrapper for Noise {
         self.episode = episode;
     }
 
-    fn apply(&mut self, frame: &mut FrameMut<'_>, view: View) {
-        let random = Counter(view.key(self.episode).seed());
+    fn apply(&mut self, frame: &mut FrameMut<'_>, which: EpisodeFrame) {
+        let random = Counter(which.key(self.episode).seed());
         match self.settings.kind {
-            Kind::Gaussian => self.gaussian(frame.rgb, self.settings.std.at(view.step()), random),
-            Kind::SaltPepper => salt_pepper(frame.rgb, self.settings.amount.at(view.step()), random),
+            Kind::Gaussian => self.gaussian(frame.rgb, self.settings.std.at(which.step()), random),
+            Kind::SaltPepper => salt_pepper(frame.rgb, self.settings.amount.at(which.step()), random),
         }
     }
 

@@ -1,18 +1,18 @@
-//! A random linear filter from three channels to three, drawn at the beginning of an episode.
+//! A random convolution from three channels to three, sampled once per episode.
 //!
-//! Every channel of the result is the sum, over a window of `kernel_size`² pixels and the three channels, of the picture
+//! Every channel of the result is the sum, over a window of `kernel_size`² pixels and the three channels, of the frame
 //! times weights from N(0, 1 / (3 kernel_size²)), clipped to 0 ..= 255 and rounded down; edges are mirrored.
 //!
 //! | parameter | unit | default | range |
 //! | --- | --- | --- | --- |
-//! | `kernel_size` | pixels; even numbers mean the next odd one | 3 | 1 to 15 |
+//! | `kernel_size` | pixels; even values mean the next odd one | 3 | 1 to 15 |
 //!
-//! Source: `RandomConvWrapper` of the reference (Lee et al. 2020, "Network Randomization"). Nothing is normalised, so
-//! about one channel in two is black in places, as there.
+//! Source: `RandomConvWrapper` of the reference (Lee et al. 2020, "Network Randomization"). The result is not normalised,
+//! so about half of the channels are clipped to 0 in some areas, as there.
 
 use super::border::mirror;
 use super::settings::{Domain, Parameter};
-use super::{View, VisualWrapper, WrapperEntry, gaussian, typed};
+use super::{EpisodeFrame, VisualWrapper, WrapperEntry, gaussian, typed};
 use rand::Rng as _;
 use serde::Deserialize;
 use swm_core::{FrameMut, Key};
@@ -20,10 +20,10 @@ use swm_core::{FrameMut, Key};
 /// The registry row.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "random-conv",
-    summary: "passes the picture through a random filter, one an episode",
+    summary: "applies a random convolution, sampled once per episode",
     parameters: &[Parameter {
         name: "kernel_size",
-        summary: "side of the window, pixels; even numbers mean the next odd one",
+        summary: "side of the window, pixels; even values mean the next odd one",
         domain: Domain::Integer { low: 1, high: 15 },
         default: Some("3"),
     }],
@@ -45,9 +45,9 @@ const BLOCK: usize = 8;
 #[derive(Clone)]
 pub(super) struct RandomConv {
     side: usize,
-    /// What the three results take from a channel of a place of the window, `[row, channel, column]`.
+    /// The weights of the three results, `[row, channel, column]`.
     weights: Vec<[f32; 3]>,
-    /// Every row of the picture, a channel after the other, with its mirrored surroundings.
+    /// The frame as `[height, channel, stride]`, each row with its mirrored surroundings.
     planes: Vec<f32>,
     /// One row of the result.
     sums: Vec<[[f32; BLOCK]; 3]>,
@@ -60,7 +60,7 @@ impl RandomConv {
         conv
     }
 
-    /// Sets the weights, `[result, row, column, channel]`.
+    /// Sets the weights from a sequence in the order `[result, row, column, channel]`.
     pub fn set(&mut self, weights: impl Iterator<Item = f32>) {
         let side = self.side;
         for (i, weight) in weights.enumerate() {
@@ -75,7 +75,6 @@ impl VisualWrapper for RandomConv {
         ENTRY.id
     }
 
-    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
     fn reset(&mut self, episode: Key) {
         let mut rng = episode.rng();
         let n = 3 * self.side * self.side;
@@ -83,8 +82,7 @@ impl VisualWrapper for RandomConv {
         self.set((0..3 * n).map(|_| (deviation * gaussian::quantile(rng.sample(rand::distr::Open01))) as f32));
     }
 
-    #[allow(clippy::cast_possible_truncation, clippy::cast_possible_wrap, clippy::cast_sign_loss)]
-    fn apply(&mut self, frame: &mut FrameMut<'_>, _view: View) {
+    fn apply(&mut self, frame: &mut FrameMut<'_>, _which: EpisodeFrame) {
         let (width, height, side) = (frame.width, frame.height, self.side);
         if frame.rgb.is_empty() {
             return;

@@ -1,15 +1,15 @@
-//! The picture moved by up to `pad` pixels both ways, the uncovered rim filled with its nearest pixels.
+//! A random shift by up to `pad` pixels on both axes; uncovered pixels repeat the nearest edge.
 //!
 //! | parameter | unit | default | range |
 //! | --- | --- | --- | --- |
 //! | `pad` | pixels; both offsets are drawn uniformly from -pad ..= pad | 4 | 0 to 1024 |
-//! | `resample` | when the offsets are drawn | `episode` | `episode`, `step` |
+//! | `resample` | when the offsets are sampled | `episode` | `episode`, `step` |
 //!
-//! Source: `RandomShiftWrapper` of the reference. It draws with every call; the paper says once an episode, which is the
-//! default here; `resample=step` is the package's way, with equal pictures for equal steps.
+//! Source: `RandomShiftWrapper` of the reference, which samples at every call. The paper samples once per episode, which
+//! is the default here; `resample=step` samples per step, so that drawing a step twice gives equal frames.
 
 use super::settings::{Domain, Parameter};
-use super::{View, VisualWrapper, WrapperEntry, typed};
+use super::{EpisodeFrame, VisualWrapper, WrapperEntry, typed};
 use rand::Rng as _;
 use serde::Deserialize;
 use swm_core::{FrameMut, Key};
@@ -17,17 +17,17 @@ use swm_core::{FrameMut, Key};
 /// The registry row.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "random-shift",
-    summary: "moves the picture by a random offset and repeats its edges",
+    summary: "shifts the frame by a random offset and repeats its edges",
     parameters: &[
         Parameter {
             name: "pad",
-            summary: "greatest offset both ways, pixels",
+            summary: "greatest offset on both axes, pixels",
             domain: Domain::Integer { low: 0, high: 1024 },
             default: Some("4"),
         },
         Parameter {
             name: "resample",
-            summary: "when the offset is drawn",
+            summary: "when the offset is sampled",
             domain: Domain::Choice(&["episode", "step"]),
             default: Some("episode"),
         },
@@ -68,23 +68,23 @@ impl VisualWrapper for RandomShift {
         self.episode = episode;
     }
 
-    fn apply(&mut self, frame: &mut FrameMut<'_>, view: View) {
+    fn apply(&mut self, frame: &mut FrameMut<'_>, which: EpisodeFrame) {
         if frame.rgb.is_empty() {
             return;
         }
         let Settings { pad, resample } = self.settings;
         let key = match resample {
             Resample::Episode => self.episode,
-            Resample::Step => view.key(self.episode),
+            Resample::Step => which.key(self.episode),
         };
         let mut rng = key.rng();
         let [down, right] = [(); 2].map(|()| rng.random_range(0..=2 * pad));
-        // Place `i` of the new picture shows place `i + offset - pad` of the old one.
+        // Pixel `i` of the new frame is pixel `i + offset - pad` of the old one.
         let source = |i: usize, offset: usize, n: usize| (i + offset).saturating_sub(pad).min(n - 1);
         self.old.clear();
         self.old.extend_from_slice(frame.rgb);
         let (width, old) = (frame.width, self.old.as_chunks::<3>().0);
-        // Columns whose source lies within the old picture, and the first of those sources.
+        // The columns whose source lies within the old frame, and the first of these sources.
         let start = pad.saturating_sub(right).min(width);
         let from = source(start, right, width);
         let inner = (width - from).min(width - start);

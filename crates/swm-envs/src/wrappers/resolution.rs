@@ -1,14 +1,14 @@
-//! Fewer pixels: the picture shrunk to `scale` of its size and shown at its old size, each pixel a block.
+//! Reduced resolution: the frame is shrunk to `scale` of its size, and enlarged to its old size in blocks.
 //!
 //! | parameter | unit | default | range |
 //! | --- | --- | --- | --- |
-//! | `scale` | part of width and height; the sides are rounded and at least 1 | 0.5 | 0 to 1 |
+//! | `scale` | share of width and height; the sides are rounded and at least 1 | 0.5 | 0 to 1 |
 //!
 //! Source: `ResolutionWrapper` of the reference (area interpolation down, nearest neighbour up). Deviation: no
 //! `scale` above 1, which changes nothing but time.
 
 use super::settings::{Domain, Parameter};
-use super::{View, VisualWrapper, WrapperEntry, typed};
+use super::{EpisodeFrame, VisualWrapper, WrapperEntry, typed};
 use serde::Deserialize;
 use swm_core::FrameMut;
 use swm_image::resize::AreaResizer;
@@ -16,10 +16,10 @@ use swm_image::resize::AreaResizer;
 /// The registry row.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "resolution",
-    summary: "shrinks the picture and shows it at its old size in blocks",
+    summary: "shrinks the frame and enlarges it to its old size in blocks",
     parameters: &[Parameter {
         name: "scale",
-        summary: "part of width and height that is kept",
+        summary: "factor of width and height",
         domain: Domain::Number { low: 0.0, high: 1.0 },
         default: Some("0.5"),
     }],
@@ -39,7 +39,7 @@ struct Settings {
 struct Resolution {
     scale: f64,
     resizer: Option<AreaResizer>,
-    /// For every column of the picture, the one of the small picture that it shows.
+    /// The column of the small image for every column of the frame.
     columns: Vec<usize>,
     small: Vec<u8>,
 }
@@ -49,8 +49,7 @@ impl VisualWrapper for Resolution {
         ENTRY.id
     }
 
-    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    fn apply(&mut self, frame: &mut FrameMut<'_>, _view: View) {
+    fn apply(&mut self, frame: &mut FrameMut<'_>, _which: EpisodeFrame) {
         if frame.rgb.is_empty() {
             return;
         }

@@ -1,5 +1,5 @@
-//! Settings of wrappers: a table of parameters per wrapper says what there is, what is allowed and what holds
-//! otherwise, for the command line, for JSON, for messages and for listings alike.
+//! Settings of wrappers: each wrapper has a table of parameters with allowed values and defaults. Command line, JSON,
+//! errors and listings all use this table.
 
 use serde::Deserialize;
 use serde_json::{Number, Value};
@@ -16,16 +16,16 @@ pub struct Parameter {
     pub name: &'static str,
     /// What it means, with its unit.
     pub summary: &'static str,
-    /// What it may be.
+    /// Its allowed values.
     pub domain: Domain,
-    /// What it is where nobody says, in the form of the command line; `None` where it must be given.
+    /// Its default in the form of the command line; `None` if it is required.
     pub default: Option<&'static str>,
 }
 
-/// What a parameter may be. On the command line the numbers of a list are joined by `/`, in JSON they are an array.
+/// The allowed values of a parameter. On the command line the values of a list are joined by `/`, in JSON they are an array.
 #[derive(Clone, Copy, Debug)]
 pub enum Domain {
-    /// A whole number.
+    /// An integer.
     Integer {
         /// The least.
         low: u64,
@@ -39,41 +39,41 @@ pub enum Domain {
         /// The greatest.
         high: f64,
     },
-    /// One number, or the two ends of a range to draw from.
+    /// One number, or the two ends of a range to sample from.
     Range {
         /// The least.
         low: f64,
         /// The greatest.
         high: f64,
     },
-    /// The two ends of a range to draw from, or one number, how far the range reaches to both sides of `around`.
+    /// The two ends of a range to sample from, or one number: the half-width of a range around `around`.
     Spread {
-        /// The value that changes nothing.
+        /// The value without effect.
         around: f64,
         /// The least.
         low: f64,
         /// The greatest.
         high: f64,
     },
-    /// A number, or how it changes with the steps of the episode ([`Schedule`]).
+    /// A number, or a schedule over the steps of the episode ([`Schedule`]).
     Schedule {
         /// The least.
         low: f64,
         /// The greatest.
         high: f64,
     },
-    /// A colour: red, green and blue, or one number for all three.
+    /// A colour: red, green and blue, or one value for all three.
     Color,
     /// Colours, one after another.
     Colors,
-    /// One of some words.
+    /// One of several words.
     Choice(&'static [&'static str]),
     /// A file or folder.
     Path,
 }
 
 impl Domain {
-    /// A value as it is written on the command line; whether it is allowed is for [`Domain::check`] to say.
+    /// Reads a value in the form of the command line, without checking it ([`Domain::contains`]).
     fn read(&self, text: &str) -> Value {
         if matches!(self, Self::Path | Self::Choice(_)) {
             return text.into();
@@ -88,7 +88,7 @@ impl Domain {
         }
     }
 
-    /// Whether a value is allowed.
+    /// Returns whether a value is allowed.
     fn contains(&self, value: &Value) -> bool {
         let within =
             |low: f64, high: f64| move |value: &Value| value.as_f64().is_some_and(|v| (low..=high).contains(&v));
@@ -119,47 +119,47 @@ impl Domain {
 impl fmt::Display for Domain {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Integer { low, high } => write!(f, "a whole number from {low} to {high}"),
+            Self::Integer { low, high } => write!(f, "an integer from {low} to {high}"),
             Self::Number { low, high } => write!(f, "a number from {low} to {high}"),
             Self::Range { low, high } => write!(f, "a number from {low} to {high}, or a range low/high of them"),
             Self::Spread { around, low, high } => {
                 let most = (high - around).max(around - low);
                 write!(
                     f,
-                    "a number from 0 to {most} (that far around {around}), or a range low/high from {low} to {high}"
+                    "a number from 0 to {most} (half-width around {around}), or a range low/high from {low} to {high}"
                 )
             }
             Self::Schedule { low, high } => write!(
                 f,
                 "a number from {low} to {high}, or linear/START/END/STEPS, cosine/START/END/STEPS, \
-                 exponential/START/DECAY/FLOOR or sinusoidal/LOW/HIGH/PERIOD of them, or one for every step, \
-                 FIRST/SECOND/…, the last one held"
+                 exponential/START/DECAY/FLOOR or sinusoidal/LOW/HIGH/PERIOD of them, or one value per step, \
+                 FIRST/SECOND/…, the last one repeated"
             ),
-            Self::Color => write!(f, "red/green/blue from 0 to 255, or one number for all three"),
-            Self::Colors => write!(f, "red/green/blue from 0 to 255, again for every further colour"),
+            Self::Color => write!(f, "red/green/blue from 0 to 255, or one value for all three"),
+            Self::Colors => write!(f, "red/green/blue from 0 to 255, repeated for further colours"),
             Self::Choice(words) => write!(f, "{}", words.join(" or ")),
             Self::Path => write!(f, "a path"),
         }
     }
 }
 
-/// A value in the form of the command line.
-fn written(value: &Value) -> String {
+/// Formats a value in the form of the command line.
+fn formatted(value: &Value) -> String {
     match value {
         Value::String(word) => word.clone(),
-        Value::Array(parts) => parts.iter().map(written).collect::<Vec<_>>().join("/"),
+        Value::Array(parts) => parts.iter().map(formatted).collect::<Vec<_>>().join("/"),
         other => other.to_string(),
     }
 }
 
 impl Parameter {
-    /// The default as JSON; null where the parameter must be given.
+    /// Returns the default as JSON; null if the parameter is required.
     pub fn default_value(&self) -> Value {
         self.default.map_or(Value::Null, |text| self.domain.read(text))
     }
 }
 
-/// The parameter of a name.
+/// Returns the parameter of a name.
 fn find(wrapper: &str, table: &'static [Parameter], name: &str) -> Result<&'static Parameter> {
     table.iter().find(|parameter| parameter.name == name).ok_or_else(|| {
         let names: Vec<&str> = table.iter().map(|parameter| parameter.name).collect();
@@ -171,12 +171,12 @@ fn find(wrapper: &str, table: &'static [Parameter], name: &str) -> Result<&'stat
     })
 }
 
-/// Reads `name=value,name=value` of one wrapper.
+/// Reads the settings `name=value,name=value` of a wrapper.
 pub(super) fn read(wrapper: &str, table: &'static [Parameter], text: &str) -> Result<Settings> {
     let mut settings = Settings::new();
     for part in text.split(',').filter(|part| !part.is_empty()) {
         let Some((name, value)) = part.split_once('=') else {
-            let problem = format!("'{part}' is no setting");
+            let problem = format!("'{part}' is not a setting");
             return Err(Error::config(format!("wrapper '{wrapper}'"), problem, "write it as NAME=VALUE"));
         };
         let value = find(wrapper, table, name)?.domain.read(value);
@@ -188,7 +188,7 @@ pub(super) fn read(wrapper: &str, table: &'static [Parameter], text: &str) -> Re
     Ok(settings)
 }
 
-/// All parameters of the table: those given, checked, and the defaults of the others.
+/// Returns all parameters of the table: the given values, checked, and the defaults of the others.
 pub(super) fn complete(wrapper: &str, table: &'static [Parameter], given: &Settings) -> Result<Settings> {
     for name in given.keys() {
         find(wrapper, table, name)?;
@@ -207,7 +207,7 @@ pub(super) fn complete(wrapper: &str, table: &'static [Parameter], given: &Setti
         if !parameter.domain.contains(&value) {
             return Err(Error::OutOfSpace {
                 what: format!("wrapper '{wrapper}': {}", parameter.name),
-                given: written(&value),
+                given: formatted(&value),
                 expected: parameter.domain.to_string(),
             });
         }
@@ -216,35 +216,34 @@ pub(super) fn complete(wrapper: &str, table: &'static [Parameter], given: &Setti
     Ok(settings)
 }
 
-/// A number that follows the steps of the episode, counted from its first picture.
+/// A value as a function of the step of the episode, which starts at 0.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(untagged)]
 pub enum Schedule {
-    /// Always the same.
+    /// The same value at every step.
     Constant(f64),
-    /// By a formula with three numbers.
+    /// A formula with three parameters.
     Formula(Formula, f64, f64, f64),
-    /// One number a step; the last is held.
+    /// One value per step; the last one is repeated.
     Steps(Vec<f64>),
 }
 
-/// How a [`Schedule`] changes.
+/// The formula of a [`Schedule`].
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Formula {
-    /// `start, end, steps`: straight from one to the other, then held.
+    /// `start, end, steps`: linear from start to end, then constant.
     Linear,
-    /// `start, end, steps`: half a cosine from one to the other, then held.
+    /// `start, end, steps`: half a cosine wave from start to end, then constant.
     Cosine,
-    /// `start, decay, floor`: times `decay` every step, never below `floor`.
+    /// `start, decay, floor`: multiplied by `decay` at every step, at least `floor`.
     Exponential,
-    /// `low, high, period`: a sine between the two, from their middle upwards, `period` steps long.
+    /// `low, high, period`: a sine wave between low and high, starting upwards from the mean, with a period in steps.
     Sinusoidal,
 }
 
 impl Schedule {
-    /// The number at a step.
-    #[allow(clippy::cast_precision_loss)]
+    /// Returns the value at a step.
     pub fn at(&self, step: u64) -> f64 {
         use std::f64::consts::{PI, TAU};
         let index = usize::try_from(step).unwrap_or(usize::MAX);
@@ -264,7 +263,7 @@ impl Schedule {
         }
     }
 
-    /// Whether no step can leave these bounds.
+    /// Returns whether all values lie within these bounds.
     fn stays_within(&self, low: f64, high: f64) -> bool {
         let allowed = |value: f64| (low..=high).contains(&value);
         match *self {
@@ -278,7 +277,7 @@ impl Schedule {
     }
 }
 
-/// A [`Domain::Range`] or [`Domain::Spread`] as given.
+/// The value of a [`Domain::Range`] or [`Domain::Spread`].
 #[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(untagged)]
 pub(super) enum Ends {
@@ -287,7 +286,7 @@ pub(super) enum Ends {
 }
 
 impl Ends {
-    /// The range; one number is both ends.
+    /// Returns the range; a single number is both its ends.
     pub fn range(self) -> [f64; 2] {
         match self {
             Self::One(value) => [value; 2],
@@ -295,7 +294,7 @@ impl Ends {
         }
     }
 
-    /// The range; one number reaches that far around `center`, but not below `low`.
+    /// Returns the range; a single number is its half-width around `center`, but the range does not go below `low`.
     pub fn around(self, center: f64, low: f64) -> [f64; 2] {
         match self {
             Self::One(value) => [(center - value).max(low), center + value],
@@ -304,7 +303,7 @@ impl Ends {
     }
 }
 
-/// A [`Domain::Color`] as given.
+/// The value of a [`Domain::Color`].
 #[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(untagged)]
 pub(super) enum Color {
@@ -331,7 +330,7 @@ mod tests {
             let schedule: Schedule = serde_json::from_str(json).expect("a schedule");
             steps.map(|step| (schedule.at(step) * 1e6).round() / 1e6)
         };
-        // The reference's functions of these names at these steps.
+        // Values of the functions of the reference with these names.
         assert_eq!(at("7", [0, 1, 50, 1000]), [7.0; 4]);
         assert_eq!(at(r#"["linear", 2, 12, 10]"#, [0, 5, 10, 99]), [2.0, 7.0, 12.0, 12.0]);
         assert_eq!(at(r#"["cosine", 2, 12, 10]"#, [0, 2, 5, 99]), [2.0, 2.954915, 7.0, 12.0]);

@@ -1,34 +1,34 @@
-//! [`Wrapped`]: an environment whose pictures pass through visual wrappers.
+//! [`Wrapped`]: an environment whose frames pass through visual wrappers, and [`Stack`], which makes them.
 
-use super::{View, VisualWrapper, parse};
+use super::{EpisodeFrame, VisualWrapper, parse};
 use std::collections::BTreeMap;
 use swm_core::{
     Action, Callable, DatasetStart, DatasetStartEnv, DispatchEnv, Env, EnvSpec, Error, FactorValues, FrameMut, Key,
     ResetOptions, Result, RowMut, RowRef, Schema, Snapshot, Transition, dataset_start,
 };
 
-/// What wrappers do to the picture of the goal.
+/// Whether wrappers change the goal frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum GoalPicture {
-    /// Nothing, as in the reference, whose wrappers change what is seen on the way and leave the goal as it was
-    /// recorded or drawn. The default: results compare with the reference's.
+pub enum GoalFrame {
+    /// The goal frame stays unchanged, as in the reference, whose wrappers change only the frames of steps. This is the
+    /// default, so that results are comparable with the reference's.
     #[default]
     Clean,
-    /// What they do to all others: start and goal then differ by where things are, not by how they look.
+    /// The goal frame is wrapped like all others, so that start and goal differ only by the state.
     Wrapped,
 }
 
-/// Wrappers in the order they are applied, to be put around any number of environments.
+/// Wrappers in the order in which they are applied, for any number of environments.
 #[derive(Default)]
 pub struct Stack(Vec<Box<dyn VisualWrapper>>);
 
 impl Stack {
-    /// These wrappers.
+    /// Makes a stack of wrappers.
     pub fn new(wrappers: Vec<Box<dyn VisualWrapper>>) -> Self {
         Self(wrappers)
     }
 
-    /// Reads `noise,std=8`, `blur` and so on. Files are read once, however many environments are wrapped.
+    /// Reads wrappers in the form of the command line, such as `noise,std=8`. Files are read once for all environments.
     ///
     /// # Errors
     /// When a wrapper or a parameter is unknown, a value is not allowed, or a file cannot be read.
@@ -36,13 +36,13 @@ impl Stack {
         texts.iter().map(|text| parse(text.as_ref())).collect::<Result<_>>().map(Self)
     }
 
-    /// Whether there is no wrapper.
+    /// Returns whether there is no wrapper.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
 
-    /// The environment with these wrappers around it; itself where there is none.
-    pub fn wrap(&self, env: Box<dyn Env>, goal: GoalPicture) -> Box<dyn Env> {
+    /// Wraps an environment; an empty stack returns it unchanged.
+    pub fn wrap(&self, env: Box<dyn Env>, goal: GoalFrame) -> Box<dyn Env> {
         if self.is_empty() {
             return env;
         }
@@ -50,42 +50,42 @@ impl Stack {
     }
 }
 
-/// An environment whose pictures pass through wrappers, first to last. Everything else is the environment's own.
+/// An environment whose frames pass through wrappers, first to last. Everything else is unchanged.
 ///
 /// Steps are counted from the last reset or [`Env::restore_from`]; randomness comes from the seed of the last reset.
 /// Both are part of the snapshot.
 pub struct Wrapped {
     env: Box<dyn Env>,
     wrappers: Vec<Box<dyn VisualWrapper>>,
-    goal: GoalPicture,
+    goal: GoalFrame,
     seed: u64,
     step: u64,
 }
 
 impl Wrapped {
-    /// Puts wrappers around an environment.
-    pub fn new(env: Box<dyn Env>, wrappers: Vec<Box<dyn VisualWrapper>>, goal: GoalPicture) -> Self {
+    /// Wraps an environment.
+    pub fn new(env: Box<dyn Env>, wrappers: Vec<Box<dyn VisualWrapper>>, goal: GoalFrame) -> Self {
         let mut wrapped = Self { env, wrappers, goal, seed: 0, step: 0 };
         wrapped.begin(0, 0);
         wrapped
     }
 
-    /// The wrappers are those of an episode after some steps. All they need for it is its key.
+    /// Resets the wrappers to an episode after some steps.
     fn begin(&mut self, seed: u64, step: u64) {
         (self.seed, self.step) = (seed, step);
         let episode = Key::new(seed).with("wrapper");
-        for (wrapper, place) in self.wrappers.iter_mut().zip(0..) {
-            wrapper.reset(episode.at(place));
+        for (wrapper, index) in self.wrappers.iter_mut().zip(0..) {
+            wrapper.reset(episode.at(index));
         }
     }
 
-    fn apply(&mut self, frame: &mut FrameMut<'_>, view: View) {
+    fn apply(&mut self, frame: &mut FrameMut<'_>, which: EpisodeFrame) {
         for wrapper in &mut self.wrappers {
-            wrapper.apply(frame, view);
+            wrapper.apply(frame, which);
         }
     }
 
-    /// What snapshots of this stack begin with.
+    /// Returns the prefix of snapshots of this stack.
     fn tag(&self) -> Vec<u8> {
         let ids: Vec<&str> = self.wrappers.iter().map(|wrapper| wrapper.id()).collect();
         format!("wrapped[{}]", ids.join(",")).into_bytes()
@@ -139,14 +139,14 @@ impl Env for Wrapped {
 
     fn render(&mut self, mut frame: FrameMut<'_>) -> Result<()> {
         self.env.render(FrameMut { rgb: &mut *frame.rgb, ..frame })?;
-        self.apply(&mut frame, View::Step(self.step));
+        self.apply(&mut frame, EpisodeFrame::Step(self.step));
         Ok(())
     }
 
     fn render_goal(&mut self, mut frame: FrameMut<'_>) -> Result<()> {
         self.env.render_goal(FrameMut { rgb: &mut *frame.rgb, ..frame })?;
-        if self.goal == GoalPicture::Wrapped {
-            self.apply(&mut frame, View::Goal);
+        if self.goal == GoalFrame::Wrapped {
+            self.apply(&mut frame, EpisodeFrame::Goal);
         }
         Ok(())
     }
@@ -174,7 +174,7 @@ impl Env for Wrapped {
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
         let tag = self.tag();
         let body = snapshot.0.strip_prefix(&tag[..]).and_then(|rest| rest.split_at_checked(16));
-        let Some((numbers, inner)) = body else {
+        let Some((counters, inner)) = body else {
             return Err(Error::mismatch(
                 "restoring a snapshot",
                 "one of an environment without wrappers, or with other ones",
@@ -182,7 +182,7 @@ impl Env for Wrapped {
             ));
         };
         self.env.restore(&Snapshot(inner.to_vec()))?;
-        let [seed, step] = [0, 1].map(|i| u64::from_le_bytes(numbers.as_chunks().0[i]));
+        let [seed, step] = [0, 1].map(|i| u64::from_le_bytes(counters.as_chunks().0[i]));
         self.begin(seed, step);
         Ok(())
     }

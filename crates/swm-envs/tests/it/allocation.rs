@@ -1,4 +1,4 @@
-//! Nothing is allocated in a step, an observation or a frame, once an environment is warm.
+//! Steps, observations and frames allocate no memory after the first ones.
 
 use swm_conformance::allocation::{self, Counting};
 use swm_envs::ENVS;

@@ -1,9 +1,9 @@
-//! What every environment must keep.
+//! The conformance suite over every native environment.
 
 use swm_conformance::Worlds;
 use swm_envs::ENVS;
 
-/// What `goal.scale` does.
+/// Why `goal.scale` changes nothing.
 const GOAL_SCALE: &str = "the reference samples it and draws the goal pose as large as the block";
 
 static WORLDS: Worlds = Worlds {

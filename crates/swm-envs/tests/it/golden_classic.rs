@@ -1,26 +1,26 @@
-//! The worlds of classic control against rollouts of the Python reference (Gymnasium's, wrapped).
+//! Classic control compared with rollouts of the Python reference, which wraps the environments of Gymnasium.
 
-use crate::golden::{self, Golden, picture_difference};
+use swm_conformance::golden::{self, Golden, image_difference};
 use swm_core::{Action, Batch, Env, FrameMut, ResetOptions, Schema, Space};
 
 fn frame(env: &mut dyn Env, (width, height): (usize, usize)) -> Vec<u8> {
     let mut rgb = vec![0; width * height * 3];
-    env.render(FrameMut::new(width, height, &mut rgb)).expect("a picture");
+    env.render(FrameMut::new(width, height, &mut rgb)).expect("a frame");
     rgb
 }
 
-/// Follows every rollout of a world; the reference draws it at `size`.
+/// Replays every rollout of an environment; `size` is the width and height at which the reference draws it.
 fn follow(id: &str, size: (usize, usize)) {
-    let files = golden::files(&format!("{}-", id.replace('/', "_")));
-    assert!(files.len() >= 2, "the files beside this test are always there");
+    let files = golden::files(env!("CARGO_MANIFEST_DIR"), &format!("{}-", id.replace('/', "_")));
+    assert!(files.len() >= 2, "the golden files beside this test are missing");
     for file in files {
         let mut golden = Golden::open(&file);
         let name = file.display();
-        let mut env = swm_envs::ENVS.get(id).expect("a registered world").env().expect("an environment");
+        let mut env = swm_envs::ENVS.get(id).expect("a registered environment").env().expect("an environment");
         let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);
         let states = golden.read::<f64>("info.state");
-        // Where it was recorded, the start in double precision.
-        let exact = golden.names().contains(&"start".to_owned());
+        // Some files contain the start state in double precision.
+        let exact = golden.has("start");
         let n = env.spec().columns[0].len();
         let options = ResetOptions {
             variation: golden.variation(),
@@ -28,25 +28,25 @@ fn follow(id: &str, size: (usize, usize)) {
             ..ResetOptions::default()
         };
         env.reset(0, &options).expect("recorded values are possible");
-        let first = picture_difference(&frame(&mut *env, size), &golden.read("frame_first"));
+        let first = image_difference(&frame(&mut *env, size), &golden.read("frame_first"));
 
         let (rewards, terminations) = (golden.read::<f64>("reward"), golden.read::<bool>("terminated"));
         let discrete = matches!(env.spec().action_space, Space::Discrete { .. });
         let choices = if discrete { golden.read::<i64>("action") } else { vec![] };
-        let numbers = if discrete { vec![] } else { golden.read::<f32>("action") };
+        let values = if discrete { vec![] } else { golden.read::<f32>("action") };
         for t in 0..rewards.len() {
-            let action = if discrete { Action::Discrete(&choices[t..=t]) } else { Action::Continuous(&numbers[t..=t]) };
+            let action = if discrete { Action::Discrete(&choices[t..=t]) } else { Action::Continuous(&values[t..=t]) };
             let transition = env.step(action).expect("a step");
             env.observe(&mut row.row_mut(0));
             let state = row.row(0).to_f64("state").expect("a column");
-            let wanted = &states[n * (t + 1)..][..n];
-            let apart = state.iter().zip(wanted).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
-            assert!(apart <= 1e-5, "{name}, state {t}: {state:?}, not {wanted:?}");
+            let expected = &states[n * (t + 1)..][..n];
+            let apart = state.iter().zip(expected).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            assert!(apart <= 1e-5, "{name}, state {t}: {state:?}, expected {expected:?}");
             let apart = (transition.reward - rewards[t]).abs();
-            assert!(apart <= 1e-5, "{name}, reward {t}: {}, not {}", transition.reward, rewards[t]);
+            assert!(apart <= 1e-5, "{name}, reward {t}: {}, expected {}", transition.reward, rewards[t]);
             assert_eq!(transition.terminated, terminations[t], "{name}, terminated {t}");
         }
-        let last = picture_difference(&frame(&mut *env, size), &golden.read("frame_last"));
+        let last = image_difference(&frame(&mut *env, size), &golden.read("frame_last"));
         assert!(first <= 0.2 && last <= 0.2, "{name}: frames differ by {first} and {last}");
     }
 }

@@ -1,10 +1,10 @@
-//! Push-T against rollouts that the Python reference recorded (pymunk 7.3).
+//! Push-T compared with rollouts that the Python reference recorded (pymunk 7.3).
 
-use crate::golden::{self, Golden, picture_difference};
+use swm_conformance::golden::{self, Golden, image_difference};
 use swm_core::{Action, Batch, Env, EnvEntry, FrameMut, ResetOptions, Schema, VariationRequest};
 use swm_envs::push_t;
 
-/// An environment and the row it is observed in.
+/// An environment with a row for its observations.
 struct Probe {
     env: Box<dyn Env>,
     row: Batch,
@@ -25,21 +25,21 @@ impl Probe {
 
     fn frame(&mut self) -> Vec<u8> {
         let mut rgb = vec![0; 224 * 224 * 3];
-        self.env.render(FrameMut::new(224, 224, &mut rgb)).expect("a picture");
+        self.env.render(FrameMut::new(224, 224, &mut rgb)).expect("a frame");
         rgb
     }
 }
 
-/// The largest difference of two rows.
-fn apart(a: &[f64], b: &[f64]) -> f64 {
+/// Returns the largest absolute difference of two rows.
+fn max_difference(a: &[f64], b: &[f64]) -> f64 {
     assert_eq!(a.len(), b.len());
     a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max)
 }
 
 #[test]
 fn contacts_follow_the_reference() {
-    let files = golden::files("pusht-contact");
-    assert!(!files.is_empty(), "the file beside this test is always there");
+    let files = golden::files(env!("CARGO_MANIFEST_DIR"), "pusht-contact");
+    assert!(!files.is_empty(), "the golden file beside this test is missing");
     for file in files {
         let mut golden = Golden::open(&file);
         for pair in golden.names().iter().filter_map(|name| name.strip_suffix(".state")) {
@@ -59,17 +59,17 @@ fn contacts_follow_the_reference() {
             };
             let mut probe = Probe::new(&push_t::ENTRY, &options);
 
-            let mut errors = vec![apart(&states[..4], &probe.observe("state")[..4])];
+            let mut errors = vec![max_difference(&states[..4], &probe.observe("state")[..4])];
             assert!(errors[0] < 1e-6, "{what}: off by {} at the reset", errors[0]);
             let mut touched = false;
             for (t, action) in actions.chunks_exact(2).enumerate() {
                 let transition = probe.env.step(Action::Continuous(action)).expect("a step");
-                let (wanted, state) = (&states[7 * (t + 1)..][..7], probe.observe("state"));
-                let error = apart(&wanted[..4], &state[..4]);
+                let (expected, state) = (&states[7 * (t + 1)..][..7], probe.observe("state"));
+                let error = max_difference(&expected[..4], &state[..4]);
                 errors.push(error);
                 touched |= contacts[t] > 0;
                 assert!(touched || error < 1e-6, "{what}: off by {error} at {t}, before any contact");
-                if apart(wanted, &state) < 1e-6 {
+                if max_difference(expected, &state) < 1e-6 {
                     assert!((transition.reward - rewards[t]).abs() < 1e-6, "{what}: reward {t}");
                     assert_eq!(transition.terminated, terminations[t], "{what}: terminated {t}");
                     assert_eq!(transition.terminated, probe.env.is_success(), "{what}: success {t}");
@@ -85,9 +85,9 @@ fn contacts_follow_the_reference() {
 }
 
 #[test]
-fn rollouts_and_pictures_follow_the_reference() {
-    let files = golden::files("swm_PushT-v1-");
-    assert!(files.len() >= 2, "the files beside this test are always there");
+fn rollouts_and_frames_follow_the_reference() {
+    let files = golden::files(env!("CARGO_MANIFEST_DIR"), "swm_PushT-v1-");
+    assert!(files.len() >= 2, "the golden files beside this test are missing");
     for file in files {
         let mut golden = Golden::open(&file);
         let name = file.display();
@@ -102,21 +102,21 @@ fn rollouts_and_pictures_follow_the_reference() {
             "info.goal_proprio",
             "info.n_contacts",
         ];
-        let wanted = columns.map(|column| golden.read::<f64>(column));
+        let expected = columns.map(|column| golden.read::<f64>(column));
         let goals = golden.read::<f64>("info.goal_state");
         let variation = golden.variation();
         let options = ResetOptions { variation, state: None, goal_state: Some(goals[..7].to_vec()) };
         let mut probe = Probe::new(&push_t::ENTRY, &options);
         let follows = |probe: &mut Probe, t: usize| {
-            for (column, rows) in columns.iter().zip(&wanted) {
+            for (column, rows) in columns.iter().zip(&expected) {
                 let got = probe.observe(&column[column.find('.').map_or(0, |dot| dot + 1)..]);
                 let n = got.len();
-                let error = apart(&got, &rows[n * t..][..n]);
+                let error = max_difference(&got, &rows[n * t..][..n]);
                 assert!(error < 1e-6, "{name}: {column} {t} is off by {error}");
             }
         };
         follows(&mut probe, 0);
-        let first = picture_difference(&probe.frame(), &golden.read("frame_first"));
+        let first = image_difference(&probe.frame(), &golden.read("frame_first"));
         let (rewards, terminations) = (golden.read::<f64>("reward"), golden.read::<bool>("terminated"));
         for (t, action) in golden.read::<f32>("action").chunks_exact(2).enumerate() {
             let transition = probe.env.step(Action::Continuous(action)).expect("a step");
@@ -124,35 +124,35 @@ fn rollouts_and_pictures_follow_the_reference() {
             assert!((transition.reward - rewards[t]).abs() < 1e-6, "{name}: reward {t}");
             assert_eq!(transition.terminated, terminations[t], "{name}: terminated {t}");
         }
-        let last = picture_difference(&probe.frame(), &golden.read("frame_last"));
-        assert!(first < 0.1 && last < 0.1, "{name}: pictures differ by {first} and {last} of 255");
+        let last = image_difference(&probe.frame(), &golden.read("frame_last"));
+        assert!(first < 0.1 && last < 0.1, "{name}: frames differ by {first} and {last} of 255");
     }
 }
 
 #[test]
 fn discrete_actions_follow_the_reference() {
-    let files = golden::files("swm_PushT-Discrete-v1-");
-    assert!(files.len() >= 4, "the files beside this test are always there");
+    let files = golden::files(env!("CARGO_MANIFEST_DIR"), "swm_PushT-Discrete-v1-");
+    assert!(files.len() >= 4, "the golden files beside this test are missing");
     for file in files {
         let mut golden = Golden::open(&file);
         let name = file.display();
         let goal_state = Some(golden.read::<f64>("goal_state"));
         let options = ResetOptions { variation: golden.variation(), state: None, goal_state };
         let mut probe = Probe::new(&push_t::discrete::ENTRY, &options);
-        let first = picture_difference(&probe.frame(), &golden.read("frame_first"));
+        let first = image_difference(&probe.frame(), &golden.read("frame_first"));
         let (states, contacts) = (golden.read::<f64>("info.state"), golden.read::<i64>("info.n_contacts"));
         let (rewards, terminations) = (golden.read::<f64>("reward"), golden.read::<bool>("terminated"));
-        let mut errors = vec![apart(&states[..7], &probe.observe("state"))];
+        let mut errors = vec![max_difference(&states[..7], &probe.observe("state"))];
         for (t, action) in golden.read::<i64>("action").chunks_exact(2).enumerate() {
             let transition = probe.env.step(Action::Discrete(action)).expect("a step");
-            errors.push(apart(&states[7 * (t + 1)..][..7], &probe.observe("state")));
+            errors.push(max_difference(&states[7 * (t + 1)..][..7], &probe.observe("state")));
             assert!((transition.reward - rewards[t]).abs() < 1e-6, "{name}: reward {t}");
             assert_eq!(transition.terminated, terminations[t], "{name}: terminated {t}");
             assert_eq!(probe.observe("n_contacts"), [contacts[t + 1] as f64], "{name}: contacts {t}");
         }
-        let last = picture_difference(&probe.frame(), &golden.read("frame_last"));
+        let last = image_difference(&probe.frame(), &golden.read("frame_last"));
         let worst = errors.iter().copied().fold(0.0, f64::max);
         assert!(worst < 1e-6, "{name}: the state is off by {worst}");
-        assert!(first < 0.1 && last < 0.1, "{name}: pictures differ by {first} and {last} of 255");
+        assert!(first < 0.1 && last < 0.1, "{name}: frames differ by {first} and {last} of 255");
     }
 }

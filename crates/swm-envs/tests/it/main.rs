@@ -1,11 +1,8 @@
-//! Integration tests: golden rollouts of the Python reference, and what every environment must keep.
+//! Integration tests: golden rollouts of the Python reference, the conformance suite, and the visual wrappers.
 
 mod allocation;
 mod conformance;
-mod golden;
 mod golden_classic;
-mod golden_piecewise;
-mod golden_point_maze;
+mod golden_point_agents;
 mod golden_push_t;
-mod golden_two_room;
 mod wrappers;

@@ -4,7 +4,7 @@ use super::{emit, emit_json, table};
 use clap::Args;
 use serde_json::{Map, Value};
 use swm_core::Result;
-use swm_envs::wrappers::{GoalPicture, Stack, WRAPPERS, read};
+use swm_envs::wrappers::{GoalFrame, Stack, WRAPPERS, read};
 use swm_eval::Choice;
 
 /// Which wrappers the pictures of a world pass through.
@@ -36,8 +36,8 @@ impl WrapperArgs {
     ///
     /// # Errors
     /// As [`WrapperArgs::choices`].
-    pub fn stack(&self) -> Result<(Stack, GoalPicture)> {
-        let goal = if self.wrap_goal { GoalPicture::Wrapped } else { GoalPicture::Clean };
+    pub fn stack(&self) -> Result<(Stack, GoalFrame)> {
+        let goal = if self.wrap_goal { GoalFrame::Wrapped } else { GoalFrame::Clean };
         Ok((Stack::parse(&self.wrappers)?, goal))
     }
 }

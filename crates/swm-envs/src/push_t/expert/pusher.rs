@@ -10,6 +10,7 @@ use super::push_model::{Candidates, Observation, Push, PushModel};
 use crate::push_t::TABLE;
 use crate::push_t::physics::Vec2;
 use crate::push_t::state::{State, checked};
+use swm_core::columns::{GOAL_STATE, STATE};
 use swm_core::policy::Expert;
 use swm_core::{Key, Result, Rng, RowRef};
 
@@ -96,8 +97,8 @@ impl Expert for Pusher {
     }
 
     fn act(&mut self, row: RowRef<'_>, action: &mut [f64]) -> Result<()> {
-        let state = checked(row.get::<f64>("state")?, "state")?;
-        let goal = checked(row.get::<f64>("goal_state")?, "goal_state")?;
+        let state = checked(row.get::<f64>(STATE)?, STATE)?;
+        let goal = checked(row.get::<f64>(GOAL_STATE)?, GOAL_STATE)?;
         let shapes: [f64; 4] = row.get::<f64>("shapes")?.try_into().unwrap_or_default();
         let now = Observation { state, agent_angle: row.get::<f64>("agent_pose")?[2] };
         let known = self.model.take().filter(|model| model.shapes == shapes);

@@ -1,7 +1,6 @@
-//! Nothing is allocated in a step, an observation or a frame, once a world is warm.
+//! Checks that steps, observations and frames allocate no memory after a warm-up.
 //!
-//! Allocations are counted on the thread that asks for it, so tests that run beside do not matter. The program of the tests
-//! must use the allocator that counts:
+//! Allocations are counted per thread, so concurrent tests do not interfere. The test program must use the counting allocator:
 //!
 //! ```ignore
 //! #[global_allocator]
@@ -12,68 +11,73 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 use swm_core::{Action, Batch, EnvEntry, FrameMut, Key, ResetOptions, Schema, Space, VariationRequest};
 
-/// Steps before counting begins, and steps that are counted.
+/// Steps before counting starts, and steps counted.
 const WARM_UP: usize = 30;
 
-/// The system's allocator, counting.
+/// The system's allocator with a count per thread.
 pub struct Counting;
 
 thread_local! {
-    /// What this thread has allocated, while it counts.
+    /// Allocations of this thread, while it counts them.
     static ALLOCATIONS: Cell<Option<usize>> = const { Cell::new(None) };
 }
 
-/// `const` and without a destructor, the counter can be read in every state of a thread, and reading it allocates nothing.
+/// Counts an allocation. The counter is `const` and has no destructor, so it can be read in every state of a thread and
+/// reading it allocates nothing.
 fn count() {
     ALLOCATIONS.with(|count| count.set(count.get().map(|n| n + 1)));
 }
 
-// Sound: every call goes to the system's allocator as it came; counting touches neither memory nor arguments.
-#[allow(unsafe_code)]
+// SAFETY: every call goes to the system's allocator unchanged; counting touches neither memory nor arguments.
+#[allow(unsafe_code, reason = "a global allocator is an unsafe trait")]
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         count();
+        // SAFETY: the caller keeps the contract of `GlobalAlloc`.
         unsafe { System.alloc(layout) }
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
         count();
+        // SAFETY: as above.
         unsafe { System.alloc_zeroed(layout) }
     }
 
     unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
         count();
+        // SAFETY: as above.
         unsafe { System.realloc(pointer, layout, size) }
     }
 
     unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        // SAFETY: as above.
         unsafe { System.dealloc(pointer, layout) }
     }
 }
 
-/// How many times `work` allocates.
+/// The number of allocations of `work` on this thread.
 pub fn allocations(work: impl FnOnce()) -> usize {
     ALLOCATIONS.set(Some(0));
     work();
     ALLOCATIONS.take().unwrap_or_default()
 }
 
-/// Whether the program's allocator is the one that counts: without it, nothing would be found.
+/// Checks that the program uses [`Counting`] as its allocator.
 ///
 /// # Panics
-/// When it is another one.
-pub fn the_counter_counts() {
-    assert_eq!(allocations(|| drop(std::hint::black_box(vec![1u8; 100]))), 1, "the program's allocator is another one");
+/// When it uses another one.
+pub fn counting_allocator_is_active() {
+    assert_eq!(allocations(|| drop(std::hint::black_box(vec![1u8; 100]))), 1, "the program uses another allocator");
     assert_eq!(allocations(|| _ = std::hint::black_box([1u8; 100])), 0);
 }
 
-/// Steps every world, with the usual factors and with all varied, and draws it and its goal in squares of these sides.
+/// Steps every environment, with default factors and with all varied, and renders it and its goal at these frame sizes
+/// (pixels per side).
 ///
 /// # Panics
-/// When a step, an observation or a frame allocates memory, or is refused.
-#[allow(clippy::cast_possible_truncation)]
+/// When a step, an observation or a frame allocates memory or fails.
 pub fn steps_and_frames_allocate_nothing(rows: &[EnvEntry], sides: &[usize]) {
-    let mut guilty = vec![];
+    let mut allocating = vec![];
     for entry in rows {
         for (seed, variation) in
             [None, Some(vec!["all".to_owned()]), Some(vec!["all".to_owned()])].into_iter().enumerate()
@@ -86,18 +90,18 @@ pub fn steps_and_frames_allocate_nothing(rows: &[EnvEntry], sides: &[usize]) {
             let mut worst = 0;
             for t in 0..2 * WARM_UP {
                 let action = env.spec().action_space.sample(&mut Key::new(seed as u64).at(t as u64).rng());
-                let numbers: Vec<f32> = action.iter().map(|&v| v as f32).collect();
+                let values: Vec<f32> = action.iter().map(|&v| v as f32).collect();
                 let choice: Vec<i64> = action.iter().map(|&v| v as i64).collect();
                 let action = match env.spec().action_space {
-                    Space::Box { .. } => Action::Continuous(&numbers),
+                    Space::Box { .. } => Action::Continuous(&values),
                     _ => Action::Discrete(&choice),
                 };
                 let count = allocations(|| {
                     env.step(action).expect("an action of the action space");
                     env.observe(&mut row.row_mut(0));
                     for (side, rgb) in &mut frames {
-                        env.render(FrameMut::new(*side, *side, rgb)).expect("a picture");
-                        env.render_goal(FrameMut::new(*side, *side, rgb)).expect("a picture");
+                        env.render(FrameMut::new(*side, *side, rgb)).expect("a frame");
+                        env.render_goal(FrameMut::new(*side, *side, rgb)).expect("a frame");
                     }
                     std::hint::black_box((env.is_success(), env.goal_distance()));
                 });
@@ -106,9 +110,9 @@ pub fn steps_and_frames_allocate_nothing(rows: &[EnvEntry], sides: &[usize]) {
                 }
             }
             if worst > 0 {
-                guilty.push(format!("{}, seed {seed}: {worst} times in a step", entry.id));
+                allocating.push(format!("{}, seed {seed}: {worst} times in a step", entry.id));
             }
         }
     }
-    assert!(guilty.is_empty(), "memory is allocated: {guilty:#?}");
+    assert!(allocating.is_empty(), "steps allocate memory: {allocating:#?}");
 }

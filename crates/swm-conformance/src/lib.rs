@@ -1,10 +1,11 @@
-//! What every environment must keep, checked on every row of a registry: a new one is tested by being listed.
+//! Conformance tests of environments: every check runs on every entry of a registry, so a new environment is tested as soon
+//! as it is listed.
 //!
 //! ```ignore
-//! static WORLDS: Worlds = Worlds::of(my_crate::ENVS.rows);
-//! swm_conformance::tests!(WORLDS);
+//! static SUITE: Suite = Suite::of(my_crate::ENVS.rows);
+//! swm_conformance::tests!(SUITE);
 //! ```
-//! makes a test of each of the [`checks`]. They panic, as tests do.
+//! makes one test of each of the [`checks`].
 
 pub mod allocation;
 pub mod checks;
@@ -12,82 +13,82 @@ pub mod golden;
 
 use swm_core::EnvEntry;
 
-/// Environments to check, and how thoroughly: worlds that draw slowly are looked at less often.
-pub struct Worlds {
+/// Environments to check, and how thoroughly. Suites of environments that render slowly use smaller numbers.
+pub struct Suite {
     /// The environments.
     pub rows: &'static [EnvEntry],
-    /// Whether each must have an expert.
-    pub demonstrated: bool,
-    /// Height and width of the pictures compared: not square, so that mixed-up axes show.
-    pub size: (usize, usize),
-    /// Sizes at which pictures are written completely.
-    pub sizes: &'static [(usize, usize)],
-    /// Steps over which episodes are compared, picture by picture.
+    /// Whether each environment must have an expert.
+    pub require_experts: bool,
+    /// Height and width of compared frames, in pixels; not square, to reveal swapped axes.
+    pub frame_size: (usize, usize),
+    /// Frame sizes at which every pixel must be written.
+    pub frame_sizes: &'static [(usize, usize)],
+    /// Steps over which episodes are compared, frame by frame.
     pub steps: u64,
-    /// Goals sampled for each.
+    /// Goals sampled per environment.
     pub goals: u64,
-    /// Rows restored for each.
-    pub rows_restored: u64,
-    /// Values tried for each factor, beside each of these many other choices of all others.
+    /// Dataset rows restored per environment.
+    pub restored_rows: u64,
+    /// Values tried per factor, with the other factors at their defaults and in each of the contexts.
     pub values: usize,
-    /// See [`Worlds::values`].
+    /// Random samples of the other factors in which a factor is tried.
     pub contexts: u64,
-    /// Requests for each factor and group.
+    /// Requests per factor and group.
     pub requests: usize,
-    /// Resets with everything varied.
+    /// Resets with all factors varied.
     pub resets: u64,
-    /// Factors that change nothing: environment, factor, why.
-    pub idle: &'static [(&'static str, &'static str, &'static str)],
+    /// Factors without effect: environment, factor, reason.
+    pub inert_factors: &'static [(&'static str, &'static str, &'static str)],
 }
 
-impl Worlds {
-    /// Environments that are fast, each with an expert.
+impl Suite {
+    /// A thorough suite, for environments that are fast and have experts.
     pub const fn of(rows: &'static [EnvEntry]) -> Self {
         Self {
             rows,
-            demonstrated: true,
-            size: (72, 96),
-            sizes: &[(1, 1), (7, 13), (64, 64), (96, 33), (224, 224), (256, 300)],
+            require_experts: true,
+            frame_size: (72, 96),
+            frame_sizes: &[(1, 1), (7, 13), (64, 64), (96, 33), (224, 224), (256, 300)],
             steps: 8,
             goals: 40,
-            rows_restored: 10,
+            restored_rows: 10,
             values: 12,
             contexts: 8,
             requests: 5,
             resets: 10_000,
-            idle: &[],
+            inert_factors: &[],
         }
     }
 }
 
-/// A test of each of the [`checks`].
+/// Makes a test of each of the [`checks`], or of those named.
 #[macro_export]
 macro_rules! tests {
-    ($worlds:expr) => {
+    ($suite:expr) => {
         $crate::tests!(
-            $worlds,
-            rows_declare_what_they_are,
-            results_do_not_depend_on_threads_or_neighbours,
-            environments_share_nothing_and_forget_the_past,
-            rows_and_pictures_are_written_completely,
-            wrong_actions_are_errors_and_change_nothing,
-            what_follows_a_restore_followed_the_snapshot,
-            sampled_goals_are_new_and_count_when_reached,
-            dataset_rows_bring_back_their_world,
-            factors_change_what_they_name,
-            random_variations_never_fail,
-            many_resets_of_everything_never_fail,
-            groups_single_factors_and_pinned_values_go_together,
-            goal_distances_fall_to_the_goal,
-            impossible_resets_are_errors,
-            experts_stay_in_the_action_space_and_follow_their_key
+            $suite,
+            entries_are_complete,
+            results_are_independent_of_threads_and_slots,
+            environments_are_independent,
+            observations_and_frames_are_fully_written,
+            invalid_actions_are_errors_without_effect,
+            restores_snapshot_bit_for_bit,
+            sampled_goals_are_new_and_reachable,
+            dataset_rows_restore_state_and_factors,
+            every_factor_has_an_effect,
+            any_requested_factors_can_be_sampled,
+            resets_with_all_factors_varied_succeed,
+            groups_factors_and_pinned_values_combine,
+            goal_distance_decreases_to_the_goal,
+            invalid_resets_are_errors,
+            experts_are_valid_and_deterministic
         );
     };
-    ($worlds:expr, $($check:ident),+) => {
+    ($suite:expr, $($check:ident),+) => {
         $(
             #[test]
             fn $check() {
-                $crate::checks::$check(&$worlds);
+                $crate::checks::$check(&$suite);
             }
         )+
     };

@@ -1,19 +1,19 @@
 """One Gymnasium environment behind one flat buffer.
 
-A `Bridge` finds out what its environment is (`describe`: spaces, columns, pictures, factors of variation), and then
-writes whatever a reset, a step or a render brings into a single buffer, each thing at its own 64-byte aligned offset.
-It returns nothing: whoever holds the buffer reads it. The same class serves a worker process (`worker.py`, over shared
-memory) and an interpreter that lives in the caller's process.
+A `Bridge` describes its environment (`describe`: spaces, columns, frames, factors of variation) and writes the outputs
+of a reset, a step or a render into a single buffer, each at its own 64-byte aligned offset. The owner of the buffer
+reads them from there. The same class serves a worker process (`worker.py`, over shared memory) and the interpreter of
+the Python package.
 
 Columns come from two places:
 
-* the observation: a `Box` is `observation`, a `Dict` is a column a key, a `Tuple` `observation_0`, `observation_1` …;
-  nested ones join their keys with `_`;
-* the numeric entries of `info` that a reset and a step showed: bool, int and float scalars, and arrays of fixed shape.
-  An entry that is missing from a later `info` keeps its last value in the episode, and is 0 until it was there once, so
+* the observation: a `Box` is `observation`, a `Dict` one column per key, a `Tuple` `observation_0`, `observation_1` …;
+  nested spaces join their keys with `_`;
+* the numeric entries of `info` of a first reset and step: bool, int and float scalars, and arrays of fixed shape.
+  An entry that is missing from a later `info` keeps its last value in the episode, and is 0 until it first occurs, so
   a column never holds a NaN that the environment did not write.
 
-A name that the platform uses itself gets the prefix `obs_` or `info_`; entries that begin with `_` are private.
+A name that the engine reserves gets the prefix `obs_` or `info_`; entries that begin with `_` are private.
 """
 
 import ast
@@ -29,26 +29,26 @@ import numpy as np
 from gymnasium import spaces
 
 ALIGN = 64
-# The head of the buffer: reward, distance to the goal; terminated, truncated, success.
+# The header of the buffer: reward, goal distance; terminated, truncated, success.
 HEAD = struct.Struct('<dd???')
-# Columns that the platform adds itself.
-TAKEN = frozenset(
+# Columns that the engine adds itself.
+RESERVED = frozenset(
     'action reward terminated truncated success step_idx episode_idx episode_seed ep_len ep_offset pixels goal'.split()
 )
-# `info` entries that have another way to the platform.
-ELSEWHERE = frozenset(['success', 'is_success'])
-# Steps of an episode of an environment that names no limit.
-STEPS = 1000
+# `info` entries that go into the header.
+IN_HEADER = frozenset(['success', 'is_success'])
+# The time limit of an environment without one.
+DEFAULT_STEPS = 1000
 
-RESET, STEP, DRAWN_STEP, RENDER = b'rsdp'
+RESET, STEP, STEP_AND_RENDER, RENDER = b'rsdp'
 
 
 class Unsupported(Exception):
-    """The environment has something that no column or action of the platform can hold."""
+    """The environment has a space that columns or actions cannot represent."""
 
 
-class Wrong(ValueError):
-    """Something was asked for that the environment does not have: what is wrong, and what to do."""
+class InvalidRequest(ValueError):
+    """A request for something that the environment does not have: the problem, and how to fix it."""
 
     def __str__(self):
         return '; '.join(self.args)
@@ -58,15 +58,15 @@ class Wrong(ValueError):
 
 
 def bounds(values):
-    """Bounds as JSON: one number where all are the same, None for an infinite one."""
+    """Bounds as JSON: one value if all are equal, None for an infinite one."""
     flat = np.asarray(values).reshape(-1)
     if flat.size and (flat == flat[0]).all():
         flat = flat[:1]
     return [float(v) if math.isfinite(v) else None for v in flat]
 
 
-def held(dtype):
-    """The type a column holds numbers of this type in."""
+def column_dtype(dtype):
+    """The dtype of a column for values of this dtype."""
     dtype = np.dtype(dtype)
     if dtype.kind == 'b':
         return np.dtype(bool)
@@ -77,11 +77,11 @@ def held(dtype):
         return np.dtype(np.int32 if small else np.int64)
     if dtype.kind == 'f':
         return np.dtype(np.float32 if dtype.itemsize <= 4 else np.float64)
-    raise Unsupported(f'numbers of type {dtype}')
+    raise Unsupported(f'values of type {dtype}')
 
 
 def box(low, high, shape, dtype):
-    return {'type': 'Box', 'shape': list(shape), 'dtype': held(dtype).name, 'low': bounds(low), 'high': bounds(high)}
+    return {'type': 'Box', 'shape': list(shape), 'dtype': column_dtype(dtype).name, 'low': bounds(low), 'high': bounds(high)}
 
 
 def multi(nvec, start):
@@ -90,10 +90,10 @@ def multi(nvec, start):
 
 
 def leaves(space, name, path=()):
-    """The spaces inside a space that is made of others: (name, path, space), in their order."""
+    """The leaf spaces of a nested space, in order: (name, path, space)."""
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         inside = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
-        # The keys of an observation are names enough; below them, and in a tuple, names are joined.
+        # A key of the outermost Dict is the name itself; deeper names, and those of a tuple, are joined.
         above = '' if isinstance(space, spaces.Dict) and not path else f'{name}_'
         for key, part in inside:
             yield from leaves(part, f'{above}{key}', (*path, key))
@@ -104,7 +104,7 @@ def leaves(space, name, path=()):
 def described(space):
     """An observation's space as JSON, with the type and shape of its column."""
     if isinstance(space, spaces.Box):
-        return box(space.low, space.high, space.shape, space.dtype), held(space.dtype), space.shape
+        return box(space.low, space.high, space.shape, space.dtype), column_dtype(space.dtype), space.shape
     if isinstance(space, spaces.Discrete):
         return {'type': 'Discrete', 'n': int(space.n), 'start': int(space.start)}, np.dtype(np.int64), ()
     if isinstance(space, spaces.MultiDiscrete):
@@ -116,7 +116,7 @@ def described(space):
 
 
 class Actions:
-    """How the numbers of an action become what the environment takes."""
+    """Converts actions from the buffer to the environment's action space."""
 
     def __init__(self, space):
         self.space = space
@@ -126,7 +126,7 @@ class Actions:
             with np.errstate(over='ignore'):
                 sides = ('low', 'high')
                 low, high = np.float32([np.concatenate([getattr(p, s).reshape(-1) for p in parts]) for s in sides])
-            # Random actions need bounds: a side without one counts as 1. Actions are passed on as they come.
+            # Random actions need bounds, so infinite ones become 1. Actions themselves are not clipped.
             low = np.where(np.isfinite(low), low, -1)
             high = np.where(np.isfinite(high), high, 1)
             shape = parts[0].shape if len(parts) == 1 else low.shape
@@ -140,11 +140,11 @@ class Actions:
                 self.json = multi(np.concatenate(nvec), np.concatenate(start))
         self.len = sum(math.prod(part.shape or (1,)) for part in parts)
         if not self.len:
-            raise Unsupported(f'actions of {space}: there is nothing to choose')
+            raise Unsupported(f'actions of {space}: the space is empty')
 
     @staticmethod
     def choices(part):
-        """How many values each integer of a space has, and the first of each."""
+        """The number of values of each integer of a space, and the first value of each."""
         if isinstance(part, spaces.Discrete):
             return np.array([part.n]), np.array([part.start])
         if isinstance(part, spaces.MultiDiscrete):
@@ -155,10 +155,10 @@ class Actions:
         if isinstance(part, spaces.Box) and part.dtype.kind in 'iub':
             low, high = (np.asarray(v, np.int64).reshape(-1) for v in (part.low, part.high))
             return high - low + 1, low
-        raise Unsupported(f'actions of {part} (beside discrete ones, if there are several): wrap the environment')
+        raise Unsupported(f'actions of {part} (mixed with discrete ones, if there are several): wrap the environment')
 
-    def read(self, numbers):
-        """The environment's own form of an action; never a view of the buffer."""
+    def read(self, values):
+        """The action in the environment's action space; a copy, not a view of the buffer."""
         at = 0
 
         def take(space):
@@ -169,10 +169,10 @@ class Actions:
                 return tuple(take(part) for part in space.spaces)
             begin, at = at, at + math.prod(space.shape or (1,))
             if isinstance(space, spaces.Discrete):
-                return int(numbers[begin])
-            value = numbers[begin:at].astype(space.dtype).reshape(space.shape)
+                return int(values[begin])
+            value = values[begin:at].astype(space.dtype).reshape(space.shape)
             if isinstance(space, spaces.Box) and space.dtype == np.float64:
-                # A bound that single precision moved outside is the bound.
+                # Rounding to single precision may move a bound outside the space.
                 for side in (space.low, space.high):
                     value = np.where(side.astype(np.float32) == value, side, value)
             return value
@@ -184,7 +184,7 @@ class Actions:
 
 
 def factor(key, space):
-    """A leaf of a `variation_space` as JSON; the reference's protocol, by what the leaf has."""
+    """A leaf of a `variation_space` as JSON, recognised by its attributes as in the reference implementation."""
     value = getattr(space, 'init_value', None)
     if value is None:
         value = getattr(space, 'value', None)
@@ -205,7 +205,7 @@ def factor(key, space):
 
 
 def variation_space(env):
-    """The factors of an environment: its own, or those of the outermost wrapper that has some."""
+    """The `variation_space` of the outermost wrapper that has one, or of the environment."""
     while env is not None:
         space = getattr(env, 'variation_space', None)
         if space is not None:
@@ -233,12 +233,12 @@ def factors(space, prefix=''):
 # ---- states ----
 
 
-# Methods that put an environment into a recorded state, by the names that say so, and the column each takes.
+# Names of methods that set a state, and the column each takes.
 SETTERS = [(('set_state', '_set_state'), 'state'), (('set_goal_state', '_set_goal_state'), 'goal_state')]
 
 
 def callables(env):
-    """How an environment takes a state: `swm_callables` if it says so itself, else its methods of one argument with a
+    """The methods that set a state: `swm_callables` if the environment defines it, else its methods of one argument with a
     name of `SETTERS`."""
     own = getattr(env.unwrapped, 'swm_callables', None)
     if own is not None:
@@ -251,13 +251,13 @@ def callables(env):
                 found.append({'method': name, 'args': {key: {'value': column, 'in_dataset': True}}})
                 break
         if not found:
-            # A goal alone is no start.
+            # A goal without a state is not a start.
             return []
     return found
 
 
 def only_argument(method):
-    """The name of the one argument that a method needs, None if it needs others."""
+    """The name of the only required argument of a method, None if there are none or several."""
     try:
         parameters = inspect.signature(method).parameters.values()
     except (TypeError, ValueError):
@@ -267,18 +267,18 @@ def only_argument(method):
 
 
 def argument(value):
-    """An argument as it came: an array by its type, shape and bytes, or anything of JSON's."""
+    """An argument from JSON: an array given by dtype, shape and hexadecimal bytes, or any other JSON value."""
     if isinstance(value, dict) and value.keys() == {'dtype', 'shape', 'data'}:
         array = np.frombuffer(bytes.fromhex(value['data']), value['dtype']).reshape(value['shape'])
-        # Its own, to be written into; numbers as numpy's numbers.
+        # A writable copy; scalars as NumPy scalars.
         return array.copy()[()]
     return value
 
 
-# ---- pictures ----
+# ---- frames ----
 
 
-def is_picture(value):
+def is_frame(value):
     return getattr(value, 'dtype', None) == np.uint8 and getattr(value, 'ndim', 0) == 3 and value.shape[2] in (3, 4)
 
 
@@ -295,12 +295,12 @@ class Bridge:
     """One environment and the buffer it writes into."""
 
     def __init__(self, env, max_episode_steps=None):
-        """Tries the environment (a reset, a step, a picture) to learn what it is."""
+        """Runs a reset, a step and a render to learn the columns and the frame size."""
         self.env = env
         self.actions = Actions(env.action_space)
         self.factors = list(factors(variation_space(env)))
         limit = max_episode_steps or getattr(env.spec, 'max_episode_steps', None)
-        self.max_episode_steps = limit or STEPS
+        self.max_episode_steps = limit or DEFAULT_STEPS
 
         observation, first = env.reset(seed=0)
         env.action_space.seed(0)
@@ -316,28 +316,28 @@ class Bridge:
                 self.observed.append((path, name, form, dtype, shape, self.columns[-1]['offset']))
         if not self.observed:
             raise Unsupported(f'observations of {env.observation_space}: none of them is an array of fixed shape')
-        # Entries of `info`, in the order of their names: dictionaries of an environment need not keep one.
+        # Entries of `info`, sorted by name, because their order may vary.
         for key in sorted(key for key in {**first, **second} if isinstance(key, str)):
             seen = [value for value in (numeric(info.get(key)) for info in (first, second)) if value is not None]
             fixed = len({value.shape for value in seen}) == 1
-            goal = key == 'goal' and seen and is_picture(seen[0])
-            if fixed and not goal and key not in ELSEWHERE and not key.startswith('_'):
-                dtype = held(np.result_type(*seen))
+            goal = key == 'goal' and seen and is_frame(seen[0])
+            if fixed and not goal and key not in IN_HEADER and not key.startswith('_'):
+                dtype = column_dtype(np.result_type(*seen))
                 self.column(names, key, 'info_', dtype, seen[0].shape)
                 self.informed.append((key, dtype, seen[0].shape, self.columns[-1]['offset']))
         self.factors_at = self.place(8 * sum(len(form['init']) for form, _ in self.factors))
 
-        self.no_picture, self.render_shape, self.looks = '', None, None
-        picture = self.first_picture()
-        if picture is not None:
-            self.render_shape = picture.shape[:2]
-            self.picture_at = self.place(math.prod(self.render_shape) * 3)
+        self.no_frame, self.render_shape, self.looks = '', None, None
+        frame = self.first_frame()
+        if frame is not None:
+            self.render_shape = frame.shape[:2]
+            self.frame_at = self.place(math.prod(self.render_shape) * 3)
         goal = first.get('goal')
-        self.goal_shape = goal.shape[:2] if is_picture(goal) else None
+        self.goal_shape = goal.shape[:2] if is_frame(goal) else None
         if self.goal_shape:
             self.goal_at = self.place(math.prod(self.goal_shape) * 3)
 
-        # Versions of the packages behind it: that of its class, that of its registration, and those it names itself.
+        # Versions of the packages of its class and its registration, and of those that it names itself.
         modules = type(env.unwrapped).__module__, str(getattr(env.spec, 'entry_point', ''))
         packages = (module.partition(':')[0].partition('.')[0] for module in modules)
         self.libraries = {}
@@ -355,23 +355,23 @@ class Bridge:
 
     def column(self, names, name, prefix, dtype, shape):
         name = name.replace('/', '_').replace(' ', '_')
-        while name in TAKEN or name in names:
+        while name in RESERVED or name in names:
             name = prefix + name
         names.add(name)
         offset = self.place(math.prod(shape) * dtype.itemsize)
         self.columns.append({'name': name, 'dtype': dtype.name, 'shape': list(shape), 'offset': offset})
         return name
 
-    def first_picture(self):
-        """What `render` gives, or the observation that is a picture; None, and why, where there is neither."""
+    def first_frame(self):
+        """A frame from `render`, or an observation that is one; None, with the reason in `no_frame`, if there is neither."""
         try:
-            # Some environments draw without having been asked for a mode.
-            picture = self.env.render() if self.env.render_mode in ('rgb_array', None) else None
-            if is_picture(picture):
-                return picture
-            self.no_picture = f'render() gives {type(picture).__name__} in mode {self.env.render_mode!r}'
-        except Exception as error:  # Whatever its renderer raises, the environment can do without pictures.
-            self.no_picture = f'render() raises {type(error).__name__}: {error}'
+            # Some environments render without a render mode.
+            frame = self.env.render() if self.env.render_mode in ('rgb_array', None) else None
+            if is_frame(frame):
+                return frame
+            self.no_frame = f'render() gives {type(frame).__name__} in mode {self.env.render_mode!r}'
+        except Exception as error:  # The environment is usable without frames.
+            self.no_frame = f'render() raises {type(error).__name__}: {error}'
         for place, (_, _, _, dtype, shape, _) in enumerate(self.observed):
             if dtype == np.uint8 and len(shape) == 3 and shape[2] == 3:
                 self.looks = place
@@ -379,7 +379,7 @@ class Bridge:
         return None
 
     def describe(self):
-        """What the environment is, and where in the buffer everything lies, as JSON."""
+        """The description of the environment, with offsets in the buffer, as JSON."""
         return json.dumps({
             'action': self.actions.json,
             'action_offset': self.action_at,
@@ -387,9 +387,9 @@ class Bridge:
             'observation': [[name, form] for _, name, form, *_ in self.observed],
             'factors': [form for form, _ in self.factors],
             'factors_offset': self.factors_at,
-            'picture': self.render_shape and {'size': self.render_shape, 'offset': self.picture_at},
+            'frame': self.render_shape and {'size': self.render_shape, 'offset': self.frame_at},
             'goal': self.goal_shape and {'size': self.goal_shape, 'offset': self.goal_at},
-            'no_picture': self.no_picture,
+            'no_frame': self.no_frame,
             'pixel_art': bool(getattr(self.env.unwrapped, 'swm_pixel_art', False)),
             'max_episode_steps': self.max_episode_steps,
             'libraries': self.libraries,
@@ -398,7 +398,7 @@ class Bridge:
         })
 
     def attach(self, buffer):
-        """Writes into `buffer` from now on: `size` bytes."""
+        """Uses `buffer`, of `size` bytes, for all outputs."""
         self.buffer = buffer
 
         def view(offset, shape, dtype):
@@ -407,7 +407,7 @@ class Bridge:
         self.action = view(self.action_at, self.actions.len, self.actions.dtype)
         self.observed_views = [(path, view(at, shape, dtype)) for path, _, _, dtype, shape, at in self.observed]
         self.informed_views = {key: view(at, shape, dtype) for key, dtype, shape, at in self.informed}
-        self.picture = self.render_shape and view(self.picture_at, (*self.render_shape, 3), np.uint8)
+        self.frame = self.render_shape and view(self.frame_at, (*self.render_shape, 3), np.uint8)
         self.goal = self.goal_shape and view(self.goal_at, (*self.goal_shape, 3), np.uint8)
         self.factor_views, at = [], self.factors_at
         for form, leaf in self.factors:
@@ -415,14 +415,14 @@ class Bridge:
             at += 8 * len(form['init'])
         self.spaces = {form['key']: (form, leaf) for form, leaf in self.factors}
         self.views = {c['name']: view(c['offset'], c['shape'], np.dtype(c['dtype'])) for c in self.columns}
-        # What the columns of a recorded goal hold throughout the episode.
+        # Values of goal columns that stay the same throughout the episode.
         self.held = []
 
     def handle(self, op, payload):
-        """Does what a request asks: its kind, and for a reset its seed and options as JSON."""
+        """Handles a request: its kind, and for a reset its arguments as JSON."""
         if op == STEP:
             self.step()
-        elif op == DRAWN_STEP:
+        elif op == STEP_AND_RENDER:
             self.step()
             self.render()
         elif op == RENDER:
@@ -434,7 +434,7 @@ class Bridge:
 
     def reset(self, seed, variation=None, variation_values=None, recorded=None):
         """Starts an episode. `variation` and `variation_values` become the `options` of the environment's reset; `recorded`
-        is what `put` is given afterwards."""
+        are the arguments of a following `put`."""
         options = {}
         if variation is not None:
             options['variation'] = variation
@@ -447,25 +447,25 @@ class Bridge:
             value = getattr(leaf, 'value', None)
             view[...] = np.asarray(leaf.init_value if value is None else value, np.float64).reshape(-1)
         if self.goal is not None:
-            self.goal[...] = info['goal'][..., :3] if is_picture(info.get('goal')) else 0
+            self.goal[...] = info['goal'][..., :3] if is_frame(info.get('goal')) else 0
         self.held = []
         self.write(observation, 0.0, False, False, info)
         if recorded is not None:
             self.put(**recorded)
 
     def put(self, calls, shown, held):
-        """Puts the environment into a recorded state: calls methods of its own, (method, arguments) each, and shows in the
-        columns what the recorded rows hold, in those of the goal from now on."""
+        """Sets a recorded state: calls methods of the environment, and writes the recorded values into the columns, those of
+        `held` again after every step."""
         for call in calls:
             self.method(call['method'])(**{key: argument(value) for key, value in call['args'].items()})
         shown, self.held = ([(self.views[name], argument(value)) for name, value in part.items()] for part in (shown, held))
         for view, value in [*shown, *self.held]:
             view[...] = np.reshape(value, view.shape)
-        # What the reset said of the goal was said of another state.
+        # The header of the reset belongs to another state.
         HEAD.pack_into(self.buffer, 0, 0.0, math.inf, False, False, False)
 
     def method(self, name):
-        """A method of the environment by its name; of its wrappers, from the outermost inwards, if it has none."""
+        """A method of the environment by name, or of its wrappers, from the outermost inwards."""
         env, layers = self.env, [self.env.unwrapped]
         while env is not env.unwrapped:
             layers.append(env)
@@ -479,10 +479,10 @@ class Bridge:
         near = difflib.get_close_matches(name, known, 1)
         meant = f', did you mean {near[0]}' if near else ''
         fix = f'it has {", ".join(known)}' if known else 'it has none but those of gymnasium.Env'
-        raise Wrong(f"{own.__name__} has no method '{name}'{meant}", fix)
+        raise InvalidRequest(f"{own.__name__} has no method '{name}'{meant}", fix)
 
     def value(self, key, value):
-        """A factor's numbers in the form its space holds."""
+        """A factor's value in the form of its space."""
         form, leaf = self.spaces[key]
         if form['space']['type'] == 'Discrete':
             return int(value[0])
@@ -505,7 +505,7 @@ class Bridge:
             value = np.asarray(value)
             if value.shape != view.shape or (value.dtype.kind == 'f') > (view.dtype.kind == 'f'):
                 raise ValueError(
-                    f"info['{key}'] was {view.dtype} {list(view.shape)} when the environment was tried, and is"
+                    f"info['{key}'] was {view.dtype} {list(view.shape)} at the first reset and step, and is"
                     f' {value.dtype} {list(value.shape)} now: give it one type and shape'
                 )
             view[...] = value
@@ -518,17 +518,17 @@ class Bridge:
         HEAD.pack_into(self.buffer, 0, float(reward), float(distance), bool(terminated), bool(truncated), bool(success))
 
     def render(self):
-        """Draws into the buffer."""
+        """Renders into the buffer."""
         if self.looks is not None:
-            self.picture[...] = self.observed_views[self.looks][1]
+            self.frame[...] = self.observed_views[self.looks][1]
             return
-        picture = self.env.render()
-        if not is_picture(picture) or picture.shape[:2] != self.render_shape:
+        frame = self.env.render()
+        if not is_frame(frame) or frame.shape[:2] != self.render_shape:
             raise ValueError(
-                f'render() gave {getattr(picture, "shape", type(picture).__name__)}, and {(*self.render_shape, 3)}'
-                ' when the environment was tried: pictures must keep their size'
+                f'render() gave {getattr(frame, "shape", type(frame).__name__)}, and {(*self.render_shape, 3)}'
+                ' at the first reset and step: frames must keep their size'
             )
-        self.picture[...] = picture[..., :3]
+        self.frame[...] = frame[..., :3]
 
     def close(self):
         self.env.close()
@@ -538,14 +538,14 @@ class Bridge:
 
 
 class Missing(Exception):
-    """A package that must be installed: its name, and what for."""
+    """A missing package: the asset that installs it, and the import error."""
 
 
 WORDS = {'true': True, 'false': False, 'none': None}
 
 
 def literal(text):
-    """What a word of the command line means: a Python literal, a truth value, or else the text itself."""
+    """The value of a command-line word: a Python literal, a truth value, or else the text itself."""
     try:
         return WORDS[text] if text in WORDS else ast.literal_eval(text)
     except (ValueError, SyntaxError):
@@ -553,10 +553,10 @@ def literal(text):
 
 
 def make(id, options, wrappers=()):
-    """The environment of an id as a `Bridge`; `options` are what `gymnasium.make` is given, as text or as they are, and
-    `wrappers` what is put around it, first to last.
+    """Makes the environment of an id as a `Bridge`. `options` are arguments of `gymnasium.make`, as text or as values;
+    `wrappers` are applied first to last.
 
-    The clock belongs to the platform: an environment's own limit is declared, not enforced by Gymnasium.
+    The engine enforces the time limit, so Gymnasium's own is disabled.
     """
     kwargs = {key: literal(text) if isinstance(text, str) else text for key, text in options.items()}
     try:
@@ -579,7 +579,7 @@ def make(id, options, wrappers=()):
     try:
         env = gymnasium.make(spec, **{'render_mode': 'rgb_array', **settings})
     except TypeError as error:
-        # Some environments cannot be drawn at all.
+        # Some environments have no render mode.
         if 'render_mode' not in str(error) or 'render_mode' in kwargs:
             raise
         env = gymnasium.make(spec, **settings)

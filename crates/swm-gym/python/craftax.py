@@ -1,7 +1,7 @@
 """Craftax as Gymnasium environments, under the ids, spaces and sizes of stable-worldmodel's Python package.
 
-Craftax computes in JAX: a pure function from a key, a state and an action to the next state. An environment here holds
-key and state. Symbolic variants can be drawn as well, by the renderer that makes the observations of the pixel ones.
+Craftax is a pure JAX function from a key, a state and an action to the next state; an environment here holds key and
+state. Symbolic variants render with the renderer of the pixel observations.
 """
 
 import importlib
@@ -15,8 +15,8 @@ import numpy as np
 from craftax.craftax_env import make_craftax_env_from_name
 from gymnasium import spaces
 
-# Our id: Craftax's own, the shape of an observation (its `observation_space` swaps height and width), and the limit of
-# steps that its parameters name.
+# Id: Craftax's own id, the shape of an observation (Craftax's `observation_space` swaps height and width), and the time
+# limit of its parameters.
 VARIANTS = {
     'swm/CraftaxPixels-v1': ('Craftax-Pixels-v1', (130, 110, 3), 100_000),
     'swm/CraftaxSymbolic-v1': ('Craftax-Symbolic-v1', (8268,), 100_000),
@@ -26,7 +26,7 @@ VARIANTS = {
 
 
 def register():
-    """Makes the ids known to Gymnasium."""
+    """Registers the ids with Gymnasium."""
     for id, (name, shape, steps) in VARIANTS.items():
         if id not in gymnasium.registry:
             gymnasium.register(
@@ -35,7 +35,7 @@ def register():
 
 
 def textured(make, *arguments):
-    """What `make` makes with Craftax's textures, which Craftax keeps in a file: half of one if it was stopped then."""
+    """Calls `make`, and rebuilds Craftax's texture cache if the cached file is incomplete."""
     try:
         return make(*arguments)
     except (EOFError, OSError, ValueError, pickle.UnpicklingError):
@@ -46,16 +46,16 @@ def textured(make, *arguments):
 
 
 class Craftax(gymnasium.Env):
-    """One world of Craftax."""
+    """A Craftax environment."""
 
     metadata = {'render_modes': ['rgb_array'], 'render_fps': 30}
     swm_libraries = ('craftax', 'jax')
-    # Scaled to the size of a picture without blending neighbours.
+    # Frames are resized without interpolation.
     swm_pixel_art = True
 
     def __init__(self, name, shape, render_mode=None):
         self.render_mode = render_mode
-        # The pool starts the next episode, not the environment.
+        # The pool resets the environment, so Craftax must not.
         env = textured(make_craftax_env_from_name, name, False)
         params = env.default_params
         self.observation_space = spaces.Box(0.0, 1.0, shape, np.float32)
@@ -68,17 +68,17 @@ class Craftax(gymnasium.Env):
 
         @jax.jit
         def begin(key):
-            kept, used = jax.random.split(key)
-            return env.reset(used, params), kept
+            next_key, step_key = jax.random.split(key)
+            return env.reset(step_key, params), next_key
 
         @jax.jit
         def go(key, state, action):
-            kept, used = jax.random.split(key)
-            observation, state, reward, done, info = env.step(used, state, action, params)
-            # One array comes over sooner than thirty.
+            next_key, step_key = jax.random.split(key)
+            observation, state, reward, done, info = env.step(step_key, state, action, params)
+            # One transfer to the host is faster than thirty.
             self.names = list(info)
-            numbers = jnp.stack([jnp.float32(value) for value in (reward, done, *info.values())])
-            return observation, state, numbers, kept
+            values = jnp.stack([jnp.float32(value) for value in (reward, done, *info.values())])
+            return observation, state, values, next_key
 
         self.begin, self.go = begin, go
         self.key = jax.random.PRNGKey(0)
@@ -91,11 +91,11 @@ class Craftax(gymnasium.Env):
         return self.observation, {}
 
     def step(self, action):
-        observation, self.state, numbers, self.key = self.go(self.key, self.state, int(action))
+        observation, self.state, values, self.key = self.go(self.key, self.state, int(action))
         self.observation = np.asarray(observation, np.float32)
-        reward, done, *info = np.asarray(numbers)
+        reward, done, *info = np.asarray(values)
         return self.observation, float(reward), bool(done), False, dict(zip(self.names, info))
 
     def render(self):
-        picture = self.observation * 255.0 if self.pixels else np.asarray(self.draw(self.state))
-        return np.rint(np.clip(picture, 0.0, 255.0)).astype(np.uint8)
+        frame = self.observation * 255.0 if self.pixels else np.asarray(self.draw(self.state))
+        return np.rint(np.clip(frame, 0.0, 255.0)).astype(np.uint8)

@@ -1,11 +1,11 @@
-"""The process around a `Bridge`: requests come in on a socket, what they bring goes into shared memory.
+"""The worker process of a `Bridge`: requests arrive on a socket, outputs go into shared memory.
 
-File descriptors at the start: 0 is the socket, 1 the shared memory (a file without a name), 2 a pipe whose last lines
-the parent keeps. Before anything of the environment runs, 0 becomes /dev/null and 1 a copy of 2, so that nothing an
-environment prints or reads can disturb the exchange.
+File descriptors at the start: 0 is the socket, 1 the shared memory (a file without a name), 2 a pipe to the parent.
+Before any code of the environment runs, 0 becomes /dev/null and 1 a copy of 2, so that the environment's input and
+output cannot disturb the protocol.
 
-A request is a byte that says which, the length of its payload (4 bytes, little-endian) and the payload; so is an
-answer. The first request carries the sources of the other modules and what environment to make.
+A request is one byte for its kind, the length of its payload (4 bytes, little-endian) and the payload; an answer has
+the same form. The first request carries the sources of the other modules and the environment to make.
 """
 
 import ctypes
@@ -21,13 +21,13 @@ import sys
 import traceback
 
 FRAME = struct.Struct('<BI')
-# The kinds of answers: done; raised a Python error; no such id; a package is missing; refused in words, and with what to do.
-DONE, RAISED, UNKNOWN, MISSING, REFUSED, WRONG = b'.xumfw'
+# Kinds of answers: done; an exception; an unknown id; a missing package; unsupported; an invalid request.
+DONE, RAISED, UNKNOWN, MISSING, REFUSED, INVALID = b'.xumfw'
 PR_SET_PDEATHSIG = 1
 
 
 def die_with(parent):
-    """Ends this process when the parent ends, however it ends, and whatever this process is busy with."""
+    """Ends this process when the parent ends, however it ends."""
     if sys.platform == 'linux':
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
@@ -35,7 +35,7 @@ def die_with(parent):
 
 
 class Sources(importlib.abc.MetaPathFinder, importlib.abc.InspectLoader):
-    """Imports modules that came as text, so that nothing has to be installed."""
+    """Imports modules from text, so that nothing has to be installed."""
 
     def __init__(self, texts):
         self.texts = texts
@@ -50,8 +50,8 @@ class Sources(importlib.abc.MetaPathFinder, importlib.abc.InspectLoader):
         return compile(self.texts[name], f'{name}.py', 'exec')
 
 
-class Line:
-    """The exchange with the parent."""
+class Connection:
+    """The connection to the parent."""
 
     def __init__(self, descriptor):
         self.socket = socket.socket(fileno=descriptor)
@@ -61,7 +61,7 @@ class Line:
         while len(data) < n:
             more = self.socket.recv(n - len(data))
             if not more:
-                raise EOFError('the parent has closed the connection, or is gone')
+                raise EOFError('the parent closed the connection or ended')
             data += more
         return data
 
@@ -74,68 +74,68 @@ class Line:
         self.socket.sendall(FRAME.pack(kind, len(data)) + data)
 
 
-def made(line, memory):
-    """Makes what the first request wants and says what it is, or why it cannot be."""
-    wanted = json.loads(line.request()[1])
-    sys.meta_path.append(Sources(wanted['modules']))
+def make(connection, memory):
+    """Makes the environment of the first request and answers with its description, or why it cannot be made."""
+    request = json.loads(connection.request()[1])
+    sys.meta_path.append(Sources(request['modules']))
     try:
         import gymnasium
         import swm_bridge
     except ModuleNotFoundError as error:
-        return line.answer(MISSING, json.dumps({'asset': 'gymnasium', 'message': str(error)}))
+        return connection.answer(MISSING, json.dumps({'asset': 'gymnasium', 'message': str(error)}))
     try:
-        bridge = swm_bridge.make(wanted['id'], wanted['options'])
+        bridge = swm_bridge.make(request['id'], request['options'])
         description = bridge.describe()
-        # Room that is not there is an error now, not a SIGBUS later.
+        # A lack of memory is an error now instead of a SIGBUS later.
         os.posix_fallocate(memory, 0, bridge.size)
         bridge.attach(mmap.mmap(memory, bridge.size))
-        line.answer(DONE, description)
+        connection.answer(DONE, description)
         return bridge
     except swm_bridge.Missing as error:
         asset, message = error.args
-        line.answer(MISSING, json.dumps({'asset': asset, 'message': message}))
+        connection.answer(MISSING, json.dumps({'asset': asset, 'message': message}))
     except gymnasium.error.UnregisteredEnv:
-        line.answer(UNKNOWN, json.dumps(sorted(gymnasium.registry)))
+        connection.answer(UNKNOWN, json.dumps(sorted(gymnasium.registry)))
     except (swm_bridge.Unsupported, gymnasium.error.DependencyNotInstalled, gymnasium.error.DeprecatedEnv) as error:
-        line.answer(REFUSED, str(error))
+        connection.answer(REFUSED, str(error))
     except BaseException:
-        line.answer(RAISED, traceback.format_exc())
+        connection.answer(RAISED, traceback.format_exc())
     return None
 
 
-def obey(line, bridge):
-    """Does what is asked until the parent closes the line."""
-    from swm_bridge import Wrong
+def handle_requests(connection, bridge):
+    """Handles requests until the parent closes the connection."""
+    from swm_bridge import InvalidRequest
 
     while True:
-        op, payload = line.request()
+        op, payload = connection.request()
         try:
             bridge.handle(op, payload)
-        except Wrong as error:
-            line.answer(WRONG, json.dumps(error.args))
-        except BaseException:  # Even `sys.exit()` is an answer.
-            line.answer(RAISED, traceback.format_exc())
+        except InvalidRequest as error:
+            connection.answer(INVALID, json.dumps(error.args))
+        except BaseException:  # Including `sys.exit()`.
+            connection.answer(RAISED, traceback.format_exc())
         else:
-            line.answer(DONE)
+            connection.answer(DONE)
 
 
 def serve():
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent decides when to stop.
     die_with(int(sys.argv[1]))
-    line, memory = Line(os.dup(0)), os.dup(1)
+    connection, memory = Connection(os.dup(0)), os.dup(1)
     null = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null, 0)
     os.dup2(2, 1)
     bridge = None
     try:
-        bridge = made(line, memory)
+        bridge = make(connection, memory)
         if bridge is not None:
-            obey(line, bridge)
+            handle_requests(connection, bridge)
     except (EOFError, ConnectionError):
         if bridge is not None:
             bridge.close()
     finally:
-        # Not by the way of threads that an environment left behind.
+        # Without waiting for threads of the environment.
         os._exit(0)
 
 

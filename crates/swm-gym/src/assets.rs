@@ -1,35 +1,35 @@
-//! The Python packages that environments need, pinned, in a virtual environment of their own.
+//! The pinned Python packages that Gymnasium environments need, in a virtual environment.
 //!
-//! They live beside the other assets: in `$SWM_ASSETS`, else `$STABLEWM_HOME/assets`, else
+//! It is in the folder of the other assets: in `$SWM_ASSETS`, else `$STABLEWM_HOME/assets`, else
 //! `~/.stable_worldmodel/assets`, under `python-gym`.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use swm_core::{Error, Result};
 
-/// A package, and what comes with it.
+/// A package and its requirements.
 pub struct Package {
-    /// The name `swm assets install` takes.
+    /// Its name for `swm assets install`.
     pub name: &'static str,
     /// Its version.
     pub version: &'static str,
-    /// What it is for, in a few words.
+    /// Its purpose, in a few words.
     pub summary: &'static str,
-    /// The distribution that tells whether it is there.
+    /// The distribution whose metadata shows that it is installed.
     distribution: &'static str,
-    /// What pip is asked for besides Gymnasium.
+    /// The requirements for pip besides Gymnasium.
     requirements: &'static [&'static str],
 }
 
-/// What all of them need; pygame draws Gymnasium's own environments.
+/// Requirements of all packages; pygame renders Gymnasium's own environments.
 const GYMNASIUM: &[&str] = &["gymnasium==1.4.0", "pygame==2.6.1"];
 
-/// Everything that can be installed.
+/// All packages that can be installed.
 pub const PACKAGES: &[Package] = &[
     Package {
         name: "gymnasium",
         version: "1.4.0",
-        summary: "Gymnasium and its classic control environments, in a Python environment of ours",
+        summary: "Gymnasium and its classic control environments, in a virtual environment of their own",
         distribution: "gymnasium",
         requirements: &[],
     },
@@ -50,12 +50,12 @@ pub const PACKAGES: &[Package] = &[
 ];
 
 impl Package {
-    /// Where it is or would be.
+    /// The folder it is installed to.
     pub fn folder(&self) -> PathBuf {
         environment()
     }
 
-    /// Whether this version is there.
+    /// Whether this version is installed.
     pub fn is_installed(&self) -> bool {
         let name = format!("{}-{}.dist-info", self.distribution, self.version);
         let Ok(entries) = std::fs::read_dir(environment().join("lib")) else { return false };
@@ -63,7 +63,7 @@ impl Package {
     }
 }
 
-/// Where assets live; `swm-mujoco` keeps its own in the same place.
+/// The folder of assets, which `swm-mujoco` shares.
 pub(crate) fn folder() -> PathBuf {
     let set = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     let home = || Path::new(&std::env::var_os("HOME").unwrap_or_default()).join(".stable_worldmodel");
@@ -75,34 +75,34 @@ fn environment() -> PathBuf {
     folder().join("python-gym")
 }
 
-/// Its interpreter, whether it is there or not.
+/// The interpreter of the virtual environment, which may not exist yet.
 pub(crate) fn python() -> PathBuf {
     environment().join("bin").join("python")
 }
 
-/// Installs a package with pip, after making the virtual environment where there is none. Where it is.
+/// Installs a package with pip and returns the folder of the virtual environment, which is made if it does not exist.
 ///
 /// # Errors
 /// When Python or pip fails.
 pub fn install(package: &Package) -> Result<PathBuf> {
-    let place = environment();
+    let folder = environment();
     if !python().is_file() {
         let mut make = Command::new("python3");
-        run("making a Python environment with `python3 -m venv`", make.args(["-m", "venv"]).arg(&place))?;
+        run("making a Python environment with `python3 -m venv`", make.args(["-m", "venv"]).arg(&folder))?;
     }
     let mut pip = Command::new(python());
     pip.args(["-m", "pip", "install", "--quiet", "--disable-pip-version-check"]);
     pip.args(GYMNASIUM).args(package.requirements);
     run(&format!("installing {} {} with pip", package.name, package.version), &mut pip)?;
-    Ok(place)
+    Ok(folder)
 }
 
-/// Asks pip whether what is installed fits together.
+/// Checks with pip that a package and its dependencies are installed and compatible.
 ///
 /// # Errors
-/// When the package is not there, or lacks something.
+/// When they are not.
 pub fn verify(package: &Package) -> Result<()> {
-    let fix = || format!("`swm assets install {}` brings it", package.name);
+    let fix = || format!("run `swm assets install {}`", package.name);
     if !package.is_installed() {
         let what = format!("asset {} {}", package.name, package.version);
         return Err(Error::config(what, format!("it is not installed in {}", environment().display()), fix()));
@@ -122,6 +122,6 @@ fn run(what: &str, command: &mut Command) -> Result<()> {
     if output.status.success() {
         return Ok(());
     }
-    let said = [output.stdout, output.stderr].concat();
-    Err(Error::external(what, String::from_utf8_lossy(&said).trim()))
+    let printed = [output.stdout, output.stderr].concat();
+    Err(Error::external(what, String::from_utf8_lossy(&printed).trim()))
 }

@@ -1,22 +1,20 @@
-//! [`choose`]: what users type, `ID` or `ID,key=value,…`, as a row of the registry of environments.
+//! [`choose`]: parses `ID` or `ID,key=value,…` into a row of the registry of environments.
 
-use crate::{Form, GymConfig, GymEnv, WorkerTransport};
+use crate::{EnvLayout, GymConfig, GymEnv, WorkerTransport};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Env, EnvChoice, EnvEntry, Error, Result};
 
-/// Ids to show where environments are listed, and what they need.
+/// Example ids for listings of environments, with what they require.
 pub const EXAMPLES: &[(&str, &str)] = &[
-    ("CartPole-v1", "any environment that Gymnasium knows: `swm assets install gymnasium`"),
+    ("CartPole-v1", "any environment registered with Gymnasium: `swm assets install gymnasium`"),
     ("module:Name-v0", "any environment that importing the module registers"),
     ("ALE/Pong-v5", "the Arcade Learning Environment: `swm assets install ale`"),
     ("swm/CraftaxPixels-v1", "Craftax; also CraftaxSymbolic-v1, CraftaxClassicPixels-v1, CraftaxClassicSymbolic-v1"),
 ];
 
-/// Whether an id is of Gymnasium's form: a version at its end, and no world of ours.
-///
-/// `swm/…` is ours, apart from Craftax.
-pub fn looks_foreign(text: &str) -> bool {
+/// Whether an id has Gymnasium's form: a version, a namespace or a module. `swm/…` ids are native, apart from Craftax.
+pub fn is_gymnasium_id(text: &str) -> bool {
     let id = text.split(',').next().unwrap_or_default();
     if id.starts_with("swm/") {
         return id.starts_with("swm/Craftax");
@@ -25,8 +23,8 @@ pub fn looks_foreign(text: &str) -> bool {
     version || id.contains('/') || id.contains(':')
 }
 
-/// Reads `ID` or `ID,key=value,…`, where the keys are arguments of `gymnasium.make`: `ALE/Pong-v5,frameskip=2`. An id
-/// may name the module that registers it: `my_worlds:Maze-v0`. Nothing is started: what Python does not know shows when
+/// Parses `ID` or `ID,key=value,…`, where the keys are arguments of `gymnasium.make`: `ALE/Pong-v5,frameskip=2`. An id
+/// may name the module that registers it: `my_envs:Maze-v0`. No process starts, so an unknown id is an error when
 /// an environment is made.
 ///
 /// # Errors
@@ -36,7 +34,7 @@ pub fn choose(text: &str) -> Result<EnvChoice> {
     parse(text)?;
     let mut entries = ENTRIES.lock().unwrap_or_else(PoisonError::into_inner);
     let entry = *entries.entry(text.to_owned()).or_insert_with(|| {
-        // Rows of a registry are static; one leaks for each text that a user ever types.
+        // Rows of a registry are static, so each distinct text leaks one.
         Box::leak(Box::new(EnvEntry {
             id: interned(text),
             summary: "a Gymnasium environment",
@@ -53,27 +51,27 @@ pub fn choose(text: &str) -> Result<EnvChoice> {
 /// # Errors
 /// When it cannot be made: no Python, no such id, a package that is missing, an exception.
 pub fn make(text: &str, config: GymConfig) -> Result<Box<dyn Env>> {
-    static FORMS: Mutex<BTreeMap<(String, crate::Python), Arc<Form>>> = Mutex::new(BTreeMap::new());
+    static LAYOUTS: Mutex<BTreeMap<(String, crate::Python), Arc<EnvLayout>>> = Mutex::new(BTreeMap::new());
     let (id, options) = parse(text)?;
     let (restarts, key) = (config.restarts, (text.to_owned(), config.python.clone()));
     let transport = Box::new(WorkerTransport::new(id, options, config)?);
-    // The first of a kind is waited for; the others start side by side.
-    let known = FORMS.lock().unwrap_or_else(PoisonError::into_inner).get(&key).cloned();
+    // The first environment of a kind is waited for; the others start in parallel.
+    let known = LAYOUTS.lock().unwrap_or_else(PoisonError::into_inner).get(&key).cloned();
     let env = match known {
-        Some(form) => GymEnv::like(form, transport, restarts)?,
+        Some(layout) => GymEnv::like(layout, transport, restarts)?,
         None => {
             let env = GymEnv::new(text, transport, restarts)?;
-            FORMS.lock().unwrap_or_else(PoisonError::into_inner).insert(key, Arc::clone(env.form()));
+            LAYOUTS.lock().unwrap_or_else(PoisonError::into_inner).insert(key, Arc::clone(env.layout()));
             env
         }
     };
     Ok(Box::new(env))
 }
 
-/// The id and the arguments in a text. Commas inside brackets and quotes belong to a value.
+/// Splits a text into id and arguments. Commas inside brackets and quotes belong to a value.
 fn parse(text: &str) -> Result<(&str, BTreeMap<String, String>)> {
     let mut parts = vec![];
-    let (mut begin, mut depth, mut quote) = (0, 0_i32, None);
+    let (mut start, mut depth, mut quote) = (0, 0_i32, None);
     for (at, c) in text.char_indices() {
         match (quote, c) {
             (Some(open), _) if c == open => quote = None,
@@ -82,13 +80,13 @@ fn parse(text: &str) -> Result<(&str, BTreeMap<String, String>)> {
             (None, '(' | '[' | '{') => depth += 1,
             (None, ')' | ']' | '}') => depth -= 1,
             (None, ',') if depth == 0 => {
-                parts.push(&text[begin..at]);
-                begin = at + 1;
+                parts.push(&text[start..at]);
+                start = at + 1;
             }
             _ => {}
         }
     }
-    parts.push(&text[begin..]);
+    parts.push(&text[start..]);
     let id = parts[0];
     let wrong = |problem: String| Error::config(format!("environment '{text}'"), problem, "write ID or ID,key=value,…");
     if id.is_empty() {
@@ -96,24 +94,25 @@ fn parse(text: &str) -> Result<(&str, BTreeMap<String, String>)> {
     }
     let mut options = BTreeMap::new();
     for part in &parts[1..] {
-        let (key, value) = part.split_once('=').ok_or_else(|| wrong(format!("'{part}' is no key=value")))?;
+        let (key, value) =
+            part.split_once('=').ok_or_else(|| wrong(format!("'{part}' is not of the form key=value")))?;
         if options.insert(key.to_owned(), value.to_owned()).is_some() {
-            return Err(wrong(format!("'{key}' is there twice")));
+            return Err(wrong(format!("'{key}' occurs twice")));
         }
     }
     Ok((id, options))
 }
 
-/// The same text, kept for ever; once however often it is asked for.
+/// A static copy of a text; equal texts share one copy.
 pub(crate) fn interned(text: &str) -> &'static str {
     static TEXTS: Mutex<BTreeSet<&'static str>> = Mutex::new(BTreeSet::new());
     let mut texts = TEXTS.lock().unwrap_or_else(PoisonError::into_inner);
     match texts.get(text) {
         Some(known) => known,
         None => {
-            let kept: &'static str = Box::leak(text.into());
-            texts.insert(kept);
-            kept
+            let interned: &'static str = Box::leak(text.into());
+            texts.insert(interned);
+            interned
         }
     }
 }
@@ -123,13 +122,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_text_is_an_id_and_arguments() -> Result<()> {
+    fn parses_id_and_arguments() -> Result<()> {
         assert_eq!(parse("CartPole-v1")?, ("CartPole-v1", BTreeMap::new()));
-        let (id, options) = parse("my.worlds:Maze-v0,size=(3,4),name='a,b',hard=true")?;
-        assert_eq!(id, "my.worlds:Maze-v0");
-        let wanted = [("hard", "true"), ("name", "'a,b'"), ("size", "(3,4)")];
-        assert_eq!(options, wanted.map(|(key, value)| (key.to_owned(), value.to_owned())).into());
-        for (text, words) in [("", "no id"), ("CartPole-v1,fast", "'fast' is no key=value"), ("A,k=1,k=2", "twice")] {
+        let (id, options) = parse("my.envs:Maze-v0,size=(3,4),name='a,b',hard=true")?;
+        assert_eq!(id, "my.envs:Maze-v0");
+        let expected = [("hard", "true"), ("name", "'a,b'"), ("size", "(3,4)")];
+        assert_eq!(options, expected.map(|(key, value)| (key.to_owned(), value.to_owned())).into());
+        for (text, words) in
+            [("", "no id"), ("CartPole-v1,fast", "'fast' is not of the form key=value"), ("A,k=1,k=2", "twice")]
+        {
             let error = parse(text).expect_err(text).to_string();
             assert!(error.contains(words), "{error}");
         }
@@ -137,7 +138,7 @@ mod tests {
     }
 
     #[test]
-    fn the_id_keeps_everything_that_was_typed() -> Result<()> {
+    fn the_id_keeps_its_arguments() -> Result<()> {
         let text = "ALE/Pong-v5,frameskip=2";
         assert_eq!(choose(text)?.id(), text);
         assert!(std::ptr::eq(choose(text)?.entry.id, choose(text)?.entry.id), "leaked once");
@@ -145,12 +146,12 @@ mod tests {
     }
 
     #[test]
-    fn our_worlds_are_not_asked_for_in_python() {
+    fn native_ids_are_not_gymnasium_ids() {
         for text in ["CartPole-v1", "ALE/Pong-v5,frameskip=2", "swm/CraftaxPixels-v1", "mine:Maze-v0", "mine:maze"] {
-            assert!(looks_foreign(text), "{text}");
+            assert!(is_gymnasium_id(text), "{text}");
         }
         for text in ["swm/PushT-v1", "swm/PusT-v1", "pusht", "push-variant", ""] {
-            assert!(!looks_foreign(text), "{text}");
+            assert!(!is_gymnasium_id(text), "{text}");
         }
     }
 }

@@ -1,74 +1,76 @@
-//! [`Description`]: what the bridge says of an environment; [`Form`]: what that makes of a world.
+//! [`Description`]: the bridge's description of an environment. [`EnvLayout`]: the spec and the memory layout that follow
+//! from it.
 
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::ops::Range;
 use swm_core::{Action, Callable, ColumnSpec, DType, EnvSpec, Error, Factor, Result, Schema, Space, VariationSpace};
 
-/// What an environment is, and where in the buffer everything lies: `Bridge.describe()`.
+/// The spaces, columns and factors of an environment, with their offsets in the buffer: `Bridge.describe()`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 pub struct Description {
-    action: Wire,
+    action: SpaceJson,
     action_offset: usize,
-    columns: Vec<Column>,
-    observation: Vec<(String, Wire)>,
-    factors: Vec<WireFactor>,
+    columns: Vec<ColumnJson>,
+    observation: Vec<(String, SpaceJson)>,
+    factors: Vec<FactorJson>,
     factors_offset: usize,
-    picture: Option<Place>,
-    goal: Option<Place>,
-    no_picture: String,
+    frame: Option<FrameRegion>,
+    goal: Option<FrameRegion>,
+    no_frame: String,
     pixel_art: bool,
     max_episode_steps: usize,
     libraries: BTreeMap<String, String>,
-    /// How it takes a state, if its methods tell.
-    calls: Vec<Callable>,
+    /// The methods that set its state, if it has any.
+    #[serde(rename = "calls")]
+    callables: Vec<Callable>,
     /// Bytes of the buffer.
     pub size: usize,
 }
 
 impl Description {
-    /// Reads what the bridge says.
+    /// Parses the JSON of `Bridge.describe()`.
     ///
     /// # Errors
-    /// When it is of another version.
+    /// When it has another form.
     pub fn parse(json: &str) -> Result<Self> {
-        serde_json::from_str(json).map_err(|error| Error::external("reading what an environment is", error))
+        serde_json::from_str(json).map_err(|error| Error::external("parsing the description of an environment", error))
     }
 }
 
-/// A column and where it lies.
+/// A column and its offset in the buffer.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
-struct Column {
+struct ColumnJson {
     name: String,
     dtype: String,
     shape: Vec<usize>,
     offset: usize,
 }
 
-/// An RGB picture of `[height, width]` and where it lies.
+/// The size `[height, width]` of an RGB frame and its offset in the buffer.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
-pub(crate) struct Place {
+pub(crate) struct FrameRegion {
     pub size: [usize; 2],
     pub offset: usize,
 }
 
-impl Place {
+impl FrameRegion {
     pub fn range(&self) -> Range<usize> {
         self.offset..self.offset + self.size[0] * self.size[1] * 3
     }
 }
 
 #[derive(Clone, Debug, PartialEq, Deserialize)]
-struct WireFactor {
+struct FactorJson {
     key: String,
-    space: Wire,
+    space: SpaceJson,
     init: Vec<f64>,
 }
 
-/// A space; bounds are one number for all, and none where there is no bound.
+/// A space; `low` and `high` have one bound for all elements or one for each, and `null` for no bound.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(tag = "type")]
-enum Wire {
+enum SpaceJson {
     Box {
         shape: Vec<usize>,
         dtype: String,
@@ -87,7 +89,7 @@ enum Wire {
     Rgb,
 }
 
-impl Wire {
+impl SpaceJson {
     fn space(&self) -> Result<Space> {
         Ok(match self {
             Self::Box { shape, dtype, low, high } => {
@@ -113,26 +115,26 @@ impl Wire {
     }
 }
 
-/// The type that numpy gives this name.
+/// The element type of a NumPy name.
 fn type_of(name: &str) -> Result<DType> {
     const ALL: [DType; 6] = [DType::Bool, DType::U8, DType::Int32, DType::Int64, DType::Float32, DType::Float64];
     let known = || ALL.iter().map(|dtype| dtype.name());
     let found = ALL.iter().find(|dtype| dtype.name() == name);
-    found.copied().ok_or_else(|| Error::unknown("type of numbers", name, known(), "columns hold no other"))
+    found.copied().ok_or_else(|| Error::unknown("element type", name, known(), "columns hold these types"))
 }
 
-/// What all environments of one id share: the platform's view of a description.
-pub struct Form {
+/// The spec and the memory layout of all environments of one id.
+pub struct EnvLayout {
     pub(crate) description: Description,
     pub(crate) spec: EnvSpec,
-    /// Where each column lies.
+    /// The byte range of each column.
     pub(crate) columns: Vec<Range<usize>>,
-    /// Where the action lies.
+    /// The byte range of the action.
     pub(crate) action: Range<usize>,
 }
 
-/// The head of the buffer: reward, distance to the goal, then three flags.
-pub(crate) mod head {
+/// Offsets in the header of the buffer: reward and goal distance (doubles), then three flags.
+pub(crate) mod header {
     pub const REWARD: usize = 0;
     pub const DISTANCE: usize = 8;
     pub const TERMINATED: usize = 16;
@@ -141,29 +143,29 @@ pub(crate) mod head {
     pub const END: usize = 19;
 }
 
-impl Form {
-    /// The world that environments of this description are, under this id.
+impl EnvLayout {
+    /// The layout of an environment with this description, under this id.
     ///
     /// # Errors
     /// When a factor's default is outside its own space, or the description contradicts itself.
     pub fn new(id: &str, description: Description) -> Result<Self> {
         let mut factors = vec![];
-        for WireFactor { key, space, init } in &description.factors {
+        for FactorJson { key, space, init } in &description.factors {
             let factor = Factor::new(key, space.space()?, init.clone());
             factor.space.check(&format!("the default of '{key}' of {id}"), init)?;
             factors.push(factor);
         }
         let mut columns = vec![];
-        let mut places = vec![];
-        for Column { name, dtype, shape, offset } in &description.columns {
+        let mut ranges = vec![];
+        for ColumnJson { name, dtype, shape, offset } in &description.columns {
             let column = ColumnSpec::new(name, type_of(dtype)?, shape.clone());
-            places.push(*offset..offset + column.row_bytes());
+            ranges.push(*offset..offset + column.row_bytes());
             columns.push(column);
         }
         Schema::new(columns.clone())?;
         let mut observation_space = vec![];
         for (name, space) in &description.observation {
-            // Once for each id: the names of a registry are static.
+            // Leaks once per name: the names in a spec are static.
             observation_space.push((crate::choose::interned(name), space.space()?));
         }
         let spec = EnvSpec {
@@ -177,31 +179,31 @@ impl Form {
         };
         let column = spec.action_column();
         let action = description.action_offset..description.action_offset + column.row_bytes();
-        let form = Self { columns: places, action, spec, description };
-        let pictures = form.picture().into_iter().chain(form.goal()).map(Place::range);
-        let all = form.columns.iter().cloned().chain(pictures).chain([form.action.clone(), form.factors()]);
-        let end = all.map(|range| range.end).max().unwrap_or(0).max(head::END);
-        if end > form.description.size {
+        let layout = Self { columns: ranges, action, spec, description };
+        let frames = layout.frame().into_iter().chain(layout.goal()).map(FrameRegion::range);
+        let all = layout.columns.iter().cloned().chain(frames).chain([layout.action.clone(), layout.factors()]);
+        let end = all.map(|range| range.end).max().unwrap_or(0).max(header::END);
+        if end > layout.description.size {
             return Err(Error::mismatch(
                 "describing an environment",
                 format!("{end} bytes"),
-                form.description.size.to_string(),
+                layout.description.size.to_string(),
             ));
         }
-        Ok(form)
+        Ok(layout)
     }
 
-    /// The pictures the environment draws.
-    pub(crate) fn picture(&self) -> Option<&Place> {
-        self.description.picture.as_ref()
+    /// The region of the rendered frame, if the environment renders.
+    pub(crate) fn frame(&self) -> Option<&FrameRegion> {
+        self.description.frame.as_ref()
     }
 
-    /// The picture of the goal that its `info` holds.
-    pub(crate) fn goal(&self) -> Option<&Place> {
+    /// The region of the goal frame, if `info` has one.
+    pub(crate) fn goal(&self) -> Option<&FrameRegion> {
         self.description.goal.as_ref()
     }
 
-    /// The numbers of an action, as they lie in the memory.
+    /// The bytes of an action, as in the memory.
     pub(crate) fn bytes<'a>(&self, action: Action<'a>) -> Result<&'a [u8]> {
         let space = &self.spec.action_space;
         Ok(match space {
@@ -210,27 +212,27 @@ impl Form {
         })
     }
 
-    /// Why there are no pictures.
-    pub(crate) fn no_picture(&self) -> &str {
-        &self.description.no_picture
+    /// Why the environment does not render.
+    pub(crate) fn no_frame(&self) -> &str {
+        &self.description.no_frame
     }
 
-    /// Whether pictures are pixel art.
+    /// Whether frames are pixel art.
     pub(crate) fn pixel_art(&self) -> bool {
         self.description.pixel_art
     }
 
-    /// What decides numbers and pictures, with versions.
+    /// The versions of the libraries that affect values and frames.
     pub(crate) fn libraries(&self) -> &BTreeMap<String, String> {
         &self.description.libraries
     }
 
-    /// The methods that put it into a state.
-    pub(crate) fn calls(&self) -> &[Callable] {
-        &self.description.calls
+    /// The methods that set its state.
+    pub(crate) fn callables(&self) -> &[Callable] {
+        &self.description.callables
     }
 
-    /// Where the factors' values lie, as doubles in sampling order.
+    /// The byte range of the factor values, doubles in sampling order.
     pub(crate) fn factors(&self) -> Range<usize> {
         let n: usize = self.spec.variation_space.factors().iter().map(|factor| factor.space.len()).sum();
         self.description.factors_offset..self.description.factors_offset + n * size_of::<f64>()

@@ -1,18 +1,18 @@
-//! [`Transport`]: how requests reach an environment, and the memory it answers in.
+//! [`Transport`]: sends requests to an environment and holds the memory that it writes results into.
 
 use crate::Description;
 use swm_core::Error;
 
-/// What is asked of an environment. Whatever it brings is in [`Transport::memory`] afterwards.
+/// A request to an environment. Its results are in [`Transport::memory`] afterwards.
 #[derive(Clone, Copy, Debug)]
 pub enum Request<'a> {
     /// Start an episode; the arguments of `Bridge.reset` as JSON.
     Reset(&'a str),
     /// Take the action in the memory.
     Step,
-    /// The same, and draw.
-    DrawnStep,
-    /// Draw.
+    /// Take the action in the memory and render.
+    StepAndRender,
+    /// Render.
     Render,
 }
 
@@ -22,7 +22,7 @@ impl<'a> Request<'a> {
         match self {
             Self::Reset(_) => b'r',
             Self::Step => b's',
-            Self::DrawnStep => b'd',
+            Self::StepAndRender => b'd',
             Self::Render => b'p',
         }
     }
@@ -36,52 +36,52 @@ impl<'a> Request<'a> {
     }
 }
 
-/// Why a request brought nothing.
+/// Why a request failed.
 #[derive(Debug)]
 pub enum Failure {
-    /// It makes no sense to ask again: the id is unknown, a package is missing.
+    /// A repeated request would fail in the same way: the id is unknown, a package is missing.
     Refused(Error),
-    /// The environment raised; the traceback. Asking again would raise again.
+    /// The environment raised an exception; the traceback. A repeated request would raise again.
     Raised(String),
-    /// Whoever ran the environment is gone; how, and its last words. A new one may do better.
+    /// The worker is lost; how it ended, with its last output. A new worker may succeed.
     Lost(String),
 }
 
-/// The way to one environment.
+/// The connection to one environment.
 pub trait Transport: Send {
-    /// Begins to make the environment anew, whatever became of the old one; need not wait for it.
+    /// Starts to make the environment again, whatever the state of the old one; need not wait for it.
     ///
     /// # Errors
-    /// When there is nothing to make it with.
+    /// When no worker can be started.
     fn restart(&mut self) -> Result<(), Failure>;
 
-    /// What the environment is; waits until it is made. Called once after a new transport and after each restart.
+    /// Waits until the environment is made and returns its description. Called once for a new transport and after each restart.
     ///
     /// # Errors
     /// When it cannot be made.
     fn describe(&mut self) -> Result<Description, Failure>;
 
-    /// Whether the environment works while nobody waits for it.
-    fn apart(&self) -> bool {
+    /// Whether the environment runs in another process, in parallel with the caller.
+    fn runs_in_parallel(&self) -> bool {
         false
     }
 
-    /// Asks without waiting, where the environment is apart; whether that went well. [`Transport::call`] with the same request
-    /// follows and waits for the answer. Until then [`Transport::memory`] is empty.
-    fn announce(&mut self, _request: Request<'_>) -> bool {
+    /// Sends a request without waiting, if the environment runs in parallel, and returns whether it was sent.
+    /// [`Transport::call`] with the same request follows and waits for the answer. Until then [`Transport::memory`] is empty.
+    fn dispatch(&mut self, _request: Request<'_>) -> bool {
         false
     }
 
-    /// Asks, unless that was announced, and waits for the answer.
+    /// Sends a request, unless it was dispatched, and waits for the answer.
     ///
     /// # Errors
-    /// When the environment raises, or is gone.
+    /// When the environment raises, or its worker is lost.
     fn call(&mut self, request: Request<'_>) -> Result<(), Failure>;
 
-    /// The buffer of the bridge, [`Description::size`] bytes; empty before [`Transport::describe`], after a loss, and while the
-    /// environment works.
+    /// The buffer of the bridge, [`Description::size`] bytes; empty before [`Transport::describe`], after a loss, and while a
+    /// dispatched request runs.
     fn memory(&self) -> &[u8];
 
-    /// The same, to write actions into.
+    /// The buffer of the bridge, for writing actions.
     fn memory_mut(&mut self) -> &mut [u8];
 }

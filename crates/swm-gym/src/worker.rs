@@ -1,9 +1,9 @@
-//! [`WorkerTransport`]: an environment in a Python process of its own, over shared memory.
+//! [`WorkerTransport`]: an environment in a separate Python process, over shared memory.
 //!
 //! The process gets three descriptors: a socket for requests and answers as its standard input, the shared memory as its
-//! standard output (an unnamed file that vanishes with its last holder), a pipe as its standard error, whose last lines
-//! are kept for error messages. It dies when it is dropped here, when its socket closes, and, on Linux, by the kernel's
-//! hand when this process ends in any way.
+//! standard output (an unnamed file, deleted with its last descriptor), and a pipe as its standard error, whose last lines
+//! appear in error messages. It ends when the transport is dropped, when its socket closes, and, on Linux, when this process
+//! ends in any way.
 
 use crate::config::{GymConfig, Python};
 use crate::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport, WORKER, assets};
@@ -21,10 +21,10 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use swm_core::Error;
 
-/// Lines of a worker's standard error that are kept.
+/// The number of last lines of a worker's standard error in error messages.
 const LINES: usize = 20;
-/// How long a worker that has nothing more to do, or is dying, is waited for.
-const PATIENCE: Duration = Duration::from_millis(500);
+/// How long the end of a worker process is waited for.
+const EXIT_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// A Python process with one environment.
 pub struct WorkerTransport {
@@ -36,11 +36,11 @@ pub struct WorkerTransport {
 
 struct Process {
     child: Child,
-    line: UnixStream,
+    socket: UnixStream,
     file: File,
     memory: Option<MmapMut>,
-    /// Whether a request was sent of which the answer is not yet read: the memory is the worker's.
-    told: bool,
+    /// Whether a request was sent whose answer is not read yet; the worker then owns the memory.
+    pending: bool,
     tail: Tail,
 }
 
@@ -58,12 +58,12 @@ impl WorkerTransport {
         }
     }
 
-    /// The process that runs the environment now.
+    /// The id of the process that runs the environment.
     pub fn process_id(&self) -> Option<u32> {
         self.process.as_ref().map(|process| process.child.id())
     }
 
-    /// Ends a process that does not keep to the exchange; how it ended, and its last words.
+    /// Ends a process that violates the protocol or a timeout, and returns how it ended with its last output.
     fn lose(&mut self, problem: &std::io::Error, limit: Duration) -> Failure {
         use std::io::ErrorKind::{TimedOut, WouldBlock};
         let Some(mut process) = self.process.take() else { return Failure::Lost("its worker process is gone".into()) };
@@ -85,14 +85,14 @@ impl WorkerTransport {
         Failure::Lost(how)
     }
 
-    /// Sends a request, if that is still to be done, and reads the answer.
+    /// Sends a request, unless it is pending, and reads the answer.
     fn exchange(&mut self, op: u8, payload: &[u8], limit: Duration) -> Result<(u8, Vec<u8>), Failure> {
         let Some(process) = &mut self.process else { return Err(Failure::Lost("its worker process is gone".into())) };
-        let sent = if std::mem::take(&mut process.told) { Ok(()) } else { process.send(op, payload) };
+        let sent = if std::mem::take(&mut process.pending) { Ok(()) } else { process.send(op, payload) };
         sent.and_then(|()| process.receive()).map_err(|problem| self.lose(&problem, limit))
     }
 
-    /// What an answer that is no success means.
+    /// The failure that an answer stands for.
     fn failure(&self, kind: u8, text: Vec<u8>) -> Failure {
         let text = String::from_utf8_lossy(&text).into_owned();
         let (id, python) = (&self.id, &self.config.python);
@@ -100,7 +100,7 @@ impl WorkerTransport {
             b'x' => return Failure::Raised(text),
             b'u' => {
                 let known: Vec<String> = serde_json::from_str(&text).unwrap_or_default();
-                let hint = format!("it is none of the {} that Gymnasium knows in {python}", known.len());
+                let hint = format!("it is not among the {} registered with Gymnasium in {python}", known.len());
                 Error::unknown("environment", id, known.iter().map(String::as_str), hint)
             }
             b'm' => {
@@ -112,7 +112,11 @@ impl WorkerTransport {
                 let [problem, fix]: [String; 2] = serde_json::from_str(&text).unwrap_or_default();
                 Error::config(id, problem, fix)
             }
-            _ => Error::config(id, text, format!("install what it asks for in {python}, or choose another")),
+            _ => Error::config(
+                id,
+                text,
+                format!("install the required packages in {python}, or choose another environment"),
+            ),
         };
         Failure::Refused(refused)
     }
@@ -122,22 +126,22 @@ impl Transport for WorkerTransport {
     fn restart(&mut self) -> Result<(), Failure> {
         self.process = None;
         let modules = BTreeMap::from([("swm_bridge", BRIDGE), ("swm_craftax", CRAFTAX)]);
-        let wanted = serde_json::json!({"id": self.id, "options": self.options, "modules": modules});
+        let request = serde_json::json!({"id": self.id, "options": self.options, "modules": modules});
         let mut process = Process::start(&self.id, &self.config.python).map_err(Failure::Refused)?;
-        // A process that cannot even be told will be found dead by whoever waits for its description.
-        if let Err(problem) = process.send(b'm', wanted.to_string().as_bytes()) {
-            tracing::debug!("{}: its worker did not listen: {problem}", self.id);
+        // A process that does not receive the request is reported by `describe`.
+        if let Err(problem) = process.send(b'm', request.to_string().as_bytes()) {
+            tracing::debug!("{}: its worker did not receive the first request: {problem}", self.id);
         }
         self.process = Some(process);
         Ok(())
     }
 
     fn describe(&mut self) -> Result<Description, Failure> {
-        let limit = self.config.start;
+        let limit = self.config.start_timeout;
         let Some(process) = &mut self.process else { return Err(Failure::Lost("its worker process is gone".into())) };
-        let answer = process.line.set_read_timeout(Some(limit)).and_then(|()| process.receive());
+        let answer = process.socket.set_read_timeout(Some(limit)).and_then(|()| process.receive());
         let (kind, text) = answer.map_err(|problem| match self.lose(&problem, limit) {
-            // Waiting as long again would bring nothing.
+            // A new worker would exceed the same timeout.
             Failure::Lost(how) if problem.kind() == std::io::ErrorKind::WouldBlock => {
                 Failure::Refused(Error::external(format!("making {}", self.id), how))
             }
@@ -149,37 +153,37 @@ impl Transport for WorkerTransport {
         }
         let description = Description::parse(&String::from_utf8_lossy(&text)).map_err(Failure::Refused)?;
         if let Some(process) = &mut self.process {
-            let opened = process.open(description.size, self.config.answer);
+            let opened = process.open(description.size, self.config.call_timeout);
             opened.map_err(|error| Failure::Refused(Error::external("sharing memory with a worker", error)))?;
         }
         Ok(description)
     }
 
-    fn apart(&self) -> bool {
+    fn runs_in_parallel(&self) -> bool {
         true
     }
 
-    /// A worker that cannot be told is found dead by the call.
-    fn announce(&mut self, request: Request<'_>) -> bool {
+    /// A worker that cannot receive the request is reported by the call.
+    fn dispatch(&mut self, request: Request<'_>) -> bool {
         let Some(process) = &mut self.process else { return false };
-        process.told = process.told || process.send(request.op(), request.payload()).is_ok();
-        process.told
+        process.pending = process.pending || process.send(request.op(), request.payload()).is_ok();
+        process.pending
     }
 
     fn call(&mut self, request: Request<'_>) -> Result<(), Failure> {
-        match self.exchange(request.op(), request.payload(), self.config.answer)? {
+        match self.exchange(request.op(), request.payload(), self.config.call_timeout)? {
             (b'.', _) => Ok(()),
             (kind, text) => Err(self.failure(kind, text)),
         }
     }
 
     fn memory(&self) -> &[u8] {
-        let process = self.process.as_ref().filter(|process| !process.told);
+        let process = self.process.as_ref().filter(|process| !process.pending);
         process.and_then(|process| process.memory.as_deref()).unwrap_or_default()
     }
 
     fn memory_mut(&mut self) -> &mut [u8] {
-        let process = self.process.as_mut().filter(|process| !process.told);
+        let process = self.process.as_mut().filter(|process| !process.pending);
         process.and_then(|process| process.memory.as_deref_mut()).unwrap_or_default()
     }
 }
@@ -189,14 +193,14 @@ impl Process {
         let shared = if Path::new("/dev/shm").is_dir() { "/dev/shm".into() } else { std::env::temp_dir() };
         let file = tempfile::tempfile_in(&shared).map_err(|error| Error::io(&shared, "making shared memory", error))?;
         let io = |error| Error::external("starting a worker", error);
-        let (line, far) = UnixStream::pair().map_err(io)?;
+        let (socket, remote) = UnixStream::pair().map_err(io)?;
         let mut command = Command::new(&python.program);
         command.args(["-c", WORKER, &std::process::id().to_string(), id]);
-        command.stdin(Stdio::from(OwnedFd::from(far)));
+        command.stdin(Stdio::from(OwnedFd::from(remote)));
         command.stdout(Stdio::from(file.try_clone().map_err(io)?)).stderr(Stdio::piped());
-        // Signals of a terminal are for us; who asked for the worker decides what becomes of it.
+        // Terminal signals reach this process only, which then ends its workers.
         command.process_group(0);
-        // Each environment has a core at most: there are as many workers as environments. What somebody set, stays.
+        // One core per environment at most: there are as many workers as environments. Variables that are set stay.
         let cache = assets::folder().join("jax-cache");
         let defaults = [
             ("OMP_NUM_THREADS", "1".as_ref()),
@@ -209,7 +213,7 @@ impl Process {
             ("SDL_AUDIODRIVER", "dummy".as_ref()),
             ("PYGAME_HIDE_SUPPORT_PROMPT", "1".as_ref()),
         ];
-        // Without a screen, MuJoCo's Python package draws through EGL only.
+        // Without a display, MuJoCo's Python package renders through EGL only.
         let headless = std::env::var_os("DISPLAY").is_none().then_some(("MUJOCO_GL", "egl".as_ref()));
         for (name, value) in defaults.into_iter().chain(headless) {
             if std::env::var_os(name).is_none() {
@@ -220,7 +224,7 @@ impl Process {
             Error::config("Python", format!("{python} cannot be started: {error}"), python.fix("gymnasium"))
         })?;
         let tail = Tail::of(child.stderr.take(), id);
-        Ok(Self { child, line, file, memory: None, told: false, tail })
+        Ok(Self { child, socket, file, memory: None, pending: false, tail })
     }
 
     fn send(&mut self, op: u8, payload: &[u8]) -> std::io::Result<()> {
@@ -228,45 +232,45 @@ impl Process {
         let mut head = [0; 5];
         head[0] = op;
         head[1..].copy_from_slice(&n.to_le_bytes());
-        self.line.write_all(&head)?;
-        if payload.is_empty() { Ok(()) } else { self.line.write_all(payload) }
+        self.socket.write_all(&head)?;
+        if payload.is_empty() { Ok(()) } else { self.socket.write_all(payload) }
     }
 
     fn receive(&mut self) -> std::io::Result<(u8, Vec<u8>)> {
         let mut head = [0; 5];
-        self.line.read_exact(&mut head)?;
+        self.socket.read_exact(&mut head)?;
         let [kind, n @ ..] = head;
         // Most answers are empty: no allocation.
         let mut text = vec![0; u32::from_le_bytes(n) as usize];
-        self.line.read_exact(&mut text)?;
+        self.socket.read_exact(&mut text)?;
         Ok((kind, text))
     }
 
-    /// Maps the memory that the worker has made room in.
+    /// Maps the memory that the worker allocated.
     fn open(&mut self, size: usize, answer: Duration) -> std::io::Result<()> {
-        self.line.set_read_timeout(Some(answer))?;
-        let room = self.file.metadata()?.len();
-        if room < size as u64 {
-            return Err(std::io::Error::other(format!("it has {room} bytes of {size}")));
+        self.socket.set_read_timeout(Some(answer))?;
+        let allocated = self.file.metadata()?.len();
+        if allocated < size as u64 {
+            return Err(std::io::Error::other(format!("it has {allocated} bytes of {size}")));
         }
         self.memory = Some(map(&self.file)?);
         Ok(())
     }
 
-    /// How it ended, if it has or is about to.
+    /// The exit status, if the process ends within the timeout.
     fn end(&mut self) -> Option<std::process::ExitStatus> {
         let turns = 100;
         for _ in 0..turns {
             if let Ok(Some(status)) = self.child.try_wait() {
                 return Some(status);
             }
-            std::thread::sleep(PATIENCE / turns);
+            std::thread::sleep(EXIT_TIMEOUT / turns);
         }
         None
     }
 
     fn kill(&mut self) {
-        // It may have ended by itself.
+        // The process may have ended already.
         if let Err(problem) = self.child.kill().and_then(|()| self.child.wait()) {
             tracing::debug!("stopping a worker: {problem}");
         }
@@ -274,22 +278,22 @@ impl Process {
 }
 
 impl Drop for Process {
-    /// Lets the worker close its environment, for a moment.
+    /// Gives the worker time to close its environment.
     fn drop(&mut self) {
-        let closed = self.line.shutdown(std::net::Shutdown::Write);
-        if closed.and_then(|()| self.line.set_read_timeout(Some(PATIENCE))).is_ok() {
-            // Its end of the line closes when it ends.
+        let closed = self.socket.shutdown(std::net::Shutdown::Write);
+        if closed.and_then(|()| self.socket.set_read_timeout(Some(EXIT_TIMEOUT))).is_ok() {
+            // The worker's end of the socket closes when it ends.
             let mut rest = [0; 64];
-            while matches!(self.line.read(&mut rest), Ok(1..)) {}
+            while matches!(self.socket.read(&mut rest), Ok(1..)) {}
         }
         self.kill();
     }
 }
 
-#[allow(unsafe_code)]
+#[allow(unsafe_code, reason = "shared memory is mapped from a file")]
 fn map(file: &File) -> std::io::Result<MmapMut> {
-    // SAFETY: the file has no name; besides us only our worker holds it, which never changes its size. The worker writes
-    // to it only between a request and its answer, when nobody here holds a reference: `Transport::announce` and `call`
+    // SAFETY: the file has no name; only this process and its worker hold it, and the worker never changes its size. The worker writes
+    // to it only between a request and its answer, when this process holds no reference: `Transport::dispatch` and `call`
     // borrow the transport mutably, and between the two it lends no memory. A worker that does not answer in time is
     // killed before the memory is touched again.
     unsafe { MmapMut::map_mut(file) }
@@ -305,10 +309,10 @@ struct Tail {
 impl Tail {
     fn of(pipe: Option<ChildStderr>, id: &str) -> Self {
         let lines = Arc::new(Mutex::new(VecDeque::new()));
-        let (kept, id) = (Arc::clone(&lines), id.to_owned());
+        let (last, id) = (Arc::clone(&lines), id.to_owned());
         let (tell, over) = channel();
         let read = move || {
-            let _closed_at_the_end: Sender<()> = tell;
+            let _dropped_at_the_end: Sender<()> = tell;
             let mut pipe = pipe.map(BufReader::new);
             let mut line = vec![];
             while let Some(pipe) = &mut pipe
@@ -316,39 +320,39 @@ impl Tail {
             {
                 let text = String::from_utf8_lossy(&line).trim_end().to_owned();
                 tracing::debug!("{id}: {text}");
-                let mut kept = kept.lock().unwrap_or_else(PoisonError::into_inner);
-                if kept.len() == LINES {
-                    kept.pop_front();
+                let mut last = last.lock().unwrap_or_else(PoisonError::into_inner);
+                if last.len() == LINES {
+                    last.pop_front();
                 }
-                kept.push_back(text);
+                last.push_back(text);
                 line.clear();
             }
         };
-        // Without a thread nothing is kept, and the worker's words are lost: an error message less.
+        // Without this thread, error messages lack the worker's last output.
         if let Err(problem) = std::thread::Builder::new().name("swm-gym-stderr".to_owned()).spawn(read) {
-            tracing::debug!("keeping the words of a worker: {problem}");
+            tracing::debug!("collecting the output of a worker: {problem}");
         }
         Self { lines, over }
     }
 
-    /// What was said last, once the worker has ended.
+    /// The last lines, once the worker has ended.
     fn lines(&self) -> Vec<String> {
-        // A child of the worker may hold the pipe on: do not wait for it.
-        let _closed_or_late = self.over.recv_timeout(PATIENCE);
+        // A child of the worker may hold the pipe open, so the wait is bounded.
+        let _closed_or_timed_out = self.over.recv_timeout(EXIT_TIMEOUT);
         self.lines.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
     }
 }
 
-/// A command and where its child goes.
+/// A command and the channel that receives its child.
 type Job = (Command, SyncSender<std::io::Result<Child>>);
 
-/// Starts a process from a thread that lives as long as this process: the kernel's promise to end a child with its
-/// parent (`PR_SET_PDEATHSIG`) counts from the thread that started it.
+/// Starts a process from a thread that lives as long as this process, because the kernel ends a child with the thread that
+/// started it (`PR_SET_PDEATHSIG`).
 fn spawn(command: Command) -> std::io::Result<Child> {
     static STARTER: Mutex<Option<(u32, Sender<Job>)>> = Mutex::new(None);
     let (tell, child) = sync_channel(1);
     let mut starter = STARTER.lock().unwrap_or_else(PoisonError::into_inner);
-    // A fork of this process has no such thread any more.
+    // A fork of this process does not have that thread.
     let here = std::process::id();
     let jobs = match &*starter {
         Some((process, jobs)) if *process == here => jobs.clone(),
@@ -356,7 +360,7 @@ fn spawn(command: Command) -> std::io::Result<Child> {
             let (jobs, queue) = channel::<Job>();
             std::thread::Builder::new().name("swm-gym-starter".to_owned()).spawn(move || {
                 for (mut command, tell) in queue {
-                    // Who asked may have given up.
+                    // The receiver may be gone.
                     let _received = tell.send(command.spawn());
                 }
             })?;

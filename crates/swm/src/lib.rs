@@ -42,7 +42,7 @@ const ROWS: [EnvEntry; swm_envs::ENVS.rows.len() + swm_mujoco::ENVS.rows.len()] 
 pub fn env(text: &str) -> Result<EnvChoice> {
     let id = text.split(',').next().unwrap_or_default();
     let ours = |id: &str| ENVS.get(id).is_ok();
-    if !ours(id) && !ours(&format!("swm/{id}")) && swm_gym::looks_foreign(text) {
+    if !ours(id) && !ours(&format!("swm/{id}")) && swm_gym::is_gymnasium_id(text) {
         return swm_gym::choose(text);
     }
     ENVS.choose(text)

@@ -7,8 +7,8 @@ use swm_envs::ENVS;
 static ALLOCATOR: Counting = Counting;
 
 #[test]
-fn the_counter_counts() {
-    allocation::the_counter_counts();
+fn counting_allocator_is_active() {
+    allocation::counting_allocator_is_active();
 }
 
 #[test]

@@ -1,14 +1,14 @@
 //! The conformance suite over every native environment.
 
-use swm_conformance::Worlds;
+use swm_conformance::Suite;
 use swm_envs::ENVS;
 
 /// Why `goal.scale` changes nothing.
 const GOAL_SCALE: &str = "the reference samples it and draws the goal pose as large as the block";
 
-static WORLDS: Worlds = Worlds {
-    idle: &[("swm/PushT-v1", "goal.scale", GOAL_SCALE), ("swm/PushT-Discrete-v1", "goal.scale", GOAL_SCALE)],
-    ..Worlds::of(ENVS.rows)
+static SUITE: Suite = Suite {
+    inert_factors: &[("swm/PushT-v1", "goal.scale", GOAL_SCALE), ("swm/PushT-Discrete-v1", "goal.scale", GOAL_SCALE)],
+    ..Suite::of(ENVS.rows)
 };
 
-swm_conformance::tests!(WORLDS);
+swm_conformance::tests!(SUITE);

@@ -16,7 +16,7 @@ fn pong_shows_its_frames() {
     }
     // What it draws is what it observes.
     let observed = env.column("observation");
-    let drawn = env.picture(210, 160);
+    let drawn = env.frame(210, 160);
     assert!(observed.iter().zip(&drawn).all(|(&a, &b)| a == f64::from(b)), "two pictures");
     assert!(drawn.chunks_exact(3).any(|pixel| pixel != &drawn[..3]), "there is something to see");
     assert!(play("ALE/Pong-v5", &config, &[0, 1], 2, 5)[1] == play("ALE/Pong-v5", &config, &[1], 1, 5)[0]);
@@ -42,7 +42,7 @@ fn craftax_is_played_and_drawn() {
             env.env.step(Action::Discrete(&[action])).expect("a step");
         }
         assert!(env.env.libraries().contains_key("craftax"), "{id}");
-        let picture = env.picture(64, 64);
+        let picture = env.frame(64, 64);
         assert!(picture.chunks_exact(3).any(|pixel| pixel != &picture[..3]), "{id}: there is something to see");
     }
 }

@@ -2,9 +2,9 @@
 //! Where it names none, they are skipped, in words; where it names one without Gymnasium, they fail.
 
 mod atari;
+mod dataset_start;
 mod parents;
 mod play;
-mod recorded;
 mod robust;
 mod spaces;
 
@@ -20,9 +20,9 @@ fn config() -> Option<GymConfig> {
         return None;
     };
     Some(GymConfig {
-        python: Python { program: PathBuf::from(program), whence: "named by $SWM_PYTHON" },
-        start: Duration::from_secs(1800),
-        answer: Duration::from_secs(60),
+        python: Python { program: PathBuf::from(program), origin: "named by $SWM_PYTHON" },
+        start_timeout: Duration::from_secs(1800),
+        call_timeout: Duration::from_secs(60),
         restarts: 2,
     })
 }
@@ -38,7 +38,7 @@ fn has(config: &GymConfig, module: &str) -> bool {
     there
 }
 
-#[allow(clippy::print_stderr)]
+#[allow(clippy::print_stderr, reason = "a skipped test must be visible")]
 fn skip(why: &str) {
     eprintln!("skipped: {why}");
 }

@@ -74,13 +74,13 @@ impl Seen {
         self.env.observe(&mut self.row.row_mut(0));
         let mut bytes: Vec<u8> =
             (0..self.row.schema().columns().len()).flat_map(|column| self.row.bytes(column)).copied().collect();
-        bytes.extend(self.picture(9, 12));
+        bytes.extend(self.frame(9, 12));
         bytes
     }
 
-    pub fn picture(&mut self, height: usize, width: usize) -> Vec<u8> {
+    pub fn frame(&mut self, height: usize, width: usize) -> Vec<u8> {
         let mut rgb = vec![7; height * width * 3];
-        self.env.render(FrameMut::new(width, height, &mut rgb)).expect("a picture");
+        self.env.render(FrameMut::new(width, height, &mut rgb)).expect("a frame");
         rgb
     }
 }
@@ -136,7 +136,7 @@ fn what_was_announced_happens_once() {
     plain.env.step(push).expect("a step");
     assert!(told.dispatch(PendingCall::Step(push)));
     assert!(plain.env.snapshot() == told.env.snapshot());
-    assert!(plain.picture(9, 12) == told.picture(9, 12) && plain.everything() == told.everything());
+    assert!(plain.frame(9, 12) == told.frame(9, 12) && plain.everything() == told.everything());
     plain.env.step(push).and_then(|_| plain.env.step(none)).expect("two steps");
     assert!(told.dispatch(PendingCall::Step(push)));
     told.env.step(none).expect("another step");
@@ -216,9 +216,9 @@ fn info_goals_and_pictures_reach_the_world() {
     assert_eq!(noises[0], noises[1], "what is missing keeps its value");
     assert_ne!(noises[1], noises[2]);
     // The blue third at the top, at its own size and at another.
-    let own = room.picture(12, 16);
+    let own = room.frame(12, 16);
     assert_eq!((&own[..3], &own[own.len() - 3..]), (&[0, 0, 140][..], &[0, 0, 0][..]));
-    let half = room.picture(6, 8);
+    let half = room.frame(6, 8);
     assert_eq!((half[2], half[half.len() - 1]), (140, 0));
     // The next episode forgets.
     room.env.reset(3, &ResetOptions::default()).expect("a reset");
@@ -264,12 +264,12 @@ fn a_wrapper_may_have_the_factors_and_draw() {
     let Some(config) = config() else { return };
     let mut coated = Seen::of(make("tests.it.worlds:Coated-v0", &config));
     coated.env.reset(1, &ResetOptions::default()).expect("a reset");
-    assert_eq!(coated.picture(2, 2), [9; 12]);
+    assert_eq!(coated.frame(2, 2), [9; 12]);
     let pinned = [("coat".to_owned(), vec![1.0, 2.0, 3.0])].into();
     let variation = VariationRequest { variation: None, variation_values: pinned };
     coated.env.reset(1, &ResetOptions { variation, ..ResetOptions::default() }).expect("a reset");
     assert_eq!(coated.env.factors().rgb("coat"), [1, 2, 3]);
-    assert_eq!(coated.picture(1, 1), [1, 2, 3]);
+    assert_eq!(coated.frame(1, 1), [1, 2, 3]);
 }
 
 #[test]
@@ -321,7 +321,7 @@ fn what_a_gymnasium_environment_cannot_do_is_said() {
     assert!(wrong.contains("sutton") && wrong.contains("CartPole-v1"), "{wrong}");
     let module = swm_gym::make("no_such_module:Maze-v0", config.clone()).err().expect("no module").to_string();
     assert!(module.contains("no_such_module"), "{module}");
-    let python = swm_gym::Python { program: "/no/such/python".into(), whence: "named by a test" };
+    let python = swm_gym::Python { program: "/no/such/python".into(), origin: "named by a test" };
     let none = swm_gym::make("CartPole-v1", GymConfig { python, ..config }).err().expect("no Python").to_string();
     assert!(none.contains("/no/such/python (named by a test)") && none.contains("SWM_PYTHON"), "{none}");
 }

@@ -111,7 +111,7 @@ fn an_exception_is_told_and_not_tried_again() {
 #[test]
 fn an_environment_that_hangs_is_stopped() {
     let Some(config) = config() else { return };
-    let config = GymConfig { answer: Duration::from_millis(1500), restarts: 1, ..config };
+    let config = GymConfig { call_timeout: Duration::from_millis(1500), restarts: 1, ..config };
     let mut env = make(&format!("{ROOM},hang_at=2"), &config);
     env.reset(0, &ResetOptions::default()).expect("a reset");
     env.step(PUSH).expect("a step");

@@ -21,7 +21,6 @@ fn actions_of_every_kind_arrive() {
         env.env.reset(0, &ResetOptions::default()).expect("a reset");
         env.env.step(Action::Discrete(action)).unwrap_or_else(|error| panic!("{kind}: {error}"));
         let seen = env.column("observation");
-        #[allow(clippy::cast_precision_loss)]
         let wanted: Vec<f64> = action.iter().map(|&choice| choice as f64).collect();
         assert_eq!(seen[..wanted.len()], wanted, "{kind}");
     }

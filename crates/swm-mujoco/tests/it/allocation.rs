@@ -11,7 +11,7 @@ static ALLOCATOR: Counting = Counting;
 
 #[test]
 fn counter_counts_allocations() {
-    allocation::the_counter_counts();
+    allocation::counting_allocator_is_active();
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! The conformance suite over every environment of this crate. Rendering takes tens of milliseconds here, so the checks run
 //! with fewer repetitions than for 2-D environments.
 
-use swm_conformance::Worlds;
+use swm_conformance::Suite;
 use swm_mujoco::ENVS;
 
 /// The reference declares the factor and never applies it.
@@ -82,19 +82,19 @@ const IDLE: &[(&str, &str, &str)] = &[
     ("swm/WalkerDMControl-v0", "gravity.y", PLANAR),
 ];
 
-static WORLDS: Worlds = Worlds {
-    demonstrated: false,
-    size: (48, 64),
-    sizes: &[(1, 1), (13, 7)],
+static SUITE: Suite = Suite {
+    require_experts: false,
+    frame_size: (48, 64),
+    frame_sizes: &[(1, 1), (13, 7)],
     steps: 2,
     goals: 2,
-    rows_restored: 1,
+    restored_rows: 1,
     values: 1,
     contexts: 1,
     requests: 1,
     resets: 20,
-    idle: IDLE,
-    ..Worlds::of(ENVS.rows)
+    inert_factors: IDLE,
+    ..Suite::of(ENVS.rows)
 };
 
-swm_conformance::tests!(WORLDS);
+swm_conformance::tests!(SUITE);

@@ -55,7 +55,7 @@ fn an_environment_with_setters_starts_where_it_was_recorded() {
     assert_eq!(field.env.factors().scalar("agent.size"), 1.5, "factors are the recorded ones");
     assert!(!field.env.is_success() && field.env.goal_distance().is_infinite());
     let wind = field.column("wind");
-    let own = field.picture(16, 16);
+    let own = field.frame(16, 16);
     assert_eq!(own[3 * (9 * 16 + 6)], 255, "it stands there, too");
     let mut goal = vec![0; 12];
     field.env.render_goal(FrameMut::new(2, 2, &mut goal)).expect("a goal");

@@ -1,0 +1,31 @@
+//! Checks of registry entries and their specs.
+
+use crate::Suite;
+use swm_core::columns::STATE;
+use swm_core::{DType, Schema, Space};
+
+/// Entries have unique ids and complete specs: actions, columns, factors, experts.
+pub fn entries_are_complete(suite: &Suite) {
+    for entry in suite.rows {
+        let (env, id) = (entry.env().expect("an environment"), entry.id);
+        let spec = env.spec();
+        assert_eq!(spec.id, id);
+        assert_eq!(suite.rows.iter().filter(|other| other.id == id).count(), 1, "{id} is listed once");
+        assert!(!entry.summary.is_empty(), "{id} has a summary");
+        assert!(spec.max_episode_steps > 0, "{id}");
+        let schema = Schema::new(spec.columns.clone()).unwrap_or_else(|error| panic!("{id}: {error}"));
+        assert!(schema.find(STATE).is_some(), "{id} observes its state");
+        let supported = match spec.action_space {
+            Space::Box { dtype, .. } => dtype == DType::Float32,
+            Space::Discrete { .. } | Space::MultiDiscrete { .. } => true,
+            Space::Rgb => false,
+        };
+        assert!(supported, "{id}: actions are a float32 box, discrete or multi-discrete");
+        assert!(!suite.require_experts || !entry.experts.is_empty(), "{id} has an expert");
+        for (i, expert) in entry.experts.iter().enumerate() {
+            assert!(entry.experts[..i].iter().all(|other| other.id != expert.id), "{id}: two experts '{}'", expert.id);
+            assert!(!expert.summary.is_empty(), "{id}: {} has a summary", expert.id);
+        }
+        assert!(!spec.variation_space.factors().is_empty(), "{id} has factors of variation");
+    }
+}

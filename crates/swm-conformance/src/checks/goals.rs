@@ -1,0 +1,72 @@
+//! Checks of sampled goals and goal distances.
+
+use super::experts::follow_expert;
+use super::probe::{Probe, all_varied, frame_difference};
+use crate::Suite;
+use swm_core::columns::{GOAL_STATE, STATE};
+use swm_core::{Batch, ColumnSpec, DType, Key, ResetOptions, Schema};
+
+/// Sampled goals are new, follow from their key, match their frame, and succeed when reached.
+pub fn sampled_goals_are_new_and_reachable(suite: &Suite) {
+    for entry in suite.rows {
+        let mut distinct = 0;
+        for seed in 0..suite.goals {
+            let options = if seed % 2 == 0 { ResetOptions::default() } else { all_varied() };
+            let mut probe = Probe::reset(suite, entry, seed, &options);
+            let (id, key) = (entry.id, Key::new(seed).with("goal"));
+            let (state, snapshot) = (probe.column(STATE), probe.env.snapshot());
+            probe.env.sample_goal(key).unwrap_or_else(|error| panic!("{id}, seed {seed}: {error}"));
+            assert_eq!(probe.column(STATE), state, "{id}: sampling a goal changes the state");
+            assert!(!probe.env.is_success(), "{id}, seed {seed}: the goal is reached at once");
+            assert!(probe.env.snapshot() != snapshot, "{id}: the snapshot lacks the goal");
+            let goal = probe.column(GOAL_STATE);
+            probe.env.sample_goal(key).expect("the same goal");
+            assert_eq!(probe.column(GOAL_STATE), goal, "{id}: one key gives two goals");
+            let goal_frame = probe.goal_frame();
+            probe.env.sample_goal(key.at(1)).expect("another goal");
+            distinct += u64::from(probe.column(GOAL_STATE) != goal);
+
+            // The goal state succeeds, by reset and by restore, and its frame equals the goal frame.
+            let there = ResetOptions { state: Some(goal.clone()), goal_state: Some(goal.clone()), ..options };
+            let mut there = Probe::reset(suite, entry, seed, &there);
+            assert!(there.env.is_success(), "{id}, seed {seed}: a reset to the goal does not succeed");
+            let schema = Schema::new([ColumnSpec::new(STATE, DType::Float64, [goal.len()])]).expect("a schema");
+            let mut row = Batch::zeros(&schema, 1);
+            row.get_mut(STATE).expect("the state").copy_from_slice(&goal);
+            there.env.restore_from(row.row(0), row.row(0)).expect("a row");
+            assert!(there.env.is_success(), "{id}, seed {seed}: a restore to the goal does not succeed");
+            let difference = frame_difference(&there.frame(), &goal_frame);
+            assert!(difference < 1.0, "{id}, seed {seed}: the goal frame differs by {difference} of 255");
+        }
+        let goals = suite.goals;
+        assert!(distinct * 20 >= goals * 19, "{}: only {distinct} of {goals} keys give different goals", entry.id);
+    }
+}
+
+/// The goal distance is positive at the start, near 0 at the goal, and smaller after an expert reached it.
+pub fn goal_distance_decreases_to_the_goal(suite: &Suite) {
+    for entry in suite.rows {
+        let mut reached = 0;
+        for seed in 0..6.min(suite.goals) {
+            let (id, key) = (entry.id, Key::new(seed).with("goal"));
+            let options = if seed < 4 { ResetOptions::default() } else { all_varied() };
+            let mut probe = Probe::reset(suite, entry, seed, &options);
+            probe.env.sample_goal(key).unwrap_or_else(|error| panic!("{id}, seed {seed}: {error}"));
+            let before = probe.env.goal_distance();
+            assert!(before.is_finite() && before > 0.0, "{id}, seed {seed}: distance {before} to a goal not reached");
+            let goal = probe.column(GOAL_STATE);
+            let there = ResetOptions { state: Some(goal.clone()), goal_state: Some(goal), ..options };
+            let there = Probe::reset(suite, entry, seed, &there).env.goal_distance();
+            assert!((0.0..=0.05 * before).contains(&there), "{id}, seed {seed}: {there} at the goal, {before} before");
+            if !entry.experts.is_empty() && follow_expert(entry, &mut probe, seed) {
+                reached += 1;
+                let after = probe.env.goal_distance();
+                assert!(
+                    after < before,
+                    "{id}, seed {seed}: {after} where the expert reached the goal, {before} before"
+                );
+            }
+        }
+        assert!(reached > 0 || entry.experts.is_empty(), "{}: its expert reaches no goal", entry.id);
+    }
+}

@@ -1,0 +1,183 @@
+//! Starts of Gymnasium environments at dataset rows: the arguments of `Bridge.reset`.
+//!
+//! Gymnasium has no interface for setting a state, so methods of the environment are called after the reset: those that the
+//! caller names, or those that the bridge found by their names. They return no observation, so the columns take the values
+//! of the start row until the next step; columns of the goal (`goal_NAME`) take those of the goal row in every step.
+
+use crate::EnvLayout;
+use serde_json::{Value, json};
+use swm_core::columns::{EPISODE_SEED, PIXELS, SEED, flat, flat_factor, goal_source, is_flat_factor, join_seed};
+use swm_core::{Callable, CallableArgument, DType, DatasetStart, Error, ResetOptions, Result, RowRef, Schema};
+
+/// The methods to call: `named`, or else those of the environment's description.
+pub fn callables<'a>(layout: &'a EnvLayout, named: &'a [Callable]) -> Result<&'a [Callable]> {
+    let callables = if named.is_empty() { layout.callables() } else { named };
+    if !callables.is_empty() {
+        return Ok(callables);
+    }
+    Err(Error::config(
+        format!("starting {} from a row of a dataset", layout.spec.id),
+        "it has no method known to set a state",
+        "give it a method `set_state(state)`, or name one of its own, from Python: World.evaluate(callables=[{'method': \
+         'set_state', 'args': {'state': {'value': 'state'}}}])",
+    ))
+}
+
+/// The columns of a dataset that a start reads.
+///
+/// # Errors
+/// When the dataset lacks a column that an argument names.
+pub fn columns(layout: &EnvLayout, stored: &Schema, named: &[Callable]) -> Result<Vec<String>> {
+    let find = |name: &str| stored.columns().iter().position(|column| flat(&column.name) == name);
+    // Images are large, so only the goal frame and named ones are read.
+    let mut read: Vec<bool> = stored.columns().iter().map(|column| is_always_read(&flat(&column.name))).collect();
+    for call in callables(layout, named)? {
+        for argument in call.args.values() {
+            if let Some(column) = argument_column(argument)? {
+                let (_, name) = source(&column);
+                let index = find(name).ok_or_else(|| {
+                    let known = stored.columns().iter().map(|column| column.name.as_str());
+                    let known: Vec<&str> = known.filter(|name| source(name).0 == Source::Start).collect();
+                    let hint = format!(
+                        "{}() takes it, and the dataset has {}; the prefix `goal_` denotes the value at the goal",
+                        call.method,
+                        known.join(", ")
+                    );
+                    Error::unknown("column", &column, known, hint)
+                })?;
+                read[index] = true;
+            }
+        }
+    }
+    for own in &layout.spec.columns {
+        let name = flat(&own.name);
+        if let Some(index) = find(source(&name).1) {
+            read[index] = true;
+        }
+    }
+    let read = stored.columns().iter().zip(read).filter(|(_, read)| *read);
+    Ok(read.map(|(column, _)| column.name.clone()).collect())
+}
+
+/// Whether a column is read for every environment: factors, the seed, the frame.
+fn is_always_read(name: &str) -> bool {
+    is_flat_factor(name) || [SEED, EPISODE_SEED, PIXELS].contains(&name)
+}
+
+/// The row that a column is read from.
+#[derive(Clone, Copy, PartialEq)]
+enum Source {
+    Start,
+    Goal,
+}
+
+/// The row that a column is read from, and its name there.
+fn source(name: &str) -> (Source, &str) {
+    goal_source(name).map_or((Source::Start, name), |name| (Source::Goal, name))
+}
+
+/// The flat name of the column that an argument names; `None` for a literal value.
+fn argument_column(argument: &CallableArgument) -> Result<Option<String>> {
+    match (&argument.value, argument.in_dataset) {
+        (_, false) => Ok(None),
+        (Value::String(name), true) => Ok(Some(flat(name))),
+        (other, true) => Err(Error::mismatch(
+            "reading callables",
+            format!("the value {other} from the dataset"),
+            "a column's name; with 'in_dataset': False it is the value itself",
+        )),
+    }
+}
+
+/// The seed and options of the reset: the recorded seed, unless factors are to be sampled, and the recorded factors.
+pub fn reset(layout: &EnvLayout, seed: u64, options: &ResetOptions, start: RowRef<'_>) -> Result<(u64, ResetOptions)> {
+    let mut options = options.clone();
+    let samples = options.variation.variation.as_ref().is_some_and(|keys| !keys.is_empty());
+    let seed = if samples { seed } else { recorded_seed(start)?.unwrap_or(seed) };
+    for factor in layout.spec.variation_space.factors() {
+        let name = flat_factor(&factor.key);
+        if let Some(index) = start.schema().find(&name)
+            && start.schema().columns()[index].len() == factor.space.len()
+        {
+            options.variation.variation_values.insert(factor.key.clone(), start.to_f64(&name)?);
+        }
+    }
+    Ok((seed, options))
+}
+
+/// The seed of the recorded episode, from the column `seed` of other programs or from `episode_seed`.
+fn recorded_seed(start: RowRef<'_>) -> Result<Option<u64>> {
+    let values = |name| start.schema().find(name).map(|_| start.to_f64(name)).transpose();
+    if let Some(&[seed]) = values(SEED)?.as_deref()
+        && seed >= 0.0
+    {
+        return Ok(Some(seed as u64));
+    }
+    let elements = values(EPISODE_SEED)?.and_then(|elements| <[f64; 3]>::try_from(elements).ok());
+    Ok(elements.map(join_seed))
+}
+
+/// The argument `recorded` of `Bridge.reset`: the methods with their arguments, and the values of columns afterwards.
+pub fn json(layout: &EnvLayout, from: &DatasetStart<'_>) -> Result<Value> {
+    let value = |name: &str| {
+        let (row_of, name) = source(name);
+        let row = if row_of == Source::Goal { from.goal } else { from.start };
+        row.schema().find(name).map(|index| array(row, index))
+    };
+    let mut made = vec![];
+    for call in callables(layout, from.callables)? {
+        let mut arguments = serde_json::Map::new();
+        for (key, argument) in &call.args {
+            let given = match argument_column(argument)? {
+                None => argument.value.clone(),
+                Some(column) => value(&column).unwrap_or_default(),
+            };
+            arguments.insert(key.clone(), given);
+        }
+        made.push(json!({"method": call.method, "args": arguments}));
+    }
+    let (mut shown, mut held) = (serde_json::Map::new(), serde_json::Map::new());
+    for own in &layout.spec.columns {
+        let name = flat(&own.name);
+        let (row_of, there) = source(&name);
+        let fits =
+            from.start.schema().find(there).is_some_and(|at| from.start.schema().columns()[at].len() == own.len());
+        if let Some(value) = value(&name).filter(|_| fits) {
+            let values = if row_of == Source::Goal { &mut held } else { &mut shown };
+            values.insert(own.name.clone(), value);
+        }
+    }
+    Ok(json!({"calls": made, "shown": shown, "held": held}))
+}
+
+/// The value of a column in a row as hexadecimal bytes, which preserve every bit.
+fn array(row: RowRef<'_>, index: usize) -> Value {
+    const DIGITS: &[u8; 16] = b"0123456789abcdef";
+    let column = &row.schema().columns()[index];
+    let digits = row.bytes(index).iter().flat_map(|byte| [byte >> 4, byte & 15]);
+    let data: String = digits.map(|digit| char::from(DIGITS[usize::from(digit)])).collect();
+    json!({"dtype": column.dtype.name(), "shape": column.shape, "data": data})
+}
+
+/// The frame of a goal.
+#[derive(Clone, PartialEq)]
+pub struct GoalFrame {
+    /// Height and width in pixels.
+    pub size: [usize; 2],
+    /// The pixels, `[height, width, 3]`.
+    pub rgb: Vec<u8>,
+}
+
+impl GoalFrame {
+    /// The frame in the goal's row, if it has one.
+    pub fn of(from: &DatasetStart<'_>) -> Option<Self> {
+        let index = from.goal.schema().find(PIXELS)?;
+        let column = &from.goal.schema().columns()[index];
+        match column.shape[..] {
+            [height, width, 3] if column.dtype == DType::U8 => {
+                Some(Self { size: [height, width], rgb: from.goal.bytes(index).to_vec() })
+            }
+            _ => None,
+        }
+    }
+}

@@ -123,7 +123,7 @@ fn an_environment_may_say_itself_what_to_call() {
     // A method of that name that wants something else is none of those meant.
     let mut jointed = make("tests.it.worlds:Jointed-v0", &config);
     let error = start(&mut *jointed, &ResetOptions::default(), &[]).expect_err("two arguments").to_string();
-    assert!(error.contains("nothing says how it takes a state"), "{error}");
+    assert!(error.contains("it has no method known to set a state"), "{error}");
 }
 
 #[test]

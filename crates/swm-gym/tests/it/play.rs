@@ -306,7 +306,9 @@ fn what_a_gymnasium_environment_cannot_do_is_said() {
     assert!(early.contains("reset it first"), "{early}");
     assert!(env.env.sample_goal(Key::new(0)).expect_err("no goals").to_string().contains("another seed"));
     let state = ResetOptions { state: Some(vec![0.0; 4]), ..ResetOptions::default() };
-    assert!(env.env.reset(0, &state).expect_err("no states").to_string().contains("the seed decides the initial state"));
+    assert!(
+        env.env.reset(0, &state).expect_err("no states").to_string().contains("the seed decides the initial state")
+    );
     let variation = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
     let varied = ResetOptions { variation, ..ResetOptions::default() };
     assert!(env.env.reset(0, &varied).expect_err("no factors").to_string().contains("variation_space"));

@@ -1,55 +1,55 @@
-//! [`Canvas`]: draws scenes, and keeps the memory it needs for that.
+//! [`Canvas`]: draws scenes and reuses its memory from frame to frame.
 
 use crate::layers::pattern;
-use crate::light::Lamp;
-use crate::paint::Lit;
+use crate::light::ShadingLight;
+use crate::paint::Lighting;
 use crate::scene::{Assets, Light, Scene};
 use crate::shadow::Shadow;
 use crate::split::Split;
-use crate::strip::{Picture, Strip, clear};
+use crate::strip::{Frame, Strip, is_transparent};
 use crate::view::View;
 use std::ops::Range;
 
-/// What to draw, and where: `height` rows of `width` pixels, the upper row first.
+/// What to draw, and the memory to draw it into: `height` rows of `width` pixels, the upper row first.
 pub enum Target<'a> {
-    /// Red, green, blue: three bytes a pixel.
+    /// Red, green and blue, `[height, width, 3]`.
     Rgb(&'a mut [u8]),
-    /// Distance along the direction the camera looks in.
+    /// Depth along the camera's direction, `[height, width]`.
     Depth(&'a mut [f32]),
-    /// Labels of geoms, -1 where there is none.
+    /// Labels of geoms, `[height, width]`; -1 where there is none.
     Labels(&'a mut [i32]),
 }
 
-/// Draws scenes. One canvas serves any scenes and sizes; after the first pictures of a kind, it allocates nothing.
+/// Draws scenes. One canvas serves any scenes and sizes; after the first frames of a kind, it does not allocate.
 ///
-/// A sample takes 8 bytes for each layer it needs (what is seen, what is mirrored, what is behind glass), and as much again for each
-/// of at most 4 views of which it keeps what stands still; a texel of a map of shadows, likewise.
+/// A sample takes 8 bytes in each layer that a frame needs (main, mirrored, transparent), and 8 bytes for each of at
+/// most 4 views with cached static geometry. A texel of a shadow map takes as much.
 #[derive(Default)]
 pub struct Canvas {
     threads: usize,
     split: Split,
     strips: Vec<Strip>,
-    lamps: Lamps,
+    lights: LightSet,
     shadows: Vec<Shadow>,
 }
 
 impl Canvas {
-    /// An empty one, which draws on the thread that asks.
+    /// Makes an empty canvas that draws on the calling thread.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Draws the next pictures on at most so many threads: that which asks, and others of the pool of `rayon` that it belongs to. A
-    /// picture is cut where it has enough work for that; its bytes stay the same.
-    pub fn spread(&mut self, threads: usize) {
+    /// Sets the number of threads of the next frames: the calling thread and others of its `rayon` pool. Frames with
+    /// too little work are not split; the bytes of a frame do not depend on the number.
+    pub fn set_threads(&mut self, threads: usize) {
         self.threads = threads;
     }
 
-    /// Draws a scene at `width` times `height` pixels, colours with so many samples a pixel (1, 2 or 4). Labels are taken in the middle
-    /// of every pixel, depths at its first sample, as graphics cards do.
+    /// Draws a scene at `width` × `height` pixels, colours with 1, 2 or 4 samples per pixel. As on graphics cards,
+    /// labels are sampled at the centre of every pixel and depths at its first sample.
     ///
-    /// Whatever does not fit is left as it is: rows beyond the end of the target, places beyond the end of the assets, geoms with
-    /// numbers that are not finite. A camera with such numbers sees nothing.
+    /// Invalid input draws nothing and never panics: targets that are too small stay unchanged, and geoms with
+    /// unknown assets or values that are not finite are left out. A camera with such values sees an empty scene.
     pub fn draw(
         &mut self,
         scene: &Scene,
@@ -67,7 +67,7 @@ impl Canvas {
         if width == 0 || height == 0 || width > 1 << 14 || height > 1 << 14 || size < width * height {
             return;
         }
-        if !seeing(&view) {
+        if !is_valid(&view) {
             match target {
                 Target::Rgb(bytes) => bytes.fill(0),
                 Target::Depth(metres) => metres.fill(scene.camera.far),
@@ -80,15 +80,15 @@ impl Canvas {
             Target::Depth(_) => &pattern(samples)[..1],
             Target::Labels(_) => pattern(1),
         };
-        let picture = Picture { scene, assets, view: &view, pattern };
-        self.split.cut(&picture, self.threads);
-        self.paint(&picture, target);
+        let frame = Frame { scene, assets, view: &view, pattern };
+        self.split.cut(&frame, self.threads);
+        self.paint(&frame, target);
     }
 
-    /// Draws a picture in the strips it was cut into.
-    fn paint(&mut self, picture: &Picture<'_>, target: Target<'_>) {
-        let &Picture { scene, assets, view, .. } = picture;
-        let opaque = |geom: usize| !clear(scene, geom, view);
+    /// Draws a frame in the strips it was split into.
+    fn paint(&mut self, frame: &Frame<'_>, target: Target<'_>) {
+        let &Frame { scene, assets, view, .. } = frame;
+        let opaque = |geom: usize| !is_transparent(scene, geom, view);
         let Split { ends, pays, .. } = &self.split;
         if self.strips.len() < ends.len() {
             self.strips.resize_with(ends.len(), Strip::default);
@@ -96,69 +96,70 @@ impl Canvas {
         let strips = &mut self.strips[..ends.len()];
         match target {
             Target::Rgb(bytes) => {
-                self.lamps.fill(scene);
-                let Lamps { plain, shadowed, casting, all } = &self.lamps;
+                self.lights.fill(scene);
+                let LightSet { plain, shadowed, casting, all } = &self.lights;
                 if self.shadows.len() < casting.len() {
                     self.shadows.resize_with(casting.len(), Shadow::default);
                 }
                 let shadows = &mut self.shadows[..casting.len()];
-                // Texels are to be smaller than pixels.
+                // Texels must be smaller than pixels.
                 let side = (2 * view.width.max(view.height)).clamp(192, 1024);
-                both(
+                join_if(
                     *pays,
                     || {
-                        each(strips, ends, 0, (&mut [], 0), &|strip, rows, _: &mut [u8]| {
-                            strip.find(picture, rows, opaque)
+                        for_each_strip(strips, ends, 0, (&mut [], 0), &|strip, rows, _: &mut [u8]| {
+                            strip.draw_geoms(frame, rows, opaque)
                         })
                     },
-                    || cast(shadows, casting, *pays, &|shadow, light| shadow.cast(scene, assets, light, side)),
+                    || cast_shadows(shadows, casting, *pays, &|shadow, light| shadow.cast(scene, assets, light, side)),
                 );
-                let lamps = Lit { plain, shadowed, shadows };
-                let unshaded = Lit { plain: all, shadowed: &[], shadows: &[] };
-                each(strips, ends, 0, (bytes, 3 * view.width), &|strip, _, bytes| {
-                    strip.colours(picture, lamps, unshaded, bytes);
+                let lights = Lighting { plain, shadowed, shadows };
+                let unshaded = Lighting { plain: all, shadowed: &[], shadows: &[] };
+                for_each_strip(strips, ends, 0, (bytes, 3 * view.width), &|strip, _, bytes| {
+                    strip.write_colours(frame, lights, unshaded, bytes);
                 });
             }
-            Target::Depth(metres) => each(strips, ends, 0, (metres, view.width), &|strip, rows, metres| {
-                strip.find(picture, rows, opaque);
-                strip.depths(picture, metres);
+            Target::Depth(metres) => for_each_strip(strips, ends, 0, (metres, view.width), &|strip, rows, metres| {
+                strip.draw_geoms(frame, rows, opaque);
+                strip.write_depths(frame, metres);
             }),
-            Target::Labels(labels) => each(strips, ends, 0, (labels, view.width), &|strip, rows, labels| {
-                strip.find(picture, rows, |geom| scene.geoms[geom].label.is_some());
-                strip.labels(picture, labels);
+            Target::Labels(labels) => for_each_strip(strips, ends, 0, (labels, view.width), &|strip, rows, labels| {
+                strip.draw_geoms(frame, rows, |geom| scene.geoms[geom].label.is_some());
+                strip.write_labels(frame, labels);
             }),
         }
     }
 }
 
-/// The lamps of a scene.
+/// The lights of a scene.
 #[derive(Default)]
-struct Lamps {
-    /// Those without shadows, and those with, by the places of these.
-    plain: Vec<Lamp>,
-    shadowed: Vec<Lamp>,
-    /// The lights that cast them.
+struct LightSet {
+    /// Lights without shadows.
+    /// Lights with shadows are in `shadowed`, in the order of `casting`.
+    plain: Vec<ShadingLight>,
+    shadowed: Vec<ShadingLight>,
+    /// The scene's lights that cast shadows.
     casting: Vec<Light>,
-    /// All, those without shadows first.
-    all: Vec<Lamp>,
+    /// All lights, those without shadows first.
+    all: Vec<ShadingLight>,
 }
 
-impl Lamps {
+impl LightSet {
     fn fill(&mut self, scene: &Scene) {
         let casts = |light: &&Light| scene.shadows && light.shadows;
         self.casting.clear();
         self.casting.extend(scene.lights.iter().filter(casts));
         self.shadowed.clear();
-        self.shadowed.extend(self.casting.iter().map(Lamp::new));
+        self.shadowed.extend(self.casting.iter().map(ShadingLight::new));
         self.plain.clear();
-        self.plain.extend(scene.lights.iter().filter(|light| !casts(light)).map(Lamp::new));
+        self.plain.extend(scene.lights.iter().filter(|light| !casts(light)).map(ShadingLight::new));
         self.all.clear();
         self.all.extend(self.plain.iter().chain(&self.shadowed));
     }
 }
 
-/// Does two things, on two threads where that pays.
-fn both(pays: bool, a: impl FnOnce() + Send, b: impl FnOnce() + Send) {
+/// Runs two functions, on two threads where that pays.
+fn join_if(pays: bool, a: impl FnOnce() + Send, b: impl FnOnce() + Send) {
     if pays {
         rayon::join(a, b);
     } else {
@@ -167,8 +168,9 @@ fn both(pays: bool, a: impl FnOnce() + Send, b: impl FnOnce() + Send) {
     }
 }
 
-/// Works on every strip, the first of which begins at row `top`, and on its rows of the target, so many numbers each; on a thread each.
-fn each<T: Send>(
+/// Runs `work` on every strip and its rows of the target, a thread per strip. The first strip begins at row `top`; a
+/// row of the target has `row` values.
+fn for_each_strip<T: Send>(
     strips: &mut [Strip],
     ends: &[usize],
     top: usize,
@@ -183,24 +185,24 @@ fn each<T: Send>(
             let middle = first.last().copied().unwrap_or(top);
             let (above, below) = target.split_at_mut((middle - top) * row);
             rayon::join(
-                || each(upper, first, top, (above, row), work),
-                || each(lower, last, middle, (below, row), work),
+                || for_each_strip(upper, first, top, (above, row), work),
+                || for_each_strip(lower, last, middle, (below, row), work),
             );
         }
     }
 }
 
-/// Casts the shadows of lights, on a thread each where that pays.
-fn cast(shadows: &mut [Shadow], lights: &[Light], pays: bool, work: &(impl Fn(&mut Shadow, &Light) + Sync)) {
+/// Draws the shadow maps of lights, a thread per light where that pays.
+fn cast_shadows(shadows: &mut [Shadow], lights: &[Light], pays: bool, work: &(impl Fn(&mut Shadow, &Light) + Sync)) {
     if let ([shadow, shadows @ ..], [light, lights @ ..]) = (shadows, lights) {
-        both(pays && !lights.is_empty(), || work(shadow, light), || cast(shadows, lights, pays, work));
+        join_if(pays && !lights.is_empty(), || work(shadow, light), || cast_shadows(shadows, lights, pays, work));
     }
 }
 
-/// Whether a camera's numbers make a picture.
-fn seeing(view: &View) -> bool {
+/// Whether a camera's values are finite and make a frame.
+fn is_valid(view: &View) -> bool {
     let numbers = [view.position, view.right, view.up, view.forward];
-    let density = view.dense[0] * view.dense[1];
+    let density = view.pixels_per_unit[0] * view.pixels_per_unit[1];
     numbers.iter().flatten().all(|x| x.is_finite())
         && density.is_finite()
         && density > 0.0
@@ -217,14 +219,14 @@ mod tests {
 
     const SIZE: (usize, usize) = (11, 150);
 
-    /// Colours, depths and labels, drawn in strips that end so.
-    fn cut(canvas: &mut Canvas, scene: &Scene, ends: &[usize]) -> (Vec<u8>, Vec<u32>, Vec<i32>) {
+    /// Colours, depths and labels, drawn in strips with the given ends.
+    fn draw_in_strips(canvas: &mut Canvas, scene: &Scene, ends: &[usize]) -> (Vec<u8>, Vec<u32>, Vec<i32>) {
         let (assets, view, n) = (assets(), View::of(&scene.camera, SIZE.0, SIZE.1), SIZE.0 * SIZE.1);
         let (mut rgb, mut depths, mut labels) = (vec![0; 3 * n], vec![0.0; n], vec![0; n]);
-        if seeing(&view) {
+        if is_valid(&view) {
             (canvas.split.ends, canvas.split.pays) = (ends.to_vec(), ends.len() > 1);
             let mut draw = |samples, target| {
-                canvas.paint(&Picture { scene, assets: &assets, view: &view, pattern: pattern(samples) }, target);
+                canvas.paint(&Frame { scene, assets: &assets, view: &view, pattern: pattern(samples) }, target);
             };
             draw(4, Target::Rgb(&mut rgb));
             draw(1, Target::Depth(&mut depths));
@@ -236,11 +238,11 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(300))]
         #[test]
-        fn strips_show_what_the_whole_shows(scene in scene()) {
+        fn strips_equal_the_whole_frame(scene in scene()) {
             let mut canvas = Canvas::new();
-            let whole = cut(&mut canvas, &scene, &[150]);
+            let whole = draw_in_strips(&mut canvas, &scene, &[150]);
             for ends in [&[64, 150][..], &[128, 150], &[64, 128, 150], &[150]] {
-                prop_assert_eq!(&cut(&mut canvas, &scene, ends), &whole, "{:?}", ends);
+                prop_assert_eq!(&draw_in_strips(&mut canvas, &scene, ends), &whole, "{:?}", ends);
             }
         }
     }

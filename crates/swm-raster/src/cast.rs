@@ -1,72 +1,75 @@
-//! Rays against shapes: where a row of rays enters a shape, and what its surface is like there.
+//! Ray casting: where a row of rays enters a shape, and the surface there.
 //!
-//! A shape is brought to unit size ([`Posed`]), so that few kernels serve all. They are loops over the rays of a row without
-//! branches. Rays begin near the shape, not at the camera: small shapes far away would drown in rounding.
+//! Shapes are scaled to unit size ([`PosedShape`]), so that few kernels serve all. The kernels are loops without
+//! branches over the rays of a row. Rays begin near the shape and not at the camera, because rounding would lose
+//! small shapes far away.
 
 use crate::scene::{Geom, Shape};
 use crate::vector::{V3, add, scale, sub, unrotate};
 use crate::view::View;
 use swm_simd::vectorize;
 
-/// What a unit shape is.
+/// A shape of unit size.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Unit {
-    /// z = 0, |x| and |y| at most these.
+    /// The rectangle z = 0 with these half sides.
     Plane([f32; 2]),
-    /// Radius 1.
+    /// The sphere of radius 1.
     Sphere,
-    /// Radius 1, half its cylinder's length.
+    /// The capsule of radius 1 along z, with half the length of its cylinder.
     Capsule(f32),
-    /// Radius 1, z from -1 to 1.
+    /// The cylinder of radius 1 with z from -1 to 1.
     Cylinder,
-    /// From -1 to 1.
+    /// The cube from -1 to 1.
     Cube,
 }
 
-/// Sizes are at least this.
+/// Lower bound of all sizes.
 const SMALLEST: f32 = 1e-6;
 
-/// A shape of unit size, and the rays of a view as it sees them: at pixel (x, y), they pass depth `depth` at
-/// `place + (x - base[0]) * places[0] + (y - base[1]) * places[1]`, and go on in the direction that is made in the same way.
+/// A shape of unit size, and the rays of a view in its coordinates.
+///
+/// The ray of pixel (x, y) passes depth `depth` at `position + (x - base[0]) * positions[0] + (y - base[1]) *
+/// positions[1]`; its direction is the same sum of `direction` and `directions`.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Posed {
+pub(crate) struct PosedShape {
     pub unit: Unit,
-    /// By what unit coordinates are multiplied to become local ones.
+    /// The scale from unit coordinates to the geom's local coordinates.
     pub sizes: V3,
     pub base: [f32; 2],
     pub depth: f32,
     pub near: f32,
-    pub place: V3,
-    pub places: [V3; 2],
+    pub position: V3,
+    pub positions: [V3; 2],
     pub direction: V3,
     pub directions: [V3; 2],
 }
 
-/// The rays through a row of pixels: at `x` pixels from the left and `y` from the upper edge of the row, they pass the depth of
-/// [`Posed`] at `place + x * places[0] + y * places[1]`, and so the direction.
+/// The rays through a row of pixels. At `x` pixels from the left and `y` from the upper edge of the row, a ray passes
+/// the depth of its [`PosedShape`] at `position + x * positions[0] + y * positions[1]`; directions likewise.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Row {
     base: f32,
-    place: V3,
-    places: [V3; 2],
+    position: V3,
+    positions: [V3; 2],
     direction: V3,
     directions: [V3; 2],
     depth: f32,
     near: f32,
 }
 
-/// Samples next to each other, and the nearest thing at each.
+/// Neighbouring samples and what they show.
 pub(crate) struct Samples<'a> {
-    /// Where they are: from the left of the picture, and from the upper edge of the row.
+    /// Coordinates of the samples, from the left of the frame and from the upper edge of the row.
     pub at: [&'a [f32]; 2],
-    /// What is not farther than this does not count.
+    /// Depths that a geom must lie behind.
     pub floor: &'a [f32],
     pub depths: &'a mut [f32],
     pub ids: &'a mut [u32],
 }
 
 impl Shape {
-    /// The unit shape, and its sizes; `None` of a mesh.
+    /// Returns the unit shape and its sizes, or `None` for a mesh.
     pub(crate) fn unit(&self) -> Option<(Unit, V3)> {
         let (unit, sizes) = match *self {
             Self::Plane(x, y) => (Unit::Plane([x.half, y.half]), [1.0; 3]),
@@ -79,7 +82,7 @@ impl Shape {
         Some((unit, sizes.map(|size| size.max(SMALLEST))))
     }
 
-    /// The middle and half the sides of a box around it, along its axes; of a mesh, nothing.
+    /// Returns the centre and half sides of the local bounding box; zeros for a mesh.
     pub(crate) fn bounds(&self) -> (V3, V3) {
         let halves = match *self {
             Self::Plane(x, y) => [x.half, y.half, 0.0],
@@ -93,15 +96,14 @@ impl Shape {
     }
 }
 
-impl Posed {
-    /// A geom in a view; `None` of meshes.
+impl PosedShape {
+    /// Returns the pose of a geom in a view, or `None` for a mesh.
     pub fn new(geom: &Geom, view: &View) -> Option<Self> {
         let (unit, sizes) = geom.shape.unit()?;
         let rays = view.rays();
         let ([x, y, w], depth) = view.project(geom.position);
-        // The pixel and the depth the shape is near, or what comes close where it is behind the camera.
+        // The pixel and depth near the shape, clamped to the frame where the shape is behind the camera.
         let inside = |at: f32, most: usize| {
-            #[allow(clippy::cast_precision_loss)]
             let most = most as f32;
             if at.is_finite() { at.clamp(0.0, most) } else { 0.5 * most }
         };
@@ -113,29 +115,28 @@ impl Posed {
         };
         let at = |from: V3, steps: [V3; 2]| add(from, add(scale(steps[0], base[0]), scale(steps[1], base[1])));
         let direction = at(rays.direction, rays.directions);
-        let place = add(sub(at(rays.origin, rays.origins), geom.position), scale(direction, depth));
-        let places = [0, 1].map(|k| local(add(rays.origins[k], scale(rays.directions[k], depth))));
+        let position = add(sub(at(rays.origin, rays.origins), geom.position), scale(direction, depth));
+        let positions = [0, 1].map(|k| local(add(rays.origins[k], scale(rays.directions[k], depth))));
         Some(Self {
             unit,
             sizes,
             base,
             depth,
             near: view.near,
-            place: local(place),
-            places,
+            position: local(position),
+            positions,
             direction: local(direction),
             directions: rays.directions.map(local),
         })
     }
 
-    /// The rays of row `y`.
-    #[allow(clippy::cast_precision_loss)]
+    /// Returns the rays of row `y`.
     pub fn row(&self, y: usize) -> Row {
         let down = y as f32 - self.base[1];
         Row {
             base: self.base[0],
-            place: add(self.place, scale(self.places[1], down)),
-            places: self.places,
+            position: add(self.position, scale(self.positions[1], down)),
+            positions: self.positions,
             direction: add(self.direction, scale(self.directions[1], down)),
             directions: self.directions,
             depth: self.depth,
@@ -143,13 +144,13 @@ impl Posed {
         }
     }
 
-    /// Puts the shape, as `id`, where it is nearer than what is there.
+    /// Writes the shape as `id` to the samples where it is the nearest.
     pub fn enter(&self, row: &Row, id: u32, samples: Samples<'_>) {
         let Samples { at: [x, y], floor, depths, ids } = samples;
         match self.unit {
             Unit::Plane(halves) => enter_plane(&self.rectangle(halves), row, id, x, y, floor, depths, ids),
             Unit::Sphere => enter_sphere(row, id, x, y, floor, depths, ids),
-            Unit::Capsule(half) => enter_capsule(&Rod(half), row, id, x, y, floor, depths, ids),
+            Unit::Capsule(half) => enter_capsule(&Capsule(half), row, id, x, y, floor, depths, ids),
             Unit::Cylinder => enter_cylinder(row, id, x, y, floor, depths, ids),
             Unit::Cube => enter_cube(row, id, x, y, floor, depths, ids),
         }
@@ -159,23 +160,31 @@ impl Posed {
         Rectangle(halves, self.near - self.depth)
     }
 
-    /// What is seen through the middles of pixels: depth (added to that of the pose), unit coordinates, and the direction of the
-    /// surface in unit coordinates, not of length 1. Rays that miss are led to the rim.
-    pub fn surface(&self, x: &[f32], y: &[f32], depths: &mut [f32], places: [&mut [f32]; 3], normals: [&mut [f32]; 3]) {
-        let ([px, py, pz], [nx, ny, nz]) = (places, normals);
+    /// Computes the visible surface at pixel positions: depths relative to that of the pose, unit coordinates, and
+    /// normals in unit coordinates, which are not normalised. Rays that miss the shape get the nearest point of its
+    /// outline.
+    pub fn surface(
+        &self,
+        x: &[f32],
+        y: &[f32],
+        depths: &mut [f32],
+        positions: [&mut [f32]; 3],
+        normals: [&mut [f32]; 3],
+    ) {
+        let ([px, py, pz], [nx, ny, nz]) = (positions, normals);
         match self.unit {
             Unit::Plane(halves) => {
                 surface_plane(&self.rectangle(halves), self, x, y, depths, px, py, pz, nx, ny, nz);
             }
             Unit::Sphere => surface_sphere(self, x, y, depths, px, py, pz, nx, ny, nz),
-            Unit::Capsule(half) => surface_capsule(&Rod(half), self, x, y, depths, px, py, pz, nx, ny, nz),
+            Unit::Capsule(half) => surface_capsule(&Capsule(half), self, x, y, depths, px, py, pz, nx, ny, nz),
             Unit::Cylinder => surface_cylinder(self, x, y, depths, px, py, pz, nx, ny, nz),
             Unit::Cube => surface_cube(self, x, y, depths, px, py, pz, nx, ny, nz),
         }
     }
 }
 
-/// A ray: where it is at the depth of the pose, and its direction.
+/// A ray: its position at the depth of the pose, and its direction.
 #[derive(Clone, Copy)]
 struct Ray {
     p: V3,
@@ -187,26 +196,27 @@ impl Row {
     fn ray(&self, x: f32, y: f32) -> Ray {
         let x = x - self.base;
         let at = |from: V3, steps: &[V3; 2]| add(from, add(scale(steps[0], x), scale(steps[1], y)));
-        Ray { p: at(self.place, &self.places), d: at(self.direction, &self.directions) }
+        Ray { p: at(self.position, &self.positions), d: at(self.direction, &self.directions) }
     }
 }
 
-impl Posed {
+impl PosedShape {
     #[inline(always)]
     fn ray(&self, x: f32, y: f32) -> Ray {
         let (x, y) = (x - self.base[0], y - self.base[1]);
         let at = |from: V3, steps: &[V3; 2]| add(from, add(scale(steps[0], x), scale(steps[1], y)));
-        Ray { p: at(self.place, &self.places), d: at(self.direction, &self.directions) }
+        Ray { p: at(self.position, &self.positions), d: at(self.direction, &self.directions) }
     }
 }
 
-/// Not zero, so that one can divide by it.
+/// Returns `x`, or a small value where `x` is too close to 0 for a division.
 #[inline(always)]
 fn nonzero(x: f32) -> f32 {
     if x.abs() > 1e-12 { x } else { 1e-12 }
 }
 
-/// A ball around (0, 0, z): the way to where a ray enters, and how far inside it passes (negative where it misses).
+/// Intersects the unit sphere around (0, 0, z). Returns the ray parameter of the entry, and 1 minus the squared
+/// distance from the centre, which is negative for a miss.
 #[inline(always)]
 fn ball(ray: Ray, z: f32) -> (f32, f32) {
     let Ray { p: [x, y, pz], d: [a, b, c] } = ray;
@@ -218,7 +228,8 @@ fn ball(ray: Ray, z: f32) -> (f32, f32) {
     (k - (inside.max(0.0) / square).sqrt(), inside)
 }
 
-/// An endless cylinder of radius 1 along z: the ways to where a ray enters and leaves, and how far inside it passes.
+/// Intersects the infinite cylinder of radius 1 along z. Returns the ray parameters of entry and exit, and 1 minus
+/// the squared distance from the axis.
 #[inline(always)]
 fn tube(ray: Ray) -> (f32, f32, f32) {
     let Ray { p: [x, y, _], d: [a, b, _] } = ray;
@@ -230,7 +241,7 @@ fn tube(ray: Ray) -> (f32, f32, f32) {
     (k - half, k + half, inside)
 }
 
-/// The space between -1 and 1 of one coordinate: the ways to where a ray enters and leaves.
+/// Intersects the slab from -1 to 1 of one coordinate. Returns the ray parameters of entry and exit.
 #[inline(always)]
 fn slab(p: f32, d: f32) -> (f32, f32) {
     let by = 1.0 / nonzero(d);
@@ -238,21 +249,21 @@ fn slab(p: f32, d: f32) -> (f32, f32) {
     (a.min(b), a.max(b))
 }
 
-/// A unit shape.
+/// A unit shape that rays intersect.
 trait Solid {
-    /// The way along a ray to where it enters, and whether it does.
+    /// Returns the ray parameter of the entry, and whether the ray hits.
     fn enter(&self, ray: Ray) -> (f32, bool);
 
-    /// The way to where a ray enters, or comes close to the shape; the place, and the direction of the surface there.
+    /// Returns the ray parameter of the entry, or of the closest approach for a miss, with position and normal there.
     fn surface(&self, ray: Ray) -> (f32, V3, V3);
 }
 
-/// A rectangle at z = 0: its halves, and the least way along a ray that is in front of the camera.
+/// A rectangle at z = 0: half sides, and the smallest ray parameter in front of the camera.
 struct Rectangle([f32; 2], f32);
 struct Sphere;
 /// A capsule: half the length of its cylinder.
-struct Rod(f32);
-struct Drum;
+struct Capsule(f32);
+struct Cylinder;
 struct Cube;
 
 impl Solid for Rectangle {
@@ -264,7 +275,7 @@ impl Solid for Rectangle {
 
     #[inline(always)]
     fn surface(&self, Ray { p, d }: Ray) -> (f32, V3, V3) {
-        // A pixel whose middle is past the horizon or the rim takes what is there.
+        // A pixel whose centre lies past the horizon or the edge takes a point far away on the plane.
         let way = -p[2] / nonzero(d[2]);
         let way = if way > self.1 { way } else { 1e6 };
         (way, [p[0] + way * d[0], p[1] + way * d[1], 0.0], [0.0, 0.0, 1.0])
@@ -286,7 +297,7 @@ impl Solid for Sphere {
     }
 }
 
-impl Solid for Rod {
+impl Solid for Capsule {
     #[inline(always)]
     fn enter(&self, ray: Ray) -> (f32, bool) {
         let (body, _, inside) = tube(ray);
@@ -302,7 +313,7 @@ impl Solid for Rod {
     #[inline(always)]
     fn surface(&self, ray: Ray) -> (f32, V3, V3) {
         let (hit, is_hit) = self.enter(ray);
-        // Past the rim: where it passes the axis, or the nearer end.
+        // For a miss: the point closest to the axis or to the nearer end.
         let (body, _, _) = tube(ray);
         let end = (ray.p[2] + body * ray.d[2]).clamp(-self.0, self.0);
         let (rim, _) = ball(ray, end);
@@ -312,7 +323,7 @@ impl Solid for Rod {
     }
 }
 
-impl Solid for Drum {
+impl Solid for Cylinder {
     #[inline(always)]
     fn enter(&self, ray: Ray) -> (f32, bool) {
         let (enter, leave, inside) = tube(ray);
@@ -356,7 +367,7 @@ impl Solid for Cube {
     }
 }
 
-/// Puts a solid where it is nearer than what is there.
+/// Writes a solid to the samples where it is the nearest.
 #[inline(always)]
 #[allow(clippy::too_many_arguments, reason = "references to numbers of which the compiler knows that they are apart")]
 fn enter(
@@ -380,12 +391,12 @@ fn enter(
     }
 }
 
-/// What is seen of a solid at many places.
+/// Computes the visible surface of a solid at many pixel positions.
 #[inline(always)]
 #[allow(clippy::too_many_arguments, reason = "as above")]
 fn surfaces(
     solid: &impl Solid,
-    pose: &Posed,
+    pose: &PosedShape,
     x: &[f32],
     y: &[f32],
     t: &mut [f32],
@@ -400,9 +411,9 @@ fn surfaces(
     let (y, t, px, py, pz) = (&y[..n], &mut t[..n], &mut px[..n], &mut py[..n], &mut pz[..n]);
     let (nx, ny, nz) = (&mut nx[..n], &mut ny[..n], &mut nz[..n]);
     for i in 0..n {
-        let (way, place, normal) = solid.surface(pose.ray(x[i], y[i]));
+        let (way, position, normal) = solid.surface(pose.ray(x[i], y[i]));
         t[i] = way;
-        (px[i], py[i], pz[i]) = (place[0], place[1], place[2]);
+        (px[i], py[i], pz[i]) = (position[0], position[1], position[2]);
         (nx[i], ny[i], nz[i]) = (normal[0], normal[1], normal[2]);
     }
 }
@@ -421,7 +432,7 @@ vectorize! {
     }
 
     fn enter_capsule(
-        solid: &Rod, row: &Row, id: u32, x: &[f32], y: &[f32], floor: &[f32], depths: &mut [f32], ids: &mut [u32],
+        solid: &Capsule, row: &Row, id: u32, x: &[f32], y: &[f32], floor: &[f32], depths: &mut [f32], ids: &mut [u32],
     ) {
         enter(solid, row, id, x, y, floor, depths, ids);
     }
@@ -429,7 +440,7 @@ vectorize! {
     fn enter_cylinder(
         row: &Row, id: u32, x: &[f32], y: &[f32], floor: &[f32], depths: &mut [f32], ids: &mut [u32],
     ) {
-        enter(&Drum, row, id, x, y, floor, depths, ids);
+        enter(&Cylinder, row, id, x, y, floor, depths, ids);
     }
 
     fn enter_cube(
@@ -439,35 +450,35 @@ vectorize! {
     }
 
     fn surface_plane(
-        solid: &Rectangle, pose: &Posed, x: &[f32], y: &[f32], t: &mut [f32],
+        solid: &Rectangle, pose: &PosedShape, x: &[f32], y: &[f32], t: &mut [f32],
         px: &mut [f32], py: &mut [f32], pz: &mut [f32], nx: &mut [f32], ny: &mut [f32], nz: &mut [f32],
     ) {
         surfaces(solid, pose, x, y, t, px, py, pz, nx, ny, nz);
     }
 
     fn surface_sphere(
-        pose: &Posed, x: &[f32], y: &[f32], t: &mut [f32],
+        pose: &PosedShape, x: &[f32], y: &[f32], t: &mut [f32],
         px: &mut [f32], py: &mut [f32], pz: &mut [f32], nx: &mut [f32], ny: &mut [f32], nz: &mut [f32],
     ) {
         surfaces(&Sphere, pose, x, y, t, px, py, pz, nx, ny, nz);
     }
 
     fn surface_capsule(
-        solid: &Rod, pose: &Posed, x: &[f32], y: &[f32], t: &mut [f32],
+        solid: &Capsule, pose: &PosedShape, x: &[f32], y: &[f32], t: &mut [f32],
         px: &mut [f32], py: &mut [f32], pz: &mut [f32], nx: &mut [f32], ny: &mut [f32], nz: &mut [f32],
     ) {
         surfaces(solid, pose, x, y, t, px, py, pz, nx, ny, nz);
     }
 
     fn surface_cylinder(
-        pose: &Posed, x: &[f32], y: &[f32], t: &mut [f32],
+        pose: &PosedShape, x: &[f32], y: &[f32], t: &mut [f32],
         px: &mut [f32], py: &mut [f32], pz: &mut [f32], nx: &mut [f32], ny: &mut [f32], nz: &mut [f32],
     ) {
-        surfaces(&Drum, pose, x, y, t, px, py, pz, nx, ny, nz);
+        surfaces(&Cylinder, pose, x, y, t, px, py, pz, nx, ny, nz);
     }
 
     fn surface_cube(
-        pose: &Posed, x: &[f32], y: &[f32], t: &mut [f32],
+        pose: &PosedShape, x: &[f32], y: &[f32], t: &mut [f32],
         px: &mut [f32], py: &mut [f32], pz: &mut [f32], nx: &mut [f32], ny: &mut [f32], nz: &mut [f32],
     ) {
         surfaces(&Cube, pose, x, y, t, px, py, pz, nx, ny, nz);

@@ -1,7 +1,8 @@
-//! Pictures of simple scenes, drawn on the CPU: small ones, fast.
+//! A CPU renderer of small frames of simple 3-D scenes.
 //!
-//! A [`Scene`] holds planes, ellipsoids, capsules, cylinders, boxes and meshes with materials, lights and a camera; [`Assets`]
-//! hold textures and meshes, prepared once. A [`Canvas`] draws them: colours with anti-aliasing, depths, or labels.
+//! A [`Scene`] holds planes, ellipsoids, capsules, cylinders, boxes and meshes with materials, lights and a camera.
+//! [`Assets`] hold textures and meshes, prepared once. A [`Canvas`] draws them: anti-aliased colours, depths, or
+//! labels.
 //!
 //! ```
 //! use swm_raster::{Assets, Camera, Canvas, Geom, IDENTITY, Scene, Shape, Target};
@@ -32,27 +33,29 @@
 //! assert_eq!(labels, [-1, -1, -1, -1, 7, -1, -1, -1, -1]);
 //! ```
 //!
-//! **The method.** Pictures are so small that triangles of a finely divided sphere would be smaller than pixels. So shapes are met
-//! by rays, a row of them at a time (`cast`), and only meshes are triangles, in versions as coarse as the picture allows (`mesh`).
-//! Both leave the nearest thing at every sample (`layers`); light is computed once a pixel and thing, many at a time (`paint`).
-//! What light does not reach is found in the same way, from the light (`shadow`).
+//! **Method.** In small frames the triangles of a finely divided sphere would be smaller than pixels. So primitives
+//! are ray cast, a row of rays at a time (`cast`), and only meshes are rasterised, at the coarsest detail level that
+//! looks the same (`mesh`). Both write a depth buffer (`layers`). Shading runs once per pixel and geom, for many
+//! fragments at a time (`paint`). Shadow maps are drawn in the same way from the light (`shadow`).
 //!
-//! **The model** is the fixed pipeline of OpenGL as MuJoCo uses it, down to where light is interpolated (planes and boxes)
-//! and how textures are filtered, so that pictures are those that MuJoCo's renderer draws, but for some rims.
+//! **Model.** The fixed pipeline of OpenGL as MuJoCo uses it, including where lighting is interpolated (planes and
+//! boxes) and how textures are filtered. Frames equal those of MuJoCo's renderer except at some edges.
 //!
-//! **Threads.** A large picture is cut into strips of rows (`split`), each drawn by a thread (`strip`), while others cast shadows.
+//! **Threads.** A large frame is split into strips of rows (`split`), one thread each (`strip`), while other threads
+//! draw shadow maps.
 //!
-//! **What is kept.** What stands still is drawn once: the next picture from the same place begins with a copy of it (`still`). So does
-//! the map of a light. The sky is looked up once for each direction one looks in (`sky`).
+//! **Caches.** Static geometry is drawn once per view; later frames begin with a copy of its depth buffer
+//! (`geometry_cache`). Shadow maps do the same. The sky is looked up once per camera direction (`sky`).
 //!
-//! **Determinism.** A picture's bytes depend on the scene alone, not on how it was cut, nor on what
-//! was drawn before. Numbers are single precision without fused operations.
+//! **Determinism.** The bytes of a frame depend on the scene alone, not on the number of threads nor on earlier
+//! frames. Arithmetic is single precision without fused operations.
 
 #[cfg(test)]
 extern crate self as swm_raster;
 
 mod canvas;
 mod cast;
+mod geometry_cache;
 mod layers;
 mod light;
 mod mesh;
@@ -62,7 +65,6 @@ mod scene;
 mod shadow;
 mod sky;
 mod split;
-mod still;
 mod strip;
 mod texture;
 mod vector;

@@ -1,18 +1,18 @@
-//! The lighting of OpenGL's fixed pipeline: ambient, scattered and mirrored light, at a point of a surface.
+//! Lighting of OpenGL's fixed pipeline: ambient, diffuse and specular light at a point of a surface.
 
 use crate::scalar::power;
 use crate::scene::{Geom, Light, Scene};
 use crate::vector::{V3, dot, scale, sub, unit};
 use swm_simd::vectorize;
 
-/// A light, prepared for a picture.
+/// A light, prepared for a frame.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Lamp {
+pub(crate) struct ShadingLight {
     directional: bool,
     position: V3,
     direction: V3,
     attenuation: V3,
-    /// The cosine of the cut-off angle; less than -1 for a lamp that shines everywhere alike.
+    /// Cosine of the cutoff angle; below -1 for a light that shines in all directions.
     edge: f32,
     exponent: f32,
     ambient: V3,
@@ -20,22 +20,22 @@ pub(crate) struct Lamp {
     specular: V3,
 }
 
-/// How a surface answers light.
+/// The material of a geom, in OpenGL's terms.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Matter {
-    /// What it scatters.
+pub(crate) struct Material {
+    /// Diffuse and ambient colour.
     pub rgb: V3,
-    /// What it shows in the dark.
-    pub glow: V3,
-    /// What it mirrors of a light.
+    /// Emitted colour.
+    pub emission: V3,
+    /// Specular reflectance, a grey.
     pub specular: f32,
-    /// How narrow highlights are.
+    /// Exponent of specular highlights.
     pub exponent: f32,
 }
 
-impl Lamp {
+impl ShadingLight {
     pub fn new(light: &Light) -> Self {
-        // OpenGL ignores angles between 90 and 180 degrees, and a lamp that was told none shines everywhere.
+        // OpenGL ignores angles between 90 and 180 degrees; a cutoff above 90 stands for a light in all directions.
         let everywhere = light.directional || light.cutoff > 90.0;
         Self {
             directional: light.directional,
@@ -50,21 +50,21 @@ impl Lamp {
         }
     }
 
-    /// The direction from a place to the lamp.
+    /// Returns the unit direction from a position to the light.
     #[inline(always)]
-    pub fn from(&self, place: V3) -> V3 {
-        let way = sub(self.position, place);
+    pub fn direction_from(&self, position: V3) -> V3 {
+        let way = sub(self.position, position);
         let by = 1.0 / dot(way, way).max(1e-20).sqrt();
         if self.directional { scale(self.direction, -1.0) } else { scale(way, by) }
     }
 
-    /// What a surface sends to the eye of this lamp's light.
+    /// Returns the light that a surface reflects to the eye.
     #[inline(always)]
-    fn seen<const DIRECTIONAL: bool>(&self, matter: &Matter, eye: V3, place: V3, normal: V3) -> V3 {
+    fn reflected<const DIRECTIONAL: bool>(&self, material: &Material, eye: V3, position: V3, normal: V3) -> V3 {
         let (to, strength) = if DIRECTIONAL {
             (scale(self.direction, -1.0), 1.0)
         } else {
-            let way = sub(self.position, place);
+            let way = sub(self.position, position);
             let distance = dot(way, way).max(1e-20).sqrt();
             let to = scale(way, 1.0 / distance);
             let [a, b, c] = self.attenuation;
@@ -73,78 +73,85 @@ impl Lamp {
             let spot = power(along.clamp(0.0, 1.0), self.exponent);
             (to, if along >= self.edge { fading * spot } else { 0.0 })
         };
-        let view = sub(eye, place);
+        let view = sub(eye, position);
         let view = scale(view, 1.0 / dot(view, view).max(1e-20).sqrt());
         let half = [to[0] + view[0], to[1] + view[1], to[2] + view[2]];
         let facing = dot(normal, to);
         let mirrored = dot(normal, half) / dot(half, half).max(1e-20).sqrt();
-        let shine = power(mirrored.clamp(0.0, 1.0), matter.exponent) * matter.specular;
+        let shine = power(mirrored.clamp(0.0, 1.0), material.exponent) * material.specular;
         let shine = if facing > 0.0 { shine } else { 0.0 };
         let facing = facing.max(0.0);
         std::array::from_fn(|k| {
-            strength * (matter.rgb[k] * (self.ambient[k] + facing * self.diffuse[k]) + shine * self.specular[k])
+            strength * (material.rgb[k] * (self.ambient[k] + facing * self.diffuse[k]) + shine * self.specular[k])
         })
     }
 
-    /// What a surface sends to the eye of this lamp's light.
-    pub fn at(&self, matter: &Matter, eye: V3, place: V3, normal: V3) -> V3 {
+    /// Returns the light that a surface reflects to the eye.
+    pub fn at(&self, material: &Material, eye: V3, position: V3, normal: V3) -> V3 {
         match self.directional {
-            true => self.seen::<true>(matter, eye, place, normal),
-            false => self.seen::<false>(matter, eye, place, normal),
+            true => self.reflected::<true>(material, eye, position, normal),
+            false => self.reflected::<false>(material, eye, position, normal),
         }
     }
 
-    /// Adds what surfaces send to the eye of this lamp's light.
-    pub fn add(&self, matter: &Matter, eye: V3, places: [&[f32]; 3], normals: [&[f32]; 3], sums: [&mut [f32]; 3]) {
+    /// Adds the light that surfaces reflect to the eye to `sums`.
+    pub fn add(
+        &self,
+        material: &Material,
+        eye: V3,
+        positions: [&[f32]; 3],
+        normals: [&[f32]; 3],
+        sums: [&mut [f32]; 3],
+    ) {
         match self.directional {
-            true => add_directional(self, matter, eye, places, normals, sums),
-            false => add_spot(self, matter, eye, places, normals, sums),
+            true => add_directional(self, material, eye, positions, normals, sums),
+            false => add_spot(self, material, eye, positions, normals, sums),
         }
     }
 }
 
-impl Matter {
-    /// What a geom is made of, its colour multiplied.
+impl Material {
+    /// Returns the material of a geom with its colour multiplied by `by`.
     pub fn new(geom: &Geom, by: f32) -> Self {
         let rgb = [0, 1, 2].map(|k| geom.rgba[k] * by);
         Self {
             rgb,
-            glow: scale(rgb, geom.emission),
+            emission: scale(rgb, geom.emission),
             specular: geom.specular,
             // OpenGL's limits.
             exponent: (geom.shininess * 128.0).clamp(0.0, 128.0),
         }
     }
 
-    /// What is there without any lamp.
-    pub fn dark(&self, scene: &Scene) -> V3 {
+    /// Returns the colour without any light: emission, and dim light from everywhere in a scene without lights.
+    pub fn base_colour(&self, scene: &Scene) -> V3 {
         let everywhere = if scene.lights.is_empty() { 0.3 } else { 0.0 };
-        [0, 1, 2].map(|k| self.glow[k] + everywhere * self.rgb[k])
+        [0, 1, 2].map(|k| self.emission[k] + everywhere * self.rgb[k])
     }
 }
 
 vectorize! {
     fn add_directional(
-        lamp: &Lamp, matter: &Matter, eye: V3, places: [&[f32]; 3], normals: [&[f32]; 3], sums: [&mut [f32]; 3],
+        light: &ShadingLight, material: &Material, eye: V3, positions: [&[f32]; 3], normals: [&[f32]; 3], sums: [&mut [f32]; 3],
     ) {
-        let n = places[0].len();
-        let ([px, py, pz], [nx, ny, nz]) = (places.map(|lane| &lane[..n]), normals.map(|lane| &lane[..n]));
+        let n = positions[0].len();
+        let ([px, py, pz], [nx, ny, nz]) = (positions.map(|lane| &lane[..n]), normals.map(|lane| &lane[..n]));
         let [r, g, b] = sums.map(|lane| &mut lane[..n]);
         for i in 0..n {
-            let seen = lamp.seen::<true>(matter, eye, [px[i], py[i], pz[i]], [nx[i], ny[i], nz[i]]);
-            (r[i], g[i], b[i]) = (r[i] + seen[0], g[i] + seen[1], b[i] + seen[2]);
+            let reflected = light.reflected::<true>(material, eye, [px[i], py[i], pz[i]], [nx[i], ny[i], nz[i]]);
+            (r[i], g[i], b[i]) = (r[i] + reflected[0], g[i] + reflected[1], b[i] + reflected[2]);
         }
     }
 
     fn add_spot(
-        lamp: &Lamp, matter: &Matter, eye: V3, places: [&[f32]; 3], normals: [&[f32]; 3], sums: [&mut [f32]; 3],
+        light: &ShadingLight, material: &Material, eye: V3, positions: [&[f32]; 3], normals: [&[f32]; 3], sums: [&mut [f32]; 3],
     ) {
-        let n = places[0].len();
-        let ([px, py, pz], [nx, ny, nz]) = (places.map(|lane| &lane[..n]), normals.map(|lane| &lane[..n]));
+        let n = positions[0].len();
+        let ([px, py, pz], [nx, ny, nz]) = (positions.map(|lane| &lane[..n]), normals.map(|lane| &lane[..n]));
         let [r, g, b] = sums.map(|lane| &mut lane[..n]);
         for i in 0..n {
-            let seen = lamp.seen::<false>(matter, eye, [px[i], py[i], pz[i]], [nx[i], ny[i], nz[i]]);
-            (r[i], g[i], b[i]) = (r[i] + seen[0], g[i] + seen[1], b[i] + seen[2]);
+            let reflected = light.reflected::<false>(material, eye, [px[i], py[i], pz[i]], [nx[i], ny[i], nz[i]]);
+            (r[i], g[i], b[i]) = (r[i] + reflected[0], g[i] + reflected[1], b[i] + reflected[2]);
         }
     }
 }

@@ -1,79 +1,81 @@
-//! [`Mesh`]: triangles, and coarser versions of them for small pictures.
+//! [`Mesh`]: triangles with detail levels for small frames.
 //!
-//! A version merges all vertices of a cell of a cubic grid. One whose cells are smaller than a part of a pixel cannot be told
-//! from the original, but a robot of 100,000 triangles has some thousands in a small picture.
+//! A detail level merges the vertices in each cell of a cubic grid. A level whose cells are smaller than a pixel
+//! looks like the original, and a robot of 100,000 triangles needs only some thousands of them in a small frame.
 
 use crate::vector::{V3, add, scale, sub, unit};
 use std::collections::HashMap;
 
-/// Cells along the longest side of the finest of the coarser versions.
+/// Cells along the longest side at the finest merged level.
 const FINEST: f32 = 512.0;
 
-/// And of the coarsest.
+/// Cells along the longest side at the coarsest level.
 const COARSEST: f32 = 7.0;
 
-/// Edges of so many triangles may be those of holes in a mesh that counts as closed: parts of robots have holes where the next part
-/// begins.
+/// Largest ratio of unmatched edges to triangles of a mesh that counts as closed: parts of robots have holes where
+/// the next part begins.
 const OPEN: f32 = 0.1;
 
 /// A mesh, prepared once.
 #[derive(Clone, Debug)]
 pub struct Mesh {
-    /// From fine to coarse.
-    levels: Vec<Level>,
-    /// Whether it has an inside: edges are those of two triangles.
+    /// Detail levels, from fine to coarse.
+    levels: Vec<DetailLevel>,
+    /// Whether nearly all edges belong to two triangles, so that the mesh has an inside.
     closed: bool,
     low: V3,
     high: V3,
 }
 
-/// One version.
+/// One detail level.
 #[derive(Clone, Debug, Default)]
-pub(crate) struct Level {
-    /// The side of the cells whose vertices were merged; 0 for the original.
+pub(crate) struct DetailLevel {
+    /// Side of the cells whose vertices were merged; 0 for the original.
     pub cell: f32,
-    /// Where vertices are.
-    pub places: Vec<V3>,
-    /// By corner: directions of the surface, of length 1 (`normals[corner.normal]`).
+    /// Positions of vertices.
+    pub positions: Vec<V3>,
+    /// Unit normals, indexed by `corners`.
     pub normals: Vec<V3>,
-    /// By corner: texture coordinates; empty where there are none.
+    /// Texture coordinates, indexed by `corners`.
     pub coordinates: Vec<[f32; 2]>,
-    /// Triangles, counterclockwise seen from outside: places in `places`.
+    /// Triangles, counterclockwise seen from outside: indices into `positions`.
     pub faces: Vec<[u32; 3]>,
-    /// Places in `normals` and `coordinates`.
+    /// Indices into `normals` and `coordinates`.
     pub corners: Vec<[u32; 3]>,
 }
 
 /// A corner of a triangle.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Corner {
-    /// Its place.
-    pub place: V3,
-    /// The direction of the surface there.
+    /// Position in local coordinates.
+    pub position: V3,
+    /// Normal of the surface.
     pub normal: V3,
-    /// Where it is on a texture.
+    /// Texture coordinates.
     pub coordinates: [f32; 2],
 }
 
 impl Mesh {
-    /// A mesh of triangles, counterclockwise seen from outside. Those with numbers that are not finite are left out.
+    /// Builds a mesh of triangles that are counterclockwise seen from outside. Triangles with values that are not
+    /// finite are left out.
     pub fn new(triangles: impl IntoIterator<Item = [Corner; 3]>) -> Self {
-        let mut level = Level::default();
-        let (mut places, mut looks) = (HashMap::new(), HashMap::new());
+        let mut level = DetailLevel::default();
+        let (mut positions, mut corner_ids) = (HashMap::new(), HashMap::new());
         let index = |i: usize| u32::try_from(i).unwrap_or(u32::MAX);
         for triangle in triangles {
-            if triangle.iter().any(|c| c.place.iter().chain(&c.normal).chain(&c.coordinates).any(|x| !x.is_finite())) {
+            if triangle.iter().any(|c| c.position.iter().chain(&c.normal).chain(&c.coordinates).any(|x| !x.is_finite()))
+            {
                 continue;
             }
             level.faces.push(triangle.map(|corner| {
-                *places.entry(corner.place.map(f32::to_bits)).or_insert_with(|| {
-                    level.places.push(corner.place);
-                    index(level.places.len() - 1)
+                *positions.entry(corner.position.map(f32::to_bits)).or_insert_with(|| {
+                    level.positions.push(corner.position);
+                    index(level.positions.len() - 1)
                 })
             }));
             level.corners.push(triangle.map(|corner| {
-                let look = (corner.normal.map(f32::to_bits), corner.coordinates.map(f32::to_bits));
-                *looks.entry(look).or_insert_with(|| {
+                let key = (corner.normal.map(f32::to_bits), corner.coordinates.map(f32::to_bits));
+                *corner_ids.entry(key).or_insert_with(|| {
                     level.normals.push(unit(corner.normal));
                     level.coordinates.push(corner.coordinates);
                     index(level.normals.len() - 1)
@@ -81,9 +83,9 @@ impl Mesh {
             }));
         }
         let fold = |with: fn(f32, f32) -> f32, from: f32| {
-            level.places.iter().fold([from; 3], |a, b| std::array::from_fn(|k| with(a[k], b[k])))
+            level.positions.iter().fold([from; 3], |a, b| std::array::from_fn(|k| with(a[k], b[k])))
         };
-        let (low, high) = match level.places.is_empty() {
+        let (low, high) = match level.positions.is_empty() {
             true => ([0.0; 3], [0.0; 3]),
             false => (fold(f32::min, f32::INFINITY), fold(f32::max, f32::NEG_INFINITY)),
         };
@@ -92,7 +94,7 @@ impl Mesh {
         let mut cells = FINEST;
         while cells >= COARSEST && side > 0.0 {
             let coarser = levels[0].merged(low, side / cells);
-            // Only what saves work is kept.
+            // Only levels that save work are stored.
             if levels.last().is_some_and(|last| coarser.faces.len() * 5 < last.faces.len() * 4) {
                 levels.push(coarser);
             }
@@ -102,35 +104,34 @@ impl Mesh {
         Self { levels, closed, low, high }
     }
 
-    /// Whether one does not see its triangles from behind, unless from inside or through small holes.
+    /// Whether the back of its triangles is visible only from inside or through small holes.
     pub(crate) fn is_closed(&self) -> bool {
         self.closed
     }
 
-    /// The corners of a box around it.
+    /// Returns the lowest and highest corner of the bounding box.
     pub(crate) fn bounds(&self) -> (V3, V3) {
         (self.low, self.high)
     }
 
-    /// The number of the coarsest version whose cells are at most so large.
+    /// Returns the index of the coarsest level whose cells are at most `cell` large.
     pub(crate) fn level_for(&self, cell: f32) -> usize {
         self.levels.iter().rposition(|level| level.cell <= cell).unwrap_or(0)
     }
 
-    /// A version by its number.
-    pub(crate) fn level(&self, number: usize) -> &Level {
-        &self.levels[number.min(self.levels.len() - 1)]
+    /// Returns a level by its index.
+    pub(crate) fn level(&self, index: usize) -> &DetailLevel {
+        &self.levels[index.min(self.levels.len() - 1)]
     }
 
-    /// Triangles of every version, from fine to coarse.
+    /// Returns the number of triangles of every level, from fine to coarse.
     pub fn triangles(&self) -> impl Iterator<Item = usize> + '_ {
         self.levels.iter().map(|level| level.faces.len())
     }
 }
 
-impl Level {
-    /// Whether all edges, but for a few, are passed once in either direction.
-    #[allow(clippy::cast_precision_loss)]
+impl DetailLevel {
+    /// Whether nearly all edges are used once in each direction.
     fn is_closed(&self) -> bool {
         let mut passed = HashMap::new();
         for [a, b, c] in &self.faces {
@@ -142,33 +143,33 @@ impl Level {
         open as f32 <= OPEN * self.faces.len() as f32
     }
 
-    /// The version whose vertices are those of cells of this size, each in the mean of its vertices. Directions are merged only
-    /// with those that point the same way, so that thin plates keep two sides.
-    #[allow(clippy::cast_possible_truncation)]
+    /// Merges the vertices in each cell of this side into their mean. Normals are merged only with those that point
+    /// in a similar direction, so that thin plates keep both sides.
     fn merged(&self, low: V3, cell: f32) -> Self {
         let index = |i: usize| u32::try_from(i).unwrap_or(u32::MAX);
-        let key =
-            |place: V3| place.map(|x| x).iter().zip(low).map(|(x, low)| ((x - low) / cell) as i32).collect::<Vec<_>>();
+        let key = |position: V3| {
+            position.map(|x| x).iter().zip(low).map(|(x, low)| ((x - low) / cell) as i32).collect::<Vec<_>>()
+        };
         let (mut cells, mut sums) = (HashMap::new(), Vec::<(V3, f32)>::new());
         let merged: Vec<u32> = self
-            .places
+            .positions
             .iter()
-            .map(|&place| {
-                let at = *cells.entry(key(place)).or_insert_with(|| {
+            .map(|&position| {
+                let at = *cells.entry(key(position)).or_insert_with(|| {
                     sums.push(([0.0; 3], 0.0));
                     index(sums.len() - 1)
                 });
                 let sum = &mut sums[at as usize];
-                *sum = (add(sum.0, place), sum.1 + 1.0);
+                *sum = (add(sum.0, position), sum.1 + 1.0);
                 at
             })
             .collect();
         let mut new = Self { cell, ..Self::default() };
-        new.places = sums.iter().map(|(sum, count)| scale(*sum, 1.0 / count)).collect();
-        let (mut looks, mut directions) = (HashMap::new(), Vec::<(V3, [f32; 2], f32)>::new());
+        new.positions = sums.iter().map(|(sum, count)| scale(*sum, 1.0 / count)).collect();
+        let (mut corner_ids, mut directions) = (HashMap::new(), Vec::<(V3, [f32; 2], f32)>::new());
         let mut seen = std::collections::HashSet::new();
         for (face, corners) in self.faces.iter().zip(&self.corners) {
-            let face = face.map(|place| merged[place as usize]);
+            let face = face.map(|position| merged[position as usize]);
             let [a, b, c] = face;
             if a == b || b == c || a == c {
                 continue;
@@ -181,9 +182,9 @@ impl Level {
             new.faces.push(face);
             new.corners.push(std::array::from_fn(|k| {
                 let (normal, coordinates) = (self.normals[corners[k] as usize], self.coordinates[corners[k] as usize]);
-                // Six ways to point: the axis it is nearest to, and its sign.
+                // Six directions: the axis that the normal is closest to, and its sign.
                 let axis = (0..3).max_by(|&i, &j| normal[i].abs().total_cmp(&normal[j].abs())).unwrap_or(0);
-                let at = *looks.entry((face[k], axis, normal[axis] > 0.0)).or_insert_with(|| {
+                let at = *corner_ids.entry((face[k], axis, normal[axis] > 0.0)).or_insert_with(|| {
                     directions.push(([0.0; 3], [0.0; 2], 0.0));
                     index(directions.len() - 1)
                 });
@@ -203,10 +204,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_fine_mesh_has_coarser_versions() {
+    fn fine_mesh_has_coarser_levels() {
         let mut triangles = vec![];
         let corner = |i: u8, j: u8| Corner {
-            place: [f32::from(i), f32::from(j), 0.0],
+            position: [f32::from(i), f32::from(j), 0.0],
             normal: [0.0, 0.0, 1.0],
             coordinates: [0.0; 2],
         };
@@ -224,13 +225,13 @@ mod tests {
         assert!(mesh.level_for(100.0) == counts.len() - 1);
         for number in 0..counts.len() {
             let level = mesh.level(number);
-            assert!(level.faces.iter().flatten().all(|&i| (i as usize) < level.places.len()));
+            assert!(level.faces.iter().flatten().all(|&i| (i as usize) < level.positions.len()));
             assert!(level.corners.iter().flatten().all(|&i| (i as usize) < level.normals.len()));
         }
     }
 
     #[test]
-    fn an_empty_mesh_is_one() {
+    fn empty_mesh_is_valid() {
         assert_eq!(Mesh::new([]).triangles().collect::<Vec<_>>(), [0]);
     }
 }

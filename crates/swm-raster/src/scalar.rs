@@ -1,40 +1,41 @@
 //! Scalar functions that the compiler can vectorise: plain arithmetic with the same bits on every CPU.
 
-/// The whole number next to one from 0 to 2^22; any for others. Conversion by `as` is done one by one.
+/// Returns the nearest integer of a value from 0 to 2^22, and an arbitrary one outside. Unlike a conversion by `as`,
+/// it vectorises.
 #[inline(always)]
 pub(crate) fn nearest(x: f32) -> u32 {
-    // Added to 2^23, the whole number is in the lowest bits.
+    // The sum with 2^23 has the integer in its lowest bits.
     (x + 8_388_608.0).to_bits() & 0x007f_ffff
 }
 
-/// The same as a number, from -2^22 to 2^22; about the number itself beyond.
+/// Returns the nearest integer as a float, from -2^22 to 2^22; beyond, the value itself up to rounding.
 #[inline(always)]
 pub(crate) fn rounded(x: f32) -> f32 {
     (x + 12_582_912.0) - 12_582_912.0
 }
 
-/// The greatest whole number that is not greater, from -2^22 to 2^22.
+/// Returns the largest integer that is not greater, from -2^22 to 2^22.
 #[inline(always)]
 pub(crate) fn floor(x: f32) -> f32 {
     let near = rounded(x);
     if near > x { near - 1.0 } else { near }
 }
 
-/// `base` to the power of `exponent`, for bases from 0 to 1 and exponents from 0 up, to about 1e-5; 1 for exponent 0. Plain arithmetic:
-/// the same on every machine, and the compiler can do many at once.
+/// Returns `base` to the power of `exponent`, for bases from 0 to 1 and exponents from 0 up, with an error of about
+/// 1e-5. Plain arithmetic, which gives the same bits on every machine and vectorises.
 #[inline(always)]
 pub(crate) fn power(base: f32, exponent: f32) -> f32 {
     let bits = base.max(1e-30).to_bits() as i32;
-    // Mantissa in [sqrt(1/2), sqrt(2)), exponent apart.
+    // Exponent, and mantissa in [sqrt(1/2), sqrt(2)).
     let shifted = bits - 0x3f35_04f3;
     let whole = (shifted >> 23) as f32;
     let mantissa = f32::from_bits(((shifted & 0x007f_ffff) + 0x3f35_04f3) as u32);
-    // The series of artanh: ln m = 2 artanh((m - 1) / (m + 1)).
+    // ln m = 2 artanh((m - 1) / (m + 1)), by the series of artanh.
     let u = (mantissa - 1.0) / (mantissa + 1.0);
     let v = u * u;
     let log2 = whole + u * (2.885_39 + v * (0.961_796_7 + v * (0.577_078 + v * 0.412_198_6)));
     let x = (exponent * log2).clamp(-126.0, 0.0);
-    // Whole part and fraction, from -1/2 to 1/2.
+    // Integer part, and fraction from -1/2 to 1/2.
     let whole = rounded(x);
     let f = (x - whole) * std::f32::consts::LN_2;
     let exp =
@@ -53,17 +54,17 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(1000))]
         #[test]
-        fn pictures_are_the_same_on_any_processor(scene in scene()) {
+        fn frames_are_equal_with_and_without_avx2(scene in scene()) {
             let seen = drawn(&mut Canvas::new(), &scene, &assets());
             limit_cpu_level(CpuLevel::Baseline);
-            let plain = drawn(&mut Canvas::new(), &scene, &assets());
+            let baseline = drawn(&mut Canvas::new(), &scene, &assets());
             limit_cpu_level(CpuLevel::Avx512);
-            prop_assert_eq!(seen, plain);
+            prop_assert_eq!(seen, baseline);
         }
     }
 
     #[test]
-    fn whole_numbers_are_near() {
+    fn rounding_equals_the_standard_library() {
         for x in [0.0, 0.25, 0.75, 1.0, 2.5, 99.9, 4_000_000.0_f32] {
             assert_eq!(f64::from(nearest(x)), f64::from(x.round_ties_even()));
             assert_eq!((rounded(-x), floor(-x), floor(x)), (-x.round_ties_even(), (-x).floor(), x.floor()));
@@ -71,7 +72,7 @@ mod tests {
     }
 
     #[test]
-    fn power_is_close() {
+    fn power_is_close_to_powf() {
         for i in 0..=1000u16 {
             let base = f32::from(i) / 1000.0;
             for exponent in [0.0, 0.5, 1.0, 10.0, 64.0, 128.0] {

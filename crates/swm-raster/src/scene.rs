@@ -1,5 +1,5 @@
-//! What is drawn: geoms with materials, lights, a camera, a sky. The words and the meaning of the numbers are those of
-//! OpenGL's fixed pipeline and of MuJoCo, which draws with it.
+//! What is drawn: geoms with materials, lights, a camera, a sky. Terms and units are those of OpenGL's fixed pipeline
+//! and of MuJoCo, which uses it. Lengths share one unit, angles are degrees, colours are 0 to 1.
 
 use crate::mesh::Mesh;
 use crate::scalar::floor;
@@ -7,112 +7,109 @@ use crate::texture::Texture;
 use crate::vector::V3;
 use std::sync::Arc;
 
-/// What scenes refer to by place, prepared once.
+/// What scenes refer to by index, prepared once.
 #[derive(Clone, Default)]
 pub struct Assets {
-    /// Textures.
+    /// Textures, flat and cube.
     pub textures: Vec<Arc<Texture>>,
     /// Meshes.
     pub meshes: Vec<Arc<Mesh>>,
 }
 
-/// A scene. Its vectors are meant to be cleared and filled again for the next picture.
+/// A scene. Its vectors are meant to be cleared and filled again for the next frame.
 #[derive(Clone, Debug, Default)]
 pub struct Scene {
-    /// Whence it is seen.
+    /// The camera.
     pub camera: Camera,
-    /// What is seen; later ones win where two are equally far.
+    /// The geoms. The later one is visible where two have the same depth.
     pub geoms: Vec<Geom>,
-    /// Light falls from here; without any, everything is lit evenly and dimly.
+    /// The lights. A scene without lights is lit evenly and dimly.
     pub lights: Vec<Light>,
-    /// The cube texture around everything, by its place.
+    /// Index of the cube texture that surrounds the scene.
     pub sky: Option<usize>,
-    /// What veils the horizon of the first infinite plane; shown with a sky.
+    /// Haze at the horizon of the first infinite plane; drawn only with a sky.
     pub haze: Option<Haze>,
-    /// Whether lights that cast shadows do.
+    /// Whether lights with shadows cast them.
     pub shadows: bool,
-    /// Whether the first reflecting geom reflects.
+    /// Whether the first reflective geom reflects.
     pub reflections: bool,
-    /// Half the side of the square that directional lights cast shadows in.
+    /// Half the side of the square in which directional lights cast shadows.
     pub shadow_reach: f32,
-    /// What a spot light's angle is multiplied with where it casts shadows.
+    /// Factor of a spot light's cutoff angle within which it casts shadows.
     pub shadow_angle: f32,
 }
 
 /// A camera: x to the right, y up.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Camera {
-    /// Its place.
+    /// Position.
     pub position: V3,
-    /// Where it looks, of length 1.
+    /// Viewing direction, a unit vector.
     pub forward: V3,
-    /// What is above, of length 1, at right angles to `forward`.
+    /// Upward direction, a unit vector perpendicular to `forward`.
     pub up: V3,
-    /// Left, right, bottom and top of the picture on the near plane.
+    /// Left, right, bottom and top of the frame on the near plane.
     pub frustum: [f32; 4],
-    /// Nothing nearer is seen.
+    /// Distance of the near plane.
     pub near: f32,
-    /// Nothing farther is seen.
+    /// Distance of the far plane.
     pub far: f32,
-    /// Parallel rays instead of rays from one point.
+    /// Whether rays are parallel instead of meeting in the camera.
     pub orthographic: bool,
 }
 
-/// What a geom is, around its own origin.
+/// The shape of a geom, around its own origin.
 #[derive(Clone, Copy, Debug)]
 pub enum Shape {
-    /// A rectangle at z = 0, seen from both sides, thinner from behind. It is lit at the corners of a grid, between which
-    /// colours are interpolated: one axis of it along x, one along y.
+    /// A rectangle at z = 0, visible from both sides and more transparent from behind. It is lit at the corners of a
+    /// grid, whose axes are x and y, and colours are interpolated between them.
     Plane(Axis, Axis),
-    /// An ellipsoid of these radii.
+    /// An ellipsoid with these radii.
     Ellipsoid(V3),
-    /// A cylinder along z that ends in half spheres: its radius, and half the cylinder's length.
+    /// A capsule along z: its radius, and half the length of its cylinder.
     Capsule(f32, f32),
-    /// A cylinder along z: radius, half its length.
+    /// A cylinder along z: its radius, and half its length.
     Cylinder(f32, f32),
-    /// A box: half its sides.
+    /// A box with these half sides.
     Box(V3),
-    /// A mesh of [`Assets`].
+    /// A mesh, by its index in [`Assets`].
     Mesh(usize),
 }
 
-/// Grid lines along an axis: cells of width `step`, but for the first and the last, which are `pad` wide.
+/// The grid of a plane along one axis: cells of width `step`, except for the first and the last of width `pad`.
 #[derive(Clone, Copy, Debug)]
 pub struct Axis {
-    /// Half the width of all.
+    /// Half the width of the plane.
     pub half: f32,
-    /// Width of the first and last cell.
+    /// Width of the first and the last cell.
     pub pad: f32,
-    /// Width of the others.
+    /// Width of the other cells.
     pub step: f32,
-    /// Cells, at least 1.
+    /// Number of cells, at least 1.
     pub cells: usize,
-    /// Whether it stands for an endless one.
+    /// Whether the plane is infinite along this axis.
     pub infinite: bool,
 }
 
 impl Axis {
-    /// So many equal cells from `-half` to `half`.
-    #[allow(clippy::cast_precision_loss)]
+    /// Makes a grid of `cells` equal cells from `-half` to `half`.
     pub fn even(half: f32, cells: usize) -> Self {
         let step = 2.0 * half / cells.max(1) as f32;
         Self { half, pad: step, step, cells: cells.max(1), infinite: false }
     }
 
-    /// Where the line before cell `i`, a whole number, is.
+    /// Returns the coordinate of the line before cell `i`, an integer.
     #[inline(always)]
-    #[allow(clippy::cast_precision_loss)]
     pub(crate) fn line(&self, i: f32) -> f32 {
         let inner = -self.half + self.pad + (i - 1.0) * self.step;
         let inner = if i > 0.0 { inner } else { -self.half };
         if i < self.cells as f32 { inner } else { self.half }
     }
 
-    /// The cell a place is in, and how far into it, from 0 to 1.
+    /// Returns the cell of a coordinate, and the position within it from 0 to 1.
     #[inline(always)]
-    #[allow(clippy::cast_precision_loss, clippy::manual_clamp, reason = "`clamp` would keep what is no number")]
     pub(crate) fn cell(&self, x: f32) -> (f32, f32) {
-        // Where it is among the inner lines; what is far outside, or no number, may be anywhere.
+        // Position among the inner lines. Values far outside and NaN are clamped.
         let from = ((x + self.half - self.pad) / self.step).max(-1.0).min(1e6);
         let last = (self.cells - 1) as f32;
         let cell = floor(from) + 1.0;
@@ -122,28 +119,28 @@ impl Axis {
     }
 }
 
-/// A thing in the scene.
+/// A geom: a shape with a pose and a material.
 #[derive(Clone, Copy, Debug)]
 pub struct Geom {
-    /// Its form and size.
+    /// Shape and size.
     pub shape: Shape,
-    /// Where its origin is.
+    /// Position of the origin.
     pub position: V3,
-    /// Its axes, as columns of a matrix given row after row.
+    /// Rotation, `[3, 3]` row-major; its columns are the local axes.
     pub rotation: [f32; 9],
-    /// Colour, and opacity: below 0.995, what is behind shines through.
+    /// Colour and opacity. A geom with an opacity below 0.995 is transparent.
     pub rgba: [f32; 4],
-    /// How much of its colour it glows with.
+    /// Emission, as a factor of the colour.
     pub emission: f32,
-    /// The colour of highlights, a grey.
+    /// Specular reflectance, a grey.
     pub specular: f32,
-    /// How small highlights are: OpenGL's exponent, divided by 128.
+    /// Shininess: OpenGL's exponent divided by 128.
     pub shininess: f32,
-    /// How much of a mirror image a plane or the upper side of a box shows.
+    /// Weight of the mirror image on a plane or on the upper side of a box.
     pub reflectance: f32,
-    /// What its colour is multiplied with.
+    /// The texture that multiplies the colour.
     pub paint: Option<Paint>,
-    /// Its number in pictures of labels; `None` leaves it out of them.
+    /// Label in label images; `None` leaves the geom out of them.
     pub label: Option<i32>,
     /// Whether it casts shadows.
     pub casts: bool,
@@ -152,60 +149,60 @@ pub struct Geom {
 /// A texture on a geom.
 #[derive(Clone, Copy, Debug)]
 pub struct Paint {
-    /// Its place in [`Assets`].
+    /// Index of the texture in [`Assets`].
     pub texture: usize,
-    /// How it lies there.
+    /// How the texture is mapped.
     pub mapping: Mapping,
 }
 
-/// How a texture lies on a geom.
+/// How a texture is mapped to a geom.
 #[derive(Clone, Copy, Debug)]
 pub enum Mapping {
-    /// Seen along z: the texture's coordinates are `scale * (x, y) + offset`.
+    /// Projected along z: texture coordinates are `scale * (x, y) + offset`.
     Flat {
-        /// By what local coordinates are multiplied.
+        /// Factor of the local coordinates.
         scale: [f32; 2],
-        /// What is added.
+        /// Added to the product.
         offset: [f32; 2],
     },
-    /// On each side of a box, so many times.
+    /// On each side of a box, repeated along both axes.
     Sides([f32; 2]),
-    /// A cube texture, by the direction from the origin of the geom, each axis multiplied.
+    /// A cube texture, by the direction from the geom's origin, with a factor per axis.
     Cube(V3),
-    /// By the coordinates of a mesh.
+    /// By the texture coordinates of the mesh.
     Own,
 }
 
 /// A light.
 #[derive(Clone, Copy, Debug)]
 pub struct Light {
-    /// Where it is; of a directional one, whence it casts shadows.
+    /// Position; for a directional light, where its shadow map is drawn from.
     pub position: V3,
-    /// Where it shines, of length 1.
+    /// Direction, a unit vector.
     pub direction: V3,
-    /// All rays parallel; otherwise a spot.
+    /// Whether all rays are parallel. Otherwise it is a spot light.
     pub directional: bool,
-    /// Constant, linear and quadratic decay with distance, of spots.
+    /// Constant, linear and quadratic attenuation with distance, of spot lights.
     pub attenuation: V3,
-    /// Degrees from its direction that a spot reaches, at most 90; more stands for everywhere.
+    /// Half opening angle of a spot light in degrees, at most 90; above, it shines in all directions.
     pub cutoff: f32,
-    /// How a spot fades towards its edge.
+    /// Exponent of a spot light's falloff towards its edge.
     pub exponent: f32,
-    /// Light from everywhere.
+    /// Ambient colour.
     pub ambient: V3,
-    /// Light that surfaces scatter.
+    /// Diffuse colour.
     pub diffuse: V3,
-    /// Light of highlights.
+    /// Specular colour.
     pub specular: V3,
     /// Whether it casts shadows.
     pub shadows: bool,
 }
 
-/// A veil at the horizon.
+/// Haze at the horizon.
 #[derive(Clone, Copy, Debug)]
 pub struct Haze {
-    /// Its colour.
+    /// Colour.
     pub rgb: V3,
-    /// How far it reaches towards the camera, as a part of the distance of the sky.
+    /// How far it extends towards the camera, relative to the distance of the sky.
     pub depth: f32,
 }

@@ -1,36 +1,37 @@
-//! Where a lamp does not shine: the scene seen from there, nearest things only.
+//! Shadow maps: the depth buffer of the scene, seen from a light.
 //!
-//! The map covers what casts shadows and no more, so that it is sharp although it is small. A convex shape is never in its
-//! own shadow, but where it turns away from the lamp; only meshes need a margin against rounding.
+//! A map covers only the geoms that cast shadows, so that it is sharp although it is small. A convex shape shadows
+//! itself only where it faces away from the light; only meshes need a margin against rounding.
 
+use crate::geometry_cache::{DrawSettings, GeometryCache};
 use crate::layers::{Layers, NOTHING, pattern, touched};
-use crate::light::Lamp;
+use crate::light::ShadingLight;
 use crate::scene::{Assets, Geom, Light, Scene, Shape};
-use crate::still::{Setting, Still};
 use crate::texture::MANY;
 use crate::vector::{V3, across, cross, dot, unit};
 use crate::view::View;
 use swm_simd::LANES;
 use swm_simd::vectorize;
 
-/// Texels of a side of the map that the fixed pipeline draws: a finer one is not needed.
+/// Texels along the side of the map that MuJoCo's renderer draws; a finer map is not needed.
 const FINEST: usize = 4096;
 
-/// The cosine up to which a surface is edge-on to the light.
+/// Cosine up to which a surface counts as edge-on to the light.
 const EDGE_ON: f32 = 0.01;
 
-/// What one light does not reach.
+/// The shadow map of one light.
 #[derive(Default)]
 pub(crate) struct Shadow {
     layers: Layers,
-    still: Still,
+    cache: GeometryCache,
     view: Option<View>,
-    /// By geom: whether it may be in its own shadow.
-    hollow: Vec<bool>,
+    /// By geom: whether it can shadow itself.
+    shadows_itself: Vec<bool>,
 }
 
 impl Shadow {
-    /// Draws the map of a light, of at most `side` texels a side. The part in front of `scene.camera.near` casts no shadows.
+    /// Draws the map of a light, with at most `side` texels along a side. Geoms nearer to it than `scene.camera.near`
+    /// cast no shadow.
     pub fn cast(&mut self, scene: &Scene, assets: &Assets, light: &Light, side: usize) {
         self.view = None;
         let forward = unit(light.direction);
@@ -45,8 +46,7 @@ impl Shadow {
         if !(reach > 0.0 && reach.is_finite()) {
             return;
         }
-        #[allow(clippy::cast_precision_loss)]
-        let dense = FINEST as f32 / (2.0 * reach);
+        let pixels_per_unit = FINEST as f32 / (2.0 * reach);
         let whole = View {
             position: light.position,
             right: cross(forward, up),
@@ -54,7 +54,7 @@ impl Shadow {
             forward,
             left: -reach,
             top: reach,
-            dense: [dense; 2],
+            pixels_per_unit: [pixels_per_unit; 2],
             near: scene.camera.near,
             orthographic: light.directional,
             width: FINEST,
@@ -77,35 +77,44 @@ impl Shadow {
             true => ((wide * side).div_ceil(longest), (high * side).div_ceil(longest)),
             false => (wide, high),
         };
-        #[allow(clippy::cast_precision_loss)]
         let view = View {
-            left: whole.left + x0 as f32 / dense,
-            top: whole.top - y0 as f32 / dense,
-            dense: [dense * width as f32 / wide as f32, dense * height as f32 / high as f32],
+            left: whole.left + x0 as f32 / pixels_per_unit,
+            top: whole.top - y0 as f32 / pixels_per_unit,
+            pixels_per_unit: [
+                pixels_per_unit * width as f32 / wide as f32,
+                pixels_per_unit * height as f32 / high as f32,
+            ],
             width,
             height,
             ..whole
         };
         self.layers.start(width, 0..height, pattern(1));
-        self.hollow.clear();
-        self.hollow.extend(scene.geoms.iter().map(|geom| matches!(geom.shape, Shape::Mesh(_))));
-        let setting = Setting { assets, view: &view, far: scene.camera.far, casting: true };
-        self.still.draw(&mut self.layers, setting, casters());
+        self.shadows_itself.clear();
+        self.shadows_itself.extend(scene.geoms.iter().map(|geom| matches!(geom.shape, Shape::Mesh(_))));
+        let settings = DrawSettings { assets, view: &view, far: scene.camera.far, casting: true };
+        self.cache.draw(&mut self.layers, settings, casters());
         self.view = Some(view);
     }
 
-    /// Which of the places on surfaces of a geom the light of a lamp reaches: 1 or 0.
-    pub fn reaches(&self, geom: u32, lamp: &Lamp, places: [&[f32]; 3], normals: [&[f32]; 3], lit: &mut [f32]) {
-        facing(lamp, places, normals, lit);
+    /// Writes 1 where a light reaches positions on the surface of a geom, and 0 in its shadow.
+    pub fn write_lit(
+        &self,
+        geom: u32,
+        light: &ShadingLight,
+        positions: [&[f32]; 3],
+        normals: [&[f32]; 3],
+        lit: &mut [f32],
+    ) {
+        facing(light, positions, normals, lit);
         let Some(view) = &self.view else {
             lit.iter_mut().for_each(|lit| *lit = if *lit < -EDGE_ON { 0.0 } else { 1.0 });
             return;
         };
         let mut texels = [[0.0; MANY]; 3];
-        project(view, places, &mut texels);
+        project(view, positions, &mut texels);
         let [x, y, depths] = &texels;
         for (from, lit) in (0..).step_by(LANES).zip(lit.chunks_mut(LANES)) {
-            // What turns away is in its own shadow; along an edge-on surface, ambient light passes.
+            // Surfaces that face away are in their own shadow; ambient light passes along edge-on surfaces.
             let (mut cosines, mut count) = ([0.0; LANES], 0);
             for ((cosine, lit), x) in cosines.iter_mut().zip(lit.iter_mut()).zip(&x[from..]) {
                 *cosine = *lit;
@@ -117,27 +126,26 @@ impl Shadow {
             }
             for (i, (lit, facing)) in (from..).zip(lit.iter_mut().zip(cosines)) {
                 let inside = x[i] >= 0.0 && facing >= -EDGE_ON;
-                if inside && self.darkens(view, geom, [x[i], y[i], depths[i]], facing) {
+                if inside && self.is_shadowed(view, geom, [x[i], y[i], depths[i]], facing) {
                     *lit = 0.0;
                 }
             }
         }
     }
 
-    /// Whether something is before a place inside the map.
+    /// Whether something lies between the light and a position on the map.
     #[inline]
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    fn darkens(&self, view: &View, geom: u32, [x, y, depth]: V3, facing: f32) -> bool {
+    fn is_shadowed(&self, view: &View, geom: u32, [x, y, depth]: V3, facing: f32) -> bool {
         let at = self.layers.span(y as usize, x as usize, x as usize).start;
         let id = self.layers.ids[at];
         if id == NOTHING {
             return false;
         }
         let caster = self.layers.geom(id);
-        if caster == geom && !self.hollow.get(caster as usize).copied().unwrap_or(true) {
+        if caster == geom && !self.shadows_itself.get(caster as usize).copied().unwrap_or(true) {
             return false;
         }
-        // A texel shows its middle: half a texel beside it, a slanted surface is that much nearer.
+        // A texel holds the depth at its centre: half a texel away, a slanted surface is nearer by this margin.
         let slope = ((1.0 - facing * facing).max(0.0).sqrt() / facing.max(0.05)).min(8.0);
         let margin = (0.5 + slope) / view.pixels_at(depth);
         depth > self.layers.depths[at] + margin
@@ -145,11 +153,10 @@ impl Shadow {
 }
 
 vectorize! {
-    /// Where places are on the map, and how far from the light; x is -1 outside.
-    #[allow(clippy::cast_precision_loss)]
-    fn project(view: &View, places: [&[f32]; 3], texels: &mut [[f32; MANY]; 3]) {
-        let n = places[0].len().min(MANY);
-        let [px, py, pz] = places.map(|lane| &lane[..n]);
+    /// Projects positions onto the map. x is -1 outside of it.
+    fn project(view: &View, positions: [&[f32]; 3], texels: &mut [[f32; MANY]; 3]) {
+        let n = positions[0].len().min(MANY);
+        let [px, py, pz] = positions.map(|lane| &lane[..n]);
         let [x, y, depths] = texels;
         let (width, height) = (view.width as f32, view.height as f32);
         for i in 0..n {
@@ -162,12 +169,12 @@ vectorize! {
         }
     }
 
-    /// The cosines between surfaces and the ways to a lamp.
-    fn facing(lamp: &Lamp, places: [&[f32]; 3], normals: [&[f32]; 3], cosines: &mut [f32]) {
+    /// Computes the cosines between normals and the directions to a light.
+    fn facing(light: &ShadingLight, positions: [&[f32]; 3], normals: [&[f32]; 3], cosines: &mut [f32]) {
         let n = cosines.len();
-        let ([px, py, pz], [nx, ny, nz]) = (places.map(|lane| &lane[..n]), normals.map(|lane| &lane[..n]));
+        let ([px, py, pz], [nx, ny, nz]) = (positions.map(|lane| &lane[..n]), normals.map(|lane| &lane[..n]));
         for i in 0..n {
-            cosines[i] = dot([nx[i], ny[i], nz[i]], lamp.from([px[i], py[i], pz[i]]));
+            cosines[i] = dot([nx[i], ny[i], nz[i]], light.direction_from([px[i], py[i], pz[i]]));
         }
     }
 }

@@ -1,48 +1,49 @@
-//! What is behind everything: a cube texture on a cylinder around the camera, and haze before it.
+//! The background: a cube texture on a cylinder around the camera, and haze in front of it.
 
 use crate::layers::{Layers, NOTHING};
 use crate::scene::{Assets, Geom, Haze, Scene, Shape};
-use crate::texture::{MANY, Reader, Spots, Texture};
+use crate::texture::{MANY, Sampler, Texture, TextureLookup};
 use crate::vector::{V3, add, dot, scale, sub, unrotate};
 use crate::view::View;
 use std::ops::Range;
 use std::sync::Arc;
 use swm_simd::vectorize;
 
-/// How far the sky is: just so near that no part of its cylinder is cut off, as a part of the depth one sees.
-const NEAR: f32 = 0.7;
+/// Distance of the sky relative to the far plane: small enough that the far plane cuts nothing off its cylinder.
+const DISTANCE: f32 = 0.7;
 
-/// The cylinder's radius, and half its height.
+/// Returns the radius of the sky's cylinder, which is also half its height.
 pub(crate) fn radius(scene: &Scene) -> f32 {
-    NEAR * scene.camera.far
+    DISTANCE * scene.camera.far
 }
 
-/// The depth at which a ray meets the sky.
+/// Returns the depth at which a ray meets the sky.
 #[inline(always)]
 pub(crate) fn depth(radius: f32, direction: V3) -> f32 {
     let [x, y, z] = direction;
     radius / (x * x + y * y).sqrt().max(z.abs()).max(1e-12)
 }
 
-/// The sky as it was seen last. It is so far away that it stays the same while a camera only moves: its rows are looked up once.
+/// The colours of the sky in the last frame. The sky does not move with the camera's position, so they stay valid
+/// until the camera turns.
 #[derive(Default)]
-pub(crate) struct Backdrop {
-    /// The texture and the rays it was seen along.
+pub(crate) struct SkyCache {
+    /// The texture, and the rays it was looked up along.
     seen: Option<(Arc<Texture>, V3, [V3; 2])>,
     width: usize,
     rows: Range<usize>,
-    /// Red, green and blue of pixels, and by row whether they were looked up.
+    /// Red, green and blue of pixels.
+    /// `known` says by row whether they were looked up.
     colours: [Vec<f32>; 3],
     known: Vec<bool>,
-    reader: Reader,
-    /// Scratch: how much of each pixel of a row is open, and how far the sky is there.
+    sampler: Sampler,
+    /// Scratch: the uncovered part of each pixel of a row, and the depth of the sky there.
     open: Vec<f32>,
     far: Vec<f32>,
 }
 
-impl Backdrop {
-    /// Paints the sky where nothing is before it, and black elsewhere, in the rows of the layers.
-    #[allow(clippy::cast_precision_loss)]
+impl SkyCache {
+    /// Draws the sky where nothing covers it, and black elsewhere, in the rows of the layers.
     pub fn paint(
         &mut self,
         scene: &Scene,
@@ -76,7 +77,7 @@ impl Backdrop {
             let row = add(rays.direction, scale(rays.directions[1], y as f32 + 0.5));
             let samples = main.span(y, 0, view.width);
             if endless {
-                // The sky is nearer than the far ends of endless planes.
+                // The sky hides the far ends of infinite planes.
                 depths(radius, row, rays.directions[0], &mut self.far);
                 hide(&self.far, main.samples, &main.depths[samples.clone()], &mut main.ids[samples.clone()]);
             }
@@ -88,53 +89,53 @@ impl Backdrop {
             }
             if !std::mem::replace(&mut self.known[line], true) {
                 let [r, g, b] = self.colours.each_mut().map(|colours| &mut colours[pixels.clone()]);
-                look_up(texture, &mut self.reader, row, rays.directions, [r, g, b]);
+                look_up(texture, &mut self.sampler, row, rays.directions, [r, g, b]);
             }
             for (colours, sky) in colours.iter_mut().zip(&self.colours) {
-                shine_through(&sky[pixels.clone()], &self.open, &mut colours[pixels.clone()]);
+                weight_by_open(&sky[pixels.clone()], &self.open, &mut colours[pixels.clone()]);
             }
         }
     }
 }
 
-/// The sky's colours along the rays of a row, which begins so, and to the right and down.
-fn look_up(texture: &Texture, reader: &mut Reader, row: V3, [right, down]: [V3; 2], [r, g, b]: [&mut [f32]; 3]) {
+/// Looks up the sky's colours along the rays of a row: direction of the first ray, and its change to the right and
+/// down.
+fn look_up(texture: &Texture, sampler: &mut Sampler, row: V3, [right, down]: [V3; 2], [r, g, b]: [&mut [f32]; 3]) {
     // The texture's y axis points upwards.
     let turn = |[x, y, z]: V3| [x, z, -y];
     let (row, right, down) = (turn(row), turn(right), turn(down));
-    let ([mut s, mut t, mut dense], mut faces) = ([[0.0; MANY]; 3], [0; MANY]);
+    let ([mut s, mut t, mut texels_per_pixel], mut faces) = ([[0.0; MANY]; 3], [0; MANY]);
     for from in (0..r.len()).step_by(MANY) {
         let part = from..r.len().min(from + MANY);
         let n = part.len();
-        find(texture, &row, &right, &down, from, &mut s, &mut t, &mut dense, &mut faces);
-        let spots = Spots { s: &s[..n], t: &t[..n], dense: &dense[..n], faces: &faces[..n] };
-        texture.colours(&spots, reader, [&mut r[part.clone()], &mut g[part.clone()], &mut b[part]]);
+        find(texture, &row, &right, &down, from, &mut s, &mut t, &mut texels_per_pixel, &mut faces);
+        let lookup =
+            TextureLookup { s: &s[..n], t: &t[..n], texels_per_pixel: &texels_per_pixel[..n], faces: &faces[..n] };
+        texture.colours(&lookup, sampler, [&mut r[part.clone()], &mut g[part.clone()], &mut b[part]]);
     }
 }
 
 vectorize! {
-    /// Where on the sky rays of a row meet it, from pixel `from` on.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+    /// Computes faces and coordinates of the rays of a row, from pixel `from` on.
     fn find(
         texture: &Texture, row: &V3, right: &V3, down: &V3, from: usize, s: &mut [f32; MANY], t: &mut [f32; MANY],
-        dense: &mut [f32; MANY], faces: &mut [u32; MANY],
+        texels_per_pixel: &mut [f32; MANY], faces: &mut [u32; MANY],
     ) {
         for i in 0..MANY {
             let direction = add(*row, scale(*right, from as f32 + (i as u32 as i32 as f32 + 0.5)));
-            let (face, spot, texels) = texture.face_in(direction, *right, *down);
-            (faces[i], s[i], t[i], dense[i]) = (face, spot[0], spot[1], texels);
+            let (face, position, texels) = texture.face_in(direction, *right, *down);
+            (faces[i], s[i], t[i], texels_per_pixel[i]) = (face, position[0], position[1], texels);
         }
     }
 
-    /// The depths at which rays of a row, which begins so, meet the sky.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_precision_loss)]
+    /// Computes the depths at which the rays of a row meet the sky.
     fn depths(radius: f32, row: V3, right: V3, far: &mut [f32]) {
         for (i, far) in far.iter_mut().enumerate() {
             *far = depth(radius, add(row, scale(right, i as u32 as i32 as f32 + 0.5)));
         }
     }
 
-    /// Takes away what is farther than the sky.
+    /// Removes samples that lie behind the sky.
     fn hide(far: &[f32], samples: usize, depths: &[f32], ids: &mut [u32]) {
         #[inline(always)]
         fn hide<const SAMPLES: usize>(far: &[f32], depths: &[f32], ids: &mut [u32]) {
@@ -152,7 +153,7 @@ vectorize! {
         }
     }
 
-    /// Finds how much of every pixel shows nothing: a share for every sample.
+    /// Computes the uncovered part of every pixel: `share` per empty sample.
     fn count_open(ids: &[u32], samples: usize, share: f32, open: &mut [f32]) {
         #[inline(always)]
         fn count<const SAMPLES: usize>(ids: &[u32], share: f32, open: &mut [f32]) {
@@ -167,17 +168,17 @@ vectorize! {
         }
     }
 
-    /// The sky as far as pixels are open.
-    fn shine_through(sky: &[f32], open: &[f32], colours: &mut [f32]) {
+    /// Weights the sky's colours by the uncovered part of pixels.
+    fn weight_by_open(sky: &[f32], open: &[f32], colours: &mut [f32]) {
         for ((sky, open), colour) in sky.iter().zip(open).zip(colours) {
             *colour = sky * open;
         }
     }
 }
 
-/// Haze above an infinite plane: a cone that begins on the plane, inside the sky's cylinder, and ends at the height of the eye, on
-/// the cylinder. It is thickest where it crosses the way to where the plane meets the sky.
-pub(crate) struct Veil {
+/// Haze above an infinite plane: a cone from a circle on the plane, inside the sky's cylinder, to the cylinder at the
+/// height of the eye. Its opacity is greatest where it crosses the line of sight to the horizon.
+pub(crate) struct HazeCone {
     rotation: [f32; 9],
     elevation: f32,
     radius: f32,
@@ -186,15 +187,15 @@ pub(crate) struct Veil {
     pub rgb: V3,
 }
 
-impl Veil {
-    /// The haze of a scene, if its first infinite plane is below the eye.
+impl HazeCone {
+    /// Returns the haze of a scene if its first infinite plane is below the eye.
     pub fn new(scene: &Scene, haze: &Haze, eye: V3) -> Option<Self> {
         let plane =
             scene.geoms.iter().find(|geom| matches!(geom.shape, Shape::Plane(x, y) if x.infinite && y.infinite))?;
         let normal = [plane.rotation[2], plane.rotation[5], plane.rotation[8]];
         let elevation = dot(sub(eye, plane.position), normal) / radius(scene);
         let inner = haze.depth;
-        // Where a line from the eye at 45 degrees would be for an eye at height 1.
+        // Where a line from an eye at height 1, at 45 degrees, meets the cone.
         let alpha = 1f32.atan2(inner);
         let beta = 0.75 * std::f32::consts::PI - alpha;
         let thickest = 0.5f32.sqrt() * inner * alpha.sin() / beta.sin();
@@ -208,13 +209,13 @@ impl Veil {
         })
     }
 
-    /// How thick it is along a ray, and at which depth.
+    /// Returns the opacity along a ray, and the depth of the haze there.
     #[inline]
     pub fn at(&self, direction: V3) -> Option<(f32, f32)> {
         let local = unrotate(&self.rotation, direction);
         let across = (local[0] * local[0] + local[1] * local[1]).sqrt();
         let slope = local[2] / across.max(1e-12);
-        // The part of the way down from the eye to the plane: on the cone, the radius is 1 - inner * part.
+        // Relative height between eye and plane: on the cone, the radius is 1 - inner * part.
         let part = slope / (slope * self.inner - self.elevation);
         if !(0.0..=1.0).contains(&part) {
             return None;
@@ -228,7 +229,7 @@ impl Veil {
     }
 }
 
-/// A colour behind another.
+/// Blends a colour over another.
 #[inline]
 pub(crate) fn over(front: f32, opacity: f32, behind: f32) -> f32 {
     opacity * front + (1.0 - opacity) * behind

@@ -1,60 +1,59 @@
-//! [`Strip`]: some rows of a picture, which one thread draws.
+//! [`Strip`]: some rows of a frame, drawn by one thread.
 
+use crate::geometry_cache::{DrawSettings, GeometryCache};
 use crate::layers::{Layers, NOTHING, Region, touched};
-use crate::paint::{Lit, Look, Painter};
+use crate::paint::{Lighting, Painter, ShadingContext};
 use crate::scalar::nearest;
 use crate::scene::{Assets, Scene, Shape};
-use crate::sky::{self, Backdrop, Veil};
-use crate::still::{Setting, Still};
+use crate::sky::{self, HazeCone, SkyCache};
 use crate::vector::{add, dot, scale, sub};
 use crate::view::View;
 use std::ops::Range;
 use swm_simd::vectorize;
 
-/// Rows of a picture, and the memory they need.
+/// Rows of a frame, and the memory for drawing them.
 #[derive(Default)]
 pub(crate) struct Strip {
     pub main: Layers,
-    still: Still,
+    cache: GeometryCache,
     mirror: Layers,
-    glass: Layers,
+    transparent: Layers,
     painter: Painter,
-    backdrop: Backdrop,
+    sky_cache: SkyCache,
     /// Red, green and blue of all pixels.
     colours: [Vec<f32>; 3],
-    /// Places of geoms one sees through, from near to far, and how far they are.
-    clear: Vec<(f32, usize)>,
+    /// Distances and indices of transparent geoms, from near to far.
+    transparent_geoms: Vec<(f32, usize)>,
 }
 
-/// A picture to be drawn: what is the same for all its strips.
+/// The frame to draw: what all strips share.
 #[derive(Clone, Copy)]
-pub(crate) struct Picture<'a> {
+pub(crate) struct Frame<'a> {
     pub scene: &'a Scene,
     pub assets: &'a Assets,
     pub view: &'a View,
-    /// Where samples are in a pixel.
+    /// Positions of samples within a pixel.
     pub pattern: &'static [[f32; 2]],
 }
 
-/// Less opaque geoms let something through.
-const OPAQUE: f32 = 0.995;
+/// Opacity below which geoms are transparent.
+const MIN_OPAQUE: f32 = 0.995;
 
-/// How much of a plane is left of its opacity, seen from behind.
-const BEHIND: f32 = 0.3;
+/// Factor of a plane's opacity when it is seen from behind.
+const BACK_OPACITY: f32 = 0.3;
 
 impl Strip {
-    /// Finds what is nearest at every sample of some rows, of the geoms that count.
-    pub fn find(&mut self, picture: &Picture<'_>, rows: Range<usize>, counts: impl Fn(usize) -> bool) {
-        let Picture { scene, assets, view, pattern } = *picture;
+    /// Draws the selected geoms into the depth buffer of some rows.
+    pub fn draw_geoms(&mut self, frame: &Frame<'_>, rows: Range<usize>, counts: impl Fn(usize) -> bool) {
+        let Frame { scene, assets, view, pattern } = *frame;
         self.main.start(view.width, rows, pattern);
         let geoms = (0u32..).zip(&scene.geoms).filter(|(number, _)| counts(*number as usize));
-        let setting = Setting { assets, view, far: scene.camera.far, casting: false };
-        self.still.draw(&mut self.main, setting, geoms);
+        let settings = DrawSettings { assets, view, far: scene.camera.far, casting: false };
+        self.cache.draw(&mut self.main, settings, geoms);
     }
 
-    /// Writes depths; where nothing is, that of the sky, or how far one sees.
-    #[allow(clippy::cast_precision_loss)]
-    pub fn depths(&self, &Picture { scene, view, .. }: &Picture<'_>, metres: &mut [f32]) {
+    /// Writes depths; where nothing was drawn, that of the sky or the far plane.
+    pub fn write_depths(&self, &Frame { scene, view, .. }: &Frame<'_>, metres: &mut [f32]) {
         let (rays, radius) = (view.rays(), sky::radius(scene));
         let [dx, dy] = self.main.pattern[0];
         for (y, metres) in self.main.rows.clone().zip(metres.chunks_exact_mut(view.width)) {
@@ -69,7 +68,7 @@ impl Strip {
     }
 
     /// Writes labels.
-    pub fn labels(&self, &Picture { scene, view, .. }: &Picture<'_>, labels: &mut [i32]) {
+    pub fn write_labels(&self, &Frame { scene, view, .. }: &Frame<'_>, labels: &mut [i32]) {
         for (y, labels) in self.main.rows.clone().zip(labels.chunks_exact_mut(view.width)) {
             for (label, &id) in labels.iter_mut().zip(&self.main.ids[self.main.span(y, 0, view.width)]) {
                 *label = match id {
@@ -80,39 +79,39 @@ impl Strip {
         }
     }
 
-    /// Writes colours. `unshaded` are the lamps without their shadows, for what is seen in mirrors and through glass.
-    pub fn colours(&mut self, picture: &Picture<'_>, lamps: Lit<'_>, unshaded: Lit<'_>, bytes: &mut [u8]) {
-        let Picture { scene, assets, view, .. } = *picture;
+    /// Writes colours. `unshaded` are the lights without shadows, for mirrored and transparent geoms.
+    pub fn write_colours(&mut self, frame: &Frame<'_>, lights: Lighting<'_>, unshaded: Lighting<'_>, bytes: &mut [u8]) {
+        let Frame { scene, assets, view, .. } = *frame;
         self.painter.start(scene.geoms.len());
         for colours in &mut self.colours {
             colours.resize(view.width * self.main.rows.len(), 0.0);
         }
-        self.backdrop.paint(scene, assets, view, &mut self.main, &mut self.colours);
+        self.sky_cache.paint(scene, assets, view, &mut self.main, &mut self.colours);
         if scene.reflections {
-            self.reflect(picture, unshaded);
+            self.draw_reflection(frame, unshaded);
             self.painter.start(scene.geoms.len());
         }
         let Self { main, painter, colours, .. } = self;
-        let look = Look { scene, assets, view, lamps, dimmed: 1.0 };
+        let context = ShadingContext { scene, assets, view, lights, dimmed: 1.0 };
         let whole = [0, 0, view.width, view.height];
-        painter.paint(main, &look, whole, |pixels, part, seen| add_part(colours, pixels, part, seen));
-        veil(scene, view, main, colours);
-        self.see_through(picture, unshaded);
+        painter.paint(main, &context, whole, |pixels, part, seen| add_part(colours, pixels, part, seen));
+        draw_haze(scene, view, main, colours);
+        self.draw_transparent(frame, unshaded);
         let [r, g, b] = &self.colours;
         to_bytes(r, g, b, bytes.as_chunks_mut::<3>().0);
     }
 
-    /// Draws the mirror image in the first geom that reflects. It is lit without shadows.
-    fn reflect(&mut self, &Picture { scene, assets, view, .. }: &Picture<'_>, lamps: Lit<'_>) {
+    /// Draws the mirror image in the first reflective geom, without shadows.
+    fn draw_reflection(&mut self, &Frame { scene, assets, view, .. }: &Frame<'_>, lights: Lighting<'_>) {
         let reflecting = |number: &usize| {
             let geom = &scene.geoms[*number];
             let shape = matches!(geom.shape, Shape::Plane(..) | Shape::Box(_));
-            shape && geom.reflectance > 0.0 && !clear(scene, *number, view)
+            shape && geom.reflectance > 0.0 && !is_transparent(scene, *number, view)
         };
         let Some(number) = (0..scene.geoms.len()).find(reflecting) else { return };
         let geom = &scene.geoms[number];
         let normal = [geom.rotation[2], geom.rotation[5], geom.rotation[8]];
-        // Of a box, the upper side reflects.
+        // A box reflects on its upper side.
         let height = if let Shape::Box(halves) = geom.shape { halves[2] } else { 0.0 };
         let point = add(geom.position, scale(normal, height));
         let Some(region) = touched(geom, assets, view) else { return };
@@ -123,27 +122,28 @@ impl Strip {
         let Self { main, mirror, painter, colours, .. } = self;
         mirror.start(view.width, main.rows.clone(), main.pattern);
         mirror.ids.fill(NOTHING);
-        // One sees only where the mirror is, and what is in front of it.
+        // Only the pixels of the mirror, and only what lies in front of it.
         let own = u32::try_from(number).unwrap_or(NOTHING);
-        open(own, scene.camera.far, &main.ids, &mut mirror.depths);
+        select_mirror(own, scene.camera.far, &main.ids, &mut mirror.depths);
         let mut seen = [usize::MAX, usize::MAX, 0, 0];
         for (other, geom) in (0u32..).zip(&scene.geoms) {
-            if other != own && !clear(scene, other as usize, view) {
+            if other != own && !is_transparent(scene, other as usize, view) {
                 let touched = mirror.draw(other, geom, (assets, &mirrored), Some(&main.depths), false);
-                seen = touched.map_or(seen, |touched| around(seen, touched));
+                seen = touched.map_or(seen, |touched| union(seen, touched));
             }
         }
-        let seen = within(seen, region);
-        // Mirrored lamps shine on mirrored things: the same light as on the things themselves. Nothing is in a shadow.
-        let look = Look { scene, assets, view: &mirrored, lamps, dimmed: geom.reflectance };
-        painter.paint(mirror, &look, seen, |pixels, part, seen| add_part(colours, pixels, part, seen));
+        let seen = intersection(seen, region);
+        // Mirrored lights on mirrored geoms give the same light as the originals.
+        let context = ShadingContext { scene, assets, view: &mirrored, lights, dimmed: geom.reflectance };
+        painter.paint(mirror, &context, seen, |pixels, part, seen| add_part(colours, pixels, part, seen));
     }
 
-    /// Draws what one sees through: from near to far, and again from far to near. Nothing shades it.
-    fn see_through(&mut self, &Picture { scene, assets, view, .. }: &Picture<'_>, lamps: Lit<'_>) {
-        let Self { main, glass, painter, colours, clear, .. } = self;
-        clear.clear();
-        for (number, geom) in scene.geoms.iter().enumerate().filter(|(number, _)| self::clear(scene, *number, view)) {
+    /// Draws transparent geoms from near to far, and again from far to near as MuJoCo does, without shadows.
+    fn draw_transparent(&mut self, &Frame { scene, assets, view, .. }: &Frame<'_>, lights: Lighting<'_>) {
+        let Self { main, transparent, painter, colours, transparent_geoms, .. } = self;
+        transparent_geoms.clear();
+        for (number, geom) in scene.geoms.iter().enumerate().filter(|(number, _)| is_transparent(scene, *number, view))
+        {
             let distance = match geom.shape {
                 Shape::Plane(..) => 1e10,
                 shape => {
@@ -152,30 +152,30 @@ impl Strip {
                     dot(way, way).sqrt() - dot(halves, halves).sqrt()
                 }
             };
-            clear.push((distance, number));
+            transparent_geoms.push((distance, number));
         }
-        if clear.is_empty() {
+        if transparent_geoms.is_empty() {
             return;
         }
-        clear.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        transparent_geoms.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         painter.start(scene.geoms.len());
-        let look = Look { scene, assets, view, lamps, dimmed: 1.0 };
-        glass.start(view.width, main.rows.clone(), main.pattern);
-        for &(_, number) in clear.iter().chain(clear.iter().rev()) {
+        let context = ShadingContext { scene, assets, view, lights, dimmed: 1.0 };
+        transparent.start(view.width, main.rows.clone(), main.pattern);
+        for &(_, number) in transparent_geoms.iter().chain(transparent_geoms.iter().rev()) {
             let geom = &scene.geoms[number];
             let Some(region) = touched(geom, assets, view) else { continue };
             let [x0, y0, x1, y1] = main.part(region);
             for row in (y0..y1).map(|y| main.span(y, x0, x1)) {
-                glass.depths[row.clone()].copy_from_slice(&main.depths[row.clone()]);
-                glass.ids[row].fill(NOTHING);
+                transparent.depths[row.clone()].copy_from_slice(&main.depths[row.clone()]);
+                transparent.ids[row].fill(NOTHING);
             }
-            glass.forget();
-            glass.draw(u32::try_from(number).unwrap_or(NOTHING), geom, (assets, view), None, false);
+            transparent.clear_triangles();
+            transparent.draw(u32::try_from(number).unwrap_or(NOTHING), geom, (assets, view), None, false);
             let opacity = match geom.shape {
-                Shape::Plane(..) if hind(scene, number, view) => BEHIND * geom.rgba[3],
+                Shape::Plane(..) if is_seen_from_behind(scene, number, view) => BACK_OPACITY * geom.rgba[3],
                 _ => geom.rgba[3],
             };
-            painter.paint(glass, &look, region, |pixels, part, seen| {
+            painter.paint(transparent, &context, region, |pixels, part, seen| {
                 let opacity = (part * opacity).clamp(0.0, 1.0);
                 for (colours, seen) in colours.iter_mut().zip(seen) {
                     for (colour, seen) in colours[pixels.clone()].iter_mut().zip(seen) {
@@ -187,7 +187,7 @@ impl Strip {
     }
 }
 
-/// Adds parts of colours to those of pixels.
+/// Adds colours to pixels, weighted by the covered part.
 fn add_part(colours: &mut [Vec<f32>; 3], pixels: Range<usize>, part: f32, seen: [&[f32]; 3]) {
     for (colours, seen) in colours.iter_mut().zip(seen) {
         for (colour, seen) in colours[pixels.clone()].iter_mut().zip(seen) {
@@ -196,33 +196,33 @@ fn add_part(colours: &mut [Vec<f32>; 3], pixels: Range<usize>, part: f32, seen: 
     }
 }
 
-/// The smallest region around two.
-fn around(a: Region, b: Region) -> Region {
+/// Returns the smallest region around two regions.
+fn union(a: Region, b: Region) -> Region {
     [a[0].min(b[0]), a[1].min(b[1]), a[2].max(b[2]), a[3].max(b[3])]
 }
 
-/// What is in both of two regions; of regions that lie apart, one without pixels.
-fn within(a: Region, b: Region) -> Region {
+/// Returns the intersection of two regions; it is empty where they lie apart.
+fn intersection(a: Region, b: Region) -> Region {
     let [x, y] = [a[0].max(b[0]), a[1].max(b[1])];
     [x, y, a[2].min(b[2]).max(x), a[3].min(b[3]).max(y)]
 }
 
-/// Whether one sees the back of a plane.
-fn hind(scene: &Scene, number: usize, view: &View) -> bool {
+/// Whether a geom is a plane that is seen from behind.
+fn is_seen_from_behind(scene: &Scene, number: usize, view: &View) -> bool {
     let geom = &scene.geoms[number];
     let normal = [geom.rotation[2], geom.rotation[5], geom.rotation[8]];
     matches!(geom.shape, Shape::Plane(..)) && dot(sub(view.position, geom.position), normal) < 0.0
 }
 
-/// Whether one sees through a geom.
-pub(crate) fn clear(scene: &Scene, number: usize, view: &View) -> bool {
-    scene.geoms[number].rgba[3] < OPAQUE || hind(scene, number, view)
+/// Whether a geom is transparent in a view.
+pub(crate) fn is_transparent(scene: &Scene, number: usize, view: &View) -> bool {
+    scene.geoms[number].rgba[3] < MIN_OPAQUE || is_seen_from_behind(scene, number, view)
 }
 
 /// Draws haze over the sky and the far ends of planes.
-#[allow(clippy::cast_precision_loss)]
-fn veil(scene: &Scene, view: &View, main: &Layers, colours: &mut [Vec<f32>; 3]) {
-    let Some(veil) = scene.haze.filter(|_| scene.sky.is_some()).and_then(|haze| Veil::new(scene, &haze, view.position))
+fn draw_haze(scene: &Scene, view: &View, main: &Layers, colours: &mut [Vec<f32>; 3]) {
+    let Some(veil) =
+        scene.haze.filter(|_| scene.sky.is_some()).and_then(|haze| HazeCone::new(scene, &haze, view.position))
     else {
         return;
     };
@@ -242,14 +242,14 @@ fn veil(scene: &Scene, view: &View, main: &Layers, colours: &mut [Vec<f32>; 3]) 
 }
 
 vectorize! {
-    /// One sees so far where a geom is, and nothing elsewhere.
-    fn open(own: u32, far: f32, ids: &[u32], depths: &mut [f32]) {
+    /// Sets depths to the far plane where the mirror is visible, and closes all other samples.
+    fn select_mirror(own: u32, far: f32, ids: &[u32], depths: &mut [f32]) {
         for (depth, id) in depths.iter_mut().zip(ids) {
             *depth = if *id == own { far } else { f32::NEG_INFINITY };
         }
     }
 
-    /// Colours to bytes, rounded; what is no number is black.
+    /// Converts colours to bytes, rounded; NaN becomes black.
     #[allow(clippy::manual_clamp, reason = "`clamp` would keep what is no number")]
     fn to_bytes(r: &[f32], g: &[f32], b: &[f32], bytes: &mut [[u8; 3]]) {
         let n = bytes.len().min(r.len());
@@ -266,9 +266,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn regions_that_lie_apart_share_no_pixels() {
-        assert_eq!(within([2, 3, 9, 8], [4, 1, 20, 6]), [4, 3, 9, 6]);
-        assert_eq!(within([0, 0, 3, 3], [5, 0, 9, 3]), [5, 0, 5, 3]);
-        assert_eq!(within([0, 6, 3, 9], [0, 0, 3, 4]), [0, 6, 3, 6]);
+    fn intersection_of_distant_regions_is_empty() {
+        assert_eq!(intersection([2, 3, 9, 8], [4, 1, 20, 6]), [4, 3, 9, 6]);
+        assert_eq!(intersection([0, 0, 3, 3], [5, 0, 9, 3]), [5, 0, 5, 3]);
+        assert_eq!(intersection([0, 6, 3, 9], [0, 0, 3, 4]), [0, 6, 3, 6]);
     }
 }

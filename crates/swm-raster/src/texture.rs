@@ -1,47 +1,47 @@
-//! [`Texture`]: pictures with smaller versions of themselves, looked up with linear interpolation.
+//! [`Texture`]: images with mip levels, sampled with trilinear interpolation.
 //!
-//! The choice between two versions is that of Mesa's software rasteriser, with which pictures are compared: the larger
-//! of the coordinates' derivatives counts, and versions blend only in the second half of the way from one to the next.
+//! Mip levels are chosen as in Mesa's software rasteriser, whose frames are the reference: by the larger derivative
+//! of the coordinates, and two levels blend only in the second half of the way from one to the next.
 
 use crate::scalar::{nearest, rounded};
 use swm_simd::vectorize;
 
-/// Places looked up at once.
+/// Number of texture samples that are looked up together.
 pub(crate) const MANY: usize = 128;
 
-/// A flat texture, or the six faces of a cube (+x, -x, +y, -y, +z, -z, as OpenGL orders and turns them).
+/// A flat texture, or the six faces of a cube (+x, -x, +y, -y, +z, -z, in OpenGL's order and orientation).
 #[derive(Clone, Debug)]
 pub struct Texture {
     width: u32,
     height: u32,
-    /// Versions of a face, from fine to coarse: where each begins, of the texels of the face. It is kept row after row, with a frame
-    /// of one texel around it that repeats the texture or continues its rim.
+    /// Index of the first texel of each mip level within a face, from fine to coarse. Levels are row-major, with a
+    /// border of one texel that repeats the texture or continues its edge.
     levels: Vec<usize>,
-    /// Faces one after the other, each of so many texels.
+    /// Texels per face.
     face: usize,
-    /// RGBA texels in a word each.
+    /// RGBA texels in a word each, face after face.
     texels: Vec<u32>,
 }
 
-/// A picture while its smaller versions are made.
-struct Sheet {
+/// An image while its mip levels are made.
+struct MipLevel {
     width: usize,
     height: usize,
     texels: Vec<u32>,
 }
 
-/// What is looked up: coordinates from 0 to 1 on a face of a texture, and how many of its texels a pixel covers.
-pub(crate) struct Spots<'a> {
+/// Texture samples to look up: coordinates from 0 to 1 on a face, and texels per pixel.
+pub(crate) struct TextureLookup<'a> {
     pub s: &'a [f32],
     pub t: &'a [f32],
-    pub dense: &'a [f32],
+    pub texels_per_pixel: &'a [f32],
     pub faces: &'a [u32],
 }
 
-/// Every other byte of a word: two channels that can be multiplied by up to 256 at once.
+/// Mask of every other byte of a word: two channels that are multiplied by up to 256 at once.
 const TWO: u32 = 0x00ff_00ff;
 
-/// Words weighted by numbers that sum to 256, channel by channel.
+/// Returns the mean of words, channel by channel, with weights that sum to 256.
 #[inline(always)]
 fn weighted<const N: usize>(words: [u32; N], weights: [u32; N]) -> u32 {
     let (mut even, mut odd) = (0x0080_0080, 0x0080_0080);
@@ -52,8 +52,8 @@ fn weighted<const N: usize>(words: [u32; N], weights: [u32; N]) -> u32 {
     (even >> 8 & TWO) | (odd & !TWO)
 }
 
-impl Sheet {
-    /// `channels` (3 or 4) bytes a texel; `None` where sizes do not fit.
+impl MipLevel {
+    /// Reads an image of 3 or 4 `channels`. `None` where the sizes do not match.
     fn new(width: usize, height: usize, channels: usize, bytes: &[u8]) -> Option<Self> {
         let texels = width.checked_mul(height)?;
         // Coordinates are counted in 256ths of texels.
@@ -65,7 +65,7 @@ impl Sheet {
         Some(Self { width, height, texels: bytes.chunks_exact(channels).map(word).collect() })
     }
 
-    /// Half the width and height, at least 1.
+    /// Returns the next mip level: half the width and height, at least 1.
     fn halved(&self) -> Self {
         let (width, height) = ((self.width / 2).max(1), (self.height / 2).max(1));
         let at = |x: usize, y: usize| self.texels[y.min(self.height - 1) * self.width + x.min(self.width - 1)];
@@ -76,8 +76,8 @@ impl Sheet {
         Self { width, height, texels: texels.collect() }
     }
 
-    /// The texels with their frame.
-    fn framed(&self, repeat: bool) -> impl Iterator<Item = u32> + '_ {
+    /// Returns the texels with their border.
+    fn with_border(&self, repeat: bool) -> impl Iterator<Item = u32> + '_ {
         let inside = move |i: usize, n: usize| match repeat {
             true => (i + n - 1) % n,
             false => i.saturating_sub(1).min(n - 1),
@@ -90,68 +90,66 @@ impl Sheet {
 }
 
 impl Texture {
-    /// A flat texture of `channels` (3 or 4) bytes a texel; `None` where the sizes do not fit.
+    /// Makes a flat texture of 3 or 4 `channels`. `None` where the sizes do not match.
     pub fn flat(width: usize, height: usize, channels: usize, bytes: &[u8]) -> Option<Self> {
-        Some(Self::new(vec![Sheet::new(width, height, channels, bytes)?], true))
+        Some(Self::new(vec![MipLevel::new(width, height, channels, bytes)?], true))
     }
 
-    /// A cube texture: six squares one after the other, or one for all sides; `None` where the sizes do not fit.
+    /// Makes a cube texture of six square images in sequence, or of one for all faces. `None` where the sizes do not
+    /// match.
     pub fn cube(side: usize, channels: usize, bytes: &[u8]) -> Option<Self> {
         let face = side.checked_mul(side)?.checked_mul(channels)?;
-        let sheet = |bytes| Sheet::new(side, side, channels, bytes);
-        let sheets = match bytes.len() {
-            one if one == face && face > 0 => [bytes; 6].into_iter().map(sheet).collect::<Option<_>>()?,
+        let image = |bytes| MipLevel::new(side, side, channels, bytes);
+        let images = match bytes.len() {
+            one if one == face && face > 0 => [bytes; 6].into_iter().map(image).collect::<Option<_>>()?,
             six if face.checked_mul(6) == Some(six) && face > 0 => {
-                bytes.chunks_exact(face).map(sheet).collect::<Option<_>>()?
+                bytes.chunks_exact(face).map(image).collect::<Option<_>>()?
             }
             _ => return None,
         };
-        Some(Self::new(sheets, false))
+        Some(Self::new(images, false))
     }
 
-    /// A white one, flat and a cube's.
+    /// Returns a white texture, which serves as a flat and as a cube texture.
     pub fn white() -> Self {
-        let white = || Sheet { width: 1, height: 1, texels: vec![u32::MAX] };
+        let white = || MipLevel { width: 1, height: 1, texels: vec![u32::MAX] };
         Self::new((0..6).map(|_| white()).collect(), false)
     }
 
-    /// Faces of one size, and their smaller versions down to one texel.
-    #[allow(clippy::cast_possible_truncation)]
-    fn new(faces: Vec<Sheet>, repeat: bool) -> Self {
+    /// Builds the mip levels of faces of one size, down to one texel.
+    fn new(faces: Vec<MipLevel>, repeat: bool) -> Self {
         let (width, height) = faces.first().map_or((1, 1), |face| (face.width, face.height));
         let (mut levels, mut texels) = (vec![], vec![]);
         let count = faces.len().max(1);
-        for mut sheet in faces {
+        for mut image in faces {
             levels.clear();
             let begin = texels.len();
             loop {
                 levels.push(texels.len() - begin);
-                texels.extend(sheet.framed(repeat));
-                if sheet.width == 1 && sheet.height == 1 {
+                texels.extend(image.with_border(repeat));
+                if image.width == 1 && image.height == 1 {
                     break;
                 }
-                sheet = sheet.halved();
+                image = image.halved();
             }
         }
         Self { width: width as u32, height: height as u32, levels, face: texels.len() / count, texels }
     }
 
-    /// Whether it is a cube's.
+    /// Whether this is a cube texture.
     pub fn is_cube(&self) -> bool {
         self.texels.len() == 6 * self.face
     }
 
-    /// How many texels a pixel covers, where coordinates change so much from a pixel to the next.
+    /// Returns the texels per pixel for the change of coordinates from one pixel to the next.
     #[inline(always)]
-    #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn dense(&self, change: [f32; 2]) -> f32 {
+    pub(crate) fn texels_per_pixel(&self, change: [f32; 2]) -> f32 {
         (change[0] * self.width as f32).max(change[1] * self.height as f32)
     }
 
-    /// The face in a direction, which changes so much from a pixel to the next, to the right and down; the place there, and how many
-    /// texels a pixel covers. The faces are those of OpenGL's table.
+    /// Returns the face that a direction meets, the coordinates there, and the texels per pixel. `right` and `down`
+    /// are the change of the direction to the neighbouring pixels. The faces are those of OpenGL's table.
     #[inline(always)]
-    #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation)]
     pub(crate) fn face_in(&self, d: [f32; 3], right: [f32; 3], down: [f32; 3]) -> (u32, [f32; 2], f32) {
         let [x, y, z] = [d[0].abs(), d[1].abs(), d[2].abs()];
         let on_x = (x >= y) & (x >= z);
@@ -171,7 +169,7 @@ impl Texture {
         } else {
             4
         } + u32::from(main < 0.0);
-        // What runs across, along and away.
+        // The components along s, along t, and along the major axis.
         let across = |v: [f32; 3]| {
             if on_x {
                 -sign * v[2]
@@ -194,30 +192,30 @@ impl Texture {
         let major = 1.0 / main.abs().max(1e-20);
         let (s, t) = (across(d) * major, along(d) * major);
         let slope = |v: [f32; 3]| (across(v) - s * away(v)).abs().max((along(v) - t * away(v)).abs());
-        let dense = slope(right).max(slope(down)) * major * 0.5 * self.width as f32;
-        (if self.is_cube() { face } else { 0 }, [0.5 * s + 0.5, 0.5 * t + 0.5], dense)
+        let texels_per_pixel = slope(right).max(slope(down)) * major * 0.5 * self.width as f32;
+        (if self.is_cube() { face } else { 0 }, [0.5 * s + 0.5, 0.5 * t + 0.5], texels_per_pixel)
     }
 
-    /// The colours (0 to 1) at up to [`MANY`] spots.
-    pub(crate) fn colours(&self, spots: &Spots<'_>, reader: &mut Reader, [r, g, b]: [&mut [f32]; 3]) {
-        let (n, Reader { seen, next }) = (spots.s.len().min(MANY), reader);
-        choose(self, &spots.s[..n], &spots.t[..n], &spots.dense[..n], seen);
-        seen.faces[..n].copy_from_slice(&spots.faces[..n]);
-        seen.look(self, n);
-        seen.mix(next, self, n);
-        split(&seen.words[..n], r, g, b);
+    /// Looks up colours, 0 to 1, at up to [`MANY`] samples.
+    pub(crate) fn colours(&self, lookup: &TextureLookup<'_>, sampler: &mut Sampler, [r, g, b]: [&mut [f32]; 3]) {
+        let (n, Sampler { level, next }) = (lookup.s.len().min(MANY), sampler);
+        choose(self, &lookup.s[..n], &lookup.t[..n], &lookup.texels_per_pixel[..n], level);
+        level.faces[..n].copy_from_slice(&lookup.faces[..n]);
+        level.context(self, n);
+        level.mix(next, self, n);
+        split(&level.words[..n], r, g, b);
     }
 
-    /// The colour at one spot: a place on a face, and how many texels a pixel covers.
+    /// Looks up one colour: face, coordinates and texels per pixel.
     #[cfg(test)]
-    fn colour(&self, reader: &mut Reader, (face, [s, t], dense): (u32, [f32; 2], f32)) -> [f32; 3] {
+    fn colour(&self, sampler: &mut Sampler, (face, [s, t], texels_per_pixel): (u32, [f32; 2], f32)) -> [f32; 3] {
         let (mut r, mut g, mut b) = ([0.0], [0.0], [0.0]);
-        let spots = Spots { s: &[s], t: &[t], dense: &[dense], faces: &[face] };
-        self.colours(&spots, reader, [&mut r, &mut g, &mut b]);
+        let lookup = TextureLookup { s: &[s], t: &[t], texels_per_pixel: &[texels_per_pixel], faces: &[face] };
+        self.colours(&lookup, sampler, [&mut r, &mut g, &mut b]);
         [r[0], g[0], b[0]]
     }
 
-    /// Two texels next to each other in two rows.
+    /// Returns two neighbouring texels of two rows.
     #[inline(always)]
     fn four(&self, at: usize, stride: usize) -> [u32; 4] {
         let two = |at: usize| self.texels.get(at..at + 2).map_or([0; 2], |two| [two[0], two[1]]);
@@ -226,23 +224,23 @@ impl Texture {
     }
 }
 
-/// Scratch of looking things up.
+/// The memory of texture lookups.
 #[derive(Default)]
-pub(crate) struct Reader {
-    seen: Seen,
-    next: Seen,
+pub(crate) struct Sampler {
+    level: LevelSample,
+    next: LevelSample,
 }
 
-/// What is found at spots.
-struct Seen {
+/// Samples of one mip level each.
+struct LevelSample {
     s: [f32; MANY],
     t: [f32; MANY],
     faces: [u32; MANY],
-    /// The version, and in 256ths how much the next one adds.
+    /// The mip level, and the weight of the next one in 256ths.
     levels: [u32; MANY],
     shares: [u32; MANY],
-    /// The texel at the upper left, counted from that of the frame, and in 256ths how far the spot is from its middle.
-    places: [u32; MANY],
+    /// The upper left of four texels, counted from the border, and the position between their centres in 256ths.
+    indices: [u32; MANY],
     strides: [u32; MANY],
     right: [u32; MANY],
     below: [u32; MANY],
@@ -250,7 +248,7 @@ struct Seen {
     words: [u32; MANY],
 }
 
-impl Default for Seen {
+impl Default for LevelSample {
     fn default() -> Self {
         const NONE: [u32; MANY] = [0; MANY];
         Self {
@@ -259,7 +257,7 @@ impl Default for Seen {
             faces: NONE,
             levels: NONE,
             shares: NONE,
-            places: NONE,
+            indices: NONE,
             strides: NONE,
             right: NONE,
             below: NONE,
@@ -269,30 +267,30 @@ impl Default for Seen {
     }
 }
 
-impl Seen {
-    /// Looks up the versions chosen.
-    fn look(&mut self, texture: &Texture, n: usize) {
-        let Self { s, t, faces, levels, places, strides, right, below, four, words, .. } = self;
-        find(texture.width, texture.height, &s[..n], &t[..n], &levels[..n], places, strides, right, below);
+impl LevelSample {
+    /// Looks up the chosen mip levels.
+    fn context(&mut self, texture: &Texture, n: usize) {
+        let Self { s, t, faces, levels, indices, strides, right, below, four, words, .. } = self;
+        find(texture.width, texture.height, &s[..n], &t[..n], &levels[..n], indices, strides, right, below);
         let [a, b, c, d] = four;
         for i in 0..n {
             let Some(begin) = texture.levels.get(levels[i] as usize) else { continue };
-            let at = faces[i] as usize * texture.face + begin + places[i] as usize;
+            let at = faces[i] as usize * texture.face + begin + indices[i] as usize;
             [a[i], b[i], c[i], d[i]] = texture.four(at, strides[i] as usize);
         }
         between(&right[..n], &below[..n], a, b, c, d, words);
     }
 
-    /// Adds what the next versions show, where they do.
+    /// Blends in the next mip levels where they have weight.
     fn mix(&mut self, next: &mut Self, texture: &Texture, n: usize) {
         let (mut count, mut from) = (0, [0; MANY]);
         for i in 0..n {
-            // Written in any case, and kept if it is to be.
+            // Always written, and counted only if it has weight.
             (next.s[count], next.t[count], next.faces[count]) = (self.s[i], self.t[i], self.faces[i]);
             (next.levels[count], from[count]) = (self.levels[i] + 1, i);
             count += usize::from(self.shares[i] > 0);
         }
-        next.look(texture, count);
+        next.context(texture, count);
         for (&i, &word) in from[..count].iter().zip(&next.words) {
             self.words[i] = weighted([self.words[i], word], [256 - self.shares[i], self.shares[i]]);
         }
@@ -300,52 +298,50 @@ impl Seen {
 }
 
 vectorize! {
-    /// Chooses versions, and brings coordinates into the texture.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
-    fn choose(texture: &Texture, s: &[f32], t: &[f32], dense: &[f32], seen: &mut Seen) {
+    /// Chooses mip levels and wraps coordinates to 0 ..= 1.
+    fn choose(texture: &Texture, s: &[f32], t: &[f32], texels_per_pixel: &[f32], level: &mut LevelSample) {
         let n = s.len().min(MANY);
-        let (s, t, dense) = (&s[..n], &t[..n], &dense[..n]);
-        let Seen { s: inside_s, t: inside_t, levels, shares, .. } = seen;
+        let (s, t, texels_per_pixel) = (&s[..n], &t[..n], &texels_per_pixel[..n]);
+        let LevelSample { s: inside_s, t: inside_t, levels, shares, .. } = level;
         let last = texture.levels.len() as i32 - 1;
         let whole = |x: f32| {
             let part = x - rounded(x);
             let part = if part < 0.0 { part + 1.0 } else { part };
-            // What is no number, or too large to have a fraction, is 0.
+            // NaN, and values too large to have a fraction, become 0.
             if part <= 1.0 { part } else { 0.0 }
         };
         for i in 0..n {
-            // 3.5 / sqrt(8): a texel a pixel is still the full version.
-            let scaled = if dense[i] > 1.0 { (dense[i] * 1.237_436_9).min(1e9) } else { 1.0 };
+            // 3.5 / sqrt(8): one texel per pixel still gives the finest level.
+            let scaled = if texels_per_pixel[i] > 1.0 { (texels_per_pixel[i] * 1.237_436_9).min(1e9) } else { 1.0 };
             let exponent = (scaled.to_bits() >> 23) as i32 - 127;
             let mantissa = f32::from_bits(scaled.to_bits() & 0x007f_ffff | 0x3f80_0000);
             let between = if exponent < last { (2.0 * mantissa - 3.0) * 256.0 } else { 0.0 };
-            // Less than a few steps of a byte apart, one of them will do.
+            // Within a few 256ths of a level, that level alone is used.
             levels[i] = (exponent.min(last) + i32::from(between > 240.0)) as u32;
             shares[i] = nearest(if (between > 16.0) & (between <= 240.0) { between } else { 0.0 });
             (inside_s[i], inside_t[i]) = (whole(s[i]), whole(t[i]));
         }
     }
 
-    /// Finds texels: where they are on a version, and from each row of it to the next.
-    #[allow(clippy::cast_precision_loss)]
+    /// Computes the indices of texels within their levels, and the strides of the levels.
     fn find(
-        width: u32, height: u32, s: &[f32], t: &[f32], levels: &[u32], places: &mut [u32; MANY],
+        width: u32, height: u32, s: &[f32], t: &[f32], levels: &[u32], indices: &mut [u32; MANY],
         strides: &mut [u32; MANY], right: &mut [u32; MANY], below: &mut [u32; MANY],
     ) {
         let n = s.len().min(MANY);
         let (s, t, levels) = (&s[..n], &t[..n], &levels[..n]);
         for i in 0..n {
             let (w, h) = ((width >> levels[i]).max(1), (height >> levels[i]).max(1));
-            // In 256ths, from the middle of the first texel of the frame.
+            // In 256ths, from the centre of the first texel of the border.
             let x = nearest(s[i] * (256 * w) as i32 as f32) + 128;
             let y = nearest(t[i] * (256 * h) as i32 as f32) + 128;
             strides[i] = w + 2;
-            places[i] = (y >> 8) * (w + 2) + (x >> 8);
+            indices[i] = (y >> 8) * (w + 2) + (x >> 8);
             (right[i], below[i]) = (x & 255, y & 255);
         }
     }
 
-    /// The words between four texels.
+    /// Interpolates between four texels.
     fn between(
         right: &[u32], below: &[u32], a: &[u32; MANY], b: &[u32; MANY], c: &[u32; MANY], d: &[u32; MANY],
         words: &mut [u32; MANY],
@@ -354,7 +350,7 @@ vectorize! {
         let (right, below) = (&right[..n], &below[..n]);
         for i in 0..n {
             let both = right[i] * below[i];
-            // Rounded so that they still sum to 256.
+            // Rounded so that the weights still sum to 256.
             let q = (256 * right[i] - both + 128) >> 8;
             let r = (256 * below[i] - both + 128) >> 8;
             let s = (both + 128) >> 8;
@@ -362,8 +358,7 @@ vectorize! {
         }
     }
 
-    /// The colours in words.
-    #[allow(clippy::cast_precision_loss)]
+    /// Converts words to colours.
     fn split(words: &[u32], r: &mut [f32], g: &mut [f32], b: &mut [f32]) {
         let n = words.len();
         let (r, g, b) = (&mut r[..n], &mut g[..n], &mut b[..n]);
@@ -379,31 +374,31 @@ mod tests {
     use super::*;
 
     #[test]
-    fn texels_stand_where_they_were_given() {
+    fn texels_are_at_their_coordinates() {
         let texture = Texture::flat(2, 1, 3, &[255, 0, 0, 0, 0, 255]).expect("a texture");
-        let mut reader = Reader::default();
-        assert_eq!(texture.colour(&mut reader, (0, [0.25, 0.5], 0.0)), [1.0, 0.0, 0.0]);
-        assert_eq!(texture.colour(&mut reader, (0, [1.75, 0.5], 0.0)), [0.0, 0.0, 1.0]);
-        // A pixel that covers everything sees the mean.
-        let mean = texture.colour(&mut reader, (0, [0.25, 0.5], 8.0));
+        let mut sampler = Sampler::default();
+        assert_eq!(texture.colour(&mut sampler, (0, [0.25, 0.5], 0.0)), [1.0, 0.0, 0.0]);
+        assert_eq!(texture.colour(&mut sampler, (0, [1.75, 0.5], 0.0)), [0.0, 0.0, 1.0]);
+        // A pixel that covers the whole texture gets its mean.
+        let mean = texture.colour(&mut sampler, (0, [0.25, 0.5], 8.0));
         assert!((mean[0] - 0.5).abs() < 0.01 && (mean[2] - 0.5).abs() < 0.01, "{mean:?}");
     }
 
     #[test]
-    fn a_cube_has_six_sides() {
+    fn cube_directions_select_faces() {
         let bytes: Vec<u8> = (0..6u8).flat_map(|face| [face * 40, 0, 0]).collect();
         let texture = Texture::cube(1, 3, &bytes).expect("a texture");
         let directions =
             [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]];
-        let mut reader = Reader::default();
+        let mut sampler = Sampler::default();
         for (face, direction) in (0..6u8).zip(directions) {
-            let seen = texture.colour(&mut reader, texture.face_in(direction, [0.0; 3], [0.0; 3]));
-            assert!((seen[0] * 255.0 - f32::from(face * 40)).abs() < 0.01);
+            let level = texture.colour(&mut sampler, texture.face_in(direction, [0.0; 3], [0.0; 3]));
+            assert!((level[0] * 255.0 - f32::from(face * 40)).abs() < 0.01);
         }
     }
 
     #[test]
-    fn sizes_that_do_not_fit_are_refused() {
+    fn mismatched_sizes_are_refused() {
         assert!(Texture::flat(2, 2, 3, &[0; 11]).is_none());
         assert!(Texture::flat(0, 2, 3, &[]).is_none());
         assert!(Texture::cube(2, 3, &[0; 13]).is_none());

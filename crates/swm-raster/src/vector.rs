@@ -1,9 +1,9 @@
-//! Vectors and rotations of three numbers.
+//! Vectors of three values, and rotations.
 
 /// A point, direction or colour.
 pub type V3 = [f32; 3];
 
-/// The rotation that leaves everything where it is.
+/// The identity rotation.
 pub const IDENTITY: [f32; 9] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
 
 pub(crate) fn add(a: V3, b: V3) -> V3 {
@@ -30,19 +30,19 @@ pub(crate) fn length(a: V3) -> f32 {
     dot(a, a).sqrt()
 }
 
-/// A vector of length 1, or zero for zero.
+/// Returns a vector of length 1, or zero for zero.
 pub(crate) fn unit(a: V3) -> V3 {
     let length = length(a);
     if length > 0.0 { scale(a, 1.0 / length) } else { [0.0; 3] }
 }
 
-/// Some unit vector at right angles to a unit vector.
+/// Returns a unit vector perpendicular to a unit vector.
 pub(crate) fn across(a: V3) -> V3 {
     let helper = if a[0].abs() < 0.9 { [1.0, 0.0, 0.0] } else { [0.0, 1.0, 0.0] };
     unit(cross(a, helper))
 }
 
-/// A local vector in the world. Rotations are row after row; their columns are the local axes.
+/// Rotates a local vector into the world. Rotations are `[3, 3]` row-major; their columns are the local axes.
 pub(crate) fn rotate(by: &[f32; 9], a: V3) -> V3 {
     [
         by[0] * a[0] + by[1] * a[1] + by[2] * a[2],
@@ -51,7 +51,7 @@ pub(crate) fn rotate(by: &[f32; 9], a: V3) -> V3 {
     ]
 }
 
-/// A vector of the world in local axes.
+/// Rotates a world vector into local axes.
 pub(crate) fn unrotate(by: &[f32; 9], a: V3) -> V3 {
     [
         by[0] * a[0] + by[3] * a[1] + by[6] * a[2],

@@ -1,31 +1,33 @@
-//! [`View`]: the way between places and pixels, of a camera, of its mirror image, or of a light that casts shadows.
+//! [`View`]: projection between world positions and pixels, for a camera, its mirror image, or a light that casts
+//! shadows.
 
 use crate::scene::Camera;
 use crate::vector::{V3, add, cross, dot, scale, sub};
 
-/// A picture's geometry. Pixel (x, y) covers the square from (x, y) to (x + 1, y + 1), row 0 above.
+/// The projection of a frame. Pixel (x, y) covers the square from (x, y) to (x + 1, y + 1); row 0 is the uppermost.
 ///
-/// Rays are so long that their parameter is the depth: the distance along `forward`.
+/// Ray directions are scaled so that the ray parameter is the depth, the distance along `forward`.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct View {
     pub position: V3,
     pub right: V3,
     pub up: V3,
     pub forward: V3,
-    /// The left and upper edge of the picture, at depth 1 or, of an orthographic one, at any.
+    /// Left and upper edge of the frame at depth 1, or at any depth of an orthographic view.
     pub left: f32,
     pub top: f32,
-    /// Pixels in a unit there.
-    pub dense: [f32; 2],
+    /// Pixels per unit there.
+    pub pixels_per_unit: [f32; 2],
     pub near: f32,
     pub orthographic: bool,
     pub width: usize,
     pub height: usize,
-    /// Left and right are exchanged: the triangles one sees run clockwise.
+    /// Whether left and right are exchanged, so that front faces run clockwise.
     pub mirrored: bool,
 }
 
-/// A pencil of rays: at pixel coordinates (x, y), `origin + x * origins[0] + y * origins[1]`, and so the direction.
+/// A bundle of rays. The ray of pixel coordinates (x, y) starts at `origin + x * origins[0] + y * origins[1]`;
+/// directions likewise.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Rays {
     pub origin: V3,
@@ -35,8 +37,7 @@ pub(crate) struct Rays {
 }
 
 impl View {
-    /// What a camera sees in a picture of this size.
-    #[allow(clippy::cast_precision_loss)]
+    /// Returns the view of a camera for a frame of this size.
     pub fn of(camera: &Camera, width: usize, height: usize) -> Self {
         let [left, right, bottom, top] = camera.frustum;
         let unit = if camera.orthographic { 1.0 } else { 1.0 / camera.near };
@@ -47,7 +48,7 @@ impl View {
             forward: camera.forward,
             left: left * unit,
             top: top * unit,
-            dense: [width as f32 / ((right - left) * unit), height as f32 / ((top - bottom) * unit)],
+            pixels_per_unit: [width as f32 / ((right - left) * unit), height as f32 / ((top - bottom) * unit)],
             near: camera.near,
             orthographic: camera.orthographic,
             width,
@@ -56,7 +57,7 @@ impl View {
         }
     }
 
-    /// What is seen in a mirror: through `point`, with this normal.
+    /// Returns the view in a mirror through `point` with this normal.
     pub fn mirrored(&self, point: V3, normal: V3) -> Self {
         let turn = |a: V3| sub(a, scale(normal, 2.0 * dot(a, normal)));
         Self {
@@ -69,11 +70,11 @@ impl View {
         }
     }
 
-    /// All rays.
+    /// Returns the rays of all pixels.
     pub fn rays(&self) -> Rays {
         let corner = add(scale(self.right, self.left), scale(self.up, self.top));
-        let across = scale(self.right, 1.0 / self.dense[0]);
-        let down = scale(self.up, -1.0 / self.dense[1]);
+        let across = scale(self.right, 1.0 / self.pixels_per_unit[0]);
+        let down = scale(self.up, -1.0 / self.pixels_per_unit[1]);
         match self.orthographic {
             true => Rays {
                 origin: add(self.position, corner),
@@ -90,33 +91,33 @@ impl View {
         }
     }
 
-    /// Pixel coordinates times `w`, and `w`: the depth, or 1 where rays are parallel; and the depth.
+    /// Projects a position: pixel coordinates times `w` and `w`, and the depth. `w` is the depth, or 1 in an
+    /// orthographic view.
     #[inline(always)]
-    pub fn project(&self, place: V3) -> (V3, f32) {
-        let from = sub(place, self.position);
+    pub fn project(&self, position: V3) -> (V3, f32) {
+        let from = sub(position, self.position);
         let depth = dot(from, self.forward);
         let w = if self.orthographic { 1.0 } else { depth };
-        let x = (dot(from, self.right) - self.left * w) * self.dense[0];
-        let y = (self.top * w - dot(from, self.up)) * self.dense[1];
+        let x = (dot(from, self.right) - self.left * w) * self.pixels_per_unit[0];
+        let y = (self.top * w - dot(from, self.up)) * self.pixels_per_unit[1];
         ([x, y, w], depth)
     }
 
-    /// How many pixels a unit has at a depth.
+    /// Returns the pixels per unit at a depth.
     pub fn pixels_at(&self, depth: f32) -> f32 {
-        let dense = self.dense[0].max(self.dense[1]);
-        if self.orthographic { dense } else { dense / depth.max(self.near) }
+        let pixels_per_unit = self.pixels_per_unit[0].max(self.pixels_per_unit[1]);
+        if self.orthographic { pixels_per_unit } else { pixels_per_unit / depth.max(self.near) }
     }
 
-    /// The pixels that a box can touch: `[x0, y0, x1, y1]`, the latter excluded; `None` where it is out of sight. The box is given by
-    /// its middle, and the three vectors from there to its sides.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
+    /// Returns the region of pixels that a box can touch, or `None` when it is out of sight. The box is given by its
+    /// centre and the vectors from there to three of its sides.
     pub fn touched(&self, middle: V3, halves: [V3; 3]) -> Option<[usize; 4]> {
         let mut bounds = [f32::INFINITY, f32::INFINITY, f32::NEG_INFINITY, f32::NEG_INFINITY];
         let (mut behind, mut before) = (false, false);
         for corner in 0..8u8 {
             let sign = |k: u8| if corner >> k & 1 == 1 { 1.0 } else { -1.0 };
-            let place = (0..3u8).fold(middle, |at, k| add(at, scale(halves[usize::from(k)], sign(k))));
-            let ([x, y, w], depth) = self.project(place);
+            let position = (0..3u8).fold(middle, |at, k| add(at, scale(halves[usize::from(k)], sign(k))));
+            let ([x, y, w], depth) = self.project(position);
             if depth <= self.near {
                 behind = true;
                 continue;
@@ -131,7 +132,7 @@ impl View {
         if behind && !self.orthographic {
             bounds = [0.0, 0.0, self.width as f32, self.height as f32];
         }
-        // Conversion saturates, and NaN becomes 0.
+        // The conversion saturates, and NaN becomes 0.
         let low = |x: f32, most: usize| (x.floor() as usize).min(most);
         let high = |x: f32, most: usize| (x.ceil() as usize).min(most);
         let touched = [

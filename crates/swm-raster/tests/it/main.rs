@@ -1,6 +1,6 @@
-//! What holds of every scene, however odd, and what simple scenes look like.
+//! Properties of every scene, and the known content of simple scenes.
 
-mod moving;
-mod odd;
-mod plain;
+mod arbitrary_scenes;
+mod changing_scenes;
 mod scenes;
+mod simple_scenes;

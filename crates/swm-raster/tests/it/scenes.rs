@@ -1,4 +1,5 @@
-//! Scenes of every kind, among them those nobody would draw: sizes of zero, places that are no numbers, cameras inside of bodies.
+//! Random scenes of every kind, including invalid ones: sizes of zero, positions that are NaN, cameras inside of
+//! geoms.
 #![allow(clippy::expect_used, reason = "for tests")]
 
 use proptest::prelude::*;
@@ -8,7 +9,18 @@ use swm_raster::{
     Texture, V3,
 };
 
-/// Numbers, among them those that are trouble.
+/// A camera at the origin that faces +y, with a field of view of 90 degrees.
+pub const CAMERA: Camera = Camera {
+    position: [0.0; 3],
+    forward: [0.0, 1.0, 0.0],
+    up: [0.0, 0.0, 1.0],
+    frustum: [-0.02, 0.02, -0.02, 0.02],
+    near: 0.02,
+    far: 100.0,
+    orthographic: false,
+};
+
+/// Values, including infinities, NaN and extremes.
 fn number() -> impl Strategy<Value = f32> {
     prop_oneof![
         8 => -3.0..3.0f32,
@@ -53,7 +65,7 @@ fn paint() -> impl Strategy<Value = Option<Paint>> {
     prop::option::of((0..4usize, mapping).prop_map(|(texture, mapping)| Paint { texture, mapping }))
 }
 
-/// A thing.
+/// A random geom.
 pub fn geom() -> impl Strategy<Value = Geom> {
     let looks = (prop::array::uniform4(number()), number(), number(), number(), number(), paint());
     (shape(), vector(), rotation(), looks, any::<bool>()).prop_map(|(shape, position, rotation, looks, casts)| {
@@ -84,15 +96,7 @@ fn light() -> impl Strategy<Value = Light> {
 }
 
 fn camera() -> impl Strategy<Value = Camera> {
-    let usual = vector().prop_map(|position| Camera {
-        position,
-        forward: [0.0, 1.0, 0.0],
-        up: [0.0, 0.0, 1.0],
-        frustum: [-0.02, 0.02, -0.02, 0.02],
-        near: 0.02,
-        far: 100.0,
-        orthographic: false,
-    });
+    let usual = vector().prop_map(|position| Camera { position, ..CAMERA });
     let odd = (vector(), vector(), vector(), prop::array::uniform4(number()), number(), number(), any::<bool>())
         .prop_map(|(position, forward, up, frustum, near, far, orthographic)| Camera {
             position,
@@ -106,7 +110,7 @@ fn camera() -> impl Strategy<Value = Camera> {
     prop_oneof![3 => usual, 1 => odd]
 }
 
-/// A scene.
+/// A random scene.
 pub fn scene() -> impl Strategy<Value = Scene> {
     let more = (prop::option::of(0..4usize), any::<bool>(), any::<bool>(), number(), number());
     (camera(), prop::collection::vec(geom(), 0..12), prop::collection::vec(light(), 0..4), more).prop_map(
@@ -124,9 +128,9 @@ pub fn scene() -> impl Strategy<Value = Scene> {
     )
 }
 
-/// A tetrahedron, triangles without area and with numbers that are none, nothing; a flat and a cube texture.
+/// A tetrahedron, triangles that are degenerate or not finite, an empty mesh; a flat, a cube and a white texture.
 pub fn assets() -> Assets {
-    let corner = |place: V3| Corner { place, normal: place, coordinates: [0.5, 2.5] };
+    let corner = |position: V3| Corner { position, normal: position, coordinates: [0.5, 2.5] };
     let [a, b, c, d] = [[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, -1.0, -1.0]].map(corner);
     let solid = Mesh::new([[a, b, d], [a, d, c], [a, c, b], [b, c, d]]);
     let broken = Mesh::new([[a, a, a], [a, b, corner([f32::NAN, 0.0, 0.0])], [a, b, corner([1e30; 3])]]);

@@ -71,7 +71,7 @@ fn mesh(model: &MjModel, number: usize) -> Mesh {
             let own = model.mesh_normal()[normals + index(model.mesh_facenormal()[face][k])];
             let smooth = own.iter().zip(flat).map(|(a, b)| a * b).sum::<f32>() >= SMOOTH_COSINE;
             Corner {
-                place: positions[k],
+                position: positions[k],
                 normal: if coordinates.is_some() || smooth { own } else { flat },
                 coordinates: coordinates
                     .map_or([0.0; 2], |first| model.mesh_texcoord()[first + index(model.mesh_facetexcoord()[face][k])]),
@@ -99,7 +99,7 @@ fn height_field(model: &MjModel, number: usize) -> Mesh {
     let mut triangles = vec![];
     let mut triangle = |positions: [V3; 3]| {
         let normal = face_normal(positions);
-        triangles.push(positions.map(|place| Corner { place, normal, coordinates: [0.0; 2] }));
+        triangles.push(positions.map(|position| Corner { position, normal, coordinates: [0.0; 2] }));
     };
     for r in 1..rows {
         for c in 1..columns {

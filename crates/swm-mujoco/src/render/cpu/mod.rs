@@ -62,7 +62,7 @@ impl Workspace {
             FrameBuffer::Depth(metres) => Target::Depth(metres),
             FrameBuffer::Segmentation(geoms) => Target::Labels(geoms),
         };
-        self.canvas.spread(thread_budget::threads());
+        self.canvas.set_threads(thread_budget::threads());
         self.canvas.draw(&self.scene, &self.assets, size, samples, target);
     }
 }

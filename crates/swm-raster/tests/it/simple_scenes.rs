@@ -1,20 +1,8 @@
-//! Simple scenes whose pictures one can work out.
+//! Simple scenes whose frames are known.
 
+use crate::scenes::CAMERA;
 use std::sync::Arc;
 use swm_raster::{Assets, Axis, Camera, Canvas, Corner, Geom, IDENTITY, Light, Mesh, Scene, Shape, Target, V3};
-
-/// A camera at the origin that looks along y, with an angle of 90 degrees.
-fn camera() -> Camera {
-    Camera {
-        position: [0.0; 3],
-        forward: [0.0, 1.0, 0.0],
-        up: [0.0, 0.0, 1.0],
-        frustum: [-0.1, 0.1, -0.1, 0.1],
-        near: 0.1,
-        far: 100.0,
-        orthographic: false,
-    }
-}
 
 fn geom(shape: Shape, position: V3) -> Geom {
     Geom {
@@ -62,14 +50,14 @@ fn depths(scene: &Scene, assets: &Assets) -> Vec<f32> {
     depths
 }
 
-/// What is at the middle of the picture.
-fn middle<T: Copy>(picture: &[T]) -> T {
-    let channels = picture.len() / (SIDE * SIDE);
-    picture[(SIDE / 2 * SIDE + SIDE / 2) * channels]
+/// The value at the centre of a frame.
+fn middle<T: Copy>(frame: &[T]) -> T {
+    let channels = frame.len() / (SIDE * SIDE);
+    frame[(SIDE / 2 * SIDE + SIDE / 2) * channels]
 }
 
 #[test]
-fn shapes_are_as_far_as_they_are() {
+fn depths_of_shapes_are_exact() {
     let half_turn = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0];
     for (shape, nearest) in [
         (Shape::Ellipsoid([1.0, 2.0, 1.0]), 8.0),
@@ -77,10 +65,10 @@ fn shapes_are_as_far_as_they_are() {
         (Shape::Cylinder(0.5, 2.0), 9.5),
         (Shape::Box([1.0, 3.0, 1.0]), 7.0),
     ] {
-        let scene = Scene { camera: camera(), geoms: vec![geom(shape, [0.0, 10.0, 0.0])], ..Scene::default() };
+        let scene = Scene { camera: CAMERA, geoms: vec![geom(shape, [0.0, 10.0, 0.0])], ..Scene::default() };
         let seen = middle(&depths(&scene, &Assets::default()));
         assert!((seen - nearest).abs() < 0.05, "{shape:?}: {seen}");
-        // Far away and small: rounding must not eat it.
+        // Far away and small: rounding must not lose it.
         let mut far = scene.clone();
         far.camera.far = 2e4;
         far.geoms[0].position[1] += 1e4;
@@ -88,18 +76,18 @@ fn shapes_are_as_far_as_they_are() {
         let seen = middle(&depths(&far, &Assets::default()));
         assert!((seen - nearest - 1e4).abs() < 0.05, "{shape:?}: {seen}");
     }
-    // Upright things lie down when they are turned.
+    // A rotated geom.
     let mut lying = geom(Shape::Capsule(0.5, 2.0), [0.0, 10.0, 0.0]);
     lying.rotation = half_turn;
-    let scene = Scene { camera: camera(), geoms: vec![lying], ..Scene::default() };
+    let scene = Scene { camera: CAMERA, geoms: vec![lying], ..Scene::default() };
     assert!((middle(&depths(&scene, &Assets::default())) - 7.5).abs() < 0.05);
 }
 
-/// A plane below the camera, and a ball above it.
-fn ball_over_plane(shadows: bool) -> Scene {
+/// A plane below the camera, and a sphere above it.
+fn sphere_over_plane(shadows: bool) -> Scene {
     let floor = Shape::Plane(Axis::even(20.0, 40), Axis::even(20.0, 40));
     Scene {
-        camera: Camera { position: [0.0, 0.0, 2.0], ..camera() },
+        camera: Camera { position: [0.0, 0.0, 2.0], ..CAMERA },
         geoms: vec![geom(floor, [0.0; 3]), geom(Shape::Ellipsoid([1.0; 3]), [0.0, 5.0, 2.0])],
         lights: vec![light(shadows)],
         shadows: true,
@@ -110,7 +98,7 @@ fn ball_over_plane(shadows: bool) -> Scene {
     }
 }
 
-/// The pixel at which a place is seen by the camera of [`ball_over_plane`].
+/// The pixel that shows a position in [`sphere_over_plane`].
 fn pixel([x, y, z]: V3) -> usize {
     let side = SIDE as f32;
     let column = ((x / y + 1.0) * 0.5 * side) as usize;
@@ -119,8 +107,8 @@ fn pixel([x, y, z]: V3) -> usize {
 }
 
 #[test]
-fn a_ball_throws_a_shadow_below_itself() {
-    let (lit, dark) = (ball_over_plane(false), ball_over_plane(true));
+fn sphere_casts_a_shadow_below_it() {
+    let (lit, dark) = (sphere_over_plane(false), sphere_over_plane(true));
     let [lit, dark] = [lit, dark].map(|scene| rgb(&scene, &Assets::default()));
     let (below, beside) = (3 * pixel([0.0, 5.0, 0.0]), 3 * pixel([3.0, 5.0, 0.0]));
     assert_eq!(lit[below], 204);
@@ -129,32 +117,32 @@ fn a_ball_throws_a_shadow_below_itself() {
 }
 
 #[test]
-fn a_plane_mirrors_as_much_as_it_should() {
-    let mut scene = ball_over_plane(false);
+fn plane_reflects_by_its_reflectance() {
+    let mut scene = sphere_over_plane(false);
     scene.geoms[0].rgba = [0.0, 0.0, 0.0, 1.0];
     scene.geoms[0].reflectance = 0.5;
     scene.geoms[1].emission = 1.0;
     scene.lights.clear();
-    let picture = rgb(&scene, &Assets::default());
-    // The ball glows, and is lit from everywhere: 1.3 of its colour, halved by the mirror.
-    let mirrored = picture[3 * pixel([0.0, 5.0, -1.8])];
+    let frame = rgb(&scene, &Assets::default());
+    // The sphere emits its colour and gets dim light from everywhere: 1.3 of its colour, halved by the mirror.
+    let mirrored = frame[3 * pixel([0.0, 5.0, -1.8])];
     assert!((160..=170).contains(&mirrored), "{mirrored}");
-    assert_eq!(picture[3 * pixel([3.0, 5.0, -1.8])], 0);
+    assert_eq!(frame[3 * pixel([3.0, 5.0, -1.8])], 0);
 }
 
 #[test]
-fn glass_covers_twice() {
-    let mut scene = ball_over_plane(false);
+fn transparent_geoms_are_blended_twice() {
+    let mut scene = sphere_over_plane(false);
     scene.lights.clear();
     scene.geoms.remove(0);
     scene.geoms[0].rgba = [1.0, 1.0, 1.0, 0.5];
     scene.geoms[0].emission = 0.7;
-    // From near to far and back: three quarters of white, for what it covers is black.
+    // Drawn from near to far and again from far to near: three quarters of white over black.
     assert_eq!(middle(&rgb(&scene, &Assets::default())), 191);
 }
 
 #[test]
-fn a_mesh_looks_like_the_box_it_is() {
+fn mesh_of_a_box_equals_the_box() {
     let corner = |i: usize| -> V3 { std::array::from_fn(|k| if i >> k & 1 == 1 { 1.0 } else { -1.0 }) };
     // Sides by their corners, counterclockwise from outside.
     let sides = [
@@ -166,11 +154,11 @@ fn a_mesh_looks_like_the_box_it_is() {
         ([0, 2, 3, 1], [0.0, 0.0, -1.0]),
     ];
     let triangles = sides.iter().flat_map(|([a, b, c, d], normal)| {
-        let corner = |i: usize| Corner { place: corner(i), normal: *normal, coordinates: [0.0; 2] };
+        let corner = |i: usize| Corner { position: corner(i), normal: *normal, coordinates: [0.0; 2] };
         [[corner(*a), corner(*b), corner(*c)], [corner(*a), corner(*c), corner(*d)]]
     });
     let assets = Assets { meshes: vec![Arc::new(Mesh::new(triangles))], ..Assets::default() };
-    let mut scene = ball_over_plane(true);
+    let mut scene = sphere_over_plane(true);
     scene.camera.position[0] = 1.5;
     let [solid, mesh] = [Shape::Box([1.0; 3]), Shape::Mesh(0)].map(|shape| {
         scene.geoms[1].shape = shape;

@@ -1,5 +1,5 @@
-//! Compares frames of the Python reference with those of the CPU renderer: writes `docs/worlds-3d.png` and the table of
-//! `docs/worlds-3d.md`.
+//! Compares frames of the Python reference with those of the CPU renderer: writes `docs/environments-3d.png` and the table of
+//! `docs/environments-3d.md`.
 //!
 //! ```text
 //! SWM_GOLDEN_IMAGES=DIR cargo nextest run --release -p swm-mujoco golden

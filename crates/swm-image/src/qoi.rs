@@ -1,17 +1,18 @@
-//! The QOI picture format (specification 1.0, qoiformat.org): lossless, and the fastest to decode of those that other
-//! programs open as well.
+//! The QOI image format (specification 1.0, qoiformat.org): lossless, and the fastest to decode of the lossless
+//! formats that other programs read as well.
 //!
-//! A picture is a sequence of operations on the last pixel: repeat it, take one of 64 seen before, change it a little,
-//! or replace it. Drawn pictures are mostly runs, which are found and filled here many bytes at a time.
+//! An image is a sequence of operations on the last pixel: repeat it, take one of 64 earlier ones, change it a
+//! little, or replace it. Frames of simulations are mostly runs, which are found and filled here many bytes at a
+//! time.
 
 use swm_core::{Error, Result};
 
 /// Bytes of the header.
 const HEADER: usize = 14;
-/// What follows the last operation.
+/// The bytes after the last operation.
 const END: [u8; 8] = [0, 0, 0, 0, 0, 0, 0, 1];
 
-// The operations, by their first byte. Those of two bits hold a payload of six.
+// Operations, by their first byte. Those of two bits hold a payload of six.
 const INDEX: u8 = 0x00;
 const DIFF: u8 = 0x40;
 const LUMA: u8 = 0x80;
@@ -19,26 +20,26 @@ const RUN: u8 = 0xc0;
 const RGB: u8 = 0xfe;
 const RGBA: u8 = 0xff;
 
-/// The longest run that one operation holds, and that operation.
+/// The longest run of one operation.
 const LONGEST: usize = 62;
-#[allow(clippy::cast_possible_truncation)]
 const LONGEST_RUN: u8 = RUN | (LONGEST as u8 - 1);
 
 /// Red, green, blue, opacity.
 type Pixel = [u8; 4];
 
-/// The pixel before the first.
+/// The pixel before the first one.
 const START: Pixel = [0, 0, 0, 255];
 
-/// The place of a pixel among those seen before: (3 r + 5 g + 7 b + 11 a) mod 64.
+/// Returns the slot of a pixel in the table of earlier pixels: (3 r + 5 g + 7 b + 11 a) mod 64.
 fn slot(pixel: Pixel) -> usize {
-    // One product adds all four at its top. What it adds below stays below: at most 4590 · 2^40.
+    // One multiplication sums all four products in the top byte. The lower sums do not carry into it: at most 4590 ·
+    // 2^40.
     let bytes = u64::from(u32::from_le_bytes(pixel));
     let spread = (bytes & 0xff00_ff00) << 32 | bytes & 0x00ff_00ff;
     (spread.wrapping_mul(0x0300_0700_0005_000b) >> 56) as usize % 64
 }
 
-/// Encodes an RGB picture of `[height, width, 3]` bytes, appending to `out`.
+/// Encodes an RGB image, `[height, width, 3]`, and appends it to `out`.
 pub fn encode(rgb: &[u8], height: u16, width: u16, out: &mut Vec<u8>) {
     out.extend_from_slice(b"qoif");
     out.extend_from_slice(&u32::from(width).to_be_bytes());
@@ -57,7 +58,6 @@ pub fn encode(rgb: &[u8], height: u16, width: u16, out: &mut Vec<u8>) {
                 run -= LONGEST;
             }
             if run > 0 {
-                #[allow(clippy::cast_possible_truncation)] // below 62
                 out.push(RUN | (run as u8 - 1));
             }
             continue;
@@ -65,7 +65,6 @@ pub fn encode(rgb: &[u8], height: u16, width: u16, out: &mut Vec<u8>) {
         at += 3;
         let slot = slot(pixel);
         if seen[slot] == pixel {
-            #[allow(clippy::cast_possible_truncation)] // below 64
             out.push(INDEX | slot as u8);
         } else {
             seen[slot] = pixel;
@@ -86,11 +85,11 @@ pub fn encode(rgb: &[u8], height: u16, width: u16, out: &mut Vec<u8>) {
     out.extend_from_slice(&END);
 }
 
-/// How many pixels from byte `at` on equal the one before them.
+/// Returns how many pixels from byte `at` on equal the pixel before them.
 fn repeats(rgb: &[u8], at: usize) -> usize {
     const WIDE: usize = 32;
     let mut end = at;
-    // Equal to itself moved by a pixel: one colour.
+    // Pixels that equal themselves shifted by one pixel have one colour.
     while let (Some(a), Some(b)) = (rgb[end - 3..].first_chunk::<WIDE>(), rgb[end..].first_chunk::<WIDE>()) {
         if a != b {
             break;
@@ -103,10 +102,10 @@ fn repeats(rgb: &[u8], at: usize) -> usize {
     (end - at) / 3
 }
 
-/// The height and width that a header states.
+/// Returns the height and width that the header states.
 ///
 /// # Errors
-/// When it is no header, or states no picture.
+/// When the header is damaged.
 pub fn size(bytes: &[u8]) -> Result<(usize, usize)> {
     let header = bytes.first_chunk::<HEADER>();
     let Some(&[b'q', b'o', b'i', b'f', w0, w1, w2, w3, h0, h1, h2, h3, 3 | 4, 0 | 1]) = header else {
@@ -117,13 +116,14 @@ pub fn size(bytes: &[u8]) -> Result<(usize, usize)> {
     Ok((side([h0, h1, h2, h3]), side([w0, w1, w2, w3])))
 }
 
-/// Decodes a picture whose header was checked against the `[height, width, 3]` bytes of `out`. Transparency is dropped.
+/// Decodes an image into `out`, `[height, width, 3]`, whose size the caller has compared with the header. Opacity is
+/// dropped.
 ///
 /// # Errors
-/// When the operations do not fill the picture exactly.
+/// When the operations do not fill the image exactly.
+#[allow(clippy::too_many_lines, reason = "one match over the operations")]
 pub fn decode(bytes: &[u8], out: &mut [u8]) -> Result<()> {
-    let damaged =
-        |problem| Error::mismatch("decoding a QOI picture", problem, "operations for every pixel, and an end");
+    let damaged = |problem| Error::mismatch("decoding a QOI image", problem, "operations for every pixel, and an end");
     let Some(mut rest) = bytes.get(HEADER..).and_then(|rest| rest.strip_suffix(&END)) else {
         return Err(damaged("one that is cut off"));
     };
@@ -151,15 +151,15 @@ pub fn decode(bytes: &[u8], out: &mut [u8]) -> Result<()> {
                 seen[slot(pixel)] = pixel;
             }
             RUN..RGB => {
-                // A long run is several operations; filled at once, it costs one.
+                // A long run is several operations; they are filled at once.
                 let mut run = usize::from(op - RUN) + 1;
                 while let Some((&more @ RUN..RGB, after)) = rest.split_first() {
                     rest = after;
                     run += usize::from(more - RUN) + 1;
                 }
-                let Some(place) = out.get_mut(at..at + 3 * run) else { return Err(damaged("too long a run")) };
-                fill(place, pixel);
-                at += place.len();
+                let Some(target) = out.get_mut(at..at + 3 * run) else { return Err(damaged("too long a run")) };
+                fill(target, pixel);
+                at += target.len();
                 continue;
             }
             RGB => {
@@ -179,9 +179,9 @@ pub fn decode(bytes: &[u8], out: &mut [u8]) -> Result<()> {
                 seen[slot(pixel)] = pixel;
             }
         }
-        // Four bytes cost less than three; the next pixel overwrites the last.
+        // Writing four bytes is faster than three; the next pixel overwrites the fourth.
         match out[at..].first_chunk_mut() {
-            Some(place) => *place = pixel,
+            Some(target) => *target = pixel,
             None => out[at..].copy_from_slice(&pixel[..3]),
         }
         at += 3;
@@ -189,11 +189,11 @@ pub fn decode(bytes: &[u8], out: &mut [u8]) -> Result<()> {
     if rest.is_empty() { Ok(()) } else { Err(damaged("too many operations")) }
 }
 
-/// Repeats a pixel.
-fn fill(place: &mut [u8], [r, g, b, _]: Pixel) {
+/// Fills bytes with a pixel.
+fn fill(target: &mut [u8], [r, g, b, _]: Pixel) {
     const WIDE: usize = 48;
     let pattern: [u8; WIDE] = std::array::from_fn(|i| [r, g, b][i % 3]);
-    let (chunks, rest) = place.as_chunks_mut::<WIDE>();
+    let (chunks, rest) = target.as_chunks_mut::<WIDE>();
     chunks.fill(pattern);
     rest.copy_from_slice(&pattern[..rest.len()]);
 }
@@ -203,23 +203,24 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn round(rgb: &[u8], height: u16, width: u16) -> Vec<u8> {
+    fn round_trip(rgb: &[u8], height: u16, width: u16) -> Vec<u8> {
         let mut bytes = vec![7];
         encode(rgb, height, width, &mut bytes);
         assert_eq!(bytes.remove(0), 7, "appends");
         assert_eq!(size(&bytes).expect("a header"), (height.into(), width.into()));
         let mut back = vec![0; rgb.len()];
         decode(&bytes, &mut back).expect("decodes");
-        assert!(back == rgb, "{height} x {width} came back otherwise");
+        assert!(back == rgb, "{height} x {width} differs after a round trip");
         bytes
     }
 
     #[test]
     fn operations_are_those_of_the_specification() {
-        // Two of the start's colour, one near it, one less near, one far, the first again, and a run of 63.
+        // Two pixels of the start's colour, one close to it, one less close, one far, an earlier one, and a run of
+        // 63.
         let mut pixels = vec![[0, 0, 0], [0, 0, 0], [1, 255, 1], [11, 9, 9], [200, 0, 7], [1, 255, 1]];
         pixels.extend([[9, 9, 9]; 64]);
-        let bytes = round(pixels.as_flattened(), 7, 10);
+        let bytes = round_trip(pixels.as_flattened(), 7, 10);
         let luma = [LUMA | 42, (8 << 4) | 6];
         // 3 · 1 + 5 · 255 + 7 · 1 + 11 · 255 = 4090 = 63 · 64 + 58.
         let expected = [&[RUN | 1, DIFF | 0b11_01_11][..], &luma, &[RGB, 200, 0, 7, INDEX | 58]].concat();
@@ -228,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn foreign_pictures_may_have_four_channels() {
+    fn four_channel_files_of_other_writers_decode() {
         let mut bytes = [&b"qoif"[..], &2_u32.to_be_bytes(), &1_u32.to_be_bytes(), &[4, 1]].concat();
         bytes.extend([RGBA, 10, 20, 30, 40, DIFF | 0b11_10_01]);
         bytes.extend(END);
@@ -238,25 +239,25 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fill_the_picture_exactly_is_refused() {
+    fn operations_must_fill_the_image_exactly() {
         let rgb: Vec<u8> = (0..300_u32).map(|i| (i * i / 7) as u8).collect();
-        let bytes = round(&rgb, 10, 10);
+        let bytes = round_trip(&rgb, 10, 10);
         let refused = |bytes: &[u8], pixels: usize| decode(bytes, &mut vec![0; 3 * pixels]).is_err();
         assert!((0..bytes.len()).all(|end| refused(&bytes[..end], 100)));
         assert!(refused(&bytes, 99) && refused(&bytes, 101) && !refused(&bytes, 100));
         assert!(refused(&[&bytes[..], &[0]].concat(), 100));
-        let flat = round(&[7; 300], 10, 10);
+        let flat = round_trip(&[7; 300], 10, 10);
         assert!(refused(&flat, 40), "a run beyond the end");
     }
 
     proptest! {
         #[test]
-        fn every_picture_comes_back(
+        fn every_image_survives_a_round_trip(
             seed in prop::collection::vec((any::<[u8; 3]>(), 1_usize..150), 1..40),
             noise in prop::collection::vec((0_usize..2000, any::<u8>()), 0..200),
             width in 1_u16..90,
         ) {
-            // Runs of colours, disturbed in places by a little and by much.
+            // Runs of colours, changed at random positions by a little or by much.
             let mut rgb: Vec<u8> = seed.iter().flat_map(|(pixel, run)| pixel.repeat(*run)).collect();
             let len = rgb.len();
             for (at, value) in noise {
@@ -264,7 +265,7 @@ mod tests {
             }
             let height = rgb.len() / 3 / usize::from(width) + 1;
             rgb.resize(height * usize::from(width) * 3, 77);
-            round(&rgb, height as u16, width);
+            round_trip(&rgb, height as u16, width);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The videos of a dataset: their tables are read once and kept, and so are decoders.
+//! The opened videos of a dataset: their tables are read once and cached, and decoders are pooled.
 
 use crate::decode::{DecoderPool, FrameRequest, Source, Video};
 use rayon::prelude::*;
@@ -7,31 +7,31 @@ use std::hash::Hash;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::Result;
 
-/// Bytes of tables, and of videos that are held in memory, that are kept.
-const KEPT_BYTES: usize = 256 << 20;
+/// Limit of cached tables and videos in memory, in bytes.
+const MAX_BYTES: usize = 256 << 20;
 
-/// Videos by their key.
+/// A cache of opened videos by key.
 pub struct VideoCache<K> {
     decoders: DecoderPool,
-    shelf: Mutex<Shelf<K>>,
+    entries: Mutex<Entries<K>>,
 }
 
-struct Shelf<K> {
+struct Entries<K> {
     videos: HashMap<K, Arc<Video>>,
-    /// Oldest first.
+    /// Keys, the oldest first.
     order: VecDeque<K>,
     bytes: usize,
 }
 
 impl<K> Default for VideoCache<K> {
     fn default() -> Self {
-        let shelf = Shelf { videos: HashMap::new(), order: VecDeque::new(), bytes: 0 };
-        Self { decoders: DecoderPool::default(), shelf: Mutex::new(shelf) }
+        let entries = Entries { videos: HashMap::new(), order: VecDeque::new(), bytes: 0 };
+        Self { decoders: DecoderPool::default(), entries: Mutex::new(entries) }
     }
 }
 
 impl<K: Clone + Eq + Hash + Send + Sync> VideoCache<K> {
-    /// A video, opened unless it is known.
+    /// Returns a video, opening it unless it is cached.
     ///
     /// # Errors
     /// When it cannot be opened.
@@ -40,32 +40,32 @@ impl<K: Clone + Eq + Hash + Send + Sync> VideoCache<K> {
             return Ok(Arc::clone(video));
         }
         let video = Arc::new(Video::open(source()?)?);
-        let mut shelf = self.lock();
-        if shelf.videos.insert(key.clone(), Arc::clone(&video)).is_none() {
-            shelf.order.push_back(key.clone());
-            shelf.bytes += video.memory();
-            while shelf.bytes > KEPT_BYTES
-                && let Some(oldest) = shelf.order.pop_front()
+        let mut entries = self.lock();
+        if entries.videos.insert(key.clone(), Arc::clone(&video)).is_none() {
+            entries.order.push_back(key.clone());
+            entries.bytes += video.memory();
+            while entries.bytes > MAX_BYTES
+                && let Some(oldest) = entries.order.pop_front()
             {
-                let freed = shelf.videos.remove(&oldest).map_or(0, |video| video.memory());
-                shelf.bytes -= freed;
+                let freed = entries.videos.remove(&oldest).map_or(0, |video| video.memory());
+                entries.bytes -= freed;
             }
         }
         Ok(video)
     }
 
-    /// Height and width of a video's pictures: its first frame has the size that its header says.
+    /// Returns the height and width of a video, after checking that its first frame has the size of its header.
     ///
     /// # Errors
-    /// When it has not, or the video cannot be opened.
+    /// When the sizes differ, or the video cannot be opened.
     pub fn frame_size(&self, key: &K, source: impl FnOnce() -> Result<Source>) -> Result<(usize, usize)> {
         let video = self.get(key, source)?;
         self.decoders.check_size(&video)?;
         Ok(video.size())
     }
 
-    /// What is wrong with the video of an episode's column, in words: it cannot be opened, or has not a frame for every
-    /// row.
+    /// Returns a description of what is wrong with the video of an episode's column: it cannot be opened, or its
+    /// frame count differs from the episode's rows.
     pub fn irregularity(
         &self,
         key: &K,
@@ -80,8 +80,8 @@ impl<K: Clone + Eq + Hash + Send + Sync> VideoCache<K> {
         }
     }
 
-    /// Decodes rows of pictures. Each is wanted as `(its video, what says which frame, where to)`; equal videos follow
-    /// each other. `source` opens a video, `frame` finds the frame in it.
+    /// Decodes frames, each given as `(video key, frame description, memory)`; equal keys follow each other. `source`
+    /// opens a video, and `frame` returns the index of a description.
     ///
     /// # Errors
     /// When a video cannot be opened, lacks the frame, or is damaged.
@@ -113,7 +113,7 @@ impl<K: Clone + Eq + Hash + Send + Sync> VideoCache<K> {
         self.decoders.read(frames)
     }
 
-    fn lock(&self) -> std::sync::MutexGuard<'_, Shelf<K>> {
-        self.shelf.lock().unwrap_or_else(PoisonError::into_inner)
+    fn lock(&self) -> std::sync::MutexGuard<'_, Entries<K>> {
+        self.entries.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -1,24 +1,23 @@
-//! Decoded planes to RGB, straight into the caller's memory, and back.
+//! Conversion of decoded planes to RGB and back.
 //!
-//! A colour-difference sample is repeated for the pixels that share it, as FFmpeg's own converter does for pictures
-//! that keep their size, so that the pictures are those that PyAV, torchcodec and decord give.
+//! A chroma sample is repeated for the pixels that share it, as FFmpeg's own converter does for frames that keep
+//! their size, so the frames equal those of PyAV, torchcodec and decord.
 
 use ffmpeg_next::color::{Range, Space};
 use ffmpeg_next::format::Pixel;
 use ffmpeg_next::frame;
 use swm_simd::vectorize;
 
-/// Bits behind the point of the factors. Everything is 16 bits wide, so that a register holds many.
+/// Fraction bits of the factors. All values have 16 bits, so that a register holds many.
 const FACTOR: u32 = 13;
 
-/// Bits behind the point of products. Where colour differences are shared there are none, and products are cut off:
-/// FFmpeg's converter for these formats does so, and its pictures are to be met to the last bit.
+/// Fraction bits of products. Where chroma is shared there are none and products are truncated, because FFmpeg's
+/// converter for these formats does so and frames must equal its frames bit for bit.
 const fn fraction(shared: bool) -> u32 {
     if shared { 0 } else { 4 }
 }
 
-/// What turns luma and colour differences into red, green and blue: `R = y·(Y − black) + rv·V`, and so on, with U and V
-/// counted from 128.
+/// Factors from YUV to RGB: `R = y·(Y − black) + rv·V`, and so on, with U and V counted from 128.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Matrix {
     black: i16,
@@ -29,7 +28,7 @@ struct Matrix {
     bu: i16,
 }
 
-/// The shares of red and blue in luma. What says nothing is BT.601, as for FFmpeg.
+/// Returns the weights of red and blue in luma. Unspecified spaces are BT.601, as in FFmpeg.
 fn shares(space: Space) -> (f64, f64) {
     match space {
         Space::BT709 => (0.2126, 0.0722),
@@ -44,7 +43,7 @@ impl Matrix {
     fn new(space: Space, full_range: bool) -> Self {
         let (red, blue) = shares(space);
         let green = 1.0 - red - blue;
-        // Luma has 219 steps and colour differences have 224, unless they use the whole byte.
+        // Luma has 219 steps and chroma 224, unless they use the full byte.
         let (black, luma, difference) = if full_range { (0, 1.0, 1.0) } else { (16, 255.0 / 219.0, 255.0 / 224.0) };
         let fixed = |factor: f64| (factor * f64::from(1 << FACTOR)).round() as i16;
         Self {
@@ -58,17 +57,18 @@ impl Matrix {
     }
 }
 
-/// How samples of colour differences are shared.
+/// The layout of the planes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Planes {
-    /// One U and V for `1 << .0` columns and `1 << .1` rows.
+    /// One U and V sample for `1 << .0` columns and `1 << .1` rows.
     Yuv(usize, usize),
     Grey,
-    /// Green, blue, red.
+    /// Green, blue and red planes.
     Gbr,
 }
 
-/// The formats that are converted here, all of 8 bits. Others go through [`Pixel::YUV444P`] first.
+/// Returns the layout of the 8-bit formats that are converted directly, and whether they use the full range. Others
+/// are converted to [`Pixel::YUV444P`] first.
 fn planes(format: Pixel) -> Option<(Planes, bool)> {
     Some(match format {
         Pixel::YUV420P => (Planes::Yuv(1, 1), false),
@@ -83,14 +83,14 @@ fn planes(format: Pixel) -> Option<(Planes, bool)> {
     })
 }
 
-/// Whether [`to_rgb`] takes frames of this format.
+/// Whether [`to_rgb`] supports frames of this format.
 pub fn is_native(format: Pixel) -> bool {
     planes(format).is_some()
 }
 
-/// Writes a frame of a native format as RGB, `height * width * 3` bytes.
+/// Converts a frame of a native format to RGB, `[height, width, 3]`.
 ///
-/// Returns `false`, having written nothing, when the frame has another format or size.
+/// Returns `false` and writes nothing when the frame has another format or size.
 pub fn to_rgb(frame: &frame::Video, width: usize, height: usize, out: &mut [u8]) -> bool {
     let Some((planes, full)) = planes(frame.format()) else { return false };
     if (frame.width() as usize, frame.height() as usize, out.len()) != (width, height, width * height * 3) {
@@ -153,18 +153,18 @@ fn interleave(r: &[u8], g: &[u8], b: &[u8], out: &mut [u8]) {
     }
 }
 
-/// Pixels converted at a time: several registers' worth, in memory next to the processor.
+/// Pixels converted at a time: several registers, in first-level cache.
 const PIECE: usize = 64;
 
-/// One row, with one U and V for every pixel or for every two.
+/// Converts one row, with one U and V for every pixel or for every two.
 #[inline(always)]
 fn yuv_row<const SHARED: bool>(matrix: &Matrix, y: &[u8], u: &[u8], v: &[u8], out: &mut [u8]) {
-    // A sample times a factor has its fraction in the upper half of the product.
+    // The upper half of a sample times a factor must have `fraction` bits.
     let sample = 16 - FACTOR + fraction(SHARED);
     let step = if SHARED { PIECE / 2 } else { PIECE };
     let pieces = y.chunks(PIECE).zip(u.chunks(step)).zip(v.chunks(step)).zip(out.chunks_mut(PIECE * 3));
     for (((y, u), v), out) in pieces {
-        // A last piece that is not full is padded, so that the loops have a length that the compiler knows.
+        // The last piece is padded, so that loops have a constant length.
         let (mut luma, mut differences) = ([0_u8; PIECE], [[0_u8; PIECE]; 2]);
         luma[..y.len()].copy_from_slice(y);
         for (to, from) in differences.iter_mut().zip([u, v]) {
@@ -198,21 +198,21 @@ fn grey_row(matrix: &Matrix, y: &[u8], out: &mut [u8]) {
     }
 }
 
-/// The upper half of a product.
+/// Returns the upper half of a product.
 #[inline(always)]
 fn times(a: i16, b: i16) -> i16 {
     ((i32::from(a) * i32::from(b)) >> 16) as i16
 }
 
-/// A sum of products as a byte, rounded where it has a fraction.
+/// Converts a sum of products to a byte, rounded where it has a fraction.
 #[inline(always)]
 fn clamp(value: i16, fraction: u32) -> u8 {
     let half = if fraction > 0 { 1 << (fraction - 1) } else { 0 };
     ((value + half) >> fraction).clamp(0, 255) as u8
 }
 
-/// Fills a frame of [`Pixel::YUV420P`] (BT.601, 16 to 235) or [`Pixel::YUV444P`] with RGB pixels, or one of
-/// [`Pixel::RGB24`] as it is. Shared colour differences are the mean of their pixels.
+/// Converts RGB pixels to a frame of [`Pixel::YUV420P`] (BT.601, 16 to 235) or [`Pixel::YUV444P`], or copies them to
+/// one of [`Pixel::RGB24`]. Shared chroma is the mean of its pixels.
 pub fn from_rgb(rgb: &[u8], frame: &mut frame::Video) {
     let (width, height) = (frame.width() as usize, frame.height() as usize);
     let rows = rgb.chunks_exact(width * 3);
@@ -250,19 +250,19 @@ pub fn from_rgb(rgb: &[u8], frame: &mut frame::Video) {
 mod tests {
     use super::*;
 
-    fn picture(width: usize, height: usize) -> Vec<u8> {
+    fn test_image(width: usize, height: usize) -> Vec<u8> {
         (0..width * height)
             .flat_map(|i| [(i % width * 255 / width) as u8, (i / width * 255 / height) as u8, (i * 3 % 256) as u8])
             .collect()
     }
 
     #[test]
-    fn colours_come_back() {
+    fn colours_survive_a_round_trip() {
         for (format, width, height, tolerance) in
             [(Pixel::YUV444P, 71, 33, 2), (Pixel::YUV420P, 70, 34, 4), (Pixel::YUV444P, 1, 1, 2)]
         {
-            // Pixels in squares of one colour lose nothing to sharing.
-            let small = picture(width / 2 + 1, height / 2 + 1);
+            // Squares of one colour lose nothing where chroma is shared.
+            let small = test_image(width / 2 + 1, height / 2 + 1);
             let rgb: Vec<u8> = (0..width * height)
                 .flat_map(|i| small[(i / width / 2 * (width / 2 + 1) + i % width / 2) * 3..][..3].to_vec())
                 .collect();

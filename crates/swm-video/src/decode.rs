@@ -1,12 +1,11 @@
-//! Frames by number: all frames of a batch are asked for together, each run from a key frame is decoded once, runs are
-//! decoded in parallel.
+//! Decoding of frames by index. All frames of a batch are requested together; each run from a key frame is decoded
+//! once, and runs are decoded in parallel.
 
 use crate::colour;
 use crate::mp4::{self, Codec, Index};
+use crate::reducer::Reducer;
 use ffmpeg_next::codec::{self, Compliance, Flags, threading};
 use ffmpeg_next::decoder::{self, Check};
-use ffmpeg_next::format::Pixel;
-use ffmpeg_next::software::scaling;
 use ffmpeg_next::{Dictionary, Discard, Packet, ffi, frame};
 use rayon::prelude::*;
 use std::fs::File;
@@ -15,19 +14,19 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
 
-/// DecoderPool that wait for the next run. Each holds a few decoded pictures.
+/// Decoders in the pool. Each holds a few decoded frames.
 const IDLE_DECODERS: usize = 32;
 
-/// Where a video's bytes are.
+/// The source of a video's bytes.
 #[derive(Clone, Debug)]
 pub enum Source {
     /// In a file.
     File(PathBuf),
-    /// In memory, and what error messages call it.
+    /// In memory, with the name that error messages use.
     Memory(PathBuf, Arc<[u8]>),
 }
 
-/// A source that is being read.
+/// An opened source.
 enum Open<'a> {
     File(File),
     Memory(&'a [u8]),
@@ -69,7 +68,7 @@ impl Open<'_> {
     }
 }
 
-/// An MP4 file whose tables were read. Nothing is kept open.
+/// An MP4 file whose tables were read. The file is not kept open.
 #[derive(Debug)]
 pub struct Video {
     source: Source,
@@ -77,10 +76,10 @@ pub struct Video {
 }
 
 impl Video {
-    /// Reads where the frames are.
+    /// Reads the tables of a video.
     ///
     /// # Errors
-    /// When the file cannot be read, is no plain MP4, or has a codec that we do not decode.
+    /// When the file cannot be read, is not a plain MP4 file, or has an unsupported codec.
     pub fn open(source: Source) -> Result<Self> {
         let (mut open, length) = source.open()?;
         let index = Index::read(length, |offset, bytes| open.read(offset, bytes));
@@ -88,17 +87,17 @@ impl Video {
         Ok(Self { source, index })
     }
 
-    /// How many frames there are.
+    /// Returns the number of frames.
     pub fn frames(&self) -> usize {
         self.index.frames.len()
     }
 
-    /// Height and width.
+    /// Returns the height and width.
     pub fn size(&self) -> (usize, usize) {
         (self.index.height, self.index.width)
     }
 
-    /// Bytes that keeping it takes.
+    /// Returns the bytes of memory that the opened video takes.
     pub fn memory(&self) -> usize {
         let index = &self.index;
         let tables = index.samples.len() * size_of::<mp4::Sample>() + index.frames.len() * 12;
@@ -107,7 +106,7 @@ impl Video {
         size_of::<Self>() + tables + sums + bytes
     }
 
-    /// Calls `each` with the coded picture of every one of these frames.
+    /// Calls `each` with the encoded bytes of every frame of `frames`.
     ///
     /// # Errors
     /// When the file is damaged.
@@ -126,7 +125,7 @@ impl Video {
         Ok(())
     }
 
-    /// The error of a video that is not what it should be.
+    /// Returns the error of a damaged video.
     pub fn damaged(&self, problem: &str) -> Error {
         damaged(self.source.label(), problem)
     }
@@ -135,30 +134,31 @@ impl Video {
         self.damaged(&format!("has {} frames, and frame {frame} was asked for", self.frames()))
     }
 
-    /// The frame shown nearest to a time, and how far from it, both in seconds. None where there are no frames.
+    /// Returns the frame closest to a time, and its distance from the time, both in seconds. `None` where there are
+    /// no frames.
     pub fn frame_at(&self, seconds: f64) -> Option<(usize, f64)> {
         let frame = self.index.frame_at(seconds)?;
         Some((frame, (self.index.seconds(frame) - seconds).abs()))
     }
 }
 
-/// The error of a video that is not what it should be.
+/// Returns the error of a damaged video.
 fn damaged(path: &Path, problem: &str) -> Error {
     let fix = "restore it from a copy, or write it anew with `ffmpeg -i IN -c:v libx264 OUT.mp4`";
     Error::corrupt(path, format!("the video {problem}"), fix)
 }
 
-/// A frame that is wanted, and where to.
+/// A request to decode a frame into memory.
 pub struct FrameRequest<'a> {
     /// The video.
     pub video: &'a Video,
     /// Index of the frame in presentation order.
     pub frame: usize,
-    /// `[height, width, 3]` bytes.
+    /// The memory, `[height, width, 3]`.
     pub out: &'a mut [u8],
 }
 
-/// A frame of one run.
+/// A requested frame of one run.
 struct Job<'a> {
     video: &'a Video,
     /// The sample at which decoding begins.
@@ -167,10 +167,11 @@ struct Job<'a> {
     out: &'a mut [u8],
 }
 
-/// DecoderPool that are kept between reads. Files of one dataset have the same parameters, so one decoder serves many.
+/// Decoders that are reused between batches. Files of one dataset have the same parameters, so one decoder serves
+/// many files.
 #[derive(Default)]
 pub struct DecoderPool {
-    /// Last used last.
+    /// The last one was used last.
     idle: Mutex<Vec<Decoder>>,
 }
 
@@ -206,18 +207,18 @@ impl DecoderPool {
             let Some(Job { video, .. }) = run.first() else { return Ok(()) };
             let video = *video;
             let mut decoder = self.take(video)?;
-            // After a failure the decoder's state is anybody's guess; it is dropped.
+            // After a failure the state of the decoder is unknown, so it is dropped.
             decoder.run(video, run).map_err(|problem| damaged(video.source.label(), &problem))?;
             self.give_back(decoder);
             Ok(())
         })
     }
 
-    /// Checks that the first frame has the size that the header says. Who makes room for pictures of an unknown file
-    /// asks this first.
+    /// Checks that the first frame has the size that the header states, before memory is allocated for frames of an
+    /// unknown file.
     ///
     /// # Errors
-    /// When it has another, or cannot be decoded.
+    /// When the sizes differ, or the frame cannot be decoded.
     pub fn check_size(&self, video: &Video) -> Result<()> {
         let mut decoder = self.take(video)?;
         let found = decoder.first_size(video).map_err(|problem| video.damaged(&problem))?;
@@ -250,7 +251,7 @@ impl DecoderPool {
     }
 }
 
-/// One of FFmpeg's decoders and its memory.
+/// An FFmpeg decoder and its memory.
 struct Decoder {
     codec: Codec,
     extradata: Arc<[u8]>,
@@ -280,15 +281,15 @@ impl Decoder {
         };
         let mut context = codec::Context::new_with_codec(found);
         set_extradata(&mut context, &index.extradata);
-        // Runs are decoded in parallel, not what is within them. Strict: a stream that does not say how far its pictures
-        // are reordered is not taken to mean "not at all". What is damaged is refused, not concealed.
+        // One thread, because runs are decoded in parallel. Strict, because a stream that does not state how far
+        // frames are reordered must not be taken to mean "not at all". Damage is refused, not concealed.
         context.set_threading(threading::Config::count(1));
         context.compliance(Compliance::Strict);
-        // Frames after a key frame that forgets nothing are held back otherwise; we know which ones it suffices for.
+        // The decoder would hold back frames after an open key frame; the tables say which frames it suffices for.
         context.set_flags(Flags::OUTPUT_CORRUPT);
         let mut decoder = context.decoder();
         decoder.check(Check::CRC | Check::BITSTREAM | Check::BUFFER | Check::EXPLODE);
-        // Damaged headers may promise any size; coded pictures are padded to whole blocks.
+        // Damaged headers may state any size; encoded frames are padded to whole blocks.
         let mut options = Dictionary::new();
         options.set("max_pixels", &((index.width + 256) * (index.height + 256)).to_string());
         let inner = decoder.open_as_with(found, options).and_then(|opened| opened.video());
@@ -309,7 +310,7 @@ impl Decoder {
             && (Arc::ptr_eq(&self.extradata, &index.extradata) || self.extradata == index.extradata)
     }
 
-    /// Decodes the frames of one run, which are in decoding order.
+    /// Decodes the requested frames of one run, which are in decoding order.
     fn run(&mut self, video: &Video, jobs: &mut [Job<'_>]) -> Result<(), String> {
         let (Some(first), Some(last)) = (jobs.first().map(|job| job.key), jobs.last().map(|job| job.sample)) else {
             return Ok(());
@@ -318,7 +319,7 @@ impl Decoder {
         let samples = &video.index.samples[first..=last];
         let mut missing = jobs.len();
         let mut reducer = Reducer::default();
-        // Samples that lie side by side are read together.
+        // Neighbouring samples are read together.
         let mut at = first;
         for group in samples.chunk_by(|a, b| a.offset + u64::from(a.size) == b.offset) {
             let mut coded = std::mem::take(&mut self.coded);
@@ -329,12 +330,12 @@ impl Decoder {
                 let (bytes, others) = rest.split_at(sample.size as usize);
                 rest = others;
                 video.index.check(at, bytes)?;
-                // A picture that is not wanted and to which no other refers is not decoded.
+                // A frame that is not requested and that no other frame refers to is not decoded.
                 let wanted = jobs.binary_search_by_key(&at, |job| job.sample).is_ok();
                 self.inner.skip_frame(if wanted { Discard::Default } else { Discard::NonReference });
                 let mut packet = Packet::copy(bytes);
                 packet.set_pts(Some(at as i64));
-                self.inner.send_packet(&packet).map_err(|e| format!("cannot be decoded in coded picture {at}: {e}"))?;
+                self.inner.send_packet(&packet).map_err(|e| format!("cannot be decoded in encoded frame {at}: {e}"))?;
                 self.receive(video, jobs, &mut missing, &mut reducer)?;
                 at += 1;
             }
@@ -347,13 +348,13 @@ impl Decoder {
         self.inner.flush();
         if missing > 0 {
             return Err(format!(
-                "is damaged: of the frames from coded picture {first} to {last}, {missing} are missing"
+                "is damaged: of the frames from encoded frame {first} to {last}, {missing} are missing"
             ));
         }
         Ok(())
     }
 
-    /// Height and width of the first frame.
+    /// Decodes the first frame and returns its height and width.
     fn first_size(&mut self, video: &Video) -> Result<(usize, usize), String> {
         let (mut open, _) = video.source.open().map_err(|e| e.to_string())?;
         let Some(sample) = video.index.samples.first() else { return Err("has no frame".to_owned()) };
@@ -367,7 +368,7 @@ impl Decoder {
         Ok((self.frame.height() as usize, self.frame.width() as usize))
     }
 
-    /// Takes what the decoder has finished, and puts it where it is wanted.
+    /// Receives the finished frames of the decoder and converts the requested ones.
     fn receive(
         &mut self,
         video: &Video,
@@ -386,7 +387,7 @@ impl Decoder {
             let end = jobs.partition_point(|job| job.sample <= sample);
             let Some((Job { out, .. }, others)) = jobs[begin..end].split_first_mut() else { continue };
             if self.frame.is_corrupt() || self.frame.has_decode_errors() {
-                return Err(format!("is damaged in coded picture {sample}"));
+                return Err(format!("is damaged in encoded frame {sample}"));
             }
             let (height, width) = video.size();
             let frame =
@@ -401,41 +402,14 @@ impl Decoder {
     }
 }
 
-/// Brings frames of rare formats (10 bits, packed) to one that is converted directly.
-#[derive(Default)]
-struct Reducer {
-    made: Option<(scaling::Context, frame::Video)>,
-}
-
-impl Reducer {
-    fn reduce(&mut self, frame: &frame::Video) -> Result<&frame::Video, String> {
-        let (from, width, height) = (frame.format(), frame.width(), frame.height());
-        let same = |made: &(scaling::Context, frame::Video)| {
-            let input = made.0.input();
-            (input.format, input.width, input.height) == (from, width, height)
-        };
-        if !self.made.as_ref().is_some_and(same) {
-            let flags = scaling::Flags::BILINEAR | scaling::Flags::ACCURATE_RND;
-            let scaler = scaling::Context::get(from, width, height, Pixel::YUV444P, width, height, flags);
-            let scaler = scaler.map_err(|e| format!("has pixels that nothing converts: {e}"))?;
-            self.made = Some((scaler, frame::Video::empty()));
-        }
-        let Some((scaler, reduced)) = &mut self.made else { return Err("has pixels that nothing converts".to_owned()) };
-        scaler.run(frame, reduced).map_err(|e| format!("has pixels that cannot be converted: {e}"))?;
-        reduced.set_color_space(frame.color_space());
-        reduced.set_color_range(frame.color_range());
-        Ok(reduced)
-    }
-}
-
-/// Gives a decoder the parameters that stand in the file's header instead of its pictures.
-#[allow(unsafe_code)]
+/// Sets the codec parameters that the file's header holds.
+#[allow(unsafe_code, reason = "sets a field of FFmpeg's context that its wrapper does not offer")]
 fn set_extradata(context: &mut codec::Context, bytes: &[u8]) {
     if bytes.is_empty() {
         return;
     }
     let Ok(length) = i32::try_from(bytes.len()) else { return };
-    // The wrapper sets these only by opening a file with libavformat, whose parsers we keep away from damaged files.
+    // The wrapper sets these only by opening a file with libavformat, whose parsers must not read damaged files.
     // SAFETY: the memory comes from FFmpeg's allocator, has the zeroed padding that decoders read, is filled within its
     // length, and belongs to the context from here on, which frees it. The context was not opened yet and has none.
     unsafe {
@@ -454,7 +428,7 @@ fn set_extradata(context: &mut codec::Context, bytes: &[u8]) {
 mod tests {
     use super::*;
 
-    /// The frames of `tests/interop/odd-NAME.mp4`, as another program decoded them, and the video.
+    /// Returns the frames of `tests/interop/odd-NAME.mp4`, as PyAV decoded them, and the video.
     fn odd(name: &str) -> (Vec<u8>, Video) {
         let place = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop").join(format!("odd-{name}"));
         let expected = swm_image::read_png(&place.with_extension("png")).expect("a PNG").rgb;
@@ -462,16 +436,16 @@ mod tests {
     }
 
     #[test]
-    fn any_frame_of_any_video_is_found() {
+    fn every_frame_of_every_codec_decodes() {
         let decoders = DecoderPool::default();
-        // Ten bits: the other program blurs the colours of neighbours, so only the mean is alike.
+        // Ten bits: the other program interpolates chroma, so only the mean is close.
         for (name, tolerance) in [("times", 0), ("hevc", 0), ("deep", 4)] {
             let (expected, video) = odd(name);
             assert_eq!((video.frames(), video.size()), (14, (32, 48)), "{name}");
             let size = 32 * 48 * 3;
             let bytes: Arc<[u8]> = std::fs::read(video.source.label()).expect("reads").into();
             let same = Video::open(Source::Memory("a blob".into(), bytes)).expect("opens");
-            // Each alone, then all at once, backwards, from a file and from memory, and some twice.
+            // Each alone, then all at once, in reverse from memory, and with repetitions.
             let orders: [Vec<usize>; 3] = [(0..14).collect(), (0..14).rev().collect(), vec![9, 3, 9, 13, 0, 3]];
             for (i, order) in orders.into_iter().enumerate() {
                 let mut out = vec![7; order.len() * size];
@@ -507,7 +481,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_there_is_said() {
+    fn missing_frames_and_wrong_files_are_errors() {
         let (_, video) = odd("times");
         let mut out = vec![0; 32 * 48 * 3];
         let error = |frame, out: &mut [u8]| {
@@ -517,6 +491,6 @@ mod tests {
         assert!(error(14, &mut out).contains("14 frames"));
         assert!(error(0, &mut out[1..]).contains("48 x 32"));
         let png = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/odd-times.png");
-        assert!(Video::open(Source::File(png)).expect_err("a picture").to_string().contains("no MP4"));
+        assert!(Video::open(Source::File(png)).expect_err("an image").to_string().contains("no MP4"));
     }
 }

@@ -1,4 +1,4 @@
-//! Frames in, an MP4 file of H.264 out.
+//! Encoding of frames as an MP4 file with H.264.
 
 use crate::colour;
 use crate::mp4;
@@ -12,48 +12,48 @@ use swm_core::{Error, Result};
 use swm_image::ImageCodec;
 use swm_simd::CpuLevel;
 
-/// How frames become a video.
+/// Settings of the encoder.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Encoding {
-    /// What is lost.
+    /// Lossless, or a quality.
     pub quality: Quality,
     /// Frames from one key frame to the next. A random frame costs half of them to decode.
     pub gop: u32,
-    /// Whether pictures may depend on later ones, and other tools that make files smaller and decoding slower.
+    /// Whether frames may depend on later ones, and other tools that make files smaller and decoding slower.
     pub small: bool,
 }
 
-/// What is lost.
+/// The quality of encoded frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Quality {
-    /// Nothing: the very pixels come back.
+    /// Decoded frames equal the originals.
     Lossless,
-    /// More, the higher the constant rate factor.
+    /// Constant rate factor: the higher, the more is lost.
     Crf(u8),
 }
 
 impl Encoding {
-    /// For training: any frame is near a key frame, and decodes fast. What pictures lose follows from how they would be
-    /// stored one by one.
+    /// Settings for training data: a key frame every few frames, and fast decoding. The quality follows from the
+    /// codec of single images.
     pub fn training(codec: ImageCodec) -> Self {
         let quality = match codec {
-            // Quality 95 becomes 18, which looks like the source.
+            // JPEG quality 95 becomes a rate factor of 18, which looks like the original.
             ImageCodec::Jpeg { quality } => Quality::Crf((8 + 2 * 100_u8.saturating_sub(quality.max(50))).min(51)),
             _ => Quality::Lossless,
         };
         Self { quality, gop: TRAINING_GOP, small: false }
     }
 
-    /// For people: small files that browsers play.
+    /// Settings for people: small files that browsers play.
     pub const fn viewing() -> Self {
         Self { quality: Quality::Crf(18), gop: 250, small: true }
     }
 
-    /// The encoder's name, the pixels it is given, and its options.
+    /// Returns the name of the encoder, its pixel format and its options.
     fn settings(self, even: bool) -> (&'static str, Pixel, Vec<(&'static str, String)>) {
         let pixels = if even { Pixel::YUV420P } else { Pixel::YUV444P };
         match self.quality {
-            // Red, green and blue stay as they are.
+            // RGB without conversion.
             Quality::Lossless => {
                 ("libx264rgb", Pixel::RGB24, vec![("qp", "0".to_owned()), ("preset", "veryfast".to_owned())])
             }
@@ -78,14 +78,14 @@ fn instruction_set() -> Option<&'static str> {
     (swm_simd::cpu_level() == CpuLevel::Avx512).then_some("AVX2")
 }
 
-/// Frames from one key frame to the next in videos for training.
+/// Frames from one key frame to the next in training data.
 const TRAINING_GOP: u32 = 8;
 
-/// Encodes frames (each `height * width * 3` bytes, RGB) as an MP4 file in memory, sealed with checksums. Equal frames
-/// give equal bytes with the same libraries.
+/// Encodes frames, `[height, width, 3]` RGB bytes each, as an MP4 file in memory with checksums. Equal frames give
+/// equal bytes with the same libraries.
 ///
 /// # Errors
-/// When there is no frame, a frame or a number has a wrong size, or FFmpeg has no such encoder.
+/// When there is no frame, a frame or a setting has a wrong size, or FFmpeg has no such encoder.
 pub fn encode<I>(width: usize, height: usize, fps: u32, encoding: Encoding, frames: I) -> Result<Vec<u8>>
 where
     I: IntoIterator,
@@ -116,19 +116,19 @@ fn failed(error: ffmpeg_next::Error) -> Error {
     Error::external("encoding a video with FFmpeg", error)
 }
 
-/// A video that is being written.
+/// Encodes a video frame by frame.
 pub struct Encoder {
     encoder: encoder::video::Encoder,
     output: format::context::Output,
     file: Memory,
     frame: frame::Video,
     packet: Packet,
-    /// Of the encoder, and of the file.
+    /// Time units of the encoder and of the file.
     units: [Rational; 2],
 }
 
 impl Encoder {
-    /// A video of frames of `width` by `height` pixels.
+    /// Begins a video of `width` × `height` pixels.
     pub fn new(width: usize, height: usize, fps: u32, encoding: Encoding) -> Result<Self> {
         crate::prepare();
         let even = width.is_multiple_of(2) && height.is_multiple_of(2);
@@ -146,7 +146,7 @@ impl Encoder {
         context.set_width(wide);
         context.set_height(high);
         context.set_format(pixels);
-        // Said, because players guess it from the size otherwise.
+        // Stated, because players guess it from the size otherwise.
         if pixels != Pixel::RGB24 {
             context.set_colorspace(Space::SMPTE170M);
             context.set_color_range(Range::MPEG);
@@ -177,7 +177,7 @@ impl Encoder {
 
     /// Adds the next frame, `[height, width, 3]` bytes. `index` counts frames from 0.
     pub fn add_frame(&mut self, rgb: &[u8], index: i64) -> Result<()> {
-        // The encoder may still hold the last frame's memory.
+        // The encoder may still use the last frame's memory.
         let mut frame = frame::Video::new(self.frame.format(), self.frame.width(), self.frame.height());
         colour::from_rgb(rgb, &mut frame);
         frame.set_pts(Some(index));
@@ -186,7 +186,7 @@ impl Encoder {
         self.receive()
     }
 
-    /// Moves what the encoder has finished into the file.
+    /// Writes the finished packets of the encoder to the file.
     fn receive(&mut self) -> Result<()> {
         loop {
             match self.encoder.receive_packet(&mut self.packet) {
@@ -203,7 +203,7 @@ impl Encoder {
         }
     }
 
-    /// The file.
+    /// Finishes the file and returns its bytes.
     pub fn finish(mut self) -> Result<Vec<u8>> {
         self.encoder.send_eof().map_err(failed)?;
         self.receive()?;
@@ -216,7 +216,7 @@ impl Encoder {
     }
 }
 
-/// A file in memory, which FFmpeg fills and we take.
+/// A file in memory that FFmpeg writes to.
 #[derive(Clone, Default)]
 struct Memory(Arc<Mutex<Cursor<Vec<u8>>>>);
 

@@ -12,6 +12,7 @@ mod colour;
 mod decode;
 mod encode;
 mod mp4;
+mod reducer;
 
 pub use cache::VideoCache;
 pub use decode::{DecoderPool, FrameRequest, Source, Video};

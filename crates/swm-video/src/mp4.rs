@@ -1,16 +1,15 @@
-//! Where the frames of an MP4 file are: its sample tables (ISO/IEC 14496-12), read without a library.
+//! The sample tables of MP4 files (ISO/IEC 14496-12), parsed without a library.
 //!
-//! Frame-exact access needs to know every coded picture's place, size, presentation time and whether decoding can begin
-//! there. Reading the tables takes microseconds where demultiplexing takes the whole file, and a damaged table is met
-//! by safe code.
+//! Access to single frames needs the position, size, presentation time and key flag of every encoded frame. Reading
+//! the tables takes microseconds, whereas demultiplexing reads the whole file, and safe code handles damaged tables.
 
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Bytes of a file's tables at most: an hour of video has less than one of these megabytes.
+/// Limit of a file's tables in bytes; an hour of video has less than a megabyte of them.
 const LARGEST_TABLES: u64 = 256 << 20;
 
-/// The box that [`seal`] appends: checksums of our own files.
+/// Identifier of the box with checksums that [`seal`] appends.
 const SEAL: [u8; 16] = *b"swm frame sums 1";
 
 type Result<T> = std::result::Result<T, String>;
@@ -24,12 +23,12 @@ pub enum Codec {
     Av1,
 }
 
-/// One coded picture, in decoding order.
+/// One encoded frame, in decoding order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Sample {
     pub offset: u64,
     pub size: u32,
-    /// When it is shown, in the track's units.
+    /// Presentation time, in the track's units.
     pub time: i64,
     /// Whether decoding can begin here.
     pub key: bool,
@@ -39,19 +38,19 @@ pub struct Sample {
 #[derive(Clone, Debug)]
 pub struct Index {
     pub codec: Codec,
-    /// What the decoder needs to begin: the record in the file's sample entry.
+    /// Parameters of the decoder: the record in the file's sample entry.
     pub extradata: Arc<[u8]>,
     pub width: usize,
     pub height: usize,
-    /// In decoding order.
+    /// The samples, in decoding order.
     pub samples: Vec<Sample>,
-    /// The sample of each frame, in the order of presentation. Samples that the edit list hides are not among them.
+    /// The sample of each frame, in presentation order, without those that the edit list hides.
     pub frames: Vec<u32>,
-    /// When each frame is shown, from the beginning of the presentation, in the track's units.
+    /// Presentation time of each frame, in the track's units.
     pub times: Vec<i64>,
-    /// The track's units in a second.
+    /// Track units per second.
     pub timescale: u32,
-    /// The sums of the samples, where the file was sealed.
+    /// Checksums of the samples, in files that were sealed.
     pub sums: Option<Vec<u32>>,
 }
 
@@ -100,7 +99,7 @@ impl Index {
                 }
                 b"moof" | b"styp" | b"sidx" => return Err("is cut into fragments".to_owned()),
                 b"ftyp" | b"mdat" | b"free" | b"skip" | b"wide" | b"meta" | b"udta" | b"pdin" => {}
-                // Were it ignored, a flipped bit could hide our checksums.
+                // Ignoring unknown boxes would let a flipped bit hide the checksums.
                 other => return Err(format!("has the unknown box '{}'", other.escape_ascii())),
             }
             at += size;
@@ -150,33 +149,33 @@ impl Index {
         Ok(Self { codec, extradata, width, height, samples, frames, times, timescale, sums: None })
     }
 
-    /// The sample at which decoding must begin to see this one: the last key sample before it that is not shown after
-    /// it.
+    /// Returns the sample at which decoding of a sample must begin: the last key sample before it that is not
+    /// presented after it.
     pub fn key_before(&self, sample: usize) -> usize {
         let shown = self.samples[sample].time;
         let begins = |i: &usize| self.samples[*i].key && self.samples[*i].time <= shown;
         (0..=sample).rev().find(begins).unwrap_or(0)
     }
 
-    /// Checks what was read of a sample.
+    /// Checks the bytes of a sample.
     pub fn check(&self, sample: usize, bytes: &[u8]) -> Result<()> {
         if bytes.is_empty() {
-            return Err(format!("is damaged: its coded picture {sample} is empty"));
+            return Err(format!("is damaged: its encoded frame {sample} is empty"));
         }
         match &self.sums {
             Some(sums) if sums[sample] != sum(bytes) => {
-                Err(format!("is damaged in coded picture {sample}: its checksum differs"))
+                Err(format!("is damaged in encoded frame {sample}: its checksum differs"))
             }
             _ => Ok(()),
         }
     }
 
-    /// When a frame is shown, in seconds.
+    /// Returns the presentation time of a frame in seconds.
     pub fn seconds(&self, frame: usize) -> f64 {
         self.times[frame] as f64 / f64::from(self.timescale)
     }
 
-    /// The frame that is shown nearest to a time in seconds.
+    /// Returns the frame whose presentation time is closest to a time in seconds.
     pub fn frame_at(&self, seconds: f64) -> Option<usize> {
         let after = self.times.partition_point(|&time| time as f64 / f64::from(self.timescale) < seconds);
         let candidates = [after.checked_sub(1), (after < self.times.len()).then_some(after)];
@@ -185,7 +184,7 @@ impl Index {
     }
 }
 
-/// Appends the checksums of the samples and the tables to a finished file, in a box that players skip.
+/// Appends checksums of the samples and the tables to a finished file, in a box that players skip.
 pub fn seal(file: &mut Vec<u8>) -> Result<()> {
     let read = |file: &[u8], offset: u64, bytes: &mut [u8]| {
         let from = usize::try_from(offset).ok().and_then(|at| file.get(at..)?.get(..bytes.len()));
@@ -208,8 +207,8 @@ pub fn seal(file: &mut Vec<u8>) -> Result<()> {
     Ok(())
 }
 
-/// A checksum against damage, not against malice. Every step is one-to-one, so that the 64 bits differ whenever one
-/// word does.
+/// Returns a checksum against accidental damage. Every step is one-to-one, so the 64 bits differ whenever one word
+/// differs.
 pub fn sum(bytes: &[u8]) -> u32 {
     const ODD: u64 = 0x9e37_79b9_7f4a_7c15;
     let mut sum = ODD ^ bytes.len() as u64;
@@ -225,7 +224,7 @@ pub fn sum(bytes: &[u8]) -> u32 {
     (sum >> 32) as u32 ^ sum as u32
 }
 
-/// The boxes within a box.
+/// Iterates over the boxes within a box.
 struct Boxes<'a>(&'a [u8]);
 
 impl<'a> Iterator for Boxes<'a> {
@@ -259,7 +258,7 @@ impl<'a> Boxes<'a> {
     }
 }
 
-/// The first box of that kind.
+/// Returns the first box of a kind.
 fn find<'a>(parent: &'a [u8], kind: &[u8; 4]) -> Result<Option<&'a [u8]>> {
     for child in Boxes(parent) {
         let (found, body) = child?;
@@ -270,10 +269,10 @@ fn find<'a>(parent: &'a [u8], kind: &[u8; 4]) -> Result<Option<&'a [u8]>> {
     Ok(None)
 }
 
-/// Big-endian numbers, one after another.
-struct Numbers<'a>(&'a [u8]);
+/// Reads big-endian integers in sequence.
+struct Integers<'a>(&'a [u8]);
 
-impl Numbers<'_> {
+impl Integers<'_> {
     fn bytes<const N: usize>(&mut self) -> Result<[u8; N]> {
         let (first, rest) = self.0.split_first_chunk::<N>().ok_or("one of its tables is cut short")?;
         self.0 = rest;
@@ -296,7 +295,7 @@ impl Numbers<'_> {
         Ok(i64::from_be_bytes(self.bytes()?))
     }
 
-    /// The number of entries that follow, each of `size` bytes.
+    /// Returns the number of entries that follow, each of `size` bytes.
     fn count(&mut self, size: usize) -> Result<usize> {
         let count = self.u32()? as usize;
         if count.checked_mul(size).is_none_or(|bytes| bytes > self.0.len()) {
@@ -306,31 +305,31 @@ impl Numbers<'_> {
     }
 }
 
-/// A box that begins with a version and flags: the version, and what follows.
-fn versioned(body: &[u8]) -> Result<(u8, Numbers<'_>)> {
-    let mut numbers = Numbers(body);
-    let [version, ..] = numbers.bytes::<4>()?;
-    Ok((version, numbers))
+/// Reads a box that begins with a version and flags: the version, and the rest.
+fn versioned(body: &[u8]) -> Result<(u8, Integers<'_>)> {
+    let mut integers = Integers(body);
+    let [version, ..] = integers.bytes::<4>()?;
+    Ok((version, integers))
 }
 
-/// Units in a second, of a header of a movie or a track.
+/// Returns the units per second in the header of a movie or a track.
 fn timescale(header: &[u8]) -> Result<u32> {
-    let (version, mut numbers) = versioned(header)?;
-    // When it was made and when it was changed.
-    if version == 1 { numbers.bytes::<16>().map(drop) } else { numbers.bytes::<8>().map(drop) }?;
-    match numbers.u32()? {
-        0 => Err("its clock does not tick".to_owned()),
+    let (version, mut integers) = versioned(header)?;
+    // Creation and modification time.
+    if version == 1 { integers.bytes::<16>().map(drop) } else { integers.bytes::<8>().map(drop) }?;
+    match integers.u32()? {
+        0 => Err("its time unit is 0".to_owned()),
         timescale => Ok(timescale),
     }
 }
 
-/// Codec, decoder record, width and height.
+/// Returns the codec, its decoder record, width and height.
 fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize)> {
-    /// Bytes of a visual sample entry before its boxes, and where its size stands.
+    /// Bytes of a visual sample entry before its boxes, and the offset of its size.
     const ENTRY: usize = 78;
     const SIZE: usize = 24;
-    let (_, numbers) = versioned(stsd)?;
-    let entries = numbers.0.get(4..).unwrap_or_default();
+    let (_, integers) = versioned(stsd)?;
+    let entries = integers.0.get(4..).unwrap_or_default();
     let (kind, entry) = Boxes(entries).next().ok_or("its video has no codec")??;
     let (codec, record) = match &kind {
         b"avc1" | b"avc3" => (Codec::H264, b"avcC"),
@@ -343,40 +342,40 @@ fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize)> {
     };
     let (fixed, boxes) = entry.split_at_checked(ENTRY).ok_or("the description of its codec is cut short")?;
     let size = |at: usize| usize::from(u16::from_be_bytes([fixed[at], fixed[at + 1]]));
-    // Boxes of other makers may follow in forms of their own; only ours must be whole.
+    // Boxes of other vendors may follow in unknown forms.
     let record = Boxes(boxes).flatten().find(|(kind, _)| kind == record).map_or(&[][..], |(_, body)| body);
-    // A decoder takes VP9 without a record.
+    // A decoder needs no record for VP9.
     let extradata = if codec == Codec::Vp9 { &[] } else { record };
     let (width, height) = (size(SIZE), size(SIZE + 2));
     if width == 0 || height == 0 {
-        return Err("its pictures have no size".to_owned());
+        return Err("its frames have no size".to_owned());
     }
     Ok((codec, extradata.into(), width, height))
 }
 
-/// What the presentation shows of a track.
+/// The part of a track that is presented.
 struct Edit {
-    /// The track's times that are shown.
+    /// The track's times that are presented.
     shown: Range<i64>,
-    /// What turns them into times of the presentation.
+    /// Added to these times for the time of the presentation.
     shift: i64,
 }
 
-/// The edit list. One piece of the track, perhaps after a pause, is what encoders write to hide their delay; more is
-/// film editing, of which a dataset needs none.
+/// Reads the edit list. Encoders write one segment, perhaps after a pause, to hide their delay. More segments are
+/// refused.
 fn edit(trak: &[u8], movie_scale: u32, timescale: u32) -> Result<Edit> {
     let mut edit = Edit { shown: i64::MIN..i64::MAX, shift: 0 };
     let Some(edts) = find(trak, b"edts")? else { return Ok(edit) };
     let Some(elst) = find(edts, b"elst")? else { return Ok(edit) };
-    let (version, mut numbers) = versioned(elst)?;
+    let (version, mut integers) = versioned(elst)?;
     let (mut start, mut pieces) = (0_i64, 0);
-    for _ in 0..numbers.count(if version == 1 { 20 } else { 12 })? {
+    for _ in 0..integers.count(if version == 1 { 20 } else { 12 })? {
         let (duration, from) = if version == 1 {
-            (numbers.u64()?, numbers.i64()?)
+            (integers.u64()?, integers.i64()?)
         } else {
-            (numbers.u32()?.into(), numbers.i32()?.into())
+            (integers.u32()?.into(), integers.i32()?.into())
         };
-        numbers.u32()?; // its speed
+        integers.u32()?; // its speed
         let units = u128::from(duration) * u128::from(timescale) / u128::from(movie_scale);
         let units = i64::try_from(units).unwrap_or(i64::MAX);
         if from >= 0 {
@@ -389,7 +388,8 @@ fn edit(trak: &[u8], movie_scale: u32, timescale: u32) -> Result<Edit> {
     if pieces > 1 { Err("is edited from several pieces".to_owned()) } else { Ok(edit) }
 }
 
-/// All samples, in decoding order.
+/// Reads all samples, in decoding order.
+#[allow(clippy::too_many_lines, reason = "reads the six tables of samples in sequence")]
 fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
     let table = |kind: &[u8; 4]| find(stbl, kind)?.ok_or(format!("its table '{}' is missing", kind.escape_ascii()));
     // Sizes.
@@ -397,7 +397,7 @@ fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
     let same = sizes.u32()?;
     let count = if same == 0 { sizes.count(4)? } else { sizes.u32()? as usize };
     if same != 0 && u64::from(same) * count as u64 > length {
-        return Err("is shorter than its pictures".to_owned());
+        return Err("is shorter than its frames".to_owned());
     }
     let mut samples = vec![Sample { offset: 0, size: same, time: 0, key: false }; count];
     if same == 0 {
@@ -405,7 +405,7 @@ fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
             sample.size = sizes.u32()?;
         }
     }
-    // Decoding times, and what shifts them to presentation times.
+    // Decoding times, and their offsets to presentation times.
     let (_, mut durations) = versioned(table(b"stts")?)?;
     let (mut at, mut time) = (0, 0_i64);
     for _ in 0..durations.count(8)? {
@@ -417,13 +417,13 @@ fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
         at = at.saturating_add(n);
     }
     if at < count {
-        return Err("some of its pictures have no time".to_owned());
+        return Err("some of its frames have no time".to_owned());
     }
     if let Some(ctts) = find(stbl, b"ctts")? {
         let (_, mut shifts) = versioned(ctts)?;
         let mut at = 0_usize;
         for _ in 0..shifts.count(8)? {
-            // Version 0 says unsigned, but writers of negative shifts exist.
+            // Version 0 is unsigned by the standard, but writers of negative offsets exist.
             let (n, shift) = (shifts.u32()? as usize, shifts.i32()?);
             samples
                 .iter_mut()
@@ -433,7 +433,7 @@ fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
             at = at.saturating_add(n);
         }
     }
-    // Where decoding can begin: everywhere, unless a table says where.
+    // Key frames: every sample, unless a table lists them.
     match find(stbl, b"stss")? {
         None => samples.iter_mut().for_each(|sample| sample.key = true),
         Some(stss) => {
@@ -441,11 +441,11 @@ fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
             for _ in 0..keys.count(4)? {
                 let number = keys.u32()? as usize;
                 let sample = number.checked_sub(1).and_then(|i| samples.get_mut(i));
-                sample.ok_or("names a key picture that does not exist")?.key = true;
+                sample.ok_or("names a key frame that does not exist")?.key = true;
             }
         }
     }
-    // Places: samples follow each other within chunks, which have the places.
+    // Positions: samples follow each other within chunks, whose offsets are in a table.
     let (wide, chunks) = match find(stbl, b"stco")? {
         Some(stco) => (false, stco),
         None => (true, table(b"co64")?),
@@ -453,7 +453,8 @@ fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
     let (_, mut chunks) = versioned(chunks)?;
     let n = chunks.count(if wide { 8 } else { 4 })?;
     let (_, mut table) = versioned(table(b"stsc")?)?;
-    // Runs of chunks: the first chunk (from 1), the samples in each, and which description, of which we read one.
+    // Runs of chunks: the first chunk (from 1), its number of samples, and the index of the description, of which
+    // only the first is read.
     let mut runs = vec![];
     for _ in 0..table.count(12)? {
         runs.push((table.u32()? as usize, table.u32()? as usize));
@@ -468,15 +469,15 @@ fn samples(stbl: &[u8], length: u64) -> Result<Vec<Sample>> {
         let mut offset = if wide { chunks.u64()? } else { chunks.u32()?.into() };
         for sample in samples.iter_mut().skip(at).take(per_chunk) {
             sample.offset = offset;
-            offset = offset.checked_add(sample.size.into()).ok_or("a picture lies beyond its end")?;
+            offset = offset.checked_add(sample.size.into()).ok_or("a frame lies beyond its end")?;
             if offset > length {
-                return Err("ends before its last picture".to_owned());
+                return Err("ends before its last frame".to_owned());
             }
         }
         at = at.saturating_add(per_chunk);
     }
     if at < count {
-        return Err("some of its pictures have no place".to_owned());
+        return Err("some of its frames have no position".to_owned());
     }
     Ok(samples)
 }

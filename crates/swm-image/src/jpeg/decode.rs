@@ -64,7 +64,7 @@ impl Kernel for DecodeScan<'_> {
 type PlaneTables<'a> = [[&'a HuffmanTable; 2]; 3];
 
 /// Decodes the coefficients of a scan and transforms them into the planes.
-// Over 60 lines, because the state of the scan is shared by all of it and calls would cost a tenth of the speed.
+#[allow(clippy::too_many_lines, reason = "the state of the scan is shared by the whole loop")]
 #[inline(always)]
 fn decode_planes<L: Level>(header: &Header, scan: &[u8], tables: &Tables, planes: &mut Planes) -> Option<()> {
     let (rows, columns) = header.mcu_grid();

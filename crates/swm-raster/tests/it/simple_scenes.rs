@@ -72,7 +72,7 @@ fn depths_of_shapes_are_exact() {
         let mut far = scene.clone();
         far.camera.far = 2e4;
         far.geoms[0].position[1] += 1e4;
-        far.camera.frustum = [-1e-4, 1e-4, -1e-4, 1e-4];
+        far.camera.frustum = [-2e-5, 2e-5, -2e-5, 2e-5];
         let seen = middle(&depths(&far, &Assets::default()));
         assert!((seen - nearest - 1e4).abs() < 0.05, "{shape:?}: {seen}");
     }

@@ -108,6 +108,7 @@ impl Axis {
 
     /// Returns the cell of a coordinate, and the position within it from 0 to 1.
     #[inline(always)]
+    #[allow(clippy::manual_clamp, reason = "`clamp` would keep NaN")]
     pub(crate) fn cell(&self, x: f32) -> (f32, f32) {
         // Position among the inner lines. Values far outside and NaN are clamped.
         let from = ((x + self.half - self.pad) / self.step).max(-1.0).min(1e6);

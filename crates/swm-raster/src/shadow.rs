@@ -32,6 +32,7 @@ pub(crate) struct Shadow {
 impl Shadow {
     /// Draws the map of a light, with at most `side` texels along a side. Geoms nearer to it than `scene.camera.near`
     /// cast no shadow.
+    #[allow(clippy::too_many_lines, reason = "one setup of the view and its crop")]
     pub fn cast(&mut self, scene: &Scene, assets: &Assets, light: &Light, side: usize) {
         self.view = None;
         let forward = unit(light.direction);

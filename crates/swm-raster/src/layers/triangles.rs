@@ -123,6 +123,7 @@ impl Layers {
     /// Draws a triangle, given by the equations of its corners' weights divided by `w`, within a region whose left
     /// edge is the x of `base`.
     #[inline(always)]
+    #[allow(clippy::too_many_arguments, reason = "the equations of one triangle")]
     fn fill(
         &mut self,
         simd: impl F32x8,

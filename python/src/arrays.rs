@@ -1,4 +1,4 @@
-//! Columns of batches as numpy arrays, and back.
+//! Conversion between the columns of batches and numpy arrays.
 
 use numpy::ndarray::{ArrayView, IxDyn};
 use numpy::{Element, PyArray1, PyArrayDyn, PyArrayMethods as _, PyReadonlyArrayDyn, PyUntypedArrayMethods as _};
@@ -7,8 +7,8 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use swm::core::{Batch, ColumnSpec, DType, Schema};
 
-/// Calls `$go::<T>($($arg),*)` with the element type of a column.
-macro_rules! typed {
+/// Calls `$go::<T>($($arg),*)` with the Rust type of a [`DType`].
+macro_rules! with_dtype {
     ($dtype:expr, $go:ident($($arg:expr),*)) => {
         match $dtype {
             DType::Bool => $go::<bool>($($arg),*),
@@ -21,8 +21,8 @@ macro_rules! typed {
     };
 }
 
-/// A copy of some rows of a column, of shape `[rows, ..]`.
-pub fn copied<'py>(py: Python<'py>, batch: &Batch, column: usize, rows: &[usize]) -> PyResult<Bound<'py, PyAny>> {
+/// Copies some rows of a column into an array `[rows, ..]`.
+pub fn copy_rows<'py>(py: Python<'py>, batch: &Batch, column: usize, rows: &[usize]) -> PyResult<Bound<'py, PyAny>> {
     let spec = &batch.schema().columns()[column];
     let n = spec.row_bytes();
     let mut bytes = Vec::with_capacity(rows.len() * n);
@@ -32,27 +32,33 @@ pub fn copied<'py>(py: Python<'py>, batch: &Batch, column: usize, rows: &[usize]
     array(py, spec.dtype, &with_rows(&[rows.len()], spec), &bytes)
 }
 
-/// An array of these bytes, which need not be aligned.
+/// Copies bytes, which need not be aligned, into an array of this type and shape.
+///
+/// # Panics
+/// If the number of bytes does not match the shape.
 pub fn array<'py>(py: Python<'py>, dtype: DType, shape: &[usize], bytes: &[u8]) -> PyResult<Bound<'py, PyAny>> {
     fn make<'py, T: Element + Copy>(py: Python<'py>, shape: &[usize], bytes: &[u8]) -> PyResult<Bound<'py, PyAny>> {
         let array = PyArrayDyn::<T>::zeros(py, IxDyn(shape), false);
-        // SAFETY: the array was just made, is contiguous, and nobody else knows of it. It has as many bytes as are given
-        // (asserted), and every pattern of them is a value: booleans are stored as 0 and 1.
-        #[allow(unsafe_code)]
+        // SAFETY: the new array is contiguous and has no other reference. It has as many bytes as are given (asserted), and
+        // they are valid values of `T`: batches store booleans as 0 and 1.
+        #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
         unsafe {
-            assert_eq!(array.len() * size_of::<T>(), bytes.len(), "as many bytes as the shape says");
+            assert_eq!(array.len() * size_of::<T>(), bytes.len(), "the bytes must fill the shape");
             std::ptr::copy_nonoverlapping(bytes.as_ptr(), array.data().cast::<u8>(), bytes.len());
         }
         Ok(array.into_any())
     }
-    typed!(dtype, make(py, shape, bytes))
+    with_dtype!(dtype, make(py, shape, bytes))
 }
 
-/// A view of every row of a column, `[rows, 1, ..]`: of one moment. It follows what is written to the batch.
+/// An array that shares the memory of a column, so it shows later writes to the batch.
+///
+/// # Shapes
+/// `[rows, 1, ..]` with `time`, else `[rows, ..]`.
 ///
 /// # Safety
-/// The batch must stay where it is, and as long as it is, for as long as `owner` lives.
-#[allow(unsafe_code)]
+/// The batch must neither move nor be resized while `owner` lives.
+#[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
 pub unsafe fn view<'py>(
     batch: &Batch,
     column: usize,
@@ -64,37 +70,45 @@ pub unsafe fn view<'py>(
         shape: &[usize],
         owner: &Bound<'py, PyAny>,
     ) -> PyResult<Bound<'py, PyAny>> {
-        // SAFETY: columns are aligned to 64 bytes and hold values of this type; the caller vouches for their life.
+        // SAFETY: columns are aligned to 64 bytes and hold values of this type; the caller guarantees their lifetime.
+
         let view = unsafe { ArrayView::from_shape_ptr(IxDyn(shape), bytes.as_ptr().cast::<T>()) };
-        // SAFETY: as above.
+        // SAFETY: `owner` keeps the memory alive, as the caller guarantees.
         Ok(unsafe { PyArrayDyn::borrow_from_array(&view, owner.clone()) }.into_any())
     }
     let spec = &batch.schema().columns()[column];
     let rows = [batch.rows(), 1];
     let shape = with_rows(if time { &rows } else { &rows[..1] }, spec);
     let bytes = batch.bytes(column);
-    // SAFETY: handed on.
-    unsafe { typed!(spec.dtype, make(bytes, &shape, owner)) }
+    // SAFETY: the caller's guarantee is passed on.
+    unsafe { with_dtype!(spec.dtype, make(bytes, &shape, owner)) }
 }
 
 fn with_rows(rows: &[usize], spec: &ColumnSpec) -> Vec<usize> {
     rows.iter().chain(&spec.shape).copied().collect()
 }
 
-/// Copies the numbers of an array, in row-major order, over a column. The array must be of the column's type already.
+/// Copies the elements of an array, in row-major order, into a column of the same type.
+///
+/// # Errors
+/// `TypeError` for another type, `ValueError` for another number of elements or an array that is not contiguous.
 pub fn fill(batch: &mut Batch, column: usize, given: &Bound<'_, PyAny>) -> PyResult<()> {
     fn go<T: Element + Copy>(to: &mut [u8], given: &Bound<'_, PyAny>, what: &str) -> PyResult<()> {
         let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, T>>() else {
-            return Err(PyTypeError::new_err(format!("{what}: expected a numpy array of its type, got {given:?}")));
+            return Err(PyTypeError::new_err(format!(
+                "{what}: expected a numpy array of the column's type, got {given:?}"
+            )));
         };
-        let slice = array.as_slice().map_err(|_| PyValueError::new_err(format!("{what}: not contiguous")))?;
+        let slice = array.as_slice().map_err(|_| {
+            PyValueError::new_err(format!("{what}: expected a contiguous array; call numpy.ascontiguousarray"))
+        })?;
         if size_of_val(slice) != to.len() {
             let (n, expected) = (slice.len(), to.len() / size_of::<T>());
-            let problem = format!("{what}: got {n} numbers (shape {:?}), expected {expected}", array.shape());
+            let problem = format!("{what}: got {n} values (shape {:?}), expected {expected}", array.shape());
             return Err(PyValueError::new_err(problem));
         }
-        // SAFETY: numpy's elements of these types are plain bytes, and both have the same number of them (checked).
-        #[allow(unsafe_code)]
+        // SAFETY: elements of these types are plain data, and both sides have the same number of bytes (checked above).
+        #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
         unsafe {
             std::ptr::copy_nonoverlapping(slice.as_ptr().cast::<u8>(), to.as_mut_ptr(), to.len());
         }
@@ -102,29 +116,33 @@ pub fn fill(batch: &mut Batch, column: usize, given: &Bound<'_, PyAny>) -> PyRes
     }
     let spec = batch.schema().columns()[column].clone();
     let to = batch.bytes_mut(column);
-    typed!(spec.dtype, go(to, given, &spec.name))
+    with_dtype!(spec.dtype, go(to, given, &spec.name))
 }
 
-/// A batch of arrays `[rows, ..]` of the types batches have.
+/// A batch with a column for every array `[rows, ..]` of `infos`.
+///
+/// # Errors
+/// `TypeError` for a type that batches cannot hold, `ValueError` if the arrays differ in their number of rows.
 pub fn batch(infos: &Bound<'_, PyDict>) -> PyResult<Batch> {
     let mut columns = vec![];
     let mut rows = None;
     for (name, value) in infos {
         let name: String = name.extract()?;
-        let (dtype, shape) = form(&value).ok_or_else(|| {
+        let (dtype, shape) = dtype_and_shape(&value).ok_or_else(|| {
             let message = format!("{name}: expected a numpy array of bool, uint8, int32, int64, float32 or float64");
             PyTypeError::new_err(message)
         })?;
         let Some((&first, rest)) = shape.split_first() else {
-            return Err(PyValueError::new_err(format!("{name}: has no rows")));
+            return Err(PyValueError::new_err(format!("{name}: got an array without dimensions, expected [rows, ..]")));
         };
         if *rows.get_or_insert(first) != first {
-            let message = format!("{name}: has {first} rows, other columns {}", rows.unwrap_or_default());
+            let message =
+                format!("{name}: got {first} rows, expected {} as in the other columns", rows.unwrap_or_default());
             return Err(PyValueError::new_err(message));
         }
         columns.push(ColumnSpec::new(name, dtype, rest));
     }
-    let schema = Schema::new(columns).map_err(crate::errors::raised)?;
+    let schema = Schema::new(columns).map_err(crate::errors::to_py_err)?;
     let mut batch = Batch::zeros(&schema, rows.unwrap_or(0));
     for (column, (_, value)) in infos.iter().enumerate() {
         fill(&mut batch, column, &value)?;
@@ -132,8 +150,8 @@ pub fn batch(infos: &Bound<'_, PyDict>) -> PyResult<Batch> {
     Ok(batch)
 }
 
-/// The type and shape of a numpy array, if a batch can hold it.
-fn form(value: &Bound<'_, PyAny>) -> Option<(DType, Vec<usize>)> {
+/// The type and shape of a numpy array; `None` if batches cannot hold its type.
+fn dtype_and_shape(value: &Bound<'_, PyAny>) -> Option<(DType, Vec<usize>)> {
     let array = value.cast::<numpy::PyUntypedArray>().ok()?;
     let is = |name: &str| array.dtype().str().is_ok_and(|s| s.to_string_lossy() == name);
     let all = [DType::Bool, DType::U8, DType::Int32, DType::Int64, DType::Float32, DType::Float64];
@@ -141,8 +159,8 @@ fn form(value: &Bound<'_, PyAny>) -> Option<(DType, Vec<usize>)> {
     Some((dtype, array.shape().to_vec()))
 }
 
-/// The numbers of a `float32` array, with its shape checked.
-pub fn numbers(what: &str, given: &Bound<'_, PyAny>, shape: &[usize]) -> PyResult<Vec<f32>> {
+/// The elements of a `float32` array, after a check of its shape. `what` names the array in errors.
+pub fn f32_values(what: &str, given: &Bound<'_, PyAny>, shape: &[usize]) -> PyResult<Vec<f32>> {
     let Ok(array) = given.extract::<PyReadonlyArrayDyn<'_, f32>>() else {
         return Err(PyTypeError::new_err(format!(
             "{what}: expected a float32 array of shape {shape:?}, got {given:?}"
@@ -155,7 +173,7 @@ pub fn numbers(what: &str, given: &Bound<'_, PyAny>, shape: &[usize]) -> PyResul
     Ok(array.as_array().iter().copied().collect())
 }
 
-/// A `float32` array of this shape.
-pub fn floats<'py>(py: Python<'py>, numbers: &[f32], shape: &[usize]) -> PyResult<Bound<'py, PyAny>> {
-    Ok(PyArray1::from_slice(py, numbers).reshape(IxDyn(shape))?.into_any())
+/// A `float32` array of this shape with these elements.
+pub fn f32_array<'py>(py: Python<'py>, values: &[f32], shape: &[usize]) -> PyResult<Bound<'py, PyAny>> {
+    Ok(PyArray1::from_slice(py, values).reshape(IxDyn(shape))?.into_any())
 }

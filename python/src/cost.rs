@@ -1,7 +1,7 @@
-//! [`PythonCost`]: a model of Python's as a [`CostModel`], through an object that adapts it (`stable_worldmodel.planning`).
+//! [`PythonCost`]: a [`CostModel`] implemented in Python, called through the adapter class of `stable_worldmodel.planning`.
 
 use crate::arrays;
-use crate::errors::{foreign, raised};
+use crate::errors::{from_py_err, to_py_err};
 use crate::model::Model;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -11,48 +11,66 @@ use swm::core::{
 };
 use swm::plan::{ActionScale, Score, SimulatorCost};
 
-/// What to plan in.
-pub struct Planned {
+/// A model to plan with.
+pub struct PlanningModel {
     pub cost: Box<dyn CostModel>,
-    /// What the model means by an action; none where it says nothing.
+    /// The scale of the model's actions; `None` if the model does not define one.
     pub scale: Option<ActionScale>,
+    /// The hash of the model's weights, for checkpoints.
     pub weights: Option<String>,
-    /// Whether Python is asked.
+    /// Whether the model is implemented in Python.
     pub python: bool,
 }
 
-/// What somebody gave as a model: one of ours, an adapted one of Python's, or nothing for the world itself.
-pub fn model(given: Option<&Bound<'_, PyAny>>, spec: &EnvSpec, action_block: usize) -> PyResult<Planned> {
+/// The model that Python passes: a checkpoint of the engine, an adapter of a Python model, or `None` for the simulator.
+///
+/// # Errors
+/// If the simulator cannot be made, the checkpoint cannot be loaded or the adapter lacks an attribute.
+pub fn planning_model(
+    given: Option<&Bound<'_, PyAny>>,
+    spec: &EnvSpec,
+    action_block: usize,
+) -> PyResult<PlanningModel> {
     let Some(given) = given else {
-        let env = swm::env(&spec.id).map_err(raised)?;
+        let env = swm::env(&spec.id).map_err(to_py_err)?;
         let scale = ActionScale::unscaled(spec);
         let cost = SimulatorCost::new(move || env.env(), scale.clone(), action_block, Score::default());
-        return Ok(Planned { cost: Box::new(cost.map_err(raised)?), scale: Some(scale), weights: None, python: false });
+        return Ok(PlanningModel {
+            cost: Box::new(cost.map_err(to_py_err)?),
+            scale: Some(scale),
+            weights: None,
+            python: false,
+        });
     };
     if let Ok(model) = given.cast::<Model>() {
         let model = model.get();
-        let (cost, scale) = model.planned()?;
-        return Ok(Planned { cost, scale: Some(scale), weights: Some(model.weights.clone()), python: false });
+        let (cost, scale) = model.cost_model()?;
+        return Ok(PlanningModel { cost, scale: Some(scale), weights: Some(model.weights.clone()), python: false });
     }
     let cost = Box::new(PythonCost::new(given)?);
-    Ok(Planned { cost, scale: None, weights: None, python: true })
+    Ok(PlanningModel { cost, scale: None, weights: None, python: true })
 }
 
-/// A model of Python's.
+/// A cost model implemented in Python.
 pub struct PythonCost {
-    /// It has `observe(infos, envs)`, `cost(candidates)`, and where it says so `cost_and_gradient`, `encode`, `predict`,
-    /// `predict_vjp`, `constrain`, `constrain_vjp`: all of numpy arrays.
+    /// Has the methods `observe(infos)` and `cost(candidates)`, and depending on its flags `cost_and_gradient`, `encode`,
+    /// `predict`, `predict_vjp`, `constrain` and `constrain_vjp`. All of them take and return numpy arrays.
     adapter: Py<PyAny>,
     gradient: bool,
+    /// The latent dimension, if the model has latent dynamics.
     latent: Option<usize>,
     constrained: bool,
-    /// Environments that were observed last.
+    /// The number of environments in the last observation.
     envs: usize,
-    /// What went wrong where a trait lends no place for an error; the next question is answered by it.
+    /// The error of a trait method that cannot return one; the next call returns it.
     failed: RefCell<Option<Error>>,
 }
 
 impl PythonCost {
+    /// Wraps an adapter.
+    ///
+    /// # Errors
+    /// If the adapter lacks one of its flags.
     pub fn new(adapter: &Bound<'_, PyAny>) -> PyResult<Self> {
         Ok(Self {
             gradient: adapter.getattr("has_gradient")?.extract()?,
@@ -64,43 +82,43 @@ impl PythonCost {
         })
     }
 
-    /// Notes that the adapter has observed so many environments already.
+    /// Records that the adapter has already observed `envs` environments.
     pub fn observed(&mut self, envs: usize) {
         self.envs = envs;
     }
 
     /// Calls a method of the adapter.
-    fn ask<T>(&self, work: impl FnOnce(&Bound<'_, PyAny>) -> PyResult<T>) -> Result<T> {
+    fn call<T>(&self, work: impl FnOnce(&Bound<'_, PyAny>) -> PyResult<T>) -> Result<T> {
         if let Some(error) = self.failed.take() {
             return Err(error);
         }
-        Python::attach(|py| work(self.adapter.bind(py))).map_err(foreign)
+        Python::attach(|py| work(self.adapter.bind(py))).map_err(from_py_err)
     }
 }
 
-/// Candidates as an array `[envs, samples, horizon, dim]`.
+/// The candidates as an array `[envs, samples, horizon, dim]`.
 fn candidates<'py>(py: Python<'py>, given: Candidates<'_>) -> PyResult<Bound<'py, PyAny>> {
-    arrays::floats(py, given.actions, &[given.envs, given.samples, given.horizon, given.dim])
+    arrays::f32_array(py, given.actions, &[given.envs, given.samples, given.horizon, given.dim])
 }
 
 impl CostModel for PythonCost {
     fn observe(&mut self, infos: &Batch, envs: &[usize]) -> Result<()> {
         self.envs = envs.len();
-        self.ask(|adapter| {
+        self.call(|adapter| {
             let py = adapter.py();
             let dict = PyDict::new(py);
             for (i, column) in infos.schema().columns().iter().enumerate() {
-                dict.set_item(&column.name, arrays::copied(py, infos, i, envs)?)?;
+                dict.set_item(&column.name, arrays::copy_rows(py, infos, i, envs)?)?;
             }
             adapter.call_method1("observe", (dict,)).map(drop)
         })
     }
 
     fn cost(&mut self, given: Candidates<'_>, costs: &mut [f32]) -> Result<()> {
-        self.ask(|adapter| {
+        self.call(|adapter| {
             let returned = adapter.call_method1("cost", (candidates(adapter.py(), given)?,))?;
             let shape = [given.envs, given.samples];
-            costs.copy_from_slice(&arrays::numbers("the costs that the model returned", &returned, &shape)?);
+            costs.copy_from_slice(&arrays::f32_values("the costs of the model", &returned, &shape)?);
             Ok(())
         })
     }
@@ -120,12 +138,12 @@ impl CostModel for PythonCost {
 
 impl DifferentiableCost for PythonCost {
     fn cost_and_gradient(&mut self, given: Candidates<'_>, costs: &mut [f32], gradient: &mut [f32]) -> Result<()> {
-        self.ask(|adapter| {
+        self.call(|adapter| {
             let shape = [given.envs, given.samples, given.horizon, given.dim];
             let returned = adapter.call_method1("cost_and_gradient", (candidates(adapter.py(), given)?,))?;
             let (cost, slope): (Bound<'_, PyAny>, Bound<'_, PyAny>) = returned.extract()?;
-            costs.copy_from_slice(&arrays::numbers("the costs that the model returned", &cost, &shape[..2])?);
-            gradient.copy_from_slice(&arrays::numbers("the gradient of the model's costs", &slope, &shape)?);
+            costs.copy_from_slice(&arrays::f32_values("the costs of the model", &cost, &shape[..2])?);
+            gradient.copy_from_slice(&arrays::f32_values("the gradient of the model's costs", &slope, &shape)?);
             Ok(())
         })
     }
@@ -138,22 +156,22 @@ impl LatentDynamics for PythonCost {
 
     fn encode(&mut self, start: &mut [f32], goal: &mut [f32]) -> Result<()> {
         let shape = [self.envs, self.latent_dim()];
-        self.ask(|adapter| {
+        self.call(|adapter| {
             let (from, to): (Bound<'_, PyAny>, Bound<'_, PyAny>) = adapter.call_method0("encode")?.extract()?;
-            start.copy_from_slice(&arrays::numbers("the latents of the present", &from, &shape)?);
-            goal.copy_from_slice(&arrays::numbers("the latents of the goal", &to, &shape)?);
+            start.copy_from_slice(&arrays::f32_values("the latents of the current observation", &from, &shape)?);
+            goal.copy_from_slice(&arrays::f32_values("the latents of the goal", &to, &shape)?);
             Ok(())
         })
     }
 
     fn predict(&mut self, latents: &[f32], actions: &[f32], next: &mut [f32]) -> Result<()> {
         let dim = self.latent_dim();
-        self.ask(|adapter| {
+        self.call(|adapter| {
             let (py, n) = (adapter.py(), latents.len() / dim);
             let given =
-                (arrays::floats(py, latents, &[n, dim])?, arrays::floats(py, actions, &[n, actions.len() / n])?);
+                (arrays::f32_array(py, latents, &[n, dim])?, arrays::f32_array(py, actions, &[n, actions.len() / n])?);
             let returned = adapter.call_method1("predict", given)?;
-            next.copy_from_slice(&arrays::numbers("the latents that the model predicted", &returned, &[n, dim])?);
+            next.copy_from_slice(&arrays::f32_values("the predicted latents", &returned, &[n, dim])?);
             Ok(())
         })
     }
@@ -167,18 +185,18 @@ impl LatentDynamics for PythonCost {
         action_gradient: &mut [f32],
     ) -> Result<()> {
         let dim = self.latent_dim();
-        self.ask(|adapter| {
+        self.call(|adapter| {
             let (py, n) = (adapter.py(), latents.len() / dim);
             let width = actions.len() / n;
             let given = (
-                arrays::floats(py, latents, &[n, dim])?,
-                arrays::floats(py, actions, &[n, width])?,
-                arrays::floats(py, next_gradient, &[n, dim])?,
+                arrays::f32_array(py, latents, &[n, dim])?,
+                arrays::f32_array(py, actions, &[n, width])?,
+                arrays::f32_array(py, next_gradient, &[n, dim])?,
             );
             let returned = adapter.call_method1("predict_vjp", given)?;
             let (states, acts): (Bound<'_, PyAny>, Bound<'_, PyAny>) = returned.extract()?;
-            latent_gradient.copy_from_slice(&arrays::numbers("a prediction's gradient", &states, &[n, dim])?);
-            action_gradient.copy_from_slice(&arrays::numbers("a prediction's gradient", &acts, &[n, width])?);
+            latent_gradient.copy_from_slice(&arrays::f32_values("the gradient of a prediction", &states, &[n, dim])?);
+            action_gradient.copy_from_slice(&arrays::f32_values("the gradient of a prediction", &acts, &[n, width])?);
             Ok(())
         })
     }
@@ -186,7 +204,7 @@ impl LatentDynamics for PythonCost {
 
 impl Constrained for PythonCost {
     fn constraints(&self, horizon: usize) -> usize {
-        self.ask(|adapter| adapter.call_method1("constraints", (horizon,))?.extract()).unwrap_or_else(|error| {
+        self.call(|adapter| adapter.call_method1("constraints", (horizon,))?.extract()).unwrap_or_else(|error| {
             self.failed.replace(Some(error));
             1
         })
@@ -194,22 +212,22 @@ impl Constrained for PythonCost {
 
     fn constrain(&mut self, given: Candidates<'_>, values: &mut [f32]) -> Result<()> {
         let n = values.len() / (given.envs * given.samples);
-        self.ask(|adapter| {
+        self.call(|adapter| {
             let returned = adapter.call_method1("constrain", (candidates(adapter.py(), given)?,))?;
             let shape = [given.envs, given.samples, n];
-            values.copy_from_slice(&arrays::numbers("the constraints that the model returned", &returned, &shape)?);
+            values.copy_from_slice(&arrays::f32_values("the constraints of the model", &returned, &shape)?);
             Ok(())
         })
     }
 
     fn constrain_vjp(&mut self, given: Candidates<'_>, weights: &[f32], gradient: &mut [f32]) -> Result<()> {
         let n = weights.len() / (given.envs * given.samples);
-        self.ask(|adapter| {
+        self.call(|adapter| {
             let py = adapter.py();
-            let weights = arrays::floats(py, weights, &[given.envs, given.samples, n])?;
+            let weights = arrays::f32_array(py, weights, &[given.envs, given.samples, n])?;
             let returned = adapter.call_method1("constrain_vjp", (candidates(py, given)?, weights))?;
             let shape = [given.envs, given.samples, given.horizon, given.dim];
-            let added = arrays::numbers("the gradient of the model's constraints", &returned, &shape)?;
+            let added = arrays::f32_values("the gradient of the model's constraints", &returned, &shape)?;
             gradient.iter_mut().zip(added).for_each(|(to, more)| *to += more);
             Ok(())
         })

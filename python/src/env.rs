@@ -1,8 +1,8 @@
-//! [`NativeEnv`]: one environment of ours, for Gymnasium.
+//! [`NativeEnv`]: a single native environment, for Gymnasium.
 
 use crate::arrays;
 use crate::data::process;
-use crate::errors::raised;
+use crate::errors::to_py_err;
 use crate::world::{factors, reset_options, stack};
 use numpy::PyReadonlyArray1;
 use pyo3::exceptions::PyTypeError;
@@ -11,13 +11,13 @@ use pyo3::types::{PyBytes, PyDict};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use swm::core::{Action, Batch, CameraView, DType, Env, Error, FrameMut, Key, Schema, Snapshot, thread_budget};
 
-/// One environment.
+/// A single native environment.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
 pub struct NativeEnv(Mutex<State>);
 
 struct State {
     env: Box<dyn Env>,
-    /// What it shows, one row.
+    /// The info columns of the current step, one row.
     row: Batch,
 }
 
@@ -28,7 +28,7 @@ impl NativeEnv {
 }
 
 impl State {
-    /// Its observation, as arrays of their own.
+    /// Observes the environment and copies its info columns into arrays.
     fn observe<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         self.env.observe(&mut self.row.row_mut(0));
         let dict = PyDict::new(py);
@@ -49,26 +49,26 @@ impl NativeEnv {
             let row = Batch::zeros(&Schema::new(env.spec().columns.clone())?, 1);
             Ok(State { env, row })
         });
-        made.map(|state| Self(Mutex::new(state))).map_err(raised)
+        made.map(|state| Self(Mutex::new(state))).map_err(to_py_err)
     }
 
-    /// What it is, as JSON.
+    /// The specification as JSON.
     fn spec(&self) -> String {
         swm::describe::spec(self.lock().env.spec()).to_string()
     }
 
-    /// Starts an episode; returns what it shows.
+    /// Starts an episode and returns the info columns.
     fn reset<'py>(&self, py: Python<'py>, seed: u64, options: &str) -> PyResult<Bound<'py, PyDict>> {
         let options = reset_options(options)?;
         let mut state = self.lock();
         let state = &mut *state;
-        py.detach(|| state.env.reset(seed, &options)).map_err(raised)?;
+        py.detach(|| state.env.reset(seed, &options)).map_err(to_py_err)?;
         state.observe(py)
     }
 
-    /// Applies an action, a `float32` or `int64` array; returns what it shows, the reward, whether the episode is over because
-    /// of where the world is, and because of the clock, and whether the goal is reached.
-    #[allow(clippy::type_complexity)]
+    /// Applies an action, a `float32` or `int64` array `[dim]`. Returns the info columns, the reward, and the flags
+    /// terminated, truncated and success.
+    #[allow(clippy::type_complexity, reason = "a Python tuple")]
     fn step<'py>(
         &self,
         py: Python<'py>,
@@ -76,32 +76,34 @@ impl NativeEnv {
     ) -> PyResult<(Bound<'py, PyDict>, f64, bool, bool, bool)> {
         let mut state = self.lock();
         let state = &mut *state;
-        let stepped = if let Ok(numbers) = action.extract::<PyReadonlyArray1<'_, f32>>() {
-            let numbers = numbers.as_slice()?;
-            py.detach(|| state.env.step(Action::Continuous(numbers)))
+        let stepped = if let Ok(values) = action.extract::<PyReadonlyArray1<'_, f32>>() {
+            let values = values.as_slice()?;
+            py.detach(|| state.env.step(Action::Continuous(values)))
         } else if let Ok(integers) = action.extract::<PyReadonlyArray1<'_, i64>>() {
             let integers = integers.as_slice()?;
             py.detach(|| state.env.step(Action::Discrete(integers)))
         } else {
-            return Err(PyTypeError::new_err(format!("expected a float32 or int64 array as action, got {action:?}")));
+            return Err(PyTypeError::new_err(format!(
+                "step: expected a float32 or int64 array as action, got {action:?}"
+            )));
         };
-        let transition = stepped.map_err(raised)?;
+        let transition = stepped.map_err(to_py_err)?;
         let success = state.env.is_success();
         Ok((state.observe(py)?, transition.reward, transition.terminated, transition.truncated, success))
     }
 
-    /// Its picture, `[height, width, 3]`, or with `goal` that of its goal.
+    /// Renders the environment, or its goal with `goal`, into an array `[height, width, 3]` of `uint8`.
     fn render<'py>(&self, py: Python<'py>, height: usize, width: usize, goal: bool) -> PyResult<Bound<'py, PyAny>> {
         let mut state = self.lock();
         let state = &mut *state;
         let mut rgb = vec![0; height * width * 3];
         let frame = FrameMut::new(width, height, &mut rgb);
         let draw = || if goal { state.env.render_goal(frame) } else { state.env.render(frame) };
-        process::work(py, || thread_budget::all(draw)).map_err(raised)?;
+        process::detached(py, || thread_budget::all(draw)).map_err(to_py_err)?;
         arrays::array(py, DType::U8, &[height, width, 3], &rgb)
     }
 
-    /// What a view of it shows, such as `wrist:depth`.
+    /// Renders a camera view, such as `wrist:depth`.
     fn render_view<'py>(
         &self,
         py: Python<'py>,
@@ -109,49 +111,49 @@ impl NativeEnv {
         height: usize,
         width: usize,
     ) -> PyResult<Bound<'py, PyAny>> {
-        let view = CameraView::parse(view).map_err(raised)?;
+        let view = CameraView::parse(view).map_err(to_py_err)?;
         let column = view.column(height, width);
         let mut bytes = vec![0; column.row_bytes()];
         let mut state = self.lock();
         let state = &mut *state;
-        process::work(py, || thread_budget::all(|| state.env.render_view(&view, height, width, &mut bytes)))
-            .map_err(raised)?;
+        process::detached(py, || thread_budget::all(|| state.env.render_view(&view, height, width, &mut bytes)))
+            .map_err(to_py_err)?;
         arrays::array(py, column.dtype, &column.shape, &bytes)
     }
 
-    /// The factors of the episode, by key.
+    /// The factors of the current episode, by key.
     fn factors<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         factors(py, &*self.lock().env)
     }
 
-    /// How far the world is from its goal.
+    /// The distance of the state from the goal.
     fn goal_distance(&self) -> f64 {
         self.lock().env.goal_distance()
     }
 
-    /// Whether the goal is reached now.
+    /// Whether the state satisfies the goal.
     fn is_success(&self) -> bool {
         self.lock().env.is_success()
     }
 
-    /// Chooses a new reachable goal.
+    /// Samples a new reachable goal.
     fn sample_goal(&self, seed: u64) -> PyResult<()> {
-        self.lock().env.sample_goal(Key::new(seed).with("goal")).map_err(raised)
+        self.lock().env.sample_goal(Key::new(seed).with("goal")).map_err(to_py_err)
     }
 
-    /// The full state.
+    /// The full state, randomness included.
     fn snapshot<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
         PyBytes::new(py, &self.lock().env.snapshot().0)
     }
 
-    /// Puts a state back; returns what it shows.
+    /// Restores a snapshot and returns the info columns.
     fn restore<'py>(&self, py: Python<'py>, state: Vec<u8>) -> PyResult<Bound<'py, PyDict>> {
         let mut this = self.lock();
-        this.env.restore(&Snapshot(state)).map_err(raised)?;
+        this.env.restore(&Snapshot(state)).map_err(to_py_err)?;
         this.observe(py)
     }
 
-    /// Continues from a row of a dataset towards another one.
+    /// Restores the state of a dataset row, with the state of another row as the goal. Returns the info columns.
     fn restore_from<'py>(
         &self,
         py: Python<'py>,
@@ -161,10 +163,10 @@ impl NativeEnv {
         let (start, goal) = (arrays::batch(start)?, arrays::batch(goal)?);
         if start.rows() != 1 || goal.rows() != 1 {
             let given = format!("{} rows of a start, {} of a goal", start.rows(), goal.rows());
-            return Err(raised(Error::mismatch("restoring from a dataset", given, "one of each")));
+            return Err(to_py_err(Error::mismatch("restoring from a dataset", given, "one of each")));
         }
         let mut this = self.lock();
-        this.env.restore_from(start.row(0), goal.row(0)).map_err(raised)?;
+        this.env.restore_from(start.row(0), goal.row(0)).map_err(to_py_err)?;
         this.observe(py)
     }
 }

@@ -1,12 +1,12 @@
-//! Our errors as Python's exceptions, and Python's signals in our loops.
+//! Conversion between engine errors and Python exceptions, and Python's signals in the engine's loops.
 
 use pyo3::exceptions::{PyFileNotFoundError, PyKeyboardInterrupt, PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use std::time::{Duration, Instant};
 use swm::core::Error;
 
-/// The exception that says what an error says. What Python raised comes back as it was raised.
-pub fn raised(error: Error) -> PyErr {
+/// The Python exception of an engine error. An exception that passed through the engine is returned unchanged.
+pub fn to_py_err(error: Error) -> PyErr {
     let message = error.to_string();
     match error {
         Error::Embedder(inner) => match inner.downcast::<PyErr>() {
@@ -15,7 +15,7 @@ pub fn raised(error: Error) -> PyErr {
         },
         Error::Interrupted => PyKeyboardInterrupt::new_err(message),
         Error::UnknownName { kind: "dataset" | "checkpoint", .. } => PyFileNotFoundError::new_err(message),
-        // The system's number makes Python choose FileNotFoundError, PermissionError and their like.
+        // Python derives FileNotFoundError, PermissionError, … from the operating system's error number.
         Error::Io { source, path, .. } => match source.raw_os_error() {
             Some(number) => PyOSError::new_err((number, message, path.display().to_string())),
             None => PyOSError::new_err(message),
@@ -25,25 +25,28 @@ pub fn raised(error: Error) -> PyErr {
     }
 }
 
-/// An exception on its way through the engine.
-pub fn foreign(error: PyErr) -> Error {
+/// Wraps a Python exception in an engine error, so that [`to_py_err`] can return it unchanged.
+pub fn from_py_err(error: PyErr) -> Error {
     Error::Embedder(Box::new(error))
 }
 
-/// A poll for long loops: lets Python handle its signals, so that Ctrl-C raises `KeyboardInterrupt`, at most every twenty
-/// milliseconds.
-pub fn signals() -> impl FnMut() -> swm::core::Result<()> {
+/// A poll function for long loops: runs Python's signal handlers, so that Ctrl-C raises `KeyboardInterrupt`, at most every
+/// 20 ms.
+pub fn signal_poll() -> impl FnMut() -> swm::core::Result<()> {
     let mut last = Instant::now();
     move || {
         if last.elapsed() < Duration::from_millis(20) {
             return Ok(());
         }
         last = Instant::now();
-        Python::attach(|py| py.check_signals()).map_err(foreign)
+        Python::attach(|py| py.check_signals()).map_err(from_py_err)
     }
 }
 
-/// Text that should be JSON.
+/// Parses JSON. `what` names the text in the error.
+///
+/// # Errors
+/// `ValueError` if the text is not JSON of this type.
 pub fn json<T: serde::de::DeserializeOwned>(what: &str, text: &str) -> PyResult<T> {
     serde_json::from_str(text).map_err(|error| PyValueError::new_err(format!("{what}: {error}")))
 }

@@ -1,29 +1,29 @@
-//! [`InProcess`]: Gymnasium environments in this very interpreter, through the bridge that worker processes use.
+//! [`InProcess`]: Gymnasium environments in this interpreter, through the bridge that worker processes also use.
 
-use crate::errors::foreign;
+use crate::errors::from_py_err;
 use pyo3::prelude::*;
 use pyo3::types::{PyByteArray, PyBytes, PyModule};
 use swm::gym::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport};
 
-/// The way to an environment of this interpreter.
+/// A [`Transport`] to an environment in this interpreter.
 pub struct InProcess {
-    /// Makes the environment: takes nothing, returns a `Bridge`.
+    /// A callable without arguments that makes the environment and returns a `Bridge`.
     make: Py<PyAny>,
     bridge: Option<Py<PyAny>>,
-    /// What the bridge writes into. Its views keep it from being resized.
+    /// The memory that the bridge reads and writes. The views of the bridge prevent a resize.
     memory: Option<Py<PyByteArray>>,
 }
 
 impl InProcess {
-    /// The way to what `make` makes.
+    /// A transport to the environment that `make` makes.
     pub fn new(make: Py<PyAny>) -> Self {
         Self { make, bridge: None, memory: None }
     }
 }
 
-/// Whatever Python raised goes back to it as it is: asking again would raise it again.
+/// A Python exception as a failure that is not retried: another attempt would raise it again.
 fn refused(error: PyErr) -> Failure {
-    Failure::Refused(foreign(error))
+    Failure::Refused(from_py_err(error))
 }
 
 impl Transport for InProcess {
@@ -47,7 +47,9 @@ impl Transport for InProcess {
 
     fn call(&mut self, request: Request<'_>) -> Result<(), Failure> {
         Python::attach(|py| {
-            let Some(bridge) = &self.bridge else { return Err(Failure::Lost("it was not made yet".to_owned())) };
+            let Some(bridge) = &self.bridge else {
+                return Err(Failure::Lost("the environment was not described yet".to_owned()));
+            };
             let payload = PyBytes::new(py, request.payload());
             bridge.bind(py).call_method1("handle", (request.op(), payload)).map(drop).map_err(refused)
         })
@@ -55,9 +57,9 @@ impl Transport for InProcess {
 
     fn memory(&self) -> &[u8] {
         let Some(memory) = &self.memory else { return &[] };
-        // SAFETY: the array is ours and the bridge's, whose views forbid a change of its size. The bridge writes only inside
-        // of `call`, which borrows this exclusively.
-        #[allow(unsafe_code)]
+        // SAFETY: only this object and the bridge hold the array, and the views of the bridge prevent a resize. The bridge
+        // writes only during `call`, which borrows `self` exclusively.
+        #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
         Python::attach(|py| unsafe {
             let memory = memory.bind(py);
             std::slice::from_raw_parts(memory.data(), memory.len())
@@ -66,8 +68,8 @@ impl Transport for InProcess {
 
     fn memory_mut(&mut self) -> &mut [u8] {
         let Some(memory) = &self.memory else { return &mut [] };
-        // SAFETY: as above; this is borrowed exclusively.
-        #[allow(unsafe_code)]
+        // SAFETY: as in `memory`; `self` is borrowed exclusively.
+        #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
         Python::attach(|py| unsafe {
             let memory = memory.bind(py);
             std::slice::from_raw_parts_mut(memory.data(), memory.len())
@@ -75,7 +77,7 @@ impl Transport for InProcess {
     }
 }
 
-/// The module with the class `Bridge`, loaded once. With `craftax`, `swm_craftax` becomes importable: it needs JAX.
+/// The Python module with the class `Bridge`, loaded once. With `craftax`, also loads `swm_craftax`, which needs JAX.
 #[pyfunction]
 pub fn bridge(py: Python<'_>, craftax: bool) -> PyResult<Bound<'_, PyModule>> {
     let modules = py.import("sys")?.getattr("modules")?;

@@ -1,30 +1,31 @@
-//! The Python extension `stable_worldmodel._engine`: thin bindings, a file a concept. What users see is the Python package
-//! beside this crate; nothing here is meant to be called by them.
+//! The Python extension module `stable_worldmodel._engine`: thin bindings, one concept per file. Users call the Python
+//! package `stable_worldmodel`; this module is private to it.
 //!
-//! - [`errors`]: what goes wrong, as Python's exceptions; signals.
+//! - [`errors`]: engine errors as Python exceptions, and signal handling.
 //! - [`arrays`]: batches as numpy arrays, and back.
-//! - [`world`], [`policy`]: many environments at once and who acts in them.
-//! - [`cost`], [`solver`], [`model`]: models of Python's to plan in, planning, models of our own.
+//! - [`world`], [`policy`]: batches of environments and the policies that act in them.
+//! - [`cost`], [`solver`], [`model`]: models implemented in Python, planning, and the engine's checkpoints.
 //! - [`data`]: datasets, the loader, the replay buffer, conversion.
-//! - [`gym`]: environments of others, in this interpreter.
-//! - [`env`](mod@env), [`pictures`]: one environment, and visual wrappers, for Gymnasium.
+//! - [`gym`]: third-party Gymnasium environments in this interpreter.
+//! - [`env`](mod@env), [`frames`]: a single environment, and visual wrappers, for Gymnasium.
+//! - [`listing`]: the engine's registries, and the command line.
 
 mod arrays;
 mod cost;
 mod data;
 mod env;
 mod errors;
+mod frames;
 mod gym;
 mod listing;
 mod model;
-mod pictures;
 mod policy;
 mod solver;
 mod world;
 
 use pyo3::prelude::*;
 
-/// The engine.
+/// The extension module `stable_worldmodel._engine`.
 #[pymodule]
 mod _engine {
     #[pymodule_export]
@@ -34,19 +35,19 @@ mod _engine {
     #[pymodule_export]
     use super::data::replay::{ReplayBuffer, ReplaySampler};
     #[pymodule_export]
-    use super::data::work::{convert, detect, doctor, find_dataset, inspect, target};
+    use super::data::tools::{convert, detect, doctor, find_dataset, inspect, target};
     #[pymodule_export]
     use super::data::writer::Writer;
     #[pymodule_export]
     use super::env::NativeEnv;
+    #[pymodule_export]
+    use super::frames::{VisualWrappers, schedule};
     #[pymodule_export]
     use super::gym::bridge;
     #[pymodule_export]
     use super::listing::{command, envs, formats, home, solvers, spec, wrappers};
     #[pymodule_export]
     use super::model::Model;
-    #[pymodule_export]
-    use super::pictures::{Pictures, schedule};
     #[pymodule_export]
     use super::policy::Actor;
     #[pymodule_export]
@@ -58,7 +59,7 @@ mod _engine {
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
-        data::process::begin();
+        data::process::record_process();
         module.add("__version__", env!("CARGO_PKG_VERSION"))
     }
 }

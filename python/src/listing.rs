@@ -1,17 +1,17 @@
-//! What there is, as JSON, and the command line.
+//! The engine's registries as JSON, and the command line.
 
-use crate::errors::raised;
+use crate::errors::to_py_err;
 use clap::Parser as _;
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
 
-/// Ids of the environments.
+/// The ids of the native environments.
 #[pyfunction]
 pub fn envs() -> Vec<&'static str> {
     swm::ENVS.rows.iter().map(|row| row.id).collect()
 }
 
-/// What an environment is.
+/// The description of an environment, as JSON: spaces, info columns, factors, options, experts.
 #[pyfunction]
 pub fn spec(py: Python<'_>, id: &str) -> PyResult<String> {
     let described = py.detach(|| {
@@ -19,10 +19,10 @@ pub fn spec(py: Python<'_>, id: &str) -> PyResult<String> {
         let env = chosen.env()?;
         Ok(swm::describe::env(&chosen.entry, env.spec()).to_string())
     });
-    described.map_err(raised)
+    described.map_err(to_py_err)
 }
 
-/// The solvers and their settings.
+/// The default settings of every solver by its id, as JSON.
 #[pyfunction]
 pub fn solvers() -> String {
     let rows = swm::plan::SOLVERS.rows.iter();
@@ -30,7 +30,7 @@ pub fn solvers() -> String {
     Value::Object(all).to_string()
 }
 
-/// The visual wrappers and their settings.
+/// The settings of every visual wrapper by its id, as JSON.
 #[pyfunction]
 pub fn wrappers() -> String {
     let rows = swm::envs::wrappers::WRAPPERS.rows.iter();
@@ -38,25 +38,25 @@ pub fn wrappers() -> String {
     Value::Object(all).to_string()
 }
 
-/// The dataset formats.
+/// The ids of the dataset formats.
 #[pyfunction]
 pub fn formats() -> Vec<&'static str> {
     swm::data::FORMATS.rows.iter().map(|row| row.id).collect()
 }
 
-/// The folder everything without a path of its own lives in.
+/// The home folder: datasets and checkpoints given by name are in it.
 #[pyfunction]
 pub fn home() -> String {
     swm::home::home().display().to_string()
 }
 
-/// Runs the command line; returns its exit code.
+/// Runs the command line with these arguments (the program's name first) and returns its exit code.
 #[pyfunction]
-pub fn command(py: Python<'_>, words: Vec<String>) -> u8 {
-    py.detach(|| match swm::cli::Cli::try_parse_from(words) {
+pub fn command(py: Python<'_>, arguments: Vec<String>) -> u8 {
+    py.detach(|| match swm::cli::Cli::try_parse_from(arguments) {
         Ok(cli) => cli.run(),
         Err(error) => {
-            // Help and versions are printed as answers, wrong words as complaints; there is nobody left to tell if that fails.
+            // Prints help and versions to stdout and wrong arguments to stderr. A failure to print cannot be reported anywhere.
             let _ = error.print();
             u8::try_from(error.exit_code()).unwrap_or(2)
         }

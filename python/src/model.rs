@@ -1,7 +1,7 @@
-//! [`Model`]: a checkpoint of ours, to plan in.
+//! [`Model`]: a checkpoint of the engine, to plan with or to act with.
 
 use crate::arrays;
-use crate::errors::{json, raised};
+use crate::errors::{json, to_py_err};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde_json::{Value, json};
@@ -22,28 +22,32 @@ pub struct Model {
     scale: ActionScale,
     /// The hash of its weights.
     pub weights: String,
-    card: String,
-    /// The cost that answers [`Model::cost`], made when it is first asked.
-    asked: Mutex<Option<Box<dyn CostModel>>>,
-    /// The policy that answers [`Model::act`], and for how many environments it was made.
-    acting: Mutex<Option<(Box<dyn Policy>, usize)>>,
-    /// The environment it was trained on.
+    /// The checkpoint info as JSON.
+    info: String,
+    /// The cost model of [`Model::cost`], made by the first call.
+    cost: Mutex<Option<Box<dyn CostModel>>>,
+    /// The policy of [`Model::act`] and its number of environments, made by the first call.
+    policy: Mutex<Option<(Box<dyn Policy>, usize)>>,
+    /// The id of the environment it was trained on.
     env: Option<String>,
 }
 
 impl Model {
-    /// A cost of its own, and what it means by an action.
-    pub fn planned(&self) -> PyResult<(Box<dyn CostModel>, ActionScale)> {
-        let loaded = load(&self.path, &self.device).map_err(raised)?;
+    /// A new cost model and the scale of its actions.
+    ///
+    /// # Errors
+    /// If the checkpoint cannot be loaded, holds a policy without a cost, or the objective is not valid.
+    pub fn cost_model(&self) -> PyResult<(Box<dyn CostModel>, ActionScale)> {
+        let loaded = load(&self.path, &self.device).map_err(to_py_err)?;
         let cost = loaded.cost().ok_or_else(|| {
             let what = format!("checkpoint {}", self.path.display());
-            raised(Error::config(what, "it acts and does not predict", "let it act: FeedForwardPolicy"))
+            to_py_err(Error::config(what, "it acts and does not predict", "let it act: FeedForwardPolicy"))
         })?;
         let objective: ObjectiveConfig = match &self.objective {
             Value::Null => ObjectiveConfig::default(),
             given => json("objective", &given.to_string())?,
         };
-        Ok((objective.apply(cost).map_err(raised)?, self.scale.clone()))
+        Ok((objective.apply(cost).map_err(to_py_err)?, self.scale.clone()))
     }
 }
 
@@ -51,7 +55,7 @@ impl Model {
 impl Model {
     #[new]
     fn new(py: Python<'_>, name: &str, device: &str, objective: &str) -> PyResult<Self> {
-        let device = swm::models::device::parse(device).map_err(raised)?;
+        let device = swm::models::device::parse(device).map_err(to_py_err)?;
         let objective: Value = json("objective", objective)?;
         let (path, info) = py
             .detach(|| {
@@ -59,7 +63,7 @@ impl Model {
                 let info = load(&path, &device)?.info()?;
                 Ok((path, info))
             })
-            .map_err(raised)?;
+            .map_err(to_py_err)?;
         let CheckpointInfo { family, weights, config, dataset_info, image_size, action_block, history, .. } = &info;
         let described = json!({
             "family": family,
@@ -78,54 +82,60 @@ impl Model {
             objective,
             scale: info.dataset_info.action.clone(),
             weights: info.weights.clone(),
-            card: described.to_string(),
-            asked: Mutex::new(None),
-            acting: Mutex::new(None),
+            info: described.to_string(),
+            cost: Mutex::new(None),
+            policy: Mutex::new(None),
             env: info.dataset_info.env.clone(),
         })
     }
 
-    /// What it is, as JSON.
+    /// The checkpoint info as JSON.
     #[getter]
-    fn card(&self) -> &str {
-        &self.card
+    fn info(&self) -> &str {
+        &self.info
     }
 
-    /// Where it is.
+    /// The path of the checkpoint.
     #[getter]
     fn path(&self) -> String {
         self.path.display().to_string()
     }
 
-    /// What a model that acts does: an action a row of infos, in the environment's units.
+    /// The actions of a checkpoint with a policy, in the environment's units.
+    ///
+    /// # Shapes
+    /// `infos`: `[envs, ..]`; result: `[envs, dim]`.
     fn act<'py>(&self, py: Python<'py>, infos: &Bound<'py, PyDict>) -> PyResult<Bound<'py, PyAny>> {
         let batch = arrays::batch(infos)?;
         let rows = batch.rows();
-        let mut acting = self.acting.lock().unwrap_or_else(PoisonError::into_inner);
-        let acting = &mut *acting;
+        let mut policy = self.policy.lock().unwrap_or_else(PoisonError::into_inner);
+        let cached = &mut *policy;
         let actions = py.detach(|| {
             let what = || format!("checkpoint {}", self.path.display());
             let Some(id) = &self.env else {
-                return Err(Error::config(what(), "it does not say which environment it acts in", "train it again"));
+                return Err(Error::config(what(), "its manifest does not name an environment", "train it again"));
             };
             let spec = swm::env(id)?.env()?.spec().clone();
-            if acting.as_ref().is_none_or(|(_, slots)| *slots != rows) {
+            if cached.as_ref().is_none_or(|(_, slots)| *slots != rows) {
                 let policy = load(&self.path, &self.device)?.policy(&spec, rows).ok_or_else(|| {
                     Error::config(what(), "it predicts and does not act", "plan in it: get_cost, MPCPolicy")
                 })??;
-                *acting = Some((policy, rows));
+                *cached = Some((policy, rows));
             }
             let mut actions = Batch::zeros(&Schema::new([spec.action_column()])?, rows);
-            if let Some((policy, _)) = acting {
+            if let Some((policy, _)) = cached {
                 (0..rows).for_each(|slot| policy.begin(slot, Key::new(0).at(slot as u64)));
                 policy.act(&batch, &vec![true; rows], &mut actions)?;
             }
             Ok(actions)
         });
-        arrays::copied(py, &actions.map_err(raised)?, 0, &(0..rows).collect::<Vec<_>>())
+        arrays::copy_rows(py, &actions.map_err(to_py_err)?, 0, &(0..rows).collect::<Vec<_>>())
     }
 
-    /// What plans cost: `[envs, samples]` for infos of `envs` rows and candidates `[envs, samples, horizon, dim]`.
+    /// The costs of candidate action sequences.
+    ///
+    /// # Shapes
+    /// `infos`: `[envs, ..]`; `candidates`: `[envs, samples, horizon, dim]`; result: `[envs, samples]`.
     fn cost<'py>(
         &self,
         py: Python<'py>,
@@ -133,20 +143,20 @@ impl Model {
         candidates: &Bound<'py, PyAny>,
     ) -> PyResult<Bound<'py, PyAny>> {
         let shape: [usize; 4] = candidates.getattr("shape")?.extract()?;
-        let actions = arrays::numbers("action candidates", candidates, &shape)?;
+        let actions = arrays::f32_values("action candidates", candidates, &shape)?;
         let [envs, samples, horizon, dim] = shape;
         let batch = arrays::batch(infos)?;
         let mut costs = vec![0.0; envs * samples];
-        let mut asked = self.asked.lock().unwrap_or_else(PoisonError::into_inner);
-        let cost = match &mut *asked {
+        let mut cached = self.cost.lock().unwrap_or_else(PoisonError::into_inner);
+        let cost = match &mut *cached {
             Some(cost) => cost,
-            none => none.insert(self.planned()?.0),
+            none => none.insert(self.cost_model()?.0),
         };
         py.detach(|| {
             cost.observe(&batch, &(0..envs).collect::<Vec<_>>())?;
             cost.cost(Candidates { actions: &actions, envs, samples, horizon, dim }, &mut costs)
         })
-        .map_err(raised)?;
-        arrays::floats(py, &costs, &[envs, samples])
+        .map_err(to_py_err)?;
+        arrays::f32_array(py, &costs, &[envs, samples])
     }
 }

@@ -1,7 +1,7 @@
-//! [`Actor`]: who acts, as the engine sees it: policies of ours, and of Python's.
+//! [`Actor`]: a policy bound to a world: a policy of the engine, or one implemented in Python.
 
-use crate::cost::model;
-use crate::errors::{foreign, json, raised};
+use crate::cost::planning_model;
+use crate::errors::{from_py_err, json, to_py_err};
 use crate::world::World;
 use crate::{arrays, solver};
 use numpy::PyArray1;
@@ -11,17 +11,17 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use swm::core::{Batch, EnvPool, Key, Named as _, Policy, RandomPolicy, Result};
 use swm::plan::{ActionScale, MpcConfig, MpcPolicy, TraceLog};
 
-/// Who acts in one world.
+/// A policy for the environments of one world.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
 pub struct Actor {
     policy: Mutex<Box<dyn Policy>>,
     log: Option<TraceLog>,
-    /// The hash of the weights behind it.
+    /// The hash of the policy's weights, for checkpoints.
     pub weights: Option<String>,
 }
 
 impl Actor {
-    /// The policy, for as long as nobody else uses it.
+    /// Locks the policy.
     pub fn lock(&self) -> PyResult<MutexGuard<'_, Box<dyn Policy>>> {
         Ok(self.policy.lock().unwrap_or_else(PoisonError::into_inner))
     }
@@ -37,43 +37,43 @@ impl Actor {
 
 #[pymethods]
 impl Actor {
-    /// Uniformly at random.
+    /// The policy that samples actions uniformly.
     #[staticmethod]
     fn random(world: &World, seed: Option<u64>) -> PyResult<Self> {
         let world = world.lock()?;
         Ok(Self::new(Box::new(RandomPolicy::new(world.spec(), world.pool().len())), seed))
     }
 
-    /// One of the environment's experts, the first by default.
+    /// An expert of the environment by name.
     #[staticmethod]
     fn expert(world: &World, name: &str, seed: Option<u64>) -> PyResult<Self> {
         let world = world.lock()?;
-        let entry = swm::env(&world.spec().id).map_err(raised)?.entry;
-        Ok(Self::new(swm::resolver::scripted(&entry, name, &world).map_err(raised)?, seed))
+        let entry = swm::env(&world.spec().id).map_err(to_py_err)?.entry;
+        Ok(Self::new(swm::resolver::scripted(&entry, name, &world).map_err(to_py_err)?, seed))
     }
 
-    /// A checkpoint that acts by itself.
+    /// The policy of a checkpoint.
     #[staticmethod]
     fn checkpoint(py: Python<'_>, world: &World, name: &str) -> PyResult<Self> {
         let world = world.lock()?;
         let (spec, slots) = (world.spec().clone(), world.pool().len());
-        let (policy, card) = py.detach(|| swm::resolver::direct(name, &spec, slots)).map_err(raised)?;
-        Ok(Self { weights: Some(card.weights), ..Self::new(policy, None) })
+        let (policy, info) = py.detach(|| swm::resolver::direct(name, &spec, slots)).map_err(to_py_err)?;
+        Ok(Self { weights: Some(info.weights), ..Self::new(policy, None) })
     }
 
-    /// What `call(infos, active, fresh)` returns: `infos` as [`World::infos`] gives them, which slots act, and which of them
-    /// begin an episode; it returns an array of actions.
+    /// A policy implemented in Python: `call(infos, active, fresh)` returns an array of actions. `infos` are those of
+    /// [`World::infos`]; `active` marks the slots that act, `fresh` those that begin an episode.
     #[staticmethod]
-    fn calling(world: &Bound<'_, World>, call: Py<PyAny>) -> PyResult<Self> {
+    fn python(world: &Bound<'_, World>, call: Py<PyAny>) -> PyResult<Self> {
         let infos = World::infos(world)?.unbind();
         let fresh = vec![false; world.get().lock()?.pool().len()];
-        Ok(Self::new(Box::new(Calling { call, infos, fresh }), None))
+        Ok(Self::new(Box::new(PythonPolicy { call, infos, fresh }), None))
     }
 
-    /// One that plans in a model: a [`crate::model::Model`], an object of `stable_worldmodel.planning` that adapts one of
-    /// Python's, or `None` for the world itself.
+    /// A planning policy. `model` is a [`crate::model::Model`], an adapter of `stable_worldmodel.planning`, or `None` for the
+    /// simulator.
     #[staticmethod]
-    #[allow(clippy::too_many_arguments)]
+    #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
     fn planning(
         py: Python<'_>,
         world: &World,
@@ -81,40 +81,40 @@ impl Actor {
         settings: &str,
         mpc: &str,
         scale: Option<(Vec<f32>, Vec<f32>)>,
-        given: Option<&Bound<'_, PyAny>>,
+        model: Option<&Bound<'_, PyAny>>,
         seed: Option<u64>,
     ) -> PyResult<Self> {
         let world = world.lock()?;
         let (spec, slots) = (world.spec().clone(), world.pool().len());
         let mpc: MpcConfig = json("plan", mpc)?;
-        let made = solver::made(solver, settings)?;
+        let search = solver::make(solver, settings)?;
         let scale = scale.map(|(mean, std)| ActionScale { mean, std });
-        let model = model(given, &spec, mpc.action_block)?;
+        let model = planning_model(model, &spec, mpc.action_block)?;
         let scale = scale.or(model.scale).unwrap_or_else(|| ActionScale::unscaled(&spec));
         let mut cost = model.cost;
         let actions = swm::plan::ActionKind::of(&spec.action_space);
-        swm::plan::pairing(solver, &mut *cost, actions).map_err(raised)?;
+        swm::plan::pairing(solver, &mut *cost, actions).map_err(to_py_err)?;
         let log = TraceLog::default();
-        let policy = py.detach(|| MpcPolicy::new(made, cost, mpc, scale, &spec, slots)).map_err(raised)?;
+        let policy = py.detach(|| MpcPolicy::new(search, cost, mpc, scale, &spec, slots)).map_err(to_py_err)?;
         let policy = policy.traced(log.clone());
-        let policy: Box<dyn Policy> = if model.python { Box::new(Here(policy)) } else { Box::new(policy) };
+        let policy: Box<dyn Policy> = if model.python { Box::new(OnThisThread(policy)) } else { Box::new(policy) };
         Ok(Self { log: Some(log), weights: model.weights, ..Self::new(policy, seed) })
     }
 
-    /// The plans made since the last call, as JSON.
+    /// Returns and clears the records of the plans since the last call, as JSON.
     fn take_plans(&self) -> String {
         let plans = self.log.as_ref().map(TraceLog::take).unwrap_or_default();
         serde_json::json!(plans).to_string()
     }
 
-    /// Experts of an environment.
+    /// The names of an environment's experts.
     #[staticmethod]
     fn experts(env: &str) -> PyResult<Vec<&'static str>> {
-        Ok(swm::env(env).map_err(raised)?.entry.experts.iter().map(|expert| expert.id()).collect())
+        Ok(swm::env(env).map_err(to_py_err)?.entry.experts.iter().map(|expert| expert.id()).collect())
     }
 }
 
-/// A policy with a seed of its own beside the episode's.
+/// A policy whose random stream depends on a seed in addition to the episode's key.
 struct Seeded {
     policy: Box<dyn Policy>,
     seed: u64,
@@ -142,16 +142,16 @@ impl Policy for Seeded {
     }
 }
 
-/// A policy that asks Python: it is asked on the thread that called, where Ctrl-C arrives.
-struct Here(MpcPolicy);
+/// A planning policy with a Python model, which it calls on the current thread, where Python handles Ctrl-C.
+struct OnThisThread(MpcPolicy);
 
-impl Policy for Here {
+impl Policy for OnThisThread {
     fn begin(&mut self, slot: usize, key: Key) {
         self.0.begin(slot, key);
     }
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
-        solver::here(|| self.0.act(infos, active, actions))
+        solver::on_this_thread(|| self.0.act(infos, active, actions))
     }
 
     fn observe_envs(&mut self, envs: &EnvPool, active: &[bool]) -> Result<()> {
@@ -167,28 +167,28 @@ impl Policy for Here {
     }
 }
 
-/// A policy of Python's.
-struct Calling {
+/// A policy implemented in Python.
+struct PythonPolicy {
     call: Py<PyAny>,
     infos: Py<PyDict>,
     fresh: Vec<bool>,
 }
 
-impl Policy for Calling {
+impl Policy for PythonPolicy {
     fn begin(&mut self, slot: usize, _key: Key) {
         self.fresh[slot] = true;
     }
 
     fn act(&mut self, _infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
         let Self { call, infos, fresh } = self;
-        let asked = Python::attach(|py| {
+        let called = Python::attach(|py| {
             let infos = infos.bind(py).copy()?;
             let flags = |flags: &[bool]| PyArray1::from_slice(py, flags);
             let given = call.bind(py).call1((infos, flags(active), flags(fresh)))?;
             arrays::fill(actions, 0, &given)
         });
         fresh.fill(false);
-        asked.map_err(foreign)
+        called.map_err(from_py_err)
     }
 
     fn uses_threads(&self) -> bool {

@@ -1,8 +1,8 @@
-//! Planning outside of worlds: one problem for every environment of some infos.
+//! Planning outside of a world: [`solve`] plans once for every row of some infos.
 
 use crate::arrays;
 use crate::cost::PythonCost;
-use crate::errors::{json, raised};
+use crate::errors::{json, to_py_err};
 use crate::model::Model;
 use crate::world::plan_key;
 use pyo3::prelude::*;
@@ -12,11 +12,11 @@ use serde_json::Value;
 use swm::core::{Error, Key, PlanProblem, PlanSpace, Solver};
 use swm::plan::SOLVERS;
 
-/// Works with this very thread as one of a pool's. Solvers ask a model from whichever thread of the pool they work on, and
-/// Python hands its signals to the main thread only: so a model of Python's is asked where Ctrl-C arrives.
-pub fn here<T: Send>(work: impl FnOnce() -> T + Send) -> T {
+/// Runs `work` in a thread pool that consists of the current thread. Solvers call the model from any thread of their pool,
+/// and Python handles signals only in the main thread, so a Python model must be called there for Ctrl-C to work.
+pub fn on_this_thread<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     thread_local! {
-        // A pool that this thread belongs to cannot end before it does.
+        // Leaked, because a pool that a thread belongs to cannot be dropped before the thread ends.
         static POOL: Option<&'static ThreadPool> =
             ThreadPoolBuilder::new().use_current_thread().build().ok().map(|pool| &*Box::leak(Box::new(pool)));
     }
@@ -26,18 +26,23 @@ pub fn here<T: Send>(work: impl FnOnce() -> T + Send) -> T {
     }
 }
 
-/// A solver with these settings, JSON.
-pub fn made(solver: &str, settings: &str) -> PyResult<Box<dyn Solver>> {
+/// A solver by id, with settings in JSON.
+///
+/// # Errors
+/// For an unknown solver or setting.
+pub fn make(solver: &str, settings: &str) -> PyResult<Box<dyn Solver>> {
     let settings: Value = json("solver settings", settings)?;
-    (SOLVERS.get(solver).map_err(raised)?.make)(&settings).map_err(raised)
+    (SOLVERS.get(solver).map_err(to_py_err)?.make)(&settings).map_err(to_py_err)
 }
 
-/// Plans for every row of `infos`, with the key `(seed, number, row)`. `low` and `high` bound the numbers of a model step, or
-/// `choices` are its choices; `init` is `[envs, horizon, dim]`. Returns actions `[envs, horizon, dim]`, their costs and how
-/// the searches went, as JSON.
+/// Plans for every row of `infos`, with the random key `(seed, call, row)`. `low` and `high` bound the elements of a model
+/// step, or `choices` are the sizes of its discrete choices. Returns the actions, their costs, and the search traces as JSON.
+///
+/// # Shapes
+/// `infos`: `[envs, ..]`; `init` and actions: `[envs, horizon, dim]`; costs: `[envs]`.
 #[pyfunction]
-#[pyo3(signature = (solver, settings, model, infos, envs, horizon, low, high, choices, init, seed, number))]
-#[allow(clippy::too_many_arguments)]
+#[pyo3(signature = (solver, settings, model, infos, envs, horizon, low, high, choices, init, seed, call))]
+#[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
 pub fn solve<'py>(
     py: Python<'py>,
     solver: &str,
@@ -51,19 +56,19 @@ pub fn solve<'py>(
     choices: Option<Vec<usize>>,
     init: Option<&Bound<'py, PyAny>>,
     seed: u64,
-    number: u64,
+    call: u64,
 ) -> PyResult<(Bound<'py, PyAny>, Bound<'py, PyAny>, String)> {
-    let mut solver = made(solver, settings)?;
+    let mut solver = make(solver, settings)?;
     let space = match &choices {
         Some(choices) => PlanSpace::Discrete { choices },
         None => PlanSpace::Continuous { low: &low, high: &high },
     };
     let dim = space.dim();
-    let init = init.map(|init| arrays::numbers("init_action", init, &[envs, horizon, dim])).transpose()?;
-    let keys: Vec<Key> = (0..envs).map(|row| plan_key(seed).at(number).at(row as u64)).collect();
+    let init = init.map(|init| arrays::f32_values("init_action", init, &[envs, horizon, dim])).transpose()?;
+    let keys: Vec<Key> = (0..envs).map(|row| plan_key(seed).at(call).at(row as u64)).collect();
     let problem = PlanProblem { horizon, space, keys: &keys, init: init.as_deref(), deadline: None };
     let plan = if let Ok(model) = model.cast::<Model>() {
-        let (mut cost, _) = model.get().planned()?;
+        let (mut cost, _) = model.get().cost_model()?;
         let batch = arrays::batch(infos)?;
         py.detach(|| {
             cost.observe(&batch, &(0..envs).collect::<Vec<_>>())?;
@@ -73,10 +78,10 @@ pub fn solve<'py>(
         let mut cost = PythonCost::new(model)?;
         model.call_method1("observe", (infos,))?;
         cost.observed(envs);
-        py.detach(|| here(|| solver.solve(&mut cost, problem)))
+        py.detach(|| on_this_thread(|| solver.solve(&mut cost, problem)))
     };
-    let plan = plan.map_err(raised)?;
-    let trace = serde_json::to_string(&plan.trace).map_err(|e| raised(Error::external("writing a trace", e)))?;
-    let actions = arrays::floats(py, &plan.actions, &[envs, horizon, dim])?;
-    Ok((actions, arrays::floats(py, &plan.costs, &[envs])?, trace))
+    let plan = plan.map_err(to_py_err)?;
+    let trace = serde_json::to_string(&plan.trace).map_err(|e| to_py_err(Error::external("writing a trace", e)))?;
+    let actions = arrays::f32_array(py, &plan.actions, &[envs, horizon, dim])?;
+    Ok((actions, arrays::f32_array(py, &plan.costs, &[envs])?, trace))
 }

@@ -1,8 +1,8 @@
-//! [`World`]: many environments of one kind, their infos as numpy arrays, collecting and evaluating.
+//! [`World`]: a batch of environments with their infos as numpy arrays; collection and evaluation.
 
 use crate::arrays;
 use crate::data::foreign::ForeignWriter;
-use crate::errors::{foreign, json, raised, signals};
+use crate::errors::{from_py_err, json, signal_poll, to_py_err};
 use crate::gym::InProcess;
 use crate::policy::Actor;
 use pyo3::exceptions::PyIndexError;
@@ -21,33 +21,39 @@ use swm::envs::wrappers::{GoalFrame, Stack, WRAPPERS};
 use swm::eval::{CollectConfig, EvalConfig, Starts, Videos, WorldConfig, episode_key, reset_seed};
 use swm::gym::GymEnv;
 
-/// Many environments of one kind.
+/// A batch of environments of one kind.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
 pub struct World {
     world: Mutex<swm::eval::World>,
     envs: usize,
 }
 
-/// Visual wrappers by id and settings, one stack for all environments.
+/// The stack of visual wrappers of a JSON list of `[id, settings]`, shared by all environments.
+///
+/// # Errors
+/// `ValueError` for an unknown wrapper or setting.
 pub fn stack(wrappers: &str, wrap_goal: bool) -> PyResult<(Arc<Stack>, GoalFrame)> {
     let choices: Vec<(String, Map<String, Value>)> = json("wrappers", wrappers)?;
     let made: swm::core::Result<_> =
         choices.into_iter().map(|(id, settings)| WRAPPERS.get(&id)?.make(&settings.into_iter().collect())).collect();
     let goal = if wrap_goal { GoalFrame::Wrapped } else { GoalFrame::Clean };
-    Ok((Arc::new(Stack::new(made.map_err(raised)?)), goal))
+    Ok((Arc::new(Stack::new(made.map_err(to_py_err)?)), goal))
 }
 
 impl World {
-    /// The engine's world, for as long as nobody else plays in it.
+    /// Locks the world of the engine.
+    ///
+    /// # Errors
+    /// If another thread, or a policy of a running call, uses the world.
     pub fn lock(&self) -> PyResult<MutexGuard<'_, swm::eval::World>> {
         match self.world.try_lock() {
             Ok(world) => Ok(world),
-            // What a panic left is consistent enough to be reset.
+            // A panic leaves the environments in a state that a reset replaces.
             Err(TryLockError::Poisoned(poisoned)) => Ok(poisoned.into_inner()),
-            Err(TryLockError::WouldBlock) => Err(raised(Error::config(
+            Err(TryLockError::WouldBlock) => Err(to_py_err(Error::config(
                 "world",
-                "it is being played in by somebody else",
-                "wait for them: a policy gets what it needs as its arguments",
+                "another call is using it",
+                "wait until that call returns; a policy gets the infos as its argument",
             ))),
         }
     }
@@ -57,7 +63,7 @@ impl World {
 impl World {
     #[new]
     #[pyo3(signature = (env, envs, image, views, max_episode_steps, threads, wrappers, wrap_goal))]
-    #[allow(clippy::too_many_arguments)]
+    #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
     fn new(
         py: Python<'_>,
         env: String,
@@ -71,18 +77,18 @@ impl World {
     ) -> PyResult<Self> {
         let (stack, goal) = stack(wrappers, wrap_goal)?;
         let views: swm::core::Result<Vec<CameraView>> = views.iter().map(|text| CameraView::parse(text)).collect();
-        let config = WorldConfig { envs, image, views: views.map_err(raised)?, max_episode_steps, threads };
+        let config = WorldConfig { envs, image, views: views.map_err(to_py_err)?, max_episode_steps, threads };
         let world = py.detach(|| {
             let chosen = swm::env(&env)?;
             swm::eval::World::of(|| Ok(stack.wrap(chosen.env()?, goal)), config)
         });
-        Ok(Self { world: Mutex::new(world.map_err(raised)?), envs })
+        Ok(Self { world: Mutex::new(world.map_err(to_py_err)?), envs })
     }
 
-    /// Environments of this interpreter: `make` takes nothing and returns a `Bridge`.
+    /// A world of Gymnasium environments in this interpreter: `make()` returns a `Bridge`.
     #[staticmethod]
-    #[allow(clippy::too_many_arguments)]
-    fn foreign(
+    #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
+    fn gymnasium(
         py: Python<'_>,
         id: String,
         make: Py<PyAny>,
@@ -102,79 +108,84 @@ impl World {
             };
             swm::eval::World::of(made, config)
         });
-        Ok(Self { world: Mutex::new(world.map_err(raised)?), envs })
+        Ok(Self { world: Mutex::new(world.map_err(to_py_err)?), envs })
     }
 
-    /// What the environments are, as JSON.
+    /// The specification of the environments as JSON.
     fn spec(&self) -> PyResult<String> {
         Ok(swm::describe::spec(self.lock()?.spec()).to_string())
     }
 
-    /// Steps after which episodes are truncated.
+    /// The time limit of an episode, in steps.
     fn max_episode_steps(&self) -> PyResult<usize> {
         Ok(self.lock()?.pool().max_episode_steps())
     }
 
-    /// What the last reset or step produced: views, `[envs, 1, ..]`, that follow every later one.
+    /// The infos of the last reset or step as arrays `[envs, 1, ..]` that share the engine's memory, so later steps update
+    /// them.
     pub fn infos<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyDict>> {
         let infos = PyDict::new(slf.py());
         let world = slf.get().lock()?;
         let batch = world.pool().infos();
         for (i, column) in batch.schema().columns().iter().enumerate() {
             // SAFETY: the pool never resizes its infos, and lives as long as this object, which the array keeps alive.
-            #[allow(unsafe_code)]
+            #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
             infos.set_item(&column.name, unsafe { arrays::view(batch, i, true, slf.as_any()) }?)?;
         }
         Ok(infos)
     }
 
-    /// The actions of the next [`World::advance`], one row an environment: to be written into.
+    /// The actions `[envs, ..]` of the next [`World::advance`], for the caller to write.
     fn actions<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
         let mut world = slf.get().lock()?;
         let batch = world.actions_mut();
         // SAFETY: the world never resizes its actions, and lives as long as this object, which the array keeps alive.
-        #[allow(unsafe_code)]
+        #[allow(unsafe_code, reason = "numpy arrays share memory with the engine")]
         unsafe {
             arrays::view(batch, 0, false, slf.as_any())
         }
     }
 
-    /// Starts episodes: `(slot, seed)`. `options` is a JSON object of a variation request, a state and a goal state.
+    /// Starts an episode in every given `(slot, seed)`. `options` is a JSON object with a variation request, a state and a
+    /// goal state.
     fn reset(&self, py: Python<'_>, starts: Vec<(usize, u64)>, options: &str) -> PyResult<()> {
         let options = reset_options(options)?;
         if let Some((slot, _)) = starts.iter().find(|(slot, _)| *slot >= self.envs) {
-            return Err(PyIndexError::new_err(format!("environment {slot} of {}", self.envs)));
+            return Err(PyIndexError::new_err(format!(
+                "reset: environment {slot} does not exist, there are {}",
+                self.envs
+            )));
         }
         let mut world = self.lock()?;
         let world = &mut *world;
         let resets: Vec<Reset> =
             starts.iter().map(|&(slot, seed)| Reset { slot, seed, options: options.clone() }).collect();
-        py.detach(|| world.restart(&resets)).map_err(raised)
+        py.detach(|| world.restart(&resets)).map_err(to_py_err)
     }
 
-    /// Tells a policy that a slot begins an episode of a seed.
+    /// Begins the episode `episode` of `seed` in a slot of the policy.
     fn begin(&self, actor: &Actor, slot: usize, seed: u64, episode: usize) -> PyResult<()> {
         actor.lock()?.begin(slot, episode_key(seed, episode));
         Ok(())
     }
 
-    /// Lets a policy fill the actions of the active slots.
-    fn ask(&self, py: Python<'_>, actor: &Actor, active: Vec<bool>) -> PyResult<()> {
+    /// Computes the policy's actions for the active slots.
+    fn act(&self, py: Python<'_>, actor: &Actor, active: Vec<bool>) -> PyResult<()> {
         let (mut world, mut policy) = (self.lock()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
-        py.detach(|| world.act(policy, &active)).map_err(raised)
+        py.detach(|| world.act(policy, &active)).map_err(to_py_err)
     }
 
-    /// Steps the active slots with the actions that were written.
+    /// Steps the active slots with the current actions.
     fn advance(&self, py: Python<'_>, active: Vec<bool>) -> PyResult<()> {
         let mut world = self.lock()?;
         let world = &mut *world;
-        py.detach(|| world.advance(&active)).map_err(raised)
+        py.detach(|| world.advance(&active)).map_err(to_py_err)
     }
 
-    /// Lets a policy play `steps` steps. Slots whose episode is over begin the next one instead: of a seed, numbered from
-    /// `next`; returns `(slot, episode)` of those, and the next number.
-    #[allow(clippy::too_many_arguments)]
+    /// Plays `steps` steps with a policy. A slot whose episode is over starts the next episode of `seed` instead of stepping;
+    /// `next` is the index of that episode. Returns `(slot, episode)` of the started episodes and the next index.
+    #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
     fn play(
         &self,
         py: Python<'_>,
@@ -187,13 +198,13 @@ impl World {
         let (mut world, mut policy) = (self.lock()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
         let mut begun = vec![];
-        let mut signals = signals();
+        let mut poll = signal_poll();
         py.detach(|| {
             let schema = world.pool().infos().schema();
             let flags = [schema.index("terminated")?, schema.index("truncated")?];
             let mut active = vec![true; world.pool().len()];
             for _ in 0..steps {
-                signals()?;
+                poll()?;
                 let infos = world.pool().infos();
                 for (slot, active) in active.iter_mut().enumerate() {
                     *active = flags.iter().all(|&flag| infos.bytes(flag)[slot] == 0);
@@ -206,8 +217,8 @@ impl World {
                     let over = (0..active.len()).filter(|&slot| !active[slot]);
                     let starting: Vec<(usize, usize)> = over.zip(next..).collect();
                     next += starting.len();
-                    // Read only now: most calls begin no episode.
-                    let options = reset_options(options).map_err(foreign)?;
+                    // Parsed here because most calls start no episode.
+                    let options = reset_options(options).map_err(from_py_err)?;
                     let reset = |&(slot, episode)| {
                         let seed = reset_seed(episode_key(seed, episode));
                         Reset { slot, seed, options: options.clone() }
@@ -221,31 +232,31 @@ impl World {
             }
             Ok(())
         })
-        .map_err(raised)?;
+        .map_err(to_py_err)?;
         Ok((begun, next))
     }
 
-    /// The factors of a slot's episode, by key.
+    /// The factors of the current episode of a slot, by key.
     fn factors<'py>(&self, py: Python<'py>, slot: usize) -> PyResult<Bound<'py, PyDict>> {
         factors(py, self.lock()?.pool().env(slot))
     }
 
-    /// The full state of a slot.
+    /// The full state of a slot's environment.
     fn snapshot<'py>(&self, py: Python<'py>, slot: usize) -> PyResult<Bound<'py, PyBytes>> {
         Ok(PyBytes::new(py, &self.lock()?.pool().env(slot).snapshot().0))
     }
 
-    /// Puts the full state of a slot back.
+    /// Restores a snapshot in a slot.
     fn restore(&self, py: Python<'_>, slot: usize, state: Vec<u8>) -> PyResult<()> {
         let mut world = self.lock()?;
         let world = &mut *world;
         let snapshot = Snapshot(state);
-        py.detach(|| world.modify(&[slot], |_, env| env.restore(&snapshot))).map_err(raised)
+        py.detach(|| world.modify(&[slot], |_, env| env.restore(&snapshot))).map_err(to_py_err)
     }
 
-    /// Plays episodes into a dataset at `path`, or into `writer`, an object with `write_episode`; returns `(episodes, added,
-    /// steps)`.
-    #[allow(clippy::too_many_arguments)]
+    /// Collects episodes into a dataset at `path`, or into `writer`, an object with `write_episode`. Returns
+    /// `(episodes, added, steps)`.
+    #[allow(clippy::too_many_arguments, reason = "one argument for each option in Python")]
     fn collect(
         &self,
         py: Python<'_>,
@@ -258,7 +269,7 @@ impl World {
         config: &str,
         progress: Option<Py<PyAny>>,
     ) -> PyResult<(usize, usize, usize)> {
-        let wanted: Collection = json("collection", config)?;
+        let settings: Collection = json("collection", config)?;
         let mode = match mode {
             "append" => WriteMode::Append,
             "overwrite" => WriteMode::Overwrite,
@@ -269,19 +280,19 @@ impl World {
         let (world, policy) = (&mut *world, &mut **policy);
         let collected = py.detach(|| {
             let config = CollectConfig {
-                episodes: wanted.episodes,
-                seed: wanted.seed,
-                variation: wanted.variation,
-                policy: wanted.policy,
-                goal: wanted.goal,
-                first: wanted.first,
+                episodes: settings.episodes,
+                seed: settings.seed,
+                variation: settings.variation,
+                policy: settings.policy,
+                goal: settings.goal,
+                first: settings.first,
             };
             let mut manifest = world.collect_manifest(&config);
             if let Some(weights) = &actor.weights {
                 manifest.hashes.insert("policy".to_owned(), weights.clone());
             }
             manifest.config["codec"] = serde_json::json!(codec);
-            manifest.config["wrappers"] = wanted.wrappers;
+            manifest.config["wrappers"] = settings.wrappers;
             let writer: Box<dyn swm::data::Writer> = match (writer, path) {
                 (Some(writer), _) => Box::new(ForeignWriter::new(writer, 0)),
                 (None, path) => {
@@ -297,11 +308,11 @@ impl World {
             };
             world.collect(policy, writer, &config, &mut control(progress))
         });
-        let collected = collected.map_err(raised)?;
+        let collected = collected.map_err(to_py_err)?;
         Ok((collected.episodes, collected.added, collected.steps))
     }
 
-    /// Plays starts and judges them; returns the run as JSON.
+    /// Evaluates a policy and returns the run as JSON.
     fn evaluate(
         &self,
         py: Python<'_>,
@@ -310,45 +321,46 @@ impl World {
         dataset: Option<String>,
         progress: Option<Py<PyAny>>,
     ) -> PyResult<String> {
-        let wanted: Evaluation = json("evaluation", config)?;
+        let settings: Evaluation = json("evaluation", config)?;
         let (mut world, mut policy) = (self.lock()?, actor.lock()?);
         let (world, policy) = (&mut *world, &mut **policy);
         let run = py.detach(|| {
             let starts = match dataset {
                 Some(dataset) => {
                     let reader = swm::home::open_dataset(&dataset)?;
-                    let picks = match wanted.picks {
+                    let picks = match settings.picks {
                         Some(picks) => picks,
-                        None => Starts::choose(&*reader, wanted.episodes, wanted.goal_offset, wanted.seed)?,
+                        None => Starts::choose(&*reader, settings.episodes, settings.goal_offset, settings.seed)?,
                     };
-                    let (env, offset) = (world.pool().env(0), wanted.goal_offset);
-                    let calls = &wanted.callables;
-                    Starts::from_dataset(&*reader, env, picks, offset, wanted.seed, wanted.variation, calls)?
+                    let (env, offset) = (world.pool().env(0), settings.goal_offset);
+                    let calls = &settings.callables;
+                    Starts::from_dataset(&*reader, env, picks, offset, settings.seed, settings.variation, calls)?
                 }
-                None if matches!(wanted.counting, Counting::Compat { .. }) => {
-                    Starts::sequential(wanted.episodes, wanted.seed, wanted.variation)?
+                None if matches!(settings.counting, Counting::Compat { .. }) => {
+                    Starts::sequential(settings.episodes, settings.seed, settings.variation)?
                 }
-                None => Starts::episodic(wanted.episodes, wanted.seed, wanted.variation)?,
+                None => Starts::episodic(settings.episodes, settings.seed, settings.variation)?,
             };
-            let videos = wanted.videos.map(|(root, prefix, count)| Videos { root, prefix, count, fps: 15 });
+            let videos = settings.videos.map(|(root, prefix, count)| Videos { root, prefix, count, fps: 15 });
             let config = EvalConfig {
-                policy: wanted.policy,
-                condition: wanted.condition,
-                budget: wanted.budget,
-                counting: wanted.counting,
+                policy: settings.policy,
+                condition: settings.condition,
+                budget: settings.budget,
+                counting: settings.counting,
                 videos,
             };
             world.evaluate(policy, &starts, &config, &mut control(progress))
         });
-        serde_json::to_string(&run.map_err(raised)?).map_err(|error| raised(Error::external("writing a run", error)))
+        serde_json::to_string(&run.map_err(to_py_err)?)
+            .map_err(|error| to_py_err(Error::external("writing the run as JSON", error)))
     }
 
-    /// What decides the numbers and pictures, with versions, as JSON.
+    /// The libraries that determine states and frames, with their versions, as JSON.
     fn libraries(&self) -> PyResult<String> {
         Ok(Value::from_iter(self.lock()?.libraries()).to_string())
     }
 
-    /// How many episodes are stored at a place already; none where nothing is.
+    /// The number of episodes stored at a path; `None` if there is no dataset.
     #[staticmethod]
     fn stored(py: Python<'_>, path: &str, format: Option<&str>) -> PyResult<Option<usize>> {
         let stored = py.detach(|| {
@@ -358,17 +370,17 @@ impl World {
             }
             Ok(Some(swm::data::open(location)?.episodes().len()))
         });
-        stored.map_err(raised)
+        stored.map_err(to_py_err)
     }
 
-    /// The seed that the environment of an episode is reset with.
+    /// The seed that resets the environment for an episode.
     #[staticmethod]
     fn episode_seed(seed: u64, episode: usize) -> u64 {
         reset_seed(episode_key(seed, episode))
     }
 }
 
-/// What to collect, apart from where to.
+/// The settings of a collection, from JSON.
 #[derive(serde::Deserialize)]
 struct Collection {
     episodes: usize,
@@ -380,7 +392,7 @@ struct Collection {
     wrappers: Value,
 }
 
-/// What to evaluate.
+/// The settings of an evaluation, from JSON.
 #[derive(serde::Deserialize)]
 struct Evaluation {
     episodes: usize,
@@ -396,15 +408,15 @@ struct Evaluation {
     videos: Option<(PathBuf, String, usize)>,
 }
 
-/// Long runs let Python see its signals, and tell how far they are, ten times a second at most.
+/// A run control that runs Python's signal handlers and calls `progress(done, total, steps)` at most ten times a second.
 fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
     let failed = Arc::new(Mutex::new(None));
-    let told = Arc::clone(&failed);
-    let mut signals = signals();
+    let callback_error = Arc::clone(&failed);
+    let mut poll = signal_poll();
     let control = Control::new().with_poll(move || {
         match failed.lock().unwrap_or_else(std::sync::PoisonError::into_inner).take() {
-            Some(error) => Err(foreign(error)),
-            None => signals(),
+            Some(error) => Err(from_py_err(error)),
+            None => poll(),
         }
     });
     let Some(call) = progress else { return control };
@@ -418,12 +430,15 @@ fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
         let steps = at.metric("steps").unwrap_or_default() as usize;
         let outcome = Python::attach(|py| call.call1(py, (at.done, at.total, steps)).map(drop));
         if let Err(error) = outcome {
-            told.lock().unwrap_or_else(std::sync::PoisonError::into_inner).get_or_insert(error);
+            callback_error.lock().unwrap_or_else(std::sync::PoisonError::into_inner).get_or_insert(error);
         }
     })
 }
 
-/// Options of a reset, from JSON.
+/// The options of a reset, from JSON.
+///
+/// # Errors
+/// `ValueError` if the JSON is not valid.
 pub fn reset_options(text: &str) -> PyResult<ResetOptions> {
     #[derive(serde::Deserialize)]
     struct Given {
@@ -435,7 +450,7 @@ pub fn reset_options(text: &str) -> PyResult<ResetOptions> {
     Ok(ResetOptions { variation, state, goal_state })
 }
 
-/// The factors of an episode, by key, each a list of numbers.
+/// The factors of the current episode, by key, each a list of floats.
 pub fn factors<'py>(py: Python<'py>, env: &dyn Env) -> PyResult<Bound<'py, PyDict>> {
     let dict = PyDict::new(py);
     for (key, value) in env.factors().iter() {
@@ -444,7 +459,7 @@ pub fn factors<'py>(py: Python<'py>, env: &dyn Env) -> PyResult<Bound<'py, PyDic
     Ok(dict)
 }
 
-/// The key of plans that are made outside of episodes.
+/// The random key of plans made outside of episodes.
 pub fn plan_key(seed: u64) -> Key {
     Key::new(seed).with("solve")
 }

@@ -48,7 +48,7 @@ def open_world(
         return made
 
     described = ",".join([env_name, *(f"{key}={value}" for key, value in options.items())])
-    world = _engine.World.foreign(
+    world = _engine.World.gymnasium(
         described, make, num_envs, image, max_episode_steps, threads, json.dumps(drawn or []), wrap_goal
     )
     return world, envs, drawn or []

@@ -229,10 +229,10 @@ def _bounds(space: Any, block: int, model: Any) -> tuple[list[float], list[float
     if isinstance(space, spaces.MultiDiscrete):
         return [], [], [int(n) for n in space.nvec.reshape(-1)] * block
     low, high = (np.asarray(side, dtype=np.float32).reshape(-1) for side in (space.low, space.high))
-    card = getattr(model, "card", None)
-    if card is not None:
-        card = json.loads(card)
-        mean, std = (np.asarray(card[name], dtype=np.float32) for name in ("action_mean", "action_std"))
+    info = getattr(model, "info", None)
+    if info is not None:
+        info = json.loads(info)
+        mean, std = (np.asarray(info[name], dtype=np.float32) for name in ("action_mean", "action_std"))
         low, high = (low - mean) / std, (high - mean) / std
     return np.tile(low, block).tolist(), np.tile(high, block).tolist(), None
 

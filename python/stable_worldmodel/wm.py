@@ -36,7 +36,7 @@ class Model:
     def __init__(self, name: str, device: str = "cpu", objective: dict[str, Any] | None = None) -> None:
         self._engine_model = _engine.Model(str(name), device, json.dumps(objective))
         #: What it is: `family`, `env`, `image`, `action_block`, `history`, `config`, `weights` and more.
-        self.card: dict[str, Any] = json.loads(self._engine_model.card)
+        self.card: dict[str, Any] = json.loads(self._engine_model.info)
 
     @property
     def path(self) -> str:

@@ -294,7 +294,7 @@ class World:
     def _ask(self, policy: Any) -> np.ndarray:
         """What a policy of the engine does now."""
         active = ~(self.terminateds | self.truncateds)
-        self._world.ask(self._actor(policy), active.tolist())
+        self._world.act(self._actor(policy), active.tolist())
         return self._actions.reshape(self.envs.action_space.shape).copy()
 
     def _asked(self, policy: Any, infos: dict[str, Any], active: np.ndarray) -> np.ndarray:
@@ -344,7 +344,7 @@ class World:
                 infos.pop("goal", None)
             return self._asked(policy, infos, active)
 
-        return _engine.Actor.calling(self._world, call)
+        return _engine.Actor.python(self._world, call)
 
     # Long runs.
 

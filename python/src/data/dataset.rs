@@ -1,9 +1,9 @@
-//! [`Dataset`]: the rows of episodes, as numpy arrays.
+//! [`Dataset`]: reads the rows of episodes into numpy arrays.
 
 use super::foreign::ForeignReader;
-use super::process::work;
-use super::{Column, Kept, columns, described};
-use crate::errors::raised;
+use super::process::detached;
+use super::{BatchMemory, Column, columns, described};
+use crate::errors::to_py_err;
 use numpy::{PyArray1, PyReadonlyArray1};
 use pyo3::exceptions::{PyIndexError, PyValueError};
 use pyo3::prelude::*;
@@ -14,10 +14,10 @@ use swm::core::{Batch, ColumnSpec, Error, Result, Schema};
 use swm::data::{CacheConfig, FORMATS, Reader, StepRange, views};
 use swm::home;
 
-/// How a reader is made, once more in a forked process.
+/// Opens a reader; called again in a forked process.
 type Open = Arc<dyn Fn() -> Result<Arc<dyn Reader>> + Send + Sync>;
 
-/// A dataset, or a view of some.
+/// A dataset, or a view of one or several datasets.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
 pub struct Dataset {
     open: Open,
@@ -25,35 +25,39 @@ pub struct Dataset {
 }
 
 struct Opened {
-    /// Who opened it.
+    /// The id of the process that opened the reader.
     process: u32,
     reader: Arc<dyn Reader>,
 }
 
 impl Dataset {
+    /// A dataset that `open` opens, now and again after a fork.
+    ///
+    /// # Errors
+    /// The error of `open`.
     pub fn of(py: Python<'_>, open: Open) -> PyResult<Self> {
-        let reader = work(py, || open()).map_err(raised)?;
+        let reader = detached(py, || open()).map_err(to_py_err)?;
         Ok(Self { open, opened: Mutex::new(Opened { process: std::process::id(), reader }) })
     }
 
-    /// Its reader, in whichever process.
+    /// The reader for this process.
     ///
     /// # Errors
-    /// When it must be opened again and cannot be.
+    /// If the reader must be opened again in a forked process and that fails.
     pub fn reader(&self) -> Result<Arc<dyn Reader>> {
         let mut opened = self.opened.lock().unwrap_or_else(PoisonError::into_inner);
         let process = std::process::id();
         if opened.process != process {
             let reader = (self.open)()?;
-            // What the parent opened may wait for its threads when it goes.
+            // Dropping the parent's reader could wait for threads that this process does not have.
             std::mem::forget(std::mem::replace(&mut opened.reader, reader));
             opened.process = process;
         }
         Ok(Arc::clone(&opened.reader))
     }
 
-    fn here(&self, py: Python<'_>) -> PyResult<Arc<dyn Reader>> {
-        work(py, || self.reader()).map_err(raised)
+    fn open_reader(&self, py: Python<'_>) -> PyResult<Arc<dyn Reader>> {
+        detached(py, || self.reader()).map_err(to_py_err)
     }
 }
 
@@ -81,7 +85,7 @@ impl Dataset {
         Self::of(py, Arc::new(open))
     }
 
-    /// A dataset that an object of Python's reads: see [`ForeignReader`].
+    /// A dataset read by a Python object: see [`ForeignReader`].
     #[staticmethod]
     fn foreign(py: Python<'_>, reader: Py<PyAny>) -> PyResult<Self> {
         let reader: Arc<dyn Reader> = Arc::new(ForeignReader::new(py, reader)?);
@@ -95,7 +99,7 @@ impl Dataset {
         Self::of(py, Arc::new(open))
     }
 
-    /// A dataset with columns of another one that has the same episodes.
+    /// A dataset extended by columns of another dataset with the same episodes.
     #[staticmethod]
     fn merge(py: Python<'_>, base: Py<Self>, other: Py<Self>, names: Vec<String>) -> PyResult<Self> {
         let open = move || {
@@ -105,8 +109,8 @@ impl Dataset {
         Self::of(py, Arc::new(open))
     }
 
-    /// The same dataset, with decoded rows of some columns kept in memory.
-    fn kept(slf: Py<Self>, py: Python<'_>, names: Vec<String>, bytes: usize) -> PyResult<Self> {
+    /// The same dataset, with decoded rows of some columns cached in memory, up to `bytes`.
+    fn cached(slf: Py<Self>, py: Python<'_>, names: Vec<String>, bytes: usize) -> PyResult<Self> {
         let open = move || {
             let names: Vec<&str> = names.iter().map(String::as_str).collect();
             CacheConfig::Memory { bytes }.over(slf.get().reader()?, &names)
@@ -114,34 +118,33 @@ impl Dataset {
         Self::of(py, Arc::new(open))
     }
 
-    /// Its columns.
+    /// The columns: name, type and shape of a row.
     fn schema(&self, py: Python<'_>) -> PyResult<Vec<Column>> {
-        Ok(described(self.here(py)?.schema()))
+        Ok(described(self.open_reader(py)?.schema()))
     }
 
-    /// Rows of every episode.
-    #[allow(clippy::cast_possible_wrap)]
+    /// The number of rows of every episode, `[episodes]`.
     fn lengths<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<i64>>> {
-        let reader = self.here(py)?;
+        let reader = self.open_reader(py)?;
         Ok(PyArray1::from_iter(py, reader.episodes().iter().map(|episode| episode.length as i64)))
     }
 
-    /// The number of every episode.
-    fn numbers<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<i64>>> {
-        let reader = self.here(py)?;
+    /// The index of every episode, `[episodes]`.
+    fn episode_indices<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<i64>>> {
+        let reader = self.open_reader(py)?;
         Ok(PyArray1::from_iter(py, reader.episodes().iter().map(|episode| episode.index)))
     }
 
-    /// Where it comes from, as JSON, if it says.
+    /// The manifest (provenance) of the dataset as JSON, if it has one.
     fn manifest(&self, py: Python<'_>) -> PyResult<Option<String>> {
-        let manifest = self.here(py)?.manifest();
+        let manifest = self.open_reader(py)?.manifest();
         let text = manifest.map(|manifest| serde_json::to_string(&manifest)).transpose();
-        text.map_err(|error| raised(Error::external("writing a manifest", error)))
+        text.map_err(|error| to_py_err(Error::external("writing a manifest", error)))
     }
 
-    /// What is the same in every step of an episode, by name.
+    /// The constants of an episode, by name.
     fn constants<'py>(&self, py: Python<'py>, episode: usize) -> PyResult<Bound<'py, PyDict>> {
-        let constants = work(py, || self.reader()?.constants(episode)).map_err(raised)?;
+        let constants = detached(py, || self.reader()?.constants(episode)).map_err(to_py_err)?;
         let dict = PyDict::new(py);
         for (name, bytes) in constants {
             dict.set_item(name, PyBytes::new(py, &bytes))?;
@@ -149,8 +152,11 @@ impl Dataset {
         Ok(dict)
     }
 
-    /// The rows of runs of episodes, one run after another, as arrays `[rows, ..]`: of actions all, of other columns the
-    /// first and every `frameskip`-th behind it. Everything is read together.
+    /// Reads the rows `starts[i] .. starts[i] + lengths[i]` of `episodes[i]`, for all `i` in one pass, concatenated. The
+    /// `action` column has all rows, other columns the first row of each run and every `frameskip`-th row after it.
+    ///
+    /// # Shapes
+    /// `episodes`, `starts`, `lengths`: `[runs]`; each column: `[rows, ..]`.
     fn read<'py>(
         &self,
         py: Python<'py>,
@@ -163,7 +169,7 @@ impl Dataset {
         let (episodes, starts, lengths) = (episodes.as_array(), starts.as_array(), lengths.as_array());
         if frameskip == 0 || episodes.len() != starts.len() || episodes.len() != lengths.len() {
             return Err(PyValueError::new_err(
-                "expected a frameskip of at least 1, and a start and a length an episode",
+                "read: expected frameskip >= 1 and arrays of episodes, starts and lengths of the same length",
             ));
         }
         let mut runs = Vec::with_capacity(episodes.len());
@@ -171,22 +177,24 @@ impl Dataset {
             let (Ok(episode), Ok(start), Ok(length)) =
                 (usize::try_from(episode), usize::try_from(start), usize::try_from(length))
             else {
-                return Err(PyIndexError::new_err(format!("{length} rows from row {start} of episode {episode}")));
+                return Err(PyIndexError::new_err(format!(
+                    "read: got {length} rows from row {start} of episode {episode}, expected no negative values"
+                )));
             };
             runs.push(StepRange::new(episode, start, length));
         }
-        let batch = work(py, || read(&*self.reader()?, &names, &runs, frameskip)).map_err(raised)?;
-        // Columns may have more rows than others, so each is a batch of its own.
+        let batch = detached(py, || read(&*self.reader()?, &names, &runs, frameskip)).map_err(to_py_err)?;
+        // The columns differ in their number of rows, so each is a batch of its own.
         let dict = PyDict::new(py);
         for column in batch {
-            dict.update(columns(py, Kept::Own(column))?.as_mapping())?;
+            dict.update(columns(py, BatchMemory::Owned(column))?.as_mapping())?;
         }
         Ok(dict)
     }
 }
 
 fn read(reader: &dyn Reader, names: &[String], runs: &[StepRange], frameskip: usize) -> Result<Vec<Batch>> {
-    let shown: Vec<StepRange> = match frameskip {
+    let frames: Vec<StepRange> = match frameskip {
         1 => vec![],
         _ => runs
             .iter()
@@ -194,7 +202,7 @@ fn read(reader: &dyn Reader, names: &[String], runs: &[StepRange], frameskip: us
             .collect(),
     };
     let one = |name: &String| {
-        let runs = if name == ACTION || frameskip == 1 { runs } else { &shown };
+        let runs = if name == ACTION || frameskip == 1 { runs } else { &frames };
         let spec: ColumnSpec = reader.schema().column(name)?.clone();
         let mut batch = Batch::zeros(&Schema::new([spec])?, runs.iter().map(|run| run.length).sum());
         reader.read_column(name, runs, batch.bytes_mut(0))?;

@@ -1,17 +1,17 @@
-//! Readers and writers that Python brings, as the engine's own.
+//! Readers and writers implemented in Python, as readers and writers of the engine.
 
 use super::{Column, described, schema};
 use crate::arrays;
-use crate::errors::foreign;
+use crate::errors::from_py_err;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use swm::core::{Batch, Error, Manifest, Result, Schema};
 use swm::data::{Constants, Episode, Reader, StepRange, Writer, checksum};
 
-/// The columns that number episodes and steps.
+/// The columns with the indices of episodes and steps, which the engine computes.
 const NUMBERING: [&str; 2] = ["episode_idx", "step_idx"];
 
-/// A dataset that an object of Python's reads. The object has `schema()`, a list of `(name, type, shape)`; `lengths()`, the
+/// A reader implemented by a Python object. The object has `schema()`, a list of `(name, type, shape)`; `lengths()`, the
 /// rows of every episode; and `rows(column, episode, start, length)`, an array `[length, ..]` of the column's type.
 pub struct ForeignReader {
     object: Py<PyAny>,
@@ -20,12 +20,15 @@ pub struct ForeignReader {
 }
 
 impl ForeignReader {
-    #[allow(clippy::cast_possible_wrap)]
+    /// Wraps a Python object.
+    ///
+    /// # Errors
+    /// If the object raises, or a column has a type that cannot be stored.
     pub fn new(py: Python<'_>, object: Py<PyAny>) -> PyResult<Self> {
         let given: Vec<Column> = object.call_method0(py, "schema")?.extract(py)?;
-        let numbers = NUMBERING.map(|name| (name.to_owned(), "int64".to_owned(), vec![]));
+        let indices = NUMBERING.map(|name| (name.to_owned(), "int64".to_owned(), vec![]));
         let data = given.into_iter().filter(|(name, ..)| !NUMBERING.contains(&name.as_str()));
-        let schema = schema(numbers.into_iter().chain(data).collect())?;
+        let schema = schema(indices.into_iter().chain(data).collect())?;
         let lengths: Vec<usize> = object.call_method0(py, "lengths")?.extract(py)?;
         let episodes = lengths.into_iter().enumerate().map(|(i, length)| Episode { index: i as i64, length }).collect();
         Ok(Self { object, schema, episodes })
@@ -34,23 +37,23 @@ impl ForeignReader {
     fn rows(&self, column: &str, range: &StepRange) -> Result<Batch> {
         let read = || {
             Python::attach(|py| {
-                let asked = (column, range.episode, range.start, range.length);
-                let rows = self.object.bind(py).call_method1("rows", asked)?;
+                let arguments = (column, range.episode, range.start, range.length);
+                let rows = self.object.bind(py).call_method1("rows", arguments)?;
                 let dict = PyDict::new(py);
                 dict.set_item(column, rows)?;
                 arrays::batch(&dict)
             })
         };
-        let rows: Batch = read().map_err(foreign)?;
+        let rows: Batch = read().map_err(from_py_err)?;
         let (given, expected) = (&rows.schema().columns()[0], self.schema.column(column)?);
         if given == expected && rows.rows() == range.length {
             return Ok(rows);
         }
-        let form = |schema: &Schema| format!("{:?}", described(schema));
+        let describe = |schema: &Schema| format!("{:?}", described(schema));
         Err(Error::mismatch(
             format!("reading {} rows of '{column}' from Python", range.length),
-            format!("{} rows of {}", rows.rows(), form(rows.schema())),
-            form(&Schema::new([expected.clone()])?),
+            format!("{} rows of {}", rows.rows(), describe(rows.schema())),
+            describe(&Schema::new([expected.clone()])?),
         ))
     }
 }
@@ -64,7 +67,6 @@ impl Reader for ForeignReader {
         &self.episodes
     }
 
-    #[allow(clippy::cast_possible_wrap)]
     fn read_column(&self, column: &str, ranges: &[StepRange], out: &mut [u8]) -> Result<()> {
         let n = self.schema.column(column)?.row_bytes();
         let mut rest = out;
@@ -73,19 +75,19 @@ impl Reader for ForeignReader {
             let known = |episode: &Episode| end.is_some_and(|end| end <= episode.length);
             if !self.episodes.get(range.episode).is_some_and(known) {
                 let given = format!("{} rows from row {} of episode {}", range.length, range.start, range.episode);
-                return Err(Error::mismatch("reading rows", given, "rows that there are"));
+                return Err(Error::mismatch("reading rows", given, "rows inside the episode"));
             }
-            let Some((place, others)) = rest.split_at_mut_checked(range.length * n) else {
-                return Err(Error::mismatch("reading rows", "less room", "room for every row"));
+            let Some((target, others)) = rest.split_at_mut_checked(range.length * n) else {
+                return Err(Error::mismatch("reading rows", "a buffer that is too small", "room for every row"));
             };
             rest = others;
             if let Some(which) = NUMBERING.iter().position(|&name| name == column) {
-                for (row, place) in place.chunks_exact_mut(n).enumerate() {
-                    let number = if which == 0 { range.episode } else { range.start + row } as i64;
-                    place.copy_from_slice(&number.to_ne_bytes());
+                for (row, target) in target.chunks_exact_mut(n).enumerate() {
+                    let index = if which == 0 { range.episode } else { range.start + row } as i64;
+                    target.copy_from_slice(&index.to_ne_bytes());
                 }
             } else {
-                place.copy_from_slice(self.rows(column, range)?.bytes(0));
+                target.copy_from_slice(self.rows(column, range)?.bytes(0));
             }
         }
         Ok(())
@@ -95,7 +97,7 @@ impl Reader for ForeignReader {
         None
     }
 
-    /// Nobody but Python knows.
+    /// The size on disk is unknown to the engine.
     fn footprint(&self) -> Result<Vec<(String, u64)>> {
         Ok(vec![])
     }
@@ -105,15 +107,15 @@ impl Reader for ForeignReader {
     }
 }
 
-/// Hands episodes to an object of Python's: `write_episode({column: array [rows, ..]})`. What is the same in all steps of an
-/// episode is not handed on.
+/// A writer that passes episodes to a Python object: `write_episode({column: array [rows, ..]})`. The constants of an episode
+/// are not passed on.
 pub struct ForeignWriter {
     object: Py<PyAny>,
     episodes: usize,
 }
 
 impl ForeignWriter {
-    /// Hands on to `object`, whose dataset has so many episodes.
+    /// Writes to `object`, whose dataset already has `episodes` episodes.
     pub fn new(object: Py<PyAny>, episodes: usize) -> Self {
         Self { object, episodes }
     }
@@ -132,7 +134,7 @@ impl Writer for ForeignWriter {
             }
             self.object.call_method1(py, "write_episode", (dict,))
         };
-        Python::attach(write).map_err(foreign)?;
+        Python::attach(write).map_err(from_py_err)?;
         self.episodes += 1;
         Ok(())
     }
@@ -141,7 +143,7 @@ impl Writer for ForeignWriter {
         self.episodes
     }
 
-    /// Whoever opened it closes it.
+    /// Does nothing: the Python code that opened the object closes it.
     fn finish(self: Box<Self>) -> Result<()> {
         Ok(())
     }

@@ -1,9 +1,9 @@
-//! [`Loader`]: shuffled batches, made ahead by threads of the engine.
+//! [`Loader`]: shuffled batches, prefetched by threads of the engine.
 
 use super::dataset::Dataset;
-use super::process::{is_forked, work};
-use super::{Column, Kept, columns, described};
-use crate::errors::{json, raised, signals};
+use super::process::{detached, is_forked};
+use super::{BatchMemory, Column, columns, described};
+use crate::errors::{json, signal_poll, to_py_err};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde::Deserialize;
@@ -13,9 +13,9 @@ use std::time::Duration;
 use swm::core::{Error, Result};
 use swm::data::{CacheConfig, ClipSpec, GoalSpec, LoaderConfig};
 
-/// What to load and how, from JSON.
+/// The settings of a loader, from JSON.
 #[derive(Deserialize)]
-struct Wanted {
+struct Options {
     num_steps: usize,
     frameskip: usize,
     columns: Vec<String>,
@@ -28,13 +28,13 @@ struct Wanted {
     prefetch: usize,
     prefetch_bytes: usize,
     episodes: Option<Vec<usize>>,
-    /// Bytes of decoded rows to keep.
+    /// Size of the cache of decoded rows in bytes; 0 disables it.
     cache: usize,
-    /// Where to keep them, if not in memory.
+    /// The folder of the cache; in memory if `None`.
     cache_dir: Option<PathBuf>,
 }
 
-impl Wanted {
+impl Options {
     fn config(self) -> LoaderConfig {
         let cache = match (self.cache, self.cache_dir) {
             (0, _) => CacheConfig::Off,
@@ -47,7 +47,7 @@ impl Wanted {
             batch_size: self.batch_size,
             shuffle: self.shuffle,
             seed: self.seed,
-            // A forked process loads in the thread that asks: see `process`.
+            // A forked process loads in the calling thread: see `process`.
             threads: if is_forked() { 0 } else { self.threads },
             prefetch: self.prefetch,
             prefetch_bytes: self.prefetch_bytes,
@@ -58,8 +58,8 @@ impl Wanted {
     }
 }
 
-/// Something with threads. They end where it goes; but they may wait for Python's lock, and a process forked since has
-/// none of them.
+/// An object that owns threads. Dropping it ends them without the GIL, which they may wait for; in a process forked
+/// later it is leaked, because that process does not have the threads.
 struct Threaded<T: Send + 'static> {
     inner: Arc<Mutex<Option<T>>>,
     process: u32,
@@ -75,7 +75,10 @@ impl<T: Send> Threaded<T> {
         Self { inner, process: std::process::id() }
     }
 
-    /// Does something with it, if its threads are here.
+    /// Calls `work` with the inner object.
+    ///
+    /// # Errors
+    /// The error of `work`, or if the object belongs to another process or was ended with the interpreter.
     fn with<R>(&self, work: impl FnOnce(&mut T) -> Result<R>) -> Result<R> {
         if self.process != std::process::id() {
             let problem = "it was made in the process that this one was forked from";
@@ -83,7 +86,11 @@ impl<T: Send> Threaded<T> {
         }
         match &mut *lock(&self.inner) {
             Some(inner) => work(inner),
-            None => Err(Error::config("loader", "it ended with the interpreter", "use it before")),
+            None => Err(Error::config(
+                "loader",
+                "its threads ended when the interpreter shut down",
+                "use it before the interpreter exits",
+            )),
         }
     }
 }
@@ -98,10 +105,10 @@ impl<T: Send> Drop for Threaded<T> {
     }
 }
 
-/// What has threads now.
+/// All objects with running threads.
 static LIVE: Mutex<Vec<Weak<dyn End>>> = Mutex::new(vec![]);
 
-/// Something whose threads can be ended.
+/// Ends the threads of an object.
 trait End: Send + Sync {
     fn end(&self);
 }
@@ -117,8 +124,8 @@ fn lock<T: ?Sized>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Ends the threads of all loaders. To be called while the interpreter is sound: a thread that asks for its lock when it is
-/// not any more takes the process with it.
+/// Ends the threads of all loaders. Call it before the interpreter shuts down: a thread that takes the GIL of an interpreter
+/// in shutdown crashes the process.
 #[pyfunction]
 pub fn end_loaders(py: Python<'_>) {
     if !is_forked() {
@@ -129,11 +136,11 @@ pub fn end_loaders(py: Python<'_>) {
     }
 }
 
-/// Batches of clips, epoch after epoch.
+/// Loads batches of clips, epoch by epoch.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
 pub struct Loader(Threaded<swm::data::Loader>);
 
-/// The batches of one epoch, from one on.
+/// An iterator over the remaining batches of one epoch.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
 pub struct Epoch(Threaded<swm::data::Epoch>);
 
@@ -141,46 +148,46 @@ pub struct Epoch(Threaded<swm::data::Epoch>);
 impl Loader {
     #[new]
     fn new(py: Python<'_>, dataset: &Dataset, config: &str) -> PyResult<Self> {
-        let config = json::<Wanted>("loader", config)?.config();
-        let made = work(py, || swm::data::Loader::new(dataset.reader()?, config));
-        made.map(|loader| Self(Threaded::new(loader))).map_err(raised)
+        let config = json::<Options>("loader", config)?.config();
+        let made = detached(py, || swm::data::Loader::new(dataset.reader()?, config));
+        made.map(|loader| Self(Threaded::new(loader))).map_err(to_py_err)
     }
 
-    /// The columns of a batch.
+    /// The columns of a batch: name, type and shape of a row.
     fn schema(&self) -> PyResult<Vec<Column>> {
-        self.0.with(|loader| Ok(described(loader.schema()))).map_err(raised)
+        self.0.with(|loader| Ok(described(loader.schema()))).map_err(to_py_err)
     }
 
-    /// Clips in an epoch.
+    /// The number of clips in an epoch.
     fn clips(&self) -> PyResult<usize> {
-        self.0.with(|loader| Ok(loader.clips())).map_err(raised)
+        self.0.with(|loader| Ok(loader.clips())).map_err(to_py_err)
     }
 
-    /// Batches in an epoch.
+    /// The number of batches in an epoch.
     fn batches(&self) -> PyResult<usize> {
-        self.0.with(|loader| Ok(loader.batches_per_epoch())).map_err(raised)
+        self.0.with(|loader| Ok(loader.batches_per_epoch())).map_err(to_py_err)
     }
 
-    /// The batches of an epoch, from `first` on.
+    /// The batches of an epoch, from batch `first` on.
     fn epoch(&self, py: Python<'_>, epoch: u64, first: usize) -> PyResult<Epoch> {
         let begun = py.detach(|| self.0.with(|loader| Ok(loader.epoch(epoch, first))));
-        Ok(Epoch(Threaded::new(begun.map_err(raised)?)))
+        Ok(Epoch(Threaded::new(begun.map_err(to_py_err)?)))
     }
 }
 
 #[pymethods]
 impl Epoch {
-    /// The next batch, as arrays `[clips, ..]` that look at its memory; `None` where the epoch ends.
+    /// The next batch as arrays `[clips, ..]` that share its memory; `None` at the end of the epoch.
     fn next<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyDict>>> {
-        let next = work(py, || {
+        let next = detached(py, || {
             self.0.with(|epoch| {
-                let mut signals = signals();
+                let mut poll = signal_poll();
                 while !epoch.wait(Duration::from_millis(20)) {
-                    signals()?;
+                    poll()?;
                 }
                 epoch.next().transpose()
             })
         });
-        next.map_err(raised)?.map(|batch| columns(py, Kept::Lent(batch))).transpose()
+        next.map_err(to_py_err)?.map(|batch| columns(py, BatchMemory::Loaded(batch))).transpose()
     }
 }

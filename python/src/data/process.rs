@@ -1,6 +1,6 @@
-//! Forked processes, such as a torch `DataLoader`'s workers: they have the memory of their parent and none of its threads.
-//! Whoever waits for one of those waits for ever. So they open datasets again, and work on a thread of their own; one, as
-//! there are several such processes.
+//! Support for forked processes, such as the workers of a torch `DataLoader`. A forked process has the memory of its parent
+//! and none of its threads, so waiting for a thread of the parent never returns. Forked processes therefore open datasets
+//! again and run the engine on one thread of their own (one, because there are usually several such processes).
 
 use pyo3::prelude::*;
 use std::sync::{Mutex, OnceLock, PoisonError};
@@ -8,26 +8,26 @@ use swm::core::{Error, Result};
 
 static FIRST: OnceLock<u32> = OnceLock::new();
 
-/// Notes which process has the threads of the engine: the one that loads it.
-pub fn begin() {
+/// Records the id of the process that loads the engine and owns its threads.
+pub fn record_process() {
     FIRST.get_or_init(std::process::id);
 }
 
-/// Whether this process was forked from the one that loaded the engine.
+/// Whether this process was forked from the process that loaded the engine.
 pub fn is_forked() -> bool {
     *FIRST.get_or_init(std::process::id) != std::process::id()
 }
 
-/// Does something without holding Python's lock, on threads that are there.
+/// Runs `work` without the GIL; in a forked process, on the thread pool of that process.
 ///
 /// # Errors
-/// Its own, or when the system has no threads left.
-pub fn work<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send) -> Result<T> {
-    py.detach(|| if is_forked() { own_threads()?.install(work) } else { work() })
+/// The error of `work`, or a failure to start the thread of a forked process.
+pub fn detached<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T> + Send) -> Result<T> {
+    py.detach(|| if is_forked() { forked_pool()?.install(work) } else { work() })
 }
 
-/// The threads of this forked process. They are never ended.
-fn own_threads() -> Result<&'static rayon::ThreadPool> {
+/// The thread pool of this forked process, leaked because it lives until the process ends.
+fn forked_pool() -> Result<&'static rayon::ThreadPool> {
     static THREADS: Mutex<Option<(u32, &'static rayon::ThreadPool)>> = Mutex::new(None);
     let mut made = THREADS.lock().unwrap_or_else(PoisonError::into_inner);
     let process = std::process::id();

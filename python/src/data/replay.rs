@@ -1,9 +1,9 @@
 //! [`ReplayBuffer`]: the latest episodes of a running collection.
 
 use super::dataset::Dataset;
-use super::{Column, Kept, columns, constants, schema};
+use super::{BatchMemory, Column, columns, schema};
 use crate::arrays;
-use crate::errors::{json, raised};
+use crate::errors::{json, to_py_err};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use serde::Deserialize;
@@ -11,13 +11,13 @@ use std::sync::Arc;
 use swm::core::Key;
 use swm::data::{ClipSpec, GoalSpec, ReplayConfig, ReplayLoader};
 
-/// The latest episodes, of at most so many rows.
+/// The latest episodes, with at most `capacity` rows in all.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
 pub struct ReplayBuffer(swm::data::ReplayBuffer);
 
-/// What to draw, from JSON.
+/// The settings of a sampler, from JSON.
 #[derive(Deserialize)]
-struct Wanted {
+struct Options {
     num_steps: usize,
     frameskip: usize,
     columns: Vec<String>,
@@ -26,7 +26,7 @@ struct Wanted {
     recent: Option<usize>,
 }
 
-/// Draws batches of a buffer.
+/// Samples batches from a buffer.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
 pub struct ReplaySampler {
     loader: ReplayLoader,
@@ -37,51 +37,52 @@ pub struct ReplaySampler {
 impl ReplayBuffer {
     #[new]
     fn new(columns: Vec<Column>, capacity: usize) -> PyResult<Self> {
-        swm::data::ReplayBuffer::new(&schema(columns)?, capacity).map(Self).map_err(raised)
+        swm::data::ReplayBuffer::new(&schema(columns)?, capacity).map(Self).map_err(to_py_err)
     }
 
-    /// Adds an episode, arrays `[rows, ..]` of the schema's types in its order; the oldest ones leave to make room.
-    fn add(&self, py: Python<'_>, episode: &Bound<'_, PyDict>, same: &Bound<'_, PyDict>) -> PyResult<()> {
-        let (episode, same) = (arrays::batch(episode)?, constants(same)?);
-        py.detach(|| self.0.add(&episode, &same)).map_err(raised)
+    /// Adds an episode (arrays `[rows, ..]` with the schema's columns in order) and its constants, and removes the oldest
+    /// episodes until it fits.
+    fn add(&self, py: Python<'_>, episode: &Bound<'_, PyDict>, constants: &Bound<'_, PyDict>) -> PyResult<()> {
+        let (episode, constants) = (arrays::batch(episode)?, super::constants(constants)?);
+        py.detach(|| self.0.add(&episode, &constants)).map_err(to_py_err)
     }
 
-    /// Rows it holds.
+    /// The number of rows in the buffer.
     fn rows(&self) -> usize {
         self.0.rows()
     }
 
-    /// Episodes it holds.
+    /// The number of episodes in the buffer.
     fn episodes(&self) -> usize {
         self.0.episodes()
     }
 
-    /// Episodes that ever came.
+    /// The number of episodes added since the buffer was made.
     fn added(&self) -> u64 {
         self.0.added()
     }
 
-    /// What it holds now, which stays so.
+    /// An immutable view of the current content.
     fn snapshot(&self, py: Python<'_>) -> PyResult<Dataset> {
         let reader = self.0.snapshot();
         Dataset::of(py, Arc::new(move || Ok(Arc::clone(&reader))))
     }
 
-    /// Draws what the configuration, JSON, says.
+    /// A sampler with settings in JSON.
     fn sampler(&self, config: &str, seed: u64) -> PyResult<ReplaySampler> {
-        let Wanted { num_steps, frameskip, columns, goals, batch_size, recent } = json("sampler", config)?;
+        let Options { num_steps, frameskip, columns, goals, batch_size, recent } = json("sampler", config)?;
         let clip = ClipSpec { num_steps, frameskip, columns };
         let config = ReplayConfig { clip, goals, batch_size, recent, threads: 0, ..ReplayConfig::default() };
-        let loader = self.0.loader(config).map_err(raised)?;
+        let loader = self.0.loader(config).map_err(to_py_err)?;
         Ok(ReplaySampler { loader, key: Key::new(seed).with("replay") })
     }
 }
 
 #[pymethods]
 impl ReplaySampler {
-    /// The batch of this number: a function of the seed, the number, and what the buffer holds.
-    fn sample<'py>(&self, py: Python<'py>, number: u64) -> PyResult<Bound<'py, PyDict>> {
-        let batch = py.detach(|| self.loader.sample(self.key.at(number))).map_err(raised)?;
-        columns(py, Kept::Lent(batch))
+    /// Samples batch `index`, which depends only on the seed, the index and the content of the buffer.
+    fn sample<'py>(&self, py: Python<'py>, index: u64) -> PyResult<Bound<'py, PyDict>> {
+        let batch = py.detach(|| self.loader.sample(self.key.at(index))).map_err(to_py_err)?;
+        columns(py, BatchMemory::Loaded(batch))
     }
 }

@@ -1,8 +1,8 @@
-//! [`Writer`]: episodes into a dataset of one of our formats.
+//! [`Writer`]: writes episodes into a dataset in one of the engine's formats.
 
-use super::{Column, constants, image_codec, schema, write_mode};
+use super::{Column, image_codec, schema, write_mode};
 use crate::arrays;
-use crate::errors::{json, raised};
+use crate::errors::{json, to_py_err};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -10,7 +10,7 @@ use std::sync::{Mutex, PoisonError};
 use swm::data::{FORMATS, WriteOptions};
 use swm::home;
 
-/// Writes episodes of a schema.
+/// A dataset writer; `None` once it is finished.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
 pub struct Writer(Mutex<Option<Box<dyn swm::data::Writer>>>);
 
@@ -37,26 +37,26 @@ impl Writer {
                 None => swm::data::create(location, &schema, options),
             }
         });
-        made.map(|writer| Self(Mutex::new(Some(writer)))).map_err(raised)
+        made.map(|writer| Self(Mutex::new(Some(writer)))).map_err(to_py_err)
     }
 
-    /// Adds an episode, arrays `[rows, ..]` of the schema's types in its order, and what is the same in all of its steps.
-    fn write(&self, py: Python<'_>, episode: &Bound<'_, PyDict>, same: &Bound<'_, PyDict>) -> PyResult<()> {
-        let (episode, same) = (arrays::batch(episode)?, constants(same)?);
+    /// Adds an episode (arrays `[rows, ..]` with the schema's columns in order) and its constants.
+    fn write(&self, py: Python<'_>, episode: &Bound<'_, PyDict>, constants: &Bound<'_, PyDict>) -> PyResult<()> {
+        let (episode, constants) = (arrays::batch(episode)?, super::constants(constants)?);
         py.detach(|| match &mut *self.lock() {
-            Some(writer) => writer.write_episode_with(&episode, &same).map_err(raised),
+            Some(writer) => writer.write_episode_with(&episode, &constants).map_err(to_py_err),
             None => Err(PyValueError::new_err("the writer is closed: open another one, with mode='append'")),
         })
     }
 
-    /// Episodes of the dataset; none once it is closed.
+    /// The number of episodes in the dataset; `None` once the writer is finished.
     fn episodes(&self) -> Option<usize> {
         self.lock().as_ref().map(|writer| writer.episodes())
     }
 
-    /// Commits what is not committed yet, and ends.
+    /// Commits the remaining episodes and closes the writer.
     fn finish(&self, py: Python<'_>) -> PyResult<()> {
-        py.detach(|| self.lock().take().map_or(Ok(()), |writer| writer.finish())).map_err(raised)
+        py.detach(|| self.lock().take().map_or(Ok(()), |writer| writer.finish())).map_err(to_py_err)
     }
 }
 

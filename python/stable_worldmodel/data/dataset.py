@@ -197,7 +197,7 @@ class StoredDataset(Dataset):
 
     def _open(self) -> Any:
         handle = _engine.Dataset(self.path, self.format)
-        return handle.kept(self._cached, 1 << 62) if self._cached else handle
+        return handle.cached(self._cached, 1 << 62) if self._cached else handle
 
     @property
     def engine(self) -> Any:

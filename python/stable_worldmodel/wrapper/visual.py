@@ -104,9 +104,9 @@ class VisualWrapper(gymnasium.Wrapper):
     def __init__(self, env: gymnasium.Env, *values: Any, seed: int | None = None, **settings: Any) -> None:
         super().__init__(env)
         self._settings = self.engine_settings(*values, **settings)
-        self._picture = _engine.Pictures(json.dumps([[self.id, self._settings]]))
+        self._engine_wrapper = _engine.VisualWrappers(json.dumps([[self.id, self._settings]]))
         self._seed, self._episode, self._step = seed or 0, 0, 0
-        self._picture.begin(self._seed)
+        self._engine_wrapper.reset(self._seed)
 
     @classmethod
     def engine_settings(cls, *values: Any, seed: int | None = None, **settings: Any) -> dict[str, Any]:
@@ -120,7 +120,7 @@ class VisualWrapper(gymnasium.Wrapper):
         """Begins an episode: what is drawn once for all its pictures is drawn."""
         self._episode += 1
         self._step = 0
-        self._picture.begin(self._seed + self._episode if seed is None else seed)
+        self._engine_wrapper.reset(self._seed + self._episode if seed is None else seed)
         observation, info = self.env.reset(seed=seed, options=options)
         return observation, self._changed(info)
 
@@ -141,7 +141,7 @@ class VisualWrapper(gymnasium.Wrapper):
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
             name = type(self).__name__
             raise ValueError(f"{name}: expected a picture [height, width, 3] of uint8, got {picture.dtype} {picture.shape}")
-        return self._picture.apply(np.ascontiguousarray(picture), self._step)
+        return self._engine_wrapper.apply(np.ascontiguousarray(picture), self._step)
 
     def _changed(self, info: dict[str, Any]) -> dict[str, Any]:
         for name in [name for name in info if name == "pixels" or name.startswith("pixels.")]:

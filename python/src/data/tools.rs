@@ -1,9 +1,9 @@
-//! Converting, examining, describing.
+//! Converts, examines and describes datasets.
 
 use super::dataset::Dataset;
 use super::image_codec;
-use super::process::work;
-use crate::errors::{foreign, json, raised, signals};
+use super::process::detached;
+use crate::errors::{from_py_err, json, signal_poll, to_py_err};
 use pyo3::prelude::*;
 use serde::Deserialize;
 use serde_json::{Value, json as value};
@@ -15,9 +15,9 @@ use swm::data::doctor::{examine, open_damaged, repair};
 use swm::data::{ConvertMode, ConvertOptions, Converted, Location, Reader, checksum, formats};
 use swm::home;
 
-/// How to convert, from JSON.
+/// The options of a conversion, from JSON.
 #[derive(Deserialize)]
-struct Wanted {
+struct Options {
     format: Option<String>,
     mode: Mode,
     codec: Option<Value>,
@@ -34,7 +34,7 @@ enum Mode {
     Append,
 }
 
-impl Wanted {
+impl Options {
     fn options(self) -> PyResult<ConvertOptions> {
         let mode = match self.mode {
             Mode::Resume => ConvertMode::Resume,
@@ -53,61 +53,62 @@ impl Wanted {
     }
 }
 
-/// A control that reports progress to Python's `tell(stage, done, total)` and lets Python handle signals. An exception
-/// that either raises stops the run.
-fn control<'a>(tell: Option<Py<PyAny>>) -> Control<'a> {
+/// A run control that calls Python's `progress(stage, done, total)` and runs Python's signal handlers. An exception from
+/// either stops the run.
+fn control<'a>(progress: Option<Py<PyAny>>) -> Control<'a> {
     let failed = Arc::new(Mutex::new(None));
-    let raised = Arc::clone(&failed);
-    let mut signals = signals();
+    let callback_error = Arc::clone(&failed);
+    let mut poll = signal_poll();
     let control =
         Control::new().with_poll(move || match failed.lock().unwrap_or_else(PoisonError::into_inner).take() {
-            Some(error) => Err(foreign(error)),
-            None => signals(),
+            Some(error) => Err(from_py_err(error)),
+            None => poll(),
         });
-    let Some(tell) = tell else { return control };
+    let Some(progress) = progress else { return control };
     control.with_events(move |event| {
         let Event::Progress(at) = event else { return };
-        let outcome = Python::attach(|py| tell.call1(py, (at.stage, at.done, at.total)).map(drop));
+        let outcome = Python::attach(|py| progress.call1(py, (at.stage, at.done, at.total)).map(drop));
         if let Err(error) = outcome {
-            raised.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+            callback_error.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
         }
     })
 }
 
-fn text(found: &impl serde::Serialize) -> PyResult<String> {
-    serde_json::to_string(found).map_err(|error| raised(Error::external("writing JSON", error)))
+/// The value as JSON text.
+fn to_json(found: &impl serde::Serialize) -> PyResult<String> {
+    serde_json::to_string(found).map_err(|error| to_py_err(Error::external("writing JSON", error)))
 }
 
-/// Writes a dataset to another place; returns what became of it as JSON. `tell(stage, done, total)` is called on the way.
+/// Copies a dataset to `target` and returns the outcome as JSON. Calls `progress(stage, done, total)`.
 #[pyfunction]
 pub fn convert(
     py: Python<'_>,
     dataset: &Dataset,
     target: &str,
     options: &str,
-    tell: Option<Py<PyAny>>,
+    progress: Option<Py<PyAny>>,
 ) -> PyResult<String> {
-    let options = json::<Wanted>("conversion", options)?.options()?;
-    let mut control = control(tell);
-    let converted = work(py, || {
+    let options = json::<Options>("conversion", options)?.options()?;
+    let mut control = control(progress);
+    let converted = detached(py, || {
         let target = home::target(target, options.format.as_deref())?;
         swm::data::convert(&dataset.reader()?, &target, &options, &mut control)
     });
-    text(&converted.map_err(raised)?)
+    to_json(&converted.map_err(to_py_err)?)
 }
 
-/// Examines a dataset, and writes what is sound of it to `target` if there is one; returns what was found as JSON.
+/// Examines a dataset, and writes its sound episodes to `target` if given. Returns the diagnosis as JSON.
 #[pyfunction]
 pub fn doctor(
     py: Python<'_>,
     path: &str,
     target: Option<&str>,
     options: &str,
-    tell: Option<Py<PyAny>>,
+    progress: Option<Py<PyAny>>,
 ) -> PyResult<String> {
-    let options = json::<Wanted>("repair", options)?.options()?;
-    let mut control = control(tell);
-    let found = work(py, || {
+    let options = json::<Options>("repair", options)?.options()?;
+    let mut control = control(progress);
+    let found = detached(py, || {
         let (reader, lost) = open_damaged(&home::find_dataset(path)?)?;
         let mut diagnosis = examine(&*reader, &swm::models::dataset_requirements()?, &mut control)?;
         diagnosis.add_losses(lost);
@@ -121,13 +122,13 @@ pub fn doctor(
         found["repaired"] = value!(repaired);
         Ok(found)
     });
-    text(&found.map_err(raised)?)
+    to_json(&found.map_err(to_py_err)?)
 }
 
-/// What is in a dataset, as JSON. With `summed` everything is read for the checksum of what readers get.
+/// Describes a dataset as JSON. With `with_checksum`, reads all rows to compute the checksum of the decoded content.
 #[pyfunction]
-pub fn inspect(py: Python<'_>, dataset: &Dataset, summed: bool) -> PyResult<String> {
-    let found = work(py, || {
+pub fn inspect(py: Python<'_>, dataset: &Dataset, with_checksum: bool) -> PyResult<String> {
+    let found = detached(py, || {
         let reader = dataset.reader()?;
         let reader: &dyn Reader = &*reader;
         let footprint: BTreeMap<String, u64> = reader.footprint()?.into_iter().collect();
@@ -139,27 +140,27 @@ pub fn inspect(py: Python<'_>, dataset: &Dataset, summed: bool) -> PyResult<Stri
             "bytes": footprint.values().sum::<u64>(),
             "footprint": footprint,
             "content_hash": reader.content_hash()?,
-            "checksum": if summed { Some(checksum(reader)?) } else { None },
+            "checksum": if with_checksum { Some(checksum(reader)?) } else { None },
         }))
     });
-    text(&found.map_err(raised)?)
+    to_json(&found.map_err(to_py_err)?)
 }
 
-/// The format that recognises a path or URI, existing or about to be created.
+/// The id of the format that recognises a path or URI; the path need not exist.
 #[pyfunction]
 pub fn detect(path: &str) -> PyResult<Option<&'static str>> {
-    let location = Location::parse(path).map_err(raised)?;
+    let location = Location::parse(path).map_err(to_py_err)?;
     Ok(formats::detect(&location).map(|format| format.id()))
 }
 
-/// Where a dataset is that is there, given by path, URI or name.
+/// The location of an existing dataset, given by path, URI or name.
 #[pyfunction]
 pub fn find_dataset(path: &str) -> PyResult<String> {
-    home::find_dataset(path).map(|location| location.to_string()).map_err(raised)
+    home::find_dataset(path).map(|location| location.to_string()).map_err(to_py_err)
 }
 
-/// Where a dataset is to be written, given by path, URI or name.
+/// The location for a new dataset, given by path, URI or name.
 #[pyfunction]
 pub fn target(path: &str, format: Option<&str>) -> PyResult<String> {
-    home::target(path, format).map(|location| location.to_string()).map_err(raised)
+    home::target(path, format).map(|location| location.to_string()).map_err(to_py_err)
 }

@@ -1,7 +1,7 @@
-//! [`Pictures`]: visual wrappers on pictures of Python's.
+//! [`VisualWrappers`]: visual wrappers applied to frames that Python holds.
 
 use crate::arrays;
-use crate::errors::{json, raised};
+use crate::errors::{json, to_py_err};
 use numpy::{PyReadonlyArray3, PyUntypedArrayMethods as _};
 use pyo3::prelude::*;
 use serde_json::{Map, Value};
@@ -9,37 +9,36 @@ use std::sync::{Mutex, PoisonError};
 use swm::core::{DType, FrameMut, Key};
 use swm::envs::wrappers::{EpisodeFrame, VisualWrapper, WRAPPERS};
 
-/// Wrappers in the order in which they are applied.
+/// A stack of visual wrappers, in the order in which they are applied.
 #[pyclass(frozen, module = "stable_worldmodel._engine")]
-pub struct Pictures(Mutex<Vec<Box<dyn VisualWrapper>>>);
+pub struct VisualWrappers(Mutex<Vec<Box<dyn VisualWrapper>>>);
 
 #[pymethods]
-impl Pictures {
+impl VisualWrappers {
+    /// Builds the wrappers from a JSON list of `[id, settings]`.
     #[new]
     fn new(wrappers: &str) -> PyResult<Self> {
         let choices: Vec<(String, Map<String, Value>)> = json("wrappers", wrappers)?;
         let made = choices.into_iter().map(|(id, settings)| WRAPPERS.get(&id)?.make(&settings.into_iter().collect()));
-        Ok(Self(Mutex::new(made.collect::<swm::core::Result<_>>().map_err(raised)?)))
+        Ok(Self(Mutex::new(made.collect::<swm::core::Result<_>>().map_err(to_py_err)?)))
     }
 
-    /// Begins the episode of a seed.
-    fn begin(&self, seed: u64) {
+    /// Resets the wrappers for an episode with this seed.
+    fn reset(&self, seed: u64) {
         let episode = Key::new(seed).with("wrapper");
-        for (wrapper, place) in self.0.lock().unwrap_or_else(PoisonError::into_inner).iter_mut().zip(0..) {
-            wrapper.reset(episode.at(place));
+        for (wrapper, index) in self.0.lock().unwrap_or_else(PoisonError::into_inner).iter_mut().zip(0..) {
+            wrapper.reset(episode.at(index));
         }
     }
 
-    /// A changed copy of a picture that shows the world after some steps.
-    fn apply<'py>(
-        &self,
-        py: Python<'py>,
-        picture: PyReadonlyArray3<'py, u8>,
-        step: u64,
-    ) -> PyResult<Bound<'py, PyAny>> {
-        let shape = picture.shape();
+    /// Returns a changed copy of the frame of an episode's step.
+    ///
+    /// # Shapes
+    /// `frame` and the result: `[height, width, 3]`, `uint8`.
+    fn apply<'py>(&self, py: Python<'py>, frame: PyReadonlyArray3<'py, u8>, step: u64) -> PyResult<Bound<'py, PyAny>> {
+        let shape = frame.shape();
         let (height, width) = (shape[0], shape[1]);
-        let mut rgb = picture.as_slice()?.to_vec();
+        let mut rgb = frame.as_slice()?.to_vec();
         let mut wrappers = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let wrappers = &mut *wrappers;
         py.detach(|| {
@@ -50,7 +49,7 @@ impl Pictures {
     }
 }
 
-/// The number of a schedule at a step.
+/// The value of a schedule, given as JSON, at a step of the episode.
 #[pyfunction]
 pub fn schedule(text: &str, step: u64) -> PyResult<f64> {
     Ok(json::<swm::envs::wrappers::Schedule>("schedule", text)?.at(step))

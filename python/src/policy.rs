@@ -57,7 +57,7 @@ impl Actor {
     fn checkpoint(py: Python<'_>, world: &World, name: &str) -> PyResult<Self> {
         let world = world.lock()?;
         let (spec, slots) = (world.spec().clone(), world.pool().len());
-        let (policy, info) = py.detach(|| swm::resolver::direct(name, &spec, slots)).map_err(to_py_err)?;
+        let (policy, info) = py.detach(|| swm::resolver::checkpoint_policy(name, &spec, slots)).map_err(to_py_err)?;
         Ok(Self { weights: Some(info.weights), ..Self::new(policy, None) })
     }
 

@@ -297,7 +297,7 @@ impl World {
                 (Some(writer), _) => Box::new(ForeignWriter::new(writer, 0)),
                 (None, path) => {
                     let location = swm::home::target(&path.unwrap_or_default(), format.as_deref())?;
-                    swm::collect::check(&location, mode, &manifest, false)?;
+                    swm::collect_target::check(&location, mode, &manifest, false)?;
                     let schema = world.collect_schema(config.goal)?;
                     let options = WriteOptions { mode, codec, manifest: Some(manifest), ..WriteOptions::default() };
                     match &format {

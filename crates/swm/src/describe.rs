@@ -1,9 +1,10 @@
-//! What an environment is, as JSON with the fields a Python user knows.
+//! Descriptions of environments as JSON, with the field names of Gymnasium's spaces. `swm envs --json` and the Python
+//! package use them.
 
 use serde_json::{Map, Value, json};
 use swm_core::{EnvEntry, EnvSpec, Named as _, Space, VariationSpace};
 
-/// A row of the registry of environments.
+/// Returns a registered environment: its spec, summary, options and experts.
 pub fn env(row: &EnvEntry, made: &EnvSpec) -> Value {
     let mut value = spec(made);
     value["summary"] = json!(row.summary);
@@ -13,7 +14,7 @@ pub fn env(row: &EnvEntry, made: &EnvSpec) -> Value {
     value
 }
 
-/// What never changes about an environment.
+/// Returns the spec of an environment: spaces, info columns, factors of variation, time limit, cameras.
 pub fn spec(spec: &EnvSpec) -> Value {
     let info: Map<String, Value> = spec
         .columns
@@ -41,7 +42,7 @@ pub fn spec(spec: &EnvSpec) -> Value {
     })
 }
 
-/// What an agent observes: a space, or several by name.
+/// Returns the observation space; several spaces become a `Dict`.
 fn observation(spec: &EnvSpec) -> Value {
     match &spec.observation_space[..] {
         [(_, one)] => space(one),
@@ -53,7 +54,7 @@ fn observation(spec: &EnvSpec) -> Value {
     }
 }
 
-/// Every factor by its key.
+/// Returns the space and the default value of every factor of variation, by key.
 pub fn variation(variation_space: &VariationSpace) -> Map<String, Value> {
     let factors = variation_space.factors().iter();
     factors
@@ -65,7 +66,7 @@ pub fn variation(variation_space: &VariationSpace) -> Map<String, Value> {
         .collect()
 }
 
-/// Groups and factors, in the order they are sampled.
+/// Returns the keys of groups and factors in the order in which they are sampled.
 pub fn sampling_order(variation_space: &VariationSpace) -> Vec<String> {
     let mut order: Vec<String> = vec![];
     for factor in variation_space.factors() {
@@ -79,7 +80,7 @@ pub fn sampling_order(variation_space: &VariationSpace) -> Vec<String> {
     order
 }
 
-/// A space with its bounds written out.
+/// Returns a space with its bounds.
 fn space(space: &Space) -> Value {
     let bounds = |pick: fn((f64, f64)) -> f64| {
         let values: Vec<f64> = (0..space.len()).map(|i| pick(space.bounds(i))).collect();
@@ -98,11 +99,10 @@ fn space(space: &Space) -> Value {
     }
 }
 
-/// A value as a scalar or as lists within lists, in whole numbers where its type is whole; null where there is no bound.
-#[allow(clippy::cast_possible_truncation)]
+/// Returns a value of a space as a scalar or as nested lists. Integer spaces give integers; infinite bounds are null.
 fn shaped(space: &Space, value: &[f64]) -> Value {
-    let whole = matches!(space, Space::Discrete { .. } | Space::MultiDiscrete { .. } | Space::Rgb);
-    let mut values: Vec<Value> = value.iter().map(|&v| if whole { json!(v as i64) } else { json!(v) }).collect();
+    let is_integer = matches!(space, Space::Discrete { .. } | Space::MultiDiscrete { .. } | Space::Rgb);
+    let mut values: Vec<Value> = value.iter().map(|&v| if is_integer { json!(v as i64) } else { json!(v) }).collect();
     for &size in space.shape().iter().rev() {
         values = values.chunks(size.max(1)).map(|row| Value::Array(row.to_vec())).collect();
     }

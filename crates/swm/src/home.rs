@@ -1,11 +1,16 @@
-//! Where things live: `$STABLEWM_HOME` (default `~/.stable_worldmodel`) with `datasets/` and `checkpoints/`.
+//! Folders of named datasets and checkpoints: `$STABLEWM_HOME` (default `~/.stable_worldmodel`) with `datasets/`,
+//! `checkpoints/` and `weights/`.
 
+use std::iter::once;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use swm_core::{Error, Result};
-use swm_data::{Location, Reader};
+use swm_data::{FORMATS, Location, Reader};
 
-/// The folder everything without a path of its own lives in.
+/// The format of new datasets whose name has no suffix.
+const DEFAULT_FORMAT: &str = "lance";
+
+/// Returns the folder of all named datasets, checkpoints and weights.
 pub fn home() -> PathBuf {
     match std::env::var_os("STABLEWM_HOME") {
         Some(home) if !home.is_empty() => home.into(),
@@ -13,56 +18,59 @@ pub fn home() -> PathBuf {
     }
 }
 
-/// Where named datasets live.
+/// Returns the folder of named datasets.
 pub fn datasets() -> PathBuf {
     home().join("datasets")
 }
 
-/// Where named checkpoints live.
+/// Returns the folder of named checkpoints.
 pub fn checkpoints() -> PathBuf {
     home().join("checkpoints")
 }
 
-/// Where weights of others are kept, once downloaded.
+/// Returns the folder of downloaded pretrained weights.
 pub fn weights() -> PathBuf {
     home().join("weights")
 }
 
-/// What names under [`datasets`] may end in, and need not be given with; the first is what a new one gets.
-const SUFFIXES: [&str; 8] = ["lance", "h5", "hdf5", "lance-video", "video", "folder", "lerobot", ""];
-
-/// The place of a dataset given as a path or as a name under [`datasets`].
-pub fn dataset(given: &str) -> PathBuf {
-    let home = datasets();
-    let named_so = SUFFIXES.iter().map(|suffix| named(given, home.clone(), suffix)).find(|path| path.exists());
-    named_so.unwrap_or_else(|| named(given, home, SUFFIXES[0]))
+/// The file name suffixes of all dataset formats. A named dataset is found without its suffix.
+fn suffixes() -> impl Iterator<Item = &'static str> {
+    FORMATS.rows.iter().flat_map(|format| format.suffixes).copied()
 }
 
-/// Where a dataset is that is given as a path, as a URI, or as a name under [`datasets`].
+/// Returns the path of a dataset given as a path or as a name in [`datasets`]. If no such dataset exists, the path has the
+/// suffix of the default format.
+pub fn dataset(given: &str) -> PathBuf {
+    let folder = datasets();
+    let mut existing = once(DEFAULT_FORMAT).chain(suffixes()).chain(once("")).map(|suffix| named(given, &folder, suffix));
+    existing.find(|path| path.exists()).unwrap_or_else(|| named(given, &folder, DEFAULT_FORMAT))
+}
+
+/// Returns the location of a dataset given as a path, as a URI, or as a name in [`datasets`].
 ///
 /// # Errors
-/// When it has the form of a URI and is none of an object store.
+/// When the text is a URI of an unknown scheme.
 pub fn location(given: &str) -> Result<Location> {
     if given.contains("://") { Location::parse(given) } else { Ok(dataset(given).into()) }
 }
 
-/// The place of a checkpoint given as a path or as a name under [`checkpoints`].
+/// Returns the path of a checkpoint given as a path or as a name in [`checkpoints`].
 pub fn checkpoint(given: &str) -> PathBuf {
-    named(given, checkpoints(), "")
+    named(given, &checkpoints(), "")
 }
 
-/// Opens a dataset by path, URI or name.
+/// Opens a dataset given as a path, as a URI, or as a name in [`datasets`].
 ///
 /// # Errors
-/// When there is none (naming the nearest), or it is damaged.
+/// When it does not exist (the message names the closest name), or it is damaged.
 pub fn open_dataset(given: &str) -> Result<Arc<dyn Reader>> {
     swm_data::open(find_dataset(given)?)
 }
 
-/// Where a dataset is that is there, given by path, URI or name.
+/// Returns the location of an existing dataset given as a path, as a URI, or as a name in [`datasets`].
 ///
 /// # Errors
-/// When there is none, naming the nearest. What a URI points to is not looked at.
+/// When it does not exist; the message names the closest name. The existence of a URI is not checked.
 pub fn find_dataset(given: &str) -> Result<Location> {
     let location = location(given)?;
     match location.path() {
@@ -71,30 +79,30 @@ pub fn find_dataset(given: &str) -> Result<Location> {
     }
 }
 
-/// The folder of a checkpoint that is there, by path or name.
+/// Returns the folder of an existing checkpoint given as a path or as a name in [`checkpoints`].
 ///
 /// # Errors
-/// When there is none, naming the nearest.
+/// When it does not exist; the message names the closest name.
 pub fn find_checkpoint(given: &str) -> Result<PathBuf> {
     let path = checkpoint(given);
     if path.exists() { Ok(path) } else { Err(unknown("checkpoint", given, &path, &checkpoints())) }
 }
 
-/// A name that stands for nothing.
+/// Returns the error for a name that does not exist, with the closest name in `folder`.
 fn unknown(kind: &'static str, given: &str, path: &Path, folder: &Path) -> Error {
     let names = names_in(folder);
-    let hint = format!("there is none at {}; `swm {kind}s` lists those at home", path.display());
+    let hint = format!("{} does not exist; `swm {kind}s` lists the known {kind}s", path.display());
     Error::unknown(kind, given, names.iter().map(String::as_str), hint)
 }
 
-/// The names of what lies in a folder, in order, hidden ones left out.
+/// Returns the sorted names of the entries of a folder without dataset suffixes; hidden entries are left out.
 pub fn names_in(folder: &Path) -> Vec<String> {
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
     let mut names: Vec<String> = entries
         .filter_map(|entry| entry.file_name().into_string().ok())
         .filter(|name| !name.starts_with('.'))
         .map(|name| match name.rsplit_once('.') {
-            Some((stem, suffix)) if SUFFIXES.contains(&suffix) => stem.to_owned(),
+            Some((stem, suffix)) if suffixes().any(|known| known == suffix) => stem.to_owned(),
             _ => name,
         })
         .collect();
@@ -102,26 +110,29 @@ pub fn names_in(folder: &Path) -> Vec<String> {
     names
 }
 
-/// Where a dataset of a format is to be written that is given as a path, as a URI, or as a name under [`datasets`].
+/// Returns the location of a dataset to write, given as a path, as a URI, or as a name in [`datasets`]. A name gets the
+/// first suffix of the format.
 ///
 /// # Errors
-/// As [`location`].
+/// As [`location`], and when the format is unknown.
 pub fn target(given: &str, format: Option<&str>) -> Result<Location> {
     match format {
         Some(format) if !given.contains("://") => {
-            Ok(named(given, datasets(), if format == "hdf5" { "h5" } else { format }).into())
+            let suffix = FORMATS.get(format)?.suffixes.first().copied().unwrap_or(format);
+            Ok(named(given, &datasets(), suffix).into())
         }
         _ => location(given),
     }
 }
 
-/// What has a folder in it, an extension, or exists is a path; the rest are names.
-fn named(given: &str, folder: PathBuf, extension: &str) -> PathBuf {
+/// Returns a path unchanged, and the entry of `folder` with this suffix for a name. A text with a folder or an extension,
+/// or that of an existing file, is a path.
+fn named(given: &str, folder: &Path, suffix: &str) -> PathBuf {
     let path = Path::new(given);
     if path.components().count() > 1 || path.extension().is_some() || path.exists() {
         return path.to_owned();
     }
-    folder.join(given).with_extension(extension)
+    folder.join(given).with_extension(suffix)
 }
 
 #[cfg(test)]
@@ -129,14 +140,20 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_go_home_and_paths_stay() {
+    fn names_are_in_the_home_folder_and_paths_are_unchanged() {
         assert_eq!(dataset("a/b.lance"), Path::new("a/b.lance"));
         assert_eq!(dataset("./b"), Path::new("./b"));
         assert_eq!(dataset("rooms"), datasets().join("rooms.lance"));
-        let written = |name, format| target(name, format).expect("a place").to_string();
-        assert_eq!(written("rooms", Some("hdf5")), datasets().join("rooms.h5").to_string_lossy());
-        assert_eq!(written("a/rooms", Some("video")), "a/rooms");
-        assert_eq!(written("rooms", None), datasets().join("rooms.lance").to_string_lossy());
+        let target = |name, format| target(name, format).expect("a location").to_string();
+        assert_eq!(target("rooms", Some("hdf5")), datasets().join("rooms.h5").to_string_lossy());
+        assert_eq!(target("a/rooms", Some("video")), "a/rooms");
+        assert_eq!(target("rooms", None), datasets().join("rooms.lance").to_string_lossy());
         assert_eq!(checkpoint("lewm-rooms"), checkpoints().join("lewm-rooms"));
+    }
+
+    #[test]
+    fn every_format_has_a_suffix() {
+        assert!(suffixes().any(|suffix| suffix == DEFAULT_FORMAT));
+        assert!(FORMATS.rows.iter().all(|format| !format.suffixes.is_empty()));
     }
 }

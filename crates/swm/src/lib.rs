@@ -1,11 +1,8 @@
-//! stable-worldmodel: the whole platform behind one name.
+//! stable-worldmodel: the facade of the platform, and the `swm` command.
 //!
-//! Collect trajectories from worlds with controllable factors of variation, store and stream them, train world
-//! models, plan with them, and measure how they hold up when the world changes. The parts are crates of their
-//! own, re-exported here; this crate also builds the `swm` command.
-
-// The command line was written against the facade by its name.
-extern crate self as swm;
+//! The platform collects trajectories from environments with controllable factors of variation, stores and streams
+//! them, trains world models, plans with them, and evaluates them under shifted factors. Each part is a crate,
+//! re-exported here.
 
 pub use swm_core as core;
 pub use swm_data as data;
@@ -18,7 +15,7 @@ pub use swm_plan as plan;
 pub use swm_report as report;
 
 pub mod cli;
-pub mod collect;
+pub mod collect_target;
 pub mod describe;
 pub mod home;
 pub mod resolver;
@@ -27,22 +24,22 @@ pub mod subject;
 use swm_core::registry::{Registry, concat};
 use swm_core::{EnvChoice, EnvEntry, Result};
 
-/// Every environment of this build: those of two dimensions, then those on MuJoCo.
+/// The built-in environments: first the 2-D ones, then those simulated by MuJoCo.
 pub static ENVS: Registry<EnvEntry> = Registry { rows: &ROWS, ..swm_envs::ENVS };
 
 const ROWS: [EnvEntry; swm_envs::ENVS.rows.len() + swm_mujoco::ENVS.rows.len()] =
     concat(swm_envs::ENVS.rows, swm_mujoco::ENVS.rows);
 
-/// The environment that a text names, `ID` or `ID,option=value,…`: one of [`ENVS`], or else any that Gymnasium knows
-/// (`docs/gymnasium.md`).
+/// Returns the environment that `ID` or `ID,option=value,…` names: one of [`ENVS`], else a third-party environment of
+/// Gymnasium (`docs/gymnasium.md`).
 ///
 /// # Errors
-/// When there is none of ours and the id is not of Gymnasium's form. What Gymnasium does not know shows when an
-/// environment is made.
+/// When no built-in environment has the id and the id does not have Gymnasium's form. An id that Gymnasium does not
+/// know is an error only when the environment is made.
 pub fn env(text: &str) -> Result<EnvChoice> {
     let id = text.split(',').next().unwrap_or_default();
-    let ours = |id: &str| ENVS.get(id).is_ok();
-    if !ours(id) && !ours(&format!("swm/{id}")) && swm_gym::is_gymnasium_id(text) {
+    let is_builtin = |id: &str| ENVS.get(id).is_ok();
+    if !is_builtin(id) && !is_builtin(&format!("swm/{id}")) && swm_gym::is_gymnasium_id(text) {
         return swm_gym::choose(text);
     }
     ENVS.choose(text)
@@ -53,18 +50,18 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_not_ours_is_gymnasiums() -> Result<()> {
+    fn ids_that_are_not_built_in_go_to_gymnasium() -> Result<()> {
         for text in ["swm/PushT-v1", "swm/OGBCube-v0,env_type=double", "ALE/Pong-v5,frameskip=2", "CartPole-v1"] {
             assert_eq!(env(text)?.id(), text);
         }
-        for (text, words) in [
+        for (text, message) in [
             ("swm/PusT-v1", "did you mean swm/PushT-v1"),
             ("PushT-v1", "did you mean swm/PushT-v1"),
             ("swm/OGBCube-v0,env_type=dubble", "did you mean double"),
             ("pong", "`swm envs` lists them"),
         ] {
             let error = env(text).map(|chosen| chosen.id()).expect_err(text).to_string();
-            assert!(error.contains(words), "{error}");
+            assert!(error.contains(message), "{error}");
         }
         Ok(())
     }

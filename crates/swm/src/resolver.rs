@@ -1,31 +1,36 @@
-//! [`Home`]: what the names in an evaluation's request stand for: environments, wrappers and solvers of this build,
-//! datasets and checkpoints at home.
+//! [`HomeResolver`] loads what an evaluation request names: environments, wrappers and solvers of this build, and datasets
+//! and checkpoints of the [home folder](crate::home).
 
 use crate::home;
+use serde::de::DeserializeOwned;
 use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::rc::Rc;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::policy::ExpertPolicy;
-use swm_core::{Env, EnvEntry, EnvSpec, Error, Named as _, Policy, RandomPolicy, Result};
+use swm_core::{CostModel, Env, EnvEntry, EnvSpec, Error, Named as _, Policy, RandomPolicy, Result, Solver};
 use swm_data::Reader;
 use swm_envs::wrappers::{GoalFrame, Stack, WRAPPERS};
 use swm_eval::{Choice, EvalRequest, Model, PolicyKind, PolicyRequest, Predictor, ResolvedPolicy, Resolver, World};
-use swm_models::{CheckpointInfo, Device, load};
-use swm_plan::ActionKind;
+use swm_models::{CheckpointInfo, Device, LoadedModel, load};
 use swm_plan::objective::ObjectiveConfig;
-use swm_plan::pairing;
-use swm_plan::{ActionScale, MpcConfig, MpcPolicy, PlanRecord, SOLVERS, Score, SimulatorCost, TraceLog};
+use swm_plan::{
+    ActionKind, ActionScale, MpcConfig, MpcPolicy, PlanRecord, SOLVERS, Score, SimulatorCost, TraceLog, pairing,
+};
 
-/// Knows what is built in and what is at home.
+/// A [`Resolver`] of names in this build and in the home folder. It loads every checkpoint once.
 #[derive(Default)]
-pub struct Home {
-    /// The wrappers last asked for, made once: what they read from files is shared by all environments, a simulator's
-    /// included.
-    stack: RefCell<Option<Wrapping>>,
-    /// Every plan, with the name of the policy that made it; none where nobody asked for traces.
+pub struct HomeResolver {
+    /// The wrappers of the last request. All environments share them, and with them the files they read.
+    wrapping: RefCell<Option<Wrapping>>,
+    /// The loaded checkpoints, by path.
+    checkpoints: RefCell<BTreeMap<PathBuf, Rc<dyn LoadedModel>>>,
+    /// The traced plans; `None` without tracing.
     traces: Option<Traces>,
 }
 
-/// Wrappers, and what they do to the picture of the goal.
+/// Wrappers, and whether they apply to the frame of the goal.
 #[derive(Clone)]
 struct Wrapping {
     choices: Vec<Choice>,
@@ -33,41 +38,81 @@ struct Wrapping {
     goal: GoalFrame,
 }
 
-/// Plans and who made them.
+/// Plans, each with the name of its policy.
 type Traces = Arc<Mutex<Vec<(String, PlanRecord)>>>;
 
-impl Home {
-    /// One that keeps every plan of the policies it makes.
+impl HomeResolver {
+    /// A resolver that traces the plans of its policies.
     pub fn tracing() -> Self {
         Self { traces: Some(Traces::default()), ..Self::default() }
     }
 
-    /// The plans made since the last call, in the order they were made, each with the name of its policy.
+    /// Returns the plans since the last call, in order, each with the name of its policy.
     pub fn take_traces(&self) -> Vec<(String, PlanRecord)> {
         let Some(traces) = &self.traces else { return vec![] };
         std::mem::take(&mut *traces.lock().unwrap_or_else(PoisonError::into_inner))
     }
 
+    /// Returns the checkpoint with this path or name; it is loaded at the first call.
+    ///
+    /// # Errors
+    /// When it does not exist or is damaged.
+    pub fn checkpoint(&self, given: &str) -> Result<Rc<dyn LoadedModel>> {
+        let path = home::find_checkpoint(given)?;
+        if let Some(loaded) = self.checkpoints.borrow().get(&path) {
+            return Ok(Rc::clone(loaded));
+        }
+        let loaded: Rc<dyn LoadedModel> = Rc::from(load(&path, &Device::flex())?);
+        self.checkpoints.borrow_mut().insert(path, Rc::clone(&loaded));
+        Ok(loaded)
+    }
+
     fn wrapping(&self, request: &EvalRequest) -> Result<Wrapping> {
         let goal = if request.wrap_goal { GoalFrame::Wrapped } else { GoalFrame::Clean };
-        if let Some(known) = &*self.stack.borrow()
-            && known.choices == request.wrappers
-            && known.goal == goal
+        if let Some(last) = &*self.wrapping.borrow()
+            && last.choices == request.wrappers
+            && last.goal == goal
         {
-            return Ok(known.clone());
+            return Ok(last.clone());
         }
-        let made = request.wrappers.iter().map(|choice| {
+        let wrappers = request.wrappers.iter().map(|choice| {
             let settings = choice.settings.as_object().cloned().unwrap_or_default();
             WRAPPERS.get(&choice.id)?.make(&settings.into_iter().collect())
         });
-        let stack = Arc::new(Stack::new(made.collect::<Result<_>>()?));
+        let stack = Arc::new(Stack::new(wrappers.collect::<Result<_>>()?));
         let wrapping = Wrapping { choices: request.wrappers.clone(), stack, goal };
-        *self.stack.borrow_mut() = Some(wrapping.clone());
+        *self.wrapping.borrow_mut() = Some(wrapping.clone());
         Ok(wrapping)
     }
 
-    /// A policy that plans; its plans are traced where that was asked for.
-    fn planning(&self, name: &str, policy: MpcPolicy) -> ResolvedPolicy {
+    /// Makes a policy that plans by restoring and stepping the environment itself.
+    fn simulator_policy(&self, name: &str, score: &str, planner: Planner, world: &World) -> Result<ResolvedPolicy> {
+        let (spec, score) = (world.spec(), parse_score(score)?);
+        let (env, wrapping) = (crate::env(&spec.id)?, self.wrapping.borrow().clone());
+        let make = move || match &wrapping {
+            Some(Wrapping { stack, goal, .. }) => Ok(stack.wrap(env.env()?, *goal)),
+            None => env.env(),
+        };
+        let scale = ActionScale::unscaled(spec);
+        let cost = SimulatorCost::new(make, scale.clone(), planner.mpc.action_block, score)?;
+        Ok(self.traced(name, planner.policy(Box::new(cost), scale, world)?))
+    }
+
+    /// Makes a policy that plans with a checkpoint.
+    fn model_policy(&self, name: &str, given: &str, planner: Planner, world: &World) -> Result<ResolvedPolicy> {
+        let loaded = self.checkpoint(given)?;
+        let info = loaded.info()?;
+        check_trained_on(&info, given, world.spec())?;
+        let cost = loaded.cost().ok_or_else(|| {
+            let problem = format!("a {} model acts and does not predict", info.family);
+            Error::config(format!("checkpoint {given}"), problem, "evaluate it without a solver")
+        })?;
+        let policy = planner.policy(cost, info.dataset_info.action.clone(), world)?;
+        Ok(with_provenance(self.traced(name, policy), info))
+    }
+
+    /// Records the plans of a policy if this resolver traces.
+    fn traced(&self, name: &str, policy: MpcPolicy) -> ResolvedPolicy {
         let Some(traces) = &self.traces else { return ResolvedPolicy::from(Box::new(policy) as Box<dyn Policy>) };
         let (log, traces, name) = (TraceLog::default(), Arc::clone(traces), name.to_owned());
         let policy: Box<dyn Policy> = Box::new(policy.traced(log.clone()));
@@ -82,7 +127,7 @@ impl Home {
     }
 }
 
-impl Resolver for Home {
+impl Resolver for HomeResolver {
     fn env(&self, request: &EvalRequest) -> Result<Box<dyn Env>> {
         let (env, wrapping) = (crate::env(&request.env)?.env()?, self.wrapping(request)?);
         Ok(wrapping.stack.wrap(env, wrapping.goal))
@@ -94,63 +139,20 @@ impl Resolver for Home {
 
     fn policy(&self, request: &PolicyRequest, world: &World) -> Result<ResolvedPolicy> {
         let (spec, slots) = (world.spec(), world.pool().len());
-        let env = crate::env(&spec.id)?;
         match &request.kind {
             PolicyKind::Random => Ok(ResolvedPolicy::from(Box::new(RandomPolicy::new(spec, slots)) as Box<dyn Policy>)),
-            PolicyKind::Expert { id } => scripted(&env.entry, id, world).map(ResolvedPolicy::from),
+            PolicyKind::Expert { id } => {
+                scripted(&crate::env(&spec.id)?.entry, id, world).map(ResolvedPolicy::from)
+            }
             PolicyKind::Direct { checkpoint: given, .. } => {
-                let (policy, info) = direct(given, spec, slots)?;
-                Ok(ResolvedPolicy {
-                    weights: Some(info.weights),
-                    libraries: info.manifest.libraries,
-                    device: Some(info.manifest.device),
-                    ..ResolvedPolicy::from(policy)
-                })
+                let (policy, info) = direct(&*self.checkpoint(given)?, given, spec, slots)?;
+                Ok(with_provenance(ResolvedPolicy::from(policy), info))
             }
             PolicyKind::Plan { model, solver, mpc, objective } => {
-                let (id, solver) = (&solver.id, (SOLVERS.get(&solver.id)?.make)(&solver.settings)?);
-                let actions = ActionKind::of(&spec.action_space);
-                let wrong = |what: &str, error: serde_json::Error| {
-                    Error::config(what, error.to_string(), "`swm eval --help` lists what there is")
-                };
-                let mpc: MpcConfig = serde_json::from_value(mpc.clone()).map_err(|e| wrong("MPC settings", e))?;
-                let objective = match objective {
-                    serde_json::Value::Null => ObjectiveConfig::default(),
-                    given => serde_json::from_value(given.clone()).map_err(|e| wrong("objective", e))?,
-                };
+                let planner = Planner::new(solver, mpc, objective)?;
                 match model {
-                    Model::Simulator { score } => {
-                        let score = parse_score(score)?;
-                        let scale = ActionScale::unscaled(spec);
-                        let wrapping = self.stack.borrow().clone();
-                        let make = move || match &wrapping {
-                            Some(Wrapping { stack, goal, .. }) => Ok(stack.wrap(env.env()?, *goal)),
-                            None => env.env(),
-                        };
-                        let cost = SimulatorCost::new(make, scale.clone(), mpc.action_block, score)?;
-                        let mut cost = objective.apply(Box::new(cost))?;
-                        pairing(id, &mut *cost, actions)?;
-                        let policy = MpcPolicy::new(solver, cost, mpc, scale, spec, slots)?;
-                        Ok(self.planning(&request.name, policy))
-                    }
-                    Model::Checkpoint(given) => {
-                        let loaded = load(&home::find_checkpoint(given)?, &Device::flex())?;
-                        let info = loaded.info()?;
-                        fits(info.dataset_info.env.as_deref(), given, spec)?;
-                        let cost = loaded.cost().ok_or_else(|| {
-                            let problem = format!("a {} acts and does not predict", info.family);
-                            Error::config(format!("checkpoint {given}"), problem, "let it act (`swm eval` does)")
-                        })?;
-                        let (mut cost, scale) = (objective.apply(cost)?, info.dataset_info.action);
-                        pairing(id, &mut *cost, actions)?;
-                        let policy = MpcPolicy::new(solver, cost, mpc, scale, spec, slots)?;
-                        Ok(ResolvedPolicy {
-                            weights: Some(info.weights),
-                            libraries: info.manifest.libraries,
-                            device: Some(info.manifest.device),
-                            ..self.planning(&request.name, policy)
-                        })
-                    }
+                    Model::Simulator { score } => self.simulator_policy(&request.name, score, planner, world),
+                    Model::Checkpoint(given) => self.model_policy(&request.name, given, planner, world),
                 }
             }
         }
@@ -158,40 +160,89 @@ impl Resolver for Home {
 
     fn predictor(&self, request: &PolicyRequest) -> Result<Option<Box<dyn Predictor>>> {
         let PolicyKind::Plan { model: Model::Checkpoint(given), .. } = &request.kind else { return Ok(None) };
-        Ok(load(&home::find_checkpoint(given)?, &Device::flex())?.predictor())
+        Ok(self.checkpoint(given)?.predictor())
     }
 }
 
-/// Who acts in a world, and the hash of the weights if a checkpoint does: as [`scripted`], or by the name or path of a
-/// checkpoint that acts by itself.
+/// A solver with the settings of model-predictive control and the objective.
+struct Planner {
+    id: String,
+    solver: Box<dyn Solver>,
+    mpc: MpcConfig,
+    objective: ObjectiveConfig,
+}
+
+impl Planner {
+    fn new(solver: &Choice, mpc: &serde_json::Value, objective: &serde_json::Value) -> Result<Self> {
+        fn parse<T: DeserializeOwned>(what: &str, value: &serde_json::Value) -> Result<T> {
+            serde_json::from_value(value.clone())
+                .map_err(|error| Error::config(what, error.to_string(), "`swm eval --help` lists the settings"))
+        }
+        let (id, solver) = (solver.id.clone(), (SOLVERS.get(&solver.id)?.make)(&solver.settings)?);
+        let mpc = parse("MPC settings", mpc)?;
+        let objective =
+            if objective.is_null() { ObjectiveConfig::default() } else { parse("objective", objective)? };
+        Ok(Self { id, solver, mpc, objective })
+    }
+
+    /// Makes the policy; fails if the solver cannot minimise this cost.
+    fn policy(self, cost: Box<dyn CostModel>, scale: ActionScale, world: &World) -> Result<MpcPolicy> {
+        let spec = world.spec();
+        let mut cost = self.objective.apply(cost)?;
+        pairing(&self.id, &mut *cost, ActionKind::of(&spec.action_space))?;
+        MpcPolicy::new(self.solver, cost, self.mpc, scale, spec, world.pool().len())
+    }
+}
+
+/// Adds the checkpoint's hash, libraries and device to a policy.
+fn with_provenance(policy: ResolvedPolicy, info: CheckpointInfo) -> ResolvedPolicy {
+    ResolvedPolicy {
+        weights: Some(info.weights),
+        libraries: info.manifest.libraries,
+        device: Some(info.manifest.device),
+        ..policy
+    }
+}
+
+/// Returns the policy with this name for a world, and the hash of its weights if it is a checkpoint: a [`scripted`] policy,
+/// or a checkpoint that acts without a solver.
 ///
 /// # Errors
-/// When there is neither such an expert nor such a checkpoint, or the checkpoint is of another world or only predicts.
-pub fn acting(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Policy>, Option<String>)> {
-    let known = ["random", "expert"].contains(&name) || entry.experts.iter().any(|expert| expert.id == name);
-    if known || !home::checkpoint(name).exists() {
+/// When neither an expert nor a checkpoint has the name, or the checkpoint was trained on another environment or requires
+/// a solver.
+pub fn policy_by_name(entry: &EnvEntry, name: &str, world: &World) -> Result<(Box<dyn Policy>, Option<String>)> {
+    let is_scripted = ["random", "expert"].contains(&name) || entry.experts.iter().any(|expert| expert.id == name);
+    if is_scripted || !home::checkpoint(name).exists() {
         return Ok((scripted(entry, name, world)?, None));
     }
-    let (policy, info) = direct(name, world.spec(), world.pool().len())?;
+    let (policy, info) = checkpoint_policy(name, world.spec(), world.pool().len())?;
     Ok((policy, Some(info.weights)))
 }
 
-/// The policy of a checkpoint that acts by itself, and what the checkpoint holds.
+/// Loads a checkpoint that acts without a solver; returns its policy for `slots` environments and its description.
 ///
 /// # Errors
-/// When there is no such checkpoint, it is of another world, or it only predicts.
-pub fn direct(given: &str, spec: &EnvSpec, slots: usize) -> Result<(Box<dyn Policy>, CheckpointInfo)> {
-    let loaded = load(&home::find_checkpoint(given)?, &Device::flex())?;
+/// When it does not exist, was trained on another environment, or requires a solver.
+pub fn checkpoint_policy(given: &str, spec: &EnvSpec, slots: usize) -> Result<(Box<dyn Policy>, CheckpointInfo)> {
+    direct(&*HomeResolver::default().checkpoint(given)?, given, spec, slots)
+}
+
+fn direct(
+    loaded: &dyn LoadedModel,
+    given: &str,
+    spec: &EnvSpec,
+    slots: usize,
+) -> Result<(Box<dyn Policy>, CheckpointInfo)> {
     let info = loaded.info()?;
-    fits(info.dataset_info.env.as_deref(), given, spec)?;
+    check_trained_on(&info, given, spec)?;
     let policy = loaded.policy(spec, slots).ok_or_else(|| {
-        let problem = format!("a {} predicts and does not act", info.family);
-        Error::config(format!("checkpoint {given}"), problem, "plan in it (`swm eval` does)")
+        let problem = format!("a {} model predicts and does not act", info.family);
+        Error::config(format!("checkpoint {given}"), problem, "plan with it (`swm eval` does)")
     })??;
     Ok((policy, info))
 }
 
-/// Who acts in a world without having been trained: `random`, `expert` (the environment's first), or an expert by name.
+/// Returns an untrained policy: `random`, `expert` (the environment's first expert), or an expert by its id.
 ///
 /// # Errors
 /// When the environment has no such expert.
@@ -214,19 +265,19 @@ pub fn scripted(entry: &EnvEntry, name: &str, world: &World) -> Result<Box<dyn P
     Ok(Box::new(ExpertPolicy::new(world.spec(), (0..slots).map(|_| (expert.make)()).collect())))
 }
 
-/// What a simulator judges a plan by, by name.
+/// Returns the score of simulated plans with this name.
 ///
 /// # Errors
-/// When there is no such score.
+/// When no score has the name.
 pub fn parse_score(name: &str) -> Result<Score> {
     serde_json::from_value(name.into())
         .map_err(|_| Error::config("the simulator's score", format!("'{name}'"), "choose terminal, running or reach"))
 }
 
-/// Refuses a checkpoint trained on another environment.
-fn fits(trained_on: Option<&str>, name: &str, spec: &EnvSpec) -> Result<()> {
-    match trained_on {
-        Some(env) if env != spec.id => Err(Error::config(
+/// Fails if a checkpoint was trained on another environment.
+fn check_trained_on(info: &CheckpointInfo, name: &str, spec: &EnvSpec) -> Result<()> {
+    match &info.dataset_info.env {
+        Some(env) if *env != spec.id => Err(Error::config(
             format!("checkpoint {name}"),
             format!("it was trained on {env}, not on {}", spec.id),
             format!("evaluate it with --env {env}, or train one on {}", spec.id),

@@ -4,6 +4,7 @@
 use rand::Rng as _;
 use std::path::Path;
 use swm_bench::{Subject, Work};
+use swm_core::columns::{ACTION, GOAL, PIXELS};
 use swm_core::{
     Batch, Candidates, ColumnSpec, CostModel as _, DType, Key, PlanProblem, PlanSpace, Result, Schema, Solver as _,
 };
@@ -54,7 +55,7 @@ impl LewmSubject {
         let model = with_modulations(Lewm::init(&config.model, actions, Key::new(0), device));
         let mut cost = LewmCost::of(&model, &config.model, actions);
         let side = config.model.image;
-        let columns = [ColumnSpec::image("pixels", side, side), ColumnSpec::image("goal", side, side)];
+        let columns = [ColumnSpec::image(PIXELS, side, side), ColumnSpec::image(GOAL, side, side)];
         let mut infos = Batch::zeros(&Schema::new(columns)?, 1);
         let mut rng = Key::new(0).with("inputs").rng();
         for column in 0..2 {
@@ -90,7 +91,7 @@ impl LewmSubject {
         let weights = parameters::values(&self.model).into_iter();
         let mut tensors: Named<HostTensor> = weights.map(|(name, tensor)| (format!("w.{name}"), tensor)).collect();
         let side = self.config.model.image;
-        for name in ["pixels", "goal"] {
+        for name in [PIXELS, GOAL] {
             let planes = pixels::planes(&self.config.model, self.infos.get::<u8>(name)?, &Device::flex())?;
             let values = planes.into_data().iter::<f32>().collect();
             tensors.insert(format!("i.{name}"), HostTensor { shape: vec![3, side, side], values });
@@ -141,8 +142,8 @@ impl TrainingRun {
     fn new(config: &TrainConfig<Lewm>, model: &Lewm) -> Result<Self> {
         let (steps, side) = (config.data.num_steps, config.model.image);
         let columns = [
-            ColumnSpec::new("pixels", DType::U8, [steps, side, side, 3]),
-            ColumnSpec::new("action", DType::Float32, [steps, config.data.frameskip * ACTION_DIM]),
+            ColumnSpec::new(PIXELS, DType::U8, [steps, side, side, 3]),
+            ColumnSpec::new(ACTION, DType::Float32, [steps, config.data.frameskip * ACTION_DIM]),
         ];
         let mut batch = Batch::zeros(&Schema::new(columns)?, config.data.batch_size);
         let mut rng = Key::new(0).with("batch").rng();
@@ -160,7 +161,7 @@ impl Subject for LewmSubject {
     fn run(&mut self, work: Work) -> Result<Vec<f32>> {
         match work {
             Work::Cost => return self.costs(),
-            Work::Encode => return self.cost.latent_of(self.infos.get::<u8>("pixels")?),
+            Work::Encode => return self.cost.latent_of(self.infos.get::<u8>(PIXELS)?),
             Work::Plan => self.plan()?,
             Work::Train => self.train()?,
         }

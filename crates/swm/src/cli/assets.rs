@@ -1,6 +1,6 @@
-//! `swm assets`: what worlds need that belongs to others: libraries, models, meshes, Python packages.
+//! `swm assets`: the third-party libraries, models, meshes and Python packages that environments require.
 
-use super::{complain, emit, emit_json, table};
+use super::{emit, emit_json, eprint, table};
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -17,30 +17,37 @@ pub struct AssetsArgs {
 
 #[derive(Subcommand)]
 enum AssetsCommand {
-    /// List what can be installed, and what is (what `swm assets` alone does)
+    /// List all assets (default)
+    #[command(after_help = "Example: swm assets list")]
     List,
-    /// Fetch, check and unpack; Python packages go into an environment of ours
+    /// Download, check and unpack assets
+    ///
+    /// Python packages are installed into a virtual environment in the assets folder.
+    #[command(after_help = "Example: swm assets install mujoco")]
     Install(Names),
-    /// Read every installed file and compare it with what was installed
+    /// Compare every installed file with its recorded hash
+    #[command(after_help = "Example: swm assets verify")]
     Verify(Names),
 }
 
 #[derive(Args)]
 struct Names {
-    /// Which ones, such as mujoco or ale (default for `install`: what 3-D worlds need; for `verify`: what is installed)
+    /// Names of assets, such as mujoco or ale
+    ///
+    /// Default of `install`: the assets of 3-D environments. Default of `verify`: all installed assets.
     names: Vec<String>,
 }
 
-/// Something of others.
+/// A third-party asset.
 #[derive(Clone, Copy)]
-enum Thing {
-    /// Files that our own worlds read.
+enum Installable {
+    /// Files that built-in environments read.
     Files(&'static Asset),
     /// A Python package for Gymnasium environments.
     Python(&'static Package),
 }
 
-impl Thing {
+impl Installable {
     fn all() -> impl Iterator<Item = Self> {
         ASSETS.iter().map(Self::Files).chain(PACKAGES.iter().map(Self::Python))
     }
@@ -48,7 +55,7 @@ impl Thing {
     fn get(name: &str) -> Result<Self> {
         let known = || Self::all().map(Self::name);
         Self::all()
-            .find(|thing| thing.name() == name)
+            .find(|item| item.name() == name)
             .ok_or_else(|| Error::unknown("asset", name, known(), "`swm assets list` lists them"))
     }
 
@@ -103,12 +110,12 @@ impl Thing {
 }
 
 impl Names {
-    /// Those that were named, or the default ones.
-    fn chosen(&self, default: impl Fn(Thing) -> bool) -> Result<Vec<Thing>> {
+    /// Returns the named assets; without names, those that `default` accepts.
+    fn chosen(&self, default: impl Fn(Installable) -> bool) -> Result<Vec<Installable>> {
         if self.names.is_empty() {
-            return Ok(Thing::all().filter(|thing| default(*thing)).collect());
+            return Ok(Installable::all().filter(|item| default(*item)).collect());
         }
-        self.names.iter().map(|name| Thing::get(name)).collect()
+        self.names.iter().map(|name| Installable::get(name)).collect()
     }
 }
 
@@ -118,9 +125,9 @@ pub fn assets(args: &AssetsArgs, as_json: bool) -> anyhow::Result<()> {
         AssetsCommand::List => list(as_json),
         AssetsCommand::Install(names) => {
             let mut folders = vec![];
-            for thing in names.chosen(|thing| matches!(thing, Thing::Files(_)))? {
-                complain(&format!("installing {} {}: {}\n", thing.name(), thing.version(), thing.summary()));
-                folders.push(thing.install()?);
+            for item in names.chosen(|item| matches!(item, Installable::Files(_)))? {
+                eprint(&format!("installing {} {}: {}\n", item.name(), item.version(), item.summary()));
+                folders.push(item.install()?);
             }
             if as_json {
                 return emit_json(&folders);
@@ -129,16 +136,16 @@ pub fn assets(args: &AssetsArgs, as_json: bool) -> anyhow::Result<()> {
             Ok(())
         }
         AssetsCommand::Verify(names) => {
-            let chosen = names.chosen(Thing::is_installed)?;
-            for thing in &chosen {
-                thing.verify()?;
+            let chosen = names.chosen(Installable::is_installed)?;
+            for item in &chosen {
+                item.verify()?;
             }
-            let names: Vec<&str> = chosen.iter().map(|thing| thing.name()).collect();
+            let names: Vec<&str> = chosen.iter().map(|item| item.name()).collect();
             if as_json {
                 return emit_json(&json!({"sound": names}));
             }
             emit(&match &names[..] {
-                [] => "nothing is installed\n".to_owned(),
+                [] => "noitem is installed\n".to_owned(),
                 names => format!("sound: {}\n", names.join(", ")),
             });
             Ok(())
@@ -148,21 +155,21 @@ pub fn assets(args: &AssetsArgs, as_json: bool) -> anyhow::Result<()> {
 
 fn list(as_json: bool) -> anyhow::Result<()> {
     if as_json {
-        let all = Thing::all().map(|thing| {
+        let all = Installable::all().map(|item| {
             json!({
-                "name": thing.name(),
-                "version": thing.version(),
-                "summary": thing.summary(),
-                "installed": thing.is_installed(),
-                "folder": thing.folder(),
+                "name": item.name(),
+                "version": item.version(),
+                "summary": item.summary(),
+                "installed": item.is_installed(),
+                "folder": item.folder(),
             })
         });
         return emit_json(&all.collect::<Vec<Value>>());
     }
-    let words = |thing: Thing| if thing.is_installed() { "installed" } else { "" };
-    let rows = Thing::all()
-        .map(|thing| [thing.name(), thing.version(), words(thing), thing.summary()].map(str::to_owned).to_vec());
-    emit(&table(&["asset", "version", "", "what for"], rows));
-    emit(&format!("they live in {}\n", assets::folder().display()));
+    let status = |item: Installable| if item.is_installed() { "installed" } else { "" };
+    let rows = Installable::all()
+        .map(|item| [item.name(), item.version(), status(item), item.summary()].map(str::to_owned).to_vec());
+    emit(&table(&["asset", "version", "status", "purpose"], rows));
+    emit(&format!("folder: {}\n", assets::folder().display()));
     Ok(())
 }

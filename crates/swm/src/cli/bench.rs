@@ -1,9 +1,9 @@
-//! `swm bench`: how fast it is, beside the reference where it is installed.
+//! `swm bench`: measures speed, compared with the reference implementation where it is installed.
 
-use super::{Context, complain, emit, emit_json, table};
+use super::{Context, emit, emit_json, eprint, table};
 use clap::{Args, Subcommand};
-use swm::ENVS;
-use swm::subject::LewmSubject;
+use crate::ENVS;
+use crate::subject::LewmSubject;
 use swm_bench::{
     BenchConfig, DataBenchConfig, Drawing, ModelBenchConfig, ModelBenchReport, PlanBenchConfig, RenderBenchConfig,
     Work, bench_data, bench_envs, bench_model, bench_plan, bench_render,
@@ -17,36 +17,46 @@ use swm_mujoco::render::{Choice as Renderer, name, with};
 #[derive(Args)]
 pub struct BenchArgs {
     #[command(subcommand)]
-    what: What,
+    command: BenchCommand,
 }
 
 #[derive(Subcommand)]
-enum What {
-    /// Steps a second of worlds: stepping with rendering, and collecting into Lance. The reference runs in turn
-    /// with ours where SWM_REFERENCE_PYTHON names a Python that has it
+enum BenchCommand {
+    /// Measure steps per second of environments, and collecting into Lance
+    ///
+    /// The reference implementation is measured in turn where SWM_REFERENCE_PYTHON names a Python that has it.
+    #[command(after_help = "Example: swm bench envs swm/PushT-v1")]
     Envs(EnvsArgs),
-    /// Planning: iterations a second of CEM with a model that costs nothing, and the planner's share of the time beside a
-    /// model; then a LeWM of the published size: a plan, the costs of one iteration, encoding a picture
+    /// Measure planning with CEM: the solver alone, then with a LeWM
+    ///
+    /// First, iterations per second with a model of no cost, and the fraction of the time that the solver takes next to a
+    /// model; then, with a LeWM of the published size, a plan, the costs of one iteration, and the encoding of an image.
+    #[command(after_help = "Example: swm bench plan --envs 16")]
     Plan(PlanArgs),
-    /// A training step of a LeWM of the published size
+    /// Measure a training step of a LeWM of the published size
+    #[command(after_help = "Example: swm bench train --device cpu")]
     Train(TrainArgs),
-    /// Clips a second from every format, and conversions; the use of memory over epochs
+    /// Measure loading from every format, conversions, and memory over epochs
+    #[command(after_help = "Example: swm bench data --formats lance,hdf5")]
     Data(DataArgs),
-    /// Pictures a second, by environment and size, drawn by each renderer there is: on one thread, or on so many as --threads says
+    /// Measure frames per second of every renderer, by environment and size
+    ///
+    /// Renderers use one thread, or as many as --threads permits.
+    #[command(after_help = "Example: swm bench render --sizes 64")]
     Render(RenderArgs),
 }
 
 #[derive(Args)]
 struct RenderArgs {
-    /// Which environments (default: all of three dimensions)
+    /// Ids of environments (default: all 3-D environments)
     envs: Vec<String>,
-    /// Picture sizes
+    /// Frame sizes, in pixels
     #[arg(long, value_delimiter = ',', default_value = "64,224")]
     sizes: Vec<usize>,
-    /// Turns of each renderer
+    /// Measurements per renderer
     #[arg(long, default_value_t = 5)]
     turns: usize,
-    /// Seconds of a turn
+    /// Seconds per measurement
     #[arg(long, default_value_t = 0.5)]
     seconds: f64,
 }
@@ -55,14 +65,14 @@ struct RenderArgs {
 fn render(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
     let envs: Vec<EnvChoice> = match &args.envs[..] {
         [] => swm_mujoco::ENVS.rows.iter().map(EnvChoice::from).collect(),
-        ids => ids.iter().map(|id| swm::env(id)).collect::<swm_core::Result<_>>()?,
+        ids => ids.iter().map(|id| crate::env(id)).collect::<swm_core::Result<_>>()?,
     };
     let cpu = |work: &mut dyn FnMut() -> swm_core::Result<()>| with(Renderer::Cpu, work);
     let egl = |work: &mut dyn FnMut() -> swm_core::Result<()>| with(Renderer::Egl, work);
     let mut renderers: Vec<(String, &Drawing<'_>)> = vec![(with(Renderer::Cpu, name)?, &cpu)];
     match with(Renderer::Egl, name) {
         Ok(name) => renderers.push((name, &egl)),
-        Err(problem) => complain(&format!("{problem}\n")),
+        Err(problem) => eprint(&format!("{problem}\n")),
     }
     let threads = context.threads.max(1);
     let config = RenderBenchConfig { sizes: args.sizes.clone(), turns: args.turns, seconds: args.seconds, threads };
@@ -74,43 +84,44 @@ fn render(args: &RenderArgs, context: &Context) -> anyhow::Result<()> {
         let speed = format!("{:.0}", row.frames_per_second);
         vec![row.env.clone(), format!("{} px", row.size), row.renderer.clone(), speed]
     });
-    emit(&table(&["environment", "pictures", "renderer", "pictures/s"], rows));
-    let on = if threads == 1 { "one thread".to_owned() } else { format!("up to {threads} threads a picture") };
-    emit(&format!("{on}, medians of {} turns\n", args.turns));
+    emit(&table(&["environment", "frame size", "renderer", "frames/s"], rows));
+    let on = if threads == 1 { "one thread".to_owned() } else { format!("up to {threads} threads per frame") };
+    emit(&format!("{on}, medians of {} measurements\n", args.turns));
     Ok(())
 }
 
 #[derive(Args)]
 struct DataArgs {
-    /// The environment whose pictures are loaded
+    /// The environment whose frames are loaded
     #[arg(default_value = "swm/PushT-v1")]
     env: String,
     /// Formats to load from (default: all)
     #[arg(long, value_delimiter = ',')]
     formats: Vec<String>,
-    /// Episodes of the datasets
+    /// Episodes per dataset
     #[arg(long, default_value_t = 40)]
     episodes: usize,
-    /// Steps of an episode
+    /// Steps per episode
     #[arg(long, default_value_t = 100)]
     steps: usize,
-    /// Picture size
+    /// Frame size, in pixels
     #[arg(long, default_value_t = 224)]
     size: usize,
-    /// Pairs of turns, ours and the reference's
+    /// Pairs of measurements: this engine and the reference implementation
     #[arg(long, default_value_t = 5)]
     pairs: usize,
-    /// Seconds of a turn
+    /// Seconds per measurement
     #[arg(long, default_value_t = 2.0)]
     seconds: f64,
-    /// Epochs over which the use of memory is watched
+    /// Epochs over which memory use is measured
     #[arg(long, default_value_t = 10)]
     epochs: usize,
-    /// A folder of an object store to load from beside this machine's disk, such as s3://bucket/bench; the environment says
-    /// how it is reached (AWS_ENDPOINT_URL …)
+    /// Also load from a folder of an object store, such as s3://bucket/bench
+    ///
+    /// Environment variables such as AWS_ENDPOINT_URL configure access.
     #[arg(long, value_name = "URI")]
     remote: Option<String>,
-    /// Leave out converting
+    /// Skip conversions
     #[arg(long)]
     load_only: bool,
 }
@@ -118,7 +129,7 @@ struct DataArgs {
 /// Measures loading and converting.
 fn data(args: &DataArgs, context: &Context) -> anyhow::Result<()> {
     let report = bench_data(
-        &swm::env(&args.env)?,
+        &crate::env(&args.env)?,
         &DataBenchConfig {
             episodes: args.episodes,
             steps: args.steps,
@@ -142,24 +153,24 @@ fn data(args: &DataArgs, context: &Context) -> anyhow::Result<()> {
 
 #[derive(Args)]
 struct PlanArgs {
-    /// Environments planned in one call
+    /// Environments per planning call
     #[arg(long, value_delimiter = ',', default_value = "1,16")]
     envs: Vec<usize>,
-    /// Pairs of turns, ours and the reference's
+    /// Pairs of measurements: this engine and the reference implementation
     #[arg(long, default_value_t = 5)]
     pairs: usize,
-    /// Seconds of a turn with a model that costs nothing
+    /// Seconds per measurement with a model of no cost
     #[arg(long, default_value_t = 1.0)]
     seconds: f64,
-    /// Iterations of a plan with a LeWM; 0 leaves the LeWM out
+    /// Iterations per plan with a LeWM; 0 skips the LeWM
     #[arg(long, default_value_t = 30)]
     iterations: usize,
-    /// Where the LeWM computes: cpu, vulkan, cuda (:1 for the second such GPU) or auto
+    /// Device of the LeWM: cpu, vulkan, cuda (:1 for the second such GPU) or auto
     #[arg(long, default_value = "cpu")]
     device: String,
 }
 
-/// Measures planners, and a model that is planned with.
+/// Measures the solver, then a LeWM that it plans with.
 fn plan(args: &PlanArgs, context: &Context) -> anyhow::Result<()> {
     let planner = bench_plan(&PlanBenchConfig {
         envs: args.envs.clone(),
@@ -185,13 +196,13 @@ fn plan(args: &PlanArgs, context: &Context) -> anyhow::Result<()> {
 
 #[derive(Args)]
 struct TrainArgs {
-    /// Clips of a batch
+    /// Clips per batch
     #[arg(long, default_value_t = 8)]
     clips: usize,
-    /// Pairs of turns, ours and the reference's
+    /// Pairs of measurements: this engine and the reference implementation
     #[arg(long, default_value_t = 5)]
     pairs: usize,
-    /// Where it computes: cpu, vulkan, cuda (:1 for the second such GPU) or auto
+    /// Device: cpu, vulkan, cuda (:1 for the second such GPU) or auto
     #[arg(long, default_value = "cpu")]
     device: String,
 }
@@ -202,8 +213,8 @@ fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
     if context.json {
         return emit_json(&report);
     }
-    let rate = report.rows.first().map_or(0.0, |row| args.clips as f64 / row.seconds);
-    emit(&format!("{report}{} clips a step: {rate:.1} clips/s\n", args.clips));
+    let clips_per_second = report.rows.first().map_or(0.0, |row| args.clips as f64 / row.seconds);
+    emit(&format!("{report}{} clips per step: {clips_per_second:.1} clips/s\n", args.clips));
     Ok(())
 }
 
@@ -229,50 +240,54 @@ fn lewm(
 
 #[derive(Args)]
 struct EnvsArgs {
-    /// Which environments (default: all)
+    /// Ids of environments (default: all)
     envs: Vec<String>,
-    /// Environments of a world
+    /// Environments stepped at the same time
     #[arg(long, default_value_t = 8)]
     num_envs: usize,
-    /// Picture sizes
+    /// Frame sizes, in pixels
     #[arg(long, value_delimiter = ',', default_value = "224,64")]
     sizes: Vec<usize>,
-    /// Leave out stepping without pictures
-    #[arg(long)]
-    pictures_only: bool,
-    /// Pairs of turns, ours and the reference's
+    /// Skip stepping without rendering
+    #[arg(long, alias = "pictures-only")]
+    frames_only: bool,
+    /// Pairs of measurements: this engine and the reference implementation
     #[arg(long, default_value_t = 5)]
     pairs: usize,
-    /// Seconds of a turn
+    /// Seconds per measurement
     #[arg(long, default_value_t = 1.0)]
     seconds: f64,
-    /// Episodes the reference collects in a turn; 0 leaves collecting out
+    /// Episodes that the reference collects per measurement; 0 skips collecting
     #[arg(long, default_value_t = 8)]
     episodes: usize,
-    /// Steps of an episode, on both sides: the fewer, the more resets count
+    /// Steps per collected episode; fewer steps weigh resets more
     #[arg(long, default_value_t = 50)]
     episode_steps: usize,
 }
 
-/// Measures.
+/// Runs a benchmark and prints its report.
 pub fn bench(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
-    let args = match &args.what {
-        What::Envs(args) => args,
-        What::Plan(args) => return plan(args, context),
-        What::Train(args) => return train(args, context),
-        What::Data(args) => return data(args, context),
-        What::Render(args) => return render(args, context),
-    };
+    match &args.command {
+        BenchCommand::Envs(args) => envs(args, context),
+        BenchCommand::Plan(args) => plan(args, context),
+        BenchCommand::Train(args) => train(args, context),
+        BenchCommand::Data(args) => data(args, context),
+        BenchCommand::Render(args) => render(args, context),
+    }
+}
+
+/// Measures environments.
+fn envs(args: &EnvsArgs, context: &Context) -> anyhow::Result<()> {
     let entries: Vec<EnvChoice> = match &args.envs[..] {
         [] => ENVS.rows.iter().map(EnvChoice::from).collect(),
-        ids => ids.iter().map(|id| swm::env(id)).collect::<swm_core::Result<_>>()?,
+        ids => ids.iter().map(|id| crate::env(id)).collect::<swm_core::Result<_>>()?,
     };
     let report = bench_envs(
         &entries,
         &BenchConfig {
             envs: args.num_envs,
             sizes: args.sizes.clone(),
-            bare: !args.pictures_only,
+            bare: !args.frames_only,
             episode_steps: args.episode_steps,
             threads: context.threads,
             pairs: args.pairs,
@@ -295,9 +310,9 @@ pub fn bench(args: &BenchArgs, context: &Context) -> anyhow::Result<()> {
             row.ratio.map_or("–".to_owned(), |ratio| format!("{ratio:.1} ×")),
         ]
     });
-    emit(&table(&["environment", "work", "pictures", "steps/s", "reference", "ratio"], rows));
+    emit(&table(&["environment", "work", "frame size", "steps/s", "reference", "ratio"], rows));
     emit(&format!(
-        "{} environments, {} threads, medians of {} turns; reference: {}\n",
+        "{} environments, {} threads, medians of {} measurements; reference: {}\n",
         report.envs, report.threads, args.pairs, report.reference
     ));
     Ok(())

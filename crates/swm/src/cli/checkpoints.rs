@@ -1,10 +1,10 @@
-//! `swm checkpoints`: which models were trained here, where one came from, and whether it is whole.
+//! `swm checkpoints`: lists, shows, verifies, imports, exports and removes checkpoints.
 
 use super::{emit, emit_json, table};
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use swm::home::{self, names_in};
+use crate::home::{self, names_in};
 use swm_core::{Error, Result};
 use swm_models::{CheckpointInfo, Device, FAMILIES, checkpoint};
 
@@ -13,66 +13,72 @@ use swm_models::{CheckpointInfo, Device, FAMILIES, checkpoint};
 #[command(args_conflicts_with_subcommands = true)]
 pub struct CheckpointsArgs {
     #[command(subcommand)]
-    command: Option<What>,
-    /// Show this one: a path or a name
+    command: Option<CheckpointsCommand>,
+    /// The checkpoint to show: a path or a name
     checkpoint: Option<String>,
 }
 
 #[derive(Subcommand)]
-enum What {
-    /// List those at home
+enum CheckpointsCommand {
+    /// List the checkpoints in the home folder
+    #[command(after_help = "Example: swm checkpoints list")]
     List,
-    /// Show how one was trained
+    /// Show the provenance and the config of a checkpoint
+    #[command(after_help = "Example: swm checkpoints show lewm-rooms")]
     Show {
         /// A path or a name
         checkpoint: String,
     },
-    /// Load them and compare their hashes
+    /// Load checkpoints and compare their hashes
+    #[command(after_help = "Example: swm checkpoints verify lewm-rooms")]
     Verify {
         /// Paths or names (default: all at home)
         checkpoints: Vec<String>,
     },
-    /// Make one of what the reference trained: a folder with weights.pt and config.json
+    /// Import a checkpoint of the reference implementation
+    #[command(after_help = "Example: swm checkpoints import run --model lewm --data rooms --output lewm-rooms")]
     Import {
-        /// The folder
+        /// The folder with weights.pt and config.json
         folder: PathBuf,
         /// The model: `swm models` lists them
         #[arg(long)]
         model: String,
-        /// The dataset it was trained on, which says how actions and columns were scaled
+        /// The dataset it was trained on, for the scaling of actions and columns
         #[arg(long, value_name = "DATASET")]
         data: String,
-        /// What to call it: a path or a name
+        /// The checkpoint to write: a path or a name
         #[arg(short, long, value_name = "CHECKPOINT")]
         output: String,
     },
-    /// Write what the reference's load_pretrained reads
+    /// Write the files that `load_pretrained` of the reference reads
+    #[command(after_help = "Example: swm checkpoints export lewm-rooms exported")]
     Export {
         /// A path or a name
         checkpoint: String,
         /// The folder to write weights.pt and config.json to
         folder: PathBuf,
     },
-    /// Remove one with its logs
+    /// Remove a checkpoint and its logs
+    #[command(after_help = "Example: swm checkpoints remove lewm-rooms")]
     Remove {
         /// A path or a name
         checkpoint: String,
     },
 }
 
-/// Lists, shows, verifies or removes checkpoints.
+/// Runs `swm checkpoints`.
 pub fn checkpoints(args: &CheckpointsArgs, as_json: bool) -> anyhow::Result<()> {
     match (&args.command, &args.checkpoint) {
-        (Some(What::Show { checkpoint }), _) | (None, Some(checkpoint)) => show(checkpoint, as_json),
-        (Some(What::List) | None, None | Some(_)) => list(as_json),
-        (Some(What::Verify { checkpoints }), _) => verify(checkpoints, as_json),
-        (Some(What::Import { folder, model, data, output }), _) => import(folder, model, data, output, as_json),
-        (Some(What::Export { checkpoint, folder }), _) => export(checkpoint, folder, as_json),
-        (Some(What::Remove { checkpoint }), _) => remove(checkpoint, as_json),
+        (Some(CheckpointsCommand::Show { checkpoint }), _) | (None, Some(checkpoint)) => show(checkpoint, as_json),
+        (Some(CheckpointsCommand::List) | None, None | Some(_)) => list(as_json),
+        (Some(CheckpointsCommand::Verify { checkpoints }), _) => verify(checkpoints, as_json),
+        (Some(CheckpointsCommand::Import { folder, model, data, output }), _) => import(folder, model, data, output, as_json),
+        (Some(CheckpointsCommand::Export { checkpoint, folder }), _) => export(checkpoint, folder, as_json),
+        (Some(CheckpointsCommand::Remove { checkpoint }), _) => remove(checkpoint, as_json),
     }
 }
 
-/// Loads a checkpoint by path or name, which verifies it.
+/// Loads a checkpoint by path or name; loading compares the hash of the weights.
 fn load(given: &str) -> Result<(PathBuf, CheckpointInfo)> {
     let path = home::find_checkpoint(given)?;
     let info = swm_models::load(&path, &Device::flex())?.info()?;
@@ -117,7 +123,7 @@ fn list(as_json: bool) -> anyhow::Result<()> {
         return emit_json(&found);
     }
     if found.is_empty() {
-        emit(&format!("no checkpoints in {}; `swm train lewm --data DATASET` makes one\n", folder.display()));
+        emit(&format!("no checkpoints in {}; `swm train lewm --data DATASET` trains one\n", folder.display()));
         return Ok(());
     }
     let text = |value: &Value| value.as_str().unwrap_or("?").to_owned();
@@ -131,7 +137,7 @@ fn list(as_json: bool) -> anyhow::Result<()> {
             text(&found["weights"]).chars().take(12).collect(),
         ],
     });
-    emit(&table(&["checkpoint", "model", "environment", "pictures", "weights"], rows));
+    emit(&table(&["checkpoint", "model", "environment", "image", "weights"], rows));
     Ok(())
 }
 
@@ -153,7 +159,7 @@ fn verify(given: &[String], as_json: bool) -> anyhow::Result<()> {
     } else {
         for (name, info) in &found {
             match info {
-                Ok((_, info)) => emit(&format!("{name}: whole, weights {}\n", info.weights)),
+                Ok((_, info)) => emit(&format!("{name}: valid, weights {}\n", info.weights)),
                 Err(error) => emit(&format!("{name}: {error}\n")),
             }
         }
@@ -177,7 +183,7 @@ fn import(folder: &Path, model: &str, data: &str, output: &str, as_json: bool) -
     let reader = home::open_dataset(data)?;
     let Some(weights) = (family.import)(folder, &*reader, &out) else {
         let fix = "import lewm, pldm, dino_wm, tdmpc2, gcbc, gcivl or gciql";
-        anyhow::bail!(Error::config("--model", format!("the reference has no {model}"), fix));
+        anyhow::bail!(Error::config("--model", format!("the reference implementation has no {model}"), fix));
     };
     let weights = weights?;
     if as_json {
@@ -190,7 +196,7 @@ fn import(folder: &Path, model: &str, data: &str, output: &str, as_json: bool) -
 fn export(given: &str, folder: &Path, as_json: bool) -> anyhow::Result<()> {
     let loaded = swm_models::load(&home::find_checkpoint(given)?, &Device::flex())?;
     let Some(done) = loaded.export(folder) else {
-        let problem = format!("the reference has no {}", loaded.info()?.family);
+        let problem = format!("the reference implementation has no {}", loaded.info()?.family);
         anyhow::bail!(Error::config(format!("checkpoint {given}"), problem, "its weights are in weights.safetensors"));
     };
     done?;
@@ -203,9 +209,9 @@ fn export(given: &str, folder: &Path, as_json: bool) -> anyhow::Result<()> {
 
 fn remove(given: &str, as_json: bool) -> anyhow::Result<()> {
     let path = home::find_checkpoint(given)?;
-    // Only what is a run's folder: a mistyped path must not take anything else away.
+    // A mistyped path must not remove anything but a checkpoint.
     if checkpoint::family(&path).is_none() {
-        anyhow::bail!(Error::corrupt(&path, "there is no checkpoint", "give the folder that `swm train` wrote to"));
+        anyhow::bail!(Error::corrupt(&path, "it is not a checkpoint", "give the folder that `swm train` wrote to"));
     }
     std::fs::remove_dir_all(&path).map_err(|error| Error::io(&path, "removing a checkpoint", error))?;
     if as_json {

@@ -1,59 +1,64 @@
-//! `swm collect`: run a policy and store its episodes.
+//! `swm collect`: runs a policy and stores its episodes.
 
 use super::config::{CodecArgs, VariationArgs, image_size};
 use super::wrappers::WrapperArgs;
-use super::{Context, Progress, emit, emit_json};
+use super::{Context, emit, emit_json, progress};
 use clap::Args;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
-use swm::home;
-use swm::resolver::acting;
-use swm_core::run::{Control, Event};
-use swm_core::{CameraView, EnvChoice, Error, Result};
+use crate::{collect_target, home};
+use crate::resolver::policy_by_name;
+use swm_core::{CameraView, EnvChoice, Error, Manifest, Result, Schema};
 use swm_data::lance::{Shard, create_shard};
-use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions};
+use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions, Writer};
 use swm_eval::{CollectConfig, Collected, World, WorldConfig};
 
 /// Arguments of `swm collect`.
 #[derive(Args)]
 pub struct CollectArgs {
-    /// The environment, such as swm/TwoRoom-v1; options behind it: swm/OGBCube-v0,env_type=double
+    /// The environment, such as swm/TwoRoom-v1 or swm/OGBCube-v0,env_type=double
     env: String,
     /// The dataset to write: a path or a name
     #[arg(short, long, value_name = "DATASET")]
     output: String,
-    /// Who acts: random, expert, one of the environment's experts by name, or a checkpoint that acts by itself
+    /// The policy: random, expert, an expert's id, or a checkpoint
+    ///
+    /// The checkpoint must act without a solver. `swm envs ENV` lists the experts.
     #[arg(long, default_value = "expert")]
     policy: String,
-    /// Episodes the dataset shall have
+    /// Number of episodes of the complete dataset
     #[arg(long, default_value_t = 100)]
     episodes: usize,
-    /// What decides every episode, together with its number
+    /// Seed; it and the index of an episode determine the episode
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Environments played at the same time; the dataset does not depend on it
+    /// Parallel environments; the dataset does not depend on it
     #[arg(long, default_value_t = 8)]
     envs: usize,
-    /// Picture size: 64 or HEIGHTxWIDTH
+    /// Frame size in pixels: 64 or HEIGHTxWIDTH
     #[arg(long, default_value = "224", value_parser = image_size)]
     image: (usize, usize),
-    /// Store no pictures
+    /// Store no frames
     #[arg(long, conflicts_with = "image")]
     no_pixels: bool,
-    /// Another picture to store: CAMERA, depth, segmentation, or CAMERA:depth (`swm envs ENV` names the cameras)
+    /// Another camera view: CAMERA, depth, segmentation, or CAMERA:depth
+    ///
+    /// `swm envs ENV` lists the cameras.
     #[arg(long = "view", value_name = "VIEW", conflicts_with = "no_pixels")]
     views: Vec<String>,
-    /// Steps after which an episode is truncated (default: the environment's own)
+    /// Time limit of an episode, in steps (default: the environment's)
     #[arg(long, value_name = "STEPS")]
     max_steps: Option<usize>,
-    /// Its format, where the name does not say it (`swm formats` lists them)
+    /// Dataset format (default: from the suffix); `swm formats` lists them
     #[arg(long, value_name = "NAME")]
     format: Option<String>,
-    /// Collect the part I of N, counted from 0, of a Lance dataset; `swm datasets commit` makes one of all parts
+    /// Collect shard I of N, counted from 0, of a Lance dataset
+    ///
+    /// `swm datasets commit` commits the shards of all machines.
     #[arg(long, value_name = "I/N", value_parser = shard, conflicts_with = "format")]
     shard: Option<Shard>,
-    /// Add to a dataset whose pictures another renderer drew
+    /// Continue a dataset whose frames come from another renderer
     #[arg(long, requires = "resume")]
     mix_renderers: bool,
     #[command(flatten)]
@@ -61,7 +66,7 @@ pub struct CollectArgs {
     /// Continue an interrupted collection
     #[arg(long, conflicts_with = "overwrite")]
     resume: bool,
-    /// Replace a dataset that is already there
+    /// Replace an existing dataset
     #[arg(long)]
     overwrite: bool,
     #[command(flatten)]
@@ -70,46 +75,46 @@ pub struct CollectArgs {
     variation: VariationArgs,
 }
 
-/// Reads `I/N`.
+/// Parses `I/N`.
 fn shard(text: &str) -> std::result::Result<Shard, String> {
     let parts = text.split_once('/').and_then(|(index, count)| Some((index.parse().ok()?, count.parse().ok()?)));
     match parts {
         Some((index, count)) if index < count => Ok(Shard { index, count }),
-        _ => Err(format!("'{text}' is no part: write 0/4 for the first of four")),
+        _ => Err(format!("'{text}' is not a shard: write 0/4 for the first of four")),
     }
 }
 
-/// A collection, as `swm collect` and `swm demo` ask for it.
+/// The settings of a collection.
 pub struct Collection<'a> {
     /// The environment.
     pub env: EnvChoice,
-    /// Where to.
+    /// The dataset to write.
     pub location: &'a Location,
-    /// The format, where the location does not say it.
+    /// The format; `None` to infer it from the location.
     pub format: Option<&'a str>,
-    /// Which part of the dataset, if not all.
+    /// The shard to collect; `None` for the whole dataset.
     pub shard: Option<Shard>,
-    /// Who acts.
+    /// The name of the policy.
     pub policy: &'a str,
-    /// Environments, pictures, threads.
+    /// Environments, frames, threads.
     pub world: WorldConfig,
     /// Episodes, seed, factors.
     pub config: CollectConfig,
-    /// What to do with a dataset that is there.
+    /// Whether to create, continue or replace the dataset.
     pub mode: WriteMode,
-    /// How pictures are stored.
+    /// How frames are encoded.
     pub codec: ImageCodec,
-    /// What pictures pass through before they are stored.
+    /// Wrappers of the frames.
     pub wrappers: WrapperArgs,
-    /// Whether pictures of another renderer may stand beside those that are there.
+    /// Whether the dataset may contain frames of several renderers.
     pub mix_renderers: bool,
 }
 
-/// Runs a policy and stores its episodes.
+/// Runs `swm collect`.
 pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
     let location = home::target(&args.output, args.format.as_deref())?;
     let collection = Collection {
-        env: swm::env(&args.env)?,
+        env: crate::env(&args.env)?,
         location: &location,
         format: args.format.as_deref(),
         shard: args.shard,
@@ -145,67 +150,65 @@ pub fn collect(args: &CollectArgs, context: &Context) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Runs a collection with a progress bar.
+/// Collects, and shows progress.
 pub fn run(collection: &Collection<'_>, context: &Context) -> Result<Collected> {
     let Collection { env, location, config, .. } = collection;
     let (stack, goal) = collection.wrappers.stack()?;
     let mut world = World::of(|| Ok(stack.wrap(env.env()?, goal)), collection.world.clone())?;
-    let (mut policy, weights) = acting(&env.entry, collection.policy, &world)?;
-    // A wrong factor is found before anything of an older dataset is replaced.
+    let (mut policy, weights) = policy_by_name(&env.entry, collection.policy, &world)?;
+    // An invalid factor fails before an older dataset is replaced.
     world.spec().variation_space.resolve(&config.variation, swm_core::Key::new(config.seed))?;
-    let mut manifest = world.collect_manifest(config);
-    if let Some(weights) = weights {
-        manifest.hashes.insert("policy".to_owned(), weights);
-    }
-    manifest.config["codec"] = json!(collection.codec);
-    if !collection.wrappers.wrappers.is_empty() {
-        manifest.config["wrappers"] = json!(collection.wrappers.choices()?);
-        manifest.config["wrap_goal"] = json!(collection.wrappers.wrap_goal);
-    }
+    let manifest = collection.manifest(&world, weights)?;
     if collection.shard.is_none() {
-        swm::collect::check(location, collection.mode, &manifest, collection.mix_renderers)?;
+        collect_target::check(location, collection.mode, &manifest, collection.mix_renderers)?;
     }
-    let schema = world.collect_schema(config.goal)?;
-    let options = WriteOptions {
-        mode: collection.mode,
-        codec: collection.codec,
-        manifest: Some(manifest),
-        ..WriteOptions::default()
-    };
-    // A part has a run of the episodes, so that the whole has them in order.
-    let part = collection.shard.map_or(0..config.episodes, |Shard { index, count }| {
+    let writer = collection.writer(&world.collect_schema(config.goal)?, manifest)?;
+    // A shard has consecutive episodes, so that the committed dataset has all of them in order.
+    let episodes = collection.shard.map_or(0..config.episodes, |Shard { index, count }| {
         config.episodes * index / count..config.episodes * (index + 1) / count
     });
-    let writer = match (collection.shard, collection.format) {
-        (Some(shard), _) => create_shard(location, &schema, options, shard)?,
-        (None, Some(format)) => FORMATS.get(format)?.create(location, &schema, options)?,
-        (None, None) => swm_data::create(*location, &schema, options)?,
-    };
-    let config = &CollectConfig { episodes: part.len(), first: part.start, ..config.clone() };
-    let mut progress = Progress::new("collect", config.episodes);
-    let begun = Instant::now();
-    let speed = |steps: f64| format!("{:.0} steps/s", steps / begun.elapsed().as_secs_f64().max(1e-9));
-    let collected = {
-        let progress = &mut progress;
-        let mut control = Control::new().with_interrupt(context.stop.clone()).with_events(move |event| {
-            if let Event::Progress(at) = event {
-                progress.at(at.done, speed(at.metric("steps").unwrap_or_default()));
-            }
-        });
-        world.collect(&mut *policy, writer, config, &mut control)?
-    };
-    progress.done(&format!(
+    let config = &CollectConfig { episodes: episodes.len(), first: episodes.start, ..config.clone() };
+    let start = Instant::now();
+    let collected = world.collect(&mut *policy, writer, config, &mut progress::control(context))?;
+    let message = format!(
         "{} episodes in {location} ({} new, {} steps, {})",
         collected.episodes,
         collected.added,
         collected.steps,
-        speed(collected.steps as f64)
-    ));
+        progress::steps_per_second(collected.steps as f64, start.elapsed())
+    );
+    progress::print_summary("collect", &message);
     Ok(collected)
 }
 
-/// What `--output` of a command becomes: the folder, made.
-pub fn folder(path: &Path) -> Result<PathBuf> {
+impl Collection<'_> {
+    /// Returns the manifest of the dataset; `weights` is the hash of the policy's weights.
+    fn manifest(&self, world: &World, weights: Option<String>) -> Result<Manifest> {
+        let mut manifest = world.collect_manifest(&self.config);
+        if let Some(weights) = weights {
+            manifest.hashes.insert("policy".to_owned(), weights);
+        }
+        manifest.config["codec"] = json!(self.codec);
+        if !self.wrappers.wrappers.is_empty() {
+            manifest.config["wrappers"] = json!(self.wrappers.choices()?);
+            manifest.config["wrap_goal"] = json!(self.wrappers.wrap_goal);
+        }
+        Ok(manifest)
+    }
+
+    fn writer(&self, schema: &Schema, manifest: Manifest) -> Result<Box<dyn Writer>> {
+        let options =
+            WriteOptions { mode: self.mode, codec: self.codec, manifest: Some(manifest), ..WriteOptions::default() };
+        match (self.shard, self.format) {
+            (Some(shard), _) => create_shard(self.location, schema, options, shard),
+            (None, Some(format)) => FORMATS.get(format)?.create(self.location, schema, options),
+            (None, None) => swm_data::create(self.location.clone(), schema, options),
+        }
+    }
+}
+
+/// Creates a folder.
+pub fn create_folder(path: &Path) -> Result<PathBuf> {
     std::fs::create_dir_all(path).map_err(|e| Error::io(path, "creating the folder", e))?;
     Ok(path.to_owned())
 }

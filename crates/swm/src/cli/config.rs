@@ -1,34 +1,34 @@
-//! Words of the command line that several commands share.
+//! Arguments that several commands share: image codecs, factors of variation, frame sizes.
 
 use clap::{Args, ValueEnum};
 use std::collections::BTreeMap;
 use swm_core::{Error, Result, VariationRequest};
 use swm_data::ImageCodec;
 
-/// How pictures are stored, where the format leaves a choice.
+/// How frames are stored in formats with a choice of codec.
 #[derive(Args)]
 pub struct CodecArgs {
-    /// How pictures are stored, where the format leaves a choice
+    /// Codec of stored frames, in formats with a choice
     #[arg(long, value_enum, default_value_t = Codec::Qoi)]
     codec: Codec,
-    /// Quality of jpeg, 1 to 100
+    /// Quality of JPEG frames, 1 to 100
     #[arg(long, default_value_t = 95, value_parser = clap::value_parser!(u8).range(1..=100))]
     quality: u8,
 }
 
-/// How pictures are stored.
+/// The codec of stored frames.
 #[derive(Clone, Copy, ValueEnum)]
 enum Codec {
-    /// Lossless, the fastest
+    /// Lossless; the fastest
     Qoi,
-    /// Lossless, read by everything
+    /// Lossless; the most compatible
     Png,
-    /// Lossy, what the reference writes
+    /// Lossy; the codec of the reference implementation
     Jpeg,
 }
 
 impl CodecArgs {
-    /// What they ask for.
+    /// Returns the codec with its quality.
     pub fn codec(&self) -> ImageCodec {
         match self.codec {
             Codec::Qoi => ImageCodec::Qoi,
@@ -38,26 +38,31 @@ impl CodecArgs {
     }
 }
 
-/// Which factors of variation differ between episodes.
+/// Factors of variation to sample or to pin.
 #[derive(Args, Clone, Default)]
 pub struct VariationArgs {
-    /// Factors to sample at every reset: keys, groups such as `agent`, or `all`; `none` samples nothing
+    /// Factors to sample at every reset: keys, groups, `all` or `none`
+    ///
+    /// A group is the first part of a key, such as `agent` of `agent.color`.
     #[arg(long, value_name = "KEY", num_args = 1.., value_delimiter = ',')]
     pub variation: Option<Vec<String>>,
-    /// Factors held at a value, such as background.color=200,220,255
+    /// Factors to set to a value, such as background.color=200,220,255
     #[arg(long, value_name = "KEY=VALUE", num_args = 1..)]
     pub pin: Vec<String>,
 }
 
 impl VariationArgs {
-    /// What an environment is asked at a reset.
+    /// Returns the request that environments get at every reset.
+    ///
+    /// # Errors
+    /// When a pinned value is not `KEY=NUMBER[,NUMBER…]`.
     pub fn request(&self) -> Result<VariationRequest> {
         let mut variation_values = BTreeMap::new();
         for pin in &self.pin {
             let wrong = || {
                 Error::config(
                     format!("--pin {pin}"),
-                    "this is not KEY=NUMBER[,NUMBER…]",
+                    "it is not KEY=NUMBER[,NUMBER…]",
                     "write it like background.color=200,220,255",
                 )
             };
@@ -72,22 +77,25 @@ impl VariationArgs {
         Ok(VariationRequest { variation, variation_values })
     }
 
-    /// The shift in a few words.
+    /// Returns a short description of the shift.
     pub fn describe(&self) -> String {
         let varied = self.variation.iter().flatten().map(|key| format!("{key} sampled"));
-        let words: Vec<String> = varied.chain(self.pin.iter().cloned()).collect();
-        if words.is_empty() { "in distribution".to_owned() } else { words.join(", ") }
+        let shifts: Vec<String> = varied.chain(self.pin.iter().cloned()).collect();
+        if shifts.is_empty() { "in distribution".to_owned() } else { shifts.join(", ") }
     }
 }
 
-/// Parses a picture size: `64` or `HEIGHTxWIDTH`.
+/// Parses a frame size in pixels: `64` or `HEIGHTxWIDTH`.
+///
+/// # Errors
+/// When it is malformed or a side is not within 4 to 4096.
 pub fn image_size(given: &str) -> std::result::Result<(usize, usize), String> {
     let parse = |s: &str| s.trim().parse::<usize>().ok().filter(|n| (4..=4096).contains(n));
     let size = match given.split_once('x') {
         Some((height, width)) => parse(height).zip(parse(width)),
         None => parse(given).map(|n| (n, n)),
     };
-    size.ok_or_else(|| format!("'{given}' is no picture size: write 64 or 64x96 (height x width), from 4 to 4096"))
+    size.ok_or_else(|| format!("'{given}' is not a frame size: write 64 or 64x96 (height x width), from 4 to 4096"))
 }
 
 #[cfg(test)]
@@ -95,7 +103,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pins_and_keys_become_a_request() {
+    fn parses_variation_and_frame_sizes() {
         let args = VariationArgs {
             variation: Some(vec!["agent".to_owned()]),
             pin: vec!["background.color=1, 2,3".to_owned()],

@@ -1,11 +1,12 @@
-//! `swm datasets`, `formats` and `preview`: what data there are and what they look like.
+//! `swm datasets`, `swm formats` and `swm preview`: list datasets and formats, commit shards, write previews.
 
-use super::{Progress, emit, emit_json, table};
+use super::progress::{StageDisplay, print_summary};
+use super::{emit, emit_json, table};
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 use std::path::PathBuf;
-use swm::home::{names_in, open_dataset as open};
-use swm::{data, home};
+use crate::home::{names_in, open_dataset as open};
+use crate::{data, home};
 use swm_core::Result;
 use swm_data::Reader;
 use swm_data::lance::commit_shards;
@@ -15,16 +16,16 @@ use swm_data::lance::commit_shards;
 pub struct PreviewArgs {
     /// The dataset: a path or a name
     dataset: String,
-    /// Where to write the videos and the contact sheet
+    /// Folder of the videos and the contact sheet
     #[arg(short, long, default_value = "preview", value_name = "DIR")]
     output: PathBuf,
-    /// How many episodes, spread over the dataset
+    /// Number of episodes, spread over the dataset
     #[arg(long, default_value_t = 4)]
     episodes: usize,
-    /// A picture column, which may be given several times; all of them, side by side, without it
+    /// An image column; may be repeated (default: all, side by side)
     #[arg(long)]
     column: Vec<String>,
-    /// Frames in a second of video
+    /// Frames per second of the videos
     #[arg(long, default_value_t = 15)]
     fps: u32,
 }
@@ -38,22 +39,23 @@ pub struct DatasetsArgs {
 
 #[derive(Subcommand)]
 enum DatasetsCommand {
-    /// Make one version of the parts that `swm collect --shard` wrote
+    /// Commit the shards that `swm collect --shard` wrote
+    #[command(after_help = "Example: swm datasets commit rooms")]
     Commit {
         /// The dataset: a path, a URI or a name
         dataset: String,
-        /// Commit parts whose pictures different renderers drew
+        /// Permit shards with frames of different renderers
         #[arg(long)]
         mix_renderers: bool,
     },
 }
 
-/// Lists the datasets at home, or commits parts.
+/// Lists the datasets in the home folder, or commits shards.
 pub fn datasets(args: &DatasetsArgs, as_json: bool) -> anyhow::Result<()> {
     if let Some(DatasetsCommand::Commit { dataset, mix_renderers }) = &args.command {
         let location = home::location(dataset)?;
         if !mix_renderers {
-            swm::collect::check_parts(&location)?;
+            crate::collect_target::check_shards(&location)?;
         }
         let added = commit_shards(&location)?;
         if as_json {
@@ -77,7 +79,7 @@ pub fn datasets(args: &DatasetsArgs, as_json: bool) -> anyhow::Result<()> {
         return emit_json(&found);
     }
     if found.is_empty() {
-        emit(&format!("no datasets in {}; `swm collect ENV -o NAME` makes one\n", folder.display()));
+        emit(&format!("no datasets in {}; `swm collect ENV -o NAME` collects one\n", folder.display()));
         return Ok(());
     }
     let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
@@ -101,11 +103,11 @@ pub fn formats(as_json: bool) -> anyhow::Result<()> {
     if as_json {
         return emit_json(&rows.map(|format| json!({"id": format.id, "summary": format.summary})).collect::<Vec<_>>());
     }
-    emit(&table(&["format", "what it is"], rows.map(|format| vec![format.id.to_owned(), format.summary.to_owned()])));
+    emit(&table(&["format", "description"], rows.map(|format| vec![format.id.to_owned(), format.summary.to_owned()])));
     Ok(())
 }
 
-/// The numbers of a dataset that cost nothing to know.
+/// Returns the environment, and the counts of episodes, steps and bytes, which need no reading of rows.
 pub fn summary(reader: &dyn Reader) -> Result<Value> {
     let manifest = reader.manifest();
     Ok(json!({
@@ -116,14 +118,17 @@ pub fn summary(reader: &dyn Reader) -> Result<Value> {
     }))
 }
 
-/// Makes a video of some episodes and a contact sheet of all of them.
+/// Writes a video of each previewed episode, and a contact sheet of all.
 pub fn preview(args: &PreviewArgs, as_json: bool) -> anyhow::Result<()> {
     let reader = open(&args.dataset)?;
     let episodes = args.episodes.min(reader.episodes().len());
-    let progress = Progress::new("preview", episodes);
+    let mut display = StageDisplay::new("preview", String::new(), episodes);
     let options = data::PreviewOptions { episodes, columns: args.column.clone(), fps: args.fps };
-    let written = data::preview(&*reader, &args.output, &options, |done| progress.at(done, ""))?;
-    progress.done(&format!("{episodes} episodes in {}", args.output.display()));
+    let written = data::preview(&*reader, &args.output, &options, |done| {
+        display.update(done, String::new());
+    })?;
+    drop(display);
+    print_summary("preview", &format!("{episodes} episodes in {}", args.output.display()));
     if as_json {
         return emit_json(&json!({"files": written}));
     }
@@ -131,8 +136,7 @@ pub fn preview(args: &PreviewArgs, as_json: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A number of bytes as people read it.
-#[allow(clippy::cast_precision_loss)]
+/// Formats a size in bytes with a binary unit.
 pub fn bytes(n: u64) -> String {
     match n {
         0..1024 => format!("{n} B"),

@@ -1,11 +1,12 @@
-//! `swm doctor`: what is wrong with a dataset, which models it can train, and a new dataset of what is sound.
+//! `swm doctor`: finds the defects of a dataset and the models it can train, and writes the sound episodes to a new one.
 
-use super::convert::{TargetArgs, control, words};
-use super::{Context, complain, emit, emit_json, table};
+use super::convert::{self, TargetArgs};
+use super::progress::{control, print_summary};
+use super::{Context, emit, emit_json, table};
 use clap::Args;
 use serde_json::json;
 use std::time::Instant;
-use swm::home;
+use crate::home;
 use swm_data::ConvertMode;
 use swm_data::doctor::{Diagnosis, Finding, Severity, examine, open_damaged, repair};
 
@@ -21,7 +22,7 @@ pub struct DoctorArgs {
     target: TargetArgs,
 }
 
-/// Examines, and repairs on request. Fails when there are problems that are not repaired.
+/// Examines a dataset, and repairs it on request. Fails when there are problems that are not repaired.
 pub fn doctor(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
     let name = &args.dataset;
     let (reader, lost) = match home::find_dataset(name).and_then(|location| open_damaged(&location)) {
@@ -29,28 +30,26 @@ pub fn doctor(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
         Err(error) if error.is_usage() => return Err(error.into()),
         Err(error) => {
             if context.json {
-                let what = error.to_string();
-                emit_json(
-                    &json!({"problems": 1, "findings": [{"severity": "problem", "what": what, "episodes": []}]}),
-                )?;
+                let finding = json!({"severity": "problem", "what": error.to_string(), "episodes": []});
+                emit_json(&json!({"problems": 1, "findings": [finding]}))?;
             }
             return Err(anyhow::Error::new(error).context(format!("{name} cannot be opened")));
         }
     };
     let mut diagnosis = examine(&*reader, &swm_models::dataset_requirements()?, &mut control(context))?;
     diagnosis.add_losses(lost);
-    complain(&format!("{:>9}: {} episodes, {} rows\n", "examine", diagnosis.episodes, diagnosis.rows));
+    print_summary("examine", &format!("{} episodes, {} rows", diagnosis.episodes, diagnosis.rows));
     let mut repaired = None;
     if !context.json {
         emit(&report(&diagnosis));
     }
     if let Some(target) = &args.repair {
         let target = home::target(target, args.target.format.as_deref())?;
-        let begun = Instant::now();
+        let start = Instant::now();
         let options = args.target.options(ConvertMode::Resume);
         let converted = repair(&reader, &diagnosis, &target, &options, &mut control(context))?;
         if !context.json {
-            emit(&words(&converted, &target, begun.elapsed().as_secs_f64()));
+            emit(&convert::describe(&converted, &target, start.elapsed().as_secs_f64()));
         }
         repaired = Some(converted);
     }
@@ -62,17 +61,17 @@ pub fn doctor(args: &DoctorArgs, context: &Context) -> anyhow::Result<()> {
         emit_json(&found)?;
     }
     if problems > 0 && repaired.is_none() {
-        anyhow::bail!("{name} has problems; `swm doctor {name} --repair TARGET` writes what is sound");
+        anyhow::bail!("{name} has problems; `swm doctor {name} --repair TARGET` writes the sound episodes");
     }
     Ok(())
 }
 
-/// What was found, in words.
+/// Returns the findings and a table of models.
 fn report(diagnosis: &Diagnosis) -> String {
     let mut text = String::new();
     for finding in &diagnosis.findings {
         let severity = if finding.severity == Severity::Problem { "problem" } else { "note" };
-        text += &format!("{severity:>9}: {}{}\n", finding.what, places(finding));
+        text += &format!("{severity:>9}: {}{}\n", finding.what, episodes_of(finding));
     }
     if diagnosis.problems() == 0 {
         text += "       no problems\n";
@@ -80,20 +79,20 @@ fn report(diagnosis: &Diagnosis) -> String {
         text += &format!("    sound: {} of {} episodes\n", diagnosis.sound.len(), diagnosis.episodes);
     }
     let models = diagnosis.models.iter().map(|fit| {
-        let can = if fit.fits() { format!("yes, on {} episodes", fit.episodes) } else { fit.missing.join("; ") };
-        vec![fit.model.to_owned(), can]
+        let answer = if fit.fits() { format!("yes, on {} episodes", fit.episodes) } else { fit.missing.join("; ") };
+        vec![fit.model.to_owned(), answer]
     });
-    text + "\n" + &table(&["model", "can be trained"], models)
+    text + "\n" + &table(&["model", "trainable"], models)
 }
 
-/// In which episodes, the first few of them.
-fn places(finding: &Finding) -> String {
-    const FEW: usize = 8;
-    let few: Vec<String> = finding.episodes.iter().take(FEW).map(usize::to_string).collect();
+/// Returns the first few affected episodes.
+fn episodes_of(finding: &Finding) -> String {
+    const SHOWN: usize = 8;
+    let shown: Vec<String> = finding.episodes.iter().take(SHOWN).map(usize::to_string).collect();
     match finding.episodes.len() {
         0 => String::new(),
-        1 => format!(" (episode {})", few[0]),
-        more if more <= FEW => format!(" (episodes {})", few.join(", ")),
-        more => format!(" (episodes {} and {} more)", few.join(", "), more - FEW),
+        1 => format!(" (episode {})", shown[0]),
+        count if count <= SHOWN => format!(" (episodes {})", shown.join(", ")),
+        count => format!(" (episodes {} and {} more)", shown.join(", "), count - SHOWN),
     }
 }

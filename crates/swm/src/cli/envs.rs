@@ -1,16 +1,16 @@
-//! `swm envs` and `swm fovs`: what worlds there are and what can be varied in them.
+//! `swm envs` and `swm fovs`: list environments and their factors of variation.
 
-use super::{complain, emit, emit_json, table};
+use super::{emit, emit_json, eprint, table};
 use clap::Args;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeSet;
-use swm::{ENVS, describe, gym};
+use crate::{ENVS, describe, gym};
 use swm_core::EnvChoice;
 
 /// Arguments of `swm envs`.
 #[derive(Args)]
 pub struct EnvsArgs {
-    /// One to show in full, such as swm/TwoRoom-v1
+    /// The environment to show, such as swm/TwoRoom-v1
     env: Option<String>,
 }
 
@@ -24,7 +24,7 @@ pub struct FovsArgs {
 /// Lists the environments.
 pub fn envs(args: &EnvsArgs, as_json: bool) -> anyhow::Result<()> {
     if let Some(id) = &args.env {
-        return show(&swm::env(id)?, as_json);
+        return show(&crate::env(id)?, as_json);
     }
     if as_json {
         let all = ENVS.rows.iter().map(|row| match row.env() {
@@ -58,11 +58,11 @@ pub fn envs(args: &EnvsArgs, as_json: bool) -> anyhow::Result<()> {
         })
         .collect();
     emit(&table(&["environment", "action", "factors", "experts", "task"], rows));
-    missing.iter().for_each(|error| complain(&format!("missing: {error}\n")));
-    emit("\nand every environment of Gymnasium, such as\n");
+    missing.iter().for_each(|error| eprint(&format!("missing: {error}\n")));
+    emit("\nThird-party environments of Gymnasium work too, such as:\n");
     emit(&table(
-        &["environment", "what it is"],
-        gym::EXAMPLES.iter().map(|(id, what)| vec![(*id).to_owned(), (*what).to_owned()]),
+        &["environment", "description"],
+        gym::EXAMPLES.iter().map(|(id, description)| vec![(*id).to_owned(), (*description).to_owned()]),
     ));
     Ok(())
 }
@@ -74,14 +74,14 @@ fn show(choice: &EnvChoice, as_json: bool) -> anyhow::Result<()> {
     if as_json {
         return emit_json(&describe::env(row, spec));
     }
-    let list = |words: Vec<String>| if words.is_empty() { "none".to_owned() } else { words.join(", ") };
+    let list = |names: Vec<String>| if names.is_empty() { "none".to_owned() } else { names.join(", ") };
     let columns =
         spec.columns.iter().map(|column| format!("{} {}{:?}", column.name, column.dtype.name(), column.shape));
     let mut rows = vec![
         vec!["task".to_owned(), row.summary.to_owned()],
         vec!["action".to_owned(), spec.action_space.describe()],
         vec!["columns".to_owned(), list(columns.collect())],
-        vec!["steps".to_owned(), spec.max_episode_steps.to_string()],
+        vec!["time limit".to_owned(), format!("{} steps", spec.max_episode_steps)],
         vec!["factors".to_owned(), format!("{} (`swm fovs {}`)", spec.variation_space.factors().len(), spec.id)],
         vec!["cameras".to_owned(), list(spec.cameras.clone())],
     ];
@@ -89,17 +89,17 @@ fn show(choice: &EnvChoice, as_json: bool) -> anyhow::Result<()> {
         let values = option.values.join(", ");
         vec![
             format!("option {}", option.key),
-            format!("{}: {values} (now {})", option.summary, choice.choices.get(option.key)),
+            format!("{}: {values} (chosen: {})", option.summary, choice.choices.get(option.key)),
         ]
     }));
     rows.extend(row.experts.iter().map(|e| vec![format!("expert {}", e.id), e.summary.to_owned()]));
-    emit(&table(&[&spec.id, ""], rows));
+    emit(&table(&[&spec.id, "value"], rows));
     Ok(())
 }
 
 /// Lists the factors of variation of one environment.
 pub fn fovs(args: &FovsArgs, as_json: bool) -> anyhow::Result<()> {
-    let env = swm::env(&args.env)?.env()?;
+    let env = crate::env(&args.env)?.env()?;
     let space = &env.spec().variation_space;
     if as_json {
         return emit_json(&json!({

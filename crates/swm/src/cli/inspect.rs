@@ -1,11 +1,11 @@
-//! `swm inspect`: what is in a dataset.
+//! `swm inspect`: shows the contents of a dataset.
 
 use super::datasets::{bytes, summary};
 use super::{emit, emit_json, table};
 use clap::Args;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
-use swm::home::open_dataset;
+use crate::home::open_dataset;
 use swm_core::columns::is_stored_as;
 use swm_core::results::Summary;
 use swm_core::{Manifest, Result};
@@ -16,30 +16,32 @@ use swm_data::{Reader, checksum};
 pub struct InspectArgs {
     /// The dataset: a path, a URI or a name
     dataset: String,
-    /// Read everything and add the checksum of what readers get, which does not depend on format and codec
+    /// Read all rows and show the checksum of the decoded content
+    ///
+    /// The checksum does not depend on format and codec.
     #[arg(long)]
     checksum: bool,
 }
 
-/// Bars of the distribution of lengths, at most.
-const BARS: usize = 10;
+/// Maximum number of bars of the histogram of lengths.
+const MAX_BARS: usize = 10;
 
-/// The length of the longest bar.
-const BAR: usize = 40;
+/// Length of the longest bar, in characters.
+const BAR_LENGTH: usize = 40;
 
-/// Says what is in a dataset.
+/// Runs `swm inspect`.
 pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
     let reader = open_dataset(&args.dataset)?;
-    let found = gather(&*reader, args.checksum)?;
+    let contents = contents(&*reader, args.checksum)?;
     if as_json {
-        return emit_json(&found);
+        return emit_json(&contents);
     }
     let lengths: Vec<usize> = reader.episodes().iter().map(|episode| episode.length).collect();
     emit(&format!(
         "{} episodes, {} rows, {} on disk\n\n",
-        found["episodes"],
-        found["steps"],
-        bytes(found["bytes"].as_u64().unwrap_or_default())
+        contents["episodes"],
+        contents["steps"],
+        bytes(contents["bytes"].as_u64().unwrap_or_default())
     ));
     emit(&histogram(&lengths));
     let footprint = reader.footprint()?;
@@ -54,38 +56,37 @@ pub fn inspect(args: &InspectArgs, as_json: bool) -> anyhow::Result<()> {
             size.map_or("–".to_owned(), bytes),
         ]
     });
-    emit(&table(&["column", "type", "shape of a row", "on disk"], columns));
+    emit(&table(&["column", "type", "row shape", "on disk"], columns));
     let columns = reader.schema().columns();
     let others = footprint.iter().filter(|(part, _)| !columns.iter().any(|column| stored(part, &column.name)));
     for (part, size) in others {
         emit(&format!("{part}: {}\n", bytes(*size)));
     }
     for (name, size) in constants(&*reader)? {
-        emit(&format!("constant of every episode: {name}, {} in the first\n", bytes(size)));
+        emit(&format!("constant of every episode: {name}, {} in the first episode\n", bytes(size)));
     }
     emit(&provenance(reader.manifest().as_ref()));
-    emit(&format!("content hash: {}\n", found["content_hash"].as_str().unwrap_or_default()));
-    if let Some(checksum) = found["checksum"].as_str() {
-        emit(&format!("checksum of what readers get: {checksum}\n"));
+    emit(&format!("content hash: {}\n", contents["content_hash"].as_str().unwrap_or_default()));
+    if let Some(checksum) = contents["checksum"].as_str() {
+        emit(&format!("checksum of the decoded content: {checksum}\n"));
     }
     Ok(())
 }
 
-/// Everything that is told.
-fn gather(reader: &dyn Reader, summed: bool) -> Result<Value> {
-    let mut found = summary(reader)?;
-    #[allow(clippy::cast_precision_loss)]
+/// Returns the contents of a dataset; with `with_checksum`, all rows are read.
+fn contents(reader: &dyn Reader, with_checksum: bool) -> Result<Value> {
+    let mut contents = summary(reader)?;
     let lengths: Vec<f64> = reader.episodes().iter().map(|episode| episode.length as f64).collect();
-    found["lengths"] = json!(Summary::of(&lengths));
-    found["columns"] = json!(reader.schema());
-    found["footprint"] = json!(reader.footprint()?.into_iter().collect::<BTreeMap<_, _>>());
-    found["constants"] = json!(constants(reader)?);
-    found["content_hash"] = json!(reader.content_hash()?);
-    found["manifest"] = json!(reader.manifest());
-    if summed {
-        found["checksum"] = json!(checksum(reader)?);
+    contents["lengths"] = json!(Summary::of(&lengths));
+    contents["columns"] = json!(reader.schema());
+    contents["footprint"] = json!(reader.footprint()?.into_iter().collect::<BTreeMap<_, _>>());
+    contents["constants"] = json!(constants(reader)?);
+    contents["content_hash"] = json!(reader.content_hash()?);
+    contents["manifest"] = json!(reader.manifest());
+    if with_checksum {
+        contents["checksum"] = json!(checksum(reader)?);
     }
-    Ok(found)
+    Ok(contents)
 }
 
 /// Names and sizes of the first episode's constants.
@@ -96,33 +97,31 @@ fn constants(reader: &dyn Reader) -> Result<BTreeMap<String, u64>> {
     Ok(reader.constants(0)?.into_iter().map(|(name, bytes)| (name, bytes.len() as u64)).collect())
 }
 
-/// How many episodes have how many rows, as bars.
-#[allow(clippy::cast_precision_loss)]
+/// Draws a histogram of episode lengths.
 fn histogram(lengths: &[usize]) -> String {
     let values: Vec<f64> = lengths.iter().map(|&length| length as f64).collect();
-    let (Some(least), Some(most), Some(all)) = (lengths.iter().min(), lengths.iter().max(), Summary::of(&values))
-    else {
+    let (Some(min), Some(max), Some(all)) = (lengths.iter().min(), lengths.iter().max(), Summary::of(&values)) else {
         return String::new();
     };
     let mut text =
-        format!("rows of an episode: mean {:.1}, median {}, 95th percentile {}\n", all.mean, all.median, all.p95);
-    let width = (most - least + 1).div_ceil(BARS);
-    let mut counts = vec![0; (most - least) / width + 1];
-    lengths.iter().for_each(|length| counts[(length - least) / width] += 1);
+        format!("rows per episode: mean {:.1}, median {}, 95th percentile {}\n", all.mean, all.median, all.p95);
+    let width = (max - min + 1).div_ceil(MAX_BARS);
+    let mut counts = vec![0; (max - min) / width + 1];
+    lengths.iter().for_each(|length| counts[(length - min) / width] += 1);
     let tallest = counts.iter().max().copied().unwrap_or(1);
     for (i, &count) in counts.iter().enumerate() {
-        let (from, to) = (least + i * width, (least + (i + 1) * width - 1).min(*most));
-        let bar = "█".repeat((count * BAR).div_ceil(tallest));
+        let (from, to) = (min + i * width, (min + (i + 1) * width - 1).min(*max));
+        let bar = "█".repeat((count * BAR_LENGTH).div_ceil(tallest));
         let range = if from == to { from.to_string() } else { format!("{from} – {to}") };
         text += &format!("{range:>15}  {bar} {count}\n");
     }
     text + "\n"
 }
 
-/// Where it comes from, in a line or two.
+/// Returns the provenance of a dataset.
 fn provenance(manifest: Option<&Manifest>) -> String {
     let Some(manifest) = manifest else {
-        return "no manifest: it does not say where it comes from\n".to_owned();
+        return "no manifest: the provenance is unknown\n".to_owned();
     };
     let mut text =
         format!("made by {} of stable-worldmodel {}, seed {}", manifest.kind, manifest.swm_version, manifest.seed);
@@ -136,13 +135,13 @@ fn provenance(manifest: Option<&Manifest>) -> String {
     text + "\n"
 }
 
-/// What fits a line; `--json` has all of it.
+/// Shortens a text to one line; `--json` prints the full text.
 fn shortened(value: &str) -> String {
-    const MOST: usize = 90;
-    if value.chars().count() <= MOST {
+    const MAX_CHARS: usize = 90;
+    if value.chars().count() <= MAX_CHARS {
         return value.to_owned();
     }
-    value.chars().take(MOST).chain("…".chars()).collect()
+    value.chars().take(MAX_CHARS).chain("…".chars()).collect()
 }
 
 #[cfg(test)]
@@ -150,10 +149,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lengths_are_drawn_as_bars() {
+    fn draws_histogram_of_lengths() {
         let text = histogram(&[5, 5, 6, 30, 30, 30, 30, 41]);
         let lines: Vec<&str> = text.lines().map(str::trim).collect();
-        assert_eq!(lines[0], "rows of an episode: mean 22.1, median 30, 95th percentile 41");
+        assert_eq!(lines[0], "rows per episode: mean 22.1, median 30, 95th percentile 41");
         assert_eq!(lines[1], format!("5 – 8  {} 3", "█".repeat(30)));
         assert_eq!(lines[7], format!("29 – 32  {} 4", "█".repeat(40)));
         assert!(lines[10].starts_with("41  ") && lines[10].ends_with(" 1"), "{text}");

@@ -1,4 +1,4 @@
-//! The command line: one file a group of commands, each a thin front of the crates.
+//! The command line: one module per command, each a thin layer over the crates.
 
 mod assets;
 mod bench;
@@ -11,6 +11,7 @@ mod demo;
 mod doctor;
 mod envs;
 mod eval;
+mod eval_policy;
 mod inspect;
 mod models;
 mod planner;
@@ -18,28 +19,33 @@ mod probe;
 mod progress;
 mod pull;
 mod report;
+mod reproduce;
+mod results_tables;
 mod solvers;
 mod train;
 mod wrappers;
 
 use clap::{Parser, Subcommand};
-use progress::Progress;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Collect data from worlds, train world models, plan with them, evaluate and report.
+/// Collect data from environments, train world models, plan, evaluate, report
 #[derive(Parser)]
 #[command(name = "swm", version, propagate_version = true)]
+#[command(after_help = "Example: swm demo --output demo")]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
     /// Print one JSON document on standard output instead of tables
     #[arg(long, global = true)]
     json: bool,
-    /// Worker threads (default: one for each core); results do not depend on it
+    /// Worker threads (default: one per core); results do not depend on it
     #[arg(long, global = true, default_value_t = 0, hide_default_value = true, value_name = "N")]
     threads: usize,
-    /// What draws worlds of three dimensions: egl (OpenGL), cpu (our own), or auto, which is egl where a graphics card is
+    /// Renderer of 3-D environments: egl, cpu or auto
+    ///
+    /// egl is OpenGL on a graphics card, cpu the built-in software renderer; auto chooses egl where a graphics card is
+    /// available.
     #[arg(long, global = true, default_value = "auto", hide_default_value = true, value_name = "NAME")]
     renderer: swm_mujoco::render::Choice,
 }
@@ -47,66 +53,90 @@ pub struct Cli {
 #[derive(Subcommand)]
 enum Command {
     /// List the environments, or show one
+    #[command(after_help = "Example: swm envs swm/PushT-v1")]
     Envs(envs::EnvsArgs),
     /// List an environment's factors of variation
+    #[command(after_help = "Example: swm fovs swm/TwoRoom-v1")]
     Fovs(envs::FovsArgs),
-    /// List, install and verify what worlds need of others: MuJoCo and its models, Gymnasium, the Atari games, Craftax
+    /// List, install and verify third-party assets that environments require
+    ///
+    /// Assets are MuJoCo with its models, Gymnasium, the Atari games and Craftax.
+    #[command(after_help = "Example: swm assets install mujoco")]
     Assets(assets::AssetsArgs),
     /// List the visual wrappers and their settings
+    #[command(after_help = "Example: swm wrappers")]
     Wrappers,
-    /// List the solvers, what they plan and what they ask of a model
+    /// List the solvers, the actions they plan, and what they require of a model
+    #[command(after_help = "Example: swm solvers --json")]
     Solvers,
     /// Run a policy and store its episodes
+    #[command(after_help = "Example: swm collect swm/TwoRoom-v1 --output rooms --episodes 300")]
     Collect(collect::CollectArgs),
-    /// List the datasets at home, or make one of the parts that several machines wrote
+    /// List the datasets, or commit the shards of one
+    #[command(after_help = "Example: swm datasets")]
     Datasets(datasets::DatasetsArgs),
     /// List the dataset formats
+    #[command(after_help = "Example: swm formats")]
     Formats,
-    /// Say what is in a dataset
+    /// Show the contents of a dataset
+    #[command(after_help = "Example: swm inspect rooms --checksum")]
     Inspect(inspect::InspectArgs),
-    /// Make a video and a contact sheet of some episodes of a dataset
+    /// Write videos and a contact sheet of some episodes of a dataset
+    #[command(after_help = "Example: swm preview rooms --output preview --episodes 4")]
     Preview(datasets::PreviewArgs),
-    /// Write a dataset in another format or codec, and compare what comes out
+    /// Write a dataset in another format or codec, and compare both
+    #[command(after_help = "Example: swm convert rooms rooms-jpeg --codec jpeg")]
     Convert(convert::ConvertArgs),
-    /// Say what is wrong with a dataset and which models it can train; write a new one of what is sound
+    /// Find defects of a dataset and the models it can train; repair it
+    #[command(after_help = "Example: swm doctor rooms --repair rooms-repaired")]
     Doctor(doctor::DoctorArgs),
     /// List the models and their presets
+    #[command(after_help = "Example: swm models")]
     Models,
-    /// Train a model on a dataset
+    /// Train a model on a dataset or in an environment
+    #[command(after_help = "Example: swm train lewm --data rooms --output lewm-rooms optim.lr=3e-4")]
     Train(train::TrainArgs),
-    /// Fetch weights of others from the Hugging Face hub, to begin a training with
+    /// Download pretrained weights from the Hugging Face hub
+    #[command(after_help = "Example: swm pull facebook/dinov2-small")]
     Pull(pull::PullArgs),
-    /// List the checkpoints at home; show, verify, import, export or remove one
+    /// List the checkpoints; show, verify, import, export or remove one
+    #[command(after_help = "Example: swm checkpoints show lewm-rooms")]
     Checkpoints(checkpoints::CheckpointsArgs),
-    /// Read columns, or the pictures themselves, from a checkpoint's latents
+    /// Predict columns or reconstruct images from a checkpoint's latents
+    #[command(after_help = "Example: swm probe lewm-rooms --data rooms --columns state")]
     Probe(probe::ProbeArgs),
-    /// Evaluate a checkpoint, the expert or the random floor
+    /// Evaluate checkpoints, experts and the random-policy floor
+    #[command(after_help = "Example: swm eval lewm-rooms expert --episodes 100 --output results")]
     Eval(Box<eval::EvalArgs>),
-    /// Run an evaluation again from its results and say what differs
-    Reproduce(eval::ReproduceArgs),
-    /// Make one self-contained HTML page of results
+    /// Repeat an evaluation from its results and list the differences
+    #[command(after_help = "Example: swm reproduce results")]
+    Reproduce(reproduce::ReproduceArgs),
+    /// Write one self-contained HTML page of results
+    #[command(after_help = "Example: swm report results --output report --training lewm-rooms")]
     Report(report::ReportArgs),
-    /// Measure speed, beside the reference where it is installed
+    /// Measure speed, compared with the reference implementation if installed
+    #[command(after_help = "Example: swm bench envs swm/PushT-v1")]
     Bench(bench::BenchArgs),
-    /// Collect, train, plan, evaluate and report, in minutes
+    /// Collect, train, plan, evaluate and report within minutes
+    #[command(after_help = "Example: swm demo --output demo")]
     Demo(demo::DemoArgs),
 }
 
-/// What commands that work for a while may use.
+/// The global options, and the interrupt flag, for commands that run long.
 pub struct Context {
     /// Whether to print JSON.
     pub json: bool,
-    /// The budget of cores, shared by environments, decoders and matrix products; 0 means all of them.
+    /// The thread budget of environments, decoders and matrix products; 0 for one thread per core.
     pub threads: usize,
-    /// Set by the first Ctrl-C; long loops stop at the next safe point.
-    pub stop: Arc<AtomicBool>,
+    /// Set by the first Ctrl-C; runs stop at the next safe point.
+    pub interrupt: Arc<AtomicBool>,
 }
 
 impl Cli {
-    /// Runs the command; the exit code is 0 when done, 1 when it failed, 2 for wrong usage, 130 when
-    /// interrupted.
+    /// Runs the command. Returns the exit code: 0 for success, 1 for a failure, 2 for wrong usage, 130 for an
+    /// interrupted run.
     pub fn run(self) -> u8 {
-        // A program that embeds this one may be logging already.
+        // An embedding program may have set up logging; its setup is kept.
         let _ = tracing_subscriber::fmt()
             .with_writer(std::io::stderr)
             .with_env_filter(
@@ -118,10 +148,10 @@ impl Cli {
         match self.dispatch() {
             Ok(()) => 0,
             Err(error) => {
-                // Our own errors say everything in one line; others are told with their causes.
-                let ours = error.downcast_ref::<swm_core::Error>();
-                complain(&ours.map_or_else(|| format!("error: {error:#}\n"), |ours| format!("error: {ours}\n")));
-                match ours {
+                // Errors of this engine are complete in one line; third-party errors are printed with their causes.
+                let own = error.downcast_ref::<swm_core::Error>();
+                eprint(&own.map_or_else(|| format!("error: {error:#}\n"), |own| format!("error: {own}\n")));
+                match own {
                     Some(swm_core::Error::Interrupted) => 130,
                     Some(error) if error.is_usage() => 2,
                     _ => 1,
@@ -153,7 +183,7 @@ impl Cli {
             Command::Pull(args) => pull::pull(&args, json),
             Command::Probe(args) => probe::probe(&args, &Context::new(json, self.threads)),
             Command::Eval(args) => eval::eval(&args, &Context::new(json, self.threads)),
-            Command::Reproduce(args) => eval::reproduce(&args, &Context::new(json, self.threads)),
+            Command::Reproduce(args) => reproduce::reproduce(&args, &Context::new(json, self.threads)),
             Command::Bench(args) => bench::bench(&args, &Context::new(json, self.threads)),
             Command::Demo(args) => demo::demo(&args, &Context::new(json, self.threads)),
         }
@@ -162,42 +192,42 @@ impl Cli {
 
 impl Context {
     fn new(json: bool, threads: usize) -> Self {
-        // Burn's matrix products use rayon's global pool: it is given the same number of threads.
+        // Burn's matrix products run in rayon's global pool; it gets the same number of threads.
         rayon::ThreadPoolBuilder::new().num_threads(threads).build_global().ok();
-        let stop = Arc::new(AtomicBool::new(false));
-        let flag = Arc::clone(&stop);
+        let interrupt = Arc::new(AtomicBool::new(false));
+        let flag = Arc::clone(&interrupt);
         ctrlc::set_handler(move || {
             if flag.swap(true, Ordering::SeqCst) {
                 std::process::exit(130);
             }
-            complain("\nstopping at the next safe point; press Ctrl-C again to stop at once\n");
+            eprint("\nstopping at the next safe point; press Ctrl-C again to stop at once\n");
         })
         .ok();
-        Self { json, threads, stop }
+        Self { json, threads, interrupt }
     }
 }
 
-/// Prints to standard output; a reader that went away is no error.
-pub fn emit(text: &str) {
+/// Prints to standard output. A closed pipe is not an error.
+fn emit(text: &str) {
     use std::io::Write as _;
     let mut out = std::io::stdout().lock();
     out.write_all(text.as_bytes()).and_then(|()| out.flush()).ok();
 }
 
-/// Prints one JSON document.
-pub fn emit_json(value: &impl serde::Serialize) -> anyhow::Result<()> {
+/// Prints one JSON document to standard output.
+fn emit_json(value: &impl serde::Serialize) -> anyhow::Result<()> {
     emit(&(serde_json::to_string_pretty(value)? + "\n"));
     Ok(())
 }
 
 /// Prints to standard error.
-pub fn complain(text: &str) {
+fn eprint(text: &str) {
     use std::io::Write as _;
     std::io::stderr().write_all(text.as_bytes()).ok();
 }
 
-/// A table in the house style.
-pub fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> String {
+/// Formats rows as a table with a header.
+fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> String {
     let mut table = comfy_table::Table::new();
     table.load_preset(comfy_table::presets::NOTHING);
     table.set_style(comfy_table::TableComponent::HeaderLines, '─');
@@ -208,4 +238,43 @@ pub fn table(header: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> St
         table.add_row(row);
     }
     format!("{table}\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Cli;
+    use clap::{Command, CommandFactory as _};
+
+    /// Columns of the first line of a help text.
+    const MAX_COLUMNS: usize = 80;
+
+    fn check(command: &Command, path: &str) {
+        let about = command.get_about().expect(path).to_string();
+        assert!(about.len() < MAX_COLUMNS, "{path}: {about}");
+        let example = command.get_after_help().unwrap_or_else(|| panic!("{path} has no example")).to_string();
+        assert!(example.starts_with("Example: swm"), "{path}: {example}");
+        for argument in command.get_arguments() {
+            let help = argument.get_help().map(ToString::to_string).unwrap_or_default();
+            assert!(help.len() < MAX_COLUMNS, "{path} {}: {help}", argument.get_id());
+        }
+        for subcommand in command.get_subcommands() {
+            check(subcommand, &format!("{path} {}", subcommand.get_name()));
+        }
+    }
+
+    #[test]
+    fn help_of_every_command_is_short_and_has_an_example() {
+        check(&Cli::command(), "swm");
+    }
+
+    #[test]
+    fn examples_parse() {
+        fn parse(command: &Command) {
+            let example = command.get_after_help().expect("an example").to_string();
+            let words = example.trim_start_matches("Example: ").split(' ');
+            Cli::command().try_get_matches_from(words).unwrap_or_else(|error| panic!("{example}: {error}"));
+            command.get_subcommands().for_each(parse);
+        }
+        parse(&Cli::command());
+    }
 }

@@ -1,10 +1,10 @@
-//! `swm models`: what can be trained, and at which sizes.
+//! `swm models`: lists the model families and their presets.
 
 use super::{emit, emit_json, table};
 use serde_json::json;
 use swm_models::FAMILIES;
 
-/// Lists them.
+/// Lists the model families and their presets.
 pub fn models(as_json: bool) -> anyhow::Result<()> {
     if as_json {
         let all = FAMILIES.rows.iter().map(|family| {

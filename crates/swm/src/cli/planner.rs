@@ -1,4 +1,4 @@
-//! How a policy plans, as the command line says it: solver, horizon, objective.
+//! Arguments for planning: solvers, horizon, objective.
 
 use super::solvers;
 use clap::Args;
@@ -9,44 +9,48 @@ use swm_plan::ActionKind;
 use swm_plan::objective::ObjectiveConfig;
 use swm_plan::{MpcConfig, SOLVERS};
 
-/// How a world model plans; the defaults are those of the paper's experiments.
+/// Settings of planning. The defaults are those of the paper's experiments.
 #[derive(Args, Clone)]
 #[command(next_help_heading = "Planning")]
 pub struct PlannerArgs {
-    /// The solver and its settings, such as icem,samples=64,iterations=5 (`swm solvers` lists them); several are compared
-    /// [default: the first that plans the environment's actions]
+    /// Solver and settings, such as icem,samples=64; several are compared
+    ///
+    /// `swm solvers` lists them. Default: the first solver for the environment's actions.
     #[arg(long = "solver", value_name = "NAME[,KEY=VALUE…]")]
     pub solvers: Vec<String>,
-    /// Model steps to plan
+    /// Model steps per plan
     #[arg(long, default_value_t = 5)]
     pub horizon: usize,
     /// Model steps to execute before planning again
     #[arg(long, default_value_t = 5)]
     pub receding_horizon: usize,
-    /// Environment steps in a model step of the simulator; a checkpoint knows its own
+    /// Environment steps per model step of the simulator
+    ///
+    /// A checkpoint has its own action block.
     #[arg(long, default_value_t = 5, value_name = "STEPS")]
     pub action_block: usize,
-    /// Begin every plan anew, not from what the last one left
+    /// Do not initialise a plan with the rest of the previous plan
     #[arg(long)]
     pub cold_start: bool,
-    /// Stop searching after so many seconds; results then depend on the machine
+    /// Time limit of a plan; results then depend on the machine
     #[arg(long, value_name = "SECONDS")]
     pub latency_budget: Option<f64>,
-    /// A term of the objective: goal, control or change, with settings such as control,weight=0.01. Without a goal term
-    /// they are added to the model's own cost
+    /// Term of the objective: goal, control or change; may be repeated
+    ///
+    /// With settings, such as control,weight=0.01. Without a goal term, the model's own cost is kept and terms are added.
     #[arg(long = "term", value_name = "NAME[,KEY=VALUE…]")]
     pub terms: Vec<String>,
-    /// A constraint: action_norm,limit=2 or latent_box
+    /// Constraint, such as action_norm,limit=2 or latent_box
     #[arg(long = "limit", value_name = "NAME[,KEY=VALUE…]")]
     pub limits: Vec<String>,
-    /// What the simulator judges a plan by: terminal, running or reach
+    /// Score of simulated plans: terminal, running or reach
     #[arg(long, default_value = "terminal")]
     pub score: String,
 }
 
 impl PlannerArgs {
-    /// Every solver asked for, as a registry knows it; without any, the first that plans the environment's actions and
-    /// asks for nothing but a cost.
+    /// Returns the solvers with complete settings. Without --solver, it is the first one for the environment's actions that
+    /// requires only a cost.
     ///
     /// # Errors
     /// When a solver or a setting is unknown.
@@ -70,10 +74,11 @@ impl PlannerArgs {
         Ok(vec![Choice { id: first.id.to_owned(), settings: (first.defaults)() }])
     }
 
-    /// Planning in a model with a solver; `block` and `history` are the model's.
+    /// Returns the policy that plans in a model with a solver. `block` is the model's count of environment steps per model
+    /// step, `history` its count of observations.
     ///
     /// # Errors
-    /// When the objective is none.
+    /// When a setting of planning or of the objective is invalid.
     pub fn plan(&self, model: Model, solver: Choice, block: usize, history: usize) -> Result<PolicyKind> {
         let mpc = MpcConfig {
             horizon: self.horizon,
@@ -100,11 +105,11 @@ impl PlannerArgs {
                 })
                 .collect()
         };
-        let described = json!({
+        let config = json!({
             "terms": read("--term", "term", &self.terms)?,
             "constraints": read("--limit", "constraint", &self.limits)?,
         });
-        serde_json::from_value(described).map_err(|error| {
+        serde_json::from_value(config).map_err(|error| {
             Error::config(
                 "--term or --limit",
                 error.to_string(),
@@ -114,7 +119,7 @@ impl PlannerArgs {
     }
 }
 
-/// A name and its settings from `NAME,KEY=VALUE,…`; values are JSON where they can be, and words otherwise.
+/// Parses `NAME,KEY=VALUE,…`. Values are JSON where they parse as JSON, else strings.
 ///
 /// # Errors
 /// When a setting has no value.

@@ -1,17 +1,17 @@
-//! `swm probe`: what a checkpoint's latents say about the world.
+//! `swm probe`: predicts columns and reconstructs images from a checkpoint's latents.
 
 use super::{Context, emit, emit_json, table};
 use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
-use swm::home;
+use crate::home;
 use swm_core::Error;
 use swm_data::write_png;
 use swm_models::Device;
-use swm_models::probe::{self, ReconstructionConfig, Score, StateConfig};
+use swm_models::probe::{self, ReconstructionConfig, Score, StateConfig, StateReport};
 
-/// Arguments of `swm probe`. Read-outs are fitted on episodes that models are trained on, and judged on those held out for
-/// validation.
+/// Arguments of `swm probe`. Probes are fitted on the training episodes of the dataset, and evaluated on its validation
+/// episodes.
 #[derive(Args)]
 pub struct ProbeArgs {
     /// The checkpoint: a run folder or a name
@@ -19,34 +19,34 @@ pub struct ProbeArgs {
     /// The dataset: a path, a URI or a name
     #[arg(long, value_name = "DATASET")]
     data: String,
-    /// Columns to read from latents, such as state,goal_state
+    /// Columns to predict from latents, such as state,goal_state
     #[arg(long, value_name = "COLUMN,…", value_delimiter = ',')]
     columns: Vec<String>,
-    /// Draw pictures again from latents, and write some beside the originals to a PNG file
-    #[arg(long, value_name = "FILE")]
-    pictures: Option<PathBuf>,
-    /// Frames to fit on, at most
+    /// Reconstruct images from latents; write samples to this PNG file
+    #[arg(long, alias = "pictures", value_name = "FILE")]
+    images: Option<PathBuf>,
+    /// Maximum number of frames to fit on
     #[arg(long)]
     frames: Option<usize>,
-    /// Steps to fit each network
+    /// Optimizer steps per network
     #[arg(long)]
     steps: Option<usize>,
-    /// What decides frames, initial weights and batches
+    /// Seed of frames, initial weights and batches
     #[arg(long, default_value_t = 0)]
     seed: u64,
 }
 
-/// Probes a checkpoint.
+/// Runs `swm probe`.
 pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
     let run = home::find_checkpoint(&args.checkpoint)?;
     let loaded = swm_models::load(&run, &Device::flex())?;
     let Some(encoder) = loaded.encoder() else {
-        let problem = format!("a {} has no encoder of pictures", loaded.info()?.family);
-        return Err(Error::config(&args.checkpoint, problem, "probe a model that sees").into());
+        let problem = format!("a {} model has no image encoder", loaded.info()?.family);
+        return Err(Error::config(&args.checkpoint, problem, "probe a model with an image encoder").into());
     };
-    if args.columns.is_empty() && args.pictures.is_none() {
-        let fix = "name columns with --columns (`swm inspect` lists them), or a file with --pictures";
-        return Err(Error::config("swm probe", "nothing to read", fix).into());
+    if args.columns.is_empty() && args.images.is_none() {
+        let fix = "name columns with --columns (`swm inspect` lists them), or a file with --images";
+        return Err(Error::config("swm probe", "no columns and no images are requested", fix).into());
     }
     let reader = home::open_dataset(&args.data)?;
     let threads = swm_core::pool::threads(context.threads)?;
@@ -58,7 +58,7 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
         config.fit.steps = args.steps.unwrap_or(config.fit.steps);
         Some(threads.install(|| probe::read_state(&*encoder, &*reader, &config))?)
     };
-    let picture = match &args.pictures {
+    let reconstruction = match &args.images {
         None => None,
         Some(file) => {
             let mut config = ReconstructionConfig { seed: args.seed, ..ReconstructionConfig::default() };
@@ -66,35 +66,19 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
             config.fit.steps = args.steps.unwrap_or(config.fit.steps);
             let (report, sheet) = threads.install(|| probe::reconstruct_images(&*encoder, &*reader, &config))?;
             write_png(file, sheet.width, sheet.height, &sheet.rgb)?;
-            Some(report)
+            Some((report, file))
         }
     };
     if context.json {
-        return emit_json(&json!({ "state": state, "pictures": picture }));
+        let reconstruction = reconstruction.map(|(report, _)| report);
+        return emit_json(&json!({ "state": state, "pictures": reconstruction }));
     }
     if let Some(report) = state {
-        let share = |r2: Option<f64>| r2.map_or("–".to_owned(), |r2| format!("{r2:.3}"));
-        let row = |(linear, network): (&Score, &Score)| {
-            vec![
-                format!("{}[{}]", linear.column, linear.index),
-                format!("{:.3}", linear.spread),
-                share(linear.r2),
-                format!("{:.3}", linear.rmse),
-                share(network.r2),
-                format!("{:.3}", network.rmse),
-            ]
-        };
-        let header = ["number", "spread", "linear R²", "error", "network R²", "error"];
-        emit(&table(&header, report.linear.iter().zip(&report.network).map(row)));
-        emit(&format!(
-            "latents of {} numbers; fitted on {} frames, judged on {} of other episodes; errors are root mean squares, in the \
-             column's units\n",
-            report.latent, report.frames, report.held_out
-        ));
+        emit(&state_table(&report));
     }
-    if let (Some(report), Some(file)) = (picture, &args.pictures) {
+    if let Some((report, file)) = reconstruction {
         emit(&format!(
-            "pictures drawn again: {:.2} of 255 a pixel (their mean: {:.2}), {:.1} % of the variance; {}\n",
+            "reconstructed images: error {:.2} of 255 (of the mean image: {:.2}), {:.1} % of the variance explained; {}\n",
             report.rmse,
             report.rmse_of_mean,
             100.0 * report.explained,
@@ -102,4 +86,29 @@ pub fn probe(args: &ProbeArgs, context: &Context) -> anyhow::Result<()> {
         ));
     }
     Ok(())
+}
+
+/// Returns a table of the predicted columns, element by element.
+fn state_table(report: &StateReport) -> String {
+    let r2 = |r2: Option<f64>| r2.map_or("–".to_owned(), |r2| format!("{r2:.3}"));
+    let row = |(linear, network): (&Score, &Score)| {
+        vec![
+            format!("{}[{}]", linear.column, linear.index),
+            format!("{:.3}", linear.spread),
+            r2(linear.r2),
+            format!("{:.3}", linear.rmse),
+            r2(network.r2),
+            format!("{:.3}", network.rmse),
+        ]
+    };
+    let header = ["element", "spread", "linear R²", "linear RMSE", "network R²", "network RMSE"];
+    let rows = report.linear.iter().zip(&report.network).map(row);
+    format!(
+        "{}latent dimension {}; fitted on {} frames, evaluated on {} frames of other episodes; errors are in the column's \
+         units\n",
+        table(&header, rows),
+        report.latent,
+        report.frames,
+        report.held_out
+    )
 }

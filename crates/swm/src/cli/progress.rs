@@ -1,26 +1,69 @@
-//! Progress of long work: a bar on a terminal, a plain line every few seconds elsewhere, on standard error.
+//! Progress of long runs on standard error: a bar on a terminal, elsewhere a plain line every ten seconds.
 
-use super::complain;
+use super::results_tables::percent;
+use super::{Context, eprint};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use std::cell::Cell;
 use std::io::IsTerminal as _;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
+use swm_core::results::Proportion;
+use swm_core::run::{Control, Event, Progress};
 
-/// Seconds between plain lines.
-const PLAIN_EVERY: Duration = Duration::from_secs(10);
+/// The time between plain lines.
+const PLAIN_INTERVAL: Duration = Duration::from_secs(10);
 
-/// How far one piece of long work has come.
-pub struct Progress {
-    name: &'static str,
-    bar: ProgressBar,
-    plain: Option<Cell<Instant>>,
+/// How many metrics of a model are shown.
+const SHOWN_METRICS: usize = 4;
+
+/// Returns a control that shows the stages of a run and stops it at Ctrl-C.
+pub fn control(context: &Context) -> Control<'static> {
+    let mut shown: Option<StageDisplay> = None;
+    Control::new().with_interrupt(Arc::clone(&context.interrupt)).with_events(move |event| match event {
+        Event::Started(stage) => {
+            shown = Some(StageDisplay::new(stage.name, stage.subject.join(", "), stage.total));
+        }
+        Event::Progress(progress) => {
+            let stage =
+                shown.get_or_insert_with(|| StageDisplay::new(progress.stage, String::new(), progress.total));
+            let message = stage.message(&progress);
+            stage.update(progress.done, message);
+        }
+        Event::Finished { stage, metrics } => {
+            if let Some(finished) = shown.take()
+                && let Some(success) = success_rate(metrics)
+            {
+                print_summary(stage, &format!("{}: {success}", finished.subject));
+            }
+        }
+        _ => {}
+    })
 }
 
-impl Progress {
-    /// Progress of `total` units of work.
-    pub fn new(name: &'static str, total: usize) -> Self {
-        let terminal = std::io::stderr().is_terminal();
-        let target = if terminal { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
+/// Prints the line that remains when a stage is over.
+pub fn print_summary(stage: &str, message: &str) {
+    eprint(&format!("{stage:>9}: {message}\n"));
+}
+
+/// Returns a speed in steps per second.
+pub fn steps_per_second(steps: f64, elapsed: Duration) -> String {
+    format!("{:.0} steps/s", steps / elapsed.as_secs_f64().max(1e-9))
+}
+
+/// The display of one stage; dropping it clears the bar.
+pub struct StageDisplay {
+    name: &'static str,
+    subject: String,
+    bar: ProgressBar,
+    start: Instant,
+    /// When the last plain line was printed; `None` on a terminal.
+    last_line: Option<Instant>,
+}
+
+impl StageDisplay {
+    /// Shows a stage with `total` units of work.
+    pub fn new(name: &'static str, subject: String, total: usize) -> Self {
+        let is_terminal = std::io::stderr().is_terminal();
+        let target = if is_terminal { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
         let bar = ProgressBar::with_draw_target(Some(total as u64), target);
         if let Ok(style) =
             ProgressStyle::with_template("{prefix:>9} {bar:20.cyan/dim} {pos}/{len} eta {eta} {wide_msg}")
@@ -28,26 +71,71 @@ impl Progress {
             bar.set_style(style.progress_chars("━╸─"));
         }
         bar.set_prefix(name);
-        Self { name, bar, plain: (!terminal).then(|| Cell::new(Instant::now())) }
+        let start = Instant::now();
+        Self { name, subject, bar, start, last_line: (!is_terminal).then_some(start) }
     }
 
-    /// `done` units are done; `message` says what the work looks like now.
-    pub fn at(&self, done: usize, message: impl Into<String>) {
-        let message = message.into();
-        if let Some(last) = &self.plain
-            && last.get().elapsed() >= PLAIN_EVERY
+    /// Shows that `done` units of work are done, with a message.
+    pub fn update(&mut self, done: usize, message: String) {
+        if let Some(last) = &mut self.last_line
+            && last.elapsed() >= PLAIN_INTERVAL
         {
-            last.set(Instant::now());
+            *last = Instant::now();
             let total = self.bar.length().unwrap_or_default();
-            complain(&format!("{}: {done}/{total} {message}\n", self.name));
+            eprint(&format!("{}: {done}/{total} {message}\n", self.name));
         }
         self.bar.set_position(done as u64);
         self.bar.set_message(message);
     }
 
-    /// The work is done; `message` is what stays on the screen.
-    pub fn done(&self, message: &str) {
+    fn message(&self, progress: &Progress<'_>) -> String {
+        match progress.stage {
+            "collect" => steps_per_second(progress.metric("steps").unwrap_or_default(), self.start.elapsed()),
+            "train" => training_message(progress),
+            _ => self.subject.clone(),
+        }
+    }
+}
+
+impl Drop for StageDisplay {
+    fn drop(&mut self) {
         self.bar.finish_and_clear();
-        complain(&format!("{:>9}: {message}\n", self.name));
+    }
+}
+
+/// Formats the model's first metrics, the validation metric, and the speed of the loader.
+fn training_message(progress: &Progress<'_>) -> String {
+    // The metrics of the training loop follow those of the model.
+    let is_of_loop = |name: &str| ["validation_loss", "evaluation_return", "lr"].contains(&name);
+    let model = progress.metrics.iter().take_while(|(name, _)| !is_of_loop(name)).take(SHOWN_METRICS);
+    let model: Vec<String> = model.map(|(name, value)| format!("{name} {value:.4}")).collect();
+    let held_out = progress.metric("validation_loss").or(progress.metric("evaluation_return"));
+    let held_out = held_out.map_or(String::new(), |value| format!(", held out {value:.4}"));
+    let clips_per_second = progress.metric("clips_per_second").unwrap_or_default();
+    let wait = 100.0 * progress.metric("data_wait").unwrap_or_default();
+    format!("{}{held_out}, {clips_per_second:.0} clips/s, waits {wait:.0} %", model.join(" "))
+}
+
+/// Formats the success rate of a finished evaluation; `None` for other stages.
+fn success_rate(metrics: &[(&str, f64)]) -> Option<String> {
+    let metric = |name| metrics.iter().find(|(known, _)| *known == name).map(|(_, value)| *value as usize);
+    Some(percent(&Proportion::wilson(metric("successes")?, metric("episodes")?)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn training_message_shows_the_model_first() {
+        let metrics = [("loss", 0.5), ("validation_loss", 0.25), ("lr", 1e-3), ("clips_per_second", 12.0), ("data_wait", 0.5)];
+        let progress = Progress { stage: "train", done: 1, total: 2, unit: "steps", metrics: &metrics };
+        assert_eq!(training_message(&progress), "loss 0.5000, held out 0.2500, 12 clips/s, waits 50 %");
+    }
+
+    #[test]
+    fn only_evaluations_have_a_success_rate() {
+        assert_eq!(success_rate(&[("loss", 0.5)]), None);
+        assert!(success_rate(&[("successes", 1.0), ("episodes", 2.0)]).is_some_and(|rate| rate.starts_with("50 %")));
     }
 }

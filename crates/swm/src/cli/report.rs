@@ -1,32 +1,32 @@
-//! `swm report`: one self-contained HTML page of results.
+//! `swm report`: writes one self-contained HTML page of results.
 
 use super::train::log_of;
 use super::{emit, emit_json};
 use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
-use swm::home;
+use crate::home;
 use swm_core::Results;
 use swm_report::ReportOptions;
 
 /// Arguments of `swm report`.
 #[derive(Args)]
 pub struct ReportArgs {
-    /// Results files, or folders that hold a results.json
+    /// Results files, or folders with a results.json
     #[arg(required = true)]
     results: Vec<PathBuf>,
-    /// Where to write the page
+    /// Folder of the page
     #[arg(short, long, default_value = "report", value_name = "DIR")]
     output: PathBuf,
-    /// The headline (default: the environments)
+    /// Title (default: the environments)
     #[arg(long)]
     title: Option<String>,
-    /// Show the training curves of this checkpoint: a path or a name
+    /// Checkpoint whose training curves are shown: a path or a name
     #[arg(long, value_name = "CHECKPOINT")]
     training: Option<String>,
 }
 
-/// Makes the page.
+/// Runs `swm report`.
 pub fn report(args: &ReportArgs, as_json: bool) -> anyhow::Result<()> {
     let read: swm_core::Result<Vec<(PathBuf, Results)>> = args
         .results

@@ -1,4 +1,4 @@
-//! `swm solvers`: what plans, and what each asks of a model; and how a solver is named on the command line.
+//! `swm solvers`: lists the solvers; and parsing of `--solver NAME,KEY=VALUE,…`.
 
 use super::planner::named;
 use super::{emit, emit_json, table};
@@ -6,25 +6,25 @@ use serde_json::{Map, Value, json};
 use swm_core::{Error, Result};
 use swm_plan::{SOLVERS, SolverEntry};
 
-/// Lists them.
+/// Lists the solvers, their settings, and what they require of a model.
 pub fn solvers(as_json: bool) -> anyhow::Result<()> {
     if as_json {
         let all: Map<String, Value> = SOLVERS.rows.iter().map(|row| (row.id.to_owned(), describe(row))).collect();
         return emit_json(&all);
     }
-    let word = |value: Value| value.as_str().unwrap_or_default().to_owned();
+    let name = |value: Value| value.as_str().unwrap_or_default().to_owned();
     let rows = SOLVERS.rows.iter().map(|row| {
-        let needs: Vec<String> = row.needs.iter().map(|need| word(json!(need))).collect();
+        let needs: Vec<String> = row.needs.iter().map(|need| name(json!(need))).collect();
         vec![
             row.id.to_owned(),
-            word(json!(row.family)),
-            word(json!(row.actions)),
+            name(json!(row.family)),
+            name(json!(row.actions)),
             if needs.is_empty() { "–".to_owned() } else { needs.join(", ") },
-            words(&(row.defaults)()),
+            settings_lines(&(row.defaults)()),
             row.summary.to_owned(),
         ]
     });
-    emit(&table(&["solver", "family", "actions", "needs", "settings and defaults", "how it searches"], rows));
+    emit(&table(&["solver", "family", "actions", "requires", "settings and defaults", "method"], rows));
     Ok(())
 }
 
@@ -39,14 +39,14 @@ fn describe(row: &SolverEntry) -> Value {
     })
 }
 
-/// Settings as one writes them, a line each: `samples=300`, `optimizer.step=0.1`.
-fn words(settings: &Value) -> String {
+/// Returns settings as the command line takes them, one per line: `samples=300`, `optimizer.step=0.1`.
+fn settings_lines(settings: &Value) -> String {
     let mut lines = vec![];
     flatten("", settings, &mut lines);
     lines.iter().map(|(key, value)| format!("{key}={}", plain(value))).collect::<Vec<_>>().join("\n")
 }
 
-/// The settings within settings, by keys with dots.
+/// Collects the leaves of nested settings, by keys with dots.
 fn flatten<'a>(path: &str, value: &'a Value, lines: &mut Vec<(String, &'a Value)>) {
     match value {
         Value::Object(fields) => {
@@ -59,8 +59,7 @@ fn flatten<'a>(path: &str, value: &'a Value, lines: &mut Vec<(String, &'a Value)
     }
 }
 
-/// A value as one writes it; single precision without the digits it does not have.
-#[allow(clippy::cast_possible_truncation)]
+/// Formats a value as the command line takes it. Floats have the digits of single precision.
 fn plain(value: &Value) -> String {
     match value {
         Value::String(text) => text.clone(),
@@ -72,7 +71,7 @@ fn plain(value: &Value) -> String {
     }
 }
 
-/// A solver and its settings, complete, from `icem,samples=64,iterations=5`.
+/// Parses a solver and completes its settings with the defaults, from a text such as `icem,samples=64,iterations=5`.
 ///
 /// # Errors
 /// When the solver or a setting is unknown, or the settings contradict each other.
@@ -88,12 +87,12 @@ pub fn parse(text: &str) -> Result<(&'static SolverEntry, Value)> {
             let hint = format!("`swm solvers` lists the settings of {id}");
             return Err(Error::unknown("solver setting", &key, known.iter().map(String::as_str), hint));
         }
-        let place = key.split('.').fold(&mut settings, |at, part| &mut at[part]);
-        if !place.is_null() && std::mem::discriminant(place) != std::mem::discriminant(&value) {
-            let fix = format!("give a value like its default, {}", plain(place));
+        let setting = key.split('.').fold(&mut settings, |at, part| &mut at[part]);
+        if !setting.is_null() && std::mem::discriminant(setting) != std::mem::discriminant(&value) {
+            let fix = format!("give a value like its default, {}", plain(setting));
             return Err(Error::config(format!("solver setting {key}"), plain(&value), fix));
         }
-        *place = value;
+        *setting = value;
     }
     (entry.make)(&settings)?;
     Ok((entry, settings))
@@ -104,22 +103,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn solvers_are_read_with_their_settings() {
+    fn parses_solvers_with_settings() {
         let (entry, settings) = parse("cem,samples=64,sigma=0.5").expect("a solver");
         assert_eq!(entry.id, "cem");
         assert_eq!((&settings["samples"], &settings["sigma"]), (&json!(64), &json!(0.5)));
         assert_eq!(settings["iterations"], json!(30), "the default");
         let (_, settings) = parse("gd,optimizer.step=0.5").expect("a solver");
         assert_eq!((&settings["optimizer"]["step"], &settings["optimizer"]["kind"]), (&json!(0.5), &json!("adam")));
-        for (text, words) in [
+        for (text, message) in [
             ("cme", "did you mean cem"),
             ("cem,sample=3", "did you mean samples"),
             ("cem,samples", "KEY=VALUE"),
             ("cem,samples=many", "samples"),
             ("gd,optimizer.stepp=1", "did you mean optimizer.step"),
         ] {
-            let message = parse(text).err().expect(text).to_string();
-            assert!(message.contains(words), "{text}: {message}");
+            let error = parse(text).err().expect(text).to_string();
+            assert!(error.contains(message), "{text}: {error}");
         }
     }
 }

@@ -1,11 +1,11 @@
-//! `swm train`: train a model on a dataset.
+//! `swm train`: trains a model on a dataset, or online in an environment.
 
-use super::{Context, Progress, emit, emit_json};
+use super::progress::{control, print_summary};
+use super::{Context, emit, emit_json};
 use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use swm::home;
-use swm_core::run::{Control, Event};
+use crate::home;
 use swm_core::{EnvPool, Error, Result};
 use swm_data::Reader;
 use swm_models::{FAMILIES, OnlineRun, TrainOptions, TrainRun, TrainSummary, TrainableConfig, device};
@@ -13,33 +13,33 @@ use swm_models::{FAMILIES, OnlineRun, TrainOptions, TrainRun, TrainSummary, Trai
 /// Arguments of `swm train`.
 #[derive(Args)]
 pub struct TrainArgs {
-    /// The model: `swm models` lists them
+    /// The model; `swm models` lists them
     model: String,
     /// The dataset: a path or a name
     #[arg(long, value_name = "DATASET")]
     data: Option<String>,
-    /// The size and schedule: a preset's name or a TOML file (default: the model's first preset)
+    /// Size and schedule: a preset or a TOML file (default: the first preset)
     #[arg(long)]
     preset: Option<String>,
-    /// Learn by playing in this environment instead (tdmpc2, sac)
+    /// Train online in this environment instead (tdmpc2, sac)
     #[arg(long, value_name = "ENV", conflicts_with = "data")]
     env: Option<String>,
-    /// Steps after which an episode is truncated, with --env (default: the environment's own)
+    /// Time limit of an episode, in steps, with --env
     #[arg(long, value_name = "STEPS", requires = "env")]
     max_steps: Option<usize>,
-    /// Where to write the checkpoint and the logs: a path or a name (default: the model's and dataset's names)
+    /// The checkpoint to write: a path or a name (default: MODEL-DATASET)
     #[arg(short, long, value_name = "CHECKPOINT")]
     output: Option<String>,
-    /// The checkpoint whose frozen encoder is used: a path or a name (inverse only)
+    /// Checkpoint with the frozen encoder: a path or a name (inverse only)
     #[arg(long, value_name = "CHECKPOINT")]
     encoder: Option<String>,
-    /// Where it computes: cpu, vulkan[:I], cuda[:I], auto
+    /// Device: cpu, vulkan[:I], cuda[:I] or auto
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Continue the run that is there
+    /// Continue an interrupted run
     #[arg(long)]
     resume: bool,
-    /// Print the complete configuration and stop
+    /// Print the complete config and exit
     #[arg(long)]
     print_config: bool,
     /// Settings, such as optim.lr=3e-4 seed=1
@@ -47,7 +47,7 @@ pub struct TrainArgs {
     settings: Vec<String>,
 }
 
-/// Trains a model.
+/// Runs `swm train`.
 pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
     let family = FAMILIES.get(&args.model)?;
     let preset = args.preset.as_deref().unwrap_or(family.presets[0].id);
@@ -60,7 +60,7 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
         return Ok(());
     }
     if args.encoder.is_some() && !family.borrows_encoder {
-        let problem = format!("{} trains an encoder of its own", family.id);
+        let problem = format!("{} trains its own encoder", family.id);
         anyhow::bail!(Error::config("--encoder", problem, "leave it out, or train inverse"));
     }
     let options = TrainOptions {
@@ -74,9 +74,9 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
         return train_online(args, env, &*config, options, context);
     }
     let encoder = args.encoder.as_deref().map(home::find_checkpoint).transpose()?;
-    let (reader, out) = args.places()?;
-    let on = TrainRun { reader, encoder: encoder.as_deref(), out: &out, options };
-    let summary = run(&*config, on, context)?;
+    let (reader, out) = args.dataset_and_output()?;
+    let setup = TrainRun { reader, encoder: encoder.as_deref(), out: &out, options };
+    let summary = run(&*config, setup, context)?;
     if context.json {
         return emit_json(&summary);
     }
@@ -84,7 +84,7 @@ pub fn train(args: &TrainArgs, context: &Context) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Trains by playing.
+/// Trains online in an environment.
 fn train_online(
     args: &TrainArgs,
     env: &str,
@@ -92,34 +92,33 @@ fn train_online(
     options: TrainOptions,
     context: &Context,
 ) -> anyhow::Result<()> {
-    let choice = swm::env(env)?;
+    let choice = crate::env(env)?;
     let threads = swm_core::pool::threads(context.threads)?;
     let environments = |count: usize| {
         let envs = (0..count).map(|_| choice.env()).collect::<Result<Vec<_>>>()?;
         EnvPool::new(envs, config.image_size().map(|side| (side, side)), args.max_steps, Arc::clone(&threads))
     };
     let name = args.output.clone().unwrap_or_else(|| {
-        let world = env.rsplit('/').next().unwrap_or(env).split(',').next().unwrap_or(env);
-        format!("{}-{world}", args.model)
+        let env = env.rsplit('/').next().unwrap_or(env).split(',').next().unwrap_or(env);
+        format!("{}-{env}", args.model)
     });
     let out = home::checkpoint(&name);
-    let mut bar = Progress::new("train", config.steps());
-    let Some(summary) = config
-        .train_online(OnlineRun { environments: &environments, out: &out, options }, &mut control(context, &mut bar))
-    else {
-        let problem = format!("{} learns from datasets only", args.model);
+    let setup = OnlineRun { environments: &environments, out: &out, options };
+    let Some(summary) = config.train_online(setup, &mut control(context)) else {
+        let problem = format!("{} trains on datasets only", args.model);
         anyhow::bail!(Error::config("--env", problem, "give a dataset with --data, or train tdmpc2 or sac"));
     };
     let summary = summary?;
     let evaluated = summary.evaluated.map_or(String::new(), |mean| format!(", mean return {mean:.1}"));
     let best = summary.best.map_or(String::new(), |(step, mean)| format!(", best {mean:.1} after step {step}"));
-    bar.done(&format!(
+    let message = format!(
         "{} gradient steps and {} environment steps in {:.0} s{evaluated}{best}, {}",
         summary.steps,
         summary.env_steps,
         summary.seconds,
         out.display()
-    ));
+    );
+    print_summary("train", &message);
     if summary.interrupted {
         anyhow::bail!(Error::Interrupted);
     }
@@ -131,11 +130,11 @@ fn train_online(
 }
 
 impl TrainArgs {
-    /// The dataset, and where the checkpoint goes.
-    fn places(&self) -> Result<(Arc<dyn Reader>, PathBuf)> {
+    /// Returns the dataset and the folder of the checkpoint.
+    fn dataset_and_output(&self) -> Result<(Arc<dyn Reader>, PathBuf)> {
         let Some(data) = &self.data else {
             let fix =
-                "name one (`swm datasets` lists them), or an environment with --env for a model that learns by playing";
+                "name one (`swm datasets` lists them), or an environment with --env for a model that trains online";
             return Err(Error::config("--data", "no dataset is given", fix));
         };
         let name = self.output.clone().unwrap_or_else(|| {
@@ -146,48 +145,29 @@ impl TrainArgs {
     }
 }
 
-/// Trains with a progress bar.
-pub fn run(config: &dyn TrainableConfig, on: TrainRun<'_>, context: &Context) -> Result<TrainSummary> {
-    let out = on.out.to_owned();
-    let mut bar = Progress::new("train", config.steps());
-    let summary = config.train(on, &mut control(context, &mut bar))?;
+/// Trains on a dataset, and shows progress.
+pub fn run(config: &dyn TrainableConfig, setup: TrainRun<'_>, context: &Context) -> Result<TrainSummary> {
+    let out = setup.out.to_owned();
+    let summary = config.train(setup, &mut control(context))?;
     let early = if summary.stopped_early { ", stopped early" } else { "" };
     let best = summary.best.map_or(String::new(), |(step, loss)| format!(", best {loss:.4} after step {step}"));
-    bar.done(&format!(
-        "{} steps in {:.0} s{early}{best} ({} parameters, {:.0} clips/s, {:.0} % of it waiting for data), {}",
+    let message = format!(
+        "{} steps in {:.0} s{early}{best} ({} parameters, {:.0} clips/s, {:.0} % of the time waiting for data), {}",
         summary.steps,
         summary.seconds,
         summary.parameters,
         summary.clips_per_second,
         100.0 * summary.data_wait,
         out.display()
-    ));
+    );
+    print_summary("train", &message);
     if summary.interrupted {
         return Err(Error::Interrupted);
     }
     Ok(summary)
 }
 
-/// Where a run keeps its training log.
+/// Returns the path of a checkpoint's training log.
 pub fn log_of(checkpoint: &Path) -> PathBuf {
     checkpoint.join("train.jsonl")
-}
-
-/// Metrics of the model that the progress bar has room for.
-const SHOWN: usize = 4;
-
-/// The control of a training run that is shown by a progress bar.
-fn control<'a>(context: &Context, bar: &'a mut Progress) -> Control<'a> {
-    Control::new().with_interrupt(Arc::clone(&context.stop)).with_events(move |event| {
-        let Event::Progress(at) = event else { return };
-        // The loop's own metrics follow the model's.
-        let is_loops = |name: &str| ["validation_loss", "evaluation_return", "lr"].contains(&name);
-        let shown = at.metrics.iter().take_while(|(name, _)| !is_loops(name)).take(SHOWN);
-        let shown: Vec<String> = shown.map(|(name, value)| format!("{name} {value:.4}")).collect();
-        let validation = at.metric("validation_loss").or(at.metric("evaluation_return"));
-        let validation = validation.map_or(String::new(), |value| format!(", held out {value:.4}"));
-        let clips_per_second = at.metric("clips_per_second").unwrap_or_default();
-        let wait = 100.0 * at.metric("data_wait").unwrap_or_default();
-        bar.at(at.done, format!("{}{validation}, {clips_per_second:.0} clips/s, waits {wait:.0} %", shown.join(" ")));
-    })
 }

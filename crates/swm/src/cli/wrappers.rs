@@ -1,4 +1,4 @@
-//! `swm wrappers`: what can be done to pictures, and the arguments that ask for it.
+//! `swm wrappers`: lists the visual wrappers; and the arguments of commands that apply wrappers.
 
 use super::{emit, emit_json, table};
 use clap::Args;
@@ -7,22 +7,24 @@ use swm_core::Result;
 use swm_envs::wrappers::{GoalFrame, Stack, WRAPPERS, read};
 use swm_eval::Choice;
 
-/// Which wrappers the pictures of a world pass through.
+/// The wrappers of an environment's frames.
 #[derive(Args, Clone, Default)]
 pub struct WrapperArgs {
-    /// A wrapper of the pictures, such as noise,std=8; several are applied in this order (`swm wrappers` lists them)
+    /// Wrapper of frames, such as noise,std=8; several apply in order
+    ///
+    /// `swm wrappers` lists them.
     #[arg(long = "wrapper", value_name = "NAME[,KEY=VALUE…]")]
     pub wrappers: Vec<String>,
-    /// Apply the wrappers to the picture of the goal, too
+    /// Apply the wrappers to the frame of the goal, too
     #[arg(long, requires = "wrappers")]
     pub wrap_goal: bool,
 }
 
 impl WrapperArgs {
-    /// The wrappers and their settings, in order.
+    /// Returns the wrappers with their settings, in order.
     ///
     /// # Errors
-    /// When a wrapper or a setting is unknown or not allowed, or a file cannot be read.
+    /// When a wrapper or a setting is unknown or invalid, or a file cannot be read.
     pub fn choices(&self) -> Result<Vec<Choice>> {
         let choices = self.wrappers.iter().map(|text| {
             let (entry, settings) = read(text)?;
@@ -32,7 +34,7 @@ impl WrapperArgs {
         choices.collect()
     }
 
-    /// The stack of wrappers, and what is done to the picture of the goal.
+    /// Returns the stack of wrappers, and whether it applies to the frame of the goal.
     ///
     /// # Errors
     /// As [`WrapperArgs::choices`].
@@ -42,7 +44,7 @@ impl WrapperArgs {
     }
 }
 
-/// Lists them.
+/// Lists the wrappers and their settings.
 pub fn wrappers(as_json: bool) -> anyhow::Result<()> {
     if as_json {
         let all: Map<String, Value> = WRAPPERS.rows.iter().map(|row| (row.id.to_owned(), row.describe())).collect();
@@ -59,6 +61,6 @@ pub fn wrappers(as_json: bool) -> anyhow::Result<()> {
         });
         vec![row.id.to_owned(), row.summary.to_owned(), parameters.collect::<Vec<_>>().join("\n")]
     });
-    emit(&table(&["wrapper", "what it does", "settings, defaults (what is allowed)"], rows));
+    emit(&table(&["wrapper", "description", "setting=default (valid values)"], rows));
     Ok(())
 }

@@ -1,0 +1,89 @@
+//! Policies of `swm eval`: what a name on the command line refers to, and the policy requests made of it.
+
+use super::planner::PlannerArgs;
+use crate::resolver::{HomeResolver, parse_score};
+use serde_json::Value;
+use std::path::Path;
+use swm_core::{EnvChoice, Result};
+use swm_eval::{Model, PolicyKind, PolicyRequest};
+
+/// A policy that the command line names.
+pub struct NamedPolicy {
+    name: String,
+    kind: NamedKind,
+    /// The environment that the checkpoint was trained on.
+    pub env: Option<String>,
+    /// The side of the images that the checkpoint was trained on, in pixels.
+    pub image: Option<usize>,
+}
+
+/// The kind of a named policy.
+enum NamedKind {
+    /// A policy without a solver.
+    Direct(PolicyKind),
+    /// Planning by stepping the environment itself.
+    Simulator,
+    /// A checkpoint that predicts. If it also acts (`direct`), it plans only where a solver is named.
+    Checkpoint { given: String, block: usize, history: usize, direct: Option<PolicyKind> },
+}
+
+impl NamedPolicy {
+    /// Returns the policy with a name: `random`, `expert`, an expert's id, `simulator`, or a checkpoint, which is loaded.
+    ///
+    /// # Errors
+    /// When the environment or the checkpoint does not exist, or the checkpoint is damaged.
+    pub fn find(given: &str, env: Option<&str>, resolver: &HomeResolver) -> Result<Self> {
+        let without_checkpoint = |kind| Self { name: given.to_owned(), kind, env: None, image: None };
+        let env = env.map(crate::env).transpose()?;
+        if given == "random" {
+            return Ok(without_checkpoint(NamedKind::Direct(PolicyKind::Random)));
+        }
+        if given == "expert" || env.is_some_and(|env| env.entry.experts.iter().any(|expert| expert.id == given)) {
+            return Ok(without_checkpoint(NamedKind::Direct(PolicyKind::Expert { id: given.to_owned() })));
+        }
+        if given == "simulator" {
+            return Ok(without_checkpoint(NamedKind::Simulator));
+        }
+        let loaded = resolver.checkpoint(given)?;
+        let info = loaded.info()?;
+        let direct = PolicyKind::Direct { checkpoint: given.to_owned(), settings: Value::Null };
+        let kind = match loaded.cost() {
+            Some(_) => NamedKind::Checkpoint {
+                given: given.to_owned(),
+                block: info.action_block,
+                history: info.history,
+                direct: loaded.acts().then_some(direct),
+            },
+            None => NamedKind::Direct(direct),
+        };
+        let name = Path::new(given).file_name().map_or(given.to_owned(), |name| name.to_string_lossy().into_owned());
+        Ok(Self { name, kind, env: info.dataset_info.env, image: info.image_size })
+    }
+
+    /// Returns the requests: one policy, or one per solver.
+    ///
+    /// # Errors
+    /// When a solver, a setting, the objective or the score is unknown.
+    pub fn requests(self, env: &EnvChoice, planner: &PlannerArgs) -> Result<Vec<PolicyRequest>> {
+        let name = self.name;
+        let (model, block, history) = match self.kind {
+            NamedKind::Direct(kind) => return Ok(vec![PolicyRequest { name, kind }]),
+            NamedKind::Checkpoint { direct: Some(kind), .. } if planner.solvers.is_empty() => {
+                return Ok(vec![PolicyRequest { name, kind }]);
+            }
+            NamedKind::Simulator => {
+                parse_score(&planner.score)?;
+                (Model::Simulator { score: planner.score.clone() }, planner.action_block, 1)
+            }
+            NamedKind::Checkpoint { given, block, history, .. } => (Model::Checkpoint(given), block, history),
+        };
+        // The names of several solvers contain their settings, as the command line gives them.
+        let given = &planner.solvers;
+        let requests = planner.solvers(env)?.into_iter().enumerate().map(|(i, solver)| {
+            let name = if given.len() > 1 { format!("{name} ({})", given[i]) } else { name.clone() };
+            let kind = planner.plan(model.clone(), solver, block, history)?;
+            Ok(PolicyRequest { name, kind })
+        });
+        requests.collect()
+    }
+}

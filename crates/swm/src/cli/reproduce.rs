@@ -1,0 +1,51 @@
+//! `swm reproduce`: repeats an evaluation from its results and lists the differences.
+
+use super::collect::create_folder;
+use super::eval::{run_options, write_json};
+use super::progress::control;
+use super::results_tables::summary;
+use super::{Context, emit, emit_json};
+use crate::resolver::HomeResolver;
+use clap::Args;
+use serde_json::json;
+use std::path::PathBuf;
+
+/// Arguments of `swm reproduce`.
+#[derive(Args)]
+pub struct ReproduceArgs {
+    /// A results.json, or its folder
+    results: PathBuf,
+    /// Parallel environments; results do not depend on it
+    #[arg(long, default_value_t = 16)]
+    envs: usize,
+    /// Folder of the new results.json (default: none is written)
+    #[arg(short, long, value_name = "DIR")]
+    output: Option<PathBuf>,
+}
+
+/// Repeats an evaluation; fails if the results differ.
+pub fn reproduce(args: &ReproduceArgs, context: &Context) -> anyhow::Result<()> {
+    let file = if args.results.is_dir() { args.results.join("results.json") } else { args.results.clone() };
+    let old = swm_report::read_results(&file)?;
+    let options = run_options(args.envs, None, context);
+    let repeated =
+        swm_eval::reproduce::reproduce(&old, &HomeResolver::default(), &options, &mut control(context))?;
+    if let Some(output) = &args.output {
+        write_json(&create_folder(output)?.join("results.json"), &repeated.results)?;
+    }
+    let (holds, differences) = (repeated.holds(), &repeated.differences);
+    if context.json {
+        emit_json(&json!({"holds": holds, "differences": differences, "results": repeated.results}))?;
+    } else {
+        emit(&summary(&repeated.results));
+        differences.iter().for_each(|difference| emit(&format!("{difference}\n")));
+    }
+    if !holds {
+        anyhow::bail!("the results of {} are not reproduced: {} differences", file.display(), differences.len());
+    }
+    if !context.json {
+        let episodes: usize = repeated.results.runs.iter().map(|run| run.episodes.len()).sum();
+        emit(&format!("{episodes} episodes have the same results\n"));
+    }
+    Ok(())
+}

@@ -1,0 +1,82 @@
+//! Tables of evaluation results: success, prediction errors, and comparisons of policies.
+
+use super::table;
+use swm_core::Results;
+use swm_core::results::{Proportion, Run};
+
+/// Returns the tables of some results.
+pub fn summary(results: &Results) -> String {
+    [success(results), prediction_errors(results), comparisons(results)].into_iter().flatten().collect::<Vec<_>>().join("\n")
+}
+
+/// Formats a success rate with its 95 % confidence interval.
+pub fn percent(p: &Proportion) -> String {
+    format!("{:.0} % [{:.0}, {:.0}]", 100.0 * p.rate, 100.0 * p.low, 100.0 * p.high)
+}
+
+/// The success rate, time to goal and planning time of every run.
+fn success(results: &Results) -> Option<String> {
+    let rows = results.runs.iter().map(|run: &Run| {
+        vec![
+            run.condition.clone(),
+            run.policy.clone(),
+            percent(&run.success),
+            run.success.n.to_string(),
+            run.solved_at_start.to_string(),
+            run.time_to_goal.map_or("–".to_owned(), |t| format!("{:.0}", t.median)),
+            run.timing.plan_seconds.map_or("–".to_owned(), |t| format!("{} ({})", duration(t.median), duration(t.p95))),
+        ]
+    });
+    Some(table(
+        &["condition", "policy", "success [95 %]", "n", "solved at start", "median steps", "plan, median (p95)"],
+        rows,
+    ))
+}
+
+/// The errors of the models' predictions on the recorded trajectories; `None` where they were not requested.
+fn prediction_errors(results: &Results) -> Option<String> {
+    let predicted = results.runs.iter().filter_map(|run| Some((run, run.prediction.as_ref()?)));
+    let rows: Vec<Vec<String>> = predicted
+        .flat_map(|(run, prediction)| {
+            prediction.groups.iter().map(move |group| {
+                let outcome = group.success.map_or("all", |success| if success { "successes" } else { "failures" });
+                let last = group.steps.last().map_or(f64::NAN, |step| step.mean);
+                vec![
+                    run.condition.clone(),
+                    run.policy.clone(),
+                    outcome.to_owned(),
+                    group.trajectory.n.to_string(),
+                    format!("{:.3}", group.trajectory.mean),
+                    format!("{last:.3}"),
+                ]
+            })
+        })
+        .collect();
+    let header = ["condition", "model", "trajectories of", "n", "prediction error", "at the last step"];
+    (!rows.is_empty()).then(|| table(&header, rows))
+}
+
+/// The paired comparisons of policies; `None` for fewer than two policies.
+fn comparisons(results: &Results) -> Option<String> {
+    let rows = results.comparisons.iter().map(|comparison| {
+        let paired = &comparison.table;
+        vec![
+            comparison.condition.clone(),
+            format!("{} – {}", comparison.a, comparison.b),
+            format!("{:+.0} % [{:+.0}, {:+.0}]", 100.0 * paired.difference, 100.0 * paired.low, 100.0 * paired.high),
+            format!("{} : {}", paired.only_a, paired.only_b),
+            if paired.p < 1e-4 { "< 0.0001".to_owned() } else { format!("{:.4}", paired.p) },
+        ]
+    });
+    let header = ["condition", "compared", "difference [95 %]", "only one solved", "p (McNemar)"];
+    (!results.comparisons.is_empty()).then(|| table(&header, rows))
+}
+
+/// Formats a duration in seconds.
+fn duration(seconds: f64) -> String {
+    match seconds {
+        s if s < 0.01 => format!("{:.2} ms", 1e3 * s),
+        s if s < 1.0 => format!("{:.0} ms", 1e3 * s),
+        s => format!("{s:.2} s"),
+    }
+}

@@ -1,0 +1,73 @@
+//! Checks of the dataset that a collection writes to: whether it may be continued, and whether all its frames come from
+//! one renderer.
+
+use swm_core::{Error, Manifest, Result};
+use swm_data::lance::shard_manifests;
+use swm_data::{Location, WriteMode};
+use swm_eval::collect::check_continues;
+
+/// Checks, before any episode is played, that a collection with this manifest may be written to a location.
+/// `mix_renderers` permits frames of another renderer than those that are stored there.
+///
+/// # Errors
+/// When a dataset exists and `mode` is [`WriteMode::Create`], or when it cannot be continued with this manifest.
+pub fn check(location: &Location, mode: WriteMode, new: &Manifest, mix_renderers: bool) -> Result<()> {
+    let exists = match location.path() {
+        Some(path) => path.exists(),
+        None => swm_data::open(location.clone()).is_ok(),
+    };
+    if !exists {
+        return Ok(());
+    }
+    match mode {
+        WriteMode::Overwrite => Ok(()),
+        WriteMode::Append => {
+            let Some(stored) = swm_data::open(location.clone())?.manifest() else { return Ok(()) };
+            check_continues(&stored, new)?;
+            if !mix_renderers {
+                check_renderer("continuing a collection", &stored, new)?;
+            }
+            let (stored, new) = (&stored.config["codec"], &new.config["codec"]);
+            if stored == new {
+                return Ok(());
+            }
+            Err(Error::config(
+                "codec (--codec)",
+                format!("the dataset's frames are stored as {stored}, not {new}"),
+                "use the dataset's codec, or collect into another dataset",
+            ))
+        }
+        WriteMode::Create => Err(Error::config(
+            format!("dataset {location}"),
+            "it exists already",
+            "continue it (--resume, mode=\"append\"), replace it (--overwrite, mode=\"overwrite\"), or choose another name",
+        )),
+    }
+}
+
+/// Checks that all uncommitted shards of a dataset, and its committed episodes, have frames of the same renderer.
+///
+/// # Errors
+/// When two renderers were used.
+pub fn check_shards(location: &Location) -> Result<()> {
+    let stored = swm_data::open(location.clone()).ok().and_then(|reader| reader.manifest());
+    let shards = shard_manifests(location)?;
+    let mut manifests = stored.iter().chain(&shards);
+    let Some(first) = manifests.next() else { return Ok(()) };
+    manifests.try_for_each(|other| check_renderer("committing a shard", first, other))
+}
+
+/// Checks that two manifests name the same renderer; the device may differ.
+fn check_renderer(operation: &str, stored: &Manifest, new: &Manifest) -> Result<()> {
+    fn renderer(manifest: &Manifest) -> Option<&str> {
+        manifest.libraries.get("renderer")?.split(' ').next()
+    }
+    match (renderer(stored), renderer(new)) {
+        (Some(stored), Some(new)) if stored != new => Err(Error::config(
+            format!("{operation} with the renderer {new}"),
+            format!("the dataset's other frames were rendered by {stored}"),
+            format!("use --renderer {stored}, or accept slightly different frames with --mix-renderers"),
+        )),
+        _ => Ok(()),
+    }
+}

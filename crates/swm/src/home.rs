@@ -42,7 +42,8 @@ fn suffixes() -> impl Iterator<Item = &'static str> {
 /// suffix of the default format.
 pub fn dataset(given: &str) -> PathBuf {
     let folder = datasets();
-    let mut existing = once(DEFAULT_FORMAT).chain(suffixes()).chain(once("")).map(|suffix| named(given, &folder, suffix));
+    let mut existing =
+        once(DEFAULT_FORMAT).chain(suffixes()).chain(once("")).map(|suffix| named(given, &folder, suffix));
     existing.find(|path| path.exists()).unwrap_or_else(|| named(given, &folder, DEFAULT_FORMAT))
 }
 

@@ -141,9 +141,7 @@ impl Resolver for HomeResolver {
         let (spec, slots) = (world.spec(), world.pool().len());
         match &request.kind {
             PolicyKind::Random => Ok(ResolvedPolicy::from(Box::new(RandomPolicy::new(spec, slots)) as Box<dyn Policy>)),
-            PolicyKind::Expert { id } => {
-                scripted(&crate::env(&spec.id)?.entry, id, world).map(ResolvedPolicy::from)
-            }
+            PolicyKind::Expert { id } => scripted(&crate::env(&spec.id)?.entry, id, world).map(ResolvedPolicy::from),
             PolicyKind::Direct { checkpoint: given, .. } => {
                 let (policy, info) = direct(&*self.checkpoint(given)?, given, spec, slots)?;
                 Ok(with_provenance(ResolvedPolicy::from(policy), info))
@@ -180,8 +178,7 @@ impl Planner {
         }
         let (id, solver) = (solver.id.clone(), (SOLVERS.get(&solver.id)?.make)(&solver.settings)?);
         let mpc = parse("MPC settings", mpc)?;
-        let objective =
-            if objective.is_null() { ObjectiveConfig::default() } else { parse("objective", objective)? };
+        let objective = if objective.is_null() { ObjectiveConfig::default() } else { parse("objective", objective)? };
         Ok(Self { id, solver, mpc, objective })
     }
 

@@ -1,9 +1,9 @@
 //! `swm bench`: measures speed, compared with the reference implementation where it is installed.
 
 use super::{Context, emit, emit_json, eprint, table};
-use clap::{Args, Subcommand};
 use crate::ENVS;
 use crate::subject::LewmSubject;
+use clap::{Args, Subcommand};
 use swm_bench::{
     BenchConfig, DataBenchConfig, Drawing, ModelBenchConfig, ModelBenchReport, PlanBenchConfig, RenderBenchConfig,
     Work, bench_data, bench_envs, bench_model, bench_plan, bench_render,

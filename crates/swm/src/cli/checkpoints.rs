@@ -1,10 +1,10 @@
 //! `swm checkpoints`: lists, shows, verifies, imports, exports and removes checkpoints.
 
 use super::{emit, emit_json, table};
+use crate::home::{self, names_in};
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
-use crate::home::{self, names_in};
 use swm_core::{Error, Result};
 use swm_models::{CheckpointInfo, Device, FAMILIES, checkpoint};
 
@@ -72,7 +72,9 @@ pub fn checkpoints(args: &CheckpointsArgs, as_json: bool) -> anyhow::Result<()> 
         (Some(CheckpointsCommand::Show { checkpoint }), _) | (None, Some(checkpoint)) => show(checkpoint, as_json),
         (Some(CheckpointsCommand::List) | None, None | Some(_)) => list(as_json),
         (Some(CheckpointsCommand::Verify { checkpoints }), _) => verify(checkpoints, as_json),
-        (Some(CheckpointsCommand::Import { folder, model, data, output }), _) => import(folder, model, data, output, as_json),
+        (Some(CheckpointsCommand::Import { folder, model, data, output }), _) => {
+            import(folder, model, data, output, as_json)
+        }
         (Some(CheckpointsCommand::Export { checkpoint, folder }), _) => export(checkpoint, folder, as_json),
         (Some(CheckpointsCommand::Remove { checkpoint }), _) => remove(checkpoint, as_json),
     }

@@ -3,12 +3,12 @@
 use super::config::{CodecArgs, VariationArgs, image_size};
 use super::wrappers::WrapperArgs;
 use super::{Context, emit, emit_json, progress};
+use crate::resolver::policy_by_name;
+use crate::{collect_target, home};
 use clap::Args;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
-use crate::{collect_target, home};
-use crate::resolver::policy_by_name;
 use swm_core::{CameraView, EnvChoice, Error, Manifest, Result, Schema};
 use swm_data::lance::{Shard, create_shard};
 use swm_data::{FORMATS, ImageCodec, Location, WriteMode, WriteOptions, Writer};

@@ -4,9 +4,9 @@ use super::config::CodecArgs;
 use super::datasets::bytes;
 use super::progress::control;
 use super::{Context, emit, emit_json};
+use crate::home;
 use clap::{Args, ValueEnum};
 use std::time::Instant;
-use crate::home;
 use swm_data::{ConvertMode, ConvertOptions, Converted, Location};
 
 /// Arguments of `swm convert`.
@@ -99,7 +99,9 @@ pub fn describe(report: &Converted, target: &Location, seconds: f64) -> String {
             Some(psnr) => {
                 format!("'{}' is lossy: {psnr:.1} dB, maximum error {} of 255\n", column.column, column.max_error)
             }
-            None => format!("'{}' is rounded to single precision: maximum error {:e}\n", column.column, column.max_error),
+            None => {
+                format!("'{}' is rounded to single precision: maximum error {:e}\n", column.column, column.max_error)
+            }
         };
     }
     match &report.checksum {

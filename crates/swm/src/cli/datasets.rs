@@ -2,11 +2,11 @@
 
 use super::progress::{StageDisplay, print_summary};
 use super::{emit, emit_json, table};
+use crate::home::{names_in, open_dataset as open};
+use crate::{data, home};
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 use std::path::PathBuf;
-use crate::home::{names_in, open_dataset as open};
-use crate::{data, home};
 use swm_core::Result;
 use swm_data::Reader;
 use swm_data::lance::commit_shards;

@@ -1,15 +1,15 @@
 //! `swm demo`: collects, trains, plans, evaluates and reports within minutes on a laptop CPU.
 
 use super::collect::{self, Collection};
-use super::wrappers::WrapperArgs;
 use super::results_tables::summary;
+use super::wrappers::WrapperArgs;
 use super::{Context, emit, emit_json, eprint, eval, train};
+use crate::resolver::HomeResolver;
+use crate::{ENVS, home};
 use clap::Args;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
-use crate::resolver::HomeResolver;
-use crate::{ENVS, home};
 use swm_core::results::Counting;
 use swm_core::{Result, VariationRequest};
 use swm_data::{ImageCodec, Location, WriteMode};
@@ -151,7 +151,8 @@ fn request(args: &DemoArgs, model: &Path, side: usize, resolver: &HomeResolver) 
         objective: Value::Null,
     };
     let (factor, value) = SHIFT;
-    let shift = VariationRequest { variation_values: [(factor.to_owned(), value.to_vec())].into(), ..Default::default() };
+    let shift =
+        VariationRequest { variation_values: [(factor.to_owned(), value.to_vec())].into(), ..Default::default() };
     Ok(EvalRequest {
         version: EvalRequest::VERSION,
         env: ENV.to_owned(),

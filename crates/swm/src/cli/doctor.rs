@@ -3,10 +3,10 @@
 use super::convert::{self, TargetArgs};
 use super::progress::{control, print_summary};
 use super::{Context, emit, emit_json, table};
+use crate::home;
 use clap::Args;
 use serde_json::json;
 use std::time::Instant;
-use crate::home;
 use swm_data::ConvertMode;
 use swm_data::doctor::{Diagnosis, Finding, Severity, examine, open_damaged, repair};
 

@@ -1,10 +1,10 @@
 //! `swm envs` and `swm fovs`: list environments and their factors of variation.
 
 use super::{emit, emit_json, eprint, table};
+use crate::{ENVS, describe, gym};
 use clap::Args;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeSet;
-use crate::{ENVS, describe, gym};
 use swm_core::EnvChoice;
 
 /// Arguments of `swm envs`.

@@ -2,10 +2,10 @@
 
 use super::datasets::{bytes, summary};
 use super::{emit, emit_json, table};
+use crate::home::open_dataset;
 use clap::Args;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
-use crate::home::open_dataset;
 use swm_core::columns::is_stored_as;
 use swm_core::results::Summary;
 use swm_core::{Manifest, Result};

@@ -1,10 +1,10 @@
 //! `swm probe`: predicts columns and reconstructs images from a checkpoint's latents.
 
 use super::{Context, emit, emit_json, table};
+use crate::home;
 use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
-use crate::home;
 use swm_core::Error;
 use swm_data::write_png;
 use swm_models::Device;

@@ -23,8 +23,7 @@ pub fn control(context: &Context) -> Control<'static> {
             shown = Some(StageDisplay::new(stage.name, stage.subject.join(", "), stage.total));
         }
         Event::Progress(progress) => {
-            let stage =
-                shown.get_or_insert_with(|| StageDisplay::new(progress.stage, String::new(), progress.total));
+            let stage = shown.get_or_insert_with(|| StageDisplay::new(progress.stage, String::new(), progress.total));
             let message = stage.message(&progress);
             stage.update(progress.done, message);
         }
@@ -128,7 +127,8 @@ mod tests {
 
     #[test]
     fn training_message_shows_the_model_first() {
-        let metrics = [("loss", 0.5), ("validation_loss", 0.25), ("lr", 1e-3), ("clips_per_second", 12.0), ("data_wait", 0.5)];
+        let metrics =
+            [("loss", 0.5), ("validation_loss", 0.25), ("lr", 1e-3), ("clips_per_second", 12.0), ("data_wait", 0.5)];
         let progress = Progress { stage: "train", done: 1, total: 2, unit: "steps", metrics: &metrics };
         assert_eq!(training_message(&progress), "loss 0.5000, held out 0.2500, 12 clips/s, waits 50 %");
     }

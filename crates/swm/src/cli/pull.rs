@@ -1,9 +1,9 @@
 //! `swm pull`: downloads pretrained weights from the Hugging Face hub.
 
 use super::{emit, emit_json};
+use crate::home;
 use clap::Args;
 use serde_json::json;
-use crate::home;
 use swm_models::weights::{fetch, locate};
 
 /// Arguments of `swm pull`.

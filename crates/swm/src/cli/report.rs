@@ -2,10 +2,10 @@
 
 use super::train::log_of;
 use super::{emit, emit_json};
+use crate::home;
 use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
-use crate::home;
 use swm_core::Results;
 use swm_report::ReportOptions;
 

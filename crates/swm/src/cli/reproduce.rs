@@ -28,8 +28,7 @@ pub fn reproduce(args: &ReproduceArgs, context: &Context) -> anyhow::Result<()> 
     let file = if args.results.is_dir() { args.results.join("results.json") } else { args.results.clone() };
     let old = swm_report::read_results(&file)?;
     let options = run_options(args.envs, None, context);
-    let repeated =
-        swm_eval::reproduce::reproduce(&old, &HomeResolver::default(), &options, &mut control(context))?;
+    let repeated = swm_eval::reproduce::reproduce(&old, &HomeResolver::default(), &options, &mut control(context))?;
     if let Some(output) = &args.output {
         write_json(&create_folder(output)?.join("results.json"), &repeated.results)?;
     }

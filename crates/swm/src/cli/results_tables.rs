@@ -6,7 +6,11 @@ use swm_core::results::{Proportion, Run};
 
 /// Returns the tables of some results.
 pub fn summary(results: &Results) -> String {
-    [success(results), prediction_errors(results), comparisons(results)].into_iter().flatten().collect::<Vec<_>>().join("\n")
+    [success(results), prediction_errors(results), comparisons(results)]
+        .into_iter()
+        .flatten()
+        .collect::<Vec<_>>()
+        .join("\n")
 }
 
 /// Formats a success rate with its 95 % confidence interval.
@@ -24,7 +28,9 @@ fn success(results: &Results) -> Option<String> {
             run.success.n.to_string(),
             run.solved_at_start.to_string(),
             run.time_to_goal.map_or("–".to_owned(), |t| format!("{:.0}", t.median)),
-            run.timing.plan_seconds.map_or("–".to_owned(), |t| format!("{} ({})", duration(t.median), duration(t.p95))),
+            run.timing
+                .plan_seconds
+                .map_or("–".to_owned(), |t| format!("{} ({})", duration(t.median), duration(t.p95))),
         ]
     });
     Some(table(

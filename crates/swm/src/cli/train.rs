@@ -2,10 +2,10 @@
 
 use super::progress::{control, print_summary};
 use super::{Context, emit, emit_json};
+use crate::home;
 use clap::Args;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use crate::home;
 use swm_core::{EnvPool, Error, Result};
 use swm_data::Reader;
 use swm_models::{FAMILIES, OnlineRun, TrainOptions, TrainRun, TrainSummary, TrainableConfig, device};

@@ -1,4 +1,4 @@
-//! Collecting: resumed, interrupted, killed, and asked for nonsense.
+//! Tests of `swm collect`: determinism, interruption, resumption, shards and invalid requests.
 
 use crate::{Swm, text};
 use std::time::{Duration, Instant};
@@ -10,15 +10,15 @@ fn with<'a>(args: &[&'a str], more: &[&'a str]) -> Vec<&'a str> {
     args.iter().chain(more).copied().collect()
 }
 
-/// The dataset's content, and how many episodes it has.
+/// Returns the content hash and the number of episodes of a dataset.
 fn content(swm: &Swm, name: &str) -> (String, usize) {
     let found = swm.json(&["inspect", name]);
     let hash = found["content_hash"].as_str().expect("a hash").to_owned();
-    (hash, usize::try_from(found["episodes"].as_u64().expect("a number")).expect("a small number"))
+    (hash, usize::try_from(found["episodes"].as_u64().expect("an integer")).expect("it fits usize"))
 }
 
 #[test]
-fn a_dataset_does_not_depend_on_threads_or_environments() {
+fn dataset_does_not_depend_on_threads_or_environments() {
     let swm = Swm::new();
     let hashes = [("1", "1"), ("2", "3"), ("2", "8")].map(|(threads, envs)| {
         let more = ["--episodes", "9", "--overwrite", "--threads", threads, "--envs", envs];
@@ -31,14 +31,14 @@ fn a_dataset_does_not_depend_on_threads_or_environments() {
 }
 
 #[test]
-fn a_killed_collection_keeps_committed_episodes_and_resumes() {
+fn killed_collection_keeps_committed_episodes_and_resumes() {
     let swm = Swm::new();
     let all = ["--episodes", "100000"];
     let mut child = swm.command(&with(ROOMS, &all)).stderr(std::process::Stdio::null()).spawn().expect("swm starts");
-    // Wait for the first commit, then pull the plug.
-    let begun = Instant::now();
+    // Kill the process after the first commit.
+    let start = Instant::now();
     let partial = loop {
-        assert!(begun.elapsed() < Duration::from_secs(60), "nothing was committed in a minute");
+        assert!(start.elapsed() < Duration::from_secs(60), "nothing was committed in a minute");
         std::thread::sleep(Duration::from_millis(50));
         let output = swm.run(&["inspect", "rooms", "--json"]);
         if output.status.success() {
@@ -49,7 +49,7 @@ fn a_killed_collection_keeps_committed_episodes_and_resumes() {
         }
     };
     child.kill().expect("SIGKILL");
-    child.wait().expect("it is gone");
+    child.wait().expect("the process ends");
     let (_, kept) = content(&swm, "rooms");
     assert!(kept as u64 >= partial.expect("some"), "{kept} episodes, {partial:?} were committed");
     assert!(kept < 100_000, "the collection ended before it was killed");
@@ -62,64 +62,62 @@ fn a_killed_collection_keeps_committed_episodes_and_resumes() {
 
 #[cfg(unix)]
 #[test]
-fn ctrl_c_keeps_every_finished_episode() {
+fn interrupted_collection_keeps_finished_episodes() {
     let swm = Swm::new();
     let child = swm
         .command(&with(ROOMS, &["--episodes", "100000"]))
         .stderr(std::process::Stdio::piped())
         .spawn()
         .expect("swm starts");
-    let begun = Instant::now();
+    let start = Instant::now();
     while !swm.path("datasets/rooms.lance").exists() {
-        assert!(begun.elapsed() < Duration::from_secs(60), "no dataset appeared in a minute");
+        assert!(start.elapsed() < Duration::from_secs(60), "no dataset appeared in a minute");
         std::thread::sleep(Duration::from_millis(20));
     }
     std::thread::sleep(Duration::from_millis(300));
     let interrupted =
         std::process::Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill runs");
     assert!(interrupted.success());
-    let output = child.wait_with_output().expect("it ends");
+    let output = child.wait_with_output().expect("the process ends");
     assert_eq!(output.status.code(), Some(130), "{}", text(&output.stderr));
     assert!(text(&output.stderr).contains("interrupted"), "{}", text(&output.stderr));
     assert!(content(&swm, "rooms").1 > 0);
 }
 
 #[test]
-fn wrong_requests_are_refused_with_reasons() {
+fn invalid_requests_fail_without_replacing_the_dataset() {
     let swm = Swm::new();
     swm.json(&with(ROOMS, &["--episodes", "2"]));
-    let ask = |more: &[&str], code, words: &[&str]| swm.refuses(&with(ROOMS, more), code, words);
-    ask(&[], 2, &["rooms", "--resume", "--overwrite"]);
-    ask(&["--resume", "--pin", "agent.speed=4"], 2, &["variation", "agent.speed"]);
-    ask(&["--resume", "--codec", "jpeg"], 2, &["--codec", "qoi"]);
-    ask(&["--overwrite", "--variation", "agent.colour"], 2, &["did you mean agent.color"]);
-    ask(&["--overwrite", "--pin", "agent.color=1,2,300"], 2, &["agent.color", "0 ..= 255"]);
-    ask(&["--overwrite", "--pin", "agent.color=red"], 2, &["KEY=NUMBER"]);
-    ask(&["--overwrite", "--policy", "exprt"], 2, &["unknown policy 'exprt'", "expert"]);
-    swm.refuses(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--image", "2"], 2, &["no picture size"]);
-    // None of these replaced the dataset.
+    let fails = |more: &[&str], code, parts: &[&str]| swm.fails(&with(ROOMS, more), code, parts);
+    fails(&[], 2, &["rooms", "--resume", "--overwrite"]);
+    fails(&["--resume", "--pin", "agent.speed=4"], 2, &["variation", "agent.speed"]);
+    fails(&["--resume", "--codec", "jpeg"], 2, &["--codec", "qoi"]);
+    fails(&["--overwrite", "--variation", "agent.colour"], 2, &["did you mean agent.color"]);
+    fails(&["--overwrite", "--pin", "agent.color=1,2,300"], 2, &["agent.color", "0 ..= 255"]);
+    fails(&["--overwrite", "--pin", "agent.color=red"], 2, &["KEY=NUMBER"]);
+    fails(&["--overwrite", "--policy", "exprt"], 2, &["unknown policy 'exprt'", "expert"]);
+    swm.fails(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--image", "2"], 2, &["not a frame size"]);
     assert_eq!(content(&swm, "rooms").1, 2);
 }
 
 #[test]
-fn a_truncated_dataset_says_so() {
+fn truncated_dataset_is_an_error() {
     let swm = Swm::new();
     swm.json(&with(ROOMS, &["--episodes", "3"]));
     let data = swm.path("datasets/rooms.lance/data");
     let file = std::fs::read_dir(data).expect("data files").flatten().next().expect("one").path();
     let bytes = std::fs::read(&file).expect("readable");
     std::fs::write(&file, &bytes[..bytes.len() / 2]).expect("writable");
-    swm.refuses(&["inspect", "rooms"], 1, &["rooms.lance"]);
+    swm.fails(&["inspect", "rooms"], 1, &["rooms.lance"]);
     std::fs::remove_file(&file).expect("removable");
-    swm.refuses(&["inspect", "rooms"], 1, &["rooms.lance"]);
+    swm.fails(&["inspect", "rooms"], 1, &["rooms.lance"]);
 }
 
-/// Parts of one dataset whose pictures two renderers drew. Only one renderer is sure to be there, so the second part's
-/// note is changed to tell of another.
+/// Only one renderer is certain to be available, so the test changes the renderer in the second shard's log.
 #[test]
-fn parts_of_two_renderers_are_committed_only_when_asked() {
+fn shards_of_two_renderers_require_mix_renderers() {
     let swm = Swm::new();
-    let part = |shard| {
+    let collect = |shard| {
         [
             "collect",
             "swm/PendulumDMControl-v0",
@@ -136,16 +134,14 @@ fn parts_of_two_renderers_are_committed_only_when_asked() {
         ]
     };
     for shard in ["0/2", "1/2"] {
-        swm.json(&with(&part(shard), &["--episodes", "2", "--renderer", "cpu"]));
+        swm.json(&with(&collect(shard), &["--episodes", "2", "--renderer", "cpu"]));
     }
-    let parts = swm.path("datasets/swings.lance/_shards");
+    let logs = swm.path("datasets/swings.lance/_shards");
     let second =
-        std::fs::read_dir(parts).expect("parts").map(|entry| entry.expect("a part").path()).max().expect("two");
-    let note = second.join("begun.json");
-    let told = std::fs::read_to_string(&note).expect("a note").replace(r#""renderer":"cpu"#, r#""renderer":"egl"#);
-    std::fs::write(&note, told).expect("writes");
-    let refused = swm.run(&["datasets", "commit", "swings"]);
-    let told = text(&refused.stderr);
-    assert!(!refused.status.success() && told.contains("egl") && told.contains("--mix-renderers"), "{told}");
+        std::fs::read_dir(logs).expect("shards").map(|entry| entry.expect("a shard").path()).max().expect("two");
+    let log = second.join("begun.json");
+    let changed = std::fs::read_to_string(&log).expect("a log").replace(r#""renderer":"cpu"#, r#""renderer":"egl"#);
+    std::fs::write(&log, changed).expect("writable");
+    swm.fails(&["datasets", "commit", "swings"], 2, &["egl", "--mix-renderers"]);
     assert_eq!(swm.json(&["datasets", "commit", "swings", "--mix-renderers"])["added"], 2);
 }

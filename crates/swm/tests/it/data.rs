@@ -1,4 +1,4 @@
-//! Datasets from the command line: converted, looked at, examined and repaired.
+//! Tests of `swm convert`, `inspect`, `datasets`, `doctor` and `bench data`.
 
 use crate::{Swm, text};
 use std::path::Path;
@@ -8,7 +8,7 @@ fn collect(swm: &Swm, name: &str) {
 }
 
 #[test]
-fn a_dataset_is_converted_and_is_the_same() {
+fn converted_dataset_has_the_same_content() {
     let swm = Swm::new();
     collect(&swm, "rooms");
     let report = swm.json(&["convert", "rooms", "copy", "--codec", "png"]);
@@ -18,14 +18,14 @@ fn a_dataset_is_converted_and_is_the_same() {
     let checksum = |name: &str| swm.json(&["inspect", name, "--checksum"])["checksum"].clone();
     assert_eq!(checksum("rooms"), checksum("copy"));
     assert_eq!(checksum("copy"), report["checksum"]);
-    assert_eq!(swm.json(&["convert", "rooms", "copy"])["kept"], 5, "it is there already");
-    let words = text(&swm.run(&["convert", "rooms", "jpeg", "--codec", "jpeg", "--quality", "90"]).stdout);
-    assert!(words.contains("'pixels' is lossy") && words.contains("verified") && words.contains(" dB"), "{words}");
+    assert_eq!(swm.json(&["convert", "rooms", "copy"])["kept"], 5, "the episodes exist already");
+    let output = text(&swm.run(&["convert", "rooms", "jpeg", "--codec", "jpeg", "--quality", "90"]).stdout);
+    assert!(output.contains("'pixels' is lossy") && output.contains("verified") && output.contains(" dB"), "{output}");
 
-    swm.refuses(&["convert", "rooms", "copy", "--mode", "error"], 2, &["exists already"]);
-    swm.refuses(&["convert", "rooms", "other", "--format", "lanse"], 2, &["did you mean lance"]);
-    swm.refuses(&["convert", "romos", "other"], 2, &["did you mean rooms"]);
-    swm.refuses(&["convert", "rooms", "ftp://host/there.lance"], 2, &["ftp://"]);
+    swm.fails(&["convert", "rooms", "copy", "--mode", "error"], 2, &["exists already"]);
+    swm.fails(&["convert", "rooms", "other", "--format", "lanse"], 2, &["did you mean lance"]);
+    swm.fails(&["convert", "romos", "other"], 2, &["did you mean rooms"]);
+    swm.fails(&["convert", "rooms", "ftp://host/there.lance"], 2, &["ftp://"]);
     collect(&swm, "others");
     swm.json(&[
         "collect",
@@ -40,11 +40,11 @@ fn a_dataset_is_converted_and_is_the_same() {
         "--seed",
         "9",
     ]);
-    swm.refuses(&["convert", "rooms", "others"], 2, &["not the beginning of the source", "overwrite"]);
+    swm.fails(&["convert", "rooms", "others"], 2, &["not the beginning of the source", "overwrite"]);
     assert_eq!(swm.json(&["convert", "rooms", "others", "--mode", "append"])["episodes"], 7);
 
     let inspected = text(&swm.run(&["inspect", "rooms"]).stdout);
-    for word in ["5 episodes", "rows of an episode", "█", "pixels", "made by collect", "swm/TwoRoom-v1", "content hash"]
+    for word in ["5 episodes", "rows per episode", "█", "pixels", "made by collect", "swm/TwoRoom-v1", "content hash"]
     {
         assert!(inspected.contains(word), "{word}: {inspected}");
     }
@@ -54,17 +54,17 @@ fn a_dataset_is_converted_and_is_the_same() {
 }
 
 #[test]
-fn a_broken_dataset_is_told_and_mended() {
+fn doctor_finds_truncated_files() {
     let swm = Swm::new();
     collect(&swm, "rooms");
     let clean = swm.json(&["doctor", "rooms"]);
     assert_eq!((&clean["problems"], clean["sound"].as_array().map(Vec::len)), (&0.into(), Some(5)));
     let lewm = clean["models"].as_array().expect("models").iter().find(|fit| fit["model"] == "LeWM").expect("listed");
     assert_eq!(lewm["missing"].as_array().map(Vec::len), Some(0), "{lewm}");
-    let words = text(&swm.run(&["doctor", "rooms"]).stdout);
-    assert!(words.contains("no problems") && words.contains("TD-MPC2"), "{words}");
+    let output = text(&swm.run(&["doctor", "rooms"]).stdout);
+    assert!(output.contains("no problems") && output.contains("TD-MPC2"), "{output}");
 
-    // A data file is cut: what is read from it fails, the dataset as a whole may.
+    // Reading the truncated file fails; opening the dataset may fail, too.
     let file = largest(&swm.path("datasets/rooms.lance/data"));
     let bytes = std::fs::read(&file).expect("readable");
     std::fs::write(&file, &bytes[..bytes.len() / 2]).expect("writable");
@@ -72,7 +72,7 @@ fn a_broken_dataset_is_told_and_mended() {
     assert!(text(&output.stdout).contains("problem") || text(&output.stderr).contains("rooms"));
     assert_eq!(output.status.code(), Some(1), "{}", text(&output.stderr));
     assert!(!text(&output.stderr).contains("panicked"));
-    swm.refuses(&["doctor", "romos"], 2, &["did you mean rooms"]);
+    swm.fails(&["doctor", "romos"], 2, &["did you mean rooms"]);
 }
 
 fn largest(folder: &Path) -> std::path::PathBuf {
@@ -81,7 +81,7 @@ fn largest(folder: &Path) -> std::path::PathBuf {
 }
 
 #[test]
-fn loading_is_measured() {
+fn bench_data_measures_loading() {
     let swm = Swm::new();
     let small =
         ["--episodes", "14", "--steps", "24", "--size", "32", "--pairs", "1", "--seconds", "0.05", "--epochs", "2"];
@@ -91,5 +91,5 @@ fn loading_is_measured() {
     assert!(named("lance, lossless")["rate"].as_f64().expect("a rate") > 0.0);
     assert!(named("lance, jpeg, all kept on disk")["ours"][0].as_f64().expect("a rate") > 0.0);
     assert_eq!(found["resident"].as_array().map(Vec::len), Some(2));
-    swm.refuses(&["bench", "data", "--pairs", "0"], 2, &["at least 1 pair"]);
+    swm.fails(&["bench", "data", "--pairs", "0"], 2, &["at least 1 pair"]);
 }

@@ -1,8 +1,8 @@
-//! Gymnasium environments on the command line. They need a Python that has Gymnasium, which `$SWM_PYTHON` names.
+//! Tests of Gymnasium environments on the command line. They require a Python with Gymnasium, which `$SWM_PYTHON` names.
 
 use crate::{Swm, text};
 
-/// Whether there is a Python for these tests, which may lack some packages.
+/// Whether `$SWM_PYTHON` is set and has a module. Gymnasium is required; other modules may be missing.
 fn python(module: &str) -> bool {
     let Some(program) = std::env::var_os("SWM_PYTHON").filter(|value| !value.is_empty()) else {
         println!("SKIPPED: set SWM_PYTHON to a Python with Gymnasium, as `make test` does");
@@ -10,7 +10,6 @@ fn python(module: &str) -> bool {
     };
     let command = format!("import {module}");
     let output = std::process::Command::new(program).args(["-c", &command]).output().expect("$SWM_PYTHON starts");
-    // Gymnasium must be there; other packages may.
     assert!(output.status.success() || module != "gymnasium", "{}", text(&output.stderr));
     if !output.status.success() {
         println!("SKIPPED: $SWM_PYTHON has no {module}");
@@ -33,21 +32,22 @@ fn gymnasium_environments_are_collected_and_evaluated() {
     with(&["-o", "three", "--envs", "3", "--threads", "2"]);
     with(&["-o", "noisy", "--envs", "2", "--wrapper", "noise"]);
     let [one, three, noisy] = ["one", "three", "noisy"].map(|name| swm.json(&["inspect", name]));
-    assert_eq!(one["content_hash"], three["content_hash"], "environments and threads change nothing");
-    assert_ne!(one["content_hash"], noisy["content_hash"], "a wrapper changes pictures");
+    assert_eq!(one["content_hash"], three["content_hash"], "the content does not depend on environments and threads");
+    assert_ne!(one["content_hash"], noisy["content_hash"], "a wrapper changes frames");
     assert_eq!((&one["episodes"], &one["steps"]), (&noisy["episodes"], &noisy["steps"]));
     assert!(one["manifest"]["libraries"]["gymnasium"].is_string(), "{}", one["manifest"]);
     swm.json(&["eval", "random", "--env", "CartPole-v1", "--episodes", "3", "--image", "32", "-o", "floor"]);
     assert_eq!(swm.json(&["fovs", "CartPole-v1"])["variation"], serde_json::json!({}));
-    swm.refuses(&["collect", "CartPoel-v1", "-o", "x", "--policy", "random"], 2, &["did you mean CartPole-v1"]);
-    swm.refuses(&["collect", "CartPole-v1", "-o", "x"], 2, &["CartPole-v1 has no experts"]);
+    swm.fails(&["collect", "CartPoel-v1", "-o", "x", "--policy", "random"], 2, &["did you mean CartPole-v1"]);
+    swm.fails(&["collect", "CartPole-v1", "-o", "x"], 2, &["CartPole-v1 has no experts"]);
     let mut command = swm.command(&["envs", "CartPole-v1"]);
     let output = command.env("SWM_PYTHON", "/no/such/python").output().expect("swm starts");
     assert_eq!(output.status.code(), Some(2));
     assert!(text(&output.stderr).contains("/no/such/python (named by $SWM_PYTHON)"), "{}", text(&output.stderr));
 }
 
-/// A train that goes its way, whatever is done, at a speed that the seed decides: what it passed it passes again.
+/// An environment whose state grows by a constant speed, which depends on the seed, whatever the action. Every recorded
+/// state is reached again.
 const TRAIN: &str = "
 import gymnasium, numpy as np
 from gymnasium import spaces
@@ -77,7 +77,7 @@ gymnasium.register('Train-v0', Train, max_episode_steps=20)
 ";
 
 #[test]
-fn an_environment_with_setters_is_evaluated_from_a_dataset() {
+fn environment_with_state_setters_starts_from_a_dataset() {
     if !python("gymnasium") {
         return;
     }
@@ -94,12 +94,12 @@ fn an_environment_with_setters_is_evaluated_from_a_dataset() {
     swm.json(&["collect", "CartPole-v1", "-o", "carts", "--policy", "random", "--episodes", "2", "--no-pixels"]);
     let cart =
         ["eval", "random", "--env", "CartPole-v1", "--dataset", "carts", "--goal-offset", "2", "--episodes", "2"];
-    swm.refuses(&cart, 2, &["starting CartPole-v1 from a row of a dataset", "set_state(state)"]);
+    swm.fails(&cart, 2, &["starting CartPole-v1 from a row of a dataset", "set_state(state)"]);
 }
 
-/// The robustness sweep of the paper's Atari listing: three wrappers.
+/// The robustness sweep of the paper's Atari listing, with three wrappers.
 #[test]
-fn atari_games_pass_through_wrappers() {
+fn wrappers_change_atari_frames() {
     if !python("ale_py") {
         return;
     }
@@ -116,6 +116,6 @@ fn atari_games_pass_through_wrappers() {
         found["content_hash"].as_str().expect("a hash").to_owned()
     });
     for (i, hash) in hashes.iter().enumerate() {
-        assert!(!hashes[..i].contains(hash), "{:?} shows", sweep[i]);
+        assert!(!hashes[..i].contains(hash), "{:?} has no effect", sweep[i]);
     }
 }

@@ -1,5 +1,5 @@
-//! The `swm` command from outside, as a user meets it.
-#![allow(missing_docs, clippy::print_stdout)]
+//! Tests of the `swm` command as a process: arguments, output, exit codes and files.
+#![allow(missing_docs, clippy::print_stdout, reason = "a test crate has no public items; skipped tests print why")]
 
 mod collecting;
 mod data;
@@ -11,7 +11,7 @@ mod python;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-/// A `swm` with a home of its own.
+/// The `swm` command with a temporary home folder.
 pub(crate) struct Swm {
     home: tempfile::TempDir,
 }
@@ -29,7 +29,7 @@ impl Swm {
         self.home().join(name)
     }
 
-    /// The command, ready to run.
+    /// Returns the command with these arguments.
     pub fn command(&self, args: &[&str]) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_swm"));
         command.args(args).env("STABLEWM_HOME", self.home()).current_dir(self.home());
@@ -40,7 +40,7 @@ impl Swm {
         self.command(args).output().expect("swm starts")
     }
 
-    /// Runs it, expects success, and reads its one JSON document.
+    /// Runs the command with `--json`, expects success, and parses its JSON document.
     pub fn json(&self, args: &[&str]) -> serde_json::Value {
         let args: Vec<&str> = args.iter().copied().chain(["--json"]).collect();
         let output = self.run(&args);
@@ -49,14 +49,14 @@ impl Swm {
             .unwrap_or_else(|error| panic!("swm {args:?} printed no JSON: {error}: {}", text(&output.stdout)))
     }
 
-    /// Runs it, expects this exit code and an error that says all of `words`, without a panic.
-    pub fn refuses(&self, args: &[&str], code: i32, words: &[&str]) {
+    /// Runs the command; expects this exit code, and an error message with all `parts`, without a panic.
+    pub fn fails(&self, args: &[&str], code: i32, parts: &[&str]) {
         let output = self.run(args);
         let error = text(&output.stderr);
         assert_eq!(output.status.code(), Some(code), "swm {args:?}: {error}");
         assert!(!error.contains("panicked"), "swm {args:?}: {error}");
-        for word in words {
-            assert!(error.contains(word), "swm {args:?} does not say '{word}': {error}");
+        for part in parts {
+            assert!(error.contains(part), "swm {args:?}: no '{part}' in: {error}");
         }
     }
 }

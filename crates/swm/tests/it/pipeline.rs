@@ -1,13 +1,13 @@
-//! Train, evaluate, report, and the demo that does it all.
+//! Tests of `swm train`, `eval`, `reproduce`, `report` and `demo`.
 
 use crate::{Swm, text};
 use serde_json::Value;
 
-/// A demo small enough for a test: what it trains is useless, what it writes is complete.
+/// A demo that is small enough for a test. Its model is useless, but it writes all files.
 const DEMO: &[&str] =
     &["demo", "-o", "demo", "--episodes", "6", "--eval-episodes", "5", "schedule.steps=8", "schedule.warmup=2"];
 
-/// Runs the small demo; returns its dataset's hash and its results without what may differ: times.
+/// Runs the small demo; returns the hash of its dataset, and its results without timing.
 fn demo(swm: &Swm, more: &[&str]) -> (Value, Value) {
     let args: Vec<&str> = DEMO.iter().chain(more).copied().collect();
     let mut found = swm.json(&args);
@@ -19,7 +19,7 @@ fn demo(swm: &Swm, more: &[&str]) -> (Value, Value) {
 }
 
 #[test]
-fn the_demo_gives_the_same_bytes_with_any_threads_and_environments() {
+fn demo_does_not_depend_on_threads_and_environments() {
     let swm = Swm::new();
     let first = demo(&swm, &["--threads", "1", "--envs", "1"]);
     let page = std::fs::read_to_string(swm.path("demo/index.html")).expect("the report");
@@ -28,18 +28,18 @@ fn the_demo_gives_the_same_bytes_with_any_threads_and_environments() {
     assert_eq!(first.0, second.0, "datasets");
     assert_eq!(first.1, second.1, "results");
     let other = demo(&swm, &["--seed", "1"]);
-    assert_ne!(first.0, other.0, "another seed makes other data");
+    assert_ne!(first.0, other.0, "the seed changes the data");
 }
 
 #[test]
-fn a_checkpoint_goes_from_training_to_a_report() {
+fn trains_evaluates_and_reports() {
     let swm = Swm::new();
     swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--image", "64", "--episodes", "12", "--max-steps", "60"]);
     let train = ["train", "lewm", "--data", "rooms", "-o", "small", "schedule.steps=6", "data.batch_size=32"];
     let summary = swm.json(&train);
     assert_eq!(summary["steps"], 6);
-    swm.refuses(&train, 2, &["small", "resume"]);
-    swm.refuses(&["train", "lewm", "--data", "rooms", "-o", "small", "--resume", "optim.lr=1"], 2, &["optim.lr"]);
+    swm.fails(&train, 2, &["small", "resume"]);
+    swm.fails(&["train", "lewm", "--data", "rooms", "-o", "small", "--resume", "optim.lr=1"], 2, &["optim.lr"]);
     assert_eq!(swm.json(&["checkpoints"])[0]["name"], "small");
 
     let quick = ["--solver", "cem,samples=16,iterations=2,elites=4", "--episodes", "4", "--budget", "20"];
@@ -58,22 +58,22 @@ fn a_checkpoint_goes_from_training_to_a_report() {
     let page = std::fs::read_to_string(swm.path(report["report"].as_str().expect("a path"))).expect("the report");
     assert!(page.contains("agent.color=0,0,255") && page.contains("data:video/mp4"));
 
-    swm.refuses(&["eval", "small", "--env", "swm/PushT-v1"], 2, &["trained on swm/TwoRoom-v1"]);
-    swm.refuses(&["report", "nowhere"], 1, &["nowhere"]);
+    swm.fails(&["eval", "small", "--env", "swm/PushT-v1"], 2, &["trained on swm/TwoRoom-v1"]);
+    swm.fails(&["report", "nowhere"], 1, &["nowhere"]);
 
-    // A checkpoint of an unknown family, and a truncated one.
+    // An unknown model family, and truncated weights.
     let file = find(&swm.path("checkpoints/small"), "config.json");
     let config = std::fs::read_to_string(&file).expect("readable");
     std::fs::write(&file, config.replace("\"lewm\"", "\"dreamer\"")).expect("writable");
-    swm.refuses(&["eval", "small"], 1, &["dreamer", "does not support"]);
+    swm.fails(&["eval", "small"], 1, &["dreamer", "does not support"]);
     std::fs::write(&file, config).expect("writable");
     let weights = find(&swm.path("checkpoints/small"), "weights.safetensors");
     let bytes = std::fs::read(&weights).expect("readable");
     std::fs::write(&weights, &bytes[..bytes.len() / 2]).expect("writable");
-    swm.refuses(&["eval", "small"], 1, &["small"]);
+    swm.fails(&["eval", "small"], 1, &["small"]);
 }
 
-/// The one file of that name below a folder.
+/// Returns the only file of this name below a folder.
 fn find(folder: &std::path::Path, name: &str) -> std::path::PathBuf {
     let mut folders = vec![folder.to_owned()];
     while let Some(folder) = folders.pop() {
@@ -90,7 +90,7 @@ fn find(folder: &std::path::Path, name: &str) -> std::path::PathBuf {
 }
 
 #[test]
-fn policies_are_compared_on_the_same_starts_and_reproduced() {
+fn compares_policies_from_the_same_starts_and_reproduces_results() {
     let swm = Swm::new();
     let noise = ["--wrapper", "noise,std=4", "--wrapper", "grayscale"];
     let collect =
@@ -101,8 +101,8 @@ fn policies_are_compared_on_the_same_starts_and_reproduced() {
     let inverse = ["train", "inverse", "--data", "rooms", "-o", "direct", "--encoder", "small", "schedule.steps=4"];
     let trained = swm.json(&[&inverse[..], &["batch_size=16", "hidden=32"]].concat());
     assert_eq!(trained["steps"], 4);
-    swm.refuses(&inverse, 2, &["holds a training run already"]);
-    swm.refuses(&["train", "inverse", "--data", "rooms"], 2, &["--encoder"]);
+    swm.fails(&inverse, 2, &["holds a training run already"]);
+    swm.fails(&["train", "inverse", "--data", "rooms"], 2, &["--encoder"]);
     assert_eq!(swm.json(&["checkpoints"])[0]["family"], "inverse");
 
     let eval = ["eval", "small", "direct", "simulator", "expert", "--episodes", "4", "--budget", "60", "--trace"];
@@ -114,12 +114,15 @@ fn policies_are_compared_on_the_same_starts_and_reproduced() {
     assert_eq!(runs[0]["condition"], "noise,std=4, grayscale");
     assert_eq!(found["comparisons"].as_array().map(Vec::len), Some(10));
     assert!(runs.iter().all(|run| run["episodes"][3]["seed"] == runs[0]["episodes"][3]["seed"]));
-    assert!(runs[3]["success"]["rate"].as_f64() > runs[0]["success"]["rate"].as_f64(), "perfect dynamics help");
+    assert!(
+        runs[3]["success"]["rate"].as_f64() > runs[0]["success"]["rate"].as_f64(),
+        "planning with the true dynamics beats the floor"
+    );
     let traces: Value =
         serde_json::from_slice(&std::fs::read(swm.path("found/traces.json")).expect("traces")).expect("JSON");
     assert!(traces[0]["policy"] == "small" && traces[0]["best"].as_array().map(Vec::len) == Some(2), "{}", traces[0]);
 
-    // Gradients, latents, terms and constraints reach the solvers that ask for them.
+    // Solvers that require gradients, latents, terms or constraints get them.
     for planner in [
         &["--solver", "gd,samples=4,iterations=2,optimizer.step=0.2", "--term", "control,weight=0.01"][..],
         &["--solver", "grasp,iterations=4,sync_every=2,sync_iterations=1"],
@@ -129,22 +132,22 @@ fn policies_are_compared_on_the_same_starts_and_reproduced() {
             swm.json(&[&["eval", "small", "--episodes", "2", "--budget", "10", "-o", "other"], planner].concat());
         assert_eq!(planned["runs"][1]["timing"]["plan_seconds"]["n"].as_u64(), Some(2), "{planner:?}");
     }
-    swm.refuses(&["eval", "small", "--episodes", "2", "--solver", "lagrangian"], 2, &["needs constraints", "gd"]);
+    swm.fails(&["eval", "small", "--episodes", "2", "--solver", "lagrangian"], 2, &["needs constraints", "gd"]);
     let unfit = ["eval", "small", "--episodes", "2", "--solver", "pgd"];
-    swm.refuses(&unfit, 2, &["discrete", "cem"]);
-    assert!(!text(&swm.run(&unfit).stderr).contains("random"), "it is found before the floor is played");
+    swm.fails(&unfit, 2, &["discrete", "cem"]);
+    assert!(!text(&swm.run(&unfit).stderr).contains("random"), "the solver is checked before the floor is evaluated");
 
     let again = swm.json(&["reproduce", "found", "--threads", "1", "--envs", "3"]);
     assert_eq!((&again["holds"], &again["differences"]), (&Value::Bool(true), &Value::Array(vec![])));
-    // Other weights under the same name are found out before anything is played.
+    // Other weights under the same name are an error before any episode is played.
     std::fs::remove_dir_all(swm.path("checkpoints/small")).expect("removable");
     let other = ["train", "lewm", "--data", "rooms", "-o", "small", "schedule.steps=7", "data.batch_size=32"];
     swm.json(&other);
-    swm.refuses(&["reproduce", "found"], 2, &["weights of small", "hash"]);
+    swm.fails(&["reproduce", "found"], 2, &["weights of small", "hash"]);
 }
 
 #[test]
-fn protocols_splits_and_settings_are_checked() {
+fn checks_protocols_splits_and_settings() {
     let swm = Swm::new();
     swm.json(&["collect", "swm/TwoRoom-v1", "-o", "rooms", "--no-pixels", "--episodes", "40", "--max-steps", "40"]);
     let expert = ["eval", "expert", "--env", "swm/TwoRoom-v1", "--episodes", "6", "-o", "found"];
@@ -160,21 +163,21 @@ fn protocols_splits_and_settings_are_checked() {
     assert_eq!(found["runs"][2]["policy"], "simulator (cem,samples=9,elites=2,iterations=2)");
     let held = run(&["--hold", "3"]);
     assert_eq!(held["counting"]["strict"]["hold"], 3);
-    swm.refuses(&[&expert[..], &["--split", "rest"]].concat(), 2, &["rest"]);
-    swm.refuses(&[&expert[..], &["--wrapper", "nose"]].concat(), 2, &["did you mean noise"]);
-    swm.refuses(&["eval", "simulator", "--env", "swm/TwoRoom-v1", "--solver", "cme"], 2, &["did you mean cem"]);
-    swm.refuses(&["eval", "simulator", "--env", "swm/TwoRoom-v1", "--solver", "gd"], 2, &["gradient", "icem"]);
-    swm.refuses(&["eval", "simulator", "--env", "swm/TwoRoom-v1", "--score", "best"], 2, &["terminal"]);
-    swm.refuses(&["eval", "simulator", "--env", "swm/TwoRoom-v1", "--term", "contrl"], 2, &["control"]);
+    swm.fails(&[&expert[..], &["--split", "rest"]].concat(), 2, &["rest"]);
+    swm.fails(&[&expert[..], &["--wrapper", "nose"]].concat(), 2, &["did you mean noise"]);
+    swm.fails(&["eval", "simulator", "--env", "swm/TwoRoom-v1", "--solver", "cme"], 2, &["did you mean cem"]);
+    swm.fails(&["eval", "simulator", "--env", "swm/TwoRoom-v1", "--solver", "gd"], 2, &["gradient", "icem"]);
+    swm.fails(&["eval", "simulator", "--env", "swm/TwoRoom-v1", "--score", "best"], 2, &["terminal"]);
+    swm.fails(&["eval", "simulator", "--env", "swm/TwoRoom-v1", "--term", "contrl"], 2, &["control"]);
 }
 
 #[test]
-fn configurations_can_be_printed_and_wrong_ones_are_refused() {
+fn prints_configs_and_rejects_unknown_settings() {
     let swm = Swm::new();
     let output = swm.run(&["train", "lewm", "--preset", "paper", "--print-config", "seed=7"]);
     assert!(output.status.success(), "{}", text(&output.stderr));
     assert!(text(&output.stdout).contains("seed = 7"));
-    swm.refuses(&["train", "lwem", "--data", "x"], 2, &["did you mean lewm"]);
-    swm.refuses(&["train", "lewm"], 2, &["--data"]);
-    swm.refuses(&["train", "lewm", "--data", "x", "optim.rl=1"], 2, &["did you mean optim.lr"]);
+    swm.fails(&["train", "lwem", "--data", "x"], 2, &["did you mean lewm"]);
+    swm.fails(&["train", "lewm"], 2, &["--data"]);
+    swm.fails(&["train", "lewm", "--data", "x", "optim.rl=1"], 2, &["did you mean optim.lr"]);
 }

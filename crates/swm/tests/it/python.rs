@@ -1,9 +1,9 @@
-//! Datasets in Python: the `lance` package opens what `swm collect` wrote.
+//! Test of collected datasets with Python's `lance` package.
 
 use crate::{Swm, text};
 
-/// Prints what a notebook would look at first.
-const LOOK: &str = r#"
+/// Prints the contents of a dataset as JSON.
+const SCRIPT: &str = r#"
 import json, sys
 import lance, numpy as np, pyarrow as pa
 dataset = lance.dataset(sys.argv[1])
@@ -14,14 +14,14 @@ print(json.dumps({
     "rows": dataset.count_rows(),
     "episodes": len(set(table["episode_idx"].to_pylist())),
     "state": str(table.schema.field("state").type),
-    "picture": list(table["pixels"][0].as_py()[:4]),
+    "first_bytes": list(table["pixels"][0].as_py()[:4]),
     "nan_actions": int(np.isnan(action).any(axis=1).sum()),
     "largest_action": float(np.nanmax(np.abs(action))),
 }))
 "#;
 
 #[test]
-fn the_python_lance_package_opens_a_collected_dataset() {
+fn python_lance_opens_a_collected_dataset() {
     let Some(python) = std::env::var_os("SWM_LANCE_PYTHON") else {
         println!("SKIPPED: set SWM_LANCE_PYTHON to a Python with pylance, as `make test` does");
         return;
@@ -30,17 +30,17 @@ fn the_python_lance_package_opens_a_collected_dataset() {
     swm.json(&["collect", "swm/PushT-v1", "-o", "push", "--image", "64", "--episodes", "3", "--max-steps", "20"]);
     let ours = swm.json(&["inspect", "push"]);
     let output = std::process::Command::new(python)
-        .args(["-c", LOOK])
+        .args(["-c", SCRIPT])
         .arg(swm.path("datasets/push.lance"))
         .output()
         .expect("Python starts");
     assert!(output.status.success(), "{}", text(&output.stderr));
-    let seen: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
-    assert_eq!(seen["rows"], ours["steps"]);
-    assert_eq!(seen["episodes"], 3);
-    // The last action of each episode is missing.
-    assert_eq!(seen["nan_actions"], 3);
-    assert!(seen["largest_action"].as_f64().is_some_and(|a| a <= 1.0), "{seen}");
-    assert_eq!(seen["state"], "fixed_size_list<item: double>[7]");
-    assert_eq!(seen["picture"], serde_json::json!([b'q', b'o', b'i', b'f']));
+    let found: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    assert_eq!(found["rows"], ours["steps"]);
+    assert_eq!(found["episodes"], 3);
+    // An episode has no action after its last observation.
+    assert_eq!(found["nan_actions"], 3);
+    assert!(found["largest_action"].as_f64().is_some_and(|a| a <= 1.0), "{found}");
+    assert_eq!(found["state"], "fixed_size_list<item: double>[7]");
+    assert_eq!(found["first_bytes"], serde_json::json!([b'q', b'o', b'i', b'f']));
 }

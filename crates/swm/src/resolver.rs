@@ -172,9 +172,9 @@ struct Planner {
 
 impl Planner {
     fn new(solver: &Choice, mpc: &serde_json::Value, objective: &serde_json::Value) -> Result<Self> {
-        fn parse<T: DeserializeOwned>(what: &str, value: &serde_json::Value) -> Result<T> {
+        fn parse<T: DeserializeOwned>(setting: &str, value: &serde_json::Value) -> Result<T> {
             serde_json::from_value(value.clone())
-                .map_err(|error| Error::config(what, error.to_string(), "`swm eval --help` lists the settings"))
+                .map_err(|error| Error::config(setting, error.to_string(), "`swm eval --help` lists the settings"))
         }
         let (id, solver) = (solver.id.clone(), (SOLVERS.get(&solver.id)?.make)(&solver.settings)?);
         let mpc = parse("MPC settings", mpc)?;

@@ -1,4 +1,4 @@
-//! Policies of `swm eval`: what a name on the command line refers to, and the policy requests made of it.
+//! The policies that `swm eval` accepts by name, and their requests for the evaluation.
 
 use super::planner::PlannerArgs;
 use crate::resolver::{HomeResolver, parse_score};

@@ -9,6 +9,7 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
+use swm_core::columns::{ACTION, PIXELS};
 use swm_core::results::Summary;
 use swm_core::run::Control;
 use swm_core::{EnvChoice, Error, Named as _, RandomPolicy, Result};
@@ -54,7 +55,7 @@ pub struct DataBenchConfig {
 impl Default for DataBenchConfig {
     /// The settings of the reference's published rates: clips of 4 frames, 5 steps apart, at 224 pixels, 64 in a batch.
     fn default() -> Self {
-        let columns = ["pixels", "action"].map(str::to_owned).to_vec();
+        let columns = [PIXELS, ACTION].map(str::to_owned).to_vec();
         Self {
             episodes: 40,
             steps: 100,

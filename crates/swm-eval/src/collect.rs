@@ -13,7 +13,7 @@
 //! | column | |
 //! | --- | --- |
 //! | those of the environment | the observation; a `/` in a name becomes `.`, because most formats cannot store it |
-//! | `pixels` (and `goal`, if requested) | frames, in worlds that render |
+//! | `pixels` (and `goal`, if requested) | frames, of environments that render |
 //! | `action`, `reward`, `terminated`, `truncated`, `success` | the step |
 //! | `variation.<key>` | every factor of variation, constant over the episode |
 //! | `episode_seed` | the reset seed, constant over the episode: three `int32` of 21 bits each, the lowest first |

@@ -1,7 +1,8 @@
 //! [`choose`]: parses `ID` or `ID,key=value,…` into a row of the registry of environments.
 
+use crate::interned::interned;
 use crate::{EnvLayout, GymConfig, GymEnv, WorkerTransport};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Env, EnvChoice, EnvEntry, Error, Result};
 
@@ -103,20 +104,6 @@ fn parse(text: &str) -> Result<(&str, BTreeMap<String, String>)> {
     Ok((id, options))
 }
 
-/// A static copy of a text; equal texts share one copy.
-pub(crate) fn interned(text: &str) -> &'static str {
-    static TEXTS: Mutex<BTreeSet<&'static str>> = Mutex::new(BTreeSet::new());
-    let mut texts = TEXTS.lock().unwrap_or_else(PoisonError::into_inner);
-    match texts.get(text) {
-        Some(known) => known,
-        None => {
-            let interned: &'static str = Box::leak(text.into());
-            texts.insert(interned);
-            interned
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -138,10 +125,10 @@ mod tests {
     }
 
     #[test]
-    fn the_id_keeps_its_arguments() -> Result<()> {
+    fn id_contains_its_arguments() -> Result<()> {
         let text = "ALE/Pong-v5,frameskip=2";
         assert_eq!(choose(text)?.id(), text);
-        assert!(std::ptr::eq(choose(text)?.entry.id, choose(text)?.entry.id), "leaked once");
+        assert!(std::ptr::eq(choose(text)?.entry.id, choose(text)?.entry.id), "equal texts share one copy");
         Ok(())
     }
 

@@ -166,7 +166,7 @@ impl EnvLayout {
         let mut observation_space = vec![];
         for (name, space) in &description.observation {
             // Leaks once per name: the names in a spec are static.
-            observation_space.push((crate::choose::interned(name), space.space()?));
+            observation_space.push((crate::interned::interned(name), space.space()?));
         }
         let spec = EnvSpec {
             id: id.to_owned(),

@@ -14,6 +14,7 @@ mod dataset_start;
 mod describe;
 mod env;
 mod episode;
+mod interned;
 mod transport;
 mod worker;
 

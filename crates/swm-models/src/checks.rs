@@ -2,6 +2,7 @@
 
 use crate::pixels;
 use crate::train::at_least;
+use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{Candidates, Error, Result, Schema};
 
 /// Checks that dropout rates are at least 0 and below 1.
@@ -48,8 +49,8 @@ pub(crate) fn clip_covers_history(num_steps: usize, history: usize) -> Result<()
 /// # Errors
 /// When a column is missing or has another shape.
 pub(crate) fn planning_images(schema: &Schema, side: usize, action_dim: usize) -> Result<()> {
-    pixels::check(side, schema, "pixels")?;
-    pixels::check(side, schema, "goal")?;
+    pixels::check(side, schema, PIXELS)?;
+    pixels::check(side, schema, GOAL)?;
     if schema.find("history.length").is_none() {
         return Ok(());
     }

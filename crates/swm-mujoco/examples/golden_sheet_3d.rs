@@ -91,12 +91,12 @@ fn main() -> Result<(), Failure> {
     }
     let docs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../docs");
     let height = sheet.len() / 3 / width;
-    let file = BufWriter::new(File::create(docs.join("worlds-3d.png"))?);
+    let file = BufWriter::new(File::create(docs.join("environments-3d.png"))?);
     let mut encoder = png::Encoder::new(file, u32::try_from(width)?, u32::try_from(height)?);
     encoder.set_color(png::ColorType::Rgb);
     encoder.set_compression(png::Compression::High);
     encoder.write_header()?.write_image_data(&sheet)?;
-    let page = docs.join("worlds-3d.md");
+    let page = docs.join("environments-3d.md");
     let text = std::fs::read_to_string(&page)?;
     // The table starts with its header, in its present or its former words.
     let head = ["| environment |", "| world |"].into_iter().find_map(|head| text.split_once(head));

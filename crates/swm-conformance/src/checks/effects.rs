@@ -64,7 +64,8 @@ pub fn every_factor_has_an_effect(suite: &Suite) {
     for entry in suite.rows {
         let space = entry.env().expect("an environment").spec().variation_space.clone();
         let defaults = all_visible(&space);
-        // Some factors have an effect for certain values of others only, such as the angle of a shape that is round by default.
+        // Some factors have an effect only for certain values of another factor: the angle of a shape that is round by
+        // default has none.
         let mut contexts = vec![defaults.clone()];
         for seed in 0..suite.contexts {
             let mut request = all_visible(&space);

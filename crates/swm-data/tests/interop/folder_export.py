@@ -1,5 +1,5 @@
-"""Writes the folder dataset beside this script with the reference's own writer, and columns as other programs save
-them. Needs numpy, Pillow, and the published `stable-worldmodel`."""
+"""Writes the folder dataset next to this script with the writer of the reference implementation, and columns in the
+forms of other programs. Needs numpy, Pillow, and the published `stable-worldmodel`."""
 
 import shutil
 from pathlib import Path
@@ -13,7 +13,7 @@ lengths = [2, 3]
 rows = sum(lengths)
 
 
-def pictures():
+def images():
     t, y, x = np.mgrid[0:rows, 0:16, 0:24]
     return np.stack([8 * y + t, 4 * x + 7 * t, 90 + 0 * x], -1).astype(np.uint8)
 
@@ -26,11 +26,11 @@ with FolderWriter(here / "folder-reference", mode="overwrite") as writer:
         t = np.arange(first, first + length)
         action = np.stack([t / 4, -t], -1).astype("f4")
         action[-1] = np.nan
-        columns = {"pixels": pictures()[part], "action": action, "reward": t * 0.5, "variation.agent": np.stack([t] * 3, -1)}
+        columns = {"pixels": images()[part], "action": action, "reward": t * 0.5, "variation.agent": np.stack([t] * 3, -1)}
         columns["task"] = np.array(["push"] * length)
         writer.write_episode({name: list(values) for name, values in columns.items()})
         first += length
-# Another program may compress, store other types, and save pictures without loss under their own name.
+# Another program may compress, store other types, and save images without loss under another name.
 np.savez_compressed(here / "folder-reference/small.npz", np.arange(rows, dtype=">i2") - 3)
-Image.fromarray(pictures()[0]).save(here / "folder-reference/pixels/ep_0_step_0.png")
+Image.fromarray(images()[0]).save(here / "folder-reference/pixels/ep_0_step_0.png")
 (here / "folder-reference/pixels/ep_0_step_0.jpeg").unlink()

@@ -1,5 +1,5 @@
-"""Writes the HDF5 files beside this script: one by the reference's own writer, one by h5py with every filter, one with
-every layout. Needs numpy, h5py, hdf5plugin; for the first the published `stable-worldmodel`.
+"""Writes the HDF5 files next to this script: one by the writer of the reference implementation, one by h5py with every
+filter, one with every layout. Needs numpy, h5py, hdf5plugin; for the first the published `stable-worldmodel`.
 
     python hdf5_export.py            # hdf5-filters.h5, hdf5-layouts.h5
     python hdf5_export.py reference  # hdf5-reference.h5 as well
@@ -17,12 +17,12 @@ lengths = [6, 7, 8]
 rows = sum(lengths)
 
 
-def pictures(height=6, width=8):
+def images(height=6, width=8):
     t, y, x = np.mgrid[0:rows, 0:height, 0:width]
     return np.stack([10 * y + t, 4 * x + 7 * t, np.where((x + y) % 5 == 0, 200, 30)], -1).astype(np.uint8)
 
 
-def numbers(dtype="f8"):
+def values(dtype="f8"):
     t, k = np.mgrid[0:rows, 0:5]
     return (t * 100 + k * k).astype(dtype)
 
@@ -56,26 +56,26 @@ def filters():
     }
     with begin("hdf5-filters.h5", libver=("v110", "v110")) as file:
         for name, options in settings.items():
-            file.create_dataset(f"numbers {name}", data=numbers(), chunks=(rows, 5), **options)
-            file.create_dataset(f"pictures {name}", data=pictures(), chunks=(4, 6, 8, 3), **options)
+            file.create_dataset(f"numbers {name}", data=values(), chunks=(rows, 5), **options)
+            file.create_dataset(f"pictures {name}", data=images(), chunks=(4, 6, 8, 3), **options)
 
 
 def layouts():
     with begin("hdf5-layouts.h5", libver=("v110", "v110")) as file:
-        file.create_dataset("contiguous", data=pictures())
-        file.create_dataset("one chunk", data=pictures(), chunks=(rows, 6, 8, 3))
-        file.create_dataset("fixed", data=pictures(), chunks=(2, 4, 5, 2))
-        file.create_dataset("growing", data=pictures(), chunks=(1, 6, 8, 3), maxshape=(None, 6, 8, 3))
-        file.create_dataset("growing blocks", data=pictures(), chunks=(3, 5, 8, 3), maxshape=(None, 6, 8, 3), compression="gzip")
+        file.create_dataset("contiguous", data=images())
+        file.create_dataset("one chunk", data=images(), chunks=(rows, 6, 8, 3))
+        file.create_dataset("fixed", data=images(), chunks=(2, 4, 5, 2))
+        file.create_dataset("growing", data=images(), chunks=(1, 6, 8, 3), maxshape=(None, 6, 8, 3))
+        file.create_dataset("growing blocks", data=images(), chunks=(3, 5, 8, 3), maxshape=(None, 6, 8, 3), compression="gzip")
         for dtype in ("i1", "u2", "i2", ">i4", "u4", "u8", "f2", ">f8"):
-            file.create_dataset(f"numbers {dtype}", data=numbers(dtype) if dtype != "i1" else (numbers() % 100).astype("i1"))
+            file.create_dataset(f"numbers {dtype}", data=values(dtype) if dtype != "i1" else (values() % 100).astype("i1"))
         file["text"] = np.array([b"push"] * rows)
         file["truth"] = np.arange(rows) % 3 == 0
     with begin("hdf5-trees.h5") as file:
-        file.create_dataset("growing", data=pictures(), chunks=(1, 6, 8, 3), maxshape=(None, 6, 8, 3))
-        file.create_dataset("blocks", data=pictures(), chunks=(5, 4, 3, 3), compression="gzip")
+        file.create_dataset("growing", data=images(), chunks=(1, 6, 8, 3), maxshape=(None, 6, 8, 3))
+        file.create_dataset("blocks", data=images(), chunks=(5, 4, 3, 3), compression="gzip")
         sparse = file.create_dataset("partly written", shape=(rows, 5), chunks=(4, 5), dtype="f8")
-        sparse[:16] = numbers()[:16]
+        sparse[:16] = values()[:16]
 
 
 def reference():
@@ -86,11 +86,11 @@ def reference():
         first = 0
         for length in lengths:
             part = slice(first, first + length)
-            action = numbers("f4")[part, :2].copy()
+            action = values("f4")[part, :2].copy()
             action[-1] = np.nan
-            columns = {"pixels": pictures()[part], "action": action, "reward": numbers("f8")[part, 0], "step_idx": np.arange(length)}
+            columns = {"pixels": images()[part], "action": action, "reward": values("f8")[part, 0], "step_idx": np.arange(length)}
             # Nine columns: HDF5 stores the names of more than eight in another way.
-            columns |= {f"variation.{k}": numbers("i8")[part, k] for k in range(5)}
+            columns |= {f"variation.{k}": values("i8")[part, k] for k in range(5)}
             writer.write_episode({name: list(values) for name, values in columns.items()})
             first += length
 

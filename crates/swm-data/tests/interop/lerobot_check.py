@@ -1,4 +1,4 @@
-"""Opens a dataset with LeRobot's own package and prints what it sees as JSON: what `lerobot.rs` compares."""
+"""Opens a dataset with LeRobot's own package and prints its rows as JSON. `lerobot.rs` compares them."""
 
 import json
 import os
@@ -13,7 +13,7 @@ assert set(dataset.meta.stats) >= {"action", "observation.state", "observation.i
 rows = []
 for i in range(len(dataset)):
     row = dataset[i]
-    picture = lambda name: (row["observation.images." + name] * 255).round().permute(1, 2, 0).flatten().int().tolist()
+    image = lambda name: (row["observation.images." + name] * 255).round().permute(1, 2, 0).flatten().int().tolist()
     rows.append(
         {
             "state": row["observation.state"].tolist(),
@@ -21,8 +21,8 @@ for i in range(len(dataset)):
             "task": row["task"],
             "episode_index": int(row["episode_index"]),
             "frame_index": int(row["frame_index"]),
-            "pixels": picture("pixels"),
-            "goal": picture("goal"),
+            "pixels": image("pixels"),
+            "goal": image("goal"),
         }
     )
 print(json.dumps({"episodes": dataset.num_episodes, "rows": rows}))

@@ -1,5 +1,5 @@
-"""Writes small datasets with LeRobot's own package, and what that package reads back from them: what `lerobot.rs`
-compares.
+"""Writes small datasets with LeRobot's own package, and the frames that the package reads back from them.
+`lerobot.rs` compares both.
 
 python lerobot_export.py NAME CODEC    (lerobot 0.4.4 writes v3.0, lerobot 0.3.3 writes v2.1)
 """
@@ -16,11 +16,11 @@ LENGTHS = [11, 14, 9]
 TASKS = ["push the block", "open the drawer", "push the block"]
 
 
-def picture(e, t, height, width):
+def image(e, t, height, width):
     y, x = np.mgrid[:height, :width]
-    picture = np.stack([3 * y + 40 * e, 3 * x, 0 * x + 60 + 10 * t], -1).clip(0, 255).astype(np.uint8)
-    picture[4 + t : 12 + t, 8 + 2 * t : 20 + 2 * t] = [250, 220 - 50 * e, 20]
-    return picture
+    pixels = np.stack([3 * y + 40 * e, 3 * x, 0 * x + 60 + 10 * t], -1).clip(0, 255).astype(np.uint8)
+    pixels[4 + t : 12 + t, 8 + 2 * t : 20 + 2 * t] = [250, 220 - 50 * e, 20]
+    return pixels
 
 
 def frame(e, t, images):
@@ -29,11 +29,11 @@ def frame(e, t, images):
         "action": np.array([e + t / 4, -t], np.float32),
         "next.reward": np.array([t / 2], np.float32),
         "next.done": np.array([t == LENGTHS[e] - 1]),
-        "observation.images.top": picture(e, t, 48, 64),
-        "observation.images.wrist": picture(e, 2 * t, 48, 48),
+        "observation.images.top": image(e, t, 48, 64),
+        "observation.images.wrist": image(e, 2 * t, 48, 48),
     }
     if images:
-        row["observation.images.still"] = picture(e, t, 24, 32)
+        row["observation.images.still"] = image(e, t, 24, 32)
     return row
 
 

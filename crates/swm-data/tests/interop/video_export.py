@@ -1,5 +1,5 @@
-"""Writes `reference-video` with the writer of the published `stable-worldmodel`, and what its reader (decord) sees:
-what `video.rs` compares.
+"""Writes `reference-video` with the writer of the published `stable-worldmodel`, and the frames that its reader
+(decord) returns. `video.rs` compares both.
 
 python video_export.py    (stable-worldmodel 0.1.1, imageio-ffmpeg, decord 0.6.0)
 """
@@ -19,15 +19,15 @@ LENGTHS = [11, 14, 9]
 def episode(e):
     rows = range(LENGTHS[e])
     y, x = np.mgrid[:48, :64]
-    pictures = []
+    frames = []
     for t in rows:
-        picture = np.stack([3 * y + 40 * e, 3 * x, 0 * x + 60 + 10 * t], -1).clip(0, 255).astype(np.uint8)
-        picture[4 + t : 12 + t, 8 + 2 * t : 20 + 2 * t] = [250, 220 - 50 * e, 20]
-        pictures.append(picture)
+        frame = np.stack([3 * y + 40 * e, 3 * x, 0 * x + 60 + 10 * t], -1).clip(0, 255).astype(np.uint8)
+        frame[4 + t : 12 + t, 8 + 2 * t : 20 + 2 * t] = [250, 220 - 50 * e, 20]
+        frames.append(frame)
     action = [np.array([e, t / 4], np.float32) for t in rows]
     action[-1] = np.full(2, np.nan, np.float32)
     return {
-        "pixels": pictures,
+        "pixels": frames,
         "action": action,
         "state": [np.array([e, t, -0.5]) for t in rows],
         "step_idx": [np.int64(t) for t in rows],

@@ -146,7 +146,7 @@ fn damaged_cache_is_decoded_again() {
     std::fs::write(&rows_file, &bytes).expect("writes");
     assert!(all(&*over(&reader, &cache)) == expected);
     assert_eq!(reader.decoded(), 1);
-    assert!(all(&*over(&reader, &cache)) == expected && reader.decoded() == 0, "it is mended");
+    assert!(all(&*over(&reader, &cache)) == expected && reader.decoded() == 0, "the damaged row is stored again");
     // Both files are truncated.
     for file in files() {
         std::fs::write(&file, b"").expect("writes");

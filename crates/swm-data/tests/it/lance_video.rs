@@ -55,8 +55,8 @@ fn reads_episodes_with_their_images() {
     }
     assert!(open(folder.path().join("none.lance-video")).is_err(), "there is none");
     let images = Schema::new(schema().columns()[..1].to_vec()).expect("schema");
-    let path = folder.path().join("pictures.lance-video");
-    let error = create(&path, &images, WriteOptions::default()).err().expect("no numbers").to_string();
+    let path = folder.path().join("images.lance-video");
+    let error = create(&path, &images, WriteOptions::default()).err().expect("no numeric column").to_string();
     assert!(error.contains("format video"), "{error}");
 }
 

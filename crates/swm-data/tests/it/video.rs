@@ -183,7 +183,7 @@ fn the_reference_opens_our_videos() {
                 .iter()
                 .map(|v| v.as_u64().and_then(|v| u8::try_from(v).ok()).expect("a byte"))
                 .collect();
-            assert!(there == here.bytes(0), "{name}: the same file gives the same pictures here and there");
+            assert!(there == here.bytes(0), "{name}: both readers decode the same frames");
             let off: f64 = there.iter().zip(bytes).map(|(a, &b)| f64::from(a.abs_diff(b))).sum();
             assert!(off / bytes.len() as f64 <= tolerance, "{name}: {}", off / bytes.len() as f64);
             let state: Vec<f64> = (0..episode.rows()).flat_map(|t| [e as f64, t as f64, -0.5]).collect();

@@ -1,4 +1,4 @@
-//! Tests of worlds, mostly with a minimal environment on a line.
+//! Tests of `World`, mostly with a minimal environment on a line.
 
 mod collecting;
 mod counting;

@@ -1,4 +1,4 @@
-"""Writes JPEG pictures with Pillow, and beside each what Pillow decodes it to, for the tests of our decoder.
+"""Writes JPEG images with Pillow, and next to each the PNG image that Pillow decodes it to, for the decoder tests.
 
 Run with Pillow and numpy: `python jpeg_export.py`. Pillow decodes with libjpeg-turbo's defaults, as OpenCV and
 torchvision do.
@@ -19,19 +19,19 @@ def gradient(height, width):
 
 def disc(height, width):
     y, x = np.mgrid[:height, :width]
-    picture = np.full((height, width, 3), (250, 240, 230), np.uint8)
-    picture[(y - 30) ** 2 + (x - 40) ** 2 < 300] = (30, 60, 250)
-    picture[height // 2 :, : width // 3] = (144, 238, 144)
-    return picture
+    image = np.full((height, width, 3), (250, 240, 230), np.uint8)
+    image[(y - 30) ** 2 + (x - 40) ** 2 < 300] = (30, 60, 250)
+    image[height // 2 :, : width // 3] = (144, 238, 144)
+    return image
 
 
 def noise(height, width):
     return np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
-def save(name, picture, mode="RGB", **options):
+def save(name, image, mode="RGB", **options):
     path = HERE / f"{name}.jpg"
-    Image.fromarray(picture).convert(mode).save(path, **options)
+    Image.fromarray(image).convert(mode).save(path, **options)
     Image.open(path).convert("RGB").save(path.with_suffix(".png"), optimize=True)
 
 
@@ -43,7 +43,7 @@ save("halved-noise", noise(33, 50), quality=95)
 save("halved-narrow", gradient(40, 5), quality=95)
 save("full-disc", disc(61, 83), quality=90, subsampling=0)
 save("full-noise", noise(20, 27), quality=100, subsampling=0)
-# Those that are left to the general decoder.
+# Files of kinds that the fast decoder leaves to the general decoder.
 save("other-progressive", disc(61, 83), quality=90, progressive=True)
 save("other-columns", disc(61, 83), quality=90, subsampling=1)
 save("other-grey", disc(61, 83), mode="L", quality=90)

@@ -15,6 +15,7 @@ use crate::train::DatasetInfo;
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
+use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{Batch, Candidates, CostModel, DifferentiableCost, Error, Result, Schema};
 
 /// The planning cost of a DINO-WM.
@@ -75,7 +76,7 @@ impl DinoWmCost {
         // The recorded history has no other columns; a model that reads some starts from the present frame alone.
         let others: Vec<&str> =
             self.config.columns.iter().map(|column| column.name.as_str()).filter(|name| *name != ACTION).collect();
-        let (mut frames, mut past) = (vec![encode(row.get::<u8>("pixels")?)?], vec![]);
+        let (mut frames, mut past) = (vec![encode(row.get::<u8>(PIXELS)?)?], vec![]);
         if others.is_empty() && infos.schema().find("history.length").is_some() {
             let recorded = infos.schema().column("history.action")?.shape[0];
             let length = usize::try_from(row.get::<i32>("history.length")?[0]).unwrap_or(0);
@@ -110,7 +111,7 @@ impl DinoWmCost {
         Ok(PlanContext {
             start: self.model.embed(features, &inputs?),
             past,
-            goal: encode(row.get::<u8>("goal")?)?,
+            goal: encode(row.get::<u8>(GOAL)?)?,
             columns,
         })
     }

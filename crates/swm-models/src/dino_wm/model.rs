@@ -8,6 +8,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use std::ops::Range;
 use swm_core::Key;
+use swm_core::columns::PIXELS;
 
 /// A DINO-WM: predicts the patches of the next frame from the patches of frames and the actions between them.
 #[derive(Module, Debug)]
@@ -86,7 +87,7 @@ impl DinoWm {
             extra_encoders: ModuleDict(columns.collect()),
             decoder: (config.decoder > 0).then(|| PatchDecoder {
                 hidden: Linear::new(&decoder.of("hidden"), config.encoder.dim(), config.decoder),
-                pixels: Linear::new(&decoder.of("pixels"), config.decoder, pixels),
+                pixels: Linear::new(&decoder.of(PIXELS), config.decoder, pixels),
             }),
         }
     }

@@ -9,6 +9,7 @@ use crate::nn::parameters::{self, Named};
 use burn::module::Module;
 use burn::tensor::Tensor;
 use swm_core::Rng;
+use swm_core::columns::PIXELS;
 
 /// Normalised clips.
 pub struct TrainBatch {
@@ -57,7 +58,7 @@ pub fn step(model: &DinoWm, batch: &TrainBatch, noise: Option<&mut Rng>) -> Dino
     let prediction = Tensor::cat(parts, 3).mean();
 
     let value = |loss: &Tensor<1>| f64::from(loss.clone().inner().into_scalar::<f32>());
-    let mut losses = vec![("prediction", value(&prediction)), ("pixels", value(&pixels.mean()))];
+    let mut losses = vec![("prediction", value(&prediction)), (PIXELS, value(&pixels.mean()))];
     losses.extend(others.as_ref().map(|others| ("columns", value(others))));
     let mut loss = prediction;
     if let Some(decoder) = &learner.decoder {

@@ -11,6 +11,7 @@ use crate::weights;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
+use swm_core::columns::PIXELS;
 use swm_core::{Batch, DType, Error, Key, Result, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
 
@@ -47,8 +48,8 @@ impl Trainable for DinoWm {
     }
 
     fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
-        pixels::check(config.model.image, schema, "pixels")?;
-        let mut columns = vec!["pixels".to_owned()];
+        pixels::check(config.model.image, schema, PIXELS)?;
+        let mut columns = vec![PIXELS.to_owned()];
         for column in &config.model.columns {
             let spec = schema.column(&column.name)?;
             if spec.dtype != DType::Float32 {
@@ -96,7 +97,7 @@ impl Trainable for DinoWm {
     fn step(&self, context: &StepContext<'_, Self>, batch: &Batch) -> Result<StepOutput> {
         let StepContext { config, dataset_info, key, device, training } = context;
         let (model, data) = (&config.model, &config.data);
-        let rgb = batch.get::<u8>("pixels")?;
+        let rgb = batch.get::<u8>(PIXELS)?;
         let columns: Result<Vec<Tensor<3>>> = model
             .columns
             .iter()

@@ -10,6 +10,7 @@ use crate::pixels;
 use crate::probe::ImageEncoder;
 use burn::tensor::{Device, Tensor};
 use std::collections::VecDeque;
+use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{EnvSpec, Result, RowRef, Schema};
 use swm_plan::ActionScale;
 
@@ -74,17 +75,17 @@ impl ActionNetwork for Actor {
     }
 
     fn check(&self, infos: &Schema) -> Result<()> {
-        ["pixels", "goal"].into_iter().try_for_each(|name| pixels::check(self.config.image, infos, name))
+        [PIXELS, GOAL].into_iter().try_for_each(|name| pixels::check(self.config.image, infos, name))
     }
 
     fn next_actions(&self, episode: &mut EpisodePatches, row: RowRef<'_>) -> Result<Vec<f32>> {
         if episode.frames.len() == self.config.history {
             episode.frames.pop_front();
         }
-        episode.frames.push_back(self.patches(row.get("pixels")?)?);
+        episode.frames.push_back(self.patches(row.get(PIXELS)?)?);
         let goal = match &mut episode.goal {
             Some(goal) => goal,
-            none => none.insert(self.patches(row.get("goal")?)?),
+            none => none.insert(self.patches(row.get(GOAL)?)?),
         };
         let frames = Tensor::cat(episode.frames.iter().cloned().collect(), 1);
         let means = self.head.forward(&frames, goal, &mut DropoutRng::disabled());

@@ -12,6 +12,7 @@ use crate::{pixels, weights};
 use burn::tensor::{Device, Tensor, TensorData};
 use std::ops::Range;
 use std::path::Path;
+use swm_core::columns::{ACTION, PIXELS};
 use swm_core::{Batch, Error, Key, Result, Schema};
 use swm_data::{ClipSpec, GoalMixture, GoalSpec, LoaderConfig};
 
@@ -77,7 +78,7 @@ impl Trainable for Gcbc {
     }
 
     fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
-        pixels::check(config.model.image, schema, "pixels")?;
+        pixels::check(config.model.image, schema, PIXELS)?;
         Ok(LoaderConfig {
             clip: clip(config.data.num_steps, config.data.frameskip),
             goals: vec![goals(&config.loss.goals, GOAL, &config.model)],
@@ -134,7 +135,7 @@ macro_rules! value_learner {
             }
 
             fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
-                pixels::check(config.model.image, schema, "pixels")?;
+                pixels::check(config.model.image, schema, PIXELS)?;
                 Ok(LoaderConfig {
                     clip: clip(config.data.num_steps, config.data.frameskip),
                     goals: vec![
@@ -247,14 +248,14 @@ fn check_frames(given: usize, expected: usize) -> Result<()> {
 }
 
 fn clip(num_steps: usize, frameskip: usize) -> ClipSpec {
-    ClipSpec { num_steps, frameskip, columns: vec!["pixels".to_owned(), "action".to_owned()] }
+    ClipSpec { num_steps, frameskip, columns: vec![PIXELS.to_owned(), ACTION.to_owned()] }
 }
 
 /// Returns the specification of goal images, relative to the last frame of the history.
 fn goals(mixture: &GoalMixture, name: &str, model: &GcrlConfig) -> GoalSpec {
     GoalSpec {
         name: name.to_owned(),
-        columns: vec!["pixels".to_owned()],
+        columns: vec![PIXELS.to_owned()],
         anchor: Some(model.history.saturating_sub(1)),
         mixture: *mixture,
     }
@@ -280,7 +281,7 @@ impl<'a> BatchReader<'a> {
         device: &'a Device,
     ) -> Result<Self> {
         let actions = dataset_info.actions(batch, steps, frameskip, device)?;
-        Ok(Self { config, device, steps, frames: batch.get("pixels")?, batch, actions })
+        Ok(Self { config, device, steps, frames: batch.get(PIXELS)?, batch, actions })
     }
 
     /// Returns the images of some clips from a column with `per_clip` images per clip.

@@ -5,6 +5,7 @@ use crate::feed_forward::{ActionNetwork, FeedForwardPolicy};
 use crate::lewm::{encode, pixels};
 use crate::nn::parameters::host;
 use burn::tensor::{Device, Tensor, TensorData};
+use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{Result, RowRef, Schema};
 use swm_plan::ActionScale;
 
@@ -20,16 +21,16 @@ impl ActionNetwork for InverseCheckpoint {
     }
 
     fn check(&self, infos: &Schema) -> Result<()> {
-        ["pixels", "goal"].into_iter().try_for_each(|name| pixels::check(&self.world_model.config.model, infos, name))
+        [PIXELS, GOAL].into_iter().try_for_each(|name| pixels::check(&self.world_model.config.model, infos, name))
     }
 
     fn next_actions(&self, goal: &mut Option<Vec<f32>>, row: RowRef<'_>) -> Result<Vec<f32>> {
         let encode =
             |column: &str| encode(&self.world_model.model, &self.world_model.config.model, row.get::<u8>(column)?);
-        let mut pair = encode("pixels")?;
+        let mut pair = encode(PIXELS)?;
         match goal {
             Some(goal) => pair.extend_from_slice(goal),
-            None => pair.extend_from_slice(goal.insert(encode("goal")?)),
+            None => pair.extend_from_slice(goal.insert(encode(GOAL)?)),
         }
         let width = pair.len();
         Ok(host(self.model.forward(Tensor::from_data(TensorData::new(pair, [1, width]), &Device::flex()))))

@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 use std::path::Path;
 use std::sync::Arc;
 use std::time::Instant;
+use swm_core::columns::{ACTION, PIXELS};
 use swm_core::run::{Control, Progress};
 use swm_core::{Error, Key, Manifest, Result};
 use swm_data::{ClipSpec, Loader, LoaderConfig, Part, Reader};
@@ -94,7 +95,7 @@ pub fn train(
             "choose another folder, or remove it",
         ));
     }
-    pixels::check(&world_model.config.model, reader.schema(), "pixels")?;
+    pixels::check(&world_model.config.model, reader.schema(), PIXELS)?;
     swm_core::pool::threads(threads)?.install(|| run(config, world_model, reader, out, control))
 }
 
@@ -177,7 +178,7 @@ fn manifest(config: &InverseConfig, world_model: &Checkpoint<Lewm>, reader: &dyn
 fn loader(config: &InverseConfig, frameskip: usize, reader: Arc<dyn Reader>) -> Result<Loader> {
     let episodes = crate::train::episodes(config.hold_out, Part::Train, &*reader)?;
     let clip =
-        ClipSpec { num_steps: config.offset + 1, frameskip, columns: vec!["pixels".to_owned(), "action".to_owned()] };
+        ClipSpec { num_steps: config.offset + 1, frameskip, columns: vec![PIXELS.to_owned(), ACTION.to_owned()] };
     let config = LoaderConfig {
         clip,
         batch_size: config.batch_size,
@@ -209,7 +210,7 @@ impl Pairs {
         let (latent, actions) = (config.latent, world_model.config.data.frameskip * dim);
         let frame = config.image * config.image * 3;
         let encoded: Result<Vec<Vec<f32>>> = batch
-            .get::<u8>("pixels")?
+            .get::<u8>(PIXELS)?
             .par_chunks(FRAMES * frame)
             .map(|frames| {
                 let patches = pixels::patches(config, frames, &Device::flex())?;
@@ -217,7 +218,7 @@ impl Pairs {
             })
             .collect();
         let encoded = encoded?.concat();
-        let actions_taken = batch.get::<f32>("action")?;
+        let actions_taken = batch.get::<f32>(ACTION)?;
         let count = batch.rows() * offset;
         let mut pairs =
             Self { latents: Vec::with_capacity(2 * count * latent), actions: vec![0.0; count * actions], count };

@@ -15,6 +15,7 @@ use crate::checks;
 use crate::nn::parameters::IntoF32;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
+use swm_core::columns::{GOAL, PIXELS};
 use swm_core::{Batch, Candidates, CostModel, DifferentiableCost, LatentDynamics, Result};
 
 /// The planning cost of a LeWM.
@@ -80,7 +81,7 @@ impl LewmCost {
     fn context(&self, infos: &Batch, env: usize) -> Result<PlanContext> {
         let row = infos.row(env);
         // One image per call: a latent must not depend on the number of images in a call.
-        let mut start = vec![self.latent_of(row.get::<u8>("pixels")?)?];
+        let mut start = vec![self.latent_of(row.get::<u8>(PIXELS)?)?];
         let mut past = vec![];
         if infos.schema().find("history.length").is_some() {
             let length = usize::try_from(row.get::<i32>("history.length")?[0]).unwrap_or(0);
@@ -94,7 +95,7 @@ impl LewmCost {
             }
             past = actions[actions.len() - length * self.actions..].to_vec();
         }
-        Ok(PlanContext { start: start.concat(), past, goal: self.latent_of(row.get::<u8>("goal")?)? })
+        Ok(PlanContext { start: start.concat(), past, goal: self.latent_of(row.get::<u8>(GOAL)?)? })
     }
 }
 

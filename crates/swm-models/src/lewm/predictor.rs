@@ -4,6 +4,7 @@ use super::{Lewm, LewmConfig, Rollout, pixels};
 use crate::nn::parameters::host;
 use burn::tensor::Device;
 use rayon::prelude::*;
+use swm_core::columns::PIXELS;
 use swm_core::{Batch, Error, Predictor, Result};
 use swm_plan::ActionScale;
 
@@ -29,7 +30,7 @@ impl Predictor for LewmPredictor {
     }
 
     fn columns(&self) -> Vec<String> {
-        vec!["pixels".to_owned()]
+        vec![PIXELS.to_owned()]
     }
 
     fn latent_dim(&self) -> usize {
@@ -38,9 +39,9 @@ impl Predictor for LewmPredictor {
 
     fn encode(&mut self, rows: &Batch, latents: &mut [f32]) -> Result<()> {
         let (config, model) = (&self.config, &self.model);
-        pixels::check(config, rows.schema(), "pixels")?;
+        pixels::check(config, rows.schema(), PIXELS)?;
         let bytes = config.image * config.image * 3;
-        let work = latents.par_chunks_exact_mut(config.latent).zip(rows.get::<u8>("pixels")?.par_chunks_exact(bytes));
+        let work = latents.par_chunks_exact_mut(config.latent).zip(rows.get::<u8>(PIXELS)?.par_chunks_exact(bytes));
         work.try_for_each(|(latent, rgb)| {
             latent.copy_from_slice(&host(model.encode(pixels::patches(config, rgb, &Device::flex())?)));
             Ok(())

@@ -6,6 +6,7 @@ use crate::checks;
 use crate::nn::{BatchStatistics, Named};
 use crate::train::{DataConfig, DatasetInfo, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
 use burn::tensor::{Device, Tensor};
+use swm_core::columns::{ACTION, PIXELS};
 use swm_core::{Batch, Key, Result, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
 
@@ -71,8 +72,8 @@ pub(crate) fn check(model: &LewmConfig, data: &DataConfig) -> Result<()> {
 
 /// Returns the loader configuration for clips of images and actions.
 pub(crate) fn loader_config(model: &LewmConfig, data: &DataConfig, schema: &Schema) -> Result<LoaderConfig> {
-    pixels::check(model, schema, "pixels")?;
-    let columns = vec!["pixels".to_owned(), "action".to_owned()];
+    pixels::check(model, schema, PIXELS)?;
+    let columns = vec![PIXELS.to_owned(), ACTION.to_owned()];
     let clip = ClipSpec { num_steps: data.num_steps, frameskip: data.frameskip, columns };
     Ok(LoaderConfig { clip, ..LoaderConfig::default() })
 }
@@ -86,7 +87,7 @@ pub(crate) fn prepare(
     device: &Device,
 ) -> Result<TrainBatch> {
     Ok(TrainBatch {
-        patches: pixels::patches(model, batch.get::<u8>("pixels")?, device)?,
+        patches: pixels::patches(model, batch.get::<u8>(PIXELS)?, device)?,
         actions: dataset_info.actions(batch, data.num_steps, data.frameskip, device)?,
     })
 }

@@ -100,7 +100,7 @@ impl Collector {
         self.begin(&slots)
     }
 
-    /// Announces the running episodes to a policy that takes over.
+    /// Calls `begin` of a new policy for every running episode.
     pub fn begin_policy(&self, policy: &mut dyn Policy) {
         for (slot, running) in self.running.iter().enumerate() {
             policy.begin(slot, self.key.at(running.number));

@@ -2,6 +2,7 @@
 
 use crate::train::at_least;
 use serde::{Deserialize, Serialize};
+use swm_core::columns::PIXELS;
 use swm_core::{Error, Result};
 
 /// The sizes of a [`super::Sac`].
@@ -24,7 +25,7 @@ impl SacConfig {
         if self.columns.is_empty() {
             return Err(Error::config("model.columns", "nothing is observed", "name a column, such as [\"state\"]"));
         }
-        if self.columns.iter().any(|column| column == "pixels") {
+        if self.columns.iter().any(|column| column == PIXELS) {
             return Err(Error::config(
                 "model.columns",
                 "'pixels' is a column of images",

@@ -8,6 +8,7 @@ use crate::nn::{Named, normal};
 use crate::online::{Agent, SharedModel, StochasticActor, StochasticPolicy};
 use crate::train::{DatasetInfo, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable};
 use burn::tensor::{Device, Tensor, TensorData};
+use swm_core::columns::{ACTION, REWARD, TERMINATED};
 use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result, RowRef, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
 
@@ -55,7 +56,7 @@ impl Trainable for Sac {
 
     fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig> {
         crate::online::check_rewards(schema)?;
-        let columns = config.model.columns.iter().map(String::as_str).chain(["action", "reward", "terminated"]);
+        let columns = config.model.columns.iter().map(String::as_str).chain([ACTION, REWARD, TERMINATED]);
         let clip = ClipSpec { num_steps: 2, frameskip: 1, columns: columns.map(str::to_owned).collect() };
         clip.schema(schema)?;
         Ok(LoaderConfig { clip, ..LoaderConfig::default() })
@@ -89,8 +90,8 @@ impl Trainable for Sac {
         let batch = Transitions {
             observations: frame(0),
             actions,
-            rewards: first("reward")?,
-            terminated: first("terminated")?,
+            rewards: first(REWARD)?,
+            terminated: first(TERMINATED)?,
             next: frame(1),
             noise: [noise("next actions"), noise("actions")],
         };

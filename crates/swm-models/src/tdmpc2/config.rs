@@ -3,10 +3,8 @@
 use crate::nn::Bins;
 use crate::train::at_least;
 use serde::{Deserialize, Serialize};
+use swm_core::columns::PIXELS;
 use swm_core::{Error, Result};
-
-/// The column of images.
-pub const PIXELS: &str = "pixels";
 
 /// The sizes of a [`super::Tdmpc2`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

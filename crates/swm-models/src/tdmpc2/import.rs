@@ -1,6 +1,6 @@
 //! Import and export of checkpoints of the reference implementation, whose weights have the same names.
 
-use super::config::{Encoding, LossConfig, PIXELS, Tdmpc2Config};
+use super::config::{Encoding, LossConfig, Tdmpc2Config};
 use super::model::Tdmpc2;
 use crate::Checkpoint;
 use crate::nn::parameters::{self, HostTensor};
@@ -14,6 +14,7 @@ use serde_json::json;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::path::Path;
+use swm_core::columns::PIXELS;
 use swm_core::{Error, Key, Manifest, Result};
 
 const CLASS: &str = "stable_worldmodel.wm.tdmpc2.TDMPC2";

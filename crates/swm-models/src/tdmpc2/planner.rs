@@ -19,6 +19,7 @@ use crate::train::{DatasetInfo, TrainConfig};
 use rand::Rng as _;
 use rayon::prelude::*;
 use std::time::Instant;
+use swm_core::columns::{ACTION, STEP_IDX};
 use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result};
 use swm_plan::ActionScale;
 
@@ -187,10 +188,10 @@ impl Policy for Tdmpc2Policy {
     }
 
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()> {
-        let column = actions.schema().index("action")?;
+        let column = actions.schema().index(ACTION)?;
         let begun = Instant::now();
         // Keyed by the step of the episode, so that a policy attached later draws the same samples.
-        let steps = infos.get::<i32>("step_idx")?;
+        let steps = infos.get::<i32>(STEP_IDX)?;
         let rollouts = Rollouts::new(&self.shared_model.get(), self.discount, self.uncertainty);
         let (planner, model, explore) = (&self.planner, &self.model, self.explore);
         self.slots.par_iter_mut().enumerate().filter(|(slot, _)| active[*slot]).for_each(|(row, slot)| {

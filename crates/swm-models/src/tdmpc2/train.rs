@@ -1,6 +1,6 @@
 //! [`Trainable`] for TD-MPC2: the training loop's view of [`super::step`].
 
-use super::config::{LossConfig, PIXELS, Tdmpc2Config};
+use super::config::{LossConfig, Tdmpc2Config};
 use super::model::{Observation, Tdmpc2};
 use super::planner::Tdmpc2Policy;
 use super::step::{Draws, TrainBatch, step};
@@ -11,6 +11,7 @@ use crate::pixels::{self, ImageNormalization};
 use crate::train::{DatasetInfo, ParameterGroup, Preset, StepContext, StepOutput, TrainConfig, Trainable, at_least};
 use burn::module::Param;
 use burn::tensor::{Device, Tensor, TensorData};
+use swm_core::columns::{ACTION, PIXELS, REWARD, TERMINATED};
 use swm_core::{Batch, EnvSpec, Error, Key, Policy, Result, RowRef, Schema};
 use swm_data::{ClipSpec, LoaderConfig};
 
@@ -54,7 +55,7 @@ impl Trainable for Tdmpc2 {
             pixels::check(config.model.image, schema, PIXELS)?;
         }
         crate::online::check_rewards(schema)?;
-        let columns = config.model.columns().into_iter().chain(["action", "reward", "terminated"].map(str::to_owned));
+        let columns = config.model.columns().into_iter().chain([ACTION, REWARD, TERMINATED].map(str::to_owned));
         let clip = ClipSpec { num_steps: config.data.num_steps, frameskip: 1, columns: columns.collect() };
         clip.schema(schema)?;
         Ok(LoaderConfig { clip, ..LoaderConfig::default() })
@@ -77,8 +78,8 @@ impl Trainable for Tdmpc2 {
         let batch = TrainBatch {
             observations: observe_clips(&config.model, batch, steps, device)?,
             actions,
-            rewards: flat("reward")?,
-            terminated: flat("terminated")?,
+            rewards: flat(REWARD)?,
+            terminated: flat(TERMINATED)?,
         };
         let draws = Draws::new(*key, self, [horizon, clips, width], *training);
         let losses = step(self, &batch, &config.loss, &draws, config.shards);

@@ -3,6 +3,7 @@
 use crate::nn::parameters::Named;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
+use swm_core::columns::{ACTION, PIXELS, REWARD, TERMINATED};
 use swm_core::{Batch, ColumnSpec, DType, EnvSpec, Error, Result, Space};
 use swm_data::{Reader, column_stats};
 use swm_plan::ActionScale;
@@ -64,7 +65,7 @@ impl DatasetInfo {
     /// When there is no column of continuous actions, a column is missing, or the data are damaged.
     pub fn from_reader(reader: &dyn Reader, columns: &[String], bounded: bool) -> Result<Self> {
         let schema = reader.schema();
-        let action = schema.column("action")?;
+        let action = schema.column(ACTION)?;
         if action.dtype != DType::Float32 {
             return Err(Error::mismatch(
                 "training a model",
@@ -74,7 +75,7 @@ impl DatasetInfo {
         }
         let action = ColumnInfo::of(reader, action)?;
         let mut observed = Named::new();
-        for name in columns.iter().filter(|name| *name != "action") {
+        for name in columns.iter().filter(|name| *name != ACTION) {
             let spec = schema.column(name)?;
             if spec.dtype != DType::U8 {
                 observed.insert(name.clone(), ColumnInfo::of(reader, spec)?);
@@ -100,7 +101,7 @@ impl DatasetInfo {
             Ok((name.clone(), ColumnInfo::identity(column)))
         };
         // Images are not scaled, and the other three are no observations.
-        let skipped = ["pixels", "action", "reward", "terminated"];
+        let skipped = [PIXELS, ACTION, REWARD, TERMINATED];
         let columns = columns.iter().filter(|name| !skipped.contains(&name.as_str())).map(info);
         Ok(Self { action, columns: columns.collect::<Result<Named<_>>>()?, env: Some(spec.id.clone()) })
     }
@@ -126,7 +127,7 @@ impl DatasetInfo {
     /// When there is no column of actions, or it is of another type.
     pub fn actions(&self, batch: &Batch, steps: usize, frameskip: usize, device: &Device) -> Result<Tensor<3>> {
         let dim = self.action.dim();
-        let mut actions = batch.get::<f32>("action")?.to_vec();
+        let mut actions = batch.get::<f32>(ACTION)?.to_vec();
         let mut scaled = vec![0.0; dim];
         for action in actions.chunks_exact_mut(dim) {
             self.action.to_model(action, &mut scaled);

@@ -3,6 +3,7 @@
 //! A model step is `action_block` environment steps, so the history holds the frame at the beginning of each past model step
 //! and the block of actions executed in it.
 
+use swm_core::columns::PIXELS;
 use swm_core::{Batch, ColumnSpec, DType, Result, Schema};
 
 /// The past model steps of every slot.
@@ -116,7 +117,7 @@ impl Infos {
         let mut columns = observed.columns().to_vec();
         columns.push(ColumnSpec::new("history.length", DType::Int32, []));
         columns.push(ColumnSpec::new("history.action", DType::Float32, [past, action]));
-        let pixels = observed.find("pixels");
+        let pixels = observed.find(PIXELS);
         if let Some(pixels) = pixels {
             let shape: Vec<usize> =
                 [past].into_iter().chain(observed.columns()[pixels].shape.iter().copied()).collect();

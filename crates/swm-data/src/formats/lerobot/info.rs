@@ -6,6 +6,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use swm_core::columns::{PIXELS, PROPRIO, STATE};
 use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema};
 
 /// The version that is written.
@@ -185,13 +186,13 @@ impl Info {
                 let (height, width) = feature.size().ok_or_else(|| {
                     damaged(root, format!("the camera '{native}' has images of shape {:?}", feature.shape))
                 })?;
-                let name = if std::mem::take(&mut primary) { "pixels" } else { native };
+                let name = if std::mem::take(&mut primary) { PIXELS } else { native };
                 let kind = if feature.dtype == "video" { Kind::Video(videos) } else { Kind::Images };
                 videos += usize::from(feature.dtype == "video");
                 (ColumnSpec::image(name, height, width), kind)
             } else {
                 let Some(dtype) = feature.number() else { continue };
-                let name = if native == "observation.state" { "proprio" } else { native };
+                let name = if native == "observation.state" { PROPRIO } else { native };
                 let shape = if feature.shape == [1] { vec![] } else { feature.shape.clone() };
                 (ColumnSpec::new(name, dtype, shape), Kind::Values)
             };
@@ -259,7 +260,7 @@ impl Feature {
 
 /// Name of the feature that stores a column.
 pub fn native_name(column: &ColumnSpec, schema: &Schema) -> String {
-    let state = if schema.find("proprio").is_some() { "proprio" } else { "state" };
+    let state = if schema.find(PROPRIO).is_some() { PROPRIO } else { STATE };
     match &*column.name {
         name if column.is_image() => format!("observation.images.{name}"),
         name if name == state => "observation.state".to_owned(),

@@ -29,6 +29,6 @@ fn previews_show_every_camera() {
         let one = PreviewOptions { columns: vec!["goal".to_owned()], ..options };
         assert_eq!(preview(&*reader, &out, &one, |_| ()).expect("previews").len(), 4);
         let wrong = PreviewOptions { columns: vec!["state".to_owned()], ..PreviewOptions::default() };
-        assert!(preview(&*reader, &out, &wrong, |_| ()).expect_err("numbers").to_string().contains("pictures"));
+        assert!(preview(&*reader, &out, &wrong, |_| ()).expect_err("numbers").to_string().contains("images"));
     }
 }

@@ -1,7 +1,7 @@
 //! `bench data`: clips loaded per second and datasets converted per second.
 //!
-//! All datasets have the same content, collected once; each side writes its own. The reference loads in its own process or with
-//! worker processes, whichever is faster in a first turn.
+//! All datasets have the same content, collected once; each side writes its own. The reference loads in its own process
+//! or with worker processes, whichever is faster in a first measurement.
 
 use crate::reference::{Reference, not_compared, reference_python};
 use serde::Serialize;
@@ -34,11 +34,11 @@ pub struct DataBenchConfig {
     pub batch_size: usize,
     /// Threads of our loader.
     pub threads: usize,
-    /// The numbers of worker processes to try with the reference.
+    /// The counts of worker processes to try with the reference.
     pub workers: Vec<usize>,
-    /// Pairs of turns, ours and the reference's.
+    /// The number of measurement pairs: one of this implementation and one of the reference.
     pub pairs: usize,
-    /// Seconds of a turn of loading.
+    /// The duration of a measurement of loading, in seconds.
     pub seconds: f64,
     /// The names of the formats to load from; empty for all.
     pub formats: Vec<String>,
@@ -103,19 +103,20 @@ pub struct DataBenchRow {
     pub work: &'static str,
     /// The format and codec.
     pub what: String,
-    /// What the reference did for comparison, or the reason why it is not compared.
-    pub beside: String,
-    /// Clips or conversions per second in each of our turns.
+    /// The setup of the reference (format, worker count), or the reason why it is not compared.
+    #[serde(rename = "beside")]
+    pub reference_setup: String,
+    /// Clips or conversions per second in each measurement of this implementation.
     pub ours: Vec<f64>,
-    /// The same in each turn of the reference; empty without it.
+    /// The same for the reference; empty without a reference.
     pub reference: Vec<f64>,
-    /// The median of our turns.
+    /// The median of `ours`.
     pub rate: f64,
-    /// The median ratio of neighbouring turns: our rate divided by that of the reference.
+    /// The median over measurement pairs of the rate of this implementation divided by that of the reference.
     pub ratio: Option<f64>,
 }
 
-/// A dataset of ours to load, and the reference's format to compare with.
+/// A dataset layout to load, and the reference's format to compare with.
 struct Layout {
     name: &'static str,
     format: &'static str,
@@ -157,12 +158,12 @@ const fn layout(
 /// Measures loading from every format, converting, and memory use over some epochs.
 ///
 /// # Errors
-/// When a setting is invalid, the world or a writer fails, or the reference stops answering. Work that the reference cannot do is
-/// not an error: the row contains the reason.
+/// When a setting is invalid, an environment or a writer fails, or the reference stops answering. Work that the
+/// reference cannot do is not an error: the row contains the reason.
 #[allow(clippy::too_many_lines, reason = "the list of all measurements, in order")]
 pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBenchReport> {
     if config.pairs == 0 || !(config.seconds > 0.0 && config.seconds.is_finite()) {
-        let given = format!("{} pairs of turns of {} seconds", config.pairs, config.seconds);
+        let given = format!("{} pairs of measurements of {} seconds", config.pairs, config.seconds);
         return Err(Error::config("benchmark", given, "ask for at least 1 pair of more than 0 seconds"));
     }
     let folder = tempfile::tempdir().map_err(|e| Error::io("a temporary folder", "creating it for datasets", e))?;
@@ -204,12 +205,13 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
         report.rates.push(load(layout.name, &path, config, CacheConfig::Off, reference_side.as_mut())?);
         if layout.name == "lance, jpeg" {
             let decoded = rows * config.size * config.size * 3;
-            let kept = [
-                ("all kept in memory", CacheConfig::Memory { bytes: 2 * decoded }),
-                ("a tenth kept in memory", CacheConfig::Memory { bytes: decoded / 10 }),
-                ("all kept on disk", CacheConfig::Disk { folder: at("cache"), bytes: 2 * decoded }),
+            // The labels are part of the JSON report.
+            let caches = [
+                ("all cached in memory", CacheConfig::Memory { bytes: 2 * decoded }),
+                ("a tenth cached in memory", CacheConfig::Memory { bytes: decoded / 10 }),
+                ("all cached on disk", CacheConfig::Disk { folder: at("cache"), bytes: 2 * decoded }),
             ];
-            for (what, cache) in kept {
+            for (what, cache) in caches {
                 let what = format!("{}, {what}", layout.name);
                 report.rates.push(load(&what, &path, config, cache, reference_side.as_mut())?);
             }
@@ -221,7 +223,7 @@ pub fn bench_data(env: &EnvChoice, config: &DataBenchConfig) -> Result<DataBench
         }
     }
     if config.convert {
-        // Both sides read the same dataset, the reference's own where there is one.
+        // Both sides read the same dataset: the one that the reference wrote, if any.
         let jpeg = [at("theirs.lance"), at("jpeg.lance")].into_iter().find(|path| path.exists());
         for layout in LAYOUTS.iter().filter(wanted).filter(|layout| ["hdf5", "video"].contains(&layout.format)) {
             for (what, verify) in [("", false), (", verified", true)] {
@@ -274,7 +276,8 @@ struct ReferenceDataset<'r> {
 }
 
 impl<'r> ReferenceDataset<'r> {
-    /// Writes the dataset and finds the fastest number of workers; returns the error message of the reference on failure.
+    /// Writes the dataset and finds the fastest number of workers; returns the error message of the reference on
+    /// failure.
     fn new(
         reference: &'r mut Reference,
         config: &DataBenchConfig,
@@ -307,7 +310,7 @@ impl<'r> ReferenceDataset<'r> {
         reference.load(format, path, workers, &config.clip, config.batch_size, config.seconds)
     }
 
-    fn turn(&mut self, config: &DataBenchConfig) -> Result<f64> {
+    fn measure(&mut self, config: &DataBenchConfig) -> Result<f64> {
         Self::load(self.reference, self.format, &self.path, self.workers, config)
     }
 }
@@ -318,7 +321,7 @@ fn loader(reader: &Arc<dyn Reader>, config: &DataBenchConfig, cache: CacheConfig
     Loader::new(Arc::clone(reader), config)
 }
 
-/// Alternates turns of loading.
+/// Alternates measurements of loading.
 fn load(
     what: &str,
     path: &Path,
@@ -331,22 +334,22 @@ fn load(
     for batch in endless.loader.epoch(0, 0) {
         batch?;
     }
-    let beside = match &dataset {
+    let reference_setup = match &dataset {
         Ok(dataset) => format!("{}, {} workers", dataset.format, dataset.workers),
         Err(why) => format!("not compared: {why}"),
     };
     let mut dataset = dataset.ok();
     let (mut ours, mut reference) = (vec![], vec![]);
     for _ in 0..config.pairs {
-        ours.push(endless.turn(config)?);
+        ours.push(endless.measure(config)?);
         if let Some(dataset) = &mut dataset {
-            reference.push(dataset.turn(config)?);
+            reference.push(dataset.measure(config)?);
         }
     }
-    Ok(DataBenchRow::new("load", what.to_owned(), beside, ours, reference))
+    Ok(DataBenchRow::new("load", what.to_owned(), reference_setup, ours, reference))
 }
 
-/// Alternates turns of loading from the object store and from the local disk.
+/// Alternates measurements of loading from the object store and from the local disk.
 fn remote(local: &Path, config: &DataBenchConfig) -> Result<Option<DataBenchRow>> {
     let Some(folder) = &config.remote else { return Ok(None) };
     let target = Location::parse(&format!("{}/bench.lance", folder.to_string().trim_end_matches('/')))?;
@@ -357,15 +360,15 @@ fn remote(local: &Path, config: &DataBenchConfig) -> Result<Option<DataBenchRow>
             .map(|loader| Endless { loader, epoch: 0 });
     let (mut remote, mut local) = (vec![], vec![]);
     for _ in 0..=config.pairs {
-        remote.push(loaders[0].turn(config)?);
-        local.push(loaders[1].turn(config)?);
+        remote.push(loaders[0].measure(config)?);
+        local.push(loaders[1].measure(config)?);
     }
-    // The first turn of each is a warm-up.
-    let beside = "the local disk".to_owned();
+    // The first measurement of each is a warm-up.
+    let reference_setup = "the local disk".to_owned();
     let row = DataBenchRow::new(
         "load",
         format!("lance, jpeg, from {folder}"),
-        beside,
+        reference_setup,
         remote.split_off(1),
         local.split_off(1),
     );
@@ -380,7 +383,7 @@ struct Endless {
 
 impl Endless {
     /// Loads for about `config.seconds`, after one batch that is not counted; returns clips per second.
-    fn turn(&mut self, config: &DataBenchConfig) -> Result<f64> {
+    fn measure(&mut self, config: &DataBenchConfig) -> Result<f64> {
         self.epoch += 1;
         let mut batches = (self.epoch..).flat_map(|epoch| self.loader.epoch(epoch, 0));
         let mut next = || batches.next().unwrap_or_else(|| Err(Error::external("loading", "an epoch has no batch")));
@@ -408,7 +411,7 @@ fn resident() -> Option<u64> {
     line.split_whitespace().next()?.parse::<u64>().ok().map(|kib| kib * 1024)
 }
 
-/// Alternates turns of converting.
+/// Alternates measurements of converting.
 fn converting(
     what: &str,
     verify: bool,
@@ -419,7 +422,8 @@ fn converting(
     mut reference: Option<&mut Reference>,
 ) -> Result<DataBenchRow> {
     let (mut ours, mut theirs) = (vec![], vec![]);
-    let mut beside = if reference.is_some() { layout.reference_format.to_owned() } else { "not compared".to_owned() };
+    let mut reference_setup =
+        if reference.is_some() { layout.reference_format.to_owned() } else { "not compared".to_owned() };
     std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating a folder", e))?;
     let (our_path, reference_path) = (folder.join(layout.file), folder.join(layout.reference_file));
     for _ in 0..config.pairs {
@@ -437,23 +441,23 @@ fn converting(
             match process.convert(source, layout.reference_format, &reference_path) {
                 Ok(rate) => theirs.push(rate),
                 Err(error) => {
-                    beside = format!("not compared: {error}");
+                    reference_setup = format!("not compared: {error}");
                     reference = None;
                 }
             }
         }
     }
-    Ok(DataBenchRow::new("convert", what.to_owned(), beside, ours, theirs))
+    Ok(DataBenchRow::new("convert", what.to_owned(), reference_setup, ours, theirs))
 }
 
 impl DataBenchRow {
-    fn new(work: &'static str, what: String, beside: String, ours: Vec<f64>, reference: Vec<f64>) -> Self {
+    fn new(work: &'static str, what: String, reference_setup: String, ours: Vec<f64>, reference: Vec<f64>) -> Self {
         let ratios: Vec<f64> = ours.iter().zip(&reference).map(|(ours, theirs)| ours / theirs).collect();
         Self {
             work,
             what,
-            beside,
-            rate: Summary::of(&ours).map_or(0.0, |turns| turns.median),
+            reference_setup,
+            rate: Summary::of(&ours).map_or(0.0, |summary| summary.median),
             ratio: Summary::of(&ratios).map(|ratios| ratios.median),
             ours,
             reference,
@@ -473,8 +477,8 @@ impl fmt::Display for DataBenchReport {
             let unit = if row.work == "load" { "clips/s" } else { "a second" };
             write!(f, "{:<8} {:<36} {:>9.2} {unit:<9}", row.work, row.what, row.rate)?;
             match row.ratio {
-                Some(ratio) => writeln!(f, " {ratio:>6.1} x {} (median of {})", row.beside, row.ours.len())?,
-                None => writeln!(f, " {}", row.beside)?,
+                Some(ratio) => writeln!(f, " {ratio:>6.1} x {} (median of {})", row.reference_setup, row.ours.len())?,
+                None => writeln!(f, " {}", row.reference_setup)?,
             }
         }
         if let [first, .., last] = self.resident[..] {

@@ -17,7 +17,7 @@ use swm_eval::{CollectConfig, World, WorldConfig, episode_key, reset_seed};
 /// Settings of the benchmark.
 #[derive(Clone, Debug)]
 pub struct BenchConfig {
-    /// Environments of a world.
+    /// The number of environments that are stepped together.
     pub envs: usize,
     /// The side lengths of the square frames, in pixels.
     pub sizes: Vec<usize>,
@@ -25,20 +25,21 @@ pub struct BenchConfig {
     pub bare: bool,
     /// Worker threads; as many as the machine has cores for 0. The reference steps on one thread.
     pub threads: usize,
-    /// Pairs of turns, ours and the reference's.
+    /// The number of measurement pairs: one of this implementation and one of the reference.
     pub pairs: usize,
-    /// Seconds of a turn of stepping.
+    /// The duration of a measurement of stepping, in seconds.
     pub seconds: f64,
     /// Steps of an episode.
     pub episode_steps: usize,
-    /// Episodes the reference collects in a turn; 0 skips collecting. Our side collects `EPISODE_FACTOR` times as many, so that
-    /// both turns are long enough to measure.
+    /// Episodes the reference collects in a measurement; 0 skips collecting. This implementation collects
+    /// `EPISODE_FACTOR` times as many, so that both measurements are long enough.
     pub episodes: usize,
     /// A Python with the reference implementation, if any.
     pub python: Option<PathBuf>,
 }
 
-/// The number of episodes our side collects for each one of the reference, so that both turns take about as long.
+/// The number of episodes that this implementation collects for each one of the reference, so that both measurements
+/// take about as long.
 const EPISODE_FACTOR: usize = 32;
 
 impl Default for BenchConfig {
@@ -62,7 +63,7 @@ impl Default for BenchConfig {
 /// The result of the benchmark.
 #[derive(Clone, Debug, Serialize)]
 pub struct BenchReport {
-    /// Environments of a world.
+    /// The number of environments that are stepped together.
     pub envs: usize,
     /// Worker threads of our side.
     pub threads: usize,
@@ -82,26 +83,26 @@ pub struct BenchRow {
     pub what: &'static str,
     /// The side length of the frames, in pixels; none without frames.
     pub size: Option<usize>,
-    /// Environment steps per second in each of our turns.
+    /// Environment steps per second in each measurement of this implementation.
     pub ours: Vec<f64>,
-    /// Environment steps per second in each turn of the reference; empty without it.
+    /// Environment steps per second in each measurement of the reference; empty without a reference.
     pub reference: Vec<f64>,
-    /// The median of our turns.
+    /// The median of `ours`.
     pub steps_per_second: f64,
-    /// The median ratio of neighbouring turns: our rate divided by that of the reference.
+    /// The median over measurement pairs of the rate of this implementation divided by that of the reference.
     pub ratio: Option<f64>,
 }
 
-/// Measures stepping with rendering and collecting to Lance for every environment and size, and stepping without frames for every
-/// environment.
+/// Measures stepping with rendering and collecting to Lance for every environment and size, and stepping without frames
+/// for every environment.
 ///
 /// # Errors
-/// When a setting is invalid, a world fails, or the reference fails after its start. A reference that does not start is not an
-/// error: [`BenchReport::reference`] contains the reason.
+/// When a setting is invalid, an environment fails, or the reference fails after its start. A reference that does not
+/// start is not an error: [`BenchReport::reference`] contains the reason.
 #[allow(clippy::too_many_lines, reason = "the list of all measurements, in order")]
 pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchReport> {
     if config.pairs == 0 || !(config.seconds > 0.0 && config.seconds.is_finite()) {
-        let given = format!("{} pairs of turns of {} seconds", config.pairs, config.seconds);
+        let given = format!("{} pairs of measurements of {} seconds", config.pairs, config.seconds);
         return Err(Error::config("benchmark", given, "ask for at least 1 pair of more than 0 seconds"));
     }
     let mut report = BenchReport {
@@ -128,14 +129,14 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
                 None,
                 "step, one thread",
                 config.pairs,
-                |turn| single(env, turn as u64, config),
+                |pair| single(env, pair as u64, config),
                 reference.as_mut().map(|reference| |_| reference.bare(config.seconds)),
             )?);
         }
         for &size in &config.sizes {
             let mut reference = report.start_reference(env, size, config);
             let mut ours = Ours::new(env, Some(size), config)?;
-            // The first turn of each side is a warm-up and is not counted.
+            // The first measurement of each side is a warm-up and is not counted.
             ours.step(config.seconds / 4.0)?;
             reference.as_mut().map(|reference| reference.step(config.seconds / 4.0)).transpose()?;
             report.rows.push(BenchRow::measure(
@@ -151,7 +152,7 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
             }
             let folder =
                 tempfile::tempdir().map_err(|e| Error::io("a temporary folder", "creating it for datasets", e))?;
-            let path = |side: &str, turn: usize| folder.path().join(format!("{side}-{turn}.lance"));
+            let path = |side: &str, pair: usize| folder.path().join(format!("{side}-{pair}.lance"));
             let collect = CollectConfig {
                 episodes: config.episodes * EPISODE_FACTOR,
                 policy: "random".to_owned(),
@@ -166,14 +167,14 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
                     Some(size),
                     what,
                     config.pairs,
-                    |turn| {
-                        let config = CollectConfig { seed: turn as u64, ..collect.clone() };
-                        ours.collect(&path(&format!("ours-{name}"), turn), codec, config)
+                    |pair| {
+                        let config = CollectConfig { seed: pair as u64, ..collect.clone() };
+                        ours.collect(&path(&format!("ours-{name}"), pair), codec, config)
                     },
                     reference.as_mut().map(|reference| {
-                        |turn| {
-                            let path = path(&format!("reference-{name}"), turn);
-                            reference.collect(&path, config.episodes, turn as u64)
+                        |pair| {
+                            let path = path(&format!("reference-{name}"), pair);
+                            reference.collect(&path, config.episodes, pair as u64)
                         }
                     }),
                 )?);
@@ -183,7 +184,7 @@ pub fn bench_envs(choices: &[EnvChoice], config: &BenchConfig) -> Result<BenchRe
     Ok(report)
 }
 
-/// Our side of the benchmark: a world and a random policy.
+/// This implementation in the benchmark: a [`World`] and a random policy.
 struct Ours {
     world: World,
     policy: RandomPolicy,
@@ -247,14 +248,14 @@ impl Ours {
         let writer = create(path, &self.world.collect_schema(false)?, options)?;
         let collected = self.world.collect(&mut self.policy, writer, &config, &mut Control::default())?;
         let rate = collected.steps as f64 / begun.elapsed().as_secs_f64();
-        // The next turn of stepping starts from running episodes.
+        // The next measurement of stepping starts from running episodes.
         self.world.reset(0, &VariationRequest::default())?;
         Ok(rate)
     }
 }
 
 impl BenchReport {
-    /// Starts the reference with a world of this size, if possible; otherwise stores the reason.
+    /// Starts the reference with a `World` of this size, if possible; otherwise stores the reason.
     fn start_reference(&mut self, env: &EnvChoice, size: usize, config: &BenchConfig) -> Option<Reference> {
         let wanted =
             Size { env: &env.id(), envs: config.envs, image: (size, size), episode_steps: config.episode_steps };
@@ -271,7 +272,8 @@ impl BenchReport {
     }
 }
 
-/// Environment steps per second of a single environment on this thread, without observations, with precomputed random actions.
+/// Environment steps per second of a single environment on this thread, without observations, with precomputed random
+/// actions.
 fn single(env: &EnvChoice, seed: u64, config: &BenchConfig) -> Result<f64> {
     const ACTIONS: usize = 4096;
     /// Steps between two readings of the clock.
@@ -306,7 +308,7 @@ fn single(env: &EnvChoice, seed: u64, config: &BenchConfig) -> Result<f64> {
 }
 
 impl BenchRow {
-    /// Alternates turns of both sides; `ours` and `reference` receive the index of the turn.
+    /// Alternates measurements of both sides; `ours` and `reference` receive the index of the measurement.
     fn measure(
         env: &EnvChoice,
         size: Option<usize>,
@@ -315,22 +317,22 @@ impl BenchRow {
         mut ours: impl FnMut(usize) -> Result<f64>,
         mut reference: Option<impl FnMut(usize) -> Result<f64>>,
     ) -> Result<Self> {
-        let (mut our_turns, mut their_turns) = (vec![], vec![]);
-        for turn in 0..pairs {
-            our_turns.push(ours(turn)?);
+        let (mut our_rates, mut their_rates) = (vec![], vec![]);
+        for pair in 0..pairs {
+            our_rates.push(ours(pair)?);
             if let Some(reference) = &mut reference {
-                their_turns.push(reference(turn)?);
+                their_rates.push(reference(pair)?);
             }
         }
-        let ratios: Vec<f64> = our_turns.iter().zip(&their_turns).map(|(ours, theirs)| ours / theirs).collect();
+        let ratios: Vec<f64> = our_rates.iter().zip(&their_rates).map(|(ours, theirs)| ours / theirs).collect();
         Ok(Self {
             env: env.id(),
             what,
             size,
-            steps_per_second: Summary::of(&our_turns).map_or(0.0, |turns| turns.median),
+            steps_per_second: Summary::of(&our_rates).map_or(0.0, |summary| summary.median),
             ratio: Summary::of(&ratios).map(|ratios| ratios.median),
-            ours: our_turns,
-            reference: their_turns,
+            ours: our_rates,
+            reference: their_rates,
         })
     }
 }

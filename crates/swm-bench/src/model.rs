@@ -1,7 +1,8 @@
-//! `bench plan` and `bench train`: the time of a LeWM for planning, evaluating candidates, encoding, and a training step.
+//! `bench plan` and `bench train`: the time of a LeWM for planning, evaluating candidates, encoding, and a training
+//! step.
 //!
-//! The reference runs with the same weights. The reported ratio is our time divided by that of the reference. Outputs of both
-//! sides are compared where they are deterministic.
+//! The reference runs with the same weights. The reported ratio is our time divided by that of the reference. Outputs
+//! of both sides are compared where they are deterministic.
 
 use crate::reference::{Reference, not_compared};
 use serde::Serialize;
@@ -11,7 +12,7 @@ use std::time::Instant;
 use swm_core::results::Summary;
 use swm_core::{Error, Result};
 
-/// The work of a model that is measured.
+/// A workload of a model.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Work {
@@ -44,7 +45,7 @@ impl Work {
 
 /// A model to measure.
 pub trait Subject {
-    /// Does a work once; returns its outputs, or an empty list if they are random.
+    /// Executes a workload once; returns its outputs, or an empty list if they are random.
     ///
     /// # Errors
     /// When the model fails.
@@ -54,9 +55,9 @@ pub trait Subject {
 /// Settings of the benchmark.
 #[derive(Clone, Debug)]
 pub struct ModelBenchConfig {
-    /// The works, each with the number of repetitions in a turn.
+    /// The workloads, each with the number of repetitions in a measurement.
     pub works: Vec<(Work, usize)>,
-    /// Pairs of turns, ours and the reference's.
+    /// The number of measurement pairs: one of this implementation and one of the reference.
     pub pairs: usize,
     /// The sizes of the model, in the form that the reference's process reads.
     pub sizes: serde_json::Value,
@@ -69,22 +70,22 @@ pub struct ModelBenchConfig {
 pub struct ModelBenchReport {
     /// The version of the reference, or the reason why it is not compared.
     pub reference: String,
-    /// One entry for each work.
+    /// One entry for each workload.
     pub rows: Vec<ModelBenchRow>,
 }
 
-/// The measurements of one work.
+/// The measurements of one workload.
 #[derive(Clone, Debug, Serialize)]
 pub struct ModelBenchRow {
-    /// The work.
+    /// The workload.
     pub work: Work,
-    /// Seconds per repetition in each of our turns.
+    /// Seconds per repetition in each measurement of this implementation.
     pub ours: Vec<f64>,
-    /// The same in each turn of the reference; empty without it.
+    /// The same for the reference; empty without a reference.
     pub reference: Vec<f64>,
-    /// The median of our turns.
+    /// The median of `ours`.
     pub seconds: f64,
-    /// The median ratio of neighbouring turns: our time divided by that of the reference.
+    /// The median over measurement pairs of the time of this implementation divided by that of the reference.
     pub share: Option<f64>,
     /// The largest difference between the outputs of both sides, relative to the largest output.
     pub difference: Option<f32>,
@@ -93,11 +94,11 @@ pub struct ModelBenchRow {
 /// Measures a model; `weights` is a file with its weights and inputs for the reference's process.
 ///
 /// # Errors
-/// When there are no turns, a work fails, or the reference fails after its start. A reference that does not start is not an error:
-/// [`ModelBenchReport::reference`] contains the reason.
+/// When there are no measurements, a workload fails, or the reference fails after its start. A reference that does not
+/// start is not an error: [`ModelBenchReport::reference`] contains the reason.
 pub fn bench_model(config: &ModelBenchConfig, weights: &Path, subject: &mut dyn Subject) -> Result<ModelBenchReport> {
     if config.pairs == 0 || config.works.iter().any(|(_, count)| *count == 0) {
-        return Err(Error::config("turns of a benchmark", "0", "ask for at least 1"));
+        return Err(Error::config("measurements of a benchmark", "0", "ask for at least 1"));
     }
     let mut report = ModelBenchReport { reference: not_compared(), rows: vec![] };
     let mut reference = None;
@@ -135,7 +136,7 @@ pub fn bench_model(config: &ModelBenchConfig, weights: &Path, subject: &mut dyn 
         let shares: Vec<f64> = ours.iter().zip(&theirs).map(|(ours, theirs)| ours / theirs).collect();
         report.rows.push(ModelBenchRow {
             work,
-            seconds: Summary::of(&ours).map_or(0.0, |turns| turns.median),
+            seconds: Summary::of(&ours).map_or(0.0, |summary| summary.median),
             share: Summary::of(&shares).map(|shares| shares.median),
             difference,
             ours,
@@ -163,8 +164,8 @@ impl fmt::Display for ModelBenchReport {
         for row in &self.rows {
             write!(f, "{:>6} {:>9.1} ms", row.work.name(), 1e3 * row.seconds)?;
             if let (Some(share), Some(theirs)) = (row.share, Summary::of(&row.reference)) {
-                let turns = row.ours.len();
-                write!(f, ", {share:.2} x the reference's {:.1} ms (median of {turns})", 1e3 * theirs.median)?;
+                let pairs = row.ours.len();
+                write!(f, ", {share:.2} x the reference's {:.1} ms (median of {pairs})", 1e3 * theirs.median)?;
             }
             if let Some(difference) = row.difference {
                 write!(f, ", outputs differ by {difference:.1e}")?;

@@ -16,7 +16,7 @@ use swm_plan::Cem;
 /// Settings of the benchmark.
 #[derive(Clone, Debug)]
 pub struct PlanBenchConfig {
-    /// The numbers of environments planned in one call; one row each.
+    /// The counts of environments planned in one call; one row each.
     pub envs: Vec<usize>,
     /// Candidates, iterations, elites.
     pub cem: Cem,
@@ -24,14 +24,14 @@ pub struct PlanBenchConfig {
     pub horizon: usize,
     /// The dimension of a model step.
     pub dim: usize,
-    /// The time of a model for the candidates of one environment in one iteration, in seconds, which the planner's time is
-    /// compared with.
+    /// The time of a model for the candidates of one environment in one iteration, in seconds, which the planner's time
+    /// is compared with.
     pub model_seconds: f64,
     /// Worker threads; as many as the machine has cores for 0. The reference uses torch's default.
     pub threads: usize,
-    /// Pairs of turns, ours and the reference's.
+    /// The number of measurement pairs: one of this implementation and one of the reference.
     pub pairs: usize,
-    /// Seconds of a turn.
+    /// The duration of a measurement, in seconds.
     pub seconds: f64,
     /// A Python with the reference implementation, if any.
     pub python: Option<PathBuf>,
@@ -79,13 +79,13 @@ pub struct PlanBenchReport {
 pub struct PlanBenchRow {
     /// Environments planned in one call.
     pub envs: usize,
-    /// Iterations per second in each of our turns.
+    /// Iterations per second in each measurement of this implementation.
     pub ours: Vec<f64>,
-    /// Iterations per second in each turn of the reference; empty without it.
+    /// Iterations per second in each measurement of the reference; empty without a reference.
     pub reference: Vec<f64>,
-    /// The median of our turns.
+    /// The median of `ours`.
     pub iterations_per_second: f64,
-    /// The median ratio of neighbouring turns: our rate divided by that of the reference.
+    /// The median over measurement pairs of the rate of this implementation divided by that of the reference.
     pub ratio: Option<f64>,
     /// The planner's time divided by [`PlanBenchConfig::model_seconds`].
     pub overhead: f64,
@@ -100,7 +100,7 @@ pub fn bench_plan(config: &PlanBenchConfig) -> Result<PlanBenchReport> {
     let positive = |seconds: f64| seconds > 0.0 && seconds.is_finite();
     if config.pairs == 0 || !positive(config.seconds) || !positive(config.model_seconds) {
         let given = format!(
-            "{} pairs of turns of {} seconds, a model that takes {} seconds",
+            "{} pairs of measurements of {} seconds, a model that takes {} seconds",
             config.pairs, config.seconds, config.model_seconds
         );
         return Err(Error::config("benchmark", given, "ask for at least 1 pair, and for times above 0"));
@@ -132,7 +132,7 @@ pub fn bench_plan(config: &PlanBenchConfig) -> Result<PlanBenchReport> {
             }
         }
         let mut planning = Planning::new(config, envs);
-        // The first turn of each side is a warm-up and is not counted.
+        // The first measurement of each side is a warm-up and is not counted.
         workers.install(|| planning.solve(config.seconds / 4.0))?;
         reference.as_mut().map(|reference| reference.solve(config.seconds / 4.0)).transpose()?;
         let (mut ours, mut theirs) = (vec![], vec![]);
@@ -143,7 +143,7 @@ pub fn bench_plan(config: &PlanBenchConfig) -> Result<PlanBenchReport> {
             }
         }
         let ratios: Vec<f64> = ours.iter().zip(&theirs).map(|(ours, theirs)| ours / theirs).collect();
-        let iterations_per_second = Summary::of(&ours).map_or(0.0, |turns| turns.median);
+        let iterations_per_second = Summary::of(&ours).map_or(0.0, |summary| summary.median);
         report.rows.push(PlanBenchRow {
             envs,
             overhead: 1.0 / iterations_per_second / (config.model_seconds * envs as f64),
@@ -271,7 +271,7 @@ mod tests {
 
     #[cfg(unix)]
     #[test]
-    fn ratio_is_the_median_of_neighbouring_turns() {
+    fn ratio_is_the_median_over_measurement_pairs() {
         use std::os::unix::fs::PermissionsExt as _;
         let folder = tempfile::tempdir().expect("a folder");
         let python = folder.path().join("python");

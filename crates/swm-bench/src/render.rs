@@ -1,7 +1,7 @@
 //! `bench render`: frames per second of one environment, by environment, size and renderer.
 //!
-//! Renderers take turns within one run; the median of the turns is reported. The environment steps between two frames; the time
-//! of the step is not counted.
+//! Measurements of the renderers alternate within one run, and the report contains their median. The environment steps
+//! between two frames; the time of the step is not counted.
 
 use serde::Serialize;
 use std::time::{Duration, Instant};
@@ -14,9 +14,9 @@ use swm_eval::episode_key;
 pub struct RenderBenchConfig {
     /// The side lengths of the square frames, in pixels.
     pub sizes: Vec<usize>,
-    /// Turns of every renderer.
+    /// The number of measurements of every renderer.
     pub turns: usize,
-    /// Seconds of a turn.
+    /// The duration of a measurement, in seconds.
     pub seconds: f64,
     /// Threads that may render a frame together.
     pub threads: usize,
@@ -42,7 +42,7 @@ pub struct RenderRow {
     pub renderer: String,
     /// Threads that may render a frame together.
     pub threads: usize,
-    /// The median of the turns.
+    /// The median over measurements.
     #[serde(rename = "pictures_per_second")]
     pub frames_per_second: f64,
 }
@@ -63,9 +63,9 @@ pub fn bench_render(
         for &size in &config.sizes {
             let mut rgb = vec![0; 3 * size * size];
             let mut speeds = vec![vec![]; renderers.len()];
-            for turn in 0..config.turns.max(1) {
+            for measurement in 0..config.turns.max(1) {
                 for ((_, draw), speeds) in renderers.iter().zip(&mut speeds) {
-                    let seed = episode_key(0, turn).seed() >> 1;
+                    let seed = episode_key(0, measurement).seed() >> 1;
                     env.reset(seed, &ResetOptions::default())?;
                     let (mut spent, mut frames, mut step) = (Duration::ZERO, 0u32, 0);
                     // The first frame, which fills caches, is not counted.

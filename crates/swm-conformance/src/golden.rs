@@ -28,7 +28,7 @@ pub fn files(crate_folder: &str, prefix: &str) -> Vec<PathBuf> {
     found.into_values().collect()
 }
 
-/// A golden file. Its methods panic when an array is missing or has another type, as tests do.
+/// A golden file. For use in tests: its methods panic when an array is missing or has another type.
 pub struct Golden(NpzArchive<BufReader<File>>);
 
 impl Golden {
@@ -56,7 +56,7 @@ impl Golden {
         self.array(name).into_vec().unwrap_or_else(|error| panic!("{name}: {error}"))
     }
 
-    /// All elements of a numeric array of any type, in row-major order.
+    /// All elements of a numeric array of any type, converted to `f64`, in row-major order.
     pub fn values(&mut self, name: &str) -> Vec<f64> {
         let kind = match self.array(name).dtype() {
             DType::Plain(kind) => (kind.type_char(), kind.size_field()),
@@ -72,7 +72,7 @@ impl Golden {
         }
     }
 
-    /// An RGB image: height, width, and row-major `[height, width, 3]` bytes.
+    /// Reads an RGB image and returns its height, its width and its bytes, `[height, width, 3]`.
     pub fn image(&mut self, name: &str) -> (usize, usize, Vec<u8>) {
         let array = self.array(name);
         let &[height, width, 3] = array.shape() else { panic!("{name} is not an RGB image") };
@@ -80,12 +80,12 @@ impl Golden {
         (side(height), side(width), array.into_vec().unwrap_or_else(|error| panic!("{name}: {error}")))
     }
 
-    /// A text.
+    /// Reads a string.
     pub fn text(&mut self, name: &str) -> String {
         self.read::<String>(name).concat()
     }
 
-    /// A request that sets every factor of variation to its recorded value.
+    /// Returns a request that sets every factor of variation to its recorded value.
     pub fn variation(&mut self) -> VariationRequest {
         let mut request = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
         let text = self.text("variation");
@@ -113,7 +113,10 @@ fn flatten(key: &str, value: &serde_json::Value, into: &mut BTreeMap<String, Vec
     }
 }
 
-/// The mean absolute difference of two images, of 255.
+/// The mean absolute difference of two images, in units of 1/255.
+///
+/// # Shapes
+/// `a` and `b` have the same shape.
 ///
 /// # Panics
 /// When the lengths differ.

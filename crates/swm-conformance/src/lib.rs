@@ -1,5 +1,5 @@
-//! Conformance tests of environments: every check runs on every entry of a registry, so a new environment is tested as soon
-//! as it is listed.
+//! Conformance tests of environments: every check runs on every entry of a registry, so a new environment is tested as
+//! soon as it is listed.
 //!
 //! ```ignore
 //! static SUITE: Suite = Suite::of(my_crate::ENVS.rows);
@@ -13,7 +13,8 @@ pub mod golden;
 
 use swm_core::EnvEntry;
 
-/// Environments to check, and how thoroughly. Suites of environments that render slowly use smaller numbers.
+/// The environments to check and the extent of the checks. Suites of environments that render slowly use smaller
+/// counts.
 pub struct Suite {
     /// The environments.
     pub rows: &'static [EnvEntry],

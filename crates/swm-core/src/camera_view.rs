@@ -57,7 +57,7 @@ impl CameraView {
         }
     }
 
-    /// The column that stores it, named `pixels`, `depth.CAMERA`, `segmentation`, …
+    /// Returns the column that stores the view, named `pixels`, `depth.CAMERA`, `segmentation`, …
     pub fn column(&self, height: usize, width: usize) -> ColumnSpec {
         let name = self.to_string();
         match self.modality {
@@ -67,7 +67,7 @@ impl CameraView {
         }
     }
 
-    /// The error of an environment that cannot render this view.
+    /// Returns the error for an environment that cannot render this view.
     pub fn unknown(&self, spec: &EnvSpec) -> Error {
         let id = &spec.id;
         match (&self.camera, spec.cameras.is_empty()) {
@@ -78,7 +78,7 @@ impl CameraView {
             _ => Error::config(
                 "camera view",
                 format!("{id} cannot render {self}: it has one camera and renders colour only"),
-                "leave the view out",
+                "omit the view",
             ),
         }
     }

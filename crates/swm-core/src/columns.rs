@@ -13,11 +13,11 @@ pub const GOAL: &str = "goal";
 pub const DEPTH: &str = "depth";
 /// A segmentation image of the default camera, `[height, width]` of `Int32`.
 pub const SEGMENTATION: &str = "segmentation";
-/// The full state of the environment, in its own layout.
+/// The full state of the environment, in a layout that the environment defines.
 pub const STATE: &str = "state";
 /// The goal in the layout of [`STATE`].
 pub const GOAL_STATE: &str = "goal_state";
-/// What an agent knows of its own body.
+/// The proprioceptive observation: the state of the agent's own body.
 pub const PROPRIO: &str = "proprio";
 /// The goal in the layout of [`PROPRIO`].
 pub const GOAL_PROPRIO: &str = "goal_proprio";
@@ -100,7 +100,8 @@ pub fn is_stored_as(name: &str, stored: &str) -> bool {
     stored == name || stored == flat(name)
 }
 
-/// The column of an environment's observation in a collected dataset: a `/`, which most formats cannot hold, becomes `.`.
+/// The column of an environment's observation in a collected dataset: a `/`, which most formats cannot hold, becomes
+/// `.`.
 pub fn collected(name: &str) -> String {
     name.replace('/', ".")
 }

@@ -37,8 +37,8 @@ pub struct Callable {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CallableArgument {
-    /// The value itself, or the name of a column: a plain name reads the start row, a name of [`columns::of_goal`] reads
-    /// the goal row.
+    /// The value itself, or the name of a column: a plain name reads the start row, a name of [`columns::of_goal`]
+    /// reads the goal row.
     #[serde(default)]
     pub value: Value,
     /// Whether `value` is the name of a column.
@@ -50,7 +50,8 @@ fn yes() -> bool {
     true
 }
 
-/// An environment that starts episodes at dataset rows by rules of its own, instead of [`Env::restore_from`].
+/// An environment that starts episodes at dataset rows without [`Env::restore_from`], for example by
+/// calling methods of a Gymnasium environment.
 pub trait DatasetStartEnv {
     /// The columns of a dataset that [`DatasetStartEnv::reset_from`] reads.
     ///
@@ -58,15 +59,16 @@ pub trait DatasetStartEnv {
     /// When the dataset lacks a required column.
     fn required_columns(&self, stored: &Schema, callables: &[Callable]) -> Result<Vec<String>>;
 
-    /// Starts an episode at a row of a dataset. `seed` and `options` decide what the rows do not: randomness, and factors
-    /// that are shifted or not recorded.
+    /// Starts an episode at a row of a dataset. `seed` and `options` set everything that the rows do not contain:
+    /// randomness, and factors that are shifted or not recorded.
     ///
     /// # Errors
     /// As [`Env::reset`], and when a row lacks a required column.
     fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: DatasetStart<'_>) -> Result<()>;
 }
 
-/// The columns of a dataset that [`reset`] reads: those of the environment's own rule, or all but images.
+/// The columns of a dataset that [`reset`] reads: those of [`DatasetStartEnv::required_columns`] if the environment
+/// implements it, otherwise all except images.
 ///
 /// # Errors
 /// When the dataset lacks a required column: by default, a `state` of the environment's shape.
@@ -88,8 +90,8 @@ pub fn required_columns(env: &dyn Env, stored: &Schema, callables: &[Callable]) 
     Ok(read.map(|column| column.name.clone()).collect())
 }
 
-/// Starts an episode at a row of a dataset: by the environment's own rule, or by [`Env::reset`], which decides what the
-/// rows do not, followed by [`Env::restore_from`].
+/// Starts an episode at a row of a dataset: by [`DatasetStartEnv::reset_from`] if the environment implements it,
+/// otherwise by [`Env::reset`], which sets everything that the rows do not contain, followed by [`Env::restore_from`].
 ///
 /// # Errors
 /// As these methods.

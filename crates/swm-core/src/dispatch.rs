@@ -1,4 +1,4 @@
-//! [`DispatchEnv`]: environments in other processes, which receive a call before the pool waits for any of them.
+//! [`DispatchEnv`]: environments in worker processes, which all receive a call before the pool waits for any result.
 
 use crate::{Action, ResetOptions};
 
@@ -11,11 +11,12 @@ pub enum PendingCall<'a> {
     Step(Action<'a>),
 }
 
-/// An environment that can start the work of a call before the call is made, such as one in a worker process.
+/// An environment that can start to execute a call before the caller waits for its result, such as one in a worker
+/// process.
 pub trait DispatchEnv {
-    /// Starts the work of `call` and returns whether it started, so that the call only has to wait for it.
+    /// Starts to execute `call` and returns whether it started. The later call then only waits for the result.
     ///
-    /// The caller makes exactly that call next, with no other call in between. Invalid arguments are errors of the call,
-    /// not of this method.
+    /// The caller makes exactly that call next, with no other call in between. Invalid arguments are reported by
+    /// that call, not by this method.
     fn dispatch(&mut self, call: PendingCall<'_>) -> bool;
 }

@@ -1,9 +1,9 @@
 //! [`Env`]: one environment, with its actions, observations, goals and frames.
 //!
-//! An environment declares its observation columns up front ([`EnvSpec`]) and writes them into a [`crate::Batch`] row in
-//! place. It owns all its randomness: the same seed and the same actions give the same bytes. Its full state can be saved
-//! and restored ([`Env::snapshot`]), it can start from a row of a dataset ([`Env::restore_from`]), and it can always
-//! sample a reachable goal ([`Env::sample_goal`]).
+//! An environment declares its observation columns up front ([`EnvSpec`]) and writes them into a [`crate::Batch`] row
+//! in place. It owns all its randomness: the same seed and the same actions give the same bytes. Its full state can be
+//! saved and restored ([`Env::snapshot`]), it can start from a row of a dataset ([`Env::restore_from`]), and it can
+//! always sample a reachable goal ([`Env::sample_goal`]).
 
 use crate::batch::{ColumnSpec, RowMut, RowRef};
 use crate::camera_view::CameraView;
@@ -23,8 +23,8 @@ pub struct EnvSpec {
     pub action_space: Space,
     /// The columns [`Env::observe`] writes, in order; `state` is always among them.
     pub columns: Vec<ColumnSpec>,
-    /// The columns an agent observes, with their usual bounds. As in the reference implementation, values may exceed the
-    /// bounds. A single column is the observation itself, several are a dictionary.
+    /// The columns an agent observes, with their usual bounds. As in the reference implementation, values may exceed
+    /// the bounds. A single column is the observation itself, several are a dictionary.
     pub observation_space: Vec<(&'static str, Space)>,
     /// The factors of variation.
     pub variation_space: VariationSpace,
@@ -50,12 +50,13 @@ impl EnvSpec {
     }
 }
 
-/// What a caller may choose at a reset.
+/// The options of [`Env::reset`].
 #[derive(Clone, Debug, Default)]
 pub struct ResetOptions {
     /// Factors to sample and to pin.
     pub variation: VariationRequest,
-    /// The initial state, in the layout of the `state` column; by default the factors and the seed decide it.
+    /// The initial state, in the layout of the `state` column; by default the environment samples it
+    /// from the factors and the seed.
     pub state: Option<Vec<f64>>,
     /// The goal state, in the layout of the `state` column; by default the environment samples it.
     pub goal_state: Option<Vec<f64>>,
@@ -129,7 +130,7 @@ pub struct Transition {
     /// The reward.
     pub reward: f64,
     /// Whether a terminal state ended the episode: the goal is reached, or cannot be reached any more.
-    /// [`Env::is_success`] tells the two apart.
+    /// [`Env::is_success`] distinguishes the two cases.
     pub terminated: bool,
     /// Whether the time limit ended the episode.
     pub truncated: bool,
@@ -140,9 +141,9 @@ pub struct Transition {
 /// # Shapes
 /// `rgb` is `[height, width, 3]` bytes, row-major.
 pub struct FrameMut<'a> {
-    /// Pixels in a row.
+    /// The width in pixels.
     pub width: usize,
-    /// Rows.
+    /// The height in pixels.
     pub height: usize,
     /// The pixels.
     pub rgb: &'a mut [u8],
@@ -159,7 +160,7 @@ impl<'a> FrameMut<'a> {
     }
 }
 
-/// The full state of an environment, randomness included: opaque bytes, valid for the same environment id.
+/// The full state of an environment, including its random generators: opaque bytes, valid for the same environment id.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Snapshot(pub Vec<u8>);
 
@@ -196,11 +197,11 @@ pub trait Env: Send {
     /// As [`Env::render`].
     fn render_goal(&mut self, frame: FrameMut<'_>) -> Result<()>;
 
-    /// Renders a camera view of the present state into `out`, the bytes of a row of [`CameraView::column`]. By default an
-    /// environment has the view of [`Env::render`] only.
+    /// Renders a camera view of the present state into `out`, the bytes of a row of [`CameraView::column`]. By default
+    /// an environment has the view of [`Env::render`] only.
     ///
     /// # Errors
-    /// When there is no such camera or modality; and as [`Env::render`].
+    /// When the environment has no such camera or modality; and as [`Env::render`].
     fn render_view(&mut self, view: &CameraView, height: usize, width: usize, out: &mut [u8]) -> Result<()> {
         if *view == CameraView::default() {
             return self.render(FrameMut::new(width, height, out));
@@ -208,14 +209,14 @@ pub trait Env: Send {
         Err(view.unknown(self.spec()))
     }
 
-    /// The versions of the libraries that affect values and frames, such as `mujoco` or `renderer`. Datasets and results
-    /// record them.
+    /// The versions of the libraries that affect values and frames, such as `mujoco` or `renderer`. Datasets and
+    /// results record them.
     fn libraries(&self) -> BTreeMap<String, String> {
         BTreeMap::new()
     }
 
-    /// Data that is constant over the episode and not a column, such as the XML of its scene. Datasets store it once per
-    /// episode.
+    /// Data that is constant over the episode and not a column, such as the XML of its scene. Datasets store it once
+    /// per episode.
     fn constants(&self) -> BTreeMap<String, Vec<u8>> {
         BTreeMap::new()
     }
@@ -223,7 +224,7 @@ pub trait Env: Send {
     /// The factors of this episode.
     fn factors(&self) -> &FactorValues;
 
-    /// The full state, randomness included.
+    /// The full state, including the random generators.
     fn snapshot(&self) -> Snapshot;
 
     /// Restores a snapshot. The following steps equal those that followed the snapshot, bit for bit.
@@ -232,8 +233,8 @@ pub trait Env: Send {
     /// When the snapshot is of another environment.
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()>;
 
-    /// Continues from a dataset row (its `state` column, and factor columns where it has them), with the state of another
-    /// row as the goal.
+    /// Sets the state to that of a dataset row (its `state` column, and factor columns if present) and the goal to the
+    /// state of another row.
     ///
     /// # Errors
     /// When a row lacks a required column.
@@ -250,22 +251,22 @@ pub trait Env: Send {
 
     /// The distance from the present state to the goal, in the unit that the environment's README names.
     ///
-    /// It is 0 at the goal, never negative, and falls along a good path there (around walls, not through them). A
-    /// simulator that serves as a cost model minimises it.
+    /// It is at least 0, is 0 at the goal, and decreases along feasible paths to the goal: around walls, not through
+    /// them. A cost model that simulates the environment uses it as the cost.
     fn goal_distance(&self) -> f64;
 
-    /// This environment as one whose calls can be dispatched early, if it runs in another process.
+    /// Returns the interface for dispatching calls early, if the environment runs in another process.
     fn as_dispatch(&mut self) -> Option<&mut dyn DispatchEnv> {
         None
     }
 
-    /// This environment's own way to start at dataset rows, if [`Env::restore_from`] is not it. Callers use the functions
-    /// of [`crate::dataset_start`].
+    /// Returns the interface for starting at dataset rows, if the environment does not use [`Env::restore_from`] for
+    /// this. Callers use the functions of [`crate::dataset_start`] instead.
     fn dataset_start(&self) -> Option<&dyn DatasetStartEnv> {
         None
     }
 
-    /// As [`Env::dataset_start`], to start an episode.
+    /// The mutable form of [`Env::dataset_start`].
     fn dataset_start_mut(&mut self) -> Option<&mut dyn DatasetStartEnv> {
         None
     }

@@ -54,7 +54,7 @@ pub enum Error {
         factor: String,
         /// The constraint, in words.
         constraint: String,
-        /// How many samples were rejected.
+        /// The number of rejected samples.
         tries: usize,
     },
 
@@ -64,9 +64,9 @@ pub enum Error {
     Mismatch {
         /// The operation that failed.
         operation: String,
-        /// What was given.
+        /// The given value.
         given: String,
-        /// What was expected.
+        /// The expected value.
         expected: String,
     },
     /// A file, dataset or checkpoint that is damaged or of another format.
@@ -101,8 +101,8 @@ pub enum Error {
     },
 
     // ---- the run ----
-    /// The user interrupted the run; finished work is kept.
-    #[error("interrupted; everything finished before is kept")]
+    /// The user interrupted the run; work that was finished before is saved.
+    #[error("interrupted; work that was finished before is saved")]
     Interrupted,
     /// A third-party library failed.
     #[error("{context}: {message}")]
@@ -112,8 +112,8 @@ pub enum Error {
         /// The library's message.
         message: String,
     },
-    /// An error of the embedding program, raised by a policy, model or environment of its own and returned to it
-    /// unchanged, such as a Python exception.
+    /// An error of the embedding program, such as a Python exception: raised by a policy, model or environment that
+    /// this program defines, and returned to it unchanged.
     #[error("{0}")]
     Embedder(Box<dyn std::error::Error + Send + Sync>),
 }

@@ -1,13 +1,15 @@
-//! The contracts of stable-worldmodel: what every other crate of the workspace implements or uses.
+//! The contracts of stable-worldmodel: the traits and types that the other crates implement and use.
 //!
 //! Read the modules in this order:
 //!
 //! 1. [`batch`] and [`columns`]: named typed arrays, which all parts of the system exchange, and the names of their columns.
-//! 2. [`space`] and [`variation`]: the values of actions, observations and factors of variation.
+//! 2. [`space`], [`variation`], [`factors`]: spaces of actions and observations, factors of variation and their values in
+//!    dataset rows.
 //! 3. [`key`]: keyed random streams, the only source of randomness.
 //! 4. [`env`], [`camera_view`], [`dispatch`], [`dataset_start`]: one environment. [`pool`], [`thread_budget`]: many
 //!    environments on a fixed set of threads. [`policy`]: policies and experts.
-//! 5. [`plan`]: costs of candidate action sequences, and the solvers that minimise them.
+//! 5. [`plan`]: costs of candidate action sequences, and the solvers that minimise them. [`predictor`]: models that
+//!    predict latents. [`requirements`]: columns that a model family requires of a dataset.
 //! 6. [`run`]: progress and interruption of long commands. [`registry`], [`manifest`], [`results`], [`error`]: names,
 //!    provenance, evaluation results and errors.
 

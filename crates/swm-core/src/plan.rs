@@ -27,8 +27,8 @@ pub struct Candidates<'a> {
 
 /// Scores candidate action sequences from the present observation of each environment.
 pub trait CostModel: Send {
-    /// Reads the present observation and the goal of each environment: rows `envs` of `infos`. Work that a plan needs only
-    /// once, such as encoding both, happens here.
+    /// Reads the present observation and the goal of each environment: rows `envs` of `infos`. Work that a plan needs
+    /// only once, such as encoding both, happens here.
     ///
     /// # Errors
     /// When `infos` lacks a column that the model reads.
@@ -43,8 +43,8 @@ pub trait CostModel: Send {
     /// When the candidates do not fit the model.
     fn cost(&mut self, candidates: Candidates<'_>, costs: &mut [f32]) -> Result<()>;
 
-    /// Reads the environment of `slot` itself, before [`CostModel::observe`] names that slot. Only a model with privileged
-    /// information, such as a simulator, does.
+    /// Reads the environment of `slot` directly, before a call of [`CostModel::observe`] with that slot. Only models
+    /// with privileged information, such as simulators, override this method.
     ///
     /// # Errors
     /// When the model does not support the environment.
@@ -52,17 +52,17 @@ pub trait CostModel: Send {
         Ok(())
     }
 
-    /// This model as one with a gradient, if it has one.
+    /// Returns the gradient interface of this model, if it is differentiable.
     fn differentiable(&mut self) -> Option<&mut dyn DifferentiableCost> {
         None
     }
 
-    /// This model as one with a latent state, if it exposes one.
+    /// Returns the latent dynamics of this model, if it exposes them.
     fn latent(&mut self) -> Option<&mut dyn LatentDynamics> {
         None
     }
 
-    /// This model as one with constraints, if it has any.
+    /// Returns the constraints of this model, if it has any.
     fn constrained(&mut self) -> Option<&mut dyn Constrained> {
         None
     }
@@ -94,8 +94,8 @@ pub trait LatentDynamics: CostModel {
     /// Before the first [`CostModel::observe`].
     fn encode(&mut self, start: &mut [f32], goal: &mut [f32]) -> Result<()>;
 
-    /// Predicts one model step for `n` pairs of latent state and action. The pairs are grouped by observed environment, the
-    /// same number for each.
+    /// Predicts one model step for `n` pairs of latent state and action. The pairs are grouped by observed environment,
+    /// the same number for each.
     ///
     /// # Shapes
     /// `latents` and `next` are `[n, latent]`, `actions` is `[n, dim]`.
@@ -104,7 +104,8 @@ pub trait LatentDynamics: CostModel {
     /// When shapes do not fit the model.
     fn predict(&mut self, latents: &[f32], actions: &[f32], next: &mut [f32]) -> Result<()>;
 
-    /// The vector-Jacobian product of [`LatentDynamics::predict`]: writes the gradients with respect to latents and actions.
+    /// The vector-Jacobian product of [`LatentDynamics::predict`]: writes the gradients with respect to latents and
+    /// actions.
     ///
     /// # Shapes
     /// `next_gradient` and `latent_gradient` are `[n, latent]`, `action_gradient` is `[n, dim]`.
@@ -173,7 +174,7 @@ impl PlanSpace<'_> {
     }
 }
 
-/// A planning problem: everything a solver needs besides the cost.
+/// A planning problem: the inputs of a solver except the cost model.
 #[derive(Clone, Copy, Debug)]
 pub struct PlanProblem<'a> {
     /// The number of model steps to plan.
@@ -201,7 +202,7 @@ impl PlanProblem<'_> {
 pub struct Plan {
     /// The action sequences, `[envs, horizon, dim]`; discrete actions are one-hot vectors.
     pub actions: Vec<f32>,
-    /// The cost of each, `[envs]`: the model's cost of the best candidate of the last iteration.
+    /// The cost of each plan, `[envs]`: the model's cost of the best candidate of the last iteration.
     pub costs: Vec<f32>,
     /// The trace of each search, one per environment.
     pub trace: Vec<PlanTrace>,
@@ -216,8 +217,8 @@ pub struct PlanTrace {
     pub mean: Vec<f32>,
     /// The mean spread of the sampling distribution after the iteration, or of the candidates if the solver has none.
     pub spread: Vec<f32>,
-    /// The largest constraint value of the best candidate, if the model has constraints and the solver enforces them. It is
-    /// at most 0, or the solver's tolerance, when all are satisfied.
+    /// The largest constraint value of the best candidate, if the model has constraints and the solver enforces them.
+    /// It is at most 0, or the solver's tolerance, when all are satisfied.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub violation: Vec<f32>,
 }
@@ -227,7 +228,7 @@ pub trait Solver: Send {
     /// Solves one problem for every environment that `cost` observed.
     ///
     /// # Errors
-    /// When the solver's settings are invalid or do not fit the action space or the model, or the model fails or returns
-    /// costs that are not finite.
+    /// When the solver's settings are invalid or do not fit the action space or the model, or the model fails or
+    /// returns costs that are not finite.
     fn solve(&mut self, cost: &mut dyn CostModel, problem: PlanProblem<'_>) -> Result<Plan>;
 }

@@ -1,7 +1,7 @@
 //! [`Policy`]: reads the infos of all environments of a pool at once and fills one action row for each.
 //!
-//! A policy's randomness is keyed by the episode that a slot plays, not by the slot, so an episode has the same actions in
-//! every slot.
+//! A policy's randomness is keyed by the episode that a slot plays, not by the slot, so an episode has the same actions
+//! in every slot.
 
 use crate::batch::{Batch, DType, RowMut, RowRef};
 use crate::parallelism::Parallelism;
@@ -19,8 +19,8 @@ pub trait Policy: Send {
     /// When the infos lack a column that the policy reads, or its model fails.
     fn act(&mut self, infos: &Batch, active: &[bool], actions: &mut Batch) -> Result<()>;
 
-    /// Reads the environments themselves, before [`Policy::act`]. Only a policy with privileged information, such as one that
-    /// plans in a simulator, does.
+    /// Reads the environments directly, before [`Policy::act`]. Only policies with privileged information, such as
+    /// those that plan in a simulator, override this method.
     ///
     /// # Errors
     /// When the policy does not support an environment.

@@ -1,14 +1,14 @@
 //! Requirements of model families on datasets, as plain data.
 //!
-//! Model families state them, and the doctor of datasets compares them with a dataset. So neither needs the other's
-//! crate.
+//! Model families state their requirements, and `swm doctor` compares them with a dataset. These types are in this
+//! crate so that the crates of models and datasets do not depend on each other.
 
 use serde::Serialize;
 
-/// What a model family requires of a dataset to be trained on it. Every family requires continuous actions.
+/// The requirements of a model family on its training dataset. Every family requires continuous actions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct DatasetRequirements {
-    /// Name of the family, as reports show it.
+    /// Name of the family, as in reports.
     pub model: &'static str,
     /// The required observations.
     pub observations: RequiredObservations,

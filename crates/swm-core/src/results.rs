@@ -20,13 +20,13 @@ use serde::{Deserialize, Serialize};
 /// The content of a `results.json`.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Results {
-    /// The provenance.
+    /// The provenance of the evaluation.
     pub manifest: Manifest,
-    /// The environment's id.
+    /// The id of the environment.
     pub env: String,
     /// The protocol: `episodic` or `dataset`.
     pub protocol: String,
-    /// Which episodes count, and what counts as a success.
+    /// The rule that decides which episodes count and which of them succeed.
     #[serde(default)]
     pub counting: Counting,
     /// One entry per policy and condition.
@@ -49,12 +49,13 @@ pub struct Run {
     pub solved_at_start: usize,
     /// The success rate of the episodes that count.
     pub success: Proportion,
-    /// The success rate of the same episodes by strict counting, where they were counted otherwise and one run gives both.
+    /// The success rate of the same episodes under [`Counting::Strict`]; present if [`Results::counting`] is another
+    /// rule and the episodes determine both rates.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub strict: Option<Proportion>,
     /// The time to goal of successful episodes, in environment steps.
     pub time_to_goal: Option<Summary>,
-    /// Search traces of the planner, if recorded.
+    /// Summaries of the search traces of the planner, if recorded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub searches: Option<Searches>,
     /// Prediction errors of the model on the trajectories that the starts come from, if requested.
@@ -72,18 +73,18 @@ pub struct Run {
 pub struct EpisodeResult {
     /// The reset seed.
     pub seed: u64,
-    /// Whether it succeeded.
+    /// Whether the episode succeeded.
     pub success: bool,
     /// Whether the episode was solved at start.
     pub solved_at_start: bool,
     /// The number of steps played.
     pub steps: usize,
-    /// The first step that satisfied the goal, if the goal then had to be held for more steps.
+    /// The first step that satisfied the goal; present only if the goal had to hold for several steps.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reached: Option<usize>,
     /// The sum of rewards.
     pub total_reward: f64,
-    /// The dataset row of its start, if it started from one: `[episode, step]`.
+    /// The dataset row of the initial state, `[episode, step]`, if the episode started from a dataset.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start: Option<[usize; 2]>,
 }
@@ -91,14 +92,14 @@ pub struct EpisodeResult {
 /// Durations of a run.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Timing {
-    /// The duration of a plan over all plans, in seconds; none for policies that do not plan.
+    /// Statistics of the planning time of each plan, in seconds; `None` for policies that do not plan.
     pub plan_seconds: Option<Summary>,
     /// The duration of the run, in seconds.
     pub wall_seconds: f64,
 }
 
 impl Run {
-    /// A run of these episodes, with their success rate and time to goal.
+    /// Creates a run from its episodes, and computes their success rate and time to goal.
     pub fn new(
         condition: &str,
         policy: &str,
@@ -125,7 +126,7 @@ impl Run {
 }
 
 impl EpisodeResult {
-    /// The result of an episode before its first step.
+    /// Creates the result of an episode that has not been stepped yet.
     pub fn new(seed: u64) -> Self {
         Self { seed, ..Self::default() }
     }

@@ -1,4 +1,4 @@
-//! The run protocol: how a caller watches and stops a long command.
+//! The run protocol: progress events and interruption of long commands.
 //!
 //! Collecting, training, converting, examining, evaluating, reproducing and the demo all take a [`Control`]. They call
 //! [`Control::check`] between steps and [`Control::emit`] with an [`Event`] whenever there is progress to report.
@@ -8,7 +8,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Something a run reports to its caller.
+/// An event that a run reports to its caller.
 ///
 /// A run is a sequence of stages: [`Event::Started`], any number of the other events, [`Event::Finished`]. A stage that
 /// fails or is interrupted does not finish.
@@ -17,13 +17,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 pub enum Event<'a> {
     /// A stage starts.
     Started(Stage<'a>),
-    /// Part of the present stage is done.
+    /// Part of the current stage is done.
     Progress(Progress<'a>),
     /// A message for people, one line.
     Log(&'a str),
     /// A file or folder was written: a dataset, a checkpoint, a video.
     Saved(&'a Path),
-    /// The present stage is done; values that summarise it, by name, such as `success_rate`.
+    /// The current stage is done; `metrics` summarise it, such as `success_rate`.
     Finished {
         /// The stage's [`Stage::name`].
         stage: &'static str,
@@ -35,33 +35,33 @@ pub enum Event<'a> {
 /// A stage of a run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stage<'a> {
-    /// What is done, as an imperative verb: `collect`, `train`, `compare`, `convert`, `verify`, `examine`, `evaluate`.
+    /// The name, an imperative verb: `collect`, `train`, `compare`, `convert`, `verify`, `examine`, `evaluate`.
     pub name: &'static str,
-    /// What it is done to, such as the policy and the condition of an evaluation; empty where there is one subject only.
+    /// The subject, such as the policy and the condition of an evaluation; empty if the run has only one subject.
     pub subject: &'a [&'a str],
-    /// How many units of work there are.
+    /// The number of units of work.
     pub total: usize,
     /// The unit of work: `episodes`, `steps`, `columns`.
     pub unit: &'static str,
 }
 
-/// How far a stage is.
+/// The progress of a stage.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Progress<'a> {
     /// The stage's [`Stage::name`].
     pub stage: &'static str,
-    /// Units of work done.
+    /// The number of finished units of work.
     pub done: usize,
-    /// Units of work in all.
+    /// The number of units of work.
     pub total: usize,
     /// The unit of work: `episodes`, `steps`, `columns`.
     pub unit: &'static str,
-    /// Present values by name, such as `loss` or `steps`; those worth showing first.
+    /// Current values by name, such as `loss` or `steps`; the most important ones first.
     pub metrics: &'a [(&'static str, f64)],
 }
 
 impl Progress<'_> {
-    /// The present value of that name, if the run reports one.
+    /// The current value of a metric, if the run reports it.
     pub fn metric(&self, name: &str) -> Option<f64> {
         self.metrics.iter().find(|(known, _)| *known == name).map(|(_, value)| *value)
     }
@@ -77,7 +77,7 @@ type Poll<'a> = Box<dyn FnMut() -> Result<()> + Send + 'a>;
 /// A caller's event sink, see [`Control::with_events`].
 type Sink<'a> = Box<dyn FnMut(Event<'_>) + Send + 'a>;
 
-/// A caller's hold on a run: an interrupt flag, a poll, and an event sink, each optional.
+/// The connection of a caller to a run: an interrupt flag, a poll function and an event sink, each optional.
 #[derive(Default)]
 pub struct Control<'a> {
     interrupt: Option<Arc<AtomicBool>>,
@@ -97,14 +97,14 @@ impl<'a> Control<'a> {
         Self { interrupt: Some(flag), ..self }
     }
 
-    /// Calls `poll` at every check and stops the run with its error: for callers with signals of their own, such as Python.
-    /// It is called between steps, so a slow poll limits its own rate.
+    /// Calls `poll` at every check and stops the run with its error: for callers that handle signals themselves, such
+    /// as Python. Every step calls `poll`, so an expensive function should return early on most calls.
     #[must_use]
     pub fn with_poll(self, poll: impl FnMut() -> Result<()> + Send + 'a) -> Self {
         Self { poll: Some(Box::new(poll)), ..self }
     }
 
-    /// Sends events to `sink`, which also limits its own rate.
+    /// Sends events to `sink`. Every step may send one, so an expensive sink should drop some of them.
     #[must_use]
     pub fn with_events(self, sink: impl FnMut(Event<'_>) + Send + 'a) -> Self {
         Self { events: Some(Box::new(sink)), ..self }

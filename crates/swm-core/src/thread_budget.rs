@@ -1,4 +1,4 @@
-//! The thread budget: how many threads one environment may use, which is more than one where there are fewer environments
+//! The thread budget: the number of threads that one environment may use. It exceeds 1 if there are fewer environments
 //! than threads.
 //!
 //! The pool distributes environments over threads first ([`crate::EnvPool`]). A renderer reads [`threads`] and may draw
@@ -10,7 +10,7 @@ thread_local! {
     static THREADS: Cell<usize> = const { Cell::new(1) };
 }
 
-/// How many threads the present work may use, its own included; 1 unless a caller set a budget.
+/// The number of threads that the calling code may use, including the current one; 1 unless a caller set a budget.
 pub fn threads() -> usize {
     THREADS.get()
 }

@@ -3,9 +3,9 @@
 /// An RGB image in memory.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RgbImage {
-    /// Pixels in a row.
+    /// The width in pixels.
     pub width: usize,
-    /// Rows.
+    /// The height in pixels.
     pub height: usize,
     /// The pixels, `[height, width, 3]` bytes.
     pub rgb: Vec<u8>,

@@ -7,13 +7,13 @@ use swm_plan::ActionScale;
 
 /// A network that returns actions.
 pub trait ActionNetwork: Send + Sync {
-    /// What the network keeps from step to step of an episode, such as the encoded goal.
+    /// The state of the network within an episode, such as the encoded goal.
     type EpisodeState: Default + Send;
 
-    /// The map between environment actions and the network's.
+    /// The scale between the units of environment actions and of network actions.
     fn scale(&self) -> &ActionScale;
 
-    /// Checks that the columns the network reads are there.
+    /// Checks that `infos` has the columns that the network reads.
     ///
     /// # Errors
     /// When a column is missing or of another shape.
@@ -22,21 +22,23 @@ pub trait ActionNetwork: Send + Sync {
     /// Computes the actions of the next model step in model units.
     ///
     /// # Shapes
-    /// `[action_block * action_dim]`: one environment action after another.
+    /// Returns `[action_block, action_dim]`.
     ///
     /// # Errors
-    /// When the row cannot be read.
+    /// When the row lacks a column that the network reads.
     fn next_actions(&self, state: &mut Self::EpisodeState, row: RowRef<'_>) -> Result<Vec<f32>>;
 }
 
-/// Executes the actions of a network, one model step at a time. Every environment is computed separately, so its
-/// actions depend neither on the other environments nor on the number of threads.
+/// Executes the actions of a network, one model step at a time.
+///
+/// The network processes every environment separately, so the actions of an environment depend neither on the other
+/// environments nor on the number of threads.
 pub struct FeedForwardPolicy<N: ActionNetwork> {
     network: N,
-    /// Bounds of an environment action, element by element.
+    /// The bounds of each element of an environment action, `[action_dim]`.
     bounds: Vec<(f32, f32)>,
     slots: Vec<Slot<N::EpisodeState>>,
-    /// Seconds per decision since they were last taken.
+    /// Seconds per model step since the last call of [`Policy::take_latencies`].
     latencies: Vec<f64>,
 }
 
@@ -44,20 +46,21 @@ pub struct FeedForwardPolicy<N: ActionNetwork> {
 #[derive(Default)]
 struct Slot<S> {
     state: S,
-    /// The actions of the present model step, in environment units.
+    /// The actions of the current model step, `[action_block, action_dim]`, in environment units.
     actions: Vec<f32>,
-    /// Elements of `actions` that were executed.
+    /// The number of elements of `actions` that have been executed.
     done: usize,
-    /// Whether the next actions are to be computed.
+    /// Whether the network must compute the next actions.
     due: bool,
+    /// The error of the last model step, until [`Policy::act`] returns it.
     failed: Option<Error>,
 }
 
 impl<N: ActionNetwork> FeedForwardPolicy<N> {
-    /// Creates a policy for `slots` environments of `spec`.
+    /// Creates a policy for `slots` environments with the specification `spec`.
     ///
     /// # Errors
-    /// When the network was trained for other actions.
+    /// When the network was trained for another action space.
     pub fn new(network: N, spec: &EnvSpec, slots: usize) -> Result<Self> {
         network.scale().check(spec)?;
         let bounds = (0..spec.action_dim()).map(|i| spec.action_space.bounds(i));
@@ -122,7 +125,8 @@ impl<N: ActionNetwork> Policy for FeedForwardPolicy<N> {
         Ok(())
     }
 
-    /// Seconds per decision, encodings included; environments computed together share their time equally.
+    /// Seconds per model step, encoding included. The time of a parallel computation is divided equally among its
+    /// environments.
     fn take_latencies(&mut self) -> Vec<f64> {
         std::mem::take(&mut self.latencies)
     }

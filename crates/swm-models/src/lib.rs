@@ -2,9 +2,9 @@
 //!
 //! Contracts:
 //! - [`train`](mod@train): the training loop for every [`Trainable`] model, its configuration and logs.
-//! - [`family`]: [`ModelFamily`], the uses of a trained model; [`registry`]: the families of this build.
+//! - [`family`]: [`ModelFamily`], the contract of a model family; [`registry`]: the families of this build.
 //! - [`online`]: training by acting in environments; [`feed_forward`]: policies without planning.
-//! - [`probe`]: how much of the state of an environment the latents contain.
+//! - [`probe`]: regression of the environment state from frozen latents.
 //! - [`checkpoint`]: trained models on disk; [`weights`]: pretrained weights, and files for PyTorch.
 //!
 //! Building blocks: [`nn`], with PyTorch's parameter names; [`pixels`], the normalisation of images; [`device`].

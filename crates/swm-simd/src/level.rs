@@ -1,4 +1,4 @@
-//! Detection of the CPU's level.
+//! Run-time detection of the vector instructions of the CPU.
 
 use std::sync::atomic::{AtomicU8, Ordering};
 
@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU8, Ordering};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 #[repr(u8)]
 pub enum CpuLevel {
-    /// What every CPU of the architecture has.
+    /// The instructions that every CPU of the architecture supports.
     Baseline,
     /// x86-64-v3: AVX2, FMA, BMI1 and BMI2. 16 registers of 8 floats.
     Avx2,
@@ -35,7 +35,7 @@ pub fn cpu_level() -> CpuLevel {
     }
 }
 
-/// Makes [`cpu_level`] return at most `limit` in the whole process, for tests that compare levels.
+/// Limits the result of [`cpu_level`] to `limit` in the whole process, for tests that compare levels.
 pub fn limit_cpu_level(limit: CpuLevel) {
     LEVEL.store(detect().min(limit) as u8, Ordering::Relaxed);
 }

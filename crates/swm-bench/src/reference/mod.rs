@@ -1,6 +1,7 @@
 //! [`Reference`]: the reference implementation in a Python process.
 //!
-//! The scripts in this folder read requests from standard input, one per line, and answer with lines that start with `SWM `.
+//! The scripts in this folder read requests from standard input, one per line, and answer with lines that start with
+//! `SWM `.
 
 use std::fs::File;
 use std::io::{BufRead as _, BufReader, Read as _, Seek as _, Write as _};
@@ -22,12 +23,12 @@ pub(crate) fn reference_python() -> Option<PathBuf> {
     std::env::var_os(REFERENCE_PYTHON).filter(|path| !path.is_empty()).map(PathBuf::from)
 }
 
-/// What a report says in place of the reference's version where no Python is given.
+/// Returns the text that a report contains instead of the reference's version if no Python is given.
 pub(crate) fn not_compared() -> String {
     format!("not compared: set {REFERENCE_PYTHON} to a Python that has stable-worldmodel")
 }
 
-/// A Python process with a world, a solver, a model, or the datasets of the reference.
+/// A Python process that runs the reference: its `World`, a solver, a model, or its datasets.
 pub(crate) struct Reference {
     process: Child,
     requests: ChildStdin,
@@ -37,7 +38,7 @@ pub(crate) struct Reference {
     pub version: String,
 }
 
-/// The size of a world.
+/// The sizes of a `World` of the reference.
 #[derive(Clone, Copy)]
 pub(crate) struct Size<'a> {
     pub env: &'a str,
@@ -47,17 +48,18 @@ pub(crate) struct Size<'a> {
 }
 
 impl Reference {
-    /// Starts a process with a world and waits until it is ready.
+    /// Starts a process with a `World` and waits until it is ready.
     ///
     /// # Errors
-    /// When Python cannot be started, or the reference cannot be imported; the message contains the last line of its output.
+    /// When Python cannot be started, or the reference cannot be imported; the message contains the last line of its
+    /// output.
     pub fn start(python: &Path, size: Size<'_>) -> Result<Self> {
         let counts = [size.envs, size.image.0, size.image.1, size.episode_steps].map(|n| n.to_string());
         Self::spawn(python, SCRIPT, &[&[size.env.to_owned()][..], &counts].concat())
     }
 
-    /// Starts a process with a CEM solver and a model of precomputed costs: environments, samples, iterations, elites, horizon,
-    /// and the dimension of a model step.
+    /// Starts a process with a CEM solver and a model of precomputed costs: environments, samples, iterations, elites,
+    /// horizon, and the dimension of a model step.
     ///
     /// # Errors
     /// As [`Reference::start`].
@@ -105,7 +107,7 @@ impl Reference {
         self.rate(&format!("step\t{seconds}"))
     }
 
-    /// Steps environments without frames and without a world; returns environment steps per second.
+    /// Steps environments without frames and without a `World`; returns environment steps per second.
     pub fn bare(&mut self, seconds: f64) -> Result<f64> {
         self.rate(&format!("bare\t{seconds}"))
     }
@@ -120,19 +122,20 @@ impl Reference {
         self.rate(&format!("solve\t{seconds}"))
     }
 
-    /// Does a work of the model `count` times; returns repetitions per second.
+    /// Executes a workload of the model `count` times; returns repetitions per second.
     pub fn run(&mut self, work: &str, count: usize) -> Result<f64> {
         self.rate(&format!("run\t{work}\t{count}"))
     }
 
-    /// The outputs of a work of the model.
+    /// Executes a workload of the model and returns its outputs, flattened in row-major order.
     pub fn outputs(&mut self, work: &str) -> Result<Vec<f32>> {
         let words = self.request(&format!("outputs\t{work}"))?;
         let outputs = words.iter().map(|word| word.parse());
         outputs.collect::<std::result::Result<_, _>>().map_err(|error| Error::external("reading the reference", error))
     }
 
-    /// Loads shuffled batches of clips with the columns `pixels` and `action` for about `seconds`; returns clips per second.
+    /// Loads shuffled batches of clips with the columns `pixels` and `action` for about `seconds`; returns clips per
+    /// second.
     pub fn load(
         &mut self,
         format: &str,

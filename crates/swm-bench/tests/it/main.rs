@@ -41,7 +41,7 @@ fn report_states_that_the_reference_is_missing() {
 
 #[cfg(unix)]
 #[test]
-fn ratio_is_the_median_of_neighbouring_turns() {
+fn ratio_is_the_median_over_measurement_pairs() {
     use std::os::unix::fs::PermissionsExt as _;
     let folder = tempfile::tempdir().expect("a folder");
     let python = folder.path().join("python");

@@ -17,18 +17,18 @@ fn play(suite: &Suite, entry: &EnvEntry, slots: &[u64], workers: usize, steps: u
         .enumerate()
         .map(|(slot, &episode)| {
             policy.begin(slot, Key::new(episode));
-            // Every other episode varies all_outputs.
+            // Every other episode varies all factors.
             let options = if episode % 2 == 0 { ResetOptions::default() } else { all_varied() };
             Reset { slot, seed: episode, options }
         })
         .collect();
     pool.reset(&resets).expect("a reset");
-    let mut seen = vec![vec![]; slots.len()];
+    let mut recorded = vec![vec![]; slots.len()];
     let mut record = |pool: &EnvPool| {
-        for (slot, seen) in seen.iter_mut().enumerate() {
+        for (slot, bytes) in recorded.iter_mut().enumerate() {
             for (column, spec) in pool.infos().schema().columns().iter().enumerate() {
                 let n = spec.row_bytes();
-                seen.extend_from_slice(&pool.infos().bytes(column)[slot * n..(slot + 1) * n]);
+                bytes.extend_from_slice(&pool.infos().bytes(column)[slot * n..(slot + 1) * n]);
             }
         }
     };
@@ -39,10 +39,10 @@ fn play(suite: &Suite, entry: &EnvEntry, slots: &[u64], workers: usize, steps: u
         pool.step(&actions, &active).expect("a step");
         record(&pool);
     }
-    seen
+    recorded
 }
 
-/// Infos are the same bytes for any number of threads and in any slot.
+/// Checks that infos have the same bytes for any number of threads and in any slot.
 pub fn results_are_independent_of_threads_and_slots(suite: &Suite) {
     for entry in suite.rows {
         let episodes = [0, 1, 2, 3, 4];
@@ -62,16 +62,20 @@ pub fn results_are_independent_of_threads_and_slots(suite: &Suite) {
     }
 }
 
-/// Environments stepped in turn, after earlier episodes, give the same results as new ones.
+/// Checks that environments that are stepped alternately, after earlier episodes, give the same results as new ones.
 pub fn environments_are_independent(suite: &Suite) {
     for entry in suite.rows {
         let key = Key::new(7);
-        let alone = |seed| {
+        let new_env = |seed| {
             let mut probe = Probe::reset(suite, entry, seed, &all_varied());
-            (0..6).map(|t| (probe.step(key, t).reward, probe.all_outputs()).1).collect::<Vec<_>>()
+            let mut outputs_after = |t| {
+                probe.step(key, t);
+                probe.all_outputs()
+            };
+            (0..6).map(&mut outputs_after).collect::<Vec<_>>()
         };
-        let expected = [alone(1), alone(2)];
-        // Two environments with earlier episodes, stepped in turn.
+        let expected = [new_env(1), new_env(2)];
+        // Both environments have played another episode before.
         let mut pair =
             [Probe::reset(suite, entry, 90, &all_varied()), Probe::reset(suite, entry, 91, &ResetOptions::default())];
         for (i, probe) in pair.iter_mut().enumerate() {

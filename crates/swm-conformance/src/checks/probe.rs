@@ -3,6 +3,7 @@
 use crate::Suite;
 use swm_core::{Action, Batch, Env, EnvEntry, FrameMut, Key, ResetOptions, Schema, Space, VariationRequest};
 
+/// A request that samples the factors and groups `keys`.
 pub(super) fn vary(keys: &[&str]) -> VariationRequest {
     VariationRequest {
         variation: Some(keys.iter().map(|&key| key.to_owned()).collect()),
@@ -10,41 +11,49 @@ pub(super) fn vary(keys: &[&str]) -> VariationRequest {
     }
 }
 
+/// Reset options that sample all factors.
 pub(super) fn all_varied() -> ResetOptions {
     ResetOptions { variation: vary(&["all"]), ..ResetOptions::default() }
 }
 
 /// An environment with a row for its observations.
 pub(super) struct Probe {
+    /// The environment.
     pub env: Box<dyn Env>,
+    /// The last observation, a batch of one row.
     pub row: Batch,
     /// Height and width of its frames, in pixels.
     size: (usize, usize),
 }
 
 impl Probe {
+    /// Creates the environment of `entry`, not yet reset.
     pub fn new(suite: &Suite, entry: &EnvEntry) -> Self {
         let env = entry.env().unwrap_or_else(|error| panic!("{}: {error}", entry.id));
-        let schema = Schema::new(env.spec().columns.clone()).expect("columns have their own names");
+        let schema = Schema::new(env.spec().columns.clone()).expect("column names are unique");
         Self { env, row: Batch::zeros(&schema, 1), size: suite.frame_size }
     }
 
+    /// Creates the environment of `entry` and resets it.
     pub fn reset(suite: &Suite, entry: &EnvEntry, seed: u64, options: &ResetOptions) -> Self {
         let mut probe = Self::new(suite, entry);
         probe.env.reset(seed, options).unwrap_or_else(|error| panic!("{}, seed {seed}: {error}", entry.id));
         probe
     }
 
+    /// Observes the environment and returns the elements of a column.
     pub fn column(&mut self, name: &str) -> Vec<f64> {
         self.env.observe(&mut self.row.row_mut(0));
         self.row.row(0).to_f64(name).expect("a declared column")
     }
 
+    /// Observes the environment and returns the row.
     pub fn observed(&mut self) -> &Batch {
         self.env.observe(&mut self.row.row_mut(0));
         &self.row
     }
 
+    /// Renders the current state, `[height, width, 3]`.
     pub fn frame(&mut self) -> Vec<u8> {
         let (height, width) = self.size;
         let mut rgb = vec![0; height * width * 3];
@@ -52,6 +61,7 @@ impl Probe {
         rgb
     }
 
+    /// Renders the goal, `[height, width, 3]`.
     pub fn goal_frame(&mut self) -> Vec<u8> {
         let (height, width) = self.size;
         let mut rgb = vec![0; height * width * 3];
@@ -64,12 +74,13 @@ impl Probe {
         self.act(&self.env.spec().action_space.sample(&mut key.at(t).rng()))
     }
 
+    /// Steps with `action`, `[dim]`, converted to the type of the action space.
     pub fn act(&mut self, action: &[f64]) -> swm_core::Transition {
-        let numbers: Vec<f32> = action.iter().map(|&v| v as f32).collect();
-        let choice: Vec<i64> = action.iter().map(|&v| v as i64).collect();
+        let values: Vec<f32> = action.iter().map(|&v| v as f32).collect();
+        let integers: Vec<i64> = action.iter().map(|&v| v as i64).collect();
         let action = match self.env.spec().action_space {
-            Space::Box { .. } => Action::Continuous(&numbers),
-            _ => Action::Discrete(&choice),
+            Space::Box { .. } => Action::Continuous(&values),
+            _ => Action::Discrete(&integers),
         };
         self.env.step(action).expect("an action of the action space")
     }
@@ -84,19 +95,21 @@ impl Probe {
     }
 }
 
-/// The mean absolute difference of two frames, on a scale of 255.
+/// The mean absolute difference of two frames, in units of 1/255.
 pub(super) fn frame_difference(a: &[u8], b: &[u8]) -> f64 {
     assert_eq!(a.len(), b.len(), "frames of one size");
     a.iter().zip(b).map(|(&a, &b)| f64::from(a.abs_diff(b))).sum::<f64>() / a.len() as f64
 }
 
+/// All bytes of a batch, column by column.
 pub(super) fn bytes_of(batch: &Batch) -> Vec<u8> {
     (0..batch.schema().columns().len()).flat_map(|column| batch.bytes(column)).copied().collect()
 }
 
-pub(super) fn assert_finite(batch: &Batch, what: &str) {
+/// Asserts that the first row is finite; `label` names the row in the message.
+pub(super) fn assert_finite(batch: &Batch, label: &str) {
     for column in batch.schema().columns() {
         let value = batch.row(0).to_f64(&column.name).expect("a column");
-        assert!(value.iter().all(|v| v.is_finite()), "{what}: {} = {value:?}", column.name);
+        assert!(value.iter().all(|v| v.is_finite()), "{label}: {} = {value:?}", column.name);
     }
 }

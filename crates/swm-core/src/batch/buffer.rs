@@ -13,7 +13,7 @@ pub(super) struct Buffer {
 }
 
 impl Buffer {
-    /// Bytes held.
+    /// The number of bytes.
     pub fn len(&self) -> usize {
         self.len
     }
@@ -28,10 +28,12 @@ impl Buffer {
         self.len = len;
     }
 
+    /// The bytes.
     pub fn bytes(&self) -> &[u8] {
         &bytemuck::cast_slice(&self.lines)[..self.len]
     }
 
+    /// The bytes, for writing.
     pub fn bytes_mut(&mut self) -> &mut [u8] {
         &mut bytemuck::cast_slice_mut(&mut self.lines)[..self.len]
     }

@@ -13,7 +13,7 @@ pub use schema::{ColumnSpec, DType, Element, Schema};
 
 use crate::{Error, Result};
 use buffer::Buffer;
-use rows::{RowsMut, Start};
+use rows::{ColumnStart, RowsMut};
 
 /// Named, typed, row-major arrays with a common number of rows.
 ///
@@ -25,7 +25,7 @@ pub struct Batch {
     rows: usize,
     data: Vec<Buffer>,
     /// The address of each column; refreshed whenever mutable rows are handed out, so that this allocates nothing.
-    starts: Vec<Start>,
+    starts: Vec<ColumnStart>,
 }
 
 impl Batch {
@@ -35,7 +35,7 @@ impl Batch {
             schema: schema.clone(),
             rows: 0,
             data: schema.columns().iter().map(|_| Buffer::default()).collect(),
-            starts: vec![Start::default(); schema.columns().len()],
+            starts: vec![ColumnStart::default(); schema.columns().len()],
         };
         batch.resize(rows);
         batch
@@ -64,12 +64,12 @@ impl Batch {
         self.rows = rows;
     }
 
-    /// The raw bytes of a column, row after row.
+    /// The bytes of a column, `[rows, row_bytes]`.
     pub fn bytes(&self, column: usize) -> &[u8] {
         self.data[column].bytes()
     }
 
-    /// The raw bytes of a column, row after row, for writing.
+    /// The bytes of a column, `[rows, row_bytes]`, for writing.
     pub fn bytes_mut(&mut self, column: usize) -> &mut [u8] {
         self.data[column].bytes_mut()
     }
@@ -94,7 +94,7 @@ impl Batch {
         Ok(bytemuck::cast_slice_mut(self.bytes_mut(index)))
     }
 
-    /// A column converted to `f32`, whatever its type: `[rows, shape…]`.
+    /// The elements of a column of any type, converted to `f32`: `[rows, shape…]`.
     ///
     /// # Errors
     /// When there is no such column.

@@ -11,7 +11,7 @@ pub struct RowRef<'a> {
 }
 
 impl<'a> RowRef<'a> {
-    /// The row of that index, which must exist.
+    /// Creates a reference to row `row`, which must exist.
     pub(super) fn new(batch: &'a Batch, row: usize) -> Self {
         Self { batch, row }
     }
@@ -30,17 +30,17 @@ impl<'a> RowRef<'a> {
     /// The elements of a column, `[shape…]`.
     ///
     /// # Errors
-    /// When there is no such column, or it holds another type.
+    /// When the batch has no such column, or the column holds another type.
     pub fn get<T: Element>(self, name: &str) -> Result<&'a [T]> {
         let index = self.schema().index(name)?;
         self.batch.check::<T>(index)?;
         Ok(self.at(index))
     }
 
-    /// The elements of a column as `f64`, whatever its type: `[shape…]`.
+    /// The elements of a column of any type, converted to `f64`: `[shape…]`.
     ///
     /// # Errors
-    /// When there is no such column.
+    /// When the batch has no such column.
     pub fn to_f64(self, name: &str) -> Result<Vec<f64>> {
         let index = self.schema().index(name)?;
         Ok(match self.schema().columns()[index].dtype {
@@ -52,7 +52,7 @@ impl<'a> RowRef<'a> {
         })
     }
 
-    /// The bytes of column `index`, whatever its type.
+    /// The bytes of column `index`, of any type.
     pub fn bytes(self, index: usize) -> &'a [u8] {
         let n = self.schema().columns()[index].row_bytes();
         &self.batch.bytes(index)[self.row * n..][..n]
@@ -65,7 +65,7 @@ impl<'a> RowRef<'a> {
 }
 
 pub use shared::RowMut;
-pub(super) use shared::{RowsMut, Start};
+pub(super) use shared::{ColumnStart, RowsMut};
 
 /// Disjoint rows of one batch, written by several threads at once.
 #[allow(unsafe_code, reason = "threads write disjoint rows of one buffer, which safe slices cannot express by column")]
@@ -74,27 +74,31 @@ mod shared {
 
     /// The address of a column's first byte.
     #[derive(Clone, Copy)]
-    pub(in crate::batch) struct Start(pub *mut u8);
+    pub(in crate::batch) struct ColumnStart(pub *mut u8);
 
-    impl Default for Start {
+    impl Default for ColumnStart {
         fn default() -> Self {
             Self(std::ptr::null_mut())
         }
     }
 
-    // SAFETY: a `Start` is only read through `RowsMut`, which borrows the batch mutably and refreshes it.
-    unsafe impl Send for Start {}
-    // SAFETY: as above.
-    unsafe impl Sync for Start {}
+    // SAFETY: a `ColumnStart` is only read through `RowsMut`, which borrows the batch mutably and refreshes it.
+    unsafe impl Send for ColumnStart {}
+    // SAFETY: as for `Send`.
+    unsafe impl Sync for ColumnStart {}
 
-    /// All rows of a mutably borrowed batch. The batch hands out each row at most once at a time.
+    /// All rows of a mutably borrowed batch. At most one [`RowMut`] of each row exists at a time.
     pub(in crate::batch) struct RowsMut<'a> {
         pub schema: &'a Schema,
         pub rows: usize,
-        pub starts: &'a [Start],
+        pub starts: &'a [ColumnStart],
     }
 
     impl<'a> RowsMut<'a> {
+        /// Returns row `row` for writing.
+        ///
+        /// # Panics
+        /// When the row does not exist.
         pub fn row(&self, row: usize) -> RowMut<'a> {
             assert!(row < self.rows, "row {row} of a batch of {} rows", self.rows);
             RowMut { schema: self.schema, starts: self.starts, row }
@@ -104,7 +108,7 @@ mod shared {
     /// One row of a batch, for writing.
     pub struct RowMut<'a> {
         schema: &'a Schema,
-        starts: &'a [Start],
+        starts: &'a [ColumnStart],
         row: usize,
     }
 
@@ -128,7 +132,7 @@ mod shared {
         pub fn bytes(&mut self, index: usize) -> &mut [u8] {
             let n = self.schema.columns()[index].row_bytes();
             // SAFETY: the batch is mutably borrowed while rows exist, so its buffers neither move nor are
-            // reached otherwise; each holds `rows * n` bytes, and rows are disjoint ranges of them.
+            // accessed in any other way; each holds `rows * n` bytes, and rows are disjoint ranges of these bytes.
             unsafe { std::slice::from_raw_parts_mut(self.starts[index].0.add(self.row * n), n) }
         }
 

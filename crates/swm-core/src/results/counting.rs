@@ -1,18 +1,18 @@
-//! [`Counting`]: which episodes count, and what counts as a success.
+//! [`Counting`]: the rule that decides which episodes count and which of them succeed.
 
 use super::{EpisodeResult, Proportion};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
-/// Which episodes count, and what counts as a success.
+/// The rule that decides which episodes count and which of them succeed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum Counting {
-    /// An episode that is solved at start is neither played nor counted. An episode succeeds when its observations satisfy
-    /// the goal (the column `success`) for `hold` consecutive steps within its budget.
+    /// An episode that is solved at start is neither played nor counted. An episode succeeds when its observations
+    /// satisfy the goal (the column `success`) for `hold` consecutive steps within its budget.
     Strict {
-        /// Consecutive steps that must satisfy the goal. With more than 1, the episode continues after the first success
-        /// until the goal is held or the budget is spent.
+        /// Consecutive steps that must satisfy the goal. With more than 1, the episode continues after the first
+        /// success until the goal is held or the budget is spent.
         hold: usize,
     },
     /// The counting of the Python package `stable-worldmodel` 0.1.1, for comparison with its figures. Every start is

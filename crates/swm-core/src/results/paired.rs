@@ -1,5 +1,7 @@
-//! [`Comparison`]: two policies on the same starts. Starts differ in difficulty, so a paired comparison uses the starts that
-//! only one of the policies solves.
+//! [`Comparison`]: a paired comparison of two policies on the same starts.
+//!
+//! Starts differ in difficulty. A paired test removes this variance: it depends only on the starts that exactly one of
+//! the policies solves.
 
 use super::{Counting, Proportion, Run};
 use serde::{Deserialize, Serialize};
@@ -29,14 +31,14 @@ pub struct Paired {
     pub only_b: usize,
     /// Starts that neither policy solved.
     pub neither: usize,
-    /// The two-sided p-value of McNemar's exact test: the probability, if both policies were equally good, of a split of the
-    /// starts that only one solved that is at least as uneven.
+    /// The two-sided p-value of McNemar's exact test. The null hypothesis is that `only_a` and `only_b` are equally
+    /// likely outcomes of the starts that exactly one policy solved.
     pub p: f64,
     /// The success rate of the first policy minus that of the second.
     pub difference: f64,
     /// The lower end of the 95 % interval of the difference.
     pub low: f64,
-    /// The upper end of the interval.
+    /// The upper end of the 95 % interval of the difference.
     pub high: f64,
 }
 
@@ -60,8 +62,8 @@ impl Comparison {
         })
     }
 
-    /// Compares every policy with those before it, condition by condition, so that a learned policy is compared with the
-    /// random-policy floor as `learned` minus `random`.
+    /// Compares every policy with those before it, condition by condition, so that a learned policy is compared with
+    /// the random-policy floor as `learned` minus `random`.
     pub fn all(runs: &[Run], counting: Counting) -> Vec<Self> {
         let later = runs.iter().enumerate();
         later.flat_map(|(i, run)| runs[..i].iter().filter_map(move |other| Self::of(run, other, counting))).collect()
@@ -71,8 +73,8 @@ impl Comparison {
 impl Paired {
     /// The statistics of a table of paired outcomes.
     ///
-    /// The test is the exact, conditional one (McNemar, "Note on the sampling error of the difference between
-    /// correlated proportions or percentages", 1947): two-sided binomial, with chance one half. The interval of the
+    /// The test is McNemar's exact conditional test (McNemar, "Note on the sampling error of the difference between
+    /// correlated proportions or percentages", 1947): a two-sided binomial test with p = 1/2. The interval of the
     /// difference is Newcombe's square-and-add ("Improved confidence intervals for the difference between
     /// binomial proportions based on paired data", 1998, method 10): Wilson intervals of both rates, combined by
     /// their correlation.
@@ -105,10 +107,10 @@ impl Paired {
     }
 }
 
-/// The probability that `b + c` fair coins split at least as unevenly as `b` to `c`, in either direction.
+/// Returns the two-sided p-value of the exact binomial test of `b` successes in `b + c` trials with p = 1/2.
 fn mcnemar(b: usize, c: usize) -> f64 {
     let (n, fewer) = (b + c, b.min(c));
-    // Logarithms of the binomial probabilities, which do not underflow for thousands of coins.
+    // Logarithms of the binomial probabilities, which do not underflow for thousands of trials.
     let mut term = n as f64 * 0.5f64.ln();
     let mut tail = 0.0;
     for k in 0..=fewer {
@@ -155,8 +157,8 @@ mod tests {
         {
             let paired = Paired::of(both, only_a, only_b, neither);
             assert!((paired.low - low).abs() < 6e-5 && (paired.high - high).abs() < 6e-5, "{paired:?}");
-            let turned = Paired::of(both, only_b, only_a, neither);
-            assert!((turned.low + paired.high).abs() < 1e-12 && (turned.high + paired.low).abs() < 1e-12);
+            let swapped = Paired::of(both, only_b, only_a, neither);
+            assert!((swapped.low + paired.high).abs() < 1e-12 && (swapped.high + paired.low).abs() < 1e-12);
         }
         assert!((Paired::of(1, 1, 7, 12).p - 0.0703).abs() < 5e-5);
         let same = Paired::of(30, 0, 0, 0);

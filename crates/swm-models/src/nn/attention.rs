@@ -1,11 +1,11 @@
-//! Multi-head attention and the feed-forward block of the transformers, under the parameter names of the published
+//! Multi-head attention and the feed-forward block of transformers. Parameters have the names of the published
 //! predictors.
 
 use super::{Activation, DropoutRng, Init, LayerNorm, Linear};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData, activation};
 
-/// Added to the variance by the normalisations of these blocks.
+/// The epsilon of the layer normalisations.
 const EPSILON: f64 = 1e-5;
 
 /// Computes scaled dot-product attention with `heads` heads, `softmax(Q Kᵀ / √d + mask) V` (Vaswani et al. 2017,
@@ -32,11 +32,11 @@ pub fn attend(
     weights.matmul(split(value, keys)).swap_dims(1, 2).reshape([rows, queries, inner])
 }
 
-/// Returns the mask of causal attention over `frames` frames: minus infinity where a key belongs to a later frame than
-/// the query, else 0. Queries and keys are each a whole number of tokens per frame.
+/// Returns the additive mask of causal attention over `frames` frames: minus infinity if the key belongs to a later
+/// frame than the query, otherwise 0. The numbers of queries and of keys are multiples of `frames`.
 ///
 /// # Shapes
-/// `[1, 1, queries, keys]`.
+/// Returns `[1, 1, queries, keys]`.
 pub fn causal_mask([queries, keys]: [usize; 2], frames: usize, device: &Device) -> Tensor<4> {
     let is_later = |i: usize| (i % keys) * frames / keys > (i / keys) * frames / queries;
     let mask: Vec<f32> = (0..queries * keys).map(|i| if is_later(i) { f32::NEG_INFINITY } else { 0.0 }).collect();
@@ -48,29 +48,32 @@ pub fn causal_mask([queries, keys]: [usize; 2], frames: usize, device: &Device) 
 pub struct SelfAttention {
     /// The normalisation before the attention.
     pub norm: LayerNorm,
-    /// Queries, keys and values in one layer.
+    /// The projection to queries, keys and values.
     pub to_qkv: Linear,
-    /// The output projection; absent for a single head of the tokens' size.
+    /// The output projection; `None` for a single head whose dimension is that of the tokens.
     pub to_out: Option<AttentionOutput>,
     heads: usize,
     dropout: f32,
 }
 
-/// The output projection of an attention block. A field `_0` is element 0 of a sequence.
+/// The output projection of an attention block. The field `_0` is element 0 of a `torch.nn.Sequential`.
 #[derive(Module, Debug)]
 pub struct AttentionOutput {
-    /// The layer.
+    /// The linear layer.
     pub _0: Linear,
 }
 
 impl AttentionOutput {
-    /// An output projection from `heads` heads of `dim_head` features to `dim` features; `None` for a single head of
-    /// that size.
+    /// Creates a projection from `heads` heads of `dim_head` features to `dim` features; returns `None` for a single
+    /// head with `dim_head == dim`.
     pub(crate) fn new(init: &Init, [heads, dim_head]: [usize; 2], dim: usize) -> Option<Self> {
         (heads != 1 || dim_head != dim).then(|| Self { _0: Linear::new(&init.of("to_out"), heads * dim_head, dim) })
     }
 
-    /// Applies the projection, if there is one, with dropout.
+    /// Applies the projection and dropout if `output` is present; otherwise returns `x`.
+    ///
+    /// # Shapes
+    /// Maps `[rows, tokens, heads * dim_head]` to `[rows, tokens, dim]`.
     pub(crate) fn apply(output: Option<&Self>, x: Tensor<3>, dropout: f32, rng: &mut DropoutRng<'_>) -> Tensor<3> {
         match output {
             Some(output) => rng.dropout(output._0.forward(x), dropout),
@@ -80,7 +83,7 @@ impl AttentionOutput {
 }
 
 impl SelfAttention {
-    /// Self-attention of tokens with `dim` features.
+    /// Creates self-attention for tokens with `dim` features.
     pub(crate) fn new(init: &Init, dim: usize, [heads, dim_head]: [usize; 2], dropout: f32) -> Self {
         Self {
             norm: LayerNorm::new(init, dim, EPSILON),
@@ -91,7 +94,7 @@ impl SelfAttention {
         }
     }
 
-    /// Attention between the tokens of each window.
+    /// Computes attention between the tokens of each window.
     ///
     /// # Shapes
     /// `x` is `[windows, tokens, dim]`, `mask` is `[1, 1, tokens, tokens]`; returns `[windows, tokens, dim]`.
@@ -101,17 +104,21 @@ impl SelfAttention {
         AttentionOutput::apply(self.to_out.as_ref(), mixed, self.dropout, rng)
     }
 
-    /// Attention in windows of one token, which attends to itself alone. Draws no dropout of attention weights.
+    /// Computes attention in windows of one token, where the output is the projected value. Applies no dropout to the
+    /// attention weights.
     ///
     /// # Shapes
-    /// `[windows, 1, dim]` to the same.
+    /// Maps `[windows, 1, dim]` to the same shape.
     pub(crate) fn forward_single(&self, x: Tensor<3>, rng: &mut DropoutRng<'_>) -> Tensor<3> {
         let qkv = self.to_qkv.forward(self.norm.forward(x));
         AttentionOutput::apply(self.to_out.as_ref(), third(&qkv, 2), self.dropout, rng)
     }
 }
 
-/// Returns one third of the features.
+/// Returns the queries (`part` 0), keys (1) or values (2) of a joint projection.
+///
+/// # Shapes
+/// Maps `[windows, tokens, 3 * inner]` to `[windows, tokens, inner]`.
 fn third(qkv: &Tensor<3>, part: usize) -> Tensor<3> {
     let [windows, tokens, features] = qkv.dims();
     let inner = features / 3;
@@ -121,24 +128,24 @@ fn third(qkv: &Tensor<3>, part: usize) -> Tensor<3> {
 /// A feed-forward block: normalisation, linear, GELU, linear, with dropout after GELU and after the last layer.
 #[derive(Module, Debug)]
 pub struct FeedForward {
-    /// The sequence.
+    /// The layers.
     pub net: FeedForwardNet,
     dropout: f32,
 }
 
-/// The sequence of a [`FeedForward`] block.
+/// The layers of a [`FeedForward`] block. A field `_i` is element i of a `torch.nn.Sequential`.
 #[derive(Module, Debug)]
 pub struct FeedForwardNet {
-    /// The normalisation.
+    /// The layer normalisation.
     pub _0: LayerNorm,
-    /// Into the hidden features.
+    /// The linear layer to the hidden features.
     pub _1: Linear,
-    /// From the hidden features.
+    /// The linear layer from the hidden features.
     pub _4: Linear,
 }
 
 impl FeedForward {
-    /// A block of tokens with `dim` features and `hidden` hidden features.
+    /// Creates a block for tokens with `dim` features and `hidden` hidden features.
     pub(crate) fn new(init: &Init, dim: usize, hidden: usize, dropout: f32) -> Self {
         Self {
             net: FeedForwardNet {
@@ -150,8 +157,10 @@ impl FeedForward {
         }
     }
 
+    /// Applies the block.
+    ///
     /// # Shapes
-    /// `[rows, tokens, dim]` to the same.
+    /// Maps `[rows, tokens, dim]` to the same shape.
     pub(crate) fn forward(&self, x: Tensor<3>, rng: &mut DropoutRng<'_>) -> Tensor<3> {
         let hidden = Activation::Gelu.forward(self.net._1.forward(self.net._0.forward(x)));
         let hidden = rng.dropout(hidden, self.dropout);

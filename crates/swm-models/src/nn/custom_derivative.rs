@@ -2,10 +2,10 @@
 
 use burn::tensor::Tensor;
 
-/// Returns `value` as a function of `x` whose elementwise derivative is `derivative`; both are outside of any graph.
+/// Returns `value` with the elementwise derivative `derivative` with respect to `x`; both are detached tensors.
 ///
-/// The difference that is added to the value is exactly 0, and its gradient is the derivative times the incoming
-/// gradient. The graph then holds one product, whatever the function.
+/// Computes `(x - detach(x)) * derivative + value`. The first term is exactly 0 and carries the gradient, so the graph
+/// contains one product for any function.
 ///
 /// # Shapes
 /// All tensors have the same shape.

@@ -1,4 +1,4 @@
-//! [`Pldm`]: a world model and the inverse dynamics of its training loss.
+//! [`Pldm`]: a world model, and the inverse-dynamics network of its training loss.
 
 use crate::lewm::{Lewm, LewmConfig};
 use crate::nn::{Activation, Init, LayerNorm, Linear};
@@ -6,39 +6,39 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
 
-/// A PLDM. Planning uses the world model only; the inverse dynamics are part of the loss.
+/// The networks of a PLDM. Planning uses the world model only; the inverse dynamics are part of the loss.
 #[derive(Module, Debug)]
 pub struct Pldm {
     /// The world model, with the networks of a LeWM.
     pub model: Lewm,
-    /// Predicts the action between a latent and the next one.
+    /// The inverse dynamics, which predict the action between two successive latents.
     pub idm: Idm,
 }
 
 /// Inverse dynamics: linear, layer normalisation, GELU, linear.
 #[derive(Module, Debug)]
 pub struct Idm {
-    /// The sequence.
+    /// The layers.
     pub net: IdmNet,
 }
 
-/// The sequence of an [`Idm`].
+/// The layers of an [`Idm`]. A field `_i` is element i of a `torch.nn.Sequential`.
 #[derive(Module, Debug)]
 pub struct IdmNet {
-    /// Into the hidden features.
+    /// The linear layer to the hidden features.
     pub _0: Linear,
-    /// The normalisation.
+    /// The layer normalisation.
     pub _1: LayerNorm,
-    /// From the hidden features.
+    /// The linear layer from the hidden features.
     pub _3: Linear,
 }
 
-/// Number added to the variance by the normalisation.
+/// The epsilon of the layer normalisation.
 const EPSILON: f64 = 1e-5;
 
 impl Pldm {
-    /// A model with random weights for actions of `actions` elements per model step, whose inverse dynamics have `hidden`
-    /// features.
+    /// Creates a model with random weights. A model step has an action of dimension `actions`; the inverse dynamics
+    /// have `hidden` hidden features.
     pub fn init(config: &LewmConfig, actions: usize, hidden: usize, key: Key, device: &Device) -> Self {
         let init = Init::new(key, device).of("idm");
         let model = Lewm::init(config, actions, key, device);
@@ -47,7 +47,7 @@ impl Pldm {
 }
 
 impl Idm {
-    /// Inverse dynamics for latents of dimension `latent`, with random weights.
+    /// Creates inverse dynamics with random weights for latents of dimension `latent`.
     pub fn new(init: &Init, latent: usize, hidden: usize, actions: usize) -> Self {
         Self {
             net: IdmNet {
@@ -64,9 +64,9 @@ impl Idm {
     /// `latents` is `[clips, steps, latent]`; returns `[clips, steps - 1, actions]`.
     pub fn forward(&self, latents: Tensor<3>) -> Tensor<3> {
         let [clips, steps, latent] = latents.dims();
-        let frames = |from: usize, to: usize| latents.clone().slice([0..clips, from..to, 0..latent]);
-        // The later latent comes first, as published.
-        let pairs = Tensor::cat(vec![frames(1, steps), frames(0, steps - 1)], 2);
+        let range = |from: usize, to: usize| latents.clone().slice([0..clips, from..to, 0..latent]);
+        // As in the published code, the later latent precedes the earlier one.
+        let pairs = Tensor::cat(vec![range(1, steps), range(0, steps - 1)], 2);
         let hidden = self.net._1.forward(self.net._0.forward(pairs));
         self.net._3.forward(Activation::Gelu.forward(hidden))
     }

@@ -1,5 +1,5 @@
 //! SAC, soft actor-critic (Haarnoja et al. 2018, arXiv 1812.05905): a stochastic policy trained online with an entropy
-//! bonus. It collects demonstrations: `swm collect --policy CHECKPOINT`. See `docs/models/sac.md`.
+//! bonus. `swm collect --policy CHECKPOINT` collects demonstrations with a trained policy. See `docs/models/sac.md`.
 
 mod config;
 mod family;
@@ -11,5 +11,5 @@ pub use config::{SacConfig, SacLoss};
 pub use family::ENTRY;
 pub use model::{ActionSample, Actor, Critic, Critics, Hidden, Sac};
 
-/// Acts with a trained SAC: `tanh` of the policy's mean.
+/// The policy of a trained SAC. Its action is the `tanh` of the actor's mean.
 pub type SacPolicy = crate::online::StochasticPolicy<Sac>;

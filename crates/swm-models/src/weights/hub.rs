@@ -1,8 +1,8 @@
-//! Files of the Hugging Face hub, downloaded once and cached.
+//! [`Hub`]: downloads files of the Hugging Face hub and caches them.
 //!
-//! The cache has the layout of the hub's own libraries (`models--OWNER--NAME/snapshots/REVISION/FILE`), and files in
-//! their cache (`$HF_HOME`, by default `~/.cache/huggingface`) are used, too. Downloads go through our object stores,
-//! because the hub's client would add a second HTTP stack.
+//! The cache has the layout of Python's `huggingface_hub` (`models--OWNER--NAME/snapshots/REVISION/FILE`). Files in the
+//! cache of that package (`$HF_HOME`, by default `~/.cache/huggingface`) are used as well. Downloads use the
+//! object-store client of `swm-data`, because the hub's Rust client would add a second HTTP stack.
 
 use hf_hub::{Cache, Repo, RepoType};
 use std::io::Write as _;
@@ -11,19 +11,19 @@ use swm_core::{Error, Result};
 use swm_data::Location;
 use swm_data::objects::ObjectFile;
 
-/// Bytes per request.
-const PIECE: u64 = 32 << 20;
+/// The size of a download request, in bytes.
+const CHUNK: u64 = 32 << 20;
 
 /// The hub and the caches of its files.
 pub struct Hub {
     endpoint: String,
     cache: PathBuf,
-    /// The cache of the hub's own libraries.
+    /// The cache of Python's `huggingface_hub`.
     library_cache: Option<PathBuf>,
 }
 
 impl Hub {
-    /// The hub at the address in `HF_ENDPOINT` (by default `https://huggingface.co`); its files are cached in the
+    /// Creates a client for the address in `HF_ENDPOINT` (by default `https://huggingface.co`) that caches files in the
     /// folder `cache`.
     pub fn new(cache: &Path) -> Self {
         let variable = |name| std::env::var(name).ok().filter(|value| !value.is_empty());
@@ -34,16 +34,16 @@ impl Hub {
         Self { endpoint, cache: cache.to_owned(), library_cache: home.map(|home| home.join("hub")) }
     }
 
-    /// The hub at `endpoint`, with no cache but the folder `cache`.
+    /// Creates a client for `endpoint` that uses the folder `cache` only.
     pub fn at(endpoint: &str, cache: &Path) -> Self {
         Self { endpoint: endpoint.to_owned(), cache: cache.to_owned(), library_cache: None }
     }
 
-    /// Returns the path of a file of a repository (`OWNER/NAME`, or `OWNER/NAME@REVISION`), which is downloaded unless
-    /// it is cached.
+    /// Returns the path of a file of a repository (`OWNER/NAME` or `OWNER/NAME@REVISION`); downloads the file if it is
+    /// not cached.
     ///
     /// # Errors
-    /// When it is not cached and the hub has no such file or cannot be reached.
+    /// When the file is not cached, and the hub does not have it or cannot be reached.
     pub fn fetch(&self, repo: &str, file: &str) -> Result<PathBuf> {
         let (id, revision) = repo.split_once('@').unwrap_or((repo, "main"));
         let repository = Repo::with_revision(id.to_owned(), RepoType::Model, revision.to_owned());
@@ -57,8 +57,8 @@ impl Hub {
             other => Error::external(
                 format!("fetching {file} of {repo}"),
                 format!(
-                    "{other}; is there a network? (without one, fetch {url} elsewhere and give the file's path instead; \
-                     repositories that ask for a token cannot be fetched here)"
+                    "{other}; check the network connection, or download {url} on another machine and give the file's path \
+                     (repositories that require a token are not supported)"
                 ),
             ),
         };
@@ -71,12 +71,12 @@ impl Hub {
         };
         let folder = path.parent().unwrap_or(&self.cache);
         std::fs::create_dir_all(folder).map_err(io(folder, "creating a folder"))?;
-        // Renamed when complete, so that two processes may download the same file at once.
+        // Renaming the complete file allows two processes to download the same file at the same time.
         let part = path.with_extension(format!("part-{}", std::process::id()));
         let mut out = std::fs::File::create(&part).map_err(io(&part, "saving a download"))?;
         let mut done = 0;
         while done < remote.len() {
-            let end = (done + PIECE).min(remote.len());
+            let end = (done + CHUNK).min(remote.len());
             for bytes in remote.read(std::slice::from_ref(&(done..end))).map_err(unreachable)? {
                 out.write_all(&bytes).map_err(io(&part, "saving a download"))?;
             }
@@ -97,11 +97,11 @@ pub fn fetch(repo: &str, file: &str, cache: &Path) -> Result<PathBuf> {
     Hub::new(cache).fetch(repo, file)
 }
 
-/// Returns the path of the weights `from`: a local file, or a Hugging Face repository (`OWNER/NAME`), whose files are
-/// cached in the folder `cache`.
+/// Returns the path of a file of weights; `from` is a local file or a Hugging Face repository (`OWNER/NAME`), whose
+/// files are cached in the folder `cache`.
 ///
 /// # Errors
-/// When there is neither, or the hub cannot be reached.
+/// When `from` is neither, or the hub cannot be reached.
 pub fn locate(from: &str, cache: &Path) -> Result<PathBuf> {
     let path = PathBuf::from(from);
     if path.is_file() {
@@ -110,12 +110,13 @@ pub fn locate(from: &str, cache: &Path) -> Result<PathBuf> {
     let mut parts = from.split('/');
     let is_repo = parts.by_ref().take(2).filter(|part| !part.is_empty() && !part.starts_with('.')).count() == 2;
     if !is_repo || parts.next().is_some() {
-        let fix = "give a file of weights, or a repository of the Hugging Face hub such as facebook/dinov2-small";
+        let fix =
+            "give the path of a weights file, or a repository of the Hugging Face hub such as facebook/dinov2-small";
         return Err(Error::config("weights", format!("there is no file '{from}'"), fix));
     }
     let hub = Hub::new(cache);
     match hub.fetch(from, "model.safetensors") {
-        // Early repositories have no safetensors file.
+        // Older repositories have no safetensors file.
         Err(Error::Corrupt { .. }) => hub.fetch(from, "pytorch_model.bin"),
         found => found,
     }

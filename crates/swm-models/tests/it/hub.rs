@@ -67,5 +67,5 @@ fn unreachable_hub_error_names_the_fix() {
     // A name that can never be resolved.
     let hub = Hub::at("http://hub.invalid", folder.path());
     let message = hub.fetch("owner/name", "model.safetensors").expect_err("unreachable").to_string();
-    assert!(message.contains("is there a network?") && message.contains("give the file's path"), "{message}");
+    assert!(message.contains("check the network connection") && message.contains("give the file's path"), "{message}");
 }

@@ -1,5 +1,5 @@
-//! Golden tests of Fetch and OGBench: every recorded rollout is replayed step by step and compared in states, observations,
-//! rewards, infos, and the first and last frame.
+//! Golden tests of Fetch and OGBench: every recorded rollout is replayed step by step and compared in states,
+//! observations, rewards, infos, and the first and last frame.
 
 use crate::similarity::ImageSimilarity;
 use std::collections::BTreeMap;
@@ -15,9 +15,9 @@ struct Family {
     includes: fn(&str) -> bool,
     /// The largest allowed difference, relative for values above 1.
     tolerance: f64,
-    /// Selects the factors that reached the model when a file was recorded.
+    /// Selects the factors that the reference applied when it recorded a file.
     factors: fn(&str, VariationRequest) -> VariationRequest,
-    /// Fills in the task state at the start.
+    /// Writes the task state at the start.
     task_state: fn(&mut Golden, &mut [f64]),
     /// Seconds per action: joint velocities are compared as displacements in this time.
     step: f64,
@@ -25,7 +25,7 @@ struct Family {
     comparable_rows: fn(&str, &mut Golden) -> usize,
     /// Names of infos in the reference and of the corresponding columns, where they differ.
     renamed: &'static [(&'static str, &'static str)],
-    /// Edits the start state to the goal (a `state` column or a position), where the goal is not part of the state.
+    /// Changes a copy of the start state into the goal (a `state` column or a position).
     goal: fn(&mut Golden, &mut Vec<f64>),
 }
 
@@ -34,7 +34,8 @@ const FAMILIES: &[Family] = &[
         includes: |id| id.starts_with("swm/Fetch"),
         // Recorded with MuJoCo 3.3.2.
         tolerance: 1e-4,
-        // When asked for `all`, the reference samples every factor but applies only this one: it compares names of requests.
+        // For a request of `all`, the reference samples every factor but applies this one only, because it tests for
+        // the names in the request.
         factors: |file, mut request| {
             if file.contains("-all-") {
                 request.variation_values.retain(|key, _| key == "block.mass");
@@ -70,14 +71,16 @@ const FAMILIES: &[Family] = &[
         comparable_rows: |_, _| usize::MAX,
         renamed: &[],
         goal: |golden, state| {
-            // Files without a recorded goal never reached it: any unreachable point will do.
+            // Files without a recorded goal end before the goal is reached, so an unreachable point gives the same
+            // results.
             let goal = if golden.has("goal.xy") { golden.values("goal.xy") } else { vec![1e3, 1e3] };
             state[1..3].copy_from_slice(&goal);
         },
     },
 ];
 
-/// The task state of a table: contact, locks now and before, and the pose before.
+/// Writes the task state of a table: gripper contact, button states of this and the previous step, and the previous
+/// pose.
 fn table_task_state(golden: &mut Golden, task_state: &mut [f64]) {
     task_state[0] = golden.values("info.proprio/gripper_contact")[0];
     if golden.has("info.button_states") {
@@ -108,8 +111,9 @@ fn table_goal(golden: &mut Golden, state: &mut [f64]) {
     }
 }
 
-/// All rows; for Slide, those before the puck is struck or the simulation becomes chaotic. A puck is a cylinder: contacts with a
-/// finger are computed iteratively, with last digits that differ between versions, and contacts with the table jump along its rim.
+/// All rows; for Slide, those before the puck is struck or the simulation becomes chaotic. A puck is a cylinder:
+/// contacts with a finger are computed iteratively, with last digits that differ between versions, and contacts with
+/// the table jump along its rim.
 fn fetch_rows(file: &str, golden: &mut Golden) -> usize {
     if !file.contains("FetchSlide") {
         return usize::MAX;
@@ -121,11 +125,11 @@ fn fetch_rows(file: &str, golden: &mut Golden) -> usize {
     struck.min(rows_before_chaos(&FAMILIES[0], file, golden))
 }
 
-/// Infos without a column, or that cannot be compared: the name, success (which the pool writes), and the observation at a goal
-/// whose state was not recorded.
+/// Infos without a column, or that cannot be compared: the name, success (which the pool writes), and the observation
+/// at a goal whose state was not recorded.
 const SKIPPED_INFOS: [&str; 4] = ["env_name", "success", "is_success", "target"];
 
-/// The largest allowed mean absolute difference of images, of 255.
+/// The largest allowed mean absolute difference of images, in units of 1/255.
 const IMAGE_TOLERANCE: f64 = 3.0;
 
 /// The recorded parts of the physics' state, in the order of the `state` column.
@@ -181,8 +185,8 @@ fn column(env: &dyn Env, name: &str) -> Vec<f64> {
     row.row(0).to_f64(name).expect("a column")
 }
 
-/// All rows before the simulation becomes chaotic: where the gripper's mesh touches a button, the contacts that MuJoCo finds jump
-/// with the last digit of a pose, and the reference does not reproduce its own recording.
+/// All rows before the simulation becomes chaotic: where the gripper's mesh touches a button, the contacts that MuJoCo
+/// finds jump with the last digit of a pose, and the reference does not reproduce its own recording.
 fn table_rows(name: &str, golden: &mut Golden) -> usize {
     rows_before_chaos(&FAMILIES[1], name, golden)
 }
@@ -208,8 +212,8 @@ fn rows_before_chaos(family: &Family, name: &str, golden: &mut Golden) -> usize 
     };
     let unperturbed = play(0.0);
     let diverged = [1e-13, -1e-13, 1e-14].into_iter().filter_map(|perturbation| {
-        let apart = |(a, b): (&Vec<f64>, &Vec<f64>)| a.iter().zip(b).any(|(a, b)| (a - b).abs() > 1e-8);
-        unperturbed.iter().zip(&play(perturbation)).position(apart)
+        let differs = |(a, b): (&Vec<f64>, &Vec<f64>)| a.iter().zip(b).any(|(a, b)| (a - b).abs() > 1e-8);
+        unperturbed.iter().zip(&play(perturbation)).position(differs)
     });
     // Row t + 1 follows action t.
     diverged.min().map_or(usize::MAX, |step| step + 1)
@@ -355,12 +359,13 @@ impl<'a> Comparison<'a> {
         let Some(theirs) = recorded.get(step * ours.len()..(step + 1) * ours.len()) else {
             return self.note_difference(array, step, f64::NAN);
         };
-        let apart = |(a, b): (&f64, &f64)| match (a.is_nan(), b.is_nan()) {
+        let difference = |(a, b): (&f64, &f64)| match (a.is_nan(), b.is_nan()) {
             (true, true) => 0.0,
             _ => (a - b).abs() / b.abs().max(1.0),
         };
-        let most = ours.iter().zip(theirs).map(apart).fold(0.0, |a: f64, b| if b.is_nan() { b } else { a.max(b) });
-        self.note_difference(array, step, most);
+        let largest =
+            ours.iter().zip(theirs).map(difference).fold(0.0, |a: f64, b| if b.is_nan() { b } else { a.max(b) });
+        self.note_difference(array, step, largest);
     }
 
     fn note_difference(&mut self, array: &str, step: usize, value: f64) {
@@ -373,17 +378,17 @@ impl<'a> Comparison<'a> {
     /// Compares the frames of both renderers with a recorded image.
     fn compare_image(&mut self, array: &str, names: &[String]) {
         if names.iter().any(|name| name == array) {
-            let (height, width, wanted) = self.golden.image(array);
-            let mut rgb = vec![0; wanted.len()];
+            let (height, width, expected) = self.golden.image(array);
+            let mut rgb = vec![0; expected.len()];
             let frame = FrameMut::new(width, height, &mut rgb);
             render::with(Choice::Cpu, || self.env.render(frame)).unwrap_or_else(|error| panic!("{error}"));
             let name = format!("{}-{array}", self.name);
-            if !ImageSimilarity::report(&name, &rgb, &wanted, width).is_close() {
+            if !ImageSimilarity::report(&name, &rgb, &expected, width).is_close() {
                 self.note_difference(&format!("{array} (cpu)"), 0, f64::INFINITY);
             }
             let frame = FrameMut::new(width, height, &mut rgb);
             render::with(Choice::Egl, || self.env.render(frame)).unwrap_or_else(|error| panic!("{error}"));
-            self.note_difference(array, 0, image_difference(&rgb, &wanted));
+            self.note_difference(array, 0, image_difference(&rgb, &expected));
         }
     }
 }

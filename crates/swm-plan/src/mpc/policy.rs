@@ -1,16 +1,17 @@
 //! [`MpcPolicy`]: a policy that plans with a solver and a model.
 //!
-//! Slots that have executed their part of a plan replan together, in one [`Solver::solve`] call; the others keep executing. A
-//! plan is keyed by (episode, replan), so an episode is the same in whichever slot and together with whichever other episodes
-//! it is played.
+//! Slots that have executed their part of a plan replan together, in one [`Solver::solve`] call; the others keep
+//! executing. A plan is keyed by (episode, replan), so an episode is the same in any slot and together with any other
+//! episodes it is played.
 //!
 //! # Actions
-//! Points of a box are planned in model units ([`ActionScale`]) and clipped to the box when they are executed. Integers are
-//! planned as choices, with a one-hot vector for each integer. The `action_block` actions of a model step are concatenated.
+//! Points of a box are planned in model units ([`ActionScale`]) and clipped to the box when they are executed. Integers
+//! are planned as choices, with a one-hot vector for each integer. The `action_block` actions of a model step are
+//! concatenated.
 //!
 //! # Inputs of the model
-//! [`CostModel::observe_env`] receives the environments that are about to be planned for, [`CostModel::observe`] their info
-//! columns. With `history` above 1 there are these additional columns, oldest step first:
+//! [`CostModel::observe_env`] receives the environments that are about to be planned for, [`CostModel::observe`] their
+//! info columns. With `history` above 1 there are these additional columns, oldest step first:
 //!
 //! | column | shape | |
 //! | --- | --- | --- |
@@ -76,8 +77,8 @@ struct Scratch {
 }
 
 impl MpcPolicy {
-    /// A planning policy for `slots` environments of `spec`. `scale` is that of the model ([`ActionScale::unscaled`] for a
-    /// model that uses the environment's own units).
+    /// A planning policy for `slots` environments of `spec`. `scale` is that of the model ([`ActionScale::unscaled`]
+    /// for a model that uses the environment's own units).
     ///
     /// # Errors
     /// When the settings contradict each other, or the environment's actions cannot be planned or do not fit `scale`.
@@ -267,7 +268,8 @@ impl Policy for MpcPolicy {
         Ok(())
     }
 
-    /// Seconds each plan took, encoding the present included; the time of a call is divided equally among its environments.
+    /// Seconds each plan took, encoding the present included; the time of a call is divided equally among its
+    /// environments.
     fn take_latencies(&mut self) -> Vec<f64> {
         std::mem::take(&mut self.latencies)
     }

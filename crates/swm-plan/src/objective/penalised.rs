@@ -1,13 +1,14 @@
-//! [`Penalised`]: a model whose constraints are part of its cost, for solvers without constraints.
+//! [`Penalised`]: adds the constraint violations of a model to its cost, for solvers that do not handle constraints.
 
 use crate::search::{Settings, UNWRITTEN};
 use swm_core::{Batch, Candidates, CostModel, Env, Error, Result};
 
 /// Adds `weight` times the sum of all violations, `Σ max(0, g)`, to the cost of a candidate.
 ///
-/// The penalty is exact: with a weight above the largest Lagrange multiplier of the optimum, the cheapest candidate is the
-/// optimum itself, not a point near it. In return, the cost has a kink at the boundary. Sampling solvers are not affected;
-/// gradient solvers are, and should handle constraints themselves ([`Need::Constraints`](crate::Need::Constraints)).
+/// The penalty is exact: with a weight above the largest Lagrange multiplier of the optimum, the cheapest candidate is
+/// the optimum itself, not a point near it. In return, the cost has a kink at the boundary. Sampling solvers are not
+/// affected; gradient solvers are, and should handle constraints themselves
+/// ([`Need::Constraints`](crate::Need::Constraints)).
 pub struct Penalised {
     model: Box<dyn CostModel>,
     weight: f32,
@@ -15,7 +16,7 @@ pub struct Penalised {
 }
 
 impl Penalised {
-    /// Wraps a model.
+    /// Creates a penalised cost from a model with constraints and the weight of the penalty.
     ///
     /// # Errors
     /// When the model has no constraints or the weight is not a finite number above 0.

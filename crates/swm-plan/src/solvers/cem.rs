@@ -1,9 +1,10 @@
 //! [`Cem`]: the cross-entropy method.
 //!
-//! Rubinstein and Kroese, *The Cross-Entropy Method* (2004), as algorithm "CEM solver" of the stable-worldmodel paper. Each
-//! iteration samples a diagonal Gaussian over action sequences and refits it to the cheapest samples (the elites); the last
-//! mean is the plan. The first candidate of every iteration is the mean itself. Candidates are `[envs, samples, horizon,
-//! dim]`. The defaults are those of the paper's experiments and of the reference implementation.
+//! Rubinstein and Kroese, *The Cross-Entropy Method* (2004), as algorithm "CEM solver" of the stable-worldmodel paper.
+//! Each iteration samples a diagonal Gaussian over action sequences and refits it to the cheapest samples (the elites);
+//! the last mean is the plan. The first candidate of every iteration is the mean itself. Candidates are
+//! `[envs, samples, horizon, dim]`. The defaults are those of the paper's experiments and of the reference
+//! implementation.
 //!
 //! The paper leaves two points open:
 //! - The standard deviation of the elites is the unbiased one (divided by `elites - 1`), as in the reference
@@ -11,15 +12,15 @@
 //! - `sigma` is the initial standard deviation σ₀; the reference calls it `var_scale` and uses it in the same way.
 //!
 //! Intended differences from the paper and the reference:
-//! - Candidates are clipped to the bounds of the problem, the first one included. Without clipping, the model would evaluate
-//!   actions that the environment clips before it executes them, so the cost of the plan would not be the cost of what
-//!   happens. Infinite bounds give the paper's algorithm.
+//! - Candidates are clipped to the bounds of the problem, the first one included. Without clipping, the model would
+//!   evaluate actions that differ from the executed ones, which the environment clips. Infinite bounds give the paper's
+//!   algorithm.
 //! - Every candidate has a fixed position in a random stream keyed by (plan key, iteration); the reference draws all
-//!   environments from one generator. A plan has the same bytes whichever other environments are planned in the same call,
-//!   and for any number of threads.
+//!   environments from one generator. A plan has the same bytes for any set of environments planned in the same call
+//!   and any number of threads.
 //! - Equal costs are ordered by index; costs that are not finite are errors.
-//! - [`Plan::costs`] is the lowest cost of the last iteration; the reference reports the mean cost of the elites, which is in
-//!   the trace here.
+//! - [`Plan::costs`] is the lowest cost of the last iteration; the reference reports the mean cost of the elites, which
+//!   is in the trace here.
 
 use crate::entry::{ActionKind, Family, SolverEntry, defaults, make};
 use crate::search::{Gaussian, Population, Settings, average, continuous, iterate};

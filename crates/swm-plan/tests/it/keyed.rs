@@ -1,5 +1,5 @@
-//! Every draw has a key: the plan of an environment has the same bytes whichever other environments are planned in the same
-//! call, and on any number of threads.
+//! Every draw has a key: the plan of an environment has the same bytes for any other environments that are planned in
+//! the same call, and on any number of threads.
 
 use crate::solvers::{solves, trial};
 use crate::toys::{Model, TOYS, Toy, solve};

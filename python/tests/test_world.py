@@ -99,7 +99,7 @@ def test_policies_of_python_and_of_the_engine_collect(tmp_path):
     rows = np.tile([True] * 6 + [False], 5)
     assert (actions[rows] == 0.5).all() and np.isnan(actions[~rows]).all()
     # There is one already.
-    with pytest.raises(ValueError, match="there is one already"):
+    with pytest.raises(ValueError, match="it exists already"):
         world.collect(tmp_path / "a.lance", episodes=5, seed=1, progress=False)
     more = world.collect(tmp_path / "a.lance", episodes=2, seed=1, mode="append", progress=False)
     assert more == {"episodes": 7, "added": 2, "steps": 12}

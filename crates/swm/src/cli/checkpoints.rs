@@ -108,7 +108,7 @@ fn show(given: &str, as_json: bool) -> anyhow::Result<()> {
 
 fn list(as_json: bool) -> anyhow::Result<()> {
     let folder = home::checkpoints();
-    let found: Vec<Value> = names_in(&folder)
+    let summaries: Vec<Value> = names_in(&folder)
         .into_iter()
         .map(|name| match load(&name) {
             Ok((_, info)) => json!({
@@ -122,14 +122,14 @@ fn list(as_json: bool) -> anyhow::Result<()> {
         })
         .collect();
     if as_json {
-        return emit_json(&found);
+        return emit_json(&summaries);
     }
-    if found.is_empty() {
+    if summaries.is_empty() {
         emit(&format!("no checkpoints in {}; `swm train lewm --data DATASET` trains one\n", folder.display()));
         return Ok(());
     }
     let text = |value: &Value| value.as_str().unwrap_or("?").to_owned();
-    let rows = found.iter().map(|found| match found.get("error") {
+    let rows = summaries.iter().map(|found| match found.get("error") {
         Some(error) => vec![text(&found["name"]), text(error)],
         None => vec![
             text(&found["name"]),

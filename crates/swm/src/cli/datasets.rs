@@ -65,7 +65,7 @@ pub fn datasets(args: &DatasetsArgs, as_json: bool) -> anyhow::Result<()> {
         return Ok(());
     }
     let folder = home::datasets();
-    let found: Vec<Value> = names_in(&folder)
+    let summaries: Vec<Value> = names_in(&folder)
         .into_iter()
         .map(|name| match open(&name).and_then(|reader| summary(&*reader)) {
             Ok(mut found) => {
@@ -76,14 +76,14 @@ pub fn datasets(args: &DatasetsArgs, as_json: bool) -> anyhow::Result<()> {
         })
         .collect();
     if as_json {
-        return emit_json(&found);
+        return emit_json(&summaries);
     }
-    if found.is_empty() {
+    if summaries.is_empty() {
         emit(&format!("no datasets in {}; `swm collect ENV -o NAME` collects one\n", folder.display()));
         return Ok(());
     }
     let text = |value: &Value| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
-    let rows = found.iter().map(|found| match found.get("error") {
+    let rows = summaries.iter().map(|found| match found.get("error") {
         Some(error) => vec![text(&found["name"]), text(error)],
         None => vec![
             text(&found["name"]),

@@ -133,10 +133,8 @@ fn parts(line: &str) -> Vec<String> {
     let mut word = String::new();
     let mut lower = false;
     for c in line.chars().chain([' ']) {
-        if !c.is_alphabetic() || (c.is_uppercase() && lower) {
-            if !word.is_empty() {
-                parts.push(std::mem::take(&mut word));
-            }
+        if (!c.is_alphabetic() || (c.is_uppercase() && lower)) && !word.is_empty() {
+            parts.push(std::mem::take(&mut word));
         }
         lower = c.is_lowercase();
         if c.is_alphabetic() {

@@ -6,6 +6,7 @@
 use crate::dataset_start::{self as start, GoalFrame};
 use crate::describe::header;
 use crate::episode::Episode;
+use crate::reset_arguments::reset_arguments;
 use crate::{Description, EnvLayout, Failure, Request, Transport};
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -14,9 +15,6 @@ use swm_core::{
     PendingCall, ResetOptions, Result, RowMut, RowRef, Schema, Snapshot, Transition, VariationRequest,
 };
 use swm_image::resize::{PillowFilter, PillowResizer};
-
-/// The number of lines at the end of a traceback that an error shows.
-const LINES: usize = 12;
 
 /// A Gymnasium environment.
 pub struct GymEnv {
@@ -27,12 +25,12 @@ pub struct GymEnv {
     stage: Stage,
     /// `None` before the first reset and after an error.
     episode: Option<Episode>,
-    /// The call that was dispatched and not made yet: the reset of the episode, or the step of its last action.
+    /// The dispatched call whose answer is not read yet: the reset of the episode, or the step of its last action.
     dispatched: Option<EnvCall>,
     factors: FactorValues,
-    /// Whether the frame in the memory shows the present state.
+    /// Whether the frame in the memory shows the current state.
     frame_is_current: bool,
-    /// Whether steps also render, which is so once a frame was requested.
+    /// Whether steps also render; true after the first request of a frame.
     renders_steps: bool,
     resizer: PillowResizer,
 }
@@ -40,15 +38,15 @@ pub struct GymEnv {
 /// The state of the environment behind the transport.
 #[derive(Clone, Copy, PartialEq)]
 enum Stage {
-    /// It is being made.
+    /// The transport is making the environment.
     Starting,
-    /// It accepts requests.
+    /// The environment accepts requests.
     Ready,
-    /// It must be made again.
+    /// The environment must be made again.
     Broken,
 }
 
-/// A call of the environment, as [`Request`], with the arguments of the present episode.
+/// A call of the environment. It becomes a [`Request`] with the arguments of the current episode.
 #[derive(Clone, Copy, PartialEq)]
 enum EnvCall {
     Reset,
@@ -58,7 +56,7 @@ enum EnvCall {
 }
 
 impl GymEnv {
-    /// An environment over a transport; waits for its description. Up to `restarts` lost workers are replaced within one
+    /// Creates an environment over a transport and waits for its description. Up to `restarts` lost workers are replaced within one
     /// request.
     ///
     /// # Errors
@@ -71,9 +69,9 @@ impl GymEnv {
                 Err(Failure::Lost(how)) if lost < restarts => {
                     lost += 1;
                     tracing::warn!("{id}: {how}; starting another worker ({lost} of {restarts})");
-                    transport.restart().map_err(|failure| explain(id, "making it", 0, failure))?;
+                    transport.restart().map_err(|failure| failure.explain(id, "making it", 0))?;
                 }
-                Err(failure) => return Err(explain(id, "making it", lost, failure)),
+                Err(failure) => return Err(failure.explain(id, "making it", lost)),
             }
         };
         let mut env = Self::like(Arc::new(EnvLayout::new(id, description)?), transport, restarts)?;
@@ -81,7 +79,7 @@ impl GymEnv {
         Ok(env)
     }
 
-    /// An environment with a known layout; does not wait for its description.
+    /// Creates an environment with a known layout, without waiting for its description.
     ///
     /// # Errors
     /// When the defaults of its factors violate a constraint.
@@ -134,7 +132,7 @@ impl GymEnv {
                         EnvCall::Step => "its step",
                         EnvCall::Render => "its render",
                     };
-                    return Err(explain(&self.layout.spec.id, what, lost, failure));
+                    return Err(failure.explain(&self.layout.spec.id, what, lost));
                 }
             }
         }
@@ -189,7 +187,7 @@ impl GymEnv {
             EnvCall::Reset => Request::Reset(&episode.reset),
             EnvCall::Render => Request::Render,
             EnvCall::Step => {
-                // A dispatched action is in the memory already, and the worker owns the memory.
+                // A dispatched action is already in the memory, which the worker owns until it answers.
                 if self.dispatched.is_none() {
                     let range = self.layout.action.clone();
                     let last = episode.actions.len() - range.len();
@@ -218,7 +216,7 @@ impl GymEnv {
         }
     }
 
-    /// Replaces the episode by one without actions.
+    /// Replaces the current episode with one that has no actions yet, and reuses its memory.
     fn start_episode(&mut self, reset: String, goal: Option<GoalFrame>) {
         let mut actions = self.episode.take().map(|episode| episode.actions).unwrap_or_default();
         actions.clear();
@@ -249,72 +247,15 @@ impl GymEnv {
         self.env_call(EnvCall::Step)
     }
 
-    /// The arguments of a reset as JSON; invalid options are errors.
-    fn arguments(&self, seed: u64, options: &ResetOptions) -> Result<serde_json::Value> {
-        let id = &self.layout.spec.id;
-        if options.state.is_some() || options.goal_state.is_some() {
-            return Err(Error::config(
-                format!("{id}, the state of a reset"),
-                "the seed decides the initial state of a Gymnasium environment",
-                "choose the start by seed, or by its factors of variation if it has any",
-            ));
-        }
-        let space = &self.layout.spec.variation_space;
-        let VariationRequest { variation, variation_values } = &options.variation;
-        let requested = !variation_values.is_empty() || variation.as_ref().is_some_and(|keys| !keys.is_empty());
-        if requested && space.factors().is_empty() {
-            let problem = "it has none: neither the environment nor a wrapper has a `variation_space`";
-            return Err(Error::config(format!("factors of variation of {id}"), problem, "request no factors"));
-        }
-        let mut arguments = serde_json::json!({"seed": fold_seed(seed)});
-        if let Some(keys) = variation {
-            for key in keys {
-                space.select(key)?;
-            }
-            let all = keys.iter().any(|key| key == "all");
-            arguments["variation"] = if all { serde_json::json!(["all"]) } else { serde_json::json!(keys) };
-        }
-        if !variation_values.is_empty() {
-            for (key, value) in variation_values {
-                let known = space.factors().iter().map(|factor| factor.key.as_str());
-                let Some(index) = space.find(key) else {
-                    return Err(Error::unknown("factor of variation", key, known, "`swm fovs ENV` lists them"));
-                };
-                space.factors()[index].space.check(key, value)?;
-            }
-            arguments["variation_values"] = serde_json::json!(variation_values);
-        }
-        Ok(arguments)
-    }
-
-    /// A double of the buffer's header; 0 before there is a buffer.
+    /// Reads a double in the header of the buffer; 0 before there is a buffer.
     fn double(&self, at: usize) -> f64 {
         let bytes = self.transport.memory().get(at..at + 8);
         bytes.map_or(0.0, bytemuck::pod_read_unaligned)
     }
 
+    /// Reads a flag in the header of the buffer; false before there is a buffer.
     fn flag(&self, at: usize) -> bool {
         self.transport.memory().get(at).is_some_and(|&byte| byte != 0)
-    }
-}
-
-/// Folds a seed to the 31 bits that libraries below Gymnasium accept; smaller seeds are unchanged.
-fn fold_seed(seed: u64) -> u64 {
-    const BITS: u64 = (1 << 31) - 1;
-    if seed <= BITS { seed } else { (seed ^ (seed >> 31) ^ (seed >> 62)) & BITS }
-}
-
-/// Turns a failure into an error.
-fn explain(id: &str, what: &str, lost: usize, failure: Failure) -> Error {
-    match failure {
-        Failure::Refused(error) => error,
-        Failure::Raised(traceback) => {
-            let lines: Vec<&str> = traceback.trim_end().lines().collect();
-            let end = &lines[lines.len().saturating_sub(LINES)..];
-            Error::external(format!("{id}: {what} raised"), end.join("\n"))
-        }
-        Failure::Lost(how) if lost == 0 => Error::external(format!("{id}: {what}"), how),
-        Failure::Lost(how) => Error::external(format!("{id}: {what} failed in {} workers in a row", lost + 1), how),
     }
 }
 
@@ -325,7 +266,7 @@ impl DispatchEnv for GymEnv {
         }
         match call {
             PendingCall::Reset(seed, options) => {
-                let Ok(arguments) = self.arguments(seed, options) else { return false };
+                let Ok(arguments) = reset_arguments(&self.layout, seed, options) else { return false };
                 let arguments = arguments.to_string();
                 if !self.transport.dispatch(Request::Reset(&arguments)) {
                     return false;
@@ -358,7 +299,7 @@ impl DatasetStartEnv for GymEnv {
     fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: DatasetStart<'_>) -> Result<()> {
         self.finish_dispatched()?;
         let (seed, options) = start::reset(&self.layout, seed, options, from.start)?;
-        let mut arguments = self.arguments(seed, &options)?;
+        let mut arguments = reset_arguments(&self.layout, seed, &options)?;
         arguments["recorded"] = start::json(&self.layout, &from)?;
         self.start_episode(arguments.to_string(), GoalFrame::of(&from));
         self.run_reset()
@@ -371,7 +312,7 @@ impl Env for GymEnv {
     }
 
     fn reset(&mut self, seed: u64, options: &ResetOptions) -> Result<()> {
-        let arguments = self.arguments(seed, options)?.to_string();
+        let arguments = reset_arguments(&self.layout, seed, options)?.to_string();
         let dispatched = self.dispatched == Some(EnvCall::Reset);
         if !dispatched || self.episode.as_ref().is_none_or(|episode| episode.reset != arguments) {
             self.finish_dispatched()?;
@@ -479,7 +420,7 @@ impl Env for GymEnv {
         Episode::snapshot(self.episode.as_ref(), &self.layout.spec.id)
     }
 
-    /// Replays the episode, continuing the present one if it is a prefix.
+    /// Replays the episode of the snapshot. Continues the current episode if its actions are a prefix.
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
         let id = &self.layout.spec.id;
         let Some(Episode { reset, goal, actions }) = Episode::parse(snapshot, id, self.layout.action.len()) else {

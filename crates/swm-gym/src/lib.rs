@@ -15,6 +15,7 @@ mod describe;
 mod env;
 mod episode;
 mod interned;
+mod reset_arguments;
 mod transport;
 mod worker;
 

@@ -47,6 +47,25 @@ pub enum Failure {
     Lost(String),
 }
 
+/// The number of lines at the end of a traceback that an error shows.
+const LINES: usize = 12;
+
+impl Failure {
+    /// Converts the failure of `what` in the environment `id`, after `lost` replaced workers, into an error.
+    pub(crate) fn explain(self, id: &str, what: &str, lost: usize) -> Error {
+        match self {
+            Self::Refused(error) => error,
+            Self::Raised(traceback) => {
+                let lines: Vec<&str> = traceback.trim_end().lines().collect();
+                let end = &lines[lines.len().saturating_sub(LINES)..];
+                Error::external(format!("{id}: {what} raised"), end.join("\n"))
+            }
+            Self::Lost(how) if lost == 0 => Error::external(format!("{id}: {what}"), how),
+            Self::Lost(how) => Error::external(format!("{id}: {what} failed in {} workers in a row", lost + 1), how),
+        }
+    }
+}
+
 /// The connection to one environment.
 pub trait Transport: Send {
     /// Starts to make the environment again, whatever the state of the old one; need not wait for it.

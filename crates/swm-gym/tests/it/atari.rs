@@ -1,30 +1,29 @@
 //! The Arcade Learning Environment and Craftax.
 
-use crate::play::{Seen, make, play};
+use crate::play::{RecordedEnv, make, play};
 use crate::{config, has};
 use swm_core::{Action, DType, ResetOptions, Space};
 
 #[test]
-fn pong_shows_its_frames() {
+fn pong_observes_its_frames() {
     let Some(config) = config().filter(|config| has(config, "ale_py")) else { return };
-    let mut env = Seen::of(make("ALE/Pong-v5", &config));
+    let mut env = RecordedEnv::of(make("ALE/Pong-v5", &config));
     assert_eq!(env.env.spec().action_space, Space::Discrete { n: 6, start: 0 });
     assert!(env.env.libraries().contains_key("ale-py"), "{:?}", env.env.libraries());
     env.env.reset(1, &ResetOptions::default()).expect("a reset");
     for _ in 0..30 {
         env.env.step(Action::Discrete(&[2])).expect("a step");
     }
-    // What it draws is what it observes.
     let observed = env.column("observation");
-    let drawn = env.frame(210, 160);
-    assert!(observed.iter().zip(&drawn).all(|(&a, &b)| a == f64::from(b)), "two pictures");
-    assert!(drawn.chunks_exact(3).any(|pixel| pixel != &drawn[..3]), "there is something to see");
+    let frame = env.frame(210, 160);
+    assert!(observed.iter().zip(&frame).all(|(&a, &b)| a == f64::from(b)), "the frame is the observation");
+    assert!(frame.chunks_exact(3).any(|pixel| pixel != &frame[..3]), "the frame has more than one colour");
     assert!(play("ALE/Pong-v5", &config, &[0, 1], 2, 5)[1] == play("ALE/Pong-v5", &config, &[1], 1, 5)[0]);
 }
 
 #[test]
 #[ignore = "JAX compiles for minutes"]
-fn craftax_is_played_and_drawn() {
+fn craftax_steps_and_renders() {
     let Some(config) = config().filter(|config| has(config, "craftax")) else { return };
     for (id, shape, actions) in [
         ("swm/CraftaxClassicPixels-v1", &[63, 63, 3][..], 17),
@@ -32,7 +31,7 @@ fn craftax_is_played_and_drawn() {
         ("swm/CraftaxPixels-v1", &[130, 110, 3], 43),
         ("swm/CraftaxSymbolic-v1", &[8268], 43),
     ] {
-        let mut env = Seen::of(make(id, &config));
+        let mut env = RecordedEnv::of(make(id, &config));
         let spec = env.env.spec();
         assert_eq!(spec.action_space, Space::Discrete { n: actions, start: 0 }, "{id}");
         let observation = &spec.columns[0];
@@ -42,7 +41,7 @@ fn craftax_is_played_and_drawn() {
             env.env.step(Action::Discrete(&[action])).expect("a step");
         }
         assert!(env.env.libraries().contains_key("craftax"), "{id}");
-        let picture = env.frame(64, 64);
-        assert!(picture.chunks_exact(3).any(|pixel| pixel != &picture[..3]), "{id}: there is something to see");
+        let frame = env.frame(64, 64);
+        assert!(frame.chunks_exact(3).any(|pixel| pixel != &frame[..3]), "{id}: the frame has more than one colour");
     }
 }

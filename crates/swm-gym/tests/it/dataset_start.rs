@@ -1,16 +1,16 @@
 //! Episodes that start at a row of a dataset.
 
 use crate::config;
-use crate::play::{Seen, make};
+use crate::play::{RecordedEnv, make};
 use crate::robust::kill_process;
 use swm_core::batch::{Batch, ColumnSpec, DType, Schema};
 use swm_core::{Action, Callable, DatasetStart, Env, FrameMut, ResetOptions, VariationRequest, dataset_start};
 use swm_gym::{GymEnv, WorkerTransport};
 
-const FIELD: &str = "tests.it.worlds:Field-v0";
+const FIELD: &str = "tests.it.environments:Field-v0";
 const EAST: Action<'static> = Action::Continuous(&[0.5, 0.0]);
 
-/// A start and a goal.
+/// A start row and a goal row.
 fn rows() -> Batch {
     let schema = Schema::new([
         ColumnSpec::new("state", DType::Float64, [3]),
@@ -45,9 +45,9 @@ fn start(env: &mut dyn Env, options: &ResetOptions, callables: &[Callable]) -> s
 }
 
 #[test]
-fn an_environment_with_setters_starts_where_it_was_recorded() {
+fn environment_with_setters_starts_at_the_recorded_state() {
     let Some(config) = config() else { return };
-    let mut field = Seen::of(make(FIELD, &config));
+    let mut field = RecordedEnv::of(make(FIELD, &config));
     start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start");
     assert_eq!(field.column("state"), [-0.3, 0.25, 7.0]);
     assert_eq!(field.column("observation"), [-0.3, 0.25]);
@@ -55,8 +55,8 @@ fn an_environment_with_setters_starts_where_it_was_recorded() {
     assert_eq!(field.env.factors().scalar("agent.size"), 1.5, "factors are the recorded ones");
     assert!(!field.env.is_success() && field.env.goal_distance().is_infinite());
     let wind = field.column("wind");
-    let own = field.frame(16, 16);
-    assert_eq!(own[3 * (9 * 16 + 6)], 255, "it stands there, too");
+    let frame = field.frame(16, 16);
+    assert_eq!(frame[3 * (9 * 16 + 6)], 255, "the frame shows the recorded position");
     let mut goal = vec![0; 12];
     field.env.render_goal(FrameMut::new(2, 2, &mut goal)).expect("a goal");
     assert_eq!(goal, [200; 12]);
@@ -64,12 +64,12 @@ fn an_environment_with_setters_starts_where_it_was_recorded() {
     let state = field.column("state");
     assert!((state[0] - (-0.3 + 0.75 + wind[0])).abs() < 1e-12 && state[2] == 8.0, "{state:?}");
     assert!(!transition.terminated);
-    assert_eq!(field.column("goal_state"), [1.2, 0.25, 7.0], "in every step");
-    // The seed of the recorded episode decides what its state does not hold.
-    let mut other = Seen::of(make(FIELD, &config));
+    assert_eq!(field.column("goal_state"), [1.2, 0.25, 7.0], "the goal stays after a step");
+    // Values that are not part of the state follow from the seed of the recorded episode.
+    let mut other = RecordedEnv::of(make(FIELD, &config));
     other.env.reset(11, &ResetOptions::default()).expect("a reset");
     assert_eq!(other.column("wind"), wind);
-    // A reset forgets.
+    // A plain reset discards the recorded state.
     field.env.reset(11, &ResetOptions::default()).expect("a reset");
     assert_eq!(field.column("goal_state"), other.column("goal_state"));
 }
@@ -77,7 +77,7 @@ fn an_environment_with_setters_starts_where_it_was_recorded() {
 #[test]
 fn shifted_factors_are_sampled_from_a_new_seed() {
     let Some(config) = config() else { return };
-    let mut field = Seen::of(make(FIELD, &config));
+    let mut field = RecordedEnv::of(make(FIELD, &config));
     let variation = VariationRequest { variation: Some(vec!["agent".to_owned()]), ..VariationRequest::default() };
     start(&mut *field.env, &ResetOptions { variation, ..ResetOptions::default() }, &[]).expect("a start");
     let wind = field.column("wind");
@@ -86,9 +86,9 @@ fn shifted_factors_are_sampled_from_a_new_seed() {
 }
 
 #[test]
-fn methods_are_called_by_name() {
+fn calls_methods_by_name() {
     let Some(config) = config() else { return };
-    let mut field = Seen::of(make(FIELD, &config));
+    let mut field = RecordedEnv::of(make(FIELD, &config));
     let place =
         r#"[{"method": "place", "args": {"x": {"value": "goal_x"}, "label": {"value": "abc", "in_dataset": false}}}]"#;
     start(&mut *field.env, &ResetOptions::default(), &calls(place)).expect("a start");
@@ -109,61 +109,61 @@ fn methods_are_called_by_name() {
     assert!(error.contains("its reset raised") && error.contains("'z'"), "{error}");
     start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start after errors");
     let error =
-        start(&mut *make("CartPole-v1", &config), &ResetOptions::default(), &[]).expect_err("no way").to_string();
+        start(&mut *make("CartPole-v1", &config), &ResetOptions::default(), &[]).expect_err("no setter").to_string();
     assert!(error.contains("CartPole-v1") && error.contains("set_state(state)"), "{error}");
 }
 
 #[test]
-fn an_environment_may_say_itself_what_to_call() {
+fn environment_declares_its_setter() {
     let Some(config) = config() else { return };
-    let mut worded = Seen::of(make("tests.it.worlds:Worded-v0", &config));
-    start(&mut *worded.env, &ResetOptions::default(), &[]).expect("a start");
-    worded.env.step(EAST).expect("a step");
-    assert_eq!(worded.column("set"), [2.0]);
-    // A method of that name that wants something else is none of those meant.
-    let mut jointed = make("tests.it.worlds:Jointed-v0", &config);
+    let mut declared = RecordedEnv::of(make("tests.it.environments:Declared-v0", &config));
+    start(&mut *declared.env, &ResetOptions::default(), &[]).expect("a start");
+    declared.env.step(EAST).expect("a step");
+    assert_eq!(declared.column("set"), [2.0]);
+    // A `set_state` with other arguments is not used.
+    let mut jointed = make("tests.it.environments:Jointed-v0", &config);
     let error = start(&mut *jointed, &ResetOptions::default(), &[]).expect_err("two arguments").to_string();
     assert!(error.contains("it has no method known to set a state"), "{error}");
 }
 
 #[test]
-fn a_killed_worker_is_replayed_from_the_recorded_state() {
+fn replays_a_killed_worker_from_the_recorded_state() {
     let Some(config) = config() else { return };
     let run = |kill: Option<usize>| {
         let transport = WorkerTransport::new(FIELD, [].into(), config.clone()).expect("a worker");
         let id = transport.process_id().expect("a process");
-        let mut field = Seen::of(Box::new(GymEnv::new(FIELD, Box::new(transport), 2).expect("a world")));
+        let mut field = RecordedEnv::of(Box::new(GymEnv::new(FIELD, Box::new(transport), 2).expect("an environment")));
         start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start");
-        let mut seen = vec![field.everything()];
+        let mut outputs = vec![field.everything()];
         for t in 0..4 {
             if kill == Some(t) {
                 kill_process(id);
             }
             field.env.step(EAST).expect("a step");
-            seen.push(field.everything());
+            outputs.push(field.everything());
         }
-        seen
+        outputs
     };
-    let wanted = run(None);
-    assert!(run(Some(0)) == wanted && run(Some(2)) == wanted);
+    let expected = run(None);
+    assert!(run(Some(0)) == expected && run(Some(2)) == expected);
 }
 
 #[test]
-fn a_snapshot_knows_where_its_episode_started() {
+fn snapshot_contains_the_dataset_start() {
     let Some(config) = config() else { return };
-    let mut field = Seen::of(make(FIELD, &config));
+    let mut field = RecordedEnv::of(make(FIELD, &config));
     start(&mut *field.env, &ResetOptions::default(), &[]).expect("a start");
     field.env.step(EAST).expect("a step");
     let snapshot = field.env.snapshot();
-    let mut other = Seen::of(make(FIELD, &config));
+    let mut other = RecordedEnv::of(make(FIELD, &config));
     other.env.restore(&snapshot).expect("restored");
-    for world in [&mut field, &mut other] {
-        world.env.step(EAST).expect("a step");
+    for env in [&mut field, &mut other] {
+        env.env.step(EAST).expect("a step");
     }
     assert!(field.everything() == other.everything());
-    let goals = [&mut field, &mut other].map(|world| {
+    let goals = [&mut field, &mut other].map(|env| {
         let mut goal = vec![0; 27];
-        world.env.render_goal(FrameMut::new(3, 3, &mut goal)).expect("a goal");
+        env.env.render_goal(FrameMut::new(3, 3, &mut goal)).expect("a goal");
         goal
     });
     assert_eq!(goals, [[200; 27], [200; 27]]);

@@ -1,5 +1,7 @@
-//! Gymnasium environments in worker processes. They need a Python that has Gymnasium: the one that `$SWM_PYTHON` names.
-//! Where it names none, they are skipped, in words; where it names one without Gymnasium, they fail.
+//! Tests of Gymnasium environments in worker processes.
+//!
+//! They require the variable `$SWM_PYTHON`, the path of a Python with Gymnasium. Without the variable they are skipped with a
+//! message; with a Python that lacks Gymnasium they fail.
 
 mod atari;
 mod dataset_start;
@@ -12,7 +14,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 use swm_gym::{GymConfig, Python};
 
-/// The configuration of the tests, None to skip.
+/// The configuration of the tests; `None` skips the test.
 fn config() -> Option<GymConfig> {
     let program = std::env::var_os("SWM_PYTHON").filter(|value| !value.is_empty());
     let Some(program) = program else {
@@ -27,15 +29,15 @@ fn config() -> Option<GymConfig> {
     })
 }
 
-/// Whether the Python of the tests can import a module.
+/// Returns whether the Python of the tests can import a module.
 fn has(config: &GymConfig, module: &str) -> bool {
     let program = &config.python.program;
     let status = std::process::Command::new(program).args(["-c", &format!("import {module}")]).output();
-    let there = status.expect("$SWM_PYTHON starts").status.success();
-    if !there {
+    let found = status.expect("$SWM_PYTHON starts").status.success();
+    if !found {
         skip(&format!("{} has no {module}", program.display()));
     }
-    there
+    found
 }
 
 #[allow(clippy::print_stderr, reason = "a skipped test must be visible")]

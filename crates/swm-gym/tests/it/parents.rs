@@ -1,4 +1,4 @@
-//! No worker outlives us, however we end.
+//! Tests that workers end with their parent process, however it ends.
 
 use crate::config;
 use crate::play::ROOM;
@@ -10,13 +10,13 @@ use std::time::{Duration, Instant};
 use swm_core::{Action, Env, ResetOptions};
 use swm_gym::{GymEnv, WorkerTransport};
 
-/// Whether a process still runs; one that nobody has buried does not.
+/// Returns whether a process runs. A zombie process does not.
 fn runs(id: u32) -> bool {
     let stat = std::fs::read_to_string(Path::new("/proc").join(id.to_string()).join("stat"));
     stat.is_ok_and(|stat| stat.rsplit(')').next().is_some_and(|rest| !rest.trim_start().starts_with('Z')))
 }
 
-/// Whether a process ends within ten seconds.
+/// Returns whether a process ends within ten seconds.
 fn ends(id: u32) -> bool {
     let begun = Instant::now();
     while runs(id) {
@@ -28,47 +28,47 @@ fn ends(id: u32) -> bool {
     true
 }
 
-/// A world whose fourth step hangs, and its process.
-fn world() -> Option<(GymEnv, u32)> {
+/// Makes an environment whose fourth step hangs, and returns it with the id of its process.
+fn hanging_env() -> Option<(GymEnv, u32)> {
     let options = [("hang_at".to_owned(), "4".to_owned())];
     let transport = WorkerTransport::new(ROOM, options.into(), config()?).expect("a worker");
     let id = transport.process_id().expect("a process");
-    Some((GymEnv::new(ROOM, Box::new(transport), 2).expect("a world"), id))
+    Some((GymEnv::new(ROOM, Box::new(transport), 2).expect("an environment"), id))
 }
 
 #[test]
-fn a_dropped_world_takes_its_worker_along() {
-    let Some((env, id)) = world() else { return };
+fn dropping_an_environment_ends_its_worker() {
+    let Some((env, id)) = hanging_env() else { return };
     assert!(runs(id));
     drop(env);
     assert!(!runs(id));
 }
 
 #[test]
-fn a_panic_takes_the_worker_along() {
-    let Some((mut env, id)) = world() else { return };
+fn a_panic_ends_the_worker() {
+    let Some((mut env, id)) = hanging_env() else { return };
     let panicked = std::thread::spawn(move || {
         env.reset(0, &ResetOptions::default()).expect("a reset");
-        // Not `panic!`, whose message would look like a failure.
+        // `panic!` would print a message that looks like a failed test.
         std::panic::resume_unwind(Box::new("a panic"));
     });
     assert!(panicked.join().is_err());
     assert!(ends(id));
 }
 
-/// The kernel's promise counts from a thread: that of the starter, not of whoever asked.
+/// The kernel ends a child with the thread that started it, so a permanent thread must start the workers.
 #[test]
-fn a_worker_outlives_the_thread_that_asked_for_it() {
+fn a_worker_outlives_the_thread_that_made_its_environment() {
     if config().is_none() {
         return;
     }
-    let (mut env, id) = std::thread::spawn(|| world().expect("a world")).join().expect("no panic");
+    let (mut env, id) = std::thread::spawn(|| hanging_env().expect("an environment")).join().expect("no panic");
     env.reset(0, &ResetOptions::default()).expect("a reset");
     assert!(runs(id));
 }
 
 #[test]
-fn a_killed_process_takes_busy_workers_along() {
+fn killing_the_process_ends_busy_workers() {
     if config().is_none() {
         return;
     }
@@ -82,24 +82,24 @@ fn a_killed_process_takes_busy_workers_along() {
         .expect("a child");
     let lines = BufReader::new(child.stdout.take().expect("a pipe")).lines();
     let worker = lines.map_while(Result::ok).find_map(|line| line.split("worker=").nth(1)?.trim().parse().ok());
-    let worker = worker.expect("the child tells its worker");
+    let worker = worker.expect("the child prints the id of its worker");
     assert!(runs(worker));
     kill_process(child.id());
     child.wait().expect("an end");
-    assert!(ends(worker), "process {worker} is an orphan");
+    assert!(ends(worker), "worker process {worker} still runs");
 }
 
-/// Set for the child of the test above.
+/// The environment variable that the test above sets for its child process.
 const HANG: &str = "SWM_TEST_HANG";
 
-/// Not a test: the child of the one above, and nothing without its variable.
+/// The program of the child process of the test above; does nothing unless its variable is set.
 #[test]
-#[allow(clippy::print_stdout)]
+#[expect(clippy::print_stdout, reason = "the parent test reads the id of the worker from standard output")]
 fn hang_with_a_worker() {
     if std::env::var_os(HANG).is_none() {
         return;
     }
-    let (mut env, id) = world().expect("a world");
+    let (mut env, id) = hanging_env().expect("an environment");
     env.reset(0, &ResetOptions::default()).expect("a reset");
     for t in 0..4 {
         if t == 3 {

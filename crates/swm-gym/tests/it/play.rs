@@ -1,4 +1,4 @@
-//! What an environment produces depends on its seed and its actions, never on who else is played.
+//! Tests that the outputs of an environment depend only on its seed and actions, not on threads or other environments.
 
 use crate::config;
 use swm_core::batch::{Batch, DType, Schema};
@@ -9,13 +9,13 @@ use swm_core::{
 };
 use swm_gym::GymConfig;
 
-pub const ROOM: &str = "tests.it.worlds:Room-v0";
+pub const ROOM: &str = "tests.it.environments:Room-v0";
 
 pub fn make(text: &str, config: &GymConfig) -> Box<dyn Env> {
     swm_gym::make(text, config.clone()).unwrap_or_else(|error| panic!("{text}: {error}"))
 }
 
-/// Everything that episodes in these slots produce under random actions, as bytes.
+/// Plays episodes with random actions and returns the bytes of all their outputs, one vector per slot.
 pub fn play(text: &str, config: &GymConfig, episodes: &[u64], workers: usize, steps: usize) -> Vec<Vec<u8>> {
     let envs = episodes.iter().map(|_| make(text, config)).collect();
     let threads = threads(workers).expect("threads");
@@ -30,32 +30,32 @@ pub fn play(text: &str, config: &GymConfig, episodes: &[u64], workers: usize, st
         })
         .collect();
     pool.reset(&resets).expect("a reset");
-    let mut seen = vec![vec![]; episodes.len()];
-    let mut look = |pool: &EnvPool| {
-        for (slot, seen) in seen.iter_mut().enumerate() {
+    let mut outputs = vec![vec![]; episodes.len()];
+    let mut record = |pool: &EnvPool| {
+        for (slot, output) in outputs.iter_mut().enumerate() {
             for (column, spec) in pool.infos().schema().columns().iter().enumerate() {
                 let n = spec.row_bytes();
-                seen.extend_from_slice(&pool.infos().bytes(column)[slot * n..(slot + 1) * n]);
+                output.extend_from_slice(&pool.infos().bytes(column)[slot * n..(slot + 1) * n]);
             }
         }
     };
-    look(&pool);
+    record(&pool);
     let active = vec![true; episodes.len()];
     for _ in 0..steps {
         policy.act(pool.infos(), &active, &mut actions).expect("random actions");
         pool.step(&actions, &active).expect("a step");
-        look(&pool);
+        record(&pool);
     }
-    seen
+    outputs
 }
 
-/// An environment and a row to look at it.
-pub struct Seen {
+/// An environment and a row for its observations.
+pub struct RecordedEnv {
     pub env: Box<dyn Env>,
     row: Batch,
 }
 
-impl Seen {
+impl RecordedEnv {
     pub fn of(env: Box<dyn Env>) -> Self {
         let schema = Schema::new(env.spec().columns.clone()).expect("columns have their own names");
         Self { env, row: Batch::zeros(&schema, 1) }
@@ -86,7 +86,7 @@ impl Seen {
 }
 
 #[test]
-fn threads_and_neighbours_change_nothing() {
+fn outputs_do_not_depend_on_threads_or_other_environments() {
     let Some(config) = config() else { return };
     for text in ["CartPole-v1", ROOM] {
         let one = play(text, &config, &[0, 1, 2, 3], 1, 6);
@@ -98,10 +98,10 @@ fn threads_and_neighbours_change_nothing() {
 }
 
 #[test]
-fn one_thread_lets_all_environments_work_at_once() {
+fn environments_run_in_parallel_on_one_thread() {
     let Some(config) = config() else { return };
     let folder = tempfile::tempdir().expect("a folder");
-    // Each waits in its reset and in its step until the other is there, too; not in episodes of seed 0.
+    // Each environment waits in its reset and in its step for the other one, except in episodes of seed 0.
     let text = format!("{ROOM},meet={}", folder.path().display());
     let envs = (0..2).map(|_| make(&text, &config)).collect();
     let mut pool = EnvPool::new(envs, None, None, threads(1).expect("threads")).expect("a pool");
@@ -115,46 +115,46 @@ fn one_thread_lets_all_environments_work_at_once() {
 }
 
 #[test]
-fn what_was_announced_happens_once() {
+fn a_dispatched_call_runs_once() {
     let Some(config) = config() else { return };
     let push = Action::Continuous(&[0.1, -0.2]);
     let (start, none) = (ResetOptions::default(), Action::Continuous(&[0.0, 0.0]));
-    let mut plain = Seen::of(make(ROOM, &config));
-    let mut told = Seen::of(make(ROOM, &config));
-    for world in [&mut plain, &mut told] {
-        world.env.reset(1, &start).expect("a reset");
+    let mut plain = RecordedEnv::of(make(ROOM, &config));
+    let mut dispatched = RecordedEnv::of(make(ROOM, &config));
+    for env in [&mut plain, &mut dispatched] {
+        env.env.reset(1, &start).expect("a reset");
     }
     plain.env.reset(4, &start).expect("a reset");
-    assert!(told.dispatch(PendingCall::Reset(4, &start)));
-    assert!(!told.dispatch(PendingCall::Step(push)), "one thing at a time");
-    told.env.reset(4, &start).expect("the reset");
+    assert!(dispatched.dispatch(PendingCall::Reset(4, &start)));
+    assert!(!dispatched.dispatch(PendingCall::Step(push)), "one call at a time");
+    dispatched.env.reset(4, &start).expect("the reset");
     plain.env.step(push).expect("a step");
-    assert!(told.dispatch(PendingCall::Step(push)));
-    told.env.step(push).expect("the step");
-    assert!(plain.everything() == told.everything());
-    // Whoever does something else finds the step taken.
+    assert!(dispatched.dispatch(PendingCall::Step(push)));
+    dispatched.env.step(push).expect("the step");
+    assert!(plain.everything() == dispatched.everything());
+    // Any other call runs the dispatched step first.
     plain.env.step(push).expect("a step");
-    assert!(told.dispatch(PendingCall::Step(push)));
-    assert!(plain.env.snapshot() == told.env.snapshot());
-    assert!(plain.frame(9, 12) == told.frame(9, 12) && plain.everything() == told.everything());
+    assert!(dispatched.dispatch(PendingCall::Step(push)));
+    assert!(plain.env.snapshot() == dispatched.env.snapshot());
+    assert!(plain.frame(9, 12) == dispatched.frame(9, 12) && plain.everything() == dispatched.everything());
     plain.env.step(push).and_then(|_| plain.env.step(none)).expect("two steps");
-    assert!(told.dispatch(PendingCall::Step(push)));
-    told.env.step(none).expect("another step");
-    assert!(plain.everything() == told.everything());
-    // And whoever begins anew finds a world that is ready for it.
-    assert!(told.dispatch(PendingCall::Step(push)));
-    for world in [&mut plain, &mut told] {
-        world.env.reset(7, &start).expect("a reset");
+    assert!(dispatched.dispatch(PendingCall::Step(push)));
+    dispatched.env.step(none).expect("another step");
+    assert!(plain.everything() == dispatched.everything());
+    // So does a reset.
+    assert!(dispatched.dispatch(PendingCall::Step(push)));
+    for env in [&mut plain, &mut dispatched] {
+        env.env.reset(7, &start).expect("a reset");
     }
-    assert!(plain.everything() == told.everything());
-    // What is wrong is said by the call, and changes nothing.
-    assert!(!told.dispatch(PendingCall::Step(Action::Discrete(&[0]))));
-    assert!(told.env.step(Action::Discrete(&[0])).is_err());
-    assert!(plain.everything() == told.everything());
+    assert!(plain.everything() == dispatched.everything());
+    // An invalid call is not dispatched; the call itself returns the error and changes nothing.
+    assert!(!dispatched.dispatch(PendingCall::Step(Action::Discrete(&[0]))));
+    assert!(dispatched.env.step(Action::Discrete(&[0])).is_err());
+    assert!(plain.everything() == dispatched.everything());
 }
 
 #[test]
-fn an_environment_says_what_it_is() {
+fn spec_describes_the_environment() {
     let Some(config) = config() else { return };
     let env = make("CartPole-v1", &config);
     let spec = env.spec();
@@ -169,7 +169,7 @@ fn an_environment_says_what_it_is() {
     let spec = room.spec();
     let mut columns: Vec<(&str, DType, &[usize])> =
         spec.columns.iter().map(|column| (column.name.as_str(), column.dtype, &column.shape[..])).collect();
-    let mut wanted: [(&str, DType, &[usize]); 9] = [
+    let mut expected: [(&str, DType, &[usize]); 9] = [
         ("position", DType::Float64, &[2]),
         ("camera", DType::U8, &[6, 8, 3]),
         ("door_open", DType::Int64, &[]),
@@ -182,17 +182,17 @@ fn an_environment_says_what_it_is() {
     ];
     // A dictionary's keys come in the order Gymnasium keeps them in.
     columns.sort_by(|a, b| a.0.cmp(b.0));
-    wanted.sort_by(|a, b| a.0.cmp(b.0));
-    assert_eq!(columns, wanted);
+    expected.sort_by(|a, b| a.0.cmp(b.0));
+    assert_eq!(columns, expected);
     assert_eq!(spec.max_episode_steps, 30);
     assert_eq!(spec.action_space, Space::uniform_box([2], DType::Float32, f64::from(-0.4f32), f64::from(0.4f32)));
 }
 
 #[test]
-fn info_goals_and_pictures_reach_the_world() {
+fn info_goals_and_frames_become_outputs() {
     let Some(config) = config() else { return };
-    let mut room = Seen::of(make(ROOM, &config));
-    assert_eq!(room.env.goal_distance(), f64::INFINITY, "no episode, no distance");
+    let mut room = RecordedEnv::of(make(ROOM, &config));
+    assert_eq!(room.env.goal_distance(), f64::INFINITY, "infinite before the first episode");
     room.env.reset(3, &ResetOptions::default()).expect("a reset");
     assert_eq!((room.column("noise"), room.column("steps")), (vec![0.5], vec![0.0]));
     let mut goal = vec![0; 5 * 7 * 3];
@@ -200,7 +200,7 @@ fn info_goals_and_pictures_reach_the_world() {
     assert_eq!((goal[0], goal[2]), (40, 40));
     let (mut noises, mut steps) = (vec![], 0);
     let terminated = loop {
-        // A bound in single precision is a bound in double.
+        // A bound in single precision is also within the bound in double precision.
         let transition = room.env.step(Action::Continuous(&[0.4, -0.4])).expect("a step");
         steps += 1;
         assert_eq!(transition.reward, -1.5);
@@ -213,14 +213,14 @@ fn info_goals_and_pictures_reach_the_world() {
         }
     };
     assert_eq!(terminated, 7);
-    assert_eq!(noises[0], noises[1], "what is missing keeps its value");
+    assert_eq!(noises[0], noises[1], "a missing entry keeps its value");
     assert_ne!(noises[1], noises[2]);
-    // The blue third at the top, at its own size and at another.
+    // The top third is blue, at the native size and at half of it.
     let own = room.frame(12, 16);
     assert_eq!((&own[..3], &own[own.len() - 3..]), (&[0, 0, 140][..], &[0, 0, 0][..]));
     let half = room.frame(6, 8);
     assert_eq!((half[2], half[half.len() - 1]), (140, 0));
-    // The next episode forgets.
+    // The next episode starts with new values.
     room.env.reset(3, &ResetOptions::default()).expect("a reset");
     assert_eq!((room.column("noise"), room.column("steps")), (vec![0.5], vec![0.0]));
 }
@@ -260,9 +260,9 @@ fn factors_are_sampled_pinned_and_read_back() {
 }
 
 #[test]
-fn a_wrapper_may_have_the_factors_and_draw() {
+fn a_wrapper_may_provide_factors_and_frames() {
     let Some(config) = config() else { return };
-    let mut coated = Seen::of(make("tests.it.worlds:Coated-v0", &config));
+    let mut coated = RecordedEnv::of(make("tests.it.environments:Coated-v0", &config));
     coated.env.reset(1, &ResetOptions::default()).expect("a reset");
     assert_eq!(coated.frame(2, 2), [9; 12]);
     let pinned = [("coat".to_owned(), vec![1.0, 2.0, 3.0])].into();
@@ -273,11 +273,11 @@ fn a_wrapper_may_have_the_factors_and_draw() {
 }
 
 #[test]
-fn what_follows_a_restore_followed_the_snapshot() {
+fn restores_snapshot_bit_for_bit() {
     let Some(config) = config() else { return };
-    let mut room = Seen::of(make(ROOM, &config));
+    let mut room = RecordedEnv::of(make(ROOM, &config));
     room.env.reset(5, &ResetOptions::default()).expect("a reset");
-    let go = |room: &mut Seen, n: i16| {
+    let go = |room: &mut RecordedEnv, n: i16| {
         let actions = (0..n).map(|i| [0.1 * f32::from(i % 3), -0.2]);
         actions
             .flat_map(|action| {
@@ -288,20 +288,21 @@ fn what_follows_a_restore_followed_the_snapshot() {
     };
     go(&mut room, 2);
     let snapshot = room.env.snapshot();
-    let wanted = go(&mut room, 3);
-    room.env.restore(&snapshot).expect("back");
-    assert!(go(&mut room, 3) == wanted, "in the same environment");
-    let mut other = Seen::of(make(ROOM, &config));
-    other.env.restore(&snapshot).expect("in another one");
-    assert!(go(&mut other, 3) == wanted, "in another environment");
-    let strange = make("CartPole-v1", &config).restore(&snapshot).expect_err("another world's").to_string();
-    assert!(strange.contains("another environment"), "{strange}");
+    let expected = go(&mut room, 3);
+    room.env.restore(&snapshot).expect("a restored episode");
+    assert!(go(&mut room, 3) == expected, "the same environment differs after a restore");
+    let mut other = RecordedEnv::of(make(ROOM, &config));
+    other.env.restore(&snapshot).expect("a restored episode");
+    assert!(go(&mut other, 3) == expected, "another environment differs after a restore");
+    let error =
+        make("CartPole-v1", &config).restore(&snapshot).expect_err("a snapshot of another environment").to_string();
+    assert!(error.contains("another environment"), "{error}");
 }
 
 #[test]
-fn what_a_gymnasium_environment_cannot_do_is_said() {
+fn unsupported_requests_are_errors() {
     let Some(config) = config() else { return };
-    let mut env = Seen::of(make("CartPole-v1", &config));
+    let mut env = RecordedEnv::of(make("CartPole-v1", &config));
     let early = env.env.step(Action::Discrete(&[0])).expect_err("before a reset").to_string();
     assert!(early.contains("reset it first"), "{early}");
     assert!(env.env.sample_goal(Key::new(0)).expect_err("no goals").to_string().contains("another seed"));
@@ -315,7 +316,7 @@ fn what_a_gymnasium_environment_cannot_do_is_said() {
     env.env.reset(0, &ResetOptions::default()).expect("a reset");
     assert!(env.env.step(Action::Discrete(&[2])).is_err(), "there are two actions");
     assert!(env.env.step(Action::Continuous(&[0.0])).is_err(), "an action of another kind");
-    env.env.step(Action::Discrete(&[1])).expect("wrong actions change nothing");
+    env.env.step(Action::Discrete(&[1])).expect("a step after invalid actions");
 
     let unknown = swm_gym::make("CartPoel-v1", config.clone()).err().expect("unknown").to_string();
     assert!(unknown.contains("did you mean CartPole-v1"), "{unknown}");

@@ -1,7 +1,7 @@
-//! Workers that die, hang, raise and print.
+//! Tests of workers that die, hang, raise exceptions and print.
 
 use crate::config;
-use crate::play::{ROOM, Seen, make, play};
+use crate::play::{ROOM, RecordedEnv, make, play};
 use std::time::Duration;
 use swm_core::{Action, PendingCall, ResetOptions};
 use swm_gym::{GymConfig, GymEnv, WorkerTransport};
@@ -9,68 +9,70 @@ use swm_gym::{GymConfig, GymEnv, WorkerTransport};
 const PUSH: Action<'static> = Action::Continuous(&[0.1, -0.2]);
 
 #[test]
-fn a_worker_that_dies_in_mid_episode_changes_no_byte() {
+fn outputs_are_the_same_when_a_worker_dies_in_an_episode() {
     let Some(config) = config() else { return };
     let folder = tempfile::tempdir().expect("a folder");
     let marker = folder.path().join("died");
-    let wanted = play(ROOM, &config, &[1], 1, 6);
+    let expected = play(ROOM, &config, &[1], 1, 6);
     let dying = format!("{ROOM},die_at=4,marker={}", marker.display());
-    assert!(play(&dying, &config, &[1], 1, 6) == wanted);
-    assert!(marker.exists(), "it did die");
+    assert!(play(&dying, &config, &[1], 1, 6) == expected);
+    assert!(marker.exists(), "the worker died");
 }
 
 #[test]
-fn a_worker_killed_from_outside_changes_no_byte() {
+fn outputs_are_the_same_when_a_worker_is_killed() {
     let Some(config) = config() else { return };
     let run = |kill: Option<u32>| {
         let transport = WorkerTransport::new("CartPole-v1", [].into(), config.clone()).expect("a worker");
         let id = transport.process_id().expect("a process");
-        let mut env = Seen::of(Box::new(GymEnv::new("CartPole-v1", Box::new(transport), 2).expect("a world")));
+        let mut env =
+            RecordedEnv::of(Box::new(GymEnv::new("CartPole-v1", Box::new(transport), 2).expect("an environment")));
         env.env.reset(4, &ResetOptions::default()).expect("a reset");
-        let mut seen = vec![];
+        let mut outputs = vec![];
         for t in 0..6 {
             if kill == Some(t) {
                 kill_process(id);
             }
             env.env.step(Action::Discrete(&[i64::from(t % 2)])).expect("a step");
-            seen.push(env.everything());
+            outputs.push(env.everything());
         }
-        seen
+        outputs
     };
-    let wanted = run(None);
-    assert!(run(Some(0)) == wanted && run(Some(3)) == wanted);
+    let expected = run(None);
+    assert!(run(Some(0)) == expected && run(Some(3)) == expected);
 }
 
 #[test]
-fn what_a_killed_worker_was_told_is_told_again() {
+fn dispatched_calls_are_repeated_in_a_new_worker() {
     let Some(config) = config() else { return };
     let options = ResetOptions::default();
     let run = |kill: Option<(&str, bool)>| {
         let transport = WorkerTransport::new("CartPole-v1", [].into(), config.clone()).expect("a worker");
         let id = transport.process_id().expect("a process");
-        let mut env = Seen::of(Box::new(GymEnv::new("CartPole-v1", Box::new(transport), 2).expect("a world")));
-        let tell = |env: &mut Seen, what: &str, next: PendingCall<'_>| {
-            if kill == Some((what, false)) {
+        let mut env =
+            RecordedEnv::of(Box::new(GymEnv::new("CartPole-v1", Box::new(transport), 2).expect("an environment")));
+        let dispatch = |env: &mut RecordedEnv, call: &str, next: PendingCall<'_>| {
+            if kill == Some((call, false)) {
                 kill_process(id);
             }
             env.dispatch(next);
-            if kill == Some((what, true)) {
+            if kill == Some((call, true)) {
                 kill_process(id);
             }
         };
-        tell(&mut env, "reset", PendingCall::Reset(4, &options));
+        dispatch(&mut env, "reset", PendingCall::Reset(4, &options));
         env.env.reset(4, &options).expect("a reset");
-        let mut seen = env.everything();
-        for what in ["first", "second"] {
-            tell(&mut env, what, PendingCall::Step(Action::Discrete(&[1])));
+        let mut outputs = env.everything();
+        for call in ["first", "second"] {
+            dispatch(&mut env, call, PendingCall::Step(Action::Discrete(&[1])));
             env.env.step(Action::Discrete(&[1])).expect("a step");
-            seen.extend(env.everything());
+            outputs.extend(env.everything());
         }
-        seen
+        outputs
     };
-    let wanted = run(None);
-    for what in ["reset", "first", "second"] {
-        assert!(run(Some((what, false))) == wanted && run(Some((what, true))) == wanted, "{what}");
+    let expected = run(None);
+    for call in ["reset", "first", "second"] {
+        assert!(run(Some((call, false))) == expected && run(Some((call, true))) == expected, "{call}");
     }
 }
 
@@ -80,28 +82,28 @@ pub fn kill_process(id: u32) {
 }
 
 #[test]
-fn a_worker_that_always_dies_is_an_error_that_says_how() {
+fn a_worker_that_always_dies_is_an_error_with_its_output() {
     let Some(config) = config() else { return };
     let mut env = make(&format!("{ROOM},die_at=2"), &config);
     env.reset(0, &ResetOptions::default()).expect("a reset");
     env.step(PUSH).expect("a step");
-    let error = env.step(PUSH).expect_err("it dies").to_string();
+    let error = env.step(PUSH).expect_err("the worker dies").to_string();
     for words in [ROOM, "3 workers", "signal: 9", "about to die"] {
         assert!(error.contains(words), "{words}: {error}");
     }
-    assert!(env.step(PUSH).expect_err("over").to_string().contains("reset it first"));
+    assert!(env.step(PUSH).expect_err("no episode").to_string().contains("reset it first"));
     env.reset(0, &ResetOptions::default()).expect("a reset after an error");
     env.step(PUSH).expect("a step after an error");
 }
 
 #[test]
-fn an_exception_is_told_and_not_tried_again() {
+fn an_exception_is_an_error_without_another_attempt() {
     let Some(config) = config() else { return };
     let mut env = make(&format!("{ROOM},raise_at=2"), &config);
     env.reset(0, &ResetOptions::default()).expect("a reset");
     env.step(PUSH).expect("a step");
     let error = env.step(PUSH).expect_err("it raises").to_string();
-    for words in [ROOM, "its step raised", "raise ValueError('the room is on fire')", "worlds.py"] {
+    for words in [ROOM, "its step raised", "raise ValueError('the room is on fire')", "environments.py"] {
         assert!(error.contains(words), "{words}: {error}");
     }
     env.reset(0, &ResetOptions::default()).expect("a reset after an error");
@@ -109,7 +111,7 @@ fn an_exception_is_told_and_not_tried_again() {
 }
 
 #[test]
-fn an_environment_that_hangs_is_stopped() {
+fn a_hanging_environment_is_stopped() {
     let Some(config) = config() else { return };
     let config = GymConfig { call_timeout: Duration::from_millis(1500), restarts: 1, ..config };
     let mut env = make(&format!("{ROOM},hang_at=2"), &config);

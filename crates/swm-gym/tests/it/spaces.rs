@@ -1,11 +1,11 @@
-//! Actions of every kind arrive as what they were.
+//! Tests that actions of every kind of space reach the environment unchanged.
 
 use crate::config;
-use crate::play::{Seen, make};
+use crate::play::{RecordedEnv, make};
 use swm_core::{Action, DType, ResetOptions, Space};
 
 #[test]
-fn actions_of_every_kind_arrive() {
+fn actions_of_every_space_reach_the_environment() {
     let Some(config) = config() else { return };
     let multi = |nvec: &[i64]| Space::MultiDiscrete { nvec: nvec.to_vec(), start: vec![0; nvec.len()] };
     let cases: [(&str, Space, &[i64]); 5] = [
@@ -16,24 +16,24 @@ fn actions_of_every_kind_arrive() {
         ("tuple", multi(&[2, 3, 4]), &[1, 2, 3]),
     ];
     for (kind, space, action) in cases {
-        let mut env = Seen::of(make(&format!("tests.it.worlds:Choices-v0,kind={kind}"), &config));
+        let mut env = RecordedEnv::of(make(&format!("tests.it.environments:Choices-v0,kind={kind}"), &config));
         assert_eq!(env.env.spec().action_space, space, "{kind}");
         env.env.reset(0, &ResetOptions::default()).expect("a reset");
         env.env.step(Action::Discrete(action)).unwrap_or_else(|error| panic!("{kind}: {error}"));
-        let seen = env.column("observation");
-        let wanted: Vec<f64> = action.iter().map(|&choice| choice as f64).collect();
-        assert_eq!(seen[..wanted.len()], wanted, "{kind}");
+        let observed = env.column("observation");
+        let expected: Vec<f64> = action.iter().map(|&choice| choice as f64).collect();
+        assert_eq!(observed[..expected.len()], expected, "{kind}");
     }
-    // Several boxes are one; a side without a bound counts as 1.
-    let mut env = Seen::of(make("tests.it.worlds:Choices-v0,kind=dict", &config));
+    // A dictionary of boxes becomes one box; a missing bound becomes 1.
+    let mut env = RecordedEnv::of(make("tests.it.environments:Choices-v0,kind=dict", &config));
     let (low, high) = (vec![-1.0, -1.0, 0.0], vec![1.0; 3]);
     assert_eq!(env.env.spec().action_space, Space::Box { shape: vec![3], dtype: DType::Float32, low, high });
     env.env.reset(0, &ResetOptions::default()).expect("a reset");
     env.env.step(Action::Continuous(&[0.5, -0.25, 3.0])).expect("a step");
     assert_eq!(env.column("observation")[..3], [0.5, -0.25, 3.0]);
-    let error = swm_gym::make("tests.it.worlds:Choices-v0,kind=mixed", config.clone()).err().expect("mixed");
+    let error = swm_gym::make("tests.it.environments:Choices-v0,kind=mixed", config.clone()).err().expect("mixed");
     assert!(error.to_string().contains("wrap the environment"), "{error}");
     let rgb = &mut [0; 3];
-    let error = env.env.render(swm_core::FrameMut::new(1, 1, rgb)).expect_err("it draws nothing").to_string();
+    let error = env.env.render(swm_core::FrameMut::new(1, 1, rgb)).expect_err("no rendering").to_string();
     assert!(error.contains("render"), "{error}");
 }

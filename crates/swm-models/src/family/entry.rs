@@ -11,6 +11,9 @@ use swm_core::requirements::DatasetRequirements;
 use swm_core::{Named, Result};
 use swm_data::Reader;
 
+/// Loads a configuration from a preset and `key=value` settings.
+type LoadConfig = fn(&str, &[String]) -> Result<Box<dyn TrainableConfig>>;
+
 /// The row of a model family in a registry.
 #[derive(Clone, Copy)]
 pub struct FamilyEntry {
@@ -23,7 +26,7 @@ pub struct FamilyEntry {
     /// Whether training uses the encoder of another checkpoint.
     pub borrows_encoder: bool,
     /// Loads a configuration from a preset (its name or the path of a TOML file) and `key=value` settings.
-    pub config: fn(&str, &[String]) -> Result<Box<dyn TrainableConfig>>,
+    pub config: LoadConfig,
     /// Returns what a dataset must contain to train the default preset; `None` for a family that also requires another
     /// checkpoint.
     pub requirements: fn() -> Result<Option<DatasetRequirements>>,

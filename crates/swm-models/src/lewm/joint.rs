@@ -89,21 +89,24 @@ pub(crate) fn step(
                 shard.backward(&differentiation, gradient)
             })
             .collect();
-        for shard in shards {
-            for (name, gradient) in shard {
-                let name = format!("encoder.{name}");
-                let sum = match gradients.remove(&name) {
-                    Some(sum) => sum + gradient,
-                    None => gradient,
-                };
-                gradients.insert(name, sum);
-            }
-        }
+        shards.into_iter().for_each(|shard| add_encoder_gradients(&mut gradients, shard));
     }
     JointStep {
         prediction: f64::from(prediction_value),
         gradients,
         all,
         statistics: [projector_statistics, pred_proj_statistics],
+    }
+}
+
+/// Adds the gradients of the encoder from one shard to the sums over the shards before it.
+fn add_encoder_gradients(sums: &mut Named<Tensor<1>>, shard: Named<Tensor<1>>) {
+    for (name, gradient) in shard {
+        let name = format!("encoder.{name}");
+        let sum = match sums.remove(&name) {
+            Some(sum) => sum + gradient,
+            None => gradient,
+        };
+        sums.insert(name, sum);
     }
 }

@@ -28,6 +28,67 @@ pub fn directions(key: Key, dim: usize, count: usize) -> Vec<f32> {
     all
 }
 
+/// The trapezoidal rule over the arguments (knots) of the characteristic functions, from 0 to [`LAST_KNOT`].
+struct Quadrature {
+    /// The distance of neighbouring knots.
+    spacing: f32,
+    /// The characteristic function of the standard normal distribution at each knot.
+    target: Vec<f32>,
+    /// The weight of each knot, which counts its negative too.
+    weights: Vec<f32>,
+}
+
+impl Quadrature {
+    fn new(knots: usize) -> Self {
+        let spacing = LAST_KNOT / (knots as f32 - 1.0);
+        let target: Vec<f32> = (0..knots).map(|k| (-(k as f32 * spacing).powi(2) / 2.0).exp()).collect();
+        let weights =
+            (0..knots).map(|k| target[k] * spacing * if k == 0 || k == knots - 1 { 1.0 } else { 2.0 }).collect();
+        Self { spacing, target, weights }
+    }
+
+    /// Returns the Epps-Pulley statistic of samples and its derivative with respect to each sample.
+    fn statistic(&self, samples: impl ExactSizeIterator<Item = f32>) -> (f64, Vec<f32>) {
+        let Self { spacing, target, weights } = self;
+        let (knots, n) = (target.len(), samples.len() as f32);
+        let (mut cos, mut sin) = (vec![0.0f32; knots], vec![0.0f32; knots]);
+        let turns: Vec<(f32, f32)> = samples
+            .map(|sample| {
+                let (s, c) = (sample * spacing).sin_cos();
+                let (mut re, mut im) = (1.0f32, 0.0f32);
+                for k in 0..knots {
+                    cos[k] += re;
+                    sin[k] += im;
+                    (re, im) = (re * c - im * s, re * s + im * c);
+                }
+                (c, s)
+            })
+            .collect();
+        let mut statistic = 0.0f64;
+        // Derivatives of the statistic with respect to the sums of cosines and sines, times the knot.
+        let (mut by_cos, mut by_sin) = (vec![0.0f32; knots], vec![0.0f32; knots]);
+        for k in 0..knots {
+            let (real, imaginary) = (cos[k] / n - target[k], sin[k] / n);
+            statistic += f64::from(weights[k] * (real * real + imaginary * imaginary) * n);
+            let knot = k as f32 * spacing;
+            by_cos[k] = 2.0 * weights[k] * real * knot;
+            by_sin[k] = 2.0 * weights[k] * imaginary * knot;
+        }
+        let gradient = turns
+            .iter()
+            .map(|&(c, s)| {
+                let (mut re, mut im, mut sum) = (1.0f32, 0.0f32, 0.0f32);
+                for k in 0..knots {
+                    sum += by_sin[k] * re - by_cos[k] * im;
+                    (re, im) = (re * c - im * s, re * s + im * c);
+                }
+                sum
+            })
+            .collect();
+        (statistic, gradient)
+    }
+}
+
 /// Computes the Epps-Pulley statistic, `n ∫ |φ_n(t) - exp(-t²/2)|² exp(-t²/2) dt` averaged over steps and directions, and its
 /// gradient with respect to the latents.
 ///
@@ -36,10 +97,7 @@ pub fn directions(key: Key, dim: usize, count: usize) -> Vec<f32> {
 pub fn sigreg(latents: &[f32], steps: usize, dim: usize, directions: &[f32], knots: usize) -> (f64, Vec<f32>) {
     let batch = latents.len() / (steps * dim);
     let count = directions.len() / dim;
-    let spacing = LAST_KNOT / (knots as f32 - 1.0);
-    let target: Vec<f32> = (0..knots).map(|k| (-(k as f32 * spacing).powi(2) / 2.0).exp()).collect();
-    let weights: Vec<f32> =
-        (0..knots).map(|k| target[k] * spacing * if k == 0 || k == knots - 1 { 1.0 } else { 2.0 }).collect();
+    let quadrature = Quadrature::new(knots);
 
     // One task per step and direction returns its statistic and the gradient of its projections, so that the sums below
     // have the same order on any number of threads.
@@ -47,44 +105,10 @@ pub fn sigreg(latents: &[f32], steps: usize, dim: usize, directions: &[f32], kno
         .into_par_iter()
         .map(|task| {
             let (step, direction) = (task / count, &directions[task % count * dim..][..dim]);
-            let (mut cos, mut sin) = (vec![0.0f32; knots], vec![0.0f32; knots]);
-            let turns: Vec<(f32, f32)> = (0..batch)
-                .map(|row| {
-                    let latent = &latents[(row * steps + step) * dim..][..dim];
-                    let projection: f32 = latent.iter().zip(direction).map(|(a, b)| a * b).sum();
-                    let (s, c) = (projection * spacing).sin_cos();
-                    let (mut re, mut im) = (1.0f32, 0.0f32);
-                    for k in 0..knots {
-                        cos[k] += re;
-                        sin[k] += im;
-                        (re, im) = (re * c - im * s, re * s + im * c);
-                    }
-                    (c, s)
-                })
-                .collect();
-            let n = batch as f32;
-            let mut statistic = 0.0f64;
-            // Derivatives of the statistic with respect to the sums of cosines and sines, times the knot.
-            let (mut by_cos, mut by_sin) = (vec![0.0f32; knots], vec![0.0f32; knots]);
-            for k in 0..knots {
-                let (real, imaginary) = (cos[k] / n - target[k], sin[k] / n);
-                statistic += f64::from(weights[k] * (real * real + imaginary * imaginary) * n);
-                let knot = k as f32 * spacing;
-                by_cos[k] = 2.0 * weights[k] * real * knot;
-                by_sin[k] = 2.0 * weights[k] * imaginary * knot;
-            }
-            let gradient = turns
-                .iter()
-                .map(|&(c, s)| {
-                    let (mut re, mut im, mut sum) = (1.0f32, 0.0f32, 0.0f32);
-                    for k in 0..knots {
-                        sum += by_sin[k] * re - by_cos[k] * im;
-                        (re, im) = (re * c - im * s, re * s + im * c);
-                    }
-                    sum
-                })
-                .collect();
-            (statistic, gradient)
+            quadrature.statistic((0..batch).map(|row| {
+                let latent = &latents[(row * steps + step) * dim..][..dim];
+                latent.iter().zip(direction).map(|(a, b)| a * b).sum()
+            }))
         })
         .collect();
 

@@ -1,67 +1,26 @@
-//! The data files of a table: locating, verifying and opening them, and keeping recently used ones open.
+//! Locates, verifies and opens the data files of a table.
 
-use super::{LanceReader, lock};
+use super::lance_reader::{LanceReader, lock};
 use crate::dataset::objects::ObjectRanges;
 use crate::formats::lance::record::{EPISODES_KEY, Record};
-use crate::formats::lance::store::{self, Store, block_on, damaged};
+use crate::formats::lance::store::{self, block_on, damaged};
 use bytes::Bytes;
 use futures::{StreamExt as _, TryStreamExt as _};
 use lance_core::datatypes::Schema as LanceSchema;
 use lance_file::reader::{FileReader, ReaderProjection};
 use lance_file::versions::reader_projection_from_field_ids;
 use lance_table::format::DataFile;
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::Path;
 use std::sync::Arc;
 use swm_core::{Error, Result};
-
-/// Maximum number of open local data files. Each takes up to two file descriptors; a process usually has 1024.
-const OPEN_FILES: usize = 32;
-
-/// Maximum number of open data files in an object store, which only take memory.
-const OPEN_OBJECTS: usize = 1024;
 
 /// Data files in an object store that are opened concurrently.
 const OPENED_TOGETHER: usize = 16;
 
 /// Data files up to this size are verified before even their episode indices are read.
 const SMALL_FILE: u64 = 1 << 20;
-
-/// The most recently opened files by path, up to `limit`.
-pub(super) struct RecentFiles<T> {
-    by_path: HashMap<String, Arc<T>>,
-    /// Oldest first.
-    order: VecDeque<String>,
-    limit: usize,
-}
-
-impl<T> RecentFiles<T> {
-    pub(super) fn new(store: &Store) -> Self {
-        Self { by_path: HashMap::new(), order: VecDeque::new(), limit: open_at_once(store) }
-    }
-
-    pub(super) fn get(&self, path: &str) -> Option<Arc<T>> {
-        self.by_path.get(path).map(Arc::clone)
-    }
-
-    pub(super) fn keep(&mut self, path: &str, file: &Arc<T>) {
-        if self.by_path.insert(path.to_owned(), Arc::clone(file)).is_some() {
-            return;
-        }
-        self.order.push_back(path.to_owned());
-        if self.order.len() > self.limit
-            && let Some(oldest) = self.order.pop_front()
-        {
-            self.by_path.remove(&oldest);
-        }
-    }
-}
-
-/// Maximum number of data files open at a time.
-pub(super) fn open_at_once(store: &Store) -> usize {
-    if store.remote { OPEN_OBJECTS } else { OPEN_FILES }
-}
 
 impl LanceReader {
     /// Opens data files in an object store concurrently, because each takes several requests. Skips open files.

@@ -1,7 +1,6 @@
 //! Reads the images of a batch from their locations and decodes them in parallel.
 
-use super::files::open_at_once;
-use super::{LanceReader, RowSlot, lock, merged};
+use super::lance_reader::{FileImages, LanceReader, RowSlot, lock, merged, open_at_once};
 use crate::dataset::objects::{self, ObjectRanges};
 use crate::formats::lance::convert::image_bytes;
 use crate::formats::lance::image_locations::{ImageLocation, ImageLocations};
@@ -13,15 +12,6 @@ use std::os::unix::fs::FileExt as _;
 use std::path::Path;
 use std::sync::Arc;
 use swm_core::Result;
-
-/// The images of one column in one data file.
-pub(super) struct FileImages {
-    /// Name of the data file.
-    path: String,
-    /// Size of the file in bytes.
-    size: u64,
-    locations: ImageLocations,
-}
 
 impl LanceReader {
     /// Locations of a column's images in a fragment; `None` if the column has another layout.

@@ -3,15 +3,17 @@
 //! - [`values`]: numeric columns, cached per fragment; [`images`]: images, read directly from their locations.
 //! - [`stored_rows`]: everything else, read with Lance's decoder.
 //! - [`files`]: opens and verifies data files.
+//! - [`lance_reader`]: the state of an open table.
 
 mod files;
 mod images;
+mod lance_reader;
 mod stored_rows;
 mod values;
 
-use self::files::RecentFiles;
-use self::images::FileImages;
-use self::values::ValueCache;
+pub use self::lance_reader::LanceReader;
+
+use self::lance_reader::{RecentFiles, RowSlot};
 use super::convert::{cast, image_bytes, integers};
 use super::record::{CONSTANTS_KEY, ContentHash};
 use super::schema::{self, Kind, StoredColumn};
@@ -19,54 +21,17 @@ use super::store::{Store, damaged};
 use crate::dataset::Location;
 use crate::dataset::objects::BlockCache;
 use crate::dataset::{Constants, Episode, Irregularity, Reader, StepRange};
-use lance_file::reader::FileReader;
 use lance_table::format::Manifest as Table;
-use std::collections::{BTreeMap, HashMap, HashSet};
-use std::fs::File;
+use std::collections::BTreeMap;
 use std::ops::Range;
-use std::path::Path;
 use std::slice;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Error, Manifest, Result, Schema};
 
 /// Opens a table.
 pub fn open(location: &Location) -> Result<Arc<dyn Reader>> {
     Ok(Arc::new(LanceReader::open(location)?))
-}
-
-/// A table of episodes.
-pub struct LanceReader {
-    store: Store,
-    table: Arc<Table>,
-    schema: Schema,
-    columns: Vec<StoredColumn>,
-    episodes: Vec<Episode>,
-    /// First row of each episode, counted over the table.
-    first_rows: Vec<u64>,
-    /// First row of each fragment, followed by the number of rows.
-    fragment_rows: Vec<u64>,
-    files: Mutex<RecentFiles<FileReader>>,
-    /// Local data files, opened for reading at offsets.
-    handles: Mutex<RecentFiles<File>>,
-    /// Known locations of images.
-    image_locations: Mutex<KnownImages>,
-    value_cache: Mutex<ValueCache>,
-    /// Cached blocks of an object store.
-    blocks: Arc<BlockCache>,
-    /// Data files whose content was verified.
-    verified: Mutex<HashSet<String>>,
-}
-
-/// Locations by fragment and column name; `None` if the column must be read with Lance's decoder.
-type KnownImages = HashMap<(usize, String), Option<Arc<FileImages>>>;
-
-/// A row of the table, and the part of the output that receives it.
-type RowSlot<'a> = (u64, &'a mut [u8]);
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    // The guarded data is valid after every statement, so poisoning is ignored.
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl LanceReader {
@@ -133,19 +98,6 @@ impl LanceReader {
     /// The next free `episode_idx`.
     pub fn next_episode(&self) -> i64 {
         self.episodes.last().map_or(0, |episode| episode.index + 1)
-    }
-
-    fn folder(&self) -> &Path {
-        &self.store.label
-    }
-
-    fn rows(&self) -> u64 {
-        self.fragment_rows[self.fragment_rows.len() - 1]
-    }
-
-    /// The fragment that contains a row.
-    fn fragment_of(&self, row: u64) -> usize {
-        self.fragment_rows.partition_point(|&first| first <= row) - 1
     }
 
     /// Reads `episode_idx` and derives the episodes and their first rows.
@@ -375,17 +327,4 @@ impl LanceReader {
         }
         Ok(hash.finish(&self.constants(episode)?))
     }
-}
-
-/// Merges sorted rows into ranges.
-fn merged(requested: &[&mut RowSlot]) -> Vec<Range<u64>> {
-    let mut merged: Vec<Range<u64>> = vec![];
-    for &&mut (row, _) in requested {
-        match merged.last_mut() {
-            Some(range) if row < range.end => {}
-            Some(range) if row == range.end => range.end += 1,
-            _ => merged.push(row..row + 1),
-        }
-    }
-    merged
 }

@@ -1,7 +1,6 @@
 //! Reads any rows of a column with Lance's decoder.
 
-use super::LanceReader;
-use super::files::open_at_once;
+use super::lance_reader::{LanceReader, open_at_once};
 use crate::formats::lance::store::block_on;
 use arrow_array::ArrayRef;
 use futures::{StreamExt as _, TryStreamExt as _};

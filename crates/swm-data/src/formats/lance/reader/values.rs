@@ -1,25 +1,17 @@
 //! Reads the numeric values of a batch. They are small, so the first access decodes the whole column of a fragment and
 //! caches it while the limit allows.
 
+use super::lance_reader::{LanceReader, RowSlot, lock, merged};
 use super::stored_rows::StoredRows;
-use super::{LanceReader, RowSlot, lock, merged};
 use crate::formats::lance::convert::convert;
 use crate::formats::lance::schema::StoredColumn;
 use crate::formats::lance::store::damaged;
-use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::Arc;
 use swm_core::Result;
 
 /// Maximum size of cached values in bytes. 100,000 steps with 60 elements take a quarter of it.
 const CACHED_BYTES: usize = 128 << 20;
-
-/// Decoded values by fragment and column name.
-#[derive(Default)]
-pub(super) struct ValueCache {
-    columns: HashMap<(usize, String), Arc<Vec<u8>>>,
-    bytes: usize,
-}
 
 impl LanceReader {
     pub(super) fn read_values(&self, column: &StoredColumn, requested: &mut [RowSlot]) -> Result<()> {

@@ -1,4 +1,4 @@
-"""Environments that the tests play in; Rust names them `tests.it.worlds:NAME`."""
+"""Environments for the tests, which make them by ids of the form `tests.it.environments:NAME`."""
 
 import os
 import signal
@@ -25,8 +25,8 @@ class Factor(spaces.Box):
         self.value = value
 
 
-class Number(spaces.Discrete):
-    """A leaf of a variation space: one of several integers."""
+class IntegerFactor(spaces.Discrete):
+    """A leaf of a variation space: one of several integers with a value."""
 
     def __init__(self, n, init_value):
         super().__init__(n)
@@ -63,13 +63,16 @@ class Group(spaces.Dict):
 
 
 class Room(gymnasium.Env):
-    """A point in a room: everything a world may have. Prints, and reads what it should not."""
+    """A point in a room, with every feature that an environment may have.
+
+    It prints, and it reads standard input, which workers use for requests.
+    """
 
     metadata = {'render_modes': ['rgb_array']}
 
     def __init__(self, render_mode=None, die_at=None, marker=None, raise_at=None, hang_at=None, size=4, meet=None):
         self.render_mode = render_mode
-        self.troubles = die_at, marker, raise_at, hang_at
+        self.failures = die_at, marker, raise_at, hang_at
         self.size, self.meet = size, meet
         self.action_space = spaces.Box(-0.4, 0.4, (2,), np.float64)
         self.observation_space = spaces.Dict({
@@ -84,14 +87,14 @@ class Room(gymnasium.Env):
                 'size': Factor(0.5, 2.0, (1,), [1.0]),
                 'color': Factor(0, 255, (3,), [255, 0, 10], np.uint8),
             }),
-            'door': Group({'number': Number(4, 1)}),
+            'door': Group({'number': IntegerFactor(4, 1)}),
         })
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.variation_space.start(seed, options or {})
         print('a new episode')
-        # Not when it is tried, which is with seed 0.
+        # The bridge resets it once with seed 0 to describe it, when no other room waits.
         self.meets = self.meet and seed
         if self.meets:
             self.wait_for_another('reset-')
@@ -110,7 +113,7 @@ class Room(gymnasium.Env):
 
     def step(self, action):
         assert self.action_space.contains(action), f'{action!r} is outside'
-        die_at, marker, raise_at, hang_at = self.troubles
+        die_at, marker, raise_at, hang_at = self.failures
         self.t += 1
         print('step', self.t)
         if self.meets:
@@ -135,22 +138,22 @@ class Room(gymnasium.Env):
         return self.observation(), -1.5, self.t >= 7, False, info
 
     def wait_for_another(self, what):
-        """Returns when two rooms have come to this point."""
+        """Waits until two rooms have reached this call."""
         open(os.path.join(self.meet, f'{what}{os.getpid()}'), 'w').close()
         for _ in range(1000):
             if sum(name.startswith(what) for name in os.listdir(self.meet)) == 2:
                 return
             time.sleep(0.01)
-        raise TimeoutError('nobody came')
+        raise TimeoutError('no other room reached this call')
 
     def render(self):
-        picture = np.zeros((self.size * 3, self.size * 4, 3), np.uint8)
-        picture[: self.size, ..., 2] = 20 * self.t
-        return picture
+        frame = np.zeros((self.size * 3, self.size * 4, 3), np.uint8)
+        frame[: self.size, ..., 2] = 20 * self.t
+        return frame
 
 
 class Field(gymnasium.Env):
-    """A point that looks for another, in a wind that the seed decides; it can be put anywhere."""
+    """A point that moves to a goal in a wind that depends on the seed. Methods set its position and goal."""
 
     metadata = {'render_modes': ['rgb_array']}
 
@@ -175,7 +178,7 @@ class Field(gymnasium.Env):
 
     def _set_state(self, state):
         assert isinstance(state, np.ndarray) and state.dtype == np.float64, state
-        state += 0  # It is the environment's own.
+        state += 0  # Fails if the array is read-only.
         self.position, self.t, self.how = state[:2].copy(), int(state[2]), 1
 
     def _set_goal_state(self, goal_state):
@@ -192,29 +195,29 @@ class Field(gymnasium.Env):
         return self.position, 0.0, bool(np.abs(self.position - self.goal).max() < 0.1), False, info
 
     def render(self):
-        picture = np.zeros((16, 16, 3), np.uint8)
+        frame = np.zeros((16, 16, 3), np.uint8)
         x, y = np.clip((self.position + 2) * 4, 0, 15).astype(int)
-        picture[y, x] = 255
-        return picture
+        frame[y, x] = 255
+        return frame
 
 
 class Jointed(Field):
-    """Takes its state in another form than a column has."""
+    """Has a `set_state` method whose arguments are not one column."""
 
     _set_state = None
 
     def set_state(self, qpos, qvel):
-        raise AssertionError('nobody knows what to give')
+        raise AssertionError('no column has these arguments')
 
 
-class Worded(Jointed):
-    """Says itself how it takes one."""
+class Declared(Jointed):
+    """Declares in `swm_callables` which method sets its state."""
 
     swm_callables = [{'method': 'place', 'args': {'x': {'value': 'x'}, 'label': {'value': 'ab', 'in_dataset': False}}}]
 
 
 class Choices(gymnasium.Env):
-    """Observes nothing but what was chosen, and cannot be drawn."""
+    """Observes its last action only, and does not render."""
 
     SPACES = {
         'discrete': spaces.Discrete(3, start=-1),
@@ -237,16 +240,16 @@ class Choices(gymnasium.Env):
 
     def step(self, action):
         assert self.action_space.contains(action), f'{action!r} is outside {self.action_space}'
-        numbers = []
+        values = []
         for part in action.values() if isinstance(action, dict) else action if isinstance(action, tuple) else [action]:
-            numbers.extend(np.asarray(part, np.float32).reshape(-1))
+            values.extend(np.asarray(part, np.float32).reshape(-1))
         observation = np.zeros(self.observation_space.shape, np.float32)
-        observation[: len(numbers)] = numbers
+        observation[: len(values)] = values
         return observation, 0.0, False, False, {}
 
 
 class Coated(gymnasium.Wrapper):
-    """A wrapper with factors around an environment without any; it draws without having been asked for a mode."""
+    """A wrapper that adds factors and rendering to an environment with neither, whatever the render mode."""
 
     def __init__(self):
         super().__init__(Choices('discrete'))
@@ -265,4 +268,4 @@ gymnasium.register('Coated-v0', Coated)
 gymnasium.register('Field-v0', Field, max_episode_steps=20)
 gymnasium.register('Choices-v0', Choices)
 gymnasium.register('Jointed-v0', Jointed)
-gymnasium.register('Worded-v0', Worded)
+gymnasium.register('Declared-v0', Declared)

@@ -28,10 +28,10 @@ pub fn control(context: &Context) -> Control<'static> {
             stage.update(progress.done, message);
         }
         Event::Finished { stage, metrics } => {
-            if let Some(finished) = shown.take()
-                && let Some(success) = success_rate(metrics)
-            {
-                print_summary(stage, &format!("{}: {success}", finished.subject));
+            // Dropping the display clears the bar, which must precede the summary.
+            let subject = shown.take().map(|finished| finished.subject.clone()).unwrap_or_default();
+            if let Some(success) = success_rate(metrics) {
+                print_summary(stage, &format!("{subject}: {success}"));
             }
         }
         _ => {}

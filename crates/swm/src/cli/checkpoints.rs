@@ -32,7 +32,7 @@ enum CheckpointsCommand {
     /// Load checkpoints and compare their hashes
     #[command(after_help = "Example: swm checkpoints verify lewm-rooms")]
     Verify {
-        /// Paths or names (default: all at home)
+        /// Paths or names (default: all checkpoints in the home folder)
         checkpoints: Vec<String>,
     },
     /// Import a checkpoint of the reference implementation

@@ -3,7 +3,7 @@
 use super::progress::{StageDisplay, print_summary};
 use super::{emit, emit_json, table};
 use crate::home::{names_in, open_dataset as open};
-use crate::{data, home};
+use crate::{collect_target, data, home};
 use clap::{Args, Subcommand};
 use serde_json::{Value, json};
 use std::path::PathBuf;
@@ -52,18 +52,28 @@ enum DatasetsCommand {
 
 /// Lists the datasets in the home folder, or commits shards.
 pub fn datasets(args: &DatasetsArgs, as_json: bool) -> anyhow::Result<()> {
-    if let Some(DatasetsCommand::Commit { dataset, mix_renderers }) = &args.command {
-        let location = home::location(dataset)?;
-        if !mix_renderers {
-            crate::collect_target::check_shards(&location)?;
-        }
-        let added = commit_shards(&location)?;
-        if as_json {
-            return emit_json(&json!({"dataset": location.to_string(), "added": added}));
-        }
-        emit(&format!("{added} episodes added to {location}\n"));
-        return Ok(());
+    match &args.command {
+        Some(DatasetsCommand::Commit { dataset, mix_renderers }) => commit(dataset, *mix_renderers, as_json),
+        None => list(as_json),
     }
+}
+
+/// Commits the shards of a dataset.
+fn commit(dataset: &str, mix_renderers: bool, as_json: bool) -> anyhow::Result<()> {
+    let location = home::location(dataset)?;
+    if !mix_renderers {
+        collect_target::check_shards(&location)?;
+    }
+    let added = commit_shards(&location)?;
+    if as_json {
+        return emit_json(&json!({"dataset": location.to_string(), "added": added}));
+    }
+    emit(&format!("{added} episodes added to {location}\n"));
+    Ok(())
+}
+
+/// Lists the datasets in the home folder.
+fn list(as_json: bool) -> anyhow::Result<()> {
     let folder = home::datasets();
     let summaries: Vec<Value> = names_in(&folder)
         .into_iter()

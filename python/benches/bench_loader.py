@@ -3,10 +3,10 @@
     python benches/bench_loader.py --reference /path/to/python
 
 The loop is LeRobot's: shuffled batches of 64 clips of 4 frames, 5 rows apart, at 224 pixels, each of which goes through a
-trivial model, whose step all sides take. Our loader runs twice: as it decodes every picture, and as it is by default, keeping
-some. One collection is the content of all datasets; the reference's are written by its own writers. It runs in the Python that
-`--reference` (or `$SWM_REFERENCE_PYTHON`) names, in turns with ours: what counts is the median of the ratios of neighbouring
-turns. The reference is tried with every number of workers, and the fastest one is what ours is compared with.
+trivial model, whose step all sides take. Our loader runs twice: without a cache, and with its default cache of decoded
+frames. All datasets have the content of one collection; the reference's are written by its own writers. The reference runs
+in the Python that `--reference` (or `$SWM_REFERENCE_PYTHON`) names, in turns with ours; the result is the median of the
+ratios of neighbouring turns. The reference runs with every number of workers, and ours is compared with the fastest.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=2.0, help="of a turn")
     parser.add_argument("--workers", type=int, nargs="*", default=[0, 2], help="worker processes of DataLoaders")
     parser.add_argument("--threads", type=int, default=2, help="threads of our loader that load ahead")
-    parser.add_argument("--cache", default="512MiB", help="what our loader keeps of decoded pictures, in one row")
+    parser.add_argument("--cache", default="512MiB", help="size of our loader's cache of decoded frames, in one row")
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.serve:
@@ -191,7 +191,7 @@ def main() -> None:
                     "turn", beside, theirs, workers, given.seconds
                 )
             settings = {"columns": COLUMNS, "drop_last": True, "threads": given.threads, **CLIP}
-            for how, cache in (("Loader, every picture decoded", 0), (f"Loader, {given.cache} of pictures kept", given.cache)):
+            for how, cache in (("Loader, every frame decoded", 0), (f"Loader, {given.cache} of frames cached", given.cache)):
                 batches = endless(data.Loader(folder / place, BATCH, cache=cache, **settings))
                 ways[how] = lambda batches=batches: turn(batches, step, given.seconds)
             for workers in given.workers:

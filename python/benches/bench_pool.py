@@ -53,7 +53,7 @@ def main() -> None:
             ours.append(python(env, envs, side, given.seconds, given.chunk))
             theirs.append(command(given.swm, env, envs, side))
         ratio = statistics.median(a / b for a, b in zip(ours, theirs, strict=True))
-        size = f"{side} px" if side else "no pictures"
+        size = f"{side} px" if side else "no frames"
         print(f"{env}, {envs} environments, {size}: {statistics.median(ours):,.0f} steps/s, {ratio:.2f} x the command line's")
 
 

@@ -1,4 +1,4 @@
-"""A platform for reproducible world-model research: worlds, datasets, models, planners and evaluation.
+"""A platform for reproducible world-model research: environments, datasets, models, planners and evaluation.
 
     import stable_worldmodel as swm
 
@@ -6,8 +6,8 @@
     world.set_policy(swm.policy.RandomPolicy(seed=42))
     world.collect("pusht.lance", episodes=100, seed=42)
 
-Importing this package is cheap: its parts, numpy and the engine are loaded when they are first used. torch is
-never imported before something of torch's is used. Environments register themselves with Gymnasium.
+Importing this package is cheap: its modules, numpy and the engine are imported on first use, and torch only when a
+feature needs it. The environments are registered with Gymnasium.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ __all__ = [
     "wrapper",
 ]
 
-#: Where what is not a module of its own comes from.
-_HOMES = {"World": "world", "Metrics": "world", "PlanConfig": "policy"}
+#: The modules that define the exported classes.
+_MODULES = {"World": "world", "Metrics": "world", "PlanConfig": "policy"}
 
 
 def __getattr__(name: str) -> Any:
@@ -49,16 +49,16 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
-        home = importlib.import_module(f"{__name__}.{_HOMES.get(name, name)}")
+        module = importlib.import_module(f"{__name__}.{_MODULES.get(name, name)}")
     except ImportError as error:
         if "libav" in str(error) or "libsw" in str(error):
             message = (
-                f"{error}\nThis wheel uses the FFmpeg libraries of the machine it was built on, and they are not here. "
-                "Install those, or a wheel that has them inside (make wheel-portable)."
+                f"{error}\nThis wheel needs the FFmpeg libraries of the machine that built it, and they are not installed. "
+                "Install them, or use a wheel that contains them (make wheel-portable)."
             )
             raise ImportError(message) from error
         raise
-    value = getattr(home, name) if name in _HOMES else home
+    value = getattr(module, name) if name in _MODULES else module
     globals()[name] = value
     return value
 

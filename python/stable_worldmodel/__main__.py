@@ -6,7 +6,7 @@ import sys
 
 
 def main() -> None:
-    """Runs the `swm` command with the words of the command line, and exits with its code."""
+    """Runs the `swm` command with the arguments of this process and exits with its code."""
     from . import _engine
 
     sys.exit(_engine.command(["swm", *sys.argv[1:]]))

@@ -1,4 +1,4 @@
-"""Gymnasium environments in a `World`, in this interpreter or in processes of their own."""
+"""Gymnasium environments in this interpreter, for `World`."""
 
 from __future__ import annotations
 
@@ -21,23 +21,27 @@ def open_world(
     threads: int,
     wrap_goal: bool,
 ) -> tuple[Any, list[Any], list[Any]]:
-    """The engine's world of environments that Gymnasium makes, the environments, and what the engine puts around them.
+    """Makes a world of Gymnasium environments.
 
-    Visual wrappers of ours run in the engine; with any other among them, all of them run where Gymnasium puts them.
+    If all wrappers are visual wrappers of this package, they run in the engine. Otherwise all wrappers run in Python.
+
+    Returns:
+        The engine's world, the Gymnasium environments (filled as the world makes them), and the ids and settings of the
+        wrappers that run in the engine.
     """
-    drawn = engine_wrappers(wrappers)
-    inside = [] if drawn is not None else list(wrappers)
+    in_engine = engine_wrappers(wrappers)
+    in_python = [] if in_engine is not None else list(wrappers)
     try:
         bridge = _engine.bridge(env_name.startswith("swm/Craftax"))
     except ModuleNotFoundError as error:
         raise _missing("craftax", error) from error
     envs: list[Any] = []
-    # Ours draw in any size, which beats resizing.
+    # Native environments render at any size, which is better than resizing.
     sized = {"image_shape": image} if image is not None and env_name in _engine.envs() else {}
 
     def make() -> Any:
         try:
-            made = bridge.make(env_name, {**options, **sized}, inside)
+            made = bridge.make(env_name, {**options, **sized}, in_python)
         except bridge.Missing as error:
             raise _missing(error.args[0], error) from error
         if max_episode_steps is not None:
@@ -49,9 +53,9 @@ def open_world(
 
     described = ",".join([env_name, *(f"{key}={value}" for key, value in options.items())])
     world = _engine.World.gymnasium(
-        described, make, num_envs, image, max_episode_steps, threads, json.dumps(drawn or []), wrap_goal
+        described, make, num_envs, image, max_episode_steps, threads, json.dumps(in_engine or []), wrap_goal
     )
-    return world, envs, drawn or []
+    return world, envs, in_engine or []
 
 
 def _missing(package: str, error: Exception) -> ModuleNotFoundError:

@@ -1,4 +1,4 @@
-"""Options of a reset, as the engine takes them."""
+"""Converts the options of resets and evaluations to the JSON of the engine."""
 
 from __future__ import annotations
 
@@ -12,14 +12,19 @@ KNOWN = ("variation", "variation_values", "state", "goal_state")
 
 
 def variation(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """The variation request in `options`: what is sampled and what is pinned.
+    """The variation request in `options`.
 
-    `spaces` are the environment's factors, by key. Colours may be given as 0..255, or as fractions of 1.
+    Args:
+        options: The options of a reset. Colours are integers from 0 to 255, or fractions from 0 to 1.
+        spaces: The descriptions of the environment's factors, by key.
+
+    Returns:
+        The factors to sample (`variation`) and the values of pinned factors (`variation_values`).
     """
     options = options or {}
     unknown = [name for name in options if name not in KNOWN]
     if unknown:
-        raise ValueError(f"options: unknown {unknown}; known are {list(KNOWN)}")
+        raise ValueError(f"options: unknown {unknown}; the options are {list(KNOWN)}")
     sampled = options.get("variation")
     if isinstance(sampled, str):
         sampled = [sampled]
@@ -31,13 +36,13 @@ def variation(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[st
     if not isinstance(values, Mapping):
         raise ValueError(f"options['variation_values']: expected a dict from factors to values, got {values!r}")
     values = {_known(key, spaces): value for key, value in values.items()}
-    pinned = {key: _numbers(key, value, spaces.get(key)) for key, value in values.items()}
+    pinned = {key: _floats(key, value, spaces.get(key)) for key, value in values.items()}
     sampled = None if sampled is None else sorted({_known(key, spaces) for key in sampled})
     return {"variation": sampled, "variation_values": pinned}
 
 
 def reset(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[str, Any]]) -> str:
-    """All of `options`, as JSON."""
+    """All options of a reset, as JSON."""
     options = options or {}
     given = {
         name: None if options.get(name) is None else np.asarray(options[name], dtype=np.float64).ravel().tolist()
@@ -47,28 +52,28 @@ def reset(options: Mapping[str, Any] | None, spaces: Mapping[str, Mapping[str, A
 
 
 def callables(given: Any) -> list[dict[str, Any]]:
-    """Methods to call with their arguments, as `World.evaluate` is given them, in JSON's words."""
+    """The `callables` of `World.evaluate`, checked and converted to values that JSON can hold."""
     calls = []
     for call in given or ():
         method, args = (call.get("method"), call.get("args") or {}) if isinstance(call, Mapping) else (None, {})
         if not isinstance(method, str) or not isinstance(args, Mapping):
             raise ValueError(f"callables: expected {{'method': NAME, 'args': {{KEYWORD: {{'value': COLUMN}}}}}}, got {call!r}")
-        words: dict[str, Any] = {}
+        arguments: dict[str, Any] = {}
         for key, argument in args.items():
             if not isinstance(argument, Mapping) or "value" not in argument:
                 raise ValueError(f"callables: {method}({key}=…) needs {{'value': COLUMN}}, got {argument!r}")
             in_dataset, value = bool(argument.get("in_dataset", True)), argument["value"]
             if in_dataset and not isinstance(value, str):
                 raise ValueError(
-                    f"callables: {method}({key}=…) names a column by {value!r}; give a name, or 'in_dataset': False for a value"
+                    f"callables: {method}({key}=…) has the column {value!r}; give a name, or 'in_dataset': False for a value"
                 )
-            words[str(key)] = {"value": _plain(value, f"{method}({key}=…)"), "in_dataset": in_dataset}
-        calls.append({"method": method, "args": words})
+            arguments[str(key)] = {"value": _plain(value, f"{method}({key}=…)"), "in_dataset": in_dataset}
+        calls.append({"method": method, "args": arguments})
     return calls
 
 
 def _plain(value: Any, what: str) -> Any:
-    """A value that JSON can hold; arrays by their type, shape and bytes."""
+    """The value in a form that JSON can hold: arrays become their type, shape and bytes."""
     if hasattr(value, "detach"):
         value = value.detach().cpu().numpy()
     if isinstance(value, (np.ndarray, np.generic)) and value.dtype.kind in "biuf":
@@ -76,25 +81,23 @@ def _plain(value: Any, what: str) -> Any:
     try:
         json.dumps(value, allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"callables: {what} is {value!r}; expected numbers, text, lists, dicts or an array of numbers"
-        ) from error
+        raise TypeError(f"callables: {what} is {value!r}; expected a number, text, list, dict or numeric array") from error
     return value
 
 
 def _known(key: str, spaces: Mapping[str, Any]) -> str:
-    """The environment's name of a factor. The paper says `agent.size` where Push-T says `agent.scale`."""
+    """The environment's key of a factor. The paper writes `agent.size` for the factor `agent.scale` of Push-T."""
     group, _, name = key.rpartition(".")
     scale = f"{group}.scale"
     return scale if name == "size" and key not in spaces and scale in spaces else key
 
 
-def _numbers(key: str, value: Any, space: Mapping[str, Any] | None) -> list[float]:
+def _floats(key: str, value: Any, space: Mapping[str, Any] | None) -> list[float]:
     try:
-        numbers = np.asarray(value, dtype=np.float64).ravel()
+        values = np.asarray(value, dtype=np.float64).ravel()
     except (TypeError, ValueError) as error:
         raise ValueError(f"options['variation_values'][{key!r}]: expected numbers, got {value!r}") from error
-    fractions = np.any(numbers != np.round(numbers)) and np.all((numbers >= 0) & (numbers <= 1))
+    fractions = np.any(values != np.round(values)) and np.all((values >= 0) & (values <= 1))
     if space is not None and space["type"] == "RGBBox" and fractions:
-        numbers = np.round(255 * numbers)
-    return numbers.tolist()
+        values = np.round(255 * values)
+    return values.tolist()

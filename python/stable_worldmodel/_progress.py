@@ -1,4 +1,4 @@
-"""How far a long run is: tqdm's bar where it is installed, a line now and then otherwise, nothing where nobody looks."""
+"""Progress of long runs: a tqdm bar if tqdm is installed, else lines; only in terminals and notebooks."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def bar(what: str, total: int, shown: bool) -> Iterator[Callable[[int, int, int], None] | None]:
-    """Something to call with (done, total, steps), or nothing."""
+    """Yields a progress callback `(done, total, steps)`, or `None` if nothing is to be shown."""
     if not shown:
         yield None
         return
@@ -22,16 +22,16 @@ def bar(what: str, total: int, shown: bool) -> Iterator[Callable[[int, int, int]
     with tqdm(total=total, desc=what, unit="episode", disable=None if sys.stderr.isatty() else not _notebook()) as shown_bar:
         begun = time.monotonic()
 
-        def tell(done: int, total: int, steps: int) -> None:
+        def report(done: int, total: int, steps: int) -> None:
             shown_bar.total = total
             shown_bar.set_postfix_str(f"{steps / max(time.monotonic() - begun, 1e-9):.0f} steps/s", refresh=False)
             shown_bar.update(done - shown_bar.n)
 
-        yield tell
+        yield report
 
 
 def _notebook() -> bool:
-    """Whether somebody looks through a notebook."""
+    """Whether this is a notebook."""
     return "ipykernel" in sys.modules
 
 
@@ -40,10 +40,10 @@ def _lines(what: str) -> Callable[[int, int, int], None] | None:
         return None
     last = time.monotonic()
 
-    def tell(done: int, total: int, steps: int) -> None:
+    def report(done: int, total: int, steps: int) -> None:
         nonlocal last
         if done == total or time.monotonic() - last > 5:
             last = time.monotonic()
             print(f"{what}: {done} of {total} episodes, {steps} steps", file=sys.stderr)
 
-    return tell
+    return report

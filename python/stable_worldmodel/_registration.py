@@ -1,7 +1,7 @@
-"""Registers our environments with Gymnasium, now if it is loaded, else as soon as it is.
+"""Registers the native environments with Gymnasium: now if it is imported, else right after its import.
 
-So `import stable_worldmodel` alone makes `gymnasium.make("swm/PushT-v1")` work, in whichever order the two are
-imported, and costs nothing for those who do not use Gymnasium.
+`import stable_worldmodel` is therefore enough for `gymnasium.make("swm/PushT-v1")`, in any order of the two imports, and
+does not import Gymnasium itself.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 
 
 def install() -> None:
-    """Registers, or arranges for it."""
+    """Registers the environments, or installs an import hook that does."""
     if "gymnasium" in sys.modules:
         register()
     elif not any(isinstance(finder, _AfterGymnasium) for finder in sys.meta_path):
@@ -20,19 +20,19 @@ def install() -> None:
 
 
 def register() -> None:
-    """Registers our environments with Gymnasium; again changes nothing."""
+    """Registers the native environments with Gymnasium. Further calls change nothing."""
     import gymnasium
 
     from . import _engine
 
-    # Gymnasium imports the module only when it makes one: this may run in the midst of that module's own import.
+    # The entry point is a string, because this may run while `stable_worldmodel.envs` itself is being imported.
     for name in _engine.envs():
         if name not in gymnasium.registry:
             gymnasium.register(id=name, entry_point="stable_worldmodel.envs:NativeEnv", kwargs={"name": name})
 
 
 class _AfterGymnasium:
-    """A finder that lets others find `gymnasium`, and registers once it is loaded."""
+    """An import finder that registers the environments after the import of `gymnasium`."""
 
     def find_spec(self, name: str, path: Any = None, target: ModuleType | None = None) -> Any:
         if name != "gymnasium":

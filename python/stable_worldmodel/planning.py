@@ -1,11 +1,11 @@
-"""What a model must offer to be planned in, and what makes such a model out of less.
+"""Interfaces of models for planning, and a cost evaluator for latent dynamics.
 
 A model is anything with `get_cost(info_dict, action_candidates) -> (B, S)`: `Costable`. A model that can encode
-and predict (`Dynamics`) becomes one with `ShootingCostEvaluator`, which rolls candidates out and prices where they lead by
-objectives. The gradient solvers take gradients of `get_cost` through torch's autograd; GRASP asks for `Dynamics`.
+and predict (`Dynamics`) becomes one with `ShootingCostEvaluator`, which rolls out candidates and sums objectives of the
+trajectories. The gradient solvers differentiate `get_cost` with torch's autograd; GRASP requires `Dynamics`.
 
-Shapes: B environments, S candidates each, H model steps, A numbers of one model step (action dimension times action block), D
-numbers of a latent.
+Shapes: B environments, S candidates for each, H model steps, A the dimension of a model step (action dimension times action
+block), D the latent dimension.
 """
 
 from __future__ import annotations
@@ -31,14 +31,16 @@ __all__ = [
 
 @runtime_checkable
 class Costable(Protocol):
-    """A model to plan in."""
+    """A model with a cost of action candidates."""
 
     def get_cost(self, info_dict: dict[str, Any], action_candidates: Any) -> Any:
-        """What candidates `(B, S, H, A)` cost, `(B, S)`.
+        """The costs `(B, S)` of candidates.
 
-        `info_dict` holds what the environments show, each `(B, S, T, ..)`, with T frames of history (1 unless the plan's
-        `history_len` says more): `pixels`, `goal` and every other column. What is written into it stays for the rest of the
-        search, so that an encoding need not be computed twice.
+        Args:
+            info_dict: The infos, each `(B, S, T, ..)` with T steps of history (`history_len` of the plan config): `pixels`,
+                `goal` and the other columns. Entries that the model adds stay for the rest of the search, so an encoding
+                can be cached there.
+            action_candidates: The candidates `(B, S, H, A)`.
         """
         ...
 
@@ -48,11 +50,11 @@ class Dynamics(Protocol):
     """A model with a latent state, for GRASP and `ShootingCostEvaluator`."""
 
     def encode(self, info_dict: dict[str, Any]) -> Any:
-        """The latents of the present, `(B, D)`, of infos `(B, T, ..)`."""
+        """The latents `(B, D)` of the current observation in infos `(B, T, ..)`."""
         ...
 
     def encode_goal(self, info_dict: dict[str, Any]) -> Any:
-        """The latents of the goal, `(B, D)`."""
+        """The latents `(B, D)` of the goal in infos `(B, T, ..)`."""
         ...
 
     def predict(self, latents: Any, actions: Any) -> Any:
@@ -62,36 +64,36 @@ class Dynamics(Protocol):
 
 @runtime_checkable
 class Actionable(Protocol):
-    """A model that acts by itself."""
+    """A model with a policy."""
 
     def get_action(self, info: dict[str, Any]) -> Any:
-        """The actions `(B, ..)` for what the environments show."""
+        """The actions `(B, ..)` for infos `(B, T, ..)`."""
         ...
 
 
 @runtime_checkable
 class Transformable(Protocol):
-    """Something that scales numbers and back, such as `stable_worldmodel.data.ZScoreScaler`."""
+    """A scaler with an inverse, such as `stable_worldmodel.data.ZScoreScaler`."""
 
     def transform(self, x: Any) -> Any:
-        """To the model's units."""
+        """Converts values to the model's units."""
         ...
 
     def inverse_transform(self, x: Any) -> Any:
-        """Back."""
+        """Converts values back from the model's units."""
         ...
 
 
 class Objective(Protocol):
-    """A price of trajectories."""
+    """A cost term of trajectories."""
 
     def __call__(self, latents: Any, goal: Any, actions: Any) -> Any:
-        """The price `(N,)` of latents `(N, H + 1, D)`, the present first, with goal `(N, D)` and actions `(N, H, A)`."""
+        """The costs `(N,)` of latents `(N, H + 1, D)` (the current one first), goals `(N, D)` and actions `(N, H, A)`."""
         ...
 
 
 class GoalDistance:
-    """The squared distance of latents to the goal's: of the last one, or of all after the present with `running`."""
+    """The squared distance to the goal latent: of the last latent, or with `running` of all predicted latents."""
 
     def __init__(self, weight: float = 1.0, running: bool = False) -> None:
         self.weight, self.running = float(weight), bool(running)
@@ -102,7 +104,7 @@ class GoalDistance:
 
 
 class ActionPenalty:
-    """The squared size of the actions, in the model's units."""
+    """The squared norm of the actions, in the model's units."""
 
     def __init__(self, weight: float = 1.0) -> None:
         self.weight = float(weight)
@@ -112,11 +114,11 @@ class ActionPenalty:
 
 
 class ShootingCostEvaluator:
-    """A `Dynamics` as a `Costable`: rolls every candidate out and adds up its objectives."""
+    """A `Costable` made of `Dynamics`: rolls out every candidate and sums the objectives."""
 
     def __init__(self, dynamics: Dynamics, objective: Objective | Sequence[Objective] | None = None) -> None:
         if not isinstance(dynamics, Dynamics):
-            raise TypeError(f"{type(dynamics).__name__} has no encode, encode_goal and predict to roll out with")
+            raise TypeError(f"{type(dynamics).__name__} is not a Dynamics: expected encode, encode_goal and predict")
         self.dynamics = dynamics
         objectives = [GoalDistance()] if objective is None else objective
         self.objectives = list(objectives) if isinstance(objectives, Sequence) else [objectives]
@@ -136,8 +138,8 @@ class ShootingCostEvaluator:
             latents.append(self.dynamics.predict(latents[-1], actions[:, step]))
         stack = np.stack if isinstance(latent, np.ndarray) else _torch().stack
         trajectory = stack(latents, 1)
-        price = sum(objective(trajectory, goal, actions) for objective in self.objectives)
-        return price.reshape(envs, samples)  # type: ignore[union-attr]
+        cost = sum(objective(trajectory, goal, actions) for objective in self.objectives)
+        return cost.reshape(envs, samples)  # type: ignore[union-attr]
 
 
 def _repeat(rows: Any, times: int) -> Any:
@@ -145,7 +147,7 @@ def _repeat(rows: Any, times: int) -> Any:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# Models of Python's, as the engine asks them.
+# The adapter through which the engine calls models implemented in Python.
 
 
 def _torch() -> Any:
@@ -161,10 +163,9 @@ def has_torch() -> bool:
 
 
 def prepared(info: Mapping[str, Any], process: Mapping[str, Any], transform: Mapping[str, Any]) -> dict[str, Any]:
-    """Infos `(B, T, ..)` with every column scaled by `process` and every picture passed through `transform`, as torch
-    tensors where torch is installed.
+    """Infos `(B, T, ..)` scaled by `process` and transformed by `transform`, as torch tensors if torch is installed.
 
-    A transform gets pictures channels first, one by one, as torch tensors.
+    A transform is called with one frame `(C, H, W)` at a time, a torch tensor.
     """
     out: dict[str, Any] = {}
     for key, value in info.items():
@@ -188,16 +189,16 @@ def prepared(info: Mapping[str, Any], process: Mapping[str, Any], transform: Map
 
 
 class Adapter:
-    """A model of Python's as the engine asks it: numpy arrays in and out.
+    """A Python model for the engine, with numpy arrays as arguments and results.
 
     Args:
         model: A `Costable`, or a `Dynamics`.
-        device: Where torch's tensors go.
-        batch_size: Environments the model is asked about at once; all of them for `None`. What comes out does not depend
-            on it.
+        device: The device of torch tensors.
+        batch_size: The number of environments in one call of the model; all of them for `None`. It does not affect the
+            result.
         process, transform: As for `stable_worldmodel.policy.MPCPolicy`.
-        history: Frames the model sees.
-        dim: Numbers of one model step.
+        history: Frames the model gets, the current one included.
+        dim: The dimension of one model step.
     """
 
     def __init__(
@@ -213,7 +214,7 @@ class Adapter:
         if not hasattr(model, "get_cost") and isinstance(model, Dynamics):
             model = ShootingCostEvaluator(model)
         if not callable(getattr(model, "get_cost", None)):
-            raise TypeError(f"{type(model).__name__} has no get_cost(info_dict, action_candidates) to plan with")
+            raise TypeError(f"{type(model).__name__} cannot be planned with: expected get_cost(info_dict, action_candidates)")
         if batch_size is not None and batch_size < 1:
             raise ValueError(f"batch_size: {batch_size}; expected at least 1, or None for all environments at once")
         self.model, self.device, self.batch_size = model, device, batch_size
@@ -225,7 +226,7 @@ class Adapter:
         self.dtype = self._dtype()
         self._infos: dict[str, Any] = {}
         self._envs = 0
-        self._kept: dict[Any, dict[str, Any]] = {}
+        self._expanded_infos: dict[Any, dict[str, Any]] = {}
         self._constraints: dict[int, int] = {}
 
     def _dtype(self) -> Any:
@@ -236,11 +237,11 @@ class Adapter:
         except (AttributeError, StopIteration, TypeError):
             return _torch().float32
 
-    # What the engine asks before it plans.
+    # Read by the engine before it plans.
 
     @property
     def has_gradient(self) -> bool:
-        """Whether gradients can be had."""
+        """Whether the model supports gradients."""
         return self.torch
 
     @property
@@ -250,29 +251,29 @@ class Adapter:
 
     @property
     def dynamics(self) -> Any:
-        """The model as a `Dynamics`, if it is one."""
+        """The `Dynamics` of the model; `None` if it has none."""
         inner = getattr(self.model, "dynamics", self.model)
         return inner if isinstance(inner, Dynamics) else None
 
     @property
     def latent_dim(self) -> int | None:
-        """Numbers of a latent; none where the model shows none."""
+        """The latent dimension; `None` if the model has no `Dynamics`."""
         dynamics = self.dynamics
         if dynamics is None or not self.torch:
             return None
         dim = getattr(dynamics, "latent_dim", None)
         if dim is None:
-            raise AttributeError(f"{type(dynamics).__name__} encodes and predicts; give it latent_dim, too")
+            raise AttributeError(f"{type(dynamics).__name__} has encode and predict but no latent_dim: add the attribute")
         return int(dim)
 
-    # What the engine asks while it plans.
+    # Called by the engine while it plans.
 
     def observe(self, infos: Mapping[str, np.ndarray]) -> None:
-        """Takes note of infos `(B, ..)`."""
+        """Sets the infos of one step, `(B, ..)`, and of the history."""
         timed = {key: value[:, None] for key, value in infos.items() if not key.startswith("history.")}
         if self.history > 1 and "history.pixels" in infos and "pixels" in timed:
             past = infos["history.pixels"]
-            # What precedes an episode is its first picture again, as if the world had stood still.
+            # Before the first step, the history repeats the first frame.
             real = infos["history.length"].reshape(-1)
             steps = past.shape[1]
             for row, length in enumerate(real):
@@ -281,54 +282,54 @@ class Adapter:
                     past[row, :missing] = past[row, missing] if missing < steps else timed["pixels"][row, 0]
             timed["pixels"] = np.concatenate([past, timed["pixels"]], 1)
             timed["history_action"] = infos["history.action"]
-        self.see(timed)
+        self.set_infos(timed)
 
-    def see(self, infos: Mapping[str, Any]) -> None:
-        """Takes note of infos `(B, T, ..)`, tensors or arrays."""
+    def set_infos(self, infos: Mapping[str, Any]) -> None:
+        """Sets the infos `(B, T, ..)`, tensors or arrays."""
         self._infos = prepared(infos, self.process, self.transform)
         self._envs = len(next(iter(self._infos.values())))
-        self._kept.clear()
+        self._expanded_infos.clear()
 
     def cost(self, candidates: np.ndarray) -> np.ndarray:
-        """Costs `(B, S)`."""
+        """The costs `(B, S)` of candidates `(B, S, H, A)`."""
         if not self.torch:
             costs = [self.model.get_cost(infos, part) for infos, part in self._parts(candidates, "cost")]
             return np.ascontiguousarray(np.concatenate([np.asarray(c) for c in costs]), dtype=np.float32)
         with _torch().inference_mode():
-            return self._numpy([self._asked(infos, part) for infos, part in self._parts(candidates, "cost")])
+            return self._numpy([self._checked_cost(infos, part) for infos, part in self._parts(candidates, "cost")])
 
     def cost_and_gradient(self, candidates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Costs `(B, S)` and their gradients `(B, S, H, A)`."""
+        """The costs `(B, S)` of candidates `(B, S, H, A)` and their gradients `(B, S, H, A)`."""
         torch = _torch()
         costs, slopes = [], []
         with torch.enable_grad():
             for infos, part in self._parts(candidates, "gradient"):
                 part = part.requires_grad_()
-                cost = self._asked(infos, part)
+                cost = self._checked_cost(infos, part)
                 if not cost.requires_grad:
                     name = type(self.model).__name__
                     raise ValueError(f"{name}.get_cost is not differentiable: its result does not depend on its actions")
-                # The costs of candidates depend on their own actions only: the sum's gradient holds all of theirs. What
-                # the model kept in its infos may belong to an older graph, which is why it is kept.
+                # The cost of a candidate depends on its own actions only, so the gradient of the sum holds all gradients.
+                # Values that the model cached in its infos may belong to an older graph, so graphs are retained.
                 (slope,) = torch.autograd.grad(cost.sum(), part, retain_graph=True)
                 costs.append(cost.detach())
                 slopes.append(slope)
         return self._numpy(costs), self._numpy(slopes)
 
     def encode(self) -> tuple[np.ndarray, np.ndarray]:
-        """Latents of the present and of the goal, `(B, D)` each."""
+        """The latents `(B, D)` of the current observation and of the goal."""
         dynamics = self.dynamics
         with _torch().inference_mode():
             infos = {key: self._placed(value) for key, value in self._infos.items()}
             return self._numpy([dynamics.encode(infos)]), self._numpy([dynamics.encode_goal(infos)])
 
     def predict(self, latents: np.ndarray, actions: np.ndarray) -> np.ndarray:
-        """Latents `(N, D)` one step later."""
+        """The latents `(N, D)` one model step after `latents` `(N, D)` with actions `(N, A)`."""
         with _torch().inference_mode():
             return self._numpy([self.dynamics.predict(self._tensor(latents), self._tensor(actions))])
 
     def predict_vjp(self, latents: np.ndarray, actions: np.ndarray, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The gradients of a prediction with respect to latents and actions, weighted by `slope`."""
+        """The vector-Jacobian products of a prediction, `(N, D)` and `(N, A)`, for the output gradient `slope` `(N, D)`."""
         torch = _torch()
         with torch.enable_grad():
             given = self._tensor(latents).requires_grad_(), self._tensor(actions).requires_grad_()
@@ -338,10 +339,10 @@ class Adapter:
         return self._numpy(filled[:1]), self._numpy(filled[1:])
 
     def constraints(self, horizon: int) -> int:
-        """How many constraints a candidate has: as many as the model returns for one at rest."""
+        """The number of constraints of a candidate, as the model returns them for zero actions."""
         if horizon not in self._constraints:
-            resting = np.zeros((self._envs, 1, horizon, self.dim), dtype=np.float32)
-            self._constraints[horizon] = self.constrain(resting).shape[-1]
+            zeros = np.zeros((self._envs, 1, horizon, self.dim), dtype=np.float32)
+            self._constraints[horizon] = self.constrain(zeros).shape[-1]
         return self._constraints[horizon]
 
     def constrain(self, candidates: np.ndarray) -> np.ndarray:
@@ -366,7 +367,7 @@ class Adapter:
 
     # Between numpy and torch.
 
-    def _asked(self, infos: dict[str, Any], candidates: Any) -> Any:
+    def _checked_cost(self, infos: dict[str, Any], candidates: Any) -> Any:
         cost = self.model.get_cost(infos, candidates)
         expected = tuple(candidates.shape[:2])
         if tuple(getattr(cost, "shape", ())) != expected:
@@ -376,16 +377,16 @@ class Adapter:
         return cost if not isinstance(cost, np.ndarray) else _torch().from_numpy(cost)
 
     def _parts(self, candidates: np.ndarray, what: str) -> Any:
-        """Infos, repeated for every candidate, and candidates, for as many environments at a time as fit."""
+        """Yields infos, repeated for every candidate, and candidates, for `batch_size` environments at a time."""
         envs, samples = candidates.shape[:2]
         size = self.batch_size or envs
         for begin in range(0, envs, size):
             key = (what, begin, samples)
             rows = slice(begin, min(begin + size, envs))
             part = candidates[rows]
-            if key not in self._kept:
-                self._kept[key] = self._expanded(rows, part)
-            yield self._kept[key], self._tensor(part) if self.torch else part
+            if key not in self._expanded_infos:
+                self._expanded_infos[key] = self._expanded(rows, part)
+            yield self._expanded_infos[key], self._tensor(part) if self.torch else part
 
     def _expanded(self, rows: slice, part: np.ndarray) -> dict[str, Any]:
         samples, dim = part.shape[1], part.shape[3]

@@ -1,8 +1,8 @@
-"""Policies: who acts.
+"""Policies.
 
-A policy of one's own is any object with `get_action(infos)` that returns one action an environment; `BasePolicy` gives it the
-rest. Policies of the engine (random, experts, checkpoints, planning) run inside it: what an episode brings depends on its
-seed alone, whichever environment plays it and whatever is played beside it.
+A policy is any object with `get_action(infos)` that returns one action for each environment; `BasePolicy` provides the
+rest. The policies of the engine (random, experts, checkpoints, planning) run inside of it. There an episode depends only on
+its seed, not on the slot that plays it or on other episodes.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class PlanConfig:
     Attributes:
         horizon: Model steps to plan.
         receding_horizon: Model steps to execute before planning again; the whole horizon is open loop.
-        history_len: Frames the model sees, the present one included.
+        history_len: Frames the model gets, the current one included.
         action_block: Environment steps in one model step (the frameskip the model was trained with).
-        warm_start: Whether a plan starts from what the last one left unexecuted.
-        latency_budget: Seconds after which a search stops with what it has; results then depend on the machine.
+        warm_start: Whether a search starts from the part of the last plan that was not executed.
+        latency_budget: Seconds after which a search stops with its best plan; results then depend on the machine.
     """
 
     horizon: int = 5
@@ -60,7 +60,9 @@ class PlanConfig:
             if int(getattr(self, name)) < 1:
                 raise ValueError(f"PlanConfig.{name}: {getattr(self, name)}; expected at least 1")
         if self.receding_horizon > self.horizon:
-            raise ValueError(f"PlanConfig: {self.receding_horizon} model steps to execute, {self.horizon} planned")
+            raise ValueError(
+                f"PlanConfig: receding_horizon={self.receding_horizon} steps to execute exceed horizon={self.horizon}"
+            )
 
     @property
     def plan_len(self) -> int:
@@ -69,9 +71,9 @@ class PlanConfig:
 
 
 class BasePolicy:
-    """What policies share."""
+    """Base class of policies."""
 
-    #: What kind it is, for manifests and results.
+    #: The kind of the policy, for manifests and results.
     type = "policy"
 
     def __init__(self, **kwargs: Any) -> None:
@@ -80,15 +82,15 @@ class BasePolicy:
             setattr(self, name, value)
 
     def set_env(self, env: Any) -> None:
-        """Tells the policy which environments it acts in: `world.envs`."""
+        """Sets the environments that the policy acts in: `world.envs`."""
         self.env = env
 
     def get_action(self, obs: Any, **kwargs: Any) -> Any:
-        """The actions `(num_envs, ..)` for what the environments show."""
+        """The actions `(num_envs, ..)` for infos `(num_envs, T, ..)`."""
         raise NotImplementedError(f"{type(self).__name__} has no get_action(infos)")
 
     def _actor(self, world: World) -> Any:
-        """It as a policy of the engine, if it is one."""
+        """The policy of the engine that implements this one; `None` if it runs in Python."""
         return None
 
 
@@ -99,14 +101,14 @@ class _EnginePolicy(BasePolicy):
     """A policy that acts inside the engine."""
 
     def get_action(self, obs: Any, **kwargs: Any) -> np.ndarray:
-        """The actions for what the world shows now, whatever `obs` is."""
+        """The actions for the current infos of the world; `obs` is ignored."""
         if self.env is None:
             raise RuntimeError(f"{type(self).__name__}: world.set_policy(policy) first")
         return self.env._world._ask(self)
 
 
 class RandomPolicy(_EnginePolicy):
-    """Acts uniformly at random in the action space."""
+    """Samples actions uniformly from the action space."""
 
     type = "random"
 
@@ -115,7 +117,7 @@ class RandomPolicy(_EnginePolicy):
         self.seed = seed
 
     def set_seed(self, seed: int) -> None:
-        """Decides what it draws, beside each episode's seed."""
+        """Sets the policy's seed, which is combined with the seed of each episode."""
         self.seed = seed
         if self.env is not None:
             self.env._world._forget(self)
@@ -125,11 +127,11 @@ class RandomPolicy(_EnginePolicy):
 
 
 class ExpertPolicy(_EnginePolicy):
-    """The environment's own demonstrator.
+    """A scripted expert of the environment.
 
     Args:
         name: One of `swm.envs.experts(ID)`; the first for `"expert"`.
-        seed: What it draws beside each episode's seed.
+        seed: Combined with the seed of each episode.
     """
 
     type = "expert"
@@ -144,12 +146,12 @@ class ExpertPolicy(_EnginePolicy):
 
 
 class FeedForwardPolicy(BasePolicy):
-    """Acts by one pass through a model: an `Actionable`, or the name of a checkpoint that acts.
+    """Acts with one forward pass of a model: an `Actionable`, or a checkpoint with a policy.
 
     Args:
         model: Something with `get_action(info)`, or a checkpoint's name or path.
-        process: By column, what scales it; that of `action` scales actions back.
-        transform: By column, what pictures pass through, one by one, channels first.
+        process: Scalers by column; the scaler of `action` converts actions back (`inverse_transform`).
+        transform: Transforms of frames by column, called with one frame `(C, H, W)` at a time.
     """
 
     type = "feed_forward"
@@ -195,17 +197,17 @@ class FeedForwardPolicy(BasePolicy):
 
 
 class MPCPolicy(BasePolicy):
-    """Plans with a solver, executes the first steps of the plan, plans again.
+    """Model predictive control: plans with a solver, executes the first steps of the plan, and plans again.
 
     Args:
         solver: One of `swm.solver`, or an object with `configure` and `solve`.
-        config: How far to plan; by default 5 model steps, all of them executed, of as many environment steps as the model's
-            `action_block` says (1 where it says nothing).
-        process: By column, what scales it before the model sees it (`transform`); that of `action` scales planned actions back
-            (`inverse_transform`).
-        transform: By picture column (`pixels`, `goal`), what pictures pass through, one by one, channels first.
+        config: The planning config; by default 5 model steps, all of them executed, with the model's `action_block` (1 if it
+            has none).
+        process: Scalers by column, applied before the model (`transform`); the scaler of `action` converts planned actions
+            back (`inverse_transform`).
+        transform: Transforms by frame column (`pixels`, `goal`), called with one frame `(C, H, W)` at a time.
 
-    The infos a model gets are those of the environments that replan, `(B, T, ..)`.
+    The model gets the infos `(B, T, ..)` of the environments that replan.
     """
 
     type = "world_model"
@@ -220,7 +222,7 @@ class MPCPolicy(BasePolicy):
     ) -> None:
         super().__init__(**kwargs)
         if not isinstance(solver, Solver):
-            raise TypeError(f"{type(solver).__name__} is no solver: it needs configure(…) and solve(…)")
+            raise TypeError(f"{type(solver).__name__} is not a solver: expected configure(…) and solve(…)")
         self.solver = solver
         model = getattr(solver, "model", None)
         block = int(getattr(model, "action_block", 1))
@@ -230,7 +232,7 @@ class MPCPolicy(BasePolicy):
             raise ValueError(f"PlanConfig.action_block: {config.action_block}; {model} was trained with {block}")
         self.cfg = self.config = config
         self.process, self.transform = dict(process or {}), dict(transform or {})
-        #: How the searches went: a list of dicts, one a plan, after `evaluate` and `collect`.
+        #: The search traces, one dict for each plan, after `evaluate` and `collect`.
         self.plans: list[dict[str, Any]] = []
         self._actions: list[list[np.ndarray]] = []
         self._rest: dict[int, Any] = {}
@@ -247,23 +249,23 @@ class MPCPolicy(BasePolicy):
             return None
         model = self.solver.adapter(self.process, self.transform, self.cfg.history_len)
         if isinstance(model, _engine.Model) and (self.process or self.transform):
-            raise ValueError("MPCPolicy: models of swm.wm scale what they see by themselves; leave process and transform out")
+            raise ValueError("MPCPolicy: models of swm.wm scale their inputs themselves; remove process and transform")
         cfg = asdict(self.cfg)
         cfg["history"] = cfg.pop("history_len")
         settings = json.dumps(self.solver.settings)
         seed = self.solver.seed
         return _engine.Actor.planning(world._world, self.solver.id, settings, json.dumps(cfg), scale, model, seed)
 
-    # In Python, for solvers of one's own.
+    # Planning in Python, for user-defined solvers.
 
     def get_action(self, obs: Any, **kwargs: Any) -> np.ndarray:
-        """The actions for infos `(num_envs, T, ..)`."""
+        """The actions `(num_envs, ..)` for infos `(num_envs, T, ..)`."""
         if self.env is None:
             raise RuntimeError("MPCPolicy: world.set_policy(policy) first")
         if self.cfg.history_len > 1:
             raise ValueError(
-                f"history_len: {self.cfg.history_len}; past frames are kept for the engine's solvers only, and where actions "
-                "are scaled by a mean and a standard deviation or not at all"
+                f"history_len: {self.cfg.history_len}; only the engine's solvers get past frames, and only if actions are "
+                "scaled by a mean and a standard deviation or not at all"
             )
         infos = dict(obs)
         fresh, active = infos.pop("_needs_flush", None), infos.pop("_active", None)
@@ -302,10 +304,10 @@ class MPCPolicy(BasePolicy):
         if plan.ndim != 3 or plan.shape[0] != len(due) or plan.shape[1] < self.cfg.receding_horizon:
             raise ValueError(
                 f"{type(self.solver).__name__}.solve: got actions of shape {plan.shape}, expected "
-                f"({len(due)}, {self.cfg.horizon}, numbers of a model step)"
+                f"({len(due)}, {self.cfg.horizon}, dimension of a model step)"
             )
         if not np.isfinite(plan).all():
-            raise ValueError(f"{type(self.solver).__name__}.solve: its plan holds numbers that are not finite")
+            raise ValueError(f"{type(self.solver).__name__}.solve: expected finite actions, got a plan with NaN or infinity")
         space = single(self.env.action_space, self.env.num_envs)
         for row, i in enumerate(due):
             self._rest[i] = plan[row, self.cfg.receding_horizon :]
@@ -321,7 +323,7 @@ WorldModelPolicy = MPCPolicy
 
 
 def _executed(step: np.ndarray, space: Any) -> np.ndarray:
-    """A planned step as an action: clamped to a box; of one-hot vectors, the choices."""
+    """A planned step as an action: clipped to a `Box`, or the choices of one-hot vectors."""
     if space.dtype.kind == "f":
         return np.clip(step.reshape(space.shape), space.low, space.high).astype(space.dtype)
     sizes = [int(n) for n in np.atleast_1d(getattr(space, "nvec", getattr(space, "n", 0)))]
@@ -335,26 +337,26 @@ def _executed(step: np.ndarray, space: Any) -> np.ndarray:
 
 
 def _scale(scaler: Any) -> tuple[list[float], list[float]] | None:
-    """Mean and standard deviation of something that scales by them."""
+    """The mean and standard deviation of a scaler; `None` if it has none."""
     if scaler is None:
         return None
     for mean, std in (("mean", "std"), ("mean_", "scale_")):
         if hasattr(scaler, mean) and hasattr(scaler, std):
-            numbers = [getattr(scaler, name) for name in (mean, std)]
-            numbers = [n.detach().cpu().numpy() if hasattr(n, "detach") else n for n in numbers]
-            return tuple(np.asarray(n, dtype=np.float32).reshape(-1).tolist() for n in numbers)  # type: ignore[return-value]
+            values = [getattr(scaler, name) for name in (mean, std)]
+            values = [n.detach().cpu().numpy() if hasattr(n, "detach") else n for n in values]
+            return tuple(np.asarray(n, dtype=np.float32).reshape(-1).tolist() for n in values)  # type: ignore[return-value]
     return None
 
 
 def AutoCostModel(run_name: str, cache_dir: Any = None) -> Any:
-    """A checkpoint to plan in, by name or path: `swm.wm.load`."""
+    """Loads a checkpoint to plan with, by name or path, as `swm.wm.load`."""
     from . import wm
 
     return wm.load(_named(run_name, cache_dir))
 
 
 def AutoActionableModel(run_name: str, cache_dir: Any = None) -> Any:
-    """A checkpoint that acts, by name or path: `swm.wm.load`."""
+    """Loads a checkpoint with a policy, by name or path, as `swm.wm.load`."""
     return AutoCostModel(run_name, cache_dir)
 
 

@@ -1,13 +1,12 @@
-"""Solvers: who finds cheap action sequences.
+"""Solvers: searches for action sequences of low cost.
 
     solver = swm.solver.CEMSolver(model, num_samples=300, n_steps=30, topk=30)
     policy = swm.policy.MPCPolicy(solver, config=swm.PlanConfig(horizon=5, receding_horizon=5))
 
-`model` is anything with `get_cost` (a PyTorch module, one of `swm.wm`, …), or `"simulator"`: the world itself, the upper bound
-of any model. The search runs in the engine, for all
-environments together; what it returns depends on the seed and on each environment's own infos, never on how many are
-planned together. A solver of one's own is any object with `configure(action_space, n_envs, config)` and
-`solve(info_dict, init_action)`.
+`model` is any object with `get_cost` (a PyTorch module, a model of `swm.wm`, …), or `"simulator"`: the environment itself as
+a perfect model. The search runs in the engine for all environments together; the plan of an environment depends on the seed
+and the infos of that environment, not on the others. A user-defined solver is any object with
+`configure(action_space, n_envs, config)` and `solve(info_dict, init_action)`.
 """
 
 from __future__ import annotations
@@ -39,23 +38,23 @@ __all__ = [
 
 @runtime_checkable
 class Solver(Protocol):
-    """What a policy needs of a solver."""
+    """The interface that `MPCPolicy` requires of a solver."""
 
     def configure(self, *, action_space: spaces.Space, n_envs: int, config: Any) -> None:
-        """Tells the action space (of all environments together), how many there are, and the `PlanConfig`."""
+        """Sets the batched action space, the number of environments and the `PlanConfig`."""
         ...
 
     def solve(self, info_dict: dict[str, Any], init_action: Any = None) -> dict[str, Any]:
-        """Plans for every row of `info_dict` `(B, T, ..)`: a dict with `actions` `(B, horizon, action_dim)`."""
+        """Plans for every row of `info_dict` `(B, T, ..)`; returns a dict with `actions` `(B, horizon, action_dim)`."""
         ...
 
 
 class EngineSolver:
-    """A solver of the engine. Its settings have the names they have in `swm solvers`, beside those of the constructor."""
+    """Base class of the engine's solvers. Settings have the names of `swm solvers`, or the field's names in `_names`."""
 
-    #: Its id in the engine.
+    #: The id of the solver in the engine.
     id: str
-    #: What the constructor calls a setting of the engine.
+    #: The engine's names of settings, by their names in the constructor.
     _names: Mapping[str, str] = {}
 
     def __init__(
@@ -69,7 +68,9 @@ class EngineSolver:
         **settings: Any,
     ) -> None:
         if callbacks:
-            raise TypeError("callbacks: the search runs outside of Python; solve(…)['trace'] and policy.plans tell how it went")
+            raise TypeError(
+                "callbacks: not supported, because the search runs outside of Python; read solve(…)['trace'] or policy.plans"
+            )
         self.model, self.batch_size, self.device, self.seed = model, batch_size, device, int(seed)
         known = json.loads(_engine.solvers())[self.id]
         self.settings: dict[str, Any] = {}
@@ -93,26 +94,26 @@ class EngineSolver:
 
     @property
     def n_envs(self) -> int:
-        """Environments that are planned for."""
+        """The number of environments."""
         return self._n_envs
 
     @property
     def horizon(self) -> int:
-        """Model steps of a plan."""
+        """The number of model steps in a plan."""
         return self._configured().horizon
 
     @property
     def action_dim(self) -> int:
-        """Numbers of one model step."""
+        """The dimension of one model step."""
         return _dim(self._space(), self._configured().action_block)
 
     def adapter(self, process: Any = None, transform: Any = None, history: int = 1) -> Any:
-        """The model as the engine asks it; `None` for the world itself."""
+        """The model for the engine: a checkpoint or an `Adapter`; `None` for the simulator."""
         if self.model is None:
-            raise ValueError(f"{type(self).__name__} was made without a model to plan in: give it one, or 'simulator'")
+            raise ValueError(f"{type(self).__name__} has no model to plan with: pass one, or 'simulator'")
         if isinstance(self.model, str):
             if self.model != "simulator":
-                raise ValueError(f"model: {self.model!r}; load a checkpoint with swm.wm.load, or say 'simulator'")
+                raise ValueError(f"model: {self.model!r}; load a checkpoint with swm.wm.load, or pass 'simulator'")
             return None
         engine = getattr(self.model, "_engine_model", None)
         if engine is not None:
@@ -122,28 +123,34 @@ class EngineSolver:
     def solve(self, info_dict: dict[str, Any], init_action: Any = None) -> dict[str, Any]:
         """Plans for every row of `info_dict` `(B, T, ..)`.
 
-        Returns a dict with `actions` `(B, horizon, action_dim)`, `costs` (one an environment: of the cheapest candidate
-        of the last iteration) and `trace` (how each search went). Every call draws other random numbers; the same calls
-        with the same seed draw the same.
+        Each call uses new random numbers; the same sequence of calls with the same seed uses the same ones.
+
+        Args:
+            info_dict: Infos `(B, T, ..)`.
+            init_action: Where the search starts, `(B, at most horizon, action_dim)`; zeros fill the rest.
+
+        Returns:
+            A dict with `actions` `(B, horizon, action_dim)`, `costs` (for each environment, of the cheapest candidate of the
+            last iteration) and `trace` (the record of each search).
         """
         config, space = self._configured(), self._space()
         block, horizon, dim = config.action_block, config.horizon, self.action_dim
         model = self.adapter()
         if model is None:
-            raise ValueError("the simulator is planned in by MPCPolicy, which sees the worlds themselves; solve sees infos")
+            raise ValueError("solve: the simulator needs the environments, and solve gets infos only; use MPCPolicy")
         infos = {key: value for key, value in info_dict.items() if not isinstance(value, (list, str))}
         envs = len(next(iter(infos.values())))
         if isinstance(model, Adapter):
-            model.see(infos)
+            model.set_infos(infos)
             engine_infos: dict[str, Any] = {}
         else:
-            engine_infos = {key: now(value) for key, value in infos.items()}
+            engine_infos = {key: last_step(value) for key, value in infos.items()}
         low, high, choices = _bounds(space, block, model)
         init = None if init_action is None else _padded(init_action, envs, horizon, dim)
         actions, costs, trace = _engine.solve(
             self.id,
             json.dumps(self.settings),
-            _Seen(model) if isinstance(model, Adapter) else model,
+            _Observed(model) if isinstance(model, Adapter) else model,
             engine_infos,
             envs,
             horizon,
@@ -176,8 +183,8 @@ class EngineSolver:
         return single(self._action_space, self._n_envs)
 
 
-class _Seen:
-    """An adapter that has seen its infos already."""
+class _Observed:
+    """An adapter whose infos are set already, so that it ignores `observe`."""
 
     def __init__(self, adapter: Adapter) -> None:
         self._adapter = adapter
@@ -190,10 +197,9 @@ class _Seen:
 
 
 def single(space: Any, envs: int) -> Any:
-    """The action space of one environment, of that of one or of all `envs` together.
+    """The action space of one environment, given that space or the batched space of `envs` environments.
 
-    Several choices, as many as there are environments and all of one kind, are taken for one an environment: that is what
-    Gymnasium makes of `Discrete`.
+    A `MultiDiscrete` of `envs` equal sizes is taken as the batched space of a `Discrete`, as Gymnasium defines it.
     """
     if isinstance(space, spaces.Box) and len(space.shape) > 1:
         return spaces.Box(space.low[0], space.high[0], dtype=space.dtype.type)
@@ -204,8 +210,8 @@ def single(space: Any, envs: int) -> Any:
     return space
 
 
-def now(value: Any) -> np.ndarray:
-    """A column `(B, T, ..)` of infos as the engine takes it: the latest moment `(B, ..)`."""
+def last_step(value: Any) -> np.ndarray:
+    """The last step `(B, ..)` of an info column `(B, T, ..)`, in a type of the engine."""
     if hasattr(value, "detach"):
         value = value.detach().cpu().numpy()
     value = np.asarray(value)
@@ -223,7 +229,7 @@ def _dim(space: spaces.Space, block: int) -> int:
 
 
 def _bounds(space: Any, block: int, model: Any) -> tuple[list[float], list[float], list[int] | None]:
-    """What a model step may be, in the model's units."""
+    """The bounds of a model step in the model's units, or the sizes of its discrete choices."""
     if isinstance(space, spaces.Discrete):
         return [], [], [int(space.n)] * block
     if isinstance(space, spaces.MultiDiscrete):
@@ -248,7 +254,7 @@ _SAMPLING = {"num_samples": "samples", "n_steps": "iterations", "topk": "elites"
 
 
 class PredictiveSamplingSolver(EngineSolver):
-    """Tries many guesses once and takes the cheapest."""
+    """Predictive sampling: samples candidates once and takes the cheapest."""
 
     id = "predictive_sampling"
     _names = {"num_samples": "samples", "noise_scale": "sigma"}
@@ -262,14 +268,14 @@ class CEMSolver(EngineSolver):
 
 
 class ICEMSolver(EngineSolver):
-    """CEM with coloured noise, kept elites and momentum."""
+    """iCEM: CEM with coloured noise, elites carried over between iterations, and momentum."""
 
     id = "icem"
     _names = {**_SAMPLING, "noise_beta": "beta", "alpha": "momentum", "n_elite_keep": "keep"}
 
 
 class MPPISolver(EngineSolver):
-    """Model predictive path integral: moves a mean by the weights that samples get from their costs."""
+    """Model predictive path integral: moves the mean to the average of the samples, weighted by their costs."""
 
     id = "mppi"
     _names = _SAMPLING
@@ -286,7 +292,7 @@ _GRADIENT = {"num_samples": "samples", "n_steps": "iterations", "var_scale": "si
 
 
 class _Gradient(EngineSolver):
-    """What gradient solvers share: `optimizer_cls` (a class of `torch.optim` or its name) and `optimizer_kwargs`."""
+    """Base class of gradient solvers, with `optimizer_cls` (a class of `torch.optim` or its name) and `optimizer_kwargs`."""
 
     _optimizer: str
 
@@ -304,10 +310,10 @@ class _Gradient(EngineSolver):
 
 
 def optimizer(kind: Any, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """An optimizer of torch's, as the engine calls it."""
+    """The engine's setting for an optimizer of torch."""
     kind = (kind if isinstance(kind, str) else kind.__name__).lower()
     if kind not in ("sgd", "adam"):
-        raise ValueError(f"optimizer_cls: the engine has SGD and Adam, not {kind}")
+        raise ValueError(f"optimizer_cls: expected SGD or Adam, got {kind}")
     given = dict(settings)
     out: dict[str, Any] = {"kind": kind, "step": float(given.pop("lr", 1.0 if kind == "sgd" else 1e-3))}
     if kind == "adam":
@@ -319,7 +325,7 @@ def optimizer(kind: Any, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class GradientSolver(_Gradient):
-    """Follows the gradient of the cost from several starts."""
+    """Gradient descent on the cost from several initial action sequences."""
 
     id = "gd"
     _names = _GRADIENT
@@ -327,14 +333,14 @@ class GradientSolver(_Gradient):
 
 
 class PGDSolver(EngineSolver):
-    """Projected gradient descent for discrete actions: on probabilities of the options."""
+    """Projected gradient descent for discrete actions, on the probabilities of the options."""
 
     id = "pgd"
     _names = _GRADIENT
 
 
 class LagrangianSolver(_Gradient):
-    """Augmented Lagrangian: follows the gradient and prices violated constraints (`get_constraints`) ever higher."""
+    """Augmented Lagrangian: gradient descent with a growing penalty on violated constraints (`get_constraints`)."""
 
     id = "lagrangian"
     _names = {
@@ -351,7 +357,7 @@ AugmentedLagrangianSolver = LagrangianSolver
 
 
 class GRASPSolver(EngineSolver):
-    """Optimises states and actions together, every model step by itself; the model is a `planning.Dynamics`."""
+    """GRASP: optimises states and actions of all model steps in parallel; the model is a `planning.Dynamics`."""
 
     id = "grasp"
     _names = {"n_steps": "iterations"}

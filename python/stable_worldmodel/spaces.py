@@ -1,8 +1,7 @@
-"""Gymnasium's spaces with a value, a default and a condition: what factors of variation are made of.
+"""Gymnasium's spaces with a value, a default and a condition: the spaces of factors of variation.
 
-A factor is a space with an `init_value` (what it is where nobody varies it), a current `value`, and maybe a
-`constrain_fn` that samples must satisfy. A `Dict` of them, nested as deep as one likes, is a `variation_space`;
-its members are named by dots, such as `agent.color`.
+A factor is a space with an `init_value` (its default), a current `value`, and optionally a `constrain_fn` that samples
+must satisfy. A nested `Dict` of factors is a `variation_space`; a factor's key joins the names by dots: `agent.color`.
 """
 
 from __future__ import annotations
@@ -15,12 +14,12 @@ from gymnasium import spaces
 
 __all__ = ["Box", "Dict", "Discrete", "MultiDiscrete", "RGBBox", "reset_variation_space"]
 
-#: How often a space is sampled before its condition is taken for impossible.
+#: The number of samples after which a condition is taken to be impossible.
 TRIES = 1000
 
 
 class _Factor:
-    """What a space needs to be a factor: mixed into Gymnasium's spaces."""
+    """A mixin that makes a factor of a Gymnasium space."""
 
     constrain_fn: Callable[[Any], bool] | None
     _init_value: Any
@@ -33,13 +32,13 @@ class _Factor:
             raise ValueError(f"init_value {init_value!r} is not in {self}, or violates its constrain_fn")
 
     def _typed(self, value: Any) -> Any:
-        """The value in the type of the space, where nothing is lost by it."""
+        """The value in the type of the space, if the conversion is exact."""
         typed = np.asarray(value, dtype=self.dtype)  # type: ignore[attr-defined]
         return typed if np.array_equal(typed, np.asarray(value)) or typed.dtype.kind == "f" else np.asarray(value)
 
     @property
     def init_value(self) -> Any:
-        """The value where nobody varies it."""
+        """The default value."""
         return self._init_value
 
     @property
@@ -48,7 +47,7 @@ class _Factor:
         return self._value
 
     def reset(self) -> None:
-        """Takes the default."""
+        """Sets the value to the default."""
         self._value = self._init_value
 
     def contains(self, x: Any) -> bool:
@@ -62,7 +61,7 @@ class _Factor:
     def sample(self, mask: Any = None, probability: Any = None, *, max_tries: int = TRIES, set_value: bool = True) -> Any:
         """Samples until the condition holds, at most `max_tries` times; the sample becomes the value."""
         for _ in range(max_tries):
-            # What is not given is not named: Gymnasium knows probabilities since 1.1.
+            # Passed only if given, because Gymnasium has the argument `probability` since 1.1.
             given = {} if probability is None else {"probability": probability}
             value = super().sample(mask=mask, **given)  # type: ignore[misc]
             if self.contains(value):
@@ -89,7 +88,7 @@ class _Factor:
 
 
 class Box(_Factor, spaces.Box):
-    """Numbers within bounds."""
+    """Values within bounds."""
 
     def __init__(
         self,
@@ -106,16 +105,16 @@ class Box(_Factor, spaces.Box):
 
 
 class RGBBox(Box):
-    """A colour, or colours: whole numbers from 0 to 255, three of them along some axis."""
+    """One or several colours: integers from 0 to 255, with an axis of size 3."""
 
     def __init__(self, shape: Sequence[int] = (3,), init_value: Any = None, **kwargs: Any) -> None:
         if 3 not in tuple(shape):
-            raise ValueError(f"a colour has three numbers along some axis, shape {tuple(shape)} has not")
+            raise ValueError(f"RGBBox: expected a shape with an axis of size 3, got {tuple(shape)}")
         super().__init__(low=0, high=255, shape=shape, dtype=np.uint8, init_value=init_value, **kwargs)
 
 
 class Discrete(_Factor, spaces.Discrete):
-    """One of `n` whole numbers from `start`."""
+    """One of `n` integers from `start`."""
 
     def __init__(
         self,
@@ -132,7 +131,7 @@ class Discrete(_Factor, spaces.Discrete):
 
 
 class MultiDiscrete(_Factor, spaces.MultiDiscrete):
-    """Several whole numbers, each one of its own `nvec` many."""
+    """Several integers, the `i`-th one of `nvec[i]`."""
 
     def __init__(
         self,
@@ -148,8 +147,8 @@ class MultiDiscrete(_Factor, spaces.MultiDiscrete):
 class Dict(spaces.Dict):
     """Factors by name, nested: a `variation_space`.
 
-    They are sampled in `sampling_order` (their own order by default), so that the condition of a later one may look at the
-    values of earlier ones. A condition on the whole samples all of them again until it holds.
+    Factors are sampled in `sampling_order` (by default the order of definition), so the condition of a factor may read the
+    values of earlier ones. All factors are sampled again until the condition of the whole `Dict` holds.
     """
 
     def __init__(
@@ -162,7 +161,7 @@ class Dict(spaces.Dict):
     ) -> None:
         members = dict(spaces_dict or {})
         super().__init__(members, **kwargs)
-        # Gymnasium sorts; what is written first is sampled first here.
+        # Gymnasium sorts the keys; sampling follows the order of definition.
         self.spaces: dict[str, Any] = dict(members)
         self.constrain_fn = constrain_fn
         named = list(sampling_order or [])
@@ -216,12 +215,12 @@ class Dict(spaces.Dict):
         return space
 
     def reset(self) -> None:
-        """Every factor takes its default."""
+        """Sets every factor to its default."""
         for space in self.spaces.values():
             space.reset()
 
     def contains(self, x: Any) -> bool:
-        """Whether these values are allowed, one by one and together."""
+        """Whether every value is in its space and all conditions hold."""
         return (
             isinstance(x, Mapping)
             and all(key in x and space.contains(x[key]) for key, space in self.spaces.items())
@@ -229,7 +228,7 @@ class Dict(spaces.Dict):
         )
 
     def check(self, debug: bool = False) -> bool:
-        """Whether the current values are allowed, one by one and together."""
+        """Whether every current value is in its space and all conditions hold."""
         wrong = [key for key, factor in self.factors() if not factor.check()]
         if debug and wrong:
             import warnings
@@ -287,7 +286,7 @@ class Dict(spaces.Dict):
                 yield name, value
 
     def to_str(self) -> str:
-        """The tree of factors, one a line."""
+        """The tree of factors as text, one factor per line."""
         lines = []
         for key, space in self.spaces.items():
             if isinstance(space, Dict):
@@ -303,9 +302,10 @@ def reset_variation_space(
     options: Mapping[str, Any] | None = None,
     default_variations: Iterable[str] = (),
 ) -> None:
-    """What an environment does with its factors at a reset: all take their defaults, then those are sampled that
-    `options["variation"]` names (`default_variations` where it is not given), then those are pinned that
-    `options["variation_values"]` names.
+    """Resets the factors of an environment for an episode.
+
+    Sets all factors to their defaults, samples those of `options["variation"]` (`default_variations` if it is missing), and
+    sets those of `options["variation_values"]`.
     """
     options = options or {}
     variation_space.seed(seed)
@@ -319,7 +319,7 @@ def reset_variation_space(
 
 
 def from_description(described: Mapping[str, Any]) -> spaces.Space:
-    """A space as the engine describes it."""
+    """The space of a description by the engine."""
     kind = described["type"]
     if kind == "Dict":
         return spaces.Dict({key: from_description(inner) for key, inner in described["spaces"].items()})
@@ -328,7 +328,7 @@ def from_description(described: Mapping[str, Any]) -> spaces.Space:
     if kind == "Discrete":
         return (Discrete if factor else spaces.Discrete)(described["n"], start=described["start"], **more)
     if kind == "MultiDiscrete":
-        # Gymnasium's environments of one choice each know no start.
+        # Gymnasium batches `Discrete` spaces without a start.
         return (MultiDiscrete if factor else spaces.MultiDiscrete)(
             np.asarray(described["nvec"]), start=np.asarray(described["start"]), **more
         )
@@ -344,7 +344,7 @@ def from_description(described: Mapping[str, Any]) -> spaces.Space:
 
 
 def _unbounded(numbers: Any, bound: float) -> Any:
-    """JSON knows no infinity and says null."""
+    """The bounds, with `None` (infinity in the engine's JSON) replaced by `bound`."""
     if isinstance(numbers, list):
         return [_unbounded(number, bound) for number in numbers]
     return bound if numbers is None else numbers

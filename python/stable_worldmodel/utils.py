@@ -11,15 +11,15 @@ __all__ = ["describe", "home", "wrappers"]
 
 
 def home() -> str:
-    """The folder everything without a path of its own lives in: `$STABLEWM_HOME`, or `~/.stable_worldmodel`."""
+    """The home folder of datasets and checkpoints given by name: `$STABLEWM_HOME`, or `~/.stable_worldmodel`."""
     return _engine.home()
 
 
 def describe(env: str) -> dict[str, Any]:
-    """What an environment is: spaces, infos, factors of variation, options, experts."""
+    """The description of an environment: spaces, info columns, factors of variation, options, experts."""
     return json.loads(_engine.spec(env))
 
 
 def wrappers() -> dict[str, Any]:
-    """The visual wrappers and their settings."""
+    """The settings of every visual wrapper, by its id."""
     return json.loads(_engine.wrappers())

@@ -1,4 +1,4 @@
-"""Our own models: checkpoints of LeWM, PLDM, DINO-WM, TD-MPC2, GCBC, GCIVL, GCIQL, SAC.
+"""The engine's models: checkpoints of LeWM, PLDM, DINO-WM, TD-MPC2, GCBC, GCIVL, GCIQL, SAC.
 
 model = swm.wm.load("lewm-rooms")            # a name under $STABLEWM_HOME/checkpoints, or a path
 solver = swm.solver.CEMSolver(model)         # planning runs in the engine, without Python
@@ -19,28 +19,29 @@ import numpy as np
 
 from . import _engine
 from .planning import has_torch
-from .solver import now
+from .solver import last_step
 
 __all__ = ["Model", "load", "load_pretrained", "train"]
 
 
 class Model:
-    """A checkpoint: to plan in (`get_cost`), or to act with (`swm.policy.FeedForwardPolicy`).
+    """A checkpoint, to plan with (`get_cost`) or to act with (`swm.policy.FeedForwardPolicy`).
 
     Args:
         name: A name under `$STABLEWM_HOME/checkpoints`, or a path.
-        device: `cpu`, or a GPU where the engine was built with one.
-        objective: What plans are for besides the model's own cost: a dict as `swm eval --objective` reads.
+        device: `cpu`, or a GPU if the engine was built with support for one.
+        objective: Terms of the planning objective, a dict in the form of `swm eval --objective`; `None` for the
+            model's own cost.
     """
 
     def __init__(self, name: str, device: str = "cpu", objective: dict[str, Any] | None = None) -> None:
         self._engine_model = _engine.Model(str(name), device, json.dumps(objective))
-        #: What it is: `family`, `env`, `image`, `action_block`, `history`, `config`, `weights` and more.
+        #: The checkpoint info: `family`, `env`, `image`, `action_block`, `history`, `config`, `weights` and more.
         self.card: dict[str, Any] = json.loads(self._engine_model.info)
 
     @property
     def path(self) -> str:
-        """Where it is."""
+        """The path of the checkpoint."""
         return self._engine_model.path
 
     @property
@@ -53,10 +54,15 @@ class Model:
         return self.path
 
     def get_cost(self, info_dict: dict[str, Any], action_candidates: Any) -> Any:
-        """What candidates `(B, S, H, A)`, in the model's units, cost: `(B, S)`. torch in, torch out; numpy in, numpy out.
+        """The costs of candidate action sequences.
 
-        Infos are `(B, T, ..)`, or `(B, S, T, ..)`: the same for every candidate. Pictures, `(height, width, 3)` bytes, show
-        which.
+        Args:
+            info_dict: Infos `(B, T, ..)`, or `(B, S, T, ..)` if they are repeated for every candidate. The dimensions of
+                `pixels` and `goal` (frames `(height, width, 3)` of `uint8`) tell the two apart.
+            action_candidates: Candidates `(B, S, H, A)` in the model's units, a tensor or an array.
+
+        Returns:
+            Costs `(B, S)`: a tensor for a tensor, else an array.
         """
         torch_in = hasattr(action_candidates, "detach")
         candidates = action_candidates.detach().cpu().numpy() if torch_in else np.asarray(action_candidates)
@@ -68,10 +74,10 @@ class Model:
             for key, value in info_dict.items()
             if not isinstance(value, (list, str, Mapping)) and not key.startswith("_")
         }
-        pictures = [value.ndim for key, value in given.items() if key in ("pixels", "goal")]
-        # Infos repeated for every candidate say nothing new.
-        repeated = bool(pictures) and max(pictures) == 6
-        infos = {key: now(value[:, 0] if repeated else value) for key, value in given.items()}
+        frame_dims = [value.ndim for key, value in given.items() if key in ("pixels", "goal")]
+        # The repetitions of an info are equal: take the first.
+        repeated = bool(frame_dims) and max(frame_dims) == 6
+        infos = {key: last_step(value[:, 0] if repeated else value) for key, value in given.items()}
         costs = self._engine_model.cost(infos, candidates)
         if torch_in and has_torch():
             import torch
@@ -80,9 +86,9 @@ class Model:
         return costs
 
     def get_action(self, info: dict[str, Any], **kwargs: Any) -> Any:
-        """What a model that acts does for infos `(B, T, ..)`: `(B, ..)`, in the environment's units. torch in, torch out."""
+        """The actions `(B, A)` for infos `(B, T, ..)`, in the environment's units; a tensor if an info is one."""
         given = {key: value for key, value in info.items() if not isinstance(value, (list, str, Mapping)) and key[0] != "_"}
-        actions = self._engine_model.act({key: now(value) for key, value in given.items()})
+        actions = self._engine_model.act({key: last_step(value) for key, value in given.items()})
         if has_torch() and any(hasattr(value, "detach") for value in given.values()):
             import torch
 
@@ -94,7 +100,7 @@ class Model:
 
 
 def load(name: str, device: str = "cpu", **kwargs: Any) -> Model:
-    """A checkpoint by name or path."""
+    """Loads a checkpoint by name or path."""
     return Model(name, device, **kwargs)
 
 
@@ -111,25 +117,30 @@ def train(
     device: str = "cpu",
     **overrides: Any,
 ) -> str:
-    """Trains a model, as `swm train` does; returns the checkpoint's place.
+    """Trains a model with `swm train`.
 
     Args:
-        model: A family, such as `lewm` (`swm models` lists them).
-        data: A dataset to learn from, or `env`: an environment to play in.
+        model: A model family, such as `lewm` (`swm models` lists them).
+        data: The dataset to train on, for families that learn from a dataset.
+        env: The environment to train in, for families that learn online.
         out: The checkpoint's name or path.
-        preset: A configuration; the first one of the family for `None`.
-        **overrides: What differs from it, with `__` for dots: `train__steps=1000`.
+        preset: The name of a configuration; the first one of the family for `None`.
+        device: `cpu`, or a GPU if the engine was built with support for one.
+        **overrides: Settings that replace those of the preset, with `__` for dots: `train__steps=1000`.
+
+    Returns:
+        `out`.
     """
-    words = ["swm", "train", model]
+    arguments = ["swm", "train", model]
     for flag, value in (("--data", data), ("--env", env), ("--output", out), ("--preset", preset), ("--device", device)):
         if value is not None:
-            words += [flag, str(value)]
-    words += [f"{key.replace('__', '.')}={value}" for key, value in overrides.items()]
-    _command(words)
+            arguments += [flag, str(value)]
+    arguments += [f"{key.replace('__', '.')}={value}" for key, value in overrides.items()]
+    _command(arguments)
     return str(out)
 
 
-#: Runs the command line in a process of its own, which stops, as on Ctrl-C, when its standard input ends.
+#: A program that runs the command line and interrupts itself, as Ctrl-C does, when its standard input ends.
 _CHILD = """
 import os, signal, sys, threading
 
@@ -147,29 +158,29 @@ sys.exit(_engine.command(sys.argv[2:]))
 """
 
 
-def _command(words: list[str]) -> None:
-    """Runs the command line beside this interpreter, whose signals and logs stay its own.
+def _command(arguments: list[str]) -> None:
+    """Runs the command line in a child process, so that signals and logs of this interpreter are not affected.
 
-    It saves what it has and ends when it is interrupted, or when this interpreter ends in any way.
+    The command saves its state and ends when this interpreter is interrupted or ends.
     """
     package = Path(__file__).resolve().parent.parent
-    # A terminal is shown progress by the command itself; notebooks are told what it says.
-    told = None if sys.stderr.isatty() else subprocess.PIPE
+    # In a terminal the command prints its progress itself; in a notebook its output is copied line by line.
+    output = None if sys.stderr.isatty() else subprocess.PIPE
     child = subprocess.Popen(
-        [sys.executable, "-c", _CHILD, str(package), *words],
+        [sys.executable, "-c", _CHILD, str(package), *arguments],
         stdin=subprocess.PIPE,
-        stdout=told,
-        stderr=None if told is None else subprocess.STDOUT,
+        stdout=output,
+        stderr=None if output is None else subprocess.STDOUT,
         text=True,
         errors="replace",
         env=os.environ,
         start_new_session=True,
     )
-    said = ""
+    last_line = ""
     try:
         for line in child.stdout or ():
             sys.stderr.write(line)
-            said = line
+            last_line = line
         child.wait()
     except BaseException:
         child.stdin.close()  # type: ignore[union-attr]
@@ -179,9 +190,9 @@ def _command(words: list[str]) -> None:
         for stream in (child.stdin, child.stdout):
             if stream is not None:
                 stream.close()
-    why = said.removeprefix("error: ").strip() or "what it printed says why"
+    why = last_line.removeprefix("error: ").strip() or "see its output"
     if child.returncode == 130:
         raise KeyboardInterrupt
     if child.returncode:
         kind = ValueError if child.returncode == 2 else RuntimeError
-        raise kind(f"swm {words[1]} ended with code {child.returncode}: {why}")
+        raise kind(f"swm {arguments[1]} ended with code {child.returncode}: {why}")

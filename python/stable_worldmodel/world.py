@@ -1,4 +1,4 @@
-"""`World`: many environments at once, who acts in them, and what is done with what they play."""
+"""`World`: a batch of environments that a policy acts in, for interactive loops, collection and evaluation."""
 
 from __future__ import annotations
 
@@ -23,34 +23,35 @@ from .wrapper.visual import engine_wrappers
 
 __all__ = ["EnvPool", "Metrics", "World"]
 
-#: Formats by the ending of a path; the first is what a path without one of these gets.
+#: Formats by the suffix of a path.
 _ENDINGS = {".lance": "lance", ".h5": "hdf5", ".hdf5": "hdf5", ".mp4": "video", ".lerobot": "lerobot"}
 
 
 class World:
-    """Many environments of one kind, stepped and drawn in parallel.
+    """A batch of environments of one kind, stepped and rendered in parallel.
 
     Args:
-        env_name: An environment's id, such as `swm/PushT-v1`, with options as `ID,option=value`; or any that Gymnasium knows.
-        num_envs: Environments played side by side. What an episode brings does not depend on it.
-        image_shape: `(height, width)` of pictures.
-        max_episode_steps: Steps after which episodes are truncated; the environment's own number for `None`.
-        goal_conditioned: Whether `goal`, the picture of the goal, is among the infos.
-        extra_wrappers: What is put around every environment, in order: `functools.partial` of a class of
-            `swm.wrapper.visual`, or any factory of a `gymnasium.Wrapper`.
-        pre_wrappers: The same, before `extra_wrappers`.
-        add_pixels: Whether pictures are drawn.
-        views: What is drawn besides: cameras, `depth`, `segmentation`, or `CAMERA:MODALITY`.
-        wrap_goal: Whether visual wrappers change the picture of the goal, too.
-        threads: Worker threads; as many as there are cores for 0. What comes out does not depend on it.
-        workers: Whether environments of others get a process each, instead of living in this interpreter: they then step in
-            parallel, are restarted when they crash, and must be importable there.
-        image_resample: How pictures of others' environments are resized: `"bilinear"`, or `"nearest"` for pixel art.
+        env_name: An environment's id, such as `swm/PushT-v1`, with options as `ID,option=value`; or any id that Gymnasium
+            knows.
+        num_envs: The number of environments. Episodes do not depend on it.
+        image_shape: `(height, width)` of frames.
+        max_episode_steps: Steps after which episodes are truncated; the environment's time limit for `None`.
+        goal_conditioned: Whether the infos contain `goal`, the frame of the goal.
+        extra_wrappers: Wrappers of every environment, in order: `functools.partial` of a class of `swm.wrapper.visual`, or
+            any factory of a `gymnasium.Wrapper`.
+        pre_wrappers: Wrappers applied before `extra_wrappers`.
+        add_pixels: Whether frames are rendered.
+        views: Additional camera views: cameras, `depth`, `segmentation`, or `CAMERA:MODALITY`.
+        wrap_goal: Whether visual wrappers also change the frame of the goal.
+        threads: Worker threads; one for each core for 0. The number does not affect results.
+        workers: Whether each third-party environment gets a process of its own instead of this interpreter. The processes
+            step in parallel and are restarted after a crash; the environment must be importable there.
+        image_resample: How frames of third-party environments are resized: `"bilinear"`, or `"nearest"` for pixel art.
         **kwargs: Options of the environment.
 
     Attributes:
-        infos: What the environments show, by name: arrays `[num_envs, 1, ..]` that every reset and step writes anew,
-            without a copy. Keep `infos[name].copy()` of what shall stay.
+        infos: The info columns by name: arrays `(num_envs, 1, ..)` in the engine's memory, which every reset and step
+            overwrites. Use `infos[name].copy()` for values that must stay.
     """
 
     def __init__(
@@ -74,9 +75,9 @@ class World:
         **kwargs: Any,
     ) -> None:
         if image_transform is not None or goal_transform is not None:
-            raise TypeError("image_transform, goal_transform: give transforms to the policy that wants them (transform=…)")
+            raise TypeError("image_transform, goal_transform: not supported; pass transform=… to the policy")
         if add_pixels and image_shape is None:
-            raise ValueError("image_shape: None; give (height, width), or add_pixels=False for no pictures")
+            raise ValueError("image_shape: None; give (height, width), or add_pixels=False for no frames")
         if add_pixels and not (isinstance(image_shape, Sequence) and len(image_shape) == 2):
             raise TypeError(f"image_shape: {image_shape!r}; expected (height, width)")
         if isinstance(num_envs, bool) or int(num_envs) < 1:
@@ -86,13 +87,13 @@ class World:
         self.num_envs = int(num_envs)
         image = (int(image_shape[0]), int(image_shape[1])) if add_pixels and image_shape is not None else None
         wrappers = [*(pre_wrappers or []), *(extra_wrappers or [])]
-        drawn = engine_wrappers(wrappers)
-        self._native = drawn is not None and self._is_native(env_name)
-        #: The Gymnasium environments behind it, where they live in this interpreter.
+        in_engine = engine_wrappers(wrappers)
+        self._native = in_engine is not None and self._is_native(env_name)
+        #: The Gymnasium environments of this world that are in this interpreter.
         self.gym_envs: list[Any] = []
-        if drawn is None and workers:
-            raise ValueError("workers: wrappers of one's own cannot follow environments into other processes")
-        if not (self._native or (drawn is not None and workers)):
+        if in_engine is None and workers:
+            raise ValueError("workers: user-defined wrappers cannot run in worker processes; use workers=False")
+        if not (self._native or (in_engine is not None and workers)):
             from ._gym import open_world
 
             name, *given = env_name.split(",")
@@ -101,9 +102,9 @@ class World:
                 name, settings, self.num_envs, wrappers, image, max_episode_steps, image_resample, threads, wrap_goal
             )
         else:
-            # Workers run what this interpreter runs.
+            # Worker processes use this Python interpreter.
             os.environ.setdefault("SWM_PYTHON", sys.executable)
-            self._wrapping = drawn or []
+            self._wrapping = in_engine or []
             self._world = _engine.World(
                 self.env_name,
                 self.num_envs,
@@ -111,7 +112,7 @@ class World:
                 list(views),
                 max_episode_steps,
                 threads,
-                json.dumps(drawn),
+                json.dumps(in_engine),
                 wrap_goal,
             )
         self.infos: dict[str, np.ndarray] = self._world.infos()
@@ -121,7 +122,7 @@ class World:
         self.infos["action"] = self._actions[:, None]
         self.envs = EnvPool(self)
         self.policy: Any = None
-        #: What decides the episodes that `step` plays.
+        #: The seed of the episodes that `step` plays.
         self.seed: int | None = None
         self._actors: dict[int, tuple[Any, Any]] = {}
         self._episodes = [0] * self.num_envs
@@ -136,29 +137,29 @@ class World:
             return True
         import gymnasium
 
-        # The namespace is ours, and open to others: what nobody registered is a word of ours, misspelt.
+        # An id of this namespace that is not registered is a misspelt native one: the engine reports close names.
         return name.startswith("swm/") and not name.startswith("swm/Craftax") and name not in gymnasium.registry
 
-    # What there is.
+    # Properties.
 
     @cached_property
     def spec(self) -> dict[str, Any]:
-        """What the environments are, in words and numbers."""
+        """The specification of the environments: spaces, info columns, factors."""
         return json.loads(self._world.spec())
 
     @property
     def rewards(self) -> np.ndarray:
-        """The rewards of the last step, `[num_envs]`."""
+        """The rewards of the last step, `(num_envs,)`."""
         return self.infos["reward"][:, 0]
 
     @property
     def terminateds(self) -> np.ndarray:
-        """Whether the last step ended the episode because of where the world is, `[num_envs]`."""
+        """Whether the last step terminated the episode, `(num_envs,)`."""
         return self.infos["terminated"][:, 0]
 
     @property
     def truncateds(self) -> np.ndarray:
-        """Whether the last step ended the episode because of the clock, `[num_envs]`."""
+        """Whether the last step truncated the episode, `(num_envs,)`."""
         return self.infos["truncated"][:, 0]
 
     @property
@@ -182,22 +183,22 @@ class World:
         return self._world.max_episode_steps()
 
     def factors(self, index: int = 0) -> dict[str, list[float]]:
-        """The factors of an environment's episode, by key."""
+        """The factors of the current episode of an environment, by key."""
         return self._world.factors(index)
 
     def close(self) -> None:
-        """Ends the environments, and the processes that they live in. The world cannot be used afterwards."""
+        """Closes the environments and ends their worker processes. The world cannot be used afterwards."""
         self._actors.clear()
         for env in self.gym_envs:
             env.close()
         self.gym_envs.clear()
-        # The arrays are the engine's: it ends with the last of them.
+        # The arrays keep the engine's world alive: release them first.
         self.infos, self._actions = {}, np.empty(0)
         self.__dict__.pop("_world", None)
 
     def __getattr__(self, name: str) -> Any:
         if name == "_world":
-            raise RuntimeError("World: it was closed; make another one")
+            raise RuntimeError("World: it is closed; make a new one")
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def __enter__(self) -> World:
@@ -206,14 +207,14 @@ class World:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    # Loops of one's own.
+    # Interactive loops.
 
     def set_policy(self, policy: Any) -> None:
-        """Says who acts: an object with `get_action(infos)`."""
+        """Sets the policy: an object with `get_action(infos)`."""
         if isinstance(policy, type):
-            raise TypeError(f"{policy.__name__} is a class of policies: make one of it")
+            raise TypeError(f"{policy.__name__} is a class: pass an instance of it")
         if not (callable(getattr(policy, "get_action", None)) or callable(getattr(policy, "get_actions", None))):
-            raise TypeError(f"{type(policy).__name__} is no policy: it needs get_action(infos)")
+            raise TypeError(f"{type(policy).__name__} is not a policy: expected get_action(infos)")
         if callable(getattr(policy, "set_env", None)):
             policy.set_env(self.envs)
         self.policy = policy
@@ -223,8 +224,8 @@ class World:
         """Starts an episode in every environment and refreshes `infos`.
 
         Args:
-            seed: What decides the episodes: environment `i` plays episode `i` of this seed, the one that `collect` and
-                `evaluate` call so. A list is what the environments themselves are reset with. Drawn for `None`.
+            seed: The seed of the episodes: environment `i` plays episode `i` of this seed, as in `collect` and `evaluate`.
+                A list holds one environment seed for each environment. Random for `None`.
             options: `variation`: factors to sample; `variation_values`: factors to pin; `state`, `goal_state`: start and goal.
         """
         self._reset_text = text = _options.reset(options, self.spec["variation"])
@@ -235,7 +236,7 @@ class World:
         if not one:
             seeds = [_seed(given) for given in seed]  # type: ignore[union-attr]
             if len(seeds) != self.num_envs:
-                raise ValueError(f"seed: {len(seeds)} of them for {self.num_envs} environments")
+                raise ValueError(f"seed: expected {self.num_envs} seeds, one for each environment, got {len(seeds)}")
         else:
             seeds = [_engine.World.episode_seed(self.seed, i) for i in range(self.num_envs)]
         self._world.reset(list(enumerate(seeds)), text)
@@ -243,10 +244,10 @@ class World:
         self._actions[:] = np.nan if self._actions.dtype.kind == "f" else -1
 
     def step(self, steps: int = 1) -> None:
-        """Lets the policy act, and refreshes `infos`. Environments whose episode is over begin the next one instead.
+        """Steps the environments with the policy and refreshes `infos`. Environments whose episode is over are reset instead.
 
         Args:
-            steps: How often; policies of the engine play them in one call, without Python between.
+            steps: The number of steps. The engine's policies make all of them in one call, without Python in between.
         """
         if self.policy is None:
             raise RuntimeError("World.step: no policy; call set_policy first")
@@ -264,7 +265,7 @@ class World:
             active = ~over
             if active.any():
                 infos = {**self.infos, "_needs_flush": self._fresh.copy(), "_active": active}
-                self._actions[:] = self._asked(self.policy, infos, active)
+                self._actions[:] = self._checked_actions(self.policy, infos, active)
                 self._fresh[:] = False
                 self._world.advance(active.tolist())
             if over.any():
@@ -281,7 +282,7 @@ class World:
         return self._world.snapshot(index)
 
     def restore(self, state: bytes, index: int = 0) -> None:
-        """Puts a state back; what follows equals what followed the snapshot."""
+        """Restores a snapshot. Later steps equal those after the snapshot bit for bit."""
         self._world.restore(index, state)
 
     def _begin(self, slots: Sequence[int]) -> None:
@@ -292,15 +293,15 @@ class World:
                     self._world.begin(actor, slot, self.seed or 0, self._episodes[slot])
 
     def _ask(self, policy: Any) -> np.ndarray:
-        """What a policy of the engine does now."""
+        """The actions `(num_envs, ..)` of a policy of the engine for the current infos."""
         active = ~(self.terminateds | self.truncateds)
         self._world.act(self._actor(policy), active.tolist())
         return self._actions.reshape(self.envs.action_space.shape).copy()
 
-    def _asked(self, policy: Any, infos: dict[str, Any], active: np.ndarray) -> np.ndarray:
-        """What a policy of Python's returns, as the engine's actions."""
-        ask = getattr(policy, "get_action", None) or policy.get_actions
-        given = ask(infos)
+    def _checked_actions(self, policy: Any, infos: dict[str, Any], active: np.ndarray) -> np.ndarray:
+        """The actions of a policy implemented in Python, checked and in the shape and type of the engine."""
+        get_action = getattr(policy, "get_action", None) or policy.get_actions
+        given = get_action(infos)
         name = type(policy).__name__
         if given is None:
             raise TypeError(f"{name}.get_action returned None; expected actions of shape {self.envs.action_space.shape}")
@@ -311,13 +312,13 @@ class World:
             raise ValueError(f"{name}.get_action: got actions of shape {given.shape}, expected {expected}")
         given = given.reshape(want.shape)
         if given.dtype.kind == "f" and not np.isfinite(given[active]).all():
-            raise ValueError(f"{name}.get_action: returned actions that are not finite: {given[active]}")
+            raise ValueError(f"{name}.get_action: expected finite actions, got {given[active]}")
         if want.dtype.kind != "f":
             given = np.nan_to_num(given, nan=0)
         return np.ascontiguousarray(given, dtype=want.dtype)
 
     def _actor(self, policy: Any) -> Any:
-        """A policy as one of the engine's; none for one of Python's."""
+        """The engine's actor of a policy; `None` for a policy implemented in Python."""
         known = self._actors.get(id(policy))
         if known is not None and known[0] is policy:
             return known[1]
@@ -333,7 +334,7 @@ class World:
         self._actors.pop(id(policy), None)
 
     def _playing(self, policy: Any) -> Any:
-        """A policy for a long run: one of the engine's, or one that calls Python."""
+        """The actor of a policy for collection and evaluation; a policy in Python is called back by the engine."""
         actor = self._actor(policy)
         if actor is not None:
             return actor
@@ -342,11 +343,11 @@ class World:
             infos |= {"_needs_flush": fresh, "_active": active, "action": self.infos["action"]}
             if "goal" not in self.infos:
                 infos.pop("goal", None)
-            return self._asked(policy, infos, active)
+            return self._checked_actions(policy, infos, active)
 
         return _engine.Actor.python(self._world, call)
 
-    # Long runs.
+    # Collection and evaluation.
 
     def collect(
         self,
@@ -364,29 +365,30 @@ class World:
         codec: str | None = None,
         goal: bool = False,
     ) -> dict[str, int]:
-        """Plays episodes with the policy and stores them.
+        """Collects episodes with the policy into a dataset.
 
         Args:
-            path: Where to: a path, a URI of an object store, or a name under `$STABLEWM_HOME/datasets`. `dataset_path` is
-                another name for it.
-            episodes: How many.
-            seed: What decides them, together with their numbers; drawn for `None`.
+            path: The target: a path, a URI of an object store, or a name under `$STABLEWM_HOME/datasets`.
+            episodes: The number of episodes.
+            seed: The seed, which is combined with the index of each episode; random for `None`.
             options: Factors to sample (`variation`) and to pin (`variation_values`).
-            format: One of `swm.data.list_formats()`; what the path's ending says, or Lance, for `None`.
+            format: One of `swm.data.list_formats()`; for `None` that of the path's suffix, else Lance.
             writer: Instead of a path: an object with `write_episode(dict of arrays)`, such as `swm.data.ReplayBuffer`.
-            progress: Whether to show how far it is.
-            policy: Who acts, instead of `set_policy`'s.
+            progress: Whether to show progress.
+            dataset_path: Another name for `path`.
+            policy: The policy, instead of that of `set_policy`.
             mode: If there is a dataset already: `"error"` refuses, `"overwrite"` replaces it, `"append"` adds `episodes`
-                more, `"resume"` plays on until it has `episodes`.
-            codec: How pictures are stored: `"qoi"` (lossless), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
-            goal: Whether to store the picture of the goal with every row.
+                more, `"resume"` continues until it has `episodes`.
+            codec: How frames are stored: `"qoi"` (lossless), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
+            goal: Whether to store the frame of the goal in every row.
 
         Returns:
-            `episodes` in the dataset, `added` ones, environment `steps`. An interrupt or an error keeps what is finished.
+            A dict with the counts `episodes` (in the dataset), `added` (episodes) and `steps`. After an interrupt or an error
+            the finished episodes remain stored.
         """
         path = dataset_path if path is None else path
         if (path is None) == (writer is None):
-            raise ValueError("World.collect: give a path, or a writer")
+            raise ValueError("World.collect: expected either a path or a writer")
         if mode not in ("error", "overwrite", "append", "resume"):
             raise ValueError(f"mode: {mode!r}; expected 'error', 'overwrite', 'append' or 'resume'")
         if int(episodes) < 1:
@@ -457,32 +459,36 @@ class World:
         condition: str | None = None,
         progress: bool = True,
     ) -> Metrics:
-        """Says how often the policy reaches its goals, beside the random floor on the same starts.
+        """Measures the success rate of the policy, and of the random policy on the same starts.
 
         Args:
-            episodes: How many (50, or as many as `episodes_idx` has).
-            seed: What decides starts, goals, factors and plans; drawn for `None`.
+            episodes: The number of episodes; 50, or the length of `episodes_idx`, for `None`.
+            seed: The seed of starts, goals, factors and plans; random for `None`.
             options: Factors to sample (`variation`) and to pin (`variation_values`).
             video: A folder for videos of the first episodes.
-            dataset: Take starts and goals from a dataset: a `swm.data.Dataset`, its path, URI or name.
-            episodes_idx, start_steps: Which episodes and steps of it; chosen by the seed for `None`.
-            goal_offset: Steps from a start to its goal (25).
-            eval_budget: Steps an episode may take; the world's own, or 50 from a dataset.
+            dataset: The dataset of starts and goals: a `swm.data.Dataset`, its path, URI or name.
+            episodes_idx, start_steps: The episodes and steps of the dataset to start from; chosen by the seed for `None`.
+            goal_offset: The number of steps from a start to its goal; 25 for `None`.
+            eval_budget: The time limit of an episode in steps; for `None` that of the world, or 50 with a dataset.
             callables: The methods that put an environment into a recorded state, called in this order after its reset:
                 `{"method": NAME, "args": {KEYWORD: {"value": COLUMN}}}`, where `goal_` before a column's name takes it from
-                the goal's row, and `{"value": ANYTHING, "in_dataset": False}` is the value itself. Without any, it is
-                `set_state(state)` and `set_goal_state(goal_state)`, with or without `_` before. Environments of ours
-                know their states by themselves.
-            policy: Who acts, instead of `set_policy`'s.
-            protocol: `"strict"`: starts that are solved already do not count, and success means that the goal is satisfied;
-                `"compat"`: counts as the Python package stable-worldmodel 0.1.1 does.
-            hold: Steps in a row that must satisfy the goal (strict).
-            floor: Whether to play the same starts at random, too.
-            videos: Episodes to film, where `video` is given (all).
-            condition: What was shifted, in words, for reports.
+                the goal's row, and `{"value": ANYTHING, "in_dataset": False}` is the value itself. The default is
+                `set_state(state)` and `set_goal_state(goal_state)`, with or without a leading `_`. Native environments
+                restore recorded states themselves.
+            policy: The policy, instead of that of `set_policy`.
+            protocol: `"strict"` leaves out episodes that are solved at start and requires a satisfied goal;
+                `"compat"` counts as the Python package stable-worldmodel 0.1.1 does.
+            hold: Consecutive steps that must satisfy the goal (with `"strict"`).
+            floor: Whether to evaluate the random policy on the same starts.
+            videos: The number of episodes to record with `video`; all for `None`.
+            condition: A description of the distribution shift, for reports.
+            progress: Whether to show progress.
+
+        Returns:
+            The metrics.
         """
         if reset_mode not in (None, "auto", "wait"):
-            raise ValueError(f"reset_mode: {reset_mode!r}; expected 'auto' or 'wait' (it decides nothing here)")
+            raise ValueError(f"reset_mode: {reset_mode!r}; expected 'auto' or 'wait' (both behave the same)")
         if protocol not in ("strict", "compat"):
             raise ValueError(f"protocol: {protocol!r}; expected 'strict' or 'compat'")
         policy = self._chosen(policy)
@@ -497,7 +503,7 @@ class World:
                 picks = [[int(e), int(s)] for e, s in zip(episodes_idx, start_steps, strict=True)]
                 episodes = len(picks)
         elif episodes_idx is not None or start_steps is not None or goal_offset is not None:
-            raise ValueError("episodes_idx, start_steps, goal_offset: they choose from a dataset; give dataset=…")
+            raise ValueError("episodes_idx, start_steps, goal_offset: they select rows of a dataset; pass dataset=…")
         episodes = 50 if episodes is None else int(episodes)
         variation = _options.variation(_varied(options), self.spec["variation"])
         config = {
@@ -516,12 +522,12 @@ class World:
             acting.append(("random", _engine.Actor.random(self._world, None)))
         runs: list[dict[str, Any]] = []
         for name, actor in acting:
-            filmed = None
+            recording = None
             if video is not None and not runs:
                 folder = Path(video)
                 folder.mkdir(parents=True, exist_ok=True)
-                filmed = [str(folder), "episode", episodes if videos is None else int(videos)]
-            given = json.dumps({**config, "policy": name, "videos": filmed})
+                recording = [str(folder), "episode", episodes if videos is None else int(videos)]
+            given = json.dumps({**config, "policy": name, "videos": recording})
             with _progress.bar(f"evaluate {name}", episodes, progress) as bar:
                 runs.append(json.loads(self._world.evaluate(actor, given, dataset, bar)))
         self._settle()
@@ -530,13 +536,13 @@ class World:
         return Metrics._of(self, config, runs, dataset)
 
     def _callables(self, callables: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """Those that the engine is to call."""
+        """The callables that the engine calls; none for native environments."""
         if not self._native:
             return callables
         others = sorted({call["method"] for call in callables} - {"_set_state", "_set_goal_state", "set_state"})
         if others:
             name = self.env_name.partition(",")[0]
-            warnings.warn(f"callables: {name} starts at recorded states by itself; {others} are not called", stacklevel=3)
+            warnings.warn(f"callables: {name} restores recorded states itself; {others} are not called", stacklevel=3)
         return []
 
     def _chosen(self, policy: Any) -> Any:
@@ -547,20 +553,20 @@ class World:
         return self.policy
 
     def _settle(self) -> None:
-        """After a long run, loops of one's own begin anew."""
+        """Makes the next interactive loop start with a reset, after a collection or an evaluation."""
         self.seed = None
         self._actors.clear()
 
 
 class EnvPool:
-    """What a policy sees of a world: how many environments there are, and their spaces."""
+    """The environments of a world as policies get them in `set_env`: their number and spaces."""
 
     def __init__(self, world: World) -> None:
         self._world = world
 
     @property
     def num_envs(self) -> int:
-        """How many environments."""
+        """The number of environments."""
         return self._world.num_envs
 
     @cached_property
@@ -590,22 +596,23 @@ class EnvPool:
 
     @property
     def single_variation_space(self) -> swm_spaces.Dict:
-        """The same."""
+        """The factors of variation, as `variation_space`."""
         return self.variation_space
 
     @property
     def seeds(self) -> np.ndarray:
-        """What the environments were reset with last."""
+        """The seeds of the last resets, `(num_envs,)`."""
         seed, episodes = self._world.seed or 0, self._world._episodes
         return np.array([_engine.World.episode_seed(seed, episode) for episode in episodes], dtype=np.int64)
 
 
 class Metrics(dict):
-    """What an evaluation found.
+    """The metrics of an evaluation.
 
-    Keys: `success_rate` in percent; `interval`, its 95 % Wilson interval; `random_success_rate` and `random_interval`, the
-    floor's; `episode_successes`, `seeds` and `steps`, one an episode; `solved_at_start`, starts that needed no policy;
-    `time_to_goal`, steps among successes; `plan_seconds`, of policies that plan; `videos`.
+    Keys: `success_rate` in percent; `interval`, its 95 % Wilson interval; `random_success_rate` and `random_interval`,
+    those of the random-policy floor; `episode_successes`, `seeds` and `steps`, one entry for each episode;
+    `solved_at_start`, the number of starts that satisfy the goal; `time_to_goal`, the steps of successful episodes;
+    `plan_seconds`, the planning times; `videos`.
     """
 
     results: dict[str, Any]
@@ -650,7 +657,7 @@ class Metrics(dict):
         return metrics
 
     def save(self, path: str | Path = "results.json") -> Path:
-        """Writes `results.json`, which `swm report` makes a page of."""
+        """Writes the results as JSON, the input of `swm report`, and returns the path."""
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(self.results, indent=2))
@@ -670,12 +677,12 @@ def _percent(rate: float | None) -> float:
 
 
 def _drawn() -> int:
-    """A seed nobody chose."""
+    """A random seed."""
     return secrets.randbits(32)
 
 
 def _seed(seed: int | None) -> int:
-    """A seed, drawn where nobody chose one."""
+    """The seed, or a random one for `None`."""
     if seed is None:
         return _drawn()
     if int(seed) != seed or not 0 <= seed < 2**63:
@@ -690,7 +697,7 @@ def _name(policy: Any) -> str:
 def _varied(options: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
     fixed = [name for name in ("state", "goal_state") if (options or {}).get(name) is not None]
     if fixed:
-        raise ValueError(f"options: {fixed} would be the same in every episode; give them to World.reset")
+        raise ValueError(f"options: {fixed} would apply to every episode; pass them to World.reset")
     return options
 
 

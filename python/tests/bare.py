@@ -1,6 +1,4 @@
-"""What holds where nothing but the wheel and what it asks for is installed: it imports at once, brings neither torch nor
-anything else along, and works.
-"""
+"""A check of the wheel with only its dependencies installed: it imports fast, does not import torch, and works."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Every test has a home of its own, so that names of datasets and checkpoints meet nothing of yours."""
+"""Every test has a home folder of its own, so that it finds no datasets and checkpoints of the user."""
 
 import os
 import signal
@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-# Whoever runs the tests in the background may have made them deaf to Ctrl-C; the programs they start must hear it.
+# A shell ignores SIGINT in background jobs; the programs that tests start must receive it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-#: Where what `swm assets` brought is: not in a test's home.
+#: The folder of `swm assets`, which is not in a test's home.
 ASSETS = Path(os.environ.get("STABLEWM_HOME") or Path.home() / ".stable_worldmodel") / "assets"
 
 

@@ -1,4 +1,4 @@
-"""Small datasets whose content is known."""
+"""Small datasets with known content."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ LENGTHS = (12, 20, 9, 30)
 
 
 def episode(number, length, side=16):
-    """An episode that says in its pixels and numbers which one it is."""
+    """An episode whose pixels and values identify it."""
     random = np.random.default_rng(number)
     action = random.normal(size=(length, 2)).astype(np.float32)
     action[-1] = np.nan
@@ -28,7 +28,7 @@ def episodes(lengths=LENGTHS):
 
 
 def write(path, lengths=LENGTHS, **kwargs):
-    """Writes the episodes and gives them."""
+    """Writes the episodes and returns them."""
     written = episodes(lengths)
     with data.open_writer(path, **kwargs) as writer:
         writer.write_episodes(written)
@@ -49,7 +49,7 @@ def clips(written, num_steps, frameskip):
 
 
 def same(found, expected, lists=False):
-    """Asserts that two samples are the same; with `lists`, that scalars come as lists of one number."""
+    """Asserts that two samples are the same; with `lists`, that scalars are lists of one element."""
     assert set(found) == set(expected)
     for name, array in expected.items():
         array = array[:, None] if lists and array.ndim == 1 else array

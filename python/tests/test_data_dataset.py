@@ -32,7 +32,7 @@ def test_clips_are_windows_of_episodes(stored, num_steps, frameskip):
         same(dataset[i], expected[i], lists)
 
 
-def test_what_a_dataset_says_of_itself(stored):
+def test_dataset_description(stored):
     path, _, lists = stored
     dataset = data.load_dataset(path, keys_to_load=["action", "reward"])
     assert dataset.column_names == ["action", "reward"]
@@ -63,7 +63,7 @@ def test_chunks_episodes_columns_rows(stored):
     np.testing.assert_array_equal(dataset.get_col_data("episode_idx"), np.repeat(np.arange(4), LENGTHS))
 
 
-def test_columns_kept_and_merged(stored):
+def test_cached_and_merged_columns(stored):
     path, written, _ = stored
     dataset = data.load_dataset(
         path, num_steps=2, keys_to_load=["pixels"], keys_to_cache=["pixels"], backend="numpy",
@@ -93,13 +93,13 @@ def test_transforms_see_rows_before_actions_are_grouped(stored):
     assert seen == [(6, 2), (6, 2)]
 
 
-def test_it_may_be_pickled(stored):
+def test_dataset_can_be_pickled(stored):
     path, written, lists = stored
     dataset = pickle.loads(pickle.dumps(data.load_dataset(path, num_steps=3, keys_to_cache=["pixels"], backend="numpy")))
     same(dataset[20], clips(written, 3, 1)[20], lists)
 
 
-def test_mistakes_are_named(stored, tmp_path, monkeypatch):
+def test_wrong_arguments_raise_clear_errors(stored, tmp_path, monkeypatch):
     path, _, _ = stored
     with pytest.raises(KeyError, match="no column 'pixel'.*the columns are .*pixels"):
         data.load_dataset(path, keys_to_load=["pixel"])
@@ -128,7 +128,7 @@ def test_mistakes_are_named(stored, tmp_path, monkeypatch):
         data.load_dataset(tmp_path / "notes")
 
 
-def test_names_are_found_at_home(tmp_path, monkeypatch):
+def test_names_are_resolved_in_the_home_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("STABLEWM_HOME", str(tmp_path))
     write("rooms", (5,))
     assert (tmp_path / "datasets" / "rooms.lance").exists()

@@ -38,7 +38,7 @@ def test_batches_are_clips_in_order(stored):
     assert at == len(expected)
 
 
-def test_an_epoch_has_every_clip_once_in_an_order_of_its_own(stored):
+def test_epoch_has_every_clip_once_in_random_order(stored):
     path, written = stored
     expected = sorted(clip["reward"][0] for clip in clips(written, 3, 2))
     first, second = (sum(identities(loader(path, seed=seed)), []) for seed in (1, 2))
@@ -53,7 +53,7 @@ def test_an_epoch_has_every_clip_once_in_an_order_of_its_own(stored):
     assert len(list(loader(path, drop_last=True))) == 6
 
 
-def test_it_goes_on_where_another_was(stored):
+def test_saved_position_continues_with_the_same_batches(stored):
     path, _ = stored
     whole = loader(path, seed=5)
     epochs = [identities(whole), identities(whole)]
@@ -97,7 +97,7 @@ def test_transforms_see_rows(stored):
     np.testing.assert_allclose(scaled["action"], plain["action"] / [2, 4, 2, 4])
 
 
-def test_what_a_dataset_chose_holds(stored):
+def test_loader_uses_the_settings_of_the_dataset(stored):
     path, _ = stored
     dataset = data.load_dataset(path, num_steps=2, frameskip=3, keys_to_load=["state"], backend="numpy")
     batch = next(iter(data.Loader(dataset, 5)))
@@ -118,7 +118,7 @@ def test_batches_outlive_the_loader(stored):
         np.testing.assert_array_equal(array, copy)
 
 
-def test_mistakes_are_named(stored, tmp_path):
+def test_wrong_arguments_raise_clear_errors(stored, tmp_path):
     path, _ = stored
     with pytest.raises(KeyError, match="no column 'pixel'"):
         loader(path, columns=["pixel"])
@@ -138,7 +138,7 @@ def test_mistakes_are_named(stored, tmp_path):
         loader(path, device="cuda")
 
 
-def test_an_error_of_a_reader_reaches_whoever_loads(stored):
+def test_error_of_a_reader_is_raised_by_the_loader(stored):
     class Broken(data.Dataset):
         column_names = ["state"]
 

@@ -1,4 +1,4 @@
-"""Datasets of ours, read by the reference: the same samples, where it is installed."""
+"""The reference implementation, if installed, reads the same samples from our datasets."""
 
 import os
 import subprocess
@@ -48,6 +48,6 @@ def test_the_reference_reads_the_same(tmp_path, name):
         assert set(found) == set(expected)
         for column, array in expected.items():
             assert found[column].shape == array.shape, column
-            # It keeps numbers in single precision, some of them.
+            # It stores some columns in single precision.
             np.testing.assert_allclose(found[column], array, rtol=1e-6, err_msg=column)
     np.testing.assert_allclose(theirs["state"], ours.get_col_data("state"), rtol=1e-6)

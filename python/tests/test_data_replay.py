@@ -1,4 +1,4 @@
-"""The replay buffer: the latest episodes, drawn as seed and step say."""
+"""The replay buffer: the latest episodes, and samples that depend on seed and step."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from data_helpers import episode, episodes
 from stable_worldmodel import data
 
 
-def test_old_episodes_leave_as_a_whole():
+def test_oldest_episodes_are_removed():
     buffer = data.ReplayBuffer(max_steps=50, history_len=3, frameskip=2)
     assert len(buffer) == 0 and buffer.num_steps_stored == 0
     with buffer as writer:
@@ -31,7 +31,7 @@ def test_old_episodes_leave_as_a_whole():
     assert buffer.lengths.tolist() == [8]
 
 
-def test_samples_are_a_function_of_seed_and_step():
+def test_samples_depend_on_seed_and_step():
     buffers = [data.ReplayBuffer(100, history_len=2, seed=seed) for seed in (1, 1, 2)]
     for buffer in buffers:
         buffer.write_episodes(episodes())
@@ -43,7 +43,7 @@ def test_samples_are_a_function_of_seed_and_step():
     assert (np.diff(batch["reward"], axis=1) == 1).all()
 
 
-def test_samplers_of_ones_own():
+def test_user_defined_sampler():
     buffer = data.ReplayBuffer(100, history_len=2, sampler=lambda step, buffer, size, history: np.full(size, step))
     with pytest.raises(RuntimeError, match="no clip of 2 steps"):
         buffer.sample(4)

@@ -38,7 +38,7 @@ def test_batches_are_collated_without_a_copy(stored):
     samples = dataset.__getitems__([5, 1, 30])
     batch = torch.utils.data.default_collate(samples)
     assert batch["pixels"][1].data_ptr() == samples[1]["pixels"].data_ptr()
-    # Whoever changed a sample gets what they made of it.
+    # A changed sample is collated with its change.
     samples[2]["reward"] = torch.full((3, 1), 7.0, dtype=torch.float64)
     changed = torch.utils.data.default_collate(samples)
     assert changed["reward"][2].eq(7).all() and changed["reward"][:2].equal(batch["reward"][:2])
@@ -46,7 +46,7 @@ def test_batches_are_collated_without_a_copy(stored):
     assert set(torch.utils.data.default_collate([{**samples[0], "new": 1}])) == {*batch, "new"}
 
 
-def test_the_loader_gives_tensors_that_look_at_its_memory(stored):
+def test_tensors_share_the_memory_of_the_loader(stored):
     path, written = stored
     loader = data.Loader(path, 4, num_steps=2, shuffle=False, columns=["pixels", "action"])
     batches = [batch["pixels"] for batch in loader]

@@ -52,7 +52,7 @@ def test_discrete_actions_that_are_missing(tmp_path):
     assert data.load_dataset(tmp_path / "a.lance").get_col_data("action").ravel().tolist() == [2, 0, -1]
 
 
-def test_broken_episodes_are_refused_and_finished_ones_kept(tmp_path):
+def test_invalid_episodes_are_rejected_and_valid_ones_stored(tmp_path):
     path = tmp_path / "a.lance"
     sound = episode(0, 5)
     cases = [
@@ -64,7 +64,7 @@ def test_broken_episodes_are_refused_and_finished_ones_kept(tmp_path):
         ({**sound, "terminated": np.zeros(5)}, TypeError, "'terminated' is float64, the dataset's bool"),
         ({**sound, "state": np.zeros((5, 4), complex)}, TypeError, "complex128 cannot be stored"),
         ({**sound, "state": [np.zeros(4), np.zeros(3)]}, ValueError, "'state': its steps differ in shape"),
-        ({}, ValueError, "a column of numbers"),
+        ({}, ValueError, "at least one numeric column"),
     ]
     with data.open_writer(path) as writer:
         writer.write_episode(sound)
@@ -159,7 +159,7 @@ def numpy_format():
     del data.FORMATS["npz"]
 
 
-def test_a_format_of_ones_own(tmp_path, numpy_format):
+def test_user_defined_format(tmp_path, numpy_format):
     assert data.get_format("npz") is numpy_format and "npz" in data.list_formats()
     assert data.detect_format(tmp_path / "x.npzs") is numpy_format
     written = write(tmp_path / "a.npzs")
@@ -202,7 +202,7 @@ def test_registering(numpy_format):
     assert isinstance(data.open_writer("never.lance"), data.Writer)
 
 
-def test_convert_between_our_formats(tmp_path):
+def test_convert_between_native_formats(tmp_path):
     write(tmp_path / "a.lance")
     sums = set()
     for target, kwargs in (("b.h5", {}), ("c", {"format": "folder", "codec": "png"}), ("d.lance", {"codec": "png"})):
@@ -256,7 +256,7 @@ except KeyboardInterrupt:
 """
 
 
-def test_ctrl_c_keeps_what_was_converted(tmp_path):
+def test_ctrl_c_keeps_converted_episodes(tmp_path):
     write(tmp_path / "a.lance")
     target = tmp_path / "b.lance"
     command = [sys.executable, "-c", CONVERTING, str(tmp_path / "a.lance"), str(target)]

@@ -41,7 +41,7 @@ def same(one, other):
 
 
 @pytest.mark.parametrize("name", swm.envs.ids())
-def test_gymnasium_finds_nothing_wrong(name):
+def test_gymnasium_env_checker_passes(name):
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         env = make(name, render_mode="rgb_array")
@@ -51,7 +51,7 @@ def test_gymnasium_finds_nothing_wrong(name):
 
 
 @pytest.mark.parametrize("name", swm.envs.ids())
-def test_an_episode_follows_from_its_seed(name):
+def test_episode_depends_only_on_its_seed(name):
     one, other = (make(name, render_mode="rgb_array", image_shape=(40, 48)) for _ in range(2))
     assert one.spec.id == name and one.unwrapped.max_episode_steps > 0
     for env in (one, other):
@@ -60,9 +60,9 @@ def test_an_episode_follows_from_its_seed(name):
     assert one.unwrapped.variation_space.value.keys() == other.unwrapped.variation_space.value.keys()
     for _ in range(5):
         same(one.step(one.action_space.sample()), other.step(other.action_space.sample()))
-    picture = one.render()
-    assert picture.shape == (40, 48, 3) and picture.dtype == np.uint8 and picture.std() > 0
-    assert np.array_equal(picture, other.render())
+    image = one.render()
+    assert image.shape == (40, 48, 3) and image.dtype == np.uint8 and image.std() > 0
+    assert np.array_equal(image, other.render())
     assert one.unwrapped.render_goal().shape == (40, 48, 3)
     # Without a seed, the next episode is another one, and follows from the last seed.
     (first, _), (second, _) = one.reset(), one.reset()
@@ -75,7 +75,7 @@ def test_an_episode_follows_from_its_seed(name):
 
 @pytest.mark.parametrize("name", ["swm/TwoRoom-v1", "swm/PushT-v1", "swm/CartPoleControl-v1"])
 @pytest.mark.parametrize("mode", ["sync", "async"])
-def test_many_at_once(name, mode):
+def test_vector_environments(name, mode):
     envs = gymnasium.make_vec(name, num_envs=3, vectorization_mode=mode)
     try:
         observations, infos = envs.reset(seed=4)
@@ -121,7 +121,7 @@ def test_a_copy_has_the_options_of_the_environment():
     assert twin.name == "swm/OGBCube-v0,env_type=double" and twin.observation_space == env.observation_space
 
 
-def test_a_limit_of_gymnasiums_truncates():
+def test_time_limit_of_gymnasium_truncates():
     env = gymnasium.make("swm/TwoRoom-v1", max_episode_steps=3)
     env.reset(seed=0)
     assert [env.step(np.zeros(2, np.float32))[3] for _ in range(3)] == [False, False, True]
@@ -129,7 +129,7 @@ def test_a_limit_of_gymnasiums_truncates():
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
 @pytest.mark.parametrize("name", swm.envs.ids())
-def test_a_copy_goes_on_from_where_it_was(name, copied):
+def test_copy_continues_from_the_same_state(name, copied):
     env = make(name, render_mode="rgb_array", image_shape=(24, 24)).unwrapped
     env.reset(seed=3)
     env.step(env.action_space.sample())
@@ -164,7 +164,7 @@ IMPORTS = [
 ]
 
 
-def test_whatever_is_imported_first():
+def test_registration_in_any_import_order():
     check = "gymnasium.make('swm/TwoRoom-v1').reset(seed=0)"
     children = [
         subprocess.Popen([sys.executable, "-W", "error", "-c", f"{line}; {check}"], stderr=subprocess.PIPE, text=True)

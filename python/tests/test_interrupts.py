@@ -1,4 +1,4 @@
-"""What fails in the middle of something: the error is the one that was raised, and what was finished stays."""
+"""Failures during long runs: the original error is raised, and finished work remains."""
 
 import os
 import signal
@@ -18,7 +18,7 @@ class Broken(Exception):
 
 
 class Fragile(gymnasium.Env):
-    """Counts; raises in the step that it is told."""
+    """Counts steps, and raises in the step that `breaks` names."""
 
     metadata = {"render_modes": ["rgb_array"]}
 
@@ -216,7 +216,7 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
-def test_interrupted_training_saves_what_it_has(end, home):
+def test_interrupted_training_saves_a_checkpoint(end, home):
     child = subprocess.Popen([sys.executable, "-c", TRAINING], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     assert child.stdout.readline().strip() == "ready"
     time.sleep(1.0)
@@ -228,7 +228,7 @@ def test_interrupted_training_saves_what_it_has(end, home):
     assert (home / "checkpoints/long/checkpoint/weights.safetensors").exists()
 
 
-def test_training_says_what_is_wrong():
+def test_training_reports_wrong_arguments():
     with pytest.raises(ValueError, match="unknown dataset 'nothing'"):
         swm.wm.train("lewm", data="nothing", out="mine")
     with pytest.raises(ValueError, match="schedule.steps"):

@@ -1,4 +1,4 @@
-"""The listings of the paper, as printed but for smaller numbers, and the extensions that it describes."""
+"""The listings of the paper, with smaller settings, and user-defined extensions."""
 
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ torch.set_num_threads(1)
 
 
 class MyWorldModel(torch.nn.Module):
-    """A model of a user's own: encodes pictures, and moves the latent by every action."""
+    """A user-defined model: encodes frames, and moves the latent by every action."""
 
     def __init__(self, actions, latent=8):
         super().__init__()
@@ -24,14 +24,14 @@ class MyWorldModel(torch.nn.Module):
 
     def get_cost(self, info_dict, action_candidates):
         if "latents" not in info_dict:
-            pictures = [info_dict[key][:, 0, -1].movedim(-1, 1).float() / 255 for key in ("pixels", "goal")]
-            info_dict["latents"] = [self.encoder(one)[:, None] for one in pictures]
+            frames = [info_dict[key][:, 0, -1].movedim(-1, 1).float() / 255 for key in ("pixels", "goal")]
+            info_dict["latents"] = [self.encoder(one)[:, None] for one in frames]
         start, goal = info_dict["latents"]
         reached = start + self.actions(action_candidates).sum(2)
         return ((reached - goal) ** 2).sum(-1)
 
 
-def test_the_loop(tmp_path, monkeypatch):
+def test_listing_of_the_full_loop(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # 1] Create the world
     world = swm.World(env_name="swm/PushT-v1", num_envs=8, max_episode_steps=12, image_shape=(64, 64))
@@ -118,7 +118,7 @@ def test_robustness_sweep_on_atari():
 
 
 class Straight:
-    """A solver of one's own: of some straight lines, the cheapest."""
+    """A user-defined solver: the cheapest of several constant action sequences."""
 
     def __init__(self, model):
         self.model, self.calls = model, []
@@ -138,13 +138,13 @@ class Straight:
 
 
 class Rightward:
-    """Prices the way to the corner at (1, 1)."""
+    """A cost that is least for the action (1, 1)."""
 
     def get_cost(self, info_dict, action_candidates):
         return ((action_candidates - 1) ** 2).sum((2, 3))
 
 
-def test_a_solver_of_ones_own():
+def test_user_defined_solver():
     solver = Straight(Rightward())
     world = swm.World("swm/TwoRoom-v1", num_envs=3, image_shape=(32, 32), max_episode_steps=10)
     policy = swm.policy.MPCPolicy(solver, config=swm.PlanConfig(horizon=4, receding_horizon=2, action_block=2))
@@ -161,7 +161,7 @@ def test_a_solver_of_ones_own():
     assert len(metrics["episode_successes"]) == 4
 
 
-def test_a_format_of_ones_own(tmp_path):
+def test_user_defined_format(tmp_path):
     class Npz:
         """One file an episode."""
 
@@ -264,10 +264,10 @@ class Corridor(gymnasium.Env):
         return self._observed(), -abs(5 - self.x), done, False, self._info()
 
     def render(self):
-        picture = np.zeros((32, 32, 3), np.uint8)
+        image = np.zeros((32, 32, 3), np.uint8)
         at = int((self.x + self.length) / (2 * self.length) * 27)
-        picture[14:18, at : at + 4] = self.variation_space.value["agent"]["color"]
-        return picture
+        image[14:18, at : at + 4] = self.variation_space.value["agent"]["color"]
+        return image
 
     def _observed(self):
         return np.array([self.x, 5], np.float32)
@@ -288,7 +288,7 @@ class Forward(swm.policy.BasePolicy):
         return np.ones(self.env.action_space.shape, np.float32)
 
 
-def test_an_environment_of_ones_own(tmp_path, corridor):
+def test_user_defined_environment(tmp_path, corridor):
     world = swm.World(corridor, num_envs=3, image_shape=(32, 32), length=12)
     assert world.variation_space.names() == ["agent.color", "agent.speed", "start"]
     assert world.max_episode_steps == 8 and world.gym_envs[0].unwrapped.length == 12
@@ -312,7 +312,7 @@ def test_an_environment_of_ones_own(tmp_path, corridor):
         world.reset(options={"variation": ["agent.velocity"]})
 
 
-def test_a_wrapper_of_ones_own(corridor):
+def test_user_defined_wrapper(corridor):
     class Negative(gymnasium.Wrapper):
         def __init__(self, env, offset=0):
             super().__init__(env)

@@ -209,7 +209,7 @@ def test_a_numpy_model_sees_no_torch():
         plan(solvers.GradientSolver(NumpyQuadratic()))
 
 
-def test_a_search_begins_where_it_is_told():
+def test_search_starts_from_the_initial_actions():
     solver = configured(solvers.CEMSolver(Quadratic(), num_samples=30, n_steps=1, topk=3, var_scale=1e-4))
     init = np.full((3, 3, 2), 0.25, np.float32)
     assert np.allclose(solver.solve(infos(), init_action=init)["actions"], 0.25, atol=1e-2)
@@ -235,7 +235,7 @@ def test_a_model_is_in_inference_mode_but_for_gradients():
     assert (False, False, True) in seen
 
 
-def test_what_a_model_keeps_in_its_infos_stays_for_the_search():
+def test_infos_cached_by_a_model_stay_for_the_search():
     computed = []
 
     class Keeping(Quadratic):
@@ -327,12 +327,12 @@ def test_a_wrong_model_stops_an_evaluation(how, error, words):
         (lambda: swm.policy.MPCPolicy(object()), TypeError, "configure"),
     ],
 )
-def test_wrong_words_get_clear_errors(make, error, words):
+def test_wrong_arguments_raise_clear_errors(make, error, words):
     with pytest.raises(error, match=words):
         make()
 
 
-# In worlds.
+# In a `World`.
 
 
 class ToGoal(torch.nn.Module):
@@ -398,7 +398,7 @@ def test_the_engine_executes_plans_as_python_does(warm, process):
     assert np.nanstd(ours[0]) > 1e-4 and (np.diff(ours[2], axis=0) < 0).any()
 
 
-def test_an_episode_is_planned_the_same_wherever_it_is_played():
+def test_plans_do_not_depend_on_the_slot():
     def policy(**more):
         return swm.policy.MPCPolicy(few(solvers.CEMSolver, ToGoal(), seed=1, **more), swm.PlanConfig(3, 2))
 
@@ -417,14 +417,14 @@ def test_planning_reaches_goals():
     assert metrics["plan_seconds"] and policy.plans[0].keys() >= {"episode", "slot", "replan", "cost", "best"}
 
 
-def test_a_model_sees_what_it_was_trained_on():
+def test_model_gets_scaled_infos():
     model = ToGoal(torch.float64)
     scaler = swm.data.ZScoreScaler(np.array([100.0, 50.0]), np.array([10.0, 20.0]))
     policy = swm.policy.MPCPolicy(
         few(solvers.CEMSolver, model),
         config=swm.PlanConfig(horizon=2, receding_horizon=1, history_len=3, action_block=2),
         process={"state": scaler},
-        transform={"pixels": lambda picture: picture[:, ::2, ::2].float() / 255},
+        transform={"pixels": lambda image: image[:, ::2, ::2].float() / 255},
     )
     world = rooms(3)
     world.set_policy(policy)
@@ -437,18 +437,18 @@ def test_a_model_sees_what_it_was_trained_on():
     first, last = model.seen[0], model.seen[-1]
     assert first["pixels"].shape == (3, 20, 3, 3, 8, 8) and first["pixels"].dtype == torch.float64
     assert first["goal"].shape == (3, 20, 1, 16, 16, 3) and first["goal"].dtype == torch.uint8
-    # Before an episode begins, the world has stood still.
-    picture = torch.from_numpy(begun).movedim(-1, 1)[:, :, ::2, ::2].double() / 255
+    # Before the first step, the history repeats the first frame.
+    image = torch.from_numpy(begun).movedim(-1, 1)[:, :, ::2, ::2].double() / 255
     for frame in range(3):
-        assert torch.allclose(first["pixels"][:, 0, frame], picture)
+        assert torch.allclose(first["pixels"][:, 0, frame], image)
     # Frames are a model step of two environment steps apart: the third plan sees all three.
-    assert torch.allclose(last["pixels"][:, 0, 0], picture) and not torch.equal(last["pixels"][:, 0, 2], picture)
+    assert torch.allclose(last["pixels"][:, 0, 0], image) and not torch.equal(last["pixels"][:, 0, 2], image)
     assert last["history_action"].shape == (3, 20, 2, 4)
     assert np.allclose(last["state"][:, 0], (states[4] - [100, 50]) / [10, 20])
     assert np.allclose(first["state"][:, 0], (states[0] - [100, 50]) / [10, 20])
 
 
-def test_frames_of_the_past_are_the_engines_to_keep():
+def test_history_requires_an_engine_solver():
     policy = swm.policy.MPCPolicy(Followed(few(solvers.CEMSolver, ToGoal())), swm.PlanConfig(history_len=2))
     with pytest.raises(ValueError, match="history_len: 2"):
         rooms().evaluate(policy=policy, episodes=1, progress=False)

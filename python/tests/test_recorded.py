@@ -56,11 +56,11 @@ class Field(gymnasium.Env):
         return self.position, 0.0, bool(np.abs(self.position - self.goal).max() < 0.03), False, self.info()
 
     def render(self):
-        picture = np.zeros((32, 32, 3), np.uint8)
-        for place, channel in ((self.position, 0), (self.goal, 1)):
-            x, y = np.clip((place + 2) * 8, 0, 29).astype(int)
-            picture[y : y + 3, x : x + 3, channel] = 255
-        return picture
+        image = np.zeros((32, 32, 3), np.uint8)
+        for point, channel in ((self.position, 0), (self.goal, 1)):
+            x, y = np.clip((point + 2) * 8, 0, 29).astype(int)
+            image[y : y + 3, x : x + 3, channel] = 255
+        return image
 
 
 class Quiet(Field):
@@ -147,7 +147,7 @@ def test_episodes_start_where_they_were_recorded(fields, recorded, name, callabl
             wind = next(wind for state, wind in policy.first if np.array_equal(state, rows["state"][start]))
             assert np.array_equal(wind, rows["wind"][0]), "the seed is the recorded one"
             goal = rows["pixels"][start + 6].transpose(1, 2, 0)
-            assert any(np.array_equal(goal, shown) for shown in policy.goals), "the goal's picture is the recorded one"
+            assert any(np.array_equal(goal, shown) for shown in policy.goals), "the goal's frame is the recorded one"
         noted = metrics.results["manifest"]["config"]["callables"]
         assert [call["method"] for call in noted] == [call["method"] for call in callables or []]
         world.close()
@@ -166,7 +166,7 @@ def test_a_worker_that_dies_starts_there_again(fields, recorded, tmp_path):
 
 
 class Blind(Seeking):
-    """Without pictures."""
+    """An environment without frames."""
 
     def get_action(self, infos, **kwargs):
         return super().get_action({**infos, "goal": infos["state"]})
@@ -191,7 +191,7 @@ def test_a_worker_killed_between_steps_is_replaced(fields, recorded):
 
 
 @pytest.mark.parametrize("workers", [False, True])
-def test_what_is_wrong_is_said(fields, recorded, workers):
+def test_wrong_callables_raise_clear_errors(fields, recorded, workers):
     def error(callables, name="Quiet", kind=ValueError):
         world = swm.World(fields(name), num_envs=2, image_shape=(32, 32), workers=workers)
         with pytest.raises(kind) as caught:
@@ -213,7 +213,7 @@ def test_what_is_wrong_is_said(fields, recorded, workers):
     assert "where" in error(call("teleport", scale={"value": 1, "in_dataset": False}), kind=raised)
 
 
-def test_worlds_of_ours_know_their_states(tmp_path):
+def test_native_environments_restore_recorded_states(tmp_path):
     world = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(32, 32))
     world.set_policy(swm.policy.ExpertPolicy())
     world.collect(tmp_path / "rooms.lance", episodes=3, seed=1, progress=False)

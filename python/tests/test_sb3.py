@@ -56,7 +56,7 @@ def test_dictionaries_of_observations(name):
     assert set(observation) == {"proprio", "state"} and len(model.predict(observation)[0]) == 2
 
 
-def test_sb3_finds_nothing_wrong():
+def test_sb3_env_checker_passes():
     import gymnasium
     from stable_baselines3.common.env_checker import check_env
 

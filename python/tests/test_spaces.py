@@ -55,11 +55,11 @@ def test_groups_are_sampled_whole_and_values_pinned():
         (lambda s: s.set_init_value({"shape": 9}), "9"),
     ],
 )
-def test_what_is_not_allowed_says_so(change, words):
+def test_invalid_values_raise_clear_errors(change, words):
     with pytest.raises(ValueError, match=words):
         change(factors())
 
 
-def test_an_impossible_condition_ends():
+def test_impossible_condition_raises():
     with pytest.raises(RuntimeError, match="1000 tries"):
         swm_spaces.Box(0, 1, shape=(2,), constrain_fn=lambda x: False).sample()

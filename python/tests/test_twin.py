@@ -36,8 +36,8 @@ class Pyramid(nn.Module):
             inputs, side = stage["channels"], side // stage["patch"]
         self.hidden, self.out = nn.Linear(side**2 * inputs, hidden), nn.Linear(hidden, dim)
 
-    def forward(self, pictures):
-        x = self.stem(pictures).relu().movedim(1, -1)
+    def forward(self, frames):
+        x = self.stem(frames).relu().movedim(1, -1)
         for layer, patch in zip(self.stages, self.patches, strict=True):
             n, side, _, channels = x.shape
             blocks = x.reshape(n, side // patch, patch, side // patch, patch * channels).transpose(2, 3)
@@ -137,8 +137,8 @@ class TorchLewm(nn.Module):
         self.predictor = Predictor(latent, dim=sizes["dim"], inner=inner, hidden=sizes["mlp"], depth=sizes["depth"])
         self.pred_proj = Projector(latent, model["projector"], latent)
 
-    def latents(self, pictures):
-        return self.projector(self.encoder((pictures.movedim(-1, 1) / 255 - self.mean) / self.std))
+    def latents(self, frames):
+        return self.projector(self.encoder((frames.movedim(-1, 1) / 255 - self.mean) / self.std))
 
     def encode(self, info_dict):
         return self.latents(info_dict["pixels"][:, -1])
@@ -266,7 +266,7 @@ def test_plans_are_the_same(twins, infos, solver, settings):
     assert np.abs(ours[0] - ours[1]).max() > 10 * TOLERANCE * np.abs(ours).max()
 
 
-def test_worlds_are_played_the_same(twins):
+def test_evaluations_are_the_same(twins):
     burn, twin = twins
     scaler = swm.data.ZScoreScaler(burn.card["action_mean"], burn.card["action_std"])
     config = swm.PlanConfig(horizon=3, receding_horizon=2, action_block=burn.action_block)
@@ -287,7 +287,7 @@ def test_worlds_are_played_the_same(twins):
     assert np.allclose(*played, atol=1e-4) and played[0].std() > 0.1
 
 
-def test_a_model_of_ours_answers_numpy_and_torch(twins, infos):
+def test_engine_model_accepts_numpy_and_torch(twins, infos):
     burn, _ = twins
     candidates = np.random.default_rng(1).normal(size=(3, 1, 2, 10)).astype(np.float32)
     expected = burn.get_cost(infos, candidates)
@@ -302,11 +302,11 @@ def test_a_model_of_ours_answers_numpy_and_torch(twins, infos):
     assert np.array_equal(burn.get_cost(moments, np.repeat(candidates, 2, 1)), np.repeat(expected, 2, 1))
 
 
-def test_a_model_of_ours_says_what_does_not_fit(twins, infos):
+def test_engine_model_reports_wrong_inputs(twins, infos):
     burn, _ = twins
     with pytest.raises(ValueError, match=r"\(B, S, H, A\)"):
         burn.get_cost(infos, np.zeros((3, 4, 10), np.float32))
-    with pytest.raises(ValueError, match="10 numbers a model step"):
+    with pytest.raises(ValueError, match="10 action elements a model step"):
         burn.get_cost(infos, np.zeros((3, 4, 2, 4), np.float32))
     with pytest.raises(ValueError, match="goal"):
         burn.get_cost({"pixels": infos["pixels"]}, np.zeros((3, 4, 2, 10), np.float32))

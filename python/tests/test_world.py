@@ -18,7 +18,7 @@ def rooms(**more):
 
 
 class Zero(swm.policy.BasePolicy):
-    """A policy of Python's."""
+    """A policy implemented in Python."""
 
     def __init__(self, value=0.0):
         super().__init__()
@@ -43,7 +43,7 @@ def test_infos_are_views_that_every_step_writes():
     assert world.infos["step_idx"].ravel().tolist() == [1, 1, 1]
 
 
-def test_an_episode_is_the_same_wherever_it_is_played():
+def test_episode_does_not_depend_on_slot_or_threads():
     def played(envs, threads):
         world = rooms(num_envs=envs, threads=threads)
         world.set_policy(swm.policy.RandomPolicy(seed=5))
@@ -59,7 +59,7 @@ def test_an_episode_is_the_same_wherever_it_is_played():
             assert np.array_equal(value, other[key], equal_nan=value.dtype.kind == "f"), key
 
 
-def test_episodes_go_on_and_begin_anew():
+def test_finished_episodes_are_followed_by_new_ones():
     world = rooms(max_episode_steps=4)
     world.set_policy(Zero())
     world.reset(seed=0)
@@ -80,7 +80,7 @@ def test_factors_are_sampled_and_pinned():
     world.reset(seed=0, options={"variation": ["agent.color"], "variation_values": {"background.color": [0.1, 0.2, 0.9]}})
     colours = [tuple(world.factors(i)["agent.color"]) for i in range(3)]
     assert len(set(colours)) > 1
-    # Fractions of a colour are meant as such.
+    # Fractions of 1 are scaled to 0..255.
     assert world.factors(0)["background.color"] == [26.0, 51.0, 230.0]
     with pytest.raises(ValueError, match="agent.color"):
         world.reset(options={"variation": ["agent.colour"]})
@@ -88,7 +88,7 @@ def test_factors_are_sampled_and_pinned():
         world.reset(options={"variations": ["all"]})
 
 
-def test_policies_of_python_and_of_the_engine_collect(tmp_path):
+def test_python_policy_collects(tmp_path):
     world = rooms(max_episode_steps=6)
     policy = Zero(0.5)
     world.set_policy(policy)
@@ -98,7 +98,7 @@ def test_policies_of_python_and_of_the_engine_collect(tmp_path):
     actions = data.get_col_data("action")
     rows = np.tile([True] * 6 + [False], 5)
     assert (actions[rows] == 0.5).all() and np.isnan(actions[~rows]).all()
-    # There is one already.
+    # The dataset exists already.
     with pytest.raises(ValueError, match="it exists already"):
         world.collect(tmp_path / "a.lance", episodes=5, seed=1, progress=False)
     more = world.collect(tmp_path / "a.lance", episodes=2, seed=1, mode="append", progress=False)
@@ -109,7 +109,7 @@ def test_policies_of_python_and_of_the_engine_collect(tmp_path):
     assert np.array_equal(one.get_col_data("state"), other.get_col_data("state"))
 
 
-def test_evaluation_tells_intervals_and_the_floor(tmp_path):
+def test_evaluation_reports_intervals_and_the_random_floor(tmp_path):
     world = rooms()
     metrics = world.evaluate(
         policy=swm.policy.ExpertPolicy(), episodes=12, seed=2, video=tmp_path / "videos", videos=2, progress=False
@@ -152,7 +152,7 @@ def test_visual_wrappers_run_in_the_engine():
         rooms(extra_wrappers=[partial(NoiseWrapper, std=lambda step: "loud")])
 
 
-def test_any_function_of_the_step_is_a_schedule():
+def test_function_of_the_step_is_a_schedule():
     ours, theirs = (
         rooms(extra_wrappers=[partial(NoiseWrapper, std=schedule)])
         for schedule in (linear(8, 28, 10), lambda step: 8 + 2 * min(step, 10))
@@ -169,7 +169,7 @@ def test_any_function_of_the_step_is_a_schedule():
         rooms(extra_wrappers=[partial(NoiseWrapper, std=lambda step: 250.0 + step)])
 
 
-def test_a_world_goes_back_to_what_it_was():
+def test_snapshot_and_restore():
     world = rooms(num_envs=1)
     world.set_policy(Zero(0.7))
     world.reset(seed=0)
@@ -190,7 +190,7 @@ def test_a_world_goes_back_to_what_it_was():
         (lambda: rooms(image_shape=(0, 8)), ValueError, "at least one pixel"),
         (lambda: rooms().step(), RuntimeError, "set_policy"),
         (lambda: rooms().reset(seed=-1), ValueError, "from 0"),
-        (lambda: rooms().reset(seed=[1, 2]), ValueError, "2 of them for 3"),
+        (lambda: rooms().reset(seed=[1, 2]), ValueError, "expected 3 seeds.*got 2"),
         (lambda: rooms(image_shape=64), TypeError, "height, width"),
         (lambda: rooms().set_policy(3), TypeError, "get_action"),
         (lambda: rooms().set_policy(Zero), TypeError, "class"),
@@ -199,15 +199,15 @@ def test_a_world_goes_back_to_what_it_was():
         (lambda: rooms().evaluate(policy=Zero(), protocol="loose"), ValueError, "compat"),
         (lambda: rooms().evaluate(policy=swm.policy.ExpertPolicy("weakk")), ValueError, "weak"),
         (lambda: rooms().evaluate(policy=Zero(), dataset="nothing"), FileNotFoundError, "nothing"),
-        (lambda: rooms().evaluate(policy=Zero(np.nan), episodes=1, seed=0), ValueError, "not finite"),
+        (lambda: rooms().evaluate(policy=Zero(np.nan), episodes=1, seed=0), ValueError, "finite actions"),
     ],
 )
-def test_wrong_words_get_clear_errors(make, error, words):
+def test_wrong_arguments_raise_clear_errors(make, error, words):
     with pytest.raises(error, match=words):
         make()
 
 
-def test_what_a_policy_raises_comes_back_as_it_was(tmp_path):
+def test_exception_of_a_policy_is_raised_unchanged(tmp_path):
     class Failing(Zero):
         def get_action(self, infos, **kwargs):
             if infos["step_idx"].max() >= 3:
@@ -222,7 +222,7 @@ def test_what_a_policy_raises_comes_back_as_it_was(tmp_path):
         world.collect(tmp_path / "not.lance", episodes=3, seed=0, policy=Failing(), progress=False)
 
 
-def test_planning_in_the_world_itself():
+def test_planning_with_the_simulator():
     world = rooms(num_envs=2, add_pixels=False)
     solver = swm.solver.CEMSolver("simulator", num_samples=32, n_steps=4, topk=8)
     policy = swm.policy.MPCPolicy(solver, swm.PlanConfig(horizon=10, receding_horizon=5))
@@ -230,8 +230,8 @@ def test_planning_in_the_world_itself():
     assert metrics["success_rate"] > metrics["random_success_rate"] and policy.plans
 
 
-def test_a_model_that_acts(tmp_path):
-    """A GCBC of two steps knows nothing, and acts: by itself, and as a policy inside the engine."""
+def test_checkpoint_with_a_policy(tmp_path):
+    """A GCBC trained for two steps acts the same through `get_action` and as a policy of the engine."""
     world = rooms(image_shape=(64, 64))
     world.collect(tmp_path / "rooms.lance", episodes=12, seed=0, policy=swm.policy.ExpertPolicy(), progress=False)
     out = tmp_path / "gcbc"

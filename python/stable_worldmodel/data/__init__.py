@@ -1,9 +1,9 @@
 """Datasets: reading, loading, writing, converting and examining episodes.
 
 - `load_dataset` opens a dataset of any format for a torch `DataLoader`; `Loader` gives shuffled batches by itself.
-- `open_writer` stores episodes; `convert`, `doctor` and `inspect` do with whole datasets what their names say.
-- `register_format` adds a format of your own to all of it.
-- `MergeDataset`, `ConcatDataset`, `GoalDataset`, `ReplayBuffer`: datasets made of datasets, and of a running collection.
+- `open_writer` stores episodes; `convert`, `doctor` and `inspect` convert, examine and describe datasets.
+- `register_format` adds a user-defined format to all of these.
+- `MergeDataset`, `ConcatDataset`, `GoalDataset`, `ReplayBuffer`: datasets derived from others, and from a running collection.
 """
 
 from .buffer import ReplayBuffer, classic_filter

@@ -1,4 +1,4 @@
-"""Arrays and tensors: which of the two users get, and how episodes of any form become arrays of rows."""
+"""Conversion between arrays, tensors and episodes of rows."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import numpy.typing as npt
 Array = npt.NDArray[Any]
 Backend = Literal["torch", "numpy"]
 
-#: Columns that number episodes and steps. Readers compute them, writers ignore them.
+#: The columns with the indices of episodes and steps. Readers compute them, writers ignore them.
 NUMBERING = ("episode_idx", "step_idx")
 
-#: What is stored in place of types that are not.
+#: The stored types of types that cannot be stored.
 _WIDER = {
     "float16": "float32",
     "int8": "int32",
@@ -29,7 +29,7 @@ _STORED = ("bool", "uint8", "int32", "int64", "float32", "float64")
 
 
 def backend(given: str | None) -> Backend:
-    """What samples are made of: as asked, else torch where it is installed."""
+    """The backend of samples: the given one, else torch if it is installed."""
     if given is None:
         return "torch" if importlib.util.find_spec("torch") is not None else "numpy"
     if given not in ("torch", "numpy"):
@@ -38,7 +38,7 @@ def backend(given: str | None) -> Backend:
 
 
 def wrap(array: Array, kind: Backend) -> Any:
-    """The array as a tensor that looks at the same memory, or as it is."""
+    """The array, or a tensor that shares its memory."""
     if kind == "numpy":
         return array
     import torch
@@ -46,21 +46,18 @@ def wrap(array: Array, kind: Backend) -> Any:
     return torch.from_numpy(array)
 
 
-def is_picture(shape: tuple[int, ...]) -> bool:
-    """Whether rows of this shape are pictures, `(height, width, 1 or 3)`."""
+def is_image(shape: tuple[int, ...]) -> bool:
+    """Whether rows of this shape are images, `(H, W, 1)` or `(H, W, 3)`."""
     return len(shape) == 3 and shape[-1] in (1, 3)
 
 
 def channels_first(array: Array, shape: tuple[int, ...]) -> Array:
-    """Pictures `(..., height, width, channels)` as a view `(..., channels, height, width)`; others as they are.
-
-    `shape` is that of a row.
-    """
-    return np.moveaxis(array, -1, -3) if is_picture(shape) else array
+    """Images `(..., H, W, C)` as a view `(..., C, H, W)`; other arrays unchanged. `shape` is the shape of a row."""
+    return np.moveaxis(array, -1, -3) if is_image(shape) else array
 
 
 def to_numpy(value: Any) -> Array:
-    """Numbers of any kind (a tensor, a list of them, ...) as an array."""
+    """A tensor, a list of tensors, or any array-like value as an array."""
     torch = sys.modules.get("torch")
     if torch is not None:
         if isinstance(value, torch.Tensor):
@@ -78,10 +75,10 @@ def _from_torch(tensor: Any) -> Array:
 
 
 def rows(episode: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, str | bytes]]:
-    """An episode, a column a list of steps or an array `(T, ...)`, as arrays of the types that are stored, and text.
+    """Splits an episode into arrays `(T, ...)` of types that can be stored, and text constants.
 
-    Pictures `(T, channels, height, width)` become `(T, height, width, channels)`. Text is kept once an episode. Actions
-    may be one fewer than the other columns' rows: none is taken from the final observation.
+    Images `(T, C, H, W)` become `(T, H, W, C)`. Text is stored once per episode. `action` may have one row less than the
+    other columns, because no action follows the final observation.
     """
     arrays: dict[str, Array] = {}
     constants: dict[str, str | bytes] = {}
@@ -97,10 +94,12 @@ def rows(episode: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, str | 
         except ValueError as error:
             raise ValueError(f"column {name!r}: its steps differ in shape: {error}") from error
         if array.ndim == 0:
-            raise ValueError(f"column {name!r}: expected a value a step, got {value!r}")
+            raise ValueError(f"column {name!r}: expected one value for each step, got {value!r}")
         dtype = _WIDER.get(array.dtype.name, array.dtype.name)
         if dtype not in _STORED:
-            raise TypeError(f"column {name!r}: {array.dtype} cannot be stored; give numbers, or one text an episode")
+            raise TypeError(
+                f"column {name!r}: {array.dtype} cannot be stored; expected numeric values, or one text per episode"
+            )
         first = array.ndim == 4 and array.shape[1] in (1, 3) and array.shape[-1] not in (1, 3)
         if first and array.dtype == np.uint8:
             array = np.moveaxis(array, 1, -1)
@@ -110,7 +109,7 @@ def rows(episode: Mapping[str, Any]) -> tuple[dict[str, Array], dict[str, str | 
 
 
 def _text(name: str, value: Any) -> str | bytes | None:
-    """The text that a column is, the same in every step; `None` for numbers."""
+    """The text of a column, which is the same in every step; `None` for numeric columns."""
     if isinstance(value, (str, bytes)):
         return value
     if isinstance(value, np.ndarray):
@@ -136,5 +135,5 @@ def _equal_lengths(arrays: dict[str, Array]) -> None:
 
 
 def _missing(dtype: np.dtype[Any]) -> float:
-    """What stands for no action."""
+    """The value of a missing action."""
     return {"f": np.nan, "i": -1}.get(dtype.kind, 0)

@@ -1,4 +1,4 @@
-"""The latest episodes of a running collection, to train on while it goes on."""
+"""The latest episodes of a running collection, for training during the collection."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ Sampler = Callable[[int, "ReplayBuffer", int, int], Any]
 
 
 class ReplayBuffer(Dataset):
-    """The latest episodes, of at most `max_steps` rows: a writer to who collects, a dataset to who learns.
+    """The latest episodes, with at most `max_steps` rows: a writer for collection and a dataset for training.
 
         buffer = ReplayBuffer(max_steps=100_000, history_len=4)
         world.collect(buffer, episodes=10)
         batch = buffer.sample(256)  # arrays (256, 4, ...)
 
-    When an episode does not fit, the oldest ones leave as a whole. What is drawn is a function of the seed, the step and
-    of what the buffer holds.
+    When an episode does not fit, the oldest episodes are removed. Samples depend only on the seed, the step and the content
+    of the buffer.
 
     Args:
-        max_steps: How many rows it holds. An episode of `n` steps has `n + 1`.
+        max_steps: The maximum number of rows. An episode of `n` steps has `n + 1`.
         history_len: Steps of a clip.
         frameskip: Rows from one step to the next.
         sampler: Chooses clips: `(step, buffer, batch_size, history_len)` to indices below `num_valid_ends(history_len)`.
@@ -64,7 +64,7 @@ class ReplayBuffer(Dataset):
         self.seed = int(seed)
         self._buffer: Any = None
         self._columns: list[tuple[str, str, list[int]]] = []
-        #: What the buffer held when it was last asked, and the samplers of it.
+        #: The engine's view of the current content, and the samplers by batch size and history.
         self._snapshot: Any = None
         self._samplers: dict[tuple[int, int], Any] = {}
         self._step = 0
@@ -105,7 +105,7 @@ class ReplayBuffer(Dataset):
             self._refresh()
 
     def _refresh(self) -> None:
-        """Looks at what the buffer holds now."""
+        """Updates the snapshot, lengths and offsets to the current content."""
         self._snapshot = self._buffer.snapshot()
         lengths = self._snapshot.lengths()
         super().__init__(lengths, np.cumsum(lengths) - lengths, self.frameskip, self.num_steps, self.transform)
@@ -116,37 +116,37 @@ class ReplayBuffer(Dataset):
 
     @property
     def engine(self) -> Any:
-        """The engine's dataset of what it holds now."""
+        """The engine's dataset of the current content."""
         if self._snapshot is None:
             raise RuntimeError("the replay buffer is empty: write an episode first")
         return self._snapshot
 
     @property
     def num_steps_stored(self) -> int:
-        """Rows it holds."""
+        """The number of rows in the buffer."""
         return 0 if self._buffer is None else int(self._buffer.rows())
 
     @property
     def num_episodes_added(self) -> int:
-        """Episodes that ever came, those that left included."""
+        """The number of episodes added, removed ones included."""
         return 0 if self._buffer is None else int(self._buffer.added())
 
     def num_valid_ends(self, history_len: int | None = None) -> int:
-        """How many clips of so many steps it holds."""
+        """The number of clips of `history_len` steps in the buffer."""
         span = (self.history_len if history_len is None else history_len) * self.frameskip
         return int(np.maximum(self.lengths - span + 1, 0).sum())
 
     def sample(self, batch_size: int, history_len: int | None = None, step: int | None = None) -> dict[str, Array]:
-        """Draws a batch of clips.
+        """Samples a batch of clips.
 
         Args:
-            batch_size: How many.
+            batch_size: The number of clips.
             history_len: Steps of a clip; the buffer's without it.
             step: The number of the draw; without it they are counted.
 
         Returns:
-            Arrays `(batch_size, history_len, ...)`; `action` is `(batch_size, history_len, frameskip * numbers)`, pictures
-            `(batch_size, history_len, height, width, channels)`.
+            Arrays `(batch_size, history_len, ...)`; `action` is `(batch_size, history_len, frameskip * dim)`, images
+            `(batch_size, history_len, H, W, C)`.
         """
         steps = self.history_len if history_len is None else int(history_len)
         if batch_size < 1 or steps < 1:
@@ -211,14 +211,14 @@ class ReplayBuffer(Dataset):
         return {name: array[0] for name, array in found.items()} if np.ndim(row_idx) == 0 else found
 
     def episodes(self) -> Iterator[dict[str, Array]]:
-        """The episodes it holds, oldest first, as arrays `(T, ...)`."""
+        """Yields the episodes, oldest first, as dicts of arrays `(T, ...)`."""
         snapshot, lengths = self._snapshot, self.lengths
         for episode in range(len(lengths)):
             run = (np.asarray([n], dtype=np.int64) for n in (episode, 0, lengths[episode]))
             yield dict(snapshot.read(self.column_names, *run, 1))
 
     def dump(self, path: str | os.PathLike[str], format: str | None = None, mode: str = "overwrite", **kwargs: Any) -> None:
-        """Writes what it holds to a dataset of any format."""
+        """Writes the content to a dataset of any format."""
         with open_writer(path, format=format, mode=mode, **kwargs) as writer:
             writer.write_episodes(self.episodes())
 

@@ -1,4 +1,4 @@
-"""Datasets of episodes as sequences of clips, and datasets made of datasets."""
+"""Datasets of episodes as sequences of clips, and datasets derived from others."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ __all__ = ["ConcatDataset", "Dataset", "GoalDataset", "MergeDataset", "StoredDat
 
 
 class Dataset:
-    """Episodes, seen as all clips of `num_steps` steps that lie within one of them.
+    """The clips of `num_steps` steps inside of the episodes.
 
-    A clip covers `num_steps * frameskip` rows. Its step `k` shows row `k * frameskip` and carries the `frameskip`
-    actions from there on: `action` has the shape `(num_steps, frameskip * numbers)`, every other column
-    `(num_steps, ...)`, pictures `(num_steps, channels, height, width)`.
+    A clip covers `num_steps * frameskip` rows. Its step `k` has the columns of row `k * frameskip` and carries the `frameskip`
+    actions from there on: `action` has the shape `(num_steps, frameskip * dim)`, every other column
+    `(num_steps, ...)`, images `(T, C, H, W)` with `T = num_steps`.
 
-    Readers of formats of your own derive from it, and bring `column_names` and `_load_slice`.
+    Readers of user-defined formats derive from it and implement `column_names` and `_load_slice`.
 
     Args:
         lengths: Rows of every episode.
@@ -117,7 +117,7 @@ class Dataset:
         return self._load_slice(episode_idx, 0, int(self.lengths[episode_idx]))
 
     def get_col_data(self, col: str) -> Array:
-        """All rows of a column, `(rows, ...)`; pictures `(rows, height, width, channels)`."""
+        """All rows of a column, `(rows, ...)`; images `(rows, H, W, C)`."""
         raise NotImplementedError(f"{type(self).__name__}.get_col_data")
 
     def get_row_data(self, row_idx: Rows) -> dict[str, Array]:
@@ -125,20 +125,20 @@ class Dataset:
         raise NotImplementedError(f"{type(self).__name__}.get_row_data")
 
     def get_dim(self, col: str) -> int:
-        """Numbers in a row of a column."""
+        """The number of elements in a row of a column."""
         data = self.get_col_data(col)
         return int(np.prod(data.shape[1:]))
 
     def merge_col(self, source: list[str] | str, target: str, dim: int = -1) -> None:
-        """Adds a column made of others, side by side along `dim`: names, or a pattern that they match."""
+        """Adds a column that concatenates others, given by names or a regular expression, along `dim`."""
         raise NotImplementedError(f"{type(self).__name__}.merge_col")
 
 
 class StoredDataset(Dataset):
     """A dataset that the engine reads, of any of its formats.
 
-    Whole batches are read in one call: all their rows sorted, merged, decoded once, on all cores, without Python's lock.
-    It may be pickled (it is opened again where it arrives) and used after a fork.
+    A batch is read in one call, which decodes each row once, on all cores, without the GIL. The dataset can be pickled (the
+    other process opens it again) and used after a fork.
 
     Args:
         path: A path, a URI (`s3://`, `gs://`, `az://`, `http(s)://`), or a name under `$STABLEWM_HOME/datasets`.
@@ -154,7 +154,7 @@ class StoredDataset(Dataset):
 
     #: The format of this class's datasets; any for `None`.
     format: str | None = None
-    #: Formats whose samples show one number a step as `(num_steps, 1)`, as Lance's lists of one number are read elsewhere.
+    #: Formats whose samples have scalar columns as `(num_steps, 1)`, as other readers return Lance's lists of one element.
     _LISTS = ("lance", "lance-video")
 
     def __init__(
@@ -184,7 +184,7 @@ class StoredDataset(Dataset):
             name: (np.dtype(dtype), tuple(shape) or (() if name in NUMBERING else scalar))
             for name, dtype, shape in self._handle.schema()
         }
-        #: Whole columns that were made of others.
+        #: Columns merged from others.
         self._merged: dict[str, Array] = {}
         self._keys = [name for name in self.schema if name not in NUMBERING] if keys_to_load is None else [*keys_to_load]
         self._cached = [*(keys_to_cache or [])]
@@ -225,19 +225,19 @@ class StoredDataset(Dataset):
 
     @property
     def manifest(self) -> dict[str, Any] | None:
-        """Where the data come from, where that was recorded."""
+        """The manifest (provenance) of the dataset, if it has one."""
         text = self.engine.manifest()
         return None if text is None else dict(json.loads(text))
 
     def constants(self, episode_idx: int) -> dict[str, bytes]:
-        """What is the same in every step of an episode and no number, such as the XML of its scene."""
+        """The non-numeric constants of an episode, such as the XML of its scene."""
         return dict(self.engine.constants(int(episode_idx)))
 
     def _row_shape(self, name: str) -> tuple[int, ...]:
         return self._merged[name].shape[1:] if name in self._merged else self.schema[name][1]
 
     def _read(self, names: Sequence[str], episodes: Array, starts: Array, lengths: Array, skip: int) -> dict[str, Array]:
-        """The rows of runs, one run after another, `(rows, ...)`: of actions all, of others every `skip`-th."""
+        """The concatenated rows of runs, `(rows, ...)`: every row of `action`, every `skip`-th row of other columns."""
         stored = [name for name in names if name not in self._merged]
         found = self.engine.read(stored, *(np.ascontiguousarray(part, np.int64) for part in (episodes, starts, lengths)), skip)
         found = {name: array.reshape(len(array), *self.schema[name][1]) for name, array in found.items()}
@@ -303,7 +303,7 @@ class StoredDataset(Dataset):
         if "action" in columns:
             columns["action"] = columns["action"].reshape(size, self.num_steps, -1)
         _collate.install()
-        return _collate.Together(columns, size).samples()
+        return _collate.Batch(columns, size).samples()
 
     def get_col_data(self, col: str) -> Array:
         self._check(col)
@@ -332,14 +332,14 @@ class StoredDataset(Dataset):
             pattern = re.compile(source)
             source = [name for name in self.schema if name not in NUMBERING and pattern.match(name)]
         if not source:
-            raise KeyError(f"no column of {self.path} matches what {target!r} is made of")
+            raise KeyError(f"no column of {self.path} matches the source of {target!r}")
         self._merged[target] = np.concatenate([self.get_col_data(name) for name in source], axis=dim)
         if target not in self._keys:
             self._keys.append(target)
 
 
 class MergeDataset:
-    """Columns of several datasets with the same episodes, side by side.
+    """The columns of several datasets with the same episodes.
 
     Args:
         datasets: The datasets.
@@ -480,8 +480,8 @@ class ConcatDataset:
         return self.__getitems__([idx])[0]
 
     @staticmethod
-    def _places(before: Array, indices: Any, what: str) -> tuple[Array, Array]:
-        """Which dataset has each index, and which one it is there."""
+    def _locate(before: Array, indices: Any, what: str) -> tuple[Array, Array]:
+        """The dataset of each index, and the index in that dataset."""
         indices = np.asarray(indices, dtype=np.int64)
         total = int(before[-1])
         if ((indices < -total) | (indices >= total)).any():
@@ -492,12 +492,12 @@ class ConcatDataset:
 
     def __getitems__(self, indices: Sequence[int]) -> list[dict[str, Any]]:
         """The samples of a batch."""
-        parts, places = self._places(self._clips_before, indices, "clips")
-        return self._gathered(parts, lambda part, mask: _items(self.datasets[part], places[mask].tolist()))
+        parts, indices_in_part = self._locate(self._clips_before, indices, "clips")
+        return self._gathered(parts, lambda part, mask: _items(self.datasets[part], indices_in_part[mask].tolist()))
 
     def load_chunk(self, episodes_idx: Any, start: Any, end: Any) -> list[dict[str, Any]]:
         """As :meth:`Dataset.load_chunk`."""
-        parts, episodes = self._places(self._episodes_before, episodes_idx, "episodes")
+        parts, episodes = self._locate(self._episodes_before, episodes_idx, "episodes")
         starts, ends = np.asarray(start), np.asarray(end)
         return self._gathered(
             parts, lambda part, mask: self.datasets[part].load_chunk(episodes[mask], starts[mask], ends[mask])
@@ -513,7 +513,7 @@ class ConcatDataset:
 
     def load_episode(self, episode_idx: int) -> dict[str, Any]:
         """As :meth:`Dataset.load_episode`."""
-        parts, episodes = self._places(self._episodes_before, [episode_idx], "episodes")
+        parts, episodes = self._locate(self._episodes_before, [episode_idx], "episodes")
         return dict(self.datasets[int(parts[0])].load_episode(int(episodes[0])))
 
     def get_col_data(self, col: str) -> Array:
@@ -525,7 +525,7 @@ class ConcatDataset:
 
     def get_row_data(self, row_idx: Rows) -> dict[str, Any]:
         """As :meth:`Dataset.get_row_data`."""
-        parts, rows = self._places(self._rows_before, np.atleast_1d(np.asarray(row_idx)), "rows")
+        parts, rows = self._locate(self._rows_before, np.atleast_1d(np.asarray(row_idx)), "rows")
         found = [self.datasets[part].get_row_data(row) for part, row in zip(parts.tolist(), rows.tolist(), strict=True)]
         if np.ndim(row_idx) == 0:
             return dict(found[0])
@@ -539,10 +539,10 @@ def _items(dataset: Any, indices: Sequence[int]) -> list[dict[str, Any]]:
 
 
 class GoalDataset:
-    """A dataset whose samples come with a goal: a row that they shall lead to, `(1, ...)`.
+    """A dataset whose samples have a goal: a row of the dataset, `(1, ...)`.
 
     The goal is a random row of the dataset, a later step of the episode (nearer ones more likely, or all equally
-    likely), or the current step. Clips without a later step are left out if one may be asked for.
+    likely), or the current step. Clips without a later step are left out if the goal can be a later step.
 
     Args:
         dataset: The dataset.
@@ -551,8 +551,8 @@ class GoalDataset:
         gamma: The discount of the geometric law: the goal is `k` steps ahead with probability
             `(1 - gamma) * gamma**(k - 1)`, and the last step at most.
         current_goal_offset: Which step of the clip, counted from 1, is the current one; the last one without it.
-        goal_keys: What is loaded of goals, and the names it gets; `pixels` and `proprio` without it.
-        seed: Decides the goals, together with the epoch and the sample's index. Without it every draw is a fresh one.
+        goal_keys: The columns of goals to load and their names in the sample; `pixels` and `proprio` for `None`.
+        seed: The seed of goals, combined with the epoch and the sample's index. Goals are random for `None`.
     """
 
     def __init__(
@@ -594,7 +594,7 @@ class GoalDataset:
         self._clips = clips[later]
 
     def set_epoch(self, epoch: int) -> None:
-        """Draws other goals: with a seed they are a function of it, the epoch, and the sample's index."""
+        """Sets the epoch, which changes the goals that a seed determines."""
         self.epoch = int(epoch)
 
     @property
@@ -618,7 +618,7 @@ class GoalDataset:
     def _random(self, idx: int) -> np.random.Generator:
         if self.seed is not None:
             return np.random.default_rng([self.seed, self.epoch, idx])
-        # Worker processes must not share what their parent would have drawn.
+        # Forked workers must not share the random stream of their parent.
         if self._fresh is None or self._fresh[0] != os.getpid():
             self._fresh = (os.getpid(), np.random.default_rng())
         return self._fresh[1]
@@ -652,11 +652,11 @@ class GoalDataset:
         samples = [dict(sample) for sample in _items(self.dataset, self._indices[indices].tolist())]
         if not self.goal_keys:
             return samples
-        places = np.asarray([self._draw(i) for i in indices])
+        goal_rows = np.asarray([self._draw(i) for i in indices])
         if isinstance(self.dataset, StoredDataset):
-            goals = self.dataset._slices(places[:, 0], places[:, 1], places[:, 1] + 1)
+            goals = self.dataset._slices(goal_rows[:, 0], goal_rows[:, 1], goal_rows[:, 1] + 1)
         else:
-            goals = [self.dataset._load_slice(episode, row, row + 1) for episode, row in places.tolist()]
+            goals = [self.dataset._load_slice(episode, row, row + 1) for episode, row in goal_rows.tolist()]
         for sample, goal in zip(samples, goals, strict=True):
             for name, goal_name in self.goal_keys.items():
                 if name in goal and name in sample:

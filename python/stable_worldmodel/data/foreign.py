@@ -1,4 +1,4 @@
-"""Readers that Python brings, as datasets of the engine: to load batches from, and to convert."""
+"""Readers implemented in Python, as datasets of the engine for loading and conversion."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from ._tensors import Array
 
 __all__ = ["engine_of"]
 
-#: Slices that are kept: a conversion asks for the columns of an episode one after another.
-_KEPT = 4
+#: The number of cached slices: a conversion reads the columns of an episode one after another.
+_CACHED = 4
 
 
 class _Rows:
-    """What the engine asks of a reader: its columns, its episodes' lengths, and rows."""
+    """The interface that the engine requires of a reader: its columns, the lengths of its episodes, and rows."""
 
     def __init__(self, reader: Any) -> None:
-        # Rows as they are stored, whatever samples look like.
+        # Read stored rows, without frameskip, clips and transform.
         self._reader = copy.copy(reader)
         for name, value in (("frameskip", 1), ("num_steps", 1), ("span", 1), ("transform", None)):
             if hasattr(self._reader, name):
                 setattr(self._reader, name, value)
-        self._kept: OrderedDict[tuple[int, int, int], dict[str, Array]] = OrderedDict()
+        self._cache: OrderedDict[tuple[int, int, int], dict[str, Array]] = OrderedDict()
         self._lock = threading.Lock()
 
     def lengths(self) -> list[int]:
@@ -47,8 +47,8 @@ class _Rows:
     def _slice(self, episode: int, start: int, end: int) -> dict[str, Array]:
         key = (episode, start, end)
         with self._lock:
-            if key in self._kept:
-                return self._kept[key]
+            if key in self._cache:
+                return self._cache[key]
         if hasattr(self._reader, "_load_slice"):
             found = self._reader._load_slice(episode, start, end)
         else:
@@ -57,16 +57,16 @@ class _Rows:
         # A slice has as many actions as rows, the last one of an episode included.
         arrays, _ = _tensors.rows(found)
         with self._lock:
-            self._kept[key] = arrays
-            while len(self._kept) > _KEPT:
-                self._kept.popitem(last=False)
+            self._cache[key] = arrays
+            while len(self._cache) > _CACHED:
+                self._cache.popitem(last=False)
         return arrays
 
 
 def engine_of(dataset: Any) -> Any:
-    """The engine's dataset behind a dataset of any kind.
+    """The engine's dataset of any dataset.
 
-    Readers of formats of your own need `lengths`, and `_load_slice(episode, start, end)` or `load_episode(episode)`.
+    Readers of user-defined formats need `lengths`, and `_load_slice(episode, start, end)` or `load_episode(episode)`.
     """
     own = getattr(dataset, "engine", None)
     if isinstance(own, _engine.Dataset):

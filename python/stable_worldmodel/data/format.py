@@ -1,4 +1,4 @@
-"""Formats: how layouts on disk are recognised, read and written, ours and yours.
+"""Formats: detection, reading and writing of storage layouts, native and user-defined.
 
     @register_format
     class Zarr(Format):
@@ -13,7 +13,7 @@
         @classmethod
         def open_writer(cls, path, **kwargs): ...  # a Writer
 
-From then on `load_dataset`, `convert`, `Loader` and `World.collect(path, format="zarr")` know it.
+Afterwards `load_dataset`, `convert`, `Loader` and `World.collect(path, format="zarr")` support it.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ __all__ = [
     "validate_write_mode",
 ]
 
-#: What to do with a dataset that is there: continue it (or make one), replace it, or refuse.
+#: What to do with an existing dataset: append to it (or create one), replace it, or raise an error.
 WRITE_MODES = ("append", "overwrite", "error")
 
 
 @runtime_checkable
 class Writer(Protocol):
-    """Stores episodes as they finish. A context manager: what was written is complete when it ends.
+    """Stores finished episodes. A context manager: the dataset is complete when the context ends.
 
-    An episode is a dict from columns to their steps, a list of them or an array `(T, ...)`; pictures are
-    `(height, width, 3)` bytes. Row `t` holds the observation at `t` and the action taken from it, so the last row's
-    action is missing: NaN, or -1 of integers.
+    An episode is a dict with a list of steps or an array `(T, ...)` for each column; images are `(H, W, 3)` of
+    `uint8`. Row `t` holds the observation at `t` and the action taken from it. The action of the last row is missing: NaN,
+    or -1 for integers.
     """
 
     def __enter__(self) -> Writer: ...
@@ -54,25 +54,25 @@ class Writer(Protocol):
         """Adds one episode."""
 
     def write_episodes(self, episodes: Iterable[Mapping[str, Any]]) -> None:
-        """Adds episodes as they come."""
+        """Adds several episodes."""
 
 
 class Format:
-    """A layout on disk. Derive from it, set `name`, implement what it can, and decorate with `register_format`."""
+    """A storage layout. Subclasses set `name`, implement the supported methods, and use `register_format`."""
 
-    #: What it is called.
+    #: The name of the format.
     name: str = ""
-    #: Whether the engine reads and writes it.
+    #: Whether the engine implements the format.
     native: bool = False
 
     @classmethod
     def detect(cls, path: Any) -> bool:
-        """Whether a path looks like it, existing or about to be created."""
+        """Whether a path, existing or not, belongs to this format."""
         raise NotImplementedError(f"{cls.__name__}.detect must be implemented")
 
     @classmethod
     def open_reader(cls, path: Any, **kwargs: Any) -> Any:
-        """A :class:`~stable_worldmodel.data.Dataset` of what is there."""
+        """A :class:`~stable_worldmodel.data.Dataset` of the path."""
         raise NotImplementedError(f"the format {cls.name or cls.__name__!r} cannot be read")
 
     @classmethod
@@ -88,7 +88,7 @@ FORMATS: dict[str, type[Format]] = {}
 
 
 def register_format(cls: F) -> F:
-    """Adds a format; a decorator. Defining the same class again, as notebooks do, replaces it."""
+    """Registers a format; a decorator. A class of the same name and module replaces the old one, as in notebooks."""
     name = getattr(cls, "name", None)
     if not name:
         raise ValueError(f"{cls.__name__}: a format needs a `name`")
@@ -105,14 +105,14 @@ def list_formats() -> list[str]:
 
 
 def get_format(name: str) -> type[Format]:
-    """The format of a name."""
+    """The format with this name."""
     if name not in FORMATS:
-        raise ValueError(f"unknown format {name!r}; there are {', '.join(FORMATS)}")
+        raise ValueError(f"unknown format {name!r}; the formats are {', '.join(FORMATS)}")
     return FORMATS[name]
 
 
 def detect_format(path: str | os.PathLike[str]) -> type[Format] | None:
-    """The format that recognises a path; those registered by you are asked first."""
+    """The format of a path; user-defined formats come first."""
     ordered = sorted(FORMATS.values(), key=lambda kind: kind.native)
     return next((kind for kind in ordered if kind.detect(path)), None)
 
@@ -125,16 +125,16 @@ def validate_write_mode(mode: str) -> str:
 
 
 def open_writer(path: str | os.PathLike[str], *, format: str | None = None, mode: str = "append", **kwargs: Any) -> Any:
-    """A writer into a dataset of any format: that of the name, else the one that the path says.
+    """Opens a writer of a dataset.
 
         with open_writer("mine.lance", mode="overwrite", codec="jpeg") as writer:
             writer.write_episode({"pixels": frames, "action": actions})
 
     Args:
         path: A path, a URI, or a name under `$STABLEWM_HOME/datasets`.
-        format: The format's name.
-        mode: `"append"` continues a dataset that is there, `"overwrite"` replaces it, `"error"` refuses.
-        **kwargs: What the format's writer takes; ours take `codec`.
+        format: The format's name; detected from the path, else Lance, for `None`.
+        mode: `"append"` continues an existing dataset, `"overwrite"` replaces it, `"error"` refuses.
+        **kwargs: Arguments of the format's writer; native ones take `codec`.
     """
     validate_write_mode(mode)
     kind = get_format(format) if format is not None else detect_format(path)
@@ -144,6 +144,6 @@ def open_writer(path: str | os.PathLike[str], *, format: str | None = None, mode
 
 
 def foreign_writer(path: str | os.PathLike[str], format: str | None, mode: str) -> Any | None:
-    """A writer of a format that the engine does not know; `None` where it writes the dataset itself."""
+    """A writer of a user-defined format; `None` for formats of the engine."""
     kind = get_format(format) if format is not None else detect_format(path)
     return None if kind is None or kind.native else kind.open_writer(path, mode=validate_write_mode(mode))

@@ -32,7 +32,7 @@ class _Named(StoredDataset):
     def __init__(self, name: Any = None, *, path: Any = None, uri: Any = None, cache_dir: Any = None, **kwargs: Any):
         from .utils import resolve
 
-        given = next((place for place in (path, uri, name) if place is not None), None)
+        given = next((given for given in (path, uri, name) if given is not None), None)
         if given is None:
             raise TypeError(f"{type(self).__name__}: expected a name or a path")
         super().__init__(resolve(given, cache_dir), **kwargs)
@@ -45,7 +45,7 @@ class LanceDataset(_Named):
 
 
 class LanceVideoDataset(_Named):
-    """A Lance table whose pictures are videos beside it."""
+    """A Lance table with images in separate video files."""
 
     format = "lance-video"
 
@@ -57,19 +57,19 @@ class HDF5Dataset(_Named):
 
 
 class VideoDataset(_Named):
-    """A folder of numbers and videos."""
+    """A folder of numeric columns and videos."""
 
     format = "video"
 
 
 class FolderDataset(_Named):
-    """A folder of numbers and pictures."""
+    """A folder of numeric columns and image files."""
 
     format = "folder"
 
 
 class ImageDataset(FolderDataset):
-    """A folder of numbers and pictures."""
+    """A folder of numeric columns and image files."""
 
 
 class LeRobotAdapter(_Named):
@@ -91,13 +91,13 @@ class HDF5Writer(EpisodeWriter):
 
 
 class VideoWriter(EpisodeWriter):
-    """Writes a folder of numbers and videos."""
+    """Writes a folder of numeric columns and videos."""
 
     format = "video"
 
 
 class FolderWriter(EpisodeWriter):
-    """Writes a folder of numbers and pictures."""
+    """Writes a folder of numeric columns and image files."""
 
     format = "folder"
 

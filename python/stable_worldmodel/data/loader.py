@@ -1,4 +1,4 @@
-"""Batches for training, loaded ahead by threads of the engine, without worker processes."""
+"""Batches for training, prefetched by threads of the engine instead of worker processes."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ atexit.register(_engine.end_loaders)
 
 @dataclass(frozen=True)
 class Goals:
-    """A goal for every clip: a row that it shall lead to, as the columns `NAME_COLUMN`, `(batch, 1, ...)`, and the rows from
-    the anchor to it as `NAME_offset`, `(batch,)`, -1 where it does not follow.
+    """A goal row for every clip, as the columns `NAME_COLUMN` `(B, 1, ...)`. `NAME_offset` `(B,)` is the number of rows from
+    the anchor to the goal, or -1 if the goal is not a later row of the same episode.
 
     Attributes:
-        columns: What is loaded of goals.
-        random: The chance of any row of any episode.
+        columns: The columns of goals to load.
+        random: The probability of any row of any episode.
         geometric: The chance of a later step, `k` steps ahead with probability `(1 - discount) * discount**(k - 1)`.
         future: The chance of a later step, all equally likely.
         last: The chance of the episode's last row.
         current: The chance of the anchor itself.
-        discount: Of the geometric law.
-        anchor: The step of the clip that counts as now; the last one without it.
-        name: What the columns' names begin with.
+        discount: The discount of the geometric distribution.
+        anchor: The step of the clip that counts as the current one; the last one for `None`.
+        name: The prefix of the column names.
     """
 
     columns: Sequence[str] = ("pixels",)
@@ -52,14 +52,14 @@ class Goals:
     name: str = "goal"
 
     def spec(self) -> dict[str, Any]:
-        """As the engine takes it."""
+        """The goal specification for the engine."""
         chances = ("random", "geometric", "future", "last", "current", "discount")
         mixture = {chance: float(getattr(self, chance)) for chance in chances}
         return {"name": self.name, "columns": [*self.columns], "anchor": self.anchor, "mixture": mixture}
 
 
 def bytes_of(given: int | str) -> int:
-    """A number of bytes, given as one or as text such as `"512MB"` or `"2GiB"`."""
+    """A size in bytes, given as an integer or as text such as `"512MB"` or `"2GiB"`."""
     if not isinstance(given, str):
         return int(given)
     units = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
@@ -74,19 +74,19 @@ def bytes_of(given: int | str) -> int:
 
 
 class Loader:
-    """Shuffled batches of clips, decoded ahead by threads of the engine.
+    """Shuffled batches of clips, prefetched and decoded by threads of the engine.
 
         loader = Loader("pusht.lance", batch_size=64, num_steps=4, frameskip=5, columns=["pixels", "action"])
         for batch in loader:
             batch["pixels"]  # (64, 4, 3, 224, 224), uint8
             batch["action"]  # (64, 4, 10)
 
-    Every time it is iterated over it gives the next epoch, in an order that is a function of the seed and the epoch. The
-    tensors look at the engine's memory; it is used again when the last of them is gone. Pictures are stored row by row with
-    their channels side by side, which torch calls `channels_last`.
+    Each iteration is the next epoch, in an order that depends on the seed and the epoch. The tensors share the engine's
+    memory, which is reused after the last of them is released. Images are `(B, T, C, H, W)` in torch's memory format
+    `channels_last`.
 
     Args:
-        dataset: A path, a URI, a name, or a dataset that is open, of our or your own formats.
+        dataset: A path, a URI, a name, or an open dataset of any format.
         batch_size: Clips of a batch.
         num_steps: Steps of a clip; the open dataset's without it, or 1.
         frameskip: Rows from one step to the next; the open dataset's without it, or 1.
@@ -99,12 +99,12 @@ class Loader:
         transform: Called with the dict of every batch, in which `action` is `(batch, num_steps * frameskip, numbers)`, as in
             a dataset's `transform`.
         device: Where tensors go.
-        threads: Threads that load ahead, which share the engine's to decode; 0 loads when asked.
-        prefetch: Batches loaded ahead, at most.
-        prefetch_bytes: Bytes of them, at most.
-        cache: Bytes of decoded rows to keep for later epochs, such as `"8GB"`; 0 keeps none. Without it 512 MiB of datasets
-            that the engine reads.
-        cache_dir: A folder to keep them in, for several runs, in place of memory.
+        threads: Prefetch threads, which decode on the engine's threads; 0 loads batches on demand.
+        prefetch: The maximum number of prefetched batches.
+        prefetch_bytes: The maximum size of prefetched batches.
+        cache: The size of the cache of decoded rows for later epochs, such as `"8GB"`; 0 disables it. The default is
+            512 MiB for datasets that the engine reads.
+        cache_dir: A folder for a cache on disk that several runs share, instead of memory.
         backend: `"torch"` or `"numpy"`; torch where it is installed.
         format: The dataset's format, where it cannot be told from the path.
     """
@@ -139,7 +139,7 @@ class Loader:
         self.dataset = dataset
         self.backend = _tensors.backend(backend if backend is not None else getattr(dataset, "backend", None))
         if device is not None and self.backend == "numpy":
-            raise ValueError("device: arrays of numpy stay on the CPU; use backend='torch'")
+            raise ValueError("device: numpy arrays stay on the CPU; use backend='torch'")
         self.device = device
         self.transform = transform if transform is not None else getattr(dataset, "transform", None)
         self.batch_size = int(batch_size)
@@ -180,13 +180,13 @@ class Loader:
         self._loader = _engine.Loader(engine, json.dumps(wanted))
         #: The shape of a row of every column of a batch: what follows the batch and the steps.
         self._shapes = {name: tuple(shape[1:]) for name, _, shape in self._loader.schema()}
-        # What the dataset shows as lists of one number.
+        # Columns that the dataset returns as lists of one element.
         for name, (_, shape) in getattr(dataset, "schema", {}).items():
             for column in (name, *(f"{goal.name}_{name}" for goal in given)):
                 if name != "action" and self._shapes.get(column) == () and shape == (1,):
                     self._shapes[column] = shape
         self._action = stored.get("action")
-        #: Where the next iteration begins, and where the latest one is: epoch and batch.
+        #: Epoch and batch where the next iteration starts, and where the latest one is.
         self._next = (0, 0)
         self._at = (0, 0)
 
@@ -205,18 +205,18 @@ class Loader:
         return list(self._shapes)
 
     def set_epoch(self, epoch: int) -> None:
-        """Begins the next iteration with this epoch, unless it is the one that goes on there."""
+        """Starts the next iteration with this epoch; keeps the position inside of the epoch if it is the same."""
         if epoch != self._next[0]:
             self._next = (int(epoch), 0)
 
     def state_dict(self) -> dict[str, int]:
-        """Where the iteration is: what :meth:`load_state_dict` needs to go on with the next batch."""
+        """The position of the iteration, for :meth:`load_state_dict`."""
         epoch, batch = self._at
         clips = self.num_clips
         return {"epoch": epoch, "batch": batch, "seed": self.seed, "batch_size": self.batch_size, "clips": clips}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Begins the next iteration where another one was, with the same batches as it would have had."""
+        """Continues at a saved position, with the same batches that would have followed it."""
         here = self.state_dict()
         other = {name: (state[name], here[name]) for name in ("seed", "batch_size", "clips") if state[name] != here[name]}
         if other:

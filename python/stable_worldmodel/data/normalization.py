@@ -1,4 +1,4 @@
-"""Scaling columns to a common range. Scalers may be pickled, and take arrays and tensors alike."""
+"""Scalers of columns. They can be pickled and accept arrays and tensors."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _is_tensor(value: Any) -> bool:
 
 
 def _like(value: Any, *bounds: Array | None) -> list[Any]:
-    """Bounds as arrays or tensors, as `value` is one."""
+    """The bounds as arrays or tensors, like `value`."""
     if any(bound is None for bound in bounds):
         raise ValueError("the scaler is not fitted: call fit first, or give it its bounds")
     if not _is_tensor(value):
@@ -37,7 +37,7 @@ def _finite_rows(values: Any) -> Array:
     array = array.reshape(-1, array.shape[-1] if array.ndim > 1 else 1)
     array = array[~np.isnan(array).any(axis=1)]
     if len(array) == 0:
-        raise ValueError("a scaler cannot be fitted to no rows")
+        raise ValueError("fit: expected at least one row without NaN")
     return array
 
 
@@ -45,7 +45,7 @@ class IdentityScaler:
     """Leaves values as they are."""
 
     def fit(self, values: Any) -> IdentityScaler:
-        """Nothing to learn."""
+        """Does nothing."""
         return self
 
     def transform(self, values: X) -> X:
@@ -65,14 +65,14 @@ class IdentityScaler:
 
 
 class _Affine:
-    """Values moved and stretched, a dimension each: `(x - centre) / scale`."""
+    """Base class of scalers of the form `(x - centre) / scale` per dimension."""
 
     def _bounds(self) -> tuple[Array | None, Array | None]:
         """The centre and the scale."""
         raise NotImplementedError
 
     def fit(self, values: Any) -> Any:
-        """Learns from values `(..., d)`; rows with a NaN do not count."""
+        """Fits the scaler to values `(..., d)`; rows with NaN are ignored."""
         raise NotImplementedError
 
     def transform(self, values: Any) -> Any:
@@ -86,7 +86,7 @@ class _Affine:
         return values * scale + centre
 
     def fit_transform(self, values: Any) -> Any:
-        """Learns from values, and scales them."""
+        """Fits the scaler to the values and scales them."""
         return self.fit(values).transform(values)
 
     def __call__(self, values: Any) -> Any:
@@ -103,7 +103,7 @@ class ZScoreScaler(_Affine):
         self.eps = eps
 
     def fit(self, values: Any) -> ZScoreScaler:
-        """Learns from values `(..., d)`; rows with a NaN do not count."""
+        """Fits the scaler to values `(..., d)`; rows with NaN are ignored."""
         rows = _finite_rows(values)
         self.mean, self.std = rows.mean(axis=0, keepdims=True), rows.std(axis=0, keepdims=True)
         return self
@@ -113,7 +113,7 @@ class ZScoreScaler(_Affine):
 
 
 class PercentileScaler(_Affine):
-    """The range between two percentiles becomes -1 .. 1, and what is outside of it is clipped."""
+    """Maps the range between two percentiles to -1 .. 1 and clips values outside of it."""
 
     def __init__(self, low: float = 1.0, high: float = 99.0, q_low: Any = None, q_high: Any = None, eps: float = 1e-8) -> None:
         if not 0 <= low < high <= 100:
@@ -125,7 +125,7 @@ class PercentileScaler(_Affine):
         self.eps = eps
 
     def fit(self, values: Any) -> PercentileScaler:
-        """Learns from values `(..., d)`; rows with a NaN do not count."""
+        """Fits the scaler to values `(..., d)`; rows with NaN are ignored."""
         self.q_low, self.q_high = np.percentile(_finite_rows(values), [self.low, self.high], axis=0)
         return self
 

@@ -23,7 +23,7 @@ __all__ = ["convert", "doctor", "ensure_dir_exists", "get_cache_dir", "inspect",
 
 
 def get_cache_dir(override_root: str | Path | None = None, sub_folder: str | None = None) -> Path:
-    """The folder of everything without a path of its own (`$STABLEWM_HOME`), or one below it; made if need be."""
+    """The home folder (`$STABLEWM_HOME`), or a folder in it; created if it does not exist."""
     folder = Path(_engine.home() if override_root is None else override_root)
     folder = folder if sub_folder is None else folder / sub_folder
     folder.mkdir(parents=True, exist_ok=True)
@@ -31,23 +31,23 @@ def get_cache_dir(override_root: str | Path | None = None, sub_folder: str | Non
 
 
 def ensure_dir_exists(path: str | Path) -> None:
-    """Makes a folder, if it is not there."""
+    """Creates a folder if it does not exist."""
     Path(path).mkdir(parents=True, exist_ok=True)
 
 
 def resolve(given: str | os.PathLike[str], cache_dir: str | os.PathLike[str] | None = None) -> str:
-    """Where a dataset is that is there: a path, a URI, or a name below `datasets` of the home folder or `cache_dir`."""
+    """The location of an existing dataset: a path, a URI, or a name below `datasets` of the home folder or `cache_dir`."""
     text = os.fspath(given)
     if "://" in text:
         return text
     datasets = Path(_engine.home() if cache_dir is None else cache_dir) / "datasets"
-    # A dataset of a hub lies under its name there.
-    places = [Path(text), datasets / text, datasets / text.replace("/", "--")]
+    # Datasets of a hub are stored under their name.
+    candidates = [Path(text), datasets / text, datasets / text.replace("/", "--")]
     if cache_dir is not None:
-        places = [*places[1:], *sorted(datasets.glob(f"{text}.*")), places[0]]
-    for place in places:
-        if place.exists():
-            return os.path.abspath(place)
+        candidates = [*candidates[1:], *sorted(datasets.glob(f"{text}.*")), candidates[0]]
+    for candidate in candidates:
+        if candidate.exists():
+            return os.path.abspath(candidate)
     return os.path.abspath(_engine.find_dataset(text))
 
 
@@ -78,7 +78,7 @@ def load_dataset(
         keys_to_load: The columns of a sample; all without it.
         keys_to_cache: Columns whose decoded rows stay in memory.
         transform: Called with the dict of every sample.
-        **kwargs: What the format's reader takes besides; ours take `backend` (`"torch"` or `"numpy"`) and
+        **kwargs: Further arguments of the format's reader; native ones take `backend` (`"torch"` or `"numpy"`) and
             `keys_to_merge`.
 
     Returns:
@@ -97,14 +97,14 @@ def load_dataset(
         known = ", ".join(FORMATS)
         raise ValueError(f"{path} is of no known format ({known}); name one with format=")
     if not kind.native:
-        # Readers of others need not know all of it.
+        # Readers of user-defined formats need not accept every argument.
         defaults = {"num_steps": 1, "frameskip": 1}
         given = {name: value for name, value in given.items() if value != defaults.get(name)}
     return kind.open_reader(path, **given, **kwargs)
 
 
-def _telling(progress: bool) -> Callable[[str, int, int], None] | None:
-    """Shows how far something is, with tqdm where it is installed and somebody looks."""
+def _progress_callback(progress: bool) -> Callable[[str, int, int], None] | None:
+    """A progress callback `(stage, done, total)` that shows a tqdm bar; `None` without tqdm, a terminal or a notebook."""
     notebook = "ipykernel" in sys.modules
     if not progress or not (notebook or sys.stderr.isatty()):
         return None
@@ -114,7 +114,7 @@ def _telling(progress: bool) -> Callable[[str, int, int], None] | None:
         return None
     bar: Any = None
 
-    def tell(stage: str, done: int, total: int) -> None:
+    def report(stage: str, done: int, total: int) -> None:
         nonlocal bar
         if bar is None or bar.desc != stage:
             if bar is not None:
@@ -124,7 +124,7 @@ def _telling(progress: bool) -> Callable[[str, int, int], None] | None:
         if done == total:
             bar.close()
 
-    return tell
+    return report
 
 
 def _options(format: str | None, mode: str, codec: str | None, quality: int | None, verify: bool, least_psnr: float) -> str:
@@ -157,52 +157,53 @@ def convert(
     least_psnr: float = 25.0,
     **kwargs: Any,
 ) -> dict[str, Any]:
-    """Writes a dataset in another format or codec, and reads it again to compare what readers get.
+    """Writes a dataset in another format or codec, and compares the decoded content of both.
 
         convert("pusht.lance", "pusht.h5")
         convert("pusht.lance", "pusht-video", dest_format="video")
 
     Args:
         source: A path, a URI, a name, or a dataset that is open.
-        dest: Where to; its name says the format, or `dest_format` does, or it is Lance.
+        dest: The target. Its name determines the format unless `dest_format` is given; Lance otherwise.
         source_format: The source's format, where it cannot be told from the path.
         dest_format: The format to write.
-        format: The same.
+        format: Another name for `dest_format`.
         cache_dir: A folder in place of `$STABLEWM_HOME` to find the source in.
         progress: Whether to show a progress bar (with tqdm, if it is installed).
-        mode: What to do with a target that is there: `"resume"` goes on behind its last episode if what it has is the
+        mode: What to do with an existing target: `"resume"` continues after its last episode if its content is the
             beginning of the source, `"append"` adds to it, `"overwrite"` replaces it, `"error"` refuses.
-        codec: How pictures are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
+        codec: How images are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
         jpeg_quality: Another way to say `codec="jpeg-QUALITY"`.
         verify: Whether the target is read again and compared.
-        least_psnr: The least signal-to-noise ratio of lossy pictures, in dB; less is an error.
-        **kwargs: What the writer of a format of yours takes besides.
+        least_psnr: The least signal-to-noise ratio of lossy images, in dB; less is an error.
+        **kwargs: Further arguments of the writer of a user-defined format.
 
     Returns:
-        What became of it: `episodes`, `kept` (those that were there), `rows`, `last_actions` (left out, as no observation
-        follows them), `checksum`, and how the `columns` compare. Of a format of yours, `episodes` and `rows`.
+        A dict with `episodes`, `kept` (episodes that existed before), `rows`, `last_actions` (left out, because no
+        observation follows them), `checksum`, and the comparison of the `columns`. For a user-defined format, `episodes` and
+        `rows`.
     """
     if isinstance(source, (str, os.PathLike)):
         source = load_dataset(source, cache_dir, source_format)
     format = dest_format if format is None else format
     kind = get_format(format) if format is not None else detect_format(dest)
     kind = FORMATS["lance"] if kind is None else kind
-    tell = _telling(progress)
+    report = _progress_callback(progress)
     if not kind.native:
-        return hand_over(source, kind.open_writer(dest, mode=_plain(mode), **kwargs), tell)
+        return hand_over(source, kind.open_writer(dest, mode=_plain(mode), **kwargs), report)
     if kwargs:
         raise TypeError(f"convert: the format {kind.name} takes no {', '.join(kwargs)}")
     options = _options(kind.name, mode, codec, jpeg_quality, verify, least_psnr)
-    return dict(json.loads(_engine.convert(engine_of(source), os.fspath(dest), options, tell)))
+    return dict(json.loads(_engine.convert(engine_of(source), os.fspath(dest), options, report)))
 
 
 def _plain(mode: str) -> str:
-    """A mode that every writer knows."""
+    """The mode for writers of user-defined formats, which cannot resume."""
     return validate_write_mode("error" if mode == "resume" else mode)
 
 
-def hand_over(source: Any, writer: Any, tell: Callable[[str, int, int], None] | None) -> dict[str, Any]:
-    """Writes all episodes of a dataset with a writer that Python brings."""
+def hand_over(source: Any, writer: Any, report: Callable[[str, int, int], None] | None) -> dict[str, Any]:
+    """Writes all episodes of a dataset with a writer implemented in Python."""
     engine = engine_of(source)
     lengths = engine.lengths()
     names = [name for name, _, _ in engine.schema() if name not in _tensors.NUMBERING]
@@ -210,8 +211,8 @@ def hand_over(source: Any, writer: Any, tell: Callable[[str, int, int], None] | 
         for episode, length in enumerate(lengths):
             run = (np.asarray([number], dtype=np.int64) for number in (episode, 0, length))
             writer.write_episode(dict(engine.read(names, *run, 1)))
-            if tell is not None:
-                tell("convert", episode + 1, len(lengths))
+            if report is not None:
+                report("convert", episode + 1, len(lengths))
     return {"episodes": len(lengths), "rows": int(lengths.sum())}
 
 
@@ -224,14 +225,14 @@ def doctor(
     codec: str | None = None,
     jpeg_quality: int | None = None,
 ) -> dict[str, Any]:
-    """Reads everything as training does, and says what is wrong and which models it can train.
+    """Reads a dataset as training does, and reports problems and the models that it can train.
 
     Args:
         dataset: A path, a URI or a name.
         repair: Where to write the sound episodes to, if at all.
         format: The format of what is written.
         progress: Whether to show a progress bar.
-        codec: How pictures are stored there, as in :func:`convert`.
+        codec: How images are stored there, as in :func:`convert`.
         jpeg_quality: Another way to say `codec="jpeg-QUALITY"`.
 
     Returns:
@@ -240,15 +241,15 @@ def doctor(
     """
     options = _options(format, "resume", codec, jpeg_quality, True, 25.0)
     target = None if repair is None else os.fspath(repair)
-    return dict(json.loads(_engine.doctor(resolve(dataset), target, options, _telling(progress))))
+    return dict(json.loads(_engine.doctor(resolve(dataset), target, options, _progress_callback(progress))))
 
 
 def inspect(dataset: Any, *, checksum: bool = False) -> dict[str, Any]:
-    """What is in a dataset.
+    """Describes a dataset.
 
     Args:
         dataset: A path, a URI, a name, or a dataset that is open.
-        checksum: Whether to read everything for the hash of what readers get, which does not depend on the format.
+        checksum: Whether to read everything for the hash of the decoded content, which does not depend on the format.
 
     Returns:
         `episodes`, `steps`, `lengths`, `columns` (each with `name`, `dtype`, `shape`), `bytes`, `footprint` (bytes by

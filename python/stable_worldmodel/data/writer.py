@@ -20,7 +20,7 @@ __all__ = ["EpisodeWriter"]
 
 
 def codec_json(codec: str | None, quality: int | None = None) -> str | None:
-    """How pictures are stored, as the engine takes it: `"qoi"` or `"png"` (lossless), `"jpeg"` or `"jpeg-QUALITY"`."""
+    """The image codec as JSON for the engine: `"qoi"` or `"png"` (lossless), `"jpeg"` or `"jpeg-QUALITY"`."""
     if codec is None:
         if quality is None:
             return None
@@ -37,19 +37,19 @@ def codec_json(codec: str | None, quality: int | None = None) -> str | None:
 class EpisodeWriter:
     """Writes episodes into a dataset: a :class:`~stable_worldmodel.data.Writer`.
 
-    The first episode says which columns there are. Episodes survive a killed process once they are committed, which
+    The first episode defines the columns. Episodes survive a killed process once they are committed, which
     happens at least every two seconds and when the writer is closed.
 
     Args:
         path: A path, a URI, or a name under `$STABLEWM_HOME/datasets`.
         format: The format, where the path does not say it; Lance without either.
         mode: `"append"` continues a dataset that is there, `"overwrite"` replaces it, `"error"` refuses.
-        codec: How pictures are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
+        codec: How images are stored: `"qoi"` (lossless, the default), `"png"`, `"jpeg"` or `"jpeg-QUALITY"`.
         jpeg_quality: Another way to say `codec="jpeg-QUALITY"`.
-        manifest: Where the data come from: what to store beside them, under the key `config`.
+        manifest: The provenance of the data, stored in the dataset's manifest under the key `config`.
     """
 
-    #: The format of this class's datasets; what the path says for `None`.
+    #: The format of this class's datasets; detected from the path for `None`.
     format: str | None = None
 
     def __init__(
@@ -74,13 +74,13 @@ class EpisodeWriter:
         self._closed = False
         #: The columns and their types, once they are known.
         self._columns: dict[str, tuple[str, tuple[int, ...]]] = {}
-        place = Path(self.path)
-        there = "://" not in self.path and place.exists() and not (place.is_dir() and not any(place.iterdir()))
-        if there and mode == "error":
+        location = Path(self.path)
+        exists = "://" not in self.path and location.exists() and not (location.is_dir() and not any(location.iterdir()))
+        if exists and mode == "error":
             raise FileExistsError(
                 f"{self.path}: there is a dataset already; continue it (mode='append') or replace it (mode='overwrite')"
             )
-        if there and mode == "append":
+        if exists and mode == "append":
             schema = _engine.Dataset(self.path, self.format).schema()
             self._columns = {name: (dtype, tuple(shape)) for name, dtype, shape in schema if name not in NUMBERING}
 
@@ -109,7 +109,7 @@ class EpisodeWriter:
             raise ValueError(f"{self.path}: the writer is closed; open another one with mode='append'")
         arrays, constants = _tensors.rows(ep_data)
         if not arrays:
-            raise ValueError("an episode needs a column of numbers at least")
+            raise ValueError("an episode needs at least one numeric column")
         if not self._columns:
             self._columns = {name: (array.dtype.name, array.shape[1:]) for name, array in arrays.items()}
         fitted = self._fitted(arrays)
@@ -119,7 +119,7 @@ class EpisodeWriter:
         self._writer.write(fitted, constants)
 
     def _fitted(self, arrays: Mapping[str, Array]) -> dict[str, Array]:
-        """The episode with the columns of the dataset, in their order and of their types."""
+        """The episode with the columns of the dataset, in their order and types."""
         missing = [name for name in self._columns if name not in arrays]
         extra = [name for name in arrays if name not in self._columns]
         if missing or extra:
@@ -127,7 +127,7 @@ class EpisodeWriter:
         fitted = {}
         for name, (dtype, shape) in self._columns.items():
             array = arrays[name]
-            # Lists of one number a step are scalars to some, and lists of one to others.
+            # Some sources have scalar columns as lists of one element.
             if array.shape[1:] != shape and array[:1].size == int(np.prod(shape)) and max(array.ndim - 1, len(shape)) <= 1:
                 array = array.reshape(len(array), *shape)
             if array.shape[1:] != shape:
@@ -138,12 +138,12 @@ class EpisodeWriter:
         return fitted
 
     def write_episodes(self, episodes: Iterable[Mapping[str, Any]]) -> None:
-        """Adds episodes as they come."""
+        """Adds several episodes."""
         for episode in episodes:
             self.write_episode(episode)
 
     def close(self) -> None:
-        """Commits what was written."""
+        """Commits the episodes and closes the writer."""
         self._closed = True
         if self._writer is not None:
             self._writer.finish()

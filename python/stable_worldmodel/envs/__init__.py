@@ -1,4 +1,4 @@
-"""Our environments as Gymnasium environments.
+"""The native environments as Gymnasium environments.
 
 `gymnasium.make("swm/PushT-v1")` makes one; options of an environment are keyword arguments
 (`gymnasium.make("swm/OGBCube-v0", env_type="double")`). Factors of variation, a start and a goal are options of
@@ -23,26 +23,26 @@ __all__ = ["NativeEnv", "experts", "ids", "register"]
 
 
 def ids() -> list[str]:
-    """The ids of our environments."""
+    """The ids of the native environments."""
     return list(_engine.envs())
 
 
 def experts(env: str) -> list[str]:
-    """Who can demonstrate an environment."""
+    """The names of the experts of an environment."""
     return list(_engine.Actor.experts(env))
 
 
 class NativeEnv(gymnasium.Env):
-    """One of our environments.
+    """A native environment.
 
     Args:
-        name: Its id.
-        render_mode: `"rgb_array"` or none.
-        image_shape: `(height, width)` of pictures.
-        **options: What is chosen when it is made, such as `env_type="double"`.
+        name: The id of the environment.
+        render_mode: `"rgb_array"` or `None`.
+        image_shape: `(height, width)` of frames.
+        **options: Options of the environment, such as `env_type="double"`.
 
-    Observations are what the environment's `observation_space` says; everything it shows is in the infos, with
-    `success` (whether the goal is reached) and `goal_distance`.
+    Observations follow `observation_space`. The infos hold all columns of the environment, and `success` (whether the
+    state satisfies the goal) and `goal_distance`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 15}
@@ -52,7 +52,7 @@ class NativeEnv(gymnasium.Env):
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode: expected 'rgb_array' or None, got {render_mode!r}")
-        #: Its id with its options.
+        #: The id with its options.
         self.name = ",".join([name, *(f"{key}={value}" for key, value in options.items())])
         self._env = _engine.NativeEnv(self.name, "[]", False)
         self._described: dict[str, Any] = json.loads(self._env.spec())
@@ -60,17 +60,17 @@ class NativeEnv(gymnasium.Env):
         self.image_shape = (int(image_shape[0]), int(image_shape[1]))
         self.action_space = swm_spaces.from_description(self._described["action_space"])
         self.observation_space = swm_spaces.from_description(self._described["observation_space"])
-        shown = self._env.reset(0, _options.reset(None, {}))
-        self._start = shown["state"]
+        columns = self._env.reset(0, _options.reset(None, {}))
+        self._start = columns["state"]
         if isinstance(self.observation_space, gymnasium.spaces.Dict) and not self.observation_space.spaces:
-            # Worlds that leave it open are observed through their state.
-            state = shown["state"]
+            # An environment without an observation space is observed through its state.
+            state = columns["state"]
             self.observation_space = gymnasium.spaces.Dict(
                 {"state": gymnasium.spaces.Box(-np.inf, np.inf, state.shape, state.dtype)}
             )
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a copy needs to go on from here."""
+        """The attributes, with the native environment as a snapshot."""
         return {**self.__dict__, "_env": self.snapshot()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -80,7 +80,7 @@ class NativeEnv(gymnasium.Env):
 
     @property
     def max_episode_steps(self) -> int:
-        """Steps after which an episode is usually truncated (`swm.World` does; `gymnasium.make(…, max_episode_steps=…)`)."""
+        """Steps after which an episode is truncated, by `swm.World` (else use `gymnasium.make(…, max_episode_steps=…)`)."""
         return int(self._described["max_episode_steps"])
 
     @cached_property
@@ -89,7 +89,7 @@ class NativeEnv(gymnasium.Env):
 
     @property
     def variation_space(self) -> swm_spaces.Dict:
-        """The factors of variation, with the values of this episode."""
+        """The factors of variation, with the values of the current episode."""
         space = self._variation_space
         for key, value in self._env.factors().items():
             factor = space.find(key)
@@ -99,39 +99,39 @@ class NativeEnv(gymnasium.Env):
         return space
 
     def reset(self, *, seed: int | None = None, options: Mapping[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Starts an episode: factors, start and goal follow from the seed alone."""
+        """Starts an episode. Factors, start and goal depend only on the seed and the options."""
         super().reset(seed=seed)
         if seed is None:
             seed = int(self.np_random.integers(2**62))
-        shown = self._env.reset(seed, _options.reset(options, self._described["variation"]))
-        self._start = shown["state"]
-        return self._observed(shown), self._info(shown, self._env.is_success())
+        columns = self._env.reset(seed, _options.reset(options, self._described["variation"]))
+        self._start = columns["state"]
+        return self._observation(columns), self._info(columns, self._env.is_success())
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Applies an action."""
         continuous = isinstance(self.action_space, gymnasium.spaces.Box)
         action = np.ascontiguousarray(action, dtype=np.float32 if continuous else np.int64).reshape(-1)
-        shown, reward, terminated, truncated, success = self._env.step(action)
-        return self._observed(shown), reward, terminated, truncated, self._info(shown, success)
+        columns, reward, terminated, truncated, success = self._env.step(action)
+        return self._observation(columns), reward, terminated, truncated, self._info(columns, success)
 
     def render(self) -> np.ndarray | None:
-        """The picture, `[height, width, 3]` bytes."""
+        """The frame, `(height, width, 3)` of `uint8`; `None` without a render mode."""
         return self._env.render(*self.image_shape, False) if self.render_mode == "rgb_array" else None
 
     def render_goal(self) -> np.ndarray:
-        """The picture of the goal, `[height, width, 3]` bytes."""
+        """The frame of the goal, `(height, width, 3)` of `uint8`."""
         return self._env.render(*self.image_shape, True)
 
     def render_view(self, view: str) -> np.ndarray:
-        """What a view shows: a camera, `depth`, `segmentation`, or `CAMERA:MODALITY`."""
+        """The frame of a camera view: a camera, `depth`, `segmentation`, or `CAMERA:MODALITY`."""
         return self._env.render_view(view, *self.image_shape)
 
     def sample_goal(self, seed: int) -> None:
-        """Chooses a new reachable goal, without moving the world."""
+        """Samples a new reachable goal, without a change of the state."""
         self._env.sample_goal(seed)
 
     def goal_distance(self) -> float:
-        """How far the world is from its goal."""
+        """The distance of the state from the goal."""
         return self._env.goal_distance()
 
     def snapshot(self) -> bytes:
@@ -139,17 +139,17 @@ class NativeEnv(gymnasium.Env):
         return self._env.snapshot()
 
     def restore(self, state: bytes) -> tuple[Any, dict[str, Any]]:
-        """Puts a state back; what follows equals what followed the snapshot."""
-        shown = self._env.restore(state)
-        return self._observed(shown), self._info(shown, self._env.is_success())
+        """Restores a snapshot. Later steps equal those after the snapshot bit for bit."""
+        columns = self._env.restore(state)
+        return self._observation(columns), self._info(columns, self._env.is_success())
 
     def restore_from(self, start: Mapping[str, Any], goal: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Continues from a row of a dataset towards the state of another."""
+        """Restores the state of the dataset row `start`, with the state of the row `goal` as the goal."""
         rows = ({key: np.asarray(value)[None] for key, value in row.items()} for row in (start, goal))
-        shown = self._env.restore_from(*rows)
-        return self._observed(shown), self._info(shown, self._env.is_success())
+        columns = self._env.restore_from(*rows)
+        return self._observation(columns), self._info(columns, self._env.is_success())
 
-    # What an evaluation from a dataset calls where environments of ours live in Gymnasium's wrappers.
+    # Called by evaluations from a dataset if the environment is inside of Gymnasium wrappers.
 
     def _set_state(self, state: Any) -> None:
         self._start = np.asarray(state)
@@ -158,14 +158,14 @@ class NativeEnv(gymnasium.Env):
     def _set_goal_state(self, goal_state: Any) -> None:
         self.restore_from({"state": self._start}, {"state": np.asarray(goal_state)})
 
-    def _observed(self, shown: Mapping[str, np.ndarray]) -> Any:
+    def _observation(self, columns: Mapping[str, np.ndarray]) -> Any:
         space = self.observation_space
         if isinstance(space, gymnasium.spaces.Dict):
-            return {key: shown[key].astype(inner.dtype, copy=False) for key, inner in space.spaces.items()}
+            return {key: columns[key].astype(inner.dtype, copy=False) for key, inner in space.spaces.items()}
         name = self._described.get("observation_column", "state")
-        return shown[name].astype(space.dtype, copy=False)
+        return columns[name].astype(space.dtype, copy=False)
 
-    def _info(self, shown: dict[str, Any], success: bool) -> dict[str, Any]:
-        shown["success"] = success
-        shown["goal_distance"] = self._env.goal_distance()
-        return shown
+    def _info(self, columns: dict[str, Any], success: bool) -> dict[str, Any]:
+        columns["success"] = success
+        columns["goal_distance"] = self._env.goal_distance()
+        return columns

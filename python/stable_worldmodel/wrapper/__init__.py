@@ -1,4 +1,4 @@
-"""Wrappers: what is put around environments. Those of `visual` change pictures."""
+"""Wrappers of environments. The wrappers of `visual` change frames."""
 
 from .visual import (
     BlurWrapper,

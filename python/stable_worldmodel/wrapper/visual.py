@@ -1,13 +1,13 @@
-"""Wrappers that change pictures: perturbations for worlds whose insides cannot be varied, and beside factors of variation.
+"""Visual wrappers: perturbations of frames, for environments with or without factors of variation.
 
     world = swm.World("ALE/Pong-v5", num_envs=8, extra_wrappers=[
         partial(NoiseWrapper, std=8.0),
         partial(ColorJitterWrapper, brightness=0.3, hue=0.1),
     ])
 
-In a `World` they run in the engine. Around a Gymnasium environment they change `render()` and the `pixels` of its infos. What
-is drawn at random follows from the episode's seed, so an episode looks the same whenever it is played. `swm wrappers`
-lists their settings and what they may be.
+In a `World` they run in the engine. Around a Gymnasium environment they change `render()` and the `pixels` of its infos.
+Random values depend on the episode's seed, so an episode always looks the same. `swm wrappers` lists the settings and
+their ranges.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ __all__ = [
 
 
 class Schedule:
-    """A number that changes with the steps of an episode."""
+    """A value that changes with the steps of an episode."""
 
     def __init__(self, kind: str, *numbers: float) -> None:
         self.kind, self.numbers = kind, tuple(float(number) for number in numbers)
 
     def __call__(self, step: int) -> float:
-        """The number at a step."""
+        """The value at a step."""
         return _engine.schedule(json.dumps(self.setting()), int(step))
 
     def setting(self) -> Any:
-        """It as a setting of the engine."""
+        """The schedule as a setting of the engine."""
         return self.numbers[0] if self.kind == "constant" else [self.kind, *self.numbers]
 
     def __repr__(self) -> str:
@@ -63,42 +63,43 @@ class Schedule:
 
 
 def constant(value: float) -> Schedule:
-    """Always the same."""
+    """The same value at every step."""
     return Schedule("constant", value)
 
 
 def linear(start: float, end: float, steps: int) -> Schedule:
-    """Straight from `start` to `end` in `steps` steps, then held."""
+    """Linear from `start` to `end` over `steps` steps, then constant."""
     return Schedule("linear", start, end, steps)
 
 
 def cosine(start: float, end: float, steps: int) -> Schedule:
-    """Half a cosine from `start` to `end` in `steps` steps, then held."""
+    """Half a cosine from `start` to `end` over `steps` steps, then constant."""
     return Schedule("cosine", start, end, steps)
 
 
 def exponential(start: float, decay: float, floor: float = 0.0) -> Schedule:
-    """`start`, times `decay` every step, never below `floor`."""
+    """`start * decay**step`, but at least `floor`."""
     return Schedule("exponential", start, decay, floor)
 
 
 def sinusoidal(low: float, high: float, period: int) -> Schedule:
-    """A sine between `low` and `high`, from their middle upwards, `period` steps long."""
+    """A sine between `low` and `high` with a period of `period` steps, rising from the middle at step 0."""
     return Schedule("sinusoidal", low, high, period)
 
 
 class VisualWrapper(gymnasium.Wrapper):
-    """Something done to pictures, by the engine.
+    """Base class of visual wrappers, which the engine applies to frames.
 
     Args:
         env: A Gymnasium environment.
-        seed: What it draws where a reset names no seed.
-        **settings: Its settings.
+        *values: The settings of `positional`, in order.
+        seed: The seed of episodes whose reset has no seed.
+        **settings: Settings of the wrapper, as `swm wrappers` lists them.
     """
 
-    #: Its id in the engine.
+    #: The id of the wrapper in the engine.
     id: ClassVar[str]
-    #: The names of its settings, in the order in which they may be given without them.
+    #: The names of the settings that can be positional arguments, in order.
     positional: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, env: gymnasium.Env, *values: Any, seed: int | None = None, **settings: Any) -> None:
@@ -110,14 +111,14 @@ class VisualWrapper(gymnasium.Wrapper):
 
     @classmethod
     def engine_settings(cls, *values: Any, seed: int | None = None, **settings: Any) -> dict[str, Any]:
-        """Settings as the engine takes them."""
+        """The settings for the engine, with names and plain JSON values."""
         if len(values) > len(cls.positional):
             raise TypeError(f"{cls.__name__} takes {', '.join(cls.positional) or 'nothing'}, got {len(values)} values")
         settings = {**dict(zip(cls.positional, values, strict=False)), **settings}
-        return {name: _plain(cls, name, value) for name, value in settings.items() if value is not None}
+        return {name: _to_json(cls, name, value) for name, value in settings.items() if value is not None}
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode: what is drawn once for all its pictures is drawn."""
+        """Starts an episode and samples the parameters that are constant during it."""
         self._episode += 1
         self._step = 0
         self._engine_wrapper.reset(self._seed + self._episode if seed is None else seed)
@@ -125,23 +126,23 @@ class VisualWrapper(gymnasium.Wrapper):
         return observation, self._changed(info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Steps, and changes the pictures among the infos."""
+        """Steps the environment and applies the wrapper to the frames in the infos."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._step += 1
         return observation, reward, terminated, truncated, self._changed(info)
 
     def render(self) -> Any:
-        """The picture, changed."""
-        picture: Any = self.env.render()
-        return picture if picture is None else self.apply(picture)
+        """The changed frame."""
+        frame: Any = self.env.render()
+        return frame if frame is None else self.apply(frame)
 
-    def apply(self, picture: np.ndarray) -> np.ndarray:
-        """A changed copy of a picture, `[height, width, 3]` bytes."""
-        picture = np.asarray(picture)
-        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3:
+    def apply(self, frame: np.ndarray) -> np.ndarray:
+        """A changed copy of a frame `(height, width, 3)` of `uint8`."""
+        frame = np.asarray(frame)
+        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
             name = type(self).__name__
-            raise ValueError(f"{name}: expected a picture [height, width, 3] of uint8, got {picture.dtype} {picture.shape}")
-        return self._engine_wrapper.apply(np.ascontiguousarray(picture), self._step)
+            raise ValueError(f"{name}: expected a frame (height, width, 3) of uint8, got {frame.dtype} {frame.shape}")
+        return self._engine_wrapper.apply(np.ascontiguousarray(frame), self._step)
 
     def _changed(self, info: dict[str, Any]) -> dict[str, Any]:
         for name in [name for name in info if name == "pixels" or name.startswith("pixels.")]:
@@ -149,7 +150,7 @@ class VisualWrapper(gymnasium.Wrapper):
         return info
 
 
-def _plain(cls: type, name: str, value: Any) -> Any:
+def _to_json(cls: type, name: str, value: Any) -> Any:
     if isinstance(value, Schedule):
         return value.setting()
     if isinstance(value, Path):
@@ -159,20 +160,20 @@ def _plain(cls: type, name: str, value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, (tuple, list)):
-        plain = [_plain(cls, name, inner) for inner in value]
-        # Several colours are one list of their numbers.
+        plain = [_to_json(cls, name, inner) for inner in value]
+        # Several colours become one flat list of channel values.
         return [n for inner in plain for n in inner] if plain and isinstance(plain[0], list) else plain
     if callable(value):
         return _tabulated(cls, name, value)
     return value
 
 
-#: The steps of an episode for which a function of one's own is asked; its last number is held.
+#: The number of steps for which a user's schedule function is tabulated; its last value holds after them.
 _STEPS = 10_000
 
 
 def _tabulated(cls: type, name: str, schedule: Callable[[int], Any]) -> list[float]:
-    """The numbers that a function gives for the steps of an episode: the engine asks for no Python."""
+    """The values of a schedule function at the steps of an episode, because the engine does not call Python."""
     try:
         numbers = [float(schedule(step)) for step in range(_STEPS)]
     except (TypeError, ValueError) as error:
@@ -183,7 +184,7 @@ def _tabulated(cls: type, name: str, schedule: Callable[[int], Any]) -> list[flo
 
 
 class ChromaKeyWrapper(VisualWrapper):
-    """Replaces colours by a picture or a video."""
+    """Replaces colours by an image or a video."""
 
     id = "chroma-key"
     positional = ("key_color", "media", "tolerance")
@@ -197,7 +198,7 @@ class NoiseWrapper(VisualWrapper):
 
 
 class ColorJitterWrapper(VisualWrapper):
-    """Changes brightness, contrast, saturation and hue, by the same amounts for an episode."""
+    """Changes brightness, contrast, saturation and hue, by the same amounts during an episode."""
 
     id = "color-jitter"
     positional = ("brightness", "contrast", "saturation", "hue")
@@ -211,35 +212,35 @@ class BlurWrapper(VisualWrapper):
 
 
 class OcclusionWrapper(VisualWrapper):
-    """Lays rectangles over the picture, at the same places for an episode."""
+    """Covers parts of the frame by rectangles, at the same positions during an episode."""
 
     id = "occlusion"
     positional = ("num_patches", "size", "color")
 
 
 class MovingPatchWrapper(VisualWrapper):
-    """Lays rectangles over the picture that drift and bounce off its edges."""
+    """Covers parts of the frame by rectangles that move and bounce off its edges."""
 
     id = "moving-patch"
     positional = ("num_patches", "size", "color", "speed")
 
 
 class RandomShiftWrapper(VisualWrapper):
-    """Shifts the picture by a few pixels."""
+    """Shifts the frame by a few pixels."""
 
     id = "random-shift"
     positional = ("pad",)
 
 
 class CutoutWrapper(VisualWrapper):
-    """Masks rectangles, elsewhere in every picture."""
+    """Masks rectangles, at other positions in every frame."""
 
     id = "cutout"
     positional = ("num", "size", "color")
 
 
 class RandomConvWrapper(VisualWrapper):
-    """Passes the picture through a random convolution, the same for an episode."""
+    """Applies a random convolution to the frame, the same during an episode."""
 
     id = "random-conv"
     positional = ("kernel_size",)
@@ -254,19 +255,21 @@ class GrayscaleWrapper(VisualWrapper):
     def engine_settings(cls, *values: Any, seed: int | None = None, **settings: Any) -> dict[str, Any]:
         keep_channels = settings.pop("keep_channels", values[0] if values else True)
         if not keep_channels:
-            raise ValueError("GrayscaleWrapper: pictures keep three channels here; take one of them")
+            raise ValueError(
+                "GrayscaleWrapper: keep_channels=False is not supported: frames have three channels; select one of them"
+            )
         return super().engine_settings(seed=seed, **settings)
 
 
 class ResolutionWrapper(VisualWrapper):
-    """Draws the picture with fewer, larger pixels."""
+    """Reduces the resolution of the frame: fewer, larger pixels."""
 
     id = "resolution"
     positional = ("scale",)
 
 
 def engine_wrappers(factories: Sequence[Callable[..., Any]]) -> list[tuple[str, dict[str, Any]]] | None:
-    """What factories of wrappers make, for the engine; `None` where one of them is of another kind."""
+    """The ids and settings of visual wrappers made by these factories; `None` if one makes another kind of wrapper."""
     known = []
     for factory in factories:
         values: tuple[Any, ...] = ()

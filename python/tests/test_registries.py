@@ -1,0 +1,56 @@
+"""The Python classes match the registries of the engine: ids, settings and defaults."""
+
+import json
+
+import pytest
+
+import stable_worldmodel as swm
+from stable_worldmodel import _engine, solver
+from stable_worldmodel.data import formats
+from stable_worldmodel.wrapper import visual
+
+SOLVERS = {kind.id: kind for name in solver.__all__ if hasattr(kind := getattr(solver, name), "id")}
+WRAPPERS = {kind.id: kind for name in visual.__all__ if hasattr(kind := getattr(visual, name), "id")}
+
+
+def test_every_solver_has_a_class():
+    assert set(SOLVERS) == set(json.loads(_engine.solvers()))
+
+
+@pytest.mark.parametrize("id", SOLVERS)
+def test_solver_settings_are_those_of_the_engine(id):
+    kind, defaults = SOLVERS[id], json.loads(_engine.solvers())[id]
+    assert set(kind._names.values()) <= set(defaults)
+    if hasattr(kind, "_optimizer"):
+        assert defaults["optimizer"]["kind"] == kind._optimizer
+    # The engine's defaults are valid settings of the class.
+    assert kind("simulator", **defaults).settings == defaults
+
+
+def test_every_visual_wrapper_has_a_class():
+    assert set(WRAPPERS) == set(json.loads(_engine.wrappers()))
+
+
+@pytest.mark.parametrize("id", WRAPPERS)
+def test_positional_settings_of_wrappers_are_those_of_the_engine(id):
+    parameters = json.loads(_engine.wrappers())[id]["parameters"]
+    assert set(WRAPPERS[id].positional) <= set(parameters)
+
+
+def test_every_format_is_registered():
+    native = {name for name, kind in swm.data.FORMATS.items() if kind.native}
+    assert native == set(_engine.formats())
+    assert set(formats._READERS) <= native
+    writers = (formats.LanceWriter, formats.HDF5Writer, formats.VideoWriter, formats.FolderWriter)
+    assert {kind.format for kind in writers} <= native
+
+
+@pytest.mark.parametrize("env", swm.envs.ids())
+def test_experts_are_those_of_the_engine(env):
+    try:
+        described = swm.utils.describe(env)
+    except ValueError as error:
+        if "swm assets" not in str(error):
+            raise
+        pytest.skip("needs `swm assets`")
+    assert swm.envs.experts(env) == [expert["id"] for expert in described["experts"]]

@@ -1,4 +1,4 @@
-//! [`Checkpoint`]: a folder that holds a trained model and all that is needed to use it or to continue its training.
+//! [`Checkpoint`]: a folder with a trained model and the state for its use and for continued training.
 //!
 //! | file | content |
 //! | --- | --- |
@@ -21,7 +21,7 @@ use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use swm_core::{Error, Key, Manifest, Result, manifest};
 
-/// A trained model and all that is needed to use it.
+/// A trained model, its configuration and its provenance.
 #[derive(Clone, Debug)]
 pub struct Checkpoint<M: Trainable> {
     /// The model.
@@ -30,11 +30,11 @@ pub struct Checkpoint<M: Trainable> {
     pub config: TrainConfig<M>,
     /// Statistics of the dataset it was trained on.
     pub dataset_info: DatasetInfo,
-    /// Its provenance; `hashes["weights"]` identifies the checkpoint.
+    /// The provenance of the checkpoint; `hashes["weights"]` identifies the checkpoint.
     pub manifest: Manifest,
 }
 
-/// The state that training needs to continue exactly.
+/// The state from which training continues with the same results.
 pub(crate) struct TrainState<M> {
     /// The progress of the run.
     pub state: RunState,
@@ -84,7 +84,7 @@ impl<M: Trainable> Checkpoint<M> {
     /// Saves the checkpoint in the run folder `run`, replacing the one that is there. Returns the hash of the weights.
     ///
     /// # Errors
-    /// When the disk refuses; an earlier checkpoint is kept.
+    /// When writing fails; an earlier checkpoint is kept.
     pub fn save_to(&mut self, run: &Path) -> Result<String> {
         std::fs::create_dir_all(run).map_err(|error| Error::io(run, "creating a folder", error))?;
         self.save(run, None)

@@ -56,7 +56,7 @@ impl Location {
         })
     }
 
-    /// How error messages show it.
+    /// The location in error messages.
     pub fn label(&self) -> PathBuf {
         match self {
             Self::Path(path) => path.clone(),

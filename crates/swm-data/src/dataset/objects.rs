@@ -33,7 +33,7 @@ const GAP: u64 = 128 << 10;
 /// Maximum number of concurrent requests per read.
 const REQUESTS: usize = 32;
 
-/// Retries for a store that does not answer, for about six seconds in total.
+/// Retries of failed requests to a store, for about six seconds in total.
 #[cfg_attr(
     not(any(feature = "s3", feature = "gs", feature = "az", feature = "http")),
     allow(unused, reason = "local files need no retries")
@@ -46,9 +46,9 @@ fn retry_config() -> RetryConfig {
 /// forks) does not inherit threads, so it starts a runtime of its own.
 fn runtime() -> Result<&'static Runtime> {
     static RUNTIME: Mutex<Option<(u32, &'static Runtime)>> = Mutex::new(None);
-    let mut made = RUNTIME.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut started = RUNTIME.lock().unwrap_or_else(PoisonError::into_inner);
     let process = std::process::id();
-    if let Some((owner, runtime)) = *made
+    if let Some((owner, runtime)) = *started
         && owner == process
     {
         return Ok(runtime);
@@ -57,7 +57,7 @@ fn runtime() -> Result<&'static Runtime> {
         tokio::runtime::Builder::new_multi_thread().worker_threads(2).thread_name("swm-io").enable_all().build();
     let runtime = runtime.map_err(|e| Error::external("starting the threads that read datasets", e))?;
     let runtime = &*Box::leak(Box::new(runtime));
-    *made = Some((process, runtime));
+    *started = Some((process, runtime));
     Ok(runtime)
 }
 
@@ -84,14 +84,14 @@ pub fn store(location: &Location) -> Result<(Arc<dyn ObjectStore>, StorePath)> {
     match location {
         Location::Path(path) => {
             let path = std::path::absolute(path).map_err(|e| Error::io(path, "finding the file", e))?;
-            let inside = StorePath::from_absolute_path(&path)
+            let object_path = StorePath::from_absolute_path(&path)
                 .map_err(|e| Error::config("dataset path", e.to_string(), "use another path"))?;
-            Ok((Arc::new(object_store::local::LocalFileSystem::new()), inside))
+            Ok((Arc::new(object_store::local::LocalFileSystem::new()), object_path))
         }
         Location::Uri(url) => {
-            let inside = StorePath::from_url_path(url.path())
+            let object_path = StorePath::from_url_path(url.path())
                 .map_err(|e| Error::config("dataset", format!("{url}: {e}"), "check its spelling"))?;
-            Ok((remote(url)?, inside))
+            Ok((remote(url)?, object_path))
         }
     }
 }
@@ -101,7 +101,7 @@ pub fn store(location: &Location) -> Result<(Arc<dyn ObjectStore>, StorePath)> {
     allow(unused, reason = "without these features every URI is an error")
 )]
 fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
-    let wrong = |e: object_store::Error| {
+    let invalid = |e: object_store::Error| {
         let fix = "check the store's environment variables, such as AWS_ENDPOINT_URL, AWS_REGION and AWS_ACCESS_KEY_ID";
         Error::config("dataset", format!("{url}: {e}"), fix)
     };
@@ -112,28 +112,28 @@ fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
         "s3" => {
             // AWS_ENDPOINT_URL may name a server without TLS.
             let builder = object_store::aws::AmazonS3Builder::from_env().with_url(url.as_str()).with_allow_http(true);
-            Ok(Arc::new(builder.with_retry(retry_config()).build().map_err(wrong)?))
+            Ok(Arc::new(builder.with_retry(retry_config()).build().map_err(invalid)?))
         }
         #[cfg(feature = "gs")]
         "gs" => {
             let builder = object_store::gcp::GoogleCloudStorageBuilder::from_env().with_url(url.as_str());
-            Ok(Arc::new(builder.with_retry(retry_config()).build().map_err(wrong)?))
+            Ok(Arc::new(builder.with_retry(retry_config()).build().map_err(invalid)?))
         }
         #[cfg(feature = "az")]
         "az" => {
             let builder = object_store::azure::MicrosoftAzureBuilder::from_env().with_url(url.as_str());
-            Ok(Arc::new(builder.with_allow_http(true).with_retry(retry_config()).build().map_err(wrong)?))
+            Ok(Arc::new(builder.with_allow_http(true).with_retry(retry_config()).build().map_err(invalid)?))
         }
         #[cfg(feature = "http")]
         "http" | "https" => {
             let options = object_store::ClientOptions::new().with_allow_http(true);
             let server = &url[..url::Position::BeforePath];
             let builder = object_store::http::HttpBuilder::new().with_url(server).with_client_options(options);
-            Ok(Arc::new(builder.with_retry(retry_config()).build().map_err(wrong)?))
+            Ok(Arc::new(builder.with_retry(retry_config()).build().map_err(invalid)?))
         }
         scheme => {
             let feature = if scheme == "https" { "http" } else { scheme };
-            let problem = format!("this build does not reach {scheme}:// (it lacks the feature `{feature}`)");
+            let problem = format!("this build does not support {scheme}:// (it lacks the feature `{feature}`)");
             let fix = format!("build it with --features {feature}, or copy the dataset to this machine");
             Err(Error::config("dataset", problem, fix))
         }
@@ -171,12 +171,13 @@ impl ObjectFile {
     /// Opens a file.
     ///
     /// # Errors
-    /// If it does not exist, or the store does not answer.
+    /// If it does not exist, or a request to the store fails.
     pub fn open(location: &Location) -> Result<Self> {
         let (store, path) = store(location)?;
         let label = location.label();
-        let (asked, place) = (Arc::clone(&store), path.clone());
-        let meta = Self::finish(&label, "opening it", block_on(async move { asked.head(&place).await })?)?;
+        let (request_store, request_path) = (Arc::clone(&store), path.clone());
+        let meta =
+            Self::finish(&label, "opening it", block_on(async move { request_store.head(&request_path).await })?)?;
         Ok(Self { store, path, label, len: meta.size })
     }
 
@@ -194,7 +195,7 @@ impl ObjectFile {
     /// concurrently.
     ///
     /// # Errors
-    /// If a range exceeds the file, or the store does not answer.
+    /// If a range exceeds the file, or a request to the store fails.
     pub fn read(&self, ranges: &[Range<u64>]) -> Result<Vec<Bytes>> {
         if let Some(range) = ranges.iter().find(|range| range.start > range.end || range.end > self.len) {
             let given = format!("bytes {}..{} of {}", range.start, range.end, self.label.display());
@@ -268,7 +269,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ranges_come_back_in_the_order_asked_however_they_are_joined() -> Result<()> {
+    fn returns_ranges_in_the_requested_order() -> Result<()> {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("file");
         let content: Vec<u8> = (0..3_000_000_u32).map(|i| ((i * i) >> 7) as u8).collect();
@@ -285,7 +286,7 @@ mod tests {
     }
 
     #[test]
-    fn waiting_works_inside_another_runtime_and_survives_a_panic() -> Result<()> {
+    fn block_on_works_inside_another_runtime_and_reports_panics() -> Result<()> {
         let other = tokio::runtime::Builder::new_current_thread().build().expect("a runtime");
         assert_eq!(other.block_on(async { block_on(async { 7 }) })?, Some(7));
         let panics = block_on::<()>(async { std::panic::resume_unwind(Box::new("damaged")) })?;

@@ -42,7 +42,7 @@ impl StepRange {
 pub struct Irregularity {
     /// Position of the affected episode in [`Reader::episodes`]; `None` if the whole dataset is affected.
     pub episode: Option<usize>,
-    /// Description for people.
+    /// Human-readable description.
     pub what: String,
 }
 
@@ -54,8 +54,8 @@ pub trait Reader: Send + Sync {
     /// The episodes, in stored order.
     fn episodes(&self) -> &[Episode];
 
-    /// Reads the rows of all `ranges` of one column into `out`, one after another, in the given order. Put all ranges
-    /// of a batch into one call, because the format plans the reads of a call together.
+    /// Reads the rows of all `ranges` of one column into `out`, one after another, in the given order. Pass all ranges
+    /// of a batch in one call, because formats merge and parallelise the reads of a call.
     ///
     /// # Shapes
     /// `out` is `[rows, shape…]` in bytes, with the column's shape and type. Images are decoded to

@@ -171,10 +171,10 @@ impl ReplayBuffer {
             rows += episode.length;
             rows <= capacity
         };
-        let kept = episodes.iter().rev().take_while(fits).count().max(1).min(episodes.len());
+        let retained = episodes.iter().rev().take_while(fits).count().max(1).min(episodes.len());
         let added = reader.manifest().and_then(|manifest| manifest.config["replay"]["added"].as_u64());
-        lock(&buffer.0.state).added = added.unwrap_or(episodes.len() as u64).saturating_sub(kept as u64);
-        for (position, episode) in episodes.iter().enumerate().skip(episodes.len() - kept) {
+        lock(&buffer.0.state).added = added.unwrap_or(episodes.len() as u64).saturating_sub(retained as u64);
+        for (position, episode) in episodes.iter().enumerate().skip(episodes.len() - retained) {
             let rows = reader.read(&names, &[StepRange::new(position, 0, episode.length)])?;
             buffer.add(&rows, &reader.constants(position)?)?;
         }
@@ -424,12 +424,12 @@ impl Source {
         }
         let episodes = snapshot.episodes();
         let mut rows = 0;
-        let wanted = |episode: &&Episode| {
-            let wanted = self.recent.is_none_or(|recent| rows < recent);
+        let is_recent = |episode: &&Episode| {
+            let is_recent = self.recent.is_none_or(|recent| rows < recent);
             rows += episode.length;
-            wanted
+            is_recent
         };
-        let latest = episodes.iter().rev().take_while(wanted).count();
+        let latest = episodes.iter().rev().take_while(is_recent).count();
         let positions: Vec<usize> = (episodes.len() - latest..episodes.len()).collect();
         let clips = Clips::reaching(self.filler.clip(), self.filler.reach(), episodes, &positions)?;
         let goals = Goals::new(episodes, &positions);

@@ -1,7 +1,7 @@
 //! [`Split`]: divides the episodes of a dataset into training, validation and test.
 //!
-//! A keyed hash of an episode's index decides its part, independently of all other episodes. A growing dataset
-//! therefore keeps its parts, and training and evaluation agree whenever they use the same split.
+//! A keyed hash of an episode's index determines its part, independently of all other episodes. An episode therefore
+//! stays in its part while the dataset grows, and training and evaluation with the same split use the same parts.
 
 use crate::dataset::reader::Reader;
 use serde::{Deserialize, Serialize};
@@ -21,7 +21,7 @@ pub enum Part {
     Test,
 }
 
-/// How episodes are divided.
+/// The fractions of the parts, and the seed of the division.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Split {
@@ -92,11 +92,11 @@ impl fmt::Display for Part {
 impl FromStr for Part {
     type Err = Error;
 
-    fn from_str(word: &str) -> Result<Self> {
+    fn from_str(name: &str) -> Result<Self> {
         let parts = [Self::Train, Self::Validation, Self::Test];
         let names = parts.map(|part| part.to_string());
-        parts.into_iter().find(|part| part.to_string() == word).ok_or_else(|| {
-            Error::unknown("split", word, names.iter().map(String::as_str), "a split is train, validation or test")
+        parts.into_iter().find(|part| part.to_string() == name).ok_or_else(|| {
+            Error::unknown("split", name, names.iter().map(String::as_str), "a split is train, validation or test")
         })
     }
 }
@@ -106,18 +106,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn fractions_are_approximate_and_the_seed_decides() {
+    fn parts_have_approximate_fractions_and_depend_on_the_seed() {
         let split = Split { validation: 0.2, test: 0.1, seed: 3 };
         let parts: Vec<Part> = (0..10_000).map(|episode| split.part(episode)).collect();
-        let count = |part| parts.iter().filter(|&&given| given == part).count();
+        let count = |expected| parts.iter().filter(|&&part| part == expected).count();
         // Three standard deviations of the binomial distribution: 120 of 2000, 90 of 1000.
         assert!(count(Part::Validation).abs_diff(2000) < 120 && count(Part::Test).abs_diff(1000) < 90);
         let other = Split { seed: 4, ..split };
-        let moved = (0..10_000).filter(|&episode| other.part(episode) != split.part(episode)).count();
-        assert!(moved > 3000, "{moved}");
-        // Pinned, because published results depend on it.
-        let held = |part| (0..40).filter(|&episode| Split::default().part(episode) == part).collect::<Vec<i64>>();
-        assert_eq!((held(Part::Test), held(Part::Validation)), (vec![14], vec![4, 6, 16, 23, 24, 32]));
+        let changed = (0..10_000).filter(|&episode| other.part(episode) != split.part(episode)).count();
+        assert!(changed > 3000, "{changed}");
+        // Fixed indices, because published results depend on the default split.
+        let episodes_of =
+            |part| (0..40).filter(|&episode| Split::default().part(episode) == part).collect::<Vec<i64>>();
+        assert_eq!((episodes_of(Part::Test), episodes_of(Part::Validation)), (vec![14], vec![4, 6, 16, 23, 24, 32]));
     }
 
     #[test]

@@ -22,8 +22,8 @@ pub struct ColumnStats {
 /// Rows read at once.
 const ROWS: usize = 16 << 10;
 
-/// The statistics of a column over some episodes (all for `None`), ignoring NaN, so that the missing action of a last
-/// row does not count. Integer actions mark it with -1, which does count.
+/// Computes the statistics of a column over some episodes (all for `None`). NaN, such as the missing action of a last
+/// row, is ignored; -1, the missing action of an integer column, is counted as a value.
 ///
 /// # Errors
 /// If there is no such column, it holds images, an episode does not exist, or the data is damaged.
@@ -84,8 +84,8 @@ fn for_each_row(
     let mut rows = 0;
     for (i, &position) in positions.iter().enumerate() {
         let Some(episode) = reader.episodes().get(position) else {
-            let known = format!("positions below {}", reader.episodes().len());
-            return Err(Error::mismatch("choosing episodes", format!("position {position}"), known));
+            let expected = format!("positions below {}", reader.episodes().len());
+            return Err(Error::mismatch("choosing episodes", format!("position {position}"), expected));
         };
         pending.push(StepRange::new(position, 0, episode.length));
         rows += episode.length;

@@ -5,20 +5,20 @@ use std::time::Duration;
 use swm_core::{Batch, Manifest, Result};
 use swm_image::ImageCodec;
 
-/// What happens when the dataset to write already exists.
+/// The treatment of an existing dataset at the location to write.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum WriteMode {
-    /// Fail: the dataset must be new.
+    /// Returns an error if the dataset exists.
     #[default]
     Create,
-    /// Append to it, or create it if there is none.
+    /// Appends to the dataset, or creates it if it does not exist.
     Append,
-    /// Replace it.
+    /// Replaces the dataset.
     Overwrite,
 }
 
-/// When finished episodes are committed: as soon as one of these limits is reached. A killed process loses at most the
-/// episodes that were not committed yet.
+/// Limits at which finished episodes are committed, as soon as one of them is reached. A killed process loses at most
+/// the uncommitted episodes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CommitPolicy {
     /// Maximum number of episodes per commit.
@@ -35,16 +35,16 @@ impl Default for CommitPolicy {
     }
 }
 
-/// How a dataset is written.
+/// Options of a writer.
 #[derive(Clone, Debug, Default)]
 pub struct WriteOptions {
-    /// What happens when the dataset already exists.
+    /// The treatment of an existing dataset.
     pub mode: WriteMode,
-    /// How images are encoded.
+    /// The codec of images.
     pub codec: ImageCodec,
-    /// Provenance of the data, stored with them. When appending, it replaces the stored manifest.
+    /// Provenance of the data, stored in the dataset. When appending, it replaces the stored manifest.
     pub manifest: Option<Manifest>,
-    /// When finished episodes are committed.
+    /// Limits at which finished episodes are committed.
     pub commit: CommitPolicy,
 }
 

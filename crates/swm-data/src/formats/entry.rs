@@ -4,7 +4,7 @@ use crate::dataset::{Location, Reader, WriteOptions, Writer};
 use std::sync::Arc;
 use swm_core::{Error, Named, Result, Schema};
 
-/// A dataset format: how it is named, recognised, opened and created.
+/// A dataset format: its names, and the functions that detect, open and create its datasets.
 pub struct FormatEntry {
     /// Its id, such as `lance`.
     pub id: &'static str,
@@ -14,7 +14,7 @@ pub struct FormatEntry {
     pub suffixes: &'static [&'static str],
     /// The Cargo feature of `swm-data` that this format requires, if any.
     pub feature: Option<&'static str>,
-    /// Whether an existing dataset, or the name of one to create, belongs to this format.
+    /// Returns whether the location of an existing dataset, or of one to create, is of this format.
     pub detect: fn(&Location) -> bool,
     /// The implementation; `None` if the program was built without [`FormatEntry::feature`].
     pub backend: Option<Backend>,
@@ -57,7 +57,7 @@ impl FormatEntry {
     /// Creates, continues or replaces a dataset whose episodes have these columns.
     ///
     /// # Errors
-    /// If the dataset exists and must not, the schema differs from that of the dataset to continue, writing fails, or
+    /// If the dataset exists and `options.mode` forbids it, the schema differs from that of the dataset to continue, writing fails, or
     /// this build lacks the format's feature.
     pub fn create(&self, location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
         (self.backend()?.create)(location, schema, options)

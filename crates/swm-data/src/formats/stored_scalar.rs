@@ -1,4 +1,4 @@
-//! Numeric types of files of other programs, and their conversion to the types of columns.
+//! Numeric types in third-party files, and their conversion to the types of columns.
 
 use swm_core::DType;
 
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn numbers_of_every_width_and_order() {
+    fn converts_values_of_every_width_and_byte_order() {
         assert_eq!(convert(Class::Signed, 2, true, &[0xff, 0xfe]), Ok((-2_i32).to_ne_bytes().to_vec()));
         assert_eq!(convert(Class::Unsigned, 2, false, &[0xfe, 0xff]), Ok(65_534_i32.to_ne_bytes().to_vec()));
         assert_eq!(convert(Class::Signed, 1, false, &[0x80]), Ok((-128_i32).to_ne_bytes().to_vec()));
@@ -132,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn half_precision() {
+    fn converts_half_precision() {
         let cases = [
             (0x3c00, 1.0),
             (0xc000, -2.0),

@@ -50,7 +50,7 @@ fn every_format_preserves_the_content() {
         let target = place(folder.path(), format.id);
         let wanted = ConvertOptions { format: Some(format.id.to_owned()), ..lossless(ConvertMode::Create) };
         let report = run(&path, &target, &wanted).unwrap_or_else(|error| panic!("{}: {error}", format.id));
-        assert_eq!((report.episodes, report.kept, report.last_actions), (9, 0, 0), "{}", format.id);
+        assert_eq!((report.episodes, report.existing, report.last_actions), (9, 0, 0), "{}", format.id);
         assert_eq!(report.checksum.as_deref(), Some(&sum[..]), "{}", format.id);
         let to = format.open(&Location::from(&target)).expect("opens");
         check(&*to, 0);
@@ -110,7 +110,7 @@ fn resumes_a_stopped_conversion_and_rejects_other_targets() {
         assert_eq!(stages.contains(&"compare"), stop > 1);
     }
     let report = run(&path, &target, &lossless(ConvertMode::Resume)).expect("compares");
-    assert_eq!((report.episodes, report.kept, report.rows), (9, 9, 0));
+    assert_eq!((report.episodes, report.existing, report.rows), (9, 9, 0));
     assert_eq!(
         report.checksum,
         run(&path, &folder.path().join("whole.lance"), &lossless(ConvertMode::Create)).expect("converts").checksum

@@ -112,7 +112,7 @@ fn collected_dataset_has_no_findings() {
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 2, 0..8);
     let diagnosis = diagnose(&*open(&path).expect("opens"));
-    assert_eq!((diagnosis.problems(), diagnosis.findings.len(), diagnosis.sound.len()), (0, 0, 8), "{diagnosis:?}");
+    assert_eq!((diagnosis.problems(), diagnosis.findings.len(), diagnosis.intact.len()), (0, 0, 8), "{diagnosis:?}");
     assert_eq!(diagnosis.rows, (0..8).map(rows).sum::<usize>());
     // The longest episode, with eleven rows, is shorter than a clip of the world model.
     let fits: Vec<&str> = diagnosis.models.iter().filter(|fit| fit.fits()).map(|fit| fit.model).collect();
@@ -129,7 +129,7 @@ fn finds_a_repeated_episode_index_in_a_table() {
     assert!(problems.iter().all(|found| found.episodes == [1]), "{problems:?}");
     assert!(problems.iter().any(|found| found.what.contains("row 2 holds 0")), "{problems:?}");
     assert!(problems.iter().any(|found| found.what.contains("no action in a row that is not the last")));
-    assert_eq!(diagnosis.sound, [0, 2]);
+    assert_eq!(diagnosis.intact, [0, 2]);
 }
 
 #[test]
@@ -143,7 +143,7 @@ fn finds_restarting_steps_and_shared_rows_in_an_hdf5_file() {
     };
     assert_eq!(of(1), ["the stored steps do not count up from 0: row 2 holds 0"]);
     assert!(of(3).contains(&"some of its rows are also those of episode 2".to_owned()), "{:?}", of(3));
-    assert_eq!(diagnosis.sound, [0, 2]);
+    assert_eq!(diagnosis.intact, [0, 2]);
 }
 
 #[test]
@@ -226,7 +226,7 @@ fn finds_each_defect_in_its_episode() {
     let diagnosis = diagnose(&broken);
     let (what, episodes) = problem(&diagnosis);
     assert!(what.contains("'pixels' cannot be read") && what.contains("truncated"), "{what}");
-    assert_eq!((episodes, diagnosis.sound), (vec![1, 3], vec![0, 2]));
+    assert_eq!((episodes, diagnosis.intact), (vec![1, 3], vec![0, 2]));
     let mut broken = Broken::new(4, |_, _| {});
     broken.episodes[3].index = 1;
     let (what, episodes) = problem(&diagnose(&broken));
@@ -235,15 +235,15 @@ fn finds_each_defect_in_its_episode() {
     broken.irregular = vec![Irregularity { episode: None, what: "3 rows belong to no episode".to_owned() }];
     let diagnosis = diagnose(&broken);
     assert_eq!(problem(&diagnosis), ("3 rows belong to no episode".to_owned(), vec![]));
-    assert_eq!(diagnosis.sound.len(), 4, "the episodes are sound");
+    assert_eq!(diagnosis.intact.len(), 4, "the episodes are intact");
     let mut broken = Broken::new(4, |_, _| {});
     broken.irregular = vec![Irregularity { episode: Some(1), what: "its stored steps restart".to_owned() }];
-    assert_eq!(diagnose(&broken).sound, [0, 2, 3], "and this one is not");
+    assert_eq!(diagnose(&broken).intact, [0, 2, 3], "and this one is not");
     assert!(problem(&diagnose(&Broken::new(0, |_, _| {}))).0.contains("no episode"));
 }
 
 #[test]
-fn unusual_but_sound_data_gives_a_note() {
+fn unusual_but_intact_data_gives_a_note() {
     let notes = |broken: Broken| -> Vec<String> {
         let diagnosis = diagnose(&broken);
         assert_eq!(diagnosis.problems(), 0, "{diagnosis:?}");
@@ -279,7 +279,7 @@ fn without_reward(schema: &Schema, rows: &Batch) -> Batch {
 }
 
 #[test]
-fn repair_writes_the_sound_episodes() {
+fn repair_writes_the_intact_episodes() {
     let folder = tempfile::tempdir().expect("a folder");
     let target = folder.path().join("repaired.lance");
     let broken = Broken::new(6, |e, rows| {
@@ -295,7 +295,7 @@ fn repair_writes_the_sound_episodes() {
     broken.0.damaged = vec![2];
     let reader: Arc<dyn Reader> = Arc::new(broken);
     let diagnosis = diagnose(&*reader);
-    assert_eq!((diagnosis.problems(), &diagnosis.sound[..]), (3, &[0, 3, 5][..]));
+    assert_eq!((diagnosis.problems(), &diagnosis.intact[..]), (3, &[0, 3, 5][..]));
     let to = Location::from(&target);
     let report = repair(&reader, &diagnosis, &to, &ConvertOptions::default(), &mut Control::new()).expect("repairs");
     assert_eq!(report.episodes, 3);

@@ -84,7 +84,7 @@ fn modes(path: &Path) {
     assert!(parts.iter().any(|(part, size)| part == "pixels" && *size > 0), "{parts:?}");
     let five = reader.content_hash().expect("hashes");
 
-    let there = writer(path, WriteMode::Create).err().expect("it is there").to_string();
+    let there = writer(path, WriteMode::Create).err().expect("an existing dataset").to_string();
     assert!(there.contains("exists already") && there.contains("append"), "{there}");
     write(path, WriteMode::Append, 5..9);
     let reader = open(path).expect("opens");

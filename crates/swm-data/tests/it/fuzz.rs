@@ -46,13 +46,13 @@ fn only() -> Option<u64> {
 
 /// Damages one file of a copy of a dataset (a file or a folder) per case. Every kind of file (by folder and suffix)
 /// gets an equal number of cases. `read` opens a dataset and returns its content, as [`read_everything`] does.
-pub fn dataset<T: PartialEq>(name: &str, sound: &Path, cases: u64, read: impl Fn(&Path) -> Result<T>) -> Report {
+pub fn dataset<T: PartialEq>(name: &str, intact: &Path, cases: u64, read: impl Fn(&Path) -> Result<T>) -> Report {
     let folder = tempfile::tempdir().expect("a folder");
-    let copy = folder.path().join(sound.file_name().expect("a name"));
-    copy_all(sound, &copy);
+    let copy = folder.path().join(intact.file_name().expect("a name"));
+    copy_all(intact, &copy);
     let kinds = kinds(&copy);
     let all: Vec<&PathBuf> = kinds.iter().flatten().collect();
-    let expected = read(&copy).expect("the sound dataset is read");
+    let expected = read(&copy).expect("the intact dataset is read");
     run(name, cases, &expected, |case, rng| {
         let kind = &kinds[case as usize % kinds.len()];
         let file = &kind[rng.random_range(0..kind.len())];
@@ -73,17 +73,17 @@ pub fn dataset<T: PartialEq>(name: &str, sound: &Path, cases: u64, read: impl Fn
                 change
             }
         };
-        let words = format!("{} {change}", file.strip_prefix(folder.path()).unwrap_or(file).display());
+        let change = format!("{} {change}", file.strip_prefix(folder.path()).unwrap_or(file).display());
         let restore = move || std::fs::write(file, &bytes).expect("writes");
-        (words, || read(&copy), restore)
+        (change, || read(&copy), restore)
     })
 }
 
 /// Damages copies of a byte string, such as an encoded image.
-pub fn bytes<T: PartialEq>(name: &str, sound: &[u8], cases: u64, read: impl Fn(&[u8]) -> Result<T>) -> Report {
-    let expected = read(sound).expect("the sound bytes are read");
+pub fn bytes<T: PartialEq>(name: &str, intact: &[u8], cases: u64, read: impl Fn(&[u8]) -> Result<T>) -> Report {
+    let expected = read(intact).expect("the intact bytes are read");
     run(name, cases, &expected, |_, rng| {
-        let (damaged, change) = damage(rng, sound);
+        let (damaged, change) = damage(rng, intact);
         let read = &read;
         (change, move || read(&damaged), || {})
     })
@@ -111,8 +111,8 @@ pub fn read_everything(path: &Path) -> Result<String> {
 
 /// A damaged copy and a description of the damage. Start and end, where formats keep their structure, are hit more
 /// often.
-pub fn damage(rng: &mut Rng, sound: &[u8]) -> (Vec<u8>, String) {
-    let mut bytes = sound.to_vec();
+pub fn damage(rng: &mut Rng, intact: &[u8]) -> (Vec<u8>, String) {
+    let mut bytes = intact.to_vec();
     if bytes.is_empty() {
         return (b"not empty".to_vec(), "filled".to_owned());
     }
@@ -121,11 +121,11 @@ pub fn damage(rng: &mut Rng, sound: &[u8]) -> (Vec<u8>, String) {
     let change = match rng.random_range(0..9) {
         0 => {
             bytes.truncate(at);
-            format!("cut to {at} of {} bytes", sound.len())
+            format!("cut to {at} of {} bytes", intact.len())
         }
         1 => {
             bytes.extend((0..rng.random_range(1..64)).map(|_| rng.random::<u8>()));
-            format!("{} bytes longer", bytes.len() - sound.len())
+            format!("{} bytes longer", bytes.len() - intact.len())
         }
         2..=3 => {
             let flips: Vec<usize> = (0..rng.random_range(1..4)).map(|_| place(rng, bytes.len())).collect();
@@ -135,7 +135,7 @@ pub fn damage(rng: &mut Rng, sound: &[u8]) -> (Vec<u8>, String) {
         4..=5 => {
             // Replaces a length, a count, an offset or a version.
             let value =
-                [0, 1, u64::MAX, i64::MAX as u64, u32::MAX.into(), i32::MAX as u64, sound.len() as u64 + 1, 1 << 40]
+                [0, 1, u64::MAX, i64::MAX as u64, u32::MAX.into(), i32::MAX as u64, intact.len() as u64 + 1, 1 << 40]
                     [rng.random_range(0..8)];
             let width = [1, 2, 4, 8][rng.random_range(0..4)].min(bytes.len() - at);
             let (little, big) = (value.to_le_bytes(), value.to_be_bytes());
@@ -184,17 +184,17 @@ fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
     let watchdog = std::thread::spawn(move || watch(&watched));
     for case in only().map_or(0..cases, |case| case..case + 1) {
         let (change, read, restore) = prepare(case, &mut Key::new(0).with(name).at(case).rng());
-        let words = format!("{name}, SWM_FUZZ_CASE={case}: {change}");
-        progress.send(words.clone()).expect("the watchdog listens");
+        let change = format!("{name}, SWM_FUZZ_CASE={case}: {change}");
+        progress.send(change.clone()).expect("the watchdog listens");
         LARGEST.store(0, Ordering::Relaxed);
         let result = catch_unwind(AssertUnwindSafe(read));
         let largest = LARGEST.load(Ordering::Relaxed);
-        assert!(largest < ABSURD_MEMORY, "{words}: asked for {largest} bytes at once");
-        match result.unwrap_or_else(|_| panic!("{words}: panicked")) {
+        assert!(largest < ABSURD_MEMORY, "{change}: asked for {largest} bytes at once");
+        match result.unwrap_or_else(|_| panic!("{change}: panicked")) {
             Ok(found) if found == *expected => report.same += 1,
-            Ok(_) => report.changed.push(words),
+            Ok(_) => report.changed.push(change),
             Err(error) => {
-                assert!(error.to_string().len() > 30, "{words}: says little: {error}");
+                assert!(error.to_string().len() > 30, "{change}: says little: {error}");
                 report.refused += 1;
             }
         }
@@ -292,13 +292,13 @@ static ALLOCATOR: RecordingAllocator = RecordingAllocator;
 
 #[test]
 fn damage_is_reproducible_and_effective() {
-    let sound: Vec<u8> = (0..200).collect();
+    let intact: Vec<u8> = (0..200).collect();
     let mut same = 0;
     for case in 0..500 {
         let key = Key::new(1).at(case);
-        let (damaged, words) = damage(&mut key.rng(), &sound);
-        assert_eq!((&damaged, &words), (&damage(&mut key.rng(), &sound).0, &damage(&mut key.rng(), &sound).1));
-        same += usize::from(damaged == sound);
+        let (damaged, change) = damage(&mut key.rng(), &intact);
+        assert_eq!((&damaged, &change), (&damage(&mut key.rng(), &intact).0, &damage(&mut key.rng(), &intact).1));
+        same += usize::from(damaged == intact);
     }
     assert!(same < 25, "{same} of 500 do nothing");
 }

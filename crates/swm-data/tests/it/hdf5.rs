@@ -175,7 +175,7 @@ fn reads_a_file_of_the_reference() {
 }
 
 #[test]
-fn every_filter_of_h5py_and_hdf5plugin_is_undone() {
+fn decodes_every_filter_of_h5py_and_hdf5plugin() {
     let reader = open(interop("hdf5-filters.h5")).expect("opens");
     let names: Vec<String> = reader.schema().columns()[2..].iter().map(|column| column.name.clone()).collect();
     assert_eq!(names.len(), 2 * 26);
@@ -303,7 +303,7 @@ fn agrees(path: &Path, seen: &Value) {
 }
 
 #[test]
-fn our_files_open_in_h5py_and_what_it_appends_opens_here() {
+fn h5py_reads_our_files_and_we_read_what_it_appends() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("ours.h5");
     format_suite::write(&path, WriteMode::Create, 0..40);

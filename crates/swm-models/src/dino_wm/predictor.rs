@@ -48,7 +48,7 @@ pub struct Transformer {
     pub layers: Vec<Layer>,
 }
 
-/// One layer: attention, then a feed-forward block, each added to its input. A field `_0` is number 0 of a sequence.
+/// One layer: attention, then a feed-forward block, each added to its input. A field `_0` is element 0 of a sequence.
 #[derive(Module, Debug)]
 pub struct Layer {
     /// Self-attention.
@@ -57,7 +57,7 @@ pub struct Layer {
     pub _1: FeedForward,
 }
 
-/// Number added to the variance by the last normalisation.
+/// Added to the variance by the last normalisation.
 const EPSILON: f64 = 1e-5;
 
 impl FramePredictorConfig {

@@ -19,7 +19,7 @@ pub struct TrainBatch {
     pub columns: Vec<Tensor<3>>,
 }
 
-/// Losses and gradients of some clips.
+/// Losses and gradients of a part of a batch.
 pub struct DinoWmStep {
     /// The total loss, then its parts.
     pub losses: Vec<(&'static str, f64)>,

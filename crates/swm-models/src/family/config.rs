@@ -24,7 +24,7 @@ pub trait TrainableConfig {
     /// Returns the side of the model's square images in pixels; `None` for a state-only model.
     fn image_size(&self) -> Option<usize>;
 
-    /// Trains by acting in environments; `None` for a family that learns from datasets only.
+    /// Trains by acting in environments; `None` for a family that trains on datasets only.
     ///
     /// # Errors
     /// As [`crate::online::train_online`].

@@ -34,7 +34,7 @@ pub struct Critic {
     emb_dropout: f32,
 }
 
-/// Two hidden layers with ReLU. A field `_2` is number 2 of a sequence.
+/// Two hidden layers with ReLU. A field `_2` is element 2 of a sequence.
 #[derive(Module, Debug)]
 pub struct CriticHead {
     /// Into hidden features.

@@ -40,7 +40,7 @@ pub enum Pool {
 /// The sizes of a transformer's input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PatchGrid {
-    /// The most frames.
+    /// Maximum number of frames.
     pub frames: usize,
     /// Patches of a frame.
     pub patches: usize,
@@ -61,7 +61,7 @@ pub struct Transformer {
     patches: usize,
 }
 
-/// Attention, then a feed-forward block. A field `_0` is number 0 of a sequence.
+/// Attention, then a feed-forward block. A field `_0` is element 0 of a sequence.
 #[derive(Module, Debug)]
 pub struct Layer {
     /// The attention.
@@ -104,7 +104,7 @@ pub struct Attention {
     config: TransformerConfig,
 }
 
-/// Number added to the variance by the normalisations.
+/// Added to the variance by the normalisations.
 const EPSILON: f64 = 1e-5;
 /// The standard deviation of the learnt tokens' initial values.
 const TOKEN_STD: f32 = 0.02;
@@ -175,6 +175,8 @@ impl Transformer {
 }
 
 impl Attention {
+    /// Applies the attention; a pooling layer returns one token per frame.
+    ///
     /// # Shapes
     /// `x` is `[rows, frames * patches, dim]`, `goal` is `[rows, patches, dim]`; returns the shape of `x`, or
     /// `[rows, frames, dim]` from a pooling layer.

@@ -26,7 +26,7 @@ use swm_data::{ClipSpec, Loader, LoaderConfig, Part, Reader};
 pub struct InverseConfig {
     /// The seed of initial weights, data order and goals.
     pub seed: u64,
-    /// The most model steps from a frame to its goal.
+    /// Maximum number of model steps from a frame to its goal.
     pub offset: usize,
     /// Hidden features of the network.
     pub hidden: usize,
@@ -130,7 +130,7 @@ fn run(
         let pairs = Pairs::draw(world_model, config.offset, &*batch?, key.with("goals").at(step as u64))?;
         let factor = config.schedule.lr_factor(step);
         let norm;
-        (model, loss, norm) = learn(model, &mut optimizer, factor, pairs)?;
+        (model, loss, norm) = optimizer_step(model, &mut optimizer, factor, pairs)?;
         step += 1;
         let (elapsed, lr) = (begun.elapsed().as_secs_f64(), config.optim.lr * factor);
         clips_per_second = (step * config.batch_size) as f64 / elapsed;
@@ -242,7 +242,7 @@ impl Pairs {
 
 /// Takes one optimizer step with the learning rate times `factor`; returns the new network, the loss before the step and
 /// the norm of the gradient.
-fn learn(model: Mlp, optimizer: &mut AdamW, factor: f64, pairs: Pairs) -> Result<(Mlp, f64, f64)> {
+fn optimizer_step(model: Mlp, optimizer: &mut AdamW, factor: f64, pairs: Pairs) -> Result<(Mlp, f64, f64)> {
     let tensor = |values: Vec<f32>| {
         let width = values.len() / pairs.count;
         Tensor::<2>::from_data(TensorData::new(values, [pairs.count, width]), &Device::flex())

@@ -26,6 +26,17 @@ pub(crate) struct JointStep {
     pub statistics: [BatchStatistics; 2],
 }
 
+/// Returns every window of `history` steps that is followed by a step, shifted by `offset` steps: one window per clip if
+/// clips are one step longer than the history, as published.
+///
+/// # Shapes
+/// `x` is `[clips, steps, width]`; returns `[(steps - history) * clips, history, width]`.
+fn windows(x: &Tensor<3>, history: usize, offset: usize) -> Tensor<3> {
+    let [clips, steps, width] = x.dims();
+    let starts = 0..steps - history;
+    Tensor::cat(starts.map(|s| x.clone().slice([0..clips, s + offset..s + offset + history, 0..width])).collect(), 0)
+}
+
 /// Computes prediction error and gradients of a batch. The loss is the prediction error plus `regularise(latents)`, where
 /// the latents are `[clips, steps, latent]`. `model` has no autodiff; `shards` is at least 1.
 pub(crate) fn step(
@@ -58,21 +69,11 @@ pub(crate) fn step(
     let [_, latent] = latents.dims();
     let latents = latents.reshape([clips, steps, latent]);
     let regulariser = regularise(&latents);
-    // Every window of the history's length that is followed by a frame: one window if the clip is one frame longer than
-    // the history, as published.
     let history = head.predictor.config().history.min(steps - 1);
-    let windows = |x: &Tensor<3>, offset: usize| {
-        let [_, _, width] = x.dims();
-        let starts = 0..steps - history;
-        Tensor::cat(
-            starts.map(|s| x.clone().slice([0..clips, s + offset..s + offset + history, 0..width])).collect(),
-            0,
-        )
-    };
-    let conditions = head.embed_actions(windows(&batch.actions, 0).autodiff());
+    let conditions = head.embed_actions(windows(&batch.actions, history, 0).autodiff());
     let (predicted, pred_proj_statistics) =
-        head.predict_train(windows(&latents, 0), conditions, &mut DropoutRng(noise));
-    let prediction = (predicted - windows(&latents, 1)).square().mean();
+        head.predict_train(windows(&latents, history, 0), conditions, &mut DropoutRng(noise));
+    let prediction = (predicted - windows(&latents, history, 1)).square().mean();
     let prediction_value: f32 = prediction.clone().inner().into_scalar();
 
     let mut all = (prediction + regulariser).backward();

@@ -12,7 +12,7 @@ use swm_kernels::{Tape, VitGradient};
 
 /// The implementation of the encoder's gradient.
 pub(crate) enum Differentiation<'a> {
-    /// Burn's autodiff. Every shard has its own copy of the encoder, so that their graphs share nothing.
+    /// Burn's autodiff. Every shard has its own copy of the encoder, so that their graphs are independent.
     Burn(&'a Encoder),
     /// The CPU kernels.
     Host(Box<VitGradient>),

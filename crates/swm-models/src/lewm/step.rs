@@ -13,7 +13,7 @@ use swm_core::Rng;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SigregConfig {
-    /// Its weight in the loss, λ.
+    /// The weight of SIGReg in the loss, λ.
     pub weight: f32,
     /// Random directions per step.
     pub directions: usize,

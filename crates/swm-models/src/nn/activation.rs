@@ -34,7 +34,7 @@ impl Activation {
     }
 }
 
-/// `x Φ(x)`. The CPU uses our vectorised kernel: Burn computes the error function one element at a time, twice in
+/// `x Φ(x)`. The CPU uses the vectorised kernel of `swm-kernels`: Burn computes the error function one element at a time, twice in
 /// training.
 fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     let device = x.device();

@@ -64,7 +64,7 @@ impl BackboneConfig {
     /// Checks that the sizes fit each other and images with a side of `image` pixels. `at` is the path of the settings.
     ///
     /// # Errors
-    /// Naming the first size that does not fit.
+    /// Names the first size that does not fit.
     pub fn check(&self, at: &str, image: usize) -> Result<()> {
         let invalid = |what: &str, problem: String, fix: &str| Err(Error::config(format!("{at}.{what}"), problem, fix));
         let transformer = |name: &str, sizes: [(&str, usize); 5], dim: usize, heads: usize| {

@@ -1,5 +1,5 @@
 //! Building blocks with the parameter names and layouts of PyTorch checkpoints, so that weights are exchanged without
-//! renaming. A [`Key`] and the name of a parameter decide its initial values; there is no global generator.
+//! renaming. A [`Key`] and the name of a parameter determine its initial values; there is no global generator.
 
 pub mod activation;
 pub mod attention;

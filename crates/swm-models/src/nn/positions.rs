@@ -11,7 +11,7 @@ pub enum Resampling {
     Antialiased,
 }
 
-/// Resamples position embeddings to a square grid of `count` patches; unchanged where that is their own grid.
+/// Resamples position embeddings to a square grid of `count` patches; unchanged if the grid already has that size.
 ///
 /// # Shapes
 /// `[1, 1 + grid * grid, dim]`, with the class token first, to `[1, 1 + count, dim]`.
@@ -38,7 +38,7 @@ pub fn positions(trained: Tensor<3>, count: usize, resampling: Resampling) -> Te
 /// `[to, from]`.
 fn matrix(from: usize, to: usize, resampling: Resampling) -> Vec<f32> {
     let scale = from as f64 / to as f64;
-    // The parameter `a` and the width of the kernel, which PyTorch chooses differently for the two.
+    // The parameter `a` and the width of the kernel. PyTorch uses other values with antialiasing.
     let (sharpness, width) = match resampling {
         Resampling::Bicubic => (-0.75, 1.0),
         Resampling::Antialiased => (-0.5, scale.max(1.0)),
@@ -50,9 +50,9 @@ fn matrix(from: usize, to: usize, resampling: Resampling) -> Vec<f32> {
         for index in (centre - reach).ceil() as i64..=(centre + reach).floor() as i64 {
             let weight = cubic((index as f64 - centre) / width, sharpness);
             match resampling {
-                // The border value is repeated outside of the grid,
+                // Repeats the border value outside of the grid.
                 Resampling::Bicubic => row[index.clamp(0, from as i64 - 1) as usize] += weight,
-                // or neighbours outside of the grid are skipped.
+                // Skips neighbours outside of the grid.
                 Resampling::Antialiased if (0..from as i64).contains(&index) => row[index as usize] += weight,
                 Resampling::Antialiased => {}
             }

@@ -9,7 +9,7 @@ use swm_core::pool::Reset;
 use swm_core::{Batch, EnvPool, Error, Key, Policy, ResetOptions, Result, Schema};
 use swm_data::{Constants, ReplayBuffer};
 
-/// Environments that run episode after episode into a replay buffer.
+/// Runs episodes in a pool of environments and adds them to a replay buffer.
 pub(super) struct Collector {
     pool: EnvPool,
     replay: ReplayBuffer,
@@ -26,7 +26,7 @@ pub(super) struct Collector {
     key: Key,
     /// Steps of a segment.
     segment: usize,
-    /// The number of the next episode.
+    /// The index of the next episode.
     next: u64,
     /// Environment steps done.
     pub steps: usize,
@@ -43,7 +43,7 @@ struct Running {
     length: usize,
     /// All actions of the episode, row-major `[steps, action_dim]`.
     actions: Vec<f32>,
-    /// Its undiscounted return so far.
+    /// The undiscounted return of the episode so far.
     total: f64,
 }
 

@@ -1,11 +1,11 @@
-//! [`OnlineConfig`]: how interaction and learning alternate.
+//! [`OnlineConfig`]: the settings of online training.
 
 use super::planner_config::PlannerConfig;
 use crate::train::at_least;
 use serde::{Deserialize, Serialize};
 use swm_core::Result;
 
-/// How interaction and learning alternate: the table `online` of a configuration. The run ends after `schedule.steps`
+/// The settings of online training: the table `online` of a configuration. The run ends after `schedule.steps`
 /// optimizer steps.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -35,7 +35,7 @@ impl OnlineConfig {
     /// Checks the ranges of the settings.
     ///
     /// # Errors
-    /// Naming the first that is out of range.
+    /// Names the first that is out of range.
     pub fn check(&self) -> Result<()> {
         at_least(&[
             ("online.envs", self.envs, 1),

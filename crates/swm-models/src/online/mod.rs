@@ -1,8 +1,9 @@
-//! Online training: interaction with environments and learning by turns, in one process.
+//! Online training: interaction with environments alternates with optimizer steps, in one process.
 //!
-//! A round is one step of every environment, then as many optimizer steps as the configuration says. Transitions go to
-//! a replay buffer, segment by segment of an episode, and batches are drawn from it uniformly. The seed decides
-//! everything: episode `i` by its number, a batch by the number of its optimizer step and the content of the buffer.
+//! A round is one step of every environment, then [`OnlineConfig::updates`] optimizer steps. Transitions go to
+//! a replay buffer, segment by segment of an episode, and batches are drawn from it uniformly. The seed
+//! determines a run: episode `i` through its index, a batch through the index of its optimizer step and the content of
+//! the buffer.
 //! Results depend neither on the number of threads nor on the speed of the machine.
 //!
 //! An episode that its time limit truncates does not end a value target: only `terminated` does.

@@ -30,7 +30,7 @@ impl PlannerConfig {
     /// Checks the ranges of the settings.
     ///
     /// # Errors
-    /// Naming the first that is out of range.
+    /// Names the first that is out of range.
     pub fn check(&self) -> Result<()> {
         at_least(&[
             ("online.planner.horizon", self.horizon, 1),

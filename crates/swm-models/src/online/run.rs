@@ -6,7 +6,7 @@ use super::config::OnlineConfig;
 use super::evaluation;
 use super::shared_model::SharedModel;
 use crate::train::config::LoopConfig;
-use crate::train::learner::{self, Learn, Learner, Update};
+use crate::train::learner::{self, DynLearner, Learner, Update};
 use crate::train::metrics::{MetricWindow, Metrics};
 use crate::train::run::STAGE;
 use crate::train::run_state::is_due;
@@ -41,7 +41,8 @@ pub struct OnlineSummary {
     /// Duration of the run in seconds.
     pub seconds: f64,
     /// The fraction of the time spent on interaction.
-    pub playing: f64,
+    #[serde(rename = "playing")]
+    pub interaction: f64,
 }
 
 /// Trains a model by interaction with environments; the checkpoint, the best checkpoint so far and the logs go to the
@@ -54,7 +55,7 @@ pub struct OnlineSummary {
 ///
 /// # Errors
 /// When the configuration contradicts itself or the environments, `out` holds a run that cannot be continued, a loss is
-/// not finite, an environment fails, the caller's poll fails (after saving), or the disk refuses.
+/// not finite, an environment fails, the caller's poll fails (after saving), or writing fails.
 pub fn train_online<M: Agent>(
     config: &TrainConfig<M>,
     make_pool: &dyn Fn(usize) -> Result<EnvPool>,
@@ -127,11 +128,11 @@ fn start<'a, M: Agent>(
     Ok(Box::new(move |control| run.go(M::FAMILY, control)))
 }
 
-/// A learner whose weights the policies share, for models of any family.
-trait LearnOnline {
-    fn learner(&self) -> &dyn Learn;
-    fn learner_mut(&mut self) -> &mut dyn Learn;
-    /// Makes the policies act with the present weights.
+/// A learner of any family whose weights the policies share.
+trait DynOnlineLearner {
+    fn learner(&self) -> &dyn DynLearner;
+    fn learner_mut(&mut self) -> &mut dyn DynLearner;
+    /// Copies the present weights to the policies.
     fn publish(&self);
 }
 
@@ -140,12 +141,12 @@ struct OnlineLearner<'a, M: Agent> {
     shared: SharedModel<M>,
 }
 
-impl<M: Agent> LearnOnline for OnlineLearner<'_, M> {
-    fn learner(&self) -> &dyn Learn {
+impl<M: Agent> DynOnlineLearner for OnlineLearner<'_, M> {
+    fn learner(&self) -> &dyn DynLearner {
         &self.learner
     }
 
-    fn learner_mut(&mut self) -> &mut dyn Learn {
+    fn learner_mut(&mut self) -> &mut dyn DynLearner {
         &mut self.learner
     }
 
@@ -166,7 +167,7 @@ struct Run<'a> {
     config: LoopConfig,
     online: &'a OnlineConfig,
     out: &'a Path,
-    learner: Box<dyn LearnOnline + 'a>,
+    learner: Box<dyn DynOnlineLearner + 'a>,
     data: Data,
     /// The policy of the warm-up.
     random: Box<dyn Policy>,
@@ -185,11 +186,11 @@ struct Meter {
     /// The optimizer step at which the run began or continued.
     first_step: usize,
     /// Seconds spent on interaction.
-    playing: f64,
+    interaction_seconds: f64,
     /// Metrics since the last line of the log.
     window: MetricWindow,
     /// The mean return of the last episodes that ended.
-    played_return: Option<f64>,
+    collected_return: Option<f64>,
     /// The mean return of the last evaluation.
     evaluated_return: Option<f64>,
 }
@@ -249,15 +250,15 @@ impl Run<'_> {
             }
             let start = Instant::now();
             self.data.collector.step(if warm { &mut *self.explorer } else { &mut *self.random })?;
-            meter.playing += start.elapsed().as_secs_f64();
+            meter.interaction_seconds += start.elapsed().as_secs_f64();
             if !self.data.collector.returns.is_empty() {
-                meter.played_return = Some(mean(&std::mem::take(&mut self.data.collector.returns)));
+                meter.collected_return = Some(mean(&std::mem::take(&mut self.data.collector.returns)));
             }
             if !learns {
                 continue;
             }
             for _ in 0..self.online.updates.min(steps - self.step()) {
-                self.learn(&mut meter, control)?;
+                self.train_step(&mut meter, control)?;
             }
             self.learner.publish();
             let (done, save_every) = (self.step(), self.config.save_every);
@@ -287,7 +288,7 @@ impl Run<'_> {
     }
 
     /// Makes one optimizer step, evaluates where it is due, and reports both.
-    fn learn(&mut self, meter: &mut Meter, control: &mut Control<'_>) -> Result<()> {
+    fn train_step(&mut self, meter: &mut Meter, control: &mut Control<'_>) -> Result<()> {
         let Update { metrics, lr, gradient_norm } = self.update()?;
         meter.window.add(&metrics, gradient_norm);
         let (done, steps) = (self.step(), self.config.schedule.steps);
@@ -297,20 +298,20 @@ impl Run<'_> {
             meter.evaluated_return = Some(self.evaluate()?);
         }
         let env_steps = self.data.collector.steps as f64;
-        let played_return = meter.played_return.map(|value| ("return", value));
-        let playing = meter.playing / elapsed;
+        let collected_return = meter.collected_return.map(|value| ("return", value));
+        let interaction = meter.interaction_seconds / elapsed;
         let mut shown = metrics;
         shown.push(("env_steps", env_steps));
-        shown.extend(played_return);
+        shown.extend(collected_return);
         shown.extend(meter.evaluated_return.map(|value| ("evaluation_return", value)));
         shown.extend([("lr", lr), ("gradient_norm", gradient_norm)]);
-        shown.extend([("clips_per_second", clips_per_second), ("data_wait", playing)]);
+        shown.extend([("clips_per_second", clips_per_second), ("data_wait", interaction)]);
         control.progress(Progress { stage: STAGE, done, total: steps, unit: "steps", metrics: &shown });
         if is_due(self.config.log_every, done, steps) {
             let (mut line, norm) = meter.window.take();
             line.extend([("gradient_norm", norm), ("env_steps", env_steps)]);
-            line.extend(played_return);
-            line.extend([("clips_per_second", clips_per_second), ("playing", playing), ("seconds", elapsed)]);
+            line.extend(collected_return);
+            line.extend([("clips_per_second", clips_per_second), ("playing", interaction), ("seconds", elapsed)]);
             self.log.write(done, &line)?;
         }
         Ok(())
@@ -391,7 +392,7 @@ impl Run<'_> {
             best: learner.state().best.map(|(step, loss)| (step, -loss)),
             parameters: learner.parameter_count(),
             seconds,
-            playing: if seconds > 0.0 { meter.playing / seconds } else { 0.0 },
+            interaction: if seconds > 0.0 { meter.interaction_seconds / seconds } else { 0.0 },
         }
     }
 }
@@ -401,9 +402,9 @@ impl Meter {
         Self {
             start: Instant::now(),
             first_step,
-            playing: 0.0,
+            interaction_seconds: 0.0,
             window: MetricWindow::default(),
-            played_return: None,
+            collected_return: None,
             evaluated_return: None,
         }
     }

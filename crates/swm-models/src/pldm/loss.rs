@@ -43,7 +43,7 @@ pub struct Terms {
     pub temp_straight: Option<Tensor<1>>,
 }
 
-/// Number added to a variance before the square root.
+/// Added to a variance before the square root.
 const VARIANCE_EPSILON: f64 = 1e-4;
 /// The smallest length of a difference with a direction.
 const LENGTH_EPSILON: f64 = 1e-8;

@@ -1,4 +1,4 @@
-//! Reconstruction of images from latents, to look at what an encoder preserves.
+//! Reconstruction of images from latents, which show the information that an encoder preserves.
 
 use super::fit::{FitConfig, fit, rows};
 use super::scale::Scale;

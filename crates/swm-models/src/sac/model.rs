@@ -6,7 +6,7 @@ use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor};
 use swm_core::Key;
 
-/// A policy, two Q functions, their target networks, and the temperature. A field `_2` is number 2 of a sequence, as in
+/// A policy, two Q functions, their target networks, and the temperature. A field `_2` is element 2 of a sequence, as in
 /// PyTorch.
 #[derive(Module, Debug)]
 pub struct Sac {

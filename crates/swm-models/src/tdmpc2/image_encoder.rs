@@ -34,7 +34,7 @@ impl Convolution {
     }
 }
 
-/// The convolutions, each followed by Mish. A field `_2` is number 2 of a sequence, as in PyTorch.
+/// The convolutions, each followed by Mish. A field `_2` is element 2 of a sequence, as in PyTorch.
 #[derive(Module, Debug)]
 pub struct ImageCnn {
     /// The first convolution.

@@ -41,7 +41,7 @@ pub struct RunningScale {
     pub value: Param<Tensor<1>>,
 }
 
-/// The encoder of a column. A field `_1` is number 1 of a sequence, as in PyTorch.
+/// The encoder of a column. A field `_1` is element 1 of a sequence, as in PyTorch.
 #[derive(Module, Debug)]
 pub struct ColumnEncoder {
     /// Into the hidden features.

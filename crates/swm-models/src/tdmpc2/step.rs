@@ -45,7 +45,7 @@ pub struct Draws {
 }
 
 impl Draws {
-    /// Draws everything that a step needs.
+    /// Draws the random values of a step.
     pub fn new(key: Key, model: &Tdmpc2, shape: [usize; 3], training: bool) -> Self {
         let normal = |purpose: &str| {
             let mut rng = key.with(purpose).rng();

@@ -115,15 +115,15 @@ pub(crate) struct LoopConfig {
 const OPTIONAL: &str = "optim.accumulate = 1\noptim.ema = 0.0\nvalidation = { every = 0, batches = 8, patience = 0 }\n";
 
 impl<M: Trainable> TrainConfig<M> {
-    /// Loads a preset (its name, or the path of a TOML file), overridden by `key=value` words with dotted keys, such as
+    /// Loads a preset (its name, or the path of a TOML file), overridden by `key=value` settings with dotted keys, such as
     /// `optim.lr=3e-4`.
     ///
     /// # Errors
     /// When there is no such preset or key (naming the nearest), or a value does not fit.
-    pub fn load(preset: &str, words: &[String]) -> Result<Self> {
+    pub fn load(preset: &str, settings: &[String]) -> Result<Self> {
         let text = preset_text(M::PRESETS, preset)?;
         let presets: Vec<&str> = M::PRESETS.iter().map(|preset| preset.toml).chain([OPTIONAL]).collect();
-        let config: Self = parse(&text, words, &presets)?;
+        let config: Self = parse(&text, settings, &presets)?;
         config.check()?;
         Ok(config)
     }
@@ -139,7 +139,7 @@ impl<M: Trainable> TrainConfig<M> {
     /// Checks that the settings fit each other.
     ///
     /// # Errors
-    /// Naming the first that does not.
+    /// Names the first that does not.
     pub fn check(&self) -> Result<()> {
         at_least(&[
             ("data.num_steps", self.data.num_steps, 1),

@@ -15,7 +15,7 @@ pub struct DatasetInfo {
     pub action: ActionScale,
     /// The other numeric columns that the model observes.
     pub columns: Named<ColumnInfo>,
-    /// The environment the data came from, where the dataset names it.
+    /// The environment the data came from, if the dataset names it.
     pub env: Option<String>,
 }
 

@@ -1,6 +1,6 @@
-//! [`Learner`]: a model, its optimizer and their progress, as both training loops drive them.
+//! [`Learner`]: a model, its optimizer and their progress, which both training loops update.
 //!
-//! The loops see a model through the object-safe trait [`Learn`], so they are compiled once and not once per family.
+//! The loops access a model through the object-safe trait [`DynLearner`], so they are compiled once and not once per family.
 
 use super::config::TrainConfig;
 use super::dataset_info::DatasetInfo;
@@ -17,17 +17,17 @@ use std::path::Path;
 use swm_core::{Batch, Error, Key, Manifest, Result};
 
 /// The operations of a training loop on a model of any family.
-pub(crate) trait Learn {
+pub(crate) trait DynLearner {
     /// The progress of the run.
     fn state(&self) -> &RunState;
 
-    /// The progress of the run, to change.
+    /// The mutable progress of the run.
     fn state_mut(&mut self) -> &mut RunState;
 
     /// Saves the weights below `out` if `loss` is the lowest so far; returns whether it is.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// When writing fails.
     fn save_if_best(&mut self, loss: f64, out: &Path) -> Result<bool>;
 
     /// Loss and gradients of a batch; without `training`, of the averaged weights, where an average is kept.
@@ -39,10 +39,10 @@ pub(crate) trait Learn {
     /// Makes one optimizer step, then [`Trainable::after_step`] with `key`.
     fn update(&mut self, output: StepOutput, key: Key) -> Update;
 
-    /// Saves the checkpoint with all that is needed to continue, and returns the hash of its weights.
+    /// Saves the checkpoint with the state to continue from, and returns the hash of its weights.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// When writing fails.
     fn save(&self, out: &Path) -> Result<String>;
 
     /// The number of trained scalars.
@@ -53,7 +53,7 @@ pub(crate) trait Learn {
 pub(crate) struct Update {
     /// The metrics of the step.
     pub metrics: Metrics,
-    /// Its learning rate.
+    /// The learning rate of the step.
     pub lr: f64,
     /// The norm of the gradient before clipping.
     pub gradient_norm: f64,
@@ -66,9 +66,9 @@ const BEST: &str = "best";
 pub(crate) struct Learner<'a, M: Trainable> {
     config: &'a TrainConfig<M>,
     device: &'a Device,
-    /// The weights that are trained.
+    /// The trained weights.
     model: M,
-    /// Their exponential moving average, where one is kept.
+    /// The exponential moving average of the weights, where one is kept.
     average: Option<M>,
     dataset_info: DatasetInfo,
     manifest: Manifest,
@@ -110,7 +110,7 @@ impl<'a, M: Trainable> Learner<'a, M> {
     /// A model with initial weights, in a folder that is created.
     ///
     /// # Errors
-    /// When the data do not fit the configuration, or the disk refuses.
+    /// When the data do not fit the configuration, or writing fails.
     pub fn start(
         config: &'a TrainConfig<M>,
         dataset_info: DatasetInfo,
@@ -159,7 +159,7 @@ impl<'a, M: Trainable> Learner<'a, M> {
     }
 }
 
-impl<M: Trainable> Learn for Learner<'_, M> {
+impl<M: Trainable> DynLearner for Learner<'_, M> {
     fn state(&self) -> &RunState {
         &self.state
     }

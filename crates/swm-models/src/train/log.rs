@@ -57,7 +57,7 @@ impl Log {
     /// Writes the scalars of a step.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// When writing fails.
     pub fn write(&mut self, step: usize, scalars: Scalars<'_>) -> Result<()> {
         let mut object = serde_json::Map::new();
         object.insert("step".to_owned(), step.into());

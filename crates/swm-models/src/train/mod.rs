@@ -1,6 +1,6 @@
 //! Training on datasets: one loop for every [`Trainable`] model, its configuration and its logs.
 //!
-//! A run is decided by its configuration and its data. The step number alone decides which batches come next and which
+//! The configuration and the data determine a run. The step number alone decides which batches come next and which
 //! random numbers they use, so a run that was interrupted continues as if it had not been.
 //!
 //! Training by interaction with an environment is in [`crate::online`]; both loops drive a model through one learner.

@@ -36,7 +36,7 @@ fn one() -> usize {
     1
 }
 
-/// How the optimizer treats a parameter.
+/// The clipping group and the learning rate of a parameter.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ParameterGroup {
     /// The index of the clipping group: its parameters share one gradient norm.

@@ -14,9 +14,9 @@ pub struct TrainOptions {
     pub device: Device,
     /// Threads that compute; 0 for all.
     pub threads: usize,
-    /// Threads that load data.
+    /// Number of threads that load data.
     pub loader_threads: usize,
-    /// Batches loaded ahead.
+    /// Number of prefetched batches.
     pub prefetch: usize,
     /// The folder in which downloaded pretrained weights are cached.
     pub cache: PathBuf,

@@ -1,4 +1,4 @@
-//! Configurations from presets, TOML files and `key=value` words.
+//! Configurations from presets, TOML files and `key=value` settings.
 
 use figment::Figment;
 use figment::providers::{Format as _, Serialized, Toml};
@@ -9,9 +9,9 @@ use swm_core::{Error, Result};
 /// A named configuration.
 #[derive(Debug)]
 pub struct Preset {
-    /// Its name.
+    /// The name on the command line.
     pub id: &'static str,
-    /// What it is for, in a sentence.
+    /// One-sentence description of its purpose.
     pub summary: &'static str,
     /// The configuration.
     pub toml: &'static str,
@@ -34,20 +34,20 @@ pub(crate) fn preset_text(presets: &[Preset], preset: &str) -> Result<String> {
     }
 }
 
-/// Parses a configuration from TOML, overridden by `key=value` words with dotted keys. The valid keys are those of
+/// Parses a configuration from TOML, overridden by `key=value` settings with dotted keys. The valid keys are those of
 /// `presets`.
 ///
 /// # Errors
 /// When there is no such key (naming the nearest), or a value does not fit.
-pub(crate) fn parse<C: DeserializeOwned>(text: &str, words: &[String], presets: &[&str]) -> Result<C> {
-    merge(text, words, presets)?.extract().map_err(|error| {
+pub(crate) fn parse<C: DeserializeOwned>(text: &str, settings: &[String], presets: &[&str]) -> Result<C> {
+    merge(text, settings, presets)?.extract().map_err(|error| {
         let key = if error.path.is_empty() { "configuration".to_owned() } else { error.path.join(".") };
         Error::config(key, error.kind.to_string(), "give a value that fits (`--print-config` shows them all)")
     })
 }
 
-/// The TOML and the words merged, with their keys checked.
-fn merge(text: &str, words: &[String], presets: &[&str]) -> Result<Figment> {
+/// Merges the TOML and the settings, and checks the keys.
+fn merge(text: &str, settings: &[String], presets: &[&str]) -> Result<Figment> {
     let known = known_keys(presets);
     let check = |key: &str| {
         if known.iter().any(|name| name == key || name.starts_with(&format!("{key}."))) {
@@ -63,12 +63,12 @@ fn merge(text: &str, words: &[String], presets: &[&str]) -> Result<Figment> {
     keys.iter().try_for_each(|key| check(key))?;
 
     let mut figment = Figment::from(Toml::string(text));
-    for word in words {
-        let Some((key, value)) = word.split_once('=') else {
-            return Err(Error::config(word, "is not a setting", "write key=value, such as optim.lr=3e-4"));
+    for setting in settings {
+        let Some((key, value)) = setting.split_once('=') else {
+            return Err(Error::config(setting, "is not a setting", "write key=value, such as optim.lr=3e-4"));
         };
         check(key)?;
-        // A word that is no TOML value is a string.
+        // A setting that is no TOML value is a string.
         let value = toml::from_str::<toml::Table>(&format!("value = {value}"))
             .ok()
             .and_then(|mut table| table.remove("value"))

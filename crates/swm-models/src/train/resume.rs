@@ -16,7 +16,7 @@ pub(crate) fn refuse_existing(out: &Path) -> Error {
 /// Checks that a stored run has the configuration and the data of the requested one.
 ///
 /// # Errors
-/// Naming the settings that differ.
+/// Names the settings that differ.
 pub(crate) fn check_same_run(path: &Path, stored: &Manifest, requested: &Manifest) -> Result<()> {
     let problem = if stored.config != requested.config {
         let differing = differences("", &stored.config, &requested.config);

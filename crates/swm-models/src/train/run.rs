@@ -3,7 +3,7 @@
 use super::config::{LoopConfig, TrainConfig};
 use super::dataset_info::DatasetInfo;
 use super::failed_batch;
-use super::learner::{self, Learn, Learner, Update};
+use super::learner::{self, DynLearner, Learner, Update};
 use super::log::Log;
 use super::metrics::{MetricWindow, Metrics};
 use super::options::{TrainOptions, TrainSummary};
@@ -29,7 +29,7 @@ pub(crate) const STAGE: &str = "train";
 ///
 /// # Errors
 /// When the configuration contradicts itself or the data, `out` holds a run that cannot be continued, the loss or its
-/// gradient is not finite (the batch is saved), the caller's poll fails (after saving), or the disk refuses.
+/// gradient is not finite (the batch is saved), the caller's poll fails (after saving), or writing fails.
 pub fn train<M: Trainable>(
     config: &TrainConfig<M>,
     reader: Arc<dyn Reader>,
@@ -59,7 +59,7 @@ pub fn train<M: Trainable>(
 struct Run<'a> {
     config: LoopConfig,
     out: &'a Path,
-    learner: &'a mut dyn Learn,
+    learner: &'a mut dyn DynLearner,
     batches: Batches,
     validation: Option<Loader>,
     log: Log,
@@ -91,7 +91,7 @@ impl<'a> Run<'a> {
         reader: &Arc<dyn Reader>,
         out: &'a Path,
         options: &TrainOptions,
-        learner: &'a mut dyn Learn,
+        learner: &'a mut dyn DynLearner,
     ) -> Result<Self> {
         let loader = |part| {
             let config = LoaderConfig {

@@ -1,6 +1,6 @@
 //! Losses that are means over clips, computed in parallel.
 //!
-//! Burn computes on one thread; parallelism is ours. The configuration, not the machine, sets the number of shards a
+//! Burn computes on one thread, so shards of a batch run on several threads. The configuration, not the machine, sets the number of shards a
 //! batch is cut into. Each shard differentiates its own copy of the model, and the results are added in the order of
 //! the shards, so they do not depend on the number of threads.
 

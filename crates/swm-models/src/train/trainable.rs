@@ -21,7 +21,7 @@ use swm_data::LoaderConfig;
 pub trait Trainable: Module + Sync + 'static {
     /// The name of the family, as in `config.json` and on the command line.
     const FAMILY: &'static str;
-    /// What the family is, in a sentence.
+    /// One-sentence description of the family.
     const SUMMARY: &'static str;
     /// The built-in configurations; the first is the default.
     const PRESETS: &'static [Preset];
@@ -33,16 +33,16 @@ pub trait Trainable: Module + Sync + 'static {
     /// Weights and settings of the loss: the table `loss`.
     type Loss: Serialize + DeserializeOwned + Clone + Debug + PartialEq + Send + Sync;
 
-    /// Checks the settings that only the family understands; the loop checks its own.
+    /// Checks the settings of the family; the training loop checks the common ones.
     ///
     /// # Errors
-    /// Naming the first setting that does not fit the others.
+    /// Names the first setting that does not fit the others.
     fn check(config: &TrainConfig<Self>) -> Result<()>;
 
     /// The side of the square images that the model takes, in pixels; `None` for a state-only model.
     fn image_size(config: &Self::Config) -> Option<usize>;
 
-    /// What a batch holds: clip, columns and goals. The loop sets batch size, order, threads and episodes.
+    /// Returns the clips, columns and goals of a batch. The training loop sets batch size, order, threads and episodes.
     ///
     /// # Errors
     /// When the dataset lacks a column, or it is of another shape.
@@ -87,7 +87,7 @@ pub struct StepContext<'a, M: Trainable> {
     pub config: &'a TrainConfig<M>,
     /// Statistics of the dataset.
     pub dataset_info: &'a DatasetInfo,
-    /// Decides the random numbers of this step.
+    /// The key of the step's random draws.
     pub key: Key,
     /// The device that holds the tensors.
     pub device: &'a Device,

@@ -119,7 +119,7 @@ fn damaged(path: &Path, problem: String) -> Error {
 /// else. `what` names the module in errors, such as "the model of config.json".
 ///
 /// # Errors
-/// Naming the first weight that is missing, of another shape, or not one of the module.
+/// Names the first weight that is missing, of another shape, or not one of the module.
 pub fn fill<M: Module>(module: M, weights: &Named<HostTensor>, path: &Path, what: &str) -> Result<M> {
     match mismatch(&parameters::shapes(&module), weights, what) {
         Some(problem) => Err(Error::corrupt(path, problem, format!("give the weights of {what}"))),

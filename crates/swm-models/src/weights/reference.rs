@@ -16,7 +16,7 @@ pub(crate) struct Reference {
     pub path: PathBuf,
     /// The tree of classes, from the model down.
     pub config: Value,
-    /// Its keys, in the order of the file.
+    /// The keys of the tree, in the order of the file.
     pub keys: Keys,
     /// The state dict, without the counters of batch normalisations.
     pub weights: Named<HostTensor>,

@@ -14,7 +14,7 @@ pub const BATCHES_TRACKED: &str = "num_batches_tracked";
 /// batch normalisations ([`BATCHES_TRACKED`]), which are integers in PyTorch.
 ///
 /// # Errors
-/// When the disk refuses.
+/// When writing fails.
 pub fn write(path: &Path, tensors: &Named<HostTensor>) -> Result<()> {
     let failed = |error: std::io::Error| Error::io(path, "writing weights", error);
     let file = std::fs::File::create(path).map_err(failed)?;

@@ -1,4 +1,4 @@
-//! Configurations load from presets and `key=value` words, and errors name the setting.
+//! Configurations from presets and `key=value` settings, and errors that name the setting.
 
 use swm_models::lewm::Lewm;
 use swm_models::{TrainConfig, Trainable as _};
@@ -6,21 +6,21 @@ use swm_models::{TrainConfig, Trainable as _};
 type Config = TrainConfig<Lewm>;
 
 #[test]
-fn presets_round_trip_and_words_override_them() {
+fn presets_round_trip_and_settings_override_them() {
     for preset in Lewm::PRESETS {
         let config = Config::load(preset.id, &[]).expect(preset.id);
         let text = config.to_toml().expect("TOML");
         let again = toml::from_str::<Config>(&text).expect("the same");
         assert_eq!(again.to_toml().expect("TOML"), text);
     }
-    let words = ["optim.lr=3e-4".to_owned(), "model.latent=16".to_owned(), "optim.betas=[0.9, 0.99]".to_owned()];
-    let config = Config::load("tiny", &words).expect("a configuration");
+    let settings = ["optim.lr=3e-4".to_owned(), "model.latent=16".to_owned(), "optim.betas=[0.9, 0.99]".to_owned()];
+    let config = Config::load("tiny", &settings).expect("a configuration");
     assert_eq!((config.optim.lr, config.model.latent, config.optim.betas[1]), (3e-4, 16, 0.99));
 }
 
 #[test]
 fn invalid_settings_are_named() {
-    let message = |word: &str| Config::load("tiny", &[word.to_owned()]).expect_err("invalid").to_string();
+    let message = |setting: &str| Config::load("tiny", &[setting.to_owned()]).expect_err("invalid").to_string();
     assert!(message("optim.rl=1").contains("did you mean optim.lr"), "{}", message("optim.rl=1"));
     assert!(message("optim.lr=fast").contains("optim.lr"), "{}", message("optim.lr=fast"));
     assert!(message("optim.lr").contains("key=value"));

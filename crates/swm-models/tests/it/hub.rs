@@ -1,4 +1,4 @@
-//! Files of the Hugging Face hub, from a server on loopback.
+//! Downloads and caching of Hugging Face files, with a server on the loopback interface.
 
 use std::io::{BufRead as _, BufReader, Write as _};
 use std::net::TcpListener;
@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use swm_models::weights::hub::Hub;
 
-const FILE: &[u8] = b"not very heavy weights";
+const FILE: &[u8] = b"the content of a weights file";
 
 /// Serves one file at the hub's path for it. Returns the address of the server and the number of requests.
 fn serve() -> (String, Arc<AtomicUsize>) {
@@ -47,11 +47,11 @@ fn serve() -> (String, Arc<AtomicUsize>) {
 }
 
 #[test]
-fn files_are_fetched_once() {
+fn files_are_downloaded_once() {
     let folder = tempfile::tempdir().expect("a folder");
     let (address, requests) = serve();
     let hub = Hub::at(&address, folder.path());
-    let path = hub.fetch("owner/name", "model.safetensors").expect("it is there");
+    let path = hub.fetch("owner/name", "model.safetensors").expect("the served file");
     assert_eq!(std::fs::read(&path).expect("cached"), FILE);
     assert!(path.ends_with("models--owner--name/snapshots/main/model.safetensors"), "{}", path.display());
     let before = requests.load(Ordering::Relaxed);
@@ -64,7 +64,7 @@ fn files_are_fetched_once() {
 #[test]
 fn unreachable_hub_error_names_the_fix() {
     let folder = tempfile::tempdir().expect("a folder");
-    // A name that can never be resolved.
+    // The top-level domain `invalid` is reserved and never resolves.
     let hub = Hub::at("http://hub.invalid", folder.path());
     let message = hub.fetch("owner/name", "model.safetensors").expect_err("unreachable").to_string();
     assert!(message.contains("check the network connection") && message.contains("give the file's path"), "{message}");

@@ -13,7 +13,7 @@ use swm_models::{TrainConfig, TrainOptions, Trainable, train};
 const PENDULUM: &str = "swm/PendulumControl-v1";
 
 /// Networks of a few hundred parameters, episodes of 20 steps.
-fn config<M: Trainable>(words: &[&str]) -> TrainConfig<M> {
+fn config<M: Trainable>(settings: &[&str]) -> TrainConfig<M> {
     let family: &[&str] = match M::FAMILY {
         "sac" => &["model.hidden=8"],
         _ => &[
@@ -41,8 +41,9 @@ fn config<M: Trainable>(words: &[&str]) -> TrainConfig<M> {
         "online.evaluate_episodes=4",
         "log_every=8",
     ];
-    let words: Vec<String> = family.iter().chain(&small).chain(words).map(|&word| word.to_owned()).collect();
-    TrainConfig::load("tiny", &words).expect("a configuration")
+    let settings: Vec<String> =
+        family.iter().chain(&small).chain(settings).map(|&setting| setting.to_owned()).collect();
+    TrainConfig::load("tiny", &settings).expect("a configuration")
 }
 
 /// Makes pools of the environment `id`, whose episodes are truncated after `steps` steps.
@@ -58,17 +59,19 @@ fn run<M: Agent>(config: &TrainConfig<M>, out: &Path, options: &TrainOptions, st
     train_online(config, &pools(PENDULUM, Some(20)), out, options, &mut stop_after(stop_at))
 }
 
-/// The files that depend on the configuration alone.
+/// Reads the files of a run that are determined by its configuration.
 fn files(run: &Path) -> Vec<Vec<u8>> {
     let of = |folder: &str, name: &str| std::fs::read(run.join(folder).join(name)).expect(name);
-    let played = std::fs::read_dir(run).expect("a folder").map(|entry| entry.expect("an entry").file_name());
-    let played: Vec<String> =
-        played.map(|name| name.to_string_lossy().into_owned()).filter(|name| name.starts_with("played-")).collect();
-    assert_eq!(played.len(), 1, "{played:?}");
+    let data_folders = std::fs::read_dir(run).expect("a folder").map(|entry| entry.expect("an entry").file_name());
+    let data_folders: Vec<String> = data_folders
+        .map(|name| name.to_string_lossy().into_owned())
+        .filter(|name| name.starts_with("played-"))
+        .collect();
+    assert_eq!(data_folders.len(), 1, "{data_folders:?}");
     let mut files: Vec<Vec<u8>> = ["config.json", "weights.safetensors", "optimizer.safetensors", "state.json"]
         .map(|name| of("checkpoint", name))
         .to_vec();
-    files.push(of(&played[0], "place.json"));
+    files.push(of(&data_folders[0], "place.json"));
     files
 }
 
@@ -146,18 +149,16 @@ fn invalid_settings_and_data_are_refused() {
     let missing = refused(&offline, PENDULUM);
     assert!(missing.contains("online") && missing.contains("--data"), "{missing}");
 
-    let message = |word: &str| {
-        let words = [word.to_owned()];
-        TrainConfig::<Tdmpc2>::load("tiny", &words).expect_err("invalid").to_string()
-    };
+    let message =
+        |setting: &str| TrainConfig::<Tdmpc2>::load("tiny", &[setting.to_owned()]).expect_err("invalid").to_string();
     assert!(message("model.simplex=7").contains("multiple"), "{}", message("model.simplex=7"));
     assert!(message("data.frameskip=5").contains("rewards"), "{}", message("data.frameskip=5"));
     assert!(message("loss.discount=1.5").contains("loss.discount"));
 
-    let rewardless = Arc::new(crate::dots::Dots::new(6, 0));
+    let without_rewards = Arc::new(crate::dots::Dots::new(6, 0));
     let error = train(
         &config::<Tdmpc2>(&[]),
-        rewardless,
+        without_rewards,
         &folder.path().join("dots"),
         &TrainOptions::default(),
         &mut Control::new(),

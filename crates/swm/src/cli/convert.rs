@@ -83,8 +83,8 @@ pub fn convert(args: &ConvertArgs, context: &Context) -> anyhow::Result<()> {
 /// Returns a summary of a conversion for people.
 pub fn describe(report: &Converted, target: &Location, seconds: f64) -> String {
     let mut text = format!("{} episodes in {target}", report.episodes);
-    if report.kept > 0 {
-        text += &format!(", {} of them from an earlier run", report.kept);
+    if report.existing > 0 {
+        text += &format!(", {} of them from an earlier run", report.existing);
     }
     text += &format!(" ({} rows written, {seconds:.1} s)\n", report.rows);
     if let Some(size) = target.path().and_then(|path| swm_data::open(path).ok()?.footprint().ok()) {

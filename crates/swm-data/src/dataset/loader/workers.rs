@@ -1,4 +1,4 @@
-//! Worker threads that load numbered batches ahead of their consumer, in order, within a bounded window.
+//! Worker threads that prefetch batches in the order of their indices, within a bounded window.
 
 use crate::dataset::sync::lock;
 use std::collections::VecDeque;
@@ -9,9 +9,9 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 use swm_core::{Batch, Error, Result, Schema};
 
-/// Produces numbered batches. Several threads call it at once.
+/// Produces batches by index. Several threads call it concurrently.
 pub(crate) trait BatchSource: Send + Sync {
-    /// Produces a batch. The same number always gives the same batch.
+    /// Produces a batch. The same index always gives the same batch.
     fn produce(&self, batch: usize) -> Result<LoadedBatch>;
 }
 
@@ -47,15 +47,15 @@ impl DerefMut for LoadedBatch {
 impl Drop for LoadedBatch {
     fn drop(&mut self) {
         if let Some(batch) = self.batch.take() {
-            let mut kept = lock(&self.pool.batches);
-            if kept.len() < self.pool.limit {
-                kept.push(batch);
+            let mut spare = lock(&self.pool.batches);
+            if spare.len() < self.pool.limit {
+                spare.push(batch);
             }
         }
     }
 }
 
-/// Batches to reuse.
+/// Batches whose memory is reused.
 pub(crate) struct BatchPool {
     batches: Mutex<Vec<Batch>>,
     limit: usize,
@@ -66,7 +66,7 @@ impl BatchPool {
         Arc::new(Self { batches: Mutex::default(), limit })
     }
 
-    /// A batch to fill, with any number of rows and any content.
+    /// Returns a batch to fill: a reused one, with its old rows and content, or an empty one.
     pub fn take(self: &Arc<Self>, schema: &Schema) -> LoadedBatch {
         let batch = lock(&self.batches).pop().unwrap_or_else(|| Batch::zeros(schema, 0));
         LoadedBatch { batch: Some(batch), pool: Arc::clone(self) }
@@ -96,16 +96,16 @@ struct State {
 
 struct Job {
     id: u64,
-    producer: Arc<dyn BatchSource>,
-    /// The batch that the consumer gets next.
+    source: Arc<dyn BatchSource>,
+    /// The next batch that the consumer takes.
     next_out: usize,
     /// The first batch that no thread has started.
     next: usize,
     end: usize,
     /// Maximum number of batches that are started and not consumed.
     window: usize,
-    /// Batches from `next_out` on, if finished.
-    made: VecDeque<Option<Result<LoadedBatch>>>,
+    /// Results of the batches from `next_out` on; `None` for unfinished ones.
+    finished: VecDeque<Option<Result<LoadedBatch>>>,
 }
 
 impl Shared {
@@ -125,21 +125,21 @@ impl Shared {
                 state = self.wait(state);
                 continue;
             };
-            let (id, batch, producer) = (job.id, job.next, Arc::clone(&job.producer));
+            let (id, batch, source) = (job.id, job.next, Arc::clone(&job.source));
             job.next += 1;
             drop(state);
             // A panic becomes an error for the consumer, which would otherwise wait forever.
-            let made = catch_unwind(AssertUnwindSafe(|| producer.produce(batch)))
+            let result = catch_unwind(AssertUnwindSafe(|| source.produce(batch)))
                 .unwrap_or_else(|_| Err(Error::external("loading a batch", "a loader thread panicked; this is a bug")));
-            drop(producer);
+            drop(source);
             state = self.lock();
             // If the consumer dropped the epoch, its job is gone and the batch is dropped.
             if let Some(job) = state.jobs.iter_mut().find(|job| job.id == id) {
                 let slot = batch - job.next_out;
-                if job.made.len() <= slot {
-                    job.made.resize_with(slot + 1, || None);
+                if job.finished.len() <= slot {
+                    job.finished.resize_with(slot + 1, || None);
                 }
-                job.made[slot] = Some(made);
+                job.finished[slot] = Some(result);
                 self.changed.notify_all();
             }
         }
@@ -160,20 +160,20 @@ impl Workers {
     }
 
     /// Starts loading batches, at most `window` ahead.
-    pub fn start(workers: &Arc<Self>, producer: Arc<dyn BatchSource>, batches: Range<usize>, window: usize) -> Epoch {
+    pub fn start(workers: &Arc<Self>, source: Arc<dyn BatchSource>, batches: Range<usize>, window: usize) -> Epoch {
         let mut id = 0;
         if !workers.threads.is_empty() {
             let mut state = workers.shared.lock();
             id = state.next_id;
             state.next_id += 1;
             let (first, end) = (batches.start, batches.end);
-            let made = VecDeque::with_capacity(window);
-            let producer = Arc::clone(&producer);
-            state.jobs.push(Job { id, producer, next_out: first, next: first, end, window, made });
+            let finished = VecDeque::with_capacity(window);
+            let source = Arc::clone(&source);
+            state.jobs.push(Job { id, source, next_out: first, next: first, end, window, finished });
             drop(state);
             workers.shared.changed.notify_all();
         }
-        Epoch { workers: Arc::clone(workers), producer, id, left: batches }
+        Epoch { workers: Arc::clone(workers), source, id, remaining: batches }
     }
 }
 
@@ -191,25 +191,25 @@ impl Drop for Workers {
 /// The batches of one epoch, in order. Dropping it stops prefetching.
 pub struct Epoch {
     workers: Arc<Workers>,
-    producer: Arc<dyn BatchSource>,
+    source: Arc<dyn BatchSource>,
     id: u64,
-    left: Range<usize>,
+    remaining: Range<usize>,
 }
 
 impl Iterator for Epoch {
     type Item = Result<LoadedBatch>;
 
     fn next(&mut self) -> Option<Self::Item> {
-        let batch = self.left.next()?;
-        let result = if self.workers.threads.is_empty() { self.producer.produce(batch) } else { self.wait_for(batch) };
+        let batch = self.remaining.next()?;
+        let result = if self.workers.threads.is_empty() { self.source.produce(batch) } else { self.wait_for(batch) };
         if result.is_err() {
-            self.left = 0..0;
+            self.remaining = 0..0;
         }
         Some(result)
     }
 
     fn size_hint(&self) -> (usize, Option<usize>) {
-        (0, Some(self.left.len()))
+        (0, Some(self.remaining.len()))
     }
 }
 
@@ -217,13 +217,13 @@ impl Epoch {
     /// Waits until [`Iterator::next`] can return without blocking, at most for `at_most`. Returns whether it can.
     /// Callers that must also check for signals call it repeatedly.
     pub fn wait(&self, at_most: Duration) -> bool {
-        if self.left.is_empty() || self.workers.threads.is_empty() {
+        if self.remaining.is_empty() || self.workers.threads.is_empty() {
             return true;
         }
         let shared = &self.workers.shared;
         let waiting = |state: &mut State| {
             let job = state.jobs.iter().find(|job| job.id == self.id);
-            job.is_some_and(|job| !matches!(job.made.front(), Some(Some(_))))
+            job.is_some_and(|job| !matches!(job.finished.front(), Some(Some(_))))
         };
         let waited = shared.changed.wait_timeout_while(shared.lock(), at_most, waiting);
         !waited.unwrap_or_else(PoisonError::into_inner).1.timed_out()
@@ -236,12 +236,12 @@ impl Epoch {
             let Some(job) = state.jobs.iter_mut().find(|job| job.id == self.id) else {
                 return Err(Error::external("loading a batch", "its epoch has ended; this is a bug"));
             };
-            if let Some(made) = job.made.front_mut().and_then(Option::take) {
-                job.made.pop_front();
+            if let Some(result) = job.finished.front_mut().and_then(Option::take) {
+                job.finished.pop_front();
                 job.next_out = batch + 1;
                 drop(state);
                 shared.changed.notify_all();
-                return made;
+                return result;
             }
             state = shared.wait(state);
         }

@@ -1,5 +1,7 @@
-//! [`BlockCache`]: an in-memory cache of blocks of objects. A request costs as much as transferring a megabyte, so
-//! small ranges in random order, as training reads them, are not fetched one by one.
+//! [`BlockCache`]: an in-memory cache of blocks of objects.
+//!
+//! A request costs as much as transferring a megabyte. Training reads small ranges in random order, so the cache fetches
+//! whole blocks, several neighbours per request.
 
 use bytes::{Bytes, BytesMut};
 use futures::{StreamExt as _, TryStreamExt as _};
@@ -12,7 +14,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 /// Capacity of the cache in bytes.
 const CAPACITY: u64 = 1 << 30;
 
-/// Block size in bytes if all blocks fit into the cache, because each is read sooner or later.
+/// Block size in bytes if all blocks fit into the cache: each byte is then fetched at most once.
 const LARGE: u64 = 1 << 20;
 
 /// Block size in bytes if most blocks are evicted before they are read again.
@@ -69,7 +71,7 @@ impl BlockCache {
     ) -> object_store::Result<Vec<Vec<Bytes>>> {
         let mut held = HashMap::new();
         if !self.hold(objects, &mut held) {
-            let _one = self.fetching.lock().await;
+            let _guard = self.fetching.lock().await;
             // Another reader may have fetched these blocks in the meantime.
             self.hold(objects, &mut held);
             self.fetch(store, objects, &mut held).await?;
@@ -236,8 +238,8 @@ mod tests {
                 let cached = blocks.cached();
                 assert!(cached.bytes <= 200 && cached.order.len() == cached.blocks.len());
             }
-            let gone = ObjectRanges { path: "none".into(), size: 10, ranges: vec![0..4, 5..6] };
-            assert!(blocks.read(&store, &[gone]).await.is_err());
+            let missing = ObjectRanges { path: "none".into(), size: 10, ranges: vec![0..4, 5..6] };
+            assert!(blocks.read(&store, &[missing]).await.is_err());
         });
     }
 }

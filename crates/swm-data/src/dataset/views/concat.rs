@@ -22,12 +22,12 @@ pub fn concat(parts: Vec<Arc<dyn Reader>>) -> Result<Arc<dyn Reader>> {
     };
     let columns = data(first);
     for (i, part) in parts.iter().enumerate() {
-        let theirs = data(part);
+        let part_columns = data(part);
         let without = |a: &[ColumnSpec], b: &[ColumnSpec]| {
             let missing: Vec<ColumnSpec> = a.iter().filter(|&column| !b.contains(column)).cloned().collect();
             (!missing.is_empty()).then(|| describe_columns(&missing))
         };
-        let (missing, extra) = (without(&columns, &theirs), without(&theirs, &columns));
+        let (missing, extra) = (without(&columns, &part_columns), without(&part_columns, &columns));
         if missing.is_some() || extra.is_some() {
             return Err(Error::mismatch(
                 format!("concatenating dataset {} to the first", i + 1),

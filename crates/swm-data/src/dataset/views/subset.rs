@@ -12,21 +12,21 @@ use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
 /// If there is none, a position does not exist, or a position appears twice.
 pub fn subset(reader: Arc<dyn Reader>, positions: Vec<usize>) -> Result<Arc<dyn Reader>> {
     let all = reader.episodes();
-    let mut seen = vec![false; all.len()];
+    let mut selected = vec![false; all.len()];
     for &position in &positions {
-        match seen.get_mut(position) {
+        match selected.get_mut(position) {
             None => {
-                let known = format!("positions below {}", all.len());
-                return Err(Error::mismatch("choosing episodes", format!("position {position}"), known));
+                let expected = format!("positions below {}", all.len());
+                return Err(Error::mismatch("choosing episodes", format!("position {position}"), expected));
             }
             Some(true) => {
                 return Err(Error::mismatch(
                     "choosing episodes",
                     format!("position {position} twice"),
-                    "each one once",
+                    "each position at most once",
                 ));
             }
-            Some(seen) => *seen = true,
+            Some(selected) => *selected = true,
         }
     }
     if positions.is_empty() {
@@ -66,8 +66,8 @@ struct Subset {
 impl Subset {
     fn position(&self, episode: usize) -> Result<usize> {
         if episode >= self.episodes.len() {
-            let known = format!("positions below {}", self.episodes.len());
-            return Err(Error::mismatch("reading rows", format!("episode position {episode}"), known));
+            let expected = format!("positions below {}", self.episodes.len());
+            return Err(Error::mismatch("reading rows", format!("episode position {episode}"), expected));
         }
         Ok(self.positions.as_ref().map_or(episode, |positions| positions[episode]))
     }

@@ -1,4 +1,4 @@
-//! Column files: the common part of the formats `folder` and `video`, as in the reference's datasets of these kinds. A
+//! Column files: the common part of the formats `folder` and `video`, as in the reference's datasets of these formats. A
 //! folder holds each numeric column in one file, and a subfolder for each image column, which the formats define.
 //!
 //! ```text
@@ -14,10 +14,10 @@
 //! files start with `ep_len` as well.
 //!
 //! **Commits.** Arrays in archives cannot grow in place. Finished episodes are appended to the journal, each as a
-//! record with a checksum. Now and then, and at the end, the journal is merged into the column files: each is written
+//! record with a checksum. A merge copies the journal into the column files: each is written
 //! to a temporary file and renamed, `ep_len.npz` last. Readers use only as many rows of a column file as `ep_len.npz`
-//! declares. The journal is merged when it is half as long as the column files, so the total amount written is a small
-//! multiple of the data.
+//! declares. The journal is merged when it is half as long as the column files, and when the writer finishes, so the
+//! total amount written is a small multiple of the data.
 
 mod journal;
 mod npz;
@@ -40,7 +40,7 @@ const OFFSETS: &str = "ep_offset";
 /// The member of `ep_len.npz` with [`Metadata`].
 const METADATA: &str = "stable_worldmodel.json";
 
-/// Metadata of the dataset, stored beside the lengths.
+/// Metadata of the dataset, stored in `ep_len.npz`.
 #[derive(Default, Serialize, Deserialize)]
 struct Metadata {
     /// All columns, including images.
@@ -56,7 +56,7 @@ fn constant_member(index: usize) -> String {
     format!("constants/{index}")
 }
 
-/// An episode that is only in the journal.
+/// An episode in the journal that is not yet in the column files.
 struct PendingEpisode {
     rows: usize,
     /// The bytes of each numeric column.

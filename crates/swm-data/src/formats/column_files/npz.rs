@@ -106,7 +106,7 @@ impl Npz {
         };
         let count = header.shape.iter().try_fold(1_usize, |n, &side| n.checked_mul(side));
         let Some(count) = count.filter(|n| n.checked_mul(stored.size) == Some(bytes.len() - start)) else {
-            let problem = format!("{} bytes do not make an array {:?}", bytes.len() - start, header.shape);
+            let problem = format!("{} bytes do not fit an array of shape {:?}", bytes.len() - start, header.shape);
             return Err(damaged(&self.path, problem));
         };
         if stored.is_plain() {
@@ -125,28 +125,28 @@ fn damaged(path: &Path, problem: impl std::fmt::Display) -> Error {
 
 /// Parses a header. Returns it with the offset of the elements.
 fn parse(bytes: &[u8]) -> Result<(Header, usize), String> {
-    let cut = || "the array's header is cut off".to_owned();
-    let (start, length) = match bytes.get(..12).ok_or_else(cut)? {
+    let truncated = || "the array's header is truncated".to_owned();
+    let (start, length) = match bytes.get(..12).ok_or_else(truncated)? {
         [0x93, b'N', b'U', b'M', b'P', b'Y', 1, _, a, b, ..] => (10, u32::from(u16::from_le_bytes([*a, *b]))),
         [0x93, b'N', b'U', b'M', b'P', b'Y', 2 | 3, _, a, b, c, d] => (12, u32::from_le_bytes([*a, *b, *c, *d])),
-        _ => return Err("it is not a numpy array".to_owned()),
+        _ => return Err("it is not a NumPy array".to_owned()),
     };
-    let end = usize::try_from(length).ok().and_then(|length| length.checked_add(start)).ok_or_else(cut)?;
-    let text = std::str::from_utf8(bytes.get(start..end).ok_or_else(cut)?).map_err(|e| e.to_string())?;
+    let end = usize::try_from(length).ok().and_then(|length| length.checked_add(start)).ok_or_else(truncated)?;
+    let text = std::str::from_utf8(bytes.get(start..end).ok_or_else(truncated)?).map_err(|e| e.to_string())?;
     let field = |name: &str| {
         let (_, rest) = text.split_once(&format!("'{name}':"))?;
         Some(rest.trim_start())
     };
-    let strange = || format!("the array's header is invalid: {}", text.trim_end());
-    if !field("fortran_order").ok_or_else(strange)?.starts_with("False") {
+    let invalid = || format!("the array's header is invalid: {}", text.trim_end());
+    if !field("fortran_order").ok_or_else(invalid)?.starts_with("False") {
         return Err("the array is in Fortran order; save numpy.ascontiguousarray of it".to_owned());
     }
-    let shape = field("shape").and_then(|rest| rest.strip_prefix('(')?.split_once(')')).ok_or_else(strange)?.0;
+    let shape = field("shape").and_then(|rest| rest.strip_prefix('(')?.split_once(')')).ok_or_else(invalid)?.0;
     let shape: Result<Vec<usize>, _> =
         shape.split(',').map(str::trim).filter(|side| !side.is_empty()).map(str::parse).collect();
     // Structured types are lists; all others are quoted strings.
-    let descr = field("descr").and_then(|rest| rest.strip_prefix('\'')?.split_once('\'')).map(|(word, _)| word);
-    Ok((Header { stored: descr.and_then(scalar_type), shape: shape.map_err(|_| strange())? }, end))
+    let descr = field("descr").and_then(|rest| rest.strip_prefix('\'')?.split_once('\'')).map(|(descr, _)| descr);
+    Ok((Header { stored: descr.and_then(scalar_type), shape: shape.map_err(|_| invalid())? }, end))
 }
 
 /// Parses a numeric NumPy type, such as `<f4`.
@@ -245,7 +245,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn arrays_come_back() {
+    fn arrays_and_members_round_trip() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("a.npz");
         let mut writer = NpzWriter::create(&path).expect("creates");
@@ -263,7 +263,7 @@ mod tests {
     }
 
     #[test]
-    fn headers_of_other_arrays() {
+    fn parses_headers_of_text_scalars_and_invalid_arrays() {
         let array = |text: &str| {
             let mut bytes = b"\x93NUMPY\x02\x00".to_vec();
             bytes.extend((text.len() as u32).to_le_bytes());
@@ -273,10 +273,10 @@ mod tests {
         let text = array("{'descr': '<U5', 'fortran_order': False, 'shape': (4,), }").expect("text is an array");
         assert_eq!((text.stored, text.rows()), (None, 4));
         let scalar = array("{'descr': '>f8', 'fortran_order': False, 'shape': (), }").expect("an array");
-        assert_eq!((scalar.stored.expect("a number").big_endian, scalar.rows()), (true, 1));
+        assert_eq!((scalar.stored.expect("a numeric type").big_endian, scalar.rows()), (true, 1));
         let columns = array("{'descr': '<f8', 'fortran_order': True, 'shape': (2, 3), }").expect_err("columns");
         assert!(columns.contains("ascontiguousarray"), "{columns}");
         assert!(array("{'descr': '<f8', 'fortran_order': False, 'shape': (-2, 3), }").is_err());
-        assert!(parse(b"PK\x03\x04 is something else").expect_err("no array").contains("not a numpy array"));
+        assert!(parse(b"PK\x03\x04 is something else").expect_err("no array").contains("not a NumPy array"));
     }
 }

@@ -18,7 +18,7 @@ pub(crate) struct ColumnFiles {
     recorded: Metadata,
     columns: Vec<Column>,
     skipped: Vec<String>,
-    /// Constants of the episodes that are only in the journal.
+    /// Constants of the episodes that are in the journal but not yet in the column files.
     pending_constants: Vec<Constants>,
 }
 
@@ -26,7 +26,7 @@ struct Column {
     spec: ColumnSpec,
     /// Number of committed rows in the column's file, which may hold more.
     in_file: usize,
-    /// Rows that are only in the journal.
+    /// Rows that are in the journal but not yet in the column's file.
     unmerged_rows: Vec<u8>,
     data: OnceLock<Vec<u8>>,
 }
@@ -76,12 +76,12 @@ impl ColumnFiles {
         Ok(Self { folder: folder.to_owned(), rows, recorded, columns, skipped, pending_constants })
     }
 
-    /// The rows of the episodes.
+    /// The rows of each episode.
     pub const fn rows(&self) -> &EpisodeRows {
         &self.rows
     }
 
-    /// The folder.
+    /// The folder of the dataset.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
@@ -91,7 +91,7 @@ impl ColumnFiles {
         self.columns.iter().map(|column| &column.spec)
     }
 
-    /// The schema passed to the writer, including image columns; `None` for datasets of other programs.
+    /// The schema passed to the writer, including image columns; `None` for third-party datasets.
     pub const fn recorded(&self) -> Option<&Schema> {
         self.recorded.schema.as_ref()
     }
@@ -113,7 +113,7 @@ impl ColumnFiles {
         Schema::new(columns)
     }
 
-    /// Whether this is an index column or a numeric column.
+    /// Returns whether `name` is an index column or a numeric column.
     pub fn has(&self, name: &str) -> bool {
         self.columns().any(|column| column.name == name) || name == EPISODE_IDX || name == STEP_IDX
     }
@@ -195,7 +195,7 @@ impl ColumnFiles {
         named.iter().map(|(name, &index)| Ok((name.clone(), lengths.member(&constant_member(index))?))).collect()
     }
 
-    /// Columns in files without numeric elements.
+    /// Names of the column files without numeric elements, which are not read.
     pub(super) fn skipped(&self) -> &[String] {
         &self.skipped
     }
@@ -217,7 +217,7 @@ impl ColumnFiles {
         self.rows.episodes().len() - self.pending_constants.len()
     }
 
-    /// Bytes per column (including subfolders) and for the rest, largest first.
+    /// Bytes per column (including subfolders) and of all other files together, largest first.
     ///
     /// # Errors
     /// If the folder cannot be listed.
@@ -258,7 +258,7 @@ fn folder_size(folder: &Path) -> Result<u64> {
 fn columns(folder: &Path, recorded: &Metadata, rows: usize) -> Result<(Vec<Column>, Vec<String>)> {
     let names: Vec<String> = match &recorded.schema {
         Some(schema) => schema.columns().iter().filter(|c| !c.is_image()).map(|c| c.name.clone()).collect(),
-        None => names_of_files(folder)?,
+        None => column_file_names(folder)?,
     };
     let (mut columns, mut skipped) = (vec![], vec![]);
     for name in names {
@@ -292,8 +292,8 @@ fn columns(folder: &Path, recorded: &Metadata, rows: usize) -> Result<(Vec<Colum
     Ok((columns, skipped))
 }
 
-/// The columns of a folder that another program wrote, by name.
-fn names_of_files(folder: &Path) -> Result<Vec<String>> {
+/// The columns of a third-party folder, by name.
+fn column_file_names(folder: &Path) -> Result<Vec<String>> {
     let io = |e| Error::io(folder, "listing the folder", e);
     let mut names = vec![];
     for entry in std::fs::read_dir(folder).map_err(io)? {

@@ -1,4 +1,4 @@
-//! The format `folder`: numeric columns in column files, and one image file per step, which any program can display.
+//! The format `folder`: numeric columns in column files, and one image file per step, which image viewers can display.
 //!
 //! ```text
 //! NAME.folder/

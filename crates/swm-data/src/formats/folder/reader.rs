@@ -101,7 +101,7 @@ impl Reader for FolderReader {
     }
 }
 
-/// The image columns of a folder that another program wrote: its subfolders, by name. The first image determines the
+/// The image columns of a third-party folder: its subfolders, by name. The first image determines the
 /// size of all.
 fn infer_image_columns(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
     let folder = files.folder();

@@ -11,9 +11,9 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
 
-/// Block size for reading the structure of a remote file,
+/// Block size for reading the structure of a remote file, in bytes.
 const BLOCK: u64 = 256 << 10;
-/// and number of cached blocks.
+/// Maximum number of cached blocks of a remote file.
 const CACHED_BLOCKS: usize = 256;
 
 /// A readable file. Clones share it.
@@ -58,7 +58,7 @@ impl Source {
         Ok(Self(Arc::new(Kind::Local { file, path: path.to_owned(), len })))
     }
 
-    /// How messages show the file.
+    /// The file in error messages.
     pub fn label(&self) -> &Path {
         match &*self.0 {
             Kind::Local { path, .. } => path,

@@ -1,4 +1,4 @@
-//! Writes one HDF5 dataset: rows become chunks, and commits make them visible.
+//! Writes one HDF5 dataset: stores rows in chunks, which readers see after the next commit.
 
 use super::filters::{fletcher32, lzf};
 use super::layout::{Table, summed_bytes};
@@ -10,11 +10,11 @@ use std::fs::File;
 use std::io;
 use std::os::unix::fs::FileExt as _;
 
-/// Mask of the filter that is skipped for uncompressed chunks: the first, LZF.
+/// Filter mask of a chunk that is stored without LZF, the first filter.
 const NOT_COMPRESSED: u32 = 1;
 
-/// Nodes of B-trees are allocated together, in regions of this size in bytes.
-const PIECE: u64 = 32 << 10;
+/// Size in bytes of the regions in which nodes of B-trees are allocated together.
+const NODE_REGION: u64 = 32 << 10;
 
 thread_local! {
     static ENCODER: RefCell<lzf::Encoder> = RefCell::default();
@@ -41,7 +41,7 @@ impl Space {
     fn take_node(&mut self, size: usize) -> u64 {
         let size = size.next_multiple_of(8) as u64;
         if self.nodes.end - self.nodes.start < size {
-            let at = self.take(PIECE.max(size) as usize);
+            let at = self.take(NODE_REGION.max(size) as usize);
             self.nodes = at..self.end;
         }
         self.nodes.start += size;
@@ -57,9 +57,10 @@ pub(super) struct TableWriter {
     /// Rows of the incomplete chunk, and how many of its bytes are stored.
     open: Vec<u8>,
     stored: usize,
-    /// Regions of previous versions of incomplete chunks: free now, and free after the next commit.
+    /// Addresses of previous versions of incomplete chunks, which may be overwritten.
     free: Vec<u64>,
-    freed: Vec<u64>,
+    /// Addresses that may be overwritten after the next commit.
+    free_after_commit: Vec<u64>,
     /// Encoded chunks of an episode.
     encoded: Vec<Vec<u8>>,
     writing: Vec<u8>,
@@ -75,7 +76,7 @@ impl TableWriter {
             open: vec![],
             stored: 0,
             free: vec![],
-            freed: vec![],
+            free_after_commit: vec![],
             encoded: vec![],
             writing: vec![],
         }
@@ -163,7 +164,7 @@ impl TableWriter {
         self.writing.extend(fletcher32::sum(&self.writing).to_le_bytes());
         file.write_all_at(&self.writing, address)?;
         if self.stored > 0 {
-            self.freed.extend(self.tree.move_last(address));
+            self.free_after_commit.extend(self.tree.move_last(address));
         } else {
             let row = self.tree.last().map_or(0, |last| last.row + self.table.chunk_rows as u64);
             let entry = Entry { size: size as u32, filter_mask: 0, row, address };
@@ -173,7 +174,7 @@ impl TableWriter {
         Ok(())
     }
 
-    /// Writes data to which nothing refers yet.
+    /// Writes the incomplete chunk and the new nodes of the B-tree, which the file does not refer to yet.
     pub fn write_new(&mut self, file: &File, space: &mut Space) -> io::Result<()> {
         if self.open.len() > self.stored {
             self.store_open(file, space)?;
@@ -189,12 +190,12 @@ impl TableWriter {
     /// Updates the number of rows.
     pub fn write_rows(&mut self, file: &File) -> io::Result<()> {
         file.write_all_at(&self.rows.to_le_bytes(), self.table.rows_at)?;
-        self.free.append(&mut self.freed);
+        self.free.append(&mut self.free_after_commit);
         Ok(())
     }
 }
 
-/// Reads all rows of an uncompressed dataset that was written here.
+/// Reads all rows of an uncompressed dataset that [`TableWriter`] wrote.
 ///
 /// # Errors
 /// If it is damaged.

@@ -148,8 +148,7 @@ impl Tree {
         Ok(())
     }
 
-    /// Updates nodes in the file and the root. The previous state stays valid until each of these small writes.
-    /// small writes.
+    /// Updates nodes in the file and the root. The tree in the file is valid after each of these small writes.
     pub fn write_changes(&mut self, file: &File) -> io::Result<()> {
         for node in self.full.iter().chain(&self.edge) {
             let Some(written) = node.written else { continue };

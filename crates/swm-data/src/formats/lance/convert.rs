@@ -10,7 +10,7 @@ use arrow_schema::DataType;
 use std::sync::Arc;
 use swm_core::{DType, Error, Result};
 
-/// The encoded image in a row.
+/// Returns the encoded image in a row.
 pub fn image_bytes(values: &ArrayRef, row: usize) -> Result<&[u8]> {
     let bytes = if let Some(values) = values.as_binary_opt::<i32>() {
         (!values.is_null(row)).then(|| values.value(row))
@@ -67,7 +67,7 @@ pub fn convert(values: &ArrayRef, n: usize, dtype: DType, out: &mut [u8]) -> Res
 
 /// A value that is converted to the type of a column.
 pub trait Scalar: Copy {
-    /// What a null becomes, if the type can represent it.
+    /// The value that stands for a null; `None` if the type has none.
     const MISSING: Option<Self>;
     /// The value, rounded to `f64`.
     fn f64(self) -> f64;
@@ -113,7 +113,7 @@ where
 /// Writes values as a column with type `dtype`.
 pub fn cast<N: Scalar>(values: impl Iterator<Item = N>, dtype: DType, out: &mut [u8]) {
     fn put<const SIZE: usize>(out: &mut [u8], values: impl Iterator<Item = [u8; SIZE]>) {
-        out.chunks_exact_mut(SIZE).zip(values).for_each(|(place, value)| place.copy_from_slice(&value));
+        out.chunks_exact_mut(SIZE).zip(values).for_each(|(slot, value)| slot.copy_from_slice(&value));
     }
     match dtype {
         DType::Bool => put(out, values.map(|v| [u8::from(v.f64() != 0.0)])),

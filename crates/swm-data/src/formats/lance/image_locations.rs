@@ -43,10 +43,10 @@ impl ImageLocations {
         else {
             return Ok(None);
         };
-        let wanted: Vec<Range<u64>> = layouts.iter().map(|layout| layout.bounds.clone()).collect();
+        let bound_ranges: Vec<Range<u64>> = layouts.iter().map(|layout| layout.bounds.clone()).collect();
         let mut first = 0;
         let mut pages = vec![];
-        for (layout, bounds) in layouts.into_iter().zip(read(&wanted)?) {
+        for (layout, bounds) in layouts.into_iter().zip(read(&bound_ranges)?) {
             let FullZipPage { values, rows, width, prefix, .. } = layout;
             pages.push(Page { first, rows, values, bounds, width, prefix });
             first += rows;
@@ -72,9 +72,9 @@ impl Page {
     fn bound(&self, row: u64) -> Option<u64> {
         let at = usize::try_from(row).ok()?.checked_mul(self.width)?;
         let bytes = self.bounds.get(at..at + self.width)?;
-        let mut number = [0; 8];
-        number[..self.width].copy_from_slice(bytes);
-        Some(u64::from_le_bytes(number))
+        let mut padded = [0; 8];
+        padded[..self.width].copy_from_slice(bytes);
+        Some(u64::from_le_bytes(padded))
     }
 }
 
@@ -92,10 +92,10 @@ pub struct ImageLocation {
 impl ImageLocation {
     /// The encoded image in the bytes of this location; `None` if the length prefix differs from the bounds.
     pub fn image<'a>(&self, bytes: &'a [u8]) -> Option<&'a [u8]> {
-        let (stated, image) = bytes.split_at_checked(self.prefix)?;
-        let mut number = [0; 8];
-        number[..self.prefix].copy_from_slice(stated);
-        (u64::from_le_bytes(number) == self.length && image.len() as u64 == self.length).then_some(image)
+        let (stored_length, image) = bytes.split_at_checked(self.prefix)?;
+        let mut padded = [0; 8];
+        padded[..self.prefix].copy_from_slice(stored_length);
+        (u64::from_le_bytes(padded) == self.length && image.len() as u64 == self.length).then_some(image)
     }
 }
 

@@ -150,7 +150,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn constants_come_back_and_equal_ones_are_stored_once() {
+    fn constants_round_trip_and_equal_ones_are_stored_once() {
         let constants = |text: &str| Constants::from([("scene.xml".to_owned(), text.as_bytes().to_vec())]);
         let scene = "<body/>".repeat(1000);
         let mut record = Record::default();

@@ -201,10 +201,10 @@ pub fn columns_to_read(
         let known = recorded
             .as_ref()
             .and_then(|recorded| recorded.columns.columns().iter().find(|spec| columns::flat(&spec.name) == *name));
-        let contradiction = |held: &str| {
+        let contradiction = |found: &str| {
             super::store::damaged(
                 folder,
-                format!("column '{name}' holds {held}, which contradicts the recorded schema"),
+                format!("column '{name}' holds {found}, which contradicts the recorded schema"),
             )
         };
         let (spec, kind) = match field.data_type() {

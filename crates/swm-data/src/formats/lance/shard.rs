@@ -23,7 +23,7 @@ use std::sync::Arc;
 use swm_core::{Error, Manifest, Result, Schema};
 use swm_image::ImageCodec;
 
-/// The shard_log of a dataset that one machine writes.
+/// The part of a dataset that one machine writes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Shard {
     /// Index of the shard, from 0.

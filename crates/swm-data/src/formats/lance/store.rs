@@ -121,9 +121,9 @@ pub struct Version {
 /// Location of a table and access to its objects.
 #[derive(Clone)]
 pub struct Store {
-    /// How messages show it: the absolute path or the URI.
+    /// The location in messages: the absolute path or the URI.
     pub label: PathBuf,
-    /// Whether it is in an object store.
+    /// Whether the table is in an object store.
     pub remote: bool,
     /// Whether objects can be listed. Web servers usually cannot list.
     pub lists: bool,
@@ -355,8 +355,8 @@ impl Store {
 
     /// Removes a file that is no longer used. A failure only wastes space, so it is logged and ignored.
     pub fn remove(&self, path: &StorePath) {
-        let (objects, gone) = (Arc::clone(&self.objects), path.clone());
-        let removed = block_on(&self.label, "removing a file", async move { objects.delete(&gone).await });
+        let (objects, removed_path) = (Arc::clone(&self.objects), path.clone());
+        let removed = block_on(&self.label, "removing a file", async move { objects.delete(&removed_path).await });
         if let Err(error) = removed {
             tracing::warn!(file = %path, "an unused file of the dataset could not be removed: {error}");
         }
@@ -466,7 +466,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn system_errors_keep_their_reason() {
+    fn system_errors_keep_their_error_code() {
         let full = lance_core::Error::io("failed to persist: No space left on device (os error 28)".to_owned());
         let error = lance_error(Path::new("x.lance"), "writing", &full);
         assert!(matches!(&error, Error::Io { source, .. } if source.kind() == ErrorKind::StorageFull));
@@ -474,7 +474,7 @@ mod tests {
     }
 
     #[test]
-    fn checksum_detects_every_flipped_bit_but_its_own() {
+    fn checksum_detects_flipped_bits() {
         let plain = [&b"transaction"[..], &7_u32.to_le_bytes(), b"message", &11_u64.to_le_bytes(), b"\0\0\x02\0LANC"];
         let plain = plain.concat();
         assert!(verify_checksum(&plain).is_ok(), "other writers store none");

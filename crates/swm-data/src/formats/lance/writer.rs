@@ -61,7 +61,7 @@ pub struct PreparedWriter {
     pub episodes: usize,
 }
 
-/// Where committed episodes go.
+/// The destination of committed episodes.
 pub enum Sink {
     /// Each commit becomes a version of the table.
     Table {
@@ -185,11 +185,11 @@ pub fn match_table_columns(
             && (spec.dtype, &spec.shape) != (column.spec.dtype, &column.spec.shape)
             && (column.kind == Kind::Image || schema::codec(&old.manifest.schema).is_some())
         {
-            let words = |spec: &ColumnSpec| format!("{} {}{:?}", spec.name, spec.dtype.name(), spec.shape);
+            let describe = |spec: &ColumnSpec| format!("{} {}{:?}", spec.name, spec.dtype.name(), spec.shape);
             return Err(Error::mismatch(
                 format!("appending to {}", folder.display()),
-                words(&column.spec),
-                format!("the existing column: {}", words(spec)),
+                describe(&column.spec),
+                format!("the existing column: {}", describe(spec)),
             ));
         }
     }

@@ -121,7 +121,7 @@ mod tests {
     use swm_core::DType;
 
     #[test]
-    fn parts_give_what_the_whole_gives() {
+    fn statistics_of_parts_equal_those_of_the_whole() {
         let column = ColumnSpec::new("state", DType::Float64, [2]);
         let values: Vec<f64> = (0..40).map(|i| f64::from(i * i % 17) + if i % 2 == 0 { 100.0 } else { -3.0 }).collect();
         let mut whole = Stats::new(&column);

@@ -37,15 +37,15 @@ impl ColumnComparison {
 
     /// Adds the values of an episode. Fails with `(given, expected)` if a numeric value differs by more than rounding to
     /// single precision.
-    pub(super) fn add(&mut self, spec: &ColumnSpec, ours: &[u8], theirs: &[u8]) -> Result<(), (String, String)> {
-        self.values += (ours.len() / spec.dtype.size()) as u64;
-        if ours == theirs {
+    pub(super) fn add(&mut self, spec: &ColumnSpec, source: &[u8], target: &[u8]) -> Result<(), (String, String)> {
+        self.values += (source.len() / spec.dtype.size()) as u64;
+        if source == target {
             return Ok(());
         }
         if spec.is_image() {
-            let (sum, most) = ours
+            let (sum, most) = source
                 .par_chunks(1 << 16)
-                .zip(theirs.par_chunks(1 << 16))
+                .zip(target.par_chunks(1 << 16))
                 .map(|(a, b)| {
                     let apart = a.iter().zip(b).map(|(&a, &b)| u64::from(a.abs_diff(b)));
                     (apart.clone().map(|d| d * d).sum::<u64>(), apart.max().unwrap_or(0))
@@ -58,7 +58,7 @@ impl ColumnComparison {
             return Ok(());
         }
         let size = spec.dtype.size();
-        for (a, b) in ours.chunks_exact(size).zip(theirs.chunks_exact(size)).filter(|(a, b)| a != b) {
+        for (a, b) in source.chunks_exact(size).zip(target.chunks_exact(size)).filter(|(a, b)| a != b) {
             let (a, b) = (scalar(spec.dtype, a), scalar(spec.dtype, b));
             // Formats with single precision only round doubles.
             let rounded = spec.dtype == DType::Float64 && f64::from(a as f32) == b;

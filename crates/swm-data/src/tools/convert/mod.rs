@@ -24,7 +24,7 @@ use swm_image::ImageCodec;
 /// The unit of progress.
 const UNIT: &str = "episodes";
 
-/// What happens when the target already exists.
+/// The treatment of an existing target.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ConvertMode {
     /// Continue it after its last episode, if its content is the beginning of the source.
@@ -43,7 +43,7 @@ pub enum ConvertMode {
 pub struct ConvertOptions {
     /// The target's format; for `None` the target's suffix determines it.
     pub format: Option<String>,
-    /// What happens when the target already exists.
+    /// The treatment of an existing target.
     pub mode: ConvertMode,
     /// How the target encodes images, if its format supports several codecs.
     pub codec: ImageCodec,
@@ -74,7 +74,8 @@ pub struct Converted {
     /// Number of episodes in the target.
     pub episodes: usize,
     /// Number of episodes that an earlier conversion had written.
-    pub kept: usize,
+    #[serde(rename = "kept")]
+    pub existing: usize,
     /// Number of written rows.
     pub rows: usize,
     /// Number of episodes whose last row had an action. It was omitted, because no observation follows it.
@@ -118,7 +119,7 @@ pub fn convert(
     let all = reader.episodes().len();
     let mut report = Converted {
         episodes: all,
-        kept: 0,
+        existing: 0,
         rows: 0,
         last_actions: 0,
         checksum: None,
@@ -140,7 +141,7 @@ pub fn convert(
             }
             _ => first = episodes,
         }
-        report.kept = first;
+        report.existing = first;
         let compared = source.compare("compare", &**existing, 0..first, 0, &mut hashes, &mut report.columns, control);
         compared.map_err(|error| match error {
             Error::Mismatch { operation, given, expected } => {
@@ -309,29 +310,29 @@ impl<'a> Source<'a> {
         let total = episodes.len();
         start(control, stage, total);
         for (_, column) in data_columns(&self.schema) {
-            let theirs = copy.schema().column(&column.name)?;
-            if theirs.dtype != column.dtype || theirs.len() != column.len() {
-                let [given, expected] = [theirs, column].map(|column| describe_columns(std::slice::from_ref(column)));
+            let copied = copy.schema().column(&column.name)?;
+            if copied.dtype != column.dtype || copied.len() != column.len() {
+                let [given, expected] = [copied, column].map(|column| describe_columns(std::slice::from_ref(column)));
                 return Err(Error::mismatch(format!("column '{}'", column.name), given, expected));
             }
         }
-        let (mut ours, mut theirs) = (Batch::zeros(&self.schema, 0), Batch::zeros(&self.schema, 0));
+        let (mut source_rows, mut copy_rows) = (Batch::zeros(&self.schema, 0), Batch::zeros(&self.schema, 0));
         for (done, episode) in episodes.enumerate() {
             let (length, found) = (self.reader.episodes()[episode].length, copy.episodes()[base + episode].length);
             if found != length {
                 return Err(Error::mismatch(format!("episode {episode}"), format!("{found} rows"), length.to_string()));
             }
-            read(copy, &self.schema, base + episode, length, &mut theirs)?;
+            read(copy, &self.schema, base + episode, length, &mut copy_rows)?;
             let known = hashes[episode];
-            if known.is_some_and(|known| known == episode_hash(&theirs)) {
+            if known.is_some_and(|known| known == episode_hash(&copy_rows)) {
                 for (column, (_, spec)) in columns.iter_mut().zip(data_columns(&self.schema)) {
                     column.values += (length * spec.len()) as u64;
                 }
             } else {
-                self.read(episode, &mut ours)?;
-                hashes[episode] = Some(episode_hash(&ours));
+                self.read(episode, &mut source_rows)?;
+                hashes[episode] = Some(episode_hash(&source_rows));
                 for (column, (i, spec)) in columns.iter_mut().zip(data_columns(&self.schema)) {
-                    column.add(spec, ours.bytes(i), theirs.bytes(i)).map_err(|(given, expected)| {
+                    column.add(spec, source_rows.bytes(i), copy_rows.bytes(i)).map_err(|(given, expected)| {
                         Error::mismatch(format!("column '{}' of episode {episode}", spec.name), given, expected)
                     })?;
                 }
@@ -388,16 +389,16 @@ fn cut_last_action(rows: &mut Batch) -> bool {
     let Some(index) = rows.schema().find(ACTION) else { return false };
     let Some(last) = rows.rows().checked_sub(1) else { return false };
     let mut row = rows.row_mut(last);
-    fn cut<T: PartialEq + Copy>(action: &mut [T], missing: T, is_missing: impl Fn(&T) -> bool) -> bool {
-        let there = !action.iter().all(is_missing);
+    fn replace<T: PartialEq + Copy>(action: &mut [T], missing: T, is_missing: impl Fn(&T) -> bool) -> bool {
+        let exists = !action.iter().all(is_missing);
         action.fill(missing);
-        there
+        exists
     }
     match row.schema().columns()[index].dtype {
-        DType::Float32 => cut(row.at::<f32>(index), f32::NAN, |v| v.is_nan()),
-        DType::Float64 => cut(row.at::<f64>(index), f64::NAN, |v| v.is_nan()),
-        DType::Int32 => cut(row.at::<i32>(index), -1, |&v| v == -1),
-        DType::Int64 => cut(row.at::<i64>(index), -1, |&v| v == -1),
+        DType::Float32 => replace(row.at::<f32>(index), f32::NAN, |v| v.is_nan()),
+        DType::Float64 => replace(row.at::<f64>(index), f64::NAN, |v| v.is_nan()),
+        DType::Int32 => replace(row.at::<i32>(index), -1, |&v| v == -1),
+        DType::Int64 => replace(row.at::<i64>(index), -1, |&v| v == -1),
         DType::Bool | DType::U8 => false,
     }
 }

@@ -1,6 +1,6 @@
-//! Examines a dataset: its defects, the models it can train, and repair, which writes the sound episodes to a new dataset.
+//! Examines a dataset: its defects, the models it can train, and repair, which writes the intact episodes to a new dataset.
 //!
-//! The examination reads every row of every column as training does, so a sound dataset gives a loader no errors. Defects
+//! The examination reads every row of every column as training does, so an intact dataset gives a loader no errors. Defects
 //! that only the format can detect come from [`Reader::irregularities`].
 
 mod model_fit;
@@ -25,16 +25,16 @@ use swm_core::{Batch, ColumnSpec, DType, Error, Result};
 pub enum Severity {
     /// The data is damaged or inconsistent.
     Problem,
-    /// A remark on sound data.
+    /// A remark on intact data.
     Note,
 }
 
-/// Something the examination found.
+/// A defect or a remark that the examination reports.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Finding {
-    /// Its severity.
+    /// The severity of the finding.
     pub severity: Severity,
-    /// Description for people.
+    /// Human-readable description.
     pub what: String,
     /// Positions of the affected episodes; empty if the whole dataset is affected.
     pub episodes: Vec<usize>,
@@ -50,8 +50,9 @@ pub struct Diagnosis {
     /// Findings, problems first.
     pub findings: Vec<Finding>,
     /// Positions of the episodes without a problem.
-    pub sound: Vec<usize>,
-    /// For each model, whether the sound episodes can train it.
+    #[serde(rename = "sound")]
+    pub intact: Vec<usize>,
+    /// For each model, whether the intact episodes can train it.
     pub models: Vec<ModelFit>,
 }
 
@@ -84,7 +85,7 @@ pub fn open_damaged(location: &Location) -> Result<(Arc<dyn Reader>, Vec<String>
     })
 }
 
-/// Examines a dataset, and compares its sound episodes with the requirements of `models`.
+/// Examines a dataset, and compares its intact episodes with the requirements of `models`.
 ///
 /// # Errors
 /// If the run is stopped. Damage is not an error but a finding.
@@ -106,7 +107,7 @@ pub fn examine(reader: &dyn Reader, models: &[DatasetRequirements], control: &mu
         found.note(None, "there is no reward".to_owned());
     }
     let mut indices = HashSet::new();
-    let mut sound = vec![];
+    let mut intact = vec![];
     for (position, episode) in episodes.iter().enumerate() {
         if !indices.insert(episode.index) {
             found.problem(Some(position), format!("the index {} is also that of another episode", episode.index));
@@ -126,26 +127,26 @@ pub fn examine(reader: &dyn Reader, models: &[DatasetRequirements], control: &mu
             }
         }
         if !found.bad.contains(&position) {
-            sound.push(position);
+            intact.push(position);
         }
         control.progress(Progress { stage, done: position + 1, total, unit, metrics: &[] });
         control.check()?;
     }
     control.emit(Event::Finished { stage, metrics: &[] });
-    let lengths: Vec<usize> = sound.iter().map(|&position| episodes[position].length).collect();
+    let lengths: Vec<usize> = intact.iter().map(|&position| episodes[position].length).collect();
     Ok(Diagnosis {
         episodes: episodes.len(),
         rows: episodes.iter().map(|episode| episode.length).sum(),
         models: models.iter().map(|required| ModelFit::new(required, reader.schema(), &lengths)).collect(),
         findings: found.sorted(),
-        sound,
+        intact,
     })
 }
 
 /// Writes the episodes without a problem to a new dataset.
 ///
 /// # Errors
-/// If no episode is sound, or the target cannot be written.
+/// If no episode is intact, or the target cannot be written.
 pub fn repair(
     reader: &Arc<dyn Reader>,
     diagnosis: &Diagnosis,
@@ -153,15 +154,15 @@ pub fn repair(
     options: &ConvertOptions,
     control: &mut Control<'_>,
 ) -> Result<Converted> {
-    if diagnosis.sound.is_empty() {
-        let problem = format!("none of its {} episodes is sound", diagnosis.episodes);
+    if diagnosis.intact.is_empty() {
+        let problem = format!("none of its {} episodes is intact", diagnosis.episodes);
         return Err(Error::config(
             "repair",
             problem,
             "collect the data again, or convert them again from their source",
         ));
     }
-    convert(&subset(Arc::clone(reader), diagnosis.sound.clone())?, target, options, control)
+    convert(&subset(Arc::clone(reader), diagnosis.intact.clone())?, target, options, control)
 }
 
 /// Findings, with all episodes of the same finding grouped.

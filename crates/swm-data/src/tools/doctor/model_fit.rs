@@ -49,7 +49,7 @@ impl ModelFit {
         let episodes = lengths.iter().filter(|&&length| length >= rows).count();
         if episodes == 0 {
             let longest = lengths.iter().max().copied().unwrap_or(0);
-            missing.push(format!("no sound episode has the {rows} rows of a clip; the longest has {longest}"));
+            missing.push(format!("no intact episode has the {rows} rows of a clip; the longest has {longest}"));
         }
         Self { model: required.model, missing, episodes }
     }

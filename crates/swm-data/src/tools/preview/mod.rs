@@ -1,4 +1,4 @@
-//! Previews for people: videos of sampled episodes and a contact sheet of them, with all cameras side by side and
+//! Previews of datasets: videos of sampled episodes and a contact sheet of them, with all cameras side by side and
 //! labelled; and functions to write such videos and sheets.
 
 mod label;

@@ -1,4 +1,4 @@
-//! Videos for people: H.264 in MP4, which browsers play.
+//! Videos for viewing: H.264 in MP4, which browsers play.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -127,7 +127,7 @@ fn even(width: usize, height: usize, scale: usize) -> (usize, usize) {
     ((width * scale).next_multiple_of(2), (height * scale).next_multiple_of(2))
 }
 
-/// Starts the encoder of a video for people.
+/// Starts the encoder of a video for viewing.
 #[cfg(feature = "ffmpeg")]
 fn begin(width: usize, height: usize, fps: u32) -> Result<encoder::Encoder> {
     encoder::Encoder::new(width, height, fps, swm_video::Encoding::viewing())

@@ -126,9 +126,9 @@ fn golden_model() {
         let [samples, _, _] = golden.tensor::<3>("i.candidates").dims();
         let start = frames.slice([0..1, 0..1, 0..patches, 0..dim]).expand([samples, 1, patches, dim]);
         let rollout = model.rollout(start, golden.tensor("i.candidates"));
-        let theirs = golden.get("o.rollout");
+        let expected = golden.get("o.rollout");
         // The action part of the last frame has no meaning; both implementations leave the predictor's output there.
-        assert_eq!(theirs.shape, rollout.dims());
+        assert_eq!(expected.shape, rollout.dims());
         check(&golden, "o.rollout", &values(rollout));
     }
 }

@@ -86,27 +86,27 @@ impl Golden {
 
     /// Compares the metrics that were recorded, and all gradients.
     fn compare(&self, output: &StepOutput) {
-        for (name, ours) in &output.metrics {
+        for (name, actual) in &output.metrics {
             if self.tensors.contains_key(&format!("o.{name}")) {
-                check(self, &format!("o.{name}"), &[*ours as f32]);
+                check(self, &format!("o.{name}"), &[*actual as f32]);
             }
         }
         let mut worst = (0.0, String::new());
-        let theirs = self.group("g.");
-        let largest = theirs.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));
-        for (name, gradient) in &theirs {
-            let ours = values(output.gradients.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
+        let expected = self.group("g.");
+        let largest = expected.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));
+        for (name, gradient) in &expected {
+            let actual = values(output.gradients.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
             // A softmax cancels the bias of the keys, so its gradient is zero up to rounding; its error is relative to
             // the largest gradient of all.
             let idle = name.ends_with(".key.bias");
-            let error = error(&ours, &gradient.values, if idle { largest } else { 1e-6 });
+            let error = error(&actual, &gradient.values, if idle { largest } else { 1e-6 });
             if error > worst.0 {
                 worst = (error, name.clone());
             }
         }
         println!("worst gradient: {:.1e} ({})", worst.0, worst.1);
         assert!(worst.0 < TOLERANCE, "gradient of {} differs by {:.1e}", worst.1, worst.0);
-        let more: Vec<_> = output.gradients.keys().filter(|name| !theirs.contains_key(*name)).collect();
+        let more: Vec<_> = output.gradients.keys().filter(|name| !expected.contains_key(*name)).collect();
         assert!(more.is_empty(), "gradients that are not in the file: {more:?}");
     }
 }
@@ -183,29 +183,29 @@ fn golden_gcrl_checkpoints_round_trip() {
     let sizes = &checkpoint.config.model;
     assert_eq!((&sizes.head, &sizes.encoder), (&golden.head(), &golden.gcrl().encoder));
     assert_eq!((sizes.image, sizes.history, checkpoint.config.data.frameskip), (8, 3, 2));
-    let ours = parameters::values(&checkpoint.model);
-    assert_eq!(ours, golden.group("w."));
+    let actual = parameters::values(&checkpoint.model);
+    assert_eq!(actual, golden.group("w."));
 
     // Exported weights have the names and shapes of the reference's class, without the target networks.
     let folder = tempfile::tempdir().expect("a folder");
     import::export(&checkpoint, folder.path(), Naming::Published).expect("exported");
     let written = weights::read(&folder.path().join("weights.pt")).expect("weights");
-    let theirs = weights::read(&here.join("reference/gcivl/weights.pt")).expect("weights");
-    let theirs: BTreeMap<_, _> = theirs
+    let expected = weights::read(&here.join("reference/gcivl/weights.pt")).expect("weights");
+    let expected: BTreeMap<_, _> = expected
         .into_iter()
         .filter(|(name, _)| !name.contains(".teacher."))
         .map(|(name, weight)| (name.replace(".student.", "."), weight))
         .collect();
-    assert_eq!(written, theirs);
+    assert_eq!(written, expected);
     let again = import::import::<Gcivl>(folder.path(), dataset_info.clone()).expect("imported again");
     let again = parameters::values(&again.model);
     for (name, weight) in &again {
-        assert_eq!(weight, &ours[&name.replace(".teacher.", ".student.")], "{name}");
+        assert_eq!(weight, &actual[&name.replace(".teacher.", ".student.")], "{name}");
     }
 
     // It contains a policy but no critic, and does not fit other actions.
     let cloned = import::import::<Gcbc>(folder.path(), dataset_info.clone()).expect("the policy alone");
-    assert_eq!(parameters::values(&cloned.model)["log_stds"], ours["log_stds"]);
+    assert_eq!(parameters::values(&cloned.model)["log_stds"], actual["log_stds"]);
     let words = import::import::<Gciql>(folder.path(), dataset_info).expect_err("no critic").to_string();
     assert!(words.contains("critic_predictor"), "{words}");
     let dataset_info = DatasetInfo { action: ActionScale::identity(3), columns: Default::default(), env: None };

@@ -99,11 +99,11 @@ fn golden_evaluation() {
             for env in 0..envs {
                 let start = values(latents.clone().slice([env..env + 1, 0..history, 0..dim]));
                 let all = fast.run(&start, &values_of(actions.clone(), env), samples, steps);
-                let theirs = &golden.get(&format!("o.rollout.h{history}")).values[env * samples * length * dim..];
+                let expected = &golden.get(&format!("o.rollout.h{history}")).values[env * samples * length * dim..];
                 for (time, latents) in all.iter().enumerate() {
                     for (sample, latent) in latents.chunks(dim).enumerate() {
-                        let theirs = &theirs[(sample * length + time) * dim..][..dim];
-                        let error = error(latent, theirs, 1.0);
+                        let expected = &expected[(sample * length + time) * dim..][..dim];
+                        let error = error(latent, expected, 1.0);
                         assert!(error < TOLERANCE / 10.0, "fast rollout h{history} {time}: {error:.1e}");
                     }
                 }

@@ -67,14 +67,14 @@ impl Golden {
     /// Compares gradients with all recorded ones. Parameters whose names end in one of `idle` have no effect, because a
     /// batch normalisation or a softmax cancels them: their gradients are zero up to rounding, so their errors are
     /// relative to the largest gradient of all.
-    fn check_gradients(&self, ours: &Named<Tensor<1>>, idle: &[&str]) {
-        let theirs = self.group("g.");
-        let largest = theirs.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));
+    fn check_gradients(&self, actual: &Named<Tensor<1>>, idle: &[&str]) {
+        let expected = self.group("g.");
+        let largest = expected.values().flat_map(|g| &g.values).fold(0.0f32, |m, v| m.max(v.abs()));
         let mut worst = (0.0, String::new());
-        for (name, gradient) in &theirs {
-            let ours = values(ours.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
+        for (name, gradient) in &expected {
+            let actual = values(actual.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
             let floor = if idle.iter().any(|end| name.ends_with(end)) { largest } else { 1e-12 };
-            let error = error(&ours, &gradient.values, floor);
+            let error = error(&actual, &gradient.values, floor);
             if error > worst.0 {
                 worst = (error, name.clone());
             }
@@ -82,7 +82,7 @@ impl Golden {
         println!("worst gradient: {:.1e} ({})", worst.0, worst.1);
         assert!(worst.0 < TOLERANCE, "gradient of {} differs by {:.1e}", worst.1, worst.0);
         let names = |all: Vec<&String>| all.into_iter().cloned().collect::<Vec<_>>();
-        assert_eq!(names(ours.keys().collect()), names(theirs.keys().collect()), "parameters with gradients");
+        assert_eq!(names(actual.keys().collect()), names(expected.keys().collect()), "parameters with gradients");
     }
 
     /// Normalised images of the configured size as patches.
@@ -106,10 +106,10 @@ impl Golden {
 }
 
 /// The largest difference, relative to the largest value, or to `floor` where all are smaller.
-fn error(ours: &[f32], theirs: &[f32], floor: f32) -> f32 {
-    assert_eq!(ours.len(), theirs.len());
-    let scale = theirs.iter().fold(floor, |m, v| m.max(v.abs()));
-    ours.iter().zip(theirs).fold(0.0f32, |m, (a, b)| m.max((a - b).abs())) / scale
+fn error(actual: &[f32], expected: &[f32], floor: f32) -> f32 {
+    assert_eq!(actual.len(), expected.len());
+    let scale = expected.iter().fold(floor, |m, v| m.max(v.abs()));
+    actual.iter().zip(expected).fold(0.0f32, |m, (a, b)| m.max((a - b).abs())) / scale
 }
 
 /// The values of a tensor in row-major order.
@@ -118,8 +118,8 @@ pub fn values<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
 }
 
 /// Compares values with the tensor `name` of a golden file.
-pub fn check(golden: &Golden, name: &str, ours: &[f32]) {
-    let error = error(ours, &golden.get(name).values, 1e-6);
+pub fn check(golden: &Golden, name: &str, actual: &[f32]) {
+    let error = error(actual, &golden.get(name).values, 1e-6);
     println!("{name}: {error:.1e}");
     assert!(error < TOLERANCE, "{name} differs by {error:.1e}");
 }

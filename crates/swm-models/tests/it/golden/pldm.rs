@@ -100,11 +100,11 @@ fn golden_evaluation() {
         check(&golden, "o.cost", &values((last - goal).square().sum_dim(2)));
         // The CPU rollout, which planning uses.
         let fast = Rollout::new(&model).run(&values(start), &values(candidates), samples, horizon);
-        let theirs = &golden.get("o.rollout").values;
+        let expected = &golden.get("o.rollout").values;
         for (time, latents) in fast.iter().enumerate() {
-            for (sample, ours) in latents.chunks(latent).enumerate() {
-                let theirs = &theirs[(sample * (horizon + 1) + time) * latent..][..latent];
-                assert!(error(ours, theirs, 1.0) < TOLERANCE / 10.0, "fast rollout {time}");
+            for (sample, actual) in latents.chunks(latent).enumerate() {
+                let expected = &expected[(sample * (horizon + 1) + time) * latent..][..latent];
+                assert!(error(actual, expected, 1.0) < TOLERANCE / 10.0, "fast rollout {time}");
             }
         }
         assert_eq!(actions, golden.size("action_dim"));

@@ -98,7 +98,7 @@ fn golden_tdmpc2_training() {
             let ended = golden.train(&model, &config, &loss, "o.terminated", true, shards);
             check(&golden, "o.terminated.value", &[ended.value as f32]);
             let step = golden.train(&model, &config, &loss, "o.train", false, shards);
-            for (name, ours) in [
+            for (name, actual) in [
                 ("loss", step.total),
                 ("consist", step.consistency),
                 ("reward", step.reward),
@@ -106,16 +106,16 @@ fn golden_tdmpc2_training() {
                 ("policy", step.policy),
                 ("scale", f64::from(step.scale)),
             ] {
-                check(&golden, &format!("o.train.{name}"), &[ours as f32]);
+                check(&golden, &format!("o.train.{name}"), &[actual as f32]);
             }
-            let theirs = golden.group("g.");
+            let expected = golden.group("g.");
             let weight = |name: &str| if name.starts_with("pi.") { &step.policy } else { &step.total };
-            for (name, gradient) in &theirs {
-                let ours = values(step.gradients.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
-                let error = error(&ours, &gradient.values, 1e-6 * weight(name).abs() as f32);
+            for (name, gradient) in &expected {
+                let actual = values(step.gradients.get(name).unwrap_or_else(|| panic!("a gradient of {name}")).clone());
+                let error = error(&actual, &gradient.values, 1e-6 * weight(name).abs() as f32);
                 assert!(error < TOLERANCE, "gradient of {name} differs by {error:.1e}");
             }
-            assert_eq!(step.gradients.len(), theirs.len());
+            assert_eq!(step.gradients.len(), expected.len());
         }
     }
     assert!(read > 0, "no file with the losses of a training step");

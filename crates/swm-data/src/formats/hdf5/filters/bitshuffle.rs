@@ -28,7 +28,7 @@ fn default_block(size: usize) -> usize {
     (8192 / size / 8 * 8).max(128) * size
 }
 
-/// Decodes to exactly `out`.
+/// Decodes a chunk into `out`, which has its decoded length.
 pub fn decode(from: &[u8], size: usize, codec: Codec, out: &mut [u8]) -> Result<(), String> {
     let mut input = Input(from);
     let block = if codec == Codec::None {
@@ -94,14 +94,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bits_return_to_their_numbers() {
+    fn undo_restores_the_order_of_bits() {
         for size in [1, 2, 4, 8] {
             let bytes: Vec<u8> = (0..size * 24).map(|i| (i * 37 + 11) as u8).collect();
             let mut bits = vec![0_u8; bytes.len()];
-            for number in 0..24 {
+            for index in 0..24 {
                 for bit in 0..size * 8 {
-                    let set = bytes[number * size + bit / 8] >> (bit % 8) & 1;
-                    bits[bit * 3 + number / 8] |= set << (number % 8);
+                    let set = bytes[index * size + bit / 8] >> (bit % 8) & 1;
+                    bits[bit * 3 + index / 8] |= set << (index % 8);
                 }
             }
             let mut out = vec![0; bytes.len()];

@@ -15,16 +15,17 @@ mod flag {
 
 const HEADER: usize = 16;
 
-/// Decodes to exactly `out`.
+/// Decodes a chunk into `out`, which has its decoded length.
 pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     let mut input = Input(from);
     let [version, _, flags, size] = input.array()?;
-    let mut number = || input.array().map(u32::from_le_bytes).map(|n| n as usize);
-    let (total, block, length) = (number()?, number()?, number()?);
+    let mut next_size = || input.array().map(u32::from_le_bytes).map(|n| n as usize);
+    let (total, block, length) = (next_size()?, next_size()?, next_size()?);
     let size = usize::from(size).max(1);
     if !(1..=2).contains(&version) || total != out.len() || length != from.len() || block == 0 && total > 0 {
         return Err(format!(
-            "Blosc: version {version}, {total} bytes in {length}, where {} are in {}",
+            "Blosc: the header declares version {version}, {total} decoded and {length} encoded bytes; expected version 1 \
+             or 2, {} decoded and {} encoded bytes",
             out.len(),
             from.len()
         ));
@@ -37,14 +38,14 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     let blocks = total.div_ceil(block.max(1));
     let starts = Input(input.take(4 * blocks)?).0;
     let mut scratch = vec![];
-    for (place, start) in out.chunks_mut(block).zip(starts.as_chunks::<4>().0) {
+    for (decoded, start) in out.chunks_mut(block).zip(starts.as_chunks::<4>().0) {
         let start = u32::from_le_bytes(*start) as usize;
         let mut input = Input(from.get(start..).ok_or("Blosc: a block is outside the chunk")?);
         // The last block is one stream if it is shorter.
-        let streams = if flags & flag::ONE_STREAM != 0 || place.len() < block { 1 } else { size };
+        let streams = if flags & flag::ONE_STREAM != 0 || decoded.len() < block { 1 } else { size };
         let shuffled = (flags & flag::SHUFFLE != 0 && size > 1) || flags & flag::BITSHUFFLE != 0;
-        scratch.resize(place.len(), 0);
-        let target = if shuffled { &mut *scratch } else { &mut *place };
+        scratch.resize(decoded.len(), 0);
+        let target = if shuffled { &mut *scratch } else { &mut *decoded };
         let part = target.len() / streams;
         if part * streams != target.len() || part == 0 {
             return Err(format!("Blosc: a block of {} bytes in {streams} streams", target.len()));
@@ -66,13 +67,13 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
         }
         if flags & flag::BITSHUFFLE != 0 {
             // Only whole groups of eight elements are shuffled, or none.
-            if place.len().is_multiple_of(8 * size) {
-                bitshuffle::undo(&scratch, size, place);
+            if decoded.len().is_multiple_of(8 * size) {
+                bitshuffle::undo(&scratch, size, decoded);
             } else {
-                place.copy_from_slice(&scratch);
+                decoded.copy_from_slice(&scratch);
             }
         } else if shuffled {
-            shuffle::undo(&scratch, size, place)?;
+            shuffle::undo(&scratch, size, decoded)?;
         }
     }
     Ok(())
@@ -89,8 +90,8 @@ fn blosclz(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     loop {
         if control < 32 {
             let literals = input.take(control + 1)?;
-            let place = out.get_mut(at..at + literals.len()).ok_or("BloscLZ: it exceeds the chunk")?;
-            place.copy_from_slice(literals);
+            let target = out.get_mut(at..at + literals.len()).ok_or("BloscLZ: it exceeds the chunk")?;
+            target.copy_from_slice(literals);
             at += literals.len();
         } else {
             let mut length = (control >> 5) + 2;

@@ -65,7 +65,7 @@ mod tests {
     }
 
     #[test]
-    fn sums_are_those_of_the_definition() {
+    fn checksum_matches_the_definition() {
         for length in [0, 1, 2, 3, 511, 512, 513, 719, 720, 721, 5000, 150_528] {
             let bytes: Vec<u8> = (0..length).map(|i| (i * i / 7 + i) as u8).collect();
             assert_eq!(sum(&bytes), slow(&bytes), "{length}");

@@ -14,7 +14,7 @@ const SHORT: usize = 16;
 /// Number of remembered positions, addressed by a hash of the three bytes there.
 const TABLE_BITS: u32 = 14;
 
-/// Decodes to exactly `out`.
+/// Decodes a chunk into `out`, which has its decoded length.
 pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     let cut = || "LZF: it is truncated".to_owned();
     let (mut i, mut at) = (0, 0);
@@ -144,7 +144,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn what_is_encoded_is_decoded(
+        fn encoded_chunks_round_trip(
             seed in prop::collection::vec(any::<u8>(), 1..40),
             repeats in 0_usize..300,
             noise in prop::collection::vec(any::<u8>(), 0..9000),
@@ -167,7 +167,7 @@ mod tests {
     }
 
     #[test]
-    fn noise_stays_as_it_is_and_damage_is_found() {
+    fn does_not_encode_short_input_and_rejects_damage() {
         let mut encoder = Encoder::default();
         let mut out = vec![];
         assert!(!encoder.encode(&[1, 2, 3, 4], &mut out) && out.is_empty());

@@ -16,7 +16,7 @@ pub fn undo(from: &[u8], size: usize, out: &mut [u8]) -> Result<(), String> {
         8 => merge::<8>(from, count, out),
         _ => {
             for (byte, row) in from.chunks_exact(count).enumerate().take(size) {
-                out[byte..].iter_mut().step_by(size).zip(row).for_each(|(place, &value)| *place = value);
+                out[byte..].iter_mut().step_by(size).zip(row).for_each(|(target, &value)| *target = value);
             }
         }
     }
@@ -27,8 +27,8 @@ pub fn undo(from: &[u8], size: usize, out: &mut [u8]) -> Result<(), String> {
 
 fn merge<const N: usize>(from: &[u8], count: usize, out: &mut [u8]) {
     let rows: [&[u8]; N] = std::array::from_fn(|byte| &from[byte * count..(byte + 1) * count]);
-    for (i, place) in out.as_chunks_mut::<N>().0.iter_mut().enumerate() {
-        *place = std::array::from_fn(|byte| rows[byte][i]);
+    for (i, target) in out.as_chunks_mut::<N>().0.iter_mut().enumerate() {
+        *target = std::array::from_fn(|byte| rows[byte][i]);
     }
 }
 
@@ -37,7 +37,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bytes_return_to_their_numbers() {
+    fn undo_restores_the_order_of_bytes() {
         for size in [1, 2, 3, 4, 8, 12] {
             let bytes: Vec<u8> = (0..100).collect();
             let count = bytes.len() / size;

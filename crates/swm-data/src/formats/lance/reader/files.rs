@@ -141,11 +141,11 @@ impl LanceReader {
 
     /// The global buffer whose index is stored under `key` in the file's metadata.
     pub(super) fn buffer(&self, reader: &Arc<FileReader>, key: &str) -> Result<Option<Bytes>> {
-        let Some(number) = reader.schema().metadata.get(key).and_then(|number| number.parse::<u32>().ok()) else {
+        let Some(index) = reader.schema().metadata.get(key).and_then(|index| index.parse::<u32>().ok()) else {
             return Ok(None);
         };
         let reader = Arc::clone(reader);
-        let read = async move { reader.read_global_buffer(number).await.map(Some) };
+        let read = async move { reader.read_global_buffer(index).await.map(Some) };
         block_on(self.folder(), "reading the record of its episodes", read)
     }
 }

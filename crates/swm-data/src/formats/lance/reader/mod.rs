@@ -1,7 +1,7 @@
 //! Reads episodes: sorts and merges the ranges of a batch, reads them together, and decodes images in parallel.
 //!
 //! - [`values`]: numeric columns, cached per fragment; [`images`]: images, read directly from their locations.
-//! - [`stored_rows`]: everything else, read with Lance's decoder.
+//! - [`stored_rows`]: all other reads, with Lance's decoder.
 //! - [`files`]: opens and verifies data files.
 //! - [`lance_reader`]: the state of an open table.
 
@@ -42,9 +42,13 @@ impl LanceReader {
     pub fn open(location: &Location) -> Result<Self> {
         let store = Store::new(location)?;
         let Some(version) = store.latest()? else {
-            let there = store.remote || store.label.is_dir();
-            let problem = if there { "it holds no Lance table" } else { "there is no such dataset" };
-            return Err(Error::corrupt(&store.label, problem, "check the path; `swm datasets` lists those at home"));
+            let exists = store.remote || store.label.is_dir();
+            let problem = if exists { "it holds no Lance table" } else { "there is no such dataset" };
+            return Err(Error::corrupt(
+                &store.label,
+                problem,
+                "check the path; `swm datasets` lists the stored datasets",
+            ));
         };
         Self::of(store, version.manifest)
     }
@@ -305,7 +309,7 @@ impl Reader for LanceReader {
 }
 
 impl LanceReader {
-    /// The hashes of a fragment's episodes: from its record if it was written here, so that the data need not be read.
+    /// Returns the hashes of a fragment's episodes: those in its record, if it has one, otherwise computed from the data.
     fn hashes(&self, fragment: usize, episodes: Range<usize>) -> Result<Vec<String>> {
         if let Some((_, record)) = self.record(fragment)? {
             let stored = self.episodes[episodes.clone()].iter().map(|episode| episode.length as u64);

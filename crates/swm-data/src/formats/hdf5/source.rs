@@ -44,9 +44,11 @@ impl Source {
             return Ok(Self(Arc::new(Kind::Remote { file, label: location.label(), blocks: Mutex::default() })));
         };
         let file = File::open(path).map_err(|e| match e.kind() {
-            std::io::ErrorKind::NotFound => {
-                Error::corrupt(path, "there is no such dataset", "check the path; `swm datasets` lists those at home")
-            }
+            std::io::ErrorKind::NotFound => Error::corrupt(
+                path,
+                "there is no such dataset",
+                "check the path; `swm datasets` lists the stored datasets",
+            ),
             _ => Error::io(path, "opening the file", e),
         })?;
         Self::of(file, path)

@@ -141,7 +141,7 @@ impl Info {
         let bytes = std::fs::read(&path).map_err(|e| match e.kind() {
             std::io::ErrorKind::NotFound => {
                 let problem = if root.exists() { "it holds no meta/info.json" } else { "there is no such dataset" };
-                Error::corrupt(root, problem, "check the path; `swm datasets` lists those at home")
+                Error::corrupt(root, problem, "check the path; `swm datasets` lists the stored datasets")
             }
             _ => Error::io(&path, "reading what the dataset holds", e),
         })?;

@@ -26,7 +26,7 @@ impl VideoReader {
     pub fn open(folder: &Path) -> Result<Self> {
         if !exists(folder) {
             let problem = if folder.exists() { "it holds no ep_len.npz" } else { "there is no such dataset" };
-            return Err(Error::corrupt(folder, problem, "check the path; `swm datasets` lists those at home"));
+            return Err(Error::corrupt(folder, problem, "check the path; `swm datasets` lists the stored datasets"));
         }
         let files = ColumnFiles::open(folder)?;
         let images = match files.recorded() {

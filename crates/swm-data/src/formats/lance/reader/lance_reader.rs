@@ -35,7 +35,7 @@ pub struct LanceReader {
     /// Local data files, opened for reading at offsets.
     pub(super) handles: Mutex<RecentFiles<File>>,
     /// Known locations of images.
-    pub(super) image_locations: Mutex<KnownImages>,
+    pub(super) image_locations: Mutex<ImageLocationCache>,
     pub(super) value_cache: Mutex<ValueCache>,
     /// Cached blocks of an object store.
     pub(super) blocks: Arc<BlockCache>,
@@ -112,7 +112,7 @@ pub(super) struct FileImages {
 }
 
 /// Locations by fragment and column name; `None` if the column must be read with Lance's decoder.
-type KnownImages = HashMap<(usize, String), Option<Arc<FileImages>>>;
+type ImageLocationCache = HashMap<(usize, String), Option<Arc<FileImages>>>;
 
 /// A row of the table, and the part of the output that receives it.
 pub(super) type RowSlot<'a> = (u64, &'a mut [u8]);

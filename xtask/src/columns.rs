@@ -1,15 +1,15 @@
-//! Standard columns: their names are spelt in `swm-core` only.
+//! Names of standard columns appear as string literals in `swm-core` only.
 
 use crate::source::File;
 
 /// The file that defines the names.
 const HOME: &str = "crates/swm-core/src/columns";
 
-/// Names that mean nothing but a column. (`action`, `goal` and the like are words of settings and JSON, too.)
+/// Names that are used for columns only. (`action`, `goal` and others are also settings and JSON fields.)
 const NAMES: &[&str] =
     &["\"pixels\"", "\"terminated\"", "\"truncated\"", "\"episode_idx\"", "\"step_idx\"", "\"variation."];
 
-/// Every spelling outside the file that defines it, a sentence each. Unit tests, at the end of a file, may spell names.
+/// Returns a sentence for each literal outside the defining file. Unit tests, at the end of a file, may use literals.
 pub fn violations(files: &[File]) -> Vec<String> {
     let mut found = vec![];
     for file in files.iter().filter(|file| !file.path.starts_with(HOME) && !file.path.starts_with("xtask/")) {
@@ -32,7 +32,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn spellings_outside_the_definition_are_named() {
+    fn literals_outside_the_definition_are_violations() {
         let file = |path: &str, text: &str| File { path: path.to_owned(), text: text.to_owned() };
         let text = "let a = \"pixels\";\n// \"pixels\"\n#[cfg(test)]\nmod tests { const A: &str = \"pixels\"; }";
         assert_eq!(violations(&[file("crates/swm-core/src/columns.rs", text)]), Vec::<String>::new());

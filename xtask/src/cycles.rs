@@ -2,7 +2,7 @@
 //!
 //! A file imports another when its code names a path of this crate (`crate::…`, `super::…`, `self::…`) that leads into
 //! the other file. Names that a module re-exports count for the file that defines them, so a crate root of re-exports
-//! is no cycle. Unit tests do not count.
+//! is not part of a cycle. Unit tests are ignored.
 
 use crate::source::{self, File};
 use std::collections::{BTreeMap, BTreeSet, HashMap};
@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 /// The largest cycle that is accepted, in files.
 const LARGEST: usize = 4;
 
-/// Every cycle of more than four files, a sentence each.
+/// Returns a sentence for each cycle of more than four files.
 pub fn violations(files: &[File]) -> Vec<String> {
     let mut crates: BTreeMap<&str, Vec<&File>> = BTreeMap::new();
     for file in files {
@@ -36,7 +36,7 @@ pub fn violations(files: &[File]) -> Vec<String> {
 /// A path in this crate, such as `["batch", "Batch"]`.
 type ModulePath = Vec<String>;
 
-/// The files of a crate and which of them import which.
+/// The files of a crate and their imports.
 struct Imports<'a> {
     names: Vec<&'a str>,
     edges: Vec<BTreeSet<usize>>,
@@ -103,7 +103,7 @@ impl<'a> Imports<'a> {
     }
 }
 
-/// The module that a file under `src/` holds.
+/// The module path of a file under `src/`.
 fn module(path: &str) -> ModulePath {
     let path = path.trim_end_matches(".rs");
     let path = path.strip_suffix("/mod").unwrap_or(path);
@@ -129,7 +129,8 @@ fn resolve(
         let Some(next) = next else { break };
         path = next;
     }
-    // Naming a module itself, as `use crate::batch;` does, leads into it as well. The crate root defines nothing of its own.
+    // Naming a module itself, as `use crate::batch;` does, leads into it as well. The crate root itself defines no
+    // items.
     (1..=path.len()).rev().find_map(|n| index.get(&path[..n]).copied())
 }
 
@@ -206,7 +207,7 @@ fn expand(tree: &str) -> Vec<ModulePath> {
     paths
 }
 
-/// A path from the crate's root; none for paths into other crates.
+/// Returns the path from the crate root; `None` for paths into other crates.
 fn absolute(path: &[String], module: &[String], index: &HashMap<&[String], usize>) -> Option<ModulePath> {
     let first = path.first()?.as_str();
     let (mut base, mut rest) = match first {
@@ -266,7 +267,7 @@ mod tests {
     }
 
     #[test]
-    fn only_large_cycles_are_refused() {
+    fn only_large_cycles_are_violations() {
         let ring = |n: usize| -> Vec<File> {
             (0..n).map(|i| file(&format!("c/src/m{i}.rs"), &format!("use crate::m{}::X;", (i + 1) % n))).collect()
         };

@@ -1,7 +1,8 @@
-//! Features of shared dependencies: whatever is built, each library is compiled once.
+//! Features of shared dependencies: all builds compile a library with the same features, and therefore once.
 //!
-//! Cargo unifies features over the packages that one command builds. `workspace-hack` makes the heavy ones equal in all of them
-//! (the program, the Python extension, the tests); this check compares what Cargo resolves for each.
+//! Cargo unifies features over the packages that one command builds. `workspace-hack` gives the large libraries equal
+//! features in all builds (the program, the Python extension, the tests); this check compares what Cargo resolves for
+//! each.
 
 use anyhow::{Context as _, Result, bail};
 use std::collections::{BTreeMap, BTreeSet};
@@ -20,7 +21,7 @@ const BUILDS: &[(&str, &[&str], bool)] = &[
 /// Libraries with their features, by name and version.
 type Features = BTreeMap<String, BTreeSet<String>>;
 
-/// Every library that two builds would compile with different features, a sentence each.
+/// Returns a sentence for each library that two builds compile with different features.
 pub fn violations(root: &Path) -> Result<Vec<String>> {
     let resolved: Vec<(&str, Features)> = BUILDS
         .iter()
@@ -60,7 +61,8 @@ fn features(root: &Path, select: &[&str], tests: bool) -> Result<Features> {
     Ok(parse(&text))
 }
 
-/// The libraries of other packages in the output of `cargo tree`, procedural macros (which are built for the host) left out.
+/// The libraries of other packages in the output of `cargo tree`, without procedural macros, which are built for the
+/// host.
 fn parse(text: &str) -> Features {
     let mut all = Features::new();
     for line in text.lines() {

@@ -1,4 +1,4 @@
-//! The dependency graph: who needs whom to be built and to run. Needs of tests alone are left out.
+//! [`Graph`]: normal and build dependencies of the packages, without dev-dependencies.
 
 use anyhow::{Context as _, Result};
 use cargo_metadata::{DependencyKind, MetadataCommand};
@@ -6,15 +6,15 @@ use std::collections::{HashMap, VecDeque};
 use std::path::Path;
 use std::process::Command;
 
-/// A package and what it needs.
+/// A package and its dependencies.
 #[derive(Debug)]
 pub struct Package {
-    /// Its name; two versions of a package share it.
+    /// The name, which is the same for all versions of a package.
     pub name: String,
     /// Whether it is a crate of the workspace.
     pub member: bool,
-    /// The places of what it needs directly.
-    pub needs: Vec<usize>,
+    /// The indices of its direct dependencies.
+    pub dependencies: Vec<usize>,
 }
 
 /// All packages of the workspace and of its dependencies.
@@ -24,11 +24,12 @@ pub struct Graph {
 }
 
 impl Graph {
-    /// The graph of the workspace in a folder, on this platform, as `cargo metadata` resolves it. That is a little
-    /// more than what is built (it counts optional packages that another feature could switch on), so a check
-    /// that passes here holds for every choice of features in the lock file.
+    /// Loads the graph of the workspace in the folder `root` for this platform, as `cargo metadata` resolves it.
+    ///
+    /// The graph includes optional packages that are not built, so a check that passes holds for every choice of
+    /// features.
     pub fn load(root: &Path) -> Result<Self> {
-        let version = Command::new("rustc").arg("-vV").output().context("asking rustc for the platform")?;
+        let version = Command::new("rustc").arg("-vV").output().context("running `rustc -vV` for the platform")?;
         let version = String::from_utf8_lossy(&version.stdout).into_owned();
         let host = version.lines().find_map(|line| line.strip_prefix("host: ")).context("`rustc -vV` names no host")?;
         let metadata = MetadataCommand::new()
@@ -36,21 +37,21 @@ impl Graph {
             .other_options(vec!["--filter-platform".to_owned(), host.to_owned()])
             .exec()
             .context("running `cargo metadata`")?;
-        let place: HashMap<_, _> = metadata.packages.iter().enumerate().map(|(i, package)| (&package.id, i)).collect();
+        let index: HashMap<_, _> = metadata.packages.iter().enumerate().map(|(i, package)| (&package.id, i)).collect();
         let mut packages: Vec<Package> = metadata
             .packages
             .iter()
             .map(|package| Package {
                 name: package.name.to_string(),
                 member: metadata.workspace_members.contains(&package.id),
-                needs: vec![],
+                dependencies: vec![],
             })
             .collect();
         for node in metadata.resolve.as_ref().context("`cargo metadata` resolved nothing")?.nodes.iter() {
             let needed = node.deps.iter().filter(|need| {
                 need.dep_kinds.iter().any(|kind| matches!(kind.kind, DependencyKind::Normal | DependencyKind::Build))
             });
-            packages[place[&node.id]].needs = needed.map(|need| place[&need.pkg]).collect();
+            packages[index[&node.id]].dependencies = needed.map(|need| index[&need.pkg]).collect();
         }
         Ok(Self { packages })
     }
@@ -65,28 +66,34 @@ impl Graph {
         self.members().find(|package| package.name == name)
     }
 
-    /// The crates of the workspace that a package needs directly.
-    pub fn member_needs<'a>(&'a self, package: &'a Package) -> impl Iterator<Item = &'a str> {
-        package.needs.iter().map(|&i| &self.packages[i]).filter(|need| need.member).map(|need| need.name.as_str())
+    /// The names of a package's direct dependencies in the workspace.
+    pub fn member_dependencies<'a>(&'a self, package: &'a Package) -> impl Iterator<Item = &'a str> {
+        package
+            .dependencies
+            .iter()
+            .map(|&i| &self.packages[i])
+            .filter(|need| need.member)
+            .map(|need| need.name.as_str())
     }
 
-    /// The shortest way from a package to one whose name is `forbidden`, by names; none where there is no way.
-    pub fn way(&self, from: &Package, forbidden: fn(&str) -> bool) -> Option<Vec<&str>> {
+    /// Returns the names on the shortest path from a package to one whose name is `forbidden`; `None` if there is no
+    /// path.
+    pub fn shortest_path(&self, from: &Package, forbidden: fn(&str) -> bool) -> Option<Vec<&str>> {
         let start = self.packages.iter().position(|package| std::ptr::eq(package, from))?;
         let mut before: HashMap<usize, usize> = HashMap::from([(start, start)]);
         let mut queue = VecDeque::from([start]);
         while let Some(at) = queue.pop_front() {
             if at != start && forbidden(&self.packages[at].name) {
-                let mut way = vec![self.packages[at].name.as_str()];
+                let mut path = vec![self.packages[at].name.as_str()];
                 let mut step = at;
                 while step != start {
                     step = before[&step];
-                    way.push(&self.packages[step].name);
+                    path.push(&self.packages[step].name);
                 }
-                way.reverse();
-                return Some(way);
+                path.reverse();
+                return Some(path);
             }
-            for &next in &self.packages[at].needs {
+            for &next in &self.packages[at].dependencies {
                 if let std::collections::hash_map::Entry::Vacant(entry) = before.entry(next) {
                     entry.insert(at);
                     queue.push_back(next);
@@ -99,15 +106,15 @@ impl Graph {
 
 #[cfg(test)]
 impl Graph {
-    /// A graph of `(name, needs)`; names that begin with `swm` or are `xtask` are crates of the workspace.
+    /// A graph of `(name, dependencies)`; names that begin with `swm` or are `xtask` are crates of the workspace.
     pub fn synthetic(packages: &[(&str, &[&str])]) -> Self {
-        let place = |name: &str| packages.iter().position(|(other, _)| *other == name).expect("a package of the graph");
+        let index = |name: &str| packages.iter().position(|(other, _)| *other == name).expect("a package of the graph");
         let packages = packages
             .iter()
             .map(|(name, needs)| Package {
                 name: (*name).to_owned(),
                 member: name.starts_with("swm") || *name == "xtask",
-                needs: needs.iter().map(|need| place(need)).collect(),
+                dependencies: needs.iter().map(|need| index(need)).collect(),
             })
             .collect();
         Self { packages }
@@ -119,7 +126,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_shortest_way_is_found_and_circles_end() {
+    fn finds_the_shortest_path_in_cyclic_graphs() {
         let graph = Graph::synthetic(&[
             ("swm-a", &["x", "y"]),
             ("x", &["z", "swm-a"]),
@@ -128,8 +135,8 @@ mod tests {
             ("burn", &[]),
         ]);
         let start = graph.member("swm-a").expect("there");
-        assert_eq!(graph.way(start, |name| name == "burn"), Some(vec!["swm-a", "y", "burn"]));
-        assert_eq!(graph.way(start, |name| name == "lance"), None);
+        assert_eq!(graph.shortest_path(start, |name| name == "burn"), Some(vec!["swm-a", "y", "burn"]));
+        assert_eq!(graph.shortest_path(start, |name| name == "lance"), None);
         assert!(graph.member("x").is_none());
     }
 }

@@ -1,26 +1,26 @@
-//! The layer rules: what a crate must never know, however far down. They keep the vocabulary, the worlds, the
-//! planners and the report quick to build and free to use without a deep-learning framework or a database.
+//! The layer rules: packages that a crate must not depend on, directly or indirectly. They keep the core, environment,
+//! planning and report crates fast to build and usable without a deep-learning framework or a database.
 
 use crate::graph::Graph;
 
 /// A rule about some crates of the workspace.
 pub enum Rule {
-    /// They never reach a package of such a name, directly or through others.
+    /// `crates` must not depend on a package with a forbidden name, directly or indirectly.
     Never {
         /// The crates; empty means all.
         crates: &'static [&'static str],
         /// Whether a package's name is forbidden.
         forbidden: fn(&str) -> bool,
-        /// What holds, as a sentence.
+        /// The rule in words.
         words: &'static str,
     },
-    /// Nobody but `users` depends on them directly.
+    /// Only `users` may depend directly on `crates`.
     Only {
-        /// Who may.
+        /// The crates that may depend on them.
         users: &'static [&'static str],
         /// The crates.
         crates: &'static [&'static str],
-        /// What holds, as a sentence.
+        /// The rule in words.
         words: &'static str,
     },
 }
@@ -39,39 +39,39 @@ pub const RULES: &[Rule] = &[
             "swm-kernels",
         ],
         forbidden: |name| ["burn", "lance", "mujoco", "ffmpeg"].iter().any(|family| of_family(name, family)),
-        words: "core, envs, gym, plan, report, raster, image and kernels reach no deep learning, dataset engine, MuJoCo or FFmpeg",
+        words: "core, envs, gym, plan, report, raster, image and kernels depend on no deep learning, dataset engine, MuJoCo or FFmpeg",
     },
     Rule::Never {
         crates: &[],
-        // `datafusion-common` holds the shared types that Lance's file crate speaks; all others are the engine.
+        // `datafusion-common` holds the shared types that Lance's file crate uses; all others belong to the engine.
         forbidden: |name| of_family(name, "datafusion") && name != "datafusion-common",
-        words: "nothing brings DataFusion's query engine",
+        words: "no crate depends on DataFusion's query engine",
     },
     Rule::Never {
         crates: &["swm-plan"],
         forbidden: |name| name == "swm-models",
-        words: "solvers know cost models by their contract only",
+        words: "solvers depend on the contract of cost models only",
     },
     Rule::Never {
         crates: &["swm-eval"],
         forbidden: |name| ["swm-plan", "swm-models", "swm-envs", "swm-mujoco", "swm-gym"].contains(&name),
-        words: "evaluation knows planners, models and environments by their contracts only",
+        words: "evaluation depends on the contracts of planners, models and environments only",
     },
     Rule::Never {
         crates: &["swm-bench"],
         forbidden: |name| ["swm-models", "swm-envs", "swm-mujoco", "swm-gym"].contains(&name),
-        words: "benchmarks know models and environments by their contracts only",
+        words: "benchmarks depend on the contracts of models and environments only",
     },
     Rule::Only {
         users: &["swm"],
         crates: &["swm-envs", "swm-mujoco", "swm-models"],
-        words: "only the facade knows concrete families",
+        words: "only the facade depends on concrete families",
     },
-    Rule::Only { users: &["swm-data"], crates: &["swm-video"], words: "only the dataset crate knows FFmpeg" },
+    Rule::Only { users: &["swm-data"], crates: &["swm-video"], words: "only the dataset crate depends on FFmpeg" },
     Rule::Only {
         users: &["swm", "swm-python"],
         crates: &["swm-gym"],
-        words: "only the facade and the Python extension know Gymnasium",
+        words: "only the facade and the Python extension depend on the Gymnasium bridge",
     },
 ];
 
@@ -80,7 +80,7 @@ fn of_family(name: &str, family: &str) -> bool {
     name.strip_prefix(family).is_some_and(|rest| rest.is_empty() || rest.starts_with(['-', '_']))
 }
 
-/// What breaks the rules, a sentence each.
+/// Returns a sentence for each violation of the rules.
 pub fn violations(graph: &Graph, rules: &[Rule]) -> Vec<String> {
     let mut found = vec![];
     for rule in rules {
@@ -89,17 +89,20 @@ pub fn violations(graph: &Graph, rules: &[Rule]) -> Vec<String> {
                 let bound: Vec<_> =
                     graph.members().filter(|package| crates.is_empty() || crates.contains(&&*package.name)).collect();
                 if bound.is_empty() {
-                    found.push(format!("a rule binds nobody ({words}): {} are gone; mend xtask", crates.join(", ")));
+                    found.push(format!(
+                        "a rule applies to no crate ({words}): {} do not exist; fix xtask/src/layers.rs",
+                        crates.join(", ")
+                    ));
                 }
                 for package in bound {
-                    if let Some(way) = graph.way(package, *forbidden) {
-                        found.push(format!("{} ({words})", way.join(" → ")));
+                    if let Some(path) = graph.shortest_path(package, *forbidden) {
+                        found.push(format!("{} ({words})", path.join(" → ")));
                     }
                 }
             }
             Rule::Only { users, crates, words } => {
                 for package in graph.members().filter(|package| !users.contains(&&*package.name)) {
-                    for need in graph.member_needs(package).filter(|need| crates.contains(need)) {
+                    for need in graph.member_dependencies(package).filter(|need| crates.contains(need)) {
                         found.push(format!("{} → {need} ({words})", package.name));
                     }
                 }
@@ -113,7 +116,7 @@ pub fn violations(graph: &Graph, rules: &[Rule]) -> Vec<String> {
 mod tests {
     use super::*;
 
-    /// A workspace that keeps the rules, with more needs for some of its packages.
+    /// A workspace that satisfies the rules, with additional dependencies of some packages.
     fn with(more: &[(&str, &'static str)]) -> Vec<String> {
         let mut packages: Vec<(&str, Vec<&str>)> = vec![
             ("swm-core", vec!["serde"]),
@@ -152,7 +155,7 @@ mod tests {
     }
 
     #[test]
-    fn every_broken_rule_is_named_with_its_way() {
+    fn violations_name_the_dependency_path() {
         for (from, need, says) in [
             ("swm-core", "burn", "swm-core → burn ("),
             ("swm-envs", "mujoco-rs", "swm-envs → mujoco-rs ("),
@@ -182,8 +185,8 @@ mod tests {
     }
 
     #[test]
-    fn a_rule_about_nobody_is_no_rule() {
+    fn a_rule_without_crates_is_a_violation() {
         let found = violations(&Graph::synthetic(&[("swm", &[])]), RULES);
-        assert!(found.iter().any(|line| line.contains("binds nobody")), "{found:?}");
+        assert!(found.iter().any(|line| line.contains("applies to no crate")), "{found:?}");
     }
 }

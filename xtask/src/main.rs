@@ -1,7 +1,7 @@
 //! Checks of the workspace.
 //!
 //! `cargo xtask check` runs everything a change must pass apart from the tests, cheapest first, and stops at the
-//! first failure. Every check is a command of its own as well.
+//! first failure. Every check is also a separate command.
 
 // A command-line program; the lints guard the libraries.
 #![allow(clippy::print_stdout, clippy::print_stderr, reason = "a command-line program prints")]
@@ -22,7 +22,7 @@ use graph::Graph;
 use std::path::PathBuf;
 use std::process::{Command, ExitCode};
 
-/// A check: its name, what it proves, and what it runs.
+/// A check: its name, the property that it checks, and the function that checks it.
 type Check = (&'static str, &'static str, fn() -> Result<()>);
 
 /// The checks, cheapest first.
@@ -37,7 +37,7 @@ const CHECKS: &[Check] = &[
     ("layers", "no crate reaches what its layer excludes", || {
         verdict("layers", &layers::violations(&graph()?, layers::RULES))
     }),
-    ("table", "the crate table of ARCHITECTURE.md is true", table),
+    ("table", "the crate table of ARCHITECTURE.md matches the workspace", table),
     ("features", "every build compiles a library with the same features", || {
         verdict("features", &features::violations(&root())?)
     }),
@@ -109,14 +109,14 @@ fn graph() -> Result<Graph> {
     Graph::load(&root())
 }
 
-/// Rust sources of libraries and programs, integration tests left out.
+/// Rust sources of libraries and programs, without integration tests.
 fn sources() -> Result<Vec<source::File>> {
     let mut files = source::files(&root(), &[".rs"])?;
     files.retain(|file| file.path.contains("/src/"));
     Ok(files)
 }
 
-/// Everything people read: code, documents, Python, presets. The list of words itself is left out.
+/// All text files: code, documents, Python, presets; without the list of words itself.
 fn prose() -> Result<Vec<source::File>> {
     let mut files = source::files(&root(), &[".rs", ".md", ".py", ".toml", "Makefile"])?;
     files.retain(|file| !file.path.starts_with("xtask/"));
@@ -140,8 +140,8 @@ fn cargo(arguments: &[&str], fix: &str) -> Result<()> {
     let program = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let words = arguments.join(" ");
     let mut command = Command::new(program);
-    // `cargo run` sets variables about this package. Build scripts that watch them (ring's) would run again in the inner
-    // cargo, and everything above them would be compiled again, so they are removed.
+    // `cargo run` sets variables about this package. Build scripts that watch them (ring's) would run again in the
+    // inner cargo, and everything above them would be compiled again, so they are removed.
     let own = std::env::vars_os().map(|(name, _)| name).filter(|name| {
         let name = name.to_string_lossy();
         name == "OUT_DIR" || name.starts_with("CARGO_PKG_") || name.starts_with("CARGO_MANIFEST_")

@@ -1,8 +1,8 @@
-//! Registries: every `pub const ENTRY` stands in a list of its crate.
+//! Registries: every `pub const ENTRY` is in a list of its crate.
 
 use crate::source::{self, File};
 
-/// Every entry that no list names, a sentence each.
+/// Returns a sentence for each entry that is in no list.
 pub fn violations(files: &[File]) -> Vec<String> {
     let code: Vec<(&File, String)> =
         files.iter().map(|file| (file, source::without_tests(&source::code(&file.text)))).collect();
@@ -29,7 +29,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_entry_outside_every_list_is_named() {
+    fn an_unlisted_entry_is_a_violation() {
         let file = |path: &str, text: &str| File { path: path.to_owned(), text: text.to_owned() };
         let cem = file("crates/p/src/solvers/cem.rs", "pub const ENTRY: Entry = Entry {};");
         let room = file("crates/p/src/room/mod.rs", "pub const ENTRY: Entry = Entry {};");

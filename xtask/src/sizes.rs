@@ -2,10 +2,10 @@
 
 use crate::source::File;
 
-/// The most lines a file may have, its unit tests included.
+/// The maximum number of lines of a file, unit tests included.
 const MOST: usize = 500;
 
-/// Every file that is too long, a sentence each.
+/// Returns a sentence for each file that is too long.
 pub fn violations(files: &[File]) -> Vec<String> {
     let long = files.iter().map(|file| (file, file.text.lines().count())).filter(|(_, lines)| *lines > MOST);
     long.map(|(file, lines)| format!("{}: {lines} lines (at most {MOST}): split it by concept", file.path)).collect()
@@ -16,7 +16,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_long_file_is_named() {
+    fn a_long_file_is_a_violation() {
         let file = |lines: usize| File { path: "a.rs".to_owned(), text: "x\n".repeat(lines) };
         assert_eq!(violations(&[file(MOST)]), Vec::<String>::new());
         assert!(violations(&[file(MOST + 1)])[0].contains("501 lines"));

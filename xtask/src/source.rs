@@ -7,9 +7,9 @@ use std::process::Command;
 /// A file of the repository.
 #[derive(Debug)]
 pub struct File {
-    /// Its path from the root, with `/` between folders.
+    /// The path from the root, with `/` between folders.
     pub path: String,
-    /// Its text.
+    /// The content.
     pub text: String,
 }
 
@@ -40,7 +40,7 @@ pub fn files(root: &Path, endings: &[&str]) -> Result<Vec<File>> {
     Ok(files)
 }
 
-/// Rust source with comments, string literals and character literals replaced by spaces. Lines keep their numbers.
+/// Rust source with comments, string literals and character literals replaced by spaces. Line numbers do not change.
 pub fn code(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     let mut rest = text;
@@ -60,7 +60,7 @@ pub fn code(text: &str) -> String {
     out
 }
 
-/// The bytes of the comment or literal that `rest` starts with; 0 where it starts with neither.
+/// Returns the length in bytes of the comment or literal at the start of `rest`; 0 if there is none.
 fn skipped(rest: &str, previous: char) -> usize {
     let end_of = |from: usize, end: &str| rest[from..].find(end).map_or(rest.len(), |at| from + at + end.len());
     if rest.starts_with("//") {

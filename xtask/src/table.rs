@@ -1,4 +1,4 @@
-//! The crate table of ARCHITECTURE.md, compared with the workspace, so that it cannot go stale.
+//! Compares the crate table of ARCHITECTURE.md with the workspace.
 
 use crate::graph::Graph;
 use anyhow::{Result, bail};
@@ -17,19 +17,19 @@ pub fn parse(text: &str) -> Result<Vec<Row>> {
     let mut lines = text.lines().map(cells);
     if !lines.any(|cells| cells.iter().map(|cell| cell.to_lowercase()).eq(["crate", "responsibility", "may depend on"]))
     {
-        bail!("ARCHITECTURE.md holds no table with the header | crate | responsibility | may depend on |");
+        bail!("ARCHITECTURE.md contains no table with the header | crate | responsibility | may depend on |");
     }
     let mut rows = vec![];
     // The line under a header is its rule.
     for cells in lines.skip(1).take_while(|cells| !cells.is_empty()) {
-        let [name, _, may] = cells[..] else { bail!("a row of the crate table has not 3 columns: {cells:?}") };
+        let [name, _, may] = cells[..] else { bail!("a row of the crate table does not have 3 columns: {cells:?}") };
         let [name] = &quoted(name)[..] else { bail!("the crate table does not name one crate in backticks: {name}") };
         rows.push(Row { name: name.clone(), may: quoted(may) });
     }
     Ok(rows)
 }
 
-/// The cells of a line of a Markdown table; none where it is none.
+/// Returns the cells of a row of a Markdown table; empty if the line is not a row.
 fn cells(line: &str) -> Vec<&str> {
     let inner = line.trim().strip_prefix('|').and_then(|line| line.strip_suffix('|'));
     inner.map(|line| line.split('|').map(str::trim).collect()).unwrap_or_default()
@@ -40,7 +40,7 @@ fn quoted(cell: &str) -> Vec<String> {
     cell.split('`').skip(1).step_by(2).map(str::to_owned).collect()
 }
 
-/// Where the table and the workspace differ, a sentence each.
+/// Returns a sentence for each difference between the table and the workspace.
 pub fn violations(graph: &Graph, rows: &[Row]) -> Vec<String> {
     let mut found = vec![];
     for (i, row) in rows.iter().enumerate() {
@@ -50,7 +50,7 @@ pub fn violations(graph: &Graph, rows: &[Row]) -> Vec<String> {
         if graph.member(&row.name).is_none() {
             found.push(format!("the table lists {}, which is no crate of the workspace", row.name));
         }
-        // Other packages may be named as well; those that look like ours must be ours.
+        // The table may name third-party packages; names with the prefix of the workspace must be its crates.
         for name in row.may.iter().filter(|name| name.starts_with("swm") && graph.member(name).is_none()) {
             found.push(format!("the table lets {} depend on {name}, which is no crate of the workspace", row.name));
         }
@@ -60,7 +60,7 @@ pub fn violations(graph: &Graph, rows: &[Row]) -> Vec<String> {
             found.push(format!("the table lacks {}; add a row for it to ARCHITECTURE.md", package.name));
             continue;
         };
-        for need in graph.member_needs(package).filter(|need| !row.may.iter().any(|name| name == need)) {
+        for need in graph.member_dependencies(package).filter(|need| !row.may.iter().any(|name| name == need)) {
             found.push(format!(
                 "{} depends on {need}, which its row does not allow; drop the dependency or say in ARCHITECTURE.md why",
                 package.name
@@ -88,12 +88,12 @@ mod tests {
         &[("swm-core", &["serde"]), ("swm-plan", &["swm-core"]), ("swm", &["swm-plan"]), ("serde", &[])];
 
     #[test]
-    fn a_true_table_passes() {
+    fn a_correct_table_passes() {
         assert_eq!(check(TEXT, WORKSPACE), Vec::<String>::new());
     }
 
     #[test]
-    fn every_difference_is_named() {
+    fn every_difference_is_reported() {
         let says = |text: &str, packages: &[(&str, &[&str])], words: &str| {
             let found = check(text, packages);
             assert!(found.len() == 1 && found[0].contains(words), "{words}: {found:?}");

@@ -30,7 +30,7 @@ pub enum Space {
         /// The first integer.
         start: i64,
     },
-    /// Several integers, each from its own range.
+    /// Several integers, each with a range.
     MultiDiscrete {
         /// The number of integers in each range.
         nvec: Vec<i64>,

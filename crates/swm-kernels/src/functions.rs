@@ -62,7 +62,8 @@ pub fn silu(x: &mut [f32]) {
     dispatch(Silu(x));
 }
 
-/// Returns `Φ(x) - 1/2`, half the error function of `x / √2`, by a fitted rational function with an error of at most 2e-7.
+/// Returns `Φ(x) - 1/2`, half the error function of `x / √2`, by a fitted rational function with an error of at most
+/// 2e-7.
 #[inline(always)]
 fn half_erf<L: Level>(x: f32) -> f32 {
     let x = x.clamp(-5.6, 5.6);
@@ -186,11 +187,17 @@ pub fn softmax_backward(weights: &[f32], d: &mut [f32], width: usize) {
 }
 
 /// Computes `x *= slope` element by element.
+///
+/// # Shapes
+/// `x` and `slopes` have the same shape.
 pub fn multiply(x: &mut [f32], slopes: &[f32]) {
     x.iter_mut().zip(slopes).for_each(|(x, slope)| *x *= slope);
 }
 
 /// Computes `offset += x * slope` element by element.
+///
+/// # Shapes
+/// `offsets`, `x` and `slopes` have the same shape.
 pub fn multiply_add(offsets: &mut [f32], x: &[f32], slopes: &[f32]) {
     offsets.iter_mut().zip(x).zip(slopes).for_each(|((offset, x), slope)| *offset += x * slope);
 }
@@ -206,6 +213,9 @@ pub fn add_rows(sum: &mut [f32], x: &[f32]) {
 }
 
 /// Adds `y` to `x` element by element.
+///
+/// # Shapes
+/// `x` and `y` have the same shape.
 pub fn add(x: &mut [f32], y: &[f32]) {
     for (x, y) in x.iter_mut().zip(y) {
         *x += y;

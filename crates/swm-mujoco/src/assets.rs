@@ -1,9 +1,9 @@
-//! Third-party assets that the environments need and this project does not ship: MuJoCo's library, and the models and meshes
-//! of three Python packages.
+//! Third-party assets that the environments need and this project does not ship: MuJoCo's library, and the models and
+//! meshes of three Python packages.
 //!
-//! Each asset is a Python wheel of a pinned version and SHA-256. [`install`] downloads it with `pip download`, checks it, and
-//! unpacks the required files to `NAME-VERSION/` in [`folder`]; an interrupted installation leaves nothing behind. A list of
-//! the files with their hashes is stored with them, and [`verify`] compares it with the disk.
+//! Each asset is a Python wheel of a pinned version and SHA-256. [`install`] downloads it with `pip download`, checks
+//! it, and unpacks the required files to `NAME-VERSION/` in [`folder`]; an interrupted installation leaves nothing
+//! behind. A list of the files with their hashes is stored with them, and [`verify`] compares it with the disk.
 //!
 //! Assets are stored in `$SWM_ASSETS` if that is set, otherwise in `$STABLEWM_HOME/assets` (default
 //! `~/.stable_worldmodel/assets`).
@@ -22,7 +22,7 @@ pub struct Asset {
     pub name: &'static str,
     /// Its version.
     pub version: &'static str,
-    /// What the asset contains, in a few words.
+    /// The content of the asset, in a few words.
     pub summary: &'static str,
     /// The SHA-256 of the wheel by processor architecture; `any` fits all.
     wheels: &'static [(&'static str, &'static str)],
@@ -181,8 +181,8 @@ pub fn status() -> impl Iterator<Item = (&'static Asset, Status)> {
 /// Downloads, checks and unpacks an asset, replacing an installed one.
 ///
 /// # Errors
-/// When there is no asset of that name, or no wheel for this machine; when `pip` or the file system fails; or when the wheel has
-/// another hash.
+/// When there is no asset of that name, or no wheel for this machine; when `pip` or the file system fails; or when the
+/// wheel has another hash.
 pub fn install(name: &str) -> Result<PathBuf> {
     let asset = get(name)?;
     let (arch, sha256) = asset.wheel()?;

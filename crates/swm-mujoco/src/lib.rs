@@ -1,11 +1,11 @@
 //! 3-D environments on MuJoCo: DeepMind Control, OGBench and Fetch.
 //!
-//! MuJoCo's library and the models of the environments are not part of the program: [`assets`] installs them, and [`link`]
-//! loads the library when the first environment needs it. The environment variable `SWM_ASSETS` names the folder of the
-//! assets, for example `SWM_ASSETS=~/.cache/swm/assets`.
+//! MuJoCo's library and the models of the environments are not part of the program: [`assets`] installs them, and
+//! [`link`] loads the library when the first environment needs it. The environment variable `SWM_ASSETS` names the
+//! folder of the assets, for example `SWM_ASSETS=~/.cache/swm/assets`.
 //!
 //! Read [`physics`] (a model and its state), [`render`] (rendering), `env` (the environment shared by all families) and
-//! `task` (what a family implements), and then a family.
+//! `task` (the trait that a family implements) first, then a family.
 
 pub mod assets;
 pub mod dmc;

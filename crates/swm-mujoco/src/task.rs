@@ -1,4 +1,4 @@
-//! [`Task`]: what an environment family implements to run inside [`MujocoEnv`](crate::env::MujocoEnv).
+//! [`Task`]: the trait that an environment family implements to run inside [`MujocoEnv`](crate::env::MujocoEnv).
 
 use crate::Physics;
 use crate::render::Camera;
@@ -18,27 +18,29 @@ pub(crate) struct StepOutcome {
 
 /// The part of an environment that differs between families: start, step, observation, reward and goal.
 ///
-/// The *task state* is what a task stores besides the physics, such as a score; it is part of the `state` column. The *goal
+/// The *task state* contains the values of a task that are not part of the physics, such as a score; it is part of the
+/// `state` column. The *goal
 /// values* are stored in snapshots only, because a state is the same for every goal.
 pub(crate) trait Task: Send {
-    /// Edits the model for these factors of variation. The model is the compiled one, unless [`Task::overwrites_edits`]. Not
-    /// called again while the factors stay the same.
+    /// Edits the model for these factors of variation. The model is the compiled one, unless
+    /// [`Task::overwrites_edits`]. The method is called only when the factors change.
     ///
     /// # Errors
     /// When the model lacks an element, or cannot be compiled for these factors.
     fn apply_factors(&mut self, physics: &mut Physics, factors: &FactorValues) -> Result<()>;
 
-    /// Whether [`Task::apply_factors`] sets every value of the model that the task ever edits. The model is then not restored
-    /// first, which is slow for models with many meshes.
+    /// Whether [`Task::apply_factors`] sets every value of the model that the task ever edits. The model is then not
+    /// restored first, which is slow for models with many meshes.
     fn overwrites_edits(&self) -> bool {
         false
     }
 
-    /// Receives the factor request of a reset before [`Task::start`], for tasks that draw the factors that were not requested.
+    /// Receives the factor request of a reset before [`Task::start`], for tasks that draw the factors that were not
+    /// requested.
     fn receive_request(&mut self, _request: &VariationRequest) {}
 
-    /// Starts an episode. The state is the model's initial one ([`Physics::reset`]); derived quantities must be up to date
-    /// on return.
+    /// Starts an episode. The state is the model's initial one ([`Physics::reset`]); derived quantities must be up to
+    /// date on return.
     ///
     /// # Errors
     /// When no valid start was found.
@@ -77,13 +79,14 @@ pub(crate) trait Task: Send {
     /// When the state is invalid.
     fn set_goal_state(&mut self, physics: &mut Physics, state: &[f64], task_state: &[f64]) -> Result<()>;
 
-    /// Sets the goal from values of another form than a state, such as a position; `None` if these are not of such a form.
-    /// May change the state of the physics; the environment restores it.
+    /// Sets the goal from values of another form than a state, such as a position; `None` if these are not of such a
+    /// form. May change the state of the physics; the environment restores it.
     fn set_goal_values(&mut self, _physics: &mut Physics, _goal: &[f64]) -> Option<Result<()>> {
         None
     }
 
-    /// Samples a reachable goal that is not already reached. May change the state of the physics; the environment restores it.
+    /// Samples a reachable goal that is not already reached. May change the state of the physics; the environment
+    /// restores it.
     ///
     /// # Errors
     /// When no such goal was found.

@@ -1,4 +1,5 @@
-//! [`SolverEntry`]: the row of a solver in the registry, which states what the solver plans and what it requires of a model.
+//! [`SolverEntry`]: the row of a solver in the registry, which states what the solver plans and what it requires of a
+//! model.
 //!
 //! Every solver's file defines its row as `pub const ENTRY`; [`SOLVERS`](crate::SOLVERS) lists them.
 
@@ -17,13 +18,13 @@ pub struct SolverEntry {
     pub family: Family,
     /// The actions it plans.
     pub actions: ActionKind,
-    /// What it requires of a model beyond a cost.
+    /// The capabilities that it requires of a model in addition to a cost.
     pub needs: &'static [Need],
     /// The publication it follows.
     pub paper: &'static str,
     /// Returns the default settings, as JSON.
     pub defaults: fn() -> serde_json::Value,
-    /// Makes a solver from settings; settings that are not named keep their defaults.
+    /// Creates a solver from settings; omitted settings have their default values.
     pub make: fn(&serde_json::Value) -> Result<Box<dyn Solver>>,
 }
 
@@ -66,7 +67,8 @@ impl Named for SolverEntry {
 }
 
 impl SolverEntry {
-    /// Returns why this solver cannot plan such actions with a model that has the capabilities `offers`, if so.
+    /// Returns the reason why this solver cannot plan actions of this kind with a model that has the capabilities
+    /// `offers`; `None` if it can.
     pub fn obstacle(&self, actions: ActionKind, offers: &[Need]) -> Option<String> {
         if self.actions != actions {
             return Some(match actions {

@@ -1,7 +1,8 @@
 //! Planning: solvers that search for cheap action sequences, and the policy that replans with them.
 //!
 //! - [`solvers`]: a file for each algorithm, and [`SOLVERS`], the list of them.
-//! - [`search`]: what solvers share: the population, sampling, the gradient loop, optimizers, checks of problems and settings.
+//! - [`search`]: common parts of solvers: the population, sampling, the gradient loop, optimizers, checks of problems
+//!   and settings.
 //! - [`objective`]: terms and constraints that are added to the cost of a model or replace it.
 //! - [`mpc`]: [`MpcPolicy`], which turns any solver and any [`swm_core::CostModel`] into a [`swm_core::Policy`].
 //! - [`simulator`]: the true simulator as a cost model.

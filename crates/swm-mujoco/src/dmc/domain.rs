@@ -1,4 +1,4 @@
-//! [`Domain`]: what each domain of the suite implements; [`TaskTable`] and [`InfoColumn`], the tables it consists of.
+//! [`Domain`], the contract of a domain of the suite; [`TaskTable`] and [`InfoColumn`], the tables that describe it.
 
 use super::model_edit::ModelEdit;
 use super::observation::ObservationWriter;
@@ -43,9 +43,10 @@ pub struct InfoColumn<D> {
     pub write: fn(&D, &Physics, &mut [f64]),
 }
 
-/// A domain of the suite: the model, and what its tasks share. A value of the type is one task on a compiled model.
+/// A domain of the suite: the model and the code that its tasks have in common. A value of the type is one task on a
+/// compiled model.
 pub trait Domain: Send + Sized + 'static {
-    /// What distinguishes the tasks.
+    /// The parameters that distinguish the tasks.
     type Task: Copy + Send + 'static;
 
     /// The registered id.

@@ -24,8 +24,8 @@ pub struct GoalCoordinates {
 }
 
 impl GoalCoordinates {
-    /// The coordinates of every joint except `ignored`. Of a free body, these are height and orientation: its position on the
-    /// floor is not observed, so goals do not include it.
+    /// The coordinates of every joint except `ignored`. Of a free body, these are height and orientation: its position
+    /// on the floor is not observed, so goals do not include it.
     pub fn new(model: &MjModel, ignored: &[&str]) -> Self {
         let (mut included, mut limits) = (vec![], vec![]);
         for joint in 0..model.jnt_type().len() {
@@ -45,29 +45,29 @@ impl GoalCoordinates {
         Self { included, limits }
     }
 
-    /// Whether every joint is within its limits, extended by `tolerance`. Limits are soft: a joint can exceed them for a moment,
-    /// but cannot stay there.
+    /// Whether every joint is within its limits, extended by `tolerance`. Limits are soft: a joint can exceed them for
+    /// a few steps.
     pub fn within_limits(&self, qpos: &[f64], tolerance: f64) -> bool {
         self.limits.iter().all(|&(at, [low, high])| (low - tolerance..=high + tolerance).contains(&qpos[at]))
     }
 
     /// The absolute difference in each coordinate, in radians or metres.
-    fn differences<'a>(&'a self, here: &'a [f64], there: &'a [f64]) -> impl Iterator<Item = f64> + 'a {
+    fn differences<'a>(&'a self, qpos: &'a [f64], goal: &'a [f64]) -> impl Iterator<Item = f64> + 'a {
         self.included.iter().map(move |coordinate| match *coordinate {
-            Coordinate::Scalar(at) => (here[at] - there[at]).abs(),
-            Coordinate::Angle(at) => ((here[at] - there[at] + PI).rem_euclid(2.0 * PI) - PI).abs(),
-            Coordinate::Orientation(at) => angle_between(&here[at..at + 4], &there[at..at + 4]),
+            Coordinate::Scalar(at) => (qpos[at] - goal[at]).abs(),
+            Coordinate::Angle(at) => ((qpos[at] - goal[at] + PI).rem_euclid(2.0 * PI) - PI).abs(),
+            Coordinate::Orientation(at) => angle_between(&qpos[at..at + 4], &goal[at..at + 4]),
         })
     }
 
-    /// Whether every coordinate differs by less than `tolerance`.
-    pub fn reached(&self, here: &[f64], there: &[f64], tolerance: f64) -> bool {
-        self.differences(here, there).all(|difference| difference < tolerance)
+    /// Whether every coordinate of `qpos` differs from that of `goal` by less than `tolerance`.
+    pub fn reached(&self, qpos: &[f64], goal: &[f64], tolerance: f64) -> bool {
+        self.differences(qpos, goal).all(|difference| difference < tolerance)
     }
 
-    /// The Euclidean norm of the differences, over radians and metres alike.
-    pub fn distance(&self, here: &[f64], there: &[f64]) -> f64 {
-        self.differences(here, there).map(|difference| difference * difference).sum::<f64>().sqrt()
+    /// The Euclidean norm of the differences between `qpos` and `goal`. It mixes radians and metres.
+    pub fn distance(&self, qpos: &[f64], goal: &[f64]) -> f64 {
+        self.differences(qpos, goal).map(|difference| difference * difference).sum::<f64>().sqrt()
     }
 }
 

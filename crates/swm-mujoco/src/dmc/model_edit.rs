@@ -5,8 +5,8 @@ use mujoco_rs::wrappers::mj_editing::MjsGeom;
 use mujoco_rs::wrappers::mj_model::MjtGeomBase;
 use swm_core::{Error, FactorValues, Result};
 
-/// Edits a model's description. Arguments name elements of the model and keys of factors; values are rounded to single precision
-/// where those of the reference are. Every method fails if the model lacks the element.
+/// Edits a model's description. Arguments name elements of the model and keys of factors; values are rounded to single
+/// precision where those of the reference are. Every method fails if the model lacks the element.
 pub struct ModelEdit<'a> {
     spec: &'a mut MjSpec,
     factors: &'a FactorValues,
@@ -71,7 +71,7 @@ impl<'a> ModelEdit<'a> {
         f32::from(u8::from(self.factors.integer("rendering.render_target") != 0))
     }
 
-    /// The shape of the target, and how many sizes it has.
+    /// The shape of the target, and the number of its size parameters.
     fn target_shape(&self) -> (MjtGeomBase, usize) {
         match self.factors.integer("target.shape") {
             0 => (MjtGeomBase::mjGEOM_BOX, 3),
@@ -139,7 +139,8 @@ impl<'a> ModelEdit<'a> {
         Ok(())
     }
 
-    /// Sets the friction of the floor: the sliding coefficient of the factor, MuJoCo's defaults for torsion and rolling.
+    /// Sets the friction of the floor: the sliding coefficient of the factor, MuJoCo's defaults for torsion and
+    /// rolling.
     pub fn floor_friction(&mut self, floor: &str) -> Result<()> {
         let sliding = self.factors.scalar("floor.friction");
         *self.geom(floor)?.friction_mut() = [sliding, single(0.005), single(0.0001)];

@@ -10,11 +10,11 @@ use swm_core::{Error, Result, Rng};
 /// Starts drawn before [`sample_without_contacts`] fails.
 const START_TRIES: usize = 1000;
 
-/// Randomises every joint: limited joints within their limits, unlimited hinges over the full circle, free bodies in orientation.
-/// Unlimited slides keep their position.
+/// Randomises every joint: limited joints within their limits, unlimited hinges over the full circle, free bodies in
+/// orientation. Unlimited slides keep their position.
 ///
-/// The quaternion of a free body is drawn from the positive orthant, which does not contain all rotations: a bug of the suite,
-/// kept so that starts have the same distribution.
+/// The quaternion of a free body is drawn from the positive orthant, which does not contain all rotations: a bug of the
+/// suite, reproduced so that starts have the same distribution.
 pub fn randomize_joints(physics: &mut Physics, rng: &mut Rng) {
     for joint in 0..physics.model().jnt_type().len() {
         let model = physics.model();

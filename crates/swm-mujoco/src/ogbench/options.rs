@@ -1,4 +1,4 @@
-//! Options that tables and mazes share.
+//! Options of both table and maze environments.
 
 use swm_core::columns;
 use swm_core::registry::EnvOption;

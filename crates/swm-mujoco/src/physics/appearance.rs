@@ -1,4 +1,4 @@
-//! [`Appearance`]: what renderers use to find the meshes and textures they cached for a model.
+//! [`Appearance`]: the key of the meshes and textures that renderers cache for a model.
 
 use mujoco_rs::wrappers::MjModel;
 use std::collections::BTreeMap;

@@ -23,7 +23,8 @@ pub(super) enum Derivation {
     ForwardPassive,
     /// `mj_step` from the previous state: derived quantities lag the state by one step, as in Gymnasium.
     Step,
-    /// `mj_step` from the previous state, then `mj_step1`: poses and velocities belong to the state, as in DeepMind Control.
+    /// `mj_step` from the previous state, then `mj_step1`: poses and velocities belong to the state, as in DeepMind
+    /// Control.
     ControlStep,
 }
 
@@ -79,7 +80,8 @@ impl Physics {
         self.data.model()
     }
 
-    /// The model, for edits of values such as sizes, colours and masses. Counts, addresses and the model as a whole must stay.
+    /// The model, for edits of values such as sizes, colours and masses. Callers must not change counts
+    /// and addresses or replace the model.
     pub(crate) fn model_mut(&mut self) -> &mut MjModel {
         self.edited = true;
         // SAFETY: this crate edits values in the model's arrays and never replaces the model.
@@ -125,7 +127,7 @@ impl Physics {
         &self.appearance
     }
 
-    /// Gives a geom a colour of its own, which replaces that of its material.
+    /// Sets the colour of a geom and removes its material.
     pub(crate) fn set_geom_color(&mut self, geom: usize, rgb: [f32; 3]) {
         let model = self.model_mut();
         model.geom_rgba_mut()[geom][..3].copy_from_slice(&rgb);
@@ -140,7 +142,7 @@ impl Physics {
         self.guarded("computing a model's constants", || unsafe { ffi::mj_setConst(model, data) });
     }
 
-    /// Installs hooks that take part in every time step from now on.
+    /// Installs hooks for all following time steps.
     pub(crate) fn set_hooks(&mut self, hooks: Arc<dyn StepHooks>) {
         self.hooks = Some(hooks);
     }

@@ -73,7 +73,7 @@ static CPU: cpu::CpuRenderer = cpu::CpuRenderer;
 /// The name of the chosen renderer with its device, for manifests.
 ///
 /// # Errors
-/// When EGL was chosen and is not available; the error tells what to install.
+/// When EGL was chosen and is not available; the error names the package to install.
 pub fn name() -> Result<String> {
     renderer().map(|renderer| renderer.name().to_owned())
 }
@@ -81,7 +81,7 @@ pub fn name() -> Result<String> {
 /// The chosen renderer.
 ///
 /// # Errors
-/// When EGL was chosen and is not available; the error tells what to install.
+/// When EGL was chosen and is not available; the error names the package to install.
 pub(super) fn renderer() -> Result<&'static dyn Renderer> {
     /// Whether there is a graphics card; determined once.
     static HARDWARE: OnceLock<bool> = OnceLock::new();

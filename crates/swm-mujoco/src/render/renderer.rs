@@ -1,4 +1,4 @@
-//! [`Renderer`]: what both renderers implement, and the types they receive.
+//! [`Renderer`]: the trait that both renderers implement, and its argument types.
 
 use crate::physics::Appearance;
 use mujoco_rs::mujoco_c::mjvScene;
@@ -12,20 +12,20 @@ pub enum Camera {
     Free,
     /// A camera that orbits a point.
     Orbit {
-        /// The point to look at, in metres.
+        /// The point in the centre of the image, in metres.
         lookat: [f64; 3],
         /// Distance from the point, in metres.
         distance: f64,
         /// Angle around the vertical axis, in degrees.
         azimuth: f64,
-        /// Angle above the horizon, in degrees; negative when the camera looks down.
+        /// Angle above the horizon, in degrees; negative for a camera that points down.
         elevation: f64,
     },
     /// A camera of the model, by index.
     Fixed(usize),
 }
 
-/// What to render, and the buffer to render to: row-major `[height, width]` pixels, top row first.
+/// The modality to render, with its buffer of row-major `[height, width]` pixels, top row first.
 pub enum FrameBuffer<'a> {
     /// Red, green, blue: three bytes per pixel.
     Rgb(&'a mut [u8]),

@@ -11,7 +11,7 @@ const LIBRARY: &str = "SWM_EGL_LIBRARY";
 #[test]
 fn renders_without_a_graphics_library() {
     if std::env::var_os(LIBRARY).is_none() {
-        // A loaded library stays loaded, so the test runs in a process of its own.
+        // A library cannot be unloaded, so the test runs in a separate process.
         let test = std::env::current_exe().expect("this program");
         let mut alone = Command::new(test);
         alone.args(["--exact", "no_gl::renders_without_a_graphics_library"]).env(LIBRARY, "libNoEGL.so");

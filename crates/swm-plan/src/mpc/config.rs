@@ -1,11 +1,11 @@
-//! [`MpcConfig`]: how far to plan and how much of a plan to execute.
+//! [`MpcConfig`]: the planning horizon and the number of steps to execute before replanning.
 
 use crate::search::Settings;
 use serde::{Deserialize, Serialize};
 use std::time::{Duration, Instant};
 use swm_core::{Error, Result};
 
-/// How far to plan and how much of a plan to execute.
+/// The planning horizon and the number of steps to execute before replanning.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MpcConfig {
@@ -13,17 +13,17 @@ pub struct MpcConfig {
     pub horizon: usize,
     /// Model steps to execute before planning again; the whole horizon is open loop.
     pub receding_horizon: usize,
-    /// Environment steps in one model step (the frameskip the model was trained with). Their actions are concatenated in a
-    /// model step's action.
+    /// Environment steps in one model step (the frameskip the model was trained with). Their actions are concatenated
+    /// in a model step's action.
     pub action_block: usize,
-    /// Whether a plan starts from the part of the last plan that was not executed, moved forward and filled with zeros (the
-    /// mean action in model units; no preference among choices).
+    /// Whether a plan starts from the part of the last plan that was not executed, moved forward and filled with zeros
+    /// (the mean action in model units; no preference among choices).
     pub warm_start: bool,
     /// Model steps the model conditions on, the present one included.
     pub history: usize,
-    /// Seconds after which solvers stop searching and return the best plan so far. The time counts from the observation of
-    /// the present, for all environments that are planned together; the first iteration is always finished. With a budget,
-    /// results depend on the machine's speed and load.
+    /// Seconds after which solvers stop searching and return the best plan so far. The time counts from the observation
+    /// of the present, for all environments that are planned together; the first iteration is always finished. With a
+    /// budget, results depend on the machine's speed and load.
     pub latency_budget: Option<f64>,
 }
 

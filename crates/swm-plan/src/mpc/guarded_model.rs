@@ -1,7 +1,7 @@
 //! [`GuardedModel`]: the model as the policy passes it to a solver.
 //!
-//! The wrapper measures the time spent in the model, so that the planner's own time is known, and turns a panic into an error
-//! that names its source.
+//! The wrapper measures the time spent in the model, so that the planner's own time is known, and turns a panic into an
+//! error that names its source.
 
 use std::any::Any;
 use std::cell::RefCell;
@@ -11,8 +11,8 @@ use swm_core::{Batch, Candidates, Constrained, CostModel, DifferentiableCost, En
 
 /// A model with a timer, whose panics are errors.
 pub(crate) struct GuardedModel<'m> {
-    /// In a cell, because [`LatentDynamics`] and [`Constrained`] return their sizes through shared references, and the model
-    /// gives access to these traits through exclusive references only.
+    /// In a cell, because [`LatentDynamics`] and [`Constrained`] return their sizes through shared references, and the
+    /// model gives access to these traits through exclusive references only.
     model: RefCell<&'m mut dyn CostModel>,
     /// Seconds spent in the model.
     pub seconds: f64,
@@ -31,10 +31,11 @@ fn message(panic: &(dyn Any + Send)) -> &str {
 }
 
 fn withdrawn(what: &str) -> Error {
-    Error::external("calling the model", format!("it offered {what} before and no longer does"))
+    Error::external("calling the model", format!("it returned {what} earlier and returns none now"))
 }
 
 impl<'m> GuardedModel<'m> {
+    /// Wraps a model.
     pub fn new(model: &'m mut dyn CostModel) -> Self {
         Self { model: RefCell::new(model), seconds: 0.0 }
     }

@@ -1,7 +1,7 @@
 //! [`History`]: past frames and actions of every slot, for models that condition on more than one frame.
 //!
-//! A model step is `action_block` environment steps, so the history holds the frame at the beginning of each past model step
-//! and the block of actions executed in it.
+//! A model step is `action_block` environment steps, so the history holds the frame at the beginning of each past model
+//! step and the block of actions executed in it.
 
 use swm_core::columns::PIXELS;
 use swm_core::{Batch, ColumnSpec, DType, Result, Schema};
@@ -42,6 +42,7 @@ struct Slot {
 }
 
 impl History {
+    /// Creates the history of `slots` environments, with past actions of zero.
     pub fn new(past: usize, action_block: usize, action_dim: usize, slots: usize) -> Self {
         let empty = Slot { actions: vec![0.0; past * action_block * action_dim], ..Slot::default() };
         Self { past, action_block, action_dim, slots: vec![empty; slots], infos: None }

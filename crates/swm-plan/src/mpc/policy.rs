@@ -65,7 +65,7 @@ impl Slot {
     }
 }
 
-/// Buffers that keep their memory between calls.
+/// Buffers that are reused between calls.
 #[derive(Default)]
 struct Scratch {
     replan: Vec<usize>,
@@ -185,7 +185,7 @@ impl MpcPolicy {
     }
 }
 
-/// Checks what a solver returned for `envs` environments.
+/// Checks the plan that a solver returned for `envs` environments.
 fn check_plan(plan: &Plan, envs: usize, horizon: usize, dim: usize) -> Result<()> {
     let wrong = |given, expected| Err(Error::mismatch("the plan a solver returned", given, expected));
     if plan.actions.len() != envs * horizon * dim {

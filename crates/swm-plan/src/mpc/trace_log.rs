@@ -26,7 +26,7 @@ pub struct PlanRecord {
     pub search: PlanTrace,
 }
 
-/// A log of plans. Clones share the same log: one is given to the policy, another is read in the end.
+/// A log of plans. Clones refer to the same log: the policy writes to one clone, and the caller reads another.
 #[derive(Clone, Debug, Default)]
 pub struct TraceLog(Arc<Mutex<Vec<PlanRecord>>>);
 

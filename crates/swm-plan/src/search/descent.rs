@@ -1,7 +1,7 @@
-//! [`Descent`]: the loop that all gradient solvers share.
+//! [`Descent`]: the optimisation loop of all gradient solvers.
 //!
-//! Each step computes costs and gradients, lets the solver adjust the gradient, moves the candidates, adds noise, and projects
-//! the candidates back to what is allowed (action bounds or probability simplices).
+//! Each step computes costs and gradients, lets the solver adjust the gradient, moves the candidates, adds noise, and
+//! projects the candidates onto the feasible set (action bounds or probability simplices).
 
 use super::optimizer::{Memory, Optimizer};
 use super::population::Population;

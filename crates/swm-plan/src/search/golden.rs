@@ -25,6 +25,7 @@ pub struct Update {
 }
 
 impl Update {
+    /// Returns the elites of the recorded candidates.
     pub fn elites<'a>(&'a self, order: &'a mut Vec<usize>) -> Elites<'a> {
         Elites::select(&self.candidates, &self.costs, ELITES, order)
     }
@@ -54,6 +55,7 @@ pub fn candidates(update: &Update, gaussian: &Gaussian, bound: f32) -> Vec<f32> 
     candidates
 }
 
+/// Asserts that values equal those of the reference up to 1e-5.
 pub fn assert_near(ours: &[f32], theirs: &[f32]) {
     assert_eq!(ours.len(), theirs.len());
     for (ours, theirs) in ours.iter().zip(theirs) {

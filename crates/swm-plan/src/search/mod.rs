@@ -1,8 +1,9 @@
-//! What solvers share: the population of candidates, sampling distributions, elites, the gradient loop, and checks.
+//! Common parts of solvers: the population of candidates, sampling distributions, elites, the gradient loop, and
+//! checks.
 //!
-//! A solver checks its settings with [`Settings`] and its problem with [`continuous`] or [`discrete`]. A sampling solver then
-//! repeats [`iterate`]: draw a [`Population`], evaluate it, refit a distribution to its [`Elites`]. A gradient solver runs a
-//! [`Descent`].
+//! A solver checks its settings with [`Settings`] and its problem with [`continuous`] or [`discrete`]. A sampling
+//! solver then repeats [`iterate`]: draw a [`Population`], evaluate it, refit a distribution to its [`Elites`]. A
+//! gradient solver runs a [`Descent`].
 
 mod coloured_noise;
 mod descent;

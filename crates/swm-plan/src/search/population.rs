@@ -84,8 +84,8 @@ impl Population {
         evaluate(cost, candidates, iteration, costs)
     }
 
-    /// Calls `write(env, sample, key, candidate)` for every candidate, in parallel. `key` is that of the environment and the
-    /// iteration.
+    /// Calls `write(env, sample, key, candidate)` for every candidate, in parallel. `key` is that of the environment
+    /// and the iteration.
     pub fn write(&mut self, iteration: usize, write: impl Fn(usize, usize, Key, &mut [f32]) + Sync) {
         let (len, all) = (self.len(), self.samples * self.len());
         let keys = &self.keys;
@@ -128,8 +128,8 @@ impl Population {
         self.costs.chunks_exact(self.samples).map(lowest).collect()
     }
 
-    /// Appends an entry to the trace of every environment: the cost of its candidate `best`, the mean cost and the spread
-    /// of its candidates.
+    /// Appends an entry to the trace of every environment: the cost of its candidate `best`, the mean cost and the
+    /// spread of its candidates.
     pub fn record(&self, trace: &mut [PlanTrace], best: &[usize]) {
         let len = self.len();
         let envs = self.costs.chunks_exact(self.samples).zip(self.actions.chunks_exact(self.samples * len));
@@ -179,7 +179,7 @@ pub fn add_noise(values: &mut [f32], sigma: f32, key: Key) {
     values.iter_mut().for_each(|value| *value += sigma * rng.sample::<f32, _>(StandardNormal));
 }
 
-/// The mean of some values, summed in double precision.
+/// Returns the mean of `values`, summed in double precision.
 pub fn average(values: &[f32]) -> f32 {
     (values.iter().map(|&value| f64::from(value)).sum::<f64>() / values.len() as f64) as f32
 }

@@ -1,8 +1,9 @@
 //! The robot: a UR5e arm with a Robotiq 2F-85 gripper that points down.
 //!
-//! An action moves the gripper relative to its present pose: up to 5 cm along each axis, 0.3 rad about the vertical, and the
-//! full range of the fingers. The target pose is clipped to the workspace and converted to joint angles by inverse kinematics;
-//! the arm's position actuators hold these for one control step. Constants are OGBench's (`manipspace/envs/manipspace_env.py`).
+//! An action moves the gripper relative to its present pose: up to 5 cm along each axis, 0.3 rad about the vertical,
+//! and the full range of the fingers. The target pose is clipped to the workspace and converted to joint angles by
+//! inverse kinematics; the arm's position actuators hold these for one control step. Constants are OGBench's
+//! (`manipspace/envs/manipspace_env.py`).
 
 pub mod ik;
 pub mod pose;
@@ -71,7 +72,7 @@ pub struct Proprioception {
     pub position: Vec3,
     /// Rotation of the gripper about the vertical, in radians.
     pub yaw: f64,
-    /// How far the fingers are closed: 0 (open) to 1 (closed).
+    /// The closure of the fingers: 0 (open) to 1 (closed).
     pub closed: f64,
     /// Velocity of the finger joint, in rad/s.
     pub closing: f64,
@@ -128,7 +129,8 @@ impl Arm {
         controls[JOINTS] = CLOSED_CONTROL * closed;
     }
 
-    /// Joint angles (rad) near `start` that put the pinch site at a position (m), pointing down, rotated by `yaw` (rad).
+    /// Joint angles (rad) near `start` that put the pinch site at a position (m), pointing down, rotated by `yaw`
+    /// (rad).
     pub fn solve(&self, position: Vec3, yaw: f64, start: [f64; JOINTS]) -> [f64; JOINTS] {
         let pinch = Pose { position, rotation: pose::mul(pose::about_z(pose::wrap(yaw)), DOWN) };
         self.chain.solve(pinch.then(self.pinch_to_flange), start)
@@ -157,7 +159,7 @@ impl Arm {
     }
 }
 
-/// How far the fingers are closed: 0 (open) to 1 (closed).
+/// The closure of the fingers: 0 (open) to 1 (closed).
 fn closed_fraction(physics: &Physics) -> f64 {
     (physics.data().qpos()[JOINTS] / CLOSED).clamp(0.0, 1.0)
 }

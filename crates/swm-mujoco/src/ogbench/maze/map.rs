@@ -105,13 +105,13 @@ pub fn distance(a: Xy, b: Xy) -> f64 {
 }
 
 impl Map {
-    /// The numbers of columns and rows, as floating-point values.
+    /// The counts of columns and rows, as floating-point values.
     pub fn extent(&self) -> [f64; 2] {
         let (rows, columns) = self.size();
         [columns as f64, rows as f64]
     }
 
-    /// The point that OGBench's camera looks at, in metres.
+    /// The target point of OGBench's camera, in metres.
     pub fn camera_center(&self) -> Xy {
         self.extent().map(|cells| 2.0 * (cells - 3.0))
     }
@@ -188,7 +188,8 @@ impl ShortestPaths {
         self.steps[self.index(self.map.cell(from))].is_some()
     }
 
-    /// The next point on the path: the goal in its own cell, otherwise the centre of the neighbouring cell nearest to the goal.
+    /// The next point on the path: the goal in its own cell, otherwise the centre of the neighbouring cell nearest to
+    /// the goal.
     pub fn next(&self, from: Xy) -> Xy {
         let cell = self.map.cell(from);
         if cell == self.map.cell(self.goal) {

@@ -1,9 +1,9 @@
-//! The scripted expert of tables: performs one job after another, planning every action from the present columns, so that it
-//! recovers from errors.
+//! The scripted expert of tables: performs one job after another, planning every action from the present columns, so
+//! that it recovers from errors.
 //!
-//! As OGBench's oracles, a job consists of moves above an object, down, grasp, up, over the target, down, release. The order of
-//! jobs is planned here, because a goal may include several: lower cubes before those on top, obstacles first, unlocking before
-//! sliding, and locks last.
+//! As OGBench's oracles, a job consists of moves above an object, down, grasp, up, over the target, down, release. The
+//! order of jobs is planned here, because a goal may include several: lower cubes before those on top, obstacles first,
+//! unlocking before sliding, and locks last.
 
 use super::config::OPEN;
 use super::goal::{GOAL_TOLERANCE, Subject};
@@ -75,7 +75,7 @@ struct TableExpert {
 struct Inputs {
     gripper: Vec3,
     yaw: f64,
-    /// How far the fingers are closed, 0 to 1.
+    /// The closure of the fingers: 0 (open) to 1 (closed).
     closed: f64,
     contact: f64,
     /// Position and yaw of each cube.
@@ -279,7 +279,8 @@ fn horizontal_distance(a: Vec3, b: Vec3) -> f64 {
     (a[0] - b[0]).hypot(a[1] - b[1])
 }
 
-/// The smallest rotation (rad) from `from` to an angle equivalent to `to`, for objects with rotational symmetry `period`.
+/// The smallest rotation (rad) from `from` to an angle equivalent to `to`, for objects with rotational symmetry
+/// `period`.
 fn symmetric_rotation(from: f64, to: f64, period: f64) -> f64 {
     let difference = wrap(to - from);
     difference - (difference / period).round() * period

@@ -1,4 +1,4 @@
-//! The goal of a table: what it includes, whether it is reached, and the distance to it.
+//! The goal of a table environment: its parts, its success criterion, and the distance to it.
 
 use super::config::FixtureState;
 use super::parts::Parts;
@@ -114,8 +114,8 @@ impl GoalCheck<'_> {
         self.terms(subject).all(|term| term.reached)
     }
 
-    /// The sum of the distances of all terms that are not reached, plus the distance of the gripper from the nearest of them, in
-    /// metres.
+    /// The sum of the distances of all terms that are not reached, plus the distance of the gripper from the nearest of
+    /// them, in metres.
     pub fn distance(&self, subject: Subject, gripper: Vec3) -> f64 {
         let open = || self.terms(subject).filter(|term| !term.reached);
         let terms: f64 = open().map(|term| term.distance).sum();

@@ -1,5 +1,5 @@
-//! Contacts of two boxes that touch at their edges: the face of the first box that is most parallel to both edges, and the face
-//! of the second box likewise; the second face is clipped by the first, along the normal.
+//! Contacts of two boxes that touch at their edges: the face of the first box that is most parallel to both edges, and
+//! the face of the second box likewise; the second face is clipped by the first, along the normal.
 
 use super::{BoxContacts, Edges, OrientedBox, TINY, Vector, add, dot, from_face_frame, sign, to_face_frame};
 
@@ -78,8 +78,8 @@ pub fn edge_contacts(a: &OrientedBox, b: &OrientedBox, edges: &Edges, margin: f6
     }
     let crossings = contacts.count;
 
-    // Corners of the rectangle inside the second face. The divisor is the area at first, and the squared distance of the last
-    // accepted corner afterwards: a bug of MuJoCo 3.3.2, kept for equal results.
+    // Corners of the rectangle inside the second face. The divisor is the area at first, and the squared distance of
+    // the last accepted corner afterwards: a bug of MuJoCo 3.3.2, reproduced for equal results.
     let mut divisor = along[0] * across[1] - across[0] * along[1];
     for (cx, cy) in [(-lx, -ly), (-lx, ly), (lx, -ly), (lx, ly)] {
         let (x, y) = (cx - shadow[0][0], cy - shadow[0][1]);

@@ -1,10 +1,10 @@
 //! Contacts of two boxes, as MuJoCo 3.3.2 computes them.
 //!
-//! Later versions prefer a face to an edge pair of nearly equal overlap, which turns the contact normal by a tenth of a degree;
-//! and where an edge lies on a face, they add contacts of the adjacent face. Both change the path of a block within 40 actions.
-//! Here, the separating axis test decides between [`faces`] and [`edges`].
+//! Later versions prefer a face to an edge pair of nearly equal overlap, which turns the contact normal by a tenth of a
+//! degree; and where an edge lies on a face, they add contacts of the adjacent face. Both change the path of a block
+//! within 40 actions. Here, the separating axis test decides between [`faces`] and [`edges`].
 //!
-//! The distance of a contact on a face is half the overlap: a bug of MuJoCo 3.3.2, kept for equal results.
+//! The distance of a contact on a face is half the overlap: a bug of MuJoCo 3.3.2, reproduced for equal results.
 
 mod edges;
 mod faces;
@@ -90,7 +90,8 @@ impl OrientedBox {
         [self.rotation[i], self.rotation[3 + i], self.rotation[6 + i]]
     }
 
-    /// The distance of a point from the centre in the maximum norm, relative to the surface (1), which `margin` moves outwards.
+    /// The distance of a point from the centre in the maximum norm, relative to the surface (1), which `margin` moves
+    /// outwards.
     fn relative_depth(&self, point: Vector, margin: f64) -> f64 {
         let own = self.local_direction(add(point, self.center, -1.0));
         (0..3).map(|i| own[i].abs() / (self.half[i] + margin)).fold(0.0, f64::max)
@@ -230,8 +231,8 @@ fn sign(positive: bool) -> f64 {
 mod tests {
     use super::*;
 
-    /// Two boxes, the margin, and the contacts that MuJoCo 3.3.2 computed: normal, points and distances. The cases: two blocks on
-    /// the edge of a table, a block on the table, and the edge of a finger on the block.
+    /// Two boxes, the margin, and the contacts that MuJoCo 3.3.2 computed: normal, points and distances. The cases: two
+    /// blocks on the edge of a table, a block on the table, and the edge of a finger on the block.
     #[rustfmt::skip]
     #[allow(clippy::type_complexity, reason = "a table of recorded values")]
     fn recorded() -> [(OrientedBox, OrientedBox, f64, Vector, Vec<(Vector, f64)>); 4] { [

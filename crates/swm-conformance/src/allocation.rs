@@ -1,6 +1,7 @@
 //! Checks that steps, observations and frames allocate no memory after a warm-up.
 //!
-//! Allocations are counted per thread, so concurrent tests do not interfere. The test program must use the counting allocator:
+//! Allocations are counted per thread, so concurrent tests do not interfere. The test program must use the counting
+//! allocator:
 //!
 //! ```ignore
 //! #[global_allocator]

@@ -307,7 +307,7 @@ class Bridge:
         _, _, _, _, second = env.step(env.action_space.sample())
         names = set()
         self.size = HEAD.size
-        self.action_at = self.place(self.actions.len * self.actions.dtype.itemsize)
+        self.action_at = self.allocate(self.actions.len * self.actions.dtype.itemsize)
         self.columns, self.observed, self.informed = [], [], []
         for name, path, space in leaves(env.observation_space, 'observation'):
             form, dtype, shape = described(space)
@@ -318,24 +318,24 @@ class Bridge:
             raise Unsupported(f'observations of {env.observation_space}: none of them is an array of fixed shape')
         # Entries of `info`, sorted by name, because their order may vary.
         for key in sorted(key for key in {**first, **second} if isinstance(key, str)):
-            seen = [value for value in (numeric(info.get(key)) for info in (first, second)) if value is not None]
-            fixed = len({value.shape for value in seen}) == 1
-            goal = key == 'goal' and seen and is_frame(seen[0])
+            values = [value for value in (numeric(info.get(key)) for info in (first, second)) if value is not None]
+            fixed = len({value.shape for value in values}) == 1
+            goal = key == 'goal' and values and is_frame(values[0])
             if fixed and not goal and key not in IN_HEADER and not key.startswith('_'):
-                dtype = column_dtype(np.result_type(*seen))
-                self.column(names, key, 'info_', dtype, seen[0].shape)
-                self.informed.append((key, dtype, seen[0].shape, self.columns[-1]['offset']))
-        self.factors_at = self.place(8 * sum(len(form['init']) for form, _ in self.factors))
+                dtype = column_dtype(np.result_type(*values))
+                self.column(names, key, 'info_', dtype, values[0].shape)
+                self.informed.append((key, dtype, values[0].shape, self.columns[-1]['offset']))
+        self.factors_at = self.allocate(8 * sum(len(form['init']) for form, _ in self.factors))
 
-        self.no_frame, self.render_shape, self.looks = '', None, None
+        self.no_frame, self.render_shape, self.frame_index = '', None, None
         frame = self.first_frame()
         if frame is not None:
             self.render_shape = frame.shape[:2]
-            self.frame_at = self.place(math.prod(self.render_shape) * 3)
+            self.frame_at = self.allocate(math.prod(self.render_shape) * 3)
         goal = first.get('goal')
         self.goal_shape = goal.shape[:2] if is_frame(goal) else None
         if self.goal_shape:
-            self.goal_at = self.place(math.prod(self.goal_shape) * 3)
+            self.goal_at = self.allocate(math.prod(self.goal_shape) * 3)
 
         # Versions of the packages of its class and its registration, and of those that it names itself.
         modules = type(env.unwrapped).__module__, str(getattr(env.spec, 'entry_point', ''))
@@ -347,8 +347,8 @@ class Bridge:
             except (importlib.metadata.PackageNotFoundError, ValueError):
                 pass
 
-    def place(self, size):
-        """The offset of the next `size` bytes."""
+    def allocate(self, size):
+        """Reserves the next `size` bytes of the buffer and returns their offset."""
         offset = -(-self.size // ALIGN) * ALIGN
         self.size = offset + size
         return offset
@@ -358,7 +358,7 @@ class Bridge:
         while name in RESERVED or name in names:
             name = prefix + name
         names.add(name)
-        offset = self.place(math.prod(shape) * dtype.itemsize)
+        offset = self.allocate(math.prod(shape) * dtype.itemsize)
         self.columns.append({'name': name, 'dtype': dtype.name, 'shape': list(shape), 'offset': offset})
         return name
 
@@ -372,9 +372,9 @@ class Bridge:
             self.no_frame = f'render() gives {type(frame).__name__} in mode {self.env.render_mode!r}'
         except Exception as error:  # The environment is usable without frames.
             self.no_frame = f'render() raises {type(error).__name__}: {error}'
-        for place, (_, _, _, dtype, shape, _) in enumerate(self.observed):
+        for index, (_, _, _, dtype, shape, _) in enumerate(self.observed):
             if dtype == np.uint8 and len(shape) == 3 and shape[2] == 3:
-                self.looks = place
+                self.frame_index = index
                 return np.empty(shape, np.uint8)
         return None
 
@@ -519,8 +519,8 @@ class Bridge:
 
     def render(self):
         """Renders into the buffer."""
-        if self.looks is not None:
-            self.frame[...] = self.observed_views[self.looks][1]
+        if self.frame_index is not None:
+            self.frame[...] = self.observed_views[self.frame_index][1]
             return
         frame = self.env.render()
         if not is_frame(frame) or frame.shape[:2] != self.render_shape:

@@ -14,7 +14,8 @@ pub const EXAMPLES: &[(&str, &str)] = &[
     ("swm/CraftaxPixels-v1", "Craftax; also CraftaxSymbolic-v1, CraftaxClassicPixels-v1, CraftaxClassicSymbolic-v1"),
 ];
 
-/// Whether an id has Gymnasium's form: a version, a namespace or a module. `swm/…` ids are native, apart from Craftax.
+/// Returns whether an id has the form of a Gymnasium id: a version, a namespace or a module. `swm/…` ids are native,
+/// apart from Craftax.
 pub fn is_gymnasium_id(text: &str) -> bool {
     let id = text.split(',').next().unwrap_or_default();
     if id.starts_with("swm/") {

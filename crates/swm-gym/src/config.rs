@@ -18,8 +18,8 @@ pub struct GymConfig {
 }
 
 impl Default for GymConfig {
-    /// Half an hour to start (Craftax makes textures and compiles the first time), a minute or `$SWM_GYM_TIMEOUT` seconds per
-    /// call, two restarts.
+    /// Half an hour to start (Craftax builds textures and compiles the first time), a minute or `$SWM_GYM_TIMEOUT`
+    /// seconds per call, two restarts.
     fn default() -> Self {
         let seconds = std::env::var("SWM_GYM_TIMEOUT").ok().and_then(|text| text.parse().ok());
         let seconds = seconds.filter(|seconds: &f64| *seconds > 0.0 && *seconds < 1e9).unwrap_or(60.0);

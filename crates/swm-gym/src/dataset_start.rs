@@ -1,8 +1,9 @@
 //! Starts of Gymnasium environments at dataset rows: the arguments of `Bridge.reset`.
 //!
-//! Gymnasium has no interface for setting a state, so methods of the environment are called after the reset: those that the
-//! caller names, or those that the bridge found by their names. They return no observation, so the columns take the values
-//! of the start row until the next step; columns of the goal (`goal_NAME`) take those of the goal row in every step.
+//! Gymnasium has no interface for setting a state, so methods of the environment are called after the reset: those that
+//! the caller names, or those that the bridge found by their names. They return no observation, so the columns take the
+//! values of the start row until the next step; columns of the goal (`goal_NAME`) take those of the goal row in every
+//! step.
 
 use crate::EnvLayout;
 use serde_json::{Value, json};
@@ -18,8 +19,8 @@ pub fn callables<'a>(layout: &'a EnvLayout, named: &'a [Callable]) -> Result<&'a
     Err(Error::config(
         format!("starting {} from a row of a dataset", layout.spec.id),
         "it has no method known to set a state",
-        "give it a method `set_state(state)`, or name one of its own, from Python: World.evaluate(callables=[{'method': \
-         'set_state', 'args': {'state': {'value': 'state'}}}])",
+        "give it a method `set_state(state)`, or name one of its methods in Python: \
+         World.evaluate(callables=[{'method': 'set_state', 'args': {'state': {'value': 'state'}}}])",
     ))
 }
 

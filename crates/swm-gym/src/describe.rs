@@ -1,5 +1,5 @@
-//! [`Description`]: the bridge's description of an environment. [`EnvLayout`]: the spec and the memory layout that follow
-//! from it.
+//! [`Description`]: the bridge's description of an environment. [`EnvLayout`]: the spec and the memory layout that
+//! follow from it.
 
 use serde::Deserialize;
 use std::collections::BTreeMap;
@@ -133,7 +133,7 @@ pub struct EnvLayout {
     pub(crate) action: Range<usize>,
 }
 
-/// Offsets in the header of the buffer: reward and goal distance (doubles), then three flags.
+/// Offsets in bytes in the header of the buffer: reward and goal distance (doubles), then three flags.
 pub(crate) mod header {
     pub const REWARD: usize = 0;
     pub const DISTANCE: usize = 8;
@@ -144,7 +144,7 @@ pub(crate) mod header {
 }
 
 impl EnvLayout {
-    /// The layout of an environment with this description, under this id.
+    /// Derives the layout of the environment `id` from its description.
     ///
     /// # Errors
     /// When a factor's default is outside its own space, or the description contradicts itself.
@@ -203,7 +203,7 @@ impl EnvLayout {
         self.description.goal.as_ref()
     }
 
-    /// The bytes of an action, as in the memory.
+    /// Returns the bytes of an action in the layout of the buffer.
     pub(crate) fn bytes<'a>(&self, action: Action<'a>) -> Result<&'a [u8]> {
         let space = &self.spec.action_space;
         Ok(match space {

@@ -1,7 +1,7 @@
 //! [`GymEnv`]: a Gymnasium environment as an [`Env`].
 //!
-//! A snapshot holds the seed, the options and the actions of the episode so far. A restore, and a new worker after a lost
-//! one, replay them. An environment that is not deterministic therefore cannot be restored exactly.
+//! A snapshot holds the seed, the options and the actions of the episode so far. A restore, and a new worker after a
+//! lost one, replay them. An environment that is not deterministic therefore cannot be restored exactly.
 
 use crate::dataset_start::{self as start, GoalFrame};
 use crate::describe::header;
@@ -56,8 +56,8 @@ enum EnvCall {
 }
 
 impl GymEnv {
-    /// Creates an environment over a transport and waits for its description. Up to `restarts` lost workers are replaced within one
-    /// request.
+    /// Creates an environment over a transport and waits for its description. Up to `restarts` lost workers are
+    /// replaced within one request.
     ///
     /// # Errors
     /// When the environment cannot be made, or its actions or observations have unsupported spaces.
@@ -294,8 +294,8 @@ impl DatasetStartEnv for GymEnv {
         start::columns(&self.layout, stored, callables)
     }
 
-    /// The callables and their arguments belong to the arguments of the reset, so that a replay of the episode starts at the
-    /// same state.
+    /// The callables and their arguments belong to the arguments of the reset, so that a replay of the episode starts
+    /// at the same state.
     fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: DatasetStart<'_>) -> Result<()> {
         self.finish_dispatched()?;
         let (seed, options) = start::reset(&self.layout, seed, options, from.start)?;

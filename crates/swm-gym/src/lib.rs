@@ -1,9 +1,9 @@
 //! Any Gymnasium environment as an [`swm_core::Env`].
 //!
 //! A Python class, `Bridge` in [`BRIDGE`], describes an environment and writes its outputs into one flat buffer. A
-//! [`Transport`] holds that buffer and forwards requests: [`WorkerTransport`] starts a Python process for each environment and
-//! shares memory with it, and the Python package runs the same class in its own interpreter. [`GymEnv`] is the environment,
-//! over any transport. [`choose`] parses ids such as `ALE/Pong-v5,frameskip=2`.
+//! [`Transport`] holds that buffer and forwards requests: [`WorkerTransport`] starts a Python process for each
+//! environment and shares memory with it, and the Python package runs the same class in its own interpreter. [`GymEnv`]
+//! is the environment, over any transport. [`choose`] parses ids such as `ALE/Pong-v5,frameskip=2`.
 //!
 //! `docs/gymnasium.md` documents how observations, `info`, factors of variation, goals and frames are mapped.
 

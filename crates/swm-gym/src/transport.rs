@@ -74,7 +74,8 @@ pub trait Transport: Send {
     /// When no worker can be started.
     fn restart(&mut self) -> Result<(), Failure>;
 
-    /// Waits until the environment is made and returns its description. Called once for a new transport and after each restart.
+    /// Waits until the environment is made and returns its description. Called once for a new transport and after each
+    /// restart.
     ///
     /// # Errors
     /// When it cannot be made.
@@ -86,7 +87,8 @@ pub trait Transport: Send {
     }
 
     /// Sends a request without waiting, if the environment runs in parallel, and returns whether it was sent.
-    /// [`Transport::call`] with the same request follows and waits for the answer. Until then [`Transport::memory`] is empty.
+    /// [`Transport::call`] with the same request follows and waits for the answer. Until then [`Transport::memory`] is
+    /// empty.
     fn dispatch(&mut self, _request: Request<'_>) -> bool {
         false
     }
@@ -97,8 +99,8 @@ pub trait Transport: Send {
     /// When the environment raises, or its worker is lost.
     fn call(&mut self, request: Request<'_>) -> Result<(), Failure>;
 
-    /// The buffer of the bridge, [`Description::size`] bytes; empty before [`Transport::describe`], after a loss, and while a
-    /// dispatched request runs.
+    /// The buffer of the bridge, [`Description::size`] bytes; empty before [`Transport::describe`], after a loss, and
+    /// while a dispatched request runs.
     fn memory(&self) -> &[u8];
 
     /// The buffer of the bridge, for writing actions.

@@ -1,9 +1,9 @@
 //! [`WorkerTransport`]: an environment in a separate Python process, over shared memory.
 //!
-//! The process gets three descriptors: a socket for requests and answers as its standard input, the shared memory as its
-//! standard output (an unnamed file, deleted with its last descriptor), and a pipe as its standard error, whose last lines
-//! appear in error messages. It ends when the transport is dropped, when its socket closes, and, on Linux, when this process
-//! ends in any way.
+//! The process gets three descriptors: a socket for requests and answers as its standard input, the shared memory as
+//! its standard output (an unnamed file, deleted with its last descriptor), and a pipe as its standard error, whose
+//! last lines appear in error messages. It ends when the transport is dropped, when its socket closes, and, on Linux,
+//! when this process ends in any way.
 
 use crate::config::{GymConfig, Python};
 use crate::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport, WORKER, assets};
@@ -23,7 +23,7 @@ use swm_core::Error;
 
 /// The number of last lines of a worker's standard error in error messages.
 const LINES: usize = 20;
-/// How long the end of a worker process is waited for.
+/// The time that a worker process gets to end by itself.
 const EXIT_TIMEOUT: Duration = Duration::from_millis(500);
 
 /// A Python process with one environment.
@@ -92,7 +92,7 @@ impl WorkerTransport {
         sent.and_then(|()| process.receive()).map_err(|problem| self.lose(&problem, limit))
     }
 
-    /// The failure that an answer stands for.
+    /// Converts an answer that reports a failure.
     fn failure(&self, kind: u8, text: Vec<u8>) -> Failure {
         let text = String::from_utf8_lossy(&text).into_owned();
         let (id, python) = (&self.id, &self.config.python);
@@ -240,7 +240,7 @@ impl Process {
         let mut head = [0; 5];
         self.socket.read_exact(&mut head)?;
         let [kind, n @ ..] = head;
-        // Most answers are empty: no allocation.
+        // Most answers are empty, and an empty vector allocates nothing.
         let mut text = vec![0; u32::from_le_bytes(n) as usize];
         self.socket.read_exact(&mut text)?;
         Ok((kind, text))
@@ -292,27 +292,27 @@ impl Drop for Process {
 
 #[allow(unsafe_code, reason = "shared memory is mapped from a file")]
 fn map(file: &File) -> std::io::Result<MmapMut> {
-    // SAFETY: the file has no name; only this process and its worker hold it, and the worker never changes its size. The worker writes
-    // to it only between a request and its answer, when this process holds no reference: `Transport::dispatch` and `call`
-    // borrow the transport mutably, and between the two it lends no memory. A worker that does not answer in time is
-    // killed before the memory is touched again.
+    // SAFETY: the file has no name; only this process and its worker hold it, and the worker never changes its size.
+    // The worker writes to it only between a request and its answer, when this process holds no reference:
+    // `Transport::dispatch` and `call` borrow the transport mutably, and between the two it returns no reference to the
+    // memory. A worker that does not answer in time is killed before the memory is touched again.
     unsafe { MmapMut::map_mut(file) }
 }
 
 /// The last lines of a worker's standard error.
 struct Tail {
     lines: Arc<Mutex<VecDeque<String>>>,
-    /// Closed when the pipe is.
-    over: Receiver<()>,
+    /// Disconnected when the pipe closes.
+    closed: Receiver<()>,
 }
 
 impl Tail {
     fn of(pipe: Option<ChildStderr>, id: &str) -> Self {
         let lines = Arc::new(Mutex::new(VecDeque::new()));
         let (last, id) = (Arc::clone(&lines), id.to_owned());
-        let (tell, over) = channel();
+        let (open, closed) = channel();
         let read = move || {
-            let _dropped_at_the_end: Sender<()> = tell;
+            let _dropped_at_the_end: Sender<()> = open;
             let mut pipe = pipe.map(BufReader::new);
             let mut line = vec![];
             while let Some(pipe) = &mut pipe
@@ -332,13 +332,13 @@ impl Tail {
         if let Err(problem) = std::thread::Builder::new().name("swm-gym-stderr".to_owned()).spawn(read) {
             tracing::debug!("collecting the output of a worker: {problem}");
         }
-        Self { lines, over }
+        Self { lines, closed }
     }
 
     /// The last lines, once the worker has ended.
     fn lines(&self) -> Vec<String> {
         // A child of the worker may hold the pipe open, so the wait is bounded.
-        let _closed_or_timed_out = self.over.recv_timeout(EXIT_TIMEOUT);
+        let _closed_or_timed_out = self.closed.recv_timeout(EXIT_TIMEOUT);
         self.lines.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
     }
 }
@@ -346,11 +346,11 @@ impl Tail {
 /// A command and the channel that receives its child.
 type Job = (Command, SyncSender<std::io::Result<Child>>);
 
-/// Starts a process from a thread that lives as long as this process, because the kernel ends a child with the thread that
-/// started it (`PR_SET_PDEATHSIG`).
+/// Starts a process from a thread that lives as long as this process, because the kernel ends a child with the thread
+/// that started it (`PR_SET_PDEATHSIG`).
 fn spawn(command: Command) -> std::io::Result<Child> {
     static STARTER: Mutex<Option<(u32, Sender<Job>)>> = Mutex::new(None);
-    let (tell, child) = sync_channel(1);
+    let (answer, child) = sync_channel(1);
     let mut starter = STARTER.lock().unwrap_or_else(PoisonError::into_inner);
     // A fork of this process does not have that thread.
     let here = std::process::id();
@@ -359,9 +359,9 @@ fn spawn(command: Command) -> std::io::Result<Child> {
         _ => {
             let (jobs, queue) = channel::<Job>();
             std::thread::Builder::new().name("swm-gym-starter".to_owned()).spawn(move || {
-                for (mut command, tell) in queue {
+                for (mut command, answer) in queue {
                     // The receiver may be gone.
-                    let _received = tell.send(command.spawn());
+                    let _received = answer.send(command.spawn());
                 }
             })?;
             *starter = Some((here, jobs.clone()));
@@ -369,6 +369,6 @@ fn spawn(command: Command) -> std::io::Result<Child> {
         }
     };
     drop(starter);
-    jobs.send((command, tell)).map_err(std::io::Error::other)?;
+    jobs.send((command, answer)).map_err(std::io::Error::other)?;
     child.recv().map_err(std::io::Error::other)?
 }

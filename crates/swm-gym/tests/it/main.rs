@@ -1,7 +1,7 @@
 //! Tests of Gymnasium environments in worker processes.
 //!
-//! They require the variable `$SWM_PYTHON`, the path of a Python with Gymnasium. Without the variable they are skipped with a
-//! message; with a Python that lacks Gymnasium they fail.
+//! They require the variable `$SWM_PYTHON`, the path of a Python with Gymnasium. Without the variable they are skipped
+//! with a message; with a Python that lacks Gymnasium they fail.
 
 mod atari;
 mod dataset_start;

@@ -114,8 +114,8 @@ impl<'a> BitReader<'a> {
         value
     }
 
-    /// Reads the AC coefficients of a block, times their steps, into `to`. Returns whether there was one, and `None` when
-    /// there are more than a block holds.
+    /// Reads the AC coefficients of a block, times their steps, into `to`. Returns whether there was one, and `None`
+    /// when there are more than a block holds.
     #[inline(always)]
     pub fn ac_coefficients(&mut self, table: &HuffmanTable, steps: &[Step; 64], to: &mut Block) -> Option<bool> {
         let mut k = 0;

@@ -27,8 +27,8 @@ thread_local! {
 
 /// Decodes an image of `height` by `width` into `out`, `[height, width, 3]` RGB bytes.
 ///
-/// Returns `false`, with unspecified bytes in `out`, when the image has another size, is of a kind that is not supported,
-/// or is damaged.
+/// Returns `false`, with unspecified bytes in `out`, when the image has another size, is of a kind that is not
+/// supported, or is damaged.
 pub fn decode(bytes: &[u8], height: usize, width: usize, out: &mut [u8]) -> bool {
     if out.len() != height * width * 3 || out.is_empty() {
         return false;

@@ -1,9 +1,9 @@
 //! A baseline JPEG encoder for frames of simulations.
 //!
-//! Such frames have large areas of one colour. An MCU (16 × 16 pixels) of one colour needs no transform, only a few bits
-//! for the difference of its value from the last MCU's. Finding these MCUs first makes encoding several times faster than
-//! the general encoders we measured, which transform every block. The output is ordinary: ITU-T T.81 baseline, JFIF,
-//! chroma at half resolution (4:2:0), the example tables of Annex K scaled by quality as libjpeg does.
+//! Such frames have large areas of one colour. An MCU (16 × 16 pixels) of one colour needs no transform, only a few
+//! bits for the difference of its value from the last MCU's. Finding these MCUs first makes encoding several times
+//! faster than the general encoders we measured, which transform every block. The output is ordinary: ITU-T T.81
+//! baseline, JFIF, chroma at half resolution (4:2:0), the example tables of Annex K scaled by quality as libjpeg does.
 
 use super::ZIGZAG;
 use super::annex_k::{AC_CHROMA, AC_LUMA, CHROMA, CODES, DC_CHROMA, DC_LUMA, LUMA};
@@ -14,7 +14,8 @@ const MCU: usize = 16;
 /// Bytes in a row of an MCU.
 const LINE: usize = MCU * 3;
 
-/// Encodes an RGB image, `[height, width, 3]` with sides from 1 to 65535, with quality 1 to 100, and appends it to `out`.
+/// Encodes an RGB image, `[height, width, 3]` with sides from 1 to 65535, with quality 1 to 100, and appends it to
+/// `out`.
 ///
 /// # Panics
 /// When `rgb` has another length, which the caller checks.

@@ -8,9 +8,9 @@ pub const END_OF_BLOCK: u32 = 64;
 
 /// The meaning of the next bits of a scan, packed into one register.
 ///
-/// From the lowest bit: 5 bits, the length of the code, plus the bits of its coefficient where these fit into the index;
-/// 0 for a code that is longer than [`INDEX_BITS`]. 4 bits, how many bits of the coefficient follow. 7 bits, the zeros
-/// before the coefficient, or [`END_OF_BLOCK`]. 16 bits, the coefficient.
+/// From the lowest bit: 5 bits, the length of the code, plus the bits of its coefficient where these fit into the
+/// index; 0 for a code that is longer than [`INDEX_BITS`]. 4 bits, how many bits of the coefficient follow. 7 bits, the
+/// zeros before the coefficient, or [`END_OF_BLOCK`]. 16 bits, the coefficient.
 #[derive(Clone, Copy, Default, PartialEq, Eq)]
 pub struct Entry(u32);
 
@@ -51,7 +51,8 @@ pub struct HuffmanTable {
 }
 
 impl HuffmanTable {
-    /// Builds a table from the body of a DHT segment: 16 counts and the symbols. Returns `None` when the body is invalid.
+    /// Builds a table from the body of a DHT segment: 16 counts and the symbols. Returns `None` when the body is
+    /// invalid.
     pub fn new(counts: &[u8; 16], symbols: &[u8], is_ac: bool) -> Option<Self> {
         let mut table =
             Self { entries: [Entry::default(); 1 << INDEX_BITS], ends: [0; 17], offsets: [0; 17], symbols: [0; 256] };

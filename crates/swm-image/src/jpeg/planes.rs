@@ -4,7 +4,8 @@ use super::header::Header;
 use super::ycbcr::{Samples, convert, convert_halved};
 use swm_simd::Level;
 
-/// Samples on either side of a plane. Those of chroma repeat the outermost samples, so that every sample has neighbours.
+/// Samples on either side of a plane. Those of chroma repeat the outermost samples, so that every sample has
+/// neighbours.
 pub const MARGIN: usize = 8;
 
 /// A square of blocks that are coded together: the values of its planes, where they have only one.

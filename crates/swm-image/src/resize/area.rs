@@ -29,8 +29,8 @@ impl Taps {
     }
 }
 
-/// Resizes images of one size to another size. Shrinking averages the covered area. Enlarging blends the two pixels that
-/// a pixel of the result overlaps, weighted by the overlap.
+/// Resizes images of one size to another size. Shrinking averages the covered area. Enlarging blends the two pixels
+/// that a pixel of the result overlaps, weighted by the overlap.
 #[derive(Clone)]
 pub struct AreaResizer {
     from: [usize; 2],

@@ -331,7 +331,7 @@ def test_user_defined_wrapper(corridor):
     assert world.infos["pixels"].max() == 255 and np.median(world.infos["pixels"]) == 255
     world.step()
     assert np.allclose(world.rewards, 6)
-    # Around an environment of ours, and mixed with a visual wrapper.
+    # Around a native environment, mixed with a visual wrapper.
     mixed = swm.World(
         "swm/TwoRoom-v1", num_envs=2, image_shape=(32, 32), extra_wrappers=[Negative, partial(NoiseWrapper, std=4.0)]
     )

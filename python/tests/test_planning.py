@@ -192,7 +192,7 @@ def test_a_plan_depends_on_the_seed_and_on_its_own_infos_only(solver, model, spa
     together = plan(few(solver, model, seed=8), space=space)
     for size in (1, 2):
         assert np.array_equal(plan(few(solver, model, seed=8, batch_size=size), space=space), together)
-    # Alone, and beside others.
+    # Environments planned alone and together get the same plans.
     assert np.array_equal(plan(few(solver, model, seed=8), slice(0, 1), space=space), together[:1])
     assert np.array_equal(plan(few(solver, model, seed=8), slice(0, 2), space=space), together[:2])
     # Every call draws other numbers, the same ones in the same order.

@@ -225,7 +225,7 @@ def test_native_environments_restore_recorded_states(tmp_path):
         world.evaluate(**picks, callables=[{"method": "set_colour"}])
 
     class Same(gymnasium.Wrapper):
-        """Nothing, around an environment of ours: it then lives in this interpreter."""
+        """A wrapper without effect, which makes a native environment run in this interpreter."""
 
     wrapped = swm.World("swm/TwoRoom-v1", num_envs=2, image_shape=(32, 32), extra_wrappers=[partial(Same)])
     for one in (world, wrapped):

@@ -1,4 +1,4 @@
-//! Where the rows of episodes are in a dataset, index columns, and the time convention that writers check.
+//! Positions of episodes in a table of rows, index columns, and the time convention that writers check.
 
 use crate::dataset::reader::{Episode, StepRange};
 use std::ops::Range;

@@ -1,4 +1,4 @@
-//! Locking that ignores poisoning.
+//! Locks that ignore poisoning.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 

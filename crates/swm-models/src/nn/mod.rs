@@ -48,7 +48,7 @@ pub struct Init {
 }
 
 impl Init {
-    /// Creates a source of values on `device` that `key` decides.
+    /// Creates a source of values on `device` that `key` determines.
     pub fn new(key: Key, device: &Device) -> Self {
         Self { key, device: device.clone() }
     }

@@ -4,7 +4,7 @@ use swm_core::columns::{REWARD, TERMINATED, TRUNCATED};
 use swm_core::pool::Reset;
 use swm_core::{Batch, EnvPool, Key, Policy, ResetOptions, Result, Schema};
 
-/// Runs `episodes` episodes and returns their undiscounted returns in order. `key` and its number decide each episode.
+/// Runs `episodes` episodes and returns their undiscounted returns in order. `key` and the index of an episode determine it.
 pub(super) fn returns(pool: &mut EnvPool, policy: &mut dyn Policy, episodes: usize, key: Key) -> Result<Vec<f64>> {
     let slots = pool.len();
     let mut actions = Batch::zeros(&Schema::new(vec![pool.spec().action_column()])?, slots);

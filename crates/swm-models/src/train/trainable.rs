@@ -48,7 +48,7 @@ pub trait Trainable: Module + Sync + 'static {
     /// When the dataset lacks a column, or it is of another shape.
     fn loader_config(config: &TrainConfig<Self>, schema: &Schema) -> Result<LoaderConfig>;
 
-    /// Creates a model whose initial values are decided by `key`.
+    /// Creates a model whose initial values `key` determines.
     ///
     /// # Errors
     /// When the data do not fit the configuration.

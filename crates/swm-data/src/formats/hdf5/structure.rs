@@ -1,4 +1,4 @@
-//! Calls of `hdf5-pure`, which reads the structure of a file.
+//! Functions of `hdf5-pure` with caught panics; the crate reads the structure of a file.
 
 use crate::formats::stored_scalar::{Class, StoredScalar};
 use hdf5_pure::{Datatype, DatatypeByteOrder, FloatingPointLayout};

@@ -198,7 +198,7 @@ impl Info {
             };
             let spec = match recorded {
                 Some(known) if known.len() == spec.len() && known.is_image() == camera => known.clone(),
-                // Our writer adds features, which are not in the schema passed to it.
+                // The writer of this format adds features that are not in the schema passed to it.
                 _ if self.stable_worldmodel.is_some() => continue,
                 _ => spec,
             };

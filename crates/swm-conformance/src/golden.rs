@@ -8,7 +8,7 @@ use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use swm_core::VariationRequest;
 
-/// The golden files whose names start with `prefix`, sorted by name.
+/// Returns the golden files whose names start with `prefix`, sorted by name.
 ///
 /// They are read from `tests/golden` in the crate's folder and from the folder that `SWM_GOLDEN` names (default:
 /// `shared/reference/golden` next to the workspace). Of two files with the same name, the latter is used.
@@ -37,12 +37,12 @@ impl Golden {
         Self(NpzArchive::open(path).unwrap_or_else(|error| panic!("{}: {error}", path.display())))
     }
 
-    /// The names of the arrays.
+    /// Returns the names of the arrays.
     pub fn names(&self) -> Vec<String> {
         self.0.array_names().map(str::to_owned).collect()
     }
 
-    /// Whether there is an array of that name.
+    /// Returns whether there is an array of that name.
     pub fn has(&self, name: &str) -> bool {
         self.names().iter().any(|known| known == name)
     }
@@ -51,7 +51,7 @@ impl Golden {
         self.0.by_name(name).expect("a readable archive").unwrap_or_else(|| panic!("no array '{name}'"))
     }
 
-    /// All elements of an array of type `T`, in row-major order.
+    /// Returns all elements of an array of type `T`, in row-major order.
     pub fn read<T: npyz::Deserialize>(&mut self, name: &str) -> Vec<T> {
         self.array(name).into_vec().unwrap_or_else(|error| panic!("{name}: {error}"))
     }

@@ -2,8 +2,8 @@
 //!
 //!     cargo run --release -p swm-envs --example experts [PART OF AN ID] [EPISODES]
 //!
-//! Episode k starts from `reset(k)`, with the default variation and with all factors varied, and is truncated at the time
-//! limit of the environment. Episodes that are solved at the start are counted separately.
+//! Episode k starts from `reset(k)`, with the default variation and with all factors varied, and is truncated at the
+//! time limit of the environment. Episodes that are solved at the start are counted separately.
 
 use std::io::Write as _;
 use std::time::{Duration, Instant};

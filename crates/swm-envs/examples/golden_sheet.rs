@@ -1,4 +1,5 @@
-//! Compares frames of the Python reference with ours: `docs/environments.png`, and the table of `docs/environments.md`.
+//! Compares frames of the Python reference with those of this crate: `docs/environments.png`, and the table of
+//! `docs/environments.md`.
 //!
 //!     cargo run --release -p swm-envs --example golden_sheet
 //!
@@ -19,7 +20,7 @@ const CELL: usize = 150;
 const GAP: usize = 6;
 /// Height of the line of labels above a row, in pixels.
 const LABELS: usize = 18;
-/// Cells of a row: the recorded frame, ours and their difference, for the first and the last frame.
+/// Cells of a row: the recorded frame, the rendered frame and their difference, for the first and the last step.
 const COLUMNS: usize = 6;
 /// Factor by which differences are amplified.
 const AMPLIFICATION: u8 = 8;
@@ -47,13 +48,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     sheet.save(&docs.join("environments.png"))?;
     let page = docs.join("environments.md");
     let text = std::fs::read_to_string(&page)?;
-    let words = text.split_once("| environment |").map_or(text.as_str(), |(words, _)| words);
-    std::fs::write(&page, format!("{words}{table}"))?;
+    let prose = text.split_once("| environment |").map_or(text.as_str(), |(prose, _)| prose);
+    std::fs::write(&page, format!("{prose}{table}"))?;
     std::io::stdout().write_all(table.as_bytes())?;
     Ok(())
 }
 
-/// A recorded frame and ours.
+/// A recorded frame and the frame rendered in the same state.
 struct Frames {
     height: usize,
     width: usize,
@@ -88,7 +89,7 @@ fn start(entry: &EnvEntry, env: &dyn Env, golden: &mut Golden) -> ResetOptions {
         id if id.starts_with("swm/PushT") => None,
         // The reference moves this factor with the agent, so the recorded value is not the start position.
         "swm/SimplePointMaze-v0" => {
-            variation.variation_values.extend(read(&["obs"]).map(|place| ("agent.position".to_owned(), place)));
+            variation.variation_values.extend(read(&["obs"]).map(|position| ("agent.position".to_owned(), position)));
             None
         }
         _ => read(&["start", "info.state"]),
@@ -119,8 +120,8 @@ impl Sheet {
             let left = GAP + 3 * i * (CELL + GAP);
             // The name is as wide as two cells.
             let label = if i == 0 { name.trim_start_matches("swm/") } else { "last frame" };
-            self.words(label, left, top + 5);
-            self.words(&format!("difference {difference:.3}"), left + 2 * (CELL + GAP), top + 5);
+            self.text(label, left, top + 5);
+            self.text(&format!("difference {difference:.3}"), left + 2 * (CELL + GAP), top + 5);
             let apart: Vec<u8> = frame
                 .golden
                 .iter()
@@ -148,9 +149,9 @@ impl Sheet {
         }
     }
 
-    /// Writes text in letters of 3 x 5 dots, each two pixels wide.
-    fn words(&mut self, words: &str, left: usize, top: usize) {
-        for (i, letter) in words.to_uppercase().chars().enumerate() {
+    /// Draws text with letters of 3 x 5 dots of two pixels.
+    fn text(&mut self, text: &str, left: usize, top: usize) {
+        for (i, letter) in text.to_uppercase().chars().enumerate() {
             let dots = FONT.iter().find(|(known, _)| *known == letter).map_or(0, |(_, dots)| *dots);
             for (y, x) in (0..10).flat_map(|y| (0..6).map(move |x| (y, x))) {
                 if dots >> (14 - (y / 2 * 3 + x / 2)) & 1 == 1 {

@@ -1,5 +1,5 @@
-//! Draws a contact sheet of all wrappers, `docs/wrappers.png`: one row per wrapper, the first one without any; Push-T on
-//! the left and Two-Room on the right, each at steps 0 and 10 of an episode and at step 0 of another one.
+//! Draws a contact sheet of all wrappers, `docs/wrappers.png`: one row per wrapper, the first one without any; Push-T
+//! on the left and Two-Room on the right, each at steps 0 and 10 of an episode and at step 0 of another one.
 //!
 //!     cargo run --release -p swm-envs --example wrapper_sheet [OUT.png]
 

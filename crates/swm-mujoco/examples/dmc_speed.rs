@@ -1,5 +1,5 @@
-//! Speed of DeepMind Control environments compared with MuJoCo's `mj_step` alone on the same states and controls, and of four
-//! environments in a pool on two threads: `cargo run --release -p swm-mujoco --example dmc_speed`.
+//! Speed of DeepMind Control environments compared with MuJoCo's `mj_step` alone on the same states and controls, and
+//! of four environments in a pool on two threads: `cargo run --release -p swm-mujoco --example dmc_speed`.
 #![allow(clippy::print_stdout, reason = "a command-line program")]
 
 use std::sync::Arc;

@@ -1,5 +1,5 @@
-//! Compares frames of the Python reference with those of the CPU renderer: writes `docs/environments-3d.png` and the table of
-//! `docs/environments-3d.md`.
+//! Compares frames of the Python reference with those of the CPU renderer: writes `docs/environments-3d.png` and the
+//! table of `docs/environments-3d.md`.
 //!
 //! ```text
 //! SWM_GOLDEN_IMAGES=DIR cargo nextest run --release -p swm-mujoco golden
@@ -35,7 +35,7 @@ impl Image {
         Ok(Self { width, rgb })
     }
 
-    /// The mean absolute difference of the first two frames of a triptych, of 255.
+    /// The mean absolute difference of the first two frames of a triptych, on a scale of 0 to 255.
     fn difference(&self) -> f64 {
         let third = self.width;
         let rows = self.rgb.chunks_exact(3 * self.width).map(|row| row[..third].iter().zip(&row[third..2 * third]));
@@ -98,9 +98,7 @@ fn main() -> Result<(), Failure> {
     encoder.write_header()?.write_image_data(&sheet)?;
     let page = docs.join("environments-3d.md");
     let text = std::fs::read_to_string(&page)?;
-    // The table starts with its header, in its present or its former words.
-    let head = ["| environment |", "| world |"].into_iter().find_map(|head| text.split_once(head));
-    let prose = head.map_or(text.as_str(), |(prose, _)| prose);
+    let prose = text.split_once("| environment |").map_or(text.as_str(), |(prose, _)| prose);
     std::fs::write(&page, format!("{prose}{table}"))?;
     print!("{table}");
     Ok(())

@@ -1,5 +1,5 @@
-//! Success rates of OGBench's experts: `ogbench_experts [SEEDS] [ID …]` runs 200 seeds with default factors and 200 with all varied,
-//! towards the goals of resets and towards sampled ones.
+//! Success rates of OGBench's experts: `ogbench_experts [SEEDS] [ID …]` runs 200 seeds with default factors and 200
+//! with all varied, towards the goals of resets and towards sampled ones.
 #![allow(clippy::print_stdout, reason = "a command-line program")]
 
 use swm_core::{Action, Batch, Key, ResetOptions, Result, Schema, VariationRequest};

@@ -1,5 +1,6 @@
-//! Frames per second on one thread, and steps with a frame each, for several environments: `render_speed RENDERER SIZE SECONDS
-//! ENV…`. CPU time of the thread is measured, except for OpenGL, which renders on other threads.
+//! Frames per second on one thread, and steps with a frame each, for several environments:
+//! `render_speed RENDERER SIZE SECONDS ENV…`. CPU time of the thread is measured, except for OpenGL, which renders on
+//! other threads.
 
 use std::time::{Duration, Instant};
 use swm_core::{Action, FrameMut, ResetOptions};

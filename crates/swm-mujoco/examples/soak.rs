@@ -1,5 +1,5 @@
-//! Steps every environment with all factors varied, reset after reset, and reports memory use: `soak [STEPS]`. The steps (a
-//! million by default) are divided among the environments, which run in parallel pools.
+//! Steps every environment with all factors varied, reset after reset, and reports memory use: `soak [STEPS]`. The
+//! steps (a million by default) are divided among the environments, which run in parallel pools.
 #![allow(clippy::print_stdout, reason = "a command-line program")]
 
 use swm_core::policy::{Policy as _, RandomPolicy};

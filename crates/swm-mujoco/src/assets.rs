@@ -86,7 +86,7 @@ pub const ASSETS: &[Asset] = &[
 /// Whether an asset is installed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Status {
-    /// The list of its files is there; [`verify`] reads the files themselves.
+    /// The list of its files exists; only [`verify`] reads the files.
     Installed,
     /// The asset is not installed.
     Absent,

@@ -1,10 +1,10 @@
 //! [`MujocoEnv`]: the environment shared by all families of this crate, around a [`Task`].
 //!
-//! The environment owns the model and its state ([`Physics`]), the factors of the episode, and the renderer's scene; the task
-//! edits the model, starts episodes, steps, rewards, and holds the goal.
+//! The environment owns the model and its state ([`Physics`]), the factors of the episode, and the renderer's scene;
+//! the task edits the model, starts episodes, steps, rewards, and holds the goal.
 //!
-//! The `state` column contains the state of the physics (time, `qpos`, `qvel`, `act`, `qacc_warmstart`, `ctrl`, `eq_active`,
-//! `mocap_pos`, `mocap_quat`) followed by the task state. An episode can continue from it.
+//! The `state` column contains the state of the physics (time, `qpos`, `qvel`, `act`, `qacc_warmstart`, `ctrl`,
+//! `eq_active`, `mocap_pos`, `mocap_quat`) followed by the task state. An episode can continue from it.
 
 use crate::physics::check_finite;
 use crate::render::{self, AbstractScene, Camera, FrameBuffer};
@@ -34,8 +34,8 @@ pub(crate) struct MujocoEnv<T> {
 }
 
 impl<T: Task> MujocoEnv<T> {
-    /// Creates the environment with every factor at its default, at the start of the episode of seed 0. `spec` lists the
-    /// task's columns; `state` and `unstable` are inserted before them, and the model's cameras are added.
+    /// Creates the environment with every factor at its default, at the start of the episode of seed 0. `spec` lists
+    /// the task's columns; `state` and `unstable` are inserted before them, and the model's cameras are added.
     ///
     /// # Errors
     /// When the model cannot be copied or edited.

@@ -1,12 +1,13 @@
 //! MuJoCo's library, loaded when the first environment needs it.
 //!
-//! `mujoco-rs` declares MuJoCo's functions as symbols for the linker. This module defines them as trampolines: one jump each,
-//! through a table that [`load`] fills from `libmujoco` of the installed assets. The same program therefore starts, and works
-//! apart from these environments, where MuJoCo is not installed. A call before loading ends in [`not_loaded`].
+//! `mujoco-rs` declares MuJoCo's functions as symbols for the linker. This module defines them as trampolines: one jump
+//! each, through a table that [`load`] fills from `libmujoco` of the installed assets. The same program therefore
+//! starts, and works apart from these environments, where MuJoCo is not installed. A call before loading ends in
+//! [`not_loaded`].
 //!
 //! The module also replaces MuJoCo's error handling. By default MuJoCo writes errors to `MUJOCO_LOG.TXT` in the working
-//! directory and exits the process. Here, messages go to the program's log, and an error inside [`guard`] unwinds to it and is
-//! returned as an [`Error`].
+//! directory and exits the process. Here, messages go to the program's log, and an error inside [`guard`] unwinds to it
+//! and is returned as an [`Error`].
 #![allow(unsafe_code, reason = "foreign symbols, a table of addresses, and a handler that MuJoCo calls")]
 
 mod symbols;
@@ -80,7 +81,8 @@ unsafe extern "C" {
     static mut swm_mujoco_table: [*const (); NAMES.len()];
 }
 
-/// The target of every trampoline before [`load`]. Reaching it is a bug of this crate, which must load the library first.
+/// The target of every trampoline before [`load`]. Reaching it is a bug of this crate, which must load the library
+/// first.
 extern "C" fn not_loaded() -> ! {
     tracing::error!("a MuJoCo function was called before MuJoCo was loaded");
     std::process::abort();
@@ -136,8 +138,8 @@ struct Fault(String);
 
 /// Calls MuJoCo and returns its errors, which would otherwise end the process.
 ///
-/// `call` may only use functions declared `extern "C-unwind"` (`crate::ffi`). After an error, the objects it worked on are in an
-/// undefined state; the environment resets them.
+/// `call` may only use functions declared `extern "C-unwind"` (`crate::ffi`). After an error, the objects it worked on
+/// are in an undefined state; the environment resets them.
 ///
 /// # Errors
 /// MuJoCo's error message.

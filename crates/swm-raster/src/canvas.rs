@@ -10,7 +10,7 @@ use crate::strip::{Frame, Strip, is_transparent};
 use crate::view::View;
 use std::ops::Range;
 
-/// What to draw, and the memory to draw it into: `height` rows of `width` pixels, the upper row first.
+/// The quantity to draw, with the memory for the result: `height` rows of `width` pixels, the upper row first.
 pub enum Target<'a> {
     /// Red, green and blue, `[height, width, 3]`.
     Rgb(&'a mut [u8]),
@@ -49,7 +49,7 @@ impl Canvas {
     /// labels are sampled at the centre of every pixel and depths at its first sample.
     ///
     /// Invalid input draws nothing and never panics: targets that are too small stay unchanged, and geoms with
-    /// unknown assets or values that are not finite are left out. A camera with such values sees an empty scene.
+    /// unknown assets or values that are not finite are left out. A camera with such values gives an empty frame.
     pub fn draw(
         &mut self,
         scene: &Scene,
@@ -89,7 +89,7 @@ impl Canvas {
     fn paint(&mut self, frame: &Frame<'_>, target: Target<'_>) {
         let &Frame { scene, assets, view, .. } = frame;
         let opaque = |geom: usize| !is_transparent(scene, geom, view);
-        let Split { ends, pays, .. } = &self.split;
+        let Split { ends, parallel, .. } = &self.split;
         if self.strips.len() < ends.len() {
             self.strips.resize_with(ends.len(), Strip::default);
         }
@@ -105,13 +105,17 @@ impl Canvas {
                 // Texels must be smaller than pixels.
                 let side = (2 * view.width.max(view.height)).clamp(192, 1024);
                 join_if(
-                    *pays,
+                    *parallel,
                     || {
                         for_each_strip(strips, ends, 0, (&mut [], 0), &|strip, rows, _: &mut [u8]| {
                             strip.draw_geoms(frame, rows, opaque)
                         })
                     },
-                    || cast_shadows(shadows, casting, *pays, &|shadow, light| shadow.cast(scene, assets, light, side)),
+                    || {
+                        cast_shadows(shadows, casting, *parallel, &|shadow, light| {
+                            shadow.cast(scene, assets, light, side)
+                        })
+                    },
                 );
                 let lights = Lighting { plain, shadowed, shadows };
                 let unshaded = Lighting { plain: all, shadowed: &[], shadows: &[] };
@@ -158,9 +162,9 @@ impl LightSet {
     }
 }
 
-/// Runs two functions, on two threads where that pays.
-fn join_if(pays: bool, a: impl FnOnce() + Send, b: impl FnOnce() + Send) {
-    if pays {
+/// Runs two functions, in parallel if `parallel` is set.
+fn join_if(parallel: bool, a: impl FnOnce() + Send, b: impl FnOnce() + Send) {
+    if parallel {
         rayon::join(a, b);
     } else {
         a();
@@ -192,18 +196,27 @@ fn for_each_strip<T: Send>(
     }
 }
 
-/// Draws the shadow maps of lights, a thread per light where that pays.
-fn cast_shadows(shadows: &mut [Shadow], lights: &[Light], pays: bool, work: &(impl Fn(&mut Shadow, &Light) + Sync)) {
+/// Draws the shadow maps of lights, one thread per light if `parallel` is set.
+fn cast_shadows(
+    shadows: &mut [Shadow],
+    lights: &[Light],
+    parallel: bool,
+    work: &(impl Fn(&mut Shadow, &Light) + Sync),
+) {
     if let ([shadow, shadows @ ..], [light, lights @ ..]) = (shadows, lights) {
-        join_if(pays && !lights.is_empty(), || work(shadow, light), || cast_shadows(shadows, lights, pays, work));
+        join_if(
+            parallel && !lights.is_empty(),
+            || work(shadow, light),
+            || cast_shadows(shadows, lights, parallel, work),
+        );
     }
 }
 
 /// Whether a camera's values are finite and make a frame.
 fn is_valid(view: &View) -> bool {
-    let numbers = [view.position, view.right, view.up, view.forward];
+    let values = [view.position, view.right, view.up, view.forward];
     let density = view.pixels_per_unit[0] * view.pixels_per_unit[1];
-    numbers.iter().flatten().all(|x| x.is_finite())
+    values.iter().flatten().all(|x| x.is_finite())
         && density.is_finite()
         && density > 0.0
         && view.left.is_finite()
@@ -224,7 +237,7 @@ mod tests {
         let (assets, view, n) = (assets(), View::of(&scene.camera, SIZE.0, SIZE.1), SIZE.0 * SIZE.1);
         let (mut rgb, mut depths, mut labels) = (vec![0; 3 * n], vec![0.0; n], vec![0; n]);
         if is_valid(&view) {
-            (canvas.split.ends, canvas.split.pays) = (ends.to_vec(), ends.len() > 1);
+            (canvas.split.ends, canvas.split.parallel) = (ends.to_vec(), ends.len() > 1);
             let mut draw = |samples, target| {
                 canvas.paint(&Frame { scene, assets: &assets, view: &view, pattern: pattern(samples) }, target);
             };

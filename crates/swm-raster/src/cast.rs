@@ -58,7 +58,7 @@ pub(crate) struct Row {
     near: f32,
 }
 
-/// Neighbouring samples and what they show.
+/// Neighbouring samples with their depths and ids.
 pub(crate) struct Samples<'a> {
     /// Coordinates of the samples, from the left of the frame and from the upper edge of the row.
     pub at: [&'a [f32]; 2],
@@ -369,7 +369,7 @@ impl Solid for Cube {
 
 /// Writes a solid to the samples where it is the nearest.
 #[inline(always)]
-#[allow(clippy::too_many_arguments, reason = "references to numbers of which the compiler knows that they are apart")]
+#[allow(clippy::too_many_arguments, reason = "references that do not alias let the compiler vectorise the loops")]
 fn enter(
     solid: &impl Solid,
     row: &Row,

@@ -19,10 +19,10 @@ const VIEWS: usize = 4;
 /// Consecutive frames that share more geoms than are cached, before these are cached instead.
 const FRAMES_BEFORE_GROWTH: usize = 4;
 
-/// Everything but the geoms that decides the depth buffer, as bits.
+/// All inputs of the depth buffer except the geoms, as bits.
 type Key = [u32; 26];
 
-/// Everything of a geom that decides the depth buffer, as bits: shape and pose, not colours.
+/// The properties of a geom that affect the depth buffer, as bits: shape and pose, but not colours.
 type Pose = [u32; 17];
 
 /// The caches of some views.
@@ -40,17 +40,17 @@ struct CachedView {
     meshes: Vec<Arc<Mesh>>,
     /// The geoms of the last frame.
     poses: Vec<Pose>,
-    /// How many of the first geoms are in the snapshot.
+    /// The number of leading geoms that are in the snapshot.
     count: usize,
     save: LayersSnapshot,
     /// Consecutive frames that shared more geoms than are cached, and the smallest number they shared.
     waiting: usize,
     common: usize,
-    /// The frame that used it last.
+    /// The last frame that used this cache.
     used: u64,
 }
 
-/// What geoms are drawn with.
+/// The inputs of drawing that are the same for all geoms.
 #[derive(Clone, Copy)]
 pub(crate) struct DrawSettings<'a> {
     pub assets: &'a Assets,
@@ -166,9 +166,9 @@ impl CachedView {
 }
 
 /// Collects words into an array.
-fn bits<const N: usize>(numbers: impl IntoIterator<Item = u32>) -> [u32; N] {
-    let mut numbers = numbers.into_iter();
-    std::array::from_fn(|_| numbers.next().unwrap_or_default())
+fn bits<const N: usize>(values: impl IntoIterator<Item = u32>) -> [u32; N] {
+    let mut values = values.into_iter();
+    std::array::from_fn(|_| values.next().unwrap_or_default())
 }
 
 fn key(layers: &Layers, DrawSettings { view, far, casting, .. }: DrawSettings<'_>) -> Key {
@@ -176,11 +176,11 @@ fn key(layers: &Layers, DrawSettings { view, far, casting, .. }: DrawSettings<'_
         *view;
     let [x, y] = pixels_per_unit;
     let [dx, dy] = layers.pattern[0];
-    let numbers = [left, top, x, y, near, far, dx, dy];
-    let numbers = [position, right, up, forward].into_iter().flatten().chain(numbers).map(f32::to_bits);
+    let values = [left, top, x, y, near, far, dx, dy];
+    let values = [position, right, up, forward].into_iter().flatten().chain(values).map(f32::to_bits);
     let sizes = [width, height, layers.rows.start, layers.rows.end, layers.samples].map(|size| size as u32);
     let flags = [orthographic, mirrored, casting].into_iter().rev().fold(0, |flags, flag| flags << 1 | u32::from(flag));
-    bits(numbers.chain(sizes).chain([flags]))
+    bits(values.chain(sizes).chain([flags]))
 }
 
 fn pose(number: u32, geom: &Geom) -> Pose {
@@ -193,6 +193,6 @@ fn pose(number: u32, geom: &Geom) -> Pose {
         Shape::Box(halves) => (4, halves),
         Shape::Mesh(mesh) => (u32::try_from(mesh).unwrap_or(u32::MAX).saturating_add(5), [0.0; 3]),
     };
-    let numbers = sizes.into_iter().chain(geom.position).chain(geom.rotation).map(f32::to_bits);
-    bits([number, kind].into_iter().chain(numbers))
+    let values = sizes.into_iter().chain(geom.position).chain(geom.rotation).map(f32::to_bits);
+    bits([number, kind].into_iter().chain(values))
 }

@@ -33,10 +33,10 @@
 //! assert_eq!(labels, [-1, -1, -1, -1, 7, -1, -1, -1, -1]);
 //! ```
 //!
-//! **Method.** In small frames the triangles of a finely divided sphere would be smaller than pixels. So primitives
-//! are ray cast, a row of rays at a time (`cast`), and only meshes are rasterised, at the coarsest detail level that
-//! looks the same (`mesh`). Both write a depth buffer (`layers`). Shading runs once per pixel and geom, for many
-//! fragments at a time (`paint`). Shadow maps are drawn in the same way from the light (`shadow`).
+//! **Method.** In small frames the triangles of a finely divided sphere would be smaller than pixels. So primitives are
+//! ray cast, a row of rays at a time (`cast`), and only meshes are rasterised, at the coarsest detail level whose
+//! difference is not visible (`mesh`). Both write a depth buffer (`layers`). Shading runs once per pixel and geom, for
+//! many fragments at a time (`paint`). Shadow maps are drawn in the same way from the light (`shadow`).
 //!
 //! **Model.** The fixed pipeline of OpenGL as MuJoCo uses it, including where lighting is interpolated (planes and
 //! boxes) and how textures are filtered. Frames equal those of MuJoCo's renderer except at some edges.
@@ -45,7 +45,7 @@
 //! draw shadow maps.
 //!
 //! **Caches.** Static geometry is drawn once per view; later frames begin with a copy of its depth buffer
-//! (`geometry_cache`). Shadow maps do the same. The sky is looked up once per camera direction (`sky`).
+//! (`geometry_cache`). The same holds for shadow maps. The sky is looked up once per camera direction (`sky`).
 //!
 //! **Determinism.** The bytes of a frame depend on the scene alone, not on the number of threads nor on earlier
 //! frames. Arithmetic is single precision without fused operations.

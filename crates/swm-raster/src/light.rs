@@ -123,7 +123,7 @@ impl Material {
         }
     }
 
-    /// Returns the colour without any light: emission, and dim light from everywhere in a scene without lights.
+    /// Returns the colour without any light: emission, and dim ambient light in a scene without lights.
     pub fn base_colour(&self, scene: &Scene) -> V3 {
         let everywhere = if scene.lights.is_empty() { 0.3 } else { 0.0 };
         [0, 1, 2].map(|k| self.emission[k] + everywhere * self.rgb[k])

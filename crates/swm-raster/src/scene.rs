@@ -1,4 +1,4 @@
-//! What is drawn: geoms with materials, lights, a camera, a sky. Terms and units are those of OpenGL's fixed pipeline
+//! [`Scene`]: geoms with materials, lights, a camera and a sky. Terms and units are those of OpenGL's fixed pipeline
 //! and of MuJoCo, which uses it. Lengths share one unit, angles are degrees, colours are 0 to 1.
 
 use crate::mesh::Mesh;
@@ -7,7 +7,7 @@ use crate::texture::Texture;
 use crate::vector::V3;
 use std::sync::Arc;
 
-/// What scenes refer to by index, prepared once.
+/// The textures and meshes that scenes refer to by index, prepared once.
 #[derive(Clone, Default)]
 pub struct Assets {
     /// Textures, flat and cube.
@@ -29,9 +29,9 @@ pub struct Scene {
     pub sky: Option<usize>,
     /// Haze at the horizon of the first infinite plane; drawn only with a sky.
     pub haze: Option<Haze>,
-    /// Whether lights with shadows cast them.
+    /// Whether shadows are drawn.
     pub shadows: bool,
-    /// Whether the first reflective geom reflects.
+    /// Whether reflections in the first reflective geom are drawn.
     pub reflections: bool,
     /// Half the side of the square in which directional lights cast shadows.
     pub shadow_reach: f32,

@@ -33,7 +33,7 @@ pub(crate) struct SkyCache {
     width: usize,
     rows: Range<usize>,
     /// Red, green and blue of pixels.
-    /// `known` says by row whether they were looked up.
+    /// `known` is set for the rows that were looked up.
     colours: [Vec<f32>; 3],
     known: Vec<bool>,
     sampler: Sampler,

@@ -13,7 +13,7 @@ const PER_PIXEL: f32 = 30.0;
 const PER_SAMPLE: f32 = 0.6;
 const PER_TRIANGLE: f32 = 35.0;
 
-/// Smallest work that is worth waking another thread.
+/// The least work for which another thread is used, in nanoseconds.
 const MIN_WORK: f32 = 250_000.0;
 
 /// The ends of strips, and scratch memory.
@@ -22,7 +22,7 @@ pub(crate) struct Split {
     /// The row after the last one of each strip.
     pub ends: Vec<usize>,
     /// Whether there is enough work for more than one thread.
-    pub pays: bool,
+    pub parallel: bool,
     /// By band: its estimated work.
     work: Vec<f32>,
 }
@@ -31,12 +31,12 @@ impl Split {
     /// Splits a frame for at most `threads` threads, each with enough work.
     pub fn cut(&mut self, frame: &Frame<'_>, threads: usize) {
         self.ends.clear();
-        self.pays = false;
+        self.parallel = false;
         if threads > 1 {
             self.estimate(frame);
             let whole: f32 = self.work.iter().sum();
             let strips = threads.min((whole / MIN_WORK) as usize);
-            self.pays = strips > 1;
+            self.parallel = strips > 1;
             self.cut_into(strips, whole);
         }
         self.ends.push(frame.view.height);
@@ -46,7 +46,7 @@ impl Split {
     fn cut_into(&mut self, strips: usize, whole: f32) {
         let mut done = 0.0;
         for (band, work) in self.work.iter().enumerate() {
-            // A band belongs to the strip in whose share its middle lies.
+            // A band belongs to the strip that contains the middle of the work done up to it.
             let share = whole * (self.ends.len() + 1) as f32 / strips as f32;
             if band > 0 && self.ends.len() + 1 < strips && done + 0.5 * work > share {
                 self.ends.push(band * BAND);
@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn strips_begin_at_bands_and_share_the_work() {
+    fn strips_begin_at_bands_and_have_similar_work() {
         let mut scene = Scene { camera: CAMERA, ..Scene::default() };
         assert_eq!(ends(&scene, 16, 4), [16], "too little work");
         assert_eq!(ends(&scene, 256, 1), [256], "only one thread");

@@ -26,7 +26,7 @@ pub(crate) struct Strip {
     transparent_geoms: Vec<(f32, usize)>,
 }
 
-/// The frame to draw: what all strips share.
+/// The frame to draw; its fields are the same for all strips.
 #[derive(Clone, Copy)]
 pub(crate) struct Frame<'a> {
     pub scene: &'a Scene,
@@ -250,7 +250,7 @@ vectorize! {
     }
 
     /// Converts colours to bytes, rounded; NaN becomes black.
-    #[allow(clippy::manual_clamp, reason = "`clamp` would keep what is no number")]
+    #[allow(clippy::manual_clamp, reason = "`clamp` would keep NaN")]
     fn to_bytes(r: &[f32], g: &[f32], b: &[f32], bytes: &mut [[u8; 3]]) {
         let n = bytes.len().min(r.len());
         let (r, g, b, bytes) = (&r[..n], &g[..n], &b[..n], &mut bytes[..n]);

@@ -4,7 +4,8 @@ use super::probe::{Probe, bytes_of, vary};
 use crate::Suite;
 use swm_core::{EnvEntry, Factor, Key, ResetOptions, VariationRequest, VariationSpace};
 
-/// All factors at their defaults, except that the factors which hide others are switched on.
+/// Requests the defaults of all factors, with the `rendering.*` factors at their upper bounds: at 0 they hide the
+/// effects of other factors.
 fn all_visible(space: &VariationSpace) -> VariationRequest {
     let mut request = vary(&[]);
     for factor in space.factors().iter().filter(|factor| factor.key.starts_with("rendering.")) {
@@ -13,7 +14,7 @@ fn all_visible(space: &VariationSpace) -> VariationRequest {
     request
 }
 
-/// The outcome of a request: the frame, the observation, and the observation after some steps and a new goal.
+/// Resets with a request. Returns the frame, the observation, and the observation after some steps and a new goal.
 fn outcome(suite: &Suite, entry: &EnvEntry, variation: VariationRequest) -> Option<(Vec<u8>, Vec<u8>, Vec<u8>)> {
     let mut probe = Probe::new(suite, entry);
     probe.env.reset(5, &ResetOptions { variation, ..ResetOptions::default() }).ok()?;
@@ -26,7 +27,7 @@ fn outcome(suite: &Suite, entry: &EnvEntry, variation: VariationRequest) -> Opti
     Some((frame, row, later))
 }
 
-/// How many of the tried values of a factor changed each output, given the values of the other factors.
+/// The number of tried values of a factor, and how many of them changed each output.
 #[derive(Default)]
 struct Effects {
     tried: usize,
@@ -49,7 +50,7 @@ fn effects(suite: &Suite, entry: &EnvEntry, factor: &Factor, others: &VariationR
         }
         let mut request = others.clone();
         request.variation_values.insert(factor.key.clone(), value);
-        // Constraints may exclude a value given those of the other factors.
+        // Constraints may exclude a value, depending on the other factors.
         let Some(outcome) = outcome(suite, entry, request) else { continue };
         effects.tried += 1;
         effects.frame += usize::from(outcome.0 != base.0);

@@ -12,12 +12,12 @@ use swm_core::{
     RowRef, Snapshot, Space, Transition, VariationRequest,
 };
 
-/// Rollouts from which [`Env::sample_goal`] takes a goal before it fails.
+/// The maximal number of rollouts in which [`Env::sample_goal`] searches for a goal.
 const GOAL_TRIES: u64 = 16;
-/// Share of random actions in the expert's rollouts. In a deterministic environment all rollouts would be equal without
-/// them, and few goals would result.
-const RANDOM_SHARE: f64 = 0.02;
-/// Steps of a rollout, at most.
+/// Fraction of random actions in the expert's rollouts. Without them, all rollouts from one state would be equal, and
+/// sampled goals would come from a single trajectory.
+const RANDOM_FRACTION: f64 = 0.02;
+/// The maximal number of steps of a rollout.
 const GOAL_STEPS: usize = 200;
 /// The maximal number of values in a `state` column.
 const MAX_STATE_LEN: usize = 8;
@@ -38,7 +38,7 @@ pub struct ClassicEnv<T: ControlTask> {
     task: T,
     state: T::State,
     goal: T::State,
-    /// Made for the first frame.
+    /// Created when the first frame is drawn.
     renderer: Option<FrameRenderer>,
     /// Whether the renderer has the background and colours of this episode.
     is_renderer_current: bool,
@@ -79,7 +79,7 @@ impl<T: ControlTask> ClassicEnv<T> {
 
     /// Starts an episode with these factors, state and goal.
     fn begin(&mut self, factors: FactorValues, state: T::State, goal: T::State) {
-        // Most episodes have the factors of the one before, so the renderer's background stays valid.
+        // Most episodes have the same factors as the previous one, so the renderer's background stays valid.
         self.is_renderer_current &= factors.iter().eq(self.factors.iter());
         self.physics = physics::<T>(&factors);
         self.task = T::new(&self.physics);
@@ -96,13 +96,15 @@ impl<T: ControlTask> ClassicEnv<T> {
         renderer.draw(|surface| self.task.draw(&state, surface), frame);
     }
 
-    /// Returns the states of a rollout: in the first half of the attempts with the expert's actions, later with random
-    /// ones. Terminal states are left out unless they are the task's goal; in the last quarter they are included.
+    /// Returns the states of a rollout that may serve as goals.
+    ///
+    /// The first half of the attempts uses the expert's actions, the second half random actions. Terminal states are
+    /// excluded unless they reach the task's goal; the last quarter of the attempts includes them.
     fn rollout(&self, rng: &mut Rng, attempt: u64) -> Vec<T::State> {
         let (is_expert, with_terminal) = (attempt < GOAL_TRIES / 2, attempt >= GOAL_TRIES * 3 / 4);
         let (mut state, goal, mut states) = (self.state, T::sample_task_goal(rng), vec![]);
         while states.len() < GOAL_STEPS {
-            let action = if is_expert && !rng.random_bool(RANDOM_SHARE) {
+            let action = if is_expert && !rng.random_bool(RANDOM_FRACTION) {
                 self.task.control(&state, &goal)
             } else {
                 self.spec.action_space.sample(rng)[0]
@@ -119,7 +121,7 @@ impl<T: ControlTask> ClassicEnv<T> {
         states
     }
 
-    /// Rounds a state to what the `goal_state` column can represent.
+    /// Rounds a state to the precision of the `goal_state` column.
     fn observable(&self, state: &T::State) -> Result<T::State> {
         let mut row = [0.0; MAX_STATE_LEN];
         let len = T::STATE_BOUNDS.len();

@@ -1,4 +1,4 @@
-//! Rotation of vectors as pygame does it.
+//! Rotation of vectors with the rounding of pygame.
 
 /// Rotates a vector counter-clockwise by an angle in radians.
 ///

@@ -13,8 +13,8 @@ pub struct Tally {
     pub reward: f64,
 }
 
-/// Plays 200 episodes with the first expert until they terminate or are truncated: with the default factors or with `all`
-/// varied, towards the goal of the reset or one that `sample_goal` draws.
+/// Plays 200 episodes with the first expert until they terminate or are truncated: with the default factors or with
+/// `all` varied, towards the goal of the reset or one that `sample_goal` draws.
 pub fn tally(entry: &EnvEntry, all: bool, sampled: bool) -> Tally {
     let variation = VariationRequest { variation: all.then(|| vec!["all".to_owned()]), ..VariationRequest::default() };
     let options = ResetOptions { variation, ..ResetOptions::default() };

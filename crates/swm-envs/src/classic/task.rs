@@ -1,4 +1,4 @@
-//! [`ControlTask`]: what distinguishes one classic-control environment from another.
+//! [`ControlTask`]: the interface that each classic-control environment implements.
 
 use super::factors::{ColorFactor, PhysicsFactor};
 use super::frame::Surface;
@@ -49,7 +49,7 @@ pub trait ControlTask: Send + Sized + 'static {
     /// Checks and reads a state from a `state` column.
     ///
     /// # Errors
-    /// When the values are no state.
+    /// When the values are not a valid state.
     fn parse_state(what: &str, observed: &[f64]) -> Result<Self::State> {
         Self::state_space().check(what, observed)?;
         Ok(Self::read_state(observed))

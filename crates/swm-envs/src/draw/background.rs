@@ -1,7 +1,7 @@
 //! [`Background`]: the static part of a frame, drawn once per episode and resized once per frame size.
 //!
-//! A frame copies the resized background, draws the moving shapes at the original size, and resizes only the pixels they
-//! touch.
+//! A frame copies the resized background, draws the moving shapes at the original size, and resizes only the pixels
+//! they touch.
 
 use super::{Area, BySize, Pixels};
 use swm_core::FrameMut;
@@ -30,7 +30,7 @@ impl Background {
         Self { side, image: vec![], canvas: None, resized: BySize::default() }
     }
 
-    /// Replaces the background by what `draw` draws.
+    /// Draws a new background with `draw`.
     pub fn redraw(&mut self, draw: impl FnOnce(&mut Pixels<'_>)) {
         self.image.resize(self.side * self.side * 3, 0);
         draw(&mut Pixels::new(self.side, &mut self.image));
@@ -51,7 +51,8 @@ impl Background {
         Some(&resized.resizer)
     }
 
-    /// Fills a frame with the background and, over it, what `draw` draws. `draw` returns the area it may have changed.
+    /// Renders a frame: the background, and the shapes that `draw` draws over it. `draw` returns the area it may have
+    /// changed.
     pub fn draw_over(&mut self, mut frame: FrameMut<'_>, draw: impl FnOnce(&mut Pixels<'_>) -> Area) {
         let side = self.side;
         if self.copy_to(&mut frame).is_none() {

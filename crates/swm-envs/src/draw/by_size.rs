@@ -5,9 +5,9 @@ use std::ops::{Index, IndexMut};
 /// The maximal number of cached sizes; the size added first is dropped first.
 const MAX_SIZES: usize = 4;
 
-/// Values cached by frame size, each with a flag that says whether it is up to date.
+/// Values cached by frame size, each with a flag that is set while the value is up to date.
 pub struct BySize<T> {
-    /// The size added last comes first.
+    /// Ordered from the most recently added size to the oldest.
     entries: Vec<Entry<T>>,
 }
 
@@ -86,6 +86,6 @@ mod tests {
         assert_eq!([1, 1, 2, 1].map(|width| get(&mut cache, width)), [1, 1, 1, 1]);
         cache.invalidate();
         assert_eq!([1, 3, 4, 5].map(|width| get(&mut cache, width)), [2, 1, 1, 1]);
-        assert_eq!(get(&mut cache, 1), 1, "the size added first was dropped and is made anew");
+        assert_eq!(get(&mut cache, 1), 1, "the oldest size was dropped and is created again");
     }
 }

@@ -12,17 +12,17 @@ pub struct Point {
 }
 
 /// Coordinates are clipped to this magnitude, far outside any canvas, so that no arithmetic overflows.
-const FAR: f64 = 8192.0;
+const COORDINATE_LIMIT: f64 = 8192.0;
 
 impl Point {
-    /// The pixel in a column and a row.
+    /// Makes the pixel at column `x` and row `y`.
     pub const fn new(x: i32, y: i32) -> Self {
         Self { x, y }
     }
 
-    /// The pixel nearest to a point; halves round to even.
+    /// Returns the pixel nearest to a point; halves round to even.
     pub fn nearest(x: f64, y: f64) -> Self {
-        let whole = |v: f64| v.round_ties_even().clamp(-FAR, FAR) as i32;
+        let whole = |v: f64| v.round_ties_even().clamp(-COORDINATE_LIMIT, COORDINATE_LIMIT) as i32;
         Self { x: whole(x), y: whole(y) }
     }
 
@@ -31,7 +31,7 @@ impl Point {
     }
 }
 
-/// A rectangle of pixels; its upper ends are excluded.
+/// A rectangle of pixels from `low` to `high`, which is excluded.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Area {
     low: Point,
@@ -39,7 +39,7 @@ pub struct Area {
 }
 
 impl Area {
-    /// The area without pixels.
+    /// The empty area.
     pub const EMPTY: Self = Self { low: Point::new(i32::MAX, i32::MAX), high: Point::new(i32::MIN, i32::MIN) };
 
     /// Returns the smallest area that also contains the pixels within `reach` of `point`.
@@ -51,12 +51,12 @@ impl Area {
         }
     }
 
-    /// The area of a canvas of `side`² pixels.
+    /// Returns the area of a canvas of `side`² pixels.
     pub const fn square(side: usize) -> Self {
         Self { low: Point::new(0, 0), high: Point::new(side as i32, side as i32) }
     }
 
-    /// Returns whether two areas share a pixel.
+    /// Returns whether two areas opacity a pixel.
     pub fn touches(self, other: Self) -> bool {
         self.low.x < other.high.x && other.low.x < self.high.x && self.low.y < other.high.y && other.low.y < self.high.y
     }
@@ -95,11 +95,12 @@ impl Palette {
         self.used = self.fixed;
     }
 
-    /// Returns the index of `color` blended over the colour of `under`; `under` itself once all indices are in use.
-    fn blended(&mut self, color: [u8; 3], share: f32, under: u8) -> u8 {
+    /// Returns the index of `color` blended over the colour of index `under` with an opacity from 0 to 1; `under`
+    /// itself when all indices are in use.
+    fn blended(&mut self, color: [u8; 3], opacity: f32, under: u8) -> u8 {
         let below = self.color(under);
         let Some(slot) = self.colors.get_mut(self.used) else { return under };
-        *slot = std::array::from_fn(|i| (f32::from(color[i]) * share + f32::from(below[i]) * (1.0 - share)) as u8);
+        *slot = std::array::from_fn(|i| (f32::from(color[i]) * opacity + f32::from(below[i]) * (1.0 - opacity)) as u8);
         self.used += 1;
         (self.used - 1) as u8
     }
@@ -155,8 +156,8 @@ impl Canvas {
 
     /// Fills a polygon of up to [`MAX_CORNERS`] corners.
     ///
-    /// A row is covered from one edge, rounded down, to the next, rounded down. An edge covers its upper end but not its
-    /// lower end, except in the last row. Horizontal edges are drawn completely.
+    /// Each row is filled between pairs of edge crossings, both rounded down. An edge includes its upper end and
+    /// excludes its lower end, except in the polygon's last row. Horizontal edges are drawn completely.
     pub fn fill_polygon(&mut self, corners: &[Point], index: u8) {
         let (top, bottom) = corners.iter().fold((i32::MAX, i32::MIN), |(a, b), p| (a.min(p.y), b.max(p.y)));
         if top == bottom {
@@ -265,10 +266,10 @@ impl Canvas {
         (last_x < self.side && last_y < self.side).then_some(y * self.side + x)
     }
 
-    /// Draws a thick line of [`WIDTH`] with round ends. A line without length is not drawn.
+    /// Draws a thick line of [`WIDTH`] with round ends. A line of length 0 is not drawn.
     ///
-    /// Its sides follow from absolute differences, as in the reference's debug drawing, so they are skewed where the line
-    /// descends from left to right.
+    /// Its sides follow from absolute differences, as in the reference's debug drawing, so they are skewed where the
+    /// line descends from left to right.
     pub fn thick_line(&mut self, from: Point, to: Point, index: u8) {
         let radius = WIDTH / 2;
         self.flat_line(from, to, index);
@@ -307,11 +308,11 @@ impl Canvas {
         }
     }
 
-    fn blend(&mut self, at: Point, color: [u8; 3], share: f32, palette: &mut Palette) {
+    fn blend(&mut self, at: Point, color: [u8; 3], opacity: f32, palette: &mut Palette) {
         let (Ok(x), Ok(y)) = (usize::try_from(at.x), usize::try_from(at.y)) else { return };
         if x < self.side && y < self.side {
             let pixel = &mut self.pixels[y * self.side + x];
-            *pixel = palette.blended(color, share, *pixel);
+            *pixel = palette.blended(color, opacity, *pixel);
         }
     }
 }
@@ -329,10 +330,13 @@ struct Edge {
     end: i32,
     /// The column at which it crosses the current row, rounded down.
     x: i32,
-    /// The remainder of rounding, in units of 1 / height.
+    /// The remainder of that rounding, in units of 1 / `height`.
     rest: i32,
+    /// The change of `x` per row, rounded down.
     step: i32,
+    /// The remainder of that rounding, in units of 1 / `height`.
     step_rest: i32,
+    /// The number of rows that the edge crosses.
     height: i32,
 }
 

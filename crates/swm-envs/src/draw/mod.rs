@@ -1,4 +1,4 @@
-//! Drawing of frames the way the Python reference does it: at the reference's own size, then resized.
+//! Drawing of frames as in the Python reference: at the size that the reference draws at, then resized.
 //!
 //! A [`Canvas`] holds one byte per pixel, an index into a [`Palette`]; its shapes cover the same pixels as those of
 //! pygame 2.6, and a [`Resampler`] converts it to RGB of any size with the arithmetic of OpenCV's bilinear resize.

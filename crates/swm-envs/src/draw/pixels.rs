@@ -11,7 +11,8 @@ pub fn rect(low: [i32; 2], high: [i32; 2]) -> Area {
     Area::EMPTY.with(Point::new(low[0], low[1]), 0).with(Point::new(high[0] - 1, high[1] - 1), 0)
 }
 
-/// A square RGB image. Coordinates are in pixels from its upper left corner, so the centre of the first pixel is (½, ½).
+/// A square RGB image. Coordinates are in pixels from its upper left corner, so the centre of the first pixel is (½,
+/// ½).
 pub struct Pixels<'a> {
     side: usize,
     rgb: &'a mut [u8],
@@ -52,8 +53,8 @@ impl<'a> Pixels<'a> {
         }
     }
 
-    /// Blends a filled circle into the part of the image inside `clip`. The coverage of a pixel follows from the distance
-    /// of its centre to the circle.
+    /// Blends a filled circle into the part of the image inside `clip`. The coverage of a pixel follows from the
+    /// distance of its centre to the circle.
     pub fn circle(&mut self, [cx, cy]: [f64; 2], radius: f64, color: Rgb, opacity: f64, clip: Area) {
         let (columns, rows) = clip.within(self.side);
         let cut = |v: f64, within: &Range<usize>| (v.max(0.0) as usize).clamp(within.start, within.end);
@@ -130,8 +131,8 @@ fn mix(pixel: &mut Rgb, color: Rgb, share: f64) {
     }
 }
 
-/// Adds the part of an edge within the row from `top` to `top + 1`: for each pixel that it crosses the signed area right
-/// of it within the pixel, and the signed height for the pixels beyond.
+/// Adds the part of an edge within the row from `top` to `top + 1`: for each pixel that it crosses the signed area
+/// right of it within the pixel, and the signed height for the pixels beyond.
 fn add_edge(added: &mut [[f64; 2]], columns: &Range<usize>, from: [f64; 2], to: [f64; 2], top: f64) {
     let (low, high, sign) = if from[1] < to[1] { (from, to, 1.0) } else { (to, from, -1.0) };
     let (y0, y1) = (low[1].max(top), high[1].min(top + 1.0));

@@ -50,8 +50,8 @@ impl Brush {
         self.blend_profiles(disc.color, width, [x.pixels().start, y.pixels().start], rgb);
     }
 
-    /// Blends one disc into an image, `[height, width, 3]`, that a filter made of a 224-pixel frame. Where the image has
-    /// one colour, this equals blending before resizing.
+    /// Blends one disc into an image, `[height, width, 3]`, that a filter made of a 224-pixel frame. Where the image
+    /// has one colour, this equals blending before resizing.
     pub fn blend_resized(&mut self, disc: &SoftDisc, resizer: &TriangleResizer, rgb: &mut [u8]) {
         let mut start = [0; 2];
         self.clear(resizer.size().0, resizer.size().1);
@@ -106,8 +106,8 @@ struct Profile {
     scale: f64,
     pixels: usize,
     radius: f64,
-    /// Squared distance from the centre to the nearest pixel of the 224-pixel frame, in pixels: the reference scales its
-    /// discs to be opaque there.
+    /// Squared distance from the centre to the nearest pixel of the 224-pixel frame, in pixels: the reference scales
+    /// its discs to be opaque there.
     nearest: f64,
 }
 

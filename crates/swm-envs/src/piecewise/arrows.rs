@@ -1,4 +1,4 @@
-//! Arrows that show the drift of every zone.
+//! Draws arrows that show the drift of every zone.
 //!
 //! Sizes and proportions are those of the reference's vector field (matplotlib's `quiver` with the settings of
 //! `piecewise_env.py`).
@@ -12,15 +12,15 @@ const COLOR: Rgb = [17; 3];
 const OPACITY: f64 = 0.85;
 /// Arrows along a side of a zone.
 const PER_ZONE: usize = 3;
-/// Thickness of a shaft, in pixels. It is the unit of the lengths below.
+/// Thickness of a shaft, in pixels.
 const THICKNESS: f64 = 0.006 * SIZE;
-/// Width of a head.
+/// Width of a head, in shaft thicknesses.
 const HEAD_WIDTH: f64 = 4.0;
-/// Length of a head, from its tip to the ends of its barbs.
+/// Length of a head from its tip to the ends of its barbs, in shaft thicknesses.
 const HEAD: f64 = 4.0;
-/// Length of a head along the shaft, from its tip to where it meets the shaft.
+/// Length of a head along the shaft, from its tip to the shaft's end, in shaft thicknesses.
 const HEAD_AXIS: f64 = 3.5;
-/// An arrow shorter than this is drawn as a dot of this diameter.
+/// The length in shaft thicknesses below which an arrow is drawn as a dot, of this diameter.
 const MIN_LENGTH: f64 = 0.5;
 
 /// Draws the arrows of all zones for their drift in pixels per step.
@@ -38,7 +38,7 @@ pub fn draw(drift: &[[f64; 2]; ZONES], pixels: &mut Pixels<'_>) {
     }
 }
 
-/// Draws an arrow from its tail, `length` thicknesses long.
+/// Draws an arrow from its tail (pixels); `length` is in shaft thicknesses, `angle` in radians.
 fn arrow(tail: [f64; 2], length: f64, angle: f64, pixels: &mut Pixels<'_>) {
     let (sin, cos) = angle.sin_cos();
     let at = |[x, y]: [f64; 2]| {

@@ -15,7 +15,7 @@ use swm_core::{ExpertEntry, Key, Result, Rng, RowRef};
 pub const EXPERTS: &[ExpertEntry] = &[
     ExpertEntry {
         id: "expert",
-        summary: "straight to the target, making up for the drift, or around drift that is too strong",
+        summary: "straight to the target, compensating the drift, or around drift that is too strong",
         make: || Box::new(SteeringExpert { plan: None }),
     },
     ExpertEntry {
@@ -25,7 +25,7 @@ pub const EXPERTS: &[ExpertEntry] = &[
     },
 ];
 
-/// Heads straight for the target where that reaches it, and takes a detour otherwise.
+/// Steers straight to the target where that is possible, otherwise along a detour.
 struct SteeringExpert {
     plan: Option<Plan>,
 }

@@ -14,10 +14,10 @@ use render::{ZonesAppearance, ZonesRenderer};
 use std::f64::consts::TAU;
 use swm_core::{DType, EnvEntry, EnvSpec, Factor, FactorValues, FrameMut, Rng, RowMut, Space, VariationSpace};
 
-/// The registry row.
+/// The registry row of this environment.
 pub const ENTRY: EnvEntry = EnvEntry {
     id: Piecewise::ID,
-    summary: "walk to the target through zones that each drift their own way",
+    summary: "walk to the target through zones, each of which drifts in its own direction",
     options: &[],
     make: |_| Ok(Box::new(PointAgentEnv::<Piecewise>::new())),
     experts: expert::EXPERTS,

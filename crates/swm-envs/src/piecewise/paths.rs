@@ -32,8 +32,9 @@ const SPARE: f64 = 1e-3;
 
 /// The fewest steps to a target from every node of a grid.
 ///
-/// A step can end anywhere in a rectangle of twice the speed, moved by the drift and cut by the border. So the agent can
-/// go from node to node exactly, and a breadth-first search backwards from the target finds every path over the grid.
+/// A step can end anywhere in a rectangle of twice the speed, moved by the drift and cut by the border. So the agent
+/// can go from node to node exactly, and a breadth-first search backwards from the target finds every path over the
+/// grid.
 pub struct Detours {
     dynamics: Dynamics,
     to: Position,
@@ -50,7 +51,8 @@ impl Detours {
                 detours.steps[i] = 0;
             }
         }
-        // A summed-area table of the nodes from which the target is reachable, which counts those of a rectangle at once.
+        // A summed-area table of the nodes from which the target is reachable, which counts those of a rectangle at
+        // once.
         let mut counts = vec![0_u32; (SIDE + 1) * (SIDE + 1)];
         for step in 1..UNREACHABLE {
             for (y, row) in detours.steps.chunks_exact(SIDE).enumerate() {

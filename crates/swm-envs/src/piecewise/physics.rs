@@ -58,8 +58,8 @@ impl Dynamics {
         })
     }
 
-    /// Returns the action that leads nearest to `to`: it compensates the drift, on each axis as far as the agent's speed
-    /// allows.
+    /// Returns the action that leads nearest to `to`: it compensates the drift, on each axis as far as the agent's
+    /// speed allows.
     pub fn steer(&self, from: Position, to: Position) -> [f32; 2] {
         let drift = self.drift_at(from);
         std::array::from_fn(|i| {

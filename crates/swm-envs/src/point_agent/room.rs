@@ -16,7 +16,7 @@ pub const BORDER: f64 = 14.0;
 pub const LINE: f64 = 4.0;
 /// The episode terminates when the target is nearer than this, in pixels.
 pub const GOAL_RADIUS: f32 = 16.0;
-/// Candidates drawn for a sampled goal, at most.
+/// The maximal number of candidates drawn for a sampled goal.
 pub const GOAL_TRIES: usize = 256;
 
 /// Indices of the columns of [`spec`].

@@ -1,4 +1,4 @@
-//! [`PointTask`]: what distinguishes one point-agent environment from another.
+//! [`PointTask`]: the interface that each point-agent environment implements.
 
 use super::position::Position;
 use swm_core::{EnvSpec, FactorValues, FrameMut, Key, Result, Rng, RowMut, VariationRequest, VariationSpace};
@@ -11,7 +11,7 @@ pub trait PointTask: Sized + Send + 'static {
     const SIZE: f64;
     /// The factor that gives the goal position of an episode.
     const GOAL_FACTOR: &'static str;
-    /// How many candidates [`PointTask::find_goal`] draws at most.
+    /// The maximal number of candidates that [`PointTask::find_goal`] draws.
     const GOAL_TRIES: usize;
 
     /// Draws frames and caches what does not change between them.
@@ -23,7 +23,7 @@ pub trait PointTask: Sized + Send + 'static {
     /// Builds the task of an episode from its factors.
     fn new(factors: &FactorValues) -> Self;
 
-    /// Changes to the factors of another episode. Overridden by tasks that cache data derived from the factors.
+    /// Sets the factors of another episode. Overridden by tasks that cache data derived from the factors.
     fn set_factors(&mut self, factors: &FactorValues) {
         *self = Self::new(factors);
     }

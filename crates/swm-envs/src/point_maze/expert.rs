@@ -32,7 +32,7 @@ struct Planner {
 }
 
 impl Planner {
-    /// Makes a planner for a position. It takes over what a previous planner has found for the same maze.
+    /// Makes a planner for a position. It reuses the paths of a previous planner for the same maze.
     fn new(previous: Option<Self>, layout: &Layout, to: Position64) -> Self {
         match previous {
             Some(planner) if planner.graph.layout() == layout && planner.to == to => planner,
@@ -82,7 +82,7 @@ impl Expert for ShortestPathExpert {
 
 /// Share of legs that lead around the walls instead of straight into them.
 const AROUND_SHARE: f64 = 0.7;
-/// Steps of a leg around the walls, at most.
+/// The maximal number of steps of a leg around the walls.
 const AROUND_LEG_STEPS: u32 = 40;
 
 /// The random walk of `explore`: around the walls, or straight and into them.

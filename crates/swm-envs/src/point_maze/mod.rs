@@ -18,7 +18,7 @@ use swm_core::{
     VariationRequest, VariationSpace,
 };
 
-/// The registry row.
+/// The registry row of this environment.
 pub const ENTRY: EnvEntry = EnvEntry {
     id: PointMaze::ID,
     summary: "walk around rectangular walls to the goal",
@@ -98,7 +98,7 @@ impl PointTask for PointMaze {
         }
     }
 
-    /// Keeps the visibility graph while the layout stays the same, and the paths while the goal does, too.
+    /// Reuses the visibility graph if the layout is unchanged, and the paths if the goal is unchanged too.
     fn set_factors(&mut self, factors: &FactorValues) {
         let (layout, goal) = (layout(factors), self.appearance.goal.center);
         if layout != self.layout {
@@ -178,7 +178,7 @@ impl PointTask for PointMaze {
     fn goal_distance(&self, agent: Position, goal: Position) -> f64 {
         let (from, to) = (widen(agent), widen(goal));
         let paths = self.to_goal.get_or_init(|| self.graph().shortest_paths(to));
-        // Without a path to the goal, the straight line is what remains.
+        // Without a path to the goal, the length of the straight line is used.
         self.graph().next(from, paths).map_or_else(|| distance64(from, to), |(_, length)| length)
     }
 }

@@ -1,14 +1,14 @@
 //! `swm/PushT-Discrete-v1`: Push-T with actions from a polar grid, for planners and models of discrete actions.
 //!
 //! Only the actions differ from [`super::PushT`]. The grid is that of the reference (`quantizer.py`): equal bins of the
-//! radius and of the angle, each of which represents its centre.
+//! radius and of the angle, each represented by its centre.
 
 use super::{PushT, expert};
 use std::f64::consts::TAU;
 use swm_core::policy::Expert;
 use swm_core::{EnvEntry, ExpertEntry, Result, RowRef, Space};
 
-/// The registry row.
+/// The registry row of this environment.
 pub const ENTRY: EnvEntry = EnvEntry {
     id: "swm/PushT-Discrete-v1",
     summary: "push a block to a goal pose, by steps from a polar grid",

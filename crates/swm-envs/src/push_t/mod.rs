@@ -22,7 +22,7 @@ use swm_core::{
 };
 pub use table::{ACTION_SCALE, TABLE};
 
-/// The registry row.
+/// The registry row of this environment.
 pub const ENTRY: EnvEntry = EnvEntry {
     id: "swm/PushT-v1",
     summary: "push a block to a goal pose",
@@ -44,16 +44,16 @@ const EXPERTS: &[ExpertEntry] = &[
     },
 ];
 
-/// Goal candidates drawn before sampling a goal fails.
+/// The maximal number of candidates drawn for a goal.
 const GOAL_TRIES: usize = 1000;
 
-/// The environment.
+/// Push-T, with continuous actions or the action grid of [`discrete`].
 pub struct PushT {
     spec: EnvSpec,
     factors: FactorValues,
     simulation: Simulation,
     goal: State,
-    /// What the goal frame shows.
+    /// The state that the goal frame shows.
     goal_drawn: DrawnState,
     /// The number of contacts, summed over the physics steps since the last action.
     contacts: usize,
@@ -93,7 +93,7 @@ impl PushT {
         state_of(&self.simulation)
     }
 
-    /// Starts an episode with these factors: the simulation is at the goal, so that the goal frame can be drawn.
+    /// Starts an episode with these factors. The simulation is at the goal afterwards, for the goal frame.
     fn begin(&mut self, factors: FactorValues, goal: State) {
         self.simulation = settled(table::simulation(&factors), &goal);
         self.contacts = self.simulation.contact_count();
@@ -111,11 +111,11 @@ impl Default for PushT {
     }
 }
 
-/// Draws a goal at rest that can be reached (nothing overlaps there) and that is not reached at `start`.
+/// Draws a goal at rest at which nothing overlaps, and that is not already reached at `start`.
 fn find_goal(factors: &FactorValues, start: &State, key: Key) -> Result<State> {
     let space = |name: &str| factors.factors().iter().find(|factor| factor.key == name).map(|factor| &factor.space);
     let (Some(agents), Some(blocks)) = (space("agent.start_position"), space("block.start_position")) else {
-        return Err(Error::config("goal", "its spaces are missing", "report this"));
+        return Err(Error::config("goal", "the factors of the start positions are missing", "report this bug"));
     };
     let mut rng = key.rng();
     let angles = Space::uniform_box([], DType::Float64, 0.0, TAU);
@@ -213,7 +213,7 @@ impl Env for PushT {
     }
 
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
-        let invalid = || wrong_snapshot(&self.spec.id, "other bytes");
+        let invalid = || wrong_snapshot(&self.spec.id, "bytes of another length");
         let (factors, mut bytes) = parse_snapshot(&self.spec.id, &self.spec.variation_space, &self.factors, snapshot)?;
         let goal = take_array::<f64, 7>(&mut bytes).ok_or_else(invalid)?;
         let [contacts] = take_array::<u64, 1>(&mut bytes).ok_or_else(invalid)?;
@@ -225,7 +225,7 @@ impl Env for PushT {
         if self.simulation.load(&mut bytes).is_none() || !bytes.is_empty() {
             // A partly read state is invalid: the episode starts anew at its goal.
             self.begin(self.factors.clone(), goal);
-            return Err(wrong_snapshot(&self.spec.id, "other bytes"));
+            return Err(wrong_snapshot(&self.spec.id, "bytes of another length"));
         }
         self.contacts = contacts;
         Ok(())

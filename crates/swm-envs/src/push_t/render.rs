@@ -1,5 +1,5 @@
-//! Rendering: the goal pose, the block and the agent with outlines, the walls, and red marks at contacts, drawn at 512 x
-//! 512 pixels as in the reference and resized.
+//! Rendering: the goal pose, the block and the agent with outlines, the walls, and red marks at contacts, drawn at 512
+//! x 512 pixels as in the reference and resized.
 //!
 //! The table with goal pose and walls is static during an episode: it is drawn once, and resampled once per frame size.
 //! A frame copies it, draws agent and block on the canvas, resamples their area, and restores the canvas. While nothing
@@ -34,7 +34,7 @@ const WALL: u8 = 2;
 /// Indices of the outlines of agent and block; the inside of each has the next index.
 const BODIES: [u8; 2] = [3, 5];
 
-/// The part of the simulation's state that a frame shows.
+/// The part of the simulation state that frames depend on.
 #[derive(Clone)]
 pub struct DrawnState {
     poses: [Pose; 2],
@@ -121,7 +121,7 @@ impl TableRenderer {
         renderer
     }
 
-    /// Changes to an episode with these factors.
+    /// Starts an episode with these factors.
     pub fn begin_episode(&mut self, factors: &FactorValues) {
         self.shapes = ["agent", "block"].map(|name| body_shape(factors, name));
         let parts = [AGENT, BLOCK].map(|body| self.shapes[body].rects.len().max(1));
@@ -143,7 +143,7 @@ impl TableRenderer {
         if factors.integer("rendering.render_goal") != 0 {
             let at = factors.get("goal.position");
             let pose = Pose::new(Vec2::new(at[0], at[1]), factors.scalar("goal.angle"), Vec2::ZERO);
-            // As large as the block: the reference samples `goal.scale` and ignores it.
+            // The goal has the size of the block: the reference samples `goal.scale` and ignores it.
             for rect in &self.shapes[BLOCK].rects {
                 self.table.fill_polygon(&rect.map(|corner| pixel(pose.point(corner))), GOAL);
             }
@@ -166,7 +166,7 @@ impl TableRenderer {
         }
     }
 
-    /// Draws a frame with the agent apart from the block, which is on the canvas already.
+    /// Draws a frame in which the agent does not touch the block. The canvas already contains the block.
     fn draw_agent(&mut self, drawn: &DrawnState, area: Area, slot: usize, frame: FrameMut<'_>) {
         let ResampledTable { resampler, table, with_block, has_block } = &mut self.resampled[slot];
         if !*has_block {
@@ -214,7 +214,7 @@ impl TableRenderer {
         }
     }
 
-    /// Draws the block on the canvas, unless it is there already.
+    /// Draws the block on the canvas, unless the canvas already contains it in this pose.
     fn draw_block(&mut self, pose: &Pose, area: Area) {
         if self.drawn_block.is_some_and(|block| block.pose == *pose) {
             return;
@@ -237,7 +237,7 @@ impl TableRenderer {
     fn area(&self, body: usize, pose: &Pose) -> Area {
         let shape = &self.shapes[body];
         if shape.is_circle() {
-            return Area::EMPTY.with(pixel(pose.origin), whole(shape.radius));
+            return Area::EMPTY.with(pixel(pose.origin), rounded(shape.radius));
         }
         let corners = shape.rects.iter().flatten().map(|&corner| pixel(pose.point(corner)));
         corners.fold(Area::EMPTY, |area, corner| area.with(corner, WIDTH / 2 + 1))
@@ -263,8 +263,8 @@ impl Canvas {
         let (rim, inside) = (BODIES[body], BODIES[body] + 1);
         if shape.is_circle() {
             let centre = pixel(pose.origin);
-            self.fill_circle(centre, whole(shape.radius), rim);
-            self.fill_circle(centre, whole(shape.radius - RIM), inside);
+            self.fill_circle(centre, rounded(shape.radius), rim);
+            self.fill_circle(centre, rounded(shape.radius - RIM), inside);
             return;
         }
         let corners = shape.rects[part].map(|corner| pixel(pose.point(corner)));
@@ -274,7 +274,7 @@ impl Canvas {
         }
     }
 
-    /// Draws again the walls that bodies in these areas may cover.
+    /// Redraws the walls that bodies in these areas may cover.
     fn draw_walls(&mut self, areas: &[Area]) {
         for wall in walls() {
             if areas.iter().any(|area| area.touches(line_area(&wall))) {
@@ -289,7 +289,7 @@ fn pixel(point: Vec2) -> Point {
     Point::nearest(point.x, point.y)
 }
 
-fn whole(radius: f64) -> i32 {
+fn rounded(radius: f64) -> i32 {
     radius.round_ties_even() as i32
 }
 
@@ -316,7 +316,7 @@ mod tests {
     use swm_core::{Key, VariationRequest};
 
     #[test]
-    fn keeping_the_block_on_the_canvas_changes_no_frame() {
+    fn caching_the_block_changes_no_frame() {
         let all = VariationRequest { variation: Some(vec!["all".to_owned()]), ..VariationRequest::default() };
         let space = variation_space();
         let mut apart = 0;
@@ -325,7 +325,7 @@ mod tests {
             let mut renderer = TableRenderer::new(&factors);
             let mut simulation = settled(simulation(&factors), &start_state(&factors));
             for t in 0..6 {
-                // The block moves every third time, the agent always.
+                // The block moves in every third frame, the agent in every frame.
                 let mut state = state_of(&simulation);
                 state[0] = (state[0] + 71.0 * f64::from(t)) % TABLE;
                 state[2] = if t % 3 == 2 { (state[2] + 150.0) % TABLE } else { state[2] };

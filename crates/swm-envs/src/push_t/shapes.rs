@@ -1,8 +1,8 @@
 //! The shapes of the agent and the block: a circle, or a union of rectangles.
 //!
-//! Dimensions, centres of gravity and moments of inertia are those of the reference (`env.py`). The centre of gravity is
-//! the mean of the rectangles' centres, whatever their size, and some shapes count the moment of their first rectangle
-//! several times, as there.
+//! Dimensions, centres of gravity and moments of inertia are those of the reference (`env.py`). The centre of gravity
+//! is the mean of the rectangles' centres, whatever their size, and some shapes count the moment of their first
+//! rectangle several times, as there.
 
 use super::physics::{Body, Shape, Vec2};
 use std::f64::consts::{PI, TAU};

@@ -13,7 +13,8 @@ pub const REACH: f64 = 20.0;
 /// and the block's angle is nearer than this, in radians.
 pub const REACH_ANGLE: f64 = PI / 9.0;
 /// Weight of the agent's distance in [`goal_distance`], relative to the block's. It is small, because the agent has to
-/// leave its goal to push the block: a plan that minimised both alike would park the agent and leave the block.
+/// leave its goal to push the block: a plan that minimised both equally would leave the agent at its goal and not push
+/// the block.
 const AGENT_WEIGHT: f64 = 0.05;
 
 /// Moves the bodies to a state.
@@ -49,14 +50,14 @@ pub fn start_state(factors: &FactorValues) -> State {
 /// Checks a state that a caller gave.
 ///
 /// # Errors
-/// When it has not 7 values, or one of them is not finite.
+/// When it does not have 7 values, or one of them is not finite.
 pub fn checked(state: &[f64], what: &str) -> Result<State> {
     if let Some(bad) = state.iter().find(|v| !v.is_finite()) {
         let fix = "give finite positions, angle and velocities".to_owned();
         return Err(Error::NotFinite { what: what.to_owned(), given: bad.to_string(), fix });
     }
     state.try_into().map_err(|_| {
-        let expected = "7: agent x y, block x y, block angle, agent velocity x y";
+        let expected = "7 values: agent x y, block x y, block angle, agent velocity x y";
         Error::mismatch(format!("reading a {what}"), format!("{} values", state.len()), expected)
     })
 }
@@ -80,8 +81,8 @@ pub fn angle_between(shape: i64, from: f64, to: f64) -> f64 {
     angle.min(symmetry - angle)
 }
 
-/// Returns the distance to the goal in units of the tolerances: the Euclidean norm of the block's distance, its rotation
-/// and the weighted distance of the agent.
+/// Returns the distance to the goal in units of the tolerances: the Euclidean norm of the block's distance, its
+/// rotation and the weighted distance of the agent.
 pub fn goal_distance(factors: &FactorValues, goal: &State, state: &State) -> f64 {
     let distance = |x: usize| (state[x] - goal[x]).hypot(state[x + 1] - goal[x + 1]) / REACH;
     let angle = angle_between(factors.integer("block.shape"), goal[4], state[4]) / REACH_ANGLE;

@@ -23,8 +23,8 @@ pub const WALL_LINES: [[[f64; 2]; 2]; 4] = [
 /// Half the thickness of the walls, in pixels.
 const WALL_RADIUS: f64 = 2.0;
 
-/// Runs one step of the environment: a spring-damper controller pulls the agent towards the target of an action. Returns
-/// the number of contacts, summed over the physics steps.
+/// Runs one step of the environment: a spring-damper controller pulls the agent towards the target of an action.
+/// Returns the number of contacts, summed over the physics steps.
 ///
 /// The controller computes in single precision, as in the reference.
 pub fn advance(simulation: &mut Simulation, action: [f32; 2]) -> usize {
@@ -60,7 +60,7 @@ pub fn simulation(factors: &FactorValues) -> Simulation {
     assemble(&shapes, bodies)
 }
 
-/// Puts agent and block between the walls.
+/// Makes a simulation of agent, block and walls.
 pub fn assemble(shapes: &[BodyShape; 2], [agent, block]: [Body; 2]) -> Simulation {
     let wall = |[a, b]: [[f64; 2]; 2]| Shape::segment(WALLS, a.into(), b.into(), WALL_RADIUS);
     let mut colliders: Vec<Shape> = WALL_LINES.map(wall).into();

@@ -45,7 +45,7 @@ impl Expert for ShortestPath {
 
 /// Share of legs that lead through the doors instead of straight into the walls.
 const DOOR_SHARE: f64 = 0.7;
-/// Steps of a leg through the doors, at most.
+/// The maximal number of steps of a leg through the doors.
 const DOOR_LEG_STEPS: u32 = 60;
 
 /// The random walk of `explore`: through the doors, or straight and into the walls.

@@ -12,7 +12,7 @@ use physics::{Layout, MAX_DOORS, WALL_CENTER};
 use render::{RoomAppearance, RoomRenderer};
 use swm_core::{DType, EnvEntry, EnvSpec, Factor, FactorValues, FrameMut, Rng, RowMut, Space, VariationSpace};
 
-/// The registry row.
+/// The registry row of this environment.
 pub const ENTRY: EnvEntry = EnvEntry {
     id: TwoRoom::ID,
     summary: "walk from room to room through the doors of the wall between them, to the target",
@@ -110,7 +110,7 @@ impl PointTask for TwoRoom {
 
     fn goal_distance(&self, agent: Position, goal: Position) -> f64 {
         let (from, to) = (widen(agent), widen(goal));
-        // Without a passable door there is no path; the straight line is what remains.
+        // Without a passable door there is no path; the length of the straight line is used.
         paths::length(&self.layout, from, to).unwrap_or_else(|| distance64(from, to))
     }
 }

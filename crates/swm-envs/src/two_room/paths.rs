@@ -64,8 +64,8 @@ fn openings(layout: &Layout) -> impl Iterator<Item = [f64; 2]> + use<> {
 }
 
 /// Returns the position to walk to in order to reach `to`. This is `to` itself unless it lies inside the wall; then it
-/// is the position, among those at the wall's faces and in the doors, that reaches `to` by the shortest path. Where none
-/// is near enough, it is the nearest one.
+/// is the position, among those at the wall's faces and in the doors, that reaches `to` by the shortest path. Where
+/// none is near enough, it is the nearest one.
 fn reachable_end(layout: &Layout, from: Position64, to: Position64) -> Position64 {
     let (across, along) = (layout.across, 1 - layout.across);
     let beyond = layout.contact_depth() + SPARE;
@@ -126,7 +126,7 @@ pub fn waypoint(layout: &Layout, from: Position64, to: Position64) -> Position64
         None => best_door(layout, from, to).map(|(opening, crossing, _)| (opening, crossing)),
     };
     match door {
-        // No passable door: stay near.
+        // Without a passable door, the agent stays near the wall.
         None => to,
         Some((opening, crossing)) if !within(from, narrowed(opening, 0.5)) => {
             let [first, last] = narrowed(opening, 1.0);

@@ -54,7 +54,8 @@ impl RoomAppearance {
         }
     }
 
-    /// Returns the coordinates along the x (0) or y (1) axis at which colours may change, ascending, from 0 to [`SIZE`].
+    /// Returns the coordinates along the x (0) or y (1) axis at which colours may change, ascending, from 0 to
+    /// [`SIZE`].
     fn breaks(&self, axis: usize) -> Vec<f64> {
         let outer = BORDER - LINE;
         let mut breaks = vec![0.0, outer, outer + EDGE, BORDER];

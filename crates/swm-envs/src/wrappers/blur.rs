@@ -14,7 +14,7 @@ use super::{EpisodeFrame, VisualWrapper, WrapperEntry, typed};
 use serde::Deserialize;
 use swm_core::FrameMut;
 
-/// The registry row.
+/// The registry row of this wrapper.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "blur",
     summary: "blurs with a Gaussian window",

@@ -1,7 +1,7 @@
 //! The mirrored border that filters read beyond the edge of a frame.
 
-/// Returns the pixel, in a line of `n` ≥ 1 pixels, for a position `i` inside or outside the line. The line is mirrored at
-/// its last pixels, which are not repeated (OpenCV's default border).
+/// Returns the pixel, in a line of `n` ≥ 1 pixels, for a position `i` inside or outside the line. The line is mirrored
+/// at its last pixels, which are not repeated (OpenCV's default border).
 pub fn mirror(i: isize, n: usize) -> usize {
     let inside = i as usize;
     if inside < n {

@@ -1,8 +1,8 @@
 //! Chroma key: pixels near a key colour are replaced by a background image or video.
 //!
 //! A pixel is replaced when its Euclidean distance to one of the key colours is at most `tolerance`. The background is
-//! resized to the frame (area interpolation). A video starts with its first frame at step 0, advances one frame per step
-//! and repeats.
+//! resized to the frame (area interpolation). A video starts with its first frame at step 0, advances one frame per
+//! step and repeats.
 //!
 //! | parameter | unit | default | range |
 //! | --- | --- | --- | --- |
@@ -21,7 +21,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use swm_core::FrameMut;
 
-/// The registry row.
+/// The registry row of this wrapper.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "chroma-key",
     summary: "replaces colours by an image or a video",
@@ -94,7 +94,7 @@ impl VisualWrapper for ChromaKey {
             _ => self.media.sized(size),
         };
         let background = self.media.frame(&sized, which.step()).as_chunks::<3>().0;
-        // Most pixels of a drawn frame have the colour of their neighbour.
+        // Most pixels of a drawn frame have the colour of their neighbour, so the last result is cached.
         let mut last = ([0; 3], self.is_key([0; 3]));
         for (pixel, background) in frame.rgb.as_chunks_mut::<3>().0.iter_mut().zip(background) {
             if *pixel != last.0 {

@@ -22,7 +22,7 @@ use swm_core::{FrameMut, Key};
 
 const FACTOR: Domain = Domain::Spread { around: 1.0, low: 0.0, high: 10.0 };
 
-/// The registry row.
+/// The registry row of this wrapper.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "color-jitter",
     summary: "changes brightness, contrast, saturation and hue, by the same amounts throughout an episode",
@@ -64,9 +64,9 @@ pub(super) struct ColorJitter {
     ranges: [[f64; 2]; 4],
     brightness: f32,
     contrast: f32,
-    /// The new saturation of every saturation.
+    /// The lookup table for saturation.
     saturation: [u8; 256],
-    /// The new hue of every hue, in 180 steps.
+    /// The lookup table for hue, in 180 steps.
     hue: [u8; 180],
 }
 
@@ -77,7 +77,7 @@ impl ColorJitter {
         jitter
     }
 
-    /// Returns the new level of every level of the three channels, by brightness and contrast.
+    /// Returns a lookup table for each channel that applies brightness and contrast.
     fn channel_tables(&self, pixels: &[[u8; 3]]) -> [[u8; 256]; 3] {
         let mut sums = [0u64; 3];
         for pixel in pixels {
@@ -167,7 +167,7 @@ impl VisualWrapper for ColorJitter {
                 to_hsv([channels[0][r as usize], channels[1][g as usize], channels[2][b as usize]]);
             to_rgb([self.hue[hue as usize], self.saturation[saturation as usize], value])
         };
-        // Most pixels of a drawn frame have the colour of their neighbour.
+        // Most pixels of a drawn frame have the colour of their neighbour, so the last result is cached.
         let mut last = ([0; 3], jitter([0; 3]));
         for pixel in pixels {
             if *pixel != last.0 {

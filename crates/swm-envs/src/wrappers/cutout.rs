@@ -15,7 +15,7 @@ use super::{EpisodeFrame, VisualWrapper, WrapperEntry, typed};
 use serde::Deserialize;
 use swm_core::{FrameMut, Key};
 
-/// The registry row.
+/// The registry row of this wrapper.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "cutout",
     summary: "masks rectangles, at new positions in every step",

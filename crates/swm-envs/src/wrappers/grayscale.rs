@@ -1,12 +1,12 @@
 //! Luma in all three channels: `Y = 0.299 R + 0.587 G + 0.114 B`.
 //!
-//! No parameters. Source: `GrayscaleWrapper` of the reference, which calls OpenCV; the result is equal bit for bit (weights
-//! in units of 2⁻¹⁵). Deviation: frames always have three channels, so there is no `keep_channels`.
+//! No parameters. Source: `GrayscaleWrapper` of the reference, which calls OpenCV; the result is equal bit for bit
+//! (weights in units of 2⁻¹⁵). Deviation: frames always have three channels, so there is no `keep_channels`.
 
 use super::{EpisodeFrame, VisualWrapper, WrapperEntry};
 use swm_core::FrameMut;
 
-/// The registry row.
+/// The registry row of this wrapper.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "grayscale",
     summary: "removes colour and keeps brightness",

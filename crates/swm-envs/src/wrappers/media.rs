@@ -1,7 +1,7 @@
 //! [`Media`]: background images and videos of the chroma-key wrapper.
 //!
-//! A PNG file or a folder of them is read here; any other file (MP4, GIF, JPEG, …) is decoded once by the `ffmpeg` program.
-//! The frames, and their resized copies, are shared by all environments.
+//! A PNG file or a folder of them is read here; any other file (MP4, GIF, JPEG, …) is decoded once by the `ffmpeg`
+//! program. The frames, and their resized copies, are shared by all environments.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -28,7 +28,7 @@ pub struct SizedMedia {
 }
 
 impl Media {
-    /// Makes a media of frames, at least one.
+    /// Makes a background of these frames, at least one.
     pub fn new(frames: Vec<RgbImage>) -> Self {
         Self { frames, sizes: Mutex::default() }
     }

@@ -1,8 +1,8 @@
 //! Visual wrappers: changes to the frames of any environment that leave its dynamics untouched.
 //!
-//! A [`VisualWrapper`] changes a frame in place. [`Wrapped`] is an environment whose frames pass through an ordered stack
-//! of them. Random draws of a wrapper depend on the episode's seed, its index in the stack and the step, never on how
-//! often a frame was drawn: drawing twice gives equal bytes, and a restored snapshot continues bit for bit.
+//! A [`VisualWrapper`] changes a frame in place. [`Wrapped`] is an environment whose frames pass through an ordered
+//! stack of them. Random draws of a wrapper depend on the episode's seed, its index in the stack and the step, never on
+//! how often a frame was drawn: drawing twice gives equal bytes, and a restored snapshot continues bit for bit.
 //!
 //! Wrappers, their parameters, defaults and meanings are those of the Python package `stable-worldmodel` 0.1.1
 //! (`wrapper/visual.py`) and of the paper's table of visual wrappers; every file lists its deviations, and
@@ -87,8 +87,8 @@ pub trait VisualWrapper: Send + Sync {
     /// The id of its registry row.
     fn id(&self) -> &'static str;
 
-    /// Starts an episode. All random draws, per episode and per frame, derive from this key. Wrappers without randomness
-    /// ignore it.
+    /// Starts an episode. All random draws, per episode and per frame, derive from this key. Wrappers without
+    /// randomness ignore it.
     fn reset(&mut self, episode: Key) {
         let _ = episode;
     }
@@ -104,7 +104,7 @@ pub trait VisualWrapper: Send + Sync {
 pub struct WrapperEntry {
     /// Its id, such as `noise`.
     pub id: &'static str,
-    /// What it does to a frame, in one sentence.
+    /// A one-sentence description of its effect on a frame.
     pub summary: &'static str,
     /// Its parameters.
     pub parameters: &'static [Parameter],
@@ -151,7 +151,7 @@ pub fn parse(text: &str) -> Result<Box<dyn VisualWrapper>> {
     entry.make(&settings)
 }
 
-/// Reads wrapper and settings in the form of the command line.
+/// Reads wrapper and settings in command-line form.
 ///
 /// # Errors
 /// When the wrapper or a parameter is unknown, or a setting is malformed.

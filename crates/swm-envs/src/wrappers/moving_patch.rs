@@ -8,8 +8,9 @@
 //! | `speed` | pixels a step | 2 | 0 to 1000 |
 //!
 //! Position and direction are drawn uniformly at the start of an episode. In the goal frame the rectangles are at their
-//! start positions. Source: `MovingPatchWrapper` of the reference. It moves the rectangles step by step; here the position
-//! is a function of the step, which gives the same path while `speed` is below the free length of a rectangle's path.
+//! start positions. Source: `MovingPatchWrapper` of the reference. It moves the rectangles step by step; here the
+//! position is a function of the step, which gives the same path while `speed` is below the free length of a
+//! rectangle's path.
 
 use super::patch::{Patch, Rect};
 use super::settings::{Color, Domain, Ends, Parameter};
@@ -18,7 +19,7 @@ use rand::Rng as _;
 use serde::Deserialize;
 use swm_core::{FrameMut, Key};
 
-/// The registry row.
+/// The registry row of this wrapper.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "moving-patch",
     summary: "draws rectangles that move over the frame and bounce off its edges",
@@ -75,7 +76,7 @@ pub(super) struct Moving {
 }
 
 impl Moving {
-    /// Returns the rectangle after some steps.
+    /// Returns the rectangle after `step` steps.
     pub fn rect(&self, frame: &FrameMut<'_>, step: u64) -> Rect {
         let [height, width] = self.patch.pixels(frame);
         let free = [frame.height.saturating_sub(height) as f64, frame.width.saturating_sub(width) as f64];
@@ -87,7 +88,7 @@ impl Moving {
     }
 }
 
-/// Returns the position after a path of a length from 0, reflected at 0 and at `end`.
+/// Returns the position of a point that starts at 0, moves by `path`, and is reflected at 0 and at `end`.
 fn bounce(path: f64, end: f64) -> f64 {
     if end <= 0.0 {
         return 0.0;

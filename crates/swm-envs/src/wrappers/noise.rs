@@ -11,8 +11,8 @@
 //!
 //! Source: `NoiseWrapper` of the reference (Gaussian with a schedule); the paper's table adds salt and pepper, for
 //! which `amount` is the usual measure. Deviations: a schedule counts the steps of the episode, where the reference
-//! counts all steps since the wrapper was made; Gaussian draws are the centres of 8192 intervals of equal probability, so
-//! none lies beyond 3.8 standard deviations.
+//! counts all steps since the wrapper was made; Gaussian draws are the centres of 8192 intervals of equal probability,
+//! so none lies beyond 3.8 standard deviations.
 
 use super::settings::{Domain, Parameter, Schedule};
 use super::{EpisodeFrame, VisualWrapper, WrapperEntry, gaussian, typed};
@@ -20,7 +20,7 @@ use serde::Deserialize;
 use std::sync::LazyLock;
 use swm_core::{FrameMut, Key};
 
-/// The registry row.
+/// The registry row of this wrapper.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "noise",
     summary: "adds Gaussian or salt-and-pepper noise, sampled in every step",
@@ -68,7 +68,7 @@ enum Kind {
 /// The number of intervals of the normal distribution; a power of 2.
 const INTERVALS: usize = 8192;
 
-/// The centres of the intervals, scaled to a variance of 1 (the intervals lose 0.1 %).
+/// The centres of the intervals, scaled to a variance of 1 (the discretisation reduces the variance by 0.1 %).
 static STANDARD: LazyLock<Vec<f64>> = LazyLock::new(|| {
     let mut centres: Vec<f64> =
         (0..INTERVALS).map(|i| gaussian::quantile((i as f64 + 0.5) / INTERVALS as f64)).collect();
@@ -87,10 +87,10 @@ struct Noise {
     table_std: f64,
 }
 
-/// A fast generator (SplitMix64), because a frame needs tens of thousands of draws.
-struct Counter(u64);
+/// The SplitMix64 generator; it is fast, because a frame needs tens of thousands of draws.
+struct SplitMix64(u64);
 
-impl Counter {
+impl SplitMix64 {
     fn next(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -100,8 +100,9 @@ impl Counter {
 }
 
 impl Noise {
-    /// Adds Gaussian noise. The noise is rounded down before it is added, which is the same, because channels are integers.
-    fn gaussian(&mut self, rgb: &mut [u8], std: f64, mut random: Counter) {
+    /// Adds Gaussian noise. Rounding the noise down before the addition equals rounding the sum down, because channels
+    /// are integers.
+    fn gaussian(&mut self, rgb: &mut [u8], std: f64, mut random: SplitMix64) {
         if std <= 0.0 {
             return;
         }
@@ -125,16 +126,16 @@ impl Noise {
     }
 }
 
-/// Replaces a pixel when a uniform draw of 32 bits is below the amount: by black in the lower half of that range, by white
-/// in the upper half.
-fn salt_pepper(rgb: &mut [u8], amount: f64, mut random: Counter) {
-    let below = (amount * 2f64.powi(32)).round() as u64;
+/// Replaces each pixel with probability `amount` by black or white, with equal probability. One uniform draw of 32 bits
+/// decides both: below a threshold the pixel is replaced, below half the threshold by black.
+fn salt_pepper(rgb: &mut [u8], amount: f64, mut random: SplitMix64) {
+    let threshold = (amount * 2f64.powi(32)).round() as u64;
     for pixels in rgb.chunks_mut(6) {
         let mut bits = random.next();
         for pixel in pixels.as_chunks_mut::<3>().0 {
             let draw = bits & 0xffff_ffff;
-            if draw < below {
-                *pixel = [if 2 * draw < below { 0 } else { 255 }; 3];
+            if draw < threshold {
+                *pixel = [if 2 * draw < threshold { 0 } else { 255 }; 3];
             }
             bits >>= 32;
         }
@@ -151,7 +152,7 @@ impl VisualWrapper for Noise {
     }
 
     fn apply(&mut self, frame: &mut FrameMut<'_>, which: EpisodeFrame) {
-        let random = Counter(which.key(self.episode).seed());
+        let random = SplitMix64(which.key(self.episode).seed());
         match self.settings.kind {
             Kind::Gaussian => self.gaussian(frame.rgb, self.settings.std.at(which.step()), random),
             Kind::SaltPepper => salt_pepper(frame.rgb, self.settings.amount.at(which.step()), random),

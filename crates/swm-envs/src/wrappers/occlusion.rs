@@ -14,7 +14,7 @@ use super::{EpisodeFrame, VisualWrapper, WrapperEntry, typed};
 use serde::Deserialize;
 use swm_core::{FrameMut, Key};
 
-/// The registry row.
+/// The registry row of this wrapper.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "occlusion",
     summary: "masks rectangles, at the same positions throughout an episode",

@@ -7,8 +7,8 @@
 //! | --- | --- | --- | --- |
 //! | `kernel_size` | pixels; even values mean the next odd one | 3 | 1 to 15 |
 //!
-//! Source: `RandomConvWrapper` of the reference (Lee et al. 2020, "Network Randomization"). The result is not normalised,
-//! so about half of the channels are clipped to 0 in some areas, as there.
+//! Source: `RandomConvWrapper` of the reference (Lee et al. 2020, "Network Randomization"). The result is not
+//! normalised, so about half of the channels are clipped to 0 in some areas, as there.
 
 use super::border::mirror;
 use super::settings::{Domain, Parameter};
@@ -17,7 +17,7 @@ use rand::Rng as _;
 use serde::Deserialize;
 use swm_core::{FrameMut, Key};
 
-/// The registry row.
+/// The registry row of this wrapper.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "random-conv",
     summary: "applies a random convolution, sampled once per episode",

@@ -5,8 +5,8 @@
 //! | `pad` | pixels; both offsets are drawn uniformly from -pad ..= pad | 4 | 0 to 1024 |
 //! | `resample` | when the offsets are sampled | `episode` | `episode`, `step` |
 //!
-//! Source: `RandomShiftWrapper` of the reference, which samples at every call. The paper samples once per episode, which
-//! is the default here; `resample=step` samples per step, so that drawing a step twice gives equal frames.
+//! Source: `RandomShiftWrapper` of the reference, which samples at every call. The paper samples once per episode,
+//! which is the default here; `resample=step` samples per step, so that drawing a step twice gives equal frames.
 
 use super::settings::{Domain, Parameter};
 use super::{EpisodeFrame, VisualWrapper, WrapperEntry, typed};
@@ -14,7 +14,7 @@ use rand::Rng as _;
 use serde::Deserialize;
 use swm_core::{FrameMut, Key};
 
-/// The registry row.
+/// The registry row of this wrapper.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "random-shift",
     summary: "shifts the frame by a random offset and repeats its edges",

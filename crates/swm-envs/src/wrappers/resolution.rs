@@ -13,7 +13,7 @@ use serde::Deserialize;
 use swm_core::FrameMut;
 use swm_image::resize::AreaResizer;
 
-/// The registry row.
+/// The registry row of this wrapper.
 pub const ENTRY: WrapperEntry = WrapperEntry {
     id: "resolution",
     summary: "shrinks the frame and enlarges it to its old size in blocks",

@@ -14,52 +14,53 @@ pub type Settings = serde_json::Map<String, Value>;
 pub struct Parameter {
     /// Its name.
     pub name: &'static str,
-    /// What it means, with its unit.
+    /// A short description with its unit.
     pub summary: &'static str,
     /// Its allowed values.
     pub domain: Domain,
-    /// Its default in the form of the command line; `None` if it is required.
+    /// Its default in command-line form; `None` if it is required.
     pub default: Option<&'static str>,
 }
 
-/// The allowed values of a parameter. On the command line the values of a list are joined by `/`, in JSON they are an array.
+/// The allowed values of a parameter. On the command line the values of a list are joined by `/`, in JSON they are an
+/// array.
 #[derive(Clone, Copy, Debug)]
 pub enum Domain {
     /// An integer.
     Integer {
-        /// The least.
+        /// The lower bound.
         low: u64,
-        /// The greatest.
+        /// The upper bound.
         high: u64,
     },
     /// A number.
     Number {
-        /// The least.
+        /// The lower bound.
         low: f64,
-        /// The greatest.
+        /// The upper bound.
         high: f64,
     },
     /// One number, or the two ends of a range to sample from.
     Range {
-        /// The least.
+        /// The lower bound.
         low: f64,
-        /// The greatest.
+        /// The upper bound.
         high: f64,
     },
     /// The two ends of a range to sample from, or one number: the half-width of a range around `around`.
     Spread {
         /// The value without effect.
         around: f64,
-        /// The least.
+        /// The lower bound.
         low: f64,
-        /// The greatest.
+        /// The upper bound.
         high: f64,
     },
     /// A number, or a schedule over the steps of the episode ([`Schedule`]).
     Schedule {
-        /// The least.
+        /// The lower bound.
         low: f64,
-        /// The greatest.
+        /// The upper bound.
         high: f64,
     },
     /// A colour: red, green and blue, or one value for all three.
@@ -73,7 +74,7 @@ pub enum Domain {
 }
 
 impl Domain {
-    /// Reads a value in the form of the command line, without checking it ([`Domain::contains`]).
+    /// Reads a value in command-line form, without checking it ([`Domain::contains`]).
     fn read(&self, text: &str) -> Value {
         if matches!(self, Self::Path | Self::Choice(_)) {
             return text.into();
@@ -143,7 +144,7 @@ impl fmt::Display for Domain {
     }
 }
 
-/// Formats a value in the form of the command line.
+/// Formats a value in command-line form.
 fn formatted(value: &Value) -> String {
     match value {
         Value::String(word) => word.clone(),

@@ -28,7 +28,7 @@ impl Stack {
         Self(wrappers)
     }
 
-    /// Reads wrappers in the form of the command line, such as `noise,std=8`. Files are read once for all environments.
+    /// Reads wrappers in command-line form, such as `noise,std=8`. Files are read once for all environments.
     ///
     /// # Errors
     /// When a wrapper or a parameter is unknown, a value is not allowed, or a file cannot be read.
@@ -36,7 +36,7 @@ impl Stack {
         texts.iter().map(|text| parse(text.as_ref())).collect::<Result<_>>().map(Self)
     }
 
-    /// Returns whether there is no wrapper.
+    /// Returns whether the stack has no wrappers.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
@@ -70,7 +70,7 @@ impl Wrapped {
         wrapped
     }
 
-    /// Resets the wrappers to an episode after some steps.
+    /// Starts the wrappers' episode of a seed, and sets the number of steps taken in it.
     fn begin(&mut self, seed: u64, step: u64) {
         (self.seed, self.step) = (seed, step);
         let episode = Key::new(seed).with("wrapper");
@@ -85,7 +85,7 @@ impl Wrapped {
         }
     }
 
-    /// Returns the prefix of snapshots of this stack.
+    /// Returns the bytes with which snapshots of this stack of wrappers begin.
     fn tag(&self) -> Vec<u8> {
         let ids: Vec<&str> = self.wrappers.iter().map(|wrapper| wrapper.id()).collect();
         format!("wrapped[{}]", ids.join(",")).into_bytes()
@@ -177,8 +177,8 @@ impl Env for Wrapped {
         let Some((counters, inner)) = body else {
             return Err(Error::mismatch(
                 "restoring a snapshot",
-                "one of an environment without wrappers, or with other ones",
-                format!("one of {} {}", self.spec().id, String::from_utf8_lossy(&tag)),
+                "a snapshot of an environment without wrappers or with other wrappers",
+                format!("a snapshot of {} with {}", self.spec().id, String::from_utf8_lossy(&tag)),
             ));
         };
         self.env.restore(&Snapshot(inner.to_vec()))?;

@@ -1,5 +1,5 @@
-"""Records what the wrappers of the Python reference (pip install stable-worldmodel==0.1.1) make of one picture, with
-what they drew at random beside it. Run here: python export_wrappers.py"""
+"""Records the frames that the wrappers of the Python reference (pip install stable-worldmodel==0.1.1) compute from one
+image, with their random draws. Run in this folder: python export_wrappers.py"""
 
 import json
 
@@ -10,7 +10,7 @@ from stable_worldmodel.wrapper import visual
 HEIGHT, WIDTH = 48, 64
 
 
-def picture():
+def test_image():
     """Smooth colours, flat shapes, a grey ramp and a corner of noise."""
     y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
     frame = np.stack([255 * x / (WIDTH - 1), 255 * y / (HEIGHT - 1), 128 + 100 * np.sin(x / 7) * np.cos(y / 5)], -1)
@@ -22,8 +22,8 @@ def picture():
     return frame.round().astype(np.uint8)
 
 
-class Still(gym.Env):
-    """Always the same picture."""
+class StaticEnv(gym.Env):
+    """An environment that always renders the same frame."""
 
     render_mode = "rgb_array"
     observation_space = action_space = gym.spaces.Discrete(1)
@@ -42,7 +42,7 @@ class Still(gym.Env):
         return self.frame.copy()
 
 
-frame = picture()
+frame = test_image()
 backgrounds = {
     "small": np.ascontiguousarray(frame[:20, :30, ::-1]),
     "large": np.kron(np.ascontiguousarray(frame[::-1]), np.ones((2, 2, 1), np.uint8))[:90],
@@ -64,7 +64,7 @@ def numbers(value):
     return np.asarray(value, np.float64).tolist()
 
 
-still = Still(frame)
+still = StaticEnv(frame)
 record(visual.GrayscaleWrapper(still), {"wrapper": "grayscale"})
 for kernel, sigma in [(3, 0), (5, 0), (7, 0), (9, 0), (4, 1.3), (15, 2.5), (31, 20)]:
     record(visual.BlurWrapper(still, kernel, sigma), {"wrapper": "blur", "kernel": kernel, "sigma": sigma})

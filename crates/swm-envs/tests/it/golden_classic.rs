@@ -12,7 +12,7 @@ fn frame(env: &mut dyn Env, (width, height): (usize, usize)) -> Vec<u8> {
 /// Replays every rollout of an environment; `size` is the width and height at which the reference draws it.
 fn follow(id: &str, size: (usize, usize)) {
     let files = golden::files(env!("CARGO_MANIFEST_DIR"), &format!("{}-", id.replace('/', "_")));
-    assert!(files.len() >= 2, "the golden files beside this test are missing");
+    assert!(files.len() >= 2, "the golden files in `tests/golden` are missing");
     for file in files {
         let mut golden = Golden::open(&file);
         let name = file.display();

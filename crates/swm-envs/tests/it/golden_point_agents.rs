@@ -3,10 +3,10 @@
 use swm_conformance::golden::{self, Golden, image_difference};
 use swm_core::{Action, Batch, Env, EnvEntry, FrameMut, ResetOptions, Schema};
 
-/// The largest tolerated mean difference of a frame, of 255.
+/// The largest tolerated mean difference of a frame, on a scale of 0 to 255.
 const FRAME_TOLERANCE: f64 = 3.0;
 
-/// Returns the mean difference between a frame of the environment and a recorded one, of 255.
+/// Returns the mean difference between a frame of the environment and a recorded one, on a scale of 0 to 255.
 fn frame_difference(env: &mut dyn Env, golden: &mut Golden, name: &str) -> f64 {
     let (height, width, expected) = golden.image(name);
     let mut rgb = vec![0; height * width * 3];
@@ -18,7 +18,7 @@ fn frame_difference(env: &mut dyn Env, golden: &mut Golden, name: &str) -> f64 {
 /// `options` reads the reset options of a rollout.
 fn follow(entry: &EnvEntry, files: usize, columns: &[(&str, &str)], options: fn(&mut Golden) -> ResetOptions) {
     let found = golden::files(env!("CARGO_MANIFEST_DIR"), &format!("{}-", entry.id.replace('/', "_")));
-    assert!(found.len() >= files, "the golden files beside this test are missing");
+    assert!(found.len() >= files, "the golden files in `tests/golden` are missing");
     for file in found {
         let mut golden = Golden::open(&file);
         let name = file.display();

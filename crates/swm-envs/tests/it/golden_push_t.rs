@@ -39,7 +39,7 @@ fn max_difference(a: &[f64], b: &[f64]) -> f64 {
 #[test]
 fn contacts_follow_the_reference() {
     let files = golden::files(env!("CARGO_MANIFEST_DIR"), "pusht-contact");
-    assert!(!files.is_empty(), "the golden file beside this test is missing");
+    assert!(!files.is_empty(), "the golden files in `tests/golden` are missing");
     for file in files {
         let mut golden = Golden::open(&file);
         for pair in golden.names().iter().filter_map(|name| name.strip_suffix(".state")) {
@@ -87,7 +87,7 @@ fn contacts_follow_the_reference() {
 #[test]
 fn rollouts_and_frames_follow_the_reference() {
     let files = golden::files(env!("CARGO_MANIFEST_DIR"), "swm_PushT-v1-");
-    assert!(files.len() >= 2, "the golden files beside this test are missing");
+    assert!(files.len() >= 2, "the golden files in `tests/golden` are missing");
     for file in files {
         let mut golden = Golden::open(&file);
         let name = file.display();
@@ -132,7 +132,7 @@ fn rollouts_and_frames_follow_the_reference() {
 #[test]
 fn discrete_actions_follow_the_reference() {
     let files = golden::files(env!("CARGO_MANIFEST_DIR"), "swm_PushT-Discrete-v1-");
-    assert!(files.len() >= 4, "the golden files beside this test are missing");
+    assert!(files.len() >= 4, "the golden files in `tests/golden` are missing");
     for file in files {
         let mut golden = Golden::open(&file);
         let name = file.display();

@@ -1,5 +1,5 @@
-//! Acrobot: two links hang from a bar; a motor between them must swing the tip up to a target (`dm_control/suite/acrobot.py`,
-//! model after Coulom 2002).
+//! Acrobot: two links hang from a bar; a motor between them must swing the tip up to a target
+//! (`dm_control/suite/acrobot.py`, model after Coulom 2002).
 
 use super::domain::{Domain, TaskTable, tasks};
 use super::measures::distance;
@@ -13,7 +13,7 @@ use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry row.
+/// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Acrobot>(&[]);
 
 /// Radius of the target, in metres.

@@ -13,7 +13,7 @@ use mujoco_rs::wrappers::MjModel;
 use rand::Rng as _;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry row.
+/// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<BallInCup>(&[]);
 
 /// Indices in `qpos` of the cup's slides along x and z.

@@ -13,7 +13,7 @@ use rand_distr::StandardNormal;
 use std::f64::consts::PI;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry row.
+/// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Cartpole>(&[]);
 
 /// The start and the reward of a task.

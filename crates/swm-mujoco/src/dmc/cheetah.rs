@@ -1,5 +1,5 @@
-//! Cheetah: a planar cheetah runs (`dm_control/suite/cheetah.py`), stands, jumps and flips (added by TD-MPC2 and Newt, Hansen et
-//! al. 2024).
+//! Cheetah: a planar cheetah runs (`dm_control/suite/cheetah.py`), stands, jumps and flips (added by TD-MPC2 and Newt,
+//! Hansen et al. 2024).
 
 use super::domain::{Domain, InfoColumn, RewardFn, TaskTable, tasks};
 use super::measures::{forward_spin, height};
@@ -13,7 +13,7 @@ use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry row.
+/// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Cheetah>(&[]);
 
 /// Time steps in which a random start falls to the ground.
@@ -40,7 +40,8 @@ impl Cheetah {
         physics.data().sensordata()[self.velocity]
     }
 
-    /// Standing on one foot: torso and raised foot up. The speed term is 1 only at a speed of exactly 0, as in the reference.
+    /// Standing on one foot: torso and raised foot up. The speed term is 1 only at a speed of exactly 0, as in the
+    /// reference.
     fn stand(&self, physics: &Physics, raised: usize) -> f64 {
         let up = JUMP.of(f64::midpoint(height(physics, self.torso), height(physics, raised)));
         (5.0 * up + Tolerance::within(0.0, 0.0).of(self.speed(physics))) / 6.0

@@ -13,7 +13,7 @@ use rand::Rng as _;
 use std::f64::consts::PI;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry row.
+/// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Finger>(&[]);
 
 /// The hinge velocity at which the body counts as spinning, in rad/s.

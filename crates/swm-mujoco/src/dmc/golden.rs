@@ -1,7 +1,8 @@
-//! Golden tests: every domain reproduces rollouts that the Python reference recorded (`SWM_GOLDEN`, and `tests/golden`).
+//! Golden tests: every domain reproduces rollouts that the Python reference recorded (`SWM_GOLDEN`, and
+//! `tests/golden`).
 //!
-//! The rollouts are replayed below [`swm_core::Env`], whose actions are in single precision: those of the reference are in double
-//! precision, and with contacts the difference grows quickly.
+//! The rollouts are replayed below [`swm_core::Env`], whose actions are in single precision: those of the reference are
+//! in double precision, and with contacts the difference grows quickly.
 
 use super::ENTRIES;
 use super::domain::Domain;
@@ -17,7 +18,7 @@ use swm_core::{Batch, ColumnSpec, DType, EnvChoice, Key, Registry, Schema, colum
 
 /// The largest allowed difference of values.
 const TOLERANCE: f64 = 1e-6;
-/// The largest allowed mean difference of images, of 255.
+/// The largest allowed mean difference of images, on a scale of 0 to 255.
 const IMAGE_TOLERANCE: f64 = 3.0;
 
 /// The position of the task's target in a recording.

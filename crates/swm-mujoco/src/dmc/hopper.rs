@@ -1,5 +1,5 @@
-//! Hopper: a planar one-legged hopper stands and hops (`dm_control/suite/hopper.py`), hops backward and flips (added by TD-MPC2 and
-//! Newt, Hansen et al. 2024).
+//! Hopper: a planar one-legged hopper stands and hops (`dm_control/suite/hopper.py`), hops backward and flips (added by
+//! TD-MPC2 and Newt, Hansen et al. 2024).
 
 use super::domain::{Domain, InfoColumn, RewardFn, TaskTable, tasks};
 use super::measures::forward_spin;
@@ -13,7 +13,7 @@ use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry row.
+/// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Hopper>(&[]);
 
 /// Height of the torso above the foot when standing, in metres.

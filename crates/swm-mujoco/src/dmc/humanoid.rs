@@ -12,7 +12,7 @@ use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry row.
+/// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Humanoid>(&[]);
 
 /// Head height, in metres.

@@ -16,7 +16,7 @@ use rand::Rng as _;
 use std::f64::consts::PI;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry row.
+/// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Manipulator>(&[]);
 
 /// The joints of the arm and the hand.
@@ -24,7 +24,7 @@ const ARM: [&str; 8] =
     ["arm_root", "arm_shoulder", "arm_elbow", "arm_wrist", "finger", "fingertip", "thumb", "thumbtip"];
 /// The touch sensors of the hand.
 const TOUCH: [&str; 5] = ["palm_touch", "finger_touch", "thumb_touch", "fingertip_touch", "thumbtip_touch"];
-/// The bodies of which a task keeps only its own.
+/// The bodies that exist only in some tasks; a task removes the others.
 const PROPS: [&str; 6] = ["ball", "target_ball", "cup", "peg", "target_peg", "slot"];
 /// Distance of two sites, in metres (`_CLOSE` of the suite).
 const CLOSE: Tolerance = Tolerance::within(0.0, 0.01).gaussian(0.02);

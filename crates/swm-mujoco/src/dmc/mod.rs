@@ -1,9 +1,9 @@
-//! The DeepMind Control suite (Tassa et al. 2018, arXiv:1801.00690), with the tasks and factors of variation that the reference
-//! adds.
+//! The DeepMind Control suite (Tassa et al. 2018, arXiv:1801.00690), with the tasks and factors of variation that the
+//! reference adds.
 //!
-//! Each domain is one file: a [`Domain`](domain::Domain) with its tasks, factors, start, observation and rewards. `suite_env`
-//! makes an environment of it. Constants and formulas are those of `dm_control` 1.0.50 (`dm_control/suite/`) and, for the added
-//! tasks, of TD-MPC2 and Newt (Hansen et al. 2024).
+//! Each domain is one file: a [`Domain`](domain::Domain) with its tasks, factors, start, observation and rewards.
+//! `suite_env` makes an environment of it. Constants and formulas are those of `dm_control` 1.0.50
+//! (`dm_control/suite/`) and, for the added tasks, of TD-MPC2 and Newt (Hansen et al. 2024).
 
 mod acrobot;
 mod ball_in_cup;

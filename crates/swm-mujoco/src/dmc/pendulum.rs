@@ -12,7 +12,7 @@ use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry row.
+/// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Pendulum>(&[]);
 
 /// Deviation from the vertical that counts as upright, in radians (8 degrees).

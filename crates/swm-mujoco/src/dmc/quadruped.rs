@@ -17,7 +17,7 @@ use rand_distr::StandardNormal;
 use std::f64::consts::{PI, SQRT_2};
 use swm_core::{EnvEntry, Error, Factor, Result, Rng};
 
-/// The registry row.
+/// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Quadruped>(&[]);
 
 /// Vertical component of the torso's z-axis.

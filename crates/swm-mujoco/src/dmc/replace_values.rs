@@ -1,8 +1,8 @@
 //! Replaces the values of a compiled model by those of another compilation, except for large textures.
 //!
-//! Masses, inertias and more are computed when a model is compiled, so other factors of variation require a compilation.
-//! Nearly all of its time goes into generating the sky texture. [`replace_values`] therefore takes the values of a model that was
-//! compiled with a tiny sky: 0.5 ms instead of 100 ms.
+//! Masses, inertias and more are computed when a model is compiled, so other factors of variation require a
+//! compilation. Nearly all of its time goes into generating the sky texture. [`replace_values`] therefore takes the
+//! values of a model that was compiled with a tiny sky: 0.5 ms instead of 100 ms.
 #![allow(unsafe_code, reason = "a model's arrays are consecutive in one buffer, which is copied in two parts")]
 
 use mujoco_rs::mujoco_c::mjModel;
@@ -10,8 +10,8 @@ use mujoco_rs::wrappers::MjModel;
 use std::ops::Range;
 use swm_core::{Error, Result};
 
-/// Replaces every value of `model` by that of `other`, except for textures of different size. Both must be compiled from the
-/// same description, up to values and texture sizes.
+/// Replaces every value of `model` by that of `other`, except for textures of different size. Both must be compiled
+/// from the same description, up to values and texture sizes.
 ///
 /// # Errors
 /// When the models differ in more than that.
@@ -27,8 +27,9 @@ pub fn replace_values(model: &mut MjModel, other: &MjModel) -> Result<()> {
             model.tex_data_mut()[to].copy_from_slice(&other.tex_data()[from]);
         }
     }
-    // SAFETY: the ranges lie in the buffers of two models, and `model` is borrowed exclusively. The arrays in them have equal
-    // lengths, so every index of one is valid in the other; the texture sizes lie between the ranges and are not copied.
+    // SAFETY: the ranges lie in the buffers of two models, and `model` is borrowed exclusively. The arrays in them have
+    // equal lengths, so every index of one is valid in the other; the texture sizes lie between the ranges and are not
+    // copied.
     unsafe {
         let (to, source) = (model.ffi_mut(), other.ffi());
         for (to_range, range) in [(head, from.0), (tail, from.1)] {

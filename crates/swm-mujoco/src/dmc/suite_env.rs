@@ -22,7 +22,7 @@ use swm_core::{
 
 /// Control steps per action (the reference's action repeat).
 const ACTION_REPEAT: usize = 2;
-/// The most elements of an observation.
+/// The maximal number of elements of an observation.
 const MAX_OBSERVATION: usize = 256;
 /// Starts tried until one is stable.
 const START_TRIES: u64 = 10;
@@ -156,8 +156,8 @@ impl<D: Domain> SuiteTask<D> {
         StepOutcome { reward, terminated }
     }
 
-    /// Takes a random walk. Returns `qpos` and `qvel` of the first state after the drawn number of steps that is within the
-    /// joint limits and differs from the start; `None` if there is none.
+    /// Takes a random walk. Returns `qpos` and `qvel` of the first state after the drawn number of steps that is within
+    /// the joint limits and differs from the start; `None` if there is none.
     fn random_walk(&self, physics: &mut Physics, rng: &mut Rng) -> Option<Vec<f64>> {
         let from = physics.data().qpos().to_vec();
         let (min_steps, mut hold) = (rng.random_range(GOAL_STEPS), 0);

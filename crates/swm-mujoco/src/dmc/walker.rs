@@ -1,5 +1,5 @@
-//! Walker: a planar walker stands, walks and runs (`dm_control/suite/walker.py`), and strikes poses (added by TD-MPC2 and Newt,
-//! Hansen et al. 2024).
+//! Walker: a planar walker stands, walks and runs (`dm_control/suite/walker.py`), and strikes poses (added by TD-MPC2
+//! and Newt, Hansen et al. 2024).
 
 use super::domain::{Domain, InfoColumn, RewardFn, TaskTable, tasks};
 use super::measures::{height, uprightness};
@@ -13,7 +13,7 @@ use crate::Physics;
 use mujoco_rs::wrappers::MjModel;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry row.
+/// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Walker>(&[]);
 
 /// Height of a standing torso, in metres.

@@ -1,5 +1,5 @@
-//! The constants of the four tasks, and the initial state of their episodes. Values are those of `gymnasium-robotics` 1.4.2
-//! (`envs/fetch/`; Plappert et al. 2018, arXiv:1802.09464).
+//! The constants of the four tasks, and the initial state of their episodes. Values are those of `gymnasium-robotics`
+//! 1.4.2 (`envs/fetch/`; Plappert et al. 2018, arXiv:1802.09464).
 
 use super::compat_332::Compat332;
 use crate::assets;
@@ -125,10 +125,11 @@ impl TaskConfig {
     fn simulate_setup(&self) -> Result<Setup> {
         let folder = assets::path("gymnasium-robotics")?.join("gymnasium_robotics/envs/assets/fetch");
         let mut model = physics::compile_file(&folder.join(self.file))?;
-        // The weld holds the gripper at the mocap body itself, not at the relative pose of the model's reference configuration.
+        // The weld holds the gripper at the mocap body itself, not at the relative pose of the model's reference
+        // configuration.
         physics::edit_welds(&mut model, |data| data[..7].copy_from_slice(&[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]));
-        // As in MuJoCo 3.3.2: one contact point per pair of meshes, and one constraint system, which decides when the solver
-        // stops.
+        // As in MuJoCo 3.3.2: one contact point per pair of meshes, and one constraint system, which decides when the
+        // solver stops.
         model.opt_mut().disableflags |= mjtDisableBit::mjDSBL_MULTICCD as i32 | mjtDisableBit::mjDSBL_ISLAND as i32;
         let hooks: Arc<dyn StepHooks> = Arc::new(Compat332::new(&model)?);
         let mut physics = Physics::new(Arc::new(model))?;

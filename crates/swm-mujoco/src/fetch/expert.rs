@@ -89,8 +89,8 @@ fn gripper_offset([x, y]: [f64; 2], inputs: &Inputs) -> (f64, f64) {
     (offset[0] * x + offset[1] * y, offset[1] * x - offset[0] * y)
 }
 
-/// Moves the gripper behind the object, `back` metres from its centre, and over the object where that is in the way. `None`
-/// when the gripper is there.
+/// Moves the gripper behind the object, `back` metres from its centre, and over the object where that is in the way.
+/// `None` when the gripper is there.
 fn move_behind(inputs: &Inputs, direction: [f64; 2], back: f64, height: f64) -> Option<[f64; 4]> {
     let (ahead, left) = gripper_offset(direction, inputs);
     let [x, y] = [0, 1].map(|i| inputs.object[i] - back * direction[i]);

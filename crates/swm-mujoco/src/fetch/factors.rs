@@ -79,8 +79,8 @@ impl FactorTargets {
         })
     }
 
-    /// Applies factors to the compiled model. A factor at its default leaves the model unchanged: the reference's default
-    /// colours are not those of the models.
+    /// Applies factors to the compiled model. A factor at its default leaves the model unchanged: the reference's
+    /// default colours are not those of the models.
     pub fn apply(&self, physics: &mut Physics, factors: &FactorValues) {
         let changed = |key: &str| {
             let factor = factors.factors().iter().find(|factor| factor.key == key);
@@ -123,7 +123,8 @@ impl FactorTargets {
     }
 }
 
-/// Rotates the position of a camera around the vertical axis and raises it, with the reference's formula. Angles are in radians.
+/// Rotates the position of a camera around the vertical axis and raises it, with the reference's formula. Angles are in
+/// radians.
 fn rotate_camera([x, y, z]: [f64; 3], azimuth: f64, elevation: f64) -> [f64; 3] {
     let (x, y) = (x * azimuth.cos() - y * azimuth.sin(), x * azimuth.sin() + y * azimuth.cos());
     [x, y, z * elevation.cos() + x.hypot(y) * elevation.sin()]

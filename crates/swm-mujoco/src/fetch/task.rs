@@ -1,4 +1,5 @@
-//! [`Fetch`]: start, step, observation, reward and goal of the four tasks. Formulas are those of `gymnasium-robotics` 1.4.2.
+//! [`Fetch`]: start, step, observation, reward and goal of the four tasks. Formulas are those of `gymnasium-robotics`
+//! 1.4.2.
 
 use super::config::{GOAL_TOLERANCE, SUBSTEPS, Setup, TaskConfig};
 use super::factors::FactorTargets;
@@ -225,7 +226,8 @@ fn distance(a: Vec3, b: Vec3) -> f64 {
     a.iter().zip(b).map(|(a, b)| (a - b) * (a - b)).sum::<f64>().sqrt()
 }
 
-/// Euler angles (rad) of a row-major rotation matrix, as `mat2euler` of `gymnasium-robotics`: about the fixed x, y and z axes.
+/// Euler angles (rad) of a row-major rotation matrix, as `mat2euler` of `gymnasium-robotics`: about the fixed x, y and
+/// z axes.
 fn euler(m: &[f64; 9]) -> Vec3 {
     let cosine = m[8].hypot(m[5]);
     let y = m[2].atan2(cosine);

@@ -1,7 +1,7 @@
 //! The names of all functions of MuJoCo's C API that `mujoco-rs` declares.
 //!
-//! Extracted from `mujoco-rs` 7.0.0+mj-3.17.0 with `grep -oP 'pub fn \Kmj\w+(?=\()' src/mujoco_c.rs | sort -u`. A missing name is
-//! an undefined symbol at link time; a name that MuJoCo does not export is an error at load time.
+//! Extracted from `mujoco-rs` 7.0.0+mj-3.17.0 with `grep -oP 'pub fn \Kmj\w+(?=\()' src/mujoco_c.rs | sort -u`. A
+//! missing name is an undefined symbol at link time; a name that MuJoCo does not export is an error at load time.
 
 /// Calls `$then! { names … }`.
 macro_rules! each_symbol {

@@ -20,7 +20,8 @@ pub fn compile_file(path: &Path) -> Result<MjModel> {
     MjModel::from_xml(path).map_err(|error| Error::external(format!("compiling {}", path.display()), error))
 }
 
-/// Compiles a model from MJCF text. `files` are the files that the text includes, by name; `label` names the model in errors.
+/// Compiles a model from MJCF text. `files` are the files that the text includes, by name; `label` names the model in
+/// errors.
 ///
 /// # Errors
 /// When MuJoCo is not installed, or rejects the model (the error contains its message).

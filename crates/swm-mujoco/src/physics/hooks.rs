@@ -18,9 +18,11 @@ pub(crate) struct EqualityRow {
     pub velocity: f64,
 }
 
-/// Replaces parts of every time step. Only for models without activations, flexes and tendons that use Euler integration.
+/// Replaces parts of every time step. Only for models without activations, flexes and tendons that use Euler
+/// integration.
 pub(crate) trait StepHooks: Send + Sync {
-    /// Appends to `contacts` the contacts to simulate, given those that MuJoCo found; `found` is grouped by pair of geoms.
+    /// Appends to `contacts` the contacts to simulate, given those that MuJoCo found; `found` is grouped by pair of
+    /// geoms.
     fn replace_contacts(
         &self,
         model: &MjModel,

@@ -1,10 +1,11 @@
 //! MuJoCo models and simulation states.
 //!
-//! A model is compiled once per process ([`shared_model`]) and copied for every environment. An environment edits its copy
-//! to apply factors of variation; [`Physics::restore_model`] undoes all edits.
+//! A model is compiled once per process ([`shared_model`]) and copied for every environment. An environment edits its
+//! copy to apply factors of variation; [`Physics::restore_model`] undoes all edits.
 //!
-//! **Instability.** When a simulation diverges, MuJoCo resets the state and continues; on an internal error it would end the
-//! process. Both cases set [`Physics::is_unstable`] until the next reset, and the environment terminates the episode.
+//! **Instability.** When a simulation diverges, MuJoCo resets the state and continues; on an internal error it would
+//! end the process. Both cases set [`Physics::is_unstable`] until the next reset, and the environment terminates the
+//! episode.
 
 mod appearance;
 mod compile;

@@ -71,14 +71,16 @@ impl Physics {
         self.source_state.len() + 2
     }
 
-    /// Appends the state and how the derived quantities were computed, so that [`Physics::load`] restores both bit for bit.
+    /// Appends the state and how the derived quantities were computed, so that [`Physics::load`] restores both bit for
+    /// bit.
     pub fn save(&self, into: &mut Vec<f64>) {
         into.push(f64::from(u8::from(self.unstable)));
         into.push(f64::from(self.derivation as u8));
         into.extend(&self.source_state);
     }
 
-    /// The state within the values that [`Physics::save`] wrote: the one from which the derived quantities were computed.
+    /// The state within the values that [`Physics::save`] wrote: the one from which the derived quantities were
+    /// computed.
     pub(crate) fn saved_state(saved: &[f64]) -> &[f64] {
         saved.get(2..).unwrap_or_default()
     }

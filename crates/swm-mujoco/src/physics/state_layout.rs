@@ -4,8 +4,8 @@ use mujoco_rs::mujoco_c::mjtState;
 use mujoco_rs::wrappers::{MjData, MjModel};
 use swm_core::{Error, Result};
 
-/// The fields of a state, in this order: time, `qpos`, `qvel`, `act`, `qacc_warmstart`, `ctrl`, `eq_active`, `mocap_pos`,
-/// `mocap_quat`. This is MuJoCo's integration state without applied forces, which no environment uses.
+/// The fields of a state, in this order: time, `qpos`, `qvel`, `act`, `qacc_warmstart`, `ctrl`, `eq_active`,
+/// `mocap_pos`, `mocap_quat`. This is MuJoCo's integration state without applied forces, which no environment uses.
 pub(super) const STATE_FIELDS: u32 = mjtState::mjSTATE_TIME as u32
     | mjtState::mjSTATE_QPOS as u32
     | mjtState::mjSTATE_QVEL as u32
@@ -21,8 +21,8 @@ pub fn state_len(model: &MjModel) -> usize {
     model.state_size(STATE_FIELDS)
 }
 
-/// Copies the fields of [`STATE_FIELDS`]. MuJoCo's `mj_getState` visits every possible field, which in a small model takes 2 %
-/// of a step.
+/// Copies the fields of [`STATE_FIELDS`]. MuJoCo's `mj_getState` visits every possible field, which in a small model
+/// takes 2 % of a step.
 pub(super) fn copy_state(data: &MjData<Box<MjModel>>, into: &mut [f64]) {
     let mut rest = into;
     let mut put = |values: &[f64]| {

@@ -9,7 +9,7 @@ use mujoco_rs::mujoco_c::{mjContact, mjData, mjModel, mjtConstraint, mjtDisableB
 use std::sync::Arc;
 
 impl Physics {
-    /// Puts the model's initial state and clears the instability flag. Derived quantities are zero until
+    /// Sets the model's initial state and clears the instability flag. Derived quantities are zero until
     /// [`Physics::forward`].
     pub fn reset(&mut self) {
         self.unstable = false;
@@ -30,8 +30,8 @@ impl Physics {
         self.derive();
     }
 
-    /// Advances `steps` time steps, at least one, each with `mj_step`: derived quantities lag the state by one step, as in
-    /// Gymnasium.
+    /// Advances `steps` time steps, at least one, each with `mj_step`: derived quantities lag the state by one step, as
+    /// in Gymnasium.
     pub fn step(&mut self, steps: usize) {
         for _ in 1..steps {
             self.step_once();
@@ -41,8 +41,8 @@ impl Physics {
         self.check_stability();
     }
 
-    /// Advances `steps` time steps, at least one, as DeepMind Control does. The previous call has computed the first half of
-    /// the first step, up to the controls; poses and velocities are up to date afterwards.
+    /// Advances `steps` time steps, at least one, as DeepMind Control does. The previous call has computed the first
+    /// half of the first step, up to the controls; poses and velocities are up to date afterwards.
     pub fn step_control(&mut self, steps: usize) {
         // RK4 cannot be split into two halves.
         let whole_steps = self.model().opt().integrator == mjtIntegrator::mjINT_RK4 as i32;
@@ -174,7 +174,8 @@ unsafe fn array<'a, T>(first: *const T, count: i32) -> &'a [T] {
     if first.is_null() || count == 0 { &[] } else { unsafe { std::slice::from_raw_parts(first, count) } }
 }
 
-/// Replaces the contacts that MuJoCo found. The first ones overwrite the found ones; MuJoCo allocates room for the rest.
+/// Replaces the contacts that MuJoCo found. The first ones overwrite the found ones; MuJoCo allocates room for the
+/// rest.
 ///
 /// # Safety
 /// Model and data must be valid and belong together.

@@ -58,8 +58,9 @@ impl ImageSimilarity {
         Self { difference, ssim: sum / count }
     }
 
-    /// Compares an image of the CPU renderer with a recorded one and prints the result. If `SWM_GOLDEN_IMAGES` names a folder,
-    /// writes `NAME.png` there: the recorded image, the rendered one, and four times their difference, side by side.
+    /// Compares an image of the CPU renderer with a recorded one and prints the result. If `SWM_GOLDEN_IMAGES` names a
+    /// folder, writes `NAME.png` there: the recorded image, the rendered one, and four times their difference, side by
+    /// side.
     #[allow(clippy::print_stderr, reason = "a table for `--no-capture`")]
     pub fn report(name: &str, rendered: &[u8], recorded: &[u8], width: usize) -> Self {
         let similarity = Self::of(rendered, recorded, width);

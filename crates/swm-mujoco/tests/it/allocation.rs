@@ -1,5 +1,5 @@
-//! A warm environment allocates no memory in a step, an observation or a rendering. Allocations by MuJoCo's own allocator and by
-//! OpenGL drivers are not counted.
+//! A warm environment allocates no memory in a step, an observation or a rendering. Allocations by MuJoCo's own
+//! allocator and by OpenGL drivers are not counted.
 
 use swm_conformance::allocation::{self, Counting};
 use swm_core::{Action, Env, FrameMut, Key, ResetOptions, VariationRequest, thread_budget};
@@ -34,7 +34,8 @@ fn environments() -> Vec<Box<dyn Env>> {
         .collect()
 }
 
-/// The allocations of rendering all environments once, after enough rounds to fill every cache that holds several models.
+/// The allocations of rendering all environments once, after enough rounds to fill every cache that holds several
+/// models.
 fn allocations_of_rendering(side: usize, envs: &mut [Box<dyn Env>]) -> usize {
     let mut rgb = vec![0; side * side * 3];
     let mut draw = || {

@@ -1,5 +1,5 @@
-//! The conformance suite over every environment of this crate. Rendering takes tens of milliseconds here, so the checks run
-//! with fewer repetitions than for 2-D environments.
+//! The conformance suite over every environment of this crate. Rendering takes tens of milliseconds here, so the checks
+//! run with fewer repetitions than for 2-D environments.
 
 use swm_conformance::Suite;
 use swm_mujoco::ENVS;

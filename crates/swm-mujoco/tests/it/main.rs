@@ -1,4 +1,5 @@
-//! Integration tests: golden rollouts of the Python reference, and the conformance suite. They need the installed assets.
+//! Integration tests: golden rollouts of the Python reference, and the conformance suite. They need the installed
+//! assets.
 
 mod allocation;
 mod conformance;

@@ -55,7 +55,7 @@ fn solve(mut a: Vec<Vec<f64>>, mut b: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
 #[test]
 #[ignore = "renders 300 frames with OpenGL"]
 #[allow(clippy::print_stderr, clippy::too_many_lines, reason = "one experiment with a table for `--no-capture`")]
-fn read_out_of_one_renderer_works_for_the_other() {
+fn read_out_trained_on_one_renderer_works_on_the_other() {
     let mut env = ENVS.get(ID).and_then(|entry| entry.env()).expect("an environment");
     let (mut poses, mut frames) = (vec![], [vec![], vec![]]);
     let mut row = Batch::zeros(&Schema::new(env.spec().columns.clone()).expect("a schema"), 1);

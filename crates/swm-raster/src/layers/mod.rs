@@ -14,7 +14,7 @@ use outline::Outline;
 use std::ops::Range;
 use swm_simd::LANES;
 
-/// The id of samples that show nothing.
+/// The id of samples that no geom covers.
 pub(crate) const NOTHING: u32 = u32::MAX >> 1;
 
 /// Returns the positions of samples within a pixel.
@@ -78,7 +78,7 @@ pub(crate) struct Layers {
     lanes: [[f32; LANES]; 2],
     /// By mask of covered samples: their mean position within the pixel.
     pub centres: [[f32; 2]; 16],
-    /// By sample of a row: a floor that hides nothing.
+    /// For every sample of a row, a floor in front of all geoms, which hides none of them.
     free: Vec<f32>,
     /// Scratch: how far a shape reaches to the left and right in each row.
     outline: [Vec<f32>; 2],

@@ -62,7 +62,7 @@ impl Layers {
             [(x - view.left * w) * view.pixels_per_unit[0], (view.top * w - y) * view.pixels_per_unit[1], w, z]
         });
         to_pixels(&level.positions, &turned, [ox, oy, ow, depth], &mut vertices);
-        // Rows run downwards, so front faces, counterclockwise to the eye, are clockwise in pixels.
+        // Rows run downwards, so front faces, counterclockwise seen from the camera, are clockwise in pixels.
         let front = if view.mirrored { 1.0 } else { -1.0 };
         let front = if both_sides { 0.0 } else { front };
         let rules = DrawRules { front, near: view.near, floor, rows };

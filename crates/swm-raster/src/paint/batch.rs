@@ -75,7 +75,7 @@ pub(crate) struct Lighting<'a> {
     pub shadows: &'a [Shadow],
 }
 
-/// What is the same for all fragments.
+/// The inputs of shading that are the same for all fragments.
 pub(crate) struct ShadingContext<'a> {
     pub scene: &'a Scene,
     pub assets: &'a Assets,

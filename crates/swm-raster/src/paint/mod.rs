@@ -52,7 +52,7 @@ pub(crate) struct Painter {
 }
 
 impl Painter {
-    /// Forgets the light of the last frame. The new frame has `geoms` geoms.
+    /// Clears the light of the last frame, for a frame of `geoms` geoms.
     pub fn start(&mut self, geoms: usize) {
         self.grids.starts.clear();
         self.grids.starts.resize(geoms, u32::MAX);

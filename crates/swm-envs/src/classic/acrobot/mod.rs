@@ -10,7 +10,7 @@ use rand::Rng as _;
 use std::f64::consts::PI;
 use swm_core::{DType, EnvEntry, ExpertEntry, Result, Rng, Space, Transition};
 
-/// The registry row.
+/// The registry row of this environment.
 pub const ENTRY: EnvEntry = EnvEntry {
     id: Acrobot::ID,
     summary: "swing the end of two links above a line, with a motor in the joint between them",
@@ -18,7 +18,7 @@ pub const ENTRY: EnvEntry = EnvEntry {
     make: |_| Ok(Box::new(ClassicEnv::<Acrobot>::new())),
     experts: &[ExpertEntry {
         id: "expert",
-        summary: "turns the joint the way it turns, which adds energy until the end is high enough",
+        summary: "applies torque in the direction of the joint's rotation, which adds energy until the end is high enough",
         make: || Box::new(Controller::<Acrobot>::new()),
     }],
 };

@@ -13,7 +13,8 @@ const GRAVITY: f64 = 9.8;
 /// The maximal angular speeds of link and joint, in rad/s.
 pub const MAX_SPEED: [f64; 2] = [4.0 * PI, 9.0 * PI];
 
-/// The angle of the first link from hanging down, the angle of the joint (radians), and both angular velocities (rad/s).
+/// The angle of the first link from hanging down, the angle of the joint (radians), and both angular velocities
+/// (rad/s).
 pub type State = [f64; 4];
 
 /// The physical factors of an episode, in SI units, for both links.

@@ -11,7 +11,7 @@ pub const SIZE: (usize, usize) = (500, 500);
 pub const LINK: [u8; 3] = [0, 204, 204];
 /// Colour of the joints.
 pub const JOINT: [u8; 3] = [204, 204, 0];
-/// Colour of the line.
+/// Colour of the goal line.
 pub const LINE: [u8; 3] = [0, 0, 0];
 
 /// Coordinate of the centre of the frame, in pixels.
@@ -30,7 +30,7 @@ fn scale(physics: &Physics) -> f64 {
     MIDDLE / (physics.length[0] + physics.length[1] + MARGIN)
 }
 
-/// Draws the line.
+/// Draws the goal line.
 pub fn line(surface: &mut Surface, physics: &Physics) {
     let scale = scale(physics);
     let [from, to] = [-LINE_HALF, LINE_HALF].map(|x| pixel([x * scale + MIDDLE, LINE_HEIGHT * scale + MIDDLE]));

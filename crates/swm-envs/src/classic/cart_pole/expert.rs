@@ -10,9 +10,9 @@ const MAX_ERROR: f64 = 0.5;
 /// Returns whether to push to the right, in order to bring the cart to `goal` (in metres) with the pole up.
 ///
 /// Near upright, the motion has the flat output `y = x + c θ`, where `c` is the ratio of the accelerations that a force
-/// causes in cart and pole: the second derivative of `y` is proportional to the angle, and the fourth contains the force.
-/// State feedback places all four poles of the closed loop at one value, which gives the desired fourth derivative; the
-/// sign of the force that achieves it is the direction of the push.
+/// causes in cart and pole: the second derivative of `y` is proportional to the angle, and the fourth contains the
+/// force. State feedback places all four poles of the closed loop at one value, which gives the desired fourth
+/// derivative; the sign of the force that achieves it is the direction of the push.
 pub fn pushes_right(physics: &Physics, state: &[f64; 5], goal: f64) -> bool {
     let Physics { gravity, length, pole, total, .. } = *physics;
     let [x, v, angle, angular_velocity, _] = *state;

@@ -9,7 +9,7 @@ use physics::Physics;
 use rand::Rng as _;
 use swm_core::{DType, EnvEntry, ExpertEntry, Rng, Space, Transition};
 
-/// The registry row.
+/// The registry row of this environment.
 pub const ENTRY: EnvEntry = EnvEntry {
     id: CartPole::ID,
     summary: "push a cart left or right so that the pole on it stays up, and take it to a position",
@@ -57,8 +57,8 @@ impl ControlTask for CartPole {
         ColorFactor("axle", [0.0, 1.0], render::AXLE),
     ];
 
-    /// Position (m) and velocity (m/s) of the cart, angle (rad) and angular velocity (rad/s) of the pole, and 1 once the
-    /// pole has fallen.
+    /// Position (m) and velocity (m/s) of the cart, angle (rad) and angular velocity (rad/s) of the pole, and 1 once
+    /// the pole has fallen.
     type State = [f64; 5];
 
     fn action_space() -> Space {

@@ -1,5 +1,5 @@
-//! The dynamics: a cart on a frictionless track and a pole hinged on it (Barto, Sutton and Anderson 1983), integrated by
-//! the Euler method in double precision.
+//! The dynamics: a cart on a frictionless track and a pole hinged on it (Barto, Sutton and Anderson 1983), integrated
+//! by the Euler method in double precision.
 //!
 //! Equations, their order and constants are those of Gymnasium's CartPole.
 
@@ -34,8 +34,8 @@ impl Physics {
         Self { force, gravity, length, pole, total: pole + cart, tau }
     }
 
-    /// Advances the state by one step with a push to the right or to the left. The reward is 1, including the step in which
-    /// the pole falls, and 0 while it stays down.
+    /// Advances the state by one step with a push to the right or to the left. The reward is 1, including the step in
+    /// which the pole falls, and 0 while it stays down.
     pub fn step(&self, state: &mut [f64; 5], right: bool) -> Transition {
         let [x, v, angle, angular_velocity, fell] = *state;
         let Self { gravity, length, pole, total, tau, .. } = *self;

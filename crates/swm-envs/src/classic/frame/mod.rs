@@ -1,5 +1,5 @@
-//! Frames as the reference makes them: drawn on a surface of fixed size with the shapes of SDL_gfx, with some colours
-//! replaced, then resized with the filter of Pillow.
+//! [`FrameRenderer`]: renders frames in the steps of the reference: shapes of SDL_gfx on a surface of fixed size,
+//! replacement of some colours, and Pillow's bilinear resize.
 
 mod resize;
 mod shapes;
@@ -30,7 +30,7 @@ impl FrameRenderer {
         Self { background: blank.clone(), surface: blank, swaps: vec![], resized: BySize::default() }
     }
 
-    /// Changes to an episode with another background and other colours.
+    /// Starts an episode: draws its background with `draw`, and sets its colour replacements.
     pub fn begin_episode(&mut self, draw: impl FnOnce(&mut Surface), swaps: Swaps<'_>) {
         self.background.clear(WHITE);
         draw(&mut self.background);
@@ -41,7 +41,7 @@ impl FrameRenderer {
         self.resized.invalidate();
     }
 
-    /// Fills a frame with the background and, over it, what `draw` draws.
+    /// Renders a frame: the background, and the moving parts that `draw` draws over it.
     pub fn draw(&mut self, draw: impl FnOnce(&mut Surface), frame: FrameMut<'_>) {
         draw(&mut self.surface);
         let (width, height) = (frame.width, frame.height);

@@ -1,24 +1,26 @@
-//! From a [`Surface`] to RGB of another size by the triangle filter of Pillow's bilinear resize, in its arithmetic:
-//! weights of 22 binary digits, first along x, then along y, bytes in between. (From version 13 on, Pillow begins with y
-//! where that is cheaper; single bytes then differ by 1.)
+//! [`Resize`]: converts a [`Surface`] to an RGB frame of another size with the triangle filter of Pillow's bilinear
+//! resize.
 //!
-//! A pixel of a shrunk picture is a weighted mean of all pixels below it. Rows of flat pictures are a few runs of one
-//! colour, so the mean along x is taken over runs, with sums of weights made beforehand; and only what was drawn on
-//! the surface since the background is averaged again.
+//! The arithmetic is Pillow's: weights in units of 2⁻²², first along x, then along y, with bytes in between. (From
+//! version 13 on, Pillow begins with y where that is faster; single bytes then differ by 1.)
+//!
+//! A pixel of a frame is a weighted mean of the surface pixels under the filter. Rows of a drawing consist of a few
+//! runs of one colour, so the mean along x is computed per run, from precomputed partial sums of the weights. Only the
+//! columns that were drawn on the surface since the background are filtered again.
 
 use super::surface::{Color, NONE, Surface};
 use std::ops::Range;
 use swm_image::resize::{FilterAxis, WEIGHT_HALF, weighted_byte};
 
-/// One direction of the filter.
+/// The filter along one axis.
 #[derive(Clone)]
 struct Axis {
     filter: FilterAxis<i32>,
-    /// By pixel of the frame: where its partial sums of weights begin.
+    /// For every pixel of the frame, the index of its first partial sum in `sums`.
     sums_start: Vec<usize>,
     /// For every pixel of the frame, the sums of the weights before each pixel of the surface (one more than pixels).
     sums: Vec<i32>,
-    /// By pixel of the surface: the pixels of the frame that depend on it.
+    /// For every pixel of the surface, the range of frame pixels that depend on it.
     reach: Vec<Range<usize>>,
 }
 
@@ -39,69 +41,71 @@ impl Axis {
         Self { filter, sums_start, sums, reach }
     }
 
-    /// The taps that some of these pixels are in.
+    /// Returns the range of frame pixels that depend on some of these surface pixels.
     fn reached(&self, pixels: &Range<usize>) -> Range<usize> {
         self.reach[pixels.start].start..self.reach[pixels.end - 1].end
     }
 }
 
-/// Colours of the surface that become others in the picture, one after the other.
+/// Pairs of a colour of the surface and the colour that replaces it in the frame, applied in order.
 pub type Swaps<'a> = &'a [(Color, Color)];
 
-/// Pictures of one size.
+/// Converts surfaces of one size to frames of one size. It caches the converted background.
 #[derive(Clone)]
 pub struct Resize {
     columns: Axis,
     rows: Axis,
-    /// The surface averaged along x, its top row first.
+    /// The surface filtered along x, top row first, `[surface height, width, 3]`.
     lines: Vec<u8>,
-    /// The same of the background.
-    still: Vec<u8>,
-    /// The picture of the background.
-    picture: Vec<u8>,
-    /// The columns of every line, and of a row of the picture, that differ from the background; bytes.
+    /// The background filtered along x, with the shape of `lines`.
+    background_lines: Vec<u8>,
+    /// The background as a frame, `[height, width, 3]`.
+    background_frame: Vec<u8>,
+    /// For every line, the range of bytes that differ from the background.
     changed: Vec<Range<usize>>,
+    /// Scratch memory: weighted sums for one row of the frame, `[width, 3]`.
     sums: Vec<i32>,
 }
 
 impl Resize {
-    /// For pictures of `width` x `height` of surfaces of `surface` pixels.
+    /// Makes a converter from surfaces of `surface` (width, height) to frames of `width` x `height`, in pixels.
     pub fn new(surface: (usize, usize), width: usize, height: usize) -> Self {
         let bytes = 3 * width;
         Self {
             columns: Axis::new(surface.0, width),
             rows: Axis::new(surface.1, height),
             lines: vec![0; surface.1 * bytes],
-            still: vec![0; surface.1 * bytes],
-            picture: vec![0; height * bytes],
+            background_lines: vec![0; surface.1 * bytes],
+            background_frame: vec![0; height * bytes],
             changed: vec![0..0; surface.1],
             sums: vec![0; bytes],
         }
     }
 
-    /// Takes over a background, all of which counts as drawn.
+    /// Sets the background; all columns of `background` must be marked as drawn.
     pub fn set_background(&mut self, background: &Surface, swaps: Swaps<'_>) {
-        let mut picture = std::mem::take(&mut self.picture);
-        self.average_rows(background, swaps);
-        self.average_lines(&mut picture);
-        self.still.copy_from_slice(&self.lines);
-        self.picture = picture;
+        let mut frame = std::mem::take(&mut self.background_frame);
+        self.filter_rows(background, swaps);
+        self.filter_columns(&mut frame);
+        self.background_lines.copy_from_slice(&self.lines);
+        self.background_frame = frame;
     }
 
-    /// Draws what is on a surface that began as the background.
+    /// Converts a surface, which differs from the background only in the columns marked as drawn. Shape of `rgb`:
+    /// `[height, width, 3]`.
     pub fn draw(&mut self, surface: &Surface, swaps: Swaps<'_>, rgb: &mut [u8]) {
-        rgb.copy_from_slice(&self.picture);
-        self.average_rows(surface, swaps);
-        self.average_lines(rgb);
+        rgb.copy_from_slice(&self.background_frame);
+        self.filter_rows(surface, swaps);
+        self.filter_columns(rgb);
         let bytes = self.sums.len();
         for (y, columns) in self.changed.iter().enumerate().filter(|(_, columns)| !columns.is_empty()) {
             let line = y * bytes + columns.start..y * bytes + columns.end;
-            self.lines[line.clone()].copy_from_slice(&self.still[line]);
+            self.lines[line.clone()].copy_from_slice(&self.background_lines[line]);
         }
     }
 
-    /// Averages along x.
-    fn average_rows(&mut self, surface: &Surface, swaps: Swaps<'_>) {
+    /// Filters the drawn columns of every row along x, into `lines`.
+    fn filter_rows(&mut self, surface: &Surface, swaps: Swaps<'_>) {
         let (bytes, height) = (self.sums.len(), self.changed.len());
         for (y, changed) in self.changed.iter_mut().enumerate() {
             let from_below = height - 1 - y;
@@ -131,12 +135,12 @@ impl Resize {
                 x = run.end;
             }
             *changed = 3 * taps.start..3 * taps.end;
-            finish(sums, &mut self.lines[y * bytes..][changed.clone()]);
+            sums_to_bytes(sums, &mut self.lines[y * bytes..][changed.clone()]);
         }
     }
 
-    /// Averages along y.
-    fn average_lines(&mut self, rgb: &mut [u8]) {
+    /// Filters the changed columns of `lines` along y, into `rgb`.
+    fn filter_columns(&mut self, rgb: &mut [u8]) {
         let bytes = self.sums.len();
         for y in 0..self.rows.filter.len() {
             let lines = self.rows.filter.source(y);
@@ -151,13 +155,13 @@ impl Resize {
                 let line = &self.lines[line * bytes..][columns.clone()];
                 sums.iter_mut().zip(line).for_each(|(sum, &byte)| *sum += i32::from(byte) * weight);
             }
-            finish(sums, &mut rgb[y * bytes..][columns]);
+            sums_to_bytes(sums, &mut rgb[y * bytes..][columns]);
         }
     }
 }
 
-/// Sums of weighted bytes as bytes.
-fn finish(sums: &[i32], bytes: &mut [u8]) {
+/// Converts sums of weighted bytes to bytes.
+fn sums_to_bytes(sums: &[i32], bytes: &mut [u8]) {
     bytes.iter_mut().zip(sums).for_each(|(byte, &sum)| *byte = weighted_byte(sum));
 }
 
@@ -166,7 +170,7 @@ mod tests {
     use super::*;
     use crate::draw::Point;
 
-    /// A picture of 9 x 6 in greys, its top row first.
+    /// The grey level of a pixel in a test image of 9 x 6 pixels; row 0 is the top row.
     fn grey(x: usize, y: usize) -> u8 {
         if (x / 3 + y / 2) % 2 == 1 { ((x * 37 + y * y * 11) % 256) as u8 } else { 200 }
     }
@@ -180,15 +184,15 @@ mod tests {
     }
 
     #[test]
-    fn pictures_are_what_pillow_makes_of_them() {
+    fn resized_frames_equal_those_of_pillow() {
         // The first rows of Image.resize(size, Image.BILINEAR).
-        let wanted: [(usize, usize, &[u8]); 3] = [
+        let expected: [(usize, usize, &[u8]); 3] = [
             (4, 3, &[182, 157, 177, 179, 127, 166, 150, 110, 190, 140, 160, 187]),
             (9, 2, &[148, 162, 176, 149, 172, 195, 136, 150, 163, 155, 169, 183, 119, 142, 165, 143, 156, 170]),
             (13, 6, &[200, 200, 200, 200, 145, 122, 148, 174, 191, 200, 200, 200, 200]),
         ];
-        for (width, height, wanted) in wanted {
-            // A part belongs to the background, the others are drawn before it.
+        for (width, height, expected) in expected {
+            // Some pixels belong to the background, the others are drawn in front of it.
             for part in 0..4 {
                 let mut resize = Resize::new((9, 6), width, height);
                 let mut background = surface(|x, y| (x + y) % 4 < part);
@@ -206,23 +210,23 @@ mod tests {
                     let mut rgb = vec![1; width * height * 3];
                     resize.draw(&front, &[], &mut rgb);
                     let red: Vec<u8> = rgb.chunks(3).map(|pixel| pixel[0]).collect();
-                    assert_eq!(red[..wanted.len()], *wanted, "{width} x {height}, part {part}");
+                    assert_eq!(red[..expected.len()], *expected, "{width} x {height}, part {part}");
                 }
             }
         }
     }
 
     #[test]
-    fn colours_are_swapped_one_after_the_other() {
+    fn colour_swaps_are_applied_in_order() {
         let [a, b, c] = [77, 5, 9].map(|v| Color::new([v; 3]));
         let mut background = Surface::new(2, 2, a);
         background.set_drawn(true);
         let mut resize = Resize::new((2, 2), 1, 1);
         let mut rgb = [0; 3];
-        for (swaps, wanted) in [(vec![(a, b), (b, c)], 9), (vec![(b, c), (a, b)], 5)] {
+        for (swaps, expected) in [(vec![(a, b), (b, c)], 9), (vec![(b, c), (a, b)], 5)] {
             resize.set_background(&background, &swaps);
             resize.draw(&background, &swaps, &mut rgb);
-            assert_eq!(rgb, [wanted; 3]);
+            assert_eq!(rgb, [expected; 3]);
         }
     }
 }

@@ -31,7 +31,7 @@ pub const CONTINUOUS: EnvEntry = EnvEntry {
 /// Id and summary of both experts.
 const PUMP: ExpertEntry = ExpertEntry {
     id: "expert",
-    summary: "pushes the way the car rolls, so that it swings higher and higher",
+    summary: "pushes in the direction of motion, so that every swing is higher than the last",
     make: || Box::new(Controller::<MountainCar<Discrete>>::new()),
 };
 

@@ -37,7 +37,8 @@ impl Hill {
     pub fn continuous_step(&self, [x, speed]: [f64; 2], power: f64) -> [f64; 2] {
         let [mut x, mut speed, power, limit] = [x, speed, power, self.max_speed].map(|v| v as f32);
         let slope = self.gravity * f64::from(3.0 * x).cos();
-        // numpy rounds every operation with an element of the action, and only once where the action was clipped.
+        // As in numpy: with an element of the action, every operation is rounded to single precision; with a clipped
+        // action, which is a Python float, only the result is.
         speed += if (-1.0..=1.0).contains(&power) {
             power * self.push as f32 - slope as f32
         } else {

@@ -10,7 +10,7 @@ use rand::Rng as _;
 use std::f64::consts::PI;
 use swm_core::{DType, EnvEntry, ExpertEntry, Result, Rng, Space, Transition};
 
-/// The registry row.
+/// The registry row of this environment.
 pub const ENTRY: EnvEntry = EnvEntry {
     id: Pendulum::ID,
     summary: "swing a rod up with a motor too weak to lift it, and hold it upright",
@@ -18,7 +18,7 @@ pub const ENTRY: EnvEntry = EnvEntry {
     make: |_| Ok(Box::new(ClassicEnv::<Pendulum>::new())),
     experts: &[ExpertEntry {
         id: "expert",
-        summary: "pumps energy into the rod until it can be caught, then holds it (state feedback)",
+        summary: "pumps energy into the rod until state feedback can hold it upright, then holds it (state feedback)",
         make: || Box::new(Controller::<Pendulum>::new()),
     }],
 };
@@ -52,7 +52,8 @@ impl ControlTask for Pendulum {
         ColorFactor("hub", [0.0, 0.4], render::HUB),
     ];
 
-    /// Angle from upright (rad), angular velocity (rad/s), and the torque of the last step (N m), which the frame shows.
+    /// Angle from upright (rad), angular velocity (rad/s), and the torque of the last step (N m), which the frame
+    /// shows.
     type State = [f64; 3];
 
     fn action_space() -> Space {

@@ -1,4 +1,5 @@
-//! The dynamics: a rod that rotates about its end, with a weak motor there, integrated by the semi-implicit Euler method.
+//! The dynamics: a rod that rotates about its end, with a weak motor there, integrated by the semi-implicit Euler
+//! method.
 //!
 //! Equations, their order and precision are those of Gymnasium's Pendulum: double precision, except for what numpy
 //! computes from an action, which is in single precision.
@@ -43,8 +44,8 @@ impl Physics {
         3.0 * self.gravity / (2.0 * self.length)
     }
 
-    /// Advances the state by one step with a torque. The state is the angle, the angular velocity, and the torque of the
-    /// last step. The reward is the negative cost of angle, angular velocity and torque.
+    /// Advances the state by one step with a torque. The state is the angle, the angular velocity, and the torque of
+    /// the last step. The reward is the negative cost of angle, angular velocity and torque.
     pub fn step(&self, state: &mut [f64; 3], torque: f64) -> Transition {
         let [angle, velocity, _] = *state;
         let limit = self.max_torque as f32;

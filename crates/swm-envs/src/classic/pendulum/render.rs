@@ -37,8 +37,8 @@ pub fn rod(surface: &mut Surface, &[angle, _, torque]: &[f64; 3]) {
     surface.disc(hub, HUB_RADIUS as i32, Color::new(HUB));
 }
 
-// The arrow for a clockwise torque: a ring from the top clockwise to the left, and a head at its end. Coordinates are in
-// pixels of Gymnasium's arrow image, y down, measured on it.
+// The arrow for a clockwise torque: a ring from the top clockwise to the left, and a head at its end. Coordinates are
+// in pixels of Gymnasium's arrow image, y down, measured on it.
 
 /// Width and height of the image.
 const BOX: [f64; 2] = [329.0, 312.0];
@@ -56,12 +56,12 @@ const NOTCH: [f64; 2] = [22.0, 153.5];
 const BARBS: [f64; 2] = [0.0, 45.0];
 /// y of the ends of the barbs.
 const BARBS_AT: f64 = 170.0;
-/// Opacity of the arrow. pygame's `smoothscale` leaves it slightly below 1, so the colour replacement does not match and
-/// the arrow stays black whatever the colour of the hub is.
+/// Opacity of the arrow. pygame's `smoothscale` leaves it slightly below 1, so the colour replacement does not match
+/// and the arrow stays black whatever the colour of the hub is.
 const OPACITY: f32 = 0.992;
 
-/// Returns the intervals in which the arrow crosses a horizontal line: the ring right and left of its centre, and the two
-/// sides of the head.
+/// Returns the intervals in which the arrow crosses a horizontal line: the ring right and left of its centre, and the
+/// two sides of the head.
 fn crossings(y: f64) -> [[f64; 2]; 4] {
     const EMPTY: [f64; 2] = [0.0; 2];
     let dy = y - CENTRE[1];

@@ -1,7 +1,7 @@
 //! [`ConfigurationSpace`]: the positions of the agent at which it overlaps neither the block nor the walls.
 //!
-//! An agent with a fixed angle touches a convex part of the block exactly when its origin is on the edge of the Minkowski
-//! difference of the two. So the agent is treated as a point among convex polygons, whatever the shapes are.
+//! An agent with a fixed angle touches a convex part of the block exactly when its origin is on the edge of the
+//! Minkowski difference of the two. So the agent is treated as a point among convex polygons, whatever the shapes are.
 
 use crate::push_t::TABLE;
 use crate::push_t::physics::Vec2;
@@ -103,7 +103,8 @@ impl ConfigurationSpace {
         Self { low: inset - low, high: Vec2::new(TABLE, TABLE) - inset - high, obstacles: obstacles.collect() }
     }
 
-    /// Returns the distance at which an agent at a point is from touching the block, in pixels; negative when it overlaps.
+    /// Returns the distance at which an agent at a point is from touching the block, in pixels; negative when it
+    /// overlaps.
     pub fn clearance(&self, at: Vec2) -> f64 {
         self.obstacles.iter().map(|obstacle| obstacle.clearance(at)).fold(f64::INFINITY, f64::min)
     }
@@ -113,8 +114,8 @@ impl ConfigurationSpace {
         (self.low.x..=self.high.x).contains(&at.x) && (self.low.y..=self.high.y).contains(&at.y)
     }
 
-    /// Returns points `gap` pixels from touching the block and about `spacing` pixels apart, each with the direction into
-    /// the block.
+    /// Returns points `gap` pixels from touching the block and about `spacing` pixels apart, each with the direction
+    /// into the block.
     pub fn contact_points(&self, gap: f64, spacing: f64) -> Vec<(Vec2, Vec2)> {
         let mut points = vec![];
         for Obstacle { corners, normals } in &self.obstacles {

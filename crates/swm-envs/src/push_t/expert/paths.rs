@@ -62,8 +62,8 @@ impl<'a> ShortestPaths<'a> {
     }
 }
 
-/// Returns whether the straight path between two points is free. An end that is nearer to an obstacle than a path should
-/// be reduces the distance required, so that the agent can leave the obstacle.
+/// Returns whether the straight path between two points is free. An end that is nearer to an obstacle than a path
+/// should be reduces the distance required, so that the agent can leave the obstacle.
 fn is_free(space: &ConfigurationSpace, from: Vec2, to: Vec2) -> bool {
     space.obstacles.iter().all(|obstacle| {
         let margin = SPARE.min(obstacle.clearance(from) - 0.01).min(obstacle.clearance(to) - 0.01);

@@ -23,7 +23,7 @@ const PUSH_OVERHEAD: f64 = 30.0;
 /// A push ends when it has not brought the block nearer for this many steps.
 const PATIENCE: usize = 3;
 
-/// What the expert reads of the observation.
+/// The part of the observation that the expert reads.
 pub struct Observation {
     pub state: State,
     /// The agent's angle in radians, which `state` does not contain.
@@ -88,9 +88,9 @@ impl PushModel {
         let bodies = [body_shapes[AGENT].body(), body_shapes[BLOCK].body()];
         let gyration = bodies[BLOCK].inverse_inertia.sqrt().recip();
         let e = (-1.0f64).exp();
-        // A round agent is a critically damped spring of 10 / s for 0.1 s: it covers 1 - 2 / e of the distance, and moves
-        // velocity / 10 e farther. Other agents lose their velocity in every physics step: each step covers a hundredth
-        // of the remaining distance.
+        // A round agent is a critically damped spring of 10 / s for 0.1 s: it covers 1 - 2 / e of the distance, and
+        // moves velocity / 10 e farther. Other agents lose their velocity in every physics step: each step covers a
+        // hundredth of the remaining distance.
         let (covered, drift, max_steps) = if body_shapes[AGENT].is_circle() {
             (1.0 - 2.0 * e, 0.1 * e, 6)
         } else {
@@ -124,8 +124,8 @@ impl PushModel {
         (Vec2::new(state[2] - goal[2], state[3] - goal[3]).length(), angle)
     }
 
-    /// Returns the distance of the block from its goal as one value in pixels. It measures the centre of gravity, which a
-    /// rotation leaves in place, and adds the cost of the rotation.
+    /// Returns the distance of the block from its goal as one value in pixels. It measures the centre of gravity, which
+    /// a rotation leaves in place, and adds the cost of the rotation.
     pub fn error(&self, state: &State, goal: &State) -> f64 {
         let centre =
             |state: &State| Pose::new(Vec2::new(state[2], state[3]), state[4], -self.body_shapes[BLOCK].cog).origin;
@@ -231,8 +231,8 @@ impl PushModel {
         advance(&mut self.simulation, action.map(|v| v as f32));
     }
 
-    /// Tries a push from a position, and returns it with the best number of steps. `before` is the present error, `path`
-    /// the number of steps to the position.
+    /// Tries a push from a position, and returns it with the best number of steps. `before` is the present error,
+    /// `path` the number of steps to the position.
     fn attempt(
         &mut self,
         now: &Observation,

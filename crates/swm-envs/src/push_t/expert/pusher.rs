@@ -1,9 +1,9 @@
 //! [`Pusher`]: the expert that plans pushes in a copy of the simulation.
 //!
-//! A plan is a path around the block to a point beside it, and a push from there: a direction, a strength and a number of
-//! steps. Pushes from all around the block are tried in the model, and the one that reduces the error fastest wins. Where
-//! none does, the expert searches for a push that makes a good one possible. When the block is at its goal, the agent
-//! walks to its own goal.
+//! A plan is a path around the block to a point beside it, and a push from there: a direction, a strength and a number
+//! of steps. Pushes from all around the block are tried in the model, and the expert chooses the one that reduces the
+//! error fastest. Where none does, it searches for a push that makes a good one possible. When the block is at its
+//! goal, the agent walks to its own goal.
 
 use super::paths::ShortestPaths;
 use super::push_model::{Candidates, Observation, Push, PushModel};

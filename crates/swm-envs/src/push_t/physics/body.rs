@@ -9,12 +9,13 @@ use bytemuck::{Pod, Zeroable};
 pub struct Pose {
     /// Cosine and sine of the angle, as x and y.
     rotation: Vec2,
-    /// The image of the origin, in table coordinates.
+    /// The position of the origin after the transformation, in table coordinates.
     pub origin: Vec2,
 }
 
 impl Pose {
-    /// Makes the pose of a body whose centre of gravity `cog` (in body coordinates) is at `position`; `angle` in radians.
+    /// Makes the pose of a body whose centre of gravity `cog` (in body coordinates) is at `position`; `angle` in
+    /// radians.
     pub fn new(position: Vec2, angle: f64, cog: Vec2) -> Self {
         let (sin, cos) = angle.sin_cos();
         let rotated = Vec2::new(cog.x * cos - cog.y * sin, cog.x * sin + cog.y * cos);
@@ -43,7 +44,7 @@ pub struct Body {
     pub angle: f64,
     /// The velocity of the centre of gravity.
     pub velocity: Vec2,
-    /// The angular velocity, from x towards y.
+    /// The angular velocity in radians per second, from x towards y.
     pub angular_velocity: f64,
     /// The bias velocity, which separates overlapping shapes; it acts in one step only.
     pub bias_velocity: Vec2,
@@ -128,7 +129,8 @@ impl Body {
         self.bias_angular_velocity += self.inverse_inertia * arm.cross(impulse);
     }
 
-    /// Returns the change of speed along `n` that a unit impulse along `n` at `arm` causes (the inverse effective mass).
+    /// Returns the change of speed along `n` that a unit impulse along `n` at `arm` causes (the inverse effective
+    /// mass).
     pub fn response(&self, arm: Vec2, n: Vec2) -> f64 {
         let lever = arm.cross(n);
         self.inverse_mass + self.inverse_inertia * lever * lever

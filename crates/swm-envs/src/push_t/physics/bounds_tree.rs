@@ -1,14 +1,14 @@
-//! [`BoundsTree`]: a binary tree of bounding boxes, which finds the shapes that may touch.
+//! [`BoundsTree`]: a binary tree of bounding boxes for finding pairs of shapes that may touch.
 //!
 //! The order in which pairs are found decides the order in which contacts are solved, and with it the last digits of
-//! every trajectory. So the tree grows exactly as Chipmunk's (`cpBBTree.c`): a leaf is inserted where the areas of the
-//! boxes grow least, and moves only when its shape leaves a box that was widened by its velocity.
+//! every trajectory. The tree is therefore built exactly as Chipmunk's (`cpBBTree.c`): a leaf is inserted where the
+//! areas of the boxes grow least, and moves only when its shape leaves a box that was widened by its velocity.
 
 use super::bounds::Bounds;
 use super::vec2::Vec2;
 use bytemuck::{Pod, Zeroable};
 
-/// The index of no node.
+/// Marks the absence of a node where an index of a node is stored.
 pub const NONE: u32 = u32::MAX;
 
 /// A leaf (the first nodes of a tree, one per shape) or an inner node with two children.
@@ -183,16 +183,16 @@ impl BoundsTree {
 /// Returns the box of a moving shape, widened so that the shape stays inside for some steps.
 pub fn widened(bounds: Bounds, velocity: Vec2) -> Bounds {
     // A single-precision constant in Chipmunk; it decides ties between boxes.
-    const MARGIN_SHARE: f64 = 0.1f32 as f64;
-    let margin = (bounds.high - bounds.low) * MARGIN_SHARE;
-    let ahead = velocity * MARGIN_SHARE;
+    const MARGIN_FRACTION: f64 = 0.1f32 as f64;
+    let margin = (bounds.high - bounds.low) * MARGIN_FRACTION;
+    let ahead = velocity * MARGIN_FRACTION;
     Bounds {
         low: bounds.low + Vec2::new((-margin.x).min(ahead.x), (-margin.y).min(ahead.y)),
         high: bounds.high + Vec2::new(margin.x.max(ahead.x), margin.y.max(ahead.y)),
     }
 }
 
-/// The nodes still to visit. The capacity suffices for a tree of a dozen leaves.
+/// The nodes that a traversal has yet to visit. The capacity suffices for a tree of a dozen leaves.
 struct Stack {
     nodes: [u32; 16],
     len: usize,

@@ -7,7 +7,7 @@ use bytemuck::{Pod, Zeroable};
 /// The maximal number of moving shapes, and of neighbours of one shape.
 const MAX_SHAPES: usize = 16;
 
-/// Two shapes whose widened bounding boxes touch, the one found first first.
+/// Two shapes whose widened bounding boxes touch, in the order in which they were found.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]
 pub struct CandidatePair {
@@ -47,8 +47,8 @@ impl Simulation {
         self.tree_stamp += 1;
     }
 
-    /// Finds the contacts of a leaf's pairs, if `collide` is set. If the leaf has moved within the tree in this step, its
-    /// pairs are found first.
+    /// Finds the contacts of a leaf's pairs, if `collide` is set. If the leaf has moved within the tree in this step,
+    /// its pairs are found first.
     pub(super) fn update_pairs(&mut self, leaf: u32, collide: bool) {
         let walls = self.walls();
         let shape = leaf + walls;

@@ -1,9 +1,9 @@
-//! Contact search between two shapes, operation by operation that of Chipmunk (`cpCollision.c`).
+//! Finds the contacts of two shapes with the same sequence of operations as Chipmunk (`cpCollision.c`).
 //!
 //! Shapes overlap when their Minkowski difference, enlarged by their radii, contains the origin. GJK (Gilbert, Johnson
 //! and Keerthi 1988) finds the edge of the difference nearest to the origin. When the origin lies inside, EPA (the
-//! expanding polytope algorithm) expands the polygon until that edge is on the surface. The edges of the two shapes that
-//! face each other there are clipped against each other, which gives up to two contacts.
+//! expanding polytope algorithm) expands the polygon until that edge is on the surface. The edges of the two shapes
+//! that face each other there are clipped against each other, which gives up to two contacts.
 
 use super::contact::Contact;
 use super::shape::{Kind, Shape};
@@ -16,7 +16,7 @@ const MAX_ITERATIONS: usize = 30;
 pub struct Manifold {
     /// Unit vector from the first shape to the second.
     pub normal: Vec2,
-    /// The contacts; the first `count` are valid. Their `arms` hold points instead of lever arms.
+    /// The contacts; the first `count` are valid. Here their `arms` are points in table coordinates, not lever arms.
     pub contacts: [Contact; 2],
     /// The number of contacts.
     pub count: usize,
@@ -64,7 +64,7 @@ impl Manifold {
     }
 }
 
-/// Returns a symmetric hash of two, which identifies a contact in the next step.
+/// Returns a symmetric hash of two hashes, which identifies a contact in the next step.
 fn hash_pair(a: u64, b: u64) -> u64 {
     const FACTOR: u64 = 3_344_921_057;
     a.wrapping_mul(FACTOR) ^ b.wrapping_mul(FACTOR)
@@ -206,7 +206,8 @@ impl Pair<'_> {
         Nearest::between(&v0, &v1)
     }
 
-    /// Finds the closest points of overlapping shapes by EPA, from a triangle of the difference that contains the origin.
+    /// Finds the closest points of overlapping shapes by EPA, from a triangle of the difference that contains the
+    /// origin.
     fn penetration(&self, triangle: [Corner; 3]) -> Nearest {
         let mut hull = [triangle[0]; MAX_ITERATIONS + 3];
         hull[..3].copy_from_slice(&triangle);
@@ -231,16 +232,16 @@ impl Pair<'_> {
             // The new hull starts with p; old corners inside it are dropped.
             let old = hull;
             hull[0] = p;
-            let mut kept_count = 1;
+            let mut new_count = 1;
             for i in 0..count {
                 let index = (nearest.0 + 1 + i) % count;
                 let next = if i + 1 < count { old[(index + 1) % count].ab } else { p.ab };
-                if is_left(hull[kept_count - 1].ab, next, old[index].ab) {
-                    hull[kept_count] = old[index];
-                    kept_count += 1;
+                if is_left(hull[new_count - 1].ab, next, old[index].ab) {
+                    hull[new_count] = old[index];
+                    new_count += 1;
                 }
             }
-            count = kept_count;
+            count = new_count;
             iteration += 1;
         }
     }

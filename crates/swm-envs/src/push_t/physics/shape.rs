@@ -4,7 +4,7 @@ use super::body::Body;
 use super::bounds::Bounds;
 use super::vec2::Vec2;
 
-/// The kinds of shapes, in the order that the contact search requires of a pair.
+/// The kinds of shapes. The contact search requires that the first shape of a pair has the lesser kind.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
     /// One point and a radius.
@@ -22,9 +22,9 @@ pub struct Shape {
     pub kind: Kind,
     /// Index of its body.
     pub body: usize,
-    /// The distance by which it extends beyond its points, in pixels.
+    /// The distance by which the shape extends beyond its points, in pixels.
     pub radius: f64,
-    /// Corners in body coordinates; the first [`Shape::len`] count.
+    /// Corners in body coordinates; the first [`Shape::len`] are valid.
     pub corners: [Vec2; 4],
     /// Outward normal of the edge that ends in the corner of the same index, in body coordinates (for a segment: of its
     /// right side).
@@ -32,14 +32,23 @@ pub struct Shape {
     /// Corners in table coordinates.
     pub points: [Vec2; 4],
     /// Normals in table coordinates.
-    pub edges: [Vec2; 4],
+    pub table_normals: [Vec2; 4],
     /// Bounding box in table coordinates.
     pub bounds: Bounds,
 }
 
 impl Shape {
     fn new(kind: Kind, body: usize, radius: f64, corners: [Vec2; 4], normals: [Vec2; 4]) -> Self {
-        Self { kind, body, radius, corners, normals, points: corners, edges: normals, bounds: Bounds::default() }
+        Self {
+            kind,
+            body,
+            radius,
+            corners,
+            normals,
+            points: corners,
+            table_normals: normals,
+            bounds: Bounds::default(),
+        }
     }
 
     /// Makes a circle about the body's origin.
@@ -74,7 +83,7 @@ impl Shape {
         for i in 0..self.len() {
             let point = body.pose.point(self.corners[i]);
             self.points[i] = point;
-            self.edges[i] = body.pose.direction(self.normals[i]);
+            self.table_normals[i] = body.pose.direction(self.normals[i]);
             bounds = bounds.with(point);
         }
         self.bounds = bounds.grown(self.radius);
@@ -102,12 +111,16 @@ impl Shape {
     pub fn facing_edge(&self, n: Vec2) -> (usize, usize) {
         match self.kind {
             Kind::Circle => (0, 0),
-            Kind::Segment if self.edges[0].dot(n) > 0.0 => (0, 1),
+            Kind::Segment if self.table_normals[0].dot(n) > 0.0 => (0, 1),
             Kind::Segment => (1, 0),
             Kind::Quad => {
                 let at = self.support(n);
                 let next = (at + 1) % 4;
-                if n.dot(self.edges[at]) > n.dot(self.edges[next]) { ((at + 3) % 4, at) } else { (at, next) }
+                if n.dot(self.table_normals[at]) > n.dot(self.table_normals[next]) {
+                    ((at + 3) % 4, at)
+                } else {
+                    (at, next)
+                }
             }
         }
     }

@@ -18,11 +18,11 @@ pub const WALLS: usize = 2;
 
 /// Duration of one physics step, in seconds (`env.py` of the reference).
 pub const DT: f64 = 0.01;
-/// Rounds of sequential impulses (Chipmunk's default).
+/// Iterations of sequential impulses (Chipmunk's default).
 const ITERATIONS: usize = 10;
 /// Overlap that is tolerated, in pixels (Chipmunk's default, a single-precision constant there).
 const SLOP: f64 = 0.1f32 as f64;
-/// Share of an overlap that remains after 1/60 second (Chipmunk's default, single precision there).
+/// Fraction of an overlap that remains after 1/60 second (Chipmunk's default, single precision there).
 const OVERLAP_LEFT: f64 = (1.0f32 - 0.1f32) as f64;
 /// Steps for which the impulses of a vanished contact are stored (Chipmunk's default).
 const PERSISTENCE: u32 = 3;
@@ -159,7 +159,7 @@ impl Simulation {
         if bodies[0] == bodies[1] || !shape_a.bounds.intersects(&shape_b.bounds) {
             return hint;
         }
-        // Where neither body can be moved, a contact changes nothing.
+        // A contact has no effect if neither body is dynamic.
         if !bodies.iter().any(|&body| self.bodies[body].is_dynamic()) {
             return hint;
         }
@@ -223,7 +223,7 @@ impl Simulation {
         self.static_tree.leaves
     }
 
-    /// Moves a shape to where its body is.
+    /// Moves a shape to the pose of its body.
     pub(super) fn update_shape(&mut self, shape: u32) {
         let shape = &mut self.shapes[shape as usize];
         shape.update(&self.bodies[shape.body]);
@@ -235,8 +235,9 @@ impl Simulation {
     }
 }
 
-/// Returns the order in which Chipmunk visits moving shapes, to step and to draw them. It is the order of its hash table,
-/// whose size is the first of these primes that exceeds the number of shapes.
+/// Returns the order in which Chipmunk updates and draws moving shapes.
+///
+/// It is the order of Chipmunk's hash table, whose size is the first of these primes that exceeds the number of shapes.
 pub fn visiting_order(walls: usize, moving: usize) -> Vec<usize> {
     let size = [5, 13, 23].into_iter().find(|&size| size > moving).unwrap_or(usize::MAX);
     let mut order: Vec<usize> = (0..moving).collect();

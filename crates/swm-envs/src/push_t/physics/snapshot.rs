@@ -1,4 +1,5 @@
-//! The state of a [`Simulation`] as bytes: bodies, trees, pairs and contacts, everything the next step depends on.
+//! Converts the state of a [`Simulation`] to bytes and back: bodies, trees, pairs and contacts, on which the next step
+//! depends.
 
 use super::simulation::Simulation;
 use bytemuck::Pod;
@@ -14,8 +15,8 @@ impl Simulation {
         put(bytes, &self.active);
     }
 
-    /// Reads a state that [`Simulation::save`] wrote for the same shapes, and advances `bytes` past it. Returns `None`, and
-    /// leaves the simulation in an unspecified state, when the bytes are invalid.
+    /// Reads a state that [`Simulation::save`] wrote for the same shapes, and advances `bytes` past it. Returns `None`,
+    /// and leaves the simulation in an unspecified state, when the bytes are invalid.
     pub fn load(&mut self, bytes: &mut &[u8]) -> Option<()> {
         self.bodies = take_array(bytes)?;
         take(bytes, &mut self.tree.nodes)?;

@@ -172,11 +172,11 @@ fn rectangles_have_the_requested_size_and_uniform_positions() {
             .collect();
         for &[x, y, width, height] in &found {
             assert!((20..=50).contains(&width) && (12..=30).contains(&height), "{text}: {width} x {height}");
-            assert!(x + width <= 100 && y + height <= 60, "{text}: it sticks out");
+            assert!(x + width <= 100 && y + height <= 60, "{text}: the rectangle extends beyond the frame");
         }
         for (axis, side, low, high) in [(2, 100.0, 20.0, 50.0), (3, 60.0, 12.0, 30.0)] {
             let center = mean(found.iter().map(|f| f[axis - 2] as f64 + f[axis] as f64 / 2.0));
-            assert!((center / side - 0.5).abs() < 0.04, "{text}: the middle lies at {center} of {side}");
+            assert!((center / side - 0.5).abs() < 0.04, "{text}: the centre lies at {center} of {side}");
             let size = mean(found.iter().map(|f| f[axis] as f64));
             assert!((size - (low + high) / 2.0).abs() < 0.05 * side, "{text}: the mean side is {size}");
         }

@@ -12,7 +12,7 @@ use swm_envs::wrappers::{EpisodeFrame, VisualWrapper, parse};
 /// Width and height of most frames in these tests; not square, so that swapped axes are detected.
 const SIZE: [usize; 2] = [48, 40];
 
-/// What a wrapper's frames depend on.
+/// The inputs that change a wrapper's result on one image.
 #[derive(Clone, Copy, PartialEq)]
 enum Varies {
     /// On nothing.

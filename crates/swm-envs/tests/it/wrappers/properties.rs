@@ -1,4 +1,4 @@
-//! Properties that every wrapper has: determinism, snapshots, independence of the rest of the environment.
+//! Properties of every wrapper: determinism, snapshots, and no effect on anything but frames.
 
 use super::{SIZE, Varies, applied, make, variants};
 use std::collections::BTreeSet;
@@ -35,17 +35,17 @@ fn step(env: &mut dyn Env) {
 }
 
 #[test]
-fn frames_depend_on_seed_and_step_only() {
+fn frames_depend_only_on_seed_and_step() {
     let folder = tempfile::tempdir().expect("a folder");
     for (text, varies) in variants(folder.path()) {
         let (mut wrapper, mut other) = (make(&text), make(&text));
         let at = EpisodeFrame::Step;
         let first = applied(&mut *wrapper, SIZE, 1, at(3));
         assert_eq!(first, applied(&mut *wrapper, SIZE, 1, at(3)), "{text}: drawing twice differs");
-        // Frames drawn before, their size, and the instance have no influence.
+        // Earlier frames, their size, and the instance do not affect the result.
         applied(&mut *other, [31, 7], 9, at(8));
         applied(&mut *other, SIZE, 2, EpisodeFrame::Goal);
-        assert_eq!(first, applied(&mut *other, SIZE, 1, at(3)), "{text}: the past matters");
+        assert_eq!(first, applied(&mut *other, SIZE, 1, at(3)), "{text}: earlier frames change the result");
         assert_eq!(first, applied(&mut *other.fork(), SIZE, 1, at(3)), "{text}: a fork differs");
         let seeds: BTreeSet<Vec<u8>> = (1..9).map(|seed| applied(&mut *wrapper, SIZE, seed, at(3))).collect();
         let steps: BTreeSet<Vec<u8>> = (0..8).map(|step| applied(&mut *wrapper, SIZE, 1, at(step))).collect();
@@ -88,12 +88,12 @@ fn restored_snapshot_continues_bit_for_bit() {
         step(&mut *other);
         let snapshot = env.snapshot();
         let follow = |env: &mut dyn Env| {
-            let mut seen = vec![env.snapshot().0, frame(env), goal_frame(env)];
+            let mut frames = vec![env.snapshot().0, frame(env), goal_frame(env)];
             for _ in 0..4 {
                 step(env);
-                seen.push(frame(env));
+                frames.push(frame(env));
             }
-            seen
+            frames
         };
         let expected = follow(&mut *env);
         for env in [&mut *env, &mut *other] {
@@ -102,8 +102,8 @@ fn restored_snapshot_continues_bit_for_bit() {
         }
         let bare = two_room::ENTRY.env().expect("an environment").snapshot().0;
         let cut = snapshot.0[..20].to_vec();
-        let stranger = wrapped(&["grayscale"], GoalFrame::Clean).snapshot().0;
-        for foreign in [bare, cut, stranger, vec![]] {
+        let other_stack = wrapped(&["grayscale"], GoalFrame::Clean).snapshot().0;
+        for foreign in [bare, cut, other_stack, vec![]] {
             assert!(env.restore(&Snapshot(foreign)).is_err(), "{text}: a foreign snapshot is refused");
         }
         assert!(
@@ -158,8 +158,8 @@ fn wrapped_goal_has_the_appearance_of_the_episode() {
     for env in [&mut env, &mut clean] {
         env.reset(2, &at_goal).expect("a reset");
     }
-    assert_eq!(frame(&mut *clean), goal_frame(&mut *clean), "what is sampled per episode applies to the goal");
-    assert_ne!(frame(&mut *env), goal_frame(&mut *env), "the goal has noise of its own");
+    assert_eq!(frame(&mut *clean), goal_frame(&mut *clean), "values sampled per episode apply to the goal frame");
+    assert_ne!(frame(&mut *env), goal_frame(&mut *env), "goal frame and step frame have different noise");
     let goal = goal_frame(&mut *env);
     step(&mut *env);
     assert_eq!(goal, goal_frame(&mut *env), "the goal frame does not change with the steps");
@@ -186,25 +186,25 @@ fn dataset_row_starts_an_episode_of_the_last_seed() {
 }
 
 #[test]
-fn order_and_index_in_the_stack_matter() {
-    let seen = |texts: &[&str]| {
+fn frames_depend_on_the_order_and_index_of_wrappers() {
+    let frames = |texts: &[&str]| {
         let mut env = wrapped(texts, GoalFrame::Clean);
         env.reset(1, &fixed_factors()).expect("a reset");
         frame(&mut *env)
     };
-    assert_ne!(seen(&["noise,std=60", "blur"]), seen(&["blur", "noise,std=60"]));
-    assert_ne!(seen(&["grayscale", "occlusion,color=255/0/0"]), seen(&["occlusion,color=255/0/0", "grayscale"]));
+    assert_ne!(frames(&["noise,std=60", "blur"]), frames(&["blur", "noise,std=60"]));
+    assert_ne!(frames(&["grayscale", "occlusion,color=255/0/0"]), frames(&["occlusion,color=255/0/0", "grayscale"]));
     // Two wrappers of one kind sample differently.
     let difference = |texts: &[&str]| {
-        let (seen, clean) = (seen(texts), seen(&[]));
-        seen.iter().zip(clean).filter(|(a, b)| **a != *b).count()
+        let (frames, clean) = (frames(texts), frames(&[]));
+        frames.iter().zip(clean).filter(|(a, b)| **a != *b).count()
     };
     let one = difference(&["occlusion,color=99"]);
-    assert!(difference(&["occlusion,color=99", "occlusion,color=99"]) > one, "the second patch lies elsewhere");
+    assert!(difference(&["occlusion,color=99", "occlusion,color=99"]) > one, "the second patch is at another position");
 }
 
 #[test]
-fn threads_and_other_environments_do_not_matter() {
+fn frames_do_not_depend_on_threads_or_other_environments() {
     let texts = ["color-jitter", "moving-patch", "noise", "random-shift,resample=step"];
     let play = |seeds: &[u64], workers: usize| -> Vec<Vec<u8>> {
         let stack = Stack::parse(&texts).expect("wrappers");
@@ -219,20 +219,20 @@ fn threads_and_other_environments_do_not_matter() {
         pool.reset(&resets).expect("a reset");
         let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), seeds.len());
         actions.get_mut::<f32>("action").expect("actions").fill(0.3);
-        let mut seen = vec![vec![]; seeds.len()];
+        let mut frames = vec![vec![]; seeds.len()];
         for _ in 0..5 {
-            for (slot, seen) in seen.iter_mut().enumerate() {
+            for (slot, frames) in frames.iter_mut().enumerate() {
                 for column in ["pixels", "goal"] {
                     let column = pool.infos().schema().index(column).expect("a column");
-                    seen.extend_from_slice(pool.infos().row(slot).at::<u8>(column));
+                    frames.extend_from_slice(pool.infos().row(slot).at::<u8>(column));
                 }
             }
             pool.step(&actions, &vec![true; seeds.len()]).expect("a step");
         }
-        seen
+        frames
     };
     let expected = play(&[0, 1, 2, 3, 4], 1);
-    assert!(expected == play(&[0, 1, 2, 3, 4], 4), "threads matter");
-    assert!(expected[3..4] == play(&[3], 2), "other environments matter");
+    assert!(expected == play(&[0, 1, 2, 3, 4], 4), "the number of threads changes frames");
+    assert!(expected[3..4] == play(&[3], 2), "other environments change frames");
     assert!(expected[0] != expected[1], "episodes differ");
 }

@@ -25,7 +25,7 @@ fn every_row_and_parameter_is_tested_and_documented() {
                 parameter.default.map_or("must be given".to_owned(), |default| format!("`{default}`")),
                 parameter.domain
             );
-            assert!(docs.contains(&row), "docs/wrappers.md says, under {}:\n{row}", entry.id);
+            assert!(docs.contains(&row), "docs/wrappers.md contains, under {}:\n{row}", entry.id);
             assert_eq!(described["parameters"][name]["default"], parameter.default_value());
         }
     }
@@ -41,17 +41,17 @@ fn invalid_settings_are_errors_that_name_the_setting() {
             error.to_string()
         }
     };
-    let says = |text: &str, words: &[&str]| {
+    let error_contains = |text: &str, words: &[&str]| {
         let message = message(text);
         words.iter().for_each(|word| assert!(message.contains(word), "{text}: {message}"));
     };
-    says("nose", &["wrapper", "'nose'", "noise", "swm wrappers"]);
-    says("noise,sdt=8", &["'sdt'", "std", "takes kind, std, amount"]);
-    says("chroma-key,color=1/2/3", &["'color'", "key_color"]);
-    says("grayscale,keep=1", &["'keep'", "takes none"]);
-    says("noise,8", &["'8'", "NAME=VALUE"]);
-    says("noise,std=1,std=2", &["'std'", "twice"]);
-    says("chroma-key,key_color=1/2/3", &["'media' is missing", "PNG"]);
+    error_contains("nose", &["wrapper", "'nose'", "noise", "swm wrappers"]);
+    error_contains("noise,sdt=8", &["'sdt'", "std", "takes kind, std, amount"]);
+    error_contains("chroma-key,color=1/2/3", &["'color'", "key_color"]);
+    error_contains("grayscale,keep=1", &["'keep'", "takes none"]);
+    error_contains("noise,8", &["'8'", "NAME=VALUE"]);
+    error_contains("noise,std=1,std=2", &["'std'", "twice"]);
+    error_contains("chroma-key,key_color=1/2/3", &["'media' is missing", "PNG"]);
     for (text, given, allowed) in [
         ("noise,std=-1", "-1", "from 0 to 255"),
         ("noise,std=256", "256", "from 0 to 255"),
@@ -84,7 +84,7 @@ fn invalid_settings_are_errors_that_name_the_setting() {
     ] {
         let name = text.split([',', '=']).nth(1).expect("a name");
         let name = if text.starts_with("chroma-key") && given.contains('/') { "key_color" } else { name };
-        says(text, &[text.split(',').next().expect("a wrapper"), name, given, allowed]);
+        error_contains(text, &[text.split(',').next().expect("a wrapper"), name, given, allowed]);
     }
     // The same settings as JSON.
     let json = |id: &str, settings: Value| {

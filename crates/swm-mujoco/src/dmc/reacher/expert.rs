@@ -11,11 +11,11 @@ pub const EXPERTS: &[ExpertEntry] = &[ExpertEntry {
     make: || Box::new(Controller),
 }];
 
-/// Stiffness (control per radian) and damping (control per rad/s) for shoulder and wrist. The wrist is light enough to be
-/// damped by its joint.
+/// Stiffness (control per radian) and damping (control per rad/s) for shoulder and wrist. The wrist is light enough to
+/// be damped by its joint.
 const GAINS: [[f64; 2]; 2] = [[2.0, 0.15], [2.0, 0.0]];
 
-/// Reads `qpos`, `qvel` and `goal_state`; has no memory.
+/// Reads `qpos`, `qvel` and `goal_state`; stateless.
 struct Controller;
 
 impl Expert for Controller {

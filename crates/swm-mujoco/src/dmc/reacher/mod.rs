@@ -16,7 +16,7 @@ use rand::Rng as _;
 use std::f64::consts::PI;
 use swm_core::{EnvEntry, Factor, Result, Rng};
 
-/// The registry row.
+/// The registry row of this domain.
 pub const ENTRY: EnvEntry = entry::<Reacher>(expert::EXPERTS);
 
 /// Lengths of the links from shoulder to wrist and from wrist to finger, in metres.
@@ -138,7 +138,8 @@ impl Domain for Reacher {
         Tolerance::within(0.0, sizes[self.target][0] + sizes[self.finger][0]).of(norm(&self.to_target(physics)))
     }
 
-    /// The joint angles with the finger at the target, by inverse kinematics; the wrist keeps its present sign.
+    /// The joint angles with the finger at the target, by inverse kinematics; the sign of the wrist angle does not
+    /// change.
     fn goal_qpos(&self, physics: &Physics, qpos: &mut [f64]) -> bool {
         let target = physics.model().geom_pos()[self.target];
         let bend = wrist_angle(norm(&target[..2])).copysign(physics.data().qpos()[1]);

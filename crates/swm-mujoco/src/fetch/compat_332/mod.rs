@@ -1,7 +1,7 @@
 //! Compatibility mode with MuJoCo 3.3.2, with which the reference's Fetch rollouts were recorded.
 //!
-//! Four later changes of MuJoCo become visible in these environments within a few steps. [`Compat332`] reverts them between the
-//! stages of each time step:
+//! Four later changes of MuJoCo become visible in these environments within a few steps. [`Compat332`] reverts them
+//! between the stages of each time step:
 //!
 //! 1. The reference acceleration of a weld now includes the change of its Jacobian. The gripper is attached by a weld.
 //! 2. A mesh on a plane now has four contact points instead of three. This concerns the base of the robot.
@@ -71,8 +71,8 @@ fn margin(model: &MjModel, pair: [usize; 2]) -> f64 {
     first.max(second)
 }
 
-/// A contact of two geoms without point, distance and frame: the larger friction, and the mean of the solver parameters. All
-/// geoms of the models have the same priority and mixing weight.
+/// A contact of two geoms without point, distance and frame: the larger friction, and the mean of the solver
+/// parameters. All geoms of the models have the same priority and mixing weight.
 fn contact_template(model: &MjModel, pair: [usize; 2]) -> mjContact {
     let [first, second] = pair;
     let mean = |a: f64, b: f64| 0.5 * (a + b);

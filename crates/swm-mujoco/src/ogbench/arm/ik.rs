@@ -12,7 +12,7 @@ const MAX_ITERATIONS: usize = 20;
 /// In metres and radians.
 const TOLERANCE: f64 = 1e-4;
 const DAMPING: f64 = 1e-12;
-/// The most a joint rotates in one iteration, in radians.
+/// The maximal rotation of a joint in one iteration, in radians.
 const MAX_STEP: f64 = std::f64::consts::FRAC_PI_4;
 
 /// A link of the arm and the joint that moves it.

@@ -114,7 +114,8 @@ pub struct Pose {
 }
 
 impl Pose {
-    /// The composition of transforms: the pose `inner`, given in the frame of `self`, in the frame that `self` is given in.
+    /// The composition of transforms: the pose `inner`, given in the frame of `self`, in the frame that `self` is given
+    /// in.
     pub fn then(self, inner: Self) -> Self {
         Self {
             position: add(self.position, rotate(self.rotation, inner.position)),

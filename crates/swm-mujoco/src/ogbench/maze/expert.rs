@@ -1,4 +1,5 @@
-//! The scripted expert of mazes: moves a point from cell to cell along the shortest path. There is no expert for the ant.
+//! The scripted expert of mazes: moves a point from cell to cell along the shortest path. There is no expert for the
+//! ant.
 
 use super::task::POINT_STEP;
 use swm_core::policy::Expert;

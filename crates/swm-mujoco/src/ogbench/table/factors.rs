@@ -1,5 +1,5 @@
-//! The factors of variation of a table, and their edits of the compiled model. Names, bounds, defaults and order are those of
-//! the reference.
+//! The factors of variation of a table, and their edits of the compiled model. Names, bounds, defaults and order are
+//! those of the reference.
 
 use super::config::{CUBE_COLORS, Camera, FRONT, SIDE, TableConfig};
 use super::parts::Parts;
@@ -95,7 +95,8 @@ pub fn apply(physics: &mut Physics, config: &TableConfig, parts: &Parts, factors
         }
     }
     physics.set_const();
-    // Markers are moved relative to their bodies. MuJoCo would skip the transform of geoms that coincide with their bodies.
+    // Markers are moved relative to their bodies. MuJoCo would skip the transform of geoms that coincide with their
+    // bodies.
     for cube in &parts.cubes {
         physics.model_mut().geom_sameframe_mut()[cube.geoms[1]] = mjtSameFrame::mjSAMEFRAME_NONE;
     }

@@ -12,7 +12,7 @@ const WRONG_LOCK_DISTANCE: f64 = 0.1;
 /// The objects that a goal includes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Subject {
-    /// Everything.
+    /// All objects.
     All,
     /// One cube.
     Cube(usize),

@@ -1,4 +1,5 @@
-//! A table with an arm and cubes, and in the scene buttons, a drawer and a window: `swm/OGBCube-v0` and `swm/OGBScene-v0`.
+//! A table with an arm and cubes, and in the scene buttons, a drawer and a window: `swm/OGBCube-v0` and
+//! `swm/OGBScene-v0`.
 
 mod arena;
 mod config;

@@ -67,7 +67,7 @@ pub struct Fixtures {
     pub window: Sliding,
 }
 
-/// The indices of everything on a table.
+/// The indices of all objects on a table.
 #[derive(Clone, Debug)]
 pub struct Parts {
     /// The cubes.
@@ -84,7 +84,7 @@ const DAMPING: [f64; 2] = [1e6, 2.0];
 const UNLOCKED_COLOR: [f32; 3] = [0.9; 3];
 
 impl Parts {
-    /// Finds everything in a model.
+    /// Finds the objects of a table in a model.
     ///
     /// # Errors
     /// When the model lacks an element.
@@ -154,8 +154,8 @@ impl Cube {
         qpos[3..7].copy_from_slice(&rotation);
     }
 
-    /// Moves the marker's geom to the goal, relative to its mocap body at `body`. The body itself is part of the state, which must
-    /// not depend on the goal.
+    /// Moves the marker's geom to the goal, relative to its mocap body at `body`. The body itself is part of the state,
+    /// which must not depend on the goal.
     pub fn place_marker(&self, physics: &mut Physics, body: Pose, goal: Pose) {
         let identity = Pose { position: [0.0; 3], rotation: IDENTITY };
         let relative = if body == goal { identity } else { body.inverse().then(goal) };

@@ -190,7 +190,8 @@ impl Table {
         }
     }
 
-    /// Draws a cube without another cube on top, and its goal: on another cube, in the open drawer, or at the factors' position.
+    /// Draws a cube without another cube on top, and its goal: on another cube, in the open drawer, or at the factors'
+    /// position.
     fn draw_cube(&mut self, physics: &Physics, now: FixtureState, factors: &FactorValues, rng: &mut Rng) {
         let qpos = physics.data().qpos();
         let positions: Vec<Vec3> = self.parts.cubes.iter().map(|cube| cube.position(qpos)).collect();
@@ -219,8 +220,8 @@ impl Table {
         self.goal.cubes[cube] = (position, about_z(factors.get("cube.goal_yaw")[0]));
     }
 
-    /// Samples a goal that is not reached: cubes on the table, on each other or in the drawer; locks, drawer and window in random
-    /// states. The physics is in the goal state afterwards.
+    /// Samples a goal that is not reached: cubes on the table, on each other or in the drawer; locks, drawer and window
+    /// in random states. The physics is in the goal state afterwards.
     ///
     /// # Errors
     /// When no such goal was drawn.

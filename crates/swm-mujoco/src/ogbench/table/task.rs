@@ -58,7 +58,7 @@ pub struct Table {
 
 /// The goal of an episode.
 pub struct Goal {
-    /// The objects that it includes.
+    /// The objects that the goal includes.
     pub subject: Subject,
     /// The goal pose of each cube; only the position counts for success.
     pub cubes: Vec<(Vec3, Quat)>,
@@ -161,8 +161,8 @@ impl Table {
         }
     }
 
-    /// Moves cubes that left the workspace to the middle of the table. This happens when a drawer with a cube inside is locked
-    /// while it moves. The reference moves them to a random position.
+    /// Moves cubes that left the workspace to the middle of the table. This happens when a drawer with a cube inside is
+    /// locked while it moves. The reference moves them to a random position.
     fn return_lost_cubes(&self, physics: &mut Physics) {
         let [low, high] = WORKSPACE;
         for cube in &self.parts.cubes {
@@ -187,7 +187,8 @@ impl Table {
         }
     }
 
-    /// Moves the mocap bodies of the cubes' markers, which are part of the state, to the goal. For the start of an episode.
+    /// Moves the mocap bodies of the cubes' markers, which are part of the state, to the goal. For the start of an
+    /// episode.
     pub(super) fn move_marker_bodies(&self, physics: &mut Physics) {
         for (cube, &(position, rotation)) in self.parts.cubes.iter().zip(&self.goal.cubes) {
             let at = Pose { position, rotation };

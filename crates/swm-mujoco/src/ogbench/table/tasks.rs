@@ -199,7 +199,8 @@ pub const OCTUPLE: &[Task] = &[
     ),
 ];
 
-/// Open both fixtures; close and lock both; rearrange; cube into the drawer; cube into the locked drawer with the window open.
+/// Open both fixtures; close and lock both; rearrange; cube into the drawer; cube into the locked drawer with the
+/// window open.
 pub const SCENE: &[Task] = &[
     scene([&[[0.35, 0.05, 0.02]], &[[0.35, 0.05, 0.02]]], [fixed([1, 1], 0.0, 0.0), fixed([1, 1], -0.16, 0.2)]),
     scene([&[[0.35, -0.05, 0.02]], &[[0.35, -0.05, 0.02]]], [fixed([0, 0], -0.16, 0.2), fixed([0, 0], 0.0, 0.0)]),

@@ -10,7 +10,7 @@ use mujoco_rs::mujoco_c::{
 use mujoco_rs::wrappers::MjModel;
 use swm_raster::{Axis, Camera, Geom, Haze, Light, Mapping, Paint, Scene, Shape, V3};
 
-/// The most cells along each axis of a model's plane.
+/// The maximal number of cells along each axis of a model's plane.
 const MAX_CELLS: usize = 200;
 
 /// Cells along each axis of a plane that is not a geom of the model.
@@ -136,8 +136,8 @@ fn shape(from: &mjvGeom, model: &MjModel, of_model: bool) -> Option<Shape> {
     })
 }
 
-/// How MuJoCo tessellates a plane along an axis. `size` is half the extent in metres (0: infinite), `spacing` half the distance
-/// between grid lines in metres.
+/// How MuJoCo tessellates a plane along an axis. `size` is half the extent in metres (0: infinite), `spacing` half the
+/// distance between grid lines in metres.
 fn axis(size: f64, spacing: f64, repeat: f32, model: &MjModel) -> Axis {
     if size > 0.0 {
         let spacing = spacing.max(size / (MAX_CELLS - 2) as f64);
@@ -164,8 +164,8 @@ fn axis(size: f64, spacing: f64, repeat: f32, model: &MjModel) -> Axis {
     }
 }
 
-/// The texture of a geom. OpenGL generates texture coordinates from unit shapes, except for planes and meshes of the model, whose
-/// vertices are in metres.
+/// The texture of a geom. OpenGL generates texture coordinates from unit shapes, except for planes and meshes of the
+/// model, whose vertices are in metres.
 fn paint(from: &mjvGeom, model: &MjModel) -> Option<Paint> {
     let material = usize::try_from(from.matid).ok()?;
     let (texture, uniform, repeat) = match usize::try_from(from.texid) {

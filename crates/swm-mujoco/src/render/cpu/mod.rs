@@ -1,7 +1,8 @@
-//! The CPU renderer: draws MuJoCo's abstract scenes with `swm-raster`, on the calling thread and on idle threads of its pool.
+//! The CPU renderer: draws MuJoCo's abstract scenes with `swm-raster`, on the calling thread and on idle threads of its
+//! pool.
 //!
-//! It needs no graphics library and produces the same bytes on every machine. Plane grids, mesh vertices and mip maps, which
-//! MuJoCo computes when it creates a rendering context, are computed here once per model group and cached.
+//! It needs no graphics library and produces the same bytes on every machine. Plane grids, mesh vertices and mip maps,
+//! which MuJoCo computes when it creates a rendering context, are computed here once per model group and cached.
 
 mod assets;
 mod convert;
@@ -43,7 +44,8 @@ impl Renderer for CpuRenderer {
 }
 
 thread_local! {
-    /// One workspace per rendering in progress: a thread that waits for other threads to finish its frame may start another.
+    /// One workspace per rendering in progress: a thread that waits for other threads to finish its frame may start
+    /// another.
     static WORKSPACES: RefCell<Vec<Workspace>> = RefCell::default();
 }
 

@@ -12,7 +12,8 @@ use std::ffi::c_int;
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
 
-/// Contexts that a thread caches; the least recently used one is dropped first. Each holds a shadow map of 64 MB, and more.
+/// Contexts that a thread caches; the least recently used one is dropped first. Each holds a shadow map of 64 MB, and
+/// more.
 const MAX_CONTEXTS: usize = 4;
 
 /// Serialises the creation and destruction of contexts: MuJoCo counts them in an unguarded variable.
@@ -27,8 +28,8 @@ pub struct RenderContexts {
     scratch: Vec<u8>,
 }
 
-/// A context for the models of one group. Each has its own OpenGL context, because MuJoCo leaves lights and the shadow map in
-/// OpenGL's state.
+/// A context for the models of one group. Each has its own OpenGL context, because MuJoCo leaves lights and the shadow
+/// map in OpenGL's state.
 struct RenderContext {
     library: Arc<Library>,
     gl: GlContext,

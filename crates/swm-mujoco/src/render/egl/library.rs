@@ -58,8 +58,8 @@ pub struct GlContext {
 }
 
 impl Library {
-    /// Loads EGL: the library that `SWM_EGL_LIBRARY` names, otherwise the system's. Its symbols become globally visible,
-    /// because MuJoCo looks up OpenGL's functions through them.
+    /// Loads EGL: the library that `SWM_EGL_LIBRARY` names, otherwise the system's. Its symbols become globally
+    /// visible, because MuJoCo looks up OpenGL's functions through them.
     ///
     /// # Errors
     /// When the library is not installed.
@@ -131,8 +131,8 @@ impl Library {
         type QueryString = unsafe extern "C" fn(Pointer, c_int) -> *const c_char;
         type PlatformDisplay = unsafe extern "C" fn(u32, Pointer, *const c_int) -> Pointer;
         let mut found = vec![];
-        // SAFETY: the signatures are those of EGL_EXT_device_enumeration, EGL_EXT_device_query and EGL_EXT_platform_base; the
-        // functions receive devices that EGL returned, and buffers of the stated length.
+        // SAFETY: the signatures are those of EGL_EXT_device_enumeration, EGL_EXT_device_query and
+        // EGL_EXT_platform_base; the functions receive devices that EGL returned, and buffers of the stated length.
         unsafe {
             let query: Option<QueryDevices> = self.extension(c"eglQueryDevicesEXT");
             let describe: Option<QueryString> = self.extension(c"eglQueryDeviceStringEXT");

@@ -1,8 +1,9 @@
 //! MuJoCo's OpenGL renderer without a window, in contexts that EGL creates on a device.
 //!
-//! OpenGL requires that each context is used by one thread, while environments run on any thread. Contexts therefore belong
-//! to render threads of this module, which draw the jobs of a queue while the callers wait. Graphics cards are preferred; Mesa
-//! renders in software. `MUJOCO_EGL_DEVICE_ID` selects a device by index, as in MuJoCo's Python packages.
+//! OpenGL requires that each context is used by one thread, while environments run on any thread. Contexts therefore
+//! belong to render threads of this module, which draw the jobs of a queue while the callers wait. Graphics cards are
+//! preferred; Mesa renders in software. `MUJOCO_EGL_DEVICE_ID` selects a device by index, as in MuJoCo's Python
+//! packages.
 #![allow(
     unsafe_code,
     reason = "EGL and OpenGL through pointers, and scenes lent to another thread while the owner waits"
@@ -19,14 +20,15 @@ use std::sync::mpsc::{self, Sender};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use swm_core::{Error, Result};
 
-/// The most render threads: each holds contexts and their device memory.
+/// The maximal number of render threads: each holds contexts and their device memory.
 const MAX_THREADS: usize = 8;
 
-/// The most render threads on a graphics card; more do not increase its load.
+/// The maximal number of render threads on a graphics card; more do not increase its load.
 const MAX_HARDWARE_THREADS: usize = 4;
 
-/// Whether there is a usable graphics card. EGL is loaded only if the system has a device file of a card; otherwise it would load
-/// Mesa with its compiler, whose symbols conflict with those that PyTorch's Triton loads into the same process.
+/// Whether there is a usable graphics card. EGL is loaded only if the system has a device file of a card; otherwise it
+/// would load Mesa with its compiler, whose symbols conflict with those that PyTorch's Triton loads into the same
+/// process.
 pub(crate) fn has_hardware() -> bool {
     let is_card = |name: &str| name == "dri" || name == "dxg" || name.starts_with("nvidia");
     let devices = std::fs::read_dir("/dev").into_iter().flatten().flatten();
@@ -48,7 +50,8 @@ struct Job {
     completion: Arc<Completion>,
 }
 
-// SAFETY: the caller lends what a job points to until the job is complete; only one thread accesses it in between.
+// SAFETY: the caller keeps the memory that a job points to valid until the job is complete; only one thread accesses it
+// in between.
 unsafe impl Send for Job {}
 
 /// Jobs in order of arrival.

@@ -1,5 +1,5 @@
-//! Contacts of two boxes of which one touches with a face: the part of the other box that is parallel to the face, clipped by it.
-//! That part is a face, an edge or a corner; an axis counts as parallel up to 30 degrees.
+//! Contacts of two boxes of which one touches with a face: the part of the other box that is parallel to the face,
+//! clipped by it. That part is a face, an edge or a corner; an axis counts as parallel up to 30 degrees.
 
 use super::{BoxContacts, Face, OrientedBox, TINY, Vector, add, from_face_frame, sign, to_face_frame};
 
@@ -10,7 +10,8 @@ const STEEP: f64 = 0.5;
 pub fn face_contacts(flat: &OrientedBox, other: &OrientedBox, face: &Face, margin: f64) -> BoxContacts {
     let &Face { of_second, axis, positive } = face;
     let view = |v| to_face_frame(axis, positive, flat.local_direction(v));
-    // From here on, the face is the plane z = 0 with the other box above it, and its rectangle is centred at the origin.
+    // From here on, the face is the plane z = 0 with the other box above it, and its rectangle is centred at the
+    // origin.
     let [lx, ly, height] = to_face_frame(axis, positive, flat.half).map(f64::abs);
     let size = [lx, ly];
     let axes: [Vector; 3] = std::array::from_fn(|k| view(other.axis(k)));

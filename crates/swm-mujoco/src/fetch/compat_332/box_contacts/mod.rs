@@ -17,7 +17,7 @@ const TINY: f64 = 1e-15;
 /// Relative distance from the surface within which a point counts as neither inside nor outside.
 const SLACK: f64 = 0.01;
 
-/// The most contacts of two boxes: two for each side of the rectangle on each edge, and all corners.
+/// The maximal number of contacts of two boxes: two for each side of the rectangle on each edge, and all corners.
 const MAX_CONTACTS: usize = 24;
 
 /// A box in world coordinates.
@@ -118,10 +118,10 @@ enum LeastOverlap {
 
 /// A face of a box.
 struct Face {
-    /// Whether it belongs to the second box.
+    /// Whether the face belongs to the second box.
     of_second: bool,
     axis: usize,
-    /// Whether it is at the positive end of the axis.
+    /// Whether the face is at the positive end of the axis.
     positive: bool,
 }
 

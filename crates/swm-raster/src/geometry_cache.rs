@@ -79,8 +79,8 @@ impl GeometryCache {
         } else {
             layers.clear(settings.far);
         }
-        let draw = |layers: &mut Layers, (number, geom): (u32, &Geom)| {
-            layers.draw(number, geom, (settings.assets, settings.view), None, settings.casting);
+        let draw = |layers: &mut Layers, (index, geom): (u32, &Geom)| {
+            layers.draw(index, geom, (settings.assets, settings.view), None, settings.casting);
         };
         let (first, rest) = (geoms.clone().take(keep), geoms.skip(keep));
         if !known {
@@ -129,8 +129,8 @@ impl CachedView {
     /// Stores the poses of a frame's geoms. Returns how many of the first geoms equal those of the last frame.
     fn update_poses<'a>(&mut self, geoms: impl Iterator<Item = (u32, &'a Geom)>) -> usize {
         let (mut same, mut count) = (None, 0);
-        for (slot, (number, geom)) in geoms.enumerate() {
-            let pose = pose(number, geom);
+        for (slot, (index, geom)) in geoms.enumerate() {
+            let pose = pose(index, geom);
             match self.poses.get_mut(slot) {
                 Some(known) if *known == pose => {}
                 Some(known) => {
@@ -183,7 +183,7 @@ fn key(layers: &Layers, DrawSettings { view, far, casting, .. }: DrawSettings<'_
     bits(values.chain(sizes).chain([flags]))
 }
 
-fn pose(number: u32, geom: &Geom) -> Pose {
+fn pose(index: u32, geom: &Geom) -> Pose {
     let (kind, sizes) = match geom.shape {
         // The grid of a plane affects only its lighting.
         Shape::Plane(x, y) => (0, [x.half, y.half, 0.0]),
@@ -194,5 +194,5 @@ fn pose(number: u32, geom: &Geom) -> Pose {
         Shape::Mesh(mesh) => (u32::try_from(mesh).unwrap_or(u32::MAX).saturating_add(5), [0.0; 3]),
     };
     let values = sizes.into_iter().chain(geom.position).chain(geom.rotation).map(f32::to_bits);
-    bits([number, kind].into_iter().chain(values))
+    bits([index, kind].into_iter().chain(values))
 }

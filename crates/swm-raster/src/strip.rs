@@ -47,7 +47,7 @@ impl Strip {
     pub fn draw_geoms(&mut self, frame: &Frame<'_>, rows: Range<usize>, counts: impl Fn(usize) -> bool) {
         let Frame { scene, assets, view, pattern } = *frame;
         self.main.start(view.width, rows, pattern);
-        let geoms = (0u32..).zip(&scene.geoms).filter(|(number, _)| counts(*number as usize));
+        let geoms = (0u32..).zip(&scene.geoms).filter(|(index, _)| counts(*index as usize));
         let settings = DrawSettings { assets, view, far: scene.camera.far, casting: false };
         self.cache.draw(&mut self.main, settings, geoms);
     }
@@ -103,13 +103,13 @@ impl Strip {
 
     /// Draws the mirror image in the first reflective geom, without shadows.
     fn draw_reflection(&mut self, &Frame { scene, assets, view, .. }: &Frame<'_>, lights: Lighting<'_>) {
-        let reflecting = |number: &usize| {
-            let geom = &scene.geoms[*number];
+        let reflecting = |index: &usize| {
+            let geom = &scene.geoms[*index];
             let shape = matches!(geom.shape, Shape::Plane(..) | Shape::Box(_));
-            shape && geom.reflectance > 0.0 && !is_transparent(scene, *number, view)
+            shape && geom.reflectance > 0.0 && !is_transparent(scene, *index, view)
         };
-        let Some(number) = (0..scene.geoms.len()).find(reflecting) else { return };
-        let geom = &scene.geoms[number];
+        let Some(index) = (0..scene.geoms.len()).find(reflecting) else { return };
+        let geom = &scene.geoms[index];
         let normal = [geom.rotation[2], geom.rotation[5], geom.rotation[8]];
         // A box reflects on its upper side.
         let height = if let Shape::Box(halves) = geom.shape { halves[2] } else { 0.0 };
@@ -123,7 +123,7 @@ impl Strip {
         mirror.start(view.width, main.rows.clone(), main.pattern);
         mirror.ids.fill(NOTHING);
         // Only the pixels of the mirror, and only what lies in front of it.
-        let own = u32::try_from(number).unwrap_or(NOTHING);
+        let own = u32::try_from(index).unwrap_or(NOTHING);
         select_mirror(own, scene.camera.far, &main.ids, &mut mirror.depths);
         let mut seen = [usize::MAX, usize::MAX, 0, 0];
         for (other, geom) in (0u32..).zip(&scene.geoms) {
@@ -142,8 +142,7 @@ impl Strip {
     fn draw_transparent(&mut self, &Frame { scene, assets, view, .. }: &Frame<'_>, lights: Lighting<'_>) {
         let Self { main, transparent, painter, colours, transparent_geoms, .. } = self;
         transparent_geoms.clear();
-        for (number, geom) in scene.geoms.iter().enumerate().filter(|(number, _)| is_transparent(scene, *number, view))
-        {
+        for (index, geom) in scene.geoms.iter().enumerate().filter(|(index, _)| is_transparent(scene, *index, view)) {
             let distance = match geom.shape {
                 Shape::Plane(..) => 1e10,
                 shape => {
@@ -152,7 +151,7 @@ impl Strip {
                     dot(way, way).sqrt() - dot(halves, halves).sqrt()
                 }
             };
-            transparent_geoms.push((distance, number));
+            transparent_geoms.push((distance, index));
         }
         if transparent_geoms.is_empty() {
             return;
@@ -161,8 +160,8 @@ impl Strip {
         painter.start(scene.geoms.len());
         let context = ShadingContext { scene, assets, view, lights, dimmed: 1.0 };
         transparent.start(view.width, main.rows.clone(), main.pattern);
-        for &(_, number) in transparent_geoms.iter().chain(transparent_geoms.iter().rev()) {
-            let geom = &scene.geoms[number];
+        for &(_, index) in transparent_geoms.iter().chain(transparent_geoms.iter().rev()) {
+            let geom = &scene.geoms[index];
             let Some(region) = touched(geom, assets, view) else { continue };
             let [x0, y0, x1, y1] = main.part(region);
             for row in (y0..y1).map(|y| main.span(y, x0, x1)) {
@@ -170,9 +169,9 @@ impl Strip {
                 transparent.ids[row].fill(NOTHING);
             }
             transparent.clear_triangles();
-            transparent.draw(u32::try_from(number).unwrap_or(NOTHING), geom, (assets, view), None, false);
+            transparent.draw(u32::try_from(index).unwrap_or(NOTHING), geom, (assets, view), None, false);
             let opacity = match geom.shape {
-                Shape::Plane(..) if is_seen_from_behind(scene, number, view) => BACK_OPACITY * geom.rgba[3],
+                Shape::Plane(..) if is_seen_from_behind(scene, index, view) => BACK_OPACITY * geom.rgba[3],
                 _ => geom.rgba[3],
             };
             painter.paint(transparent, &context, region, |pixels, part, seen| {
@@ -208,15 +207,15 @@ fn intersection(a: Region, b: Region) -> Region {
 }
 
 /// Whether a geom is a plane that is seen from behind.
-fn is_seen_from_behind(scene: &Scene, number: usize, view: &View) -> bool {
-    let geom = &scene.geoms[number];
+fn is_seen_from_behind(scene: &Scene, index: usize, view: &View) -> bool {
+    let geom = &scene.geoms[index];
     let normal = [geom.rotation[2], geom.rotation[5], geom.rotation[8]];
     matches!(geom.shape, Shape::Plane(..)) && dot(sub(view.position, geom.position), normal) < 0.0
 }
 
 /// Whether a geom is transparent in a view.
-pub(crate) fn is_transparent(scene: &Scene, number: usize, view: &View) -> bool {
-    scene.geoms[number].rgba[3] < MIN_OPAQUE || is_seen_from_behind(scene, number, view)
+pub(crate) fn is_transparent(scene: &Scene, index: usize, view: &View) -> bool {
+    scene.geoms[index].rgba[3] < MIN_OPAQUE || is_seen_from_behind(scene, index, view)
 }
 
 /// Draws haze over the sky and the far ends of planes.

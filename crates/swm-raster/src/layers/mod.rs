@@ -177,7 +177,7 @@ impl Layers {
     /// the geom can touch.
     pub fn draw(
         &mut self,
-        number: u32,
+        index: u32,
         geom: &Geom,
         (assets, view): (&Assets, &View),
         floor: Option<&[f32]>,
@@ -195,12 +195,12 @@ impl Layers {
                 let level = mesh.level(number_of_level);
                 let position = u32::try_from(number_of_level).unwrap_or(0);
                 let both_sides = caster && !mesh.is_closed();
-                self.draw_mesh((number, position), geom, level, (view, part[1]..part[3]), floor, both_sides);
+                self.draw_mesh((index, position), geom, level, (view, part[1]..part[3]), floor, both_sides);
             }
             shape => {
                 let (_, halves) = shape.bounds();
                 let outline = Outline::new(geom, halves, view);
-                self.draw_shape(number, &PosedShape::new(geom, view)?, part, &outline, floor);
+                self.draw_shape(index, &PosedShape::new(geom, view)?, part, &outline, floor);
             }
         }
         Some(region)
@@ -208,7 +208,7 @@ impl Layers {
 
     fn draw_shape(
         &mut self,
-        number: u32,
+        index: u32,
         pose: &PosedShape,
         [left, y0, right, y1]: Region,
         outline: &Outline,
@@ -230,7 +230,7 @@ impl Layers {
                 depths: &mut self.depths[span.clone()],
                 ids: &mut self.ids[span],
             };
-            pose.enter(&pose.row(y), number, samples);
+            pose.enter(&pose.row(y), index, samples);
         }
         self.outline = [lows, highs];
     }

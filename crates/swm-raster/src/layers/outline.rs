@@ -32,8 +32,8 @@ impl Outline {
     /// Projects a bounding box with these half sides.
     pub fn new(geom: &Geom, halves: V3, view: &View) -> Self {
         let mut corners = [[0.0; 2]; 8];
-        for (number, corner) in corners.iter_mut().enumerate() {
-            let local = std::array::from_fn(|k| if number >> k & 1 == 1 { halves[k] } else { -halves[k] });
+        for (index, corner) in corners.iter_mut().enumerate() {
+            let local = std::array::from_fn(|k| if index >> k & 1 == 1 { halves[k] } else { -halves[k] });
             let ([x, y, w], depth) = view.project(add(geom.position, rotate(&geom.rotation, local)));
             if !(depth > view.near && x.is_finite() && y.is_finite()) {
                 return Self { edges: None };

@@ -44,7 +44,7 @@ impl Triangle {
 impl Layers {
     pub(super) fn draw_mesh(
         &mut self,
-        (number, position): (u32, u32),
+        (index, position): (u32, u32),
         geom: &Geom,
         level: &DetailLevel,
         (view, rows): (&View, Range<usize>),
@@ -66,13 +66,13 @@ impl Layers {
         let front = if view.mirrored { 1.0 } else { -1.0 };
         let front = if both_sides { 0.0 } else { front };
         let rules = DrawRules { front, near: view.near, floor, rows };
-        dispatch_avx2(MeshTriangles { layers: self, number: (number, position), level, vertices: &vertices, rules });
+        dispatch_avx2(MeshTriangles { layers: self, index: (index, position), level, vertices: &vertices, rules });
         self.vertices = vertices;
     }
 
     /// Draws a triangle in front of the camera if it faces the camera.
     #[inline(always)]
-    fn triangle(&mut self, simd: impl F32x8, number: (u32, u32, u32), [a, b, c]: [[f32; 4]; 3], rules: &DrawRules<'_>) {
+    fn triangle(&mut self, simd: impl F32x8, index: (u32, u32, u32), [a, b, c]: [[f32; 4]; 3], rules: &DrawRules<'_>) {
         let area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
         if area * rules.front < 0.0 || area.abs() <= 1e-12 || !area.is_finite() {
             return;
@@ -98,12 +98,12 @@ impl Layers {
         };
         let shares = [share(a, b, c), share(b, c, a), share(c, a, b)];
         let region = [x0 as usize, first as usize, x1 as usize, last as usize];
-        self.fill(simd, number, base, shares, depths, region, rules);
+        self.fill(simd, index, base, shares, depths, region, rules);
     }
 
     /// Draws a triangle that crosses the near plane.
     #[cold]
-    fn near_triangle(&mut self, number: (u32, u32, u32), corners: [[f32; 4]; 3], rules: &DrawRules<'_>) {
+    fn near_triangle(&mut self, index: (u32, u32, u32), corners: [[f32; 4]; 3], rules: &DrawRules<'_>) {
         // A weight divided by w is linear on the screen: the inverse of the matrix of the corners.
         let [a, b, c] =
             corners.map(|[x, y, w, _]| [f64::from(x) * f64::from(w), f64::from(y) * f64::from(w), f64::from(w)]);
@@ -117,7 +117,7 @@ impl Layers {
         }
         let shares = [bc, ca, ab].map(|row| row.map(|x| (x / determinant) as f32));
         let region = [0, rules.rows.start, self.width, rules.rows.end];
-        self.fill(Portable, number, [0.0; 2], shares, corners.map(|corner| corner[3]), region, rules);
+        self.fill(Portable, index, [0.0; 2], shares, corners.map(|corner| corner[3]), region, rules);
     }
 
     /// Draws a triangle, given by the equations of its corners' weights divided by `w`, within a region whose left
@@ -200,7 +200,7 @@ impl Layers {
 struct MeshTriangles<'a> {
     layers: &'a mut Layers,
     /// The geom, and the detail level of its mesh.
-    number: (u32, u32),
+    index: (u32, u32),
     level: &'a DetailLevel,
     vertices: &'a [[f32; 4]],
     rules: DrawRules<'a>,
@@ -223,15 +223,15 @@ impl Kernel for MeshTriangles<'_> {
     #[inline(always)]
     fn run<L: swm_simd::Level>(self) {
         let simd = L::f32x8();
-        let Self { layers, number, level, vertices, rules } = self;
+        let Self { layers, index, level, vertices, rules } = self;
         for (face, &[a, b, c]) in level.faces.iter().enumerate() {
             let corners = [vertices[a as usize], vertices[b as usize], vertices[c as usize]];
-            let number = (number.0, number.1, face as u32);
+            let index = (index.0, index.1, face as u32);
             let [p, q, r] = corners.map(|corner| corner[3] > rules.near);
             if p & q & r {
-                layers.triangle(simd, number, corners, &rules);
+                layers.triangle(simd, index, corners, &rules);
             } else if p | q | r {
-                layers.near_triangle(number, corners, &rules);
+                layers.near_triangle(index, corners, &rules);
             }
         }
     }

@@ -91,7 +91,7 @@ impl Batch {
         &mut self,
         grids: &mut LightGrids,
         runs: &[Run],
-        (number, geom, shape_pose): (u32, &Geom, Option<&PosedShape>),
+        (index, geom, shape_pose): (u32, &Geom, Option<&PosedShape>),
         layers: &Layers,
         context: &ShadingContext<'_>,
     ) {
@@ -106,7 +106,7 @@ impl Batch {
         let material = Material::new(geom, context.dimmed);
         let lit_at_corners = self.is_coarse(geom, context.view);
         let passes = 1 + context.lights.shadowed.len();
-        let start = if lit_at_corners { grids.of(number, geom, passes) } else { 0 };
+        let start = if lit_at_corners { grids.of(index, geom, passes) } else { 0 };
         if lit_at_corners {
             self.cells(geom);
         }
@@ -125,7 +125,7 @@ impl Batch {
                 let (positions, normals) =
                     (self.position.each_ref().map(|l| &l[..n]), self.normal.each_ref().map(|l| &l[..n]));
                 let lit = &mut self.lit[..n];
-                shadow.write_lit(number, light, positions, normals, lit);
+                shadow.write_lit(index, light, positions, normals, lit);
                 for (sum, light) in self.sum.iter_mut().zip(&self.pass) {
                     add_lit(&mut sum[..n], &light[..n], lit);
                 }

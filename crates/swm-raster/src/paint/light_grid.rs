@@ -171,8 +171,8 @@ impl GridCell {
 
 impl LightGrids {
     /// Returns the index of a geom's first corner, adding its corners at first use.
-    pub fn of(&mut self, number: u32, geom: &Geom, passes: usize) -> usize {
-        let start = &mut self.starts[number as usize];
+    pub fn of(&mut self, index: u32, geom: &Geom, passes: usize) -> usize {
+        let start = &mut self.starts[index as usize];
         if *start == u32::MAX {
             let corners = match geom.shape {
                 Shape::Plane(x, y) => (x.cells + 1) * (y.cells + 1),

@@ -77,16 +77,16 @@ impl Painter {
             self.gather(layers, [x0, y, x1, next]);
             let mut begin = 0;
             for k in 0..self.present.len() {
-                let number = self.present[k];
+                let index = self.present[k];
                 // After sorting, counts are the ends of the runs.
-                let end = std::mem::take(&mut self.counts[number as usize]);
-                let geom = &context.scene.geoms[number as usize];
+                let end = std::mem::take(&mut self.counts[index as usize]);
+                let geom = &context.scene.geoms[index as usize];
                 let shape_pose = PosedShape::new(geom, context.view);
                 let mut runs = self.sorted[begin..end].iter().copied();
                 let mut rest = runs.next();
                 while rest.is_some() {
                     rest = fill(&mut self.lit, rest, &mut runs);
-                    self.batch.shade(&mut self.grids, &self.lit, (number, geom, shape_pose.as_ref()), layers, context);
+                    self.batch.shade(&mut self.grids, &self.lit, (index, geom, shape_pose.as_ref()), layers, context);
                     self.batch.show(&self.lit, layers, &mut show);
                 }
                 begin = end;

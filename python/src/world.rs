@@ -12,6 +12,7 @@ use serde_json::{Map, Value};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, TryLockError};
 use std::time::{Duration, Instant};
+use swm::core::columns::{TERMINATED, TRUNCATED};
 use swm::core::pool::Reset;
 use swm::core::results::Counting;
 use swm::core::run::{Control, Event};
@@ -201,7 +202,7 @@ impl World {
         let mut poll = signal_poll();
         py.detach(|| {
             let schema = world.pool().infos().schema();
-            let flags = [schema.index("terminated")?, schema.index("truncated")?];
+            let flags = [schema.index(TERMINATED)?, schema.index(TRUNCATED)?];
             let mut active = vec![true; world.pool().len()];
             for _ in 0..steps {
                 poll()?;

@@ -320,7 +320,7 @@ def test_a_wrong_model_stops_an_evaluation(how, error, words):
         (lambda: plan(solvers.GradientSolver(Wrong("detached"), num_samples=20)), ValueError, "differentiable"),
         (lambda: plan(solvers.GRASPSolver(Quadratic())), ValueError, "grasp|latent"),
         (lambda: plan(solvers.LagrangianSolver(Quadratic(), tolerance=-1)), ValueError, "tolerance"),
-        (lambda: plan(solvers.CEMSolver(Prices()), space=CHOICES), ValueError, "categorical_cem"),
+        (lambda: plan(solvers.CEMSolver(Prices()), space=CHOICES), ValueError, "continuous actions.*swm solvers"),
         (lambda: plan(solvers.PGDSolver(Quadratic())), ValueError, "gd|continuous"),
         (lambda: solvers.GradientSolver(Quadratic(), optimizer_cls=torch.optim.RMSprop), ValueError, "adam|Adam"),
         (lambda: swm.PlanConfig(horizon=2, receding_horizon=3), ValueError, "execute"),

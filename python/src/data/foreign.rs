@@ -5,11 +5,12 @@ use crate::arrays;
 use crate::errors::from_py_err;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use swm::core::columns::{EPISODE_IDX, STEP_IDX};
 use swm::core::{Batch, Error, Manifest, Result, Schema};
 use swm::data::{Constants, Episode, Reader, StepRange, Writer, checksum};
 
 /// The columns with the indices of episodes and steps, which the engine computes.
-const NUMBERING: [&str; 2] = ["episode_idx", "step_idx"];
+const NUMBERING: [&str; 2] = [EPISODE_IDX, STEP_IDX];
 
 /// A reader implemented by a Python object. The object has `schema()`, a list of `(name, type, shape)`; `lengths()`, the
 /// rows of every episode; and `rows(column, episode, start, length)`, an array `[length, ..]` of the column's type.

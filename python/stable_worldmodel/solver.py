@@ -288,7 +288,7 @@ class CategoricalCEMSolver(EngineSolver):
     _names = {"num_samples": "samples", "n_steps": "iterations", "topk": "elites", "alpha": "momentum"}
 
 
-_GRADIENT = {"num_samples": "samples", "n_steps": "iterations", "var_scale": "sigma", "grad_clip": "clip"}
+_GRADIENT = {"num_samples": "samples", "n_steps": "iterations", "var_scale": "sigma"}
 
 
 class _Gradient(EngineSolver):
@@ -328,7 +328,7 @@ class GradientSolver(_Gradient):
     """Gradient descent on the cost from several initial action sequences."""
 
     id = "gd"
-    _names = _GRADIENT
+    _names = {**_GRADIENT, "grad_clip": "clip"}
     _optimizer = "sgd"
 
 

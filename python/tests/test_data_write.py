@@ -243,12 +243,12 @@ import sys
 from stable_worldmodel import data, _engine
 from stable_worldmodel.data import utils
 
-def tell(stage, done, total):
+def report(stage, done, total):
     if done == 2:
         print("converting", flush=True)
         sys.stdin.readline()
 
-utils._telling = lambda progress: tell
+utils._progress_callback = lambda progress: report
 try:
     data.convert(sys.argv[1], sys.argv[2])
 except KeyboardInterrupt:

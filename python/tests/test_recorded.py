@@ -208,7 +208,7 @@ def test_wrong_callables_raise_clear_errors(fields, recorded, workers):
     assert "set_state" in error(None) and "callables" in error(None)
     assert "COLUMN" in error(call("teleport", where="state"))
     assert "column" in error(call("teleport", where={"value": 3}))
-    assert "array of numbers" in error(call("aim", at={"value": object(), "in_dataset": False}), kind=TypeError)
+    assert "numeric array" in error(call("aim", at={"value": object(), "in_dataset": False}), kind=TypeError)
     raised = RuntimeError if workers else TypeError
     assert "where" in error(call("teleport", scale={"value": 1, "in_dataset": False}), kind=raised)
 

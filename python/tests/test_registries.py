@@ -21,8 +21,6 @@ def test_every_solver_has_a_class():
 def test_solver_settings_are_those_of_the_engine(id):
     kind, defaults = SOLVERS[id], json.loads(_engine.solvers())[id]
     assert set(kind._names.values()) <= set(defaults)
-    if hasattr(kind, "_optimizer"):
-        assert defaults["optimizer"]["kind"] == kind._optimizer
     # The engine's defaults are valid settings of the class.
     assert kind("simulator", **defaults).settings == defaults
 

@@ -89,7 +89,7 @@ fn bench_data_measures_loading() {
     let rates = found["rates"].as_array().expect("rates");
     let named = |name: &str| rates.iter().find(|row| row["what"] == name).unwrap_or_else(|| panic!("{name}: {found}"));
     assert!(named("lance, lossless")["rate"].as_f64().expect("a rate") > 0.0);
-    assert!(named("lance, jpeg, all kept on disk")["ours"][0].as_f64().expect("a rate") > 0.0);
+    assert!(named("lance, jpeg, all cached on disk")["ours"][0].as_f64().expect("a rate") > 0.0);
     assert_eq!(found["resident"].as_array().map(Vec::len), Some(2));
     swm.fails(&["bench", "data", "--pairs", "0"], 2, &["at least 1 pair"]);
 }

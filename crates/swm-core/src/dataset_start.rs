@@ -1,7 +1,7 @@
 //! Starting an episode at a recorded row of a dataset, towards the state of another row.
 //!
-//! [`required_columns`] and [`reset`] do it for any environment: by [`Env::reset`] and [`Env::restore_from`], or by the
-//! environment's own [`DatasetStartEnv`] where it cannot restore its state from a row.
+//! [`reset`] starts any environment in this way, and [`required_columns`] lists the columns that it reads. Both use
+//! [`DatasetStartEnv`] if the environment implements it, otherwise [`Env::reset`] and [`Env::restore_from`].
 
 use crate::batch::{RowRef, Schema};
 use crate::{Env, Error, ResetOptions, Result, columns};
@@ -16,7 +16,7 @@ pub struct DatasetStart<'a> {
     pub start: RowRef<'a>,
     /// The row whose state is the goal.
     pub goal: RowRef<'a>,
-    /// Methods that put a third-party environment into a state; native environments need none.
+    /// Methods that set the state of a third-party environment; native environments need none.
     pub callables: &'a [Callable],
 }
 

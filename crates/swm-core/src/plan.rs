@@ -1,7 +1,7 @@
 //! Planning: a [`CostModel`] scores candidate action sequences, a [`Solver`] minimises the cost and returns a [`Plan`].
 //!
 //! Model and solver exchange plain host slices, so solvers depend on no deep-learning framework. All environments that
-//! replan at a step share one call, yet the plan of each depends on its own cost and key only.
+//! replan at a step share one call. The plan of an environment depends on its own cost and key only.
 
 use crate::{Batch, Env, Key, Result};
 use serde::Serialize;

@@ -1,6 +1,7 @@
 //! [`Results`]: the results of an evaluation, as written to `results.json` and read by reports.
 //!
-//! The manifest determines everything except [`Run::timing`]: two equal evaluations write equal results, times aside.
+//! The manifest determines everything except [`Run::timing`], so two evaluations with equal manifests write results
+//! that differ in their timing only.
 
 mod counting;
 mod paired;

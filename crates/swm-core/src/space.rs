@@ -1,7 +1,7 @@
 //! [`Space`]: the set of values of an action, an observation or a factor of variation.
 //!
 //! A value of any space is a slice of `f64` (exact for every type here). The space gives its shape, element type and
-//! bounds. Its JSON form is that of `swm fovs --json`.
+//! bounds. [`Space`] serialises to the JSON that `swm fovs --json` prints.
 
 use crate::batch::DType;
 use crate::{Error, Result, Rng};

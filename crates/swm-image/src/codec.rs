@@ -9,7 +9,8 @@ use swm_core::{Error, Result};
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
 pub enum ImageCodec {
-    /// JPEG with chrominance at half resolution (4:2:0), as the reference's datasets store it (with quality 95).
+    /// JPEG with chrominance at half resolution (4:2:0), as datasets of the reference implementation store frames (with
+    /// quality 95).
     Jpeg {
         /// 1 (smallest files) to 100 (most faithful).
         quality: u8,
@@ -127,7 +128,8 @@ pub fn decode(bytes: &[u8], height: usize, width: usize, out: &mut [u8]) -> Resu
             if jpeg::decode(bytes, height, width, out) {
                 return Ok(());
             }
-            // The fast decoder refuses other kinds of JPEG, other sizes and damaged files; the general one decides.
+            // The fast decoder returns false for unsupported kinds of JPEG, other sizes and damaged files. The general
+            // decoder decodes unsupported kinds and returns an error for the rest.
             let decoder = jpeg::Decoder::new(bytes)?;
             check(decoder.size())?;
             decoder.decode(out)
@@ -160,7 +162,7 @@ mod tests {
         rgb
     }
 
-    /// The test image and what decoding its encoding returns.
+    /// Returns the test image, and the pixels after encoding and decoding it.
     fn round_trip(codec: ImageCodec, height: usize, width: usize) -> (Vec<u8>, Vec<u8>) {
         let rgb = test_image(height, width);
         let mut bytes = vec![];

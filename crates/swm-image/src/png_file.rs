@@ -1,4 +1,4 @@
-//! PNG: the stored form of frames in memory, and files for people.
+//! PNG: encoding and decoding of stored frames in memory, and reading and writing of image files.
 
 use crate::RgbImage;
 use png::{Compression, EncodingError, Filter, Transformations};
@@ -7,13 +7,13 @@ use std::io::{BufReader, BufWriter, Cursor};
 use std::path::Path;
 use swm_core::{Error, Result};
 
-/// Bytes that the pixels of a PNG file may take in memory.
+/// The maximum size of the pixels of a PNG file in memory, in bytes.
 const MAX_BYTES: usize = 1 << 30;
 
 /// Appends an RGB image, `[height, width, 3]`, as a PNG file tuned for fast decoding.
 ///
 /// # Errors
-/// When the PNG encoder refuses it.
+/// When the PNG encoder fails.
 pub fn encode(rgb: &[u8], height: u16, width: u16, out: &mut Vec<u8>) -> Result<()> {
     let failed = |error: EncodingError| Error::external("encoding a PNG image", error);
     let mut encoder = png::Encoder::new(out, width.into(), height.into());

@@ -1,4 +1,4 @@
-//! Episodes that start at a row of a dataset.
+//! Tests of episodes that start at a row of a dataset.
 
 use crate::config;
 use crate::play::{RecordedEnv, make};

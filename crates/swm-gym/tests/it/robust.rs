@@ -16,7 +16,7 @@ fn outputs_are_the_same_when_a_worker_dies_in_an_episode() {
     let expected = play(ROOM, &config, &[1], 1, 6);
     let dying = format!("{ROOM},die_at=4,marker={}", marker.display());
     assert!(play(&dying, &config, &[1], 1, 6) == expected);
-    assert!(marker.exists(), "the worker died");
+    assert!(marker.exists(), "the worker did not die");
 }
 
 #[test]
@@ -78,7 +78,7 @@ fn dispatched_calls_are_repeated_in_a_new_worker() {
 
 pub fn kill_process(id: u32) {
     let killed = std::process::Command::new("kill").args(["-9", &id.to_string()]).status();
-    assert!(killed.expect("kill").success());
+    assert!(killed.expect("the program `kill`").success());
 }
 
 #[test]

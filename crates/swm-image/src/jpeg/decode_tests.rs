@@ -47,7 +47,7 @@ fn decodes_bit_for_bit_as_pillow() {
             assert!(decode_at_baseline(&bytes, height, width, &mut out), "{name}");
             assert!(out == expected, "{name} without AVX2");
         }
-        // The general decoder reads the others, and rounds differently.
+        // The general decoder also reads the kinds that the fast decoder does not support. It rounds differently.
         crate::decode(&bytes, height, width, &mut out).expect("an image");
         let off: u32 = out.iter().zip(&expected).map(|(a, b)| u32::from(a.abs_diff(*b))).sum();
         assert!(f64::from(off) / (expected.len() as f64) < 3.0, "{name}: {off}");
@@ -55,9 +55,8 @@ fn decodes_bit_for_bit_as_pillow() {
     }
 }
 
-/// Patches of one colour, alike and not, at every position of images of many sizes.
 #[test]
-fn patches_decode_alike_with_and_without_avx2() {
+fn random_rectangles_decode_equally_with_and_without_avx2() {
     let mut seed = 1_u32;
     let mut next = move |n: u32| {
         seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -83,7 +82,7 @@ fn patches_decode_alike_with_and_without_avx2() {
 }
 
 #[test]
-fn damaged_files_are_refused_or_decoded_without_panic() {
+fn damaged_files_fail_or_decode_without_panic() {
     let images = pillow_images();
     let mut out = vec![0; 112 * 112 * 3];
     for (name, bytes, [height, width], _) in &images {
@@ -99,6 +98,6 @@ fn damaged_files_are_refused_or_decoded_without_panic() {
                 damaged[at] = bytes[at];
             }
         }
-        assert_eq!(decode(bytes, *height, *width, out), !name.starts_with("other"), "{name} after the damaged ones");
+        assert_eq!(decode(bytes, *height, *width, out), !name.starts_with("other"), "{name} after damaged files");
     }
 }

@@ -48,7 +48,7 @@ fn scaled(table: &[u8; 64], quality: u8) -> [u8; 64] {
     table.map(|value| ((u32::from(value) * scale + 50) / 100).clamp(1, 255) as u8)
 }
 
-/// Copies an MCU out of an image; beyond the edges the last row and column repeat.
+/// Copies an MCU out of an image; beyond the edges the last row and column are repeated.
 fn gather(rgb: &[u8], (h, w): (usize, usize), (top, left): (usize, usize), mcu: &mut [u8; MCU * LINE]) {
     let columns = MCU.min(w - left);
     for (row, line) in mcu.chunks_exact_mut(LINE).enumerate() {
@@ -88,7 +88,7 @@ fn round(value: f32) -> i32 {
 struct Scan<'a> {
     /// Bits that are not written yet, at the low end.
     bits: u64,
-    /// How many more bits fit.
+    /// The number of bits that still fit.
     free: u32,
     out: &'a mut Vec<u8>,
     /// The last DC coefficient of each component.
@@ -312,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn images_of_one_colour_keep_it() {
+    fn images_of_one_colour_keep_their_colour() {
         for color in [[0, 0, 0], [255, 255, 255], [255, 0, 0], [0, 0, 255], [144, 238, 144], [12, 200, 77]] {
             let flat = image(40, 33, |_, _| color);
             let worst = decoded(&flat, 40, 33, 95).iter().zip(&flat).map(|(&a, &b)| a.abs_diff(b)).max();

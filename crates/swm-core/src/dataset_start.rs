@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
 
-/// A start and a goal from a dataset: two rows, their columns under [`columns::flat`] names.
+/// A start and a goal from a dataset: two rows, whose columns have [`columns::flat`] names.
 #[derive(Clone, Copy)]
 pub struct DatasetStart<'a> {
     /// The row at which the episode starts.

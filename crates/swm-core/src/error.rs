@@ -79,7 +79,7 @@ pub enum Error {
         /// How to fix it.
         fix: String,
     },
-    /// The operating system refused a file operation.
+    /// A file operation failed.
     #[error("{}: {action}: {source}{}", .path.display(), disk_hint(.source))]
     Io {
         /// The file or folder.

@@ -218,7 +218,7 @@ pub struct PlanTrace {
     /// The mean spread of the sampling distribution after the iteration, or of the candidates if the solver has none.
     pub spread: Vec<f32>,
     /// The largest constraint value of the best candidate, if the model has constraints and the solver enforces them.
-    /// It is at most 0, or the solver's tolerance, when all are satisfied.
+    /// The value is at most 0, or at most the solver's tolerance, when all constraints are satisfied.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub violation: Vec<f32>,
 }

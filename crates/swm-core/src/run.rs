@@ -17,7 +17,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 pub enum Event<'a> {
     /// A stage starts.
     Started(Stage<'a>),
-    /// Part of the current stage is done.
+    /// The progress of the current stage.
     Progress(Progress<'a>),
     /// A one-line message for the user.
     Log(&'a str),

@@ -38,7 +38,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn budget_ends_with_its_work() {
+    fn budget_is_restored_after_the_work() {
         let budgets = with(3, || (threads(), with(2, threads), threads()));
         assert_eq!((budgets, threads()), ((3, 2, 3), 1));
         assert!(std::panic::catch_unwind(|| with(5, || panic!("as a test"))).is_err());
@@ -46,7 +46,7 @@ mod tests {
     }
 
     #[test]
-    fn all_threads_are_those_of_the_pool() {
+    fn all_sets_the_thread_count_of_the_pool() {
         let pool = crate::pool::threads(3).expect("a thread pool");
         assert_eq!(pool.install(|| all(threads)), 3);
     }

@@ -215,13 +215,13 @@ mod tests {
         assert_eq!(bytes.remove(0), 7, "appends");
         assert_eq!(size(&bytes).expect("a header"), (height.into(), width.into()));
         let mut back = vec![0; rgb.len()];
-        decode(&bytes, &mut back).expect("decodes");
+        decode(&bytes, &mut back).expect("a decoded image");
         assert!(back == rgb, "{height} x {width} differs after a round trip");
         bytes
     }
 
     #[test]
-    fn operations_are_those_of_the_specification() {
+    fn encodes_operations_of_the_specification() {
         // Two pixels of the colour of `START`, one with a small difference, one with a larger difference, an unrelated
         // one, an earlier one, and a run of 63.
         let mut pixels = vec![[0, 0, 0], [0, 0, 0], [1, 255, 1], [11, 9, 9], [200, 0, 7], [1, 255, 1]];
@@ -240,7 +240,7 @@ mod tests {
         bytes.extend([RGBA, 10, 20, 30, 40, DIFF | 0b11_10_01]);
         bytes.extend(END);
         let mut out = [0; 6];
-        decode(&bytes, &mut out).expect("decodes");
+        decode(&bytes, &mut out).expect("a decoded image");
         assert_eq!(out, [10, 20, 30, 11, 20, 29]);
     }
 

@@ -414,7 +414,7 @@ fn set_extradata(context: &mut codec::Context, bytes: &[u8]) {
     let Ok(length) = i32::try_from(bytes.len()) else { return };
     // The wrapper sets these only by opening a file with libavformat, whose parsers must not read damaged files.
     // SAFETY: the memory comes from FFmpeg's allocator, has the zeroed padding that decoders read, is filled within its
-    // length, and belongs to the context from here on, which frees it. The context was not opened yet and has none.
+    // length, and then belongs to the context, which frees it. The context is not open yet and has no extradata.
     unsafe {
         let memory = ffi::av_mallocz(bytes.len() + ffi::AV_INPUT_BUFFER_PADDING_SIZE as usize).cast::<u8>();
         if memory.is_null() {
@@ -435,7 +435,7 @@ mod tests {
     fn odd(name: &str) -> (Vec<u8>, Video) {
         let stem = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop").join(format!("odd-{name}"));
         let expected = swm_image::read_png(&stem.with_extension("png")).expect("a PNG").rgb;
-        (expected, Video::open(Source::File(stem.with_extension("mp4"))).expect("opens"))
+        (expected, Video::open(Source::File(stem.with_extension("mp4"))).expect("a readable video"))
     }
 
     #[test]
@@ -446,8 +446,8 @@ mod tests {
             let (expected, video) = odd(name);
             assert_eq!((video.frames(), video.size()), (14, (32, 48)), "{name}");
             let size = 32 * 48 * 3;
-            let bytes: Arc<[u8]> = std::fs::read(video.source.label()).expect("reads").into();
-            let same = Video::open(Source::Memory("a blob".into(), bytes)).expect("opens");
+            let bytes: Arc<[u8]> = std::fs::read(video.source.label()).expect("a readable file").into();
+            let same = Video::open(Source::Memory("a blob".into(), bytes)).expect("a readable video");
             // Frames one by one from the file, then all frames in reverse order from memory, then frames with
             // repetitions.
             let orders: [Vec<usize>; 3] = [(0..14).collect(), (0..14).rev().collect(), vec![9, 3, 9, 13, 0, 3]];
@@ -458,9 +458,9 @@ mod tests {
                 let wanted: Vec<FrameRequest<'_>> =
                     frames.map(|(&frame, out)| FrameRequest { video, frame, out }).collect();
                 if i == 0 {
-                    wanted.into_iter().for_each(|wanted| decoders.read(vec![wanted]).expect("decodes"));
+                    wanted.into_iter().for_each(|wanted| decoders.read(vec![wanted]).expect("decoded frames"));
                 } else {
-                    decoders.read(wanted).expect("decodes");
+                    decoders.read(wanted).expect("decoded frames");
                 }
                 for (&frame, found) in order.iter().zip(out.chunks_exact(size)) {
                     let off: usize =
@@ -476,7 +476,7 @@ mod tests {
         let (_, video) = odd("times");
         for t in 0..14 {
             let time = f64::from(350 + 40 * t + 11 * t * t) / 1000.0;
-            let (frame, away) = video.frame_at(time + 0.004).expect("has frames");
+            let (frame, away) = video.frame_at(time + 0.004).expect("a frame");
             assert_eq!(frame, t as usize);
             assert!((away - 0.004).abs() < 1e-3, "{away}");
         }
@@ -490,7 +490,7 @@ mod tests {
         let mut out = vec![0; 32 * 48 * 3];
         let error = |frame, out: &mut [u8]| {
             let wanted = vec![FrameRequest { video: &video, frame, out }];
-            DecoderPool::default().read(wanted).expect_err("fails").to_string()
+            DecoderPool::default().read(wanted).expect_err("an error").to_string()
         };
         assert!(error(14, &mut out).contains("14 frames"));
         assert!(error(0, &mut out[1..]).contains("48 x 32"));

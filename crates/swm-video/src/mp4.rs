@@ -30,7 +30,7 @@ pub struct Sample {
     pub size: u32,
     /// Presentation time, in the track's units.
     pub time: i64,
-    /// Whether decoding can begin here.
+    /// Whether decoding can begin at this sample.
     pub key: bool,
 }
 

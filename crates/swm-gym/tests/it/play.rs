@@ -318,7 +318,7 @@ fn unsupported_requests_are_errors() {
     assert!(env.env.step(Action::Continuous(&[0.0])).is_err(), "an action of another kind");
     env.env.step(Action::Discrete(&[1])).expect("a step after invalid actions");
 
-    let unknown = swm_gym::make("CartPoel-v1", config.clone()).err().expect("unknown").to_string();
+    let unknown = swm_gym::make("CartPoel-v1", config.clone()).err().expect("an unknown id").to_string();
     assert!(unknown.contains("did you mean CartPole-v1"), "{unknown}");
     let wrong = swm_gym::make("CartPole-v1,sutton=1", config.clone()).err().expect("no such argument").to_string();
     assert!(wrong.contains("sutton") && wrong.contains("CartPole-v1"), "{wrong}");

@@ -102,7 +102,7 @@ fn an_exception_is_an_error_without_another_attempt() {
     let mut env = make(&format!("{ROOM},raise_at=2"), &config);
     env.reset(0, &ResetOptions::default()).expect("a reset");
     env.step(PUSH).expect("a step");
-    let error = env.step(PUSH).expect_err("it raises").to_string();
+    let error = env.step(PUSH).expect_err("an exception").to_string();
     for words in [ROOM, "its step raised", "raise ValueError('the room is on fire')", "environments.py"] {
         assert!(error.contains(words), "{words}: {error}");
     }
@@ -117,7 +117,7 @@ fn a_hanging_environment_is_stopped() {
     let mut env = make(&format!("{ROOM},hang_at=2"), &config);
     env.reset(0, &ResetOptions::default()).expect("a reset");
     env.step(PUSH).expect("a step");
-    let error = env.step(PUSH).expect_err("it hangs").to_string();
+    let error = env.step(PUSH).expect_err("a timeout").to_string();
     for words in ["2 workers", "did not answer within 1.5s", "about to hang"] {
         assert!(error.contains(words), "{words}: {error}");
     }

@@ -9,10 +9,11 @@ use swm_simd::{CpuLevel, limit_cpu_level};
 /// A name, the bytes of the file, height and width, and the pixels that Pillow decodes.
 type PillowImage = (String, Vec<u8>, [usize; 2], Vec<u8>);
 
-/// The images that Pillow wrote, and what it decodes them to (`tests/interop/jpeg_export.py`).
+/// Returns the images that Pillow wrote, and the pixels that Pillow decodes from them (`tests/interop/jpeg_export.py`).
 fn pillow_images() -> Vec<PillowImage> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/jpeg");
-    let mut paths: Vec<_> = std::fs::read_dir(folder).expect("images").map(|e| e.expect("entry").path()).collect();
+    let mut paths: Vec<_> =
+        std::fs::read_dir(folder).expect("a folder of images").map(|e| e.expect("a folder entry").path()).collect();
     paths.retain(|path| path.extension().is_some_and(|extension| extension == "jpg"));
     paths.sort();
     let read = |path: &Path| {

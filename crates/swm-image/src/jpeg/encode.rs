@@ -60,7 +60,7 @@ fn gather(rgb: &[u8], (h, w): (usize, usize), (top, left): (usize, usize), mcu: 
     }
 }
 
-/// Whether one quarter of an MCU (0 and 1 above, 2 and 3 below) has one colour.
+/// Whether one quarter of an MCU (0 and 1 in the upper half, 2 and 3 in the lower half) has one colour.
 fn quarter_is_flat(mcu: &[u8; MCU * LINE], quarter: usize) -> bool {
     let start = quarter / 2 * 8 * LINE + quarter % 2 * (LINE / 2);
     let row = |row: usize| &mcu[start + row * LINE..][..LINE / 2];
@@ -145,7 +145,7 @@ impl Scan<'_> {
         self.block(2, &chroma[1]);
     }
 
-    /// Writes a block of one value.
+    /// Writes a block whose samples are all equal.
     fn flat_block(&mut self, component: usize, value: f32) {
         let kind = usize::from(component > 0);
         // The DC coefficient is 8 times the value, and 64 times with the factor that the transform keeps.

@@ -263,7 +263,7 @@ def only_argument(method):
     except (TypeError, ValueError):
         return None
     required = [p for p in parameters if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
-    return required[0].name if len(required) == 1 and required[0].kind is not free[0].POSITIONAL_ONLY else None
+    return required[0].name if len(required) == 1 and required[0].kind is not required[0].POSITIONAL_ONLY else None
 
 
 def argument(value):

@@ -72,8 +72,8 @@ pub fn counting_allocator_is_active() {
     assert_eq!(allocations(|| _ = std::hint::black_box([1u8; 100])), 0);
 }
 
-/// Steps every environment, with default factors and with all varied, and renders it and its goal at these frame sizes
-/// (pixels per side).
+/// Steps every environment, with default factors and with all factors varied, and renders it and its goal as square
+/// frames of `sides` pixels per side.
 ///
 /// # Panics
 /// When a step, an observation or a frame allocates memory or fails.

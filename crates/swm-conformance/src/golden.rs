@@ -13,11 +13,11 @@ use swm_core::VariationRequest;
 /// They are read from `tests/golden` in the crate's folder and from the folder that `SWM_GOLDEN` names (default:
 /// `shared/reference/golden` next to the workspace). Of two files with the same name, the latter is used.
 pub fn files(crate_folder: &str, prefix: &str) -> Vec<PathBuf> {
-    let here = Path::new(crate_folder);
+    let root = Path::new(crate_folder);
     let shared =
-        std::env::var_os("SWM_GOLDEN").map_or_else(|| here.join("../../../shared/reference/golden"), PathBuf::from);
+        std::env::var_os("SWM_GOLDEN").map_or_else(|| root.join("../../../shared/reference/golden"), PathBuf::from);
     let mut found = BTreeMap::new();
-    for folder in [here.join("tests/golden"), shared] {
+    for folder in [root.join("tests/golden"), shared] {
         for entry in std::fs::read_dir(&folder).into_iter().flatten().flatten() {
             let name = entry.file_name().to_string_lossy().into_owned();
             if name.starts_with(prefix) && name.ends_with(".npz") {

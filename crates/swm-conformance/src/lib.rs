@@ -5,7 +5,7 @@
 //! static SUITE: Suite = Suite::of(my_crate::ENVS.rows);
 //! swm_conformance::tests!(SUITE);
 //! ```
-//! makes one test of each of the [`checks`].
+//! This makes one test of each of the [`checks`].
 
 pub mod allocation;
 pub mod checks;

@@ -19,7 +19,7 @@ impl Modality {
     const ALL: [(Self, &'static str); 3] =
         [(Self::Rgb, columns::PIXELS), (Self::Depth, columns::DEPTH), (Self::Segmentation, columns::SEGMENTATION)];
 
-    /// The name of its columns: `pixels`, `depth` or `segmentation`.
+    /// The name of the modality in column names: `pixels`, `depth` or `segmentation`.
     pub fn name(self) -> &'static str {
         Self::ALL[self as usize].1
     }

@@ -1,7 +1,7 @@
 //! Column names: constants for the standard columns, their indices in a schema, and the encodings of names.
 //!
-//! Every other file spells a standard column by its constant and encodes or decodes a name by a function of this
-//! module, so that a column has one name on the way from an environment to a report.
+//! Other modules refer to standard columns by these constants, and encode and decode names by these functions, so that
+//! a column has the same name in environments, datasets, models and reports.
 
 use crate::{Result, Schema};
 
@@ -44,7 +44,7 @@ pub const SEED: &str = "seed";
 const FACTOR: &str = "variation.";
 /// The prefix of factor columns under their flat names.
 const FLAT_FACTOR: &str = "variation_";
-/// The prefix of columns that hold the goal's value of another column.
+/// The prefix of a column that holds another column's value at the goal.
 const OF_GOAL: &str = "goal_";
 
 /// The indices of the standard columns in a schema.
@@ -95,7 +95,7 @@ pub fn flat(name: &str) -> String {
     name.replace('.', "_")
 }
 
-/// Whether two names denote one column, `stored` being a full or a flat name of `name`.
+/// Whether `stored` is the full or the flat name of column `name`.
 pub fn is_stored_as(name: &str, stored: &str) -> bool {
     stored == name || stored == flat(name)
 }
@@ -129,12 +129,13 @@ pub fn of_camera(modality: &str, camera: Option<&str>) -> String {
     }
 }
 
-/// The column that holds the goal's value of another one: `goal_state` for `state`, `goal` for `pixels`.
+/// The column that holds the value of column `name` at the goal: `goal_state` for `state`, `goal` for `pixels`.
 pub fn of_goal(name: &str) -> String {
     if name == PIXELS { GOAL.to_owned() } else { format!("{OF_GOAL}{name}") }
 }
 
-/// The column whose goal value a name denotes, if it denotes one: `state` for `goal_state`, `pixels` for `goal`.
+/// The column whose value at the goal column `name` holds, or `None` if `name` is not a goal column: `state` for
+/// `goal_state`, `pixels` for `goal`.
 pub fn goal_source(name: &str) -> Option<&str> {
     if name == GOAL { Some(PIXELS) } else { name.strip_prefix(OF_GOAL) }
 }
@@ -185,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn seeds_survive_single_precision() {
+    fn split_seeds_are_exact_in_single_precision() {
         for seed in [0, 1, 0x1f_ffff, 1 << 42, u64::MAX >> 1] {
             assert_eq!(join_seed(split_seed(seed).map(|element| f64::from(element as f32))), seed);
         }

@@ -1,7 +1,7 @@
 //! Starting an episode at a recorded row of a dataset, towards the state of another row.
 //!
-//! [`required_columns`] and [`reset`] do it for any environment: by [`Env::reset`] and [`Env::restore_from`], or by the
-//! environment's own [`DatasetStartEnv`] where it cannot restore its state from a row.
+//! [`reset`] starts any environment in this way, and [`required_columns`] lists the columns that it reads. Both use
+//! [`DatasetStartEnv`] if the environment implements it, otherwise [`Env::reset`] and [`Env::restore_from`].
 
 use crate::batch::{RowRef, Schema};
 use crate::{Env, Error, ResetOptions, Result, columns};
@@ -9,14 +9,14 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
 
-/// A start and a goal from a dataset: two rows, their columns under [`columns::flat`] names.
+/// A start and a goal from a dataset: two rows, whose columns have [`columns::flat`] names.
 #[derive(Clone, Copy)]
 pub struct DatasetStart<'a> {
     /// The row at which the episode starts.
     pub start: RowRef<'a>,
     /// The row whose state is the goal.
     pub goal: RowRef<'a>,
-    /// Methods that put a third-party environment into a state; native environments need none.
+    /// Methods that set the state of a third-party environment; native environments need none.
     pub callables: &'a [Callable],
 }
 

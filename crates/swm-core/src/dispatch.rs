@@ -14,7 +14,8 @@ pub enum PendingCall<'a> {
 /// An environment that can start to execute a call before the caller waits for its result, such as one in a worker
 /// process.
 pub trait DispatchEnv {
-    /// Starts to execute `call` and returns whether it started. The later call then only waits for the result.
+    /// Starts to execute `call` and returns whether it started. The call itself, which follows, then only waits for the
+    /// result.
     ///
     /// The caller makes exactly that call next, with no other call in between. Invalid arguments are reported by
     /// that call, not by this method.

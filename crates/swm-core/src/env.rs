@@ -24,7 +24,7 @@ pub struct EnvSpec {
     /// The columns [`Env::observe`] writes, in order; `state` is always among them.
     pub columns: Vec<ColumnSpec>,
     /// The columns an agent observes, with their usual bounds. As in the reference implementation, values may exceed
-    /// the bounds. A single column is the observation itself, several are a dictionary.
+    /// the bounds. A single column is the observation itself; several columns form a dictionary.
     pub observation_space: Vec<(&'static str, Space)>,
     /// The factors of variation.
     pub variation_space: VariationSpace,
@@ -209,8 +209,8 @@ pub trait Env: Send {
         Err(view.unknown(self.spec()))
     }
 
-    /// The versions of the libraries that affect values and frames, such as `mujoco` or `renderer`. Datasets and
-    /// results record them.
+    /// The versions of the libraries that affect observations, rewards or frames, such as `mujoco` or `renderer`.
+    /// Datasets and results record them.
     fn libraries(&self) -> BTreeMap<String, String> {
         BTreeMap::new()
     }

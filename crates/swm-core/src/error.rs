@@ -79,7 +79,7 @@ pub enum Error {
         /// How to fix it.
         fix: String,
     },
-    /// The operating system refused a file operation.
+    /// A file operation failed.
     #[error("{}: {action}: {source}{}", .path.display(), disk_hint(.source))]
     Io {
         /// The file or folder.
@@ -170,7 +170,7 @@ pub fn nearest<'a>(given: &str, known: impl IntoIterator<Item = &'a str>) -> Vec
             let folded = fold(name);
             let contains = folded.contains(&wanted) || wanted.contains(&folded);
             let (short, long) = (wanted.len().min(folded.len()), wanted.len().max(folded.len()).max(1));
-            // A substring scores higher the more of the name it covers.
+            // The score of a substring grows with the fraction of the name that it covers.
             let bonus = if contains { 0.15 * short as f64 / long as f64 } else { 0.0 };
             // Jaro-Winkler scores one typing error in a very short name too low.
             let typo = if strsim::osa_distance(&wanted, &folded) == 1 { 0.9 } else { 0.0 };

@@ -1,12 +1,12 @@
-//! Factor values as bytes and from dataset rows, as every environment's `snapshot`, `restore` and `restore_from` use
-//! them.
+//! Conversion of factor values to and from bytes, and from dataset rows, for the methods `snapshot`, `restore` and
+//! `restore_from` of environments.
 
 use crate::{Error, FactorValues, Key, Result, RowRef, Snapshot, VariationRequest, VariationSpace, columns};
 
 /// A request that resolves to exactly these values.
 ///
 /// Only values that differ from their defaults are pinned, because [`VariationSpace::resolve`] checks constraints on
-/// pinned factors and trusts untouched defaults.
+/// pinned factors and does not check defaults.
 pub fn pin(values: &FactorValues) -> VariationRequest {
     let changed = values.factors().iter().zip(values.iter()).filter(|(factor, (_, value))| factor.init_value != *value);
     VariationRequest {
@@ -15,7 +15,7 @@ pub fn pin(values: &FactorValues) -> VariationRequest {
     }
 }
 
-/// The factor values of a dataset row; `current` values where it has no column.
+/// The factor values of a dataset row. A factor without a column has its value of `current`.
 ///
 /// # Errors
 /// When a column holds a value outside its factor's space.
@@ -65,7 +65,7 @@ pub fn snapshot(id: &str, values: &FactorValues, state: impl IntoIterator<Item =
 /// Parses a [`snapshot`] into its factor values, `None` if they equal `current`, and its state bytes.
 ///
 /// # Errors
-/// When it is of another environment, too short, or holds invalid values.
+/// When the snapshot is of another environment, too short, or holds invalid values.
 pub fn parse_snapshot<'a>(
     id: &str,
     space: &VariationSpace,
@@ -78,13 +78,13 @@ pub fn parse_snapshot<'a>(
     }
 }
 
-/// The error of a snapshot that is not of this environment.
+/// The error for a snapshot that was not made by the environment `id`.
 pub fn wrong_snapshot(id: &str, given: impl Into<String>) -> Error {
     Error::mismatch("restoring a snapshot", given, format!("one of {id}"))
 }
 
-/// As [`read`], but returns `None` if the values equal `current`. A planner in a simulator restores states of one episode
-/// thousands of times, and comparing bytes is much faster than resolving the factors again.
+/// As [`read`], but returns `None` if the values equal `current`. A planner in a simulator restores states of one
+/// episode thousands of times, and comparing bytes is much faster than resolving the factors again.
 ///
 /// # Errors
 /// As [`read`].

@@ -1,8 +1,8 @@
 //! [`Key`]: keyed random streams, the only source of randomness.
 //!
-//! A [`Key`] names a purpose, such as `(seed, "env", episode 7, "factor", "agent.color")`, and seeds a counter-based
-//! generator of its own. Streams of different purposes are independent, so results do not depend on threads, batch
-//! sizes, or the order of work.
+//! A [`Key`] identifies one use of randomness, such as `(seed, "env", episode 7, "factor", "agent.color")`, and seeds a
+//! separate counter-based generator for it. Streams of different purposes are independent, so results do not depend on
+//! threads, batch sizes, or the order of work.
 //!
 //! ```
 //! use rand::Rng as _;
@@ -27,13 +27,13 @@ impl Key {
         Self([0; 32]).mix(b's', &seed.to_le_bytes())
     }
 
-    /// The key of one purpose below this one.
+    /// The key derived from this one for a purpose.
     #[must_use]
     pub fn with(self, purpose: &str) -> Self {
         self.mix(b'p', purpose.as_bytes())
     }
 
-    /// The key of one index (an episode, an iteration, a sample) below this one.
+    /// The key derived from this one for an index: an episode, an iteration or a sample.
     #[must_use]
     pub fn at(self, index: u64) -> Self {
         self.mix(b'i', &index.to_le_bytes())
@@ -68,7 +68,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn purposes_and_indices_never_collide() {
+    fn different_purposes_and_indices_give_different_keys() {
         let root = Key::new(0);
         let keys =
             [root, root.with("a"), root.with("b"), root.at(0), root.at(1), root.with("a").at(1), root.at(1).with("a")];
@@ -80,7 +80,7 @@ mod tests {
     }
 
     #[test]
-    fn keys_are_pinned() {
+    fn derived_keys_keep_their_values() {
         // Published results depend on these streams: changing them is a breaking change.
         assert_eq!(Key::new(42).with("env").at(7).seed(), PINNED);
     }

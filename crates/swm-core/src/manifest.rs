@@ -1,16 +1,16 @@
-//! [`Manifest`]: the provenance of a dataset, a checkpoint or a result, sufficient to make it again.
+//! [`Manifest`]: the provenance of a dataset, a checkpoint or a result, sufficient to reproduce it.
 
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// The provenance of an artifact. It holds no times, so two equal runs have equal manifests.
+/// The provenance of an artifact. A manifest holds no timestamps, so two equal runs have equal manifests.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
-    /// The command that made it: `collect`, `train`, `evaluate`.
+    /// The command that made the artifact: `collect`, `train`, `evaluate`.
     pub kind: String,
     /// The version of stable-worldmodel.
     pub swm_version: String,
-    /// Versions of the libraries that affect values.
+    /// Versions of the libraries that affect the content of the artifact.
     pub libraries: BTreeMap<String, String>,
     /// The seed.
     pub seed: u64,

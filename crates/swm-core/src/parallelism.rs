@@ -1,31 +1,32 @@
-//! [`Parallelism`]: whether work on several slots is worth distributing over threads. The answer affects the duration of
-//! the work only, never its outcome.
+//! [`Parallelism`]: decides whether distributing the work of several slots over threads saves time. The decision
+//! affects the duration of the work only, not its result.
 
 use std::time::{Duration, Instant};
 
-/// The approximate cost of distributing work over threads and waiting for them; less work than that stays on one thread.
+/// The approximate cost of distributing work over threads and waiting for them. Work that takes less time runs on one
+/// thread.
 const OVERHEAD: Duration = Duration::from_micros(20);
 
-/// The duration of one slot's work, as measured last time.
+/// The duration of one slot's work, measured at the last call.
 #[derive(Debug)]
 pub(crate) struct Parallelism(Duration);
 
 impl Default for Parallelism {
-    /// Unknown: the first work is distributed.
+    /// The duration is unknown before the first call, whose work is therefore distributed.
     fn default() -> Self {
         Self(Duration::MAX)
     }
 }
 
 impl Parallelism {
-    /// Whether one thread finishes the work of so many slots sooner than several.
+    /// Whether one thread finishes the work of `slots` slots sooner than several threads.
     pub fn is_serial(&self, slots: usize) -> bool {
         self.0.saturating_mul(u32::try_from(slots).unwrap_or(u32::MAX)) < OVERHEAD
     }
 
     /// Records work on `slots` slots that started at `start` and ran on `workers` threads.
     pub fn record(&mut self, start: Instant, workers: usize, slots: usize) {
-        let small = |n: usize| u32::try_from(n.max(1)).unwrap_or(u32::MAX);
-        self.0 = start.elapsed().saturating_mul(small(workers.min(slots))) / small(slots);
+        let to_u32 = |n: usize| u32::try_from(n.max(1)).unwrap_or(u32::MAX);
+        self.0 = start.elapsed().saturating_mul(to_u32(workers.min(slots))) / to_u32(slots);
     }
 }

@@ -1,7 +1,7 @@
 //! Planning: a [`CostModel`] scores candidate action sequences, a [`Solver`] minimises the cost and returns a [`Plan`].
 //!
 //! Model and solver exchange plain host slices, so solvers depend on no deep-learning framework. All environments that
-//! replan at a step share one call, yet the plan of each depends on its own cost and key only.
+//! replan at a step share one call. The plan of an environment depends on its own cost and key only.
 
 use crate::{Batch, Env, Key, Result};
 use serde::Serialize;
@@ -218,7 +218,7 @@ pub struct PlanTrace {
     /// The mean spread of the sampling distribution after the iteration, or of the candidates if the solver has none.
     pub spread: Vec<f32>,
     /// The largest constraint value of the best candidate, if the model has constraints and the solver enforces them.
-    /// It is at most 0, or the solver's tolerance, when all are satisfied.
+    /// The value is at most 0, or at most the solver's tolerance, when all constraints are satisfied.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub violation: Vec<f32>,
 }

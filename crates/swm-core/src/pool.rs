@@ -1,8 +1,9 @@
 //! [`EnvPool`]: many environments of one kind, stepped and rendered on a fixed set of threads.
 //!
 //! All output is written in place into one [`Batch`], the infos: the environment's own columns, then `reward`,
-//! `terminated`, `truncated`, `success`, `step_idx`, and, if the pool renders, `pixels`, `goal` and further camera views.
-//! The output of an environment depends on its seed and its actions only, not on the number of threads or environments.
+//! `terminated`, `truncated`, `success`, `step_idx`, and, if the pool renders, `pixels`, `goal` and further camera
+//! views. The output of an environment depends on its seed and its actions only, not on the number of threads or
+//! environments.
 
 use crate::batch::{Batch, ColumnSpec, DType, RowMut, Schema};
 use crate::columns::{self, ColumnIndices};
@@ -25,7 +26,7 @@ pub struct Reset {
 
 /// The columns that the pool adds after the environment's own.
 struct PoolColumns {
-    at: ColumnIndices,
+    standard: ColumnIndices,
     step_idx: usize,
     frames: Option<FrameColumns>,
     /// The views that are rendered besides `pixels` and `goal`.
@@ -37,7 +38,7 @@ struct PoolColumns {
 struct FrameColumns {
     pixels: usize,
     goal: usize,
-    /// The first view; one column for each view follows.
+    /// The column of the first view; the columns of the other views follow it.
     first_view: usize,
     height: usize,
     width: usize,
@@ -74,8 +75,8 @@ impl PoolColumns {
                 width,
             }),
         };
-        let (at, step_idx) = (ColumnIndices::of(&schema)?, schema.index(columns::STEP_IDX)?);
-        Ok((schema, Self { at, step_idx, frames, views }))
+        let (standard, step_idx) = (ColumnIndices::of(&schema)?, schema.index(columns::STEP_IDX)?);
+        Ok((schema, Self { standard, step_idx, frames, views }))
     }
 }
 
@@ -105,7 +106,7 @@ pub fn threads(n: usize) -> Result<Arc<rayon::ThreadPool>> {
 }
 
 impl EnvPool {
-    /// A pool of these environments. `image` is the `(height, width)` of frames; without it, the pool renders nothing.
+    /// Creates a pool of `envs`. `image` is the `(height, width)` of frames; without it, the pool renders nothing.
     /// `max_episode_steps` replaces the environment's own time limit.
     ///
     /// # Errors
@@ -208,7 +209,7 @@ impl EnvPool {
                 slot.dispatch(PendingCall::Reset(reset.seed, &reset.options));
             }
         }
-        self.each(Some(resets.len()), |i, slot, columns, row| {
+        self.for_each_slot(Some(resets.len()), |i, slot, columns, row| {
             let Some(reset) = by_slot[i] else { return Ok(()) };
             slot.env.reset(reset.seed, &reset.options)?;
             slot.start(columns, row)
@@ -224,7 +225,7 @@ impl EnvPool {
         slots: &[usize],
         change: impl Fn(usize, &mut dyn Env) -> Result<()> + Sync,
     ) -> Result<()> {
-        self.each(Some(slots.len()), |i, slot, columns, row| {
+        self.for_each_slot(Some(slots.len()), |i, slot, columns, row| {
             if !slots.contains(&i) {
                 return Ok(());
             }
@@ -234,10 +235,11 @@ impl EnvPool {
     }
 
     /// Steps the slots whose `active` is true with their row of `actions`, a batch with the column
-    /// [`EnvSpec::action_column`]; the other slots keep their infos.
+    /// [`EnvSpec::action_column`]; the infos of the other slots do not change.
     ///
     /// # Errors
-    /// When `actions` has another form, and as [`Env::step`] and [`Env::render`].
+    /// When `actions` has another column type or another number of rows than the pool, and as [`Env::step`] and
+    /// [`Env::render`].
     pub fn step(&mut self, actions: &Batch, active: &[bool]) -> Result<()> {
         if actions.rows() != self.len() || active.len() != self.len() {
             return Err(Error::mismatch(
@@ -267,27 +269,28 @@ impl EnvPool {
         for (i, slot) in self.slots.iter_mut().enumerate().filter(|(i, _)| active[*i]) {
             dispatched &= slot.dispatch(PendingCall::Step(action(i)));
         }
-        // One thread is enough to wait for other processes; frames are resized and changed in this one.
+        // Environments in worker processes step in parallel while one thread waits for them. Frames are resized in this
+        // process, so steps with frames use several threads.
         let serial = self.parallelism.is_serial(stepping) || (dispatched && self.columns.frames.is_none());
-        let stepped = self.each((!serial).then_some(stepping), |i, slot, columns, row| {
+        let stepped = self.for_each_slot((!serial).then_some(stepping), |i, slot, columns, row| {
             if !active[i] {
                 return Ok(());
             }
             let mut transition = slot.env.step(action(i))?;
             slot.steps += 1;
             transition.truncated |= slot.steps >= limit && !transition.terminated;
-            row.set(columns.at.reward, &[transition.reward as f32]);
-            row.set(columns.at.terminated, &[u8::from(transition.terminated)]);
-            row.set(columns.at.truncated, &[u8::from(transition.truncated)]);
+            row.set(columns.standard.reward, &[transition.reward as f32]);
+            row.set(columns.standard.terminated, &[u8::from(transition.terminated)]);
+            row.set(columns.standard.truncated, &[u8::from(transition.truncated)]);
             slot.observe(columns, row)
         });
         self.parallelism.record(start, if serial { 1 } else { self.threads.current_num_threads() }, stepping);
         stepped
     }
 
-    /// Runs `work` on every slot and returns the error of the lowest slot that failed. `busy` is the number of slots that
-    /// have work and divide the threads among them; `None` runs everything on the calling thread.
-    fn each(
+    /// Runs `work` on every slot and returns the error of the lowest slot that failed. `busy` is the number of slots
+    /// that have work; the threads are divided among these slots. `None` runs everything on the calling thread.
+    fn for_each_slot(
         &mut self,
         busy: Option<usize>,
         work: impl Fn(usize, &mut Slot, &PoolColumns, &mut RowMut<'_>) -> Result<()> + Sync,
@@ -327,9 +330,9 @@ impl Slot {
     /// Fills the row of an episode's first observation.
     fn start(&mut self, columns: &PoolColumns, row: &mut RowMut<'_>) -> Result<()> {
         self.steps = 0;
-        row.set(columns.at.reward, &[0.0f32]);
-        row.set(columns.at.terminated, &[0u8]);
-        row.set(columns.at.truncated, &[0u8]);
+        row.set(columns.standard.reward, &[0.0f32]);
+        row.set(columns.standard.terminated, &[0u8]);
+        row.set(columns.standard.truncated, &[0u8]);
         self.observe(columns, row)?;
         match columns.frames {
             Some(FrameColumns { goal, height, width, .. }) => {
@@ -342,7 +345,7 @@ impl Slot {
     /// Fills the columns of a row that follow from the present state.
     fn observe(&mut self, columns: &PoolColumns, row: &mut RowMut<'_>) -> Result<()> {
         self.env.observe(row);
-        row.set(columns.at.success, &[u8::from(self.env.is_success())]);
+        row.set(columns.standard.success, &[u8::from(self.env.is_success())]);
         row.set(columns.step_idx, &[self.steps as i32]);
         if let Some(FrameColumns { pixels, first_view, height, width, .. }) = columns.frames {
             self.env.render(FrameMut::new(width, height, row.at::<u8>(pixels)))?;

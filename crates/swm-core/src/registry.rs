@@ -1,5 +1,5 @@
-//! [`Registry`]: a list of everything of one kind, such as environments or solvers. A row holds the id, the constructor
-//! and the defaults together, so a new member is added in one place.
+//! [`Registry`]: a list of all implementations of one kind, such as environments or solvers. A row holds the id, the
+//! constructor and the defaults of one implementation.
 
 use crate::policy::Expert;
 use crate::{Env, Error, Result};
@@ -15,7 +15,7 @@ pub trait Named {
 pub struct Registry<T: 'static> {
     /// The kind of the rows, for errors: "environment".
     pub kind: &'static str,
-    /// Where they are listed, for errors: "`swm envs` lists them".
+    /// Where users find the ids, for errors: "`swm envs` lists them".
     pub hint: &'static str,
     /// The rows.
     pub rows: &'static [T],
@@ -49,7 +49,7 @@ pub const fn concat<T: Copy, const N: usize>(first: &[T], second: &[T]) -> [T; N
     all
 }
 
-/// An option of an environment, chosen when it is made, such as its task.
+/// An option of an environment, such as its task. Its value is chosen when the environment is made.
 #[derive(Clone, Copy, Debug)]
 pub struct EnvOption {
     /// Its name, such as `task`.

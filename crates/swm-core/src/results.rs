@@ -1,6 +1,7 @@
 //! [`Results`]: the results of an evaluation, as written to `results.json` and read by reports.
 //!
-//! The manifest determines everything except [`Run::timing`]: two equal evaluations write equal results, times aside.
+//! The manifest determines everything except [`Run::timing`], so two evaluations with equal manifests write results
+//! that differ in their timing only.
 
 mod counting;
 mod paired;
@@ -49,8 +50,8 @@ pub struct Run {
     pub solved_at_start: usize,
     /// The success rate of the episodes that count.
     pub success: Proportion,
-    /// The success rate of the same episodes under [`Counting::Strict`]; present if [`Results::counting`] is another
-    /// rule and the episodes determine both rates.
+    /// The success rate of the same episodes under [`Counting::Strict`]; present if [`Results::counting`] is not strict
+    /// and the episodes determine both rates.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub strict: Option<Proportion>,
     /// The time to goal of successful episodes, in environment steps.

@@ -17,9 +17,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 pub enum Event<'a> {
     /// A stage starts.
     Started(Stage<'a>),
-    /// Part of the current stage is done.
+    /// The progress of the current stage.
     Progress(Progress<'a>),
-    /// A message for people, one line.
+    /// A one-line message for the user.
     Log(&'a str),
     /// A file or folder was written: a dataset, a checkpoint, a video.
     Saved(&'a Path),
@@ -149,7 +149,7 @@ mod tests {
     }
 
     #[test]
-    fn interrupt_flag_comes_before_the_poll() {
+    fn interrupt_flag_is_checked_before_the_poll() {
         let flag = Arc::new(AtomicBool::new(false));
         let mut polls = 0;
         let mut control = Control::new().with_interrupt(Arc::clone(&flag)).with_poll(|| {
@@ -166,9 +166,9 @@ mod tests {
 
     #[test]
     fn events_reach_the_sink_in_order() {
-        let mut seen = vec![];
+        let mut lines = vec![];
         let mut control = Control::new().with_events(|event| {
-            seen.push(match event {
+            lines.push(match event {
                 Event::Started(stage) => format!("{} {:?}", stage.name, stage.subject),
                 Event::Progress(at) => format!("{}/{} {}", at.done, at.total, at.unit),
                 Event::Saved(path) => path.display().to_string(),
@@ -181,7 +181,7 @@ mod tests {
         control.emit(Event::Saved(Path::new("out")));
         control.emit(Event::Finished { stage: "train", metrics: &[("loss", 0.25)] });
         drop(control);
-        assert_eq!(seen, ["train [\"lewm\"]", "3/5 steps", "out", "[(\"loss\", 0.25)]"]);
+        assert_eq!(lines, ["train [\"lewm\"]", "3/5 steps", "out", "[(\"loss\", 0.25)]"]);
     }
 
     #[test]

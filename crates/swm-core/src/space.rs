@@ -1,7 +1,7 @@
 //! [`Space`]: the set of values of an action, an observation or a factor of variation.
 //!
 //! A value of any space is a slice of `f64` (exact for every type here). The space gives its shape, element type and
-//! bounds. Its JSON form is that of `swm fovs --json`.
+//! bounds. [`Space`] serialises to the JSON that `swm fovs --json` prints.
 
 use crate::batch::DType;
 use crate::{Error, Result, Rng};
@@ -172,7 +172,7 @@ mod tests {
     use crate::Key;
 
     #[test]
-    fn samples_are_in_their_space() {
+    fn samples_are_inside_the_space() {
         let spaces = [
             Space::uniform_box([2], DType::Float32, -1.0, 1.0),
             Space::uniform_box([], DType::Float64, 0.0, 1e-3),

@@ -1,5 +1,5 @@
-//! The thread budget: the number of threads that one environment may use. It exceeds 1 if there are fewer environments
-//! than threads.
+//! The thread budget: the number of threads that one environment may use. The budget exceeds 1 if there are fewer
+//! environments than threads.
 //!
 //! The pool distributes environments over threads first ([`crate::EnvPool`]). A renderer reads [`threads`] and may draw
 //! parts of one frame on as many threads of the current rayon pool. Its output must not depend on the budget.
@@ -38,16 +38,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn budget_ends_with_its_work() {
-        let seen = with(3, || (threads(), with(2, threads), threads()));
-        assert_eq!((seen, threads()), ((3, 2, 3), 1));
+    fn budget_is_restored_after_the_work() {
+        let budgets = with(3, || (threads(), with(2, threads), threads()));
+        assert_eq!((budgets, threads()), ((3, 2, 3), 1));
         assert!(std::panic::catch_unwind(|| with(5, || panic!("as a test"))).is_err());
         assert_eq!(threads(), 1);
     }
 
     #[test]
-    fn all_threads_are_those_of_the_pool() {
-        let pool = crate::pool::threads(3).expect("threads");
+    fn all_sets_the_thread_count_of_the_pool() {
+        let pool = crate::pool::threads(3).expect("a thread pool");
         assert_eq!(pool.install(|| all(threads)), 3);
     }
 }

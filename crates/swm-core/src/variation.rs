@@ -34,7 +34,7 @@ impl Factor {
 #[derive(Clone)]
 struct Constraint {
     factor: usize,
-    words: &'static str,
+    description: &'static str,
     holds: fn(&FactorValues) -> bool,
 }
 
@@ -47,7 +47,7 @@ pub struct VariationSpace {
     defaults: Vec<String>,
 }
 
-/// Samples of a constrained factor before [`VariationSpace::resolve`] fails.
+/// The number of rejected samples of a constrained factor after which [`VariationSpace::resolve`] fails.
 const TRIES: usize = 10_000;
 
 impl VariationSpace {
@@ -74,14 +74,15 @@ impl VariationSpace {
     }
 
     /// Adds a constraint: `factor` is sampled again until `holds` returns true. `holds` may read that factor's value,
-    /// those of factors earlier in the sampling order, and pinned values. `words` states the constraint in errors.
+    /// those of factors earlier in the sampling order, and pinned values. `description` states the constraint in
+    /// errors.
     ///
     /// # Panics
     /// When there is no such factor.
     #[must_use]
-    pub fn constrain(mut self, factor: &str, words: &'static str, holds: fn(&FactorValues) -> bool) -> Self {
+    pub fn constrain(mut self, factor: &str, description: &'static str, holds: fn(&FactorValues) -> bool) -> Self {
         let factor = self.find(factor).unwrap_or_else(|| panic!("constraint on '{factor}', which is not a factor"));
-        self.constraints.push(Constraint { factor, words, holds });
+        self.constraints.push(Constraint { factor, description, holds });
         self
     }
 
@@ -164,20 +165,20 @@ impl VariationSpace {
                 if tries == TRIES {
                     return Err(Error::Unsatisfiable {
                         factor: factor.key.clone(),
-                        constraint: broken.words.to_owned(),
+                        constraint: broken.description.to_owned(),
                         tries,
                     });
                 }
             }
         }
-        // Pinned values must satisfy their constraints given the final values; untouched defaults are trusted.
+        // Pinned values must satisfy their constraints given the final values; defaults are not checked.
         for constraint in &self.constraints {
             if pinned[constraint.factor] && !(constraint.holds)(&values) {
                 let factor = &self.factors[constraint.factor];
                 return Err(Error::OutOfSpace {
                     what: factor.key.clone(),
                     given: format!("{:?}", values.values[constraint.factor]),
-                    expected: constraint.words.to_owned(),
+                    expected: constraint.description.to_owned(),
                 });
             }
         }
@@ -274,18 +275,18 @@ mod tests {
     }
 
     #[test]
-    fn varying_one_factor_leaves_the_others_unchanged() {
+    fn varying_one_factor_leaves_other_factors_unchanged() {
         let space = space();
         let key = Key::new(5);
-        let none = space.resolve(&request(&[]), key).expect("nothing");
+        let none = space.resolve(&request(&[]), key).expect("no varied factor");
         assert_eq!(none.get("agent.color"), [255.0, 0.0, 0.0]);
-        let one = space.resolve(&request(&["agent.color"]), key).expect("one");
-        let group = space.resolve(&request(&["agent"]), key).expect("group");
+        let one = space.resolve(&request(&["agent.color"]), key).expect("one varied factor");
+        let group = space.resolve(&request(&["agent"]), key).expect("a varied group");
         assert_eq!(one.get("agent.color"), group.get("agent.color"));
         assert_eq!(one.get("agent.x"), [0.25]);
         assert_ne!(group.get("agent.x"), [0.25]);
         for seed in 0..100 {
-            let all = space.resolve(&request(&["all"]), Key::new(seed)).expect("all");
+            let all = space.resolve(&request(&["all"]), Key::new(seed)).expect("all factors varied");
             assert!(all.scalar("target.x") > all.scalar("agent.x"));
         }
     }
@@ -297,7 +298,7 @@ mod tests {
             variation: None,
             variation_values: [(key.to_owned(), value.to_vec())].into(),
         };
-        let message = |r: &VariationRequest| space.resolve(r, Key::new(0)).expect_err("wrong").to_string();
+        let message = |r: &VariationRequest| space.resolve(r, Key::new(0)).expect_err("an invalid request").to_string();
         assert!(message(&request(&["agent.colour"])).contains("did you mean agent.color"));
         assert!(message(&pin("agent.x", &[2.0])).contains("0 ..= 1"));
         assert!(message(&pin("agent.y", &[0.5])).contains("agent.x"));

@@ -37,18 +37,18 @@ RESERVED = frozenset(
 )
 # `info` entries that go into the header.
 IN_HEADER = frozenset(['success', 'is_success'])
-# The time limit of an environment without one.
+# The time limit of an environment that defines none.
 DEFAULT_STEPS = 1000
 
 RESET, STEP, STEP_AND_RENDER, RENDER = b'rsdp'
 
 
 class Unsupported(Exception):
-    """The environment has a space that columns or actions cannot represent."""
+    """Raised when columns or actions cannot represent a space of the environment."""
 
 
 class InvalidRequest(ValueError):
-    """A request for something that the environment does not have: the problem, and how to fix it."""
+    """Raised when a request names something that the environment lacks. The arguments are the problem and the fix."""
 
     def __str__(self):
         return '; '.join(self.args)
@@ -93,7 +93,7 @@ def leaves(space, name, path=()):
     """The leaf spaces of a nested space, in order: (name, path, space)."""
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         inside = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
-        # A key of the outermost Dict is the name itself; deeper names, and those of a tuple, are joined.
+        # A key of the outermost Dict is a column name. Keys of inner spaces and of tuples are joined with `_`.
         above = '' if isinstance(space, spaces.Dict) and not path else f'{name}_'
         for key, part in inside:
             yield from leaves(part, f'{above}{key}', (*path, key))
@@ -108,7 +108,7 @@ def described(space):
     if isinstance(space, spaces.Discrete):
         return {'type': 'Discrete', 'n': int(space.n), 'start': int(space.start)}, np.dtype(np.int64), ()
     if isinstance(space, spaces.MultiDiscrete):
-        # A column of 64-bit integers, as its space has.
+        # The elements of a `MultiDiscrete` space are 64-bit integers, and so are those of the column.
         return multi(space.nvec, space.start), np.dtype(np.int64), space.shape
     if isinstance(space, spaces.MultiBinary):
         return box(np.zeros(space.shape), np.ones(space.shape), space.shape, bool), np.dtype(bool), space.shape
@@ -251,7 +251,7 @@ def callables(env):
                 found.append({'method': name, 'args': {key: {'value': column, 'in_dataset': True}}})
                 break
         if not found:
-            # A goal without a state is not a start.
+            # Setting a goal without setting a state does not define a start.
             return []
     return found
 
@@ -262,8 +262,8 @@ def only_argument(method):
         parameters = inspect.signature(method).parameters.values()
     except (TypeError, ValueError):
         return None
-    free = [p for p in parameters if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
-    return free[0].name if len(free) == 1 and free[0].kind is not free[0].POSITIONAL_ONLY else None
+    required = [p for p in parameters if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    return required[0].name if len(required) == 1 and required[0].kind is not required[0].POSITIONAL_ONLY else None
 
 
 def argument(value):
@@ -295,7 +295,7 @@ class Bridge:
     """One environment and the buffer it writes into."""
 
     def __init__(self, env, max_episode_steps=None):
-        """Runs a reset, a step and a render to learn the columns and the frame size."""
+        """Runs a reset, a step and a render to determine the columns and the frame size."""
         self.env = env
         self.actions = Actions(env.action_space)
         self.factors = list(factors(variation_space(env)))
@@ -337,7 +337,7 @@ class Bridge:
         if self.goal_shape:
             self.goal_at = self.allocate(math.prod(self.goal_shape) * 3)
 
-        # Versions of the packages of its class and its registration, and of those that it names itself.
+        # Versions of the packages that define the environment's class and entry point, and of those in `swm_libraries`.
         modules = type(env.unwrapped).__module__, str(getattr(env.spec, 'entry_point', ''))
         packages = (module.partition(':')[0].partition('.')[0] for module in modules)
         self.libraries = {}
@@ -363,9 +363,9 @@ class Bridge:
         return name
 
     def first_frame(self):
-        """A frame from `render`, or an observation that is one; None, with the reason in `no_frame`, if there is neither."""
+        """A frame from `render`, or an RGB observation; None, with the reason in `no_frame`, if there is neither."""
         try:
-            # Some environments render without a render mode.
+            # Some environments without a render mode support `render`.
             frame = self.env.render() if self.env.render_mode in ('rgb_array', None) else None
             if is_frame(frame):
                 return frame
@@ -434,7 +434,7 @@ class Bridge:
 
     def reset(self, seed, variation=None, variation_values=None, recorded=None):
         """Starts an episode. `variation` and `variation_values` become the `options` of the environment's reset; `recorded`
-        are the arguments of a following `put`."""
+        are the arguments of `set_recorded_state`."""
         options = {}
         if variation is not None:
             options['variation'] = variation
@@ -451,17 +451,17 @@ class Bridge:
         self.held = []
         self.write(observation, 0.0, False, False, info)
         if recorded is not None:
-            self.put(**recorded)
+            self.set_recorded_state(**recorded)
 
-    def put(self, calls, shown, held):
-        """Sets a recorded state: calls methods of the environment, and writes the recorded values into the columns, those of
-        `held` again after every step."""
+    def set_recorded_state(self, calls, shown, held):
+        """Sets a recorded state: calls methods of the environment, and writes the recorded values `shown` and `held` into
+        the columns. The values `held` are written again after every step."""
         for call in calls:
             self.method(call['method'])(**{key: argument(value) for key, value in call['args'].items()})
         shown, self.held = ([(self.views[name], argument(value)) for name, value in part.items()] for part in (shown, held))
         for view, value in [*shown, *self.held]:
             view[...] = np.reshape(value, view.shape)
-        # The header of the reset belongs to another state.
+        # The header that the reset wrote describes another state.
         HEAD.pack_into(self.buffer, 0, 0.0, math.inf, False, False, False)
 
     def method(self, name):
@@ -538,7 +538,7 @@ class Bridge:
 
 
 class Missing(Exception):
-    """A missing package: the asset that installs it, and the import error."""
+    """Raised when a package is missing. The arguments are the asset that installs it and the import error."""
 
 
 WORDS = {'true': True, 'false': False, 'none': None}
@@ -579,7 +579,7 @@ def make(id, options, wrappers=()):
     try:
         env = gymnasium.make(spec, **{'render_mode': 'rgb_array', **settings})
     except TypeError as error:
-        # Some environments have no render mode.
+        # Some environments take no argument `render_mode`.
         if 'render_mode' not in str(error) or 'render_mode' in kwargs:
             raise
         env = gymnasium.make(spec, **settings)

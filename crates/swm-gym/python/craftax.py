@@ -55,7 +55,7 @@ class Craftax(gymnasium.Env):
 
     def __init__(self, name, shape, render_mode=None):
         self.render_mode = render_mode
-        # The pool resets the environment, so Craftax must not.
+        # Disables Craftax's automatic resets, because the pool resets the environment.
         env = textured(make_craftax_env_from_name, name, False)
         params = env.default_params
         self.observation_space = spaces.Box(0.0, 1.0, shape, np.float32)
@@ -75,7 +75,7 @@ class Craftax(gymnasium.Env):
         def go(key, state, action):
             next_key, step_key = jax.random.split(key)
             observation, state, reward, done, info = env.step(step_key, state, action, params)
-            # One transfer to the host is faster than thirty.
+            # One transfer of all values to the host is faster than a transfer of each value.
             self.names = list(info)
             values = jnp.stack([jnp.float32(value) for value in (reward, done, *info.values())])
             return observation, state, values, next_key

@@ -1,8 +1,8 @@
 """The worker process of a `Bridge`: requests arrive on a socket, outputs go into shared memory.
 
-File descriptors at the start: 0 is the socket, 1 the shared memory (a file without a name), 2 a pipe to the parent.
-Before any code of the environment runs, 0 becomes /dev/null and 1 a copy of 2, so that the environment's input and
-output cannot disturb the protocol.
+File descriptors at the start: 0 is the socket, 1 the shared memory (an anonymous file), 2 a pipe to the parent.
+Before any code of the environment runs, 0 becomes /dev/null and 1 becomes a copy of 2, so that reads and writes of the
+environment do not reach the socket and the shared memory.
 
 A request is one byte for its kind, the length of its payload (4 bytes, little-endian) and the payload; an answer has
 the same form. The first request carries the sources of the other modules and the environment to make.
@@ -20,14 +20,14 @@ import struct
 import sys
 import traceback
 
-FRAME = struct.Struct('<BI')
+HEADER = struct.Struct('<BI')
 # Kinds of answers: done; an exception; an unknown id; a missing package; unsupported; an invalid request.
-DONE, RAISED, UNKNOWN, MISSING, REFUSED, INVALID = b'.xumfw'
+DONE, RAISED, UNKNOWN, MISSING, UNSUPPORTED, INVALID = b'.xumfw'
 PR_SET_PDEATHSIG = 1
 
 
-def die_with(parent):
-    """Ends this process when the parent ends, however it ends."""
+def exit_with_parent(parent):
+    """Makes this process end when the parent process ends in any way."""
     if sys.platform == 'linux':
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
@@ -35,7 +35,7 @@ def die_with(parent):
 
 
 class Sources(importlib.abc.MetaPathFinder, importlib.abc.InspectLoader):
-    """Imports modules from text, so that nothing has to be installed."""
+    """Imports modules from source texts that the parent sends, so that they need not be installed."""
 
     def __init__(self, texts):
         self.texts = texts
@@ -59,19 +59,19 @@ class Connection:
     def read(self, n):
         data = b''
         while len(data) < n:
-            more = self.socket.recv(n - len(data))
-            if not more:
+            chunk = self.socket.recv(n - len(data))
+            if not chunk:
                 raise EOFError('the parent closed the connection or ended')
-            data += more
+            data += chunk
         return data
 
     def request(self):
-        op, n = FRAME.unpack(self.read(FRAME.size))
+        op, n = HEADER.unpack(self.read(HEADER.size))
         return op, self.read(n) if n else b''
 
     def answer(self, kind, text=''):
         data = text.encode('utf-8', 'replace')
-        self.socket.sendall(FRAME.pack(kind, len(data)) + data)
+        self.socket.sendall(HEADER.pack(kind, len(data)) + data)
 
 
 def make(connection, memory):
@@ -86,7 +86,7 @@ def make(connection, memory):
     try:
         bridge = swm_bridge.make(request['id'], request['options'])
         description = bridge.describe()
-        # A lack of memory is an error now instead of a SIGBUS later.
+        # Allocates the memory, so that a lack of memory raises an error here instead of a SIGBUS at a later write.
         os.posix_fallocate(memory, 0, bridge.size)
         bridge.attach(mmap.mmap(memory, bridge.size))
         connection.answer(DONE, description)
@@ -97,7 +97,7 @@ def make(connection, memory):
     except gymnasium.error.UnregisteredEnv:
         connection.answer(UNKNOWN, json.dumps(sorted(gymnasium.registry)))
     except (swm_bridge.Unsupported, gymnasium.error.DependencyNotInstalled, gymnasium.error.DeprecatedEnv) as error:
-        connection.answer(REFUSED, str(error))
+        connection.answer(UNSUPPORTED, str(error))
     except BaseException:
         connection.answer(RAISED, traceback.format_exc())
     return None
@@ -120,8 +120,8 @@ def handle_requests(connection, bridge):
 
 
 def serve():
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent decides when to stop.
-    die_with(int(sys.argv[1]))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The parent handles SIGINT and closes the connection.
+    exit_with_parent(int(sys.argv[1]))
     connection, memory = Connection(os.dup(0)), os.dup(1)
     null = os.open(os.devnull, os.O_RDONLY)
     os.dup2(null, 0)
@@ -135,7 +135,7 @@ def serve():
         if bridge is not None:
             bridge.close()
     finally:
-        # Without waiting for threads of the environment.
+        # `os._exit` does not wait for threads of the environment.
         os._exit(0)
 
 

@@ -1,7 +1,7 @@
 //! The pinned Python packages that Gymnasium environments need, in a virtual environment.
 //!
-//! It is in the folder of the other assets: in `$SWM_ASSETS`, else `$STABLEWM_HOME/assets`, else
-//! `~/.stable_worldmodel/assets`, under `python-gym`.
+//! The virtual environment is the folder `python-gym` in the folder of all assets: `$SWM_ASSETS`, else
+//! `$STABLEWM_HOME/assets`, else `~/.stable_worldmodel/assets`.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -50,42 +50,43 @@ pub const PACKAGES: &[Package] = &[
 ];
 
 impl Package {
-    /// The folder it is installed to.
+    /// The folder that the package is installed to.
     pub fn folder(&self) -> PathBuf {
-        environment()
+        virtual_environment()
     }
 
     /// Whether this version is installed.
     pub fn is_installed(&self) -> bool {
         let name = format!("{}-{}.dist-info", self.distribution, self.version);
-        let Ok(entries) = std::fs::read_dir(environment().join("lib")) else { return false };
+        let Ok(entries) = std::fs::read_dir(virtual_environment().join("lib")) else { return false };
         entries.flatten().any(|entry| entry.path().join("site-packages").join(&name).is_dir())
     }
 }
 
 /// The folder of assets, which `swm-mujoco` shares.
 pub(crate) fn folder() -> PathBuf {
-    let set = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    let variable = |name| std::env::var_os(name).filter(|value| !value.is_empty()).map(PathBuf::from);
     let home = || Path::new(&std::env::var_os("HOME").unwrap_or_default()).join(".stable_worldmodel");
-    set("SWM_ASSETS").unwrap_or_else(|| set("STABLEWM_HOME").unwrap_or_else(home).join("assets"))
+    variable("SWM_ASSETS").unwrap_or_else(|| variable("STABLEWM_HOME").unwrap_or_else(home).join("assets"))
 }
 
-/// The virtual environment.
-fn environment() -> PathBuf {
+/// The folder of the virtual environment.
+fn virtual_environment() -> PathBuf {
     folder().join("python-gym")
 }
 
 /// The interpreter of the virtual environment, which may not exist yet.
 pub(crate) fn python() -> PathBuf {
-    environment().join("bin").join("python")
+    virtual_environment().join("bin").join("python")
 }
 
-/// Installs a package with pip and returns the folder of the virtual environment, which is made if it does not exist.
+/// Installs a package with pip and returns the folder of the virtual environment, which this function makes if it does
+/// not exist.
 ///
 /// # Errors
 /// When Python or pip fails.
 pub fn install(package: &Package) -> Result<PathBuf> {
-    let folder = environment();
+    let folder = virtual_environment();
     if !python().is_file() {
         let mut make = Command::new("python3");
         run("making a Python environment with `python3 -m venv`", make.args(["-m", "venv"]).arg(&folder))?;
@@ -105,7 +106,7 @@ pub fn verify(package: &Package) -> Result<()> {
     let fix = || format!("run `swm assets install {}`", package.name);
     if !package.is_installed() {
         let what = format!("asset {} {}", package.name, package.version);
-        return Err(Error::config(what, format!("it is not installed in {}", environment().display()), fix()));
+        return Err(Error::config(what, format!("it is not installed in {}", virtual_environment().display()), fix()));
     }
     let mut pip = Command::new(python());
     run(

@@ -26,8 +26,8 @@ pub fn is_gymnasium_id(text: &str) -> bool {
 }
 
 /// Parses `ID` or `ID,key=value,…`, where the keys are arguments of `gymnasium.make`: `ALE/Pong-v5,frameskip=2`. An id
-/// may name the module that registers it: `my_envs:Maze-v0`. No process starts, so an unknown id is an error when
-/// an environment is made.
+/// may name the module that registers it: `my_envs:Maze-v0`. No process starts here, so an unknown id becomes an error
+/// only when an environment is made.
 ///
 /// # Errors
 /// When the text has another form.
@@ -51,13 +51,15 @@ pub fn choose(text: &str) -> Result<EnvChoice> {
 /// Makes the environment of a text in a worker process.
 ///
 /// # Errors
-/// When it cannot be made: no Python, no such id, a package that is missing, an exception.
+/// When the environment cannot be made: Python or a package is missing, the id is unknown, or Python raises an
+/// exception.
 pub fn make(text: &str, config: GymConfig) -> Result<Box<dyn Env>> {
     static LAYOUTS: Mutex<BTreeMap<(String, crate::Python), Arc<EnvLayout>>> = Mutex::new(BTreeMap::new());
     let (id, options) = parse(text)?;
     let (restarts, key) = (config.restarts, (text.to_owned(), config.python.clone()));
     let transport = Box::new(WorkerTransport::new(id, options, config)?);
-    // The first environment of a kind is waited for; the others start in parallel.
+    // Starting the first environment of an id gives its layout; later environments use this layout and start in
+    // parallel.
     let known = LAYOUTS.lock().unwrap_or_else(PoisonError::into_inner).get(&key).cloned();
     let env = match known {
         Some(layout) => GymEnv::like(layout, transport, restarts)?,

@@ -13,7 +13,7 @@ pub struct GymConfig {
     pub start_timeout: Duration,
     /// The timeout of a reset, a step or a frame.
     pub call_timeout: Duration,
-    /// How many lost workers are replaced within one request.
+    /// The maximum number of lost workers that are replaced within one request.
     pub restarts: usize,
 }
 
@@ -59,7 +59,7 @@ impl Python {
 }
 
 impl Python {
-    /// How to install one of the [`assets::PACKAGES`].
+    /// Returns an instruction for installing one of the [`assets::PACKAGES`].
     pub(crate) fn fix(&self, asset: &str) -> String {
         if self.origin == NAMED {
             return format!("install it there, or unset $SWM_PYTHON and run `swm assets install {asset}`");

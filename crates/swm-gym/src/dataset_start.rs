@@ -1,9 +1,9 @@
 //! Starts of Gymnasium environments at dataset rows: the arguments of `Bridge.reset`.
 //!
 //! Gymnasium has no interface for setting a state, so methods of the environment are called after the reset: those that
-//! the caller names, or those that the bridge found by their names. They return no observation, so the columns take the
-//! values of the start row until the next step; columns of the goal (`goal_NAME`) take those of the goal row in every
-//! step.
+//! the caller names, or those that the bridge found by their names. These methods return no observation, so the columns
+//! take the values of the start row until the next step. Columns of the goal (`goal_NAME`) take the values of the goal
+//! row in the whole episode.
 
 use crate::EnvLayout;
 use serde_json::{Value, json};
@@ -30,7 +30,7 @@ pub fn callables<'a>(layout: &'a EnvLayout, named: &'a [Callable]) -> Result<&'a
 /// When the dataset lacks a column that an argument names.
 pub fn columns(layout: &EnvLayout, stored: &Schema, named: &[Callable]) -> Result<Vec<String>> {
     let find = |name: &str| stored.columns().iter().position(|column| flat(&column.name) == name);
-    // Images are large, so only the goal frame and named ones are read.
+    // Images are large, so only the column of frames and the images that arguments name are read.
     let mut read: Vec<bool> = stored.columns().iter().map(|column| is_always_read(&flat(&column.name))).collect();
     for call in callables(layout, named)? {
         for argument in call.args.values() {
@@ -72,7 +72,7 @@ enum Source {
     Goal,
 }
 
-/// The row that a column is read from, and its name there.
+/// The row that a column is read from, and the column's name in that row.
 fn source(name: &str) -> (Source, &str) {
     goal_source(name).map_or((Source::Start, name), |name| (Source::Goal, name))
 }
@@ -118,7 +118,8 @@ fn recorded_seed(start: RowRef<'_>) -> Result<Option<u64>> {
     Ok(elements.map(join_seed))
 }
 
-/// The argument `recorded` of `Bridge.reset`: the methods with their arguments, and the values of columns afterwards.
+/// The argument `recorded` of `Bridge.reset`: the methods with their arguments, and the recorded values that the
+/// columns take after the methods ran.
 pub fn json(layout: &EnvLayout, from: &DatasetStart<'_>) -> Result<Value> {
     let value = |name: &str| {
         let (row_of, name) = source(name);
@@ -140,9 +141,9 @@ pub fn json(layout: &EnvLayout, from: &DatasetStart<'_>) -> Result<Value> {
     let (mut shown, mut held) = (serde_json::Map::new(), serde_json::Map::new());
     for own in &layout.spec.columns {
         let name = flat(&own.name);
-        let (row_of, there) = source(&name);
+        let (row_of, column) = source(&name);
         let fits =
-            from.start.schema().find(there).is_some_and(|at| from.start.schema().columns()[at].len() == own.len());
+            from.start.schema().find(column).is_some_and(|at| from.start.schema().columns()[at].len() == own.len());
         if let Some(value) = value(&name).filter(|_| fits) {
             let values = if row_of == Source::Goal { &mut held } else { &mut shown };
             values.insert(own.name.clone(), value);

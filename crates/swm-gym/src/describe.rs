@@ -1,5 +1,5 @@
-//! [`Description`]: the bridge's description of an environment. [`EnvLayout`]: the spec and the memory layout that
-//! follow from it.
+//! [`Description`]: the bridge's description of an environment. [`EnvLayout`]: the spec and the memory layout that are
+//! derived from the description.
 
 use serde::Deserialize;
 use std::collections::BTreeMap;
@@ -21,7 +21,7 @@ pub struct Description {
     pixel_art: bool,
     max_episode_steps: usize,
     libraries: BTreeMap<String, String>,
-    /// The methods that set its state, if it has any.
+    /// The methods that set the state of the environment; empty if it has none.
     #[serde(rename = "calls")]
     callables: Vec<Callable>,
     /// Bytes of the buffer.
@@ -32,7 +32,7 @@ impl Description {
     /// Parses the JSON of `Bridge.describe()`.
     ///
     /// # Errors
-    /// When it has another form.
+    /// When the text is not such JSON.
     pub fn parse(json: &str) -> Result<Self> {
         serde_json::from_str(json).map_err(|error| Error::external("parsing the description of an environment", error))
     }
@@ -103,7 +103,7 @@ impl SpaceJson {
                 }
                 Space::Box {
                     shape: shape.clone(),
-                    dtype: type_of(dtype)?,
+                    dtype: dtype_of(dtype)?,
                     low: all(low, f64::NEG_INFINITY),
                     high: all(high, f64::INFINITY),
                 }
@@ -116,7 +116,7 @@ impl SpaceJson {
 }
 
 /// The element type of a NumPy name.
-fn type_of(name: &str) -> Result<DType> {
+fn dtype_of(name: &str) -> Result<DType> {
     const ALL: [DType; 6] = [DType::Bool, DType::U8, DType::Int32, DType::Int64, DType::Float32, DType::Float64];
     let known = || ALL.iter().map(|dtype| dtype.name());
     let found = ALL.iter().find(|dtype| dtype.name() == name);
@@ -158,7 +158,7 @@ impl EnvLayout {
         let mut columns = vec![];
         let mut ranges = vec![];
         for ColumnJson { name, dtype, shape, offset } in &description.columns {
-            let column = ColumnSpec::new(name, type_of(dtype)?, shape.clone());
+            let column = ColumnSpec::new(name, dtype_of(dtype)?, shape.clone());
             ranges.push(*offset..offset + column.row_bytes());
             columns.push(column);
         }
@@ -227,7 +227,7 @@ impl EnvLayout {
         &self.description.libraries
     }
 
-    /// The methods that set its state.
+    /// The methods that set the state of the environment.
     pub(crate) fn callables(&self) -> &[Callable] {
         &self.description.callables
     }

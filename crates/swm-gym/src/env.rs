@@ -1,7 +1,7 @@
 //! [`GymEnv`]: a Gymnasium environment as an [`Env`].
 //!
-//! A snapshot holds the seed, the options and the actions of the episode so far. A restore, and a new worker after a
-//! lost one, replay them. An environment that is not deterministic therefore cannot be restored exactly.
+//! A snapshot holds the seed, the options and the actions of the episode so far. A restore replays them, and so does a
+//! new worker that replaces a lost one. A restore is therefore exact for deterministic environments only.
 
 use crate::dataset_start::{self as start, GoalFrame};
 use crate::describe::header;
@@ -20,7 +20,7 @@ use swm_image::resize::{PillowFilter, PillowResizer};
 pub struct GymEnv {
     transport: Box<dyn Transport>,
     layout: Arc<EnvLayout>,
-    /// How many lost workers are replaced within one request.
+    /// The maximum number of lost workers that are replaced within one request.
     restarts: usize,
     stage: Stage,
     /// `None` before the first reset and after an error.
@@ -50,7 +50,7 @@ enum Stage {
 #[derive(Clone, Copy, PartialEq)]
 enum EnvCall {
     Reset,
-    /// The last of the episode's actions.
+    /// A step with the last of the episode's actions.
     Step,
     Render,
 }
@@ -84,9 +84,9 @@ impl GymEnv {
     /// # Errors
     /// When the defaults of its factors violate a constraint.
     pub fn like(layout: Arc<EnvLayout>, transport: Box<dyn Transport>, restarts: usize) -> Result<Self> {
-        let nothing = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
+        let no_factors = VariationRequest { variation: Some(vec![]), ..VariationRequest::default() };
         Ok(Self {
-            factors: layout.spec.variation_space.resolve(&nothing, Key::new(0))?,
+            factors: layout.spec.variation_space.resolve(&no_factors, Key::new(0))?,
             resizer: PillowResizer::new(if layout.pixel_art() {
                 PillowFilter::Nearest
             } else {
@@ -108,7 +108,7 @@ impl GymEnv {
         &self.layout
     }
 
-    /// Makes a call. If the worker is lost, replays the episode in a new one and calls again.
+    /// Makes a call. If the worker is lost, replays the episode in a new worker and repeats the call.
     fn env_call(&mut self, env_call: EnvCall) -> Result<()> {
         let mut lost = 0;
         loop {
@@ -138,7 +138,7 @@ impl GymEnv {
         }
     }
 
-    /// Waits until the environment is made; makes it again if it is broken.
+    /// Waits until the environment is made. A broken environment is made again.
     fn ready(&mut self) -> Result<(), Failure> {
         if self.stage == Stage::Broken {
             self.transport.restart()?;
@@ -152,7 +152,7 @@ impl GymEnv {
         Ok(())
     }
 
-    /// Checks that the environment has the same description as the others of its id.
+    /// Checks that the environment has the same description as earlier environments of its id.
     fn check_description(&self, description: &Description) -> Result<(), Failure> {
         if *description == self.layout.description {
             return Ok(());
@@ -187,7 +187,7 @@ impl GymEnv {
             EnvCall::Reset => Request::Reset(&episode.reset),
             EnvCall::Render => Request::Render,
             EnvCall::Step => {
-                // A dispatched action is already in the memory, which the worker owns until it answers.
+                // A dispatched action is already in the memory, which only the worker accesses until it answers.
                 if self.dispatched.is_none() {
                     let range = self.layout.action.clone();
                     let last = episode.actions.len() - range.len();
@@ -207,7 +207,7 @@ impl GymEnv {
         if self.renders_steps { Request::StepAndRender } else { Request::Step }
     }
 
-    /// Completes a dispatched call that the caller did not make.
+    /// Waits for the result of a dispatched call, when the caller makes another call than the dispatched one.
     fn finish_dispatched(&mut self) -> Result<()> {
         match self.dispatched {
             None => Ok(()),
@@ -294,8 +294,8 @@ impl DatasetStartEnv for GymEnv {
         start::columns(&self.layout, stored, callables)
     }
 
-    /// The callables and their arguments belong to the arguments of the reset, so that a replay of the episode starts
-    /// at the same state.
+    /// The callables and their arguments belong to the arguments of the reset, so a replay of the episode starts at the
+    /// same state.
     fn reset_from(&mut self, seed: u64, options: &ResetOptions, from: DatasetStart<'_>) -> Result<()> {
         self.finish_dispatched()?;
         let (seed, options) = start::reset(&self.layout, seed, options, from.start)?;
@@ -420,7 +420,8 @@ impl Env for GymEnv {
         Episode::snapshot(self.episode.as_ref(), &self.layout.spec.id)
     }
 
-    /// Replays the episode of the snapshot. Continues the current episode if its actions are a prefix.
+    /// Replays the episode of the snapshot. If the current episode has the same reset and its actions are a prefix of
+    /// the snapshot's, the replay continues the current episode.
     fn restore(&mut self, snapshot: &Snapshot) -> Result<()> {
         let id = &self.layout.spec.id;
         let Some(Episode { reset, goal, actions }) = Episode::parse(snapshot, id, self.layout.action.len()) else {
@@ -431,8 +432,8 @@ impl Env for GymEnv {
             ));
         };
         self.finish_dispatched()?;
-        let same = |now: &&Episode| now.reset == reset && now.goal == goal && actions.starts_with(&now.actions);
-        let prefix = self.episode.as_ref().filter(same);
+        let is_prefix = |now: &&Episode| now.reset == reset && now.goal == goal && actions.starts_with(&now.actions);
+        let prefix = self.episode.as_ref().filter(is_prefix);
         let mut at = match prefix.map(|now| now.actions.len()) {
             Some(at) => at,
             None => {

@@ -1,4 +1,4 @@
-//! [`Episode`]: what determines the state of a Gymnasium environment, and its form as a snapshot.
+//! [`Episode`]: the inputs that determine the state of a Gymnasium environment, and their encoding as a snapshot.
 
 use crate::dataset_start::GoalFrame;
 use swm_core::Snapshot;
@@ -7,7 +7,7 @@ use swm_core::Snapshot;
 pub(crate) struct Episode {
     /// The arguments of its reset, as JSON.
     pub reset: String,
-    /// The frame of its goal, if it starts from a dataset that has one.
+    /// The frame of its goal, if the episode starts at a dataset row and the dataset has frames.
     pub goal: Option<GoalFrame>,
     /// The bytes of its actions, concatenated.
     pub actions: Vec<u8>,
@@ -28,14 +28,14 @@ impl Episode {
 
     /// Parses a snapshot of the environment `id`, whose actions have `action_bytes` bytes; `None` if it is not one.
     pub fn parse(snapshot: &Snapshot, id: &str, action_bytes: usize) -> Option<Self> {
-        let (of, rest) = line(&snapshot.0)?;
+        let (snapshot_id, rest) = line(&snapshot.0)?;
         let (reset, rest) = line(rest)?;
         let (size, rest) = line(rest)?;
         let (height, width) = size.split_once(' ')?;
         let size: [usize; 2] = [height.parse().ok()?, width.parse().ok()?];
         let (rgb, actions) = rest.split_at_checked(size[0].checked_mul(size[1])?.checked_mul(3)?)?;
         let goal = (!rgb.is_empty()).then(|| GoalFrame { size, rgb: rgb.to_vec() });
-        (of == id && actions.len().is_multiple_of(action_bytes)).then(|| Self {
+        (snapshot_id == id && actions.len().is_multiple_of(action_bytes)).then(|| Self {
             reset,
             goal,
             actions: actions.to_vec(),

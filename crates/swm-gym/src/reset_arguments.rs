@@ -45,7 +45,7 @@ pub fn reset_arguments(layout: &EnvLayout, seed: u64, options: &ResetOptions) ->
     Ok(arguments)
 }
 
-/// Folds a seed to the 31 bits that libraries below Gymnasium accept; smaller seeds are unchanged.
+/// Folds a seed to the 31 bits that libraries of Gymnasium environments accept; smaller seeds are unchanged.
 fn fold_seed(seed: u64) -> u64 {
     const BITS: u64 = (1 << 31) - 1;
     if seed <= BITS { seed } else { (seed ^ (seed >> 31) ^ (seed >> 62)) & BITS }

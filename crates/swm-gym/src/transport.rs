@@ -1,9 +1,9 @@
-//! [`Transport`]: sends requests to an environment and holds the memory that it writes results into.
+//! [`Transport`]: sends requests to an environment and holds the memory that the environment writes results into.
 
 use crate::Description;
 use swm_core::Error;
 
-/// A request to an environment. Its results are in [`Transport::memory`] afterwards.
+/// A request to an environment. The environment writes the results into [`Transport::memory`].
 #[derive(Clone, Copy, Debug)]
 pub enum Request<'a> {
     /// Start an episode; the arguments of `Bridge.reset` as JSON.
@@ -39,11 +39,11 @@ impl<'a> Request<'a> {
 /// Why a request failed.
 #[derive(Debug)]
 pub enum Failure {
-    /// A repeated request would fail in the same way: the id is unknown, a package is missing.
+    /// A repeated request would fail in the same way, for example because the id is unknown or a package is missing.
     Refused(Error),
-    /// The environment raised an exception; the traceback. A repeated request would raise again.
+    /// The environment raised an exception, whose traceback this is. A repeated request would raise it again.
     Raised(String),
-    /// The worker is lost; how it ended, with its last output. A new worker may succeed.
+    /// The worker process is lost; the text says how it ended and contains its last output. A new worker may succeed.
     Lost(String),
 }
 
@@ -68,7 +68,7 @@ impl Failure {
 
 /// The connection to one environment.
 pub trait Transport: Send {
-    /// Starts to make the environment again, whatever the state of the old one; need not wait for it.
+    /// Starts to make the environment again, in whatever state the old environment is, without waiting for the new one.
     ///
     /// # Errors
     /// When no worker can be started.
@@ -78,7 +78,7 @@ pub trait Transport: Send {
     /// restart.
     ///
     /// # Errors
-    /// When it cannot be made.
+    /// When the environment cannot be made.
     fn describe(&mut self) -> Result<Description, Failure>;
 
     /// Whether the environment runs in another process, in parallel with the caller.

@@ -1,9 +1,9 @@
 //! [`WorkerTransport`]: an environment in a separate Python process, over shared memory.
 //!
 //! The process gets three descriptors: a socket for requests and answers as its standard input, the shared memory as
-//! its standard output (an unnamed file, deleted with its last descriptor), and a pipe as its standard error, whose
-//! last lines appear in error messages. It ends when the transport is dropped, when its socket closes, and, on Linux,
-//! when this process ends in any way.
+//! its standard output (an anonymous file, which is deleted when its last descriptor closes), and a pipe as its
+//! standard error, whose last lines appear in error messages. The process ends when the transport is dropped, when its
+//! socket closes, and, on Linux, when this process ends in any way.
 
 use crate::config::{GymConfig, Python};
 use crate::{BRIDGE, CRAFTAX, Description, Failure, Request, Transport, WORKER, assets};
@@ -39,13 +39,13 @@ struct Process {
     socket: UnixStream,
     file: File,
     memory: Option<MmapMut>,
-    /// Whether a request was sent whose answer is not read yet; the worker then owns the memory.
+    /// Whether a request was sent whose answer is not read yet. Only the worker accesses the memory until then.
     pending: bool,
     tail: Tail,
 }
 
 impl WorkerTransport {
-    /// Starts a process that makes the environment; does not wait for it.
+    /// Starts a process that makes the environment, without waiting for the environment.
     ///
     /// # Errors
     /// When Python cannot be started.
@@ -71,7 +71,7 @@ impl WorkerTransport {
         let mut how = if matches!(problem.kind(), TimedOut | WouldBlock) {
             format!("worker process {id} did not answer within {limit:?} and was stopped")
         } else {
-            match process.end() {
+            match process.exit_status() {
                 Some(status) => format!("worker process {id} ended with {status}"),
                 None => format!("worker process {id} closed its connection ({problem}) and was stopped"),
             }
@@ -92,7 +92,7 @@ impl WorkerTransport {
         sent.and_then(|()| process.receive()).map_err(|problem| self.lose(&problem, limit))
     }
 
-    /// Converts an answer that reports a failure.
+    /// Converts an answer that reports a failure into a [`Failure`].
     fn failure(&self, kind: u8, text: Vec<u8>) -> Failure {
         let text = String::from_utf8_lossy(&text).into_owned();
         let (id, python) = (&self.id, &self.config.python);
@@ -128,7 +128,7 @@ impl Transport for WorkerTransport {
         let modules = BTreeMap::from([("swm_bridge", BRIDGE), ("swm_craftax", CRAFTAX)]);
         let request = serde_json::json!({"id": self.id, "options": self.options, "modules": modules});
         let mut process = Process::start(&self.id, &self.config.python).map_err(Failure::Refused)?;
-        // A process that does not receive the request is reported by `describe`.
+        // If the process does not receive the request, `describe` returns the error.
         if let Err(problem) = process.send(b'm', request.to_string().as_bytes()) {
             tracing::debug!("{}: its worker did not receive the first request: {problem}", self.id);
         }
@@ -163,7 +163,7 @@ impl Transport for WorkerTransport {
         true
     }
 
-    /// A worker that cannot receive the request is reported by the call.
+    /// If the worker cannot receive the request, [`Transport::call`] returns the error.
     fn dispatch(&mut self, request: Request<'_>) -> bool {
         let Some(process) = &mut self.process else { return false };
         process.pending = process.pending || process.send(request.op(), request.payload()).is_ok();
@@ -200,7 +200,8 @@ impl Process {
         command.stdout(Stdio::from(file.try_clone().map_err(io)?)).stderr(Stdio::piped());
         // Terminal signals reach this process only, which then ends its workers.
         command.process_group(0);
-        // One core per environment at most: there are as many workers as environments. Variables that are set stay.
+        // Each worker uses at most one core, because there are as many workers as environments. Variables that are
+        // already set keep their values.
         let cache = assets::folder().join("jax-cache");
         let defaults = [
             ("OMP_NUM_THREADS", "1".as_ref()),
@@ -213,7 +214,7 @@ impl Process {
             ("SDL_AUDIODRIVER", "dummy".as_ref()),
             ("PYGAME_HIDE_SUPPORT_PROMPT", "1".as_ref()),
         ];
-        // Without a display, MuJoCo's Python package renders through EGL only.
+        // Without a display, MuJoCo's Python package can render only through EGL.
         let headless = std::env::var_os("DISPLAY").is_none().then_some(("MUJOCO_GL", "egl".as_ref()));
         for (name, value) in defaults.into_iter().chain(headless) {
             if std::env::var_os(name).is_none() {
@@ -257,14 +258,14 @@ impl Process {
         Ok(())
     }
 
-    /// The exit status, if the process ends within the timeout.
-    fn end(&mut self) -> Option<std::process::ExitStatus> {
-        let turns = 100;
-        for _ in 0..turns {
+    /// Waits for the process to end and returns its exit status; `None` after [`EXIT_TIMEOUT`].
+    fn exit_status(&mut self) -> Option<std::process::ExitStatus> {
+        let polls = 100;
+        for _ in 0..polls {
             if let Ok(Some(status)) = self.child.try_wait() {
                 return Some(status);
             }
-            std::thread::sleep(EXIT_TIMEOUT / turns);
+            std::thread::sleep(EXIT_TIMEOUT / polls);
         }
         None
     }
@@ -292,10 +293,10 @@ impl Drop for Process {
 
 #[allow(unsafe_code, reason = "shared memory is mapped from a file")]
 fn map(file: &File) -> std::io::Result<MmapMut> {
-    // SAFETY: the file has no name; only this process and its worker hold it, and the worker never changes its size.
-    // The worker writes to it only between a request and its answer, when this process holds no reference:
-    // `Transport::dispatch` and `call` borrow the transport mutably, and between the two it returns no reference to the
-    // memory. A worker that does not answer in time is killed before the memory is touched again.
+    // SAFETY: the file is anonymous; only this process and its worker hold a descriptor of it, and the worker never
+    // changes its size. The worker writes to it only between a request and its answer, when this process holds no
+    // reference: `Transport::dispatch` and `call` borrow the transport mutably, and between the two it returns no
+    // reference to the memory. A worker that does not answer in time is killed before the memory is touched again.
     unsafe { MmapMut::map_mut(file) }
 }
 
@@ -335,7 +336,7 @@ impl Tail {
         Self { lines, closed }
     }
 
-    /// The last lines, once the worker has ended.
+    /// Waits until the pipe closes, for at most [`EXIT_TIMEOUT`], and returns the last lines.
     fn lines(&self) -> Vec<String> {
         // A child of the worker may hold the pipe open, so the wait is bounded.
         let _closed_or_timed_out = self.closed.recv_timeout(EXIT_TIMEOUT);
@@ -352,10 +353,10 @@ fn spawn(command: Command) -> std::io::Result<Child> {
     static STARTER: Mutex<Option<(u32, Sender<Job>)>> = Mutex::new(None);
     let (answer, child) = sync_channel(1);
     let mut starter = STARTER.lock().unwrap_or_else(PoisonError::into_inner);
-    // A fork of this process does not have that thread.
-    let here = std::process::id();
+    // A forked process does not have the threads of its parent.
+    let current = std::process::id();
     let jobs = match &*starter {
-        Some((process, jobs)) if *process == here => jobs.clone(),
+        Some((process, jobs)) if *process == current => jobs.clone(),
         _ => {
             let (jobs, queue) = channel::<Job>();
             std::thread::Builder::new().name("swm-gym-starter".to_owned()).spawn(move || {
@@ -364,7 +365,7 @@ fn spawn(command: Command) -> std::io::Result<Child> {
                     let _received = answer.send(command.spawn());
                 }
             })?;
-            *starter = Some((here, jobs.clone()));
+            *starter = Some((current, jobs.clone()));
             jobs
         }
     };

@@ -1,4 +1,5 @@
-//! The codecs of stored frames. Decoding recognises the format by the first bytes, so a dataset may mix codecs.
+//! [`ImageCodec`]: the codecs of stored frames. The decoder recognises the format by the first bytes, so a dataset may
+//! mix codecs.
 
 use crate::{jpeg, png_file, qoi};
 use serde::{Deserialize, Serialize};
@@ -9,7 +10,8 @@ use swm_core::{Error, Result};
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
 pub enum ImageCodec {
-    /// JPEG with chrominance at half resolution (4:2:0), as the reference's datasets store it (with quality 95).
+    /// JPEG with chrominance at half resolution (4:2:0), as datasets of the reference implementation store frames (with
+    /// quality 95).
     Jpeg {
         /// 1 (smallest files) to 100 (most faithful).
         quality: u8,
@@ -127,7 +129,8 @@ pub fn decode(bytes: &[u8], height: usize, width: usize, out: &mut [u8]) -> Resu
             if jpeg::decode(bytes, height, width, out) {
                 return Ok(());
             }
-            // The fast decoder refuses other kinds of JPEG, other sizes and damaged files; the general one decides.
+            // The fast decoder returns false for unsupported kinds of JPEG, other sizes and damaged files. The general
+            // decoder decodes unsupported kinds and returns an error for the rest.
             let decoder = jpeg::Decoder::new(bytes)?;
             check(decoder.size())?;
             decoder.decode(out)
@@ -160,14 +163,14 @@ mod tests {
         rgb
     }
 
-    /// The test image and what decoding its encoding returns.
+    /// Returns the test image, and the pixels after encoding and decoding it.
     fn round_trip(codec: ImageCodec, height: usize, width: usize) -> (Vec<u8>, Vec<u8>) {
         let rgb = test_image(height, width);
         let mut bytes = vec![];
-        codec.encode(&rgb, height, width, &mut bytes).expect("encodes");
-        assert_eq!(image_size(&bytes).expect("has a size"), (height, width));
+        codec.encode(&rgb, height, width, &mut bytes).expect("an encoded image");
+        assert_eq!(image_size(&bytes).expect("an image size"), (height, width));
         let mut decoded = vec![0; rgb.len()];
-        decode(&bytes, height, width, &mut decoded).expect("decodes");
+        decode(&bytes, height, width, &mut decoded).expect("a decoded image");
         (rgb, decoded)
     }
 
@@ -190,13 +193,13 @@ mod tests {
         let mut out = vec![0; rgb.len()];
         for codec in [ImageCodec::Jpeg { quality: 95 }, ImageCodec::Png, ImageCodec::Qoi] {
             let mut bytes = vec![];
-            codec.encode(&rgb, 40, 40, &mut bytes).expect("encodes");
+            codec.encode(&rgb, 40, 40, &mut bytes).expect("an encoded image");
             for cut in (0..bytes.len() * 9 / 10).step_by(7) {
                 assert!(decode(&bytes[..cut], 40, 40, &mut out).is_err(), "{codec:?} cut at {cut}");
             }
             let other = decode(&bytes, 20, 80, &mut out).expect_err("another size").to_string();
             assert!(other.contains("40 x 40") && other.contains("20 x 80"), "{other}");
         }
-        assert!(decode(b"GIF89a", 40, 40, &mut out).expect_err("no image").to_string().contains("JPEG, PNG or QOI"));
+        assert!(decode(b"GIF89a", 40, 40, &mut out).expect_err("GIF bytes").to_string().contains("JPEG, PNG or QOI"));
     }
 }

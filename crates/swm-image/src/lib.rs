@@ -1,9 +1,9 @@
 //! Images in memory and in files: encoding, decoding and pixel arithmetic, all without C code.
 //!
-//! - [`ImageCodec`], [`decode`], [`image_size`]: the codecs that datasets store frames with. A stored image names its
-//!   own format in its first bytes.
+//! - [`ImageCodec`], [`decode`], [`image_size`]: the codecs that datasets store frames with. The first bytes of a
+//!   stored image identify its format.
 //! - [`read_png`], [`write_png`]: PNG files.
-//! - [`resize`]: one resizer per semantics (Pillow's and OpenCV's filters).
+//! - [`resize`]: resizing as Pillow and as OpenCV define it.
 //!
 //! Videos are in `swm-video`. Images are `[height, width, 3]` RGB bytes, row-major, unless stated otherwise.
 

@@ -1,4 +1,4 @@
-//! PNG: the stored form of frames in memory, and files for people.
+//! PNG: encoding and decoding of stored frames in memory, and reading and writing of image files.
 
 use crate::RgbImage;
 use png::{Compression, EncodingError, Filter, Transformations};
@@ -7,13 +7,13 @@ use std::io::{BufReader, BufWriter, Cursor};
 use std::path::Path;
 use swm_core::{Error, Result};
 
-/// Bytes that the pixels of a PNG file may take in memory.
+/// The maximum size of the pixels of a PNG file in memory, in bytes.
 const MAX_BYTES: usize = 1 << 30;
 
 /// Appends an RGB image, `[height, width, 3]`, as a PNG file tuned for fast decoding.
 ///
 /// # Errors
-/// When the PNG encoder refuses it.
+/// When the PNG encoder fails.
 pub fn encode(rgb: &[u8], height: u16, width: u16, out: &mut Vec<u8>) -> Result<()> {
     let failed = |error: EncodingError| Error::external("encoding a PNG image", error);
     let mut encoder = png::Encoder::new(out, width.into(), height.into());
@@ -131,13 +131,14 @@ mod tests {
 
     #[test]
     fn written_files_are_read_back() {
-        let folder = tempfile::tempdir().expect("folder");
+        let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("a.png");
         let rgb: Vec<u8> = (0..5 * 4 * 3).collect();
-        write_png(&path, 5, 4, &rgb).expect("written");
-        assert_eq!(read_png(&path).expect("read"), RgbImage { width: 5, height: 4, rgb: rgb.clone() });
+        write_png(&path, 5, 4, &rgb).expect("a written file");
+        assert_eq!(read_png(&path).expect("a readable file"), RgbImage { width: 5, height: 4, rgb: rgb.clone() });
         assert!(write_png(&path, 4, 4, &rgb).is_err());
-        let missing = write_png(&folder.path().join("missing/a.png"), 5, 4, &rgb).expect_err("no folder").to_string();
+        let missing =
+            write_png(&folder.path().join("missing/a.png"), 5, 4, &rgb).expect_err("a missing folder").to_string();
         assert!(missing.contains("creating an image"), "{missing}");
     }
 }

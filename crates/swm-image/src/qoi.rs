@@ -1,9 +1,9 @@
 //! The QOI image format (specification 1.0, qoiformat.org): lossless, and the fastest to decode of the lossless
 //! formats that other programs read as well.
 //!
-//! An image is a sequence of operations on the last pixel: repeat it, take one of 64 earlier ones, change it a
-//! little, or replace it. Frames of simulations are mostly runs, which are found and filled here many bytes at a
-//! time.
+//! An image is a sequence of operations on the last pixel: repeat it, take one of 64 earlier pixels, change it a
+//! little, or replace it. Frames of simulations consist mostly of runs of equal pixels. The encoder finds runs, and the
+//! decoder fills them, many bytes at a time.
 
 use swm_core::{Error, Result};
 
@@ -12,7 +12,8 @@ const HEADER: usize = 14;
 /// The bytes after the last operation.
 const END: [u8; 8] = [0, 0, 0, 0, 0, 0, 0, 1];
 
-// Operations, by their first byte. Those of two bits hold a payload of six.
+// Tags of the operations, in the first byte. The tags from `INDEX` to `RUN` are the two upper bits; the six lower bits
+// are payload.
 const INDEX: u8 = 0x00;
 const DIFF: u8 = 0x40;
 const LUMA: u8 = 0x80;
@@ -32,8 +33,8 @@ const START: Pixel = [0, 0, 0, 255];
 
 /// Returns the slot of a pixel in the table of earlier pixels: (3 r + 5 g + 7 b + 11 a) mod 64.
 fn slot(pixel: Pixel) -> usize {
-    // One multiplication sums all four products in the top byte. The lower sums do not carry into it: at most 4590 ·
-    // 2^40.
+    // One multiplication sums all four products in the top byte. The lower sums do not carry into the top byte: they
+    // are at most 4590 · 2^40.
     let bytes = u64::from(u32::from_le_bytes(pixel));
     let spread = (bytes & 0xff00_ff00) << 32 | bytes & 0x00ff_00ff;
     (spread.wrapping_mul(0x0300_0700_0005_000b) >> 56) as usize % 64
@@ -89,7 +90,7 @@ pub fn encode(rgb: &[u8], height: u16, width: u16, out: &mut Vec<u8>) {
 fn repeats(rgb: &[u8], at: usize) -> usize {
     const WIDE: usize = 32;
     let mut end = at;
-    // Pixels that equal themselves shifted by one pixel have one colour.
+    // If bytes equal the bytes one pixel before them, all their pixels have one colour.
     while let (Some(a), Some(b)) = (rgb[end - 3..].first_chunk::<WIDE>(), rgb[end..].first_chunk::<WIDE>()) {
         if a != b {
             break;
@@ -142,16 +143,21 @@ pub fn decode(bytes: &[u8], out: &mut [u8]) -> Result<()> {
                 seen[slot(pixel)] = pixel;
             }
             LUMA..RUN => {
-                let Some((&reds, after)) = rest.split_first() else { return Err(damaged("too few operations")) };
+                let Some((&nibbles, after)) = rest.split_first() else { return Err(damaged("too few operations")) };
                 rest = after;
                 let green = (op & 63).wrapping_sub(32);
                 let [r, g, b, a] = pixel;
-                let other = |nibble: u8| green.wrapping_add(nibble).wrapping_sub(8);
-                pixel = [r.wrapping_add(other(reds >> 4)), g.wrapping_add(green), b.wrapping_add(other(reds & 15)), a];
+                let red_or_blue = |nibble: u8| green.wrapping_add(nibble).wrapping_sub(8);
+                pixel = [
+                    r.wrapping_add(red_or_blue(nibbles >> 4)),
+                    g.wrapping_add(green),
+                    b.wrapping_add(red_or_blue(nibbles & 15)),
+                    a,
+                ];
                 seen[slot(pixel)] = pixel;
             }
             RUN..RGB => {
-                // A long run is several operations; they are filled at once.
+                // A long run is several operations, which are filled at once.
                 let mut run = usize::from(op - RUN) + 1;
                 while let Some((&more @ RUN..RGB, after)) = rest.split_first() {
                     rest = after;
@@ -209,15 +215,15 @@ mod tests {
         assert_eq!(bytes.remove(0), 7, "appends");
         assert_eq!(size(&bytes).expect("a header"), (height.into(), width.into()));
         let mut back = vec![0; rgb.len()];
-        decode(&bytes, &mut back).expect("decodes");
+        decode(&bytes, &mut back).expect("a decoded image");
         assert!(back == rgb, "{height} x {width} differs after a round trip");
         bytes
     }
 
     #[test]
-    fn operations_are_those_of_the_specification() {
-        // Two pixels of the start's colour, one close to it, one less close, one far, an earlier one, and a run of
-        // 63.
+    fn encodes_operations_of_the_specification() {
+        // Two pixels of the colour of `START`, one with a small difference, one with a larger difference, an unrelated
+        // one, an earlier one, and a run of 63.
         let mut pixels = vec![[0, 0, 0], [0, 0, 0], [1, 255, 1], [11, 9, 9], [200, 0, 7], [1, 255, 1]];
         pixels.extend([[9, 9, 9]; 64]);
         let bytes = round_trip(pixels.as_flattened(), 7, 10);
@@ -229,12 +235,12 @@ mod tests {
     }
 
     #[test]
-    fn four_channel_files_of_other_writers_decode() {
+    fn files_with_four_channels_decode() {
         let mut bytes = [&b"qoif"[..], &2_u32.to_be_bytes(), &1_u32.to_be_bytes(), &[4, 1]].concat();
         bytes.extend([RGBA, 10, 20, 30, 40, DIFF | 0b11_10_01]);
         bytes.extend(END);
         let mut out = [0; 6];
-        decode(&bytes, &mut out).expect("decodes");
+        decode(&bytes, &mut out).expect("a decoded image");
         assert_eq!(out, [10, 20, 30, 11, 20, 29]);
     }
 
@@ -242,12 +248,12 @@ mod tests {
     fn operations_must_fill_the_image_exactly() {
         let rgb: Vec<u8> = (0..300_u32).map(|i| (i * i / 7) as u8).collect();
         let bytes = round_trip(&rgb, 10, 10);
-        let refused = |bytes: &[u8], pixels: usize| decode(bytes, &mut vec![0; 3 * pixels]).is_err();
-        assert!((0..bytes.len()).all(|end| refused(&bytes[..end], 100)));
-        assert!(refused(&bytes, 99) && refused(&bytes, 101) && !refused(&bytes, 100));
-        assert!(refused(&[&bytes[..], &[0]].concat(), 100));
+        let fails = |bytes: &[u8], pixels: usize| decode(bytes, &mut vec![0; 3 * pixels]).is_err();
+        assert!((0..bytes.len()).all(|end| fails(&bytes[..end], 100)));
+        assert!(fails(&bytes, 99) && fails(&bytes, 101) && !fails(&bytes, 100));
+        assert!(fails(&[&bytes[..], &[0]].concat(), 100));
         let flat = round_trip(&[7; 300], 10, 10);
-        assert!(refused(&flat, 40), "a run beyond the end");
+        assert!(fails(&flat, 40), "a run beyond the end");
     }
 
     proptest! {

@@ -1,4 +1,4 @@
-//! The owned RGB image that readers of files and contact sheets return.
+//! [`RgbImage`]: the type of images that functions return.
 
 /// An RGB image in memory.
 #[derive(Clone, Debug, PartialEq, Eq)]

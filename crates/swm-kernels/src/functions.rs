@@ -21,8 +21,8 @@ pub fn gelu(x: &mut [f32]) {
     dispatch(Gelu(x));
 }
 
-/// Computes the tangent of [`gelu`] at every element: replaces `x` by the tangent's value at 0, `-x² φ(x)`, and writes
-/// its slope, `Φ(x) + x φ(x)`, to `slopes`.
+/// Computes the tangent of [`gelu`] at every element: replaces `x` by the value of the tangent line at 0, `-x² φ(x)`,
+/// and writes its slope, `Φ(x) + x φ(x)`, to `slopes`.
 ///
 /// # Shapes
 /// `x` and `slopes` have the same length.
@@ -91,7 +91,7 @@ pub(crate) fn exp<L: Level>(x: f32) -> f32 {
     series * scale
 }
 
-/// Returns the sum of the elements, added lane by lane.
+/// Returns the sum of the elements, accumulated in separate lanes.
 #[inline(always)]
 pub(crate) fn sum(x: &[f32]) -> f32 {
     let mut lanes = [0.0f32; LANES];
@@ -104,7 +104,7 @@ pub(crate) fn sum(x: &[f32]) -> f32 {
     fold(lanes) + rest.iter().sum::<f32>()
 }
 
-/// Returns the scalar product, added lane by lane.
+/// Returns the scalar product, accumulated in separate lanes.
 #[inline(always)]
 pub(crate) fn dot<L: Level>(a: &[f32], b: &[f32]) -> f32 {
     let mut lanes = [0.0f32; LANES];

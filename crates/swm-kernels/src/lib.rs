@@ -1,9 +1,9 @@
 //! CPU kernels of planning and of training vision transformers, on plain row-major `f32` slices.
 //!
 //! A tensor library allocates and reads memory once per operation. Here weights are laid out once ([`Panels`]), scratch
-//! memory is reused ([`ScratchPool`]), and every row is computed on its own, so that no byte of a result depends on the
-//! number of threads or on the other rows. The crate depends neither on tensors nor on model families: `swm-models` converts
-//! its layers to [`Affine`], [`Norm`], [`Panels`] and [`VitParameters`].
+//! memory is reused ([`ScratchPool`]), and every row is computed independently, so no byte of a result depends on the
+//! number of threads or on the other rows. The crate depends neither on tensors nor on model families: `swm-models`
+//! converts its layers to [`Affine`], [`Norm`], [`Panels`] and [`VitParameters`].
 
 #![allow(clippy::needless_range_loop, reason = "indexed loops over constant lane counts are vectorised")]
 

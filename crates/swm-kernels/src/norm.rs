@@ -4,7 +4,7 @@ use crate::Affine;
 use crate::functions::{dot, sum};
 use swm_simd::{Kernel, Level, dispatch};
 
-/// A layer normalisation: scale and shift per feature, and the number added to the variance.
+/// A layer normalisation: scale and shift per feature, and the constant added to the variance.
 #[derive(Clone, Debug)]
 pub struct Norm {
     weight: Vec<f32>,
@@ -48,7 +48,7 @@ pub struct Modulation<'a> {
     pub parts: usize,
     /// Index of the part that holds the shift; the scale is the next part.
     pub shift: usize,
-    /// Number that the standardisation before the modulation adds to the variance.
+    /// The constant that the standardisation before the modulation adds to the variance.
     pub epsilon: f32,
 }
 

@@ -1,8 +1,8 @@
 //! [`Panels`]: products of rows with a matrix that is laid out once and used often.
 //!
-//! The matrix is cut into panels of 32 columns, so that a product reads it in order. A tile of the result, some rows of a
-//! panel, stays in registers while its terms are added one after the other: a row's result does not depend on the other
-//! rows.
+//! The matrix is cut into panels of 32 columns, so that a product reads it in order. A tile of the result, some rows of
+//! a panel, stays in registers while its terms are added one after the other. The result of a row does not depend on
+//! the other rows.
 
 use crate::Affine;
 use swm_simd::{CpuLevel, Kernel, Level, dispatch};
@@ -74,7 +74,8 @@ impl Panels {
         }
     }
 
-    /// Replaces the matrix by `inputs` rows in memory, given as a slice and the distance from row to row in elements.
+    /// Replaces the matrix by the first `inputs` rows of an array, given as a slice and the distance from row to row in
+    /// elements.
     ///
     /// # Shapes
     /// `rows` is `[inputs, outputs]` with the given stride.
@@ -112,7 +113,8 @@ impl Panels {
         self.apply_strided(y.len() / self.outputs, (x, self.inputs), (y, self.outputs));
     }
 
-    /// Computes `y = x W + b` for rows with strides: each array is a slice and the distance from row to row in elements.
+    /// Computes `y = x W + b` for rows with strides: each array is a slice and the distance from row to row in
+    /// elements.
     ///
     /// # Shapes
     /// `x` is `[rows, inputs]`, `y` is `[rows, outputs]`.
@@ -209,10 +211,10 @@ impl<const TRANSPOSED: bool> Product<'_, TRANSPOSED> {
                     }
                 }
             }
-            let Some(held) = self.tile.as_chunks_mut::<W>().0.first_chunk_mut::<R>() else { return };
-            *held = sums;
+            let Some(stored) = self.tile.as_chunks_mut::<W>().0.first_chunk_mut::<R>() else { return };
+            *stored = sums;
             let width = (self.weights.outputs - first).min(W * LANES);
-            for (r, sums) in held.iter().enumerate() {
+            for (r, sums) in stored.iter().enumerate() {
                 let to = &mut self.y.0[(row + r) * self.y.1 + first..][..width];
                 for (to, sums) in to.chunks_mut(LANES).zip(sums) {
                     if TRANSPOSED {
@@ -258,7 +260,7 @@ mod tests {
                 again.fill_rows(inputs, (&matrix, outputs));
                 again.apply(&x, &mut sum);
                 assert_eq!(sum, y);
-                // A row on its own has the same bytes as among other rows, and with a stride.
+                // A row that is computed alone and with a stride has the same bytes as among other rows.
                 let mut alone = vec![f32::NAN; outputs + 2];
                 panels.apply_strided(1, (&x[(rows - 1) * inputs..], inputs), (&mut alone, outputs + 2));
                 assert_eq!(alone[..outputs], y[(rows - 1) * outputs..]);

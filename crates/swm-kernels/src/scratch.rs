@@ -2,12 +2,13 @@
 
 use std::sync::{Mutex, PoisonError};
 
-/// A pool of scratch values: as many as threads have ever used it at the same time.
+/// A pool of scratch values. Its size is the largest number of threads that have used it at the same time.
 #[derive(Debug, Default)]
 pub struct ScratchPool<T>(Mutex<Vec<T>>);
 
 impl<T: Default> ScratchPool<T> {
-    /// Calls `work` with a scratch value that no other thread uses meanwhile. It holds what its last user left in it.
+    /// Calls `work` with a scratch value that no other thread uses meanwhile. The value still contains the data of its
+    /// last use.
     pub fn with<R>(&self, work: impl FnOnce(&mut T) -> R) -> R {
         let free = || self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let mut scratch = free().pop().unwrap_or_default();

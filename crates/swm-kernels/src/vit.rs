@@ -1,13 +1,14 @@
 //! [`VitEncoder`]: the class token of a vision transformer (Dosovitskiy et al. 2021), one image at a time.
 //!
-//! The tokens of an image are split into blocks of rows, which threads compute in parallel; every row is computed on its
-//! own, so that the result has the same bytes on any number of threads. The last layer computes only the class token.
+//! The tokens of an image are split into blocks of rows, which threads compute in parallel; every row is computed
+//! independently, so the result has the same bytes on any number of threads. The last layer computes only the class
+//! token.
 
 use crate::functions::{add, gelu, softmax};
 use crate::{Affine, Norm, Panels, ScratchPool, grown};
 use rayon::prelude::*;
 
-/// The most rows of a block.
+/// The maximum number of rows of a block.
 const BLOCK: usize = 36;
 
 /// Parameters of a vision transformer, or their gradients.
@@ -67,7 +68,7 @@ pub(crate) struct Layer {
     pub mlp: [Panels; 2],
 }
 
-/// Memory of one image.
+/// Scratch memory for one image.
 #[derive(Default)]
 struct Scratch {
     x: Vec<f32>,
@@ -77,7 +78,7 @@ struct Scratch {
     keys_values: Vec<Panels>,
 }
 
-/// Memory of one block of rows.
+/// Scratch memory for one block of rows.
 #[derive(Default)]
 struct BlockScratch {
     narrow: Vec<f32>,
@@ -153,9 +154,9 @@ impl VitEncoder {
     /// Writes the class token and the embedded patches with their positions to `x`, `[tokens, dim]`.
     fn embed_patches(&self, patches: &[f32], block: usize, x: &mut [f32]) {
         let (dim, inputs) = (self.dim, self.embed.inputs());
-        let (class, others) = x.split_at_mut(dim);
+        let (class, patch_tokens) = x.split_at_mut(dim);
         class.copy_from_slice(&self.positions[..dim]);
-        let rows = others.par_chunks_mut(block * dim).zip(patches.par_chunks(block * inputs));
+        let rows = patch_tokens.par_chunks_mut(block * dim).zip(patches.par_chunks(block * inputs));
         rows.zip(self.positions[dim..].par_chunks(block * dim)).for_each(|((x, patches), positions)| {
             self.embed.apply(patches, x);
             add(x, positions);
@@ -182,7 +183,8 @@ impl Layer {
         }
     }
 
-    /// Computes the layer for a block of rows: `x` is `[rows, dim]`, their part of `qkv` is `[rows, 3 * dim]`.
+    /// Computes the layer for a block of rows: `x` is `[rows, dim]`, and `qkv`, the part of these rows, is
+    /// `[rows, 3 * dim]`.
     fn apply(&self, x: &mut [f32], qkv: &[f32], keys_values: &[Panels], scratch: &mut BlockScratch) {
         let dim = self.out.inputs();
         let (rows, heads) = (x.len() / dim, keys_values.len() / 2);

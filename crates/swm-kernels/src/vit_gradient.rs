@@ -1,6 +1,6 @@
 //! [`VitGradient`]: gradients of a vision transformer's parameters, one image after the other.
 //!
-//! The backward pass reads the matrix products that the forward pass stored, and recomputes what lies between them
+//! The backward pass reads the matrix products that the forward pass stored, and recomputes the operations between them
 //! (normalisations, attention, GELU). The last layer computes only the class token, so no gradient of another token
 //! passes through its feed-forward block.
 

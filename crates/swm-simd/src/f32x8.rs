@@ -5,16 +5,16 @@
 /// Floats per vector.
 pub const LANES: usize = 8;
 
-/// Operations on eight floats. A value of such a type shows that the CPU supports the operations.
+/// Operations on eight floats. The existence of a value of such a type proves that the CPU supports the operations.
 pub trait F32x8: Copy {
     /// Eight floats.
     type Vector: Copy;
-    /// A boolean for each of them.
+    /// A boolean for each lane.
     type Mask: Copy;
 
     /// Loads eight floats.
     fn load(self, from: &[f32; LANES]) -> Self::Vector;
-    /// Repeats a float.
+    /// Returns a vector with `value` in every lane.
     fn splat(self, value: f32) -> Self::Vector;
     /// Returns a + b.
     fn add(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
@@ -24,7 +24,7 @@ pub trait F32x8: Copy {
     fn mul(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
     /// Returns a / b.
     fn div(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
-    /// Returns the smaller of both, and b where one is NaN.
+    /// Returns the smaller of a and b, and b where either is NaN.
     fn min(self, a: Self::Vector, b: Self::Vector) -> Self::Vector;
     /// Returns a >= b, which is false for NaN.
     fn ge(self, a: Self::Vector, b: Self::Vector) -> Self::Mask;
@@ -34,17 +34,17 @@ pub trait F32x8: Copy {
     fn and(self, a: Self::Mask, b: Self::Mask) -> Self::Mask;
     /// Returns a | b.
     fn or(self, a: Self::Mask, b: Self::Mask) -> Self::Mask;
-    /// Whether the mask is true anywhere.
+    /// Whether the mask is true in any lane.
     fn any(self, mask: Self::Mask) -> bool;
     /// Stores eight floats.
     fn store(self, values: Self::Vector, to: &mut [f32; LANES]);
-    /// Stores floats where the mask is true.
+    /// Stores the lanes of `values` where the mask is true.
     fn store_masked(self, mask: Self::Mask, values: Self::Vector, to: &mut [f32; LANES]);
-    /// Stores a word where the mask is true.
+    /// Stores `word` in the lanes where the mask is true.
     fn store_word_masked(self, mask: Self::Mask, word: u32, to: &mut [u32; LANES]);
 }
 
-/// One float after the other, on every CPU.
+/// Computes one lane after the other, on every CPU.
 #[derive(Clone, Copy, Debug)]
 pub struct Portable;
 
@@ -133,7 +133,7 @@ mod avx2 {
         _mm256_storeu_si256, _mm256_sub_ps,
     };
 
-    /// Shows that the CPU supports AVX2.
+    /// Proves that the CPU supports AVX2.
     #[derive(Clone, Copy, Debug)]
     pub struct Avx2Lanes(());
 

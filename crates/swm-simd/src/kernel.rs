@@ -24,8 +24,8 @@ pub trait Level {
     }
 }
 
-/// A computation that is compiled for every level. Every function that it calls must be `#[inline(always)]`, so that it
-/// is compiled for the level, too.
+/// A computation that is compiled for every level. Every function that it calls must be `#[inline(always)]`, so that
+/// the function is compiled for the level, too.
 pub trait Kernel {
     /// The result.
     type Output;
@@ -60,8 +60,8 @@ pub fn dispatch<K: Kernel>(kernel: K) -> K::Output {
     dispatch_avx2(kernel)
 }
 
-/// Runs a kernel at AVX2 where the CPU supports it and at the baseline elsewhere, for kernels that AVX-512 does not make
-/// faster.
+/// Runs a kernel at AVX2 where the CPU supports it and at the baseline elsewhere, for kernels that AVX-512 does not
+/// make faster.
 #[inline]
 pub fn dispatch_avx2<K: Kernel>(kernel: K) -> K::Output {
     #[cfg(target_arch = "x86_64")]

@@ -1,7 +1,7 @@
-//! The one choice of the CPU's vector instructions at run time, for every crate of the workspace. Without dependencies.
+//! Chooses the CPU's vector instructions at run time, for every crate of the workspace. This crate has no dependencies.
 //!
-//! - [`dispatch`] and [`dispatch_avx2`] run a [`Kernel`], plain loops that are compiled for several instruction sets, at
-//!   the best level that the CPU supports.
+//! - [`dispatch`] and [`dispatch_avx2`] run a [`Kernel`], plain loops that are compiled for several instruction sets,
+//!   at the best level that the CPU supports.
 //! - [`vectorize!`] does the same for single functions.
 //! - [`F32x8`] provides eight floats at once, for loops that are too short for the compiler to vectorise.
 //! - [`cpu_level`] returns the level for code that needs nothing else.

@@ -1,4 +1,4 @@
-//! The opened videos of a dataset: their tables are read once and cached, and decoders are pooled.
+//! The opened videos of a dataset: caches the tables of each video and pools decoders.
 
 use crate::decode::{DecoderPool, FrameRequest, Source, Video};
 use rayon::prelude::*;

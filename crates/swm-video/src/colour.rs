@@ -1,6 +1,6 @@
 //! Conversion of decoded planes to RGB and back.
 //!
-//! A chroma sample is repeated for the pixels that share it, as FFmpeg's own converter does for frames that keep
+//! A chroma sample is repeated for the pixels that weight it, as FFmpeg's own converter does for frames that keep
 //! their size, so the frames equal those of PyAV, torchcodec and decord.
 
 use ffmpeg_next::color::{Range, Space};
@@ -11,8 +11,8 @@ use swm_simd::vectorize;
 /// Fraction bits of the factors. All values have 16 bits, so that a register holds many.
 const FACTOR: u32 = 13;
 
-/// Fraction bits of products. Where chroma is shared there are none and products are truncated, because FFmpeg's
-/// converter for these formats does so and frames must equal its frames bit for bit.
+/// Fraction bits of products. Where pixels share chroma samples, products have no fraction bits and are truncated,
+/// because FFmpeg's converter for these formats does so and frames must equal its frames bit for bit.
 const fn fraction(shared: bool) -> u32 {
     if shared { 0 } else { 4 }
 }
@@ -29,7 +29,7 @@ struct Matrix {
 }
 
 /// Returns the weights of red and blue in luma. Unspecified spaces are BT.601, as in FFmpeg.
-fn shares(space: Space) -> (f64, f64) {
+fn luma_weights(space: Space) -> (f64, f64) {
     match space {
         Space::BT709 => (0.2126, 0.0722),
         Space::FCC => (0.30, 0.11),
@@ -41,7 +41,7 @@ fn shares(space: Space) -> (f64, f64) {
 
 impl Matrix {
     fn new(space: Space, full_range: bool) -> Self {
-        let (red, blue) = shares(space);
+        let (red, blue) = luma_weights(space);
         let green = 1.0 - red - blue;
         // Luma has 219 steps and chroma 224, unless they use the full byte.
         let (black, luma, difference) = if full_range { (0, 1.0, 1.0) } else { (16, 255.0 / 219.0, 255.0 / 224.0) };
@@ -67,8 +67,8 @@ enum Planes {
     Gbr,
 }
 
-/// Returns the layout of the 8-bit formats that are converted directly, and whether they use the full range. Others
-/// are converted to [`Pixel::YUV444P`] first.
+/// Returns the layout of the 8-bit formats that are converted directly, and whether they use the full range. Frames of
+/// other formats are converted to [`Pixel::YUV444P`] first.
 fn planes(format: Pixel) -> Option<(Planes, bool)> {
     Some(match format {
         Pixel::YUV420P => (Planes::Yuv(1, 1), false),
@@ -98,8 +98,8 @@ pub fn to_rgb(frame: &frame::Video, width: usize, height: usize, out: &mut [u8])
     }
     let matrix = Matrix::new(frame.color_space(), full || frame.color_range() == Range::JPEG);
     let plane = |i: usize| Plane { bytes: frame.data(i), stride: frame.stride(i) };
-    let others = if planes == Planes::Grey { 0 } else { 1 };
-    convert(&matrix, planes, &[plane(0), plane(others), plane(2 * others)], width, out);
+    let chroma_step = if planes == Planes::Grey { 0 } else { 1 };
+    convert(&matrix, planes, &[plane(0), plane(chroma_step), plane(2 * chroma_step)], width, out);
     true
 }
 
@@ -221,7 +221,7 @@ pub fn from_rgb(rgb: &[u8], frame: &mut frame::Video) {
         frame.data_mut(0).chunks_mut(stride).zip(rows).for_each(|(to, from)| to[..from.len()].copy_from_slice(from));
         return;
     }
-    let (red, blue) = shares(Space::Unspecified);
+    let (red, blue) = luma_weights(Space::Unspecified);
     let luma = |p: &[u8; 3]| red * f64::from(p[0]) + (1.0 - red - blue) * f64::from(p[1]) + blue * f64::from(p[2]);
     let stride = frame.stride(0);
     for (to, from) in frame.data_mut(0).chunks_mut(stride).zip(rows) {
@@ -230,9 +230,9 @@ pub fn from_rgb(rgb: &[u8], frame: &mut frame::Video) {
         }
     }
     let shared = if frame.format() == Pixel::YUV420P { 2 } else { 1 };
-    for (plane, colour, share) in [(1, 2, blue), (2, 0, red)] {
+    for (plane, colour, weight) in [(1, 2, blue), (2, 0, red)] {
         let stride = frame.stride(plane);
-        let scale = 224.0 / 255.0 / (2.0 * (1.0 - share)) / (shared * shared) as f64;
+        let scale = 224.0 / 255.0 / (2.0 * (1.0 - weight)) / (shared * shared) as f64;
         for (y, to) in frame.data_mut(plane).chunks_mut(stride).enumerate().take(height / shared) {
             for (x, to) in to.iter_mut().enumerate().take(width / shared) {
                 let mut difference = 0.0;
@@ -257,11 +257,11 @@ mod tests {
     }
 
     #[test]
-    fn colours_survive_a_round_trip() {
+    fn colours_are_close_after_a_round_trip() {
         for (format, width, height, tolerance) in
             [(Pixel::YUV444P, 71, 33, 2), (Pixel::YUV420P, 70, 34, 4), (Pixel::YUV444P, 1, 1, 2)]
         {
-            // Squares of one colour lose nothing where chroma is shared.
+            // Squares of 2 × 2 equal pixels share a chroma sample without loss.
             let small = test_image(width / 2 + 1, height / 2 + 1);
             let rgb: Vec<u8> = (0..width * height)
                 .flat_map(|i| small[(i / width / 2 * (width / 2 + 1) + i % width / 2) * 3..][..3].to_vec())
@@ -277,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn primaries_are_those_of_the_standards() {
+    fn red_converts_as_in_the_standards() {
         // Red in BT.601 and BT.709, 16 to 235: ITU-R BT.601-7 and BT.709-6.
         for (space, [y, u, v]) in [(Space::Unspecified, [81, 90, 240]), (Space::BT709, [63, 102, 240])] {
             let mut frame = frame::Video::new(Pixel::YUV444P, 2, 1);

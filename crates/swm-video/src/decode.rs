@@ -14,15 +14,15 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 use swm_core::{Error, Result};
 
-/// Decoders in the pool. Each holds a few decoded frames.
+/// The maximum number of idle decoders in the pool. Each holds the memory of a few decoded frames.
 const IDLE_DECODERS: usize = 32;
 
 /// The source of a video's bytes.
 #[derive(Clone, Debug)]
 pub enum Source {
-    /// In a file.
+    /// A file.
     File(PathBuf),
-    /// In memory, with the name that error messages use.
+    /// Bytes in memory, with the path that error messages contain.
     Memory(PathBuf, Arc<[u8]>),
 }
 
@@ -116,9 +116,9 @@ impl Video {
         for frame in frames {
             let sample = self.index.frames.get(frame).map(|&i| i as usize);
             let sample = sample.ok_or_else(|| self.lacks(frame))?;
-            let place = self.index.samples[sample];
-            bytes.resize(place.size as usize, 0);
-            let read = open.read(place.offset, &mut bytes).and_then(|()| self.index.check(sample, &bytes));
+            let entry = self.index.samples[sample];
+            bytes.resize(entry.size as usize, 0);
+            let read = open.read(entry.offset, &mut bytes).and_then(|()| self.index.check(sample, &bytes));
             read.map_err(|problem| damaged(self.source.label(), &problem))?;
             each(&bytes);
         }
@@ -158,7 +158,7 @@ pub struct FrameRequest<'a> {
     pub out: &'a mut [u8],
 }
 
-/// A requested frame of one run.
+/// A requested frame of a run, which is decoded from a key frame on.
 struct Job<'a> {
     video: &'a Video,
     /// The sample at which decoding begins.
@@ -171,7 +171,7 @@ struct Job<'a> {
 /// many files.
 #[derive(Default)]
 pub struct DecoderPool {
-    /// The last one was used last.
+    /// Idle decoders, the most recently used one last.
     idle: Mutex<Vec<Decoder>>,
 }
 
@@ -199,10 +199,10 @@ impl DecoderPool {
             let sample = sample as usize;
             jobs.push(Job { video, key: index.key_before(sample), sample, out });
         }
-        let place = |job: &Job<'_>| (std::ptr::from_ref(job.video) as usize, job.key, job.sample);
-        jobs.sort_unstable_by_key(place);
+        let order = |job: &Job<'_>| (std::ptr::from_ref(job.video) as usize, job.key, job.sample);
+        jobs.sort_unstable_by_key(order);
         let runs: Vec<&mut [Job<'_>]> =
-            jobs.chunk_by_mut(|a, b| (place(a).0, place(a).1) == (place(b).0, place(b).1)).collect();
+            jobs.chunk_by_mut(|a, b| (order(a).0, order(a).1) == (order(b).0, order(b).1)).collect();
         runs.into_par_iter().with_max_len(1).try_for_each(|run| {
             let Some(Job { video, .. }) = run.first() else { return Ok(()) };
             let video = *video;
@@ -281,15 +281,18 @@ impl Decoder {
         };
         let mut context = codec::Context::new_with_codec(found);
         set_extradata(&mut context, &index.extradata);
-        // One thread, because runs are decoded in parallel. Strict, because a stream that does not state how far
-        // frames are reordered must not be taken to mean "not at all". Damage is refused, not concealed.
+        // One thread, because runs are decoded in parallel. Strict compliance, because otherwise FFmpeg assumes that
+        // frames are not reordered when a stream does not state the reordering depth. Damaged frames are errors and are
+        // not concealed.
         context.set_threading(threading::Config::count(1));
         context.compliance(Compliance::Strict);
-        // The decoder would hold back frames after an open key frame; the tables say which frames it suffices for.
+        // Without this flag the decoder withholds frames after an open key frame. `Index::key_before` chooses a key
+        // frame from which the requested frame can be decoded.
         context.set_flags(Flags::OUTPUT_CORRUPT);
         let mut decoder = context.decoder();
         decoder.check(Check::CRC | Check::BITSTREAM | Check::BUFFER | Check::EXPLODE);
-        // Damaged headers may state any size; encoded frames are padded to whole blocks.
+        // Damaged headers may state any size. Encoded frames are padded to whole blocks, so the limit exceeds the frame
+        // size.
         let mut options = Dictionary::new();
         options.set("max_pixels", &((index.width + 256) * (index.height + 256)).to_string());
         let inner = decoder.open_as_with(found, options).and_then(|opened| opened.video());
@@ -327,8 +330,8 @@ impl Decoder {
             open.read(group[0].offset, &mut coded)?;
             let mut rest = &coded[..];
             for sample in group {
-                let (bytes, others) = rest.split_at(sample.size as usize);
-                rest = others;
+                let (bytes, following) = rest.split_at(sample.size as usize);
+                rest = following;
                 video.index.check(at, bytes)?;
                 // A frame that is not requested and that no other frame refers to is not decoded.
                 let wanted = jobs.binary_search_by_key(&at, |job| job.sample).is_ok();
@@ -385,7 +388,7 @@ impl Decoder {
             let Some(sample) = self.frame.pts().and_then(|pts| usize::try_from(pts).ok()) else { continue };
             let begin = jobs.partition_point(|job| job.sample < sample);
             let end = jobs.partition_point(|job| job.sample <= sample);
-            let Some((Job { out, .. }, others)) = jobs[begin..end].split_first_mut() else { continue };
+            let Some((Job { out, .. }, duplicates)) = jobs[begin..end].split_first_mut() else { continue };
             if self.frame.is_corrupt() || self.frame.has_decode_errors() {
                 return Err(format!("is damaged in encoded frame {sample}"));
             }
@@ -396,13 +399,13 @@ impl Decoder {
                 let found = format!("{} x {}", frame.width(), frame.height());
                 return Err(format!("has a frame of {found} pixels, unlike the {width} x {height} its header says"));
             }
-            others.iter_mut().for_each(|other| other.out.copy_from_slice(out));
+            duplicates.iter_mut().for_each(|job| job.out.copy_from_slice(out));
             *missing = missing.saturating_sub(end - begin);
         }
     }
 }
 
-/// Sets the codec parameters that the file's header holds.
+/// Sets the codec parameters of the file's header.
 #[allow(unsafe_code, reason = "sets a field of FFmpeg's context that its wrapper does not offer")]
 fn set_extradata(context: &mut codec::Context, bytes: &[u8]) {
     if bytes.is_empty() {
@@ -411,7 +414,7 @@ fn set_extradata(context: &mut codec::Context, bytes: &[u8]) {
     let Ok(length) = i32::try_from(bytes.len()) else { return };
     // The wrapper sets these only by opening a file with libavformat, whose parsers must not read damaged files.
     // SAFETY: the memory comes from FFmpeg's allocator, has the zeroed padding that decoders read, is filled within its
-    // length, and belongs to the context from here on, which frees it. The context was not opened yet and has none.
+    // length, and then belongs to the context, which frees it. The context is not open yet and has no extradata.
     unsafe {
         let memory = ffi::av_mallocz(bytes.len() + ffi::AV_INPUT_BUFFER_PADDING_SIZE as usize).cast::<u8>();
         if memory.is_null() {
@@ -430,22 +433,23 @@ mod tests {
 
     /// Returns the frames of `tests/interop/odd-NAME.mp4`, as PyAV decoded them, and the video.
     fn odd(name: &str) -> (Vec<u8>, Video) {
-        let place = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop").join(format!("odd-{name}"));
-        let expected = swm_image::read_png(&place.with_extension("png")).expect("a PNG").rgb;
-        (expected, Video::open(Source::File(place.with_extension("mp4"))).expect("opens"))
+        let stem = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop").join(format!("odd-{name}"));
+        let expected = swm_image::read_png(&stem.with_extension("png")).expect("a PNG").rgb;
+        (expected, Video::open(Source::File(stem.with_extension("mp4"))).expect("a readable video"))
     }
 
     #[test]
     fn every_frame_of_every_codec_decodes() {
         let decoders = DecoderPool::default();
-        // Ten bits: the other program interpolates chroma, so only the mean is close.
+        // PyAV interpolates the chroma of 10-bit frames, so only the mean difference is small.
         for (name, tolerance) in [("times", 0), ("hevc", 0), ("deep", 4)] {
             let (expected, video) = odd(name);
             assert_eq!((video.frames(), video.size()), (14, (32, 48)), "{name}");
             let size = 32 * 48 * 3;
-            let bytes: Arc<[u8]> = std::fs::read(video.source.label()).expect("reads").into();
-            let same = Video::open(Source::Memory("a blob".into(), bytes)).expect("opens");
-            // Each alone, then all at once, in reverse from memory, and with repetitions.
+            let bytes: Arc<[u8]> = std::fs::read(video.source.label()).expect("a readable file").into();
+            let same = Video::open(Source::Memory("a blob".into(), bytes)).expect("a readable video");
+            // Frames one by one from the file, then all frames in reverse order from memory, then frames with
+            // repetitions.
             let orders: [Vec<usize>; 3] = [(0..14).collect(), (0..14).rev().collect(), vec![9, 3, 9, 13, 0, 3]];
             for (i, order) in orders.into_iter().enumerate() {
                 let mut out = vec![7; order.len() * size];
@@ -454,9 +458,9 @@ mod tests {
                 let wanted: Vec<FrameRequest<'_>> =
                     frames.map(|(&frame, out)| FrameRequest { video, frame, out }).collect();
                 if i == 0 {
-                    wanted.into_iter().for_each(|wanted| decoders.read(vec![wanted]).expect("decodes"));
+                    wanted.into_iter().for_each(|wanted| decoders.read(vec![wanted]).expect("decoded frames"));
                 } else {
-                    decoders.read(wanted).expect("decodes");
+                    decoders.read(wanted).expect("decoded frames");
                 }
                 for (&frame, found) in order.iter().zip(out.chunks_exact(size)) {
                     let off: usize =
@@ -472,7 +476,7 @@ mod tests {
         let (_, video) = odd("times");
         for t in 0..14 {
             let time = f64::from(350 + 40 * t + 11 * t * t) / 1000.0;
-            let (frame, away) = video.frame_at(time + 0.004).expect("has frames");
+            let (frame, away) = video.frame_at(time + 0.004).expect("a frame");
             assert_eq!(frame, t as usize);
             assert!((away - 0.004).abs() < 1e-3, "{away}");
         }
@@ -486,7 +490,7 @@ mod tests {
         let mut out = vec![0; 32 * 48 * 3];
         let error = |frame, out: &mut [u8]| {
             let wanted = vec![FrameRequest { video: &video, frame, out }];
-            DecoderPool::default().read(wanted).expect_err("fails").to_string()
+            DecoderPool::default().read(wanted).expect_err("an error").to_string()
         };
         assert!(error(14, &mut out).contains("14 frames"));
         assert!(error(0, &mut out[1..]).contains("48 x 32"));

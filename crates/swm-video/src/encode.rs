@@ -15,11 +15,13 @@ use swm_simd::CpuLevel;
 /// Settings of the encoder.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Encoding {
-    /// Lossless, or a quality.
+    /// The quality of the decoded frames.
     pub quality: Quality,
-    /// Frames from one key frame to the next. A random frame costs half of them to decode.
+    /// The number of frames from one key frame to the next. Decoding one random frame decodes half of these frames on
+    /// average.
     pub gop: u32,
-    /// Whether frames may depend on later ones, and other tools that make files smaller and decoding slower.
+    /// Whether the encoder uses methods that make files smaller and decoding slower, such as frames that depend on
+    /// later frames.
     pub small: bool,
 }
 
@@ -28,7 +30,7 @@ pub struct Encoding {
 pub enum Quality {
     /// Decoded frames equal the originals.
     Lossless,
-    /// Constant rate factor: the higher, the more is lost.
+    /// Constant rate factor: higher values give smaller files of lower quality.
     Crf(u8),
 }
 
@@ -44,7 +46,7 @@ impl Encoding {
         Self { quality, gop: TRAINING_GOP, small: false }
     }
 
-    /// Settings for people: small files that browsers play.
+    /// Settings for videos that people watch: small files that browsers play.
     pub const fn viewing() -> Self {
         Self { quality: Quality::Crf(18), gop: 250, small: true }
     }
@@ -71,9 +73,9 @@ impl Encoding {
     }
 }
 
-/// Returns the instruction set that x264 is limited to, if its own choice is wrong. With AVX-512 the rate control
-/// (`mbtree`) of x264 164 reads uninitialised memory when a frame is at most a few macroblocks wide (seen at 32, 48 and
-/// 64 pixels), so equal frames gave different files.
+/// Returns the instruction set that x264 is limited to, if the set that x264 would choose gives wrong results. With
+/// AVX-512 the rate control (`mbtree`) of x264 164 reads uninitialised memory when a frame is at most a few macroblocks
+/// wide (seen at 32, 48 and 64 pixels), so equal frames gave different files.
 fn instruction_set() -> Option<&'static str> {
     (swm_simd::cpu_level() == CpuLevel::Avx512).then_some("AVX2")
 }
@@ -137,8 +139,8 @@ impl Encoder {
             let problem = format!("this machine's FFmpeg has no encoder {name}; install one built with it");
             return Err(Error::external("encoding a video", problem));
         };
-        let number = |n: usize| u32::try_from(n).map_err(|_| Error::config("video", format!("{n} pixels"), "fewer"));
-        let (wide, high) = (number(width)?, number(height)?);
+        let side = |n: usize| u32::try_from(n).map_err(|_| Error::config("video", format!("{n} pixels"), "fewer"));
+        let (wide, high) = (side(width)?, side(height)?);
         let file = Memory::default();
         let stream = format::context::StreamIo::from_write_seek(file.clone()).map_err(failed)?;
         let mut output = format::output_to_stream(stream, None, Some("mp4")).map_err(failed)?;
@@ -146,7 +148,7 @@ impl Encoder {
         context.set_width(wide);
         context.set_height(high);
         context.set_format(pixels);
-        // Stated, because players guess it from the size otherwise.
+        // Players guess the colour space from the frame size unless the file states it.
         if pixels != Pixel::RGB24 {
             context.set_colorspace(Space::SMPTE170M);
             context.set_color_range(Range::MPEG);

@@ -1,4 +1,4 @@
-//! MP4 videos with FFmpeg's libraries, in process: frames by index out of files, and files out of frames.
+//! MP4 videos with FFmpeg's libraries, in process: decodes frames by index and encodes frames.
 //!
 //! - [`Video`], [`DecoderPool`]: reads frames by index; each run from a key frame is decoded once, by pooled decoders.
 //! - [`VideoCache`]: the opened videos of a dataset.

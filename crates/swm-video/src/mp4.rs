@@ -30,7 +30,7 @@ pub struct Sample {
     pub size: u32,
     /// Presentation time, in the track's units.
     pub time: i64,
-    /// Whether decoding can begin here.
+    /// Whether decoding can begin at this sample.
     pub key: bool,
 }
 
@@ -50,12 +50,13 @@ pub struct Index {
     pub times: Vec<i64>,
     /// Track units per second.
     pub timescale: u32,
-    /// Checksums of the samples, in files that were sealed.
+    /// Checksums of the samples, in files that [`seal`] finished.
     pub sums: Option<Vec<u32>>,
 }
 
 impl Index {
-    /// Reads the tables of a file of `length` bytes; `read(offset, bytes)` fills `bytes` from there.
+    /// Reads the tables of a file of `length` bytes; `read(offset, bytes)` fills `bytes` from the file, starting at
+    /// `offset`.
     pub fn read(length: u64, mut read: impl FnMut(u64, &mut [u8]) -> Result<()>) -> Result<Self> {
         let (mut moov, mut seal) = (None, None);
         let mut at = 0;
@@ -90,10 +91,10 @@ impl Index {
                 b"moov" => moov = Some(body(LARGEST_TABLES)?),
                 b"uuid" => {
                     let bytes = body(LARGEST_TABLES)?;
-                    let alike = bytes.iter().zip(&SEAL).filter(|(a, b)| a == b).count();
+                    let matching = bytes.iter().zip(&SEAL).filter(|(a, b)| a == b).count();
                     match bytes.strip_prefix(&SEAL) {
                         Some(sums) => seal = Some(sums.to_vec()),
-                        None if alike > SEAL.len() / 2 => return Err("has damaged checksums".to_owned()),
+                        None if matching > SEAL.len() / 2 => return Err("has damaged checksums".to_owned()),
                         None => {}
                     }
                 }
@@ -149,8 +150,8 @@ impl Index {
         Ok(Self { codec, extradata, width, height, samples, frames, times, timescale, sums: None })
     }
 
-    /// Returns the sample at which decoding of a sample must begin: the last key sample before it that is not
-    /// presented after it.
+    /// Returns the key sample at which decoding of `sample` must begin: in decoding order, the last key sample up to
+    /// `sample` that is not presented after `sample`.
     pub fn key_before(&self, sample: usize) -> usize {
         let shown = self.samples[sample].time;
         let begins = |i: &usize| self.samples[*i].key && self.samples[*i].time <= shown;
@@ -357,12 +358,12 @@ fn description(stsd: &[u8]) -> Result<(Codec, Arc<[u8]>, usize, usize)> {
 struct Edit {
     /// The track's times that are presented.
     shown: Range<i64>,
-    /// Added to these times for the time of the presentation.
+    /// The presentation time minus the track's time.
     shift: i64,
 }
 
-/// Reads the edit list. Encoders write one segment, perhaps after a pause, to hide their delay. More segments are
-/// refused.
+/// Reads the edit list. Encoders write one segment, possibly after an empty one, to hide their delay. Several segments
+/// are an error.
 fn edit(trak: &[u8], movie_scale: u32, timescale: u32) -> Result<Edit> {
     let mut edit = Edit { shown: i64::MIN..i64::MAX, shift: 0 };
     let Some(edts) = find(trak, b"edts")? else { return Ok(edit) };
@@ -375,7 +376,7 @@ fn edit(trak: &[u8], movie_scale: u32, timescale: u32) -> Result<Edit> {
         } else {
             (integers.u32()?.into(), integers.i32()?.into())
         };
-        integers.u32()?; // its speed
+        integers.u32()?; // the playback rate
         let units = u128::from(duration) * u128::from(timescale) / u128::from(movie_scale);
         let units = i64::try_from(units).unwrap_or(i64::MAX);
         if from >= 0 {

@@ -1,4 +1,4 @@
-//! Conversion of rare pixel formats by FFmpeg's scaler.
+//! Conversion of rare pixel formats with FFmpeg's scaler.
 
 use ffmpeg_next::format::Pixel;
 use ffmpeg_next::frame;

@@ -36,19 +36,19 @@ struct Effects {
     later: usize,
 }
 
-fn effects(suite: &Suite, entry: &EnvEntry, factor: &Factor, others: &VariationRequest) -> Effects {
+fn effects(suite: &Suite, entry: &EnvEntry, factor: &Factor, context: &VariationRequest) -> Effects {
     let mut effects = Effects::default();
-    let Some(base) = outcome(suite, entry, others.clone()) else { return effects };
+    let Some(base) = outcome(suite, entry, context.clone()) else { return effects };
     let mut rng = Key::new(1).with(&factor.key).rng();
     for _ in 0..600 {
         let value = factor.space.sample(&mut rng);
         if effects.tried == suite.values {
             break;
         }
-        if others.variation_values.get(&factor.key).unwrap_or(&factor.init_value) == &value {
+        if context.variation_values.get(&factor.key).unwrap_or(&factor.init_value) == &value {
             continue;
         }
-        let mut request = others.clone();
+        let mut request = context.clone();
         request.variation_values.insert(factor.key.clone(), value);
         // Constraints may exclude a value, depending on the other factors.
         let Some(outcome) = outcome(suite, entry, request) else { continue };
@@ -60,13 +60,13 @@ fn effects(suite: &Suite, entry: &EnvEntry, factor: &Factor, others: &VariationR
     effects
 }
 
-/// Every factor changes an output, and colours change frames only.
+/// Checks that every factor changes an output, and that colours change frames only.
 pub fn every_factor_has_an_effect(suite: &Suite) {
     for entry in suite.rows {
         let space = entry.env().expect("an environment").spec().variation_space.clone();
         let defaults = all_visible(&space);
-        // Some factors have an effect only for certain values of another factor: the angle of a shape that is round by
-        // default has none.
+        // Some factors have an effect only for certain values of another factor. For example, the angle of a shape
+        // changes nothing while the shape is round, which is its default.
         let mut contexts = vec![defaults.clone()];
         for seed in 0..suite.contexts {
             let mut request = all_visible(&space);

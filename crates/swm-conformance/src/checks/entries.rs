@@ -4,7 +4,7 @@ use crate::Suite;
 use swm_core::columns::STATE;
 use swm_core::{DType, Schema, Space};
 
-/// Entries have unique ids and complete specs: actions, columns, factors, experts.
+/// Checks that entries have unique ids and complete specs: actions, columns, factors, experts.
 pub fn entries_are_complete(suite: &Suite) {
     for entry in suite.rows {
         let (env, id) = (entry.env().expect("an environment"), entry.id);

@@ -22,7 +22,7 @@ pub(super) fn follow_expert(entry: &EnvEntry, probe: &mut Probe, seed: u64) -> b
     })
 }
 
-/// Experts act within the action space, and their actions do not depend on other slots.
+/// Checks that actions of experts are in the action space and do not depend on other slots.
 pub fn experts_are_valid_and_deterministic(suite: &Suite) {
     for entry in suite.rows {
         for expert in entry.experts {

@@ -6,7 +6,8 @@ use crate::Suite;
 use swm_core::columns::{GOAL_STATE, STATE};
 use swm_core::{Batch, ColumnSpec, DType, Key, ResetOptions, Schema};
 
-/// Sampled goals are new, follow from their key, match their frame, and succeed when reached.
+/// Checks that a sampled goal is not reached yet, depends on its key only, matches its frame, and counts as success
+/// when reached.
 pub fn sampled_goals_are_new_and_reachable(suite: &Suite) {
     for entry in suite.rows {
         let mut distinct = 0;
@@ -27,15 +28,15 @@ pub fn sampled_goals_are_new_and_reachable(suite: &Suite) {
             distinct += u64::from(probe.column(GOAL_STATE) != goal);
 
             // The goal state succeeds, by reset and by restore, and its frame equals the goal frame.
-            let there = ResetOptions { state: Some(goal.clone()), goal_state: Some(goal.clone()), ..options };
-            let mut there = Probe::reset(suite, entry, seed, &there);
-            assert!(there.env.is_success(), "{id}, seed {seed}: a reset to the goal does not succeed");
+            let options = ResetOptions { state: Some(goal.clone()), goal_state: Some(goal.clone()), ..options };
+            let mut at_goal = Probe::reset(suite, entry, seed, &options);
+            assert!(at_goal.env.is_success(), "{id}, seed {seed}: a reset to the goal does not succeed");
             let schema = Schema::new([ColumnSpec::new(STATE, DType::Float64, [goal.len()])]).expect("a schema");
             let mut row = Batch::zeros(&schema, 1);
             row.get_mut(STATE).expect("the state").copy_from_slice(&goal);
-            there.env.restore_from(row.row(0), row.row(0)).expect("a row");
-            assert!(there.env.is_success(), "{id}, seed {seed}: a restore to the goal does not succeed");
-            let difference = frame_difference(&there.frame(), &goal_frame);
+            at_goal.env.restore_from(row.row(0), row.row(0)).expect("a row");
+            assert!(at_goal.env.is_success(), "{id}, seed {seed}: a restore to the goal does not succeed");
+            let difference = frame_difference(&at_goal.frame(), &goal_frame);
             assert!(difference < 1.0, "{id}, seed {seed}: the goal frame differs by {difference} of 255");
         }
         let goals = suite.goals;
@@ -43,7 +44,8 @@ pub fn sampled_goals_are_new_and_reachable(suite: &Suite) {
     }
 }
 
-/// The goal distance is positive at the start, near 0 at the goal, and smaller after an expert reached it.
+/// Checks that the goal distance is positive at the start, near 0 at the goal, and smaller after an expert reached the
+/// goal.
 pub fn goal_distance_decreases_to_the_goal(suite: &Suite) {
     for entry in suite.rows {
         let mut reached = 0;
@@ -55,9 +57,12 @@ pub fn goal_distance_decreases_to_the_goal(suite: &Suite) {
             let before = probe.env.goal_distance();
             assert!(before.is_finite() && before > 0.0, "{id}, seed {seed}: distance {before} to a goal not reached");
             let goal = probe.column(GOAL_STATE);
-            let there = ResetOptions { state: Some(goal.clone()), goal_state: Some(goal), ..options };
-            let there = Probe::reset(suite, entry, seed, &there).env.goal_distance();
-            assert!((0.0..=0.05 * before).contains(&there), "{id}, seed {seed}: {there} at the goal, {before} before");
+            let options = ResetOptions { state: Some(goal.clone()), goal_state: Some(goal), ..options };
+            let at_goal = Probe::reset(suite, entry, seed, &options).env.goal_distance();
+            assert!(
+                (0.0..=0.05 * before).contains(&at_goal),
+                "{id}, seed {seed}: {at_goal} at the goal, {before} before"
+            );
             if !entry.experts.is_empty() && follow_expert(entry, &mut probe, seed) {
                 reached += 1;
                 let after = probe.env.goal_distance();

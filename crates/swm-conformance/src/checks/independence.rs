@@ -6,13 +6,13 @@ use swm_core::pool::{Reset, threads};
 use swm_core::{Batch, EnvEntry, EnvPool, Key, Policy, RandomPolicy, ResetOptions, Schema};
 
 /// Plays episodes with random actions in a pool and returns all infos of each episode as bytes.
-fn play(suite: &Suite, entry: &EnvEntry, slots: &[u64], workers: usize, steps: usize) -> Vec<Vec<u8>> {
-    let envs = slots.iter().map(|_| entry.env().expect("an environment")).collect();
+fn play(suite: &Suite, entry: &EnvEntry, episodes: &[u64], workers: usize, steps: usize) -> Vec<Vec<u8>> {
+    let envs = episodes.iter().map(|_| entry.env().expect("an environment")).collect();
     let mut pool =
         EnvPool::new(envs, Some(suite.frame_size), Some(steps), threads(workers).expect("threads")).expect("a pool");
-    let mut policy = RandomPolicy::new(pool.spec(), slots.len());
-    let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), slots.len());
-    let resets: Vec<Reset> = slots
+    let mut policy = RandomPolicy::new(pool.spec(), episodes.len());
+    let mut actions = Batch::zeros(&Schema::new([pool.spec().action_column()]).expect("a schema"), episodes.len());
+    let resets: Vec<Reset> = episodes
         .iter()
         .enumerate()
         .map(|(slot, &episode)| {
@@ -23,7 +23,7 @@ fn play(suite: &Suite, entry: &EnvEntry, slots: &[u64], workers: usize, steps: u
         })
         .collect();
     pool.reset(&resets).expect("a reset");
-    let mut recorded = vec![vec![]; slots.len()];
+    let mut recorded = vec![vec![]; episodes.len()];
     let mut record = |pool: &EnvPool| {
         for (slot, bytes) in recorded.iter_mut().enumerate() {
             for (column, spec) in pool.infos().schema().columns().iter().enumerate() {
@@ -34,7 +34,7 @@ fn play(suite: &Suite, entry: &EnvEntry, slots: &[u64], workers: usize, steps: u
     };
     record(&pool);
     for _ in 0..steps {
-        let active = vec![true; slots.len()];
+        let active = vec![true; episodes.len()];
         policy.act(pool.infos(), &active, &mut actions).expect("random actions");
         pool.step(&actions, &active).expect("a step");
         record(&pool);

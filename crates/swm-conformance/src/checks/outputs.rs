@@ -4,7 +4,7 @@ use super::probe::{Probe, all_varied, assert_finite, bytes_of};
 use crate::Suite;
 use swm_core::{Action, FrameMut, Key, ResetOptions, Space};
 
-/// Rows and frames do not depend on the previous content of their memory.
+/// Checks that rows and frames do not depend on the previous content of their memory.
 pub fn observations_and_frames_are_fully_written(suite: &Suite) {
     for entry in suite.rows {
         let mut probe = Probe::reset(suite, entry, 3, &all_varied());
@@ -33,7 +33,7 @@ pub fn observations_and_frames_are_fully_written(suite: &Suite) {
     }
 }
 
-/// Actions of the wrong kind, dimension or value are errors and leave the state unchanged.
+/// Checks that actions of the wrong kind, dimension or value are errors and leave the state unchanged.
 pub fn invalid_actions_are_errors_without_effect(suite: &Suite) {
     for entry in suite.rows {
         let mut probe = Probe::reset(suite, entry, 0, &ResetOptions::default());
@@ -42,11 +42,11 @@ pub fn invalid_actions_are_errors_without_effect(suite: &Suite) {
         let space = probe.env.spec().action_space.clone();
         let invalid: Vec<Action<'_>> = match space {
             Space::Discrete { .. } | Space::MultiDiscrete { .. } => {
-                let ends = |past: i64| {
-                    let end = |i| if past < 0 { space.bounds(i).0 as i64 - 1 } else { space.bounds(i).1 as i64 + 1 };
+                let outside = |sign: i64| {
+                    let end = |i| if sign < 0 { space.bounds(i).0 as i64 - 1 } else { space.bounds(i).1 as i64 + 1 };
                     Action::Discrete((0..n).map(end).collect::<Vec<_>>().leak())
                 };
-                vec![ends(-1), ends(1), Action::Discrete(vec![0; n + 1].leak()), Action::Continuous(&[0.0])]
+                vec![outside(-1), outside(1), Action::Discrete(vec![0; n + 1].leak()), Action::Continuous(&[0.0])]
             }
             _ => vec![
                 Action::Discrete(&[0]),

@@ -5,7 +5,7 @@ use crate::Suite;
 use swm_core::columns::STATE;
 use swm_core::{EnvEntry, Factor, Key, ResetOptions};
 
-/// Any factor, any group and all factors can be sampled.
+/// Checks that every factor, every group, and all factors together can be sampled.
 pub fn any_requested_factors_can_be_sampled(suite: &Suite) {
     for entry in suite.rows {
         let mut probe = Probe::new(suite, entry);
@@ -41,7 +41,7 @@ pub fn any_requested_factors_can_be_sampled(suite: &Suite) {
     }
 }
 
-/// Many resets with all factors varied succeed.
+/// Checks that many resets with all factors varied succeed.
 pub fn resets_with_all_factors_varied_succeed(suite: &Suite) {
     let resets = suite.resets;
     let check = |entry: &EnvEntry, seeds: std::ops::Range<u64>| {
@@ -63,7 +63,7 @@ pub fn resets_with_all_factors_varied_succeed(suite: &Suite) {
     });
 }
 
-/// A request may combine groups, factors and pinned values.
+/// Checks that a request may combine groups, factors and pinned values.
 pub fn groups_factors_and_pinned_values_combine(suite: &Suite) {
     for entry in suite.rows {
         let mut probe = Probe::new(suite, entry);
@@ -99,7 +99,7 @@ pub fn groups_factors_and_pinned_values_combine(suite: &Suite) {
     }
 }
 
-/// Unknown factors, values out of bounds and states of the wrong form are errors.
+/// Checks that unknown factors, values out of bounds, and states of a wrong length or with NaNs are errors.
 pub fn invalid_resets_are_errors(suite: &Suite) {
     for entry in suite.rows {
         let mut probe = Probe::reset(suite, entry, 0, &ResetOptions::default());

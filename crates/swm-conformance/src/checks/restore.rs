@@ -5,7 +5,7 @@ use crate::Suite;
 use swm_core::columns::{STATE, flat_factor};
 use swm_core::{Batch, ColumnSpec, DType, Key, ResetOptions, Schema, Snapshot, VariationRequest};
 
-/// After a restore, every environment continues as after the snapshot, bit for bit.
+/// Checks that every environment continues after a restore as after the snapshot, bit for bit.
 pub fn restores_snapshot_bit_for_bit(suite: &Suite) {
     for entry in suite.rows {
         for (seed, options) in [(0, ResetOptions::default()), (1, all_varied()), (2, all_varied())] {
@@ -17,21 +17,21 @@ pub fn restores_snapshot_bit_for_bit(suite: &Suite) {
             probe.env.sample_goal(key).expect("a goal");
             let snapshot = probe.env.snapshot();
             let follow = |probe: &mut Probe| {
-                let mut seen = probe.all_outputs();
+                let mut outputs = probe.all_outputs();
                 for t in 5..5 + suite.steps {
                     let transition = probe.step(key, t);
-                    seen.extend(transition.reward.to_le_bytes());
-                    seen.extend([u8::from(transition.terminated), u8::from(transition.truncated)]);
-                    seen.extend(probe.all_outputs());
+                    outputs.extend(transition.reward.to_le_bytes());
+                    outputs.extend([u8::from(transition.terminated), u8::from(transition.truncated)]);
+                    outputs.extend(probe.all_outputs());
                 }
-                seen
+                outputs
             };
             let expected = follow(&mut probe);
             let mut other = Probe::reset(suite, entry, 77, &all_varied());
             for (probe, name) in
                 [(&mut probe, "the same"), (&mut other, "another"), (&mut Probe::new(suite, entry), "a new")]
             {
-                probe.env.restore(&snapshot).expect("an own snapshot");
+                probe.env.restore(&snapshot).expect("a snapshot of this environment");
                 assert!(probe.env.snapshot() == snapshot, "{}: {name} environment", entry.id);
                 assert!(follow(probe) == expected, "{}: {name} environment continues differently", entry.id);
             }
@@ -39,13 +39,9 @@ pub fn restores_snapshot_bit_for_bit(suite: &Suite) {
             assert_eq!(factors(&probe), factors(&other), "{}: factors are part of the state", entry.id);
         }
         let mut probe = Probe::reset(suite, entry, 0, &ResetOptions::default());
-        let whole = probe.env.snapshot().0;
-        for bytes in [vec![], b"another env".to_vec(), whole[..whole.len() - 1].to_vec()] {
-            assert!(
-                probe.env.restore(&Snapshot(bytes)).is_err(),
-                "{}: accepts a snapshot of another environment",
-                entry.id
-            );
+        let valid = probe.env.snapshot().0;
+        for bytes in [vec![], b"another env".to_vec(), valid[..valid.len() - 1].to_vec()] {
+            assert!(probe.env.restore(&Snapshot(bytes)).is_err(), "{}: accepts an invalid snapshot", entry.id);
         }
     }
 }
@@ -68,7 +64,7 @@ fn dataset_row(probe: &mut Probe, dtype: DType) -> Batch {
     row
 }
 
-/// Restoring a dataset row restores the state, the factors and both frames.
+/// Checks that restoring a dataset row restores the state, the factors and both frames.
 pub fn dataset_rows_restore_state_and_factors(suite: &Suite) {
     for entry in suite.rows {
         for seed in 0..suite.restored_rows {
@@ -101,9 +97,9 @@ pub fn dataset_rows_restore_state_and_factors(suite: &Suite) {
                 }
             }
         }
-        let nothing =
+        let no_state =
             Batch::zeros(&Schema::new([ColumnSpec::new("position", DType::Float64, [2])]).expect("a schema"), 1);
-        let error = Probe::new(suite, entry).env.restore_from(nothing.row(0), nothing.row(0)).expect_err("no state");
+        let error = Probe::new(suite, entry).env.restore_from(no_state.row(0), no_state.row(0)).expect_err("no state");
         assert!(error.to_string().contains(STATE), "{}: {error}", entry.id);
     }
 }

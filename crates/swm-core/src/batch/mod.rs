@@ -1,8 +1,8 @@
 //! [`Batch`]: named, typed, row-major arrays with a common number of rows.
 //!
-//! Environments, writers, loaders, policies and models exchange nothing else: environments write their observations
-//! into a batch in place, writers store batches, loaders return them, models read them. A [`Schema`] lists the columns.
-//! Column data is contiguous and aligned to 64 bytes, so a tensor or an array view needs no copy.
+//! Environments, writers, loaders, policies and models exchange data as batches only: environments write their
+//! observations into a batch in place, writers store batches, loaders return them, models read them. A [`Schema`] lists
+//! the columns. Column data is contiguous and aligned to 64 bytes, so a tensor or an array view needs no copy.
 
 mod buffer;
 mod rows;
@@ -24,7 +24,7 @@ pub struct Batch {
     schema: Schema,
     rows: usize,
     data: Vec<Buffer>,
-    /// The address of each column; refreshed whenever mutable rows are handed out, so that this allocates nothing.
+    /// The address of each column. Every mutable access to rows updates these addresses in place, without allocation.
     starts: Vec<ColumnStart>,
 }
 
@@ -51,12 +51,12 @@ impl Batch {
         self.rows
     }
 
-    /// Bytes held.
+    /// The size of all columns in bytes.
     pub fn byte_len(&self) -> usize {
         self.data.iter().map(Buffer::len).sum()
     }
 
-    /// Changes the number of rows; new rows are zero. Memory stays allocated, so growing again costs nothing.
+    /// Changes the number of rows; new rows are zero. Memory stays allocated, so growing again allocates nothing.
     pub fn resize(&mut self, rows: usize) {
         for (buffer, column) in self.data.iter_mut().zip(self.schema.columns()) {
             buffer.resize(rows * column.row_bytes());

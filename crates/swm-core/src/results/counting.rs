@@ -15,13 +15,13 @@ pub enum Counting {
         /// success until the goal is held or the budget is spent.
         hold: usize,
     },
-    /// The counting of the Python package `stable-worldmodel` 0.1.1, for comparison with its figures. Every start is
-    /// played and counts, solved at start or not, and an episode succeeds when the environment *terminates* within its
-    /// budget for any reason. A termination by failure (a pole that falls) counts as a success.
+    /// The counting of the Python package `stable-worldmodel` 0.1.1, for comparison with its published figures. Every
+    /// start is played and counts, solved at start or not, and an episode succeeds when the environment *terminates*
+    /// within its budget for any reason. A termination by failure (a pole that falls) counts as a success.
     ///
-    /// Its episodic protocol plays `envs` environments at a time, resets each as it finishes, and counts the first
-    /// episodes that finish. Long episodes, which mostly fail, therefore count less often, and the rate depends on
-    /// `envs`.
+    /// The episodic protocol of that package plays `envs` environments at a time, resets each environment when its
+    /// episode finishes, and counts the first episodes that finish. Long episodes, which mostly fail, therefore count
+    /// less often, and the rate depends on `envs`.
     Compat {
         /// Environments played at the same time.
         envs: usize,

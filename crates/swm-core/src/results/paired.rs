@@ -62,8 +62,8 @@ impl Comparison {
         })
     }
 
-    /// Compares every policy with those before it, condition by condition, so that a learned policy is compared with
-    /// the random-policy floor as `learned` minus `random`.
+    /// Compares every run with each earlier run of the same condition, so that a learned policy is compared with the
+    /// random-policy floor as `learned` minus `random`.
     pub fn all(runs: &[Run], counting: Counting) -> Vec<Self> {
         let later = runs.iter().enumerate();
         later.flat_map(|(i, run)| runs[..i].iter().filter_map(move |other| Self::of(run, other, counting))).collect()

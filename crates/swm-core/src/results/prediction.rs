@@ -1,4 +1,4 @@
-//! [`Prediction`]: a model's prediction errors on recorded trajectories, grouped by the success of its plans there.
+//! [`Prediction`]: a model's prediction errors on recorded trajectories, grouped by the success of the episodes.
 
 use super::Summary;
 use serde::{Deserialize, Serialize};
@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 pub struct Prediction {
     /// Environment steps per model step.
     pub frameskip: usize,
-    /// The variance of the latents of all predicted observations, averaged over latent dimensions. It is the unit of errors:
-    /// always predicting the mean latent has an error of 1.
+    /// The variance of the latents of all predicted observations, averaged over latent dimensions. It is the unit of
+    /// errors: always predicting the mean latent has an error of 1.
     pub variance: f64,
     /// The errors of every trajectory.
     pub trajectories: Vec<Trajectory>,
@@ -29,12 +29,12 @@ pub struct Trajectory {
     pub errors: Vec<f64>,
 }
 
-/// The prediction errors of some of the trajectories.
+/// The prediction errors of one group of trajectories.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Group {
     /// Successes, failures, or all trajectories for `None`.
     pub success: Option<bool>,
-    /// The trajectories' mean errors over their steps.
+    /// The mean errors of the trajectories, each over its own steps.
     pub trajectory: Summary,
     /// The errors of each model step.
     pub steps: Vec<Summary>,

@@ -65,7 +65,7 @@ mod tests {
         traces.push(trace(&[10.0]));
         let found = Searches::of(&traces).expect("traces");
         assert_eq!(found.best[0], Band { low: 1.0, median: 5.0, high: 9.0 });
-        assert_eq!(found.best[1], Band { low: 0.5, median: 0.5, high: 0.5 }, "of the ten plans that reached it");
+        assert_eq!(found.best[1], Band { low: 0.5, median: 0.5, high: 0.5 }, "ten plans have a second iteration");
         assert_eq!((found.plans, found.mean.len(), found.spread.len()), (11, 1, 0));
         traces.reverse();
         assert_eq!(Searches::of(&traces), Some(found));

@@ -83,7 +83,7 @@ mod tests {
 
     #[test]
     fn summary_of_an_even_number_of_values() {
-        let summary = Summary::of(&[3.0, 1.0, 2.0, 10.0]).expect("some");
+        let summary = Summary::of(&[3.0, 1.0, 2.0, 10.0]).expect("a summary of four values");
         assert_eq!((summary.mean, summary.median, summary.p95), (4.0, 2.5, 10.0));
         assert!(Summary::of(&[]).is_none());
     }

@@ -1,4 +1,4 @@
-//! The Arcade Learning Environment and Craftax.
+//! Tests of the Arcade Learning Environment and of Craftax.
 
 use crate::play::{RecordedEnv, make, play};
 use crate::{config, has};

@@ -1,4 +1,4 @@
-//! Episodes that start at a row of a dataset.
+//! Tests of episodes that start at a row of a dataset.
 
 use crate::config;
 use crate::play::{RecordedEnv, make};
@@ -86,7 +86,7 @@ fn shifted_factors_are_sampled_from_a_new_seed() {
 }
 
 #[test]
-fn calls_methods_by_name() {
+fn dataset_start_calls_methods_by_name() {
     let Some(config) = config() else { return };
     let mut field = RecordedEnv::of(make(FIELD, &config));
     let place =
@@ -97,8 +97,9 @@ fn calls_methods_by_name() {
     assert!((position[0] - f64::from(1.2f32) - wind[0]).abs() < 1e-12 && position[1] == wind[1], "{position:?}");
     assert_eq!(field.column("set"), [3.0]);
 
-    let mut wrong =
-        |json: &str| start(&mut *field.env, &ResetOptions::default(), &calls(json)).expect_err("wrong").to_string();
+    let mut wrong = |json: &str| {
+        start(&mut *field.env, &ResetOptions::default(), &calls(json)).expect_err("an invalid callable").to_string()
+    };
     let error = wrong(r#"[{"method": "set_place"}]"#);
     assert!(error.contains("Field has no method 'set_place'") && error.contains("place"), "{error}");
     let error = wrong(r#"[{"method": "place", "args": {"x": {"value": "goal_y"}}}]"#);
@@ -114,7 +115,7 @@ fn calls_methods_by_name() {
 }
 
 #[test]
-fn environment_declares_its_setter() {
+fn environment_may_declare_its_setter() {
     let Some(config) = config() else { return };
     let mut declared = RecordedEnv::of(make("tests.it.environments:Declared-v0", &config));
     start(&mut *declared.env, &ResetOptions::default(), &[]).expect("a start");
@@ -156,7 +157,7 @@ fn snapshot_contains_the_dataset_start() {
     field.env.step(EAST).expect("a step");
     let snapshot = field.env.snapshot();
     let mut other = RecordedEnv::of(make(FIELD, &config));
-    other.env.restore(&snapshot).expect("restored");
+    other.env.restore(&snapshot).expect("a restored episode");
     for env in [&mut field, &mut other] {
         env.env.step(EAST).expect("a step");
     }

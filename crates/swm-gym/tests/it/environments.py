@@ -26,7 +26,7 @@ class Factor(spaces.Box):
 
 
 class IntegerFactor(spaces.Discrete):
-    """A leaf of a variation space: one of several integers with a value."""
+    """A leaf of a variation space: an integer with a range and a value."""
 
     def __init__(self, n, init_value):
         super().__init__(n)
@@ -53,17 +53,17 @@ class Group(spaces.Dict):
     def start(self, seed, options):
         self.seed(seed)
         leaves = dict(self.leaves())
-        wanted = options.get('variation', ['agent.size'])
+        varied = options.get('variation', ['agent.size'])
         for key, leaf in leaves.items():
             leaf.value = leaf.init_value
-            if 'all' in wanted or key in wanted or key.split('.')[0] in wanted:
+            if 'all' in varied or key in varied or key.split('.')[0] in varied:
                 leaf.draw()
         for key, value in options.get('variation_values', {}).items():
             leaves[key].set_value(value)
 
 
 class Room(gymnasium.Env):
-    """A point in a room, with every feature that an environment may have.
+    """A point in a room, with every feature of environments that the bridge supports.
 
     It prints, and it reads standard input, which workers use for requests.
     """
@@ -94,7 +94,7 @@ class Room(gymnasium.Env):
         super().reset(seed=seed)
         self.variation_space.start(seed, options or {})
         print('a new episode')
-        # The bridge resets it once with seed 0 to describe it, when no other room waits.
+        # The bridge resets the environment once with seed 0 to describe it; no other environment waits then.
         self.meets = self.meet and seed
         if self.meets:
             self.wait_for_another('reset-')
@@ -202,7 +202,7 @@ class Field(gymnasium.Env):
 
 
 class Jointed(Field):
-    """Has a `set_state` method whose arguments are not one column."""
+    """Has a `set_state` method with two arguments, which no single column provides."""
 
     _set_state = None
 

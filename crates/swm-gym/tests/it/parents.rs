@@ -1,4 +1,4 @@
-//! Tests that workers end with their parent process, however it ends.
+//! Tests that a worker process ends when its parent process ends in any way.
 
 use crate::config;
 use crate::play::ROOM;
@@ -11,15 +11,15 @@ use swm_core::{Action, Env, ResetOptions};
 use swm_gym::{GymEnv, WorkerTransport};
 
 /// Returns whether a process runs. A zombie process does not.
-fn runs(id: u32) -> bool {
+fn is_running(id: u32) -> bool {
     let stat = std::fs::read_to_string(Path::new("/proc").join(id.to_string()).join("stat"));
     stat.is_ok_and(|stat| stat.rsplit(')').next().is_some_and(|rest| !rest.trim_start().starts_with('Z')))
 }
 
 /// Returns whether a process ends within ten seconds.
-fn ends(id: u32) -> bool {
+fn ends_in_time(id: u32) -> bool {
     let begun = Instant::now();
-    while runs(id) {
+    while is_running(id) {
         if begun.elapsed() > Duration::from_secs(10) {
             return false;
         }
@@ -39,9 +39,9 @@ fn hanging_env() -> Option<(GymEnv, u32)> {
 #[test]
 fn dropping_an_environment_ends_its_worker() {
     let Some((env, id)) = hanging_env() else { return };
-    assert!(runs(id));
+    assert!(is_running(id));
     drop(env);
-    assert!(!runs(id));
+    assert!(!is_running(id));
 }
 
 #[test]
@@ -53,7 +53,7 @@ fn a_panic_ends_the_worker() {
         std::panic::resume_unwind(Box::new("a panic"));
     });
     assert!(panicked.join().is_err());
-    assert!(ends(id));
+    assert!(ends_in_time(id));
 }
 
 /// The kernel ends a child with the thread that started it, so a permanent thread must start the workers.
@@ -64,7 +64,7 @@ fn a_worker_outlives_the_thread_that_made_its_environment() {
     }
     let (mut env, id) = std::thread::spawn(|| hanging_env().expect("an environment")).join().expect("no panic");
     env.reset(0, &ResetOptions::default()).expect("a reset");
-    assert!(runs(id));
+    assert!(is_running(id));
 }
 
 #[test]
@@ -72,27 +72,27 @@ fn killing_the_process_ends_busy_workers() {
     if config().is_none() {
         return;
     }
-    let test = std::env::current_exe().expect("a program");
-    let mut child = Command::new(test)
+    let program = std::env::current_exe().expect("the path of the test program");
+    let mut child = Command::new(program)
         .args(["--exact", "parents::hang_with_a_worker", "--nocapture"])
         .env(HANG, "1")
         .stdout(Stdio::piped())
         .stderr(Stdio::null())
         .spawn()
         .expect("a child");
-    let lines = BufReader::new(child.stdout.take().expect("a pipe")).lines();
+    let lines = BufReader::new(child.stdout.take().expect("standard output of the child")).lines();
     let worker = lines.map_while(Result::ok).find_map(|line| line.split("worker=").nth(1)?.trim().parse().ok());
     let worker = worker.expect("the child prints the id of its worker");
-    assert!(runs(worker));
+    assert!(is_running(worker));
     kill_process(child.id());
-    child.wait().expect("an end");
-    assert!(ends(worker), "worker process {worker} still runs");
+    child.wait().expect("an exit status");
+    assert!(ends_in_time(worker), "worker process {worker} still runs");
 }
 
-/// The environment variable that the test above sets for its child process.
+/// The environment variable that [`killing_the_process_ends_busy_workers`] sets for its child process.
 const HANG: &str = "SWM_TEST_HANG";
 
-/// The program of the child process of the test above; does nothing unless its variable is set.
+/// The program of the child process of [`killing_the_process_ends_busy_workers`]; does nothing unless [`HANG`] is set.
 #[test]
 #[expect(clippy::print_stdout, reason = "the parent test reads the id of the worker from standard output")]
 fn hang_with_a_worker() {

@@ -57,7 +57,7 @@ pub struct RecordedEnv {
 
 impl RecordedEnv {
     pub fn of(env: Box<dyn Env>) -> Self {
-        let schema = Schema::new(env.spec().columns.clone()).expect("columns have their own names");
+        let schema = Schema::new(env.spec().columns.clone()).expect("column names are unique");
         Self { env, row: Batch::zeros(&schema, 1) }
     }
 
@@ -89,11 +89,11 @@ impl RecordedEnv {
 fn outputs_do_not_depend_on_threads_or_other_environments() {
     let Some(config) = config() else { return };
     for text in ["CartPole-v1", ROOM] {
-        let one = play(text, &config, &[0, 1, 2, 3], 1, 6);
-        assert!(one == play(text, &config, &[0, 1, 2, 3], 4, 6), "{text}: four threads differ from one");
-        assert!(one[0] != one[1], "{text}: two seeds give two episodes");
-        assert!(one[..2] == play(text, &config, &[0, 1], 2, 6), "{text}: two environments differ from four");
-        assert!(one[3] == play(text, &config, &[3], 1, 6)[0], "{text}: one alone differs");
+        let serial = play(text, &config, &[0, 1, 2, 3], 1, 6);
+        assert!(serial == play(text, &config, &[0, 1, 2, 3], 4, 6), "{text}: four threads differ from one");
+        assert!(serial[0] != serial[1], "{text}: two seeds give two episodes");
+        assert!(serial[..2] == play(text, &config, &[0, 1], 2, 6), "{text}: two environments differ from four");
+        assert!(serial[3] == play(text, &config, &[3], 1, 6)[0], "{text}: one alone differs");
     }
 }
 
@@ -101,7 +101,7 @@ fn outputs_do_not_depend_on_threads_or_other_environments() {
 fn environments_run_in_parallel_on_one_thread() {
     let Some(config) = config() else { return };
     let folder = tempfile::tempdir().expect("a folder");
-    // Each environment waits in its reset and in its step for the other one, except in episodes of seed 0.
+    // Each environment waits in its reset and in its step for the other environment, except in episodes of seed 0.
     let text = format!("{ROOM},meet={}", folder.path().display());
     let envs = (0..2).map(|_| make(&text, &config)).collect();
     let mut pool = EnvPool::new(envs, None, None, threads(1).expect("threads")).expect("a pool");
@@ -132,7 +132,7 @@ fn a_dispatched_call_runs_once() {
     assert!(dispatched.dispatch(PendingCall::Step(push)));
     dispatched.env.step(push).expect("the step");
     assert!(plain.everything() == dispatched.everything());
-    // Any other call runs the dispatched step first.
+    // Any other call completes the dispatched step first.
     plain.env.step(push).expect("a step");
     assert!(dispatched.dispatch(PendingCall::Step(push)));
     assert!(plain.env.snapshot() == dispatched.env.snapshot());
@@ -141,7 +141,7 @@ fn a_dispatched_call_runs_once() {
     assert!(dispatched.dispatch(PendingCall::Step(push)));
     dispatched.env.step(none).expect("another step");
     assert!(plain.everything() == dispatched.everything());
-    // So does a reset.
+    // A reset completes the dispatched step first, too.
     assert!(dispatched.dispatch(PendingCall::Step(push)));
     for env in [&mut plain, &mut dispatched] {
         env.env.reset(7, &start).expect("a reset");
@@ -180,7 +180,7 @@ fn spec_describes_the_environment() {
         ("noise", DType::Float64, &[]),
         ("steps", DType::Int64, &[]),
     ];
-    // A dictionary's keys come in the order Gymnasium keeps them in.
+    // Gymnasium determines the order of a dictionary's keys, so both lists are sorted.
     columns.sort_by(|a, b| a.0.cmp(b.0));
     expected.sort_by(|a, b| a.0.cmp(b.0));
     assert_eq!(columns, expected);
@@ -200,7 +200,7 @@ fn info_goals_and_frames_become_outputs() {
     assert_eq!((goal[0], goal[2]), (40, 40));
     let (mut noises, mut steps) = (vec![], 0);
     let terminated = loop {
-        // A bound in single precision is also within the bound in double precision.
+        // The bridge converts the bound in single precision to the bound in double precision.
         let transition = room.env.step(Action::Continuous(&[0.4, -0.4])).expect("a step");
         steps += 1;
         assert_eq!(transition.reward, -1.5);
@@ -215,9 +215,9 @@ fn info_goals_and_frames_become_outputs() {
     assert_eq!(terminated, 7);
     assert_eq!(noises[0], noises[1], "a missing entry keeps its value");
     assert_ne!(noises[1], noises[2]);
-    // The top third is blue, at the native size and at half of it.
-    let own = room.frame(12, 16);
-    assert_eq!((&own[..3], &own[own.len() - 3..]), (&[0, 0, 140][..], &[0, 0, 0][..]));
+    // The top third is blue, at the native size and at half that size.
+    let native = room.frame(12, 16);
+    assert_eq!((&native[..3], &native[native.len() - 3..]), (&[0, 0, 140][..], &[0, 0, 0][..]));
     let half = room.frame(6, 8);
     assert_eq!((half[2], half[half.len() - 1]), (140, 0));
     // The next episode starts with new values.
@@ -240,15 +240,15 @@ fn factors_are_sampled_pinned_and_read_back() {
         let factors = room.factors();
         Ok::<_, Error>((factors.scalar("agent.size"), factors.rgb("agent.color"), factors.integer("door.number")))
     };
-    let plain = reset(Some(&[]), &[]).expect("nothing varied");
+    let plain = reset(Some(&[]), &[]).expect("no varied factor");
     assert_eq!(plain, (1.0, [255, 0, 10], 1));
-    let default = reset(None, &[]).expect("the environment's own choice");
+    let default = reset(None, &[]).expect("the default factors");
     assert!(default.0 != 1.0 && default.1 == plain.1, "{default:?}");
-    assert_ne!(reset(Some(&["agent"]), &[]).expect("a group").1, plain.1);
-    assert_ne!(reset(Some(&["all"]), &[]).expect("everything").1, plain.1);
+    assert_ne!(reset(Some(&["agent"]), &[]).expect("a varied group").1, plain.1);
+    assert_ne!(reset(Some(&["all"]), &[]).expect("all factors varied").1, plain.1);
     let pinned: &[(&str, &[f64])] =
         &[("door.number", &[3.0]), ("agent.color", &[1.0, 2.0, 3.0]), ("agent.size", &[0.75])];
-    assert_eq!(reset(Some(&["all"]), pinned).expect("everything pinned"), (0.75, [1, 2, 3], 3));
+    assert_eq!(reset(Some(&["all"]), pinned).expect("all factors pinned"), (0.75, [1, 2, 3], 3));
     for (variation, pinned, words) in [
         (Some(&["agent.colour"][..]), &[][..], "did you mean agent.color"),
         (None, &[("agent.size", &[9.0][..])][..], "0.5 ..= 2"),
@@ -277,7 +277,7 @@ fn restores_snapshot_bit_for_bit() {
     let Some(config) = config() else { return };
     let mut room = RecordedEnv::of(make(ROOM, &config));
     room.env.reset(5, &ResetOptions::default()).expect("a reset");
-    let go = |room: &mut RecordedEnv, n: i16| {
+    let outputs_of_steps = |room: &mut RecordedEnv, n: i16| {
         let actions = (0..n).map(|i| [0.1 * f32::from(i % 3), -0.2]);
         actions
             .flat_map(|action| {
@@ -286,14 +286,14 @@ fn restores_snapshot_bit_for_bit() {
             })
             .collect::<Vec<u8>>()
     };
-    go(&mut room, 2);
+    outputs_of_steps(&mut room, 2);
     let snapshot = room.env.snapshot();
-    let expected = go(&mut room, 3);
+    let expected = outputs_of_steps(&mut room, 3);
     room.env.restore(&snapshot).expect("a restored episode");
-    assert!(go(&mut room, 3) == expected, "the same environment differs after a restore");
+    assert!(outputs_of_steps(&mut room, 3) == expected, "the same environment differs after a restore");
     let mut other = RecordedEnv::of(make(ROOM, &config));
     other.env.restore(&snapshot).expect("a restored episode");
-    assert!(go(&mut other, 3) == expected, "another environment differs after a restore");
+    assert!(outputs_of_steps(&mut other, 3) == expected, "another environment differs after a restore");
     let error =
         make("CartPole-v1", &config).restore(&snapshot).expect_err("a snapshot of another environment").to_string();
     assert!(error.contains("another environment"), "{error}");
@@ -318,7 +318,7 @@ fn unsupported_requests_are_errors() {
     assert!(env.env.step(Action::Continuous(&[0.0])).is_err(), "an action of another kind");
     env.env.step(Action::Discrete(&[1])).expect("a step after invalid actions");
 
-    let unknown = swm_gym::make("CartPoel-v1", config.clone()).err().expect("unknown").to_string();
+    let unknown = swm_gym::make("CartPoel-v1", config.clone()).err().expect("an unknown id").to_string();
     assert!(unknown.contains("did you mean CartPole-v1"), "{unknown}");
     let wrong = swm_gym::make("CartPole-v1,sutton=1", config.clone()).err().expect("no such argument").to_string();
     assert!(wrong.contains("sutton") && wrong.contains("CartPole-v1"), "{wrong}");

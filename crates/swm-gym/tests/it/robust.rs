@@ -16,7 +16,7 @@ fn outputs_are_the_same_when_a_worker_dies_in_an_episode() {
     let expected = play(ROOM, &config, &[1], 1, 6);
     let dying = format!("{ROOM},die_at=4,marker={}", marker.display());
     assert!(play(&dying, &config, &[1], 1, 6) == expected);
-    assert!(marker.exists(), "the worker died");
+    assert!(marker.exists(), "the worker did not die");
 }
 
 #[test]
@@ -78,7 +78,7 @@ fn dispatched_calls_are_repeated_in_a_new_worker() {
 
 pub fn kill_process(id: u32) {
     let killed = std::process::Command::new("kill").args(["-9", &id.to_string()]).status();
-    assert!(killed.expect("kill").success());
+    assert!(killed.expect("the program `kill`").success());
 }
 
 #[test]
@@ -102,7 +102,7 @@ fn an_exception_is_an_error_without_another_attempt() {
     let mut env = make(&format!("{ROOM},raise_at=2"), &config);
     env.reset(0, &ResetOptions::default()).expect("a reset");
     env.step(PUSH).expect("a step");
-    let error = env.step(PUSH).expect_err("it raises").to_string();
+    let error = env.step(PUSH).expect_err("an exception").to_string();
     for words in [ROOM, "its step raised", "raise ValueError('the room is on fire')", "environments.py"] {
         assert!(error.contains(words), "{words}: {error}");
     }
@@ -117,7 +117,7 @@ fn a_hanging_environment_is_stopped() {
     let mut env = make(&format!("{ROOM},hang_at=2"), &config);
     env.reset(0, &ResetOptions::default()).expect("a reset");
     env.step(PUSH).expect("a step");
-    let error = env.step(PUSH).expect_err("it hangs").to_string();
+    let error = env.step(PUSH).expect_err("a timeout").to_string();
     for words in ["2 workers", "did not answer within 1.5s", "about to hang"] {
         assert!(error.contains(words), "{words}: {error}");
     }

@@ -17,9 +17,9 @@ pub struct BitReader<'a> {
     next: usize,
     /// Loaded bits, from the top.
     buffer: u64,
-    /// How many bits are loaded.
+    /// The number of loaded bits.
     count: u32,
-    /// How many of the loaded bits are zeros that stand for bytes beyond the end.
+    /// The number of loaded bits that stand for bytes beyond the end; these bits are 0.
     beyond: u32,
 }
 
@@ -28,7 +28,7 @@ impl<'a> BitReader<'a> {
         Self { bytes, next: 0, buffer: 0, count: 0, beyond: 0 }
     }
 
-    /// Loads bits until at least 32 are there.
+    /// Loads bits until at least 32 are loaded.
     #[inline(always)]
     pub fn refill(&mut self) {
         if self.count < 32 {
@@ -102,7 +102,7 @@ impl<'a> BitReader<'a> {
         Some(entry)
     }
 
-    /// Returns the coefficient of an entry, reading the bits of it that follow.
+    /// Returns the coefficient of an entry. Reads those bits of the coefficient that the entry does not contain.
     #[inline(always)]
     pub fn value(&mut self, entry: Entry) -> i32 {
         let size = entry.extra_bits();

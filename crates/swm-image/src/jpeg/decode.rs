@@ -1,10 +1,10 @@
 //! The fast JPEG decoder: baseline JPEG as datasets hold it, bit for bit as libjpeg (and therefore Pillow, OpenCV and
 //! torchvision) decodes it.
 //!
-//! Frames of simulations have large areas of one colour, which are cheap here: an MCU that repeats the last one is
-//! recognised by its bits alone, and one of a single colour among its like is filled without transform, upsampling or
-//! conversion. Supported is ITU-T T.81 baseline in YCbCr, chroma at full (4:4:4) or half resolution (4:2:0), without
-//! restart intervals. Everything else, and everything damaged, is left to the general decoder.
+//! Frames of simulations have large areas of one colour, which are fast to decode: an MCU that repeats the last MCU is
+//! recognised by its code alone, and an MCU of a single colour whose neighbours have the same chroma is filled without
+//! inverse transform or upsampling. Supported is ITU-T T.81 baseline in YCbCr, chroma at full (4:4:4) or half
+//! resolution (4:2:0), without restart intervals. The general decoder handles all other files, including damaged ones.
 
 use super::bit_reader::BitReader;
 use super::header::{Header, Tables};
@@ -99,7 +99,7 @@ fn decode_planes<L: Level>(header: &Header, scan: &[u8], tables: &Tables, planes
                 planes.mcus.push(last);
                 continue;
             }
-            // The value of each block that has only one.
+            // The sample value of each block whose samples are all equal.
             let mut flat = [None; 6];
             for (block, flat) in flat.iter_mut().enumerate().take(luma_blocks + 2) {
                 let plane = block.saturating_sub(luma_blocks - 1);
@@ -136,12 +136,12 @@ fn decode_planes<L: Level>(header: &Header, scan: &[u8], tables: &Tables, planes
             return None;
         }
     }
-    // Another scan, or damage, would follow otherwise.
+    // A file without an end marker here has another scan or is damaged.
     bits.is_at_end_of_image().then_some(())
 }
 
-/// Returns the bits of an MCU whose blocks are all of one value and equal to the blocks before them, and how many these
-/// are. `None` if they are too many to be compared at once.
+/// Returns the code of an MCU that repeats the last MCU, as bits and their number. Every block of such an MCU has a DC
+/// difference of 0 and no AC coefficients. `None` if the code has more than 32 bits.
 fn repeated_mcu(tables: &PlaneTables<'_>, luma_blocks: usize) -> Option<(u64, u32)> {
     let code = |table: &HuffmanTable, run: u32| {
         let matches = |entry: &Entry| (1..=INDEX_BITS).any(|length| *entry == Entry::new(length, 0, run, 0));

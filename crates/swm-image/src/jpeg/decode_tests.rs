@@ -9,10 +9,11 @@ use swm_simd::{CpuLevel, limit_cpu_level};
 /// A name, the bytes of the file, height and width, and the pixels that Pillow decodes.
 type PillowImage = (String, Vec<u8>, [usize; 2], Vec<u8>);
 
-/// The images that Pillow wrote, and what it decodes them to (`tests/interop/jpeg_export.py`).
+/// Returns the images that Pillow wrote, and the pixels that Pillow decodes from them (`tests/interop/jpeg_export.py`).
 fn pillow_images() -> Vec<PillowImage> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/jpeg");
-    let mut paths: Vec<_> = std::fs::read_dir(folder).expect("images").map(|e| e.expect("entry").path()).collect();
+    let mut paths: Vec<_> =
+        std::fs::read_dir(folder).expect("a folder of images").map(|e| e.expect("a folder entry").path()).collect();
     paths.retain(|path| path.extension().is_some_and(|extension| extension == "jpg"));
     paths.sort();
     let read = |path: &Path| {
@@ -47,7 +48,7 @@ fn decodes_bit_for_bit_as_pillow() {
             assert!(decode_at_baseline(&bytes, height, width, &mut out), "{name}");
             assert!(out == expected, "{name} without AVX2");
         }
-        // The general decoder reads the others, and rounds differently.
+        // The general decoder also reads the kinds that the fast decoder does not support. It rounds differently.
         crate::decode(&bytes, height, width, &mut out).expect("an image");
         let off: u32 = out.iter().zip(&expected).map(|(a, b)| u32::from(a.abs_diff(*b))).sum();
         assert!(f64::from(off) / (expected.len() as f64) < 3.0, "{name}: {off}");
@@ -55,9 +56,8 @@ fn decodes_bit_for_bit_as_pillow() {
     }
 }
 
-/// Patches of one colour, alike and not, at every position of images of many sizes.
 #[test]
-fn patches_decode_alike_with_and_without_avx2() {
+fn random_rectangles_decode_equally_with_and_without_avx2() {
     let mut seed = 1_u32;
     let mut next = move |n: u32| {
         seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -83,7 +83,7 @@ fn patches_decode_alike_with_and_without_avx2() {
 }
 
 #[test]
-fn damaged_files_are_refused_or_decoded_without_panic() {
+fn damaged_files_fail_or_decode_without_panic() {
     let images = pillow_images();
     let mut out = vec![0; 112 * 112 * 3];
     for (name, bytes, [height, width], _) in &images {
@@ -99,6 +99,6 @@ fn damaged_files_are_refused_or_decoded_without_panic() {
                 damaged[at] = bytes[at];
             }
         }
-        assert_eq!(decode(bytes, *height, *width, out), !name.starts_with("other"), "{name} after the damaged ones");
+        assert_eq!(decode(bytes, *height, *width, out), !name.starts_with("other"), "{name} after damaged files");
     }
 }

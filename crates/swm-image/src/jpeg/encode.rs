@@ -48,7 +48,7 @@ fn scaled(table: &[u8; 64], quality: u8) -> [u8; 64] {
     table.map(|value| ((u32::from(value) * scale + 50) / 100).clamp(1, 255) as u8)
 }
 
-/// Copies an MCU out of an image; beyond the edges the last row and column repeat.
+/// Copies an MCU out of an image; beyond the edges the last row and column are repeated.
 fn gather(rgb: &[u8], (h, w): (usize, usize), (top, left): (usize, usize), mcu: &mut [u8; MCU * LINE]) {
     let columns = MCU.min(w - left);
     for (row, line) in mcu.chunks_exact_mut(LINE).enumerate() {
@@ -60,7 +60,7 @@ fn gather(rgb: &[u8], (h, w): (usize, usize), (top, left): (usize, usize), mcu: 
     }
 }
 
-/// Whether one quarter of an MCU (0 and 1 above, 2 and 3 below) has one colour.
+/// Whether one quarter of an MCU (0 and 1 in the upper half, 2 and 3 in the lower half) has one colour.
 fn quarter_is_flat(mcu: &[u8; MCU * LINE], quarter: usize) -> bool {
     let start = quarter / 2 * 8 * LINE + quarter % 2 * (LINE / 2);
     let row = |row: usize| &mcu[start + row * LINE..][..LINE / 2];
@@ -88,7 +88,7 @@ fn round(value: f32) -> i32 {
 struct Scan<'a> {
     /// Bits that are not written yet, at the low end.
     bits: u64,
-    /// How many more bits fit.
+    /// The number of bits that still fit.
     free: u32,
     out: &'a mut Vec<u8>,
     /// The last DC coefficient of each component.
@@ -145,7 +145,7 @@ impl Scan<'_> {
         self.block(2, &chroma[1]);
     }
 
-    /// Writes a block of one value.
+    /// Writes a block whose samples are all equal.
     fn flat_block(&mut self, component: usize, value: f32) {
         let kind = usize::from(component > 0);
         // The DC coefficient is 8 times the value, and 64 times with the factor that the transform keeps.
@@ -312,7 +312,7 @@ mod tests {
     }
 
     #[test]
-    fn images_of_one_colour_keep_it() {
+    fn images_of_one_colour_keep_their_colour() {
         for color in [[0, 0, 0], [255, 255, 255], [255, 0, 0], [0, 0, 255], [144, 238, 144], [12, 200, 77]] {
             let flat = image(40, 33, |_, _| color);
             let worst = decoded(&flat, 40, 33, 95).iter().zip(&flat).map(|(&a, &b)| a.abs_diff(b)).max();

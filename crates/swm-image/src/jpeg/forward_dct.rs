@@ -1,7 +1,7 @@
 //! The cosine transform of 8 × 8 blocks, for the encoder: IEEE single precision in a fixed order, so that equal images
 //! give equal bytes on every machine.
 
-/// Eight values, each in a lane of its own.
+/// Eight values, one in each lane.
 type Lanes = [f32; 8];
 /// An 8 × 8 block, row-major.
 pub type Block = [Lanes; 8];
@@ -16,7 +16,7 @@ pub fn forward_dct(block: &Block) -> Block {
     rows
 }
 
-/// Transforms along the rows in every lane (Arai, Agui and Nakajima 1988: 5 multiplications).
+/// Transforms every lane (column) across the eight rows (Arai, Agui and Nakajima 1988: 5 multiplications).
 #[allow(clippy::needless_range_loop, reason = "the loop is over lanes, each of which crosses all rows")]
 fn transform_rows(r: &mut Block) {
     for i in 0..8 {

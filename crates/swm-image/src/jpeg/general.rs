@@ -17,7 +17,7 @@ impl<'a> Decoder<'a> {
     /// Reads the headers of a JPEG file in memory.
     ///
     /// # Errors
-    /// When they are damaged.
+    /// When the headers are damaged.
     pub fn new(bytes: &'a [u8]) -> Result<Self> {
         // Strict: a truncated file is an error, not a grey area.
         let options = DecoderOptions::default().jpeg_set_out_colorspace(ColorSpace::RGB).set_strict_mode(true);

@@ -36,12 +36,12 @@ impl Header {
                 0xc0 => header.read_frame(body)?,
                 0xc4 => read_huffman_tables(body, tables, &mut given)?,
                 0xda if header.subsampling > 0 && given == [[true; 2]; 2] => {
-                    // Luma by the first tables, both chroma planes by the second.
+                    // Luma uses the first tables, both chroma planes use the second tables.
                     return (body == [3, 1, 0x00, 2, 0x11, 3, 0x11, 0, 63, 0]).then_some((header, rest));
                 }
                 0xdb => header.read_quantisation(body)?,
-                // JFIF, notes of other programs and comments. Adobe's segment is refused: it may change the colour
-                // space.
+                // JFIF, other application segments and comments. Adobe's segment is unsupported, because it may change
+                // the colour space.
                 0xe0..=0xed | 0xef | 0xfe => {}
                 _ => return None,
             }

@@ -45,7 +45,7 @@ pub struct HuffmanTable {
     pub entries: [Entry; 1 << INDEX_BITS],
     /// For every length, the first 16-bit prefix beyond the codes of that length.
     ends: [u32; 17],
-    /// For every length, what a code plus it gives the index of the code's symbol.
+    /// For every length, the offset from a code of that length to the index of its symbol.
     offsets: [i32; 17],
     symbols: [u8; 256],
 }

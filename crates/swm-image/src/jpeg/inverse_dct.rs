@@ -29,7 +29,7 @@ mod factors {
     pub const O2: Pair = (-20995, 4177);
 }
 
-/// Bits that the first pass rounds away; it keeps two.
+/// Bits that the first pass rounds away; it keeps two fraction bits.
 const FIRST: i32 = 11;
 /// Bits that the second pass rounds away: those of its factors, the two kept ones and the transform's factor of 8.
 const SECOND: i32 = 18;
@@ -37,7 +37,7 @@ const SECOND: i32 = 18;
 /// Writes the 8 × 8 samples of a block, 128 added, as rows that are `stride` apart.
 ///
 /// # Panics
-/// When `to` is shorter than that.
+/// When `to` is shorter than `7 * stride + 8`.
 #[inline(always)]
 pub fn inverse_dct<L: Level>(block: &Block, to: &mut [u8], stride: usize) {
     #[cfg(target_arch = "x86_64")]
@@ -92,7 +92,7 @@ fn pass<const BITS: i32>(x: [Row<i16>; 8]) -> [Row<i16>; 8] {
 
 #[cfg(target_arch = "x86_64")]
 mod avx2 {
-    //! The same with eight values per register.
+    //! The transform with AVX2 intrinsics, eight values per register.
 
     use super::factors::{DIFFERENCE, E2, E3, O0, O1, O2, O3, Pair, SUM, Z3, Z4};
     use super::{Block, FIRST, SECOND};
@@ -194,7 +194,7 @@ mod tests {
         for round in 0..3000 {
             let block = std::array::from_fn(|_| {
                 seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-                // From small values to larger ones than an image has; many zeros.
+                // Many zeros, and values from small ones to larger ones than those of images.
                 if seed >> 30 == 0 { (seed as i32 >> 15 >> (round % 16)) as i16 } else { 0 }
             });
             let (mut plain, mut fast) = ([0; 80], [0; 80]);

@@ -4,11 +4,12 @@ use super::header::Header;
 use super::ycbcr::{Samples, convert, convert_halved};
 use swm_simd::Level;
 
-/// Samples on either side of a plane. Those of chroma repeat the outermost samples, so that every sample has
+/// Extra samples at the sides of a plane. In chroma planes they repeat the outermost samples, so that every sample has
 /// neighbours.
 pub const MARGIN: usize = 8;
 
-/// A square of blocks that are coded together: the values of its planes, where they have only one.
+/// A minimum coded unit (MCU), a square of blocks that are coded together: the value of each plane whose samples are
+/// all equal.
 #[derive(Clone, Copy, Default, PartialEq, Eq)]
 pub struct Mcu {
     pub luma: Option<u8>,
@@ -24,7 +25,7 @@ pub struct Planes {
 }
 
 impl Planes {
-    /// Makes room for an image, forgets the MCUs of the last one, and returns the strides of the planes.
+    /// Allocates memory for an image, clears the list of MCUs, and returns the strides of the planes.
     pub fn start(&mut self, header: &Header) -> [usize; 3] {
         let (rows, columns) = header.mcu_grid();
         let side = 8 * header.subsampling;
@@ -92,7 +93,7 @@ impl Planes {
         Some(())
     }
 
-    /// Returns the luma and chroma of an MCU that becomes a single colour.
+    /// Returns the luma and chroma of an MCU whose pixels all have the same colour.
     #[inline(always)]
     fn single_colour(&self, header: &Header, row: usize, column: usize) -> Option<[u8; 3]> {
         let (rows, columns) = header.mcu_grid();

@@ -49,7 +49,7 @@ pub fn convert<L: Level>(ys: &Samples, us: &Samples, vs: &Samples, out: &mut [u8
 
 #[cfg(target_arch = "x86_64")]
 mod avx2 {
-    //! The same with AVX2 intrinsics.
+    //! The conversions of the parent module with AVX2 intrinsics.
 
     use super::Samples;
     #[allow(clippy::wildcard_imports, reason = "the list of intrinsics would be longer than the code")]
@@ -123,7 +123,8 @@ mod avx2 {
         }
     }
 
-    /// For each third of sixteen pixels and each channel, the shuffle that puts its bytes where they belong.
+    /// For each third of sixteen pixels and each channel, the shuffle that moves its bytes to their positions in the
+    /// output.
     const SHUFFLES: [[[i64; 2]; 3]; 3] = {
         let mut shuffles = [[[0; 2]; 3]; 3];
         let mut i = 0;

@@ -3,9 +3,9 @@
 /// For each pixel along one side of the result, the pixels of the source and their weights.
 #[derive(Clone)]
 struct Taps {
-    /// Pixels of the source per pixel of the result, at most.
+    /// The largest number of source pixels per pixel of the result.
     span: usize,
-    /// By pixel of the result: its first pixel of the source.
+    /// For each pixel of the result, its first source pixel.
     first: Vec<usize>,
     /// The weights, `span` per pixel of the result, which sum to 1.
     weights: Vec<f32>,
@@ -83,7 +83,7 @@ fn shrinking(from: usize, to: usize) -> Vec<(usize, Vec<f32>)> {
     let tap = |i: usize| {
         let (start, end) = (i as f64 * scale, ((i + 1) as f64 * scale).min(from as f64));
         let first = start as usize;
-        // A sliver of a neighbour that is due to rounding does not count.
+        // An overlap of less than 1e-3 with the next pixel is due to rounding and is ignored.
         let last = ((end - 1e-3).ceil() as usize).clamp(first + 1, from);
         let covered = |pixel: usize| (end.min((pixel + 1) as f64) - start.max(pixel as f64)) / (end - start);
         (first, (first..last).map(|pixel| covered(pixel) as f32).collect())

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 /// Fraction bits of integer weights, as in Pillow.
 pub const WEIGHT_BITS: u32 = 22;
-/// Added to a sum of weighted bytes before [`weighted_byte`], so that it rounds to the nearest.
+/// Added to a sum of weighted bytes before [`weighted_byte`], so that the result is rounded to the nearest byte.
 pub const WEIGHT_HALF: i32 = 1 << (WEIGHT_BITS - 1);
 
 /// Returns a sum of bytes with integer weights as a byte. Weights may sum to slightly more than 1.
@@ -16,10 +16,10 @@ pub fn weighted_byte(sum: i32) -> u8 {
 /// For each pixel along one side of the result, the pixels of the source that it averages, and their weights.
 #[derive(Clone, Debug, Default)]
 pub struct FilterAxis<W> {
-    /// By pixel of the result: the first pixel of the source, and the one behind the last.
+    /// For each pixel of the result, its first source pixel, and the index after its last source pixel.
     first: Vec<usize>,
     end: Vec<usize>,
-    /// By pixel of the result: where its weights begin.
+    /// For each pixel of the result, the index of its first weight.
     start: Vec<usize>,
     weights: Vec<W>,
 }

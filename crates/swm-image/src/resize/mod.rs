@@ -1,8 +1,8 @@
-//! Resizing of RGB images, `[height, width, 3]` bytes, one type per semantics.
+//! Resizing of RGB images, `[height, width, 3]` bytes, with one type for each definition of resizing.
 //!
 //! | type | semantics | arithmetic |
 //! | --- | --- | --- |
-//! | [`PillowResizer`] | Pillow 13's `BILINEAR` (a triangle filter as wide as two pixels of the coarser image) or `NEAREST` | integers, rows first, bytes between the two directions |
+//! | [`PillowResizer`] | Pillow 13's `BILINEAR` (a triangle filter as wide as two pixels of the coarser image) or `NEAREST` | integers, vertical pass first, rounded to bytes between the passes |
 //! | [`TriangleResizer`] | the same triangle filter, for parts of images | `f32`, rounded once |
 //! | [`AreaResizer`] | OpenCV's `INTER_AREA` | `f32`, rounded once |
 //! | [`bilinear_taps`], [`bilinear_blend`] | OpenCV's `INTER_LINEAR` | integers |

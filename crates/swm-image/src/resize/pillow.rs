@@ -1,6 +1,6 @@
 //! [`PillowResizer`]: resizing as Pillow does it.
 //!
-//! Rows come first, as in Pillow from version 13 on; single bytes of older versions differ by 1.
+//! The vertical pass runs first, as in Pillow from version 13 on. Results of older versions differ by 1 in some bytes.
 
 use super::axis::{FilterAxis, WEIGHT_HALF, weighted_byte};
 
@@ -13,7 +13,7 @@ pub enum PillowFilter {
     Nearest,
 }
 
-/// Resizes images with one of Pillow's filters. It reuses its weights while the sizes stay the same.
+/// Resizes images with one of Pillow's filters. The resizer reuses its weights while the sizes stay the same.
 pub struct PillowResizer {
     filter: PillowFilter,
     /// Height and width of the source and of the result.
@@ -81,7 +81,7 @@ mod tests {
     fn red(width: usize, height: usize, filter: PillowFilter) -> Vec<u8> {
         let old: Vec<u8> = (0..54).flat_map(|i| [((i % 9 * 37 + (i / 9) * (i / 9) * 11) % 256) as u8, 1, 2]).collect();
         let mut resizer = PillowResizer::new(filter);
-        // Another size first, which the resizer must forget.
+        // The first resize has another size, so the second one must compute new weights.
         for (width, height) in [(5, 4), (width, height)] {
             let mut new = vec![7; width * height * 3];
             resizer.resize(&old, (6, 9), &mut new, (height, width));

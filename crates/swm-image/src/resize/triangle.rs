@@ -1,7 +1,7 @@
 //! [`TriangleResizer`]: the triangle filter of Pillow's `BILINEAR` in `f32`, for parts of images.
 //!
-//! The mean is taken along y first, where it runs over whole rows, and rounded once at the end. Pillow rounds between
-//! the two directions, so single bytes may differ by 1.
+//! The vertical pass runs first, because it works on whole rows. The result is rounded once, at the end. Pillow rounds
+//! between the two passes, so some bytes may differ by 1.
 
 use super::FilterAxis;
 use std::ops::Range;

@@ -21,7 +21,7 @@ impl Location {
     /// Parses a path or a URI. `file://` URIs become paths.
     ///
     /// # Errors
-    /// If it is a URI with an unknown scheme, or is malformed.
+    /// If `given` is a malformed URI, or a URI with an unknown scheme.
     pub fn parse(given: &str) -> Result<Self> {
         let Some((scheme, rest)) = given.split_once("://") else { return Ok(Self::Path(given.into())) };
         if scheme == "file" {
@@ -56,7 +56,7 @@ impl Location {
         })
     }
 
-    /// The location in error messages.
+    /// The location as error messages show it.
     pub fn label(&self) -> PathBuf {
         match self {
             Self::Path(path) => path.clone(),

@@ -164,7 +164,10 @@ mod tests {
             assert!((found - expected).abs() < 1e-6, "{found} {expected}");
         }
         assert!(
-            column_quantiles(&*reader, "state", None, &[1.5]).expect_err("no quantile").to_string().contains("0 ..= 1")
+            column_quantiles(&*reader, "state", None, &[1.5])
+                .expect_err("a quantile above 1")
+                .to_string()
+                .contains("0 ..= 1")
         );
         assert!(column_quantiles(&*reader, "state", Some(&[3]), &[0.5]).is_err(), "no such episode");
     }

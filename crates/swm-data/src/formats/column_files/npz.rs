@@ -21,9 +21,9 @@ const MAX_COMPRESSION: u64 = 1032;
 /// The header of an array.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Header {
-    /// The type of its elements; `None` for text and objects.
+    /// Type of the elements; `None` for text and objects.
     pub stored: Option<StoredScalar>,
-    /// Its shape; the first axis is rows.
+    /// Shape of the array; the first axis counts rows.
     pub shape: Vec<usize>,
 }
 
@@ -123,7 +123,7 @@ fn damaged(path: &Path, problem: impl std::fmt::Display) -> Error {
     Error::corrupt(path, problem.to_string(), "restore the file from a copy, or rebuild the dataset")
 }
 
-/// Parses a header. Returns it with the offset of the elements.
+/// Parses a header. Returns the header and the offset of the elements.
 fn parse(bytes: &[u8]) -> Result<(Header, usize), String> {
     let truncated = || "the array's header is truncated".to_owned();
     let (start, length) = match bytes.get(..12).ok_or_else(truncated)? {
@@ -144,7 +144,7 @@ fn parse(bytes: &[u8]) -> Result<(Header, usize), String> {
     let shape = field("shape").and_then(|rest| rest.strip_prefix('(')?.split_once(')')).ok_or_else(invalid)?.0;
     let shape: Result<Vec<usize>, _> =
         shape.split(',').map(str::trim).filter(|side| !side.is_empty()).map(str::parse).collect();
-    // Structured types are lists; all others are quoted strings.
+    // A structured type is a list; any other type is a quoted string.
     let descr = field("descr").and_then(|rest| rest.strip_prefix('\'')?.split_once('\'')).map(|(descr, _)| descr);
     Ok((Header { stored: descr.and_then(scalar_type), shape: shape.map_err(|_| invalid())? }, end))
 }
@@ -258,7 +258,7 @@ mod tests {
         assert_eq!(header.stored, Some(StoredScalar::of(DType::Int32)));
         assert_eq!((&bytes[..8], &bytes[8..]), (&[1; 8][..], &[2; 16][..]));
         assert_eq!(npz.header().expect("a header"), header);
-        assert_eq!(npz.member("note").expect("is there"), b"hello");
+        assert_eq!(npz.member("note").expect("a member"), b"hello");
         assert!(npz.has("note") && !npz.has("other") && npz.member("other").is_err());
     }
 
@@ -270,13 +270,13 @@ mod tests {
             bytes.extend(text.as_bytes());
             parse(&bytes).map(|(header, _)| header)
         };
-        let text = array("{'descr': '<U5', 'fortran_order': False, 'shape': (4,), }").expect("text is an array");
+        let text = array("{'descr': '<U5', 'fortran_order': False, 'shape': (4,), }").expect("an array of text");
         assert_eq!((text.stored, text.rows()), (None, 4));
         let scalar = array("{'descr': '>f8', 'fortran_order': False, 'shape': (), }").expect("an array");
         assert_eq!((scalar.stored.expect("a numeric type").big_endian, scalar.rows()), (true, 1));
-        let columns = array("{'descr': '<f8', 'fortran_order': True, 'shape': (2, 3), }").expect_err("columns");
-        assert!(columns.contains("ascontiguousarray"), "{columns}");
+        let fortran = array("{'descr': '<f8', 'fortran_order': True, 'shape': (2, 3), }").expect_err("Fortran order");
+        assert!(fortran.contains("ascontiguousarray"), "{fortran}");
         assert!(array("{'descr': '<f8', 'fortran_order': False, 'shape': (-2, 3), }").is_err());
-        assert!(parse(b"PK\x03\x04 is something else").expect_err("no array").contains("not a NumPy array"));
+        assert!(parse(b"PK\x03\x04 is something else").expect_err("not an array").contains("not a NumPy array"));
     }
 }

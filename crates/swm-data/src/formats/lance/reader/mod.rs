@@ -309,7 +309,8 @@ impl Reader for LanceReader {
 }
 
 impl LanceReader {
-    /// Returns the hashes of a fragment's episodes: those in its record, if it has one, otherwise computed from the data.
+    /// Returns the hashes of a fragment's episodes: those in its record, if it has one, otherwise computed from the
+    /// data.
     fn hashes(&self, fragment: usize, episodes: Range<usize>) -> Result<Vec<String>> {
         if let Some((_, record)) = self.record(fragment)? {
             let stored = self.episodes[episodes.clone()].iter().map(|episode| episode.length as u64);

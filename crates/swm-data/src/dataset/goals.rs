@@ -182,7 +182,7 @@ impl Goals {
         self.lengths[position]
     }
 
-    /// The episode position and the row within it of a row counted over all used episodes.
+    /// Converts a row, counted over all used episodes, to an episode position and a row within that episode.
     fn row(&self, row: usize) -> (usize, usize) {
         let at = self.used.partition_point(|&(_, before)| before <= row) - 1;
         let (position, before) = self.used[at];

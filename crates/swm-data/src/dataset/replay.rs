@@ -84,8 +84,8 @@ impl ReplayBuffer {
     /// Adds an episode, and evicts the oldest episodes until the new one fits.
     ///
     /// # Errors
-    /// If the columns differ from the buffer's, the episode breaks the time convention, or it is longer than the
-    /// buffer.
+    /// If the columns differ from the buffer's, the episode breaks the time convention, or the episode has more
+    /// rows than the buffer's capacity.
     pub fn add(&self, episode: &Batch, constants: &Constants) -> Result<()> {
         let Inner { schema, capacity, state, .. } = &*self.0;
         check_episode(episode, schema)?;

@@ -42,7 +42,7 @@ pub struct WriteOptions {
     pub mode: WriteMode,
     /// The codec of images.
     pub codec: ImageCodec,
-    /// Provenance of the data, stored in the dataset. When appending, it replaces the stored manifest.
+    /// Provenance of the data, stored in the dataset. When appending, this manifest replaces the stored one.
     pub manifest: Option<Manifest>,
     /// Limits at which finished episodes are committed.
     pub commit: CommitPolicy,

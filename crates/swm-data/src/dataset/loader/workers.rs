@@ -15,8 +15,8 @@ pub(crate) trait BatchSource: Send + Sync {
     fn produce(&self, batch: usize) -> Result<LoadedBatch>;
 }
 
-/// A batch from a loader. When it is dropped, the loader reuses its memory, because allocating memory for large images
-/// costs as much as decoding them.
+/// A batch from a loader. When the batch is dropped, the loader reuses its memory, because allocating memory for large
+/// images costs as much as decoding them.
 pub struct LoadedBatch {
     /// `None` only after [`LoadedBatch::into_batch`].
     batch: Option<Batch>,

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
 
-/// The episodes at these positions, in this order. They keep their `episode_idx`.
+/// The episodes at these positions, in this order. The episodes keep their `episode_idx`.
 ///
 /// # Errors
 /// If `positions` is empty, a position does not exist, or a position appears twice.

@@ -50,7 +50,7 @@ impl Npz {
     /// Opens an archive.
     ///
     /// # Errors
-    /// If it does not exist or is damaged.
+    /// If the file does not exist or is damaged.
     pub fn open(path: &Path) -> Result<Self> {
         let file = File::open(path).map_err(|e| Error::io(path, "opening a column file", e))?;
         let archive = ZipArchive::new(BufReader::new(file)).map_err(|e| damaged(path, e))?;
@@ -70,7 +70,7 @@ impl Npz {
     /// The bytes of a member.
     ///
     /// # Errors
-    /// If it does not exist or is damaged.
+    /// If the member does not exist or is damaged.
     pub fn member(&mut self, member: &str) -> Result<Vec<u8>> {
         let path = self.path.clone();
         let mut file = self.archive.by_name(member).map_err(|e| damaged(&path, format!("{member}: {e}")))?;
@@ -85,7 +85,7 @@ impl Npz {
     /// Reads the header of the array.
     ///
     /// # Errors
-    /// If there is no array, or it is damaged.
+    /// If there is no array, or the array is damaged.
     pub fn header(&mut self) -> Result<Header> {
         let path = self.path.clone();
         let file = self.archive.by_name(ARRAY).map_err(|e| damaged(&path, format!("{ARRAY}: {e}")))?;
@@ -97,7 +97,7 @@ impl Npz {
     /// Reads the array as a column with type [`StoredScalar::dtype`], and its header.
     ///
     /// # Errors
-    /// If there is no array, its elements are not numeric, or it is damaged.
+    /// If there is no array, its elements are not numeric, or the array is damaged.
     pub fn array(&mut self) -> Result<(Header, Vec<u8>)> {
         let mut bytes = self.member(ARRAY)?;
         let (header, start) = parse(&bytes).map_err(|problem| damaged(&self.path, problem))?;

@@ -324,7 +324,7 @@ pub(crate) fn lock_folder(folder: &Path) -> Result<File> {
     }
 }
 
-/// Removes a dataset. It is renamed first, so that it never exists in part.
+/// Removes a dataset. Renames the folder first, so that no partly removed dataset exists under the original name.
 pub(crate) fn remove_dataset(folder: &Path) -> Result<()> {
     let _lock = lock_folder(folder)?;
     let mut aside = folder.as_os_str().to_owned();

@@ -66,7 +66,7 @@ impl Column {
     /// Interprets a dataset as a column; `None` if it is not numeric.
     ///
     /// # Errors
-    /// If it is damaged, or its layout or filters are not supported.
+    /// If the dataset is damaged, or its layout or filters are not supported.
     #[allow(clippy::too_many_lines, reason = "one case per storage layout")]
     pub fn new(name: &str, dataset: Dataset, file_size: u64) -> Result<Option<Self>, String> {
         let Some(stored) = scalar_type(&catch_panic("its type", || dataset.datatype())?) else { return Ok(None) };
@@ -155,7 +155,7 @@ impl Column {
     /// Reads all rows.
     ///
     /// # Errors
-    /// If they are damaged.
+    /// If the rows are damaged.
     pub fn read_all(&self, source: &Source) -> Result<Vec<u8>, String> {
         let size = self.spec.row_bytes();
         let mut all = vec![0; self.rows as usize * size];

@@ -199,7 +199,7 @@ impl TableWriter {
 /// Reads all rows of an uncompressed dataset that [`TableWriter`] wrote.
 ///
 /// # Errors
-/// If it is damaged.
+/// If the dataset is damaged.
 pub(super) fn read_all(table: &Table, source: &Source) -> Result<Vec<u8>, String> {
     let rows = read_u64(source, table.rows_at)?;
     let size = table.spec.row_bytes();

@@ -61,7 +61,7 @@ impl Tree {
     /// Loads the right edge of a tree, up to the chunks before row `rows`.
     ///
     /// # Errors
-    /// If it is damaged.
+    /// If the tree is damaged.
     pub fn load(table: &Table, source: &Source, rows: u64) -> Result<Self, String> {
         let mut tree = Self::new(table);
         tree.root = read_u64(source, tree.root_at)?;
@@ -177,7 +177,7 @@ impl Tree {
     /// All chunks of a tree in a file.
     ///
     /// # Errors
-    /// If it is damaged.
+    /// If the tree is damaged.
     pub fn chunks(table: &Table, source: &Source) -> Result<Vec<Entry>, String> {
         let tree = Self::new(table);
         let root = read_u64(source, tree.root_at)?;

@@ -51,7 +51,7 @@ pub fn damaged(path: &Path, problem: impl Into<String>) -> Error {
 }
 
 /// Converts Lance's errors: errors of the operating system become [`Error::Io`], errors of a remote store keep their
-/// message, and all others mean that files are damaged.
+/// message, and all other errors mean that files are damaged.
 fn lance_error(label: &Path, action: &str, error: &lance_core::Error) -> Error {
     let text = error.to_string();
     // Lance converts some system errors to text, which still contains their code.

@@ -6,13 +6,13 @@
 //! swm bench data --formats lance --load-only --remote s3://bench/data
 //! ```
 
-#![allow(clippy::print_stdout, reason = "prints its address")]
+#![allow(clippy::print_stdout, reason = "the server prints its address")]
 
 use hyper_util::rt::{TokioExecutor, TokioIo};
 use s3s::service::S3ServiceBuilder;
 use std::error::Error;
 
-/// The address it listens on.
+/// The address that the server listens on.
 const ADDRESS: &str = "127.0.0.1:9753";
 
 fn main() -> Result<(), Box<dyn Error>> {

@@ -1,7 +1,7 @@
 //! Datasets of episodes: writing them during collection, and reading clips of them for training.
 //!
-//! - [`dataset`]: the contracts [`Reader`] and [`Writer`], and what builds on them: clips, goals, [`Loader`], cache,
-//!   [`ReplayBuffer`], [`Split`], statistics, views, [`Location`]. It does not depend on any format.
+//! - [`dataset`]: the contracts [`Reader`] and [`Writer`], and their users: clips, goals, [`Loader`], cache,
+//!   [`ReplayBuffer`], [`Split`], statistics, views, [`Location`]. This module does not depend on any format.
 //! - [`formats`]: a folder for each format on disk, and their registry [`FORMATS`]. [`lance`] is the default.
 //! - [`tools`]: [`convert`](mod@convert) between formats, [`doctor`], [`preview`](mod@preview).
 

@@ -191,6 +191,6 @@ mod tests {
         spec.columns.push("stat".to_owned());
         assert!(spec.schema(&dataset).expect_err("no such column").to_string().contains("unknown column 'stat'"));
         spec.frameskip = 0;
-        assert!(spec.schema(&dataset).expect_err("no step").to_string().contains("frameskip"));
+        assert!(spec.schema(&dataset).expect_err("a frameskip of 0").to_string().contains("frameskip"));
     }
 }

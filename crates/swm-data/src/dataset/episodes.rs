@@ -196,10 +196,10 @@ pub(crate) fn check_appendable(dataset: &impl std::fmt::Display, incoming: &Sche
 }
 
 /// Checks that an episode has the columns of the writer's schema and follows the time convention: the action of the
-/// last row is missing, all others are present and finite.
+/// last row is missing, all other actions are present and finite.
 ///
 /// # Errors
-/// If it does not.
+/// If the columns differ, there is no row, or an action breaks the time convention.
 pub(crate) fn check_episode(episode: &Batch, schema: &Schema) -> Result<()> {
     if episode.schema() != schema {
         return Err(Error::mismatch(
@@ -226,8 +226,8 @@ pub(crate) fn check_episode(episode: &Batch, schema: &Schema) -> Result<()> {
         let action = episode.row(row).to_f64(ACTION)?;
         let is_missing = action.iter().all(|&v| if float { v.is_nan() } else { v == -1.0 });
         let last = row + 1 == rows;
-        let fine = if last { is_missing } else { !is_missing && action.iter().all(|v| v.is_finite()) };
-        if !fine {
+        let valid = if last { is_missing } else { !is_missing && action.iter().all(|v| v.is_finite()) };
+        if !valid {
             return Err(Error::mismatch(
                 "writing an episode",
                 format!("action {action:?} in row {row} of {rows}"),

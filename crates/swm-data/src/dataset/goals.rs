@@ -5,8 +5,8 @@
 //!
 //! [`GoalMixture::default`], and the rule that clips without a future step are excluded, are those of the reference's
 //! `GoalDataset`. The geometric distribution with discount γ is that of hindsight relabelling in GCRL (Eysenbach et al.
-//! 2022, OGBench): the goal is `k` steps ahead with probability `(1 - γ) γ^(k - 1)`; goals beyond the end of the
-//! episode become its last such step.
+//! 2022, OGBench): the goal is `k` model steps ahead with probability `(1 - γ) γ^(k - 1)`. A goal beyond the end of the
+//! episode becomes the last model step of the episode.
 
 use crate::dataset::clips::ClipSpec;
 use crate::dataset::reader::{Episode, StepRange};
@@ -33,23 +33,23 @@ pub struct GoalMixture {
 }
 
 impl GoalMixture {
-    const NOTHING: Self = Self { last: 0.0, future: 0.0, geometric: 0.0, random: 0.0, current: 0.0, discount: 0.99 };
+    const ZERO: Self = Self { last: 0.0, future: 0.0, geometric: 0.0, random: 0.0, current: 0.0, discount: 0.99 };
     /// Always the last row of the episode.
-    pub const LAST: Self = Self { last: 1.0, ..Self::NOTHING };
+    pub const LAST: Self = Self { last: 1.0, ..Self::ZERO };
     /// Always a later step of the episode, uniformly distributed.
-    pub const FUTURE: Self = Self { future: 1.0, ..Self::NOTHING };
+    pub const FUTURE: Self = Self { future: 1.0, ..Self::ZERO };
     /// Always a row of the whole dataset, uniformly distributed.
-    pub const RANDOM: Self = Self { random: 1.0, ..Self::NOTHING };
+    pub const RANDOM: Self = Self { random: 1.0, ..Self::ZERO };
 
     /// Always a later step of the episode, geometrically distributed.
     pub const fn geometric(discount: f64) -> Self {
-        Self { geometric: 1.0, discount, ..Self::NOTHING }
+        Self { geometric: 1.0, discount, ..Self::ZERO }
     }
 }
 
 impl Default for GoalMixture {
     fn default() -> Self {
-        Self { random: 0.3, geometric: 0.5, current: 0.2, ..Self::NOTHING }
+        Self { random: 0.3, geometric: 0.5, current: 0.2, ..Self::ZERO }
     }
 }
 
@@ -71,11 +71,11 @@ pub struct GoalSpec {
 /// A drawn goal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Goal {
-    /// Position of its episode.
+    /// Position of the goal's episode.
     pub episode: usize,
-    /// Its row within the episode.
+    /// Row of the goal within the episode.
     pub row: usize,
-    /// Rows from the anchor to it; -1 if it does not follow the anchor.
+    /// Number of rows from the anchor to the goal; -1 if the goal does not follow the anchor.
     pub offset: i64,
 }
 
@@ -118,7 +118,7 @@ impl GoalSpec {
         self.anchor.unwrap_or_else(|| clip.num_steps.saturating_sub(1)) * clip.frameskip
     }
 
-    /// Rows that an episode must have, from the clip's first row, for a goal to exist.
+    /// Number of rows, counted from the clip's first row, that an episode must have for a goal to exist.
     pub(crate) fn reach(&self, clip: &ClipSpec) -> usize {
         let later = self.mixture.future > 0.0 || self.mixture.geometric > 0.0;
         self.anchor_row(clip) + 1 + if later { clip.frameskip } else { 0 }
@@ -182,7 +182,7 @@ impl Goals {
         self.lengths[position]
     }
 
-    /// The episode position and the row within it of a row counted over all used episodes.
+    /// Converts a row, counted over all used episodes, to an episode position and a row within that episode.
     fn row(&self, row: usize) -> (usize, usize) {
         let at = self.used.partition_point(|&(_, before)| before <= row) - 1;
         let (position, before) = self.used[at];
@@ -232,7 +232,7 @@ mod tests {
         }
         let mut rows = [0; 2];
         for goal in drawn(GoalMixture::RANDOM) {
-            assert!(goal.episode > 0, "an episode that is not used");
+            assert!(goal.episode > 0, "a goal from an unused episode");
             assert_eq!(goal.offset, if goal.episode == 1 && goal.row >= 8 { goal.row as i64 - 8 } else { -1 });
             rows[goal.episode - 1] += 1;
         }
@@ -260,13 +260,13 @@ mod tests {
         let current = goals.iter().filter(|goal| goal.offset == 0).count() as f64;
         // A fifth of the goals, plus the random goals that hit the anchor.
         assert!((current - 20_000.0 * (0.2 + 0.3 / 43.0)).abs() < 300.0, "{current}");
-        let of = |name: &str| {
+        let rows_of = |name: &str| {
             let goals = Goals::new(&episodes(), &[1, 2]);
             let spec = spec();
             let one = GoalSpec { name: name.to_owned(), ..goal(GoalMixture::FUTURE, None) };
             (0..50).map(|i| one.draw(&spec, &CLIP, &goals, Key::new(3).at(i).with(name)).row).collect::<Vec<_>>()
         };
-        assert_ne!(of("value_goal"), of("actor_goal"));
+        assert_ne!(rows_of("value_goal"), rows_of("actor_goal"));
     }
 
     #[test]
@@ -275,7 +275,7 @@ mod tests {
         assert_eq!(goal(GoalMixture::LAST, None).reach(&spec), 5);
         assert_eq!(goal(GoalMixture::FUTURE, None).reach(&spec), 7);
         assert_eq!(goal(GoalMixture::FUTURE, Some(0)).reach(&spec), 3);
-        let message = |goal: GoalSpec| goal.check(&spec).expect_err("nonsense").to_string();
+        let message = |goal: GoalSpec| goal.check(&spec).expect_err("an invalid spec").to_string();
         assert!(message(goal(GoalMixture { last: 0.4, ..GoalMixture::FUTURE }, None)).contains("add up to 1"));
         assert!(message(goal(GoalMixture::geometric(1.0), None)).contains("below 1"));
         assert!(message(goal(GoalMixture::LAST, Some(3))).contains("below 3"));

@@ -21,7 +21,7 @@ impl Location {
     /// Parses a path or a URI. `file://` URIs become paths.
     ///
     /// # Errors
-    /// If it is a URI with an unknown scheme, or is malformed.
+    /// If `given` is a malformed URI, or a URI with an unknown scheme.
     pub fn parse(given: &str) -> Result<Self> {
         let Some((scheme, rest)) = given.split_once("://") else { return Ok(Self::Path(given.into())) };
         if scheme == "file" {
@@ -37,7 +37,7 @@ impl Location {
         Ok(Self::Uri(url))
     }
 
-    /// The path, unless it is a URI.
+    /// The path; `None` for a URI.
     pub fn path(&self) -> Option<&Path> {
         match self {
             Self::Path(path) => Some(path),
@@ -48,7 +48,7 @@ impl Location {
     /// The path; an error for URIs.
     ///
     /// # Errors
-    /// If it is a URI, which `format` cannot read or write.
+    /// If the location is a URI, which `format` cannot read or write.
     pub fn local(&self, format: &str) -> Result<&Path> {
         self.path().ok_or_else(|| {
             let fix = "copy it to this machine, or use the format lance or hdf5, which are read from object stores";
@@ -56,7 +56,7 @@ impl Location {
         })
     }
 
-    /// The location in error messages.
+    /// The location as error messages show it.
     pub fn label(&self) -> PathBuf {
         match self {
             Self::Path(path) => path.clone(),

@@ -26,8 +26,8 @@ use url::Url;
 /// Bytes of an object.
 pub use bytes::Bytes;
 
-/// Ranges with a smaller gap than this are fetched in one request. At 100 MB/s such a gap costs one millisecond, a
-/// request several.
+/// Ranges with a smaller gap than this, in bytes, are fetched in one request. At 100 MB/s, transferring such a gap
+/// takes one millisecond, while another request takes several.
 const GAP: u64 = 128 << 10;
 
 /// Maximum number of concurrent requests per read.
@@ -43,7 +43,7 @@ fn retry_config() -> RetryConfig {
 }
 
 /// The runtime for asynchronous code: two threads, started at first use and never stopped. A forked process (Python
-/// forks) does not inherit threads, so it starts a runtime of its own.
+/// forks) does not inherit threads, so it starts a new runtime.
 fn runtime() -> Result<&'static Runtime> {
     static RUNTIME: Mutex<Option<(u32, &'static Runtime)>> = Mutex::new(None);
     let mut started = RUNTIME.lock().unwrap_or_else(PoisonError::into_inner);
@@ -140,7 +140,7 @@ fn remote(url: &Url) -> Result<Arc<dyn ObjectStore>> {
     }
 }
 
-/// Installs ring as the cryptography provider of the process, unless one is installed.
+/// Installs ring as the cryptography provider of the process, unless a provider is installed already.
 #[cfg(feature = "tls")]
 fn provide_tls() {
     // An error means that another provider is installed already.

@@ -7,13 +7,13 @@
 use std::collections::BTreeMap;
 use swm_core::{Batch, ColumnSpec, Manifest, Result, Schema};
 
-/// Named bytes that hold for a whole episode, such as the XML of its scene. Text is UTF-8.
+/// Named bytes that are constant over an episode, such as the XML of its scene. Text is UTF-8.
 pub type Constants = BTreeMap<String, Vec<u8>>;
 
 /// One episode of a dataset.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Episode {
-    /// Its value in the column `episode_idx`.
+    /// Value of the episode in the column `episode_idx`.
     pub index: i64,
     /// Number of rows, including the final observation.
     pub length: usize,
@@ -54,8 +54,8 @@ pub trait Reader: Send + Sync {
     /// The episodes, in stored order.
     fn episodes(&self) -> &[Episode];
 
-    /// Reads the rows of all `ranges` of one column into `out`, one after another, in the given order. Pass all ranges
-    /// of a batch in one call, because formats merge and parallelise the reads of a call.
+    /// Reads the rows of all `ranges` of one column into `out`, one after another, in the given order. Callers pass all
+    /// ranges of a batch in one call, because formats merge and parallelise the reads of a call.
     ///
     /// # Shapes
     /// `out` is `[rows, shape…]` in bytes, with the column's shape and type. Images are decoded to

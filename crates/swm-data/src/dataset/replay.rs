@@ -29,7 +29,7 @@ pub struct ReplayBuffer(Arc<Inner>);
 struct Inner {
     /// Columns of the episodes that are added.
     schema: Schema,
-    /// Columns of the buffer as a dataset: index columns, then the others.
+    /// Columns of the buffer as a dataset: index columns, then the columns of the episodes.
     dataset_schema: Schema,
     capacity: usize,
     state: Mutex<State>,
@@ -47,8 +47,8 @@ struct State {
 }
 
 struct StoredEpisode {
-    /// Number of episodes added before this one.
-    number: u64,
+    /// Number of episodes added before this one: its value in the column `episode_idx`.
+    index: u64,
     rows: Batch,
     constants: Constants,
 }
@@ -81,11 +81,11 @@ impl ReplayBuffer {
         lock(&self.0.state).added
     }
 
-    /// Adds an episode and evicts the oldest ones to make room.
+    /// Adds an episode, and evicts the oldest episodes until the new one fits.
     ///
     /// # Errors
-    /// If the columns differ from the buffer's, the episode breaks the time convention, or it is longer than the
-    /// buffer.
+    /// If the columns differ from the buffer's, the episode breaks the time convention, or the episode has more
+    /// rows than the buffer's capacity.
     pub fn add(&self, episode: &Batch, constants: &Constants) -> Result<()> {
         let Inner { schema, capacity, state, .. } = &*self.0;
         check_episode(episode, schema)?;
@@ -112,8 +112,8 @@ impl ReplayBuffer {
                 state.spare.push(oldest.rows);
             }
         }
-        let number = state.added;
-        state.stored.push_back(Arc::new(StoredEpisode { number, rows: copy, constants: constants.clone() }));
+        let index = state.added;
+        state.stored.push_back(Arc::new(StoredEpisode { index, rows: copy, constants: constants.clone() }));
         state.rows += rows;
         state.added += 1;
         state.snapshot = OnceLock::new();
@@ -128,34 +128,35 @@ impl ReplayBuffer {
 
     /// The current content as a dataset that does not change. Copies the list of episodes, not their data.
     pub fn snapshot(&self) -> Arc<dyn Reader> {
-        self.now()
+        self.current_snapshot()
     }
 
-    fn now(&self) -> Arc<Snapshot> {
+    fn current_snapshot(&self) -> Arc<Snapshot> {
         let state = lock(&self.0.state);
         Arc::clone(state.snapshot.get_or_init(|| Arc::new(Snapshot::new(&self.0, &state))))
     }
 
-    /// Writes the stored episodes to a dataset that `create` makes. Its manifest records what [`ReplayBuffer::restore`]
-    /// needs.
+    /// Writes the stored episodes to a dataset that `create` creates. The dataset's manifest records the capacity and
+    /// the number of episodes ever added, which [`ReplayBuffer::restore`] reads.
     pub(crate) fn save_with(
         &self,
         mut options: WriteOptions,
         create: impl FnOnce(&Schema, WriteOptions) -> Result<Box<dyn Writer>>,
     ) -> Result<()> {
-        let now = self.now();
+        let snapshot = self.current_snapshot();
         let mut manifest = options.manifest.take().unwrap_or_else(|| Manifest::new("replay", 0, json!({})));
-        manifest.config["replay"] = json!({"capacity": self.0.capacity, "added": now.added});
+        manifest.config["replay"] = json!({"capacity": self.0.capacity, "added": snapshot.added});
         options.manifest = Some(manifest);
         let mut writer = create(&self.0.schema, options)?;
-        for stored in &now.stored {
+        for stored in &snapshot.stored {
             writer.write_episode_with(&stored.rows, &stored.constants)?;
         }
         writer.finish()
     }
 
-    /// Fills a new buffer from a dataset, with the last episodes if not all fit. If [`ReplayBuffer::save`] wrote the
-    /// dataset, stored and future episodes get the same `episode_idx` as in the original buffer.
+    /// Fills a new buffer from a dataset. If not all episodes fit, the buffer holds the last ones. If
+    /// [`ReplayBuffer::save`] wrote the dataset, stored and future episodes get the same `episode_idx` as in the
+    /// original buffer.
     ///
     /// # Errors
     /// If the dataset is damaged, or its last episode is longer than the buffer.
@@ -210,9 +211,9 @@ impl ReplayBuffer {
 
 /// The index columns, followed by the columns of an episode.
 fn dataset_schema(schema: &Schema) -> Result<Schema> {
-    let numbers = [EPISODE_IDX, STEP_IDX].map(|name| ColumnSpec::new(name, DType::Int64, []));
+    let index_columns = [EPISODE_IDX, STEP_IDX].map(|name| ColumnSpec::new(name, DType::Int64, []));
     let data = schema.columns().iter().filter(|column| column.name != EPISODE_IDX && column.name != STEP_IDX);
-    Schema::new(numbers.into_iter().chain(data.cloned()).collect::<Vec<_>>())
+    Schema::new(index_columns.into_iter().chain(data.cloned()).collect::<Vec<_>>())
 }
 
 struct ReplayWriter(ReplayBuffer);
@@ -231,7 +232,7 @@ impl Writer for ReplayWriter {
     }
 }
 
-/// The buffer's content at one moment.
+/// The buffer's content at one point in time.
 struct Snapshot {
     schema: Schema,
     episodes: Vec<Episode>,
@@ -242,7 +243,7 @@ struct Snapshot {
 
 impl Snapshot {
     fn new(buffer: &Inner, state: &State) -> Self {
-        let episode = |stored: &Arc<StoredEpisode>| Episode { index: stored.number as i64, length: stored.rows.rows() };
+        let episode = |stored: &Arc<StoredEpisode>| Episode { index: stored.index as i64, length: stored.rows.rows() };
         Self {
             schema: buffer.dataset_schema.clone(),
             episodes: state.stored.iter().map(episode).collect(),
@@ -268,9 +269,9 @@ impl Reader for Snapshot {
         let n = spec.row_bytes();
         let mut rest = out;
         for range in ranges {
-            let known =
+            let fits =
                 |episode: &Episode| range.start.checked_add(range.length).is_some_and(|end| end <= episode.length);
-            if !self.episodes.get(range.episode).is_some_and(known) {
+            if !self.episodes.get(range.episode).is_some_and(fits) {
                 let given = format!("{} rows from row {} of episode {}", range.length, range.start, range.episode);
                 return Err(Error::mismatch("reading rows", given, "rows of the snapshot"));
             }
@@ -280,8 +281,8 @@ impl Reader for Snapshot {
             if column == EPISODE_IDX || column == STEP_IDX {
                 for (row, target) in target.chunks_exact_mut(n).enumerate() {
                     let step = (range.start + row) as i64;
-                    let number = if column == EPISODE_IDX { stored.number as i64 } else { step };
-                    target.copy_from_slice(&number.to_ne_bytes());
+                    let value = if column == EPISODE_IDX { stored.index as i64 } else { step };
+                    target.copy_from_slice(&value.to_ne_bytes());
                 }
             } else {
                 let bytes = stored.rows.bytes(stored.rows.schema().index(column)?);
@@ -315,7 +316,7 @@ impl Reader for Snapshot {
             hasher.update(format!("{} {} {:?};", column.name, column.dtype.name(), column.shape).as_bytes());
         }
         for stored in &self.stored {
-            hasher.update(&stored.number.to_le_bytes());
+            hasher.update(&stored.index.to_le_bytes());
             hasher.update(&(stored.rows.rows() as u64).to_le_bytes());
             (0..stored.rows.schema().columns().len()).for_each(|column| {
                 hasher.update(stored.rows.bytes(column));
@@ -334,9 +335,9 @@ pub struct ReplayConfig {
     pub goals: Vec<GoalSpec>,
     /// Windows per batch.
     pub batch_size: usize,
-    /// Sample only from the latest episodes, as many as have this many rows in total; from all for `None`.
+    /// Samples only from the latest episodes that have at least this many rows in total; from all for `None`.
     pub recent: Option<usize>,
-    /// Seed of the samples; combined with the number of the batch and the buffer's content.
+    /// Seed of the samples; combined with the index of the batch and the buffer's content.
     pub seed: u64,
     /// Prefetching threads; 0 loads in the caller's thread.
     pub threads: usize,
@@ -383,8 +384,8 @@ impl ReplayLoader {
         self.source.sample(key)
     }
 
-    /// Batches from number `first` on, without end. Iteration ends with the first error, for example while the buffer
-    /// holds no window.
+    /// The batches with indices from `first` on, without end. Iteration stops after the first error, for example if no
+    /// stored episode is long enough for a window.
     pub fn batches(&self, first: usize) -> Epoch {
         Workers::start(
             &self.workers,
@@ -417,7 +418,7 @@ struct Windows {
 impl Source {
     /// The windows of the current content.
     fn windows(&self) -> Result<Arc<Windows>> {
-        let snapshot = self.buffer.now();
+        let snapshot = self.buffer.current_snapshot();
         let mut known = lock(&self.windows);
         if let Some(windows) = known.as_ref().filter(|windows| Arc::ptr_eq(&windows.snapshot, &snapshot)) {
             return Ok(Arc::clone(windows));

@@ -126,6 +126,6 @@ mod tests {
         let [few, many] = [0.1, 0.4].map(|validation| Split { validation, ..Split::default() });
         assert!((0..1000).all(|i| (few.part(i) == Part::Test) == (many.part(i) == Part::Test)));
         assert_eq!("validation".parse::<Part>().expect("a part"), Part::Validation);
-        assert!("tset".parse::<Part>().expect_err("no part").to_string().contains("did you mean test"));
+        assert!("tset".parse::<Part>().expect_err("an unknown part").to_string().contains("did you mean test"));
     }
 }

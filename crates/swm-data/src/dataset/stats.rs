@@ -102,8 +102,8 @@ fn for_each_row(
 }
 
 /// Quantiles of a column, per element of a row, over some episodes (all for `None`), ignoring NaN. Quantiles between
-/// two values are interpolated linearly. Unlike minimum and maximum they are robust to outliers: the reference scales
-/// the range between the 0.01 and 0.99 quantiles to `[-1, 1]`.
+/// two values are interpolated linearly. Unlike minimum and maximum, quantiles are robust to outliers: the reference
+/// scales the range between the 0.01 and 0.99 quantiles to `[-1, 1]`.
 ///
 /// The whole column is held in memory. `quantiles` are fractions in `0 ..= 1`.
 ///
@@ -164,7 +164,10 @@ mod tests {
             assert!((found - expected).abs() < 1e-6, "{found} {expected}");
         }
         assert!(
-            column_quantiles(&*reader, "state", None, &[1.5]).expect_err("no quantile").to_string().contains("0 ..= 1")
+            column_quantiles(&*reader, "state", None, &[1.5])
+                .expect_err("a quantile above 1")
+                .to_string()
+                .contains("0 ..= 1")
         );
         assert!(column_quantiles(&*reader, "state", Some(&[3]), &[0.5]).is_err(), "no such episode");
     }

@@ -17,8 +17,8 @@ pub enum WriteMode {
     Overwrite,
 }
 
-/// Limits at which finished episodes are committed, as soon as one of them is reached. A killed process loses at most
-/// the uncommitted episodes.
+/// Limits of uncommitted data. Finished episodes are committed as soon as one limit is reached. A killed process loses
+/// at most the uncommitted episodes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct CommitPolicy {
     /// Maximum number of episodes per commit.
@@ -42,21 +42,21 @@ pub struct WriteOptions {
     pub mode: WriteMode,
     /// The codec of images.
     pub codec: ImageCodec,
-    /// Provenance of the data, stored in the dataset. When appending, it replaces the stored manifest.
+    /// Provenance of the data, stored in the dataset. When appending, this manifest replaces the stored one.
     pub manifest: Option<Manifest>,
     /// Limits at which finished episodes are committed.
     pub commit: CommitPolicy,
 }
 
-/// Stores complete episodes. Committed episodes survive a killed process. Dropping a writer commits the remaining ones,
-/// but only [`Writer::finish`] reports errors of that last commit.
+/// Stores complete episodes. Committed episodes survive a killed process. Dropping a writer commits the remaining
+/// episodes, but only [`Writer::finish`] reports errors of that last commit.
 pub trait Writer: Send {
-    /// Adds one complete episode and its constants. The writer numbers the columns `episode_idx` and `step_idx`
-    /// itself and ignores their values in `episode`.
+    /// Adds one complete episode and its constants. The writer computes the columns `episode_idx` and `step_idx` and
+    /// ignores their values in `episode`.
     ///
     /// # Errors
-    /// If the columns differ from the writer's schema, the episode breaks the time convention (the last action NaN or
-    /// -1, all others finite), a value does not fit its stored type, or writing fails.
+    /// If the columns differ from the writer's schema, the episode breaks the time convention (the last action is NaN
+    /// or -1, all other actions are finite), a value does not fit its stored type, or writing fails.
     fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()>;
 
     /// Adds one complete episode without [`Constants`].

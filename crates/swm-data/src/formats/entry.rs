@@ -6,11 +6,11 @@ use swm_core::{Error, Named, Result, Schema};
 
 /// A dataset format: its names, and the functions that detect, open and create its datasets.
 pub struct FormatEntry {
-    /// Its id, such as `lance`.
+    /// Id of the format, such as `lance`.
     pub id: &'static str,
     /// One-sentence description.
     pub summary: &'static str,
-    /// File name suffixes of its datasets. New datasets get the first.
+    /// File name suffixes of the format's datasets. New datasets get the first suffix.
     pub suffixes: &'static [&'static str],
     /// The Cargo feature of `swm-data` that this format requires, if any.
     pub feature: Option<&'static str>,
@@ -57,8 +57,8 @@ impl FormatEntry {
     /// Creates, continues or replaces a dataset whose episodes have these columns.
     ///
     /// # Errors
-    /// If the dataset exists and `options.mode` forbids it, the schema differs from that of the dataset to continue, writing fails, or
-    /// this build lacks the format's feature.
+    /// If the dataset exists and `options.mode` forbids it, the schema differs from that of the dataset to continue,
+    /// writing fails, or this build lacks the format's feature.
     pub fn create(&self, location: &Location, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
         (self.backend()?.create)(location, schema, options)
     }

@@ -1,4 +1,4 @@
-//! Dataset formats on disk, a folder each, with their list in [`registry`].
+//! Dataset formats on disk: one module for each format, and the list of formats in [`registry`].
 //!
 //! A format implements [`Reader`](crate::Reader) and [`Writer`](crate::Writer), and has one row, `ENTRY`, beside its
 //! implementation.
@@ -11,7 +11,7 @@ pub mod lance;
 mod lance_video;
 mod lerobot;
 pub mod registry;
-#[cfg_attr(not(feature = "hdf5"), allow(dead_code, reason = "npz files use a part of it only"))]
+#[cfg_attr(not(feature = "hdf5"), allow(dead_code, reason = "npz files use only a part of this module"))]
 mod stored_scalar;
 mod video;
 

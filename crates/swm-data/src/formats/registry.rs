@@ -48,8 +48,8 @@ pub fn open(location: impl Into<Location>) -> Result<Arc<dyn Reader>> {
 /// names. Use [`FormatEntry::create`] for locations without such a suffix.
 ///
 /// # Errors
-/// If the location names no known format, the dataset exists and must not, the schema differs from that of the dataset
-/// to continue, or writing fails.
+/// If the location names no known format, the dataset exists and `options.mode` forbids it, the schema differs from
+/// that of the dataset to continue, or writing fails.
 pub fn create(location: impl Into<Location>, schema: &Schema, options: WriteOptions) -> Result<Box<dyn Writer>> {
     let location = location.into();
     let Some(format) = detect(&location) else {

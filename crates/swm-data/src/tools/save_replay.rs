@@ -5,7 +5,8 @@ use crate::formats::create;
 use swm_core::Result;
 
 impl ReplayBuffer {
-    /// Writes the stored episodes to a dataset of any format, from which [`ReplayBuffer::restore`] recreates the buffer.
+    /// Writes the stored episodes to a dataset of any format, from which [`ReplayBuffer::restore`] recreates the
+    /// buffer.
     ///
     /// # Errors
     /// If the dataset cannot be written.

@@ -1,4 +1,4 @@
-"""Writes `broken.lance` beside this file: the second number stands for two episodes of two rows each, one after the other."""
+"""Writes `broken.lance` beside this file: `episode_idx` 1 occurs in two consecutive episodes of two rows each."""
 
 import pathlib
 

@@ -1,4 +1,5 @@
-"""Writes `broken.h5` beside this file: the steps of its second episode restart half way, its last two share a row."""
+"""Writes `broken.h5` beside this file: the steps of the second episode restart at row 2, and the last two
+episodes share a row."""
 
 import pathlib
 

@@ -1,5 +1,5 @@
-"""Opens datasets with Python's `lance` and with the reader of the published `stable-worldmodel`, and prints
-what they see as JSON, a line a dataset: what `foreign.rs` compares."""
+"""Reads datasets with Python's `lance` and with the reader of the published `stable-worldmodel`, and prints the content
+of each dataset as a line of JSON. `tests/it/reference.rs` compares these lines with the written episodes."""
 
 import json
 import sys
@@ -10,7 +10,7 @@ import numpy as np
 from reference import LanceDataset
 
 
-def numbers(values):
+def to_list(values):
     return [None if np.isnan(v) else float(v) for v in np.asarray(values, dtype=np.float64).ravel()]
 
 
@@ -22,20 +22,20 @@ for path in sys.argv[1:]:
     rows = LanceDataset(path)
     episodes = [rows.load_episode(e) for e in range(len(rows.lengths))]
     clip = dataset[1]
-    seen = {
+    content = {
         "rows": table.count_rows(),
         "episode_idx": whole["episode_idx"].to_pylist(),
         "step_idx": whole["step_idx"].to_pylist(),
         "lengths": [int(n) for n in dataset.lengths],
         "clips": len(dataset),
-        "clip_action": numbers(clip["action"]),
+        "clip_action": to_list(clip["action"]),
         "clip_action_shape": list(clip["action"].shape),
         "clip_pixels_shape": list(clip["pixels"].shape),
         "columns": {
-            name: numbers(np.concatenate([np.asarray(e[name]) for e in episodes]))
+            name: to_list(np.concatenate([np.asarray(e[name]) for e in episodes]))
             for name in dataset.column_names
             if not name.startswith(("pixels", "goal"))
         },
         "pixel_means": [float(frame.double().mean()) for e in episodes for frame in e["pixels"]],
     }
-    print(json.dumps(seen))
+    print(json.dumps(content))

@@ -1,4 +1,4 @@
-"""Writes `reference.lance` with the writer of the published `stable-worldmodel`: what `foreign.rs` reads.
+"""Writes `reference.lance` with the writer of the published `stable-worldmodel`. `tests/it/reference.rs` reads it.
 
 python export.py    (stable-worldmodel of August 2026, lancedb 0.40)
 """
@@ -11,7 +11,7 @@ from reference import LanceWriter
 
 
 def episode(e, last_action):
-    """Rows 0..6+e; every number follows from the episode and the row."""
+    """Rows 0..6+e; every value depends only on the episode and the row."""
     rows = range(6 + e)
     y, x = np.mgrid[:24, :32]
     return {
@@ -28,7 +28,7 @@ here = Path(__file__).parent
 path = here / "reference.lance"
 with LanceWriter(path, mode="overwrite") as writer:
     writer.write_episodes(episode(e, np.nan) for e in range(2))
-# Appending refuses NaN in lists (lancedb takes them for vectors), so the last episode ends with 0.
+# When appending, lancedb rejects NaN in lists (it treats them as vectors), so the last episode ends with action 0.
 with LanceWriter(path, mode="append") as writer:
     writer.write_episode(episode(2, 0.0))
 with LanceWriter(here / "reference-text.lance", mode="overwrite") as writer:

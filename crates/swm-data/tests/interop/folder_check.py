@@ -1,4 +1,5 @@
-"""Opens a folder dataset of ours with the reference's reader; prints a line of JSON. Needs torch and Pillow."""
+"""Reads a folder dataset of this project with the reference's reader; prints its content as a line of JSON. Needs torch
+and Pillow."""
 
 import json
 import sys

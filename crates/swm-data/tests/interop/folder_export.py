@@ -1,5 +1,5 @@
-"""Writes the folder dataset next to this script with the writer of the reference implementation, and columns in the
-forms of other programs. Needs numpy, Pillow, and the published `stable-worldmodel`."""
+"""Writes the folder dataset next to this script with the writer of the reference implementation, and adds a column and
+an image in the forms that other programs write. Needs numpy, Pillow, and the published `stable-worldmodel`."""
 
 import shutil
 from pathlib import Path
@@ -30,7 +30,7 @@ with FolderWriter(here / "folder-reference", mode="overwrite") as writer:
         columns["task"] = np.array(["push"] * length)
         writer.write_episode({name: list(values) for name, values in columns.items()})
         first += length
-# Another program may compress, store other types, and save images without loss under another name.
+# Other programs may compress arrays, store other types, and save lossless images with another suffix.
 np.savez_compressed(here / "folder-reference/small.npz", np.arange(rows, dtype=">i2") - 3)
 Image.fromarray(images()[0]).save(here / "folder-reference/pixels/ep_0_step_0.png")
 (here / "folder-reference/pixels/ep_0_step_0.jpeg").unlink()

@@ -1,4 +1,5 @@
-"""Opens a dataset with LeRobot's own package and prints its rows as JSON. `lerobot.rs` compares them."""
+"""Opens a dataset with LeRobot's own package and prints its rows as JSON. `tests/it/lerobot.rs` compares
+them with the written episodes."""
 
 import json
 import os

@@ -1,5 +1,5 @@
 """Writes small datasets with LeRobot's own package, and the frames that the package reads back from them.
-`lerobot.rs` compares both.
+`tests/it/lerobot.rs` compares the frames with those that this project reads.
 
 python lerobot_export.py NAME CODEC    (lerobot 0.4.4 writes v3.0, lerobot 0.3.3 writes v2.1)
 """
@@ -59,7 +59,7 @@ def main(name, codec):
             row = frame(e, t, images)
             try:
                 dataset.add_frame({**row, "task": TASKS[e]})
-            except TypeError:  # before 0.4 the task was an argument of its own
+            except TypeError:  # before 0.4, the task was a separate argument
                 dataset.add_frame(row, task=TASKS[e])
         dataset.save_episode()
     if hasattr(dataset, "finalize"):
@@ -70,8 +70,8 @@ def main(name, codec):
         frames, first = [], 0
         for length in LENGTHS:
             for t in [0, 2, length - 1]:
-                seen = dataset[first + t]["observation.images." + camera].numpy()
-                frames.append((seen * 255).round().astype(np.uint8).transpose(1, 2, 0))
+                pixels = dataset[first + t]["observation.images." + camera].numpy()
+                frames.append((pixels * 255).round().astype(np.uint8).transpose(1, 2, 0))
             first += length
         Image.fromarray(np.concatenate(frames)).save(here / f"{name}-{camera}.png")
 

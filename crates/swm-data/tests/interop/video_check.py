@@ -1,5 +1,5 @@
-"""Opens a folder of videos with the reader of the published `stable-worldmodel` (decord), and prints what it sees as
-JSON: what `video.rs` compares.
+"""Opens a folder of videos with the reader of the published `stable-worldmodel` (decord), and prints the frames and
+states of every episode as JSON. `tests/it/video.rs` compares them with the written episodes.
 """
 
 import json
@@ -13,8 +13,8 @@ assert Video.detect(path)
 dataset = Video.open_reader(path, video_keys=["pixels"])
 episodes = []
 for e, length in enumerate(dataset.lengths):
-    seen = dataset._load_slice(e, 0, int(length))
-    episode = {"pixels": seen["pixels"].permute(0, 2, 3, 1).flatten().tolist()}
-    episode["state"] = seen["state"].flatten().tolist()
+    read = dataset._load_slice(e, 0, int(length))
+    episode = {"pixels": read["pixels"].permute(0, 2, 3, 1).flatten().tolist()}
+    episode["state"] = read["state"].flatten().tolist()
     episodes.append(episode)
 print(json.dumps(episodes))

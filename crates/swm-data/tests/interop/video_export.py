@@ -1,5 +1,5 @@
 """Writes `reference-video` with the writer of the published `stable-worldmodel`, and the frames that its reader
-(decord) returns. `video.rs` compares both.
+(decord) returns. `tests/it/video.rs` compares the frames with those that this project reads.
 
 python video_export.py    (stable-worldmodel 0.1.1, imageio-ffmpeg, decord 0.6.0)
 """
@@ -43,6 +43,6 @@ with VideoWriter(path, mode="error") as writer:
 dataset = VideoDataset(path=path, video_keys=["pixels"])
 frames = []
 for e, length in enumerate(LENGTHS):
-    seen = dataset._load_slice(e, 0, length)["pixels"].numpy().transpose(0, 2, 3, 1)
-    frames += [seen[t] for t in [0, 2, length - 1]]
+    pixels = dataset._load_slice(e, 0, length)["pixels"].numpy().transpose(0, 2, 3, 1)
+    frames += [pixels[t] for t in [0, 2, length - 1]]
 Image.fromarray(np.concatenate(frames)).save(here / "reference-video-pixels.png")

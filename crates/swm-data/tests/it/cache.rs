@@ -1,4 +1,4 @@
-//! Caches of decoded rows: the same bytes, fewer decodes, and never rows of other data.
+//! Caches of decoded rows: cached reads return the same bytes with fewer decodes, and never rows of another dataset.
 
 use crate::sample::write;
 use std::path::{Path, PathBuf};
@@ -54,12 +54,12 @@ impl Reader for Counting {
 
 const IMAGE: usize = 16 * 24 * 3;
 
-fn over(reader: &Arc<Counting>, cache: &CacheConfig) -> Arc<dyn Reader> {
+fn with_cache(reader: &Arc<Counting>, cache: &CacheConfig) -> Arc<dyn Reader> {
     cache.over(Arc::clone(reader) as Arc<dyn Reader>, &["pixels", "state"]).expect("a cache")
 }
 
 /// Every image and state, as single rows in a mixed order.
-fn all(reader: &dyn Reader) -> (Vec<u8>, Vec<u8>) {
+fn read_all(reader: &dyn Reader) -> (Vec<u8>, Vec<u8>) {
     let rows = |e: usize| (0..reader.episodes()[e].length).map(move |t| StepRange::new(e, t, 1));
     let mut ranges: Vec<StepRange> = (0..reader.episodes().len()).rev().flat_map(rows).collect();
     ranges.push(StepRange::new(2, 1, 3));
@@ -78,21 +78,21 @@ fn decodes_cached_rows_once_within_the_limit() {
     let folder = tempfile::tempdir().expect("a folder");
     let (path, rows) = dataset(folder.path());
     let reader = Counting::open(&path);
-    let expected = all(&*reader);
+    let expected = read_all(&*reader);
     reader.decoded();
     let states = rows * 24;
-    for (room, kept) in [(0, 0), (10, 10), (1000, rows)] {
+    for (limit, cached_rows) in [(0, 0), (10, 10), (1000, rows)] {
         for cache in [
-            CacheConfig::Memory { bytes: states + room * IMAGE },
-            CacheConfig::Disk { folder: folder.path().join(format!("cache-{room}")), bytes: states + room * IMAGE },
+            CacheConfig::Memory { bytes: states + limit * IMAGE },
+            CacheConfig::Disk { folder: folder.path().join(format!("cache-{limit}")), bytes: states + limit * IMAGE },
         ] {
-            let cached = over(&reader, &cache);
-            assert!(all(&*cached) == expected, "{cache:?}");
-            assert_eq!(reader.decoded(), rows + 3, "the first time {cache:?}");
-            assert!(all(&*cached) == expected, "{cache:?}");
+            let cached = with_cache(&reader, &cache);
+            assert!(read_all(&*cached) == expected, "{cache:?}");
+            assert_eq!(reader.decoded(), rows + 3, "first read with {cache:?}");
+            assert!(read_all(&*cached) == expected, "{cache:?}");
             // The three rows that are read twice are cached only if all rows are.
             let decoded = reader.decoded();
-            let again = if kept == rows { 0..=0 } else { rows - kept..=rows + 3 - kept };
+            let again = if cached_rows == rows { 0..=0 } else { rows - cached_rows..=rows + 3 - cached_rows };
             assert!(again.contains(&decoded), "{decoded} of {rows} with {cache:?}");
             let wrong = cached.read(&["pixels"], &[StepRange::new(0, 3, 4)]).expect_err("no such rows").to_string();
             assert!(wrong.contains("rows below 5"), "{wrong}");
@@ -107,21 +107,21 @@ fn disk_cache_serves_later_runs_and_other_processes() {
     let (path, _) = dataset(folder.path());
     let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
     let reader = Counting::open(&path);
-    let expected = all(&*over(&reader, &cache));
+    let expected = read_all(&*with_cache(&reader, &cache));
     reader.decoded();
-    let first = over(&reader, &cache);
-    assert!(all(&*first) == expected && reader.decoded() == 0, "a new run finds it");
+    let first = with_cache(&reader, &cache);
+    assert!(read_all(&*first) == expected && reader.decoded() == 0, "a new run reads the cached rows");
     // A second cache at the same time has no lock, but reads the existing rows.
-    let second = over(&reader, &cache);
-    assert!(all(&*second) == expected && reader.decoded() == 0);
+    let second = with_cache(&reader, &cache);
+    assert!(read_all(&*second) == expected && reader.decoded() == 0);
     drop((first, second));
 
-    // Other content at the same path does not use the old cache.
+    // A dataset with other content at the same path does not use the old cache.
     write(&path, WriteMode::Overwrite, 3, 1..7);
     let changed = Counting::open(&path);
-    let fresh = all(&*changed);
+    let fresh = read_all(&*changed);
     changed.decoded();
-    assert!(all(&*over(&changed, &cache)) == fresh && changed.decoded() > 0);
+    assert!(read_all(&*with_cache(&changed, &cache)) == fresh && changed.decoded() > 0);
 }
 
 #[test]
@@ -130,7 +130,7 @@ fn damaged_cache_is_decoded_again() {
     let (path, rows) = dataset(folder.path());
     let cache = CacheConfig::Disk { folder: folder.path().join("cache"), bytes: 1 << 30 };
     let reader = Counting::open(&path);
-    let expected = all(&*over(&reader, &cache));
+    let expected = read_all(&*with_cache(&reader, &cache));
     reader.decoded();
     let files = || -> Vec<PathBuf> {
         let mut found = vec![];
@@ -144,13 +144,16 @@ fn damaged_cache_is_decoded_again() {
     let mut bytes = std::fs::read(&rows_file).expect("reads");
     bytes[2 * IMAGE + 7] ^= 1;
     std::fs::write(&rows_file, &bytes).expect("writes");
-    assert!(all(&*over(&reader, &cache)) == expected);
+    assert!(read_all(&*with_cache(&reader, &cache)) == expected);
     assert_eq!(reader.decoded(), 1);
-    assert!(all(&*over(&reader, &cache)) == expected && reader.decoded() == 0, "the damaged row is stored again");
+    assert!(
+        read_all(&*with_cache(&reader, &cache)) == expected && reader.decoded() == 0,
+        "the damaged row is stored again"
+    );
     // Both files are truncated.
     for file in files() {
         std::fs::write(&file, b"").expect("writes");
     }
-    assert!(all(&*over(&reader, &cache)) == expected);
+    assert!(read_all(&*with_cache(&reader, &cache)) == expected);
     assert_eq!(reader.decoded(), rows + 3);
 }

@@ -33,7 +33,7 @@ fn source(folder: &Path) -> PathBuf {
 }
 
 /// A path that every format accepts.
-fn place(folder: &Path, format: &str) -> PathBuf {
+fn target_path(folder: &Path, format: &str) -> PathBuf {
     folder.join(match format {
         "hdf5" => "to.h5".to_owned(),
         other => format!("to.{other}"),
@@ -47,9 +47,9 @@ fn every_format_preserves_the_content() {
     let from = open(&path).expect("opens");
     let sum = checksum(&*from).expect("a checksum");
     for format in FORMATS.rows.iter().filter(|format| format.is_available()) {
-        let target = place(folder.path(), format.id);
-        let wanted = ConvertOptions { format: Some(format.id.to_owned()), ..lossless(ConvertMode::Create) };
-        let report = run(&path, &target, &wanted).unwrap_or_else(|error| panic!("{}: {error}", format.id));
+        let target = target_path(folder.path(), format.id);
+        let convert_options = ConvertOptions { format: Some(format.id.to_owned()), ..lossless(ConvertMode::Create) };
+        let report = run(&path, &target, &convert_options).unwrap_or_else(|error| panic!("{}: {error}", format.id));
         assert_eq!((report.episodes, report.existing, report.last_actions), (9, 0, 0), "{}", format.id);
         assert_eq!(report.checksum.as_deref(), Some(&sum[..]), "{}", format.id);
         let to = format.open(&Location::from(&target)).expect("opens");
@@ -57,8 +57,8 @@ fn every_format_preserves_the_content() {
         assert_eq!(to.manifest().map(|manifest| manifest.seed), from.manifest().map(|manifest| manifest.seed));
         for column in &report.columns {
             let is_image = ["pixels", "goal"].contains(&&column.column[..]);
-            let kept = column.exact || column.psnr.is_some_and(|psnr| is_image && psnr > 25.0);
-            assert!(kept, "{}: {column:?}", format.id);
+            let preserved = column.exact || column.psnr.is_some_and(|psnr| is_image && psnr > 25.0);
+            assert!(preserved, "{}: {column:?}", format.id);
         }
         if report.columns.iter().all(|column| column.exact) {
             assert_eq!(checksum(&*to).expect("a checksum"), sum, "{}", format.id);
@@ -75,12 +75,12 @@ fn lossy_images_must_reach_the_minimum_psnr() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = source(folder.path());
     let jpeg = ConvertOptions { codec: ImageCodec::Jpeg { quality: 95 }, ..ConvertOptions::default() };
-    let report = run(&path, &folder.path().join("fine.lance"), &jpeg).expect("near enough");
+    let report = run(&path, &folder.path().join("fine.lance"), &jpeg).expect("a sufficient PSNR");
     let images = report.columns.iter().find(|column| column.column == "pixels").expect("images");
     assert!(!images.exact && images.max_error >= 1.0 && images.psnr.is_some_and(|psnr| psnr > 30.0), "{images:?}");
     assert!(report.columns.iter().filter(|column| column.column == "state").all(|column| column.exact));
     let strict = ConvertOptions { least_psnr: 90.0, ..jpeg };
-    let error = run(&path, &folder.path().join("strict.lance"), &strict).expect_err("not near enough").to_string();
+    let error = run(&path, &folder.path().join("strict.lance"), &strict).expect_err("an insufficient PSNR").to_string();
     assert!(error.contains("dB") && error.contains("codec"), "{error}");
     let unverified = ConvertOptions { verify: false, ..strict };
     let report = run(&path, &folder.path().join("unverified.lance"), &unverified).expect("converts");
@@ -106,7 +106,7 @@ fn resumes_a_stopped_conversion_and_rejects_other_targets() {
         let stopped = convert(&reader, &Location::from(&target), &options, &mut control);
         drop(control);
         assert!(matches!(stopped, Err(Error::Interrupted)), "{stopped:?}");
-        assert_eq!(open(&target).expect("opens").episodes().len(), stop, "what was written is kept");
+        assert_eq!(open(&target).expect("opens").episodes().len(), stop, "written episodes remain");
         assert_eq!(stages.contains(&"compare"), stop > 1);
     }
     let report = run(&path, &target, &lossless(ConvertMode::Resume)).expect("compares");
@@ -124,7 +124,7 @@ fn resumes_a_stopped_conversion_and_rejects_other_targets() {
     assert!(run(&path, &other, &lossless(ConvertMode::Create)).is_err());
     let longer = folder.path().join("longer.lance");
     write(&longer, WriteMode::Create, 20, 0..12);
-    let error = run(&path, &longer, &lossless(ConvertMode::Resume)).expect_err("too many").to_string();
+    let error = run(&path, &longer, &lossless(ConvertMode::Resume)).expect_err("a longer target").to_string();
     assert!(error.contains("12 episodes, more than the source's 9"), "{error}");
     let report = run(&path, &other, &lossless(ConvertMode::Append)).expect("appends");
     assert_eq!((report.episodes, open(&other).expect("opens").episodes().len()), (11, 11));
@@ -135,7 +135,8 @@ fn resumes_a_stopped_conversion_and_rejects_other_targets() {
 /// Environment variable of the child process: the target of the conversion. The source is in the same folder.
 const TARGET: &str = "SWM_TEST_CONVERT_TARGET";
 
-/// The child process of the next test, which kills it. Prints a line per episode. Without the variable it does nothing.
+/// The child process that `resumes_a_killed_conversion` kills. Prints a line per episode. Does nothing unless the
+/// variable is set.
 #[test]
 fn child_that_converts() {
     let Some(target) = std::env::var_os(TARGET).map(PathBuf::from) else { return };
@@ -161,10 +162,10 @@ fn resumes_a_killed_conversion() {
     let mut rng = Key::new(7).rng();
     let (mut kills, mut finished, mut continued) = (0, 0, false);
     while kills < 50 || finished == 0 {
-        let mut command = Command::new(std::env::current_exe().expect("this program"));
+        let mut command = Command::new(std::env::current_exe().expect("the test executable"));
         command.args(["--exact", "convert::child_that_converts", "--nocapture"]).env(TARGET, &target);
         let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("starts");
-        let mut lines = BufReader::new(child.stdout.take().expect("its output")).lines();
+        let mut lines = BufReader::new(child.stdout.take().expect("a pipe")).lines();
         // The child is killed after this many lines, unless it finishes earlier.
         let kill_after = if kills < 50 { rng.random_range(0..60) } else { usize::MAX };
         let mut done = None;
@@ -173,7 +174,7 @@ fn resumes_a_killed_conversion() {
             done = line.split_once("done ").map(|(_, checksum)| checksum.trim().to_owned()).or(done);
         }
         let _ = child.kill();
-        child.wait().expect("gone");
+        child.wait().expect("an exit status");
         kills += usize::from(done.is_none());
         if target.exists() {
             // The target always holds complete episodes, in order.
@@ -186,7 +187,7 @@ fn resumes_a_killed_conversion() {
             finished += 1;
         }
     }
-    assert!(continued, "at least one of the fifty was killed in the middle and resumed");
+    assert!(continued, "at least one killed conversion was resumed");
 }
 
 /// A third-party dataset whose last rows have actions.

@@ -1,7 +1,7 @@
 //! Damaged Lance datasets and images.
 //!
-//! The suite tests several hundred of each; `cargo test --release -p swm-data --test it damage -- --ignored` many
-//! thousand.
+//! The suite tests several hundred damaged copies of each. Run the tests with many thousand copies with:
+//! `cargo test --release -p swm-data --test it damage -- --ignored`.
 
 use crate::fuzz;
 use crate::sample::write;
@@ -49,8 +49,8 @@ fn image() -> Vec<u8> {
     (0..40_u32 * 30 * 3).map(|i| if i / 3 % 40 < 15 { 90 } else { (i * i % 251 % (1 + i / 360)) as u8 }).collect()
 }
 
-/// Damages encoded images. QOI and PNG detect changes of the size; a changed pixel is decoded, and the dataset's hash
-/// detects it.
+/// Damages encoded images. Decoders of QOI and PNG reject a changed size, but decode changed pixels without an error;
+/// the content hash of the dataset detects changed pixels.
 fn damaged_images(cases: u64) {
     for (name, codec) in
         [("qoi", ImageCodec::Qoi), ("png", ImageCodec::Png), ("jpeg", ImageCodec::Jpeg { quality: 95 })]

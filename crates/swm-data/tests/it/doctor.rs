@@ -1,4 +1,4 @@
-//! The doctor finds deliberate defects, reports them, and omits defective episodes from a repaired dataset.
+//! An examination reports deliberate defects, and a repair omits defective episodes from the repaired dataset.
 
 use crate::sample::{episode, rows, schema, write};
 use std::path::Path;
@@ -137,12 +137,16 @@ fn finds_a_repeated_episode_index_in_a_table() {
 fn finds_restarting_steps_and_shared_rows_in_an_hdf5_file() {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/broken.h5");
     let diagnosis = diagnose(&*open(&path).expect("opens"));
-    let of = |episode: usize| {
+    let problems_of = |episode: usize| {
         let here = |found: &&Finding| found.severity == Severity::Problem && found.episodes.contains(&episode);
         diagnosis.findings.iter().filter(here).map(|found| found.what.clone()).collect::<Vec<_>>()
     };
-    assert_eq!(of(1), ["the stored steps do not count up from 0: row 2 holds 0"]);
-    assert!(of(3).contains(&"some of its rows are also those of episode 2".to_owned()), "{:?}", of(3));
+    assert_eq!(problems_of(1), ["the stored steps do not count up from 0: row 2 holds 0"]);
+    assert!(
+        problems_of(3).contains(&"some of its rows are also those of episode 2".to_owned()),
+        "{:?}",
+        problems_of(3)
+    );
     assert_eq!(diagnosis.intact, [0, 2]);
 }
 
@@ -159,7 +163,7 @@ fn repairs_the_readable_part_of_a_table() {
     std::fs::write(&files[1], &bytes[..bytes.len() / 2]).expect("writes");
     let location = Location::from(&path);
     assert!(open(&location).is_err());
-    let (reader, lost) = open_damaged(&location).expect("most is left");
+    let (reader, lost) = open_damaged(&location).expect("the readable part");
     assert!(lost.len() == 1 && lost[0].contains("are lost"), "{lost:?}");
     let mut diagnosis = diagnose(&*reader);
     assert_eq!((diagnosis.episodes, diagnosis.problems()), (6, 0));
@@ -169,7 +173,7 @@ fn repairs_the_readable_part_of_a_table() {
     repair(&reader, &diagnosis, &target, &ConvertOptions::default(), &mut Control::new()).expect("repairs");
     let repaired = open(&target).expect("opens");
     assert_eq!((diagnose(&*repaired).problems(), repaired.episodes().len()), (0, 6));
-    // If no part can be opened, the error is that of opening.
+    // If no part can be opened, `open_damaged` returns the error of `open`.
     files.iter().for_each(|file| std::fs::write(file, b"").expect("writes"));
     assert!(open_damaged(&location).map(|(reader, _)| reader.episodes().len()).unwrap_or(0) == 0);
     assert!(open_damaged(&Location::from(folder.path().join("nothing.lance"))).is_err());
@@ -216,10 +220,10 @@ fn finds_each_defect_in_its_episode() {
             }
         }),
     ];
-    for (words, breaking) in breaks {
+    for (expected, breaking) in breaks {
         let (what, episodes) = problem(&diagnose(&Broken::new(4, breaking)));
-        assert!(what.contains(words), "{what} instead of {words}");
-        assert_eq!(episodes, [2], "{words}");
+        assert!(what.contains(expected), "{what} instead of {expected}");
+        assert_eq!(episodes, [2], "{expected}");
     }
     let mut broken = Broken::new(4, |_, _| {});
     broken.damaged = vec![1, 3];
@@ -235,10 +239,10 @@ fn finds_each_defect_in_its_episode() {
     broken.irregular = vec![Irregularity { episode: None, what: "3 rows belong to no episode".to_owned() }];
     let diagnosis = diagnose(&broken);
     assert_eq!(problem(&diagnosis), ("3 rows belong to no episode".to_owned(), vec![]));
-    assert_eq!(diagnosis.intact.len(), 4, "the episodes are intact");
+    assert_eq!(diagnosis.intact.len(), 4, "all episodes are intact");
     let mut broken = Broken::new(4, |_, _| {});
     broken.irregular = vec![Irregularity { episode: Some(1), what: "its stored steps restart".to_owned() }];
-    assert_eq!(diagnose(&broken).intact, [0, 2, 3], "and this one is not");
+    assert_eq!(diagnose(&broken).intact, [0, 2, 3], "episode 1 is not intact");
     assert!(problem(&diagnose(&Broken::new(0, |_, _| {}))).0.contains("no episode"));
 }
 
@@ -265,7 +269,7 @@ fn unusual_but_intact_data_gives_a_note() {
     without.schema = Some(schema);
     let diagnosis = diagnose(&without);
     assert_eq!(diagnosis.findings[0].what, "there is no reward");
-    let agent = diagnosis.models.iter().find(|fit| fit.model == "agent").expect("listed");
+    let agent = diagnosis.models.iter().find(|fit| fit.model == "agent").expect("the fit of the agent");
     assert_eq!(agent.missing, ["there is no 'reward'"]);
 }
 
@@ -305,10 +309,10 @@ fn repair_writes_the_intact_episodes() {
         let read = repaired.read(&["state"], &[StepRange::new(position, 0, rows(e))]).expect("reads");
         assert_eq!(read.bytes(0), episode(e).bytes(2));
     }
-    let hopeless: Arc<dyn Reader> = Arc::new(Broken::new(2, |_, rows| rows.resize(0)));
-    let diagnosis = diagnose(&*hopeless);
-    let refused = repair(&hopeless, &diagnosis, &to, &ConvertOptions::default(), &mut Control::new());
-    assert!(refused.expect_err("nothing is left").to_string().contains("none of its 2 episodes"));
+    let unrepairable: Arc<dyn Reader> = Arc::new(Broken::new(2, |_, rows| rows.resize(0)));
+    let diagnosis = diagnose(&*unrepairable);
+    let refused = repair(&unrepairable, &diagnosis, &to, &ConvertOptions::default(), &mut Control::new());
+    assert!(refused.expect_err("no intact episode").to_string().contains("none of its 2 episodes"));
     let mut control = Control::new().with_interrupt(Arc::new(AtomicBool::new(true)));
     let stopped = examine(&*repaired, &MODELS, &mut control);
     assert!(matches!(stopped, Err(Error::Interrupted)));

@@ -23,7 +23,7 @@ fn killed_writer_keeps_committed_episodes() {
 
 #[test]
 #[ignore = "a minute"]
-fn a_writer_killed_at_50_moments_keeps_committed_episodes() {
+fn writer_killed_50_times_keeps_committed_episodes() {
     format_suite::killed("d.folder", 50);
 }
 
@@ -32,7 +32,7 @@ fn damaged(cases: u64) {
     let path = folder.path().join("d.folder");
     format_suite::write(&path, WriteMode::Create, 0..3);
     let report = fuzz::dataset("folder", &path, cases, fuzz::read_everything);
-    // Exchanged image files cannot be detected.
+    // The format does not detect exchanged image files.
     let changed: Vec<&String> = report.changed.iter().filter(|change| !change.contains("replaced by")).collect();
     assert!(changed.is_empty(), "{changed:?}");
     assert!(report.refused as u64 > cases / 2, "{report:?}");
@@ -45,13 +45,13 @@ fn rejects_damaged_folders() {
 
 #[test]
 #[ignore = "minutes"]
-fn folders_damaged_in_10000_ways_are_refused() {
+fn rejects_folders_damaged_in_10000_ways() {
     damaged(10_000);
 }
 
 #[test]
 fn rejects_damaged_leftovers_of_an_interrupted_writer() {
-    // A journal, and column files that are still empty.
+    // The folder holds a journal, and column files without rows.
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.folder");
     let mut writer = format_suite::writer(&path, WriteMode::Create).expect("creates");
@@ -70,7 +70,7 @@ fn rejects_damaged_leftovers_of_an_interrupted_writer() {
     assert!(report.refused > 30, "{report:?}");
     for cut in (0..journal.len()).step_by(journal.len() / 40) {
         std::fs::write(copy.join("ep_len.journal"), &journal[..cut]).expect("writes");
-        let reader = open(&copy).expect("what was whole is read");
+        let reader = open(&copy).expect("the complete records");
         assert!(reader.episodes().len() < 4);
         format_suite::check(&*reader, 0);
     }
@@ -87,17 +87,17 @@ fn reads_but_does_not_append_to_a_folder_of_the_reference() {
     let lengths: Vec<usize> = reader.episodes().iter().map(|episode| episode.length).collect();
     assert_eq!(lengths, [2, 3]);
     let names: Vec<&str> = reader.schema().columns()[2..].iter().map(|column| &*column.name).collect();
-    assert_eq!(names, ["action", "pixels", "reward", "small", "variation.agent"], "text is left out");
+    assert_eq!(names, ["action", "pixels", "reward", "small", "variation.agent"], "text columns are skipped");
     let all = [StepRange::new(0, 0, 2), StepRange::new(1, 0, 3)];
     let read = reader.read(&names, &all).expect("reads");
     for t in 0..5 {
         let row = read.row(t);
-        let numbers = |name: &str| row.to_f64(name).expect("values");
+        let values = |name: &str| row.to_f64(name).expect("values");
         let last = t == 1 || t == 4;
-        assert!(if last { numbers("action")[0].is_nan() } else { numbers("action") == [t as f64 / 4.0, -(t as f64)] });
-        assert_eq!(numbers("reward"), [t as f64 * 0.5]);
-        assert_eq!(numbers("small"), [t as f64 - 3.0]);
-        assert_eq!(numbers("variation.agent"), [t as f64; 3]);
+        assert!(if last { values("action")[0].is_nan() } else { values("action") == [t as f64 / 4.0, -(t as f64)] });
+        assert_eq!(values("reward"), [t as f64 * 0.5]);
+        assert_eq!(values("small"), [t as f64 - 3.0]);
+        assert_eq!(values("variation.agent"), [t as f64; 3]);
         let mut off = 0.0;
         for (i, rgb) in row.get::<u8>("pixels").expect("images").chunks(3).enumerate() {
             let expected = [(8 * (i / 24) + t) as u8, (4 * (i % 24) + 7 * t) as u8, 90];
@@ -106,14 +106,14 @@ fn reads_but_does_not_append_to_a_folder_of_the_reference() {
         // The first image is a PNG.
         assert!(if t == 0 { off == 0.0 } else { off / 1152.0 < 6.0 }, "row {t}: {off}");
     }
-    assert!(reader.manifest().is_none() && reader.constants(1).expect("none").is_empty());
+    assert!(reader.manifest().is_none() && reader.constants(1).expect("constants").is_empty());
 
     let folder = tempfile::tempdir().expect("a folder");
     let copy = folder.path().join("copy.folder");
     fuzz::copy_all(&path, &copy);
     let schema = Schema::new(reader.schema().columns()[2..].to_vec()).expect("schema");
     let options = || WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
-    let error = create(&copy, &schema, options()).err().expect("text cannot be continued").to_string();
+    let error = create(&copy, &schema, options()).err().expect("a text column").to_string();
     assert!(error.contains("'task'"), "{error}");
     std::fs::remove_file(copy.join("task.npz")).expect("removes");
     let mut writer = create(&copy, &schema, options()).expect("continues");
@@ -133,7 +133,7 @@ fn reads_but_does_not_append_to_a_folder_of_the_reference() {
 }
 
 #[test]
-fn the_reference_opens_our_folders() {
+fn reference_reads_folders_written_here() {
     let Some(python) = std::env::var_os("SWM_REFERENCE_PYTHON") else {
         println!("SKIPPED: set SWM_REFERENCE_PYTHON to a Python with stable-worldmodel");
         return;
@@ -158,7 +158,7 @@ fn the_reference_opens_our_folders() {
     for step in 0..2 {
         let frame = last.row(first + 2 * step).get::<u8>("pixels").expect("images");
         let mean = frame.iter().map(|&value| f64::from(value)).sum::<f64>() / frame.len() as f64;
-        let theirs = seen["pixels"][step].as_f64().expect("a mean");
-        assert!((mean - theirs).abs() < 1e-9, "lossless: {mean} {theirs}");
+        let reference_mean = seen["pixels"][step].as_f64().expect("a mean");
+        assert!((mean - reference_mean).abs() < 1e-9, "lossless: {mean} {reference_mean}");
     }
 }

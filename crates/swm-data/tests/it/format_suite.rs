@@ -1,5 +1,5 @@
-//! Tests that every lossless format must pass: write modes, the time convention, constants, exclusive writers, and
-//! recovery of killed writers.
+//! Tests that every lossless format must pass: write modes, the time convention (only the last row of an episode has no
+//! action), constants, exclusive writers, and recovery after a writer is killed.
 
 use crate::sample::{self, episode, manifest, schema};
 use rand::Rng as _;
@@ -57,26 +57,26 @@ fn check_constants(reader: &dyn Reader, first: usize) {
 pub fn all(name: &str) {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join(name);
-    modes(&path);
-    rows_in_any_order(&path);
-    wrong_episodes(&path);
+    check_write_modes(&path);
+    reads_rows_in_any_order(&path);
+    rejects_invalid_episodes(&path);
     let other = |prefix: &str| folder.path().join(format!("{prefix}{name}"));
-    one_writer_at_a_time(&other("busy-"));
-    what_is_committed_is_read_while_it_is_written(&other("growing-"));
-    numbers_of_every_type(&other("types-"));
-    assert!(open(folder.path().join(format!("none-{name}"))).is_err(), "there is none");
+    rejects_a_second_writer(&other("busy-"));
+    reads_committed_episodes_during_writing(&other("growing-"));
+    numeric_types_round_trip(&other("types-"));
+    assert!(open(folder.path().join(format!("none-{name}"))).is_err(), "a missing dataset");
 }
 
-fn modes(path: &Path) {
+fn check_write_modes(path: &Path) {
     write(path, WriteMode::Create, 0..5);
     let reader = open(path).expect("opens");
     assert_eq!(reader.episodes().len(), 5);
     assert_eq!(reader.schema().columns()[0], ColumnSpec::new("episode_idx", DType::Int32, []));
-    assert_eq!(reader.schema().column("step_idx").expect("is there").dtype, DType::Int64, "as it was declared");
-    let others = |columns: &[ColumnSpec]| -> Vec<ColumnSpec> {
+    assert_eq!(reader.schema().column("step_idx").expect("a column").dtype, DType::Int64, "as it was declared");
+    let data_columns = |columns: &[ColumnSpec]| -> Vec<ColumnSpec> {
         columns.iter().filter(|column| !column.name.ends_with("_idx")).cloned().collect()
     };
-    assert_eq!(others(reader.schema().columns()), others(schema().columns()));
+    assert_eq!(data_columns(reader.schema().columns()), data_columns(schema().columns()));
     check(&*reader, 0);
     check_constants(&*reader, 0);
     assert_eq!(reader.manifest(), Some(manifest(3)));
@@ -84,8 +84,8 @@ fn modes(path: &Path) {
     assert!(parts.iter().any(|(part, size)| part == "pixels" && *size > 0), "{parts:?}");
     let five = reader.content_hash().expect("hashes");
 
-    let there = writer(path, WriteMode::Create).err().expect("an existing dataset").to_string();
-    assert!(there.contains("exists already") && there.contains("append"), "{there}");
+    let error = writer(path, WriteMode::Create).err().expect("an existing dataset").to_string();
+    assert!(error.contains("exists already") && error.contains("append"), "{error}");
     write(path, WriteMode::Append, 5..9);
     let reader = open(path).expect("opens");
     assert_eq!(reader.episodes().len(), 9);
@@ -107,7 +107,7 @@ fn modes(path: &Path) {
     assert_eq!(open(path).expect("opens").content_hash().expect("hashes"), five, "equal content has equal hashes");
 }
 
-fn rows_in_any_order(path: &Path) {
+fn reads_rows_in_any_order(path: &Path) {
     let reader = open(path).expect("opens");
     let ranges = [
         StepRange::new(3, 2, 4),
@@ -128,16 +128,16 @@ fn rows_in_any_order(path: &Path) {
             assert!(a.expect("bytes") == b.expect("bytes"), "{name} of row {row}");
         }
         assert_eq!(read.row(row).get::<f64>("state").expect("values"), [e as f64, t as f64, -0.5]);
-        assert_eq!(read.row(row).get::<i32>("episode_idx").expect("a number"), [e as i32]);
-        assert_eq!(read.row(row).get::<i64>("step_idx").expect("a number"), [t as i64]);
+        assert_eq!(read.row(row).get::<i32>("episode_idx").expect("a value"), [e as i32]);
+        assert_eq!(read.row(row).get::<i64>("step_idx").expect("a value"), [t as i64]);
     }
-    let error = |name: &str, range| reader.read(&[name], &[range]).expect_err("is not there").to_string();
+    let error = |name: &str, range| reader.read(&[name], &[range]).expect_err("a missing column or row").to_string();
     assert!(error("pixels", StepRange::new(1, 4, 3)).contains("rows below 6"));
     assert!(error("state", StepRange::new(5, 0, 1)).contains("positions below 5"));
     assert!(error("stat", StepRange::new(0, 0, 1)).contains("state"));
 }
 
-fn wrong_episodes(path: &Path) {
+fn rejects_invalid_episodes(path: &Path) {
     let mut writer = writer(path, WriteMode::Append).expect("continues");
     let mut missing = episode(0);
     let last = missing.rows() - 1;
@@ -147,22 +147,22 @@ fn wrong_episodes(path: &Path) {
     assert!(writer.write_episode(&empty).expect_err("empty").to_string().contains("without rows"));
     let few = Batch::zeros(&Schema::new(schema().columns()[1..].to_vec()).expect("schema"), 3);
     assert!(writer.write_episode(&few).expect_err("no pixels").to_string().contains("pixels"));
-    assert_eq!(writer.episodes(), 5, "nothing of these was taken");
+    assert_eq!(writer.episodes(), 5, "the writer stores no invalid episode");
     writer.finish().expect("finishes");
     assert_eq!(open(path).expect("opens").episodes().len(), 5);
 }
 
-fn one_writer_at_a_time(path: &Path) {
+fn rejects_a_second_writer(path: &Path) {
     let first = writer(path, WriteMode::Create).expect("creates");
     for mode in [WriteMode::Append, WriteMode::Overwrite] {
-        let error = writer(path, mode).err().expect("somebody writes there").to_string();
+        let error = writer(path, mode).err().expect("another writer").to_string();
         assert!(error.contains("another process writes"), "{error}");
     }
     drop(first);
     write(path, WriteMode::Append, 0..1);
 }
 
-fn what_is_committed_is_read_while_it_is_written(path: &Path) {
+fn reads_committed_episodes_during_writing(path: &Path) {
     let mut writer = writer(path, WriteMode::Create).expect("creates");
     assert_eq!(open(path).expect("opens").episodes().len(), 0);
     for e in 0..7 {
@@ -175,11 +175,11 @@ fn what_is_committed_is_read_while_it_is_written(path: &Path) {
     }
     drop(writer);
     let reader = open(path).expect("opens");
-    assert_eq!(reader.episodes().len(), 7, "dropping commits the rest");
+    assert_eq!(reader.episodes().len(), 7, "dropping the writer commits the remaining episodes");
     check(&*reader, 0);
 }
 
-fn numbers_of_every_type(path: &Path) {
+fn numeric_types_round_trip(path: &Path) {
     let types = [DType::Bool, DType::U8, DType::Int32, DType::Int64, DType::Float32, DType::Float64];
     let shapes: [&[usize]; 3] = [&[], &[1], &[2, 3]];
     let specs: Vec<ColumnSpec> = types
@@ -205,7 +205,8 @@ fn numbers_of_every_type(path: &Path) {
     (0..names.len()).for_each(|column| assert!(read.bytes(column) == batch.bytes(column), "{}", names[column]));
 }
 
-/// Kills a writer at keyed random moments. All committed episodes must be readable, and the next writer continues.
+/// Kills a writer at random times, drawn with a fixed key. All committed episodes must be readable, and the next writer
+/// continues.
 pub fn killed(name: &str, moments: u64) {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join(name);
@@ -213,19 +214,19 @@ pub fn killed(name: &str, moments: u64) {
     for moment in 0..moments {
         let mut rng = Key::new(5).with(name).at(moment).rng();
         let mut child = child(&path).spawn().expect("starts");
-        let mut lines = BufReader::new(child.stdout.take().expect("its output")).lines();
+        let mut lines = BufReader::new(child.stdout.take().expect("a pipe")).lines();
         let mut last = None;
         for _ in 0..rng.random_range(0..12) {
-            let line = lines.next().expect("more lines").expect("text");
+            let line = lines.next().expect("another line").expect("text");
             last = line.rsplit_once("episode ").map(|(_, e)| e.parse::<usize>().expect("a number")).or(last);
         }
-        // At a random moment.
+        // Waits for a random time.
         let until = Instant::now() + Duration::from_micros(rng.random_range(0..8000));
         while Instant::now() < until {
             std::hint::spin_loop();
         }
-        child.kill().expect("killed");
-        child.wait().expect("gone");
+        child.kill().expect("kills the child");
+        child.wait().expect("an exit status");
         let now = match open(&path) {
             Ok(reader) => {
                 // With a tolerance, because the child stores JPEG in formats that encode images.
@@ -237,9 +238,12 @@ pub fn killed(name: &str, moments: u64) {
                 0
             }
         };
-        // A commit has three episodes.
-        let said = last.map_or(0, |last| last + 1);
-        assert!(now >= stored && now + 3 > said, "moment {moment}: {now} episodes after {stored}; {said} were written");
+        // The child commits groups of three episodes.
+        let reported = last.map_or(0, |last| last + 1);
+        assert!(
+            now >= stored && now + 3 > reported,
+            "moment {moment}: {now} episodes after {stored}; {reported} were written"
+        );
         stored = now;
     }
     assert!(stored > 0, "no episode was committed");
@@ -253,7 +257,7 @@ pub fn killed(name: &str, moments: u64) {
 
 /// A process that writes episodes until it is killed.
 fn child(path: &Path) -> Command {
-    let program: PathBuf = std::env::current_exe().expect("this program");
+    let program: PathBuf = std::env::current_exe().expect("the test executable");
     let mut command = Command::new(program);
     command.args(["--exact", "interruption::child_that_writes", "--nocapture"]);
     command.env("SWM_TEST_CHILD_TARGET", path).stdout(Stdio::piped()).stderr(Stdio::null());

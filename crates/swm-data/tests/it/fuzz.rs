@@ -7,8 +7,8 @@
 //! assert!(report.refused > 200, "{report:?}");
 //! ```
 //!
-//! The suite of a format runs a few hundred cases; tests with `#[ignore]` run 10,000 or more, as the head of their
-//! module describes. A failure names its case, and [`only`] repeats that case.
+//! The suite of a format runs a few hundred cases; tests with `#[ignore]` run 10,000 or more, with the command in the
+//! documentation of their module. A failure names its case; the environment variable `SWM_FUZZ_CASE` repeats that case.
 
 use rand::Rng as _;
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -22,11 +22,11 @@ use std::time::Duration;
 use swm_core::{Key, Result, Rng};
 use swm_data::{StepRange, open};
 
-/// Larger allocations are failures: they trust a damaged length.
-const ABSURD_MEMORY: usize = 256 << 20;
+/// Maximum size of an allocation in bytes. A larger allocation means that the reader trusts a damaged length.
+const MAX_ALLOCATION: usize = 256 << 20;
 
 /// Time limit per case; a longer run counts as a hang.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIME_LIMIT: Duration = Duration::from_secs(60);
 
 /// Results of reading the damaged copies.
 #[derive(Debug, Default)]
@@ -109,14 +109,14 @@ pub fn read_everything(path: &Path) -> Result<String> {
     Ok(hasher.finalize().to_hex().to_string())
 }
 
-/// A damaged copy and a description of the damage. Start and end, where formats keep their structure, are hit more
-/// often.
+/// Returns a damaged copy and a description of the damage. The start and the end, where formats store their structure,
+/// are damaged more often.
 pub fn damage(rng: &mut Rng, intact: &[u8]) -> (Vec<u8>, String) {
     let mut bytes = intact.to_vec();
     if bytes.is_empty() {
         return (b"not empty".to_vec(), "filled".to_owned());
     }
-    let at = place(rng, bytes.len());
+    let at = random_offset(rng, bytes.len());
     let end = (at + rng.random_range(1..=64)).min(bytes.len());
     let change = match rng.random_range(0..9) {
         0 => {
@@ -128,7 +128,7 @@ pub fn damage(rng: &mut Rng, intact: &[u8]) -> (Vec<u8>, String) {
             format!("{} bytes longer", bytes.len() - intact.len())
         }
         2..=3 => {
-            let flips: Vec<usize> = (0..rng.random_range(1..4)).map(|_| place(rng, bytes.len())).collect();
+            let flips: Vec<usize> = (0..rng.random_range(1..4)).map(|_| random_offset(rng, bytes.len())).collect();
             flips.iter().for_each(|&at| bytes[at] ^= 1 << rng.random_range(0..8));
             format!("bits flipped in {flips:?}")
         }
@@ -161,7 +161,7 @@ pub fn damage(rng: &mut Rng, intact: &[u8]) -> (Vec<u8>, String) {
     (bytes, change)
 }
 
-fn place(rng: &mut Rng, len: usize) -> usize {
+fn random_offset(rng: &mut Rng, len: usize) -> usize {
     match rng.random_range(0..4) {
         0 => rng.random_range(0..len.min(128)),
         1 => len - 1 - rng.random_range(0..len.min(128)),
@@ -169,14 +169,15 @@ fn place(rng: &mut Rng, len: usize) -> usize {
     }
 }
 
-/// Runs the cases that `prepare` returns: a description, how to read the copy, how to restore it.
+/// Runs the cases that `prepare` returns: a description, a function that reads the damaged copy, and a function that
+/// restores it.
 fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
     name: &str,
     cases: u64,
     expected: &T,
     prepare: impl Fn(u64, &mut Rng) -> (String, R, C),
 ) -> Report {
-    // One at a time, because allocations are recorded for all threads.
+    // Only one fuzz test runs at a time, because allocations are recorded for all threads.
     static ONE: Mutex<()> = Mutex::new(());
     let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
     let mut report = Report::default();
@@ -185,16 +186,16 @@ fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
     for case in only().map_or(0..cases, |case| case..case + 1) {
         let (change, read, restore) = prepare(case, &mut Key::new(0).with(name).at(case).rng());
         let change = format!("{name}, SWM_FUZZ_CASE={case}: {change}");
-        progress.send(change.clone()).expect("the watchdog listens");
+        progress.send(change.clone()).expect("a running watchdog");
         LARGEST.store(0, Ordering::Relaxed);
         let result = catch_unwind(AssertUnwindSafe(read));
         let largest = LARGEST.load(Ordering::Relaxed);
-        assert!(largest < ABSURD_MEMORY, "{change}: asked for {largest} bytes at once");
+        assert!(largest < MAX_ALLOCATION, "{change}: allocated {largest} bytes at once");
         match result.unwrap_or_else(|_| panic!("{change}: panicked")) {
             Ok(found) if found == *expected => report.same += 1,
             Ok(_) => report.changed.push(change),
             Err(error) => {
-                assert!(error.to_string().len() > 30, "{change}: says little: {error}");
+                assert!(error.to_string().len() > 30, "{change}: the message is too short: {error}");
                 report.refused += 1;
             }
         }
@@ -209,7 +210,7 @@ fn run<T: PartialEq, R: FnOnce() -> Result<T>, C: FnOnce()>(
 fn watch(cases: &Receiver<String>) {
     let mut current = String::new();
     loop {
-        match cases.recv_timeout(PATIENCE) {
+        match cases.recv_timeout(TIME_LIMIT) {
             Ok(case) => current = case,
             Err(RecvTimeoutError::Disconnected) => return,
             Err(RecvTimeoutError::Timeout) => {
@@ -300,17 +301,17 @@ fn damage_is_reproducible_and_effective() {
         assert_eq!((&damaged, &change), (&damage(&mut key.rng(), &intact).0, &damage(&mut key.rng(), &intact).1));
         same += usize::from(damaged == intact);
     }
-    assert!(same < 25, "{same} of 500 do nothing");
+    assert!(same < 25, "{same} of 500 changes have no effect");
 }
 
 #[test]
 fn detects_panics_and_excessive_allocations() {
-    let found = |read: fn(&[u8]) -> Result<usize>| {
+    let failure = |read: fn(&[u8]) -> Result<usize>| {
         let run = || bytes("the harness", &[7; 100], 200, read);
-        let panic = catch_unwind(run).expect_err("found");
+        let panic = catch_unwind(run).expect_err("a panic");
         panic.downcast_ref::<String>().cloned().unwrap_or_default()
     };
-    let trusting = |bytes: &[u8]| Ok(Vec::<u8>::with_capacity(usize::from(bytes.last() != Some(&7)) << 29).capacity());
-    assert!(found(trusting).contains("at once"));
-    assert!(found(|bytes| Ok(bytes[99].into())).contains("panicked"));
+    let allocates = |bytes: &[u8]| Ok(Vec::<u8>::with_capacity(usize::from(bytes.last() != Some(&7)) << 29).capacity());
+    assert!(failure(allocates).contains("at once"));
+    assert!(failure(|bytes| Ok(bytes[99].into())).contains("panicked"));
 }

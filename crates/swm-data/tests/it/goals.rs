@@ -32,9 +32,9 @@ fn goals_are_rows_of_the_dataset_with_offsets() {
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..9);
     let reader = open(&path).expect("opens");
-    let wanted = [("goal", GoalMixture::default()), ("end", GoalMixture::LAST), ("later", GoalMixture::FUTURE)];
-    let batches = load(&reader, config(&wanted), 0, 0);
-    // Two steps of two rows, and one more row for a goal after the second step.
+    let goals = [("goal", GoalMixture::default()), ("end", GoalMixture::LAST), ("later", GoalMixture::FUTURE)];
+    let batches = load(&reader, config(&goals), 0, 0);
+    // A clip has two steps of two rows; a goal after the second step requires one more row.
     let expected: usize = (0..9).map(|e| (rows(e) + 1).saturating_sub(5)).sum();
     assert_eq!(batches.iter().map(Batch::rows).sum::<usize>(), expected);
     let shapes: Vec<&[usize]> = batches[0].schema().columns()[2..5].iter().map(|c| &c.shape[..]).collect();
@@ -53,7 +53,7 @@ fn goals_are_rows_of_the_dataset_with_offsets() {
                 }
                 let pixel = f64::from(row.get::<u8>(&format!("{name}_pixels")).expect("an image")[0]);
                 let drawn = (3.0 * goal[1] + 20.0 * goal[0]) % 256.0;
-                assert!((pixel - drawn).abs() < 40.0, "the image of another row: {pixel} {drawn}");
+                assert!((pixel - drawn).abs() < 40.0, "the goal image is that of another row: {pixel} {drawn}");
                 match name {
                     "end" => assert_eq!(goal[1] as usize + 1, rows(e as usize)),
                     "later" => assert!(offset > 0 && offset % 2 == 0),
@@ -77,12 +77,12 @@ fn goals_are_reproducible_and_differ_between_epochs() {
     };
     let base = states(config(&goals), 4, 0);
     let other = LoaderConfig { threads: 0, cache: CacheConfig::Off, batch_size: 7, ..config(&goals) };
-    assert_eq!(states(other, 4, 0), base, "neither threads nor the batch size matter");
+    assert_eq!(states(other, 4, 0), base, "goals depend neither on threads nor on the batch size");
     assert_eq!(states(config(&goals), 4, 2), base[2 * 5 * 3..], "resumed");
     assert_ne!(states(config(&goals), 5, 0), base);
     // Goals drawn from one episode stay in it.
     let held = LoaderConfig { episodes: Some(vec![6]), ..config(&[("goal", GoalMixture::RANDOM)]) };
     assert!(states(held, 0, 0).chunks(3).all(|state| state[0] == 6.0));
     let refused = Loader::new(reader, config(&[("goal", GoalMixture { last: 0.5, ..GoalMixture::RANDOM })]));
-    assert!(refused.err().expect("refused").to_string().contains("add up to 1"));
+    assert!(refused.err().expect("an error").to_string().contains("add up to 1"));
 }

@@ -23,7 +23,7 @@ fn killed_writer_keeps_committed_episodes() {
 
 #[test]
 #[ignore = "a minute"]
-fn a_writer_killed_at_50_moments_keeps_committed_episodes() {
+fn writer_killed_50_times_keeps_committed_episodes() {
     format_suite::killed("d.h5", 50);
 }
 
@@ -33,9 +33,10 @@ fn damaged(cases: u64) {
     format_suite::write(&path, WriteMode::Create, 0..3);
     let report = fuzz::dataset("hdf5", &path, cases, fuzz::read_everything);
     // Fletcher's checksum is modulo 65535, so it does not distinguish words 0xffff and 0x0000.
-    let blind = |change: &&String| change.contains("[ff, ff] written") || change.contains("[ff, ff, ff, ff] written");
-    let (unseen, changed): (Vec<&String>, Vec<&String>) = report.changed.iter().partition(blind);
-    assert!(changed.is_empty() && unseen.len() as u64 <= 1 + cases / 2000, "{changed:#?} {unseen:#?}");
+    let undetectable =
+        |change: &&String| change.contains("[ff, ff] written") || change.contains("[ff, ff, ff, ff] written");
+    let (undetected, changed): (Vec<&String>, Vec<&String>) = report.changed.iter().partition(undetectable);
+    assert!(changed.is_empty() && undetected.len() as u64 <= 1 + cases / 2000, "{changed:#?} {undetected:#?}");
     assert!(report.refused as u64 > cases / 2, "{} refused, {} the same", report.refused, report.same);
 }
 
@@ -46,12 +47,12 @@ fn rejects_damaged_files() {
 
 #[test]
 #[ignore = "minutes"]
-fn files_damaged_in_10000_ways_are_refused() {
+fn rejects_files_damaged_in_10000_ways() {
     damaged(10_000);
 }
 
 #[test]
-fn many_chunks_make_trees_of_several_levels() {
+fn many_chunks_form_b_trees_of_several_levels() {
     // 64 chunks per leaf, 4096 per node of the second level: three levels, with commits at any position.
     let schema = Schema::new([ColumnSpec::new("large", DType::U8, [2048]), ColumnSpec::new("small", DType::Int64, [])]);
     let schema = schema.expect("schema");
@@ -80,7 +81,7 @@ fn many_chunks_make_trees_of_several_levels() {
     for (position, episode) in reader.episodes().iter().enumerate() {
         let read = reader.read(&["large", "small"], &[StepRange::new(position, 0, episode.length)]).expect("reads");
         for t in 0..episode.length {
-            assert_eq!(read.row(t).get::<i64>("small").expect("a number"), [row as i64]);
+            assert_eq!(read.row(t).get::<i64>("small").expect("a value"), [row as i64]);
             assert!(read.row(t).get::<u8>("large").expect("bytes").iter().all(|&byte| byte == (row % 251) as u8));
             row += 1;
         }
@@ -92,21 +93,22 @@ fn interop(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop").join(name)
 }
 
-/// Episodes of the files that `hdf5_export.py` writes, with their images and values in row `t` of the file.
+/// Lengths of the episodes in the files that `hdf5_export.py` writes. [`image`] and [`values`] return the content of
+/// row `t` of a file.
 const LENGTHS: [usize; 3] = [6, 7, 8];
 
 fn image(t: usize) -> Vec<u8> {
     let mut rgb = vec![];
     for y in 0..6 {
         for x in 0..8 {
-            let third = if (x + y) % 5 == 0 { 200 } else { 30 };
-            rgb.extend([(10 * y + t) as u8, (4 * x + 7 * t) as u8, third]);
+            let blue = if (x + y) % 5 == 0 { 200 } else { 30 };
+            rgb.extend([(10 * y + t) as u8, (4 * x + 7 * t) as u8, blue]);
         }
     }
     rgb
 }
 
-fn numbers(t: usize) -> [i64; 5] {
+fn values(t: usize) -> [i64; 5] {
     std::array::from_fn(|k| (t * 100 + k * k) as i64)
 }
 
@@ -133,7 +135,7 @@ fn has_images(reader: &dyn Reader, name: &str) {
 fn has_values(reader: &dyn Reader, name: &str) {
     let read = column(reader, name);
     for t in 0..21 {
-        let expected = numbers(t).map(|number| number as f64);
+        let expected = values(t).map(|value| value as f64);
         assert_eq!(read.row(t).to_f64(name).expect("values"), expected, "{name}, row {t}");
     }
 }
@@ -146,7 +148,7 @@ fn reads_a_file_of_the_reference() {
     let types =
         [("pixels", DType::U8), ("action", DType::Float32), ("reward", DType::Float64), ("step_idx", DType::Int64)];
     for (name, dtype) in types {
-        assert_eq!(reader.schema().column(name).expect("is there").dtype, dtype);
+        assert_eq!(reader.schema().column(name).expect("a column").dtype, dtype);
     }
     let ends = [5, 12, 20];
     let (action, reward, step) = (column(&*reader, "action"), column(&*reader, "reward"), column(&*reader, "step_idx"));
@@ -155,9 +157,9 @@ fn reads_a_file_of_the_reference() {
         if ends.contains(&t) {
             assert!(given.iter().all(|value| value.is_nan()));
         } else {
-            assert_eq!(given, [numbers(t)[0] as f64, numbers(t)[1] as f64]);
+            assert_eq!(given, [values(t)[0] as f64, values(t)[1] as f64]);
         }
-        assert_eq!(reward.row(t).to_f64("reward").expect("a number"), [numbers(t)[0] as f64]);
+        assert_eq!(reward.row(t).to_f64("reward").expect("a value"), [values(t)[0] as f64]);
         let first = if t < 6 {
             0
         } else if t < 13 {
@@ -165,12 +167,12 @@ fn reads_a_file_of_the_reference() {
         } else {
             13
         };
-        assert_eq!(step.row(t).to_f64("step_idx").expect("a number"), [(t - first) as f64]);
+        assert_eq!(step.row(t).to_f64("step_idx").expect("a value"), [(t - first) as f64]);
     }
     for k in 0..5 {
         let name = format!("variation.{k}");
         let read = column(&*reader, &name);
-        (0..21).for_each(|t| assert_eq!(read.row(t).get::<i64>(&name).expect("a number"), [numbers(t)[k]]));
+        (0..21).for_each(|t| assert_eq!(read.row(t).get::<i64>(&name).expect("a value"), [values(t)[k]]));
     }
 }
 
@@ -195,27 +197,27 @@ fn reads_every_layout() {
     }
     let read = column(&*reader, "numbers i1");
     (0..21)
-        .for_each(|t| assert_eq!(read.row(t).get::<i32>("numbers i1").expect("values")[3], numbers(t)[3] as i32 % 100));
+        .for_each(|t| assert_eq!(read.row(t).get::<i32>("numbers i1").expect("values")[3], values(t)[3] as i32 % 100));
     let read = column(&*reader, "numbers f2");
     // Half precision has 11 bits, so values above 2048 must be even.
     (0..20).for_each(|t| assert_eq!(read.row(t).get::<f32>("numbers f2").expect("values")[0], (t * 100) as f32));
     let read = column(&*reader, "truth");
-    (0..21).for_each(|t| assert_eq!(read.row(t).get::<u8>("truth").expect("a truth"), [u8::from(t % 3 == 0)]));
-    assert!(reader.schema().column("text").is_err(), "text is left out");
+    (0..21).for_each(|t| assert_eq!(read.row(t).get::<u8>("truth").expect("a boolean"), [u8::from(t % 3 == 0)]));
+    assert!(reader.schema().column("text").is_err(), "text columns are skipped");
 
     let reader = open(interop("hdf5-trees.h5")).expect("opens");
     has_images(&*reader, "growing");
     has_images(&*reader, "blocks");
     let read = column(&*reader, "partly written");
     for t in 0..21 {
-        let expected = if t < 16 { numbers(t).map(|number| number as f64) } else { [0.0; 5] };
+        let expected = if t < 16 { values(t).map(|value| value as f64) } else { [0.0; 5] };
         assert_eq!(read.row(t).to_f64("partly written").expect("values"), expected, "row {t}");
     }
 }
 
 #[test]
 fn rejects_or_reads_damaged_third_party_files() {
-    // These files have no checksums: changes are not always detected, but never do harm.
+    // These files have no checksums, so some changes are not detected; no change may cause a panic or a hang.
     for name in ["hdf5-reference.h5", "hdf5-filters.h5", "hdf5-layouts.h5", "hdf5-trees.h5"] {
         let report = fuzz::dataset(name, &interop(name), 150, fuzz::read_everything);
         assert!(report.refused > 20, "{name}: {report:?}");
@@ -232,8 +234,8 @@ fn rejects_or_reads_third_party_files_damaged_in_10000_ways() {
     }
 }
 
-/// The columns of `hdf5-reference.h5`, and one of its episodes.
-fn theirs() -> Batch {
+/// One episode of `hdf5-reference.h5`.
+fn reference_episode() -> Batch {
     let reader = open(interop("hdf5-reference.h5")).expect("opens");
     let columns: Vec<ColumnSpec> = reader.schema().columns()[1..].to_vec();
     let names: Vec<&str> = columns.iter().map(|column| &*column.name).collect();
@@ -245,7 +247,7 @@ fn appends_to_a_file_of_the_reference() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("continued.h5");
     std::fs::copy(interop("hdf5-reference.h5"), &path).expect("copies");
-    let episode = theirs();
+    let episode = reference_episode();
     for round in 1..3 {
         let options = WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
         let mut writer = create(&path, episode.schema(), options).expect("continues");
@@ -277,8 +279,8 @@ fn check(mode: &str, path: &Path) -> Option<Value> {
     Some(serde_json::from_slice(&output.stdout).expect("JSON"))
 }
 
-/// Compares the columns that h5py reads with ours.
-fn agrees(path: &Path, seen: &Value) {
+/// Compares the columns that h5py reads with those that this crate reads.
+fn check_columns(path: &Path, seen: &Value) {
     let reader = open(path).expect("opens");
     let all: Vec<StepRange> =
         reader.episodes().iter().enumerate().map(|(at, episode)| StepRange::new(at, 0, episode.length)).collect();
@@ -303,22 +305,22 @@ fn agrees(path: &Path, seen: &Value) {
 }
 
 #[test]
-fn h5py_reads_our_files_and_we_read_what_it_appends() {
+fn files_round_trip_through_h5py() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("ours.h5");
     format_suite::write(&path, WriteMode::Create, 0..40);
     format_suite::write(&path, WriteMode::Append, 40..77);
     let Some(seen) = check("read", &path) else { return };
-    agrees(&path, &seen);
+    check_columns(&path, &seen);
     assert!(seen["record"].as_str().expect("text").contains("variation.agent.color"));
     let Some(seen) = check("append", &path) else { return };
     assert_eq!(open(&path).expect("opens").episodes().len(), 78);
-    agrees(&path, &seen);
-    // Appends after h5py did.
+    check_columns(&path, &seen);
+    // Appends an episode after the one that h5py appended.
     let mut writer = format_suite::writer(&path, WriteMode::Append).expect("continues");
     writer.write_episode(&crate::sample::episode(0)).expect("writes");
     writer.finish().expect("finishes");
-    let seen = check("read", &path).expect("it was there before");
-    agrees(&path, &seen);
+    let seen = check("read", &path).expect("h5py is available");
+    check_columns(&path, &seen);
     assert_eq!(open(&path).expect("opens").episodes().len(), 79);
 }

@@ -10,7 +10,8 @@ use swm_data::{CommitPolicy, WriteMode, WriteOptions, create, open};
 /// Environment variable of child processes: the path to write to.
 const TARGET: &str = "SWM_TEST_CHILD_TARGET";
 
-/// A child process of the tests below. Writes episodes forever and prints a line for each; prints an error and stops.
+/// A child process of the tests below. Writes episodes and prints a line for each, until writing fails; then prints the
+/// error.
 #[test]
 fn child_that_writes() {
     let Some(path) = std::env::var_os(TARGET).map(PathBuf::from) else { return };
@@ -19,7 +20,7 @@ fn child_that_writes() {
     for e in writer.episodes()..100_000 {
         if let Err(error) = writer.write_episode(&episode(e)) {
             println!("failed: {error}");
-            assert!(writer.finish().is_err(), "what was lost stays lost");
+            assert!(writer.finish().is_err(), "`finish` reports that a commit failed");
             return;
         }
         println!("episode {e}");
@@ -29,7 +30,7 @@ fn child_that_writes() {
 /// The command that runs a child test after `shell` has set its limits.
 fn run_child(test: &str, path: &Path, shell: &str) -> Command {
     let mut command = Command::new("sh");
-    let program = std::env::current_exe().expect("this program");
+    let program = std::env::current_exe().expect("the test executable");
     command.args(["-c", &format!("{shell} exec \"$0\" --exact interruption::{test} --nocapture")]).arg(program);
     command.env(TARGET, path).stdout(Stdio::piped()).stderr(Stdio::null());
     command
@@ -61,14 +62,14 @@ fn killed_writer_keeps_committed_episodes() {
     let mut stored = 0;
     for written in [7, 20, 33] {
         let mut child = run_child("child_that_writes", &path, "").spawn().expect("starts");
-        let mut lines = BufReader::new(child.stdout.take().expect("its output")).lines();
+        let mut lines = BufReader::new(child.stdout.take().expect("a pipe")).lines();
         let mut seen = 0;
         while seen < written {
-            let line = lines.next().expect("more lines").expect("text");
+            let line = lines.next().expect("another line").expect("text");
             seen += usize::from(line.contains("episode "));
         }
-        child.kill().expect("killed");
-        child.wait().expect("gone");
+        child.kill().expect("kills the child");
+        child.wait().expect("an exit status");
         let reader = open(&path).expect("still opens");
         // A commit has three episodes; two more may wait for the committing thread, and three may be in progress.
         let now = reader.episodes().len();
@@ -83,11 +84,11 @@ fn killed_writer_keeps_committed_episodes() {
 }
 
 /// Runs the child until it fails, and checks its error and the dataset.
-fn starve(path: &Path, shell: &str, words: &str) {
+fn write_until_failure(path: &Path, shell: &str, expected: &str) {
     let output = run_child("child_that_writes", path, shell).output().expect("runs");
     let text = String::from_utf8_lossy(&output.stdout);
     let failure = text.lines().find(|line| line.starts_with("failed: ")).unwrap_or_else(|| panic!("{text}"));
-    assert!(failure.contains(words), "{failure}");
+    assert!(failure.contains(expected), "{failure}");
     let written = text.lines().filter(|line| line.starts_with("episode ")).count();
     let reader = open(path).expect("still opens");
     assert!(reader.episodes().len() + 9 > written, "{} of {written}", reader.episodes().len());
@@ -100,7 +101,7 @@ fn file_size_limit_keeps_committed_episodes() {
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 1, 0..4);
     // A fragment of three episodes is larger than 8 blocks; the existing manifests are smaller.
-    starve(&path, "trap '' XFSZ; ulimit -f 8;", "File too large");
+    write_until_failure(&path, "trap '' XFSZ; ulimit -f 8;", "File too large");
     assert_eq!(open(&path).expect("opens").episodes().len(), 4);
 }
 
@@ -119,5 +120,5 @@ fn full_disk_keeps_committed_episodes() {
         }
     }
     let _mounted = Mounted(folder.path());
-    starve(&folder.path().join("d.lance"), "", "No space left on device");
+    write_until_failure(&folder.path().join("d.lance"), "", "No space left on device");
 }

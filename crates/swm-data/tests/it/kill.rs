@@ -1,9 +1,8 @@
 //! A writing process is killed (SIGKILL) at random moments: committed episodes must be readable, the next writer must
 //! continue, and leftovers must not matter.
 //!
-//! The suite kills a few times; `cargo test --release -p swm-data --test it kill -- --ignored` fifty times per kind of
-//! writing.
-//! kind of writing.
+//! The suite kills each kind of writer four times; `cargo test --release -p swm-data --test it kill -- --ignored` kills
+//! each kind fifty times.
 
 use crate::sample::{check, episode, options, schema};
 use rand::Rng as _;
@@ -26,10 +25,10 @@ struct Running {
 
 /// Starts a child test below and waits until it is writing.
 fn start(test: &str, path: &Path) -> Running {
-    let mut command = Command::new(std::env::current_exe().expect("this program"));
+    let mut command = Command::new(std::env::current_exe().expect("the test executable"));
     command.args(["--exact", &format!("kill::{test}"), "--nocapture"]).env(TARGET, path);
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("starts");
-    let mut output = BufReader::new(child.stdout.take().expect("its output")).lines();
+    let mut output = BufReader::new(child.stdout.take().expect("a pipe")).lines();
     let begun = output.any(|line| line.is_ok_and(|line| line.contains("begun")));
     assert!(begun, "the child ended before it began");
     Running { child, _output: output }
@@ -42,19 +41,19 @@ fn kill(mut running: Running, key: Key, longest: Duration) -> bool {
     while Instant::now() < end {
         std::hint::spin_loop();
     }
-    running.child.kill().expect("killed");
-    !running.child.wait().expect("gone").success()
+    running.child.kill().expect("kills the child");
+    !running.child.wait().expect("an exit status").success()
 }
 
 fn target() -> Option<PathBuf> {
     std::env::var_os(TARGET).map(PathBuf::from)
 }
 
-fn often() -> CommitPolicy {
+fn frequent_commits() -> CommitPolicy {
     CommitPolicy { episodes: 2, interval: Duration::from_millis(5), ..CommitPolicy::default() }
 }
 
-fn write_on(mut writer: Box<dyn Writer>, until: usize) {
+fn write_until(mut writer: Box<dyn Writer>, until: usize) {
     println!("begun");
     for e in writer.episodes()..until {
         let constants = Constants::from([("number".to_owned(), e.to_string().into_bytes())]);
@@ -67,8 +66,8 @@ fn write_on(mut writer: Box<dyn Writer>, until: usize) {
 #[test]
 fn child_that_appends() {
     let Some(path) = target() else { return };
-    let options = WriteOptions { commit: often(), ..options(WriteMode::Append) };
-    write_on(create(&path, &schema(), options).expect("continues"), 1_000_000);
+    let options = WriteOptions { commit: frequent_commits(), ..options(WriteMode::Append) };
+    write_until(create(&path, &schema(), options).expect("continues"), 1_000_000);
 }
 
 /// A child process: replaces a dataset with ten episodes, again and again.
@@ -76,8 +75,8 @@ fn child_that_appends() {
 fn child_that_replaces() {
     let Some(path) = target() else { return };
     loop {
-        let options = WriteOptions { commit: often(), ..options(WriteMode::Overwrite) };
-        write_on(create(&path, &schema(), options).expect("replaces"), 10);
+        let options = WriteOptions { commit: frequent_commits(), ..options(WriteMode::Overwrite) };
+        write_until(create(&path, &schema(), options).expect("replaces"), 10);
     }
 }
 
@@ -87,7 +86,7 @@ fn child_that_writes_parts() {
     let Some(path) = target() else { return };
     println!("begun");
     for index in 0..2 {
-        let options = WriteOptions { commit: often(), ..options(WriteMode::Append) };
+        let options = WriteOptions { commit: frequent_commits(), ..options(WriteMode::Append) };
         let shard = Shard { index, count: 2 };
         let mut writer = create_shard(&Location::from(&path), &schema(), options, shard).expect("continues");
         for e in writer.episodes()..6 {
@@ -118,7 +117,10 @@ fn killed_appends(moments: u64) {
     let mut stored = 0;
     for moment in 0..moments {
         let child = start("child_that_appends", &path);
-        assert!(kill(child, Key::new(0).with("append").at(moment), Duration::from_millis(120)), "it has no end");
+        assert!(
+            kill(child, Key::new(0).with("append").at(moment), Duration::from_millis(120)),
+            "the child ended before it was killed"
+        );
         let now = check_all(&path, true);
         assert!(now >= stored, "{now} episodes, and there were {stored}");
         stored = now;
@@ -137,7 +139,10 @@ fn killed_replacements(moments: u64) {
     let path = folder.path().join("d.lance");
     for moment in 0..moments {
         let child = start("child_that_replaces", &path);
-        assert!(kill(child, Key::new(0).with("replace").at(moment), Duration::from_millis(120)), "it has no end");
+        assert!(
+            kill(child, Key::new(0).with("replace").at(moment), Duration::from_millis(120)),
+            "the child ended before it was killed"
+        );
         assert!(check_all(&path, true) <= 10);
     }
 }
@@ -151,7 +156,7 @@ fn killed_parts(moments: u64) {
             // Another run completes the commit, unless this one was killed between the commit and its cleanup.
             let committed = open(&path).is_ok();
             if committed {
-                assert_eq!(check_all(&path, false), 12, "all or nothing");
+                assert_eq!(check_all(&path, false), 12, "both shards are committed together");
                 let _ = commit_shards(&Location::from(&path));
             } else {
                 let status = start("child_that_writes_parts", &path).child.wait().expect("ends");
@@ -159,7 +164,7 @@ fn killed_parts(moments: u64) {
             }
         }
         assert_eq!(check_all(&path, false), 12, "moment {moment}");
-        assert!(!path.join("_shards/0-of-2/done.json").exists(), "the log is gone");
+        assert!(!path.join("_shards/0-of-2/done.json").exists(), "the log is removed");
     }
 }
 

@@ -8,13 +8,13 @@ use swm_data::{CommitPolicy, Constants, ImageCodec, StepRange, WriteMode, WriteO
 
 fn failure(path: &Path, schema: &Schema, mode: WriteMode) -> String {
     match create(path, schema, options(mode)) {
-        Ok(_) => panic!("{} should be refused", path.display()),
+        Ok(_) => panic!("{} was accepted", path.display()),
         Err(error) => error.to_string(),
     }
 }
 
 #[test]
-fn reads_what_was_written() {
+fn written_episodes_round_trip() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("with space ü%20.lance");
     write(&path, WriteMode::Create, 2, 0..9);
@@ -70,7 +70,7 @@ fn invalid_columns_and_rows_are_explained() {
     let path = folder.path().join("d.lance");
     write(&path, WriteMode::Create, 3, 0..2);
     let reader = open(&path).expect("opens");
-    let wrong = |column, range| reader.read(&[column], &[range]).expect_err("wrong").to_string();
+    let wrong = |column, range| reader.read(&[column], &[range]).expect_err("an invalid request").to_string();
     assert!(wrong("pixel", StepRange::new(0, 0, 1)).contains("did you mean pixels"));
     assert!(wrong("state", StepRange::new(2, 0, 1)).contains("positions below 2"));
     assert!(wrong("state", StepRange::new(0, 3, 3)).contains("rows below 5"));
@@ -141,13 +141,19 @@ fn does_not_append_another_schema() {
     // The order of columns does not matter.
     let mut columns = schema().columns().to_vec();
     columns.reverse();
-    let turned = Schema::new(columns).expect("schema");
-    let mut other = Batch::zeros(&turned, rows(2));
-    for (i, column) in turned.columns().iter().enumerate() {
+    let reordered = Schema::new(columns).expect("schema");
+    let mut other = Batch::zeros(&reordered, rows(2));
+    for (i, column) in reordered.columns().iter().enumerate() {
         other.bytes_mut(i).copy_from_slice(episode(2).bytes(schema().index(&column.name).expect("a column")));
     }
-    let mut writer = create(&path, &turned, options(WriteMode::Append)).expect("continues");
-    assert!(writer.write_episode(&episode(2)).expect_err("another order").to_string().contains("writing an episode"));
+    let mut writer = create(&path, &reordered, options(WriteMode::Append)).expect("continues");
+    assert!(
+        writer
+            .write_episode(&episode(2))
+            .expect_err("columns in another order")
+            .to_string()
+            .contains("writing an episode")
+    );
     writer.write_episode(&other).expect("writes");
     writer.finish().expect("finishes");
     check(&*open(&path).expect("opens"), 0);
@@ -157,24 +163,24 @@ fn does_not_append_another_schema() {
 fn rejects_episodes_that_break_the_time_convention() {
     let folder = tempfile::tempdir().expect("a folder");
     let mut writer = create(folder.path().join("d.lance"), &schema(), options(WriteMode::Create)).expect("creates");
-    let mut refuse = |change: &dyn Fn(&mut Batch), words: &str| {
+    let mut refuse = |change: &dyn Fn(&mut Batch), expected: &str| {
         let mut bad = episode(2);
         change(&mut bad);
-        let error = writer.write_episode(&bad).expect_err("refused").to_string();
-        assert!(error.contains(words), "{error}");
+        let error = writer.write_episode(&bad).expect_err("an error").to_string();
+        assert!(error.contains(expected), "{error}");
     };
     refuse(&|e| e.get_mut::<f32>("action").expect("actions")[3] = f32::NAN, "row 1 of 7");
     refuse(&|e| e.get_mut::<f32>("action").expect("actions")[13] = 0.0, "final observation");
     refuse(&|e| e.get_mut::<i64>("variation.agent.color").expect("colours")[4] = 1 << 30, "within ±2^24");
     refuse(&|e| e.resize(0), "without rows");
     assert_eq!(writer.episodes(), 0);
-    writer.write_episode(&episode(0)).expect("a good one is still welcome");
+    writer.write_episode(&episode(0)).expect("a valid episode");
     writer.finish().expect("finishes");
 
     let discrete = Schema::new([ColumnSpec::new("action", DType::Int64, [])]).expect("schema");
     let mut writer = create(folder.path().join("i.lance"), &discrete, options(WriteMode::Create)).expect("creates");
     let mut batch = Batch::zeros(&discrete, 3);
-    assert!(writer.write_episode(&batch).expect_err("refused").to_string().contains("-1"));
+    assert!(writer.write_episode(&batch).expect_err("an error").to_string().contains("-1"));
     batch.get_mut::<i64>("action").expect("actions")[2] = -1;
     writer.write_episode(&batch).expect("writes");
     batch.get_mut::<i64>("action").expect("actions")[0] = -1;
@@ -198,17 +204,17 @@ fn content_hash_does_not_depend_on_files() {
 fn stores_lossless_images() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
-    for (number, codec) in [ImageCodec::Png, ImageCodec::Qoi].into_iter().enumerate() {
+    for (position, codec) in [ImageCodec::Png, ImageCodec::Qoi].into_iter().enumerate() {
         let lossless = WriteOptions { codec, ..options(WriteMode::Append) };
         let mut writer = create(&path, &schema(), lossless).expect("creates");
         writer.write_episode(&episode(1)).expect("writes");
         writer.finish().expect("finishes");
         let reader = open(&path).expect("opens");
-        let read = reader.read(&["pixels"], &[StepRange::new(number, 0, rows(1))]).expect("reads");
+        let read = reader.read(&["pixels"], &[StepRange::new(position, 0, rows(1))]).expect("reads");
         assert_eq!(read.bytes(0), episode(1).bytes(0));
     }
-    let silly = WriteOptions { codec: ImageCodec::Jpeg { quality: 0 }, ..options(WriteMode::Create) };
-    let error = create(folder.path().join("e.lance"), &schema(), silly).err().expect("refused");
+    let invalid = WriteOptions { codec: ImageCodec::Jpeg { quality: 0 }, ..options(WriteMode::Create) };
+    let error = create(folder.path().join("e.lance"), &schema(), invalid).err().expect("an error");
     assert!(error.is_usage());
 }
 
@@ -250,15 +256,15 @@ fn concurrent_writers_both_append() {
         }
     });
     let reader = open(&path).expect("opens");
-    let numbers: Vec<i64> = reader.episodes().iter().map(|episode| episode.index).collect();
-    assert_eq!(numbers, (0..(threads * each) as i64).collect::<Vec<_>>());
+    let indices: Vec<i64> = reader.episodes().iter().map(|episode| episode.index).collect();
+    assert_eq!(indices, (0..(threads * each) as i64).collect::<Vec<_>>());
     // The state identifies the episode.
     let firsts: Vec<StepRange> = (0..threads * each).map(|at| StepRange::new(at, 0, 1)).collect();
     let read = reader.read(&["state"], &firsts).expect("reads");
     let mut found: Vec<usize> = read.get::<f64>("state").expect("states").chunks(3).map(|s| s[0] as usize).collect();
     for thread in 0..threads {
         let own: Vec<usize> = found.iter().copied().filter(|e| e / each == thread).collect();
-        assert!(own.is_sorted(), "those of one writer keep their order");
+        assert!(own.is_sorted(), "episodes of one writer keep their order");
     }
     found.sort_unstable();
     assert_eq!(found, (0..threads * each).collect::<Vec<_>>());
@@ -272,8 +278,8 @@ fn writer_of_a_replaced_dataset_fails() {
     let mut first = create(&path, &schema(), options(WriteMode::Append)).expect("creates");
     let other = Schema::new([ColumnSpec::new("other", DType::Float32, [])]).expect("schema");
     create(&path, &other, options(WriteMode::Overwrite)).expect("replaces").finish().expect("finishes");
-    first.write_episode(&episode(0)).expect("takes it");
-    let error = first.finish().expect_err("its columns are gone").to_string();
+    first.write_episode(&episode(0)).expect("queues the episode");
+    let error = first.finish().expect_err("a replaced table").to_string();
     assert!(error.contains("another process replaced"), "{error}");
     assert!(open(&path).expect("opens").episodes().is_empty());
 }
@@ -298,10 +304,10 @@ fn stores_doubles_exactly_but_keeps_the_precision_of_older_tables() {
     // A table of the first version stored all numeric columns in single precision; appending keeps it.
     let old = folder.path().join("old.lance");
     crate::fuzz::copy_all(&Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/interop/single.lance"), &old);
-    let there = open(&old).expect("opens").episodes().len();
-    write(&old, WriteMode::Append, 1, there..there + 2);
+    let existing = open(&old).expect("opens").episodes().len();
+    write(&old, WriteMode::Append, 1, existing..existing + 2);
     let reader = open(&old).expect("opens");
-    assert_eq!(reader.episodes().len(), there + 2);
+    assert_eq!(reader.episodes().len(), existing + 2);
     check(&*reader, 0);
 }
 
@@ -327,7 +333,7 @@ fn reads_constants() {
         assert_eq!(reader.constants(e).expect("reads"), expected, "episode {e}");
     }
     assert!(reader.constants(10).is_err());
-    // They are part of the content hash.
+    // Constants are part of the content hash.
     let plain = folder.path().join("plain.lance");
     write(&plain, WriteMode::Create, 4, 0..10);
     let plain = open(&plain).expect("opens");
@@ -353,15 +359,15 @@ fn unwritable_locations_are_explained() {
     let error = failure(&file.join("d.lance"), &schema(), WriteMode::Create);
     assert!(error.contains("Not a directory"), "{error}");
     assert!(failure(&folder.path().join("name"), &schema(), WriteMode::Create).contains("end it in .lance"));
-    // Not even root may write here.
-    let error = create(Path::new("/proc/d.lance"), &schema(), options(WriteMode::Create)).err().expect("refused");
+    // Not even root can create a folder in `/proc`.
+    let error = create(Path::new("/proc/d.lance"), &schema(), options(WriteMode::Create)).err().expect("an error");
     assert!(matches!(error, Error::Io { .. }), "{error}");
     // A folder with other files is left unchanged.
     let other = folder.path().join("other.lance");
     std::fs::create_dir(&other).expect("a folder");
-    std::fs::write(other.join("thesis.tex"), "years of work").expect("writes");
+    std::fs::write(other.join("notes.txt"), "notes").expect("writes");
     for mode in [WriteMode::Create, WriteMode::Append, WriteMode::Overwrite] {
-        assert!(failure(&other, &schema(), mode).contains("thesis.tex"));
+        assert!(failure(&other, &schema(), mode).contains("notes.txt"));
     }
     assert!(open(&other).err().expect("no dataset").to_string().contains("not a Lance table"));
 }

@@ -21,7 +21,7 @@ fn write_shard(path: &Path, index: usize, count: usize, episodes: std::ops::Rang
 }
 
 fn failure(path: &Path) -> String {
-    commit_shards(&Location::from(path)).expect_err("refused").to_string()
+    commit_shards(&Location::from(path)).expect_err("an error").to_string()
 }
 
 #[test]
@@ -29,13 +29,13 @@ fn commits_all_shards_as_one_version() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.lance");
     assert!(failure(&path).contains("no shards to commit"));
-    // In any order; threads stand for machines.
+    // Shards are written in any order; threads stand for machines.
     std::thread::scope(|scope| {
         scope.spawn(|| write_shard(&path, 2, 3, 7..12));
         scope.spawn(|| write_shard(&path, 0, 3, 0..5));
     });
     assert!(failure(&path).contains("shard 1 of 3 is missing"));
-    assert!(open(&path).is_err(), "nothing is seen before the commit");
+    assert!(open(&path).is_err(), "readers see no dataset before the commit");
     write_shard(&path, 1, 3, 5..7);
     assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 12);
 
@@ -45,7 +45,7 @@ fn commits_all_shards_as_one_version() {
     for e in [0, 4, 5, 11] {
         assert_eq!(reader.constants(e).expect("reads")["number"], e.to_string().into_bytes());
     }
-    assert!(failure(&path).contains("no shards to commit"), "the log is gone");
+    assert!(failure(&path).contains("no shards to commit"), "the log is removed");
     // The content equals that of a single writer.
     let whole = folder.path().join("whole.lance");
     write(&whole, WriteMode::Create, 100, 0..12);
@@ -55,7 +55,7 @@ fn commits_all_shards_as_one_version() {
     let (parts, one) = (read(&*reader), read(&*open(&whole).expect("opens")));
     assert!((0..columns.len()).all(|column| parts.bytes(column) == one.bytes(column)));
 
-    // More shards, after the existing episodes; then an ordinary writer.
+    // Appends two more shards, then episodes of an ordinary writer.
     write_shard(&path, 0, 2, 12..14);
     write_shard(&path, 1, 2, 14..16);
     assert_eq!(commit_shards(&Location::from(&path)).expect("commits"), 4);
@@ -77,7 +77,7 @@ fn interrupted_shard_is_continued_or_restarted() {
     drop(writer);
     assert!(failure(&path).contains("shard 0 of 2 is not finished"));
     assert!(
-        shard_writer(&path, WriteMode::Create, 0, 2).err().expect("refused").to_string().contains("already exists")
+        shard_writer(&path, WriteMode::Create, 0, 2).err().expect("an error").to_string().contains("already exists")
     );
     let mut writer = shard_writer(&path, WriteMode::Append, 0, 2).expect("continues");
     assert_eq!(writer.episodes(), 2);
@@ -115,7 +115,7 @@ fn rejects_inconsistent_shards() {
     let path = folder.path().join("d.lance");
     let location = Location::from(&path);
     assert!(
-        shard_writer(&path, WriteMode::Create, 3, 3).err().expect("refused").to_string().contains("no shard 3 of 3")
+        shard_writer(&path, WriteMode::Create, 3, 3).err().expect("an error").to_string().contains("no shard 3 of 3")
     );
     write_shard(&path, 0, 2, 0..2);
     write_shard(&path, 0, 3, 0..2);

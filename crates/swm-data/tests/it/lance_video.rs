@@ -47,13 +47,13 @@ fn reads_episodes_with_their_images() {
         assert_eq!(reader.episodes().len(), 2);
         check(&*reader, 3);
         assert_ne!(reader.content_hash().expect("hashes"), hash);
-        let there = create(&path, &schema(), WriteOptions::default()).err().expect("it is there").to_string();
-        assert!(there.contains("exists already"), "{there}");
+        let error = create(&path, &schema(), WriteOptions::default()).err().expect("an existing dataset").to_string();
+        assert!(error.contains("exists already"), "{error}");
         let few = Schema::new(schema().columns()[..4].to_vec()).expect("schema");
         let options = WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() };
         assert!(create(&path, &few, options).is_err(), "other columns");
     }
-    assert!(open(folder.path().join("none.lance-video")).is_err(), "there is none");
+    assert!(open(folder.path().join("none.lance-video")).is_err(), "a missing dataset");
     let images = Schema::new(schema().columns()[..1].to_vec()).expect("schema");
     let path = folder.path().join("images.lance-video");
     let error = create(&path, &images, WriteOptions::default()).err().expect("no numeric column").to_string();
@@ -67,17 +67,17 @@ fn killed(moments: usize) {
     write(&path, WriteMode::Create, ImageCodec::Jpeg { quality: 95 }, 0..2);
     let mut stored = 2;
     for moment in 0..moments {
-        let mut command = Command::new(std::env::current_exe().expect("this program"));
+        let mut command = Command::new(std::env::current_exe().expect("the test executable"));
         command.args(["--exact", "interruption::child_that_writes", "--nocapture"]);
         command.env("SWM_TEST_CHILD_TARGET", &path).stdout(Stdio::piped()).stderr(Stdio::null());
         let mut child = command.spawn().expect("starts");
-        let mut lines = BufReader::new(child.stdout.take().expect("its output")).lines();
+        let mut lines = BufReader::new(child.stdout.take().expect("a pipe")).lines();
         let mut seen = 0;
         while seen < 3 + 5 * moment % 11 {
-            seen += usize::from(lines.next().expect("more lines").expect("text").contains("episode "));
+            seen += usize::from(lines.next().expect("another line").expect("text").contains("episode "));
         }
-        child.kill().expect("killed");
-        child.wait().expect("gone");
+        child.kill().expect("kills the child");
+        child.wait().expect("an exit status");
         let reader = open(&path).expect("still opens");
         check(&*reader, 0);
         // A commit has three episodes; more may wait for the committing thread.
@@ -98,7 +98,7 @@ fn killed_writer_keeps_committed_episodes() {
 
 #[test]
 #[ignore = "a minute"]
-fn a_writer_killed_at_50_moments_keeps_committed_episodes() {
+fn writer_killed_50_times_keeps_committed_episodes() {
     killed(50);
 }
 
@@ -111,12 +111,12 @@ fn damaged(cases: u64) {
 }
 
 #[test]
-fn rejects_damaged_tables() {
+fn reads_or_rejects_damaged_tables() {
     damaged(300);
 }
 
 #[test]
 #[ignore = "minutes"]
-fn tables_damaged_in_10000_ways_are_refused() {
+fn reads_or_rejects_tables_damaged_in_10000_ways() {
     damaged(10_000);
 }

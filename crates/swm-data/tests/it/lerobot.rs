@@ -1,6 +1,5 @@
-//! The format `lerobot`: datasets that LeRobot's own package wrote (`tests/interop/lerobot_export.py`), and that
-//! package
-//! reading ours. Run the long tests with:
+//! The format `lerobot`: reads datasets that LeRobot's own package wrote (`tests/interop/lerobot_export.py`), and lets
+//! this package read datasets written here. Run the long tests with:
 //!
 //! ```text
 //! cargo test --release --workspace --test it -- --ignored lerobot::
@@ -24,7 +23,7 @@ fn killed_writer_keeps_committed_episodes() {
 
 #[test]
 #[ignore = "a minute"]
-fn a_writer_killed_at_50_moments_keeps_committed_episodes() {
+fn writer_killed_50_times_keeps_committed_episodes() {
     format_suite::killed("d.lerobot", 50);
 }
 
@@ -47,10 +46,10 @@ fn reads_datasets_of_lerobot() {
                 let (row, time) = (read.row(t), t as f32);
                 assert_eq!(row.get::<f32>("observation.state").expect("values"), [e as f32, time, -0.5]);
                 assert_eq!(row.get::<f32>("action").expect("values"), [e as f32 + time / 4.0, -time]);
-                assert_eq!(row.get::<f32>("next.reward").expect("a number"), [time / 2.0]);
+                assert_eq!(row.get::<f32>("next.reward").expect("a value"), [time / 2.0]);
                 assert_eq!(row.get::<u8>("next.done").expect("a flag"), [u8::from(t + 1 == length)]);
-                assert_eq!(row.get::<i64>("task_index").expect("a number"), [(e % 2) as i64]);
-                assert_eq!(row.get::<i32>("frame_index").expect("a number"), [t as i32]);
+                assert_eq!(row.get::<i64>("task_index").expect("a value"), [(e % 2) as i64]);
+                assert_eq!(row.get::<i32>("frame_index").expect("a value"), [t as i32]);
             }
             let task = Constants::from([("task".to_owned(), tasks[e].as_bytes().to_vec())]);
             assert_eq!(reader.constants(e).expect("reads"), task);
@@ -62,7 +61,7 @@ fn reads_datasets_of_lerobot() {
             &swm_core::Schema::new(schema.columns()[2..].to_vec()).expect("a schema"),
             WriteOptions { mode: WriteMode::Append, ..WriteOptions::default() },
         );
-        assert!(writer.as_mut().err().expect("not ours").to_string().contains("convert it"), "{name}");
+        assert!(writer.as_mut().err().expect("a third-party dataset").to_string().contains("convert it"), "{name}");
     }
 }
 
@@ -91,18 +90,18 @@ fn damaged(name: &str, cases: u64) {
 }
 
 #[test]
-fn survives_damaged_datasets() {
+fn reads_or_rejects_damaged_datasets() {
     ["lerobot-v30-h264", "lerobot-v21"].iter().for_each(|name| damaged(name, 200));
 }
 
 #[test]
 #[ignore = "minutes"]
-fn datasets_damaged_in_10000_ways_are_survived() {
+fn reads_or_rejects_datasets_damaged_in_10000_ways() {
     ["lerobot-v30-h264", "lerobot-v30-av1", "lerobot-v21"].iter().for_each(|name| damaged(name, 4000));
 }
 
 #[test]
-fn lerobot_opens_our_datasets() {
+fn lerobot_reads_datasets_written_here() {
     let Some(python) = std::env::var_os("SWM_LEROBOT_PYTHON") else {
         println!("SKIPPED: set SWM_LEROBOT_PYTHON to a Python with lerobot 0.4");
         return;

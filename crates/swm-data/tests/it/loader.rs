@@ -74,7 +74,7 @@ fn yields_every_clip_once_with_its_rows() {
                 let first = ((3 * (start + k * skip) + 20 * e) % 256) as u8;
                 assert!(frame[0].abs_diff(first) < 40, "{} {first}", frame[0]);
             }
-            // Actions of skipped rows are included, in order; only that of an episode's last row is missing.
+            // Actions of skipped rows are included, in order; only the action of an episode's last row is missing.
             let action = batch.row(row).get::<f32>("action").expect("actions");
             for (i, pair) in action.chunks_exact(2).enumerate() {
                 if start + i + 1 == rows(e) {
@@ -143,17 +143,17 @@ fn reuses_memory_and_reads_two_epochs_at_once() {
         loader.epoch(epoch, 0).map(|batch| batch.expect("a batch").into_batch()).collect()
     };
     let (first, second) = (read(1), read(2));
-    // Dropped batches are refilled, with as many rows as the next batch has.
+    // The memory of dropped batches is reused, and resized to the rows of the next batch.
     let addresses = || -> Vec<(usize, Vec<u8>)> {
-        let look = |batch: LoadedBatch| (batch.bytes(0).as_ptr() as usize, batch.bytes(0).to_vec());
-        loader.epoch(1, 0).map(|batch| look(batch.expect("a batch"))).collect()
+        let address_and_bytes = |batch: LoadedBatch| (batch.bytes(0).as_ptr() as usize, batch.bytes(0).to_vec());
+        loader.epoch(1, 0).map(|batch| address_and_bytes(batch.expect("a batch"))).collect()
     };
     let (once, twice) = (addresses(), addresses());
     assert!(once.iter().chain(&twice).zip(first.iter().chain(&first)).all(|((_, a), b)| a == b.bytes(0)));
-    let mut places: Vec<usize> = once.iter().chain(&twice).map(|(place, _)| *place).collect();
-    places.sort_unstable();
-    places.dedup();
-    assert!(places.len() <= loader.prefetch() + 3, "{} buffers for {} batches", places.len(), 2 * once.len());
+    let mut buffers: Vec<usize> = once.iter().chain(&twice).map(|(address, _)| *address).collect();
+    buffers.sort_unstable();
+    buffers.dedup();
+    assert!(buffers.len() <= loader.prefetch() + 3, "{} buffers for {} batches", buffers.len(), 2 * once.len());
     let both: Vec<(LoadedBatch, LoadedBatch)> =
         loader.epoch(1, 0).zip(loader.epoch(2, 0)).map(|(a, b)| (a.expect("a batch"), b.expect("a batch"))).collect();
     let split = |pick: fn(&(LoadedBatch, LoadedBatch)) -> &LoadedBatch| {
@@ -179,7 +179,7 @@ fn prefetching_respects_its_budget() {
 fn invalid_settings_are_explained() {
     let (_folder, path) = dataset(100);
     let reader = open(&path).expect("opens");
-    let wrong = |config| Loader::new(Arc::clone(&reader), config).err().expect("refused").to_string();
+    let wrong = |config| Loader::new(Arc::clone(&reader), config).err().expect("an error").to_string();
     let columns = |name: &str| ClipSpec { columns: vec![name.to_owned()], ..config(1, 1).clip };
     assert!(wrong(LoaderConfig { clip: columns("actions"), ..config(1, 1) }).contains("did you mean action"));
     assert!(wrong(config(4, 4)).contains("the longest has 11"));

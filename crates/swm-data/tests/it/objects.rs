@@ -1,5 +1,5 @@
-//! Datasets in object stores, against an S3 server on loopback. Address and credentials of a store are environment
-//! variables, so tests that use one run in child processes.
+//! Datasets in object stores, against an S3 server on loopback. The address and credentials of a store come from
+//! environment variables, so tests that use a store run in child processes.
 
 use crate::sample::{check, episode, options, schema, write};
 use hyper_util::rt::{TokioExecutor, TokioIo};
@@ -16,8 +16,9 @@ use swm_data::{CommitPolicy, Constants, Location, StepRange, WriteMode, WriteOpt
 const TARGET: &str = "SWM_TEST_OBJECTS";
 const KEYS: [&str; 2] = ["AKEXAMPLE", "secret/example"];
 
-/// Serves the subfolders of `root` as buckets, to everyone or to holders of the keys, until the process ends. Returns
-/// its address. Unlike S3, this server checks for an existing object and writes in two steps, so writes are serialised.
+/// Serves the subfolders of `root` as buckets until the process ends; if `keys` is set, only to clients with [`KEYS`].
+/// Returns the server's address. Unlike S3, this server checks for an existing object and writes in two steps, so
+/// writes are serialised.
 pub fn serve(root: &Path, keys: bool) -> String {
     let mut service = S3ServiceBuilder::new(s3s_fs::FileSystem::new(root).expect("a root"));
     if keys {
@@ -26,7 +27,7 @@ pub fn serve(root: &Path, keys: bool) -> String {
     let service = service.build();
     let listener = std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
     let address = listener.local_addr().expect("an address");
-    listener.set_nonblocking(true).expect("as the runtime wants it");
+    listener.set_nonblocking(true).expect("a non-blocking listener");
     std::thread::spawn(move || {
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build();
         let writing = Arc::new(tokio::sync::Mutex::new(()));
@@ -35,16 +36,16 @@ pub fn serve(root: &Path, keys: bool) -> String {
             while let Ok((socket, _)) = listener.accept().await {
                 let server = hyper_util::server::conn::auto::Builder::new(TokioExecutor::new());
                 let (service, writing) = (service.clone(), Arc::clone(&writing));
-                let orderly = hyper::service::service_fn(move |request| {
+                let serialised = hyper::service::service_fn(move |request| {
                     let (service, writing) = (service.clone(), Arc::clone(&writing));
                     async move {
                         let writes = request.method() == hyper::Method::PUT;
-                        let _turn = if writes { Some(writing.lock().await) } else { None };
+                        let _guard = if writes { Some(writing.lock().await) } else { None };
                         hyper::service::Service::call(&service, request).await
                     }
                 });
                 tokio::spawn(async move {
-                    let _ = server.serve_connection(TokioIo::new(socket), orderly).await;
+                    let _ = server.serve_connection(TokioIo::new(socket), serialised).await;
                 });
             }
         });
@@ -54,7 +55,7 @@ pub fn serve(root: &Path, keys: bool) -> String {
 
 /// A process that runs one of the child tests below.
 pub fn child(test: &str, endpoint: &str, target: &str) -> Command {
-    let mut command = Command::new(std::env::current_exe().expect("this program"));
+    let mut command = Command::new(std::env::current_exe().expect("the test executable"));
     command.args(["--exact", &format!("objects::{test}"), "--nocapture"]).env(TARGET, target);
     command.env("AWS_ENDPOINT_URL", endpoint).env("AWS_REGION", "us-east-1");
     command.env("AWS_ACCESS_KEY_ID", KEYS[0]).env("AWS_SECRET_ACCESS_KEY", KEYS[1]);
@@ -86,9 +87,9 @@ fn write_to(location: &Location, mode: WriteMode, episodes: std::ops::Range<usiz
 #[test]
 fn child_that_writes_and_reads() {
     let Some(location) = target() else { return };
-    assert!(open(&location).is_err(), "nothing is there");
+    assert!(open(&location).is_err(), "no dataset exists yet");
     write_to(&location, WriteMode::Create, 0..5);
-    let error = create(&location, &schema(), options(WriteMode::Create)).err().expect("refused").to_string();
+    let error = create(&location, &schema(), options(WriteMode::Create)).err().expect("an error").to_string();
     assert!(error.contains("exists already"), "{error}");
     write_to(&location, WriteMode::Append, 5..9);
     let reader = open(&location).expect("opens");
@@ -173,8 +174,8 @@ fn concurrent_processes_append_to_a_bucket() {
         finished(&child.wait_with_output().expect("ends"));
     }
     let reader = open(folder.path().join("bucket/d.lance")).expect("opens");
-    let numbers: Vec<i64> = reader.episodes().iter().map(|episode| episode.index).collect();
-    assert_eq!(numbers, (0..36).collect::<Vec<_>>());
+    let indices: Vec<i64> = reader.episodes().iter().map(|episode| episode.index).collect();
+    assert_eq!(indices, (0..36).collect::<Vec<_>>());
     let firsts: Vec<StepRange> = (0..36).map(|at| StepRange::new(at, 0, 1)).collect();
     let states = reader.read(&["state"], &firsts).expect("reads");
     let mut found: Vec<f64> = states.get::<f64>("state").expect("states").chunks(3).map(|s| s[0]).collect();
@@ -192,10 +193,10 @@ fn reads_from_but_does_not_write_to_a_web_server() {
     assert_eq!(reader.episodes().len(), 5);
     check(&*reader, 0);
     assert!(reader.footprint().is_ok_and(|parts| !parts.is_empty()), "without a list of files");
-    let error = create(&location, &schema(), options(WriteMode::Append)).err().expect("refused").to_string();
+    let error = create(&location, &schema(), options(WriteMode::Append)).err().expect("an error").to_string();
     assert!(error.contains("cannot be written"), "{error}");
-    let gone = Location::parse(&format!("{endpoint}/bucket/none.lance")).expect("a location");
-    assert!(open(&gone).is_err());
+    let missing = Location::parse(&format!("{endpoint}/bucket/none.lance")).expect("a location");
+    assert!(open(&missing).is_err());
 
     let bytes: Vec<u8> = (0..400_000_u32).map(|i| ((i * i) >> 5) as u8).collect();
     std::fs::write(folder.path().join("bucket/file.h5"), &bytes).expect("writes");
@@ -208,8 +209,8 @@ fn reads_from_but_does_not_write_to_a_web_server() {
 
 #[test]
 fn unreachable_store_is_not_reported_as_damage() {
-    let nobody = std::net::TcpListener::bind("127.0.0.1:0").expect("a port").local_addr().expect("an address");
-    let location = Location::parse(&format!("http://{nobody}/d.lance")).expect("a location");
-    let error = open(&location).err().expect("nobody is there").to_string();
-    assert!(!error.contains("damaged") && error.contains(&nobody.to_string()), "{error}");
+    let unused_address = std::net::TcpListener::bind("127.0.0.1:0").expect("a port").local_addr().expect("an address");
+    let location = Location::parse(&format!("http://{unused_address}/d.lance")).expect("a location");
+    let error = open(&location).err().expect("no server").to_string();
+    assert!(!error.contains("damaged") && error.contains(&unused_address.to_string()), "{error}");
 }

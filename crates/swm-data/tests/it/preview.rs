@@ -14,13 +14,13 @@ fn previews_show_every_camera() {
         writer.finish().expect("finishes");
         let reader = open(&path).expect("opens");
         let out = folder.path().join(format!("{name}-preview"));
-        let mut told = vec![];
+        let mut progress = vec![];
         let options = PreviewOptions { episodes: 3, ..PreviewOptions::default() };
-        let written = preview(&*reader, &out, &options, |done| told.push(done)).expect("previews");
+        let written = preview(&*reader, &out, &options, |done| progress.push(done)).expect("previews");
         let names: Vec<&str> = written.iter().filter_map(|path| path.file_name()?.to_str()).collect();
         assert_eq!(names, ["episode_0.mp4", "episode_2.mp4", "episode_4.mp4", "contact_sheet.png"]);
-        assert_eq!(told, [1, 2, 3]);
-        assert_eq!(fuzz::files(&out).len(), 4, "nothing else is left");
+        assert_eq!(progress, [1, 2, 3]);
+        assert_eq!(fuzz::files(&out).len(), 4, "no other file remains");
         let png = std::io::BufReader::new(std::fs::File::open(&written[3]).expect("opens"));
         let png = png::Decoder::new(png).read_info().expect("an image");
         // Eight strips of two 24-pixel cameras (or of a wider line of text), below two lines of text.
@@ -29,6 +29,6 @@ fn previews_show_every_camera() {
         let one = PreviewOptions { columns: vec!["goal".to_owned()], ..options };
         assert_eq!(preview(&*reader, &out, &one, |_| ()).expect("previews").len(), 4);
         let wrong = PreviewOptions { columns: vec!["state".to_owned()], ..PreviewOptions::default() };
-        assert!(preview(&*reader, &out, &wrong, |_| ()).expect_err("numbers").to_string().contains("images"));
+        assert!(preview(&*reader, &out, &wrong, |_| ()).expect_err("a numeric column").to_string().contains("images"));
     }
 }

@@ -1,5 +1,5 @@
-//! Interoperability with the published `stable-worldmodel`. `tests/interop` holds a dataset of its writer, the script
-//! that wrote it, and the script that opens our datasets with it.
+//! Interoperability with the published `stable-worldmodel`. `tests/interop` holds a dataset that its writer wrote, the
+//! script `export.py` that wrote the dataset, and the script `check.py` that reads datasets written here.
 
 use crate::sample::{episode, options, rows, schema, write};
 use serde_json::Value;
@@ -24,7 +24,7 @@ fn reference_schema() -> Schema {
     .expect("schema")
 }
 
-/// Episode `e` of `export.py`. The third one ends with action 0.
+/// Episode `e` of `export.py`. The third episode ends with action 0.
 fn reference_episode(e: usize) -> Batch {
     let rows = 6 + e;
     let mut batch = Batch::zeros(&reference_schema(), rows);
@@ -72,7 +72,7 @@ fn reads_a_dataset_of_the_reference() {
     check_reference(&interop().join("reference.lance"), 3);
     let text = open(interop().join("reference-text.lance")).expect("opens");
     let names: Vec<&str> = text.schema().columns().iter().map(|c| c.name.as_str()).collect();
-    assert_eq!(names, ["episode_idx", "step_idx", "state"], "text is left out");
+    assert_eq!(names, ["episode_idx", "step_idx", "state"], "text columns are skipped");
 }
 
 fn copy(from: &Path, to: &Path) {
@@ -89,7 +89,7 @@ fn copy(from: &Path, to: &Path) {
 }
 
 /// Appends two episodes to a copy of the reference's dataset.
-fn continued(folder: &Path) -> PathBuf {
+fn append_to_reference(folder: &Path) -> PathBuf {
     let path = folder.join("continued.lance");
     copy(&interop().join("reference.lance"), &path);
     let mut writer = create(&path, &reference_schema(), options(WriteMode::Append)).expect("continues");
@@ -103,12 +103,12 @@ fn continued(folder: &Path) -> PathBuf {
 #[test]
 fn appends_to_a_dataset_of_the_reference() {
     let folder = tempfile::tempdir().expect("a folder");
-    check_reference(&continued(folder.path()), 5);
+    check_reference(&append_to_reference(folder.path()), 5);
 }
 
 #[test]
 #[allow(clippy::too_many_lines, reason = "one dataset per codec and kind of writer, checked by one Python process")]
-fn the_reference_opens_our_datasets() {
+fn reference_reads_datasets_written_here() {
     let Some(python) = std::env::var_os("SWM_REFERENCE_PYTHON") else {
         println!("SKIPPED: set SWM_REFERENCE_PYTHON to a Python with stable-worldmodel and pylance");
         return;
@@ -117,7 +117,7 @@ fn the_reference_opens_our_datasets() {
     let ours = folder.path().join("ours.lance");
     write(&ours, WriteMode::Create, 2, 0..5);
     write(&ours, WriteMode::Append, 100, 5..8);
-    let theirs = continued(folder.path());
+    let appended = append_to_reference(folder.path());
     let lossless = [("png", ImageCodec::Png), ("qoi", ImageCodec::Qoi)].map(|(name, codec)| {
         let path = folder.path().join(name).with_extension("lance");
         let mut writer =
@@ -140,7 +140,7 @@ fn the_reference_opens_our_datasets() {
     }
     assert_eq!(commit_shards(&Location::from(&parts)).expect("commits"), 8);
     let mut command = Command::new(python);
-    command.arg("-B").arg(interop().join("check.py")).args([&ours, &theirs, &lossless[0], &lossless[1], &parts]);
+    command.arg("-B").arg(interop().join("check.py")).args([&ours, &appended, &lossless[0], &lossless[1], &parts]);
     let output = command.output().expect("Python runs");
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let text = String::from_utf8(output.stdout).expect("text");
@@ -161,9 +161,9 @@ fn the_reference_opens_our_datasets() {
             means.push(frame.iter().map(|&v| f64::from(v)).sum::<f64>() / frame.len() as f64);
         }
     }
-    let numbers =
+    let elements =
         |value: &Value| -> Vec<Option<f64>> { value.as_array().expect("a list").iter().map(Value::as_f64).collect() };
-    let column = |name: &str| numbers(&seen[0]["columns"][name]);
+    let column = |name: &str| elements(&seen[0]["columns"][name]);
     for (i, &(e, t)) in expected.iter().enumerate() {
         assert_eq!(seen[0]["episode_idx"][i], e);
         assert_eq!(seen[0]["step_idx"][i], t);
@@ -176,15 +176,15 @@ fn the_reference_opens_our_datasets() {
         assert!((mean - means[i]).abs() < 4.0, "{mean} {}", means[i]);
     }
     for seen in &seen[2..4] {
-        for (i, mean) in numbers(&seen["pixel_means"]).into_iter().enumerate() {
+        for (i, mean) in elements(&seen["pixel_means"]).into_iter().enumerate() {
             assert!((mean.expect("a mean") - means[i]).abs() < 1e-9, "lossless");
         }
     }
-    assert_eq!(seen[4], seen[0], "parts are as good as one");
-    // Both read the same clips: 2 steps with frameskip 2 take 4 rows.
+    assert_eq!(seen[4], seen[0], "shards read like a dataset of one writer");
+    // Both readers define the same clips: 2 steps with frameskip 2 take 4 rows.
     let clips: usize = (0..8).map(|e| rows(e) - 3).sum();
     assert_eq!(seen[0]["clips"], clips);
     assert_eq!(seen[0]["clip_action_shape"], serde_json::json!([2, 4]));
-    assert_eq!(numbers(&seen[0]["clip_action"])[1], Some(0.25));
+    assert_eq!(elements(&seen[0]["clip_action"])[1], Some(0.25));
     assert_eq!(seen[0]["clip_pixels_shape"], serde_json::json!([2, 3, 16, 24]));
 }

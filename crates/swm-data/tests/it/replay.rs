@@ -1,4 +1,4 @@
-//! The replay buffer evicts the oldest episodes, is read while it grows, and can be saved and restored.
+//! The replay buffer evicts the oldest episodes, provides samples while it grows, and can be saved and restored.
 
 use crate::sample::{check, episode, rows, schema};
 use swm_core::{Batch, Key};
@@ -39,13 +39,13 @@ fn evicts_the_oldest_episodes_but_keeps_snapshots() {
     assert_eq!((buffer.rows(), buffer.episodes(), buffer.snapshot().episodes()[0].index), (30, 3, 4));
     check(&*before, 3);
     assert_ne!(before.content_hash().expect("a hash"), buffer.snapshot().content_hash().expect("a hash"));
-    assert_eq!(buffer.writer().episodes(), 7, "a collection goes on behind what was forgotten");
+    assert_eq!(buffer.writer().episodes(), 7, "a resumed collection continues after the evicted episodes");
 
     let small = ReplayBuffer::new(&schema(), 6).expect("a buffer");
     assert!(small.add(&episode(2), &Constants::new()).expect_err("too long").to_string().contains("capacity"));
     let mut broken = episode(0);
     broken.get_mut::<f32>("action").expect("actions").fill(0.5);
-    assert!(small.add(&broken, &Constants::new()).expect_err("no last row").to_string().contains("NaN"));
+    assert!(small.add(&broken, &Constants::new()).expect_err("an action in the last row").to_string().contains("NaN"));
     assert!(ReplayBuffer::new(&schema(), 0).is_err());
 }
 
@@ -57,7 +57,7 @@ fn samples_windows_uniformly_and_reproducibly() {
     assert_eq!(first_rows(&batch), first_rows(&loader.sample(Key::new(1)).expect("samples")));
     let mut count = vec![[0_i32; 10]; 6];
     for (e, start) in first_rows(&batch) {
-        assert!(start + 3 <= rows(e), "over the end of an episode");
+        assert!(start + 3 <= rows(e), "a window extends beyond its episode");
         count[e][start] += 1;
     }
     // 33 windows: five standard deviations of 9000 draws with probability 1/33.
@@ -78,7 +78,7 @@ fn samples_windows_uniformly_and_reproducibly() {
 }
 
 #[test]
-fn reads_while_it_grows() {
+fn samples_while_the_buffer_grows() {
     let buffer = filled(0..2, 200);
     let loader = buffer.loader(ReplayConfig { threads: 2, ..config(2) }).expect("a loader");
     let writer = buffer.clone();
@@ -90,21 +90,21 @@ fn reads_while_it_grows() {
     let mut latest = 0;
     for batch in loader.batches(0) {
         let batch = batch.expect("a batch");
-        let places = first_rows(&batch);
+        let first_steps = first_rows(&batch);
         // Every window is complete, even if episodes are evicted in the meantime.
-        for (row, &(e, start)) in places.iter().enumerate() {
+        for (row, &(e, start)) in first_steps.iter().enumerate() {
             let state = batch.row(row).get::<f64>("state").expect("states");
             assert_eq!([state[3], state[4]], [e as f64, start as f64 + 1.0]);
             let pixel = batch.row(row).get::<u8>("pixels").expect("images")[0];
             assert_eq!(usize::from(pixel), (3 * start + 20 * e) % 256);
         }
-        let oldest = places.iter().map(|place| place.0).min().unwrap_or(0);
+        let oldest = first_steps.iter().map(|first| first.0).min().unwrap_or(0);
         latest = latest.max(oldest);
         if oldest > 250 {
             break;
         }
     }
-    assert!(latest > 250, "it sees what came");
+    assert!(latest > 250, "the loader samples added episodes");
     writing.join().expect("the writer ends");
     // Without a window, sampling fails and the stream ends.
     let empty = ReplayBuffer::new(&schema(), 10).expect("a buffer").loader(config(1)).expect("a loader");
@@ -118,7 +118,7 @@ fn saves_and_restores() {
     let path = folder.path().join("buffer.lance");
     let buffer = filled(0..6, 30);
     let state = |buffer: &ReplayBuffer| (buffer.rows(), buffer.episodes(), buffer.added());
-    // Lance, in this build, stores no constants.
+    // The same episodes, without constants.
     let plain = ReplayBuffer::new(&schema(), 30).expect("a buffer");
     (0..6).for_each(|e| plain.add(&episode(e), &Constants::new()).expect("adds"));
     assert_eq!(state(&plain), state(&buffer));
@@ -132,7 +132,7 @@ fn saves_and_restores() {
         let batch = buffer.loader(config(2)).expect("a loader").sample(Key::new(5)).expect("samples");
         (batch.bytes(0).to_vec(), batch.bytes(1).to_vec(), batch.bytes(2).to_vec())
     };
-    assert!(drawn(&again) == drawn(&plain), "it goes on as it would have");
+    assert!(drawn(&again) == drawn(&plain), "the restored buffer draws the same samples");
     let less = ReplayBuffer::restore(&*reader, 20).expect("restores");
-    assert_eq!(state(&less), (19, 2, 6), "the latest that fit");
+    assert_eq!(state(&less), (19, 2, 6), "the latest episodes that fit");
 }

@@ -21,7 +21,7 @@ fn killed_writer_keeps_committed_episodes() {
 
 #[test]
 #[ignore = "a minute"]
-fn a_writer_killed_at_50_moments_keeps_committed_episodes() {
+fn writer_killed_50_times_keeps_committed_episodes() {
     format_suite::killed("d.video", 50);
 }
 
@@ -30,7 +30,7 @@ fn damaged(cases: u64) {
     let path = folder.path().join("d.video");
     format_suite::write(&path, WriteMode::Create, 0..3);
     let report = fuzz::dataset("video", &path, cases, fuzz::read_everything);
-    // Exchanged videos cannot be detected.
+    // The format does not detect exchanged videos.
     let changed: Vec<&String> = report.changed.iter().filter(|change| !change.contains("replaced by")).collect();
     assert!(changed.is_empty(), "{changed:?}");
     assert!(report.refused as u64 > cases / 2, "{report:?}");
@@ -43,24 +43,24 @@ fn rejects_damaged_folders() {
 
 #[test]
 #[ignore = "minutes"]
-fn folders_damaged_in_10000_ways_are_refused() {
+fn rejects_folders_damaged_in_10000_ways() {
     damaged(10_000);
 }
 
-/// Videos without our checksums: damage reaches the decoder.
+/// Damages videos without this format's checksums, so that the damage reaches the decoder.
 fn damaged_third_party(cases: u64) {
     let report = fuzz::dataset("reference-video", &interop().join("reference-video"), cases, fuzz::read_everything);
     assert!(report.refused as u64 > cases / 2, "{report:?}");
 }
 
 #[test]
-fn survives_damaged_third_party_videos() {
+fn reads_or_rejects_damaged_third_party_videos() {
     damaged_third_party(400);
 }
 
 #[test]
 #[ignore = "minutes"]
-fn foreign_videos_damaged_in_10000_ways_are_survived() {
+fn reads_or_rejects_third_party_videos_damaged_in_10000_ways() {
     damaged_third_party(10_000);
 }
 
@@ -69,15 +69,18 @@ fn reports_videos_of_other_lengths() {
     let folder = tempfile::tempdir().expect("a folder");
     let path = folder.path().join("d.video");
     format_suite::write(&path, WriteMode::Create, 0..4);
-    let found = |path: &Path| open(path).expect("opens").irregularities().expect("looks");
+    let found = |path: &Path| open(path).expect("opens").irregularities().expect("irregularities");
     assert_eq!(found(&path), []);
     std::fs::copy(path.join("pixels/ep_3.mp4"), path.join("pixels/ep_1.mp4")).expect("copies");
     std::fs::remove_file(path.join("goal/ep_2.mp4")).expect("removes");
     let found = found(&path);
     assert_eq!(found.iter().map(|found| found.episode).collect::<Vec<_>>(), [Some(1), Some(2)]);
     assert!(found[0].what.contains("8 frames for 6 rows"), "{found:?}");
-    let message =
-        open(&path).expect("opens").read(&["goal"], &[StepRange::new(2, 0, 1)]).expect_err("is gone").to_string();
+    let message = open(&path)
+        .expect("opens")
+        .read(&["goal"], &[StepRange::new(2, 0, 1)])
+        .expect_err("a missing video")
+        .to_string();
     assert!(message.contains("ep_2.mp4"), "{message}");
 }
 
@@ -104,12 +107,12 @@ pub fn check_frames(reader: &dyn Reader, column: &str, png: &str, tolerance: u8)
     assert_eq!(read.bytes(0).len(), expected.len());
     let worst = read.bytes(0).iter().zip(&expected).map(|(a, b)| a.abs_diff(*b)).max().expect("pixels");
     assert!(worst <= tolerance, "{column}: off by {worst}");
-    // Backwards and twice, which decodes runs out of order.
+    // Reads the frames backwards, and two of them twice, so that the decoder must seek.
     let back: Vec<StepRange> = ranges.iter().rev().chain(&ranges[..2]).copied().collect();
     let again = reader.read(&[column], &back).expect("reads");
     let size = read.bytes(0).len() / ranges.len();
     for (i, frame) in again.bytes(0).chunks_exact(size).enumerate() {
-        let same = ranges.iter().position(|range| *range == back[i]).expect("is there");
+        let same = ranges.iter().position(|range| *range == back[i]).expect("a requested frame");
         assert!(frame == &read.bytes(0)[same * size..][..size], "{column}: frame {:?}", back[i]);
     }
 }
@@ -151,7 +154,7 @@ fn appends_to_a_dataset_of_the_reference() {
 }
 
 #[test]
-fn the_reference_opens_our_videos() {
+fn reference_reads_videos_written_here() {
     let Some(python) = std::env::var_os("SWM_VIDEO_PYTHON") else {
         println!("SKIPPED: set SWM_VIDEO_PYTHON to a Python with stable-worldmodel and decord");
         return;

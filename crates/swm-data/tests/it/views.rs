@@ -28,7 +28,7 @@ fn concatenation_reads_like_one_dataset() {
     assert!(states.map(|state| [state[0], state[1]]).eq(expected.iter().copied()));
     assert!(read.to_f32("episode_idx").expect("values").iter().zip(&expected).all(|(&a, b)| f64::from(a) == b[0]));
     assert!(all.read(&["state"], &[StepRange::new(9, 0, 1)]).is_err() && all.read(&["stat"], &ranges).is_err());
-    assert_eq!(all.manifest(), parts[0].manifest(), "they agree");
+    assert_eq!(all.manifest(), parts[0].manifest(), "all parts have the same manifest");
     assert_ne!(all.content_hash().expect("a hash"), parts[0].content_hash().expect("a hash"));
 
     let few = select(Arc::clone(&parts[0]), &["state", "action"]).expect("columns");
@@ -62,7 +62,7 @@ fn merge_adds_columns_of_another_dataset() {
     assert_eq!(read.get::<f64>("state").expect("values")[..2], [3.0, 1.0]);
     assert!(both.footprint().expect("sizes").iter().any(|(name, _)| name == "embedding"));
 
-    let error = |other, columns: &[&str]| merge(Arc::clone(&base), other, columns).err().expect("refused").to_string();
+    let error = |other, columns: &[&str]| merge(Arc::clone(&base), other, columns).err().expect("an error").to_string();
     assert!(error(embedded("long.lance", 1), &["embedding"]).contains("episode 4"));
     assert!(error(Arc::clone(&other), &["embeding"]).contains("did you mean embedding"));
     assert!(error(Arc::clone(&base), &["state"]).contains("a column of that name"));
@@ -76,9 +76,9 @@ fn splits_keep_episode_indices() {
         let chosen = Split::default().episodes(&*all, part).expect("episodes");
         subset(Arc::clone(&all), chosen).expect("positions")
     });
-    let mut numbers: Vec<i64> = parts.iter().flat_map(|part| part.episodes().iter().map(|e| e.index)).collect();
-    numbers.sort_unstable();
-    assert_eq!(numbers, (0..40).collect::<Vec<_>>());
+    let mut indices: Vec<i64> = parts.iter().flat_map(|part| part.episodes().iter().map(|e| e.index)).collect();
+    indices.sort_unstable();
+    assert_eq!(indices, (0..40).collect::<Vec<_>>());
     // A view of views: validation and test together, of two columns.
     let held = concat(vec![Arc::clone(&parts[1]), Arc::clone(&parts[2])]).expect("concatenates");
     let held = select(held, &["state", "action"]).expect("selects");
@@ -92,9 +92,9 @@ fn splits_keep_episode_indices() {
         );
         assert_eq!(read.bytes(0), episode(e).bytes(2));
     }
-    assert!(held.read(&["pixels"], &[StepRange::new(0, 0, 1)]).is_err(), "left out");
+    assert!(held.read(&["pixels"], &[StepRange::new(0, 0, 1)]).is_err(), "an unselected column");
     for (positions, words) in [(vec![], "at least one"), (vec![40], "below 40"), (vec![1, 1], "twice")] {
-        assert!(subset(Arc::clone(&all), positions).err().expect("refused").to_string().contains(words));
+        assert!(subset(Arc::clone(&all), positions).err().expect("an error").to_string().contains(words));
     }
     assert_eq!(select(all, &COLUMNS).expect("all").schema().columns().len(), schema().columns().len() + 1);
 }

@@ -1,8 +1,8 @@
 //! Caches of decoded rows: in memory, or on disk, where the operating system's page cache serves as memory.
 //!
-//! A cache stores rows in the order in which they are first read, up to its limit in bytes, and never evicts any. A
+//! A cache stores rows in the order in which they are first read, up to its limit in bytes, and never evicts a row. A
 //! loader reads every row about once per epoch in random order, so the least recently used row is as likely to be read
-//! next as any other. Eviction would not add hits, but cost a copy for every miss.
+//! next as any other row. Eviction would not add hits, but would cost a copy for every miss.
 
 mod disk;
 mod memory;
@@ -30,8 +30,8 @@ pub enum CacheConfig {
         /// Maximum size in bytes.
         bytes: usize,
     },
-    /// Images in files below a folder, named after the dataset's content; other columns, which are small, in memory. If
-    /// several processes use the same files, one fills them and all read them.
+    /// Images in files, in a subfolder named after the dataset's content hash; other columns, which are small, in
+    /// memory. If several processes use the same files, one process fills them and all processes read them.
     Disk {
         /// The folder; several datasets may share it.
         folder: PathBuf,
@@ -92,9 +92,9 @@ impl Budget {
     }
 }
 
-/// Cached rows of one column. Several threads use it at once.
+/// Cached rows of one column. Several threads use a cache at once.
 trait RowCache: Send + Sync {
-    /// Copies a row to `out` if it is cached, and returns whether it is.
+    /// Copies a row to `out` if it is cached, and returns whether the row is cached.
     fn get(&self, row: usize, out: &mut [u8]) -> bool;
 
     /// Caches a row if the budget allows. Failing to cache is not an error, because the row can be decoded again.
@@ -199,7 +199,7 @@ impl Reader for CachedReader {
                     missing.iter().zip(out.chunks_exact(n)).for_each(|((_, row, _), bytes)| cache.put(*row, bytes));
                     return Ok(());
                 }
-                // The buffer is taken out while it is in use, because the inner reader may be a cache, too.
+                // Takes the buffer out of the cell while it is in use, because the inner reader may also be a cache.
                 let mut decoded = DECODED.take();
                 decoded.resize(missing.len() * n, 0);
                 let read = self.inner.read_column(column, &ranges, &mut decoded);

@@ -69,7 +69,7 @@ impl BatchFiller {
         names
     }
 
-    /// Rows that an episode must have, from a clip's first row.
+    /// Number of rows that an episode must have, counted from a clip's first row.
     pub fn reach(&self) -> usize {
         self.goals.iter().map(|goal| goal.reach(&self.clip)).fold(self.clip.span(), usize::max)
     }

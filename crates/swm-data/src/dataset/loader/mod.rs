@@ -158,7 +158,7 @@ impl Loader {
     }
 }
 
-/// How many batches fit into `bytes`; at least 1, at most `batches`.
+/// The number of batches that fit into `bytes`; at least 1, at most `batches`.
 pub(crate) fn window(schema: &Schema, batch_size: usize, batches: usize, bytes: usize) -> usize {
     let batch: usize = schema.columns().iter().map(|column| column.row_bytes() * batch_size).sum();
     batches.min(bytes / batch.max(1)).max(1)

@@ -15,8 +15,8 @@ pub(crate) trait BatchSource: Send + Sync {
     fn produce(&self, batch: usize) -> Result<LoadedBatch>;
 }
 
-/// A batch from a loader. When it is dropped, the loader reuses its memory, because allocating memory for large images
-/// costs as much as decoding them.
+/// A batch from a loader. When the batch is dropped, the loader reuses its memory, because allocating memory for large
+/// images costs as much as decoding them.
 pub struct LoadedBatch {
     /// `None` only after [`LoadedBatch::into_batch`].
     batch: Option<Batch>,
@@ -188,7 +188,7 @@ impl Drop for Workers {
     }
 }
 
-/// The batches of one epoch, in order. Dropping it stops prefetching.
+/// The batches of one epoch, in order. Dropping this iterator stops prefetching.
 pub struct Epoch {
     workers: Arc<Workers>,
     source: Arc<dyn BatchSource>,
@@ -214,8 +214,8 @@ impl Iterator for Epoch {
 }
 
 impl Epoch {
-    /// Waits until [`Iterator::next`] can return without blocking, at most for `at_most`. Returns whether it can.
-    /// Callers that must also check for signals call it repeatedly.
+    /// Waits until [`Iterator::next`] can return without blocking, at most for `at_most`. Returns `false` on a timeout.
+    /// Callers that also check for signals call this method repeatedly.
     pub fn wait(&self, at_most: Duration) -> bool {
         if self.remaining.is_empty() || self.workers.threads.is_empty() {
             return true;

@@ -1,7 +1,7 @@
 //! [`BlockCache`]: an in-memory cache of blocks of objects.
 //!
-//! A request costs as much as transferring a megabyte. Training reads small ranges in random order, so the cache fetches
-//! whole blocks, several neighbours per request.
+//! A request costs as much as transferring a megabyte. Training reads small ranges in random order, so the cache
+//! fetches whole blocks, several neighbours per request.
 
 use bytes::{Bytes, BytesMut};
 use futures::{StreamExt as _, TryStreamExt as _};
@@ -119,8 +119,8 @@ impl BlockCache {
             missing.retain(|&block| !held.contains_key(&(object.path.clone(), block)));
             for block in missing {
                 match requests.last_mut() {
-                    Some((of, run))
-                        if of.path == object.path
+                    Some((last, run))
+                        if last.path == object.path
                             && run.end == block
                             && run.end - run.start < MAX_BLOCKS_PER_REQUEST =>
                     {
@@ -132,7 +132,7 @@ impl BlockCache {
         }
         let ranges: Vec<(StorePath, Range<u64>)> = requests
             .iter()
-            .map(|(of, run)| (of.path.clone(), run.start * self.block..(run.end * self.block).min(of.size)))
+            .map(|(object, run)| (object.path.clone(), run.start * self.block..(run.end * self.block).min(object.size)))
             .collect();
         let fetched: Vec<Bytes> = futures::stream::iter(ranges)
             .map(|(path, range)| async move { store.get_range(&path, range).await })
@@ -220,13 +220,13 @@ mod tests {
             let mut rng = Key::new(3).rng();
             for _ in 0..50 {
                 let objects: Vec<ObjectRanges> = (0..3)
-                    .map(|of| {
-                        let size = contents[of].len() as u64;
+                    .map(|index| {
+                        let size = contents[index].len() as u64;
                         let ranges = (0..5).map(|_| {
                             let start = rng.random_range(0..=size);
                             start..rng.random_range(start..=size.min(start + 70))
                         });
-                        ObjectRanges { path: paths[of].clone(), size, ranges: ranges.collect() }
+                        ObjectRanges { path: paths[index].clone(), size, ranges: ranges.collect() }
                     })
                     .collect();
                 let read = blocks.read(&store, &objects).await.expect("reads");

@@ -93,7 +93,7 @@ impl Reader for Concat {
             jobs.push((part, offset, StepRange { episode, ..*range }));
             offset += range.length * n;
         }
-        // If all ranges belong to one part, it reads directly into the output.
+        // If all ranges belong to one part, that part reads directly into the output.
         let single_part = jobs.iter().all(|job| job.0 == jobs[0].0);
         if let (true, Some(&(part, ..))) = (single_part, jobs.first()) {
             let ranges: Vec<StepRange> = jobs.iter().map(|job| job.2).collect();
@@ -110,9 +110,9 @@ impl Reader for Concat {
             part.read_column(column, &ranges, &mut read)?;
             let mut rest = &read[..];
             for (_, offset, range) in of_part {
-                let (bytes, others) = rest.split_at(range.length * n);
+                let (bytes, after) = rest.split_at(range.length * n);
                 out[*offset..*offset + bytes.len()].copy_from_slice(bytes);
-                rest = others;
+                rest = after;
             }
         }
         lock(&self.scratch).push(read);
@@ -136,8 +136,8 @@ impl Reader for Concat {
         Ok(found)
     }
 
-    /// The manifest of the parts if they all have the same. Otherwise a manifest with those of the parts and the config
-    /// entries that all of them share.
+    /// The manifest of the parts, if all parts have the same manifest. Otherwise a new manifest with the manifests of
+    /// the parts, and with the config entries that all of these share.
     fn manifest(&self) -> Option<Manifest> {
         let manifests: Vec<Manifest> = self.parts.iter().filter_map(|part| part.manifest()).collect();
         let first = manifests.first()?;

@@ -14,7 +14,7 @@ pub use concat::concat;
 pub use merge::merge;
 pub use subset::{select, subset};
 
-/// A hash of a view: of its name and its parts.
+/// The hash of a view, computed from the name of the view and the hashes and names that define it.
 fn view_hash(view: &str, parts: impl IntoIterator<Item = String>) -> String {
     let mut hasher = blake3::Hasher::new();
     for part in std::iter::once(view.to_owned()).chain(parts) {

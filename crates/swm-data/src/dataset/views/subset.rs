@@ -6,10 +6,10 @@ use std::sync::Arc;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{ColumnSpec, Error, Manifest, Result, Schema};
 
-/// The episodes at these positions, in this order. They keep their `episode_idx`.
+/// The episodes at these positions, in this order. The episodes keep their `episode_idx`.
 ///
 /// # Errors
-/// If there is none, a position does not exist, or a position appears twice.
+/// If `positions` is empty, a position does not exist, or a position appears twice.
 pub fn subset(reader: Arc<dyn Reader>, positions: Vec<usize>) -> Result<Arc<dyn Reader>> {
     let all = reader.episodes();
     let mut selected = vec![false; all.len()];

@@ -11,7 +11,7 @@ use swm_core::{ColumnSpec, Error, Result};
 
 /// Each record starts with this tag, the lengths of its head and body, and the BLAKE3 hash of both.
 const MAGIC: &[u8; 8] = b"swm-ep-1";
-/// Bytes before the head.
+/// Size in bytes of the part of a record that precedes its head.
 const LEAD: usize = 8 + 8 + 8 + 32;
 
 /// The head of a record. The body holds the numeric columns, one after another, then the constants in order of their
@@ -51,7 +51,7 @@ pub(super) fn record(episode: usize, pending: &PendingEpisode, out: &mut Vec<u8>
 /// and is ignored.
 ///
 /// # Errors
-/// If a record is damaged, or one is missing.
+/// If a record is damaged or missing.
 pub(super) fn replay(
     path: &Path,
     mut bytes: &[u8],
@@ -126,7 +126,7 @@ impl Journal {
     pub fn append(&mut self, records: &[u8]) -> Result<()> {
         let written = self.file.write_all(records).and_then(|()| self.file.sync_data());
         if let Err(error) = written {
-            // A partial record would hide the following ones.
+            // A partial record would make all later records unreadable.
             self.truncate(self.length)?;
             return Err(Error::io(&self.path, "writing the journal", error));
         }

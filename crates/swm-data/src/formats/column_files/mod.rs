@@ -1,5 +1,6 @@
-//! Column files: the common part of the formats `folder` and `video`, as in the reference's datasets of these formats. A
-//! folder holds each numeric column in one file, and a subfolder for each image column, which the formats define.
+//! Column files: the common part of the formats `folder` and `video`, as in the reference's datasets of these formats.
+//! A folder holds one file for each numeric column, and a subfolder for each image column, whose content the format
+//! defines.
 //!
 //! ```text
 //! NAME/
@@ -13,9 +14,9 @@
 //! manifest and constants are additional members of `ep_len.npz`, which the reference ignores, and the names of other
 //! files start with `ep_len` as well.
 //!
-//! **Commits.** Arrays in archives cannot grow in place. Finished episodes are appended to the journal, each as a
-//! record with a checksum. A merge copies the journal into the column files: each is written
-//! to a temporary file and renamed, `ep_len.npz` last. Readers use only as many rows of a column file as `ep_len.npz`
+//! **Commits.** Arrays in archives cannot grow in place. Finished episodes are therefore appended to the journal, each
+//! as a record with a checksum. A merge copies the journal into the column files: each column file is written to a
+//! temporary file and renamed, `ep_len.npz` last. Readers use only as many rows of a column file as `ep_len.npz`
 //! declares. The journal is merged when it is half as long as the column files, and when the writer finishes, so the
 //! total amount written is a small multiple of the data.
 

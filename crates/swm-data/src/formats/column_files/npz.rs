@@ -21,9 +21,9 @@ const MAX_COMPRESSION: u64 = 1032;
 /// The header of an array.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(crate) struct Header {
-    /// The type of its elements; `None` for text and objects.
+    /// Type of the elements; `None` for text and objects.
     pub stored: Option<StoredScalar>,
-    /// Its shape; the first axis is rows.
+    /// Shape of the array; the first axis counts rows.
     pub shape: Vec<usize>,
 }
 
@@ -50,7 +50,7 @@ impl Npz {
     /// Opens an archive.
     ///
     /// # Errors
-    /// If it does not exist or is damaged.
+    /// If the file does not exist or is damaged.
     pub fn open(path: &Path) -> Result<Self> {
         let file = File::open(path).map_err(|e| Error::io(path, "opening a column file", e))?;
         let archive = ZipArchive::new(BufReader::new(file)).map_err(|e| damaged(path, e))?;
@@ -70,7 +70,7 @@ impl Npz {
     /// The bytes of a member.
     ///
     /// # Errors
-    /// If it does not exist or is damaged.
+    /// If the member does not exist or is damaged.
     pub fn member(&mut self, member: &str) -> Result<Vec<u8>> {
         let path = self.path.clone();
         let mut file = self.archive.by_name(member).map_err(|e| damaged(&path, format!("{member}: {e}")))?;
@@ -85,7 +85,7 @@ impl Npz {
     /// Reads the header of the array.
     ///
     /// # Errors
-    /// If there is no array, or it is damaged.
+    /// If there is no array, or the array is damaged.
     pub fn header(&mut self) -> Result<Header> {
         let path = self.path.clone();
         let file = self.archive.by_name(ARRAY).map_err(|e| damaged(&path, format!("{ARRAY}: {e}")))?;
@@ -97,7 +97,7 @@ impl Npz {
     /// Reads the array as a column with type [`StoredScalar::dtype`], and its header.
     ///
     /// # Errors
-    /// If there is no array, its elements are not numeric, or it is damaged.
+    /// If there is no array, its elements are not numeric, or the array is damaged.
     pub fn array(&mut self) -> Result<(Header, Vec<u8>)> {
         let mut bytes = self.member(ARRAY)?;
         let (header, start) = parse(&bytes).map_err(|problem| damaged(&self.path, problem))?;
@@ -123,7 +123,7 @@ fn damaged(path: &Path, problem: impl std::fmt::Display) -> Error {
     Error::corrupt(path, problem.to_string(), "restore the file from a copy, or rebuild the dataset")
 }
 
-/// Parses a header. Returns it with the offset of the elements.
+/// Parses a header. Returns the header and the offset of the elements.
 fn parse(bytes: &[u8]) -> Result<(Header, usize), String> {
     let truncated = || "the array's header is truncated".to_owned();
     let (start, length) = match bytes.get(..12).ok_or_else(truncated)? {
@@ -144,7 +144,7 @@ fn parse(bytes: &[u8]) -> Result<(Header, usize), String> {
     let shape = field("shape").and_then(|rest| rest.strip_prefix('(')?.split_once(')')).ok_or_else(invalid)?.0;
     let shape: Result<Vec<usize>, _> =
         shape.split(',').map(str::trim).filter(|side| !side.is_empty()).map(str::parse).collect();
-    // Structured types are lists; all others are quoted strings.
+    // A structured type is a list; any other type is a quoted string.
     let descr = field("descr").and_then(|rest| rest.strip_prefix('\'')?.split_once('\'')).map(|(descr, _)| descr);
     Ok((Header { stored: descr.and_then(scalar_type), shape: shape.map_err(|_| invalid())? }, end))
 }
@@ -258,7 +258,7 @@ mod tests {
         assert_eq!(header.stored, Some(StoredScalar::of(DType::Int32)));
         assert_eq!((&bytes[..8], &bytes[8..]), (&[1; 8][..], &[2; 16][..]));
         assert_eq!(npz.header().expect("a header"), header);
-        assert_eq!(npz.member("note").expect("is there"), b"hello");
+        assert_eq!(npz.member("note").expect("a member"), b"hello");
         assert!(npz.has("note") && !npz.has("other") && npz.member("other").is_err());
     }
 
@@ -270,13 +270,13 @@ mod tests {
             bytes.extend(text.as_bytes());
             parse(&bytes).map(|(header, _)| header)
         };
-        let text = array("{'descr': '<U5', 'fortran_order': False, 'shape': (4,), }").expect("text is an array");
+        let text = array("{'descr': '<U5', 'fortran_order': False, 'shape': (4,), }").expect("an array of text");
         assert_eq!((text.stored, text.rows()), (None, 4));
         let scalar = array("{'descr': '>f8', 'fortran_order': False, 'shape': (), }").expect("an array");
         assert_eq!((scalar.stored.expect("a numeric type").big_endian, scalar.rows()), (true, 1));
-        let columns = array("{'descr': '<f8', 'fortran_order': True, 'shape': (2, 3), }").expect_err("columns");
-        assert!(columns.contains("ascontiguousarray"), "{columns}");
+        let fortran = array("{'descr': '<f8', 'fortran_order': True, 'shape': (2, 3), }").expect_err("Fortran order");
+        assert!(fortran.contains("ascontiguousarray"), "{fortran}");
         assert!(array("{'descr': '<f8', 'fortran_order': False, 'shape': (-2, 3), }").is_err());
-        assert!(parse(b"PK\x03\x04 is something else").expect_err("no array").contains("not a NumPy array"));
+        assert!(parse(b"PK\x03\x04 is something else").expect_err("not an array").contains("not a NumPy array"));
     }
 }

@@ -10,8 +10,8 @@ use std::sync::OnceLock;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema};
 
-/// The numeric columns of a folder, and the rows of its episodes. A column is read at its first access and kept in
-/// memory.
+/// The numeric columns of a folder, and the rows of its episodes. A column is read at its first access and then
+/// cached in memory.
 pub(crate) struct ColumnFiles {
     folder: PathBuf,
     rows: EpisodeRows,
@@ -24,7 +24,7 @@ pub(crate) struct ColumnFiles {
 
 struct Column {
     spec: ColumnSpec,
-    /// Number of committed rows in the column's file, which may hold more.
+    /// Number of committed rows in the column's file, which may hold more rows.
     in_file: usize,
     /// Rows that are in the journal but not yet in the column's file.
     unmerged_rows: Vec<u8>,
@@ -35,9 +35,9 @@ impl ColumnFiles {
     /// Opens the column files of a folder.
     ///
     /// # Errors
-    /// If they are damaged or inconsistent.
+    /// If the column files are damaged or inconsistent.
     pub fn open(folder: &Path) -> Result<Self> {
-        // The journal is read before the lengths: episodes merged in between are then skipped as duplicates.
+        // Reads the journal before the lengths, so that episodes merged between both reads are skipped as duplicates.
         let journal_path = journal::path(folder);
         let journal = match std::fs::read(&journal_path) {
             Ok(bytes) => bytes,
@@ -182,7 +182,7 @@ impl ColumnFiles {
     /// The constants of an episode.
     ///
     /// # Errors
-    /// If they are damaged.
+    /// If the file that holds them is damaged.
     pub fn constants(&self, episode: usize) -> Result<Constants> {
         let in_file = self.rows.episodes().len() - self.pending_constants.len();
         if let Some(pending) = episode.checked_sub(in_file).and_then(|i| self.pending_constants.get(i)) {

@@ -14,8 +14,8 @@ use std::time::Instant;
 use swm_core::columns::{EPISODE_IDX, STEP_IDX};
 use swm_core::{Batch, ColumnSpec, DType, Error, Result, Schema};
 
-/// Bounds in bytes for the size at which the journal is merged; within them it is half the size of the column files.
-/// They also bound the memory.
+/// Bounds, in bytes, of the journal size at which the journal is merged. Between these bounds, that size is half the
+/// size of the column files. The bounds also limit the memory of a writer.
 const MERGE_BYTES: std::ops::RangeInclusive<usize> = 16 << 20..=256 << 20;
 
 /// Commits the numeric columns of episodes. Formats write an episode's images first, then call
@@ -53,7 +53,8 @@ impl ColumnFilesWriter {
     /// Creates, continues or replaces the column files of a folder. `known` is the schema of the dataset to continue.
     ///
     /// # Errors
-    /// If the dataset exists and must not, its columns differ, another process writes to it, or writing fails.
+    /// If the dataset exists and `options.mode` forbids it, its columns differ, another process writes to it, or
+    /// writing fails.
     pub fn create(folder: &Path, schema: &Schema, options: &WriteOptions, known: Option<&Schema>) -> Result<Self> {
         for column in schema.columns() {
             check_name(&column.name)?;
@@ -164,7 +165,8 @@ impl ColumnFilesWriter {
         &self.folder
     }
 
-    /// Adds the numeric columns of an episode that passed [`episodes::check_episode`], and commits if it is time.
+    /// Adds the numeric columns of an episode that passed [`episodes::check_episode`], and commits if the commit policy
+    /// requires it.
     ///
     /// # Errors
     /// If this or an earlier commit failed.
@@ -175,19 +177,19 @@ impl ColumnFilesWriter {
                 "an earlier commit failed; later episodes are not stored",
             ));
         }
-        let number = self.episodes();
+        let position = self.episodes();
         self.rows.push(episode.rows());
         let mut pending = PendingEpisode { rows: episode.rows(), columns: vec![], constants: constants.clone() };
         for column in &self.columns {
             if column.name == EPISODE_IDX || column.name == STEP_IDX {
                 let mut bytes = vec![0; episode.rows() * column.row_bytes()];
-                self.rows.fill_index_column(column, &[StepRange::new(number, 0, episode.rows())], &mut bytes)?;
+                self.rows.fill_index_column(column, &[StepRange::new(position, 0, episode.rows())], &mut bytes)?;
                 pending.columns.push(bytes);
             } else {
                 pending.columns.push(episode.bytes(episode.schema().index(&column.name)?).to_vec());
             }
         }
-        journal::record(number, &pending, &mut self.group)?;
+        journal::record(position, &pending, &mut self.group)?;
         self.in_group += 1;
         self.unmerged.iter_mut().zip(&pending.columns).for_each(|(unmerged_rows, bytes)| unmerged_rows.extend(bytes));
         self.add_constants(constants);
@@ -214,14 +216,14 @@ impl ColumnFilesWriter {
     fn commit(&mut self) -> Result<()> {
         self.last_commit = Instant::now();
         let Some(journal) = self.journal.as_mut() else { return Ok(()) };
-        // Stays set if an error returns early.
+        // Remains `true` if one of the operations below fails.
         self.failed = true;
         if self.in_group > 0 {
             journal.append(&self.group)?;
             (self.in_group, self.group) = (0, vec![]);
         }
-        let waiting: usize = self.unmerged.iter().chain(&self.new_constants).map(Vec::len).sum();
-        if waiting >= (self.bytes_in_files / 2).clamp(*MERGE_BYTES.start(), *MERGE_BYTES.end()) {
+        let unmerged_bytes: usize = self.unmerged.iter().chain(&self.new_constants).map(Vec::len).sum();
+        if unmerged_bytes >= (self.bytes_in_files / 2).clamp(*MERGE_BYTES.start(), *MERGE_BYTES.end()) {
             self.merge_journal()?;
             if let Some(journal) = self.journal.as_mut() {
                 journal.clear()?;
@@ -322,7 +324,7 @@ pub(crate) fn lock_folder(folder: &Path) -> Result<File> {
     }
 }
 
-/// Removes a dataset. It is renamed first, so that it never exists in part.
+/// Removes a dataset. Renames the folder first, so that no partly removed dataset exists under the original name.
 pub(crate) fn remove_dataset(folder: &Path) -> Result<()> {
     let _lock = lock_folder(folder)?;
     let mut aside = folder.as_os_str().to_owned();

@@ -11,8 +11,8 @@
 //! lossless codec. Names ending in `.png` are read as well.
 //!
 //! The images of an episode are written before its numeric columns are committed, without syncing each file. A killed
-//! process loses nothing that was committed; a power failure may lose images of the last seconds, and reading reports
-//! them as missing.
+//! process loses no committed episode. A power failure may lose images of the last seconds; readers report these images
+//! as missing.
 
 mod reader;
 mod writer;
@@ -48,7 +48,7 @@ fn image_path(folder: &Path, column: &str, episode: usize, step: usize, suffix: 
     folder.join(column).join(format!("ep_{episode}_step_{step}.{suffix}"))
 }
 
-/// The episode of an image file, by its name.
+/// The episode index in the name of an image file.
 fn episode_of(name: &str) -> Option<usize> {
     let (episode, _) = name.strip_prefix("ep_")?.split_once("_step_")?;
     episode.parse().ok()

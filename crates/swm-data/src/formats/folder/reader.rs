@@ -101,8 +101,8 @@ impl Reader for FolderReader {
     }
 }
 
-/// The image columns of a third-party folder: its subfolders, by name. The first image determines the
-/// size of all.
+/// The image columns of a third-party folder: its subfolders, by name. The first image of a subfolder determines the
+/// image size.
 fn infer_image_columns(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
     let folder = files.folder();
     let Some(first) = files.rows().episodes().iter().position(|episode| episode.length > 0) else { return Ok(vec![]) };

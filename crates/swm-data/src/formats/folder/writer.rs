@@ -49,14 +49,14 @@ struct FolderWriter {
 impl Writer for FolderWriter {
     fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
         episodes::check_episode(episode, &self.schema)?;
-        let index_of_episode = self.columns.episodes();
+        let episode_index = self.columns.episodes();
         for (index, column) in self.schema.columns().iter().enumerate().filter(|(_, column)| column.is_image()) {
             let (height, width) = (column.shape[0], column.shape[1]);
             let frames = episode.bytes(index).par_chunks_exact(column.row_bytes());
             frames.enumerate().with_max_len(1).try_for_each_init(Vec::new, |bytes, (step, frame)| {
                 bytes.clear();
                 self.codec.encode(frame, height, width, bytes)?;
-                let path = image_path(self.columns.folder(), &column.name, index_of_episode, step, SUFFIXES[0]);
+                let path = image_path(self.columns.folder(), &column.name, episode_index, step, SUFFIXES[0]);
                 std::fs::write(&path, &*bytes).map_err(|e| Error::io(path, "writing an image", e))
             })?;
         }

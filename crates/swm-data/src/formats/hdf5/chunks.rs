@@ -8,7 +8,8 @@ use std::ops::Range;
 /// The chunks, sorted by their index in the grid of chunks.
 pub(super) struct Index {
     pub chunks: Vec<Chunk>,
-    /// The decoded last chunk if chunks hold several rows, because an active writer moves it.
+    /// Row in the grid and decoded bytes of the last chunk, if chunks hold several rows and whole rows. Cached, because
+    /// an active writer moves the last chunk.
     pub tail: Option<(u64, Vec<u8>)>,
 }
 
@@ -21,7 +22,7 @@ pub(super) struct Chunk {
     pub filter_mask: u32,
 }
 
-/// Reads and decodes a chunk into `out`. `fetched` holds its stored bytes if they were fetched already.
+/// Reads and decodes a chunk into `out`. `fetched` holds the stored bytes of the chunk if they are in memory already.
 pub(super) fn read_chunk(
     source: &Source,
     pipeline: &Pipeline,
@@ -62,8 +63,9 @@ impl Index {
 pub(super) struct Grid<'a> {
     /// Rows per chunk.
     pub rows: u64,
-    /// Other sides of a chunk, and of a row.
+    /// Sides of a chunk along the axes of a row.
     sides: &'a [usize],
+    /// Shape of a row.
     shape: &'a [usize],
     /// Number of chunks along each side.
     counts: Vec<usize>,
@@ -118,7 +120,7 @@ impl<'a> Grid<'a> {
             begin[axis] = rest % self.counts[axis] * self.sides[axis];
             rest /= self.counts[axis];
         }
-        // Copies runs along the last side, one for each combination of the other indices.
+        // Copies runs along the last axis, one run for each combination of the indices along the other axes.
         let Some((&last, outer)) = self.sides.split_last() else { return };
         let axis = outer.len();
         let run = last.min(self.shape[axis] - begin[axis]) * self.size;

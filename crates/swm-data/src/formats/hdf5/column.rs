@@ -15,10 +15,10 @@ use std::ops::Range;
 use std::sync::OnceLock;
 use swm_core::ColumnSpec;
 
-/// Larger chunks are rejected, because only damaged files declare them.
+/// Maximum size of a chunk in bytes. Only damaged files declare larger chunks.
 const MAX_CHUNK_BYTES: u64 = 128 << 20;
 
-/// Maximum index of bytes that one read of contiguous rows covers.
+/// Maximum number of bytes that one read of contiguous rows covers.
 const RUN_BYTES: u64 = 1 << 20;
 
 thread_local! {
@@ -42,18 +42,21 @@ pub(super) struct Column {
     dataset: Dataset,
     stored: StoredScalar,
     storage: Storage,
-    /// Whether this format's writer wrote it. Then no chunk may be missing.
+    /// Whether this format's writer wrote the file. If so, a missing chunk is an error.
     pub written_here: bool,
 }
 
 enum Storage {
-    /// Rows are contiguous from this address on, or never written; or they are in the dataset's header.
+    /// Rows are contiguous from this address on; `None` if no row was written.
     Contiguous(Option<u64>),
+    /// Rows are in the dataset's header.
     Compact,
+    /// Rows are divided into chunks.
     Chunked {
         pipeline: Pipeline,
-        /// Rows per chunk, and its other sides.
+        /// Rows per chunk.
         rows: u64,
+        /// Sides of a chunk along the axes of a row.
         sides: Vec<usize>,
         index: OnceLock<Result<Index, String>>,
     },
@@ -63,7 +66,7 @@ impl Column {
     /// Interprets a dataset as a column; `None` if it is not numeric.
     ///
     /// # Errors
-    /// If it is damaged, or its layout or filters are not supported.
+    /// If the dataset is damaged, or its layout or filters are not supported.
     #[allow(clippy::too_many_lines, reason = "one case per storage layout")]
     pub fn new(name: &str, dataset: Dataset, file_size: u64) -> Result<Option<Self>, String> {
         let Some(stored) = scalar_type(&catch_panic("its type", || dataset.datatype())?) else { return Ok(None) };
@@ -152,7 +155,7 @@ impl Column {
     /// Reads all rows.
     ///
     /// # Errors
-    /// If they are damaged.
+    /// If the rows are damaged.
     pub fn read_all(&self, source: &Source) -> Result<Vec<u8>, String> {
         let size = self.spec.row_bytes();
         let mut all = vec![0; self.rows as usize * size];
@@ -162,10 +165,10 @@ impl Column {
         Ok(all)
     }
 
-    /// Reads rows into their slots, which are sorted by `row_of` their keys.
+    /// Reads rows into `slots`, which are sorted by the row that `row_of` returns for their keys.
     ///
     /// # Errors
-    /// If they are damaged.
+    /// If the rows are damaged.
     pub fn read(
         &self,
         source: &Source,
@@ -342,7 +345,7 @@ impl Column {
         if chunks.windows(2).any(|pair| pair[0].index == pair[1].index) {
             return Err("two chunks have the same index".to_owned());
         }
-        // Third-party files may be sparse, but are more often damaged.
+        // Third-party files may be sparse, but a file without half of its chunks is more likely damaged.
         let expected = self.rows.div_ceil(grid.rows).saturating_mul(grid.per_row() as u64);
         let present = chunks.partition_point(|chunk| chunk.index < expected) as u64;
         if present < if self.written_here { expected } else { expected / 2 } {

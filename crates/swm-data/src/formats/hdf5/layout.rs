@@ -1,6 +1,6 @@
 //! The layout of files written here. It uses the oldest structures of HDF5 (superblock 0, object headers 1, B-trees 1),
-//! which every version of the library reads. They have no checksums, so every commit is a single in-place write of a
-//! number, and the file is valid at any time, even if the writer is killed.
+//! which every version of the library reads. They have no checksums, so a commit can change a single integer in place,
+//! and the file is valid at any time, even if the writer is killed.
 //!
 //! ```text
 //! superblock                               end of the file
@@ -26,11 +26,11 @@ pub(super) const SIGNATURE: [u8; 8] = *b"\x89HDF\r\n\x1a\n";
 pub(super) const END_AT: u64 = 40;
 /// Offset of the address of the root's B-tree in the superblock.
 const ROOT_TREE_AT: u64 = 80;
-/// Offset of the root group's header, and size of its attribute that refers to the record.
+/// Offset of the root group's header.
 pub(super) const ROOT: u64 = 96;
-/// See [`ROOT`].
+/// Name of the root group's attribute that refers to the record.
 const ATTRIBUTE: &str = "stable_worldmodel.record";
-/// Spare bytes in the root's header, so that programs that add attributes do not move that attribute.
+/// Spare bytes in the root's header, so that programs that add attributes do not move [`ATTRIBUTE`].
 const SPARE_BYTES: usize = 64;
 /// Minimum number of entries in a node of a group's B-tree; the library's default.
 const GROUP_K: u16 = 16;
@@ -61,11 +61,11 @@ pub(super) struct Table {
     pub spec: ColumnSpec,
     /// Rows per chunk.
     pub chunk_rows: usize,
-    /// Whether chunks are compressed (then each is one row) or only have a checksum.
+    /// Whether chunks are compressed and hold one row each. All chunks have a checksum.
     pub compressed: bool,
-    /// Offset of its number of rows in the file.
+    /// Offset in the file of the number of rows.
     pub rows_at: u64,
-    /// Offset of the address of its B-tree.
+    /// Offset in the file of the address of the B-tree.
     pub tree_at: u64,
 }
 
@@ -77,8 +77,8 @@ impl Table {
         Self { spec, chunk_rows, compressed, rows_at: 0, tree_at: 0 }
     }
 
-    /// A dataset whose header exists.
-    fn is_at(&mut self, at: u64) {
+    /// Sets the offsets for a dataset header at offset `at` of the file.
+    fn set_header_offset(&mut self, at: u64) {
         let before: usize = messages(self)[..3].iter().map(|(_, data)| 8 + data.len()).sum();
         self.rows_at = at + 16 + 8 + 8;
         self.tree_at = at + 16 + before as u64 + 8 + 3;
@@ -95,7 +95,7 @@ impl Table {
     }
 }
 
-/// The start of a file: everything that does not grow.
+/// The first part of a file, whose size is constant.
 pub(super) struct Layout {
     /// The bytes of a file without episodes.
     pub bytes: Vec<u8>,
@@ -153,12 +153,12 @@ impl Layout {
         let mut at = symbols + 8 + 40 * 2 * leaf_k as u64;
         let mut headers = vec![];
         for table in &mut tables {
-            // A header must not cross a 512-byte boundary where a number changes.
+            // A header must not cross a 512-byte boundary, because commits change integers in the header in place.
             let bytes = header(&messages(table));
             if at % 512 + bytes.len() as u64 > 512 {
                 at = at.next_multiple_of(512);
             }
-            table.is_at(at);
+            table.set_header_offset(at);
             headers.push((at, bytes));
             at += headers[headers.len() - 1].1.len() as u64;
         }
@@ -192,7 +192,7 @@ impl Layout {
         Self { bytes: out, tables }
     }
 
-    /// Whether a file starts with this layout, apart from numbers that change.
+    /// Whether `file` is the first part of a file with this layout, apart from integers that change.
     pub fn is_that_of(&self, file: &[u8]) -> bool {
         if file.len() != self.bytes.len() {
             return false;
@@ -235,7 +235,7 @@ pub(super) fn record(source: &Source) -> Result<Option<Table>, String> {
         return Ok(None);
     }
     let mut table = Table::new(ColumnSpec::new("", DType::U8, []));
-    table.is_at(record);
+    table.set_header_offset(record);
     Ok(Some(table))
 }
 
@@ -269,7 +269,7 @@ fn header(messages: &[Message]) -> Vec<u8> {
     for (kind, data) in messages {
         out.extend(kind.to_le_bytes());
         out.extend((data.len() as u16).to_le_bytes());
-        // Type messages are constant.
+        // The flags declare type messages as constant.
         out.extend([u8::from(*kind == message::DATATYPE), 0, 0, 0]);
         out.extend(data);
     }
@@ -278,7 +278,7 @@ fn header(messages: &[Message]) -> Vec<u8> {
 
 fn root_messages(tree: u64, heap: u64, record: u64) -> Vec<Message> {
     let group = [tree, heap].iter().flat_map(|value| value.to_le_bytes()).collect();
-    // An object reference, a scalar.
+    // The type of the attribute: an object reference.
     let reference = [0x17, 0, 0, 0, 8, 0, 0, 0];
     let mut attribute = vec![1, 0];
     for size in [ATTRIBUTE.len() + 1, reference.len(), 8] {
@@ -345,7 +345,7 @@ fn datatype(dtype: DType) -> Vec<u8> {
     };
     match dtype {
         DType::Bool => {
-            // As h5py stores booleans: FALSE and TRUE over a signed byte.
+            // An enumeration of FALSE and TRUE over a signed byte, as h5py stores booleans.
             let mut out = vec![0x18, 2, 0, 0, 1, 0, 0, 0, 0x10, 8, 0, 0, 1, 0, 0, 0, 0, 0, 8, 0];
             out.extend(b"FALSE\0\0\0TRUE\0\0\0\0\0\x01");
             out.resize(out.len().next_multiple_of(8), 0);
@@ -359,7 +359,7 @@ fn datatype(dtype: DType) -> Vec<u8> {
     }
 }
 
-/// Stored size of an uncompressed chunk, in bytes.
+/// Stored size of an uncompressed chunk in bytes, including the checksum.
 pub(super) fn summed_bytes(table: &Table) -> usize {
     table.chunk_bytes() + fletcher32::SIZE
 }

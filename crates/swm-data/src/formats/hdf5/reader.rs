@@ -1,4 +1,4 @@
-//! Reads episodes.
+//! Reads the episodes of an HDF5 file.
 
 use super::column::Column;
 use super::layout::{self, LENGTHS, OFFSETS};
@@ -104,7 +104,7 @@ impl Hdf5Reader {
         &self.rows
     }
 
-    /// The record stored beside the columns.
+    /// The metadata that this format's writer stored in the file.
     pub const fn record(&self) -> &Record {
         &self.record
     }

@@ -43,7 +43,7 @@ impl Record {
     /// ignored.
     ///
     /// # Errors
-    /// If it is damaged.
+    /// If the record is damaged.
     pub fn parse(bytes: Vec<u8>, episodes: usize) -> Result<Self, String> {
         let mut record = Self::default();
         let mut at = 0;

@@ -16,7 +16,7 @@ const BLOCK: u64 = 256 << 10;
 /// Maximum number of cached blocks of a remote file.
 const CACHED_BLOCKS: usize = 256;
 
-/// A readable file. Clones share it.
+/// A readable file. Clones share the open file.
 #[derive(Clone)]
 pub(super) struct Source(Arc<Kind>);
 
@@ -60,7 +60,7 @@ impl Source {
         Ok(Self(Arc::new(Kind::Local { file, path: path.to_owned(), len })))
     }
 
-    /// The file in error messages.
+    /// The path or address of the file, for error messages.
     pub fn label(&self) -> &Path {
         match &*self.0 {
             Kind::Local { path, .. } => path,
@@ -76,7 +76,7 @@ impl Source {
         }
     }
 
-    /// Whether many requests should run concurrently, because each takes long.
+    /// Whether the file is in an object store. Requests to a store take long and should run concurrently.
     pub fn is_remote(&self) -> bool {
         matches!(&*self.0, Kind::Remote { .. })
     }

@@ -1,4 +1,4 @@
-//! Functions of `hdf5-pure` with caught panics; the crate reads the structure of a file.
+//! Calls of the crate `hdf5-pure`, which reads the structure of a file. Panics of the crate become errors.
 
 use crate::formats::stored_scalar::{Class, StoredScalar};
 use hdf5_pure::{Datatype, DatatypeByteOrder, FloatingPointLayout};

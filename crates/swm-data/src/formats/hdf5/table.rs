@@ -54,8 +54,9 @@ pub(super) struct TableWriter {
     pub table: Table,
     rows: u64,
     tree: Tree,
-    /// Rows of the incomplete chunk, and how many of its bytes are stored.
+    /// Rows of the incomplete chunk.
     open: Vec<u8>,
+    /// Number of bytes of `open` that the file contains.
     stored: usize,
     /// Addresses of previous versions of incomplete chunks, which may be overwritten.
     free: Vec<u64>,
@@ -82,10 +83,10 @@ impl TableWriter {
         }
     }
 
-    /// Continues after the first `rows` rows.
+    /// Continues a dataset after its first `rows` rows.
     ///
     /// # Errors
-    /// If they are damaged.
+    /// If the dataset is damaged.
     pub fn load(table: Table, source: &Source, rows: u64) -> Result<Self, String> {
         let tree = Tree::load(&table, source, rows)?;
         let mut writer = Self { rows, tree, ..Self::new(table) };
@@ -182,12 +183,12 @@ impl TableWriter {
         self.tree.write_new(file)
     }
 
-    /// Updates the B-tree.
+    /// Updates the B-tree in the file.
     pub fn write_changes(&mut self, file: &File) -> io::Result<()> {
         self.tree.write_changes(file)
     }
 
-    /// Updates the number of rows.
+    /// Updates the number of rows in the file.
     pub fn write_rows(&mut self, file: &File) -> io::Result<()> {
         file.write_all_at(&self.rows.to_le_bytes(), self.table.rows_at)?;
         self.free.append(&mut self.free_after_commit);
@@ -198,7 +199,7 @@ impl TableWriter {
 /// Reads all rows of an uncompressed dataset that [`TableWriter`] wrote.
 ///
 /// # Errors
-/// If it is damaged.
+/// If the dataset is damaged.
 pub(super) fn read_all(table: &Table, source: &Source) -> Result<Vec<u8>, String> {
     let rows = read_u64(source, table.rows_at)?;
     let size = table.spec.row_bytes();

@@ -24,7 +24,7 @@ pub(super) struct Entry {
     pub address: u64,
 }
 
-/// A node on the right edge, or one that was completed since the last commit.
+/// A node on the right edge, or a node that was completed since the last commit.
 struct Node {
     address: u64,
     level: u8,
@@ -61,7 +61,7 @@ impl Tree {
     /// Loads the right edge of a tree, up to the chunks before row `rows`.
     ///
     /// # Errors
-    /// If it is damaged.
+    /// If the tree is damaged.
     pub fn load(table: &Table, source: &Source, rows: u64) -> Result<Self, String> {
         let mut tree = Self::new(table);
         tree.root = read_u64(source, tree.root_at)?;
@@ -177,13 +177,13 @@ impl Tree {
     /// All chunks of a tree in a file.
     ///
     /// # Errors
-    /// If it is damaged.
+    /// If the tree is damaged.
     pub fn chunks(table: &Table, source: &Source) -> Result<Vec<Entry>, String> {
         let tree = Self::new(table);
         let root = read_u64(source, tree.root_at)?;
         let mut chunks = vec![];
-        let mut waiting = if root == UNDEFINED { vec![] } else { vec![(root, u8::MAX)] };
-        while let Some((address, above)) = waiting.pop() {
+        let mut pending = if root == UNDEFINED { vec![] } else { vec![(root, u8::MAX)] };
+        while let Some((address, above)) = pending.pop() {
             let node = tree.read(source, address)?;
             if node.level >= above {
                 return Err("its nodes form a cycle".to_owned());
@@ -191,7 +191,7 @@ impl Tree {
             if node.level == 0 {
                 chunks.extend(node.entries);
             } else {
-                waiting.extend(node.entries.iter().rev().map(|entry| (entry.address, node.level)));
+                pending.extend(node.entries.iter().rev().map(|entry| (entry.address, node.level)));
             }
         }
         Ok(chunks)
@@ -266,7 +266,7 @@ impl Node {
     }
 }
 
-/// Reads a 64-bit integer of a file.
+/// Reads a 64-bit integer at an offset of a file.
 pub(super) fn read_u64(source: &Source, at: u64) -> Result<u64, String> {
     let mut bytes = [0; 8];
     source.read(at, &mut bytes).map_err(|e| e.to_string())?;

@@ -27,7 +27,7 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
         }
     }
     let manifest = options.manifest.as_ref();
-    let mut writer = match (options.mode, is_there(path)?) {
+    let mut writer = match (options.mode, is_complete_file(path)?) {
         (_, false) => Hdf5Writer::begin(path, lock(path)?, schema, manifest)?,
         (WriteMode::Create, true) => {
             let problem = format!("{} exists already", path.display());
@@ -65,7 +65,7 @@ pub(super) fn create(location: &Location, schema: &Schema, options: WriteOptions
 }
 
 /// Whether a complete file exists.
-fn is_there(path: &Path) -> Result<bool> {
+fn is_complete_file(path: &Path) -> Result<bool> {
     let mut start = [0; SIGNATURE.len()];
     match File::open(path) {
         Ok(file) => {
@@ -102,14 +102,14 @@ fn temporary_path(path: &Path) -> PathBuf {
     path.with_file_name(name)
 }
 
-/// Replaces a file by a complete new one.
+/// Replaces the file at `path` with the complete file at `temporary`.
 fn replace_file(mut writer: Hdf5Writer, temporary: &Path, path: &Path) -> Result<Hdf5Writer> {
     std::fs::rename(temporary, path).map_err(|e| Error::io(path, "replacing the file", e))?;
     writer.path = path.to_owned();
     Ok(writer)
 }
 
-/// Copies a file with another layout to this layout and replaces it.
+/// Copies a file with another layout to a file with this layout, which replaces it.
 fn copied(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
     if let [name, ..] = reader.left_out() {
         let problem = format!("its dataset '{name}' is not numeric and cannot be appended to");
@@ -128,7 +128,7 @@ fn copied(path: &Path, reader: &Hdf5Reader) -> Result<Hdf5Writer> {
         replace_file(writer, &temporary, path)
     };
     copy().inspect_err(|_| {
-        // The file is not referenced yet.
+        // Nothing refers to the temporary file yet.
         let _ = std::fs::remove_file(&temporary);
     })
 }
@@ -143,8 +143,9 @@ struct Hdf5Writer {
     schema: Schema,
     policy: CommitPolicy,
     last_commit: Instant,
-    /// End of the file at the last commit, and the episodes since then.
+    /// End of the file at the last commit.
     committed_end: u64,
+    /// Number of episodes since the last commit.
     in_group: usize,
     /// Whether episodes were added since the file was last closed.
     unclosed: bool,
@@ -250,7 +251,7 @@ impl Hdf5Writer {
         let first = self.rows.total();
         let too_many = || Error::mismatch("writing an episode", "more than 2^31 - 1 rows", "fewer");
         let length = i32::try_from(episode.rows()).map_err(|_| too_many())?;
-        // Stays set if a write fails, because incomplete data must not be committed.
+        // Remains `true` if a write fails, because incomplete data must not be committed.
         self.failed = true;
         self.rows.push(episode.rows());
         for at in COLUMNS..self.tables.len() {
@@ -298,14 +299,14 @@ impl Hdf5Writer {
             table.write_changes(file)?;
         }
         file.sync_data()?;
-        // Lengths of the episodes last.
+        // Writes the lengths of the episodes last.
         for at in (COLUMNS..tables.len()).chain([RECORD, OFFSETS, LENGTHS]) {
             tables[at].write_rows(file)?;
         }
         file.sync_data()
     }
 
-    /// Commits the rest and marks the file as complete.
+    /// Commits the remaining episodes and marks the file as complete.
     fn close(&mut self) -> Result<()> {
         if self.in_group == 0 && !self.unclosed {
             return Ok(());
@@ -317,7 +318,7 @@ impl Hdf5Writer {
         Ok(())
     }
 
-    fn lost() -> Error {
+    fn earlier_failure() -> Error {
         Error::external("writing an episode", "an earlier write failed; later episodes are not stored")
     }
 }
@@ -326,7 +327,7 @@ impl Writer for Hdf5Writer {
     fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
         episodes::check_episode(episode, &self.schema)?;
         if self.failed {
-            return Err(Self::lost());
+            return Err(Self::earlier_failure());
         }
         self.append(episode, constants)?;
         let due = self.in_group >= self.policy.episodes
@@ -341,7 +342,7 @@ impl Writer for Hdf5Writer {
 
     fn finish(mut self: Box<Self>) -> Result<()> {
         if self.failed {
-            return Err(Self::lost());
+            return Err(Self::earlier_failure());
         }
         self.close()
     }
@@ -363,9 +364,9 @@ mod tests {
     use swm_core::{ColumnSpec, DType};
 
     #[test]
-    fn names_that_cannot_be_stored_are_refused() {
+    fn rejects_invalid_column_names() {
         for name in ["ep_len", "a/b", "."] {
-            let error = Layout::new(&[ColumnSpec::new(name, DType::U8, [])]).err().expect("refused");
+            let error = Layout::new(&[ColumnSpec::new(name, DType::U8, [])]).err().expect("an error");
             assert!(error.to_string().contains(name), "{error}");
         }
     }

@@ -8,7 +8,7 @@
 //! ignore both.
 //!
 //! A table is a local folder or a prefix in an object store. Each version is one object that is created only if no
-//! object of that name exists, so of two concurrent commits one fails and is retried. Readers need nothing but the
+//! object of that name exists, so of two concurrent commits one fails and is retried. Readers need access only to the
 //! store. Several machines write one dataset with [`create_shard`].
 
 mod convert;

@@ -160,7 +160,7 @@ mod tests {
         record.push(3, "none".to_owned(), &Constants::new());
         assert_eq!(record.sizes, [7000, 5]);
         let (stored, values) = record.encode().expect("encodes");
-        let values = values.expect("some");
+        let values = values.expect("the values of constants");
         let back = Record::decode(&stored).expect("decodes");
         assert_eq!(back.episodes, record.episodes);
         assert_eq!(back.constants(0, &values), Ok(constants(&scene)));

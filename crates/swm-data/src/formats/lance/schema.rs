@@ -223,7 +223,7 @@ pub fn columns_to_read(
                     DataType::FixedSizeList(item, n) => (item.data_type(), vec![usize::try_from(*n).unwrap_or(0)]),
                     scalar => (scalar, vec![]),
                 };
-                let Some(dtype) = number_type(item) else { continue };
+                let Some(dtype) = column_dtype(item) else { continue };
                 match known {
                     Some(spec) if !spec.is_image() && spec.len() == shape.iter().product::<usize>() => {
                         (spec.clone(), Kind::Values(Precision::of(dtype)))
@@ -249,7 +249,7 @@ pub fn columns_to_read(
 }
 
 /// The narrowest column type that holds Arrow's values without loss.
-fn number_type(data_type: &DataType) -> Option<DType> {
+fn column_dtype(data_type: &DataType) -> Option<DType> {
     Some(match data_type {
         DataType::Boolean => DType::Bool,
         DataType::UInt8 => DType::U8,
@@ -266,14 +266,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn columns_that_would_collide_are_refused() {
+    fn rejects_columns_with_the_same_stored_name() {
         let schema = |names: &[&str]| {
             let specs: Vec<ColumnSpec> = names.iter().map(|n| ColumnSpec::new(*n, DType::Float32, [])).collect();
             columns_to_write(&Schema::new(specs).expect("schema"))
         };
-        let names: Vec<String> = schema(&["a.b", "step_idx", "c"]).expect("fine").into_iter().map(|c| c.name).collect();
+        let names: Vec<String> =
+            schema(&["a.b", "step_idx", "c"]).expect("columns").into_iter().map(|c| c.name).collect();
         assert_eq!(names, ["a_b", "c"]);
-        assert!(schema(&["a.b", "a_b"]).expect_err("collide").to_string().contains("'a.b' and 'a_b'"));
-        assert!(schema(&["step_idx"]).expect_err("nothing left").to_string().contains("no columns"));
+        assert!(schema(&["a.b", "a_b"]).expect_err("equal names").to_string().contains("'a.b' and 'a_b'"));
+        assert!(schema(&["step_idx"]).expect_err("no columns").to_string().contains("no columns"));
     }
 }

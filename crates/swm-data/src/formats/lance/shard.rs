@@ -71,7 +71,7 @@ struct ShardEnd {
 /// new or contain episodes.
 ///
 /// # Errors
-/// If the shard exists and must not, its columns differ from the dataset's, or writing fails.
+/// If the shard exists and `options.mode` forbids it, its columns differ from the dataset's, or writing fails.
 pub fn create_shard(
     location: &Location,
     schema: &Schema,
@@ -117,7 +117,7 @@ pub fn create_shard(
 
 /// The log of the shard that this process writes.
 pub struct ShardLog {
-    /// Writes the data files; this shard does not commit to it.
+    /// Writes the data files. A shard does not commit versions of the table.
     pub table: Table,
     folder: String,
     groups: usize,
@@ -162,9 +162,9 @@ impl Logs {
     fn read(store: &Store) -> Result<Self> {
         let mut log = Self::default();
         for file in store.list("_shards")? {
-            let mut shards =
+            let mut components =
                 file.location.parts().map(|component| component.as_ref().to_owned()).collect::<Vec<_>>().into_iter();
-            let (Some(name), Some(folder)) = (shards.next_back(), shards.next_back()) else { continue };
+            let (Some(name), Some(folder)) = (components.next_back(), components.next_back()) else { continue };
             let Some(shard) = Shard::parse(&folder) else { continue };
             let shard_log = log.shards.entry((shard.count, shard.index)).or_default();
             match name.as_str() {
@@ -177,8 +177,9 @@ impl Logs {
         Ok(log)
     }
 
-    /// Removes the logs of committed shards, in case a commit was killed before it did. All shards are committed
-    /// together, so one committed group means that all are committed. Returns whether they are.
+    /// Removes the logs of committed shards, in case a commit was killed before it removed them. All shards are
+    /// committed together, so one committed group means that all shards are committed. Returns whether the shards are
+    /// committed.
     fn remove_committed(&self, store: &Store, version: &Version) -> bool {
         let fragments = version.manifest.fragments.iter();
         let known: Vec<&str> = fragments.flat_map(|fragment| &fragment.files).map(|file| file.path.as_str()).collect();

@@ -51,7 +51,7 @@ pub fn damaged(path: &Path, problem: impl Into<String>) -> Error {
 }
 
 /// Converts Lance's errors: errors of the operating system become [`Error::Io`], errors of a remote store keep their
-/// message, and all others mean that files are damaged.
+/// message, and all other errors mean that files are damaged.
 fn lance_error(label: &Path, action: &str, error: &lance_core::Error) -> Error {
     let text = error.to_string();
     // Lance converts some system errors to text, which still contains their code.
@@ -71,7 +71,7 @@ fn lance_error(label: &Path, action: &str, error: &lance_core::Error) -> Error {
     }
 }
 
-/// Folders that a table killed before its first commit may leave.
+/// Folders that may exist if a writer was killed before the first commit of a table.
 const FOLDERS: [&str; 4] = ["_versions", "_transactions", "_shards", "data"];
 
 /// Whether a location is a Lance table: its name ends in `.lance`, or it is a folder that contains such a table.
@@ -146,8 +146,8 @@ impl Store {
             return Ok(Self { label, remote: false, lists: true, base, objects });
         };
         let lists = !url.scheme().starts_with("http");
-        // This build does not include Lance's own stores, so it passes one in. The scheme only has to be one that Lance
-        // knows.
+        // This build does not include Lance's own stores, so it passes its store to Lance. The scheme can be any that
+        // Lance supports.
         let scheme = Url::parse("memory:///").map_err(|e| Error::external("opening an object store", e))?;
         let objects = ObjectStore::new(store, scheme, Some(BLOCK), None, false, lists, REQUESTS, RETRIES, None);
         Ok(Self { label: location.label(), remote: true, lists, base, objects: Arc::new(objects) })
@@ -284,7 +284,7 @@ impl Store {
     }
 
     /// Whether the newest version contains the appended fragments. Because old versions are deleted, a late commit may
-    /// reuse the number of a version that others already replaced.
+    /// reuse the number of a version that other writers already replaced.
     async fn contains(&self, version: u64, appended: &[Fragment]) -> lance_core::Result<bool> {
         let newest = self.latest_location().await?;
         if newest.version == version || appended.is_empty() {
@@ -376,11 +376,11 @@ impl Store {
     }
 }
 
-/// Bytes that Lance reads at once from an object, maximum number of concurrent requests, and number of retries.
+/// Number of bytes that Lance reads at once from an object.
 const BLOCK: usize = 64 << 10;
-/// See [`BLOCK`].
+/// Maximum number of concurrent requests of Lance.
 const REQUESTS: usize = 64;
-/// See [`BLOCK`].
+/// Number of retries of a failed download.
 const RETRIES: usize = 3;
 
 /// Tag followed by a BLAKE3 hash of all other bytes of a manifest's file. It is stored before Lance's message, whose
@@ -425,7 +425,7 @@ fn with_checksum(plain: &[u8]) -> lance_core::Result<Vec<u8>> {
     Ok([before, CHECKSUM_TAG, hash.as_bytes(), &after].concat())
 }
 
-/// Verifies the checksum of a manifest's file if it has one. Manifests of other writers do not.
+/// Verifies the checksum of a manifest's file, if there is one. Manifests of other writers have no checksum.
 fn verify_checksum(file: &[u8]) -> lance_core::Result<()> {
     let start = message_start(file)?;
     let Some(checksum) = start.checked_sub(CHECKSUM_LEN).filter(|&checksum| file[checksum..].starts_with(CHECKSUM_TAG))
@@ -477,7 +477,7 @@ mod tests {
     fn checksum_detects_flipped_bits() {
         let plain = [&b"transaction"[..], &7_u32.to_le_bytes(), b"message", &11_u64.to_le_bytes(), b"\0\0\x02\0LANC"];
         let plain = plain.concat();
-        assert!(verify_checksum(&plain).is_ok(), "other writers store none");
+        assert!(verify_checksum(&plain).is_ok(), "a manifest of another writer has no checksum");
         let intact = with_checksum(&plain).expect("adds a checksum");
         assert_eq!(&intact[message_start(&intact).expect("a message")..][4..11], b"message");
         assert!(verify_checksum(&intact).is_ok());

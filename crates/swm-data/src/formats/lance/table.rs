@@ -26,8 +26,8 @@ use swm_core::{Error, Result};
 /// The file format of new tables; the reference uses the same.
 const FILE_VERSION: ConcreteFileVersion = ConcreteFileVersion::V2_2;
 
-/// Versions of this writer that are retained for readers that have just opened one. Every version lists all fragments,
-/// so retaining all versions would take space quadratic in the number of commits.
+/// Number of versions of this writer that are retained, for readers that have just opened one of them. Every version
+/// lists all fragments, so retaining all versions would take space quadratic in the number of commits.
 const RETAINED_VERSIONS: usize = 8;
 
 /// The key in a data file's metadata that makes every file unique.
@@ -168,8 +168,8 @@ impl Table {
         let arrow = Arc::new(ArrowSchema::from(&fields));
         let batches: Result<Vec<RecordBatch>> = (first..)
             .zip(rows)
-            .map(|(number, &rows)| {
-                let batch = RecordBatch::try_new(Arc::clone(&arrow), vec![episode_indices(number, rows as usize)?]);
+            .map(|(index, &rows)| {
+                let batch = RecordBatch::try_new(Arc::clone(&arrow), vec![episode_indices(index, rows as usize)?]);
                 batch.map_err(|e| Error::external("numbering episodes", e))
             })
             .collect();
@@ -192,14 +192,14 @@ impl Table {
                 writer.write_batch(batch).await?;
             }
             if let Some((episodes, constants)) = record {
-                let number = writer.add_global_buffer(episodes).await?;
-                writer.add_schema_metadata(EPISODES_KEY, number.to_string());
+                let buffer = writer.add_global_buffer(episodes).await?;
+                writer.add_schema_metadata(EPISODES_KEY, buffer.to_string());
                 if let Some(constants) = constants {
-                    let number = writer.add_global_buffer(constants).await?;
-                    writer.add_schema_metadata(CONSTANTS_KEY, number.to_string());
+                    let buffer = writer.add_global_buffer(constants).await?;
+                    writer.add_schema_metadata(CONSTANTS_KEY, buffer.to_string());
                 }
             }
-            // A unique key, so that two writers never produce the same file and one cannot remove the other's.
+            // A unique value: two writers never produce files with the same name, so no writer removes another's file.
             writer.add_schema_metadata(MADE_KEY, uuid::Uuid::new_v4().simple().to_string());
             writer.finish().await?;
             let indices = writer.field_id_to_column_indices().iter().copied();
@@ -232,9 +232,9 @@ impl Table {
 }
 
 /// An `episode_idx` column: the same value in every row.
-fn episode_indices(number: i64, rows: usize) -> Result<ArrayRef> {
-    let Ok(number) = i32::try_from(number) else {
+fn episode_indices(index: i64, rows: usize) -> Result<ArrayRef> {
+    let Ok(index) = i32::try_from(index) else {
         return Err(Error::mismatch("writing an episode", "2^31 or more episodes", "fewer episodes"));
     };
-    Ok(Arc::new(Int32Array::from(vec![number; rows])))
+    Ok(Arc::new(Int32Array::from(vec![index; rows])))
 }

@@ -40,8 +40,8 @@ pub fn create(location: &Location, schema: &Schema, options: WriteOptions) -> Re
     for _ in 0..MAX_ATTEMPTS {
         // If another process creates, continues or replaces the table in between, the next attempt starts from the new
         // state.
-        if let Some(begun) = prepare(&store, schema, &options)? {
-            return begun.start(schema, &options);
+        if let Some(prepared) = prepare(&store, schema, &options)? {
+            return prepared.start(schema, &options);
         }
     }
     Err(too_many_conflicts(&store.label))

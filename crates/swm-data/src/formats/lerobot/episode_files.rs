@@ -17,7 +17,7 @@ pub(super) struct EpisodeFiles {
     pub videos: Vec<(PathBuf, f64)>,
     pub length: usize,
     pub constants: Option<String>,
-    /// Index of its files, counted over all chunks.
+    /// Index of the episode's files, counted over all chunks.
     pub file: usize,
 }
 
@@ -69,10 +69,10 @@ fn episode_files_v2(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
     Ok(files_of_episodes)
 }
 
-fn video_file(root: &Path, info: &Info, key: &str, numbers: &[(&str, usize)]) -> Result<PathBuf> {
+fn video_file(root: &Path, info: &Info, key: &str, indices: &[(&str, usize)]) -> Result<PathBuf> {
     let template = info.video_path.as_deref();
     let template = template.ok_or_else(|| damaged(root, "meta/info.json has no video_path".to_owned()))?;
-    info.file(root, template, key, numbers)
+    info.file(root, template, key, indices)
 }
 
 /// The episodes of version 3.0, which has one row per episode.
@@ -108,17 +108,17 @@ fn episode_files_v3(root: &Path, info: &Info) -> Result<Vec<EpisodeFiles>> {
         let (chunk, file) = (column_values("data/chunk_index")?, column_values("data/file_index")?);
         let mut videos = vec![];
         for key in &keys {
-            let mut begins = vec![];
+            let mut start_times = vec![];
             for batch in &batches {
                 let column = batch.column_by_name(&named(key, "from_timestamp"));
                 let column = column.and_then(|array| array.as_primitive_opt::<Float64Type>());
                 let column = column.ok_or_else(|| damaged(path, format!("it has no start times of '{key}'")))?;
-                begins.extend_from_slice(column.values());
+                start_times.extend_from_slice(column.values());
             }
             videos.push((
                 column_values(&named(key, "chunk_index"))?,
                 column_values(&named(key, "file_index"))?,
-                begins,
+                start_times,
             ));
         }
         let (mut tasks, mut constants) = (vec![], vec![]);

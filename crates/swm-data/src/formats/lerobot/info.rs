@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use swm_core::columns::{PIXELS, PROPRIO, STATE};
 use swm_core::{ColumnSpec, DType, Error, Manifest, Result, Schema};
 
-/// The version that is written.
+/// The LeRobot version of written datasets.
 pub const VERSION: &str = "v3.0";
 
 /// Path templates of version 3.0.
@@ -132,7 +132,7 @@ pub struct Column {
 }
 
 impl Info {
-    /// Reads the file of a dataset.
+    /// Reads `meta/info.json` of a dataset.
     ///
     /// # Errors
     /// If it is missing or damaged, or its version is not supported.
@@ -191,7 +191,7 @@ impl Info {
                 videos += usize::from(feature.dtype == "video");
                 (ColumnSpec::image(name, height, width), kind)
             } else {
-                let Some(dtype) = feature.number() else { continue };
+                let Some(dtype) = feature.column_dtype() else { continue };
                 let name = if native == "observation.state" { PROPRIO } else { native };
                 let shape = if feature.shape == [1] { vec![] } else { feature.shape.clone() };
                 (ColumnSpec::new(name, dtype, shape), Kind::Values)
@@ -202,29 +202,29 @@ impl Info {
                 _ if self.stable_worldmodel.is_some() => continue,
                 _ => spec,
             };
-            let counts = native == "episode_index" || native == "frame_index";
-            let absurd =
+            let is_index = native == "episode_index" || native == "frame_index";
+            let too_large =
                 spec.shape.iter().try_fold(1_usize, |n, &side| n.checked_mul(side)).is_none_or(|n| n > 1 << 28);
-            if absurd {
+            if too_large {
                 return Err(damaged(root, format!("the feature '{native}' has the shape {:?}", feature.shape)));
             }
-            if !counts && !spec.is_empty() {
+            if !is_index && !spec.is_empty() {
                 columns.push(Column { spec, native: native.clone(), kind });
             }
         }
         if let Some(recorded) = &self.stable_worldmodel {
-            let place = |column: &Column| recorded.schema.find(&column.spec.name);
-            columns.sort_by_key(place);
+            let position = |column: &Column| recorded.schema.find(&column.spec.name);
+            columns.sort_by_key(position);
         }
         Ok(columns)
     }
 
-    /// The path of a file: its template with the values filled in.
+    /// The path of a file: `template` with the key and the indices filled in.
     ///
     /// # Errors
     /// If the path leaves the dataset's folder.
-    pub fn file(&self, root: &Path, template: &str, key: &str, numbers: &[(&str, usize)]) -> Result<PathBuf> {
-        let name = fill(template, key, numbers);
+    pub fn file(&self, root: &Path, template: &str, key: &str, indices: &[(&str, usize)]) -> Result<PathBuf> {
+        let name = fill(template, key, indices);
         let inside = Path::new(&name).components().all(|part| matches!(part, std::path::Component::Normal(_)));
         if inside { Ok(root.join(name)) } else { Err(damaged(root, format!("'{name}' is outside of it"))) }
     }
@@ -245,7 +245,7 @@ impl Feature {
     }
 
     /// The column type that holds the feature's values without loss.
-    fn number(&self) -> Option<DType> {
+    fn column_dtype(&self) -> Option<DType> {
         Some(match self.dtype.as_str() {
             "bool" => DType::Bool,
             "uint8" => DType::U8,
@@ -273,8 +273,8 @@ pub fn damaged(path: &Path, problem: String) -> Error {
     Error::corrupt(path, problem, "restore it from a copy, or rebuild the dataset")
 }
 
-/// Fills the key and values into a template in Python's notation.
-pub fn fill(template: &str, key: &str, numbers: &[(&str, usize)]) -> String {
+/// Fills a key and indices into a path template in Python's format notation.
+pub fn fill(template: &str, key: &str, indices: &[(&str, usize)]) -> String {
     let mut filled = String::new();
     let mut rest = template;
     while let Some((before, after)) = rest.split_once('{') {
@@ -283,10 +283,10 @@ pub fn fill(template: &str, key: &str, numbers: &[(&str, usize)]) -> String {
         let (name, form) = field.split_once(':').unwrap_or((field, ""));
         if name == "video_key" || name == "image_key" {
             filled.push_str(key);
-        } else if let Some((_, number)) = numbers.iter().find(|(known, _)| *known == name) {
+        } else if let Some((_, index)) = indices.iter().find(|(known, _)| *known == name) {
             // A format such as `03d`.
             let width = form.trim_end_matches('d').trim_start_matches('0').parse::<usize>().unwrap_or(0).min(20);
-            filled.push_str(&format!("{number:0width$}"));
+            filled.push_str(&format!("{index:0width$}"));
         }
         rest = after;
     }
@@ -299,12 +299,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn templates_are_filled() {
-        let numbers = [("chunk_index", 2), ("file_index", 1234)];
+    fn fills_path_templates() {
+        let indices = [("chunk_index", 2), ("file_index", 1234)];
         assert_eq!(
-            fill(VIDEO_PATH, "observation.images.top", &numbers),
+            fill(VIDEO_PATH, "observation.images.top", &indices),
             "videos/observation.images.top/chunk-002/file-1234.mp4"
         );
-        assert_eq!(fill("a{unknown}b{", "", &numbers), "ab");
+        assert_eq!(fill("a{unknown}b{", "", &indices), "ab");
     }
 }

@@ -53,9 +53,10 @@ impl LerobotReader {
         let fps = info.fps().unwrap_or(1.0);
         let mut columns = info.columns(root)?;
         // Datasets written here may have columns with these names.
-        let bookkeeping = |column: &Column| info.stable_worldmodel.is_none() && ROW_COUNTERS.contains(&&*column.native);
-        columns.sort_by_key(bookkeeping);
-        let visible = 2 + columns.iter().filter(|column| !bookkeeping(column)).count();
+        let is_row_counter =
+            |column: &Column| info.stable_worldmodel.is_none() && ROW_COUNTERS.contains(&&*column.native);
+        columns.sort_by_key(is_row_counter);
+        let visible = 2 + columns.iter().filter(|column| !is_row_counter(column)).count();
         let files_of_episodes = EpisodeFiles::read(root, &info)?;
         let mut rows = EpisodeRows::default();
         files_of_episodes.iter().for_each(|files| rows.push(files.length));
@@ -135,7 +136,7 @@ impl LerobotReader {
             for (&first, episode) in self.rows.first_rows().iter().zip(self.rows.episodes()) {
                 // The offset fits, because all rows are in memory.
                 let last = (first as usize + episode.length) * size;
-                missing(column.spec.dtype, &mut data[last - size..last]);
+                set_missing(column.spec.dtype, &mut data[last - size..last]);
             }
         }
         Ok(self.data[index].get_or_init(|| data))
@@ -210,7 +211,7 @@ impl LerobotReader {
     /// The frame at a time.
     fn frame(&self, video: &Video, time: f64) -> Result<usize> {
         match video.frame_at(time) {
-            Some((frame, away)) if away <= 0.25 / self.fps => Ok(frame),
+            Some((frame, distance)) if distance <= 0.25 / self.fps => Ok(frame),
             _ => Err(video.damaged(&format!("has no frame at {time:.3} s"))),
         }
     }
@@ -252,13 +253,9 @@ impl LerobotReader {
             let first = self.rows.first_rows()[self.files[file].1.start];
             let row = |(episode, step): (usize, usize)| (self.rows.first_rows()[episode] - first) as usize + step;
             let mut groups: Vec<_> = group.chunk_by_mut(|a, b| a.0 == b.0).collect();
-            let rows = groups
-                .iter()
-                .map(|files_of_episodes| row(files_of_episodes[0].0)..row(files_of_episodes[0].0) + 1)
-                .collect();
+            let rows = groups.iter().map(|same_row| row(same_row[0].0)..row(same_row[0].0) + 1).collect();
             self.each_encoded_image(&column.native, file, rows, |at, bytes| {
-                let Some(((_, first), others)) =
-                    groups.get_mut(at).and_then(|files_of_episodes| files_of_episodes.split_first_mut())
+                let Some(((_, first), others)) = groups.get_mut(at).and_then(|same_row| same_row.split_first_mut())
                 else {
                     return Ok(());
                 };
@@ -271,8 +268,8 @@ impl LerobotReader {
     }
 }
 
-/// Fills values that stand for a missing action.
-fn missing(dtype: DType, bytes: &mut [u8]) {
+/// Overwrites an action with the values of a missing action: NaN, or -1 for integers.
+fn set_missing(dtype: DType, bytes: &mut [u8]) {
     match dtype {
         DType::Float32 => bytes.as_chunks_mut::<4>().0.fill(f32::NAN.to_ne_bytes()),
         DType::Float64 => bytes.as_chunks_mut::<8>().0.fill(f64::NAN.to_ne_bytes()),
@@ -315,7 +312,7 @@ impl Reader for LerobotReader {
     }
 
     fn read(&self, columns: &[&str], ranges: &[StepRange]) -> Result<Batch> {
-        // As the default implementation, but LeRobot names are valid, too.
+        // As the default implementation, but also accepts LeRobot names.
         let spec = |name: &&str| -> Result<ColumnSpec> {
             let index = self.index(name)?;
             let known = &self.specs[index];
@@ -359,14 +356,14 @@ impl Reader for LerobotReader {
 
     fn footprint(&self) -> Result<Vec<(String, u64)>> {
         let mut parts: BTreeMap<String, u64> = BTreeMap::new();
-        let mut todo = vec![self.root.clone()];
-        while let Some(folder) = todo.pop() {
+        let mut folders = vec![self.root.clone()];
+        while let Some(folder) = folders.pop() {
             let io = |e| Error::io(&folder, "listing the folder", e);
             for entry in std::fs::read_dir(&folder).map_err(io)? {
                 let entry = entry.map_err(io)?;
                 let metadata = entry.metadata().map_err(io)?;
                 if metadata.is_dir() {
-                    todo.push(entry.path());
+                    folders.push(entry.path());
                     continue;
                 }
                 let path = entry.path();

@@ -23,18 +23,18 @@ struct Dim {
     spread: f64,
 }
 
-const NOTHING: Dim = Dim { min: f64::INFINITY, max: f64::NEG_INFINITY, mean: 0.0, spread: 0.0 };
+const EMPTY: Dim = Dim { min: f64::INFINITY, max: f64::NEG_INFINITY, mean: 0.0, spread: 0.0 };
 
 impl Stats {
     pub fn new(column: &ColumnSpec) -> Self {
         let camera = column.is_image();
-        Self { count: 0.0, dims: vec![NOTHING; if camera { 3 } else { column.len() }], camera }
+        Self { count: 0.0, dims: vec![EMPTY; if camera { 3 } else { column.len() }], camera }
     }
 
-    /// Adds rows of values, row-major; of a camera, its pixels.
+    /// Adds rows of values in row-major order; for a camera, the pixels of its frames.
     pub fn add(&mut self, values: impl Iterator<Item = f64> + Clone, rows: usize) {
         let width = self.dims.len();
-        let mut added = vec![NOTHING; width];
+        let mut added = vec![EMPTY; width];
         let mut sums = vec![(0.0, 0.0, 0.0); width];
         for (i, value) in values.enumerate() {
             let (dim, sum) = (&mut added[i % width], &mut sums[i % width]);
@@ -42,13 +42,13 @@ impl Stats {
             dim.max = dim.max.max(value);
             // Welford's algorithm.
             sum.0 += 1.0;
-            let from = value - sum.1;
-            sum.1 += from / sum.0;
-            sum.2 += from * (value - sum.1);
+            let delta = value - sum.1;
+            sum.1 += delta / sum.0;
+            sum.2 += delta * (value - sum.1);
         }
         for (dim, (n, mean, spread)) in added.iter_mut().zip(&sums) {
             dim.mean = *mean;
-            // Images have many values per channel and row.
+            // Scaled to one value per row, because images have many values per channel and row.
             dim.spread = if *n > 0.0 { spread / n * rows as f64 } else { 0.0 };
         }
         self.merge(&added, rows as f64);
@@ -60,11 +60,11 @@ impl Stats {
             return;
         }
         for (dim, other) in self.dims.iter_mut().zip(other) {
-            let apart = other.mean - dim.mean;
+            let difference = other.mean - dim.mean;
             dim.min = dim.min.min(other.min);
             dim.max = dim.max.max(other.max);
-            dim.spread += other.spread + apart * apart * self.count * count / total;
-            dim.mean += apart * count / total;
+            dim.spread += other.spread + difference * difference * self.count * count / total;
+            dim.mean += difference * count / total;
         }
         self.count = total;
     }
@@ -105,7 +105,7 @@ impl Stats {
     }
 }
 
-/// The content of the file.
+/// The content of `meta/stats.json`.
 ///
 /// # Errors
 /// If it cannot be serialised.

@@ -35,9 +35,9 @@ pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> R
         let builder = ParquetRecordBatchReaderBuilder::try_new_with_options(file, options).map_err(|e| failed(&e))?;
         let total = usize::try_from(builder.metadata().file_metadata().num_rows()).map_err(|e| failed(&e))?;
         let fields = builder.parquet_schema().root_schema().get_fields();
-        let files_of_episodes: Vec<usize> =
+        let column_indices: Vec<usize> =
             columns.iter().filter_map(|name| fields.iter().position(|field| field.name() == *name)).collect();
-        let mask = ProjectionMask::roots(builder.parquet_schema(), files_of_episodes);
+        let mask = ProjectionMask::roots(builder.parquet_schema(), column_indices);
         let mut builder = builder.with_projection(mask).with_batch_size(ROWS);
         if let Some(rows) = rows {
             if rows.last().is_some_and(|range| range.end > total) {
@@ -56,15 +56,15 @@ pub fn read(path: &Path, columns: &[&str], rows: Option<Vec<Range<usize>>>) -> R
 /// # Errors
 /// If there is no such column, or it has another type.
 pub fn integers(path: &Path, batches: &[RecordBatch], column: &str) -> Result<Vec<i64>> {
-    let mut numbers = vec![];
+    let mut integers = vec![];
     for batch in batches {
         let values = batch.column_by_name(column).and_then(|array| {
             array.as_primitive_opt::<arrow_array::types::Int64Type>().filter(|array| array.null_count() == 0)
         });
         let values = values.ok_or_else(|| damaged(path, format!("it has no integer column '{column}'")))?;
-        numbers.extend_from_slice(values.values());
+        integers.extend_from_slice(values.values());
     }
-    Ok(numbers)
+    Ok(integers)
 }
 
 /// Writes a file atomically.
@@ -81,20 +81,20 @@ pub fn write(path: &Path, schema: &Arc<ArrowSchema>, batch: &RecordBatch) -> Res
     let mut writer = ArrowWriter::try_new(&mut bytes, Arc::clone(schema), Some(properties)).map_err(failed)?;
     writer.write(batch).map_err(failed)?;
     writer.close().map_err(failed)?;
-    put(path, &bytes)
+    write_atomically(path, &bytes)
 }
 
 /// Writes a file atomically: to a temporary file that is then renamed.
 ///
 /// # Errors
 /// If writing fails.
-pub fn put(path: &Path, bytes: &[u8]) -> Result<()> {
+pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
     let io = |e| Error::io(path, "writing a file of the dataset", e);
     if let Some(folder) = path.parent() {
         std::fs::create_dir_all(folder).map_err(io)?;
     }
-    let mut passing = path.as_os_str().to_owned();
-    passing.push(".tmp");
-    std::fs::write(&passing, bytes).map_err(io)?;
-    std::fs::rename(&passing, path).map_err(io)
+    let mut temporary = path.as_os_str().to_owned();
+    temporary.push(".tmp");
+    std::fs::write(&temporary, bytes).map_err(io)?;
+    std::fs::rename(&temporary, path).map_err(io)
 }

@@ -97,7 +97,7 @@ fn put<V: Copy>(
     }
 }
 
-/// Converts the bytes of a column to an array with its field.
+/// Converts the bytes of a column to an Arrow array, and returns it with its field.
 ///
 /// # Errors
 /// If a row has more values than Arrow supports.
@@ -123,8 +123,8 @@ pub fn array(name: &str, column: &ColumnSpec, bytes: &[u8]) -> Result<(Field, Ar
 
 fn primitive<T: ArrowPrimitiveType, const N: usize>(
     bytes: &[u8],
-    number: impl Fn([u8; N]) -> T::Native,
+    convert: impl Fn([u8; N]) -> T::Native,
 ) -> PrimitiveArray<T> {
-    let values: Vec<T::Native> = bytes.as_chunks::<N>().0.iter().map(|&chunk| number(chunk)).collect();
+    let values: Vec<T::Native> = bytes.as_chunks::<N>().0.iter().map(|&chunk| convert(chunk)).collect();
     PrimitiveArray::new(ScalarBuffer::from(values), None)
 }

@@ -6,7 +6,7 @@ use super::features::{FRAMES_PER_SECOND, new_info, stored_columns};
 use super::info::{DATA_PATH, EPISODES_PATH, Info, Recorded, VIDEO_PATH, damaged, fill};
 use super::reader::{LerobotReader, Stored};
 use super::stats::{self, Stats};
-use super::table::{self, put};
+use super::table::{self, write_atomically};
 use super::{CONSTANTS, NO_TASK, TASK, values};
 use crate::dataset::Location;
 use crate::dataset::episodes;
@@ -55,7 +55,7 @@ struct LerobotWriter {
 struct Group {
     episodes: Vec<PendingEpisode>,
     /// The bytes of each numeric column.
-    numbers: Vec<Vec<u8>>,
+    column_bytes: Vec<Vec<u8>>,
     /// The video encoder of each image column.
     encoders: Vec<Option<Encoder>>,
     rows: usize,
@@ -143,22 +143,23 @@ impl LerobotWriter {
 
     /// Removes files with higher indices than the committed ones.
     fn remove_uncommitted(&self) -> Result<()> {
-        let mut todo = vec![self.root.clone()];
-        while let Some(folder) = todo.pop() {
+        let mut folders = vec![self.root.clone()];
+        while let Some(folder) = folders.pop() {
             let io = |e| Error::io(&folder, "preparing the folder", e);
             for entry in std::fs::read_dir(&folder).map_err(io)? {
                 let path = entry.map_err(io)?.path();
                 if path.is_dir() {
-                    todo.push(path);
+                    folders.push(path);
                     continue;
                 }
-                let number = |path: &Path, prefix: &str| -> Option<usize> {
+                let index_of = |path: &Path, prefix: &str| -> Option<usize> {
                     path.file_stem()?.to_str()?.strip_prefix(prefix)?.parse().ok()
                 };
-                let chunk = path.parent().and_then(|chunk| number(chunk, "chunk-"));
-                let file = chunk.zip(number(&path, "file-")).map(|(chunk, file)| chunk * self.info.chunks_size + file);
-                let passing = path.extension().is_some_and(|suffix| suffix == "tmp");
-                if passing || file.is_some_and(|file| file >= self.file) {
+                let chunk = path.parent().and_then(|chunk| index_of(chunk, "chunk-"));
+                let file =
+                    chunk.zip(index_of(&path, "file-")).map(|(chunk, file)| chunk * self.info.chunks_size + file);
+                let temporary = path.extension().is_some_and(|suffix| suffix == "tmp");
+                if temporary || file.is_some_and(|file| file >= self.file) {
                     std::fs::remove_file(&path).map_err(io)?;
                 }
             }
@@ -168,7 +169,7 @@ impl LerobotWriter {
 
     fn clear_group(&mut self) {
         self.group = Group {
-            numbers: vec![vec![]; self.columns.len()],
+            column_bytes: vec![vec![]; self.columns.len()],
             encoders: self.columns.iter().map(|_| None).collect(),
             ..Group::default()
         };
@@ -178,17 +179,17 @@ impl LerobotWriter {
         let rows = episode.rows();
         let (schema, group, encoding) = (&self.schema, &mut self.group, self.encoding);
         let frames = i64::try_from(group.rows).map_err(|e| Error::external("writing an episode", e))?;
-        let work = self.columns.par_iter().zip(&mut group.numbers).zip(&mut group.encoders).zip(&mut self.stats);
-        work.try_for_each(|((((index, _), numbers), encoder), stats)| -> Result<()> {
+        let work = self.columns.par_iter().zip(&mut group.column_bytes).zip(&mut group.encoders).zip(&mut self.stats);
+        work.try_for_each(|((((index, _), stored), encoder), stats)| -> Result<()> {
             let column = &schema.columns()[*index];
             let bytes = episode.bytes(*index);
             if !column.is_image() {
-                let start = numbers.len();
-                numbers.extend(bytes);
+                let start = stored.len();
+                stored.extend(bytes);
                 if column.name == ACTION {
-                    repeat_last(&mut numbers[start..], column.row_bytes());
+                    repeat_last(&mut stored[start..], column.row_bytes());
                 }
-                let values = read_values(column, &numbers[start..]);
+                let values = read_values(column, &stored[start..]);
                 stats.add(values.iter().copied(), rows);
                 return Ok(());
             }
@@ -196,8 +197,8 @@ impl LerobotWriter {
                 Some(encoder) => encoder,
                 none => none.insert(Encoder::new(column.shape[1], column.shape[0], FRAMES_PER_SECOND, encoding)?),
             };
-            for (number, frame) in (frames..).zip(bytes.chunks_exact(column.row_bytes())) {
-                encoder.add_frame(frame, number)?;
+            for (frame_index, frame) in (frames..).zip(bytes.chunks_exact(column.row_bytes())) {
+                encoder.add_frame(frame, frame_index)?;
             }
             stats.add(bytes.iter().map(|&v| f64::from(v)), rows);
             Ok(())
@@ -228,12 +229,12 @@ impl LerobotWriter {
             [("chunk_index", self.file / self.info.chunks_size), ("file_index", self.file % self.info.chunks_size)];
         for ((_, native), encoder) in self.columns.iter().zip(group.encoders) {
             if let Some(encoder) = encoder {
-                put(&self.root.join(fill(VIDEO_PATH, native, &indices)), &encoder.finish()?)?;
+                write_atomically(&self.root.join(fill(VIDEO_PATH, native, &indices)), &encoder.finish()?)?;
             }
         }
-        let (schema, batch) = self.data(&group.episodes, &group.numbers)?;
+        let (schema, batch) = self.data(&group.episodes, &group.column_bytes)?;
         table::write(&self.root.join(fill(DATA_PATH, "", &indices)), &schema, &batch)?;
-        let (schema, batch) = self.episodes(&group.episodes, indices.map(|(_, number)| number))?;
+        let (schema, batch) = self.episodes(&group.episodes, indices.map(|(_, index)| index))?;
         table::write(&self.root.join(fill(EPISODES_PATH, "", &indices)), &schema, &batch)?;
         self.info.total_episodes += group.episodes.len();
         self.info.total_frames += group.rows;
@@ -320,26 +321,26 @@ impl LerobotWriter {
         record(fields, arrays)
     }
 
-    /// Writes the files that describe the whole dataset. `meta/info.json` commits.
+    /// Writes the files that describe the whole dataset. Writing `meta/info.json`, the last, commits the episodes.
     fn describe(&mut self) -> Result<()> {
         let meta = self.root.join("meta");
         if self.info.total_episodes > 0 {
             let fields =
                 vec![Field::new("task_index", DataType::Int64, false), Field::new(INDEX, DataType::Utf8, false)];
-            let numbers: Int64Array = (0..self.tasks.len() as i64).collect();
+            let task_indices: Int64Array = (0..self.tasks.len() as i64).collect();
             let (schema, batch) =
-                record(fields, vec![Arc::new(numbers), Arc::new(StringArray::from(self.tasks.clone()))])?;
+                record(fields, vec![Arc::new(task_indices), Arc::new(StringArray::from(self.tasks.clone()))])?;
             let pandas = HashMap::from([("pandas".to_owned(), pandas())]);
             let schema = Arc::new(ArrowSchema::clone(&schema).with_metadata(pandas));
             let batch = batch.with_schema(Arc::clone(&schema)).map_err(|e| Error::external("writing a table", e))?;
             table::write(&meta.join("tasks.parquet"), &schema, &batch)?;
             let names = self.columns.iter().map(|(_, native)| native.as_str());
-            put(&meta.join("stats.json"), &stats::file(names.zip(&self.stats))?)?;
+            write_atomically(&meta.join("stats.json"), &stats::file(names.zip(&self.stats))?)?;
         }
         self.info.total_tasks = self.tasks.len();
         self.info.splits = BTreeMap::from([("train".to_owned(), format!("0:{}", self.info.total_episodes))]);
         let info = serde_json::to_vec_pretty(&self.info).map_err(|e| Error::external("describing the dataset", e))?;
-        put(&meta.join("info.json"), &info)
+        write_atomically(&meta.join("info.json"), &info)
     }
 
     fn complete(&mut self) -> Result<()> {
@@ -398,7 +399,7 @@ impl Drop for LerobotWriter {
 /// The column of `meta/tasks.parquet` that pandas uses as the index.
 const INDEX: &str = "__index_level_0__";
 
-/// Metadata that makes pandas use it as the index.
+/// Metadata that makes pandas use [`INDEX`] as the index.
 fn pandas() -> String {
     let column = |name: Value, field: &str, kind: &str, numpy: &str| json!({"name": name, "field_name": field, "pandas_type": kind, "numpy_type": numpy, "metadata": null});
     json!({
@@ -423,7 +424,7 @@ fn record(fields: Vec<Field>, arrays: Vec<ArrayRef>) -> Result<(Arc<ArrowSchema>
     Ok((schema, batch))
 }
 
-/// Copies the previous action into the last row, which has none; 0 if there is no previous row.
+/// Copies the previous action into the last row, which has no action. Writes 0 if there is no previous row.
 fn repeat_last(bytes: &mut [u8], row: usize) {
     let last = bytes.len() - row;
     match last.checked_sub(row) {

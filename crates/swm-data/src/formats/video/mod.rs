@@ -11,12 +11,12 @@
 //! key frame every few frames; those of the reference have one every 250.
 //!
 //! [`ImageCodec`](swm_image::ImageCodec) determines the encoding. A lossless codec becomes lossless H.264 in RGB
-//! (profile High 4:4:4 Predictive, which FFmpeg, and thus decord, PyAV and torchcodec, decode, but few browsers). JPEG
-//! with quality `q` becomes H.264 4:2:0 with the constant rate factor 8 + 2 (100 − `q`).
+//! (profile High 4:4:4 Predictive, which FFmpeg, and thus decord, PyAV and torchcodec, decode, but few browsers play).
+//! JPEG with quality `q` becomes H.264 4:2:0 with the constant rate factor 8 + 2 (100 − `q`).
 //!
 //! The videos of an episode are written before its numeric columns are committed, each to a temporary file that is then
-//! renamed. A box that players skip holds checksums of the video's tables and of every encoded frame, so that damage is
-//! an error instead of a wrong frame.
+//! renamed. An MP4 box that players skip holds checksums of the video's tables and of every encoded frame, so that
+//! readers return an error instead of a wrong frame if the file is damaged.
 
 #[cfg(feature = "ffmpeg")]
 mod reader;

@@ -107,7 +107,7 @@ impl Reader for VideoReader {
     }
 }
 
-/// The image columns of a third-party folder: its subfolders, by name. The first video determines the
+/// The image columns of a third-party folder: its subfolders, by name. The first video of a subfolder determines the
 /// frame size.
 fn infer_image_columns(files: &ColumnFiles) -> Result<Vec<ColumnSpec>> {
     let folder = files.folder();

@@ -38,7 +38,7 @@ fn prepare(folder: &Path, episodes: usize) -> Result<()> {
         let entry = entry.map_err(io)?;
         let name = entry.file_name().to_string_lossy().into_owned();
         let episode = name.strip_prefix("ep_").and_then(|name| name.strip_suffix(".mp4")?.parse::<usize>().ok());
-        if name.ends_with(PASSING) || episode.is_some_and(|episode| episode >= episodes) {
+        if name.ends_with(TEMPORARY_SUFFIX) || episode.is_some_and(|episode| episode >= episodes) {
             std::fs::remove_file(entry.path()).map_err(io)?;
         }
     }
@@ -46,7 +46,7 @@ fn prepare(folder: &Path, episodes: usize) -> Result<()> {
 }
 
 /// Suffix of incomplete videos.
-const PASSING: &str = ".mp4.tmp";
+const TEMPORARY_SUFFIX: &str = ".mp4.tmp";
 
 struct VideoWriter {
     columns: ColumnFilesWriter,
@@ -57,16 +57,16 @@ struct VideoWriter {
 impl Writer for VideoWriter {
     fn write_episode_with(&mut self, episode: &Batch, constants: &Constants) -> Result<()> {
         episodes::check_episode(episode, &self.schema)?;
-        let (folder, number) = (self.columns.folder(), self.columns.episodes());
+        let (folder, position) = (self.columns.folder(), self.columns.episodes());
         let images = self.schema.columns().par_iter().enumerate().filter(|(_, column)| column.is_image());
         images.try_for_each(|(index, column)| {
             let frames = episode.bytes(index).chunks_exact(column.row_bytes());
             let bytes = encode(column.shape[1], column.shape[0], FPS, self.encoding, frames)?;
-            let path = video_path(folder, &column.name, number);
-            let passing = path.with_extension(&PASSING[1..]);
+            let path = video_path(folder, &column.name, position);
+            let temporary = path.with_extension(&TEMPORARY_SUFFIX[1..]);
             let io = |e| Error::io(&path, "writing a video", e);
-            std::fs::write(&passing, bytes).map_err(io)?;
-            std::fs::rename(&passing, &path).map_err(io)
+            std::fs::write(&temporary, bytes).map_err(io)?;
+            std::fs::rename(&temporary, &path).map_err(io)
         })?;
         self.columns.write(episode, constants)
     }

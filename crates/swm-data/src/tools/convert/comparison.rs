@@ -35,8 +35,8 @@ impl ColumnComparison {
         Self { column: spec.name.clone(), exact: true, max_error: 0.0, psnr: None, squares: 0.0, values: 0 }
     }
 
-    /// Adds the values of an episode. Fails with `(given, expected)` if a numeric value differs by more than rounding to
-    /// single precision.
+    /// Adds the values of an episode. Fails with `(given, expected)` if a numeric value differs by more than rounding
+    /// to single precision.
     pub(super) fn add(&mut self, spec: &ColumnSpec, source: &[u8], target: &[u8]) -> Result<(), (String, String)> {
         self.values += (source.len() / spec.dtype.size()) as u64;
         if source == target {
@@ -47,8 +47,8 @@ impl ColumnComparison {
                 .par_chunks(1 << 16)
                 .zip(target.par_chunks(1 << 16))
                 .map(|(a, b)| {
-                    let apart = a.iter().zip(b).map(|(&a, &b)| u64::from(a.abs_diff(b)));
-                    (apart.clone().map(|d| d * d).sum::<u64>(), apart.max().unwrap_or(0))
+                    let differences = a.iter().zip(b).map(|(&a, &b)| u64::from(a.abs_diff(b)));
+                    (differences.clone().map(|d| d * d).sum::<u64>(), differences.max().unwrap_or(0))
                 })
                 .reduce(|| (0, 0), |a, b| (a.0 + b.0, a.1.max(b.1)));
             self.exact = false;
@@ -60,7 +60,7 @@ impl ColumnComparison {
         let size = spec.dtype.size();
         for (a, b) in source.chunks_exact(size).zip(target.chunks_exact(size)).filter(|(a, b)| a != b) {
             let (a, b) = (scalar(spec.dtype, a), scalar(spec.dtype, b));
-            // Formats with single precision only round doubles.
+            // Formats that store only single precision round doubles.
             let rounded = spec.dtype == DType::Float64 && f64::from(a as f32) == b;
             if !(a.is_nan() && b.is_nan()) {
                 if !rounded {

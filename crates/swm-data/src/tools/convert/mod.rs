@@ -27,14 +27,14 @@ const UNIT: &str = "episodes";
 /// The treatment of an existing target.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ConvertMode {
-    /// Continue it after its last episode, if its content is the beginning of the source.
+    /// Continues the target after its last episode, if its content is the beginning of the source.
     #[default]
     Resume,
-    /// Fail.
+    /// Returns an error.
     Create,
-    /// Replace it.
+    /// Replaces the target.
     Overwrite,
-    /// Append all episodes of the source.
+    /// Appends all episodes of the source to the target.
     Append,
 }
 
@@ -295,7 +295,7 @@ impl<'a> Source<'a> {
         }
     }
 
-    /// Compares episodes with those of a copy, `base` positions later there, and stores their hashes.
+    /// Compares episodes with those of `copy`, whose positions are higher by `base`, and stores the episodes' hashes.
     #[allow(clippy::too_many_arguments, reason = "a part of `convert`, which has all of these")]
     fn compare(
         &self,
@@ -384,7 +384,8 @@ fn read(reader: &dyn Reader, schema: &Schema, episode: usize, length: usize, row
     Ok(())
 }
 
-/// Removes the last action. Returns whether there was one: third-party datasets may have it, but no observation follows.
+/// Removes the action of the last row, which no observation follows. Returns whether there was one, as in some
+/// third-party datasets.
 fn cut_last_action(rows: &mut Batch) -> bool {
     let Some(index) = rows.schema().find(ACTION) else { return false };
     let Some(last) = rows.rows().checked_sub(1) else { return false };

@@ -1,7 +1,8 @@
-//! Examines a dataset: its defects, the models it can train, and repair, which writes the intact episodes to a new dataset.
+//! Examines a dataset for defects, and reports the models that it can train. A repair writes the intact episodes to a
+//! new dataset.
 //!
-//! The examination reads every row of every column as training does, so an intact dataset gives a loader no errors. Defects
-//! that only the format can detect come from [`Reader::irregularities`].
+//! The examination reads every row of every column as training does, so a loader reads an intact dataset without
+//! errors. Defects that only the format can detect come from [`Reader::irregularities`].
 
 mod model_fit;
 
@@ -165,7 +166,7 @@ pub fn repair(
     convert(&subset(Arc::clone(reader), diagnosis.intact.clone())?, target, options, control)
 }
 
-/// Findings, with all episodes of the same finding grouped.
+/// Findings, each with all affected episodes.
 #[derive(Default)]
 struct Findings {
     found: BTreeMap<(Severity, String), Vec<usize>>,

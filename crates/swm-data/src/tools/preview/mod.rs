@@ -35,7 +35,7 @@ impl Default for PreviewOptions {
 const SHEET_COLUMNS: usize = 8;
 
 /// Target side of enlarged images, in pixels.
-const WATCHABLE: usize = 256;
+const ENLARGED_SIDE: usize = 256;
 
 /// Rows decoded at once, which bounds the memory.
 const ROWS: usize = 32;
@@ -55,7 +55,7 @@ pub fn preview(
     std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, "creating the folder", e))?;
     let chosen = chosen(reader, options.episodes)?;
     let (mut written, mut sheet) = (vec![], vec![]);
-    let scale = integer_scale(strip.width, strip.height, WATCHABLE);
+    let scale = integer_scale(strip.width, strip.height, ENLARGED_SIDE);
     for (done, &episode) in chosen.iter().enumerate() {
         let index = reader.episodes()[episode].index;
         let path = folder.join(format!("episode_{index}.mp4"));

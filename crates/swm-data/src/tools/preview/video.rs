@@ -112,11 +112,11 @@ impl VideoFile {
         let mut hidden = OsString::from(".");
         hidden.push(name);
         hidden.push(format!(".{}.partial", std::process::id()));
-        let passing = self.path.with_file_name(hidden);
-        let written = std::fs::write(&passing, bytes).and_then(|()| std::fs::rename(&passing, &self.path));
+        let temporary = self.path.with_file_name(hidden);
+        let written = std::fs::write(&temporary, bytes).and_then(|()| std::fs::rename(&temporary, &self.path));
         written.map_err(|source| {
             // Removing fails if the file was never created.
-            let _ = std::fs::remove_file(&passing);
+            let _ = std::fs::remove_file(&temporary);
             Error::io(&self.path, "writing the video", source)
         })
     }
@@ -205,7 +205,7 @@ mod tests {
             .map(|i| f64::from(out[i * 3].abs_diff(frames[5][(i / 124 / 4 * 31 + i % 124 / 4) * 3])))
             .sum();
         assert!(off / (72.0 * 124.0) < 4.0, "{}", off / (72.0 * 124.0));
-        assert_eq!(names(folder.path()).len(), 2, "nothing but the two videos is left");
+        assert_eq!(names(folder.path()).len(), 2, "only the two videos remain");
     }
 
     #[test]
@@ -220,9 +220,9 @@ mod tests {
         let found = message(1, &[good[0].clone(), vec![0; 5]]);
         assert!(found.contains("frame 1") && found.contains("5 bytes") && found.contains("48"), "{found}");
         assert!(message(1, &[]).contains("no frame"));
-        let nowhere = folder.path().join("missing").join("a.mp4");
-        let lost = write_mp4(&nowhere, 4, 4, 10, good).expect_err("fails").to_string();
-        assert!(lost.contains("No such file or directory"), "{lost}");
+        let missing = folder.path().join("missing").join("a.mp4");
+        let error = write_mp4(&missing, 4, 4, 10, good).expect_err("fails").to_string();
+        assert!(error.contains("No such file or directory"), "{error}");
         assert!(names(folder.path()).is_empty());
     }
 

@@ -12,7 +12,7 @@ pub enum Codec {
 }
 
 impl Codec {
-    /// The codec of the filter's setting.
+    /// The codec that a setting of the filter selects.
     pub fn new(setting: u32) -> Result<Self, String> {
         match setting {
             0 => Ok(Self::None),
@@ -23,7 +23,7 @@ impl Codec {
     }
 }
 
-/// Block size in bytes, as the filter chooses it.
+/// Default block size of the filter, in bytes, for elements of `size` bytes.
 fn default_block(size: usize) -> usize {
     (8192 / size / 8 * 8).max(128) * size
 }
@@ -46,25 +46,25 @@ pub fn decode(from: &[u8], size: usize, codec: Codec, out: &mut [u8]) -> Result<
     let whole = out.len() / eight * eight;
     let (blocks, rest) = out.split_at_mut(whole);
     let mut bits = vec![];
-    for place in blocks.chunks_mut(block) {
-        bits.resize(place.len(), 0);
+    for target in blocks.chunks_mut(block) {
+        bits.resize(target.len(), 0);
         match codec {
-            Codec::None => bits.copy_from_slice(input.take(place.len())?),
+            Codec::None => bits.copy_from_slice(input.take(target.len())?),
             Codec::Lz4 | Codec::Zstd => {
                 let length = input.u32_be()? as usize;
                 let bytes = input.take(length)?;
                 if codec == Codec::Lz4 { lz4_block(bytes, &mut bits)? } else { zstd_frame(bytes, &mut bits)? }
             }
         }
-        undo(&bits, size, place);
+        undo(&bits, size, target);
     }
     rest.copy_from_slice(input.take(rest.len())?);
     Ok(())
 }
 
-/// Unshuffles the bits of a multiple of eight elements.
+/// Unshuffles the bits of elements of `size` bytes. The number of elements is a multiple of eight.
 pub fn undo(from: &[u8], size: usize, out: &mut [u8]) {
-    // One row per bit: that bit of all elements, the first in the lowest bit.
+    // Each row holds one bit of all elements, with the first element in the lowest bit.
     let row = out.len() / size / 8;
     for byte in 0..size {
         let rows: [&[u8]; 8] = std::array::from_fn(|bit| &from[(byte * 8 + bit) * row..(byte * 8 + bit + 1) * row]);

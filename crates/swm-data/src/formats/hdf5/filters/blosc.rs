@@ -2,7 +2,7 @@
 //!
 //! A chunk is a header of 16 bytes (versions, flags, element size, total length, block length, chunk length), the
 //! offset of every block, then the blocks. A block is one stream, or one stream per byte of an element. Each stream has
-//! a length prefix and is stored uncompressed if that length equals its content.
+//! a length prefix; if the prefix equals the decoded length, the stream is stored uncompressed.
 
 use super::{Input, bitshuffle, copy_match, inflate, lz4_block, shuffle, zstd_frame};
 
@@ -41,7 +41,7 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     for (decoded, start) in out.chunks_mut(block).zip(starts.as_chunks::<4>().0) {
         let start = u32::from_le_bytes(*start) as usize;
         let mut input = Input(from.get(start..).ok_or("Blosc: a block is outside the chunk")?);
-        // The last block is one stream if it is shorter.
+        // A shorter last block is one stream.
         let streams = if flags & flag::ONE_STREAM != 0 || decoded.len() < block { 1 } else { size };
         let shuffled = (flags & flag::SHUFFLE != 0 && size > 1) || flags & flag::BITSHUFFLE != 0;
         scratch.resize(decoded.len(), 0);
@@ -66,7 +66,7 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
             }
         }
         if flags & flag::BITSHUFFLE != 0 {
-            // Only whole groups of eight elements are shuffled, or none.
+            // A block is shuffled only if it consists of whole groups of eight elements.
             if decoded.len().is_multiple_of(8 * size) {
                 bitshuffle::undo(&scratch, size, decoded);
             } else {

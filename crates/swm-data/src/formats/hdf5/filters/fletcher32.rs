@@ -3,7 +3,7 @@
 /// Size of a checksum in bytes.
 pub const SIZE: usize = 4;
 
-/// Words summed between two reductions: the weighted sum of so many stays below 2^32.
+/// Number of words between two reductions. The weighted sum of this many words is below 2^32.
 const BLOCK: usize = 256;
 
 /// The checksum of `bytes`.
@@ -49,8 +49,8 @@ pub fn check(bytes: &[u8]) -> Result<usize, String> {
 mod tests {
     use super::*;
 
-    /// The definition in HDF5's documentation, word by word.
-    fn slow(bytes: &[u8]) -> u32 {
+    /// Computes the checksum word by word, as HDF5's documentation defines it.
+    fn word_by_word(bytes: &[u8]) -> u32 {
         let (mut a, mut b) = (0_u32, 0_u32);
         let fold = |sum: u32| (sum & 0xffff) + (sum >> 16);
         for block in bytes.chunks(720) {
@@ -68,15 +68,15 @@ mod tests {
     fn checksum_matches_the_definition() {
         for length in [0, 1, 2, 3, 511, 512, 513, 719, 720, 721, 5000, 150_528] {
             let bytes: Vec<u8> = (0..length).map(|i| (i * i / 7 + i) as u8).collect();
-            assert_eq!(sum(&bytes), slow(&bytes), "{length}");
-            assert_eq!(sum(&vec![255; length]), slow(&vec![255; length]), "{length}");
+            assert_eq!(sum(&bytes), word_by_word(&bytes), "{length}");
+            assert_eq!(sum(&vec![255; length]), word_by_word(&vec![255; length]), "{length}");
             assert_eq!(sum(&vec![0; length]), 0);
         }
         let mut bytes = b"some bytes".to_vec();
         bytes.extend(sum(&bytes).to_le_bytes());
         assert_eq!(check(&bytes), Ok(10));
         bytes[3] ^= 1;
-        assert!(check(&bytes).expect_err("flipped").contains("checksum"));
+        assert!(check(&bytes).expect_err("a flipped bit").contains("checksum"));
         assert!(check(&[1]).is_err());
     }
 }

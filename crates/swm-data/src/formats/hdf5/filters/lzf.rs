@@ -1,4 +1,4 @@
-//! LZF, Marc Lehmann's fast codec. It is part of h5py, so every h5py reads it without plugins.
+//! LZF, Marc Lehmann's fast codec. It is part of h5py, which therefore reads LZF without plugins.
 //!
 //! The format is a stream of instructions. A byte `n` below 32 is followed by `n + 1` literals. Any other byte starts a
 //! match: its upper three bits are the length less 2 (7 means that another byte is added), and its lower five bits with
@@ -11,7 +11,7 @@ const MAX_DISTANCE: usize = 1 << 13;
 const MAX_LENGTH: usize = 264;
 /// Matches up to this length are copied at once.
 const SHORT: usize = 16;
-/// Number of remembered positions, addressed by a hash of the three bytes there.
+/// Number of bits of the hash that addresses the table of positions. The hash covers the three bytes at a position.
 const TABLE_BITS: u32 = 14;
 
 /// Decodes a chunk into `out`, which has its decoded length.
@@ -27,9 +27,10 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
             if length > out.len() - at {
                 return Err("LZF: it exceeds the chunk".to_owned());
             }
-            // If there is space, always copies the maximum length, which takes two moves instead of a call.
+            // If there is space, copies the maximum length, because a constant length compiles to two moves instead of
+            // a call.
             match (from[i..].first_chunk::<MAX_LITERALS>(), out[at..].first_chunk_mut::<MAX_LITERALS>()) {
-                (Some(literals), Some(place)) => *place = *literals,
+                (Some(literals), Some(target)) => *target = *literals,
                 _ => out[at..at + length].copy_from_slice(literals),
             }
             (i, at) = (i + length, at + length);
@@ -42,12 +43,12 @@ pub fn decode(from: &[u8], out: &mut [u8]) -> Result<(), String> {
             let distance = ((control & 31) << 8 | usize::from(*from.get(i).ok_or_else(cut)?)) + 1;
             i += 1;
             length += 2;
-            // As above, for the many short matches.
+            // Most matches are short, and are also copied with a constant length.
             match out.split_at_mut_checked(at) {
-                Some((before, place))
-                    if length <= SHORT && (SHORT..=at).contains(&distance) && place.len() >= SHORT =>
+                Some((before, target))
+                    if length <= SHORT && (SHORT..=at).contains(&distance) && target.len() >= SHORT =>
                 {
-                    place[..SHORT].copy_from_slice(&before[at - distance..at - distance + SHORT]);
+                    target[..SHORT].copy_from_slice(&before[at - distance..at - distance + SHORT]);
                 }
                 _ => copy_match(out, at, distance, length)?,
             }
@@ -67,8 +68,8 @@ impl Default for Encoder {
 }
 
 impl Encoder {
-    /// Appends the encoded bytes to `out` if that saves a third, and returns whether it does. Otherwise appends
-    /// nothing, because uncompressed bytes read faster.
+    /// Appends the encoded bytes to `out` and returns `true`, if encoding saves at least a third. Otherwise appends
+    /// nothing and returns `false`, because uncompressed bytes are read faster.
     pub fn encode(&mut self, bytes: &[u8], out: &mut Vec<u8>) -> bool {
         let begin = out.len();
         let most = bytes.len() / 3 * 2;
@@ -77,12 +78,10 @@ impl Encoder {
         while at + 2 < bytes.len() {
             let key = [bytes[at], bytes[at + 1], bytes[at + 2]];
             let hash = (u32::from_le_bytes([key[0], key[1], key[2], 0]).wrapping_mul(0x9e37_79b1)) >> (32 - TABLE_BITS);
-            // Positions are stored plus one, because 0 means none.
+            // The table stores positions plus one; 0 means that there is no position.
             let slot = &mut self.0[hash as usize];
             let before = (*slot as usize).checked_sub(1);
-            {
-                *slot = at as u32 + 1;
-            }
+            *slot = at as u32 + 1;
             let found = before.filter(|&before| at - before <= MAX_DISTANCE && bytes[before..before + 3] == key);
             let Some(before) = found else {
                 at += 1;
@@ -107,7 +106,7 @@ impl Encoder {
     }
 }
 
-/// Length of the common prefix, compared eight bytes at a time.
+/// Length of the common prefix of `a` and `b`. Compares eight bytes at a time.
 fn common(a: &[u8], b: &[u8]) -> usize {
     let words = a.as_chunks::<8>().0.iter().zip(b.as_chunks::<8>().0);
     for (i, (x, y)) in words.enumerate() {
@@ -176,6 +175,6 @@ mod tests {
             assert!(decode(&out[..cut], &mut [0; 1000]).is_err());
         }
         assert!(decode(&out, &mut [0; 999]).is_err() && decode(&out, &mut [0; 1001]).is_err());
-        assert!(decode(&[0x20, 0], &mut [0; 3]).expect_err("before the beginning").contains("before"));
+        assert!(decode(&[0x20, 0], &mut [0; 3]).expect_err("a match before the start").contains("before"));
     }
 }

@@ -50,9 +50,9 @@ impl Pipeline {
     /// The filters of a dataset whose elements have `size` bytes.
     ///
     /// # Errors
-    /// If a filter is not supported; names it.
+    /// If a filter is not supported; the error names the filter.
     pub fn new(filters: &[hdf5_pure::Filter], size: usize) -> Result<Self, String> {
-        let understood = |filter: &hdf5_pure::Filter| {
+        let parse = |filter: &hdf5_pure::Filter| {
             let value = |at: usize| filter.client_data.get(at).copied().unwrap_or(0);
             let element = |at: usize| usize::try_from(value(at)).ok().filter(|&n| n > 0).unwrap_or(size);
             Ok(match filter.id {
@@ -73,7 +73,7 @@ impl Pipeline {
                 }
             })
         };
-        filters.iter().map(understood).collect::<Result<_, _>>().map(Self)
+        filters.iter().map(parse).collect::<Result<_, _>>().map(Self)
     }
 
     /// Whether chunks are stored without filters.
@@ -157,18 +157,18 @@ fn zstd_frame(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     if size == out.len() { Ok(()) } else { Err(format!("Zstandard: it ends after {size} of {} bytes", out.len())) }
 }
 
-/// Decodes the output of the LZ4 filter: total length, block length, then blocks with length prefixes. A block that is
-/// not smaller than its content is stored uncompressed.
+/// Decodes the output of the LZ4 filter: total length, block length, then blocks with length prefixes. A block that
+/// compression does not shrink is stored uncompressed.
 fn lz4_blocks(from: &[u8], out: &mut [u8]) -> Result<(), String> {
     let mut input = Input(from);
     let (total, block) = (input.u64_be()?, input.u32_be()? as usize);
     if total != out.len() as u64 || block == 0 {
         return Err(format!("LZ4: it declares {total} bytes in blocks of {block} instead of {}", out.len()));
     }
-    for place in out.chunks_mut(block) {
+    for target in out.chunks_mut(block) {
         let size = input.u32_be()? as usize;
         let bytes = input.take(size)?;
-        if size == place.len() { place.copy_from_slice(bytes) } else { lz4_block(bytes, place)? }
+        if size == target.len() { target.copy_from_slice(bytes) } else { lz4_block(bytes, target)? }
     }
     Ok(())
 }
@@ -201,7 +201,7 @@ impl<'a> Input<'a> {
     }
 }
 
-/// Copies `length` bytes from `distance` before `at` to `at`. Overlapping ranges repeat the bytes.
+/// Copies `length` bytes that start `distance` bytes before `at` to `at`. If the ranges overlap, the bytes repeat.
 fn copy_match(out: &mut [u8], at: usize, distance: usize, length: usize) -> Result<(), String> {
     if distance > at || distance == 0 || length > out.len() - at {
         return Err(format!("a chunk refers to {distance} bytes before byte {at}, for {length} bytes"));

@@ -11,9 +11,9 @@ pub fn undo(from: &[u8], size: usize, out: &mut [u8]) -> Result<(), String> {
         return Ok(());
     }
     match size {
-        2 => merge::<2>(from, count, out),
-        4 => merge::<4>(from, count, out),
-        8 => merge::<8>(from, count, out),
+        2 => unshuffle::<2>(from, count, out),
+        4 => unshuffle::<4>(from, count, out),
+        8 => unshuffle::<8>(from, count, out),
         _ => {
             for (byte, row) in from.chunks_exact(count).enumerate().take(size) {
                 out[byte..].iter_mut().step_by(size).zip(row).for_each(|(target, &value)| *target = value);
@@ -25,7 +25,7 @@ pub fn undo(from: &[u8], size: usize, out: &mut [u8]) -> Result<(), String> {
     Ok(())
 }
 
-fn merge<const N: usize>(from: &[u8], count: usize, out: &mut [u8]) {
+fn unshuffle<const N: usize>(from: &[u8], count: usize, out: &mut [u8]) {
     let rows: [&[u8]; N] = std::array::from_fn(|byte| &from[byte * count..(byte + 1) * count]);
     for (i, target) in out.as_chunks_mut::<N>().0.iter_mut().enumerate() {
         *target = std::array::from_fn(|byte| rows[byte][i]);

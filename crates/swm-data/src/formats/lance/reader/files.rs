@@ -23,7 +23,8 @@ const OPENED_TOGETHER: usize = 16;
 const SMALL_FILE: u64 = 1 << 20;
 
 impl LanceReader {
-    /// Opens data files in an object store concurrently, because each takes several requests. Skips open files.
+    /// Opens data files in an object store concurrently, because each takes several requests. Skips files that are
+    /// already open.
     pub(super) fn open_together(&self, files: Vec<DataFile>) -> Result<()> {
         let store = self.store.clone();
         let missing: Vec<DataFile> = {

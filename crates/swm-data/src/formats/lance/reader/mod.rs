@@ -38,7 +38,7 @@ impl LanceReader {
     /// Opens the newest version of a table.
     ///
     /// # Errors
-    /// If there is no table, or it is damaged.
+    /// If there is no table, or the table is damaged.
     pub fn open(location: &Location) -> Result<Self> {
         let store = Store::new(location)?;
         let Some(version) = store.latest()? else {
@@ -56,7 +56,7 @@ impl LanceReader {
     /// Opens a version of a table.
     ///
     /// # Errors
-    /// If it is damaged.
+    /// If the table is damaged.
     pub fn of(store: Store, table: Arc<Table>) -> Result<Self> {
         let label = store.label.clone();
         let mut fragment_rows = vec![0];
@@ -309,7 +309,8 @@ impl Reader for LanceReader {
 }
 
 impl LanceReader {
-    /// Returns the hashes of a fragment's episodes: those in its record, if it has one, otherwise computed from the data.
+    /// Returns the hashes of a fragment's episodes: those in its record, if it has one, otherwise computed from the
+    /// data.
     fn hashes(&self, fragment: usize, episodes: Range<usize>) -> Result<Vec<String>> {
         if let Some((_, record)) = self.record(fragment)? {
             let stored = self.episodes[episodes.clone()].iter().map(|episode| episode.length as u64);

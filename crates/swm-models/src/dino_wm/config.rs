@@ -40,9 +40,9 @@ pub struct DinoWmConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ColumnConfig {
-    /// Its name in the dataset, such as `action` or `proprio`.
+    /// The name of the column in the dataset, such as `action` or `proprio`.
     pub name: String,
-    /// Number of its features.
+    /// Number of features of the encoded column.
     pub dim: usize,
 }
 
@@ -72,7 +72,7 @@ impl DinoWmConfig {
     /// Checks that the sizes are consistent.
     ///
     /// # Errors
-    /// Names the first size that is not.
+    /// When a size is invalid; the error names the first such size.
     pub fn check(&self) -> Result<()> {
         self.encoder.check("model.encoder", self.image)?;
         let predictor = &self.predictor;

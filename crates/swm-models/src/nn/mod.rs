@@ -53,13 +53,13 @@ impl Init {
         Self { key, device: device.clone() }
     }
 
-    /// The source for the part of that name.
+    /// Returns the source for the part named `part`.
     #[must_use]
     pub fn of(&self, part: &str) -> Self {
         Self { key: self.key.with(part), device: self.device.clone() }
     }
 
-    /// The source for the part of that index.
+    /// Returns the source for the part with the index `index`.
     #[must_use]
     pub fn at(&self, index: usize) -> Self {
         Self { key: self.key.at(index as u64), device: self.device.clone() }

@@ -23,7 +23,7 @@ impl Scale {
     /// Standardises a table.
     ///
     /// # Shapes
-    /// `[rows, width]` to the same.
+    /// Maps `[rows, width]` to the same shape.
     pub fn apply(&self, table: &[f32]) -> Vec<f32> {
         let width = self.width();
         let scaled = |(i, &v): (usize, &f32)| ((f64::from(v) - self.mean[i % width]) / self.std[i % width]) as f32;
@@ -33,7 +33,7 @@ impl Scale {
     /// Converts a standardised table back to its units.
     ///
     /// # Shapes
-    /// `[rows, width]` to the same.
+    /// Maps `[rows, width]` to the same shape.
     pub fn undo(&self, table: &mut [f32]) {
         let width = self.width();
         for (i, v) in table.iter_mut().enumerate() {

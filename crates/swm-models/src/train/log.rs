@@ -133,7 +133,7 @@ mod tests {
     fn events_round_trip_with_valid_checksums() {
         let folder = tempfile::tempdir().expect("a folder");
         let mut log = Log::new(folder.path(), false).expect("a log");
-        log.write(7, &[("loss", 0.5), ("lr", 1e-3)]).expect("written");
+        log.write(7, &[("loss", 0.5), ("lr", 1e-3)]).expect("a written file");
         let line = std::fs::read_to_string(folder.path().join("train.jsonl")).expect("lines");
         assert_eq!(line, "{\"loss\":0.5,\"lr\":0.001,\"step\":7}\n");
         let events = std::fs::read(&log.events.path).expect("events");

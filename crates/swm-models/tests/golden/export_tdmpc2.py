@@ -60,15 +60,15 @@ def terminated(model, config, batch, done, out):
     """The value loss where some steps terminate: the reference's targets with the next value masked."""
     original = reference.two_hot_inv
     step = SimpleNamespace(call=0)
-    # Every step calls two values of the next frame, which are masked, then every Q function once.
+    # In every step, the reference decodes two values of the next frame (masked), then one value per Q function.
     per_step = 2 + config.wm.num_q
 
     def masked(logits, cfg):
-        numbers = original(logits, cfg)
+        values = original(logits, cfg)
         call, step.call = step.call, step.call + 1
         if call % per_step < 2:
-            numbers = numbers * (1 - done[:, call // per_step]).unsqueeze(1)
-        return numbers
+            values = values * (1 - done[:, call // per_step]).unsqueeze(1)
+        return values
 
     reference.two_hot_inv = masked
     record(model, config, batch, out, "o.terminated")

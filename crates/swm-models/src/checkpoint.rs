@@ -156,7 +156,7 @@ impl<M: Trainable> Checkpoint<M> {
     }
 }
 
-/// The family of the model in a run folder; `None` where there is no checkpoint.
+/// The family of the model in a run folder; `None` if the folder holds no checkpoint.
 pub fn family(run: &Path) -> Option<String> {
     let file: serde_json::Value = serde_json::from_slice(&read(&locate(run)?.join(CONFIG)).ok()?).ok()?;
     Some(file.get("family")?.as_str()?.to_owned())
@@ -252,7 +252,7 @@ fn replace(run: &Path, new: &Path) -> Result<()> {
 /// Loads the weights file of a checkpoint into a model, after checking the hash of the file if `hash` is given.
 ///
 /// # Errors
-/// When the file is damaged, or its weights are not those of the model.
+/// When the file is damaged, or the names or shapes of the weights differ from the model's.
 pub(crate) fn load_weights<M: burn::module::Module>(model: M, path: &Path, hash: Option<&String>) -> Result<M> {
     let weights = unpack(path, hash)?;
     match weights::mismatch(&parameters::shapes(&model), &weights, CONFIG) {
@@ -265,8 +265,8 @@ fn broken(path: &Path, problem: String) -> Error {
     Error::corrupt(path, problem, "train again, or copy the checkpoint again from where it came")
 }
 
-/// The folder of a run's checkpoint: the folder itself, its checkpoint, or the old checkpoint that a killed process had
-/// not yet replaced.
+/// Returns the folder of a run's checkpoint: `run` itself, its checkpoint folder, or the old checkpoint that a killed
+/// process did not replace.
 fn locate(run: &Path) -> Option<PathBuf> {
     [run.to_owned(), run.join(FOLDER), run.join(format!("{FOLDER}.old"))]
         .into_iter()

@@ -47,7 +47,7 @@ pub struct ColumnConfig {
 }
 
 impl DinoWmConfig {
-    /// Returns the number of features of a patch: those of the encoder, then those of the columns.
+    /// Returns the number of features of a patch: the features of the encoder, then the features of the columns.
     pub fn dim(&self) -> usize {
         self.encoder.dim() + self.columns.iter().map(|column| column.dim).sum::<usize>()
     }

@@ -145,7 +145,7 @@ impl DinoWm {
     }
 
     /// Rolls the model out: returns the given frames, then one predicted frame after each further action. The action
-    /// features of `given` are replaced; those of the last frame have no meaning.
+    /// features of `given` are replaced; the action features of the last frame have no meaning.
     ///
     /// # Shapes
     /// `given` is `[clips, given, patches, dim]`, `actions` is `[clips, steps, action_dim]` with `steps >= given`;

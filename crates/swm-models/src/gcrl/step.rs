@@ -38,7 +38,7 @@ struct HeadInputs {
     now: Tensor<3>,
     /// The goal, in the same graph.
     goal: Tensor<3>,
-    /// The frames after those of the history, outside the graph.
+    /// The frames that follow each frame of the history, outside the graph.
     next: Tensor<3>,
     /// The goal of the policy, outside the graph.
     policy_goal: Tensor<3>,

@@ -4,13 +4,14 @@
 //!
 //! - actions are embedded and converted to modulations once for the whole sequence;
 //! - the normalised tokens of a layer are cached while the window of latents grows, and recomputed only when the window
-//!   slides, because the positions of its tokens change then;
+//!   slides, because the positions of the tokens change when it slides;
 //! - the last layer and the modules after it compute only the last token;
 //! - keys and values are never computed. A window holds a few tokens of `dim` features, and the heads together have
 //!   many more features. So a query is multiplied by the transposed key matrix, `(W_k y)ᵀq = yᵀ(W_kᵀ q)`, and compared
 //!   with the tokens themselves; the weighted mean of the tokens is multiplied by the value matrix,
-//!   `Σ a_j W_v y_j = W_v Σ a_j y_j`. This costs as much per query as keys and values cost per token, and there are
-//!   fewer queries. The first token attends to itself alone, so its value and output projections are one matrix;
+//!   `Σ a_j W_v y_j = W_v Σ a_j y_j`. A query costs as much in this form as the key and value of a token cost in the
+//!   usual form, and there are fewer queries than tokens. The first token attends to itself alone, so its value and
+//!   output projections are one matrix;
 //! - batch normalisation is folded into the linear layer before it.
 //!
 //! Rows are ordered by token, then by sample, so that tokens are contiguous. Every row is computed separately, so costs
@@ -54,9 +55,9 @@ struct Layer {
     alone: Panels,
     /// `[dim, heads * width]`.
     query: Panels,
-    /// For each head, from its query to the space of tokens, `[width, dim]`, scaled.
+    /// For each head, the scaled map from queries to the space of tokens, `[width, dim]`.
     key: Vec<Panels>,
-    /// For each head, from the weighted mean of the tokens to its values, `[dim, width]`.
+    /// For each head, the map from the weighted mean of the tokens to values, `[dim, width]`.
     value: Vec<Panels>,
     /// `[heads * width, dim]`; absent for a single head of the tokens' size.
     out: Option<Panels>,
@@ -318,7 +319,8 @@ impl Rollout {
 }
 
 impl Layer {
-    /// Computes the attention output of some rows of a window, each of which attends to its own token and earlier ones.
+    /// Computes the attention output of a range of rows of a window; each row attends to its own token and earlier
+    /// tokens.
     #[allow(clippy::too_many_arguments, reason = "the scratch buffers are borrowed separately")]
     fn attend(
         &self,

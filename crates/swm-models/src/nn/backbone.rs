@@ -135,7 +135,7 @@ impl Backbone {
         }
     }
 
-    /// Computes the features of every patch; a [`PatchCnn`] returns those of the image as one patch.
+    /// Computes the features of every patch; a [`PatchCnn`] returns the features of the image as one patch.
     ///
     /// # Shapes
     /// Maps `[frames, patches, 3 * patch * patch]` to `[frames, patches, dim]`.

@@ -49,8 +49,8 @@ pub(crate) fn vit_encoder(vit: &Vit, patches: usize) -> Option<VitEncoder> {
     Some(VitEncoder::new(&vit_parameters(vit, patches), heads, vit.layernorm.epsilon() as f32))
 }
 
-/// Lays out a vision transformer for training on images of `patches` patches; returns `None` if its learnt positions
-/// are for another number of patches.
+/// Lays out a vision transformer for training on images of `patches` patches; returns `None` if the learnt
+/// positions are for another number of patches.
 pub(crate) fn vit_gradient(vit: &Vit, patches: usize) -> Option<VitGradient> {
     let [_, learnt, _] = vit.embeddings.position_embeddings.dims();
     let heads = vit.encoder.layer.first()?.attention.heads();

@@ -4,7 +4,7 @@ use super::{Activation, BatchNorm, BatchStatistics, Init, Linear};
 use burn::module::Module;
 use burn::tensor::Tensor;
 
-/// Linear, batch normalisation, GELU, linear. Its layers have the published names `net.0`, `net.1`, `net.3`: a field
+/// Linear, batch normalisation, GELU, linear. The layers have the published names `net.0`, `net.1`, `net.3`: a field
 /// `_3` is element 3 of a sequence.
 #[derive(Module, Debug)]
 pub struct Projector {

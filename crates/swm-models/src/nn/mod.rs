@@ -1,5 +1,6 @@
 //! Building blocks with the parameter names and layouts of PyTorch checkpoints, so that weights are exchanged without
-//! renaming. A [`Key`] and the name of a parameter determine its initial values; there is no global generator.
+//! renaming. A [`Key`] and the name of a parameter determine the initial values; no global generator is
+//! used.
 
 pub mod activation;
 pub mod attention;
@@ -101,7 +102,7 @@ impl Init {
     }
 }
 
-/// Draws standard normal values, each row with its key.
+/// Draws one row of standard normal values per key.
 ///
 /// # Shapes
 /// `[keys, width]`.

@@ -201,7 +201,7 @@ impl Layer {
 }
 
 /// Mish (Misra 2019), `x tanh(ln(1 + exp x))`, with one exponential: for `n = exp x (exp x + 2)` it is `x n / (n + 2)`.
-/// Its derivative is explicit, so that a graph holds one product and not six functions.
+/// The derivative is computed explicitly, so that an autodiff graph holds one product instead of six functions.
 ///
 /// # Shapes
 /// Maps `[…]` to the same shape.

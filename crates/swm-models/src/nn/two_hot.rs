@@ -44,7 +44,8 @@ impl Bins {
         Tensor::from_data(TensorData::new(centres, [self.count]), device)
     }
 
-    /// Encodes scalars: the weight of a bin falls linearly to 0 at its neighbours.
+    /// Encodes scalars: the weight of a bin falls linearly from 1 at the bin's centre to 0 at the neighbouring
+    /// centres.
     ///
     /// # Shapes
     /// Maps `[rows]` to `[rows, bins]`.
@@ -70,7 +71,8 @@ impl Bins {
     }
 }
 
-/// Computes the cross-entropy `-Σ target log softmax(logits)`. Its gradient, `softmax(logits) - target`, is explicit.
+/// Computes the cross-entropy `-Σ target log softmax(logits)`. The gradient,
+/// `softmax(logits) - target`, is computed explicitly.
 ///
 /// # Shapes
 /// `logits` and `target` are `[rows, bins]`; returns `[rows]`.

@@ -165,7 +165,7 @@ impl Collector {
         Ok(ended)
     }
 
-    /// Starts the next episodes in these slots.
+    /// Starts the next episodes in the slots `slots`.
     fn begin(&mut self, slots: &[usize]) -> Result<()> {
         for &slot in slots {
             self.running[slot].number = self.next;
@@ -174,7 +174,7 @@ impl Collector {
         self.reset(slots)
     }
 
-    /// Resets the environments of these slots to the start of their episodes.
+    /// Resets the environments of the slots `slots` to the start of their episodes.
     fn reset(&mut self, slots: &[usize]) -> Result<()> {
         if slots.is_empty() {
             return Ok(());

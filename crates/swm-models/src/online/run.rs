@@ -180,7 +180,7 @@ struct Run<'a> {
     key: Key,
 }
 
-/// Measurements of a run between its steps.
+/// Measurements of a run.
 struct Meter {
     start: Instant,
     /// The optimizer step at which the run began or continued.

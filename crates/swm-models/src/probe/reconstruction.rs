@@ -131,8 +131,8 @@ impl Decoder {
 /// their reconstructions.
 ///
 /// # Errors
-/// When the images have another size than the encoder's or one that the blocks do not fill, no episode is held out, or
-/// a setting is out of range.
+/// When the images do not have the encoder's image size, the side is not divisible into the decoder's blocks, no
+/// episode is held out, or a setting is out of range.
 pub fn reconstruct_images(
     encoder: &dyn ImageEncoder,
     reader: &dyn Reader,
@@ -246,7 +246,7 @@ fn sheet(images: &[u8], decoded: &[f32], image: usize, shown: usize) -> Result<R
                 .iter()
                 .map(|i| decoded[i * bytes..(i + 1) * bytes].iter().map(|v| (v * 255.0).round() as u8).collect()),
         );
-        // An incomplete last row is padded, so that it stays above its reconstructions.
+        // Padding aligns the images of an incomplete last row with their reconstructions.
         if indices.len() < COLUMNS && shown > COLUMNS {
             let blank = vec![u8::MAX; bytes];
             let at = frames.len() - indices.len();

@@ -9,7 +9,7 @@ pub(super) struct Scale {
 }
 
 impl Scale {
-    /// Computes the scale of a table `[rows, width]`; a constant column keeps its unit.
+    /// Computes the scale of a table `[rows, width]`; a constant column is centred only.
     pub fn of(table: &[f32], rows: usize) -> Self {
         let (mean, std) = mean_and_std(table, rows);
         Self { mean, std: std.into_iter().map(|s| if s > 1e-12 { s } else { 1.0 }).collect() }
@@ -30,7 +30,7 @@ impl Scale {
         table.iter().enumerate().map(scaled).collect()
     }
 
-    /// Converts a standardised table back to its units.
+    /// Converts a standardised table back to the units of the columns.
     ///
     /// # Shapes
     /// Maps `[rows, width]` to the same shape.

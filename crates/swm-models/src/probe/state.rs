@@ -51,8 +51,8 @@ pub struct Score {
     pub index: usize,
     /// The standard deviation of the element, in the units of the column.
     pub spread: f64,
-    /// The coefficient of determination: 1 for perfect predictions, 0 for those of the mean. `None` for a constant
-    /// element.
+    /// The coefficient of determination: 1 for perfect predictions, 0 for predictions of the mean. `None` for a
+    /// constant element.
     pub r2: Option<f64>,
     /// The root mean squared error, in the units of the column.
     pub rmse: f64,

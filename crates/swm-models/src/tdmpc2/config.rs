@@ -46,7 +46,7 @@ impl Tdmpc2Config {
         self.encoding.iter().map(|part| part.latent).sum()
     }
 
-    /// Returns the encoding of images, if there is one.
+    /// Returns the encoding of images, if images are observed.
     pub fn image_encoding(&self) -> Option<&Encoding> {
         self.encoding.iter().find(|part| part.column == PIXELS)
     }

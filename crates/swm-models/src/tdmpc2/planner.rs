@@ -218,7 +218,7 @@ impl Policy for Tdmpc2Policy {
         Ok(())
     }
 
-    /// Returns the seconds of each plan: the time of a call is divided equally among its environments.
+    /// Returns the seconds of each plan: the time of a call is divided equally among the environments.
     fn take_latencies(&mut self) -> Vec<f64> {
         std::mem::take(&mut self.latencies)
     }

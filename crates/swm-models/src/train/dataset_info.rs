@@ -124,7 +124,7 @@ impl DatasetInfo {
     /// `[clips, steps, frameskip * action_dim]`.
     ///
     /// # Errors
-    /// When there is no column of actions, or it is of another type.
+    /// When there is no column of actions, or the column is of another type.
     pub fn actions(&self, batch: &Batch, steps: usize, frameskip: usize, device: &Device) -> Result<Tensor<3>> {
         let dim = self.action.dim();
         let mut actions = batch.get::<f32>(ACTION)?.to_vec();
@@ -145,7 +145,7 @@ fn standard_scale(action: &ColumnInfo) -> ActionScale {
     ActionScale { mean: single(&action.mean), std: single(&action.spread()) }
 }
 
-/// Maps the range of the actions in the data to -1 ..= 1; an element that is constant keeps its unit.
+/// Maps the range of the actions in the data to -1 ..= 1; a constant element is mapped to 0.
 fn range_scale(action: &ColumnInfo) -> ActionScale {
     let range = |(&low, &high): (&f64, &f64)| match high > low {
         true => (((high + low) / 2.0) as f32, ((high - low) / 2.0) as f32),

@@ -40,7 +40,7 @@ pub(crate) trait DynLearner {
     /// Makes one optimizer step, then [`Trainable::after_step`] with `key`.
     fn update(&mut self, output: StepOutput, key: Key) -> Update;
 
-    /// Saves the checkpoint with the state to continue from, and returns the hash of its weights.
+    /// Saves the checkpoint and the state from which training continues, and returns the hash of the weights.
     ///
     /// # Errors
     /// When writing fails.

@@ -110,7 +110,7 @@ struct Value {
     simple_value: Option<f32>,
 }
 
-/// A record of a TFRecord file: the length, its checksum, the data, their checksum.
+/// A record of a TFRecord file: the length, the checksum of the length, the data, the checksum of the data.
 fn record(data: &[u8]) -> Vec<u8> {
     let length = (data.len() as u64).to_le_bytes();
     let mut out = length.to_vec();
@@ -155,7 +155,8 @@ mod tests {
 
     #[test]
     fn checksum_matches_tensorflow() {
-        // The first twelve bytes of every event file that TensorFlow writes: a length of 24, then its checksum.
+        // The first twelve bytes of every event file that TensorFlow writes: a length of 24, then the checksum of the
+        // length.
         assert_eq!(masked_crc(&24u64.to_le_bytes()), 0x224b_7fa3);
     }
 }

@@ -11,7 +11,7 @@ use swm_core::{Error, Result};
 pub struct Preset {
     /// The name on the command line.
     pub id: &'static str,
-    /// One-sentence description of its purpose.
+    /// One-sentence description of the configuration.
     pub summary: &'static str,
     /// The configuration.
     pub toml: &'static str,

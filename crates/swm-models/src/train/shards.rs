@@ -10,7 +10,7 @@ use std::ops::Range;
 use swm_core::Result;
 
 /// Returns the mean of a step over shards of `rows` rows, each weighted by its number of rows. `shard(range)` computes
-/// the mean over the rows of its range.
+/// the mean over the rows of `range`.
 ///
 /// # Errors
 /// The first error of a shard.

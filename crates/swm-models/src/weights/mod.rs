@@ -115,8 +115,8 @@ fn damaged(path: &Path, problem: String) -> Error {
     Error::corrupt(path, problem, "save the state dict again, as safetensors or with torch.save")
 }
 
-/// Replaces the weights of a module: `weights` must hold each of its parameters and buffers in its shape, and nothing
-/// else. `what` names the module in errors, such as "the model of config.json".
+/// Replaces the weights of a module: `weights` must hold every parameter and buffer of the module, with the same
+/// shapes, and nothing else. `what` names the module in errors, such as "the model of config.json".
 ///
 /// # Errors
 /// When a weight is missing, has another shape, or is not a weight of the module; the error names the first such

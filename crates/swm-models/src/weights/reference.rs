@@ -30,7 +30,7 @@ impl Reference {
     /// that file.
     ///
     /// # Errors
-    /// When a file is missing or damaged, there are several files of weights, or the class is another one.
+    /// When a file is missing or damaged, there are several files of weights, or the checkpoint is of another class.
     pub fn open(from: &Path, class: &str) -> Result<Self> {
         if !from.exists() {
             let fix = "give the folder of a checkpoint, or its file of weights";
@@ -68,7 +68,7 @@ impl Reference {
         self.size_or(at, None)
     }
 
-    /// Returns the size at a dotted path, or `default` where there is none.
+    /// Returns the size at a dotted path, or `default` if there is no size at the path.
     ///
     /// # Errors
     /// When there is neither a size at the path nor a default.
@@ -77,7 +77,7 @@ impl Reference {
         found.or(default).ok_or_else(|| self.wrong(format!("{CONFIG} has no number at {at}")))
     }
 
-    /// Returns the rate at a dotted path, or 0 where there is none.
+    /// Returns the rate at a dotted path, or 0 if there is no rate at the path.
     pub fn rate(&self, at: &str) -> f32 {
         self.at(at).and_then(Value::as_f64).unwrap_or(0.0) as f32
     }

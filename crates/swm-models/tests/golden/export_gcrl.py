@@ -1,5 +1,5 @@
-"""Writes gcbc-small.safetensors, gcivl-small.safetensors and gciql-small.safetensors: numerics of goal-conditioned models at
-a very small size; and reference/gcivl, a checkpoint in the form of the published training script.
+"""Writes gcbc-small.safetensors, gcivl-small.safetensors and gciql-small.safetensors: numerics of goal-conditioned
+models at a very small size; and reference/gcivl, a checkpoint in the form of the published training script.
 
 Run with an interpreter that has torch and the reference package (`pip install stable-worldmodel torch`):
 
@@ -8,8 +8,8 @@ Run with an interpreter that has torch and the reference package (`pip install s
 Model, heads and expectile loss are the reference's (`wm/gcrl`). The package holds no training code, so the losses are
 transcribed here from the algorithms of the paper's appendix (GCBC, GCIVL and GCIQL training), with the additions of the
 published training scripts: the weight of an action is at most 100, the policy is a normal distribution with one trained
-standard deviation per element, values are pooled by the mean. Values and policy are trained together: the policy's loss has no
-gradient to encoder and values, so the gradients are those of the paper's two phases.
+standard deviation per element, values are pooled by the mean. Values and policy are trained together: the policy's
+loss has no gradient to encoder and values, so the gradients equal those of the paper's two phases.
 """
 
 import json

@@ -1,12 +1,12 @@
-"""Writes reference/{lewm,pldm,prejepa}, checkpoints that the reference wrote, and reference-*.safetensors, their outputs.
+"""Writes checkpoints of the reference to reference/{lewm,pldm,prejepa}, and their outputs to reference-*.safetensors.
 
 Run with an interpreter that has the reference package, stable-pretraining, hydra, torch and transformers:
 
     python export_reference.py FOLDER/reference
 
-Hydra builds the models from the `config.json` that is stored with them; the reference's `save_pretrained` saves them. The state
-dict of `lewm` has the names of transformers 5, that of `pldm` those of version 4 and of published files, and that of
-`prejepa` the prefix of a wrapped encoder.
+Hydra builds the models from the `config.json` that is stored with them; the reference's `save_pretrained` saves them.
+The state dict of `lewm` has the names of transformers 5, the state dict of `pldm` the names of version 4 and of
+published files, and the state dict of `prejepa` the prefix of a wrapped encoder.
 """
 
 import json

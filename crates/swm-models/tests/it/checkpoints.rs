@@ -49,7 +49,7 @@ fn damaged_checkpoints_are_refused() {
     std::fs::write(&config_file, &original).expect("a written file");
 
     // If a process is killed between the two renames, the old checkpoint remains.
-    std::fs::rename(&inner, trained.join("checkpoint.old")).expect("renamed");
+    std::fs::rename(&inner, trained.join("checkpoint.old")).expect("a renamed folder");
     load(&trained).expect("the old checkpoint");
 }
 

@@ -228,7 +228,8 @@ fn invalid_settings_data_and_environments_are_refused() {
     let error = policy.act(&without_goal, &[true], &mut actions(1)).expect_err("no goal").to_string();
     assert!(error.contains("'goal'"), "{error}");
     // A checkpoint of another family.
-    let error = Checkpoint::<Gciql>::load(&folder.path().join("run"), &Device::flex()).expect_err("gcbc").to_string();
+    let error =
+        Checkpoint::<Gciql>::load(&folder.path().join("run"), &Device::flex()).expect_err("another family").to_string();
     assert!(error.contains("gcbc") && error.contains("gciql"), "{error}");
 }
 

@@ -124,10 +124,10 @@ fn unsuitable_checkpoints_are_refused() {
     assert!(none.contains("nowhere"), "{none}");
     // Weights of another size than in config.json.
     let out = tempfile::tempdir().expect("a folder");
-    let text = std::fs::read_to_string(folder("lewm").join("config.json")).expect("there");
+    let text = std::fs::read_to_string(folder("lewm").join("config.json")).expect("a configuration file");
     std::fs::write(out.path().join("config.json"), text.replace("\"depth\": 2", "\"depth\": 1"))
         .expect("a written file");
-    std::fs::copy(folder("lewm").join("weights.pt"), out.path().join("weights.pt")).expect("copied");
+    std::fs::copy(folder("lewm").join("weights.pt"), out.path().join("weights.pt")).expect("a copied file");
     let mismatch = message(lewm::import::import(out.path(), dataset_info(2)));
     assert!(mismatch.contains("layers.1") && mismatch.contains("config.json"), "{mismatch}");
 }
